@@ -9,7 +9,7 @@ PINNED := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 PYTEST := $(PINNED) PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --benchmark-disable
 TYPED := KOOPMPC_TESTS=typed $(PYTEST) --cov --cov-report=term
 
-.PHONY: bench test typed full mutants loops soak speed docs check format clean embedded
+.PHONY: bench test typed full mutants loops real soak speed docs check format clean embedded
 
 bench: $(VENV)/installed
 	$(PINNED) $(BIN)/koopmpc bench
@@ -23,7 +23,7 @@ typed: $(VENV)/installed-dev
 	$(TYPED)
 
 full: $(VENV)/installed-dev
-	$(TYPED) -m "(slow or not slow) and not speed and not loops"
+	$(TYPED) -m "(slow or not slow) and not speed and not loops and not real"
 
 # 200 small changes of the library, of which the tests must notice 92 %: about half an hour on two cores.
 mutants: $(VENV)/installed-dev
@@ -31,6 +31,10 @@ mutants: $(VENV)/installed-dev
 
 loops: $(VENV)/installed-dev
 	KOOPMPC_TESTS=bare $(PINNED) $(BIN)/python -m pytest -n 2 --benchmark-disable -m loops tests/closed_loop
+
+# Free-run errors on measured records and their twins; KOOPMPC_RECORDS names the folder of the records.
+real: $(VENV)/installed-dev
+	KOOPMPC_TESTS=bare $(PINNED) $(BIN)/python -m pytest -n 2 --benchmark-disable -m real tests/real
 
 speed: $(VENV)/installed-dev
 	KOOPMPC_TESTS=bare $(PINNED) $(BIN)/python -m pytest tests/speed -m speed --benchmark-columns=median,iqr,rounds --benchmark-sort=name

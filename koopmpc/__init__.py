@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc import predict as predict
     from koopmpc import recording as recording
     from koopmpc import scene as scene
+    from koopmpc import supervise as supervise
     from koopmpc import synthesis as synthesis
     from koopmpc import validate as validate
     from koopmpc.bench.problem import Case as Case
@@ -52,7 +53,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.data.excitation import Feedback as Feedback
     from koopmpc.data.excitation import Multisine as Multisine
     from koopmpc.data.excitation import Noise as Noise
-    from koopmpc.data.storage import load_episodes as load_episodes
+    from koopmpc.data.files.load import load_episodes as load_episodes
     from koopmpc.errors import FitWarning as FitWarning
     from koopmpc.errors import KoopmpcError as KoopmpcError
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
@@ -94,7 +95,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.predict.predictors import load_model as load_model
     from koopmpc.recording.reader import load_run as load_run
     from koopmpc.recording.recorder import Recorder as Recorder
-    from koopmpc.recording.recorder import record as record
+    from koopmpc.recording.writer import record as record
     from koopmpc.synthesis.design import design as design
     from koopmpc.synthesis.designed import load_controller as load_controller
     from koopmpc.synthesis.select import select as select
@@ -124,18 +125,29 @@ else:
             "identify.fits.edmd",
             "loop.simulate",
         ),
+        joints={
+            "log formats": ("data.files.npz", "data.files.parquet", "data.files.plain", "recording.reader"),
+            "controllers": (
+                "control.lqr",
+                "control.linear.koopman_mpc",
+                "control.nonlinear.bilinear_mpc",
+                "control.nonlinear.nonlinear_mpc",
+                "supervise.adaptive",
+                "supervise.guarded",
+            ),
+            "monitor": ("supervise.monitor",),
+        },
         moved={
-            "Adaptive": "control",
+            "Adaptive": "supervise",
             "Files": "data",
             "GymPlant": "plants",
-            "Guarded": "control",
+            "Guarded": "supervise",
             "KoopmanRegressor": "identify",
-            "Monitor": "control",
+            "Monitor": "supervise",
             "Prior": "identify",
             "Stream": "data",
             "constrained_edmd": "identify",
             "eigenfunctions": "identify",
-            "from_peer": "predict",
             "kernel_edmd": "identify",
             "sparse_edmd": "identify",
             "stable_edmd": "identify",

@@ -1,14 +1,12 @@
-"""Tasks on a Dask cluster, and the job that local workers and a cluster share."""
+"""Tasks on a Dask cluster, and what local workers and a cluster share: jobs, and the pool that does them."""
 
 import os
 import socket
 import time
-from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from itertools import islice
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 from urllib.parse import urlsplit
 from uuid import uuid4
 
@@ -17,13 +15,14 @@ from koopmpc.errors import DataError, KoopmpcError, install
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-AHEAD = 2  # tasks for each worker that may be under way, or done before their turn
-ONE_THREAD: dict[str, str] = dict.fromkeys(  # the environment of a worker; numpy reads it when it is imported
+AHEAD = 2  # for each worker this many tasks may be under way, or be done before their turn
+ONE_THREAD: dict[str, str] = dict.fromkeys(  # environment of a worker: numpy reads it when it is imported
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
-_SHOWN = 200  # characters of a task that a message shows
-_PATIENCE = 30.0  # longest wait for a cluster without any worker [s]
-_ANSWER = 3.0  # longest wait for a scheduler to answer [s]
+_SHOWN = 200  # a message shows at most this many characters of a task
+_PATIENCE = 30.0  # raise an error if the cluster has had no worker for this time [s]
+_LOOK = 1.0  # while a result is awaited, look for workers this often [s]
+_ANSWER = 3.0  # raise an error if the scheduler does not answer within this time [s]
 _ANY_PORT = "127.0.0.1:0"
 
 
@@ -37,6 +36,26 @@ class QueuedTask(Generic[Task]):
     def __str__(self) -> str:
         text = str(self.task)
         return f"task {self.index}, {text if len(text) <= _SHOWN else text[: _SHOWN - 1] + '…'}"
+
+
+class TaskPool(Protocol):
+    """Workers that do one function on many tasks."""
+
+    def count_workers(self) -> int:
+        """Return how many workers there are, 1 or more."""
+        ...
+
+    def submit(self, job: QueuedTask[Any]) -> None:
+        """Send the job to the next worker that is free."""
+        ...
+
+    def wait(self, job: QueuedTask[Any]) -> Any:
+        """Return the result of the job, or raise what the task raised, or an error that names a job that kills."""
+        ...
+
+    def abandon(self) -> None:
+        """Stop the jobs that nobody waits for any more."""
+        ...
 
 
 def died(job: str, how: str) -> str:
@@ -73,46 +92,60 @@ def address_of(scheduler: str, workers: int | None) -> str:
     raise DataError(f'scheduler is {scheduler!r}; pass "local", or the address "tcp://host:port" of a Dask scheduler')
 
 
-def on_dask(
-    function: Callable[[Task], Result], tasks: Iterator[Task], scheduler: str, workers: int | None
-) -> Generator[Result]:
-    """Yield the results of a Dask cluster in order; Dask does the tasks of a lost worker again."""
-    with _client(scheduler, workers) as client:
-        run, futures = f"koopmpc-{uuid4()}", deque[tuple[QueuedTask[Task], Any]]()
-        jobs = (QueuedTask(i, task) for i, task in enumerate(tasks))
-        try:
-            while True:
-                room = AHEAD * max(sum(client.nthreads().values()), 1) - len(futures)
-                for job in islice(jobs, max(room, 0)):
-                    futures.append((job, client.submit(_Call(function, job.task), key=f"{run}-{job.index}")))
-                if not futures:
-                    return
-                job, future = futures[0]
-                result = _awaited(job, future, client)
-                futures.popleft()
-                del future  # the cluster may forget it
-                yield result
-        finally:
-            for _, future in futures:
-                future.cancel()
+class DaskPool(Generic[Task, Result]):
+    """The workers of a Dask cluster, which does the jobs of a lost worker again by itself."""
 
+    def __init__(self, function: Callable[[Task], Result], client: Any, address: str) -> None:
+        self._function, self._client, self._address = function, client, address
+        self._run = f"koopmpc-{uuid4()}"
+        self._futures: dict[QueuedTask[Task], Any] = {}
 
-def _awaited(job: QueuedTask[Any], future: Any, client: Any) -> Any:
-    """Return the result of the future, or raise what it raised; a cluster without any worker is not waited for."""
-    from distributed.scheduler import KilledWorker
+    def count_workers(self) -> int:
+        """Return the number of the cluster's threads, or 1 while it has none."""
+        return max(sum(self._client.nthreads().values()), 1)
 
-    while True:
-        try:
-            return future.result(timeout=_PATIENCE)
-        except TimeoutError:
-            if future.done():
-                raise  # the function itself raised it
-            if not client.nthreads():
+    def submit(self, job: QueuedTask[Task]) -> None:
+        """Send the job to the scheduler."""
+        call = _Call(self._function, job.task)
+        self._futures[job] = self._client.submit(call, key=f"{self._run}-{job.index}")
+
+    def wait(self, job: QueuedTask[Task]) -> Result:
+        """Return the result of the job, or raise what the task raised.
+
+        Raises
+        ------
+        KoopmpcError
+            Several workers died of the job, the cluster has no worker, or its scheduler has ended.
+        """
+        from distributed.client import FutureCancelledError
+        from distributed.comm.core import CommClosedError
+        from distributed.scheduler import KilledWorker
+
+        future, seen = self._futures.pop(job), time.monotonic()
+        while True:
+            try:
+                return future.result(timeout=_LOOK)
+            except KilledWorker as error:
+                raise KoopmpcError(died(str(job), "Dask gave it up")) from error
+            except (FutureCancelledError, CommClosedError) as error:
                 raise KoopmpcError(
-                    f"{job}: the cluster has had no worker for {_PATIENCE:g} s; start some with `dask worker ADDRESS`"
-                ) from None
-        except KilledWorker as error:
-            raise KoopmpcError(died(str(job), "Dask gave it up")) from error
+                    f"{job}: the Dask scheduler at {self._address} has ended; start another one, and run again"
+                ) from error
+            except TimeoutError:
+                if future.done():
+                    return future.result()  # it came just now, or the function itself raised a TimeoutError
+                if self._client.nthreads():
+                    seen = time.monotonic()
+                elif time.monotonic() > seen + _PATIENCE:
+                    raise KoopmpcError(
+                        f"{job}: the cluster has had no worker for {_PATIENCE:g} s; start some with "
+                        "`dask worker ADDRESS`"
+                    ) from None
+
+    def abandon(self) -> None:
+        """Cancel the jobs that are under way."""
+        for future in self._futures.values():
+            future.cancel()
 
 
 def _knock(scheduler: str) -> None:
@@ -129,8 +162,16 @@ def _knock(scheduler: str) -> None:
 
 
 @contextmanager
-def _client(scheduler: str, workers: int | None) -> Generator[Any]:
-    """Return a client of the cluster; a local one, which only this machine sees, is taken down after."""
+def open_dask(
+    function: Callable[[Task], Result], scheduler: str, workers: int | None
+) -> Generator[DaskPool[Task, Result]]:
+    """Return the pool of a Dask cluster; a local one, which only this machine sees, is taken down after.
+
+    Raises
+    ------
+    KoopmpcError
+        Dask is not installed, or no scheduler answers.
+    """
     try:
         from dask import config
         from distributed import Client, LocalCluster
@@ -159,4 +200,4 @@ def _client(scheduler: str, workers: int | None) -> Generator[Any]:
                 f"no Dask scheduler answers at {scheduler} within {_ANSWER:g} s; start one with `dask scheduler`, "
                 'or pass "local"'
             ) from error
-        yield client
+        yield DaskPool(function, client, scheduler)

@@ -6,6 +6,12 @@ from importlib import import_module
 from sys import modules as loaded
 from typing import Any
 
+_ROOMS: list[str] = []
+"""Modules that the front door serves as rooms: `find_public` looks into them in this order."""
+
+_JOINTS: dict[str, tuple[str, ...]] = {}
+"""Joint → modules that register themselves there, as the front door lists them."""
+
 
 def attach(
     package: str,
@@ -13,6 +19,7 @@ def attach(
     *,
     core: Sequence[str] = (),
     moved: Mapping[str, str] | None = None,
+    joints: Mapping[str, Sequence[str]] | None = None,
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` of a package that serves the names which type checkers see.
 
@@ -28,14 +35,20 @@ def attach(
     core
         Files below the package that the first name brings along, so that no later call waits for an import.
     moved
-        Names that stood here once → the room below the package that has them now; asking for one says so.
+        Names that stood here once → the room of `km` that has them now; asking for one says so.
+    joints
+        Joint → files below the package that register themselves there; `load_joint` imports them. Only the front door,
+        which stands above all rooms, has joints.
     """
-    imported = _imported(package)
+    imported = read_imports(package)
     rooms = {name: f"koopmpc.{file}" for name, file in (modules or {}).items()}
     rooms |= {name: f"{package}.{name}" for name, file in imported.items() if file == package}
     home = {name: file for name, file in imported.items() if name not in rooms}
-    every = sorted(home)
+    public = sorted(home)
     waiting = [f"{package}.{file}" for file in core]
+    if joints is not None:
+        _JOINTS.update({joint: tuple(f"{package}.{file}" for file in files) for joint, files in joints.items()})
+        _ROOMS[:] = [package, *dict.fromkeys(rooms.values())]
 
     def serve(name: str) -> Any:
         if name in rooms or name in home:
@@ -44,20 +57,52 @@ def attach(
             ready = {known: getattr(loaded[file], known) for known, file in home.items() if file in loaded}
             loaded[package].__dict__.update(ready)
         if name in rooms:
-            found = import_module(rooms[name])
+            value = import_module(rooms[name])
         elif name in home:
-            found = getattr(import_module(home[name]), name)
+            value = getattr(import_module(home[name]), name)
         elif moved is not None and name in moved:
-            raise AttributeError(f"km.{name} has moved: it is km.{moved[name]}.{name} now")
+            old = f"{package}.{name}".replace("koopmpc", "km", 1)
+            raise AttributeError(f"{old} has moved: it is km.{moved[name]}.{name} now")
         else:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        setattr(loaded[package], name, found)
-        return found
+        setattr(loaded[package], name, value)
+        return value
 
-    return serve, lambda: sorted([*every, *rooms]), every
+    return serve, lambda: sorted([*public, *rooms]), public
 
 
-def _imported(package: str) -> dict[str, str]:
+def find_public(name: str) -> Any:
+    """Return the object that koopmpc or one of its rooms serves by this name; None where none does."""
+    for room in _ROOMS:
+        module = import_module(room)
+        if name in getattr(module, "__all__", ()):
+            return getattr(module, name)
+    return None
+
+
+def load_joint(joint: str, until: Callable[[], bool] | None = None) -> tuple[str, ...]:
+    """Import the modules that register themselves at this joint, so that a room never imports one above it.
+
+    Parameters
+    ----------
+    joint
+        A joint of the table in ``koopmpc/__init__.py``.
+    until
+        Import no further module once this is true.
+
+    Returns
+    -------
+    tuple of str
+        Names of all modules of the joint, in the order of the table.
+    """
+    for file in _JOINTS[joint]:
+        if until is not None and until():
+            break
+        import_module(file)
+    return _JOINTS[joint]
+
+
+def read_imports(package: str) -> dict[str, str]:
     """Return name → file of the imports below ``if TYPE_CHECKING:`` in the source of a package that is being loaded."""
     loader: Any = loaded[package].__loader__
     tree = ast.parse(loader.get_source(package))

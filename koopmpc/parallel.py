@@ -2,33 +2,44 @@
 
 import os
 import pickle
+import re
 import signal
 import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence, Sized
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from itertools import islice
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import wait
-from time import monotonic, sleep
+from concurrent.futures import BrokenExecutor, Future
+from contextlib import AbstractContextManager, nullcontext
+from itertools import count, islice
+from multiprocessing import Pipe, parent_process
+from multiprocessing.connection import Connection, wait
 from typing import Any, cast
 
+import cloudpickle
+
 from koopmpc import checks
-from koopmpc.cluster import AHEAD, ONE_THREAD, QueuedTask, Result, Task, address_of, died, on_dask
+from koopmpc.cluster import (
+    AHEAD,
+    ONE_THREAD,
+    QueuedTask,
+    Result,
+    Task,
+    TaskPool,
+    address_of,
+    died,
+    open_dask,
+)
 from koopmpc.errors import DataError, KoopmpcError
+from koopmpc.interrupts import call_uninterrupted
 
 Progress = Callable[[int, int | None], None]
-StageProgress = Callable[
-    [str, int, int | None], None
-]  # the same for work in several stages, the name of the stage first
+"""Called with (tasks done, tasks in all)."""
+StageProgress = Callable[[str, int, int | None], None]
+"""Called with (name of the stage, tasks done, tasks in all), for work in several stages."""
 
-_TRIES = 3  # how often a task that runs alone may kill its worker before it is named
-_GRACE = 5.0  # time that a process gets to end [s]
-_GUARD = 'put what the script runs under `if __name__ == "__main__":`, for each worker imports the script first'
+_TRIES = 3  # name a task that killed its worker this many times while it ran alone
 _UNSENDABLE = (AttributeError, TypeError, pickle.PicklingError)
+_WORKER_ENVIRONMENT = {**ONE_THREAD, "LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}  # a worker may keep models between its tasks
 
 
 def map_tasks(
@@ -66,16 +77,15 @@ def map_tasks(
     KoopmpcError
         A worker died on the same task each time, cannot start, or no Dask scheduler or worker answers.
     """
-    workers = 1 if workers is None and scheduler is None else workers
-    workers = None if workers is None else checks.count(workers, "workers")
+    workers = _check_workers(workers, scheduler)
     total = len(tasks) if isinstance(tasks, Sized) else None
     if scheduler is not None:
-        results = on_dask(function, iter(tasks), address_of(scheduler, workers), workers)
+        results = _yield_results(open_dask(function, address_of(scheduler, workers), workers), tasks)
     elif workers == 1:
         results = map(function, tasks)
     else:
-        results = _on_own_processes(function, iter(tasks), workers or 1)
-    return results if progress is None else _told(results, progress, total)
+        results = _yield_results(LocalPool(workers or 1, function), tasks)
+    return results if progress is None else _report(results, progress, total)
 
 
 class Workers:
@@ -91,15 +101,14 @@ class Workers:
     """
 
     def __init__(self, workers: int | None = None, scheduler: str | None = None) -> None:
-        workers = 1 if workers is None and scheduler is None else workers
-        self._workers = None if workers is None else checks.count(workers, "workers")
-        self._scheduler, self._held = scheduler, _HeldPool(self._workers or 1)
+        self._workers, self._scheduler = _check_workers(workers, scheduler), scheduler
+        self._pool = LocalPool(self._workers or 1)
 
     def __enter__(self) -> "Workers":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._held.close()
+        self._pool.close()
 
     def map(
         self,
@@ -121,33 +130,74 @@ class Workers:
         if self._scheduler is not None or self._workers == 1:
             results = map_tasks(function, sent, workers=self._workers, scheduler=self._scheduler, progress=progress)
         else:
-            results = _on_processes(function, iter(sent), self._held, len(sent))
-            results = results if progress is None else _told(results, progress, len(sent))
+            self._pool.set_function(function)
+            results = _yield_results(nullcontext(self._pool), sent, ahead=len(sent))
+            results = results if progress is None else _report(results, progress, len(sent))
         return [result for _, result in sorted(zip(order, results, strict=True), key=lambda pair: pair[0])]
 
 
-def _told(results: Iterator[Result], progress: Progress, total: int | None) -> Iterator[Result]:
+def _check_workers(workers: int | None, scheduler: str | None) -> int | None:
+    """Return the number of local processes; None leaves it to the cluster."""
+    workers = 1 if workers is None and scheduler is None else workers
+    return None if workers is None else checks.count(workers, "workers")
+
+
+def _report(results: Iterator[Result], progress: Progress, total: int | None) -> Iterator[Result]:
+    """Yield the results, and call progress after each."""
     progress(0, total)
     for done, result in enumerate(results, start=1):
         progress(done, total)
         yield result
 
 
-class _Pool:
-    """Processes that begin afresh, with one BLAS thread each, and do `function` of what they are sent.
+def _yield_results(
+    opening: AbstractContextManager[TaskPool], tasks: Iterable[Any], ahead: int | None = None
+) -> Generator[Any]:
+    """Yield the results of a pool in the order of the tasks.
 
-    A worker gets `function` once, when it starts; another one comes with each of its tasks. Tasks and results are
-    pickled here rather than by the executor, so that an error names what does not pickle and an exception that does not
-    unpickle breaks nothing.
+    At most `ahead` tasks, by default two for each worker, are under way or wait for their turn.
+    """
+    with opening as pool:
+        jobs = (QueuedTask(i, task) for i, task in enumerate(tasks))
+        queue = deque[QueuedTask[Any]]()
+        try:
+            while True:
+                room = (AHEAD * pool.count_workers() if ahead is None else ahead) - len(queue)
+                for job in islice(jobs, max(room, 0)):
+                    queue.append(job)
+                    pool.submit(job)
+                if not queue:
+                    return
+                result = pool.wait(queue[0])
+                queue.popleft()
+                yield result
+        finally:
+            if queue:
+                pool.abandon()
+
+
+class LocalPool:
+    """Processes of loky's executor, each with one BLAS thread.
+
+    Tasks and results are pickled here rather than by the executor, so that an error names what does not pickle, and an
+    exception that does not unpickle breaks nothing. cloudpickle sends what a script defines by its code: a worker does
+    not import the script.
     """
 
-    def __init__(self, function: Callable[[Any], Any], workers: int) -> None:
-        self.workers = workers
-        self._function, self._other, self._number, self._code = function, function, 0, b""
-        _quiet_tracker()
-        self._executor = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (function,))
+    def __init__(self, workers: int, function: Callable[[Any], Any] | None = None) -> None:
+        self._workers, self._function, self._code = workers, function, (0, b"")
+        self._futures: dict[QueuedTask[Any], Future[Any]] = {}
+        self._executor: Any = None
 
-    def turn_to(self, function: Callable[[Any], Any]) -> None:
+    def __enter__(self) -> "LocalPool":
+        if self._function is not None:
+            self.set_function(self._function)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def set_function(self, function: Callable[[Any], Any]) -> None:
         """Send this function with all tasks from now on.
 
         Raises
@@ -155,203 +205,125 @@ class _Pool:
         DataError
             It does not pickle.
         """
-        if function is self._other:
-            return
-        self._other, self._number = function, self._number + 1
-        self._code = b"" if function is self._function else _pickled(function, "the function")
+        if not self._code[0] or function is not self._function:
+            self._function, self._code = function, (next(_numbers), _pickle(function, "the function"))
 
-    def submit(self, job: QueuedTask[Any]) -> "Future[bytes]":
+    def count_workers(self) -> int:
+        """Return the number of processes."""
+        return self._workers
+
+    def submit(self, job: QueuedTask[Any]) -> None:
         """Send the job to the next worker that is free.
 
         Raises
         ------
         DataError
             It does not pickle.
-        BrokenProcessPool
-            A worker has died; the pool is of no use any more.
         """
-        sent = _pickled(job.task, str(job))
+        self._futures[job] = self._send(_pickle(job.task, str(job)))
+
+    def wait(self, job: QueuedTask[Any]) -> Any:
+        """Return the result of the job, or raise what the task raised.
+
+        When a worker dies, it is not known whose job killed it. This job, the first that is due, is done again alone,
+        where a death is its own; the others that were lost are sent to new workers.
+
+        Raises
+        ------
+        KoopmpcError
+            Each worker died while it did this job alone, or while it started.
+        """
         try:
-            with _environment(ONE_THREAD), _undisturbed():  # `submit` starts the processes
-                return self._executor.submit(_work, sent, self._number, self._code)
-        except OSError as error:  # another worker died meanwhile, and the executor has closed what this one inherits
-            if self._executor._broken:
-                raise BrokenProcessPool("a worker died while another one was started") from error
-            raise
+            answer = self._futures.pop(job).result()
+        except BrokenExecutor:
+            self.close()
+            answer = self._repeat(job)
+            lost = [other for other, future in self._futures.items() if future.exception() is not None]
+            for other in lost:
+                self.submit(other)
+        fine, value = pickle.loads(answer)
+        if not fine:
+            raise value
+        return value
+
+    def abandon(self) -> None:
+        """End the processes, those that work too; the next job starts others."""
+        self._futures.clear()
+        self.close()
 
     def close(self) -> None:
-        """End the processes, those that work too; Python 3.14 calls this `kill_workers`."""
-        processes = list((self._executor._processes or {}).values())
-        self._executor.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.join(_GRACE)
-            if process.is_alive():
-                process.kill()
+        """End the processes."""
+        executor, self._executor = self._executor, None
+        if executor is not None:
+            executor.shutdown(wait=True, kill_workers=True)
+            self._lifeline.close()
 
-
-class _HeldPool:
-    """A pool that is made when it is first asked for, and made anew where it broke."""
-
-    def __init__(self, workers: int) -> None:
-        self.workers, self._pool = workers, cast("_Pool | None", None)
-
-    def of(self, function: Callable[[Any], Any]) -> _Pool:
-        """Return the pool, at work on this function."""
-        if self._pool is None:
-            self._pool = _Pool(function, self.workers)
-        self._pool.turn_to(function)
-        return self._pool
-
-    def close(self) -> None:
-        """End the processes; the next `of` begins others."""
-        if self._pool is not None:
-            self._pool.close()
-        self._pool = None
-
-
-def _on_own_processes(function: Callable[[Task], Any], tasks: Iterator[Task], workers: int) -> Generator[Any]:
-    held = _HeldPool(workers)
-    try:
-        yield from _on_processes(function, tasks, held, AHEAD * workers)
-    finally:
-        held.close()
-
-
-def _on_processes(
-    function: Callable[[Task], Any], tasks: Iterator[Task], held: _HeldPool, ahead: int
-) -> Generator[Any]:
-    """Yield the results of a pool's processes in order; at most `ahead` tasks are under way, or wait for their turn.
-
-    A worker that dies breaks the pool, and its task is not known. The first task that is due is therefore
-    done alone, where a death is its own, and the others go to a new pool.
-    """
-    jobs = (QueuedTask(i, task) for i, task in enumerate(tasks))
-    queue: deque[tuple[QueuedTask[Task], Future[bytes] | None]] = deque()
-    try:
-        while True:
-            queue.extend((job, None) for job in islice(jobs, ahead - len(queue)))
-            if not queue:
-                return
-            try:
-                for i, (job, future) in enumerate(queue):
-                    queue[i] = job, future or held.of(function).submit(job)
-                answer = cast("Future[bytes]", queue[0][1]).result()
-            except BrokenProcessPool:
-                held.close()
-                queue = deque((job, future if _is_done(future) else None) for job, future in queue)
-                done = queue[0][1]
-                answer = _alone(function, queue[0][0]) if done is None else done.result()
-            queue.popleft()
-            fine, value = pickle.loads(answer)
-            if not fine:
-                raise value
-            yield value
-    finally:
-        if queue:  # no one waits for the tasks under way
-            held.close()
-
-
-def _is_done(future: "Future[bytes] | None") -> bool:
-    return future is not None and future.done() and not future.cancelled() and future.exception() is None
-
-
-def _alone(function: Callable[[Any], Any], job: QueuedTask[Any]) -> bytes:
-    """Return the answer of a worker that has nothing else to do.
-
-    Raises
-    ------
-    KoopmpcError
-        Each worker died, or none can start.
-    """
-    end = 0
-    for _ in range(_TRIES):
-        pool = _Pool(function, 1)
+    def _send(self, task: bytes) -> "Future[Any]":
         try:
-            with _environment(ONE_THREAD), _undisturbed():
-                begun = pool._executor.submit(os.getpid)
-            processes = list((pool._executor._processes or {}).values())
-            try:
-                begun.result()
-            except BrokenProcessPool as error:
-                end = _exit_code(processes)
-                if end < 0:
-                    continue
-                raise KoopmpcError(f"the worker processes cannot start; {_GUARD}") from error
-            end = 0
-            return pool.submit(job).result()
-        except BrokenProcessPool:
-            continue
-        finally:
-            pool.close()
-    if end:
+            executor = self._executor or self._start()
+            return executor.submit(_work, task, *self._code)
+        except BrokenExecutor as error:  # another worker died meanwhile: `wait` sends the task again
+            lost = Future[Any]()
+            lost.set_exception(error)
+            return lost
+
+    def _start(self) -> Any:
+        """Return an executor whose processes have started, which inherit a blocked Ctrl-C and one BLAS thread."""
+        from loky import ProcessPoolExecutor
+
+        _quiet_tracker()
+        received, self._lifeline = Pipe(duplex=False)
+        with received:
+            self._executor = ProcessPoolExecutor(
+                self._workers, initializer=_begin, initargs=(received,), env=_WORKER_ENVIRONMENT
+            )
+            call_uninterrupted(self._send_first)
+        return self._executor
+
+    def _send_first(self) -> None:
+        self._started: Future[int] = self._executor.submit(os.getpid)  # starts the processes
+
+    def _repeat(self, job: QueuedTask[Any]) -> bytes:
+        """Return the answer of a worker that has nothing else to do."""
+        task, not_started = _pickle(job.task, str(job)), None
+        for _ in range(_TRIES):
+            with LocalPool(1) as alone:
+                alone._code = self._code
+                try:
+                    return alone._send(task).result()
+                except BrokenExecutor:
+                    not_started = alone._started.exception()
+        if not_started is None:
+            raise KoopmpcError(died(str(job), f"{_TRIES} times"))
+        codes = re.search(r"\{.+\}", str(not_started))  # loky names them in its message alone
         raise KoopmpcError(
-            f"each worker process was killed while it started (signal {-end}); run with fewer workers, or give them "
-            "more memory"
-        )
-    raise KoopmpcError(died(str(job), f"{_TRIES} times"))
+            f"each worker process was killed while it started (exit codes {codes[0] if codes else 'unknown'}); "
+            "run with fewer workers, or give them more memory"
+        ) from not_started
 
 
-def _exit_code(processes: list[Any]) -> int:
-    """Return how these processes ended: negative where a signal ended one, its number.
-
-    The executor's own thread waits for them too: where it was told first, their exit codes come a moment later.
-    """
-    deadline = monotonic() + _GRACE
-    for process in processes:
-        process.join(_GRACE)
-        while process.exitcode is None and monotonic() < deadline:
-            sleep(0.001)
-    return min((process.exitcode or 0 for process in processes), default=0)
+_dump: Callable[[object], bytes] = cast("Any", cloudpickle).dumps
+_numbers = count(1)  # of the functions that this process sends
 
 
 def _quiet_tracker() -> None:
-    """Start the process with which Python removes semaphores that are left behind, without its warnings.
+    """Start the process with which loky removes semaphores that are left behind, without its warnings.
 
-    Of a process that Ctrl-C ended it would write two lines for each semaphore below what the program said last.
+    After Ctrl-C it would write lines below the one with which the program ends.
     """
-    if os.name == "posix":
-        from multiprocessing import resource_tracker  # Windows has none
+    from loky.backend import resource_tracker
 
-        with _environment({"PYTHONWARNINGS": "ignore::UserWarning"}):
-            resource_tracker.ensure_running()
-
-
-@contextmanager
-def _environment(added: dict[str, str]) -> Generator[None]:
-    """Let processes that start meanwhile inherit these variables."""
-    before = {name: os.environ.get(name) for name in added}
-    os.environ.update(added)
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = "ignore::UserWarning"
     try:
-        yield
+        resource_tracker.ensure_running()
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        del os.environ["PYTHONWARNINGS"]
+        if before is not None:
+            os.environ["PYTHONWARNINGS"] = before
 
 
-@contextmanager
-def _undisturbed() -> Generator[None]:
-    """Let processes that start meanwhile inherit a blocked Ctrl-C, which is the parent's to answer, at the end of this.
-
-    A worker that met it while it imports would print a traceback of its own.
-    """
-    block = getattr(signal, "pthread_sigmask", None)  # Windows has none
-    if block is None:
-        yield
-        return
-    before = block(signal.SIG_BLOCK, ())
-    try:
-        block(signal.SIG_BLOCK, {signal.SIGINT})  # it may raise a KeyboardInterrupt that came before
-        yield
-    finally:
-        block(signal.SIG_SETMASK, before)
-
-
-def _pickled(value: object, name: str) -> bytes:
+def _pickle(value: object, name: str) -> bytes:
     """Return the bytes of what is sent to a worker.
 
     Raises
@@ -360,54 +332,54 @@ def _pickled(value: object, name: str) -> bytes:
         It does not pickle.
     """
     try:
-        return pickle.dumps(value)
+        return _dump(value)
     except _UNSENDABLE as error:
         raise DataError(
             f"{name} cannot be sent to a worker: {error}; run with workers=1, or define its parts in a module"
         ) from error
 
 
-_functions: dict[int, Callable[[Any], Any]] = {}  # of this worker: 0 is what it began with, others have come later
+_received: dict[int, Callable[[Any], Any]] = {}  # of this worker: the function that it was sent last
+_parents: list[Connection] = []  # of this worker: a pipe that only its parent holds open
 
 
-def _begin(function: Callable[[Any], Any]) -> None:
-    """Take the function; this runs in the worker when it starts."""
-    _functions[0] = function
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
+def _begin(parent: Connection) -> None:
+    """Leave Ctrl-C to the parent, and end with it; this runs in the worker when it starts."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _parents.append(parent)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def is_orphan() -> bool:
     """Return whether this is a worker whose parent has ended; it ends soon itself."""
-    parent = parent_process()
+    if _parents:
+        return _parents[0].poll()  # nothing is ever sent: the pipe has come to its end
+    parent = parent_process()  # of a Dask worker
     return parent is not None and not parent.is_alive()
 
 
 def _end_with_parent() -> None:
     """End this worker when its parent has ended, killed perhaps: it would wait for tasks for ever."""
-    parent = parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)
+    wait(_parents)
+    os._exit(1)
 
 
 def _work(sent: bytes, number: int, code: bytes) -> bytes:
     """Return (True, the function of the task) or (False, what it raised); this runs in the worker.
 
-    `number` names the function, and `code` is its pickle where it is another than that of the start.
+    `number` names the function, and `code` is its pickle.
     """
-    number = number if code else 0
-    if number not in _functions:
-        for old in [key for key in _functions if key]:
-            del _functions[old]
-        _functions[number] = pickle.loads(code)
-    task = pickle.loads(sent)
+    task = None
     try:
-        answer = (True, _functions[number](task))
+        if number not in _received:
+            _received.clear()
+            _received[number] = pickle.loads(code)
+        task = pickle.loads(sent)
+        answer = (True, _received[number](task))
     except Exception as error:  # whatever it is, it is raised again in the parent
         answer = (False, _portable(error))
     try:
-        return pickle.dumps(answer)
+        return _dump(answer)
     except _UNSENDABLE as error:
         return pickle.dumps((False, DataError(f"the result of {task} cannot be sent back: {error}")))
 

@@ -10,7 +10,6 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from functools import cache
-from importlib import import_module
 from math import copysign
 from types import UnionType
 from typing import (
@@ -32,6 +31,7 @@ from jaxtyping import jaxtyped  # pyright: ignore[reportUnknownVariableType]
 from numpy.typing import NDArray
 
 from koopmpc.errors import DataError, LogError
+from koopmpc.lazy import find_public
 
 Array = NDArray[Any]
 Arrays = dict[str, Array]
@@ -44,13 +44,8 @@ class Keyed(Protocol):
     def __getitem__(self, key: str, /) -> Array: ...
 
 
-_SHOWN, _LONG = 4, 80  # items and characters that a repr shows of a field
-
-ALIASES: dict[str, str] = {"Row": "LeaderboardRow", "Storage": "Dissipation"}
-"""Old name of a class → its name now: files of earlier versions name classes as they were called then."""
-
-_ROOMS = ("predict", "lifting", "data", "identify", "validate", "estimate", "control", "loop", "synthesis")
-_DOORS = ("koopmpc", *(f"koopmpc.{room}" for room in _ROOMS))
+_SHOWN = 4  # a repr shows this many items of a field
+_LONG = 80  # a repr shows this many characters of a field
 
 
 class Value:
@@ -65,6 +60,11 @@ class Value:
             cls.__repr__ = Value.__repr__  # a dataclass writes one of its own where the class itself has none
         if cls.__module__.split(".")[0] == "koopmpc":
             Value._kinds[cls.__name__] = cls
+
+    @classmethod
+    def is_registered(cls) -> bool:
+        """Return whether this very class can be named in a file."""
+        return Value._kinds.get(cls.__name__) is cls
 
     def __eq__(self, other: object) -> bool:
         if self is other:
@@ -139,7 +139,7 @@ def to_data(value: Any, arrays: Arrays | None = None) -> Any:
         case Value():
             stands = value.as_saved()
             name = type(stands).__name__
-            if Value._kinds.get(name) is not type(stands):
+            if not stands.is_registered():
                 raise DataError(f"{name} is not a class of koopmpc and cannot be saved as data")
             return {"kind": name} | {f: to_data(getattr(stands, f), arrays) for f in _fields(stands)}
         case tuple() | list():
@@ -205,18 +205,13 @@ class Viewing:
 
 
 def class_of(name: str) -> type[Value] | None:
-    """Return the Value of koopmpc that has this name, or had it once; None where there is none.
+    """Return the Value of koopmpc that has this name; None where there is none.
 
     What a package serves is imported when it is first asked for. A class that is not known yet is therefore looked up
-    in the tables of koopmpc and of its rooms: the name in the file only chooses among them.
+    in the tables of koopmpc and of its rooms; the name in the file only chooses among their names.
     """
-    name = ALIASES.get(name, name)
-    for package in _DOORS:
-        if name in Value._kinds:
-            break
-        door = import_module(package)
-        if name in getattr(door, "__all__", ()):
-            getattr(door, name)
+    if name not in Value._kinds:
+        find_public(name)
     return Value._kinds.get(name)
 
 

@@ -47,7 +47,7 @@ LONGEST = [
     "control/test_random_bilinear_loops.py",
     "fitting/test_goal.py",
     "control/test_koopman_mpc.py",
-    "test_first_edition.py",
+    "test_saved_files.py",
     "synthesis/test_stabilise.py",
     "control/test_adaptive.py",
     "faults/test_glitches.py",
@@ -77,6 +77,7 @@ def _every_qp_meets_kkt():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(solvers.SOLVERS, "osqp", CheckedOSQP)
-        patch.setattr(koopmpc.control.target, "DAQP", CheckedDAQP)
+        patch.setitem(solvers.SOLVERS, "daqp", CheckedDAQP)
+        patch.setattr(koopmpc.control.target, "FINISHER", CheckedDAQP)
         patch.setattr(koopmpc.bench.single, "_COLD_STEPS", 2)  # a sleep before each of 25 is half of a short run
         yield

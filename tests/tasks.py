@@ -4,6 +4,7 @@ from __future__ import annotations  # nothing of koopmpc is imported before a ta
 
 import os
 import signal
+import threading
 import time
 from pathlib import Path
 
@@ -22,16 +23,6 @@ def die(_: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-class DeadOnArrival:
-    """A function whose worker is killed while it starts, for that is when it is unpickled there."""
-
-    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        return die, (None,)
-
-    def __call__(self, task: object) -> object:
-        return task
-
-
 def die_once(task: tuple[str, int]) -> int:
     """Kill the worker the first time that the third task is done."""
     folder, i = task
@@ -45,6 +36,15 @@ def die_once(task: tuple[str, int]) -> int:
 def die_at_two(i: int) -> int:
     if i == 2:
         die(i)
+    return i
+
+
+def kill_at_three(task: tuple[int, int]) -> int:
+    """Kill the process of this number with the fourth task."""
+    pid, i = task
+    if i == 3:
+        os.kill(pid, signal.SIGKILL)
+    time.sleep(0.05)
     return i
 
 
@@ -74,7 +74,7 @@ def odd(_: int) -> None:
 
 
 def unsendable(_: int) -> object:
-    return lambda: 0
+    return threading.Lock()
 
 
 def dying_reader(path: Path) -> km.Episodes:
@@ -94,7 +94,7 @@ def always_dying(path: Path) -> km.Episodes:
 
 
 def _loaded(path: Path) -> km.Episodes:
-    from koopmpc.data.storage import load_episodes  # km.load_episodes brings all of koopmpc along
+    from koopmpc.data.files.load import load_episodes  # km.load_episodes brings all of koopmpc along
 
     return load_episodes(path)
 

@@ -4,13 +4,14 @@ import os
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 import koopmpc as km
-from koopmpc.cli.console import program
+from koopmpc.cli.console import find_program
 from tests.bench.tiny import write
 from tests.commands import koopmpc
 
@@ -49,12 +50,12 @@ def test_run_takes_a_path_and_leaves_a_log_a_run_and_the_table(call, tmp_path):
 def test_a_program_on_the_path_is_called_by_its_name(call, tmp_path, monkeypatch):
     folder = Path(sys.executable).parent
     monkeypatch.setenv("PATH", str(folder))
-    assert program() == ["koopmpc"]
+    assert find_program() == ["koopmpc"]
     monkeypatch.setenv("PATH", "/nowhere")
     monkeypatch.chdir(folder.parent)
-    assert [Path(part) for part in program()] == [Path(folder.name) / "koopmpc"]
+    assert [Path(part) for part in find_program()] == [Path(folder.name) / "koopmpc"]
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-    assert program()[-2:] == ["-m", "koopmpc"]
+    assert find_program()[-2:] == ["-m", "koopmpc"]
 
 
 def test_the_version_is_shown(call):
@@ -111,7 +112,7 @@ def test_a_run_that_raises_exits_with_one_and_the_others_are_there(call, tmp_pat
     def broken(parts, limits):
         raise RuntimeError("out of [gain]")
 
-    monkeypatch.setitem(km.bench.CONTROLLERS, "lqr", broken)
+    monkeypatch.setitem(km.bench.CONTROLLERS, "lqr", replace(km.bench.CONTROLLERS["lqr"], build=broken))
     result = call("run", f"{write(tmp_path)}:far", *TWO)
     assert result.exit_code == 1
     assert "tiny:far lqr: RuntimeError: out of [gain]" in result.stdout

@@ -1,26 +1,29 @@
 """Tasks come back in order wherever they are done, a lost worker costs nothing, and errors name their task."""
 
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+import tracemalloc
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from textwrap import dedent
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
 import koopmpc as km
 from koopmpc.parallel import Workers, is_orphan, map_tasks
 from tests import tasks
-from tests.cluster import two_workers
+from tests.cluster import scheduler_process, two_workers
 
+ROOT = Path(__file__).parents[1]
 HERE = {"workers": 1}
 PROCESSES = {"workers": 2}
 EVERYWHERE = pytest.mark.parametrize("where", ["here", "processes", "dask"], indirect=True)
-AWAY = pytest.mark.parametrize("where", ["processes", "dask"], indirect=True)
+MORTAL = pytest.mark.parametrize("where", ["processes", "a mortal cluster"], indirect=True)
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +33,15 @@ def scheduler() -> Iterator[str]:
 
 
 @pytest.fixture
-def where(request: pytest.FixtureRequest) -> dict:
-    """Return how map_tasks is told where to run."""
-    if request.param == "dask":
-        return {"scheduler": request.getfixturevalue("scheduler")}
-    return HERE if request.param == "here" else PROCESSES
+def where(request: pytest.FixtureRequest) -> Iterator[dict]:
+    """Return the arguments with which map_tasks runs there; a test that kills workers has a cluster of its own."""
+    if request.param == "a mortal cluster":
+        with two_workers() as address:
+            yield {"scheduler": address}
+    elif request.param == "dask":
+        yield {"scheduler": request.getfixturevalue("scheduler")}
+    else:
+        yield HERE if request.param == "here" else PROCESSES
 
 
 @EVERYWHERE
@@ -83,13 +90,13 @@ def test_tasks_are_taken_a_few_ahead_and_no_more(where: dict) -> None:
     results.close() if where is not HERE else None
 
 
-@AWAY
+@MORTAL
 def test_a_lost_worker_costs_its_task_nothing(where: dict, tmp_path: Path) -> None:
     assert list(map_tasks(tasks.die_once, [(str(tmp_path), i) for i in range(5)], **where)) == list(range(5))
     assert (tmp_path / "died").exists()
 
 
-@AWAY
+@MORTAL
 def test_a_task_that_kills_each_worker_is_named(where: dict) -> None:
     with pytest.raises(km.KoopmpcError, match=r"task 0, the first: each worker that did it died .*workers=1 to see"):
         list(map_tasks(tasks.die, ["the first"], **where))
@@ -113,27 +120,61 @@ def test_workers_that_are_busy_end_when_nobody_waits_for_them(tmp_path: Path) ->
     assert not [pid for pid in pids if _is_alive(pid)]
 
 
+def run_script(script: Path, text: str, **options: Any) -> subprocess.Popen[str]:
+    """Start a program that imports this library and these tests from where they stand."""
+    script.write_text(dedent(text))
+    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    pipe, environment = subprocess.PIPE, {**os.environ, "PYTHONPATH": paths}
+    return subprocess.Popen([sys.executable, script], stdout=pipe, stderr=pipe, text=True, env=environment, **options)
+
+
+def pids_in(folder: Path, least: int) -> list[int]:
+    """Return the process numbers that `tasks.sleep` wrote, once there are so many."""
+    wait_until(lambda: len(list(folder.iterdir())) >= least)
+    return [int(file.name) for file in folder.iterdir()]
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
 def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(
-        dedent(f"""
-        import os, signal
-        from koopmpc.parallel import Workers, is_orphan, map_tasks
+    (folder := tmp_path / "pids").mkdir()
+    parent = run_script(
+        tmp_path / "script.py",
+        f"""
+        from koopmpc.parallel import map_tasks
         from tests import tasks
-        if __name__ == "__main__":
-            results = map_tasks(tasks.sleep, [({str(tmp_path / "pids")!r}, 0)] * 4, workers=2)
-            next(results)
-            os.kill(os.getpid(), signal.SIGKILL)
-        """)
+        list(map_tasks(tasks.sleep, [({str(folder)!r}, 300)] * 4, workers=2))
+        """,
     )
-    (tmp_path / "pids").mkdir()
-    subprocess.run([sys.executable, script], capture_output=True, timeout=60, check=False)
-    pids = [int(file.name) for file in (tmp_path / "pids").iterdir()]
-    assert pids
-    ends = time.perf_counter() + 20
-    while time.perf_counter() < ends and any(map(_is_alive, pids)):
-        time.sleep(0.1)
-    assert not [pid for pid in pids if _is_alive(pid)]
+    pids = pids_in(folder, 2)
+    parent.kill()
+    parent.communicate(timeout=60)
+    wait_until(lambda: not any(map(_is_alive, pids)))
+
+
+def test_ctrl_c_ends_the_program_with_130_and_one_line_and_leaves_no_worker(tmp_path: Path) -> None:
+    (folder := tmp_path / "pids").mkdir()
+    program = run_script(
+        tmp_path / "script.py",
+        f"""
+        from koopmpc.interrupts import ENDING
+        with ENDING:
+            from koopmpc.parallel import map_tasks
+            from tests import tasks
+            list(map_tasks(tasks.sleep, [({str(folder)!r}, 300)] * 4, workers=2))
+        """,
+        start_new_session=True,
+    )
+    pids = pids_in(folder, 2)
+    os.killpg(program.pid, signal.SIGINT)
+    assert program.communicate(timeout=60) == ("", "interrupted; nothing was written\n")
+    assert program.returncode == 130
+    wait_until(lambda: not any(map(_is_alive, pids)))
 
 
 def _is_alive(pid: int) -> bool:
@@ -158,8 +199,8 @@ def test_a_worker_tells_where_it_failed_even_if_the_exception_does_not_pickle() 
 
 
 def test_what_does_not_pickle_is_told() -> None:
-    with pytest.raises(km.errors.DataError, match=r"task 0, <function .*cannot be sent to a worker.*in a module"):
-        list(map_tasks(tasks.square, [lambda: 0], **PROCESSES))
+    with pytest.raises(km.errors.DataError, match=r"task 0, <unlocked .*cannot be sent to a worker.*in a module"):
+        list(map_tasks(tasks.square, [threading.Lock()], **PROCESSES))
     with pytest.raises(km.errors.DataError, match="the result of 3 cannot be sent back"):
         list(map_tasks(tasks.unsendable, [3], **PROCESSES))
 
@@ -179,69 +220,64 @@ def test_no_task_is_no_result() -> None:
     assert list(map_tasks(tasks.square, [], **PROCESSES)) == []
 
 
-def test_a_script_without_a_guard_is_told_what_to_write(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(
-        dedent("""
-        from koopmpc.parallel import Workers, is_orphan, map_tasks
-        print(list(map_tasks(abs, [1, 2], workers=2)))
-        """)
-    )
-    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
-    assert ended.returncode != 0
-    assert 'put what the script runs under `if __name__ == "__main__":`' in ended.stderr
+def test_a_script_needs_no_guard_and_sends_functions_of_its_own(tmp_path: Path) -> None:
+    script = """
+        from koopmpc.parallel import map_tasks
+        shift = 3
+        def add(x):
+            return x + shift
+        print(list(map_tasks(add, [1, 2], workers=2)), list(map_tasks(lambda x: 2 * x, [1, 2], workers=2)))
+        """
+    program = run_script(tmp_path / "script.py", script)
+    assert program.communicate(timeout=60) == ("[4, 5] [2, 4]\n", "")
 
 
-def test_a_worker_that_is_killed_while_it_starts_is_not_blamed_on_the_script() -> None:
-    with pytest.raises(km.KoopmpcError, match=r"was killed while it started \(signal 9\); run with fewer workers"):
-        list(map_tasks(tasks.DeadOnArrival(), range(4), **PROCESSES))
+@pytest.mark.skipif(sys.platform == "win32", reason="a script is no program there")
+def test_a_worker_that_is_killed_while_it_starts_is_not_blamed_on_its_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert list(map_tasks(abs, [-1, 2], **PROCESSES)) == [1, 2]  # loky starts its processes of one program
+    (program := tmp_path / "dies").write_text("#!/bin/sh\nkill -9 $$\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    with pytest.raises(km.KoopmpcError, match=r"was killed while it started \(.*SIGKILL.*\); run with fewer workers"):
+        list(map_tasks(abs, range(4), **PROCESSES))
 
 
-def test_its_signal_is_found_also_where_the_executor_was_told_of_its_end_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    waited = os.waitpid
-
-    def slowly(pid: int, options: int) -> tuple[int, int]:
-        ended = waited(pid, options)
-        time.sleep(0.05)  # between the end of a process and the note of its exit code
-        return ended
-
-    monkeypatch.setattr(os, "waitpid", slowly)
-    with pytest.raises(km.KoopmpcError, match=r"killed while it started \(signal 9\)"):
-        list(map_tasks(tasks.DeadOnArrival(), range(4), **PROCESSES))
-
-
-def test_a_worker_that_dies_while_another_one_is_started_is_found_as_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    started = ProcessPoolExecutor._spawn_process  # pyright: ignore[reportAttributeAccessIssue]
-
-    def late(executor: ProcessPoolExecutor) -> None:
-        held, deadline = cast("Any", executor), time.monotonic() + 10
-        while held._processes and not held._broken and time.monotonic() < deadline:
-            time.sleep(0.01)
-        time.sleep(0.2)  # until its thread has closed the queue
-        started(executor)
-
-    monkeypatch.setattr(ProcessPoolExecutor, "_spawn_process", late)
-    with pytest.raises(km.KoopmpcError, match=r"killed while it started \(signal 9\)"):
-        list(map_tasks(tasks.DeadOnArrival(), range(4), **PROCESSES))
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no process that removes semaphores")
 def test_a_program_that_ends_at_once_leaves_no_lines_of_its_workers_semaphores(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(
-        dedent("""
+    program = run_script(
+        tmp_path / "script.py",
+        """
         import os
-
-        from koopmpc.parallel import Workers, is_orphan, map_tasks
-
-        if __name__ == "__main__":
-            results = map_tasks(abs, range(100), workers=2)
-            print(next(results), flush=True)
-            os._exit(3)
-        """)
+        from koopmpc.parallel import map_tasks
+        results = map_tasks(abs, range(100), workers=2)
+        print(next(results), flush=True)
+        os._exit(3)
+        """,
     )
-    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (3, "0\n", "")
+    assert program.communicate(timeout=60) == ("0\n", "")
+    assert program.returncode == 3
+
+
+@pytest.mark.parametrize(
+    ("where", "count", "size"),
+    [
+        ("processes", 500, 100_000),
+        pytest.param("processes", 100_000, 1_000, marks=pytest.mark.slow),
+        pytest.param("dask", 10_000, 10_000, marks=pytest.mark.slow),
+    ],
+    indirect=["where"],
+)
+def test_lazy_tasks_need_memory_for_a_few_of_them(where: dict, count: int, size: int) -> None:
+    list(map_tasks(len, [b""], **where))  # what is imported counts as well
+    tracemalloc.start()
+    try:
+        total = sum(map_tasks(len, (bytes(size) for _ in range(count)), **where))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert total == count * size
+    assert peak < total * (0.1 if where is PROCESSES else 0.5)  # a Dask client keeps its last 1000 messages
 
 
 def test_what_is_no_number_of_workers_or_no_scheduler_is_refused() -> None:
@@ -289,29 +325,28 @@ def test_without_dask_the_message_says_what_to_install(monkeypatch: pytest.Monke
 
 def test_a_worker_knows_that_its_parent_was_killed(tmp_path: Path) -> None:
     assert not is_orphan()
-    script, told = tmp_path / "parent.py", tmp_path / "told"
-    script.write_text(
-        dedent(f"""
-        import os, signal, time
-        from multiprocessing import get_context
+    text = f"""
+        import os, signal, threading, time
         from pathlib import Path
-        from koopmpc.parallel import is_orphan
+        from koopmpc.parallel import is_orphan, map_tasks
 
-        def worker():
+        def kill_parent(_):
+            os._exit = lambda _: None  # a worker ends with its parent
             assert not is_orphan()
-            os.kill(os.getppid(), signal.SIGKILL if hasattr(signal, "SIGKILL") else signal.SIGTERM)
+            os.kill(os.getppid(), getattr(signal, "SIGKILL", signal.SIGTERM))
             while not is_orphan():
                 time.sleep(0.01)
-            Path({str(told)!r}).write_text("an orphan")
+            Path({str(tmp_path / "told")!r}).write_text("an orphan")
+            os.kill(os.getpid(), signal.SIGTERM)
 
-        if __name__ == "__main__":
-            process = get_context("spawn").Process(target=worker)
-            process.start()
-            process.join()
-        """)
-    )
-    subprocess.run([sys.executable, script], timeout=60, check=False)
-    deadline = time.monotonic() + 20
-    while not told.exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert told.read_text() == "an orphan"
+        list(map_tasks(kill_parent, [0], workers=2))
+        """
+    run_script(tmp_path / "parent.py", text).communicate(timeout=60)
+    wait_until((tmp_path / "told").exists)
+
+
+def test_a_scheduler_that_dies_is_told(tmp_path: Path) -> None:
+    with scheduler_process(tmp_path) as (process, address):
+        results = map_tasks(tasks.kill_at_three, [(process.pid, i) for i in range(10)], scheduler=address)
+        with pytest.raises(km.KoopmpcError, match=rf"task \d+, .*: the Dask scheduler at {address} has ended"):
+            list(results)

@@ -13,14 +13,15 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from standings import format_goals, format_standings
 
 import koopmpc as km
-from koopmpc.bench.controllers import LEARNED, Prepared
-from koopmpc.bench.measured import baseline_of, best_learned, goals, markdown, measured
+from koopmpc.bench.controllers import Prepared, is_learned
+from koopmpc.bench.measured import find_baseline, find_best_learned, read_standings
 from koopmpc.bench.problem import shipped
-from koopmpc.bench.single import closed_loop
+from koopmpc.bench.single import run_closed_loop
 from koopmpc.bench.store import RunRow
-from koopmpc.recording.page import Page
+from koopmpc.page import Page
 from koopmpc.recording.video import export_video
 
 DOCS = Path(__file__).parents[1]
@@ -34,8 +35,8 @@ FEW = 6  # states that a picture shows
 def page(path: Path, *, pictures: bool = True) -> Page:
     """Write the page of a problem file, with its picture and animation."""
     problem, source = km.load_problem(path), path.read_text(encoding="utf-8")
-    name, found = problem.name, measured().get(problem.name, {})
-    best = best_learned(found) or (problem.controllers or ("koopman-mpc",))[-1]
+    name, found = problem.name, read_standings().get(problem.name, {})
+    best = find_best_learned(found) or (problem.controllers or ("koopman-mpc",))[-1]
     case = next(iter(problem.cases))
     if pictures:
         draw(problem, best, case)
@@ -80,13 +81,13 @@ def page(path: Path, *, pictures: bool = True) -> Page:
     made.text("## What the bench measured")
     if found:
         made.text(
-            f"""Cost over that of {baseline_of(found)}, in the worst of the cases in which the equations are the
+            f"""Cost over that of {find_baseline(found)}, in the worst of the cases in which the equations are the
             plant's, and the median time of a step over its. † breaks a limit on a state that it keeps."""
         )
         made.table(
             ("controller", "cost", "time of a step"),
             [
-                (f"**{c}**" if c == best else c, str(one), "1" if c == baseline_of(found) else _time(one.time))
+                (f"**{c}**" if c == best else c, str(one), "1" if c == find_baseline(found) else _time(one.time))
                 for c, one in found.items()
             ],
         )
@@ -114,7 +115,7 @@ def draw(problem: km.Problem, controller: str, case: str) -> None:
     folder = FOLDER / problem.name
     folder.mkdir(parents=True, exist_ok=True)
     row = RunRow(problem.name, case, controller, x0=tuple(problem.cases[case].x0))
-    run = closed_loop(Prepared(problem), row, plans=False)
+    run = run_closed_loop(Prepared(problem), row, plans=False)
     nx = len(problem.dynamics.states)
     states = None if nx <= FEW else list(range(0, nx, nx // 4))
     km.plot.save(km.plot.run(run, states=states, width="two columns"), folder / "run.png")
@@ -184,7 +185,7 @@ def special(problem: km.Problem, case: km.Case) -> str:
 
 def verdict(found: Any, best: str) -> str:
     """Return in a sentence which learned controller wins, and which lose."""
-    lost = [name for name, one in found.items() if name in LEARNED and (one.ratio > 1.05 or one.over)]
+    lost = [name for name, one in found.items() if is_learned(name) and (one.ratio > 1.05 or one.over)]
     first = f"The best learned controller is {best}, at {found[best].ratio:.3g} of the cost."
     return first if not lost else first + f" Beyond 5 %, or a limit, are {', '.join(lost)}."
 
@@ -225,10 +226,11 @@ def tables() -> None:
     """Write the tables of measured.json into docs/library.md."""
     path = DOCS / "library.md"
     text = path.read_text(encoding="utf-8")
-    for begin, end, table in (("table", "end", markdown), ("goals", "end of goals", goals)):
+    for begin, end, table in (("table", "end", format_standings), ("goals", "end of goals", format_goals)):
         before, rest = text.split(f"<!-- {begin} -->\n")
         text = (
-            f"{before}<!-- {begin} -->\n\n{table(measured())}\n\n<!-- {end} -->" + rest.partition(f"<!-- {end} -->")[2]
+            f"{before}<!-- {begin} -->\n\n{table(read_standings())}\n\n<!-- {end} -->"
+            + rest.partition(f"<!-- {end} -->")[2]
         )
     path.write_text(text, encoding="utf-8")
 

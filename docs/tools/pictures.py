@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import koopmpc as km
-from koopmpc.figures.style import LIMIT, REFERENCE, TRUTH, figure, legend, line, styled
+from koopmpc.figures.style import LIMIT, REFERENCE, TRUTH, draw_legend, line_style, make_figure, styled
 
 DOCS = Path(__file__).parents[1]
 
@@ -40,7 +40,7 @@ def house() -> Any:
     cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
     mpc = km.KoopmanMPC(model, cost, limits, horizon=40)
     run = km.simulate(plant, mpc, x0=[0.8, 0], reference=[0, 0], steps=60, cost=cost, limits=limits)
-    made, axes = figure(1, 4, width="two columns", height=2.0)
+    made, axes = make_figure(1, 4, width="two columns", height=2.0)
     plane, disk, ahead, loop = axes[0]
     for episode in train[:40]:
         plane.plot(*episode.X.T, color="#0072b2", linewidth=0.4, alpha=0.6)
@@ -53,9 +53,9 @@ def house() -> Any:
     foretold = model.rollout(episode.X[0], episode.U[:20])
     time = 0.05 * np.arange(21)
     ahead.plot(time, episode.X[:21, 0], **TRUTH)
-    ahead.plot(time, foretold[:, 0], **line(1))
+    ahead.plot(time, foretold[:, 0], **line_style(1))
     ahead.set(title="its forecast", xlabel="time [s]", ylabel="theta [rad]")
-    loop.plot(0.05 * np.arange(len(run.X)), run.X[:, 0], **line(0))
+    loop.plot(0.05 * np.arange(len(run.X)), run.X[:, 0], **line_style(0))
     loop.axhline(0, **REFERENCE)
     loop.set(title="Run", xlabel="time [s]", ylabel="theta [rad]")
     return made
@@ -73,14 +73,14 @@ def moments() -> Any:
         found = (np.linalg.solve(Z.T @ Z, Z.T @ Y), np.linalg.lstsq(Z, Y, rcond=0)[0])
         for name, solved in zip(errors, found, strict=True):
             errors[name].append(float(np.linalg.norm(Z @ solved - Y) / np.linalg.norm(Y)))
-    made, axes = figure(1, 1, width="two columns", height=2.6)
+    made, axes = make_figure(1, 1, width="two columns", height=2.6)
     (axis,) = axes[0]
     for i, (name, found) in enumerate(errors.items()):
-        axis.loglog(conditions, found, label=name, **line(i, len(conditions)))
+        axis.loglog(conditions, found, label=name, **line_style(i, len(conditions)))
     axis.axvline(1e6, **LIMIT)
     axis.text(1.3e6, 1e-9, "the fit changes\nits route here", fontsize=8)
     axis.set(xlabel="condition number of the scaled observables", ylabel="residual beyond the optimum, relative")
-    legend(made, [axis], 2)
+    draw_legend(made, [axis], 2)
     return made
 
 
@@ -105,10 +105,10 @@ def riccati_first() -> Any:
     run = km.simulate(
         plant, km.KoopmanMPC(model, cost, limits, horizon=40), x0=[0.8, 0], reference=[0, 0], steps=60, limits=limits
     )
-    made, axes = figure(1, 2, width="two columns", height=2.6)
+    made, axes = make_figure(1, 2, width="two columns", height=2.6)
     left, right = axes[0]
-    left.semilogy(horizons, plain, label="for the inputs", **line(1))
-    left.semilogy(horizons, np.ones(len(plain)), label="for the deviation from the Riccati plan", **line(0))
+    left.semilogy(horizons, plain, label="for the inputs", **line_style(1))
+    left.semilogy(horizons, np.ones(len(plain)), label="for the deviation from the Riccati plan", **line_style(0))
     left.set(xlabel="horizon [steps]", ylabel="condition number of the QP")
     solved = np.array([status is not km.Status.UNCONSTRAINED for status in run.status])
     steps = np.arange(len(run.U))
@@ -130,7 +130,7 @@ def terminal_cost() -> Any:
     judged = km.Cost(Q=[10, 1], R=0.1)
     horizons = [2, 4, 6, 8, 10, 14, 20, 30, 40]
     best = None
-    made, axes = figure(1, 1, width="two columns", height=2.6)
+    made, axes = make_figure(1, 1, width="two columns", height=2.6)
     (axis,) = axes[0]
     for i, (name, tail) in enumerate({"with its tail, the default": None, "Q_N = Q: no tail": 0}.items()):
         costs = []
@@ -139,9 +139,9 @@ def terminal_cost() -> Any:
             run = km.simulate(plant, mpc, x0=[0.6, 0], reference=[0, 0], steps=150, cost=judged, limits=limits)
             costs.append(km.metrics(run).cost)
         best = best or min(costs)
-        axis.semilogy(horizons, np.array(costs) / best, label=name, **line(i, len(horizons)))
+        axis.semilogy(horizons, np.array(costs) / best, label=name, **line_style(i, len(horizons)))
     axis.set(xlabel="horizon [steps]", ylabel="cost in closed loop,\nover the least")
-    legend(made, [axis], 2)
+    draw_legend(made, [axis], 2)
     return made
 
 
@@ -155,16 +155,16 @@ def one_step_errors() -> Any:
     circle = km.Fourier(2, states=["theta"])
     good = km.edmd(train, km.State() + circle + circle * km.State(["omega"]))
     bad = km.edmd(timid, km.State() + km.Monomials(5))
-    made, axes = figure(1, 2, width="two columns", height=2.6)
+    made, axes = make_figure(1, 2, width="two columns", height=2.6)
     bars, curves = axes[0]
     for i, (name, model) in enumerate({"sines and cosines, wide data": good, "monomials, timid data": bad}.items()):
-        bars.bar(i, model.report.residual[1], color=line(i)["color"], width=0.6)
+        bars.bar(i, model.report.residual[1], color=line_style(i)["color"], width=0.6)
         score = km.score(model, held_out, horizon=12)
-        curves.semilogy(np.arange(1, 13), score.rmse[:, 1], label=name, **line(i, 12))
+        curves.semilogy(np.arange(1, 13), score.rmse[:, 1], label=name, **line_style(i, 12))
     bars.set(ylabel="error after one step,\nits own data [rad/s]", xticks=[0, 1])
     bars.set_xticklabels(["sines and cosines,\nwide data", "monomials to 5,\ntimid data"])
     curves.set(xticks=range(0, 13, 3), xlabel="steps ahead", ylabel="error, held-out data [rad/s]")
-    legend(made, [curves], 2)
+    draw_legend(made, [curves], 2)
     return made
 
 
@@ -187,7 +187,7 @@ def choosing_by_closed_loop() -> Any:
         "sines × states": [km.State() + waves + waves * km.State() + km.Constant()],
         "radial": [km.State() + km.ThinPlate(_centers(train, c)) + km.Constant() for c in (20, 60)],
     }
-    made, axes = figure(1, 1, width="two columns", height=3.0)
+    made, axes = make_figure(1, 1, width="two columns", height=3.0)
     (axis,) = axes[0]
     for i, (name, liftings) in enumerate(families.items()):
         points = []
@@ -199,10 +199,14 @@ def choosing_by_closed_loop() -> Any:
                 loops = sum(_cost(plant, mpc, x0, cost, limits) for x0 in starts)
                 points.append((error, min(loops / best, 100)))
         axis.loglog(
-            *np.array(points).T, linestyle="none", marker=line(i, 8)["marker"], color=line(i)["color"], label=name
+            *np.array(points).T,
+            linestyle="none",
+            marker=line_style(i, 8)["marker"],
+            color=line_style(i)["color"],
+            label=name,
         )
     axis.set(xlabel="error of θ 20 steps ahead, held-out data [rad]", ylabel="cost in closed loop,\nover nonlinear MPC")
-    legend(made, [axis], 5)
+    draw_legend(made, [axis], 5)
     return made
 
 
@@ -236,7 +240,7 @@ def what_trust_means() -> Any:
     ]
     loop = held_out.with_episodes([km.Episode(X=run.X, U=run.U) for run in runs])
     time = 0.05 * np.arange(1, 13)
-    made, axes = figure(1, 2, width="two columns", height=2.6, sharey=True)
+    made, axes = make_figure(1, 2, width="two columns", height=2.6, sharey=True)
     for axis, (title, episodes) in zip(
         axes[0], {"inputs as in the data": held_out[40:], "in closed loop": loop}.items(), strict=True
     ):

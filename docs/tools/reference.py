@@ -13,7 +13,7 @@ import typer
 
 import koopmpc as km
 from koopmpc.cli.app import app
-from koopmpc.lazy import _imported
+from koopmpc.lazy import read_imports
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
@@ -31,6 +31,10 @@ ROOMS = {  # where a name is defined → title and first sentence of its page, i
     "loop": (
         "Closed loops",
         "`simulate` drives a plant by a controller and returns a `Run`; faults break it on purpose.",
+    ),
+    "supervise": (
+        "What watches a controller",
+        "Does the model know this step; learn on while it runs; hand over to a fallback.",
     ),
     "synthesis": ("From data to a controller", "Choose a model, choose a controller, with evidence from closed loops."),
     "codegen": ("C code", "The same controller as C99 without a heap, in a folder or behind Python's protocol."),
@@ -80,7 +84,7 @@ def entries() -> list[Entry]:
 def _served(prefix: str, module: ModuleType) -> Iterator[Entry]:
     """Yield what a module serves from its files, or, where it has no table, what it defines."""
     if hasattr(module, "__all__"):
-        homes = {name: home for name, home in _imported(module.__name__).items() if name in module.__all__}
+        homes = {name: home for name, home in read_imports(module.__name__).items() if name in module.__all__}
     else:
         homes = {name: module.__name__ for name, value in vars(module).items() if _defined(name, value, module)}
     for name, home in homes.items():

@@ -1,9 +1,9 @@
-"""The ten controllers of the bench, and what they share of one problem: step map, plant, data and models."""
+"""The controllers of the bench, and what they share of one problem: step map, plant, data and models."""
 
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -16,30 +16,24 @@ from jaxtyping import Float
 from koopmpc import disk
 from koopmpc.bench.problem import Problem
 from koopmpc.checks import nearest
-from koopmpc.control.adaptive import Adaptive
 from koopmpc.control.cost import state_tracking
+from koopmpc.control.kinds import BenchEntry, list_bench
 from koopmpc.control.limits import Limits
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC, LinearMPC
-from koopmpc.control.lqr import LQR
-from koopmpc.control.monitor import Monitor
 from koopmpc.control.move import Controller
-from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.equilibrium import Equilibria
-from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.nonlinear.problem import learned_map
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ProblemError, unwarned
-from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.fits.online import OnlineEDMD
 from koopmpc.plants.dynamics import Dynamics
 from koopmpc.plants.plant import Plant, SimulatedPlant
 from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor, load_model
+from koopmpc.supervise.monitor import Monitor
 from koopmpc.synthesis.design import design
-from koopmpc.synthesis.designed import AnyMPC, Design, load_controller, made
+from koopmpc.synthesis.designed import Design, load_controller, rebuild_controller
 
 
 class Prepared:
@@ -50,13 +44,13 @@ class Prepared:
     Parameters
     ----------
     problem
-        What is controlled.
+        The problem.
     monitored
-        Whether controllers of learned models say at each step whether it is like the data.
+        Whether controllers of learned models have a monitor, which says at each step whether it is like the data.
     seed
         Added to the seed of the training data.
     kept
-        The folder of `keep`, where what was learned is read instead of learned again.
+        The folder of `save_models`; models in it are read and not learned again.
     """
 
     def __init__(self, problem: Problem, seed: int = 0, kept: Path | None = None, *, monitored: bool = False) -> None:
@@ -68,29 +62,30 @@ class Prepared:
         self._held: dict[str, Float[np.ndarray, "T nu"]] = {}
         self._plants: dict[str, StepMap | Plant] = {}  # of the cases that have one of their own
 
-    def keep(self, names: Iterable[str]) -> None:
+    def save_models(self, names: Iterable[str]) -> None:
         """Learn what these controllers need, and write it into the folder `kept`, for all workers.
 
-        What cannot be written as data is learned by each worker itself.
+        A model that cannot be written as data is learned by each worker itself.
         """
         kept, names = self._kept, set(names)
         if kept is None:
             return
         numbers = {"training_time": 0.0, "spread": self.spread.tolist()}
         with suppress(DataError):
-            if names & {"koopman-lqr", "koopman-mpc", "offset-free", "adaptive"}:
+            models = {CONTROLLERS[name].model for name in names}
+            if "linear" in models:
                 self.model.save(f"{kept}-linear.npz")
                 numbers["training_time"] = self.training_time
-            if names & {"bilinear-mpc", "bilinear-offset"}:
+            if "bilinear" in models:
                 self.bilinear.save(f"{kept}-bilinear.npz")
-            if "designed" in names:
+            if "designed" in models:
                 for case in self.problem.cases:
                     self.design(self.problem.limits_of(case)).save(f"{kept}-{case}.npz")
         with disk.writing(f"{kept}.json") as stream:
             stream.write(json.dumps(numbers).encode())
 
     def _file(self, ending: str) -> Path | None:
-        """Return the file of this ending that `keep` wrote; None where it did not."""
+        """Return the file of this ending that `save_models` wrote; None where it did not."""
         if self._kept is None:
             return None
         path = Path(f"{self._kept}{ending}")
@@ -98,7 +93,7 @@ class Prepared:
 
     @cached_property
     def _numbers(self) -> dict[str, Any]:
-        """What `keep` wrote beside the models."""
+        """Numbers that `save_models` wrote beside the models."""
         file = self._file(".json")
         return {} if file is None else json.loads(file.read_bytes())
 
@@ -111,10 +106,10 @@ class Prepared:
     def controller(self, name: str, case: str) -> Controller:
         """Return the controller of this name for the limits of a case; it is built once, and `simulate` resets it.
 
-        One that learns while it runs is built for each run.
+        A controller that learns while it runs is built for each run.
         """
         if (name, case) not in self._controllers or name == "adaptive":
-            self._controllers[name, case] = CONTROLLERS[name](self, self.problem.limits_of(case))
+            self._controllers[name, case] = CONTROLLERS[name].build(self, self.problem.limits_of(case))
         return self._controllers[name, case]
 
     @cached_property
@@ -123,20 +118,25 @@ class Prepared:
         return discretize(self.problem.dynamics, self.problem.dt, self.problem.integrator)
 
     @cached_property
+    def local_model(self) -> LinearPredictor:
+        """The problem's equations, linearised at the equilibrium."""
+        return LinearPredictor.local(self.step_map, *self.problem.equilibrium)
+
+    @cached_property
     def truth(self) -> StepMap | Plant:
-        """The plant that is driven: the problem's `plant`, by default its model."""
-        return self._driven(self.problem.plant)
+        """The problem's `plant`, by default its model."""
+        return self._make_step_map(self.problem.plant)
 
     def truth_of(self, case: str) -> StepMap | Plant:
-        """Return the plant that is driven in this case, by default the problem's."""
+        """Return the plant of this case, by default the problem's."""
         plant = self.problem.cases[case].plant
         if plant is None:
             return self.truth
         if case not in self._plants:
-            self._plants[case] = self._driven(plant)
+            self._plants[case] = self._make_step_map(plant)
         return self._plants[case]
 
-    def off(self, case: str, wrong: float, start: int) -> StepMap | Plant:
+    def perturb_plant(self, case: str, wrong: float, start: int) -> StepMap | Plant:
         """Return the plant of a case with each parameter times 1 + e, e uniform in ±`wrong`.
 
         Raises
@@ -156,9 +156,9 @@ class Prepared:
             )
         e = np.random.default_rng([start, 1]).uniform(-wrong, wrong, len(values)).tolist()
         changed = {name: value * (1.0 + share) for (name, value), share in zip(values.items(), e, strict=True)}
-        return self._driven(dataclasses.replace(cast("Any", own), **changed))
+        return self._make_step_map(dataclasses.replace(cast("Any", own), **changed))
 
-    def start(self, case: str, start: int) -> Float[np.ndarray, " nx"]:
+    def initial_state(self, case: str, start: int) -> Float[np.ndarray, " nx"]:
         """Return an initial state: the case's own for 0, else one of the box that training data begin in."""
         given = np.asarray(self.problem.cases[case].x0, dtype=np.float64)
         if start == 0:
@@ -173,7 +173,7 @@ class Prepared:
         low, high = np.asarray(ends.min(axis=0)), np.asarray(ends.max(axis=0))
         return low + (high - low) * rng.random(len(low))
 
-    def _driven(self, plant: Dynamics | StepMap | Plant | None) -> StepMap | Plant:
+    def _make_step_map(self, plant: Dynamics | StepMap | Plant | None) -> StepMap | Plant:
         if plant is None:
             return self.step_map
         if isinstance(plant, Dynamics):
@@ -181,17 +181,17 @@ class Prepared:
         return plant
 
     def u_reference(self, case: str) -> Float[np.ndarray, "T nu"]:
-        """Return the inputs that hold the references of a case on the plant that is driven.
+        """Return the inputs that hold the references of a case on its plant.
 
-        Where that plant has no equations they are found on the model; where the cost's u_target is "zero" they are
-        zero. They are found once and serve all controllers.
+        For a plant without equations they are those of the model; for a cost whose u_target is "zero" they are zero.
+        They are computed once, for all controllers.
         """
         if case not in self._held:
-            self._held[case] = self.inputs_that_hold(case, self.truth_of(case))
+            self._held[case] = self.find_held_inputs(case, self.truth_of(case))
         return self._held[case]
 
-    def inputs_that_hold(self, case: str, truth: StepMap | Plant) -> Float[np.ndarray, "T nu"]:
-        """Return the same for another plant that is driven."""
+    def find_held_inputs(self, case: str, truth: StepMap | Plant) -> Float[np.ndarray, "T nu"]:
+        """Return the inputs that hold the references of a case on this plant."""
         problem, steps = self.problem, self.problem.cases[case].steps
         known = truth.step_map if isinstance(truth, SimulatedPlant) else truth
         plant = known if isinstance(known, StepMap) else self.step_map
@@ -232,18 +232,18 @@ class Prepared:
         return model
 
     @property
-    def watched(self) -> Episodes | None:
-        """What a monitor compares with: the data, or None where no step is watched."""
+    def monitor_data(self) -> Episodes | None:
+        """The data for a monitor; None where no controller has one."""
         return self.data if self._monitored else None
 
     def design(self, limits: Limits) -> Design:
-        """Return what `design` makes of the data, for the first case's reference and the starts of all cases."""
+        """Return the design for the first case's reference and the starts of all cases."""
         known = next((found for own, found in self._designs if own == limits), None)
         if known is not None:
             return known
         problem = self.problem
         cases = list(problem.cases.values())
-        with unwarned():  # of cases that ask for what the data do not hold
+        with unwarned():  # a case may ask for states that the data do not hold
             found = design(
                 self.data,
                 problem.cost,
@@ -263,93 +263,37 @@ class Prepared:
             return cast("BilinearPredictor", load_model(file))
         return bilinear_edmd(self.data, self.problem.lifting, ridge=self.problem.ridge, difference=True)
 
-    def kept_design(self, limits: Limits) -> AnyMPC | None:
-        """Return the designed controller for these limits that `keep` wrote; None where it did not."""
+    def load_design(self, limits: Limits) -> Any:
+        """Return the designed controller for these limits that `save_models` wrote; None where it did not."""
         case = next((case for case in self.problem.cases if self.problem.limits_of(case) == limits), None)
         file = None if case is None else self._file(f"-{case}.npz")
         return None if file is None else load_controller(file)
 
 
-Build = Callable[[Prepared, Limits], Controller]
-
-
-def _lqr(parts: Prepared, limits: Limits) -> Controller:
-    """LQR on the model's linearisation at the equilibrium."""
-    model = LinearPredictor.local(parts.step_map, *parts.problem.equilibrium)
-    return LQR(model, parts.problem.cost, limits)
-
-
-def _koopman_lqr(parts: Prepared, limits: Limits) -> Controller:
-    """LQR on the lifted predictor, learned from data."""
-    return LQR(parts.model, parts.problem.cost, limits)
-
-
-def _linear_mpc(parts: Prepared, limits: Limits) -> Controller:
-    """MPC on the model's linearisation at the equilibrium."""
-    problem = parts.problem
-    return LinearMPC(parts.step_map, *problem.equilibrium, problem.cost, limits, problem.horizon)
-
-
-def _koopman_mpc(parts: Prepared, limits: Limits, estimator: LiftedDisturbance | None = None) -> KoopmanMPC:
-    """MPC on the lifted predictor, learned from data."""
-    cost, horizon = parts.problem.cost, parts.problem.horizon
-    return KoopmanMPC(parts.model, cost, limits, horizon, estimator=estimator, monitor=parts.watched)
-
-
-def _offset_free(parts: Prepared, limits: Limits) -> Controller:
-    """MPC on the lifted predictor, with an estimated disturbance of every lifted coordinate."""
-    return _koopman_mpc(parts, limits, LiftedDisturbance())
-
-
-def _bilinear_mpc(parts: Prepared, limits: Limits, estimator: LiftedDisturbance | None = None) -> BilinearMPC:
-    """Real-time iteration on the bilinear predictor, which is lifted anew at every step of the plan."""
-    cost, horizon = parts.problem.cost, parts.problem.horizon
-    return BilinearMPC(parts.bilinear, cost, limits, horizon, estimator=estimator, monitor=parts.watched)
-
-
-def _bilinear_offset(parts: Prepared, limits: Limits) -> Controller:
-    """The same on the bilinear predictor, with an estimated disturbance of every state."""
-    return _bilinear_mpc(parts, limits, LiftedDisturbance())
-
-
-def _adaptive(parts: Prepared, limits: Limits) -> Controller:
-    """The same as koopman-mpc, with a model that goes on learning from each step that its monitor knows."""
-    problem = parts.problem
-    mpc = _koopman_mpc(parts, limits)
-    online = OnlineEDMD.start(parts.data, problem.lifting, forgetting=_FORGETTING, ridge=problem.ridge)
-    return Adaptive(mpc, online)
-
-
-def _designed(parts: Prepared, limits: Limits) -> Controller:
-    """What `design` makes of the data; one design serves all cases with these limits."""
-    kept = parts.kept_design(limits)
+def _build_designed(parts: Prepared, limits: Limits) -> Controller:
+    """Return the designed controller; one design serves all cases with these limits."""
+    kept = parts.load_design(limits)
     saved = (parts.design(limits).controller if kept is None else kept).as_data()
-    if parts.watched is not None:
-        saved = replace(saved, monitor=Monitor.of(saved.model, parts.watched))
-    return made(saved, "the design")
+    if parts.monitor_data is not None:
+        assert saved.model is not None, "design chooses controllers of learned models"
+        saved = replace(saved, monitor=Monitor.of(saved.model, parts.monitor_data))
+    return rebuild_controller(saved, "the design")
 
 
-def _nonlinear_mpc(parts: Prepared, limits: Limits) -> Controller:
-    """MPC on the model itself, the best of twelve initial guesses: the oracle where the model is the plant."""
-    return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon, starts=12)
+CONTROLLERS = list_bench()
+"""Name → `BenchEntry` of all controllers."""
+CONTROLLERS["designed"] = BenchEntry(
+    "designed",
+    "The controller that km.design chooses, by closed loops on models learned from the same data.",
+    "designed",
+    _build_designed,
+    on_request=True,  # a design takes up to a minute
+)
 
 
-CONTROLLERS: dict[str, Build] = {
-    "lqr": _lqr,
-    "koopman-lqr": _koopman_lqr,
-    "linear-mpc": _linear_mpc,
-    "koopman-mpc": _koopman_mpc,
-    "offset-free": _offset_free,
-    "bilinear-mpc": _bilinear_mpc,
-    "bilinear-offset": _bilinear_offset,
-    "nonlinear-mpc": _nonlinear_mpc,
-    "adaptive": _adaptive,
-    "designed": _designed,
-}
-ASKED = ("adaptive", "designed")  # for plants that drift; a design takes up to a minute: they run where they are named
-
-LEARNED = ("koopman-lqr", "koopman-mpc", "offset-free", "bilinear-mpc", "bilinear-offset", "adaptive", "designed")
-_FORGETTING = 0.98  # of the adaptive one: what is 35 steps ago counts by half
+def is_learned(name: str) -> bool:
+    """Return whether a controller of the bench learns its model from data."""
+    return name in CONTROLLERS and CONTROLLERS[name].model != "equations"
 
 
 def controller_names(names: Iterable[str] | None) -> tuple[str, ...]:
@@ -360,7 +304,7 @@ def controller_names(names: Iterable[str] | None) -> tuple[str, ...]:
     ProblemError
         There is no such controller, and the message names the nearest; one is named twice.
     """
-    names = tuple(names or (name for name in CONTROLLERS if name not in ASKED))
+    names = tuple(names or (name for name, entry in CONTROLLERS.items() if not entry.on_request))
     for name in names:
         if name not in CONTROLLERS:
             raise ProblemError(

@@ -17,12 +17,13 @@ from koopmpc import checks
 from koopmpc.bench.store import RunRow, load_rows, reached
 from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import DataError, KoopmpcError, LogError
-from koopmpc.loop.metrics import Metrics, beyond, duration, metrics
+from koopmpc.loop.metrics import Metrics, beyond, metrics
 from koopmpc.loop.run import Run
 from koopmpc.recording.model import ModelLog, load_model_log
 from koopmpc.recording.reader import load_run
-from koopmpc.recording.recorder import record
-from koopmpc.validate.text import plain_table
+from koopmpc.recording.writer import record
+from koopmpc.terminal import build_plain_table
+from koopmpc.text import format_duration
 
 _MOST = 5  # moments of one kind that are named
 SURE = 0.05  # a regression needs a p below this where there are enough pairs to reach it
@@ -88,12 +89,12 @@ def inspected(logs: Sequence[str | Path], where: str | None = None, *, repair: b
     if not paths:
         raise LogError(f"there is no log in {', '.join(map(str, logs))}; pass the .rrd of a run, or a folder of them")
     for path in paths:
-        found = _inspected(path, repair=repair)
+        found = _inspect(path, repair=repair)
         if wanted is None or (found.refused is None and wanted.holds(found.values)):
             yield found
 
 
-def _inspected(path: Path, *, repair: bool) -> Inspected:
+def _inspect(path: Path, *, repair: bool) -> Inspected:
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         try:
@@ -177,7 +178,7 @@ def worst_moments(run: Run) -> tuple[Moment, ...]:
         k = int(np.nanargmax(excess))
         at(k, f"largest violation: {excess[k]:.4g}")
     k = int(np.argmax(run.solve_time))
-    at(k, f"slowest step: {duration(float(run.solve_time[k]))}, {run.status[k].name}")
+    at(k, f"slowest step: {format_duration(float(run.solve_time[k]))}, {run.status[k].name}")
     fell: tuple[Fallback, ...] = run.fallback
     ended: tuple[Status, ...] = run.status
     masks = {
@@ -203,7 +204,7 @@ def inspection_table(found: Sequence[Inspected]) -> Table:
         f"{each.path.parent.name}/{name}" if names.count(name) > 1 else name
         for each, name in zip(found, names, strict=True)
     ]
-    lines = plain_table(f"{len(found)} logs", ())
+    lines = build_plain_table(f"{len(found)} logs", ())
     lines.add_column("log", overflow="fold")
     for heading in ("cost", "violation", "late", "fell back", "slowest", ""):
         lines.add_column(heading, justify="right", no_wrap=True)
@@ -215,7 +216,7 @@ def inspection_table(found: Sequence[Inspected]) -> Table:
         else:
             own = each.metrics
             cells = (f"{own.cost:.5g}", f"{own.violation:.2g}", str(own.late), str(each.values["fallbacks"]))
-            lines.add_row(name, *cells, duration(own.solve_time_max), "cut" if each.cut else "")
+            lines.add_row(name, *cells, format_duration(own.solve_time_max), "cut" if each.cut else "")
     return lines
 
 
@@ -258,11 +259,11 @@ class Where:
                 return all(every) if isinstance(op, ast.And) else any(every)
             case ast.Compare(left=left, ops=ops, comparators=rest):
                 sides = [self._value(each, values) for each in (left, *rest)]
-                return all(self._compared(op, *pair) for op, *pair in zip(ops, sides[:-1], sides[1:], strict=True))
+                return all(self._compare(op, *pair) for op, *pair in zip(ops, sides[:-1], sides[1:], strict=True))
             case _:
                 raise DataError(f'--where "{self.text}" holds more than comparisons, and, or, not')
 
-    def _compared(self, op: ast.cmpop, left: Any, right: Any) -> bool:
+    def _compare(self, op: ast.cmpop, left: Any, right: Any) -> bool:
         how = _COMPARISONS.get(type(op))
         try:
             if how is not None:
@@ -309,7 +310,7 @@ class Compared:
     @property
     def table(self) -> Table:
         """A line for each case, controller and figure."""
-        lines = plain_table("B / A", ("run",), ("figure", "pairs", "median B / A", "p", "lost", ""))
+        lines = build_plain_table("B / A", ("run",), ("figure", "pairs", "median B / A", "p", "lost", ""))
         for each in self.pairs:
             p = "–" if np.isnan(each.p) else f"{each.p:.2g}"
             cells = (each.figure, str(each.shared), f"{each.ratio:.4g}", p, str(each.lost))
@@ -361,7 +362,7 @@ def compared(a: str | Path, b: str | Path, *, threshold: float = 0.02, times: bo
         pairs = [(first[key], second[key]) for key in keys]
         what = " ".join(str(part) for part in group if part)
         figures = ("cost", "solve_time_p50") if times else ("cost",)
-        found.extend(_compared(what, figure, pairs, threshold) for figure in figures)
+        found.extend(_compare_figure(what, figure, pairs, threshold) for figure in figures)
     return Compared(tuple(found), threshold, len(first.keys() ^ second.keys()))
 
 
@@ -384,7 +385,7 @@ def _told_apart(a: RunRow, b: RunRow) -> tuple[dict[tuple[Any, ...], RunRow], di
     return {(a.problem, a.case, which): a}, {(b.problem, b.case, which): b}
 
 
-def _compared(what: str, figure: str, pairs: list[tuple[RunRow, RunRow]], threshold: float) -> Pairs:
+def _compare_figure(what: str, figure: str, pairs: list[tuple[RunRow, RunRow]], threshold: float) -> Pairs:
     from scipy.stats import wilcoxon
 
     lost = sum((a.reached and not b.reached) or (b.failure is not None and a.failure is None) for a, b in pairs)

@@ -1,7 +1,6 @@
 """What a sweep found, in tables for a terminal, and by `write_report` as one HTML file, as Markdown and as CSV."""
 
 import csv
-import html
 import io
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,6 +12,7 @@ from zlib import crc32
 
 import numpy as np
 from jaxtyping import Float
+from markdown_it import MarkdownIt
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -20,13 +20,14 @@ from rich.text import Text
 from koopmpc import disk
 from koopmpc.bench.store import ORACLE, RunRow, load_rows, manifest_of
 from koopmpc.control.move import Fallback, Status
-from koopmpc.figures.reports import attraction, profiles, times, trajectories
-from koopmpc.figures.style import svg
-from koopmpc.loop.metrics import Metrics, duration
+from koopmpc.figures.reports import draw_attraction, draw_profiles, draw_step_times, draw_trajectories
+from koopmpc.figures.style import render_svg
+from koopmpc.loop.metrics import Metrics
 from koopmpc.loop.run import Run
 from koopmpc.recording.description import STATUS_WORDS
 from koopmpc.recording.reader import load_run
-from koopmpc.validate.text import markdown_table, plain_table
+from koopmpc.terminal import build_plain_table
+from koopmpc.text import format_duration, format_markdown_table
 
 _SURE = (0.025, 0.975)  # the ends of an interval
 _STARTS = 10  # from which a map of starts is drawn
@@ -57,7 +58,7 @@ def results_table(rows: Sequence[RunRow]) -> RenderableType:
 
 
 def _case(title: str, rows: list[RunRow]) -> Table:
-    lines = plain_table(title, (), padding=(0, 0, 0, 1))
+    lines = build_plain_table(title, (), padding=(0, 0, 0, 1))
     lines.add_column("controller", no_wrap=True)
     measured = [row.metrics for row in rows if row.metrics is not None]
     violated = any(figures.violation > 0 for figures in measured)
@@ -73,7 +74,7 @@ def _case(title: str, rows: list[RunRow]) -> Table:
             lines.add_row(row.controller, *cells, style="red" if row.failure else None)
     learned = max((row.training_time for row in rows), default=0.0)
     if learned:
-        lines.caption = f"Koopman model learned from data in {duration(learned)}"
+        lines.caption = f"Koopman model learned from data in {format_duration(learned)}"
         lines.caption_justify = "left"
     return lines
 
@@ -90,8 +91,8 @@ def _run_cells(row: RunRow, figures: Metrics, oracle: float, violated: bool) -> 
     yield f"{np.abs(figures.final_error).max():.1g}"
     if violated:
         yield f"{figures.violation:.2g}"
-    yield duration(figures.solve_time_p50)
-    yield duration(figures.solve_time_p99)
+    yield format_duration(figures.solve_time_p50)
+    yield format_duration(figures.solve_time_p99)
     counts = ", ".join(f"{count} {STATUS_WORDS[Status[name]]}" for name, count in figures.status.items())
     yield counts + ("" if figures.unknown is None else f"; {figures.unknown} unknown")
 
@@ -101,7 +102,7 @@ def _under_faults(title: str, rows: Sequence[RunRow]) -> Table:
     whole = {row.controller: row for row in rows if row.fault is None}
     found = {(row.fault, row.controller): row for row in rows if row.fault is not None}
     # Without padding the box still has a blank between columns.
-    lines = plain_table(title, (), min_width=len(title), padding=0, show_edge=False)
+    lines = build_plain_table(title, (), min_width=len(title), padding=0, show_edge=False)
     faults = list(dict.fromkeys(fault for fault, _ in found))
     lines.add_column("controller", no_wrap=True)
     for fault in faults:
@@ -233,7 +234,7 @@ def _summary_cells(own: Summary) -> tuple[str, ...]:
         return f"{middle:.4g}" + (f" [{low:.4g}, {high:.4g}]" if own.runs > 1 else "")
 
     def time(value: float) -> str:
-        return "–" if np.isnan(value) else duration(value)
+        return "–" if np.isnan(value) else format_duration(value)
 
     return (
         own.controller,
@@ -250,14 +251,14 @@ def _summary_cells(own: Summary) -> tuple[str, ...]:
     )
 
 
-def summary_table(rows: Sequence[RunRow]) -> Group:
+def build_summary_table(rows: Sequence[RunRow]) -> Group:
     """Return the summaries as tables for a terminal, one for each case; columns in which all is 0 or – are left out."""
     parts: list[Table] = []
     for case, group in groupby(summaries(rows), key=lambda each: each.case):
         found = list(group)
         cells = np.array([_summary_cells(own) for own in found])
         told = [i for i in range(len(_HEADINGS)) if i == 0 or not np.isin(cells[:, i], ("0", "–")).all()]
-        lines = plain_table(case, (), padding=(0, 0, 0, 1))
+        lines = build_plain_table(case, (), padding=(0, 0, 0, 1))
         for i in told:
             lines.add_column(_HEADINGS[i], justify="right" if i > 1 else "left", no_wrap=_HEADINGS[i] in _WHOLE)
         for own, row in zip(found, cells[:, told], strict=True):
@@ -321,9 +322,12 @@ def _pictures(own: Sequence[RunRow], usual: Sequence[RunRow], folder: Path) -> I
     measured = {name: [row for row in usual if row.controller == name and row.metrics is not None] for name in names}
     hot = {name: np.array([r.metrics.solve_time_p50 for r in own if r.metrics]) for name, own in measured.items()}
     cold = {name: np.array([row.cold_p50 for row in own]) for name, own in measured.items()}
-    yield svg(times(hot, cold)), "Time of a step: median over runs, middle half, and 5 to 95 %; × with cold caches."
+    yield (
+        render_svg(draw_step_times(hot, cold)),
+        "Time of a step: median over runs, middle half, and 5 to 95 %; × with cold caches.",
+    )
     starts = {name: np.array([row.x0 for row in own]) for name, own in measured.items() if len(own) >= _STARTS}
-    runs = _logged(usual, folder)
+    runs = _load_logged(usual, folder)
     if starts and next(iter(starts.values())).shape[1] > 1:
         spread = np.ptp(np.vstack(list(starts.values())), axis=0)
         i, j = (int(k) for k in np.sort(np.argsort(-spread, kind="stable")[:2]))
@@ -333,11 +337,11 @@ def _pictures(own: Sequence[RunRow], usual: Sequence[RunRow], folder: Path) -> I
         mapped = {name: (values[:, [i, j]], reached[name]) for name, values in starts.items()}
         alone = "" if len(usual) == len(own) else ", without noise and with the plant as it is"
         yield (
-            svg(attraction(mapped, [states[i], states[j]])),
+            render_svg(draw_attraction(mapped, [states[i], states[j]])),
             f"Initial states that reach their reference, and not{alone}.",
         )
     if runs:
-        yield svg(trajectories(runs)), "The case's own start."
+        yield render_svg(draw_trajectories(runs)), "The case's own start."
 
 
 def _profile(rows: Sequence[RunRow]) -> Iterable[tuple[str, str]]:
@@ -352,11 +356,14 @@ def _profile(rows: Sequence[RunRow]) -> Iterable[tuple[str, str]]:
         best, own = least.get(_pair(row), np.nan), row.metrics
         ratios[row.controller].append(own.cost / best if row.reached and own is not None and best > 0 else np.inf)
     if len(names) > 1 and len(rows) > len(names):
-        made = profiles({name: np.array(values) for name, values in ratios.items()})
-        yield svg(made), "Performance profile: the share of runs whose cost is within τ of the best controller's."
+        made = draw_profiles({name: np.array(values) for name, values in ratios.items()})
+        yield (
+            render_svg(made),
+            "Performance profile: the share of runs whose cost is within τ of the best controller's.",
+        )
 
 
-def _logged(usual: Sequence[RunRow], folder: Path) -> dict[str, Run]:
+def _load_logged(usual: Sequence[RunRow], folder: Path) -> dict[str, Run]:
     """Return the runs from the case's own start that have a log, by controller."""
     own = [row for row in usual if row.start == row.seed == 0 and row.log is not None and row.log.is_file()]
     return {row.controller: load_run(folder / row.log.name) for row in own[:_LOGS] if row.log is not None}
@@ -408,9 +415,13 @@ def _intro(rows: Sequence[RunRow], about: dict[str, Any]) -> list[str]:
 def _markdown(rows: Sequence[RunRow], about: dict[str, Any], sections: Sequence[_Section]) -> str:
     parts = ["# Sweep", *_intro(rows, about)]
     for each in sections:
-        parts += [f"## {each.title}", markdown_table(each.headings, each.lines)]
-        parts += ["Logs: " + ", ".join(f"[{log}]({log})" for log in each.logs)] if each.logs else []
+        parts += [f"## {each.title}", format_markdown_table(each.headings, each.lines)]
+        parts += [f"Logs: {_links(each)}"] if each.logs else []
     return "\n\n".join(parts) + "\n"
+
+
+def _links(section: _Section) -> str:
+    return ", ".join(f"[{log}]({log})" for log in section.logs)
 
 
 _STYLE = """
@@ -426,22 +437,19 @@ details{font-size:.85rem}a{color:#003a7d;overflow-wrap:anywhere}
 
 
 def _html(rows: Sequence[RunRow], about: dict[str, Any], sections: Sequence[_Section]) -> str:
-    safe = html.escape
-    parts = [f"<p>{safe(text)}</p>" for text in _intro(rows, about)]
+    """Return the Markdown of the report as one HTML page, with pictures; what looks like HTML in a text is escaped."""
+    render = MarkdownIt("commonmark", {"html": False}).enable("table").render
+    parts = [render("\n\n".join(["# Sweep", *_intro(rows, about)]))]
     for each in sections:
-        head = "".join(f"<th>{safe(cell)}</th>" for cell in each.headings)
-        body = "".join("<tr>" + "".join(f"<td>{safe(cell)}</td>" for cell in row) + "</tr>" for row in each.lines)
-        parts.append(f"<h2>{safe(each.title)}</h2><div class=wide><table><tr>{head}</tr>{body}</table></div>")
-        parts += [
-            f"<figure>{_own_ids(picture)}<figcaption>{safe(text)}</figcaption></figure>"
-            for picture, text in each.pictures
-        ]
+        table = render(format_markdown_table(each.headings, each.lines))
+        parts.append(f"{render(f'## {each.title}')}<div class=wide>{table}</div>")
+        for picture, text in each.pictures:
+            parts.append(f"<figure>{_own_ids(picture)}<figcaption>{render(text)}</figcaption></figure>")
         if each.logs:
-            links = ", ".join(f'<a href="{safe(log)}">{safe(log)}</a>' for log in each.logs)
-            parts.append(f"<details><summary>{len(each.logs)} logs</summary>{links}</details>")
+            parts.append(f"<details><summary>{len(each.logs)} logs</summary>{render(_links(each))}</details>")
     start = '<!doctype html><html lang="en"><head><meta charset="utf-8">'
     view = '<meta name="viewport" content="width=device-width,initial-scale=1"><title>Sweep</title>'
-    return f"{start}{view}<style>{_STYLE}</style></head><body><h1>Sweep</h1>{''.join(parts)}</body></html>"
+    return f"{start}{view}<style>{_STYLE}</style></head><body>{''.join(parts)}</body></html>"
 
 
 def _own_ids(picture: str) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from koopmpc import disk
-from koopmpc.bench.controllers import LEARNED, Prepared
+from koopmpc.bench.controllers import Prepared, is_learned
 from koopmpc.bench.problem import Case, load_problem
 from koopmpc.bench.store import RunRow, reached
 from koopmpc.codegen.compiled import Compiled
@@ -29,11 +29,12 @@ from koopmpc.loop.faults import (
 )
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.realtime import in_real_time
-from koopmpc.loop.run import Run
+from koopmpc.loop.run import MOVE_COLUMNS, Run, columns_of_moves
 from koopmpc.loop.simulate import StepObserver, predictor_of, simulate
 from koopmpc.plants.step_map import StepMap
 from koopmpc.recording.reader import load_run
-from koopmpc.recording.recorder import Recorder, record
+from koopmpc.recording.recorder import Recorder
+from koopmpc.recording.writer import record
 
 FAULTS: dict[str, Fault] = {
     "nan-sensor": NaNSensor(probability=0.1),
@@ -43,7 +44,8 @@ FAULTS: dict[str, Fault] = {
     "actuator-delay": ActuatorDelay(1),
     "solver-failure": SolverFailure(0.2),
 }
-_COLD_STEPS, _SLEEP = 25, 0.004  # steps that are timed with cold caches, and the sleep before each [s]
+_COLD_STEPS = 25  # time this many steps with cold caches
+_SLEEP = 0.004  # sleep before each of them [s]
 
 _TOLERANCE = 1e-9  # relative violation of an input limit that counts as rounding
 
@@ -52,35 +54,35 @@ def row_of_run(parts: Prepared, row: RunRow, folder: Path, *, logged: bool, **ho
     """Run what `row` names, and return it with its figures; an exception becomes the row's failure.
 
     A run that is `logged`, or that failed, is written to a log, which is read back; one that is logged is also timed
-    with cold caches. The rest is passed to `closed_loop`.
+    with cold caches. The rest is passed to `run_closed_loop`.
     """
     begin = time.perf_counter()
     log = folder / f"{row.name}.rrd"
-    row = replace(row, x0=tuple(parts.start(row.case, row.start).tolist()))
+    row = replace(row, x0=tuple(parts.initial_state(row.case, row.start).tolist()))
     try:
-        run = closed_loop(parts, row, plans=logged, **how)
+        run = run_closed_loop(parts, row, plans=logged, **how)
         figures, arrived = metrics(run), reached(run)
         found = failures(run, parts.problem.cases[row.case].steps)
     except FullDiskError:
         raise
     except Exception as error:  # the other runs go on; the exit code says that one failed
-        return replace(row, failure=_described(error, log), elapsed=time.perf_counter() - begin)
+        return replace(row, failure=_describe_error(error, log), elapsed=time.perf_counter() - begin)
     if logged or found:
         try:
-            found += _recorded(run, log)
+            found += _record_log(run, log)
             if load_run(log) != run:
                 found.append(f"{log.name} does not read back equal to the run")
         except FullDiskError:
             raise
         except Exception as error:  # the figures of the run are kept without its log
-            found.append(_described(error, log))
+            found.append(_describe_error(error, log))
     usual = logged and row.fault is None and not row.noise and not row.wrong
     p50, p99 = _cold(parts.controller(row.controller, row.case), run) if usual else (row.cold_p50, row.cold_p99)
     return replace(
         row,
         metrics=figures,
         reached=arrived,
-        training_time=parts.training_time if row.controller in LEARNED else 0.0,
+        training_time=parts.training_time if is_learned(row.controller) else 0.0,
         log=log if log.exists() else None,
         failure="; ".join(found) or None,
         elapsed=time.perf_counter() - begin,
@@ -109,7 +111,7 @@ def failures(run: Run, steps: int) -> list[str]:
     return found
 
 
-def _described(error: Exception, log: Path) -> str:
+def _describe_error(error: Exception, log: Path) -> str:
     """Return the error in one line, and write its traceback beside the log."""
     trace = log.with_suffix(".txt")
     with disk.writing(trace) as stream:
@@ -117,7 +119,7 @@ def _described(error: Exception, log: Path) -> str:
     return f"{type(error).__name__}: {error} (the whole traceback is in {trace.name})"
 
 
-def _recorded(run: Run, log: Path) -> list[str]:
+def _record_log(run: Run, log: Path) -> list[str]:
     """Write the log; where its scene cannot be drawn, write it without the scene and return why."""
     try:
         record(run, log)
@@ -127,23 +129,23 @@ def _recorded(run: Run, log: Path) -> list[str]:
         if run.scene is None:
             raise
         record(replace(run, scene=None), log)
-        return [f"the log is without its scene: drawing scene(x, u) raised {_described(error, log)}"]
+        return [f"the log is without its scene: drawing scene(x, u) raised {_describe_error(error, log)}"]
     return []
 
 
-def closed_loop(
+def run_closed_loop(
     parts: Prepared, row: RunRow, *, plans: bool, live: bool = False, paced: bool = False, compiled: bool = False
 ) -> Run:
     """Return the run that `row` names, from its x0; `live` in a viewer, `paced` as fast as its plant would be."""
     problem, case = parts.problem, parts.problem.cases[row.case]
-    plant = parts.off(row.case, row.wrong, row.start) if row.wrong else parts.truth_of(row.case)
-    held = parts.inputs_that_hold(row.case, plant) if row.wrong else parts.u_reference(row.case)
+    plant = parts.perturb_plant(row.case, row.wrong, row.start) if row.wrong else parts.truth_of(row.case)
+    held = parts.find_held_inputs(row.case, plant) if row.wrong else parts.u_reference(row.case)
     controller = parts.controller(row.controller, row.case)
     if compiled:
         with suppress(DataError):  # what cannot be written in C stays in Python
             controller = built(controller)
     in_c = {"compiled": isinstance(controller, Compiled)} if compiled else {}
-    monitored = {"monitor": True} if parts.watched is not None else {}
+    monitored = {"monitor": True} if parts.monitor_data is not None else {}
     injected = () if row.fault is None else (FAULTS[row.fault],)
     _warm_up(controller, parts, case)
     about: dict[str, Any] = {
@@ -156,7 +158,7 @@ def closed_loop(
     noise = np.hypot(own, row.noise * parts.spread) if row.noise else case.noise
     scene = problem.scene or getattr(plant, "scene", None)
 
-    def observed(*observers: StepObserver) -> Run:
+    def simulate_with(*observers: StepObserver) -> Run:
         run = simulate(
             plant,
             controller,
@@ -174,10 +176,10 @@ def closed_loop(
         return replace(run, scene=scene)
 
     if not live:
-        return observed()
+        return simulate_with()
     names: dict[str, Any] = {"dt": plant.dt, "states": plant.states, "inputs": plant.inputs, "outputs": plant.outputs}
     with Recorder(live=True, **names, **about, scene=scene, model=predictor_of(controller)) as viewer:
-        return observed(viewer)
+        return simulate_with(viewer)
 
 
 def _warm_up(controller: Controller, parts: Prepared, case: Case) -> None:
@@ -271,8 +273,8 @@ def replayed(log: str | Path, *, plant: StepMap | None = None, controller: Contr
     if trained != problem.training.seed:
         raise ProblemError(f"{problem.name} trains with seed {problem.training.seed}, the log's run did with {trained}")
     parts = Prepared(problem, row.seed, monitored=bool(known.get("monitor")))
-    row = replace(row, x0=tuple(parts.start(row.case, row.start).tolist()))
-    run = closed_loop(parts, row, plans=logged.plans is not None, compiled=bool(known.get("compiled")))
+    row = replace(row, x0=tuple(parts.initial_state(row.case, row.start).tolist()))
+    run = run_closed_loop(parts, row, plans=logged.plans is not None, compiled=bool(known.get("compiled")))
     return Replayed(logged, run, tuple(_differences(logged, run)))
 
 
@@ -301,14 +303,15 @@ def _again(logged: Run, plant: StepMap | None, controller: Controller | None, lo
             for k in range(logged.steps)
         ]
         U = np.array([move.u for move in made], dtype=np.float64)
-        moves = {name: tuple(getattr(move, name) for move in made) for name in ("status", "fallback")}
-        moves |= {name: np.array([getattr(move, name) for move in made]) for name in ("iterations", "slack")}
+        moves = columns_of_moves(made)
+        moves |= {column.name: getattr(logged, column.name) for column in MOVE_COLUMNS if column.timed}
     return replace(logged, X=X, U=U, **moves)
 
 
 def _differences(logged: Run, run: Run) -> Iterator[str]:
     """Yield each column that differs, with the first step at which it does."""
-    for name in ("X", "Y", "U", "reference", "u_reference", "slack", "iterations", "status", "fallback"):
+    timed = [column.name for column in MOVE_COLUMNS if column.timed]
+    for name in (each for each in logged.columns() if each not in timed):
         old, new = np.asarray(getattr(logged, name)), np.asarray(getattr(run, name))
         if old.shape != new.shape:
             yield f"{name} has shape {new.shape}, the log's {old.shape}"

@@ -30,9 +30,11 @@ from koopmpc.loop.metrics import Metrics, tracking_error
 from koopmpc.loop.run import Run
 from koopmpc.parallel import is_orphan
 
-MANIFEST, ROWS = "sweep.json", "rows"
+MANIFEST = "sweep.json"
+ROWS = "rows"  # folder of the lines of finished runs
 FORMAT = "koopmpc-sweep-1"
-_LINE, _SEAL = json.JSONEncoder(), "crc32"
+_LINE = json.JSONEncoder()
+_SEAL = "crc32"  # key of a line's checksum
 _OUTLIVES = 2.0  # time that a worker gets to end after the sweep that it works for [s]
 RESULTS = "results.parquet"  # beside the logs of the runs
 ORACLE = "nonlinear-mpc"
@@ -182,7 +184,7 @@ def record_of(row: RunRow) -> dict[str, Any]:
     return record
 
 
-def row_of(record: Mapping[str, Any], folder: Path) -> RunRow:
+def parse_row(record: Mapping[str, Any], folder: Path) -> RunRow:
     """Return the row that `record_of` made this record of; its log lies in `folder`."""
     figures = None
     if record["status"] is not None:
@@ -229,7 +231,7 @@ class Journal:
         """
         told = [] if done is None else [record_of(done)]
         told += [] if following is None else [{"begins": following.name}]
-        self._write("".join(f"{_LINE.encode(_sealed(each))}\n" for each in told).encode())
+        self._write("".join(f"{_LINE.encode(_seal(each))}\n" for each in told).encode())
         return 0 if following is None or not self._begun else self._begun.count(following.name)
 
     def _write(self, line: bytes) -> None:
@@ -245,12 +247,12 @@ def _whole(file: FileIO, data: bytes) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def _sealed(content: dict[str, Any]) -> dict[str, Any]:
+def _seal(content: dict[str, Any]) -> dict[str, Any]:
     """Return the content with the checksum of its text."""
     return {**content, _SEAL: crc32(_LINE.encode(content).encode())}
 
 
-def _unsealed(text: bytes) -> dict[str, Any]:
+def _unseal(text: bytes) -> dict[str, Any]:
     """Return the content of a text that holds its checksum; older ones hold none.
 
     Raises
@@ -279,8 +281,8 @@ def _lines(path: Path) -> Iterator[tuple[dict[str, Any], RunRow | None]]:
     damaged = 0
     for line in filter(None, data.split(b"\n")):
         try:
-            found = _unsealed(line)
-            yield found, None if "begins" in found else row_of(found, path.parent.parent)
+            found = _unseal(line)
+            yield found, None if "begins" in found else parse_row(found, path.parent.parent)
         except (LookupError, TypeError, ValueError):
             damaged += _SEAL.encode() in line or line.endswith(b"}")
     if damaged:
@@ -320,7 +322,7 @@ def next_batch(folder: Path) -> int:
 
 
 @contextmanager
-def opened(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
+def open_sweep(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
     """Claim the folder for the sweep that is asked for, and yield its manifest; a sweep that was broken off goes on.
 
     Raises
@@ -340,7 +342,7 @@ def opened(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
         file.seek(0)
         text = file.read()
         try:
-            known = _unsealed(text) if text.strip() else {}
+            known = _unseal(text) if text.strip() else {}
         except ValueError as error:
             raise ProblemError(f"{path} is damaged; pass another folder, or remove it: {error}") from error
         if known and known["asked"] != asked:
@@ -350,7 +352,7 @@ def opened(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
             known = {"format": FORMAT, "asked": asked, "machine": machine()}
             file.truncate(0)
             try:
-                _whole(file, json.dumps(_sealed(known), indent=1).encode())
+                _whole(file, json.dumps(_seal(known), indent=1).encode())
             except OSError as error:
                 file.truncate(0)
                 raise disk.refused(path, error) from error
@@ -397,7 +399,7 @@ def manifest_of(folder: str | Path) -> dict[str, Any]:
     """
     path = Path(folder) / MANIFEST
     try:
-        return _unsealed(path.read_bytes())
+        return _unseal(path.read_bytes())
     except (OSError, ValueError) as error:
         raise LogError(
             f"{folder} holds no sweep: {MANIFEST} is missing or damaged; pass that of `koopmpc bench`"

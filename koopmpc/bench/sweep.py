@@ -16,21 +16,22 @@ from uuid import uuid4
 import numpy as np
 
 from koopmpc import checks, disk
-from koopmpc.bench.controllers import LEARNED, Prepared, controller_names
+from koopmpc.bench.controllers import Prepared, controller_names, is_learned
 from koopmpc.bench.problem import Problem, load_problem
 from koopmpc.bench.single import FAULTS, row_of_run
-from koopmpc.bench.store import RESULTS, ROWS, Journal, RunRow, load_rows, next_batch, opened, write_results
+from koopmpc.bench.store import RESULTS, ROWS, Journal, RunRow, load_rows, next_batch, open_sweep, write_results
 from koopmpc.control.limits import Limits
 from koopmpc.errors import ProblemError
 from koopmpc.parallel import map_tasks
 from koopmpc.recording.viewer import find_viewer, why_none
 
 MODELS = "models"  # beside the logs: what was learned
-_BATCHES, _LARGEST = 40, 50  # batches for each worker, and runs in a batch, at most
-_EACH = 100  # up to so many runs each is a batch of its own
-_FIRST = 5.0  # time until results.parquet is written for the first time [s]
-_SHARE = 100.0  # results.parquet is written again after so many times the time that it takes
-_DEATHS = 3  # workers that a run may take with it
+_BATCHES = 40  # give each worker about this many batches
+_LARGEST = 50  # put at most this many runs into a batch
+_EACH = 100  # make each run a batch of its own if there are at most this many
+_FIRST = 5.0  # write results.parquet for the first time after this time [s]
+_SHARE = 100.0  # write results.parquet again after this many times the time that writing takes
+_DEATHS = 3  # a run fails if it would begin for this time after its workers died
 
 
 class _Grid(NamedTuple):
@@ -144,7 +145,7 @@ def sweep(
         "monitor": monitor,
         "compiled": compiled,
     }
-    with opened(folder, asked):
+    with open_sweep(folder, asked):
         done = {row.key: row for row in load_rows(folder)}
         left = [row for row in rows if row.key not in done]
         grid = _Grid(uuid4().hex, dict(sent), folder.resolve(), log_starts, live, paced, monitor, compiled)
@@ -157,7 +158,7 @@ def sweep(
         say(left[0].name if left else "done")
         due = time.monotonic() + _FIRST
         try:
-            wanted = [row for row in left if row.controller in LEARNED or row.noise]
+            wanted = [row for row in left if is_learned(row.controller) or row.noise]
             models = {(row.problem, row.seed): (f"{row.problem}:{row.case}", row.seed) for row in reversed(wanted)}
             learn = partial(_learn, grid, asked["controllers"])
             for _ in map_tasks(learn, list(reversed(models.values())), **where):
@@ -201,7 +202,7 @@ def _rows(
         names = asked if controllers else controller_names(problem.controllers)
         broken = (None, *(possible_faults(problem.limits_of(case)) if faults else ()))
         for fault, n, w, seed, name in product(broken, noise, wrong, range(checks.count(seeds, "seeds")), names):
-            if seed and name not in LEARNED:
+            if seed and not is_learned(name):
                 continue  # it learns nothing, so all seeds are one
             row = RunRow(problem.name, case, name, fault=fault, noise=float(n), wrong=float(w), seed=seed)
             rows.extend(replace(row, start=start) for start in range(checks.count(starts, "starts")))
@@ -209,7 +210,7 @@ def _rows(
         for problem in problems:
             parts = Prepared(problem)
             for case in problem.cases:
-                parts.off(case, 0.0, 0)  # raises where there is nothing to be wrong
+                parts.perturb_plant(case, 0.0, 0)  # raises where there is nothing to be wrong
     return rows
 
 
@@ -247,7 +248,7 @@ def _sendable(problem: Problem) -> bytes | str:
 
 
 @lru_cache(maxsize=8)
-def _prepared(grid_name: str, sent: "Problem | bytes | str", seed: int, folder: Path, monitored: bool) -> Prepared:
+def _prepare(grid_name: str, sent: "Problem | bytes | str", seed: int, folder: Path, monitored: bool) -> Prepared:
     """Return the parts of a problem, once for each process and call of `sweep`."""
     problem = sent if isinstance(sent, Problem) else load_problem(sent) if isinstance(sent, str) else pickle.loads(sent)
     return Prepared(problem, seed, folder / MODELS, monitored=monitored)
@@ -259,9 +260,9 @@ def _learn(grid: _Grid, controllers: Sequence[str], model: tuple[str, int]) -> N
     Where that raises, the runs say so.
     """
     case, seed = model
-    parts = _prepared(grid.name, grid.problems[case], seed, grid.folder, grid.monitor)
+    parts = _prepare(grid.name, grid.problems[case], seed, grid.folder, grid.monitor)
     with suppress(Exception):  # whatever the data or a plant of the user raise
-        parts.keep(controllers)
+        parts.save_models(controllers)
 
 
 def _batches(rows: Sequence[RunRow], workers: int, first: int) -> list[tuple[int, list[RunRow]]]:
@@ -289,7 +290,7 @@ def _do(grid: _Grid, batch: tuple[int, list[RunRow]]) -> list[RunRow]:
                 done = replace(row, failure=f"its worker process died {died} times")
             else:
                 sent = grid.problems[f"{row.problem}:{row.case}"]
-                parts = _prepared(grid.name, sent, row.seed, grid.folder, grid.monitor)
+                parts = _prepare(grid.name, sent, row.seed, grid.folder, grid.monitor)
                 logged = row.start < grid.log_starts
                 how = {"live": grid.live, "paced": grid.paced, "compiled": grid.compiled}
                 done = row_of_run(parts, row, grid.folder, logged=logged, **how)

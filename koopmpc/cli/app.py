@@ -10,7 +10,18 @@ from rich.console import Console
 from rich.text import Text
 
 from koopmpc.cli import sweeps
-from koopmpc.cli.console import bar, called, console, folder_of, friendly, new_file, new_folder, say, say_page, split
+from koopmpc.cli.console import (
+    bar,
+    console,
+    folder_of,
+    format_command,
+    friendly,
+    new_file,
+    new_folder,
+    say,
+    say_page,
+    split,
+)
 from koopmpc.cli.sweeps import Logs
 from koopmpc.errors import DataError, KoopmpcError, ProblemError
 
@@ -40,7 +51,7 @@ def main(
 @app.command("list")
 def list_() -> None:
     """Show all problems with their cases, and how the best learned controller did on those that come with koopmpc."""
-    from koopmpc.bench.measured import in_words
+    from koopmpc.bench.measured import describe_best
     from koopmpc.bench.problem import list_problems, load_problem, shipped
 
     out, own = console(), shipped()
@@ -50,7 +61,7 @@ def list_() -> None:
             out.print(Text(f"  cases: {', '.join(load_problem(entry.path).cases)}"))
         except KoopmpcError as error:
             out.print(Text(f"  {error}", style="red"))
-        if entry.path in own and (words := in_words(entry.name)):
+        if entry.path in own and (words := describe_best(entry.name)):
             out.print(Text(f"  {words}", style="dim"))
 
 
@@ -62,7 +73,7 @@ def new(name: Annotated[str, typer.Argument(help="Name of the problem; the file 
     with friendly():
         path = new_problem(name)
     say(f"written: {path}; it holds a mass on a spring, put your plant in its place")
-    say(f"run it: {called('run', path)}")
+    say(f"run it: {format_command('run', path)}")
 
 
 @app.command()
@@ -93,7 +104,7 @@ def fit(
 ) -> None:
     """Choose a model for logged data, fit it, and say whether to trust it; with a goal, design a controller."""
     from koopmpc.fitting.fit import fit_data
-    from koopmpc.fitting.goal import design_data, template_of
+    from koopmpc.fitting.goal import design_data, write_template
 
     source: Any = data[0] if len(data) == 1 else data
     reading: dict[str, Any] = {
@@ -104,15 +115,29 @@ def fit(
     }
     if goal_template:
         with friendly():
-            path = new_file(Path("goal.toml"), template_of(source, **reading))
+            path = new_file(Path("goal.toml"), write_template(source, horizon=horizon, **reading))
         say(f"written: {path}; say in it what you want")
-        say(f"then: {called('fit', *data, '--goal', path)}")
+        more = ["--linear"] * linear
+        for option, value, usual in (
+            ("--workers", workers, None),
+            ("--scheduler", scheduler, None),
+            ("--logs", logs, Path("logs")),
+            ("--name", name, "fit"),
+        ):
+            more += [option, str(value)] * (value != usual)
+        say(f"then: {format_command('fit', *data, '--goal', path, *more)}")
         return
 
-    def told(text: str) -> None:
+    def say_line(text: str) -> None:
         say(f"{text}\n")
 
-    how: dict[str, Any] = {"bilinear": not linear, "workers": workers, "scheduler": scheduler, "say": told, **reading}
+    how: dict[str, Any] = {
+        "bilinear": not linear,
+        "workers": workers,
+        "scheduler": scheduler,
+        "say": say_line,
+        **reading,
+    }
     if goal is not None:
         with friendly():
             if horizon is not None:
@@ -120,7 +145,7 @@ def fit(
         with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
             designed = design_data(source, goal, folder, progress=progress, **how)
         say(f"controller: {designed.controller}, report: {designed.page}")
-        say(f"check it: {called('check', designed.controller)}\nuse it:\n{designed.usage}")
+        say(f"check it: {format_command('check', designed.controller)}\nuse it:\n{designed.usage}")
         return
     with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
         done = fit_data(source, folder, horizon=horizon, progress=progress, **how)
@@ -128,7 +153,7 @@ def fit(
         Console(stderr=True).print(Text.assemble(("not made: ", "yellow"), failure), soft_wrap=True)
     say(f"model, report and pictures: {folder}")
     if done.recording is not None:
-        say(f"look at it: {called('view', done.recording)}")
+        say(f"look at it: {format_command('view', done.recording)}")
     say(f"use it:\n{done.usage}")
 
 
@@ -151,8 +176,8 @@ def check(
         raise typer.Exit(1)
 
 
-@app.command()
-def export(
+@app.command("export")
+def run_export(
     controller: Annotated[Path, typer.Argument(help="What the save of a controller or of a design wrote.")],
     out: Annotated[Path, typer.Option("--out", help="The folder to write; it may hold an older export.")],
     name: Annotated[str, typer.Option("--name", help="What its files and symbols start with.")] = "koopmpc",
@@ -167,12 +192,12 @@ def export(
     from koopmpc.bench.controllers import Prepared
     from koopmpc.bench.problem import load_problem
     from koopmpc.codegen.export import export as write
-    from koopmpc.synthesis.designed import SavedDesign, made, saved_controller
+    from koopmpc.synthesis.designed import SavedDesign, read_controller, rebuild_controller
 
     example: dict[str, Any] = {}
     with friendly():
-        saved = saved_controller(controller)
-        loaded = made(saved, controller)
+        saved = read_controller(controller)
+        loaded = rebuild_controller(saved, controller)
         if isinstance(saved, SavedDesign):  # the model itself, from a start of the design to its reference
             asked = saved.evidence.asked
             example = {"x0": asked.starts[0], "reference": asked.reference if asked.moves else asked.reference[:1]}
@@ -185,8 +210,8 @@ def export(
     say(f"{folder}: make run builds it and prints its closed loop")
 
 
-@app.command()
-def view(
+@app.command("view")
+def run_view(
     logs: LogFiles,
     compare: Annotated[bool, typer.Option("--compare", help="Draw all runs in one set of plots.")] = False,
     web: Annotated[bool, typer.Option("--web", help="Serve to a browser on 127.0.0.1 until Ctrl-C.")] = False,
@@ -220,7 +245,7 @@ def view(
 
 
 @app.command("export-video")
-def export_video(
+def run_export_video(
     log: Annotated[Path, typer.Argument(help="A log whose plant has a scene.")],
     video: Annotated[Path, typer.Argument(help="The .gif or .mp4 to write.")],
     fps: Annotated[int, typer.Option("--fps", help="Pictures a second.")] = 20,
@@ -284,21 +309,6 @@ TERMS: dict[str, str] = {
     "–": (
         "No number: without the fault the run does not reach its reference either, or there is no run to compare with."
     ),
-    "lqr": "Linear feedback on your equations, linearised at the equilibrium, cut to the input limits.",
-    "koopman-lqr": "Linear feedback on the linear lifted model that was learned from data, cut to the input limits.",
-    "linear-mpc": "Predictive control on your equations, linearised at the equilibrium.",
-    "koopman-mpc": "Predictive control on the linear lifted model that was learned from data.",
-    "offset-free": "koopman-mpc with an estimate of what the model misses, so that no error remains at rest.",
-    "bilinear-mpc": (
-        "Predictive control on the bilinear lifted model that was learned from data. It linearises the model "
-        "along its plan once a step."
-    ),
-    "bilinear-offset": "bilinear-mpc with an estimate of what the model misses, so that no error remains at rest.",
-    "adaptive": "koopman-mpc whose model goes on learning from every step of the run.",
-    "designed": "The controller that km.design chooses, by closed loops on models learned from the same data.",
-    "nonlinear-mpc": (
-        "Predictive control on your equations as they are, solved to the end: slow, and the measure for all."
-    ),
     "lifting": (
         "The observables z = ψ(x): functions of the state, such as sines or powers, in which the model is linear."
     ),
@@ -319,7 +329,7 @@ TERMS: dict[str, str] = {
     "persistently exciting": "Inputs that vary enough to tell the effects of the last n inputs apart; n is the order.",
     "horizon": "How many steps a controller plans ahead, or how many steps a forecast is judged by.",
 }
-"""Term → what it means, in whole sentences."""
+"""Term → what it means, in whole sentences; the controllers' stand in their registry."""
 
 
 @app.command()
@@ -329,18 +339,19 @@ def explain(
     ] = None,
 ) -> None:
     """Explain a word that stands in a table, a report or a picture."""
+    from koopmpc.bench.controllers import CONTROLLERS
     from koopmpc.checks import nearest
 
-    out = console()
+    out, terms = console(), TERMS | {name: entry.explanation for name, entry in CONTROLLERS.items()}
     if not term:
-        for name, text in TERMS.items():
+        for name, text in terms.items():
             out.print(Text.assemble((name, "bold"), f": {text}"))
         return
-    known, asked = {name.lower(): text for name, text in TERMS.items()}, " ".join(term)
+    known, asked = {name.lower(): text for name, text in terms.items()}, " ".join(term)
     key = " ".join(asked.lower().split())
     with friendly():
         if key not in known:
-            raise ProblemError(f"there is no term {asked!r}{nearest(key, known)}; there are {', '.join(TERMS)}")
+            raise ProblemError(f"there is no term {asked!r}{nearest(key, known)}; there are {', '.join(terms)}")
     out.print(Text(known[key]))
 
 
@@ -353,7 +364,7 @@ def reproduce(
     """Reproduce a paper: its figures, its numbers, and a verdict on each claim; 1 where a required number is missed."""
     from time import perf_counter
 
-    from koopmpc.papers.registry import PAPERS, find_paper, reproduce_all, summary_table, verdict_table
+    from koopmpc.papers.registry import PAPERS, find_paper, make_summary_table, make_verdict_table, reproduce_all
 
     out, err = console(), Console(stderr=True)
     start = perf_counter()
@@ -364,15 +375,15 @@ def reproduce(
             folder = new_folder(logs, "papers")
             with err.status("") as status:
                 found = reproduce_all(folder, False, status.update)
-            out.print(summary_table(found))
-            paths, failed = [folder / "index.md"], any(each.outcome.failed for each in found)
+            out.print(make_summary_table(found))
+            paths, failed = [folder / "index.md"], any(each.outcome.failures for each in found)
         else:
             one = find_paper(paper)
             folder = new_folder(logs, paper)
             with err.status("") as status:
                 outcome = one.reproduce(folder, False, status.update)
-            out.print(verdict_table(one.title, outcome.claims))
-            paths, failed = [outcome.report, outcome.recording], bool(outcome.failed)
+            out.print(make_verdict_table(one.title, outcome.claims))
+            paths, failed = [outcome.report, outcome.recording], bool(outcome.failures)
         for path in paths:
             say(str(path))
         out.print(Text(f"done in {perf_counter() - start:.0f} s"))

@@ -16,8 +16,8 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from koopmpc.cli.ending import ENDING
 from koopmpc.errors import FitWarning, FullDiskError, KoopmpcError, LogError
+from koopmpc.interrupts import ENDING
 
 
 def split(names: str) -> list[str]:
@@ -25,7 +25,7 @@ def split(names: str) -> list[str]:
     return [name.strip() for name in names.split(",") if name.strip()]
 
 
-def program() -> list[str]:
+def find_program() -> list[str]:
     """Return the command that calls this program from here: its name if that is on PATH, else its path."""
     beside = shutil.which("koopmpc", path=str(Path(sys.executable).parent))
     if beside is None:
@@ -34,9 +34,9 @@ def program() -> list[str]:
     return ["koopmpc" if known is not None and Path(known).samefile(beside) else near(beside)]
 
 
-def called(*words: object) -> str:
+def format_command(*words: object) -> str:
     """Return the line of a shell that calls this program with these words."""
-    return shlex.join([*program(), *map(str, words)])
+    return shlex.join([*find_program(), *map(str, words)])
 
 
 def near(path: str) -> str:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from koopmpc.cli.console import bar, called, console, friendly, new_folder, say, say_page
-from koopmpc.cli.ending import ENDING
+from koopmpc.cli.console import bar, console, format_command, friendly, new_folder, say, say_page
 from koopmpc.errors import DataError, LogError
+from koopmpc.interrupts import ENDING
 
 if TYPE_CHECKING:
     from koopmpc.bench.problem import Problem
@@ -184,7 +184,7 @@ def _sweep(
 ) -> None:
     """Sweep with a progress bar, print the table, and exit with 1 where a run did not end as it should."""
     from koopmpc.bench.controllers import controller_names
-    from koopmpc.bench.report import results_table, summary_table, write_report
+    from koopmpc.bench.report import build_summary_table, results_table, write_report
     from koopmpc.bench.store import row_to_view
     from koopmpc.bench.sweep import sweep
 
@@ -194,13 +194,13 @@ def _sweep(
     with bar("", rate=True) as progress:
         rows = sweep(problems, controllers, folder=folder, progress=progress, **asked)
     single = all(row.start == row.seed == row.noise == row.wrong == 0 for row in rows)
-    console().print(results_table(rows) if single else summary_table(rows))
+    console().print(results_table(rows) if single else build_summary_table(rows))
     if not single:
         say(f"\nreport: {write_report(folder)}")
     say(f"\nlogs and results.parquet: {folder}")
     shown = row_to_view(rows)
     if shown is not None:
-        say(f"look at a run: {called('view', shown.log)}")
+        say(f"look at a run: {format_command('view', shown.log)}")
     if any(row.failure is not None for row in rows):
         raise typer.Exit(1)
 

@@ -4,7 +4,9 @@ import ctypes
 import platform
 import subprocess
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from threading import Lock
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -14,20 +16,22 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import numbers
-from koopmpc.codegen.sources import Language, one_source, plant_functions, tables_of
-from koopmpc.codegen.staged import TargetTable
-from koopmpc.codegen.tables import Exportable, Precision, exportable
+from koopmpc.codegen.sources import Language, write_one_source, write_plant_functions
+from koopmpc.codegen.tables import Precision, make_tables, read_program
 from koopmpc.control.linear.plan import planned_states
-from koopmpc.control.lqr import LQR
-from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, WholeRun, alone, busy
-from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
+from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, alone, busy
+from koopmpc.control.nonlinear.staged_program import StagedProgram
+from koopmpc.control.program import StepProgram
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.plants.routines import compiler, library, private_cache
+from koopmpc.plants.routines import find_compiler, find_private_cache, load_library
 from koopmpc.plants.step_map import StepMap
+from koopmpc.predict.predictors import LinearPredictor
 
-_STATUS, _FALLBACK = list(Status), list(Fallback)
+_STATUS = list(Status)
+_FALLBACK = list(Fallback)
+_ROWS = 100_000  # reference rows whose targets a controller keeps
 _PLANTS = 8  # plants whose machine code a controller keeps
-# What stands above a plant in C.
+# head of the C file of a plant
 _PLANT_HEAD = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
 
 
@@ -38,51 +42,51 @@ class NoCompilerWarning(UserWarning):
 def compiled(controller: Controller, *, precision: Precision = "double") -> Controller:
     """Return the same controller in machine code: the C of `km.export`, several times as fast a step.
 
-    It takes and returns what the original does, from the state after `reset`. Copies and pickles are controllers of
-    their own; a pickle is built again where it is loaded. Where there is no C compiler, or it fails, a warning says so
-    and the controller itself is returned. The original is left alone.
+    It has the arguments and the moves of the original, and starts as after `reset`. A copy or a pickle is a controller
+    of its own; a pickle is compiled again where it is loaded. Without a C compiler, or if that fails, koopmpc warns and
+    returns the controller itself. The original does not change.
 
     Parameters
     ----------
     controller
         An LQR, a KoopmanMPC, a LinearMPC or a BilinearMPC.
     precision
-        "double", or "float": the numbers of a microcontroller, to look at what they cost.
+        "double"; or "float", to see what the single precision of a microcontroller costs.
 
     Raises
     ------
     DataError
-        A part of the controller cannot be written in C; the message says which, and what would do.
+        No C code can be generated; the message says why, and what to do.
     """
     if not checks.among(precision, ("double", "float")):
         raise DataError(f'precision is {precision!r}; pass "double" or "float"')
     if isinstance(controller, Compiled):
         return controller
-    original, command = exportable(controller), compiler()
+    program, command = read_program(controller, ()), find_compiler()
     if command is None:
         warnings.warn(
             "no C compiler was found ($CC, cc, gcc, clang); the controller stays in Python", NoCompilerWarning, 2
         )
         return controller
     try:
-        return Compiled(original, precision, command)
+        return Compiled(controller, program, precision, command)
     except (OSError, subprocess.SubprocessError) as error:
         warnings.warn(
-            f"the C compiler failed, the controller stays in Python: {_first_error(error)}", NoCompilerWarning, 2
+            f"the C compiler failed, the controller stays in Python: {_find_error(error)}", NoCompilerWarning, 2
         )
         return controller
 
 
-def _first_error(error: Exception) -> str:
-    """Return the first error that a compiler printed, or what the system says."""
+def _find_error(error: Exception) -> str:
+    """Return the first error that a compiler printed, else the text of the exception."""
     printed = getattr(error, "stderr", None) or b""
     text = printed.decode(errors="replace") if isinstance(printed, bytes) else str(printed)
     lines = [line for line in text.splitlines() if "error" in line.lower()]
     return lines[0] if lines else str(error)
 
 
-def _processor() -> str:
-    """Return what tells this processor from others whose machine code it may not run."""
+def _read_processor() -> str:
+    """Return the flags of this processor; code that was compiled for another one may not run here."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -90,8 +94,8 @@ def _processor() -> str:
     return next((line for line in lines if line.startswith("flags")), platform.processor())
 
 
-def _built(controller: Exportable, precision: Precision, command: list[str]) -> tuple[ctypes.CDLL, dict[str, int]]:
-    """Return the machine code of a controller, for this very processor where the compiler takes its flags, and sizes.
+def _compile(program: StepProgram, precision: Precision, command: list[str]) -> tuple[ctypes.CDLL, dict[str, int]]:
+    """Return the machine code of a controller, for this processor if the compiler knows its flags, and the sizes.
 
     Raises
     ------
@@ -99,14 +103,14 @@ def _built(controller: Exportable, precision: Precision, command: list[str]) -> 
         The compiler fails or its output does not load.
     """
     single = precision == "float"
-    tables = tables_of(controller, single=single)
-    text = one_source(tables, single=single) + f"/* {_processor()} */\n"
-    cache = private_cache()
+    tables = make_tables(program, single=single)
+    text = write_one_source(tables, single=single) + f"/* {_read_processor()} */\n"
+    cache = find_private_cache()
     machine = ["-march=native", "-fvisibility=default"] if platform.machine() in ("x86_64", "AMD64") else []
     try:
-        code = library(text, [*command, *machine], cache)
+        code = load_library(text, [*command, *machine], cache)
     except subprocess.SubprocessError:
-        code = library(text, command, cache)  # it may not know this processor
+        code = load_library(text, command, cache)  # the compiler does not know this processor
     code.koopmpc_state_size.restype = ctypes.c_long
     code.koopmpc_init.restype = code.koopmpc_call.restype = None
     return code, tables.sizes
@@ -122,14 +126,14 @@ class ManyRuns(NamedTuple):
     slack: Float[np.ndarray, "E T"]
 
 
-def _at(array: np.ndarray | None) -> ctypes.c_void_p | None:
+def _address(array: np.ndarray | None) -> ctypes.c_void_p | None:
     """Return the address of an array's first number, for C; None, C's null pointer, for None."""
     return None if array is None else ctypes.c_void_p(array.ctypes.data)
 
 
-# One call with one pointer: that is what ctypes does fastest. The structures are those of c/door.c.
+# ctypes is fastest with one pointer as argument: a call passes one structure. c/door.c defines the same structures.
 class _Rows(ctypes.Structure):
-    """Rows of a preview: their address, and how many count."""
+    """Rows of a preview: their address and their number."""
 
     _fields_ = (("values", ctypes.c_void_p), ("count", ctypes.c_int))
 
@@ -148,7 +152,7 @@ _FIELDS = (
 
 
 class _Frame(ctypes.Structure):
-    """What a call passes; the same fields as in C."""
+    """The arguments and results of a call, as in C."""
 
     _fields_ = (*_FIELDS, ("slack", ctypes.c_double))
 
@@ -160,7 +164,7 @@ class _SingleFrame(ctypes.Structure):
 
 
 class _Whole(ctypes.Structure):
-    """What a whole run passes; the same fields as in C."""
+    """The arguments and results of a whole run, as in C."""
 
     _fields_ = (
         ("steps", ctypes.c_long),
@@ -170,20 +174,45 @@ class _Whole(ctypes.Structure):
     )
 
 
+class TargetTable:
+    """The targets of the reference rows that a BilinearMPC in machine code meets, found in Python; copies share it."""
+
+    def __init__(self, find: Callable[[np.ndarray], np.ndarray]) -> None:
+        self._find, self._lock = find, Lock()
+        self._known: set[bytes] = set()
+        self._table = np.zeros((0, 1))
+
+    def of(self, reference: Float[np.ndarray, "..."]) -> Float[np.ndarray, "found size"]:
+        """Return the table with the rows of this reference in it."""
+        with self._lock:
+            rows = np.atleast_2d(reference)
+            rows = rows[np.abs(rows).max(axis=1, initial=0.0) < checks.HUGE]
+            if len(self._known) + len(rows) > _ROWS:
+                self._known, self._table = set(), np.zeros((0, 1))
+            new = [row for row in rows if row.tobytes() not in self._known]
+            if new:
+                found = self._find(np.array(new))
+                self._table = np.vstack([self._table, found]) if len(self._table) else found
+                self._known |= {row.tobytes() for row in new}
+            return self._table
+
+
 class Compiled:
     """A controller in machine code; see `compiled`.
 
     One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
     """
 
-    def __init__(self, controller: Exportable, precision: Precision, command: list[str]) -> None:
+    def __init__(self, controller: Controller, program: StepProgram, precision: Precision, command: list[str]) -> None:
         self.original, self.precision = controller, precision
-        self._code, self._sizes = _built(controller, precision, command)
+        self._code, self._sizes = _compile(program, precision, command)
         sizes = self._sizes
-        self.dt, self.nu, self.horizon = controller.dt, sizes["NU"], sizes["HORIZON"]
-        self.cost, self.limits = controller.cost, controller.limits
-        self._targets = TargetTable(controller) if isinstance(controller, BilinearMPC) else None
-        self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # of a linear plan, from its inputs and its start
+        self.dt, self.nu, self.horizon = program.dt, sizes["NU"], sizes["HORIZON"]
+        self.cost, self.limits = getattr(controller, "cost", None), getattr(controller, "limits", None)
+        self._model = program.model
+        find = getattr(controller, "find_targets", None) if isinstance(program, StagedProgram) else None
+        self._targets = None if find is None else TargetTable(find)
+        self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # takes a linear plan and its start to the states
         self._ny, self._nr, self._nw = sizes["NY"], sizes["NR"], sizes["NW"]
         self._memory = np.zeros(-(-int(self._code.koopmpc_state_size()) // 8))
         self._plants: dict[int, tuple[StepMap, ctypes.CDLL]] = {}
@@ -207,7 +236,7 @@ class Compiled:
         self._pointer = ctypes.c_void_p(ctypes.addressof(frame))
         self._call = self._code.koopmpc_call
         self._y_shape, self._row_shape, self._row = (self._ny,), (self._nr,), self._reference[0]
-        self._count, self._told, self._is_double = 1, False, not single
+        self._count, self._has_extras, self._is_double = 1, False, not single
         self._solver = "" if self._targets is not None else "daqp"
         if self._targets is not None:
             self._aim(np.zeros((0, self._nr)))
@@ -220,15 +249,15 @@ class Compiled:
             None if value is None else np.ascontiguousarray(checks.array(value, name, (size,)), kind)
             for value, name, size in ((x0, "x0", self._sizes["NX"]), (u_prev, "u_prev", self.nu))
         )
-        self._code.koopmpc_init(_at(self._memory), _at(start), _at(last))
+        self._code.koopmpc_init(_address(self._memory), _address(start), _address(last))
         self._aim(np.zeros((0, self._nr)))
 
     def _aim(self, rows: Float[np.ndarray, "..."]) -> None:
-        """Give the C the targets of these rows; only that of a BilinearMPC asks for them."""
+        """Pass the targets of these rows to the C code of a BilinearMPC; other kinds have none."""
         if self._targets is not None:
-            self._aimed = rows.tobytes()
+            self._last_rows = rows.tobytes()
             self._table = self._targets.of(rows).astype(self._y.dtype)
-            self._code.koopmpc_use_targets(_at(self._memory), _at(self._table), len(self._table))
+            self._code.koopmpc_use_targets(_address(self._memory), _address(self._table), len(self._table))
 
     def __call__(
         self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
@@ -238,7 +267,7 @@ class Compiled:
             held = self._token.pop()
         except IndexError:
             raise busy(self) from None
-        except BaseException:  # a Ctrl-C that came right behind the pop
+        except BaseException:  # a Ctrl-C that came right after the pop
             self._token.append(0)
             raise
         try:
@@ -253,13 +282,13 @@ class Compiled:
                 self._row[:] = target
                 count = 1
             else:
-                count = self._rows(target, self._reference, self._nr, "reference")
-            if count != self._count:  # a field that is written takes as long as the C step
+                count = self._copy_rows(target, self._reference, self._nr, "reference")
+            if count != self._count:  # writing a field takes as long as the C step
                 frame.reference.count = self._count = count
-            if self._targets is not None and target.tobytes() != self._aimed:
+            if self._targets is not None and target.tobytes() != self._last_rows:
                 self._aim(target)
-            if applied is not None or w is not None or self._told:
-                self._tell(applied, w)
+            if applied is not None or w is not None or self._has_extras:
+                self._pass_extras(applied, w)
             self._call(self._pointer)
             u = self._u.copy() if self._is_double else self._u.astype(np.float64)
             if not frame.status:
@@ -277,34 +306,34 @@ class Compiled:
             self._token.append(held)
 
     def rehearse(self) -> None:
-        """Run the last step once more and forget it, so that the next one finds its code and tables in the caches.
+        """Run the last step once more and forget it, so that the next step finds code and tables in the caches.
 
-        After some milliseconds of sleep any call from Python takes ten times as long and more. A loop that wakes a
-        little early calls this first, and then waits for the measurement. No answer and no plan changes by it.
+        After some milliseconds of sleep a call from Python takes ten times as long. A loop may wake a little early,
+        call this, and then wait for the measurement. It changes no move and no plan.
         """
-        if self._targets is None or self._aimed:
+        if self._targets is None or self._last_rows:
             kept = self._memory.copy()
             self(self._y, self._reference[: self._count])
             self._memory[:] = kept
 
-    def _tell(self, applied: ArrayLike | None, w: ArrayLike | None) -> None:
-        """Write down what acted and what disturbs, or that nothing is told."""
+    def _pass_extras(self, applied: ArrayLike | None, w: ArrayLike | None) -> None:
+        """Pass `applied` and `w`, or that both are missing."""
         frame = self._frame
-        frame.applied, frame.w.count, self._told = None, 0, False
+        frame.applied, frame.w.count, self._has_extras = None, 0, False
         if applied is not None:
             got = numbers(applied, "applied")
             if got.shape != self._u.shape:
                 raise ShapeError(f"applied has shape {got.shape}, expected {self._u.shape}")
             self._applied[:] = got
-            frame.applied, self._told = self._applied_address, True
+            frame.applied, self._has_extras = self._applied_address, True
         if w is not None:
             pushes = numbers(w, "w")
             if not self._nw:
                 raise DataError("w was passed, but the predictor has no E; fit it on episodes that hold W")
-            frame.w.count, self._told = self._rows(pushes, self._w, self._nw, "w"), True
+            frame.w.count, self._has_extras = self._copy_rows(pushes, self._w, self._nw, "w"), True
 
-    def _rows(self, rows: Float[np.ndarray, "..."], to: Float[np.ndarray, "..."], width: int, name: str) -> int:
-        """Copy a preview; return how many of its rows count."""
+    def _copy_rows(self, rows: Float[np.ndarray, "..."], to: Float[np.ndarray, "..."], width: int, name: str) -> int:
+        """Copy the rows of a preview that the horizon reaches; return their number."""
         if rows.ndim > 2 or rows.shape[-1:] != (width,) or len(rows) == 0:
             raise ShapeError(
                 f"{name} has shape {rows.shape}, expected ({width},), or rows of {width} for steps k … k+{len(to) - 1}"
@@ -315,20 +344,19 @@ class Compiled:
 
     def plan(self) -> Plan | None:
         """Return the plan of the last call; None where it had none."""
-        original, sizes, memory = self.original, self._sizes, _at(self._memory)
-        if isinstance(original, LQR):
-            return None
+        sizes, memory, model = self._sizes, _address(self._memory), self._model
         U = np.zeros((sizes["N"], self.nu), self._y.dtype)
-        if not self._code.koopmpc_plan(memory, _at(U)):
+        if not self._code.koopmpc_plan(memory, _address(U)):
             return None
-        if isinstance(original, BilinearMPC):
+        if sizes["IS_STAGED"]:
             X = np.zeros((sizes["N"] + 1, sizes["NX"]), self._y.dtype)
-            self._code.koopmpc_plan_states(memory, _at(X))
+            self._code.koopmpc_plan_states(memory, _address(X))
             return Plan(X.astype(np.float64), U.astype(np.float64))
         if self._states is None:
+            assert isinstance(model, LinearPredictor), "it plans by one matrix"
             rates, disturbed = bool(sizes["WITH_RATES"]), bool(sizes["ESTIMATOR"])
             steps = np.arange(sizes["N"])
-            self._states = planned_states(original.predictor, steps, with_rates=rates, disturbed=disturbed)
+            self._states = planned_states(model, steps, with_rates=rates, disturbed=disturbed)
         known = self._memory.view(self._y.dtype)[: sizes["KNOWN"]]
         X = self._states @ np.concatenate([U.ravel(), known, [1.0]], dtype=np.float64)
         return Plan(X.reshape(sizes["N"] + 1, -1), U.astype(np.float64))
@@ -344,26 +372,36 @@ class Compiled:
         U: Float[np.ndarray, "T nu"],
         *,
         preview: bool,
-    ) -> WholeRun | None:
+    ) -> dict[str, Any] | None:
         """Write a whole run from X[0] and Y[0] into X, Y and U; None where the plant cannot be written in C.
 
-        `simulate` asks for it where nothing between two steps needs Python.
+        Return the columns of its moves, as `StepRows` has them.
+
+        `simulate` uses it if nothing between two steps needs Python.
         """
         misfit = rows.shape[1] != self._nr or Y.shape[1] != self._ny or (W is not None and W.shape[1] != self._nw)
-        code = None if misfit else self._machine_of(plant)
+        code = None if misfit else self._compile_plant(plant)
         if code is None:
             return None
         self._aim(rows)
         rows, W = np.ascontiguousarray(rows), None if W is None else np.ascontiguousarray(W)
         slack, times, reports = np.zeros(len(U)), np.zeros(len(U)), np.zeros((len(U), 3), dtype=np.intc)
         arrays = {"rows": rows, "X": X, "Y": Y, "U": U, "slack": slack, "times": times, "reports": reports}
-        whole = _whole_call(code, len(U), arrays, W, preview=preview)
+        whole = _run_arguments(code, len(U), arrays, W, preview=preview)
         self._code.koopmpc_run(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)))
-        return WholeRun(reports[:, 0], reports[:, 1], reports[:, 2], slack, times)
+        status, fallback, iterations = reports.T.tolist()
+        return {
+            "status": tuple([_STATUS[i] for i in status]),
+            "fallback": tuple([_FALLBACK[i] for i in fallback]),
+            "iterations": reports[:, 2].astype(np.int64),
+            "solver": tuple(["daqp" if i else "" for i in iterations]),
+            "slack": slack,
+            "solve_time": times,
+        }
 
     @alone
     def runs(self, plant: StepMap, x0: ArrayLike, reference: ArrayLike, *, steps: int) -> ManyRuns:
-        """Run the closed loop from many states in C, each time from the beginning; nothing of a run is judged or kept.
+        """Run the closed loop from many states in C, each time after a reset.
 
         Parameters
         ----------
@@ -372,7 +410,7 @@ class Compiled:
         x0
             (E, nx), a row a run.
         reference
-            (nr,) held, or (steps+1, nr), the same for all runs; the controller gets the rows ahead.
+            (nr,) for all steps, or (steps+1, nr); the same for all runs. The controller gets the rows ahead.
 
         Raises
         ------
@@ -391,7 +429,7 @@ class Compiled:
                 f"the plant measures {len(plant.outputs)} values and takes {len(plant.inputs)} inputs, the controller "
                 f"takes {self._ny} and returns {self.nu}"
             )
-        code = self._machine_of(plant)
+        code = self._compile_plant(plant)
         if code is None:
             raise DataError("the plant, or a controller of floats, cannot run in C as a whole; use km.simulate")
         rows = np.ascontiguousarray(given[np.minimum(np.arange(T + self.horizon + 1), len(given) - 1)])
@@ -401,20 +439,22 @@ class Compiled:
         X[:, 0] = starts
         slack, reports = np.zeros((E, T)), np.zeros((E, T, 3), dtype=np.intc)
         arrays = {"rows": rows, "X": X, "Y": np.empty((T + 1, self._ny)), "U": U, "slack": slack, "reports": reports}
-        whole = _whole_call(code, T, arrays, None, preview=True)
+        whole = _run_arguments(code, T, arrays, None, preview=True)
         self._code.koopmpc_runs(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)), ctypes.c_long(E))
         return ManyRuns(X, U, reports[..., 0], reports[..., 1], slack)
 
-    def _machine_of(self, plant: StepMap) -> ctypes.CDLL | None:
-        """Return the plant in machine code, built when it is first driven; None where it cannot run with this one."""
+    def _compile_plant(self, plant: StepMap) -> ctypes.CDLL | None:
+        """Return the plant in machine code, compiled at its first run; None where no C code of it can be generated."""
         known = self._plants.get(id(plant))
         if known is not None:
             return known[1]
-        command = compiler() if self.precision != "float" else None
+        command = find_compiler() if self.precision != "float" else None
         if command is None:
             return None
         try:
-            code = library(_PLANT_HEAD + plant_functions(plant.F, plant.h, Language()), command, private_cache())
+            code = load_library(
+                _PLANT_HEAD + write_plant_functions(plant.F, plant.h, Language()), command, find_private_cache()
+            )
         except (DataError, OSError, subprocess.SubprocessError):
             return None
         while len(self._plants) >= _PLANTS:
@@ -423,7 +463,7 @@ class Compiled:
         return code
 
     def __copy__(self) -> "Compiled":
-        """Return a copy that shares nothing with this one that moves in a step."""
+        """Return a copy that shares no state with this one."""
         twin = object.__new__(Compiled)
         twin.__dict__.update(self.__dict__)
         twin._memory = self._memory.copy()
@@ -434,10 +474,10 @@ class Compiled:
         return self.__copy__()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuilt, (self.original, self.precision, self._memory)
+        return _rebuild, (self.original, self.precision, self._memory)
 
 
-def _whole_call(
+def _run_arguments(
     code: ctypes.CDLL,
     steps: int,
     arrays: dict[str, np.ndarray],
@@ -445,7 +485,7 @@ def _whole_call(
     *,
     preview: bool,
 ) -> _Whole:
-    """Return what a whole run passes; it holds no reference to the arrays."""
+    """Return the arguments of a whole run; the structure keeps no reference to the arrays."""
     whole = _Whole(steps, arrays["X"].shape[-1], arrays["Y"].shape[-1], preview, W is not None)
     for name, routine in (("step", code.plant_step), ("measure", code.plant_measure)):
         setattr(whole, name, ctypes.cast(routine, ctypes.c_void_p))
@@ -455,10 +495,10 @@ def _whole_call(
     return whole
 
 
-def _rebuilt(controller: Exportable, precision: Precision, memory: Float[np.ndarray, " n"]) -> Controller:
-    """Return the controller of a pickle, built here; it goes on where the pickled one was."""
+def _rebuild(controller: Controller, precision: Precision, memory: Float[np.ndarray, " n"]) -> Controller:
+    """Return the controller of a pickle, compiled here, in the state of the pickled one."""
     result = compiled(controller, precision=precision)
     if isinstance(result, Compiled) and result._memory.shape == memory.shape:
         result._memory[:] = memory
-        result._aim(np.zeros((0, result._nr)))  # the table is where it is now
+        result._aim(np.zeros((0, result._nr)))  # the address of the table is another one here
     return result

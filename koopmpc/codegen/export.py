@@ -13,29 +13,28 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.codegen.sources import (
     Language,
-    constants,
-    flops,
-    iteration_flops,
-    named,
-    plant_functions,
-    shipped,
-    sources_of,
-    tables_of,
+    count_constants,
+    count_flops,
+    count_iteration_flops,
+    read_shipped,
+    rename_symbols,
+    write_plant_functions,
+    write_sources,
 )
-from koopmpc.codegen.tables import Exportable, Precision, Tables, exportable
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
-from koopmpc.control.lqr import LQR
+from koopmpc.codegen.tables import Precision, Tables, make_tables, read_program
+from koopmpc.control.linear.koopman_mpc import CondensedProgram
 from koopmpc.control.move import Controller
-from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.iteration import MOST
+from koopmpc.control.nonlinear.staged_program import StagedProgram
+from koopmpc.control.program import StepProgram
 from koopmpc.disk import path_of, writing
 from koopmpc.errors import DataError
-from koopmpc.estimate.kalman import KalmanFilter
-from koopmpc.plants.routines import compiler
+from koopmpc.estimate.kalman import FilterProgram
+from koopmpc.plants.routines import find_compiler
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
-_BUILT = (".o", ".a", ".su")  # what a build leaves in the folder
+_BUILT = (".o", ".a", ".su")  # endings of the files of a build
 _PROGRAMS = ("example", "sanitized")
 _DIGITS = 1e-3  # share of an input's span that rounding in single precision may come to
 
@@ -59,25 +58,26 @@ def export(
 
     The C has no heap, no file, no clock, no global variable, and no library but math.h. It computes what the controller
     does: lifting, delays, estimator, latency, previews, limits, fallbacks, with the same statuses. Its QP solver is
-    DAQP, whose sources come along; a controller with solver="daqp" and its C agree to rounding.
+    DAQP, whose sources come along; a controller with solver="daqp", which "auto" asks first, and its C agree to
+    rounding.
 
     Parameters
     ----------
     controller
         An LQR, a KoopmanMPC, a LinearMPC or a BilinearMPC, without a time_limit.
     folder
-        Is made; one that holds other files than those of an export is refused.
+        Created if needed. A folder with files that no export wrote is an error.
     name
-        What files and symbols start with: ``name_step``, ``name.h``. Controllers of different names link together.
+        Prefix of files and symbols: ``name_step``, ``name.h``. Controllers of different names link together.
     precision
         "double" or "float".
     plant
-        What `example.c` controls; by default the controller's own model, lifted afresh each step.
+        The plant of `example.c`; by default the controller's own model, lifted afresh each step.
     x0, reference
-        Where the example starts, and the row or rows that it follows; by default one root mean square of the data,
-        and zero. A model with delays starts as if x0 and the least input had been held.
+        Initial state and reference rows of the example; by default the root mean square of the data, and zero. A model
+        with delays starts as if x0 and the smallest allowed input had been held before.
     steps
-        How long the example runs.
+        Steps of the example.
 
     Raises
     ------
@@ -92,9 +92,8 @@ def export(
     if precision not in ("double", "float"):
         raise DataError(f'precision is {precision!r}; pass "double" or "float"')
     single = precision == "float"
-    known = exportable(controller)
-    rows = _reference_of(known, reference)
-    tables = tables_of(known, rows, single=single)
+    program = read_program(controller, reference)
+    tables = make_tables(program, single=single)
     coarse = float(np.finfo(np.float32).eps) * tables.conditioning
     if single and coarse > _DIGITS:
         warnings.warn(
@@ -103,16 +102,16 @@ def export(
             PrecisionWarning,
             stacklevel=2,
         )
-    texts = sources_of(tables, single=single)
-    texts |= {name: shipped("c", name) for name in ("Makefile", "CMakeLists.txt", "example.c")}
-    texts |= _plant(known, tables, plant, x0, rows, checks.count(steps, "steps"), Language(single))
-    texts = named(texts, name)
+    texts = write_sources(tables, single=single)
+    texts |= {name: read_shipped("c", name) for name in ("Makefile", "CMakeLists.txt", "example.c")}
+    texts |= _write_plant(tables, plant, x0, checks.count(steps, "steps"), Language(single))
+    texts = rename_symbols(texts, name)
     root = path_of(folder)
     _refuse_others(root, {*texts, "README.md"}, name)
     for path, text in texts.items():
         _write(root / path, text)
-    readme = {"README.md": _readme(known, tables, _measure_objects(root, name), precision)}
-    _write(root / "README.md", named(readme, name)["README.md"])
+    readme = {"README.md": _write_readme(tables, _measure_objects(root, name), precision)}
+    _write(root / "README.md", rename_symbols(readme, name)["README.md"])
     return root
 
 
@@ -121,20 +120,8 @@ def _write(path: Path, text: str) -> None:
         file.write(text.encode())
 
 
-def _reference_of(controller: Exportable, reference: ArrayLike | None) -> Float[np.ndarray, "rows nr"]:
-    """Return the rows of a reference, by default one of zeros."""
-    if isinstance(controller, LQR):
-        nr = controller._nr
-    else:
-        nr = len(controller._outputs.Q) if isinstance(controller, BilinearMPC) else len(controller._map.track.Q)
-    if reference is None:
-        return np.zeros((1, nr))
-    rows = np.atleast_2d(checks.array(reference, "reference"))
-    return checks.array(rows, "reference", (None, nr))
-
-
 def _refuse_others(root: Path, known: set[str], prefix: str) -> None:
-    """Raise DataError where the folder holds what no export has written."""
+    """Raise DataError where the folder holds a file that no export wrote."""
     if root.exists() and not root.is_dir():
         raise DataError(f"{root} is a file; pass a folder")
     for path in sorted(root.rglob("*")) if root.exists() else []:
@@ -144,46 +131,41 @@ def _refuse_others(root: Path, known: set[str], prefix: str) -> None:
             raise DataError(f"{root} holds {name}, which no export wrote; pass an empty folder, or remove that file")
 
 
-def _plant(
-    controller: Exportable,
-    tables: Tables,
-    plant: StepMap | None,
-    x0: ArrayLike | None,
-    held: Float[np.ndarray, "rows nr"],
-    steps: int,
-    language: Language,
+def _write_plant(
+    tables: Tables, plant: StepMap | None, x0: ArrayLike | None, steps: int, language: Language
 ) -> dict[str, str]:
-    """Return plant.c and plant.h: what the example controls."""
-    model, sizes = tables.model, tables.sizes
+    """Return plant.c and plant.h, the plant of the example."""
+    program, sizes = tables.program, tables.sizes
+    model, reference = program.model, program.reference
     if plant is not None:
         checks.kind(plant, "plant", StepMap, "discretize the dynamics")
-    step_map = plant or (model if isinstance(model, StepMap) else model.step_map())
-    nx, nu = step_map.F.size1_in(0), step_map.F.size1_in(1)
+    F = _model_map(program) if plant is None else plant.F
+    nx, nu = F.size1_in(0), F.size1_in(1)
     if nu != sizes["NU"]:
         raise DataError(f"the plant has {nu} inputs, the controller {sizes['NU']}; pass the plant that it controls")
     x = ca.SX.sym("x", nx)
-    measured = _measured(controller, step_map, x, sizes["NY"])
-    functions = plant_functions(step_map.F, ca.Function("measure", [x], [measured]), language)
+    measured = _express_measurement(program, plant, x, sizes["NY"])
+    functions = write_plant_functions(F, ca.Function("measure", [x], [measured]), language)
     past = None if plant is not None or isinstance(model, StepMap) else model.embedding
     size = nx if past is None else len(past.states)
-    start = _start(model, size) if x0 is None else checks.array(x0, "x0", (size,))
-    rest = np.clip(np.zeros(nu), tables.limits["input_low"], tables.limits["input_high"])
-    if past is not None:  # the plant is the model of ζ: it has been in x0 under this input
+    start = _find_start(model, size) if x0 is None else checks.array(x0, "x0", (size,))
+    rest = np.clip(np.zeros(nu), *program.inputs)
+    if past is not None:  # the plant is the model of ζ, and was in x0 under this input
         start = past.held(start, rest)
     arrays = "".join(
         language.array(name, values).replace("static const", "const") + "\n"
-        for name, values in (("plant_x0", start), ("plant_u0", rest), ("plant_reference", held))
+        for name, values in (("plant_x0", start), ("plant_u0", rest), ("plant_reference", reference))
     )
     code = (
-        '/** @file plant.c @brief What the example controls. */\n#include <math.h>\n\n#include "plant.h"\n\n'
+        '/** @file plant.c @brief The plant of the example. */\n#include <math.h>\n\n#include "plant.h"\n\n'
         + arrays
         + functions
     )
     header = (
-        "/** @file plant.h @brief What the example controls. */\n#ifndef PLANT_H\n#define PLANT_H\n\n"
+        "/** @file plant.h @brief The plant of the example. */\n#ifndef PLANT_H\n#define PLANT_H\n\n"
         '#include "koopmpc.h"\n\n'
-        f"#define PLANT_NX {nx}\n#define PLANT_STEPS {steps}\n#define PLANT_ROWS {len(held)}\n\n"
-        f"extern const koopmpc_real plant_x0[{nx}], plant_u0[{nu}], plant_reference[{held.size}];\n\n"
+        f"#define PLANT_NX {nx}\n#define PLANT_STEPS {steps}\n#define PLANT_ROWS {len(reference)}\n\n"
+        f"extern const koopmpc_real plant_x0[{nx}], plant_u0[{nu}], plant_reference[{reference.size}];\n\n"
         "/** next = F(x, u), one sample later. */\n"
         "void plant_step(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *next);\n\n"
         "/** y, what the controller measures. */\nvoid plant_measure(const koopmpc_real *x, koopmpc_real *y);\n\n"
@@ -192,17 +174,30 @@ def _plant(
     return {"plant.c": code, "plant.h": header}
 
 
-def _measured(controller: Exportable, plant: StepMap, x: ca.SX, ny: int) -> ca.SX:
-    """Return what the controller takes as y, of the plant's state x."""
-    observer = controller._initial.observer if isinstance(controller, KoopmanMPC) else None
-    predictor = None if isinstance(controller, BilinearMPC) else controller.predictor
-    filtered = isinstance(observer, KalmanFilter)
-    if filtered and predictor is not None and len(predictor.lifting.bound_states) == x.numel():
-        system = observer._system
-        H = np.zeros((ny, predictor.nz))
-        H[:, system.kept] = system.M[:, : len(system.kept)]
-        return ca.mtimes(ca.DM(H), predictor.lifting.symbolic(x)) + ca.DM(system.h)
-    y = plant.h(x)
+def _model_map(program: StepProgram) -> ca.Function:
+    """Return the controller's own model as a map of ζ, lifted afresh each step."""
+    model = program.model
+    x, u = ca.SX.sym("x", program.lifting.n), ca.SX.sym("u", model.nu)
+    if isinstance(program, StagedProgram):
+        x_next = program.functions["map"].symbolic(x, u)
+    else:
+        assert isinstance(model, LinearPredictor), "all other models are linear"
+        z = program.lifting.symbolic(x)
+        x_next = ca.DM(model.C @ model.A) @ z + ca.DM(model.C @ model.B) @ u
+        if model.embedding is not None:
+            x_next = model.embedding.symbolic(x, u, x_next)
+    return ca.Function("F", [x, u], [ca.densify(x_next)], {"cse": True})
+
+
+def _express_measurement(program: StepProgram, plant: StepMap | None, x: ca.SX, ny: int) -> ca.SX:
+    """Return y, the measurement of the controller, of the plant's state x."""
+    estimator = program.estimator if isinstance(program, CondensedProgram) else None
+    if isinstance(estimator, FilterProgram) and program.lifting.n == x.numel():
+        H, kept = np.zeros((ny, program.lifting.m)), estimator.kept
+        H[:, kept] = estimator.M[:, : len(kept)]
+        return ca.mtimes(ca.DM(H), program.lifting.symbolic(x)) + ca.DM(estimator.h)
+    own = program.model.h(x) if isinstance(program.model, StepMap) else x
+    y = own if plant is None else plant.h(x)
     if y.shape != (ny, 1):
         y = x[:ny]
     if y.shape != (ny, 1):
@@ -212,8 +207,8 @@ def _measured(controller: Exportable, plant: StepMap, x: ca.SX, ny: int) -> ca.S
     return y
 
 
-def _start(model: LinearPredictor | BilinearPredictor | StepMap, nx: int) -> Float[np.ndarray, " n"]:
-    """Return the root mean squares of the states over the data, ones where they are not known."""
+def _find_start(model: LinearPredictor | BilinearPredictor | StepMap, nx: int) -> Float[np.ndarray, " n"]:
+    """Return the root mean squares of the states in the data, ones where they are not known."""
     if isinstance(model, StepMap) or model.scale is None:
         return np.resize(np.ones(len(model.states)), nx)
     return np.resize(np.linalg.norm(model.scale @ model.C.T, axis=0), nx)
@@ -221,7 +216,7 @@ def _start(model: LinearPredictor | BilinearPredictor | StepMap, nx: int) -> Flo
 
 def _measure_objects(root: Path, name: str) -> tuple[int, int, int] | None:
     """Return bytes of code and constants, of the state, and of the stack of all functions; None without a compiler."""
-    command = compiler()
+    command = find_compiler()
     if command is None:
         return None
     probe = f'#include "{name}.h"\n{name}_state probe;\n'
@@ -251,10 +246,10 @@ def _measure_objects(root: Path, name: str) -> tuple[int, int, int] | None:
     return flash, state, stack
 
 
-def _readme(controller: Exportable, tables: Tables, measured: tuple[int, int, int] | None, precision: Precision) -> str:
+def _write_readme(tables: Tables, measured: tuple[int, int, int] | None, precision: Precision) -> str:
     """Return the README of the folder: how to build and call the controller, its memory and its operations."""
-    sizes, model, single = tables.sizes, tables.model, precision == "float"
-    numbers_held = constants(tables) * (4 if single else 8)
+    sizes, model, single = tables.sizes, tables.program.model, precision == "float"
+    numbers_held = count_constants(tables) * (4 if single else 8)
     rows = [("constants", f"{numbers_held} bytes")]
     if measured is not None:
         flash, state, stack = measured
@@ -263,12 +258,12 @@ def _readme(controller: Exportable, tables: Tables, measured: tuple[int, int, in
             ("RAM: one `koopmpc_state`", f"{state} bytes"),
             ("RAM: stack, at most (the frames of all functions together)", f"{stack} bytes"),
         ]
-    rows.append(("floating-point operations of a step without active limits, at most", str(flops(tables))))
+    rows.append(("floating-point operations of a step without active limits, at most", str(count_flops(tables))))
     if not tables.is_lqr:
         limit = MOST if tables.is_staged else int(tables.settings["iter_limit"])
         rows += [
             ("iterations of the QP solver in one solve, at most", str(limit)),
-            ("floating-point operations of one iteration, at most", str(iteration_flops(tables))),
+            ("floating-point operations of one iteration, at most", str(count_iteration_flops(tables))),
         ]
     rows.append(("rounding of the lifted state, amplified to a share of an input's span", f"{tables.conditioning:.2g}"))
     table = "\n".join(f"| {what} | {value} |" for what, value in rows)
@@ -284,7 +279,7 @@ def _readme(controller: Exportable, tables: Tables, measured: tuple[int, int, in
         'settings={"iter_limit": 100}`.\n'
     )
     dt, state_names, input_names = model.dt, ", ".join(model.states), ", ".join(model.inputs)
-    return f"""# {type(controller).__name__} in C99
+    return f"""# {tables.program.controller} in C99
 
 Sampling time {dt} s; states {state_names}; inputs {input_names}. Precision: {precision}.
 

@@ -1,4 +1,4 @@
-"""A controller as C text: its numbers, its functions from their graphs, and all files, shipped ones and its own."""
+"""The text of a controller's C: its numbers, its functions from graphs, and the files that all controllers share."""
 
 import re
 from collections.abc import Mapping
@@ -8,12 +8,9 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
 
-from koopmpc.codegen.staged import bilinear_tables
-from koopmpc.codegen.tables import Exportable, Tables, koopman_tables, lqr_tables, traced
-from koopmpc.control.lqr import LQR
-from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
+from koopmpc.codegen.tables import Tables
+from koopmpc.control.program import trace_graph
 from koopmpc.errors import DataError
 from koopmpc.plants.graph import Graph
 
@@ -23,7 +20,7 @@ _QP = ("koopmpc_qp.h", "koopmpc_qp.c", "koopmpc_daqp.c")
 _STAGED = ("koopmpc_stages.h", "koopmpc_stages.c", "koopmpc_staged.c", "koopmpc_rest.c", "koopmpc_finish.c")
 _SOLVER = ("daqp.c", "auxiliary.c", "factorization.c", "constants.h", "types.h", "auxiliary.h", "daqp.h")
 _SOLVER_FILES = (*_SOLVER, "factorization.h", "LICENSE")
-_CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"  # of what times a whole run
+_CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"  # for the step times of a whole run
 _WIDTH = 118
 
 # Each operation of `plants.graph` as C; {0} and {1} are its operands. Names of math.h go through KOOPMPC_FN, which
@@ -72,7 +69,7 @@ class Language:
     single: bool = False
 
     def number(self, value: float) -> str:
-        """Return a literal that reads back as this number; what is beyond 1e30 becomes ±1e30."""
+        """Return a literal that reads back as this number; numbers beyond ±1e30 become ±1e30."""
         value = float(np.clip(value, -1e30, 1e30))
         if self.single:
             short = f"{float(np.float32(value)):.9g}"
@@ -82,7 +79,7 @@ class Language:
     def array(self, name: str, values: np.ndarray) -> str:
         """Return the definition of a constant array, of integers or of numbers as `values` are.
 
-        An empty one holds one zero, for C has none of length 0.
+        An empty array becomes one zero: C has no array of length 0.
         """
         flat = np.asarray(values).ravel()
         if flat.dtype.kind in "iu":
@@ -104,13 +101,13 @@ class Language:
 
 
 class Function(NamedTuple):
-    """A C function made of a graph, and what it costs."""
+    """A C function, and its number of floating-point operations."""
 
     text: str
     flops: int
 
 
-def function(graph: Graph, name: str, arguments: Mapping[str, int], result: str, language: Language) -> Function:
+def write_function(graph: Graph, name: str, arguments: Mapping[str, int], result: str, language: Language) -> Function:
     """Return ``void name(const real *argument, …, real *result)``, each register written once."""
     places: list[str] = [f"{argument}[{i}]" for argument, size in arguments.items() for i in range(size)]
     registers: dict[int, str] = {}
@@ -133,31 +130,14 @@ def function(graph: Graph, name: str, arguments: Mapping[str, int], result: str,
         lines.append(f"  const koopmpc_real v{count} = {EXPRESSIONS[step].format(a, b)};")
         registers[target] = f"v{count}"
         flops += _FLOPS.get(step, _CALL if "KOOPMPC_FN" in EXPRESSIONS[step] else 1)
-    # An argument may be the result's own array: it is read before it is written.
+    # The result may be an argument's own array: all reads come before the writes.
     heads = [f"const koopmpc_real *{argument}" for argument in arguments]
     unused = [f"  (void){argument};" for argument in arguments if not any(f"{argument}[" in s for s in lines + results)]
     body = "\n".join([*unused, *lines, *results])
     return Function(f"void {name}({', '.join(heads)}, koopmpc_real *{result}) {{\n{body}\n}}\n", flops)
 
 
-def tables_of(
-    controller: Exportable, references: Float[np.ndarray, "rows nr"] | None = None, *, single: bool
-) -> Tables:
-    """Return the tables of a controller; a BilinearMPC's hold the targets of these reference rows.
-
-    Raises
-    ------
-    DataError
-        An operation of its model or its lifting cannot be written in C.
-    """
-    if isinstance(controller, BilinearMPC):
-        return bilinear_tables(controller, references, single=single)
-    if isinstance(controller, LQR):
-        return lqr_tables(controller, single=single)
-    return koopman_tables(controller, single=single)
-
-
-def sources_of(tables: Tables, *, single: bool) -> dict[str, str]:
+def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
     """Return the text of every file by its name: header, controller, model, numbers, solver."""
     language = Language(single)
     if tables.is_staged:
@@ -165,9 +145,9 @@ def sources_of(tables: Tables, *, single: bool) -> dict[str, str]:
     else:
         law = ("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")
         own = (*_OWN, *_QP, "koopmpc_target.c", *law)
-    result = {name: shipped("c", name) for name in own}
-    result["koopmpc_sizes.h"] = _sizes(tables, single=single)
-    result["koopmpc_solver.h"] = _solver(tables, language)
+    result = {name: read_shipped("c", name) for name in own}
+    result["koopmpc_sizes.h"] = _write_sizes(tables, single=single)
+    result["koopmpc_solver.h"] = _write_solver(tables, language)
     arrays = {
         "limits": ("Limits of the inputs.", language.arrays(tables.limits)),
         "observer": ("The observer's model.", language.arrays(tables.observer)),
@@ -176,49 +156,49 @@ def sources_of(tables: Tables, *, single: bool) -> dict[str, str]:
     if tables.is_staged:
         arrays["table"] = "Targets of reference rows.", language.arrays(tables.targets)
     else:
-        arrays["targets"] = "Targets and their limits.", _targets(tables, language)
+        arrays["targets"] = "Targets and their limits.", _write_targets(tables, language)
     for name, (what, body) in arrays.items():
-        result[f"koopmpc_{name}.h"] = _header(name, f"{what} Matrices stand column after column.", body)
+        result[f"koopmpc_{name}.h"] = _write_header(name, f"{what} Matrices stand column after column.", body)
     if "koopmpc_qp.c" in own:
-        result |= {f"daqp/{name}": shipped("daqp", name) for name in _SOLVER_FILES}
-        result["koopmpc_names.h"] = _names()
+        result |= {f"daqp/{name}": read_shipped("daqp", name) for name in _SOLVER_FILES}
+        result["koopmpc_names.h"] = _write_names()
     header = "koopmpc_stages.h" if tables.is_staged else "koopmpc.h"
     result["koopmpc_model.c"] = (
         "/** @file koopmpc_model.c @brief The model, written from CasADi's graph. */\n#include <math.h>\n\n"
         f'#include "{header}"\n\n'
         + "\n".join(
-            function(each.graph, name, each.arguments, each.result, language).text
+            write_function(each.graph, name, each.arguments, each.result, language).text
             for name, each in tables.functions.items()
         )
     )
     return result
 
 
-def one_source(tables: Tables, *, single: bool) -> str:
+def write_one_source(tables: Tables, *, single: bool) -> str:
     """Return all C of a controller as one file, with the functions by which Python calls it.
 
     Each local header stands where it is first included.
     """
-    texts, seen = sources_of(tables, single=single), set[str]()
+    texts, seen = write_sources(tables, single=single), set[str]()
 
-    def inlined(text: str, folder: str) -> str:
-        def replaced(match: re.Match[str]) -> str:
+    def inline(text: str, folder: str) -> str:
+        def include(match: re.Match[str]) -> str:
             name = match.group(1)
             path = next((p for p in (folder + name, name) if p in texts), "")
-            if not path:  # what DAQP includes for its own clock
+            if not path:  # DAQP includes it for its own clock
                 return match.group()
             if path in seen:
                 return ""
             seen.add(path)
-            return inlined(texts[path], path.rpartition("/")[0] + "/" if "/" in path else "")
+            return inline(texts[path], path.rpartition("/")[0] + "/" if "/" in path else "")
 
-        return re.sub(r'^#include "([^"]+)"$', replaced, text, flags=re.MULTILINE)
+        return re.sub(r'^#include "([^"]+)"$', include, text, flags=re.MULTILINE)
 
-    own = [inlined(text, "") for name, text in texts.items() if name.endswith(".c") and "/" not in name]
-    return "\n".join([_CLOCK + own[0], *own[1:], shipped("c", "door.c")])
+    own = [inline(text, "") for name, text in texts.items() if name.endswith(".c") and "/" not in name]
+    return "\n".join([_CLOCK + own[0], *own[1:], read_shipped("c", "door.c")])
 
 
-def plant_functions(F: ca.Function, h: ca.Function, language: Language) -> str:
+def write_plant_functions(F: ca.Function, h: ca.Function, language: Language) -> str:
     """Return ``plant_step(x, u, next)`` and ``plant_measure(x, y)`` of x⁺ = F(x, u), y = h(x).
 
     Raises
@@ -227,20 +207,20 @@ def plant_functions(F: ca.Function, h: ca.Function, language: Language) -> str:
         The equations cannot be written in C.
     """
     nx, nu = F.size1_in(0), F.size1_in(1)
-    step, look = traced(F, "the plant"), traced(h, "what the plant measures")
+    step, look = trace_graph(F, "the plant"), trace_graph(h, "what the plant measures")
     return (
-        function(step, "plant_step", {"x": nx, "u": nu}, "next", language).text
-        + function(look, "plant_measure", {"x": nx}, "y", language).text
+        write_function(step, "plant_step", {"x": nx, "u": nu}, "next", language).text
+        + write_function(look, "plant_measure", {"x": nx}, "y", language).text
     )
 
 
-def named(texts: dict[str, str], name: str) -> dict[str, str]:
-    """Return files whose names and symbols start with another name than `koopmpc`, so that several link together.
+def rename_symbols(texts: dict[str, str], name: str) -> dict[str, str]:
+    """Return the files with `name` in place of koopmpc in names and symbols, so that several controllers link together.
 
     Raises
     ------
     DataError
-        The name is none that C takes in lower case.
+        The name has other characters than lower-case letters, digits and _.
     """
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise DataError(f"name is {name!r}; pass one of lower-case letters, digits and _, a letter first")
@@ -251,26 +231,28 @@ def named(texts: dict[str, str], name: str) -> dict[str, str]:
     return {path if "/" in path else ours(path): text if "/" in path else ours(text) for path, text in texts.items()}
 
 
-def _names() -> str:
-    """Return the header that gives DAQP's functions names of this controller, for two may be in one program."""
+def _write_names() -> str:
+    """Return the header that renames DAQP's functions, so that one program may hold two controllers."""
     found = [
-        re.findall(r"\b(\w*(?:daqp|ldp)_?\w*)\s*\(DAQP", shipped("daqp", name)) for name in _SOLVER if name[-1] == "h"
+        re.findall(r"\b(\w*(?:daqp|ldp)_?\w*)\s*\(DAQP", read_shipped("daqp", name))
+        for name in _SOLVER
+        if name[-1] == "h"
     ]
-    found.append(re.findall(r"\b(\w+)\s*\(DAQP", shipped("daqp", "factorization.h")))
+    found.append(re.findall(r"\b(\w+)\s*\(DAQP", read_shipped("daqp", "factorization.h")))
     lines = [f"#define {name} koopmpc_{name}" for name in sorted({name for names in found for name in names})]
-    return _header("names", "DAQP's functions in this controller.", "\n".join(lines) + "\n")
+    return _write_header("names", "DAQP's functions in this controller.", "\n".join(lines) + "\n")
 
 
-def shipped(folder: str, name: str) -> str:
-    """Return a file that comes with the package."""
+def read_shipped(folder: str, name: str) -> str:
+    """Return the text of a file of the package."""
     return files("koopmpc.codegen").joinpath(folder, name).read_text(encoding="utf-8")
 
 
-def flops(tables: Tables) -> int:
+def count_flops(tables: Tables) -> int:
     """Return a bound of the floating-point operations of a step in which no limit is active and the reference rests."""
     sizes = tables.sizes
     cost = {
-        name: function(each.graph, name, each.arguments, each.result, Language()).flops
+        name: write_function(each.graph, name, each.arguments, each.result, Language()).flops
         for name, each in tables.functions.items()
     }
     nz = sizes["NZ"]
@@ -281,7 +263,7 @@ def flops(tables: Tables) -> int:
         stage = cost["koopmpc_slopes"] + cost["koopmpc_tracked"] + cost["koopmpc_limited"] + 2 * ns * nr * (nr + ns)
         end = 2 * sizes["END"] * (nr * ns + ns * ns)
         halvings = 10  # of a step, at most
-        one = N * (stage + halvings * cost["koopmpc_stage_map"]) + end + _sweeps(tables, 1)
+        one = N * (stage + halvings * cost["koopmpc_stage_map"]) + end + _count_sweeps(tables, 1)
         return sizes["ITERATIONS"] * one + (sizes["LATENCY"] + sizes["ESTIMATOR"] + 1) * cost["koopmpc_map"]
     model = 2 * nz * (nz + sizes["NU"] + sizes["NW"])
     filtered = {0: 0, 1: model + 8 * nz * sizes["NX"], 2: 4 * sizes["NS"] ** 2 * (1 + sizes.get("DELAY_Y", 0))}
@@ -293,16 +275,16 @@ def flops(tables: Tables) -> int:
     )
 
 
-def iteration_flops(tables: Tables) -> int:
+def count_iteration_flops(tables: Tables) -> int:
     """Return a bound of the floating-point operations of one iteration of the QP solver."""
     if tables.is_staged:
-        return _sweeps(tables, 2) + 100 * tables.sizes["N"] * (tables.sizes["SIDES"] + 1)
+        return _count_sweeps(tables, 2) + 100 * tables.sizes["N"] * (tables.sizes["SIDES"] + 1)
     n, m = tables.sizes["MOVES"], tables.sizes["QP_M"]
     rank = n + tables.sizes["QP_SOFT"] + 1
     return 2 * n * m + 4 * n * rank + 4 * rank * rank
 
 
-def _sweeps(tables: Tables, gradients: int) -> int:
+def _count_sweeps(tables: Tables, gradients: int) -> int:
     """Return the operations of a Riccati factorisation of all stages, and of the sweeps for so many gradients."""
     sizes = tables.sizes
     n, m, g = sizes["POINT"], sizes["NU"], sizes["LIMITED"]
@@ -310,7 +292,7 @@ def _sweeps(tables: Tables, gradients: int) -> int:
     return sizes["N"] * (factor + gradients * (8 * n * n + 16 * n * m + 4 * m * m + 4 * n * g))
 
 
-def _header(name: str, what: str, body: str) -> str:
+def _write_header(name: str, what: str, body: str) -> str:
     guard = f"KOOPMPC_{name.upper()}_H"
     includes = '#include "koopmpc.h"\n\n' if name not in ("sizes", "names") else ""
     return (
@@ -318,16 +300,16 @@ def _header(name: str, what: str, body: str) -> str:
     )
 
 
-def _sizes(tables: Tables, *, single: bool) -> str:
+def _write_sizes(tables: Tables, *, single: bool) -> str:
     lines = [f"#define KOOPMPC_{name} {value}" for name, value in sorted(tables.sizes.items())]
     precision = "#define KOOPMPC_FLOAT\n#define DAQP_SINGLE_PRECISION\n" if single else ""
     functions = "#define KOOPMPC_FN(name) name##f\n" if single else "#define KOOPMPC_FN(name) name\n"
-    dt = f"#define KOOPMPC_DT {tables.model.dt!r}\n"
+    dt = f"#define KOOPMPC_DT {tables.program.dt!r}\n"
     body = precision + functions + "#define KOOPMPC_SQRT KOOPMPC_FN(sqrt)\n" + dt + "\n".join(lines) + "\n"
-    return _header("sizes", "Sizes of this controller.", body)
+    return _write_header("sizes", "Sizes of this controller.", body)
 
 
-def _solver(tables: Tables, language: Language) -> str:
+def _write_solver(tables: Tables, language: Language) -> str:
     lines = [f"#define KOOPMPC_{name} {language.number(value)}" for name, value in sorted(tables.reals.items())]
     whole = {"cycle_tol", "iter_limit"}
     settings = ", ".join(
@@ -336,10 +318,10 @@ def _solver(tables: Tables, language: Language) -> str:
     )
     if settings:
         lines.append(f"#define KOOPMPC_SETTINGS {{{settings}}}")
-    return _header("solver", "Settings of the QP solver.", "\n".join(lines) + "\n")
+    return _write_header("solver", "Settings of the QP solver.", "\n".join(lines) + "\n")
 
 
-def _targets(tables: Tables, language: Language) -> str:
+def _write_targets(tables: Tables, language: Language) -> str:
     body = language.arrays(tables.targets)
     none = "static const koopmpc_real koopmpc_target_free[1] = {0};\n"
     entries: list[str] = []
@@ -354,7 +336,7 @@ def _targets(tables: Tables, language: Language) -> str:
     )
 
 
-def constants(tables: Tables) -> int:
+def count_constants(tables: Tables) -> int:
     """Return how many numbers the controller's tables hold."""
     groups = (tables.limits, tables.observer, tables.plan, tables.targets)
     return sum(max(1, np.size(values)) for group in groups for values in group.values())

@@ -1,36 +1,33 @@
-"""A controller as data for C: the sizes, arrays and functions that its C reads; those of all, of an LQR, a KoopmanMPC.
+"""From a `Program` to the numbers of its C code: sizes, arrays and functions by the names that they have in C."""
 
-What a BilinearMPC has beside them is in `staged`.
-"""
-
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple
 
-import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
 from koopmpc.control.limits import Interval
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
-from koopmpc.control.lqr import LQR
-from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
-from koopmpc.control.solvers.daqp import DAQP, FEW
-from koopmpc.control.target import ROUNDING, Targets
-from koopmpc.data.delay import Delay
+from koopmpc.control.linear.koopman_mpc import CondensedProgram
+from koopmpc.control.lqr import FeedbackProgram
+from koopmpc.control.nonlinear.bilinear_mpc import SETTLED
+from koopmpc.control.nonlinear.equilibrium import RANK
+from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
+from koopmpc.control.nonlinear.iteration import DIGITS, ENOUGH, MOST, PRECISE, STUCK
+from koopmpc.control.nonlinear.staged_program import StagedProgram
+from koopmpc.control.program import LinearProgram, Published, StepProgram, no_export
+from koopmpc.control.solvers.daqp import FEW
+from koopmpc.control.target import ROUNDING
 from koopmpc.errors import DataError
-from koopmpc.estimate.disturbance import DisturbanceObserver
-from koopmpc.estimate.kalman import KalmanFilter
-from koopmpc.estimate.observer import Measured
+from koopmpc.estimate.disturbance import DisturbanceProgram
+from koopmpc.estimate.kalman import FilterProgram
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 CArrays = dict[str, np.ndarray]
-Exportable = LQR | KoopmanMPC | BilinearMPC
 Precision = Literal["double", "float"]
 
-_ZERO_ROW = 1e-11  # squared length below which DAQP leaves a row as it is
+_ZERO_ROW = 1e-11  # DAQP leaves a row as it is if its squared length is below this
 
 # DAQP's tolerances in single precision: its own are below the rounding of a float.
 _SINGLE = {
@@ -40,23 +37,42 @@ _SINGLE = {
 _OTHERS = ("cycle_tol", "iter_limit", "eps_prox", "eta_prox", "rho_soft", "rel_subopt", "abs_subopt", "w_soft")
 _C_SETTINGS = (*_SINGLE, "fval_bound", *_OTHERS)
 
+# Tolerances of a StagedProgram: as in Python, and in single precision, whose rounding is 5e8 times as coarse.
+_TOLERANCES = {
+    "PRECISE": (PRECISE, 1e-6),
+    "ENOUGH": (ENOUGH, 1e-4),
+    "DIGITS": (DIGITS, 1e-6),
+    "STUCK": (STUCK, 1e-6),
+    "SETTLED": (SETTLED, 1e-4),
+    "REACH": (1e-9, 1e-5),
+    "RANK": (RANK, 1e-6),
+    "HELD": (HELD, 1e-4),
+    "TURN": (1e-15, 1e-7),
+    "SMALL": (1e-7, 1e-4),
+}
+_TABLE_NOTE = (
+    "The equilibrium of a reference, and what the end of the horizon costs there, are found when the C is written: "
+    "`koopmpc_table.h` holds them for the reference rows that `export` was given. A step whose reference holds "
+    "another row is KOOPMPC_BAD_MEASUREMENT; export with all rows, or pass a table by `koopmpc_use_targets`."
+)
+
 
 class CFunction(NamedTuple):
     """A function of C: ``void name(const real *argument, …, real *result)``."""
 
     graph: Graph
-    arguments: dict[str, int]
+    arguments: Mapping[str, int]
     result: str
 
 
 @dataclass
 class Tables:
-    """A controller as data for C: `sizes` are integers, the tables arrays, `settings` those of the QP solver.
+    """The numbers of a controller's C code: `sizes` are integers, `settings` those of the QP solver, the others arrays.
 
-    `conditioning` is how many times the rounding of an input's span a rounding of the lifted state moves the plan.
+    `conditioning` is how many times a rounding of the lifted state moves the plan, as a share of an input's span.
     """
 
-    model: LinearPredictor | BilinearPredictor | StepMap
+    program: StepProgram
     sizes: dict[str, int]
     functions: dict[str, CFunction]
     limits: CArrays = field(default_factory=dict)
@@ -72,166 +88,90 @@ class Tables:
     @property
     def is_lqr(self) -> bool:
         """Whether it is a feedback law."""
-        return bool(self.sizes["IS_LQR"])
+        return isinstance(self.program, FeedbackProgram)
 
     @property
     def is_staged(self) -> bool:
         """Whether its plan is iterated on a nonlinear model, stage by stage."""
-        return bool(self.sizes["IS_STAGED"])
+        return isinstance(self.program, StagedProgram)
 
 
-def exportable(controller: object) -> Exportable:
-    """Return a controller that can be written in C.
-
-    Raises
-    ------
-    DataError
-        It cannot; the message says which part of it is the reason, and what would do.
-    """
-    if not isinstance(controller, Exportable):
-        name = type(controller).__name__
-        why = {
-            "NonlinearMPC": "it solves its problem with ipopt or CasADi's own methods, which are no C of ours",
-            "Adaptive": "its model changes while it runs; export the controller inside it",
-            "Guarded": "it holds two controllers; export each of them",
-        }.get(name, "it is no controller that koopmpc can write in C")
-        would = "a BilinearMPC of the same model" if name == "NonlinearMPC" else "a BilinearMPC, a LinearMPC or an LQR"
-        raise DataError(f"a {name} cannot be exported: {why}; export a KoopmanMPC, {would}")
-    if isinstance(controller, LQR):
-        return controller
-    if controller._time_limit is not None:
-        bound = "" if isinstance(controller, BilinearMPC) else ', settings={"iter_limit": 100}'
-        raise DataError(
-            "the controller has a time_limit, and C has no clock; make it without one and bound the iterations: "
-            + ("sqp_iterations=1" if not bound else f'solver="daqp"{bound}')
-        )
-    if controller.watch is not None:
-        raise DataError(
-            "the controller has a monitor, whose data are not written in C; export the controller without monitor=, "
-            "and have a Python loop or a log ask the monitor"
-        )
-    observer = controller._initial.observer
-    if type(observer) not in (Measured, DisturbanceObserver, KalmanFilter):
-        raise DataError(
-            f"the estimator {type(controller._estimator).__name__} cannot be written in C; "
-            "use LiftedDisturbance or LiftedKalman"
-        )
-    return controller
-
-
-def traced(function: ca.Function, what: str) -> Graph:
-    """Return the graph of a function with one result.
+def read_program(controller: object, reference: Any = None) -> StepProgram:
+    """Return the Program of a controller.
 
     Raises
     ------
     DataError
-        It holds what cannot be written in C; the message says what it is and what would do.
+        No C code can be generated; the message is the Program's `obstacle`.
     """
-    try:
-        return Graph.trace(function)
-    except DataError as error:
-        raise DataError(f"{what} cannot be written in C: {error}") from error
+    if not isinstance(controller, Published):
+        raise no_export(controller)
+    program = controller.program(reference)
+    if not isinstance(program, StepProgram):
+        raise DataError(program.obstacle)
+    return program
 
 
-def columns(matrix: np.ndarray) -> np.ndarray:
+def make_tables(program: StepProgram, *, single: bool) -> Tables:
+    """Return the numbers of a Program's C code.
+
+    Raises
+    ------
+    DataError
+        A setting of the solver has no counterpart in C, or C code for this kind of Program is not known.
+    """
+    sizes = {"IS_LQR": 0, "IS_STAGED": 0, "NU": program.model.nu, "NR": program.nr}
+    embedding = None if isinstance(program.model, StepMap) else program.model.embedding
+    steps, inputs_too = (0, 0) if embedding is None else (embedding.steps, int(embedding.inputs))
+    sizes |= {"DELAYS": steps, "DELAYED_INPUTS": inputs_too, "NZETA": program.lifting.n, "NZ": program.lifting.m}
+    sizes["GIVEN"] = 0 if program.given is None else len(program.given)
+    lift = CFunction(program.lifting, {"zeta": program.lifting.n}, "z")
+    tables = Tables(program, sizes, {"koopmpc_lift": lift}, notes=list(program.notes))
+    tables.limits = {"input_low": program.inputs.low, "input_high": program.inputs.high}
+    tables.plan["given"] = np.zeros(0) if program.given is None else program.given
+    _add_limits(tables, rate=program.rates)
+    _add_settings(tables, single=single)
+    tables.conditioning = _amplify(program)
+    match program:
+        case FeedbackProgram():
+            _add_feedback(tables, program)
+        case CondensedProgram():
+            _add_condensed(tables, program)
+        case StagedProgram():
+            _add_staged(tables, program, single=single)
+        case _:
+            raise DataError(
+                f"there is no C code for a {type(program).__name__}; make a FeedbackProgram or a CondensedProgram"
+            )
+    return tables
+
+
+def stack(matrix: np.ndarray) -> np.ndarray:
     """Return a matrix as one column after the other."""
     return np.ascontiguousarray(np.asarray(matrix).T).ravel()
 
 
-def model_tables(
-    model: LinearPredictor | BilinearPredictor | StepMap,
-    sizes: dict[str, int],
-    lift: Callable[[ca.SX], ca.SX],
-    embedding: Delay | None,
-    inputs: Interval,
-) -> Tables:
-    """Return what all controllers have: sizes, the lifting of the state and its past, the limits of the inputs.
-
-    Raises
-    ------
-    DataError
-        The lifting holds an operation that cannot be written in C, or the past that of other inputs.
-    """
-    nu = sizes["NU"]
-    if embedding is not None and embedding.inputs and embedding.bound and len(embedding.bound[1]) != nu:
-        raise DataError("the embedding holds other inputs than the predictor; fit both on the same data to export it")
-    zeta = ca.SX.sym("zeta", sizes["NZETA"])
-    graph = traced(ca.Function("lifting", [zeta], [ca.densify(lift(zeta))], {"cse": True}), "the lifting")
-    kinds = {"IS_LQR": 0, "IS_STAGED": 0}
-    steps, inputs_too = (0, 0) if embedding is None else (embedding.steps, int(embedding.inputs))
-    past = {"DELAYS": steps, "DELAYED_INPUTS": inputs_too}
-    tables = Tables(
-        model,
-        kinds | past | {"NW1": max(1, sizes["NW"])} | sizes,
-        {"koopmpc_lift": CFunction(graph, {"zeta": sizes["NZETA"]}, "z")},
-    )
-    tables.limits = {"input_low": inputs.low, "input_high": inputs.high}
-    return tables
-
-
-def add_limits(tables: Tables, **limits: Interval | None) -> None:
+def _add_limits(tables: Tables, **limits: Interval | None) -> None:
     """Write both ends of further limits of the inputs, zeros where there is none."""
     none = np.zeros(tables.sizes["NU"])
     for name, limit in limits.items():
         low, high = (none, none) if limit is None else limit
         tables.limits |= {f"{name}_low": low, f"{name}_high": high}
+        if name.endswith("rate"):
+            tables.sizes[f"{name.upper()}D"] = int(limit is not None)
 
 
-def add_observer(tables: Tables, observer: object, predictor: LinearPredictor | None, latency: int) -> None:
-    """Write the filter, and the linear model where it is advanced."""
-    plan, sizes = tables.observer, tables.sizes
-    if isinstance(observer, KalmanFilter):
-        system, P, R = observer._system, observer._P, observer._R
-        S = system.M @ P @ system.M.T + R
-        unit = np.sqrt(S.diagonal())
-        sizes |= {
-            "ESTIMATOR": 2,
-            "NY": observer.ny,
-            "NS": len(system.F),
-            "DELAY_Y": observer._delay,
-            "PATIENCE": observer._patience,
-            "KEPT": len(system.kept),
-        }
-        plan |= {
-            "filter_F": columns(system.F),
-            "filter_G": columns(system.G),
-            "filter_f": system.f,
-            "filter_M": system.M,
-            "filter_h": system.h,
-            "filter_S": S / np.outer(unit, unit),
-            "filter_PM": columns(P @ system.M.T / unit),
-            "filter_unit": unit,
-            "filter_z": columns(system.to_z),
-            "filter_one": system.one,
-            "filter_d": columns(system.to_d),
-            "kept": np.asarray(system.kept, dtype=np.intc),
-        }
-    elif isinstance(observer, DisturbanceObserver):
-        sizes["ESTIMATOR"] = 1
-        tables.reals["GAIN"] = observer.gain
-    if predictor is not None and (isinstance(observer, DisturbanceObserver) or latency):
-        plan["C"] = columns(predictor.C)
-        plan |= {"A": columns(predictor.A), "B": columns(predictor.B), "E": columns(predictor.E)}
-
-
-def amplified(tables: Tables, gain: Float[np.ndarray, "n nz"], size: Float[np.ndarray, " nz"]) -> float:
-    """Return Σ |gain| size over an input's span, the worst of all inputs of the plan; `size` is that of z."""
-    span = tables.limits["input_high"] - tables.limits["input_low"]
-    reach = np.abs(gain) @ size
+def _amplify(program: StepProgram) -> float:
+    """Return Σ |gain| size over an input's span, for the most sensitive input of the plan; `size` is that of z."""
+    span = program.inputs.high - program.inputs.low
+    reach = np.abs(program.gain) @ program.sizes
     known = np.where(np.isfinite(span) & (span > 0), span, reach[: len(span)] + 1e-300)
     return float((reach / np.tile(known, len(reach) // len(known))).max())
 
 
-def daqp_defaults() -> dict[str, Any]:
-    """Return the settings that DAQP has here where none are given."""
-    from koopmpc.control.solvers.base import QP
-
-    one = np.ones(1)
-    return dict(DAQP(QP(np.eye(1), 0 * one, np.eye(1), -one, one))._model.settings)
-
-
-def solver_settings(tables: Tables, known: dict[str, Any], *, single: bool) -> None:
+def _add_settings(tables: Tables, *, single: bool) -> None:
     """Write DAQP's settings and the tolerances beside them."""
+    known = tables.program.settings
     if known["time_limit"] > 0:
         raise DataError(
             'a time_limit cannot be exported, C has no clock; bound the iterations: settings={"iter_limit": 100}'
@@ -249,168 +189,60 @@ def solver_settings(tables: Tables, known: dict[str, Any], *, single: bool) -> N
     }
 
 
-def memory_shares(n: int, m: int, soft: int) -> tuple[int, int]:
-    """Return how many numbers and integers a problem of n variables and m rows, some of them soft, takes."""
-    rank = n + soft + 1
-    return 6 * m + 2 * n + 5 * rank + rank * (rank + 1) // 2, m + rank + 3
+def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram) -> None:
+    """Write how z and d follow from y, and the linear model where it is advanced."""
+    plan, sizes, estimator = tables.observer, tables.sizes, program.estimator
+    sizes["ESTIMATOR"] = 0
+    if isinstance(estimator, FilterProgram):
+        F, M, P = estimator.F, estimator.M, estimator.P
+        S = M @ P @ M.T + estimator.R
+        unit = np.sqrt(S.diagonal())
+        sizes |= {
+            "ESTIMATOR": 2,
+            "NY": len(M),
+            "NS": len(F),
+            "DELAY_Y": estimator.delay,
+            "PATIENCE": estimator.patience,
+            "KEPT": len(estimator.kept),
+        }
+        plan |= {
+            "filter_F": stack(F),
+            "filter_G": stack(estimator.G),
+            "filter_f": estimator.f,
+            "filter_M": M,
+            "filter_h": estimator.h,
+            "filter_S": S / np.outer(unit, unit),
+            "filter_PM": stack(P @ M.T / unit),
+            "filter_unit": unit,
+            "filter_z": stack(estimator.to_z),
+            "filter_one": estimator.one,
+            "filter_d": stack(estimator.to_d),
+            "kept": np.asarray(estimator.kept, dtype=np.intc),
+        }
+    elif isinstance(estimator, DisturbanceProgram):
+        sizes["ESTIMATOR"] = 1
+        tables.reals["GAIN"] = estimator.gain
+    if isinstance(program, StagedProgram):
+        plan |= {"C": stack(np.eye(program.ny, program.nx)), "E": stack(program.E)}
+    elif sizes["ESTIMATOR"] == 1 or program.latency:
+        model = program.model
+        plan |= {
+            "C": stack(model.C),
+            "A": stack(model.A),
+            "B": stack(model.B),
+            "E": stack(model.E),
+        }
 
 
-def lqr_tables(controller: LQR, *, single: bool) -> Tables:
-    """Return the tables of a feedback law."""
-    predictor, targets = controller.predictor, controller._targets
-    tables = _shared(predictor, targets, controller._inputs)
-    given, rates = controller._given_rows, controller._rates
-    tables.sizes |= {
-        "IS_LQR": 1,
-        "HORIZON": 0,
-        "LATENCY": 0,
-        "N": 1,
-        "WITH_RATES": int(controller._K_rate.size > 0),
-        "RATED": int(rates is not None),
-        "GIVEN": 0 if given is None else len(given),
-    }
-    add_limits(tables, rate=rates)
-    na = targets.Z.shape[1]
-    tables.plan = {
-        "E": columns(predictor.E),
-        "gain": columns(-controller._K),
-        "gain_rate": columns(-controller._K_rate),
-        "feedforward": columns(controller._v),
-        "given": np.zeros(0) if given is None else given,
-        "target_input": targets.u0,
-        "target_span": columns(targets.W if na else np.zeros((predictor.nu, 1))),
-        "target_push": columns(targets.u_disturbance),
-    }
-    probe = cast("DAQP", targets._solver(len(targets.rows))) if na else None
-    known = daqp_defaults() if probe is None else dict(probe._model.settings)
-    solver_settings(tables, known, single=single)
-    _memory(tables, 1, 0, 0)
-    tables.conditioning = _amplified(tables, predictor, -controller._K)
-    return tables
+def _add_linear(tables: Tables, program: LinearProgram) -> None:
+    """Write the sizes of a linear model, its targets, and the two QPs that move one inside its limits.
 
-
-def koopman_tables(controller: KoopmanMPC, *, single: bool) -> Tables:
-    """Return the tables of a KoopmanMPC; one that solves with OSQP has those of its twin with DAQP."""
-    saved = controller.as_data()
-    own = saved.options["solver"] == "daqp"
-    twin = controller
-    if not own:
-        twin = KoopmanMPC(
-            controller.predictor,
-            saved.cost,
-            saved.limits,
-            saved.horizon,
-            estimator=controller._estimator,
-            latency=saved.latency,
-            moves=saved.moves,
-            solver="daqp",
-        )
-    predictor, plan = twin.predictor, twin._map
-    tables = _shared(predictor, plan.targets, plan.track.inputs)
-    if not own:
-        tables.notes.append(
-            "The controller solves with OSQP; this C solves with DAQP, to rounding: inputs differ by OSQP's tolerance."
-        )
-    track, maps, qp = plan.track, plan.maps, plan.qp
-    nz, checked, aimed = predictor.nz, int(plan.checked.sum()), bool(plan.aimed and plan.targets.Z.shape[1])
-    given = track.given
-    tables.sizes |= {
-        "N": twin._N,
-        "LATENCY": twin._latency,
-        "HORIZON": twin.horizon,
-        "WITH_RATES": int(track.with_rates),
-        "RATED": int(track.rates is not None),
-        "HARD_RATED": int(track.hard_rates is not None),
-        "KNOWN": plan.matrix.shape[1] - 1,
-        "NT": len(plan.matrix),
-        "MOVES": plan.moves,
-        "PLANNED": plan.planned,
-        "AIMED": int(aimed),
-        "CHECKED": checked,
-        "CHECKED_LIMITS": int(plan.disturbance.shape[1] > 0),
-        "GIVEN": 0 if given is None else len(given),
-        "CONSTANT": -1 if predictor.lifting.constant_index is None else predictor.lifting.constant_index,
-        "ESTIMATOR": 0,
-        "NS": nz,
-    }
-    add_limits(tables, rate=track.rates, hard_rate=track.hard_rates)
-    tables.limits["move_of"] = np.asarray(twin._move_of, dtype=np.intc)
-    solver = cast("DAQP", twin._qps._solvers[0])
-    M, scaling = _normalised(solver._M)
-    rate_input = np.full(len(qp.source), -1, dtype=np.intc)
-    rate_input[qp.rate_rows] = qp.rate_inputs
-    if not np.array_equal(solver._H, np.eye(plan.moves)):
-        raise AssertionError("the Hessian of Riccati coordinates is the identity")
-    tables.plan = {
-        "map": columns(plan.matrix[:, :-1]),
-        "low": plan.low,
-        "high": plan.high,
-        "offset": maps.offset,
-        "from_reference": columns(maps.from_reference),
-        "from_target": columns(maps.from_target) if aimed else np.zeros(0),
-        "from_given": np.zeros(0) if given is None else columns(maps.from_given),
-        "given": np.zeros(0) if given is None else given,
-        "checked": plan.targets.rows[plan.checked] if checked else np.zeros(0),
-        "disturbance": columns(plan.disturbance) if checked else np.zeros(0),
-        "M": M,
-        "scaling": scaling,
-        "unit": solver._rows,
-        "sense": solver._sense.astype(np.intc),
-        "linear": np.where(solver._sense != 0, solver._linear, 0.0),
-        "rho": np.where(solver._sense != 0, 1 / solver._curved, 0.0),
-        "source": np.asarray(qp.source, dtype=np.intc),
-        "scale": qp.scale,
-        "qp_low": np.maximum(qp.low, -1e30),
-        "qp_high": np.minimum(qp.high, 1e30),
-        "allowance": qp.softness.allowance,
-        "rate_input": rate_input,
-        "shift": np.asarray(qp.shift_dual, dtype=np.intc),
-        "deviation": columns(plan.deviation),
-    }
-    add_observer(tables, twin._initial.observer, predictor, twin._latency)
-    solver_settings(tables, dict(solver._model.settings), single=single)
-    _memory(tables, plan.moves, len(qp.source), int((solver._sense != 0).sum()))
-    steep = bool(len(qp.source)) and solver._steep()
-    tables.sizes |= {"QP_MIXED": int(solver._mixed), "STEEP": int(steep), "FEW": FEW}
-    if steep:
-        values, V = np.linalg.eigh(solver._metric())
-        tables.plan |= {"lambda": np.maximum(values, 0.0), "V": V, "MV": solver._M @ V}
-    tables.conditioning = _amplified(tables, predictor, plan.matrix[: plan.moves, :nz])
-    return tables
-
-
-def _shared(predictor: LinearPredictor, targets: Targets, inputs: Interval) -> Tables:
-    """Return what an LQR and a KoopmanMPC have in common: sizes, the lifting, limits of the inputs, targets."""
-    sizes = {
-        "NX": predictor.nx,
-        "NY": predictor.nx,
-        "NZETA": len(predictor.lifting.bound_states),
-        "NZ": predictor.nz,
-        "LEARNED": predictor.nz,
-        "NU": predictor.nu,
-        "NR": targets.from_reference.shape[1],
-        "NW": predictor.nw,
-        "NA": max(1, targets.Z.shape[1]),
-        "NL": max(1, len(targets.rows)),
-    }
-    tables = model_tables(predictor, sizes, predictor.lifting.symbolic, predictor.embedding, inputs)
-    _add_targets(tables, targets)
-    return tables
-
-
-def _amplified(tables: Tables, predictor: LinearPredictor, gain: Float[np.ndarray, "n nz"]) -> float:
-    """Return how many times a rounding of z, as large as the data were, moves the plan."""
-    scale = predictor.scale
-    size = np.ones(predictor.nz) if scale is None else np.asarray(np.linalg.norm(scale, axis=0))
-    return amplified(tables, gain, size)
-
-
-def _add_targets(tables: Tables, found: Targets) -> None:
-    """Write the targets and the two problems that move one inside its limits.
-
-    Where there are no coordinates C has one that means nothing.
+    Without equilibria C has one coordinate, which is not used.
     """
-    na = found.Z.shape[1]
+    model, targets = program.model, program.targets
+    na, nl = targets.Z.shape[1], len(targets.rows)
+    tables.sizes |= {"NX": model.nx, "NY": model.nx, "LEARNED": model.nz, "NW": model.nw, "NW1": max(1, model.nw)}
+    tables.sizes |= {"NA": max(1, na), "NL": max(1, nl)}
 
     def pad(rows: np.ndarray) -> np.ndarray:
         return rows if na else np.zeros((1, *rows.shape[1:]))
@@ -419,46 +251,51 @@ def _add_targets(tables: Tables, found: Targets) -> None:
         return matrix if na else np.zeros((len(matrix), 1))
 
     tables.targets = {
-        "target_offset": pad(found.offset),
-        "target_reference": columns(pad(found.from_reference)),
-        "target_disturbance": columns(pad(found.from_disturbance)),
-        "target_rows": columns(wide(found.rows)),
-        "target_rows_disturbance": columns(found.rows_disturbance),
-        "target_low": found.low,
-        "target_high": found.high,
-        "target_size": found.size,
+        "target_offset": pad(targets.offset),
+        "target_reference": stack(pad(targets.from_reference)),
+        "target_disturbance": stack(pad(targets.from_disturbance)),
+        "target_rows": stack(wide(targets.rows)),
+        "target_rows_disturbance": stack(targets.rows_disturbance),
+        "target_low": targets.low,
+        "target_high": targets.high,
+        "target_size": targets.size,
     }
-    for which, count in enumerate((len(found.rows), found.hard)):
+    for which, count in enumerate((nl, targets.hard)):
+        M, unit, rinv = np.zeros((count, 1)), np.ones(count), np.eye(1)
         if na:
-            solver = cast("DAQP", found._solver(count))
-            rinv = np.linalg.inv(np.linalg.cholesky(solver._H).T)
-            M, unit = solver._M @ rinv, solver._rows
-            rinv = solver._columns[:, None] * rinv
-        else:
-            M, unit, rinv = np.zeros((count, 1)), np.ones(count), np.eye(1)
-        M, scaling = _normalised(M)
-        mine = {
+            solver = program.target_solvers[which]
+            rinv = np.linalg.inv(np.linalg.cholesky(solver.H).T)
+            M, unit = solver.M @ rinv, solver.rows
+            rinv = solver.columns[:, None] * rinv
+        M, scaling = _normalise(M)
+        arrays = {
             "M": M,
             "scaling": scaling,
             "rinv": rinv[np.triu_indices(len(rinv))],
             "sense": np.zeros(count, dtype=np.intc),
             "unit": unit,
         }
-        tables.targets |= {f"target_{name}_{which}": values for name, values in mine.items()}
+        tables.targets |= {f"target_{name}_{which}": values for name, values in arrays.items()}
         tables.target_qps.append((max(1, na), count))
 
 
-def _normalised(rows: Float[np.ndarray, "m n"]) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, " m"]]:
+def _normalise(rows: Float[np.ndarray, "m n"]) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, " m"]]:
     """Return rows of length 1, and by what they were multiplied, as DAQP does it."""
     squares = (rows**2).sum(axis=1)
     scaling = np.where(squares < _ZERO_ROW, 1.0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)))
     return rows * scaling[:, None], scaling
 
 
-def _memory(tables: Tables, n: int, m: int, soft: int) -> None:
+def _memory_shares(n: int, m: int, soft: int) -> tuple[int, int]:
+    """Return how many numbers and integers a problem of n variables and m rows, some of them soft, takes."""
+    rank = n + soft + 1
+    return 6 * m + 2 * n + 5 * rank + rank * (rank + 1) // 2, m + rank + 3
+
+
+def _add_memory(tables: Tables, n: int, m: int, soft: int) -> None:
     """Set the sizes of the solver's memory: that of the plan's problem, and that of the targets'."""
-    reals, ints = zip(*(memory_shares(n, m, 0) for n, m in tables.target_qps), strict=True)
-    sizes = memory_shares(n, m, soft)
+    reals, ints = zip(*(_memory_shares(n, m, 0) for n, m in tables.target_qps), strict=True)
+    sizes = _memory_shares(n, m, soft)
     tables.sizes |= {
         "QP_M": m,
         "QP_M1": max(1, m),
@@ -467,4 +304,216 @@ def _memory(tables: Tables, n: int, m: int, soft: int) -> None:
         "QP_INTS": sizes[1],
         "TARGET_REALS": max(reals),
         "TARGET_INTS": max(ints),
+    }
+
+
+def _add_feedback(tables: Tables, program: FeedbackProgram) -> None:
+    """Write a feedback law."""
+    _add_linear(tables, program)
+    model, targets = program.model, program.targets
+    tables.sizes |= {"IS_LQR": 1, "HORIZON": 0, "LATENCY": 0, "N": 1, "WITH_RATES": int(program.K_rate.size > 0)}
+    tables.plan |= {
+        "E": stack(model.E),
+        "gain": stack(-program.K),
+        "gain_rate": stack(-program.K_rate),
+        "feedforward": stack(program.feedforward),
+        "target_input": targets.u0,
+        "target_span": stack(targets.W if targets.Z.shape[1] else np.zeros((model.nu, 1))),
+        "target_push": stack(targets.u_disturbance),
+    }
+    _add_memory(tables, 1, 0, 0)
+
+
+def _add_condensed(tables: Tables, program: CondensedProgram) -> None:
+    """Write a plan by one matrix, and its condensed QP."""
+    _add_linear(tables, program)
+    model, qp, solver, targets = program.model, program.qp, program.solver, program.targets
+    moves, m = program.deviation.shape[0], len(qp.source)
+    checked, constant = int(program.checked.sum()), model.lifting.constant_index
+    soft, any_soft = solver.soft, bool(solver.soft.any())
+    if not np.array_equal(solver.H, np.eye(moves)):
+        raise AssertionError("the Hessian of Riccati coordinates is the identity")
+    tables.sizes |= {
+        "N": program.N,
+        "LATENCY": program.latency,
+        "HORIZON": program.N + program.latency,
+        "WITH_RATES": int(program.with_rates),
+        "KNOWN": program.M.shape[1],
+        "NT": len(program.M),
+        "MOVES": moves,
+        "PLANNED": len(program.offset),
+        "AIMED": int(program.aimed),
+        "CHECKED": checked,
+        "CHECKED_LIMITS": int(program.disturbance.shape[1] > 0),
+        "CONSTANT": -1 if constant is None else constant,
+        "NS": model.nz,
+        "QP_MIXED": int(any_soft and not soft.all()),
+        "STEEP": int(solver.metric is not None),
+        "FEW": FEW,
+    }
+    _add_limits(tables, hard_rate=program.hard_rates)
+    tables.limits["move_of"] = np.asarray(program.move_of, dtype=np.intc)
+    M, scaling = _normalise(solver.M)
+    rate_input = np.full(m, -1, dtype=np.intc)
+    rate_input[qp.rate_rows] = qp.rate_inputs
+    tables.plan |= {
+        "map": stack(program.M),
+        "low": program.low,
+        "high": program.high,
+        "offset": program.offset,
+        "from_reference": stack(program.from_reference),
+        "from_target": stack(program.from_target) if program.aimed else np.zeros(0),
+        "from_given": np.zeros(0) if program.given is None else stack(program.from_given),
+        "checked": targets.rows[program.checked] if checked else np.zeros(0),
+        "disturbance": stack(program.disturbance) if checked else np.zeros(0),
+        "M": M,
+        "scaling": scaling,
+        "unit": solver.rows,
+        "sense": 8 * soft.astype(np.intc),
+        "linear": np.where(soft, solver.linear, 0.0),
+        "rho": np.where(soft, 1 / solver.curvature, 0.0),
+        "source": np.asarray(qp.source, dtype=np.intc),
+        "scale": qp.scale,
+        "qp_low": np.maximum(qp.low, -1e30),
+        "qp_high": np.minimum(qp.high, 1e30),
+        "allowance": qp.softness.allowance,
+        "rate_input": rate_input,
+        "shift": np.asarray(qp.shift_dual, dtype=np.intc),
+        "deviation": stack(program.deviation),
+    }
+    if solver.metric is not None:
+        values, V = np.linalg.eigh(solver.metric)
+        tables.plan |= {"lambda": np.maximum(values, 0.0), "V": V, "MV": solver.M @ V}
+    _add_estimator(tables, program)
+    _add_memory(tables, moves, m, int(soft.sum()))
+
+
+def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None:
+    """Write stages, their functions, weights and limits, and the targets of the reference rows."""
+    p, side, softness = program, program.sides, program.softness
+    N, nx, nu, nr, ng = p.N, p.nx, p.model.nu, p.nr, len(p.box.low)
+    goal = nx + nr + nu * (p.weighs_changes and p.end != "given")
+    box = len(p.rest.low) - nu if p.rest is not None else ng - (nu + len(p.soft_rates)) * p.with_rates
+    tables.sizes |= {
+        "IS_STAGED": 1,
+        "NX": p.ny,
+        "NY": p.ny,
+        "NS": nx,
+        "LEARNED": p.ny,
+        "CONSTANT": -1,
+        "NW": p.E.shape[1],
+        "NW1": max(1, p.E.shape[1]),
+        "N": N,
+        "LATENCY": p.latency,
+        "HORIZON": N + p.latency,
+        "MOVES": N * nu,
+        "WITH_RATES": int(p.with_rates),
+        "KNOWN": nx + nu * p.with_rates + N * p.E.shape[1] + nx * isinstance(p.estimator, DisturbanceProgram),
+        "POINT": p.ns,
+        "TRACKED": len(p.Q),
+        "LIMITED": ng,
+        "LIMITED1": max(1, ng),
+        "BOX": box,
+        "SIDES": len(side.row),
+        "SOFT": side.soft,
+        "PAIRS": max(1, N * len(side.row)),
+        "EASED": max(1, N * side.soft),
+        "SOFT_RATES": len(p.soft_rates),
+        "INTERIOR": MOST,
+        "DISTURBED": int(p.rest is not None),
+        "PUSHES": N * nx if p.rest is not None else 1,
+        "GIVEN_MAP": int(isinstance(p.model, StepMap)),
+        "ITERATIONS": p.iterations,
+        "HOLDS": int(p.holds),
+        "GIVEN_END": int(p.end == "given"),
+        "STAGE_END": {"given": 0, "tail": 1, "stage": 2}[p.end],
+        "GOAL": goal,
+        "END": goal + nu * p.with_rates,
+        "TARGETS": len(p.table),
+        "TARGET": nr + nx + nu + (nu + box) + nu + nu * nx + goal * (nr + nx + nu + 1) + 1,
+    }
+    arguments = {
+        "map": {"x": nx, "u": nu},
+        "stage_map": {"s": p.ns, "v": nu},
+        "slopes": {"s": p.ns, "v": nu},
+        "tracked": {"s": p.ns},
+        "limited": {"s": p.ns},
+        "stage": {"s": p.ns, "r": len(p.Q)},
+        "local": {"x": nx, "u": nu},
+    }
+    for name, graph in p.functions.items():
+        result = "next" if name.endswith("map") else "out"
+        tables.functions[f"koopmpc_{name}"] = CFunction(graph, arguments[name], result)
+    _add_limits(tables, hard_rate=p.hard_rates, change=p.v_limits)
+    tables.limits["move_of"] = np.arange(N, dtype=np.intc)
+    rows, inwards = (N if p.margin.any() else 1), p.margin.shape[1]
+    low, high = (np.tile(np.concatenate([p.v_limits[i], p.box[i]]), (rows, 1)) for i in (0, 1))
+    if p.margin.any():
+        low[:, low.shape[1] - inwards :] += p.margin
+        high[:, high.shape[1] - inwards :] -= p.margin
+    tables.sizes["BOX_ROWS"] = len(low)
+    soft = np.isfinite(softness.linear)
+    tables.plan |= {
+        "Q": p.Q,
+        "R": p.R,
+        "R_held": p.R_held,
+        "Q_root": p.Q_root,
+        "R_root": p.R_root,
+        "free": p.free.astype(np.intc),
+        "held_from": p.held_from.astype(np.intc),
+        "soft_rates": p.soft_rates.astype(np.intc),
+        "low": low,
+        "high": high,
+        "side_row": side.row.astype(np.intc),
+        "side_scale": side.sign / side.span,
+        "side_span": side.span,
+        "soft_linear": side.linear,
+        "soft_quadratic": side.quadratic,
+        "allowance": softness.allowance[side.row[len(side.row) - side.soft :] - nu],
+        "cost_linear": np.where(soft, softness.linear, 0.0),
+        "cost_quadratic": np.where(soft, softness.quadratic, 0.0),
+        "sizes": p.stage_sizes,
+        "input_sizes": p.input_sizes,
+    }
+    if p.rest is not None:
+        tables.plan |= {
+            "rest_weight": p.rest.weight,
+            "rest_size": p.rest.size,
+            "rest_limit": p.rest.limit_size,
+            "rest_low": p.rest.low,
+            "rest_high": p.rest.high,
+        }
+    tables.reals |= {name: values[single] for name, values in _TOLERANCES.items()}
+    _add_finish(tables, p, low, high)
+    _add_estimator(tables, p)
+    tables.targets = {"table": p.table}
+    tables.notes.append(_TABLE_NOTE)
+
+
+def _add_finish(
+    tables: Tables, program: StagedProgram, low: Float[np.ndarray, "b nq"], high: Float[np.ndarray, "b nq"]
+) -> None:
+    """Write which rows DAQP gets where interior points end early, their prices, and the sizes of its memory."""
+    free, nu, none = program.free, program.model.nu, np.zeros(program.model.nu)
+    linear = np.concatenate([np.full(nu, np.inf), 0.5 * program.softness.linear])  # half of the prices, as of the cost
+    quadratic = np.concatenate([none, 0.5 * program.softness.quadratic])
+    kept = np.tile((np.isfinite(low) | np.isfinite(high))[:1], (program.N, 1))
+    kept[~free, :nu] = False
+    place, soft = np.flatnonzero(kept), np.isfinite(linear)
+    sense = 8 * soft[place % kept.shape[1]]
+    n = nu * int(free.sum())
+    reals, ints = _memory_shares(n, len(place), int((sense > 0).sum()))
+    tables.sizes |= {
+        "FINISH_ROWS": len(place),
+        "FINISH_WIDTH": n,
+        "FINISH_SOFT": int((sense > 0).sum()),
+        "FINISH_REALS": reals,
+        "FINISH_INTS": ints,
+    }
+    tables.plan |= {
+        "finish_row": place.astype(np.intc),
+        "finish_at": (np.cumsum(free) - free).astype(np.intc),
+        "finish_sense": sense.astype(np.intc),
+        "finish_linear": np.where(soft, linear, 0.0),
+        "finish_quadratic": quadratic,
     }

@@ -5,15 +5,21 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
-    from koopmpc.control.adaptive import Adaptive as Adaptive
-    from koopmpc.control.adaptive import Guarded as Guarded
-    from koopmpc.control.base import SavedController as SavedController
+    from koopmpc.control.kinds import BenchEntry as BenchEntry
+    from koopmpc.control.kinds import ControllerKind as ControllerKind
+    from koopmpc.control.kinds import register_controller as register_controller
+    from koopmpc.control.linear.koopman_mpc import CondensedProgram as CondensedProgram
     from koopmpc.control.lqr import EigenfunctionLQR as EigenfunctionLQR
-    from koopmpc.control.monitor import Monitor as Monitor
+    from koopmpc.control.lqr import FeedbackProgram as FeedbackProgram
     from koopmpc.control.move import Controller as Controller
     from koopmpc.control.move import Fallback as Fallback
     from koopmpc.control.move import Fallible as Fallible
     from koopmpc.control.move import Plan as Plan
+    from koopmpc.control.nonlinear.staged_program import StagedProgram as StagedProgram
+    from koopmpc.control.program import Program as Program
+    from koopmpc.control.program import SavedController as SavedController
     from koopmpc.control.riccati import Gain as Gain
 else:
-    __getattr__, __dir__, __all__ = attach(__name__)
+    __getattr__, __dir__, __all__ = attach(
+        __name__, moved={"Adaptive": "supervise", "Guarded": "supervise", "Monitor": "supervise"}
+    )

@@ -1,12 +1,10 @@
-"""MPCBase: what predictive controllers share: where a plan starts, blocks, deadlines, a failed step, being saved."""
+"""MPCBase: where a plan starts, blocks of moves, deadlines, the fallback of a failed step, the data for a file."""
 
 import copy
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from time import perf_counter
-from typing import Any, Literal, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,49 +12,24 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
-from koopmpc.control.cost import Cost, Tracking
-from koopmpc.control.limits import Limits, admitted
-from koopmpc.control.monitor import Monitor, Watch
+from koopmpc.control.cost import Tracking
+from koopmpc.control.limits import clip_input
 from koopmpc.control.move import Fallback, Move, Status, Token
+from koopmpc.control.program import Published, SavedController
+from koopmpc.control.watching import StepMonitor, StepWatch
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.estimate.observer import Estimator, Measured, StateModel, StateObserver, state_model
+from koopmpc.estimate.observer import (
+    Estimator,
+    Measured,
+    StateModel,
+    StateObserver,
+    state_model,
+)
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.base import save_value
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.values import Value, Viewing
 
-Kind = Literal["KoopmanMPC", "BilinearMPC", "NonlinearMPC"]
-
-
-@dataclass(frozen=True, eq=False)
-class SavedController(Value):
-    """The data that a controller is made of. A loaded controller begins as after `reset`.
-
-    Attributes
-    ----------
-    name
-        The class of the controller.
-    model
-        The predictor of the controller.
-    cost, limits, horizon, estimator, latency, moves, time_limit
-        Arguments of the controller; `moves` are the lengths of the blocks of held inputs.
-    options
-        The arguments that only this class has.
-    monitor
-        The monitor, where it has one.
-    """
-
-    name: Kind
-    model: LinearPredictor | BilinearPredictor
-    cost: Cost
-    limits: Limits
-    horizon: int
-    estimator: Value | None
-    latency: int
-    moves: tuple[int, ...]
-    time_limit: float | None
-    options: Mapping[str, Any]
-    monitor: Monitor | None = None
+_Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 
 
 class InitialCondition(Viewing):
@@ -92,7 +65,7 @@ class InitialCondition(Viewing):
         self._sizes = model.nz, model.nu, model.nw, N
         self._with_rates, self._estimated = with_rates, estimated
         more = estimated or latency or with_rates or model.nw or model.embedding is not None
-        self._measured = None if more or not isinstance(observer, Measured) else observer  # where y is all that counts
+        self._measured = None if more or not isinstance(observer, Measured) else observer  # set if z depends on y alone
         self._shape = (observer.ny,)
         self.known = np.zeros(model.nz + model.nu * with_rates + N * model.nw + model.nz * estimated + 1)
         self.known[-1] = 1.0
@@ -133,8 +106,8 @@ class InitialCondition(Viewing):
         last
             The input that was computed last.
         applied
-            The input that acted since the last call; where it is not told, or no number, the one that was computed
-            L + 1 calls ago.
+            The input that acted since the last call; if it is missing or not finite, the input that was computed L + 1
+            calls ago.
         w
             (nw,), or rows w_k … w_{k+L+N−1}, the last repeated; zero by default.
         """
@@ -168,7 +141,7 @@ class InitialCondition(Viewing):
         if got is not None:
             acted = got
         good = observer.observe(measured, acted, self._w)
-        if self._ahead.size:  # an unknown one stays as it was
+        if self._ahead.size:  # a disturbance that is not finite keeps its last value
             self._w = np.where(np.abs(self._ahead[0]) < HUGE, self._ahead[0], self._w)
         z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
         for i in range(self._latency):
@@ -194,7 +167,7 @@ class InitialCondition(Viewing):
         self.W[:] = rows if rows.ndim == 1 else rows[self._latency :]
 
 
-def blocked(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
+def find_blocks(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
     """Return the lengths of the blocks of steps in which a plan of N steps holds its inputs: move blocking.
 
     They are N ones, or M moves of which the last is held, or `moves` itself.
@@ -220,12 +193,12 @@ def blocked(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
     return (1,) * (M - 1) + (N - M + 1,)
 
 
-class MPCBase:
+class MPCBase(Published):
     """A controller whose plan has N steps, of an input that acts `latency` steps after it was computed.
 
-    A subclass calls `_keep` with every good plan, ends a step with `_move` or `_fail`, and says in `_made_of` what it
-    is made of, for `save`. A failed step returns the next input of the last good plan, then the unconstrained input
-    clipped, then the last input.
+    A subclass calls `_keep` with every good plan, ends a step with `_move` or `_fail`, and returns in `_made_of` the
+    data for `save`. A failed step returns the next input of the last good plan; if there is none the unconstrained
+    input, clipped; if that is unknown the last input.
 
     One thread at a time may call it: a second one gets a ThreadError. Give each thread a copy of its own.
 
@@ -251,7 +224,7 @@ class MPCBase:
         What tells of each step whether the model knows it; None where that is not asked.
     """
 
-    solver_fails = False  # set by fault injection alone, see control.move.Fallible
+    solver_fails = False  # fault injection sets it, see control.move.Fallible
     _initial: InitialCondition
 
     def __init__(
@@ -267,12 +240,12 @@ class MPCBase:
         time_limit: float | None,
         *,
         stagewise: bool,
-        monitor: Monitor | None = None,
+        monitor: StepMonitor | None = None,
     ) -> None:
         self.cost, self.limits = tracking.cost, tracking.limits
         self._inputs, self._rates, self._hard_rates = tracking.inputs, tracking.rates, tracking.hard_rates
         self.dt, self.nu = dt, len(self._inputs.low)
-        self._blocks = blocks = blocked(moves, horizon)
+        self._blocks = blocks = find_blocks(moves, horizon)
         self._N = N = sum(blocks)
         self._latency = checks.count(latency, "latency", 0)
         self.horizon = N + self._latency  # steps of preview
@@ -286,21 +259,21 @@ class MPCBase:
         )
         self._token: Token = [0]
         self._inside = 0
-        self._watch = None if monitor is None else Watch(monitor, model, self._latency)
+        self._watch = None if monitor is None else monitor.watch(model, self._latency)
         MPCBase.reset(self)
 
     @property
-    def watch(self) -> Watch | None:
-        """What is known of the last step; None without a monitor."""
+    def watch(self) -> StepWatch | None:
+        """The monitor's answer on the last step; None without a monitor."""
         return self._watch
 
     def __copy__(self) -> "MPCBase":
-        """Return a copy that shares nothing with this one that moves in a step."""
+        """Return a copy that shares no state with this one."""
         return copy.deepcopy(self)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._token, self._inside = [0], 0  # that of the original may be in use
+        self._token, self._inside = [0], 0  # another thread may hold the token of the original
 
     @property
     def observer(self) -> StateObserver:
@@ -354,29 +327,34 @@ class MPCBase:
             None if self._watch is None else self._watch.monitor,
         )
 
-    def _made_of(self) -> tuple[Kind, LinearPredictor | BilinearPredictor | StepMap, dict[str, Any]]:
+    def _made_of(self) -> tuple[str, LinearPredictor | BilinearPredictor | StepMap, dict[str, Any]]:
         """Return the class, the model, and the arguments that only this class has."""
         raise NotImplementedError
 
-    def save(self, path: str | Path) -> None:
-        """Write the controller as data (.npz: arrays and one JSON text); `km.load_controller` reads it.
-
-        Raises
-        ------
-        DataError
-            A part of it is code: a StepMap, or a user's own estimator.
-        LogError
-            The path cannot be written.
-        """
-        save_value(self.as_data(), path)
+    @classmethod
+    def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
+        """Return the controller that is made of these data."""
+        build: Any = cls
+        return build(
+            saved.model,
+            saved.cost,
+            saved.limits,
+            saved.horizon,
+            estimator=saved.estimator,
+            latency=saved.latency,
+            moves=saved.moves,
+            time_limit=saved.time_limit,
+            monitor=saved.monitor,
+            **saved.options,
+        )
 
     def _keep(self, plan: Float[np.ndarray, " nv"]) -> None:
-        """Keep a good plan (by reference, for speed): its first entries are the moves."""
+        """Keep a good plan (by reference, for speed); its first entries are the moves."""
         self._kept, self._age, self._planned = plan, 0, True
         self._given = plan[: self.nu]
 
-    def _watched(self, watch: Watch, move: Move, applied: ArrayLike | None, start: float) -> Move:
-        """Return the move with the answer whether the model knows this step."""
+    def _judge_step(self, watch: StepWatch, move: Move, applied: ArrayLike | None, start: float) -> Move:
+        """Return the move with `known` set: whether the model knows this step."""
         move.known = watch.look(self._initial, move.u, applied)
         move.solve_time = perf_counter() - start
         return move
@@ -409,9 +387,9 @@ class MPCBase:
         Parameters
         ----------
         free
-            The unconstrained optimum, where it is known.
+            The unconstrained optimum, if it is known.
         applied
-            What the plant really got last, where it is not the last input returned.
+            The input that acted last, if it is not the last input returned.
         """
         self._planned = False
         before = self._given
@@ -426,7 +404,7 @@ class MPCBase:
         else:
             self._kept = None
             u, fallback = (before, Fallback.HOLD) if free is None else (free, Fallback.CLIPPED_LQR)
-        self._given = admitted(u, self._inputs, self._rates, before)
+        self._given = clip_input(u, self._inputs, self._rates, before)
         taken = perf_counter() - start
         status = status if taken <= self._allowed else Status.TIME_LIMIT
         return Move(self._given.copy(), status, fallback, taken, iterations, solver=solver)

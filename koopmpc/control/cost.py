@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.limits import Interval, Limits, Softness, half_width, magnitude
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import Lifting, rows
+from koopmpc.lifting.base import Lifting, find_observables
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.values import Value
@@ -243,9 +243,9 @@ def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits | Non
         A weight or a limit has another size than what it weighs or limits.
     """
     cost, limits = checked(cost, limits)
-    C, G = observed(predictor, cost.of), predictor.C
+    C, G = select_rows(predictor, cost.of), predictor.C
     if limits.of is not None:
-        G = np.vstack([G, observed(predictor, limits.of)])
+        G = np.vstack([G, select_rows(predictor, limits.of)])
     states, nu, ranges = predictor.states, predictor.nu, data_ranges(predictor)
     return _tracking(C, lambda kept: np.ascontiguousarray(G[kept]), cost, limits, len(C), states, nu, ranges)
 
@@ -304,7 +304,7 @@ def _tracking(
     nx = len(states)
     (Q, R), R_delta, rows = cost.matrices(nr, nu), cost.rate(nu), cost.given_inputs(nu)
     sizes = Sizes.of(cost.of.bind(states), Q, R, limits, states, ranges)
-    sized = limits.sized(nx, len(sizes.rows) - nx, nu, sizes.rows, sizes.scale)
+    sized = limits.find_sizes(nx, len(sizes.rows) - nx, nu, sizes.rows, sizes.scale)
     low, high = sized.inputs
     if rows is not None:
         reach = 1e-9 * np.maximum(np.abs(rows), np.abs(rows).max(axis=0))
@@ -338,12 +338,12 @@ def _tracking(
     )
 
 
-def observed(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "nr nz"]:
+def select_rows(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "nr nz"]:
     """Return the matrix that reads the observables `of` from z: the predictor's own C for states."""
     wanted = of.bind(predictor.states)
     if isinstance(wanted, State):
-        return predictor.C[wanted.chosen]
-    return np.eye(predictor.nz)[rows(predictor.lifting, wanted)]
+        return predictor.C[wanted.state_indices]
+    return np.eye(predictor.nz)[find_observables(predictor.lifting, wanted)]
 
 
 def checked(cost: object, limits: object) -> tuple[Cost, Limits]:

@@ -89,7 +89,7 @@ class Horizon:
         """Return the same horizon in these units."""
         L, inverse, inputs, C, G, scale = units
 
-        def measured(weight: Float[np.ndarray, "n n"], size: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+        def to_units(weight: Float[np.ndarray, "n n"], size: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
             return weight * np.outer(size, size) / scale
 
         return replace(
@@ -99,13 +99,13 @@ class Horizon:
             E=inverse @ self.E,
             C=self.C @ L / C[:, None],
             G=self.G @ L / G[:, None],
-            Q=measured(self.Q, C),
-            R=measured(self.R, inputs),
-            R_delta=None if self.R_delta is None else measured(self.R_delta, inputs),
+            Q=to_units(self.Q, C),
+            R=to_units(self.R, inputs),
+            R_delta=None if self.R_delta is None else to_units(self.R_delta, inputs),
         )
 
 
-def stages(horizon: Horizon, targets: Targets) -> list[Stage]:
+def build_stages(horizon: Horizon, targets: Targets) -> list[Stage]:
     """Return a stage for every block of b steps: A = Aᵇ, B = Σ AⁱB, and the cost of its steps summed."""
     nz, nu = horizon.B.shape
     powers = [(np.eye(nz), np.zeros((nz, nu))), (horizon.A, horizon.B)]
@@ -267,7 +267,7 @@ def condense(
         rows.append((U - np.concatenate([last[None], U[:-1]])).reshape(n, -1))
     v = np.vstack([*rows, (h.G @ Z).reshape(h.N * ng, Z.shape[2])])
     W = v[:, nx + nf :]
-    reference, target, given = _asked(h, terminal, targets, U[:, :, nx + nf :], Z[:, :, nx + nf :])
+    reference, target, given = _pull_of_targets(h, terminal, targets, U[:, :, nx + nf :], Z[:, :, nx + nf :])
     most = WELL_CONDITIONED if len(v) > n else INPUTS_ALONE
     chosen, deviation, hessian = _coordinates(W, n, coordinates, most)
     maps = Condensed(
@@ -306,7 +306,7 @@ def _of_model(maps: Condensed, h: Horizon, units: Units) -> Condensed:
     )
 
 
-def _asked(
+def _pull_of_targets(
     h: Horizon,
     terminal: Terminal,
     targets: Targets,

@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import Lifting, short
+from koopmpc.lifting.base import Lifting, strip_unit
 from koopmpc.values import Value
 
 SOFTENED = 1e-4  # a slack above this share of the size of its limit is reported
-LINEAR, QUADRATIC = 1e4, 1e2  # default weights of a slack as a share of the size of its limit, by the scale of the cost
+LINEAR = 1e4  # default linear weight of a slack as a share of its limit's size, times the scale of the cost
+QUADRATIC = 1e2  # the quadratic weight, in the same unit
 TIGHTEST = 0.2  # share of the range by which a limit is tightened at most
 _AHEAD = 5  # steps of an error band that tighten limits
 Slack = tuple[ArrayLike, ArrayLike]
@@ -196,7 +197,7 @@ class Limits(Value):
         said: list[str] = []
         for i in np.flatnonzero(capped.any(axis=0)).tolist():
             first = int(capped[:, i].argmax())
-            name = short(states[i]) if len(states) == len(cap) else f"state {i}"
+            name = strip_unit(states[i]) if len(states) == len(cap) else f"state {i}"
             said.append(
                 f"{name}: from step {first + 1} on the margin is {cap[i]:.4g}, {100 * share:.3g} % of the range, "
                 f"though the errors ask for up to {rows[:, i].max():.4g}"
@@ -226,7 +227,7 @@ class Limits(Value):
         size = np.where(np.isnan(half_width(box)), magnitude(box), half_width(box))
         return Softness(linear, quadratic, SOFTENED * np.where(size > 0, size, 1.0))
 
-    def sized(self, nx: int, ny: int, nu: int, sizes: Float[np.ndarray, " n"], scale: float) -> SizedLimits:
+    def find_sizes(self, nx: int, ny: int, nu: int, sizes: Float[np.ndarray, " n"], scale: float) -> SizedLimits:
         """Return all limits of a model with `nx` states, `ny` observables `of` (0 without one) and `nu` inputs.
 
         `sizes` are those of [x; of(x)], `scale` that of the cost, see `Sizes`.
@@ -271,7 +272,7 @@ class Limits(Value):
         return Interval(*(np.concatenate(each) for each in zip(self.states(nx), outputs, strict=True)))
 
 
-def ahead(margin: Float[np.ndarray, "K n"], N: int) -> Float[np.ndarray, "N n"]:
+def preview_margin(margin: Float[np.ndarray, "K n"], N: int) -> Float[np.ndarray, "N n"]:
     """Return the margins of the steps 1 … N."""
     return margin[np.minimum(np.arange(N), len(margin) - 1)]
 
@@ -290,12 +291,12 @@ def magnitude(box: Interval) -> Float[np.ndarray, " n"]:
     return np.maximum(low, high)
 
 
-def beyond(value: Float[np.ndarray, " n"], box: Interval) -> float:
+def measure_violation(value: Float[np.ndarray, " n"], box: Interval) -> float:
     """Return how far the value that is farthest outside its limits is outside; 0 where all are inside."""
     return float(np.maximum(box.low - value, value - box.high).max(initial=0.0))
 
 
-def admitted(
+def clip_input(
     u: Float[np.ndarray, " nu"], inputs: Interval, rates: Interval | None, last: Float[np.ndarray, " nu"]
 ) -> Float[np.ndarray, " nu"]:
     """Return the input inside its limits, and as far as they allow within a change inside `rates` from the last."""
@@ -335,7 +336,9 @@ def _prices(
     linear, quadratic = (np.broadcast_to(part, (n,)).copy() for part in parts)
     free = np.flatnonzero(linear + quadratic == 0)
     if free.size:
-        raise DataError(f"{name} has both weights zero at index {int(free[0])}; a limit that costs nothing is none")
+        raise DataError(
+            f"{name} has both weights zero at index {int(free[0])}; give one above zero, or remove the limit"
+        )
     return linear, quadratic
 
 

@@ -2,7 +2,9 @@
 
 import copy
 from collections.abc import Callable
+from dataclasses import dataclass
 from time import perf_counter
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -14,22 +16,29 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.horizon import horizon_of
-from koopmpc.control.limits import Interval, Limits, admitted
+from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
+from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.move import Fallback, Move, Status, Token, alone
+from koopmpc.control.program import LinearProgram, Published, SavedController, linear_parts, reference_table
 from koopmpc.control.riccati import Gain
-from koopmpc.control.target import Units, targets_of
+from koopmpc.control.solvers.daqp import DAQPSetup, daqp_settings
+from koopmpc.control.target import Targets, Units, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Measured
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Eigenfunction
+from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Buffered
 from koopmpc.predict.predictors import LinearPredictor
 
 _NOTHING = np.zeros(0)  # no measured disturbance moves an estimate here
 
 
-class FeedbackLaw:
+_Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
+
+
+class FeedbackLaw(Published):
     """What laws u(x) without a plan share: the limits of the inputs and of their changes, the last input, one thread.
 
     Parameters
@@ -45,13 +54,13 @@ class FeedbackLaw:
     horizon = 0  # no preview
 
     def __init__(self, dt: float, nx: int, inputs: Interval, rates: Interval | None) -> None:
-        self.dt, self.nu, self._nx, self._inputs, self._rates = dt, len(inputs.low), nx, inputs, rates
+        self.dt, self.nu, self._nx, self.inputs, self.rates = dt, len(inputs.low), nx, inputs, rates
         self._token: Token = [0]
         self._inside = 0
         FeedbackLaw.reset(self)
 
     def __copy__(self) -> "FeedbackLaw":
-        """Return a copy that shares nothing with this one that moves in a step."""
+        """Return a copy that shares no state with this one."""
         return copy.deepcopy(self)
 
     @alone
@@ -66,25 +75,73 @@ class FeedbackLaw:
             x0 or u_prev is of another length, or holds what is no finite number; pass None where it is not known.
         """
         checks.start(x0, self._nx)
-        zero = np.clip(np.zeros(self.nu), *self._inputs)
+        zero = np.clip(np.zeros(self.nu), *self.inputs)
         self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
 
-    def _got(self, applied: ArrayLike | None) -> None:
+    def take_applied(self, applied: ArrayLike | None) -> None:
         """Take the input that the plant really got for the last one, where it can be used."""
         if applied is not None:
             got = checks.array(applied, "applied", (self.nu,), finite=False)
             if (np.abs(got) < HUGE).all():
                 self._last = got
 
-    def _limited(self, free: Float[np.ndarray, " nu"] | None, start: float) -> Move:
+    def limit_input(self, free: Float[np.ndarray, " nu"] | None, start: float) -> Move:
         """Return the input inside its limits; None, where nothing is known, is answered by the last one."""
         if free is None:
-            self._last = admitted(self._last, self._inputs, self._rates, self._last)
+            self._last = clip_input(self._last, self.inputs, self.rates, self._last)
             return Move(self._last.copy(), Status.BAD_MEASUREMENT, Fallback.HOLD, perf_counter() - start, 0)
-        u = admitted(free, self._inputs, self._rates, self._last)
+        u = clip_input(free, self.inputs, self.rates, self._last)
         status = Status.UNCONSTRAINED if (u == free).all() else Status.SATURATED
         self._last = u
         return Move(u.copy(), status, Fallback.NONE, perf_counter() - start, 0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FeedbackProgram(LinearProgram):
+    """u = feedforward [w; r; u_r] − K ψ(ζ) − K_rate u_{k−1}, clipped to the limits of changes and of inputs.
+
+    Attributes
+    ----------
+    K, K_rate
+        (nu, nz), and (nu, nu) where changes of the inputs are weighed, else (nu, 0).
+    feedforward
+        (nu, nw + nr + nu).
+    """
+
+    K: Float[np.ndarray, "nu _"]
+    K_rate: Float[np.ndarray, "nu _"]
+    feedforward: Float[np.ndarray, "nu _"]
+
+
+def feedback_program(
+    controller: object,
+    predictor: LinearPredictor,
+    targets: Targets,
+    inputs: Interval,
+    rates: Interval | None,
+    reference: Float[np.ndarray, "rows nr"],
+    K: Float[np.ndarray, "nu nz"],
+    feedforward: Float[np.ndarray, "nu n"],
+    *,
+    K_rate: Float[np.ndarray, "nu m"] | None = None,
+    given: Float[np.ndarray, "k nu"] | None = None,
+) -> FeedbackProgram:
+    """Return the Program of u = feedforward [w; r; u_r] − K ψ(ζ) − K_rate u_{k−1}; see `FeedbackProgram`."""
+    parts = linear_parts(predictor, targets)
+    solvers: tuple[DAQPSetup, ...] = parts["target_solvers"]
+    return FeedbackProgram(
+        controller=type(controller).__name__,
+        **parts,
+        inputs=inputs,
+        rates=rates,
+        given=given,
+        reference=reference,
+        gain=-K,
+        settings=solvers[0].settings if solvers else daqp_settings(),
+        K=K,
+        K_rate=np.zeros((len(K), 0)) if K_rate is None else K_rate,
+        feedforward=feedforward,
+    )
 
 
 class LQR(FeedbackLaw):
@@ -144,9 +201,34 @@ class LQR(FeedbackLaw):
         self._row = 0  # of a given u_target, for the next call
         super().__init__(predictor.dt, predictor.nx, track.inputs, track.rates)
 
+    def as_data(self) -> SavedController:
+        """Return what the controller was made of."""
+        return SavedController("LQR", self.predictor, self.cost, self.limits)
+
+    @classmethod
+    def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
+        """Return the controller that is made of these data."""
+        build: Any = cls
+        return build(saved.model, saved.cost, saved.limits, **saved.options)
+
+    def build_program(self, reference: ArrayLike | None) -> FeedbackProgram:
+        """Return the data of a step."""
+        return feedback_program(
+            self,
+            self.predictor,
+            self._targets,
+            self.inputs,
+            self.rates,
+            reference_table(reference, self._nr),
+            self._K,
+            self._v,
+            K_rate=self._K_rate,
+            given=self._given_rows,
+        )
+
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Set the last input, zero inside the limits by default; rows of a given u_target start anew."""
+        """Set the last input, zero inside the limits by default; rows of a given u_target start at the first."""
         self._observer.reset()
         self._row = 0
         super().reset(x0, u_prev)
@@ -173,12 +255,12 @@ class LQR(FeedbackLaw):
             self._reference_key = key
         if self._given_rows is not None and self._row + 1 < len(self._given_rows):
             self._row += 1
-        self._got(applied)
+        self.take_applied(applied)
         self._observer.observe(x, self._last, _NOTHING)
         free = self._feedforward - self._K @ self._observer.z
         if self._K_rate.size:
             free -= self._K_rate @ self._last
-        return self._limited(free if (np.abs(free) < HUGE).all() else None, start)
+        return self.limit_input(free if (np.abs(free) < HUGE).all() else None, start)
 
     def _disturbance(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, " nw"]:
         """Return w of this step, NaN where it cannot be."""
@@ -342,7 +424,7 @@ class EigenfunctionLQR(FeedbackLaw):
                 f"the eigenfunction has {eigenfunction.nz} observables ({', '.join(eigenfunction.names)}); pass a real"
                 " one: of a complex φ, |φ|² is a real eigenfunction of 2 Re λ, to be found with eigenvalue=2 Re λ"
             )
-        self.eigenfunction, self.cost, self.limits = eigenfunction, cost, limits
+        self.eigenfunction, self.cost, self.limits, self._B = eigenfunction, cost, limits, B
         if eigenvalue is None:
             if not isinstance(eigenfunction, Eigenfunction):
                 raise DataError("eigenvalue is missing; pass that of the observable, 0 for a conserved quantity")
@@ -367,6 +449,35 @@ class EigenfunctionLQR(FeedbackLaw):
         self._read = Buffered(ca.Function("u", [x, aim], [both], {"cse": True}))
         sized = Limits() if limits is None else limits
         super().__init__(checks.positive(dt, "dt", "s"), x.numel(), sized.inputs(nu), sized.rates(nu))
+
+    def as_data(self) -> SavedController:
+        """Return what the controller was made of; a function B becomes its graph.
+
+        Raises
+        ------
+        DataError
+            B holds an operation that cannot be written as data.
+        """
+        x, B = ca.SX.sym("x", self._nx), self._B
+        if callable(B):
+            B = Graph.trace(ca.Function("B", [x], [ca.densify(ca.vec(ca.SX(B(x))))], {"cse": True}))
+        options = {"eigenfunction": self.eigenfunction, "dt": self.dt, "B": B, "eigenvalue": self._rate}
+        return SavedController("EigenfunctionLQR", None, self.cost, self.limits, options=options)
+
+    @classmethod
+    def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
+        """Return the controller that is made of these data."""
+        options = dict(saved.options)
+        graph = options["B"]
+        if isinstance(graph, Graph):
+            nx = graph.n
+
+            def B(x: ca.SX) -> ca.SX:
+                return ca.SX(ca.reshape(graph.symbolic(x), nx, -1))
+
+            options["B"] = B
+        build: Any = cls
+        return build(options.pop("eigenfunction"), saved.cost, saved.limits, **options)
 
     def _effect(self, x: ca.SX, B: ArrayLike | Callable[[ca.SX], ca.SX] | None) -> ca.SX:
         """Return β(x), (1, nu)."""
@@ -406,6 +517,28 @@ class EigenfunctionLQR(FeedbackLaw):
         start = perf_counter()
         x = checks.array(y, "y", (len(self.eigenfunction.bound_states),), finite=False)
         aim = float(checks.reference_rows(checks.numbers(reference, "reference"), 0, 1)[0, 0])
-        self._got(applied)
+        self.take_applied(applied)
         both = self._read(x, np.array([aim]))[0]
-        return self._limited(both[1:] if (np.abs(both) < HUGE).all() and abs(aim) < HUGE else None, start)
+        return self.limit_input(both[1:] if (np.abs(both) < HUGE).all() and abs(aim) < HUGE else None, start)
+
+
+register_controller(
+    ControllerKind(
+        LQR,
+        bench=(
+            BenchEntry(
+                "lqr",
+                "Linear feedback on your equations, linearised at the equilibrium, cut to the input limits.",
+                "equations",
+                lambda parts, limits: LQR(parts.local_model, parts.problem.cost, limits),
+            ),
+            BenchEntry(
+                "koopman-lqr",
+                "Linear feedback on the linear lifted model that was learned from data, cut to the input limits.",
+                "linear",
+                lambda parts, limits: LQR(parts.model, parts.problem.cost, limits),
+            ),
+        ),
+    )
+)
+register_controller(ControllerKind(EigenfunctionLQR))

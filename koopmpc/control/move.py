@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import wraps
 from threading import get_ident
-from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc.errors import ThreadError
@@ -23,8 +23,8 @@ Token = list[int]
 class Status(Enum):
     """How a step ended.
 
-    The first four are as intended; the others come with a Fallback, but for TIME_LIMIT, where an answer that was found
-    too late is used all the same: its Fallback is NONE.
+    The first four are regular. The others come with a Fallback; only with TIME_LIMIT it may be NONE: an answer that was
+    found too late is used.
     """
 
     UNCONSTRAINED = 0  # the unconstrained optimum meets every limit
@@ -39,13 +39,13 @@ class Status(Enum):
 
 
 class Fallback(Enum):
-    """What replaced the answer of a failed step; always inside the input limits."""
+    """The input that replaces the answer of a failed step; always inside the input limits."""
 
     NONE = 0
     SHIFTED_PLAN = 1  # the last good plan, moved on by one step
     CLIPPED_LQR = 2  # the unconstrained optimum, clipped to the input limits
     HOLD = 3  # the last input again
-    OTHER_CONTROLLER = 4  # the move of the controller that stands by where the model does not know
+    OTHER_CONTROLLER = 4  # the move of the standby controller, where the model does not know the step
 
 
 @dataclass(slots=True)
@@ -57,7 +57,7 @@ class Move:
     u
         (nu,) input to apply, a fresh array.
     status, fallback
-        How it came about.
+        How the step ended.
     solve_time
         Wall-clock time of the whole step, from y to u [s].
     iterations
@@ -65,10 +65,10 @@ class Move:
     slack
         How far the plan breaks the soft limit, or the rate, that gives way most, in its own unit; 0 but for SOFTENED.
     solver
-        Whose answer it is where several may solve a step: "osqp" or "daqp", the last asked where none had one.
+        Name of the QP solver that answered, "osqp" or "daqp"; if none did, of the last one that was asked.
     known
-        Whether state and input lie where the data of the model were, and what came is what it predicted; None where
-        the controller has no monitor.
+        Whether the step is like the data of the model: state and input inside their region, the measurement as
+        predicted. None without a monitor.
     """
 
     u: Float[np.ndarray, " nu"]
@@ -81,16 +81,6 @@ class Move:
     known: bool | None = None
 
 
-class WholeRun(NamedTuple):
-    """The steps of a run that a controller has made at once: numbers of Status and Fallback, and the rest of a Move."""
-
-    status: Int[np.ndarray, " T"]
-    fallback: Int[np.ndarray, " T"]
-    iterations: Int[np.ndarray, " T"]
-    slack: Float[np.ndarray, " T"]
-    solve_time: Float[np.ndarray, " T"]
-
-
 @dataclass(frozen=True, eq=False)
 class Plan(Value):
     """The plan behind a Move: X (N+1, nx) from the measured state on, U (N, nu) with U[0] the move."""
@@ -101,10 +91,10 @@ class Plan(Value):
 
 @runtime_checkable
 class Fallible(Protocol):
-    """A controller whose solver can be made to fail, to see what it does then."""
+    """A controller whose solver can be made to fail, for tests of its fallback."""
 
     solver_fails: bool
-    """While True, the solver runs, but its answer is lost and the step is FAILED."""
+    """While it is True, the answer of the solver is dropped and the step is FAILED."""
 
 
 @runtime_checkable
@@ -150,19 +140,19 @@ class Controller(Protocol):
 
 
 def busy(controller: object) -> ThreadError:
-    """Return the error of a thread that found another one inside."""
+    """Return the error for a second thread that enters a controller."""
     name = type(controller).__name__
     return ThreadError(f"two threads entered one {name} at once; give each thread a copy: copy.copy(controller)")
 
 
 def alone(method: TurnTaker) -> TurnTaker:
-    """Return the method so that it raises ThreadError while another thread is in a method of the same object.
+    """Let a method raise ThreadError while another thread is in a method of the same object.
 
     Methods of one thread may call each other.
     """
 
     @wraps(method)
-    def entered(self: Any, *arguments: Any, **options: Any) -> Any:
+    def enter(self: Any, *arguments: Any, **options: Any) -> Any:
         me = get_ident()
         if self._inside == me:
             return method(self, *arguments, **options)
@@ -180,4 +170,4 @@ def alone(method: TurnTaker) -> TurnTaker:
             self._inside = 0
             self._token.append(held)
 
-    return cast("TurnTaker", entered)
+    return cast("TurnTaker", enter)

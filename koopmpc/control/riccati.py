@@ -6,13 +6,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
 from scipy.linalg.lapack import dgesv, dpotrf, dpotrs
 
 from koopmpc.checks import root
 from koopmpc.errors import DataError, DefinitenessError
 
-DIGITS, LOST = 1e-9, 1e-6  # what a step may lose of P; by how much of its size P may be indefinite
+DIGITS = 1e-9  # use the root of P if a step may lose more than this share of P
+LOST = 1e-6  # use the root of P if P is indefinite by more than this share of its size
 SETTLED = 1e-9  # the gain of the difference equation has settled when it moves by less, relative to its size
 RESTS = 50  # steps for which it must have settled, at most
 LARGEST = 1e12  # growth of P over Q at which an unstable uncontrollable mode has taken over
@@ -72,23 +73,25 @@ def recursion(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Flo
 
     K = S⁻¹(BᵀPA + Mᵀ), v = −S⁻¹g, g = Bᵀ(p + P e) + r; P ← Q + AᵀPA − KᵀSK, p ← q + Aᵀ(p + P e) − Kᵀg.
 
-    A step loses eps ‖A‖² of the digits of P, in balanced units. Where this is more than 1e-9, as with models whose
-    observables are almost dependent, or where P has lost its definiteness, the same law is found by `rooted`, which
-    loses eps ‖A‖ and takes ten times as long.
+    A step loses eps ‖A‖² of the digits of P, in balanced units. If this is more than 1e-9, as with models whose
+    observables are almost dependent, or if P has lost its definiteness, the same recursion goes backwards on a root F
+    of P = FᵀF (`step_root`): it loses eps ‖A‖ and takes ten times as long.
 
     Raises
     ------
     DefinitenessError
         R + BᵀPB is not positive definite at some stage, in exact arithmetic.
+    DataError
+        The model's forecast overflows within the horizon.
     """
     if np.finfo(float).eps * max(map(_growth, {id(stage.A): stage.A for stage in stages}.values())) ** 2 < DIGITS:
         try:
-            law = _plain(stages, P_N, p_N)
+            law = sweep_backwards(stages, P_N, p_N, rooted=False)
         except DefinitenessError:
-            return rooted(stages, P_N, p_N)
+            return sweep_backwards(stages, P_N, p_N, rooted=True)
         if _semidefinite(law.P):
             return law
-    return rooted(stages, P_N, p_N)
+    return sweep_backwards(stages, P_N, p_N, rooted=True)
 
 
 def _growth(A: Float[np.ndarray, "nx nx"]) -> float:
@@ -96,19 +99,33 @@ def _growth(A: Float[np.ndarray, "nx nx"]) -> float:
     return float(np.linalg.norm(np.asarray(scipy.linalg.matrix_balance(A, permute=False)[0])))
 
 
-def _plain(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[np.ndarray, "nx nf"]) -> Law:
+@np.errstate(over="ignore", invalid="ignore")
+def sweep_backwards(
+    stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[np.ndarray, "nx nf"], *, rooted: bool
+) -> Law:
+    """Return the law by one sweep backwards, on P or on its root."""
     nx, nu = stages[0].B.shape
     N = len(stages)
     K, L, v = np.empty((N, nu, nx)), np.empty((N, nu, nu)), np.empty((N, nu, p_N.shape[1]))
-    P, p = P_N, p_N
+    P, p = root(P_N) if rooted else P_N, p_N
+    costs = {id(stage): root(_joint(stage)) for stage in stages} if rooted else {}
     for k in range(N - 1, -1, -1):
         A, B, _, _, _, e, q, r = stages[k]
-        p = p if e is None else p + P @ e
-        K[k], L[k], P = step(stages[k], P)
+        if e is not None:
+            p = p + (P.T @ (P @ e) if rooted else P @ e)
+        if rooted:
+            try:
+                K[k], L[k], P = step_root(stages[k], P, costs[id(stages[k])])
+            except OverflowError:
+                raise DataError(
+                    f"the model's forecast overflows within {N - k} steps; fit it again, or take a shorter horizon"
+                ) from None
+        else:
+            K[k], L[k], P = step(stages[k], P)
         g = B.T @ p if r is None else B.T @ p + r
-        v[k] = -solved(L[k], g)
+        v[k] = -solve_factored(L[k], g)
         p = A.T @ p - K[k].T @ g if q is None else q + A.T @ p - K[k].T @ g
-    return Law(K, L, v, P, p)
+    return Law(K, L, v, P.T @ P if rooted else P, p)
 
 
 def _semidefinite(P: Float[np.ndarray, "nx nx"]) -> bool:
@@ -119,9 +136,10 @@ def _semidefinite(P: Float[np.ndarray, "nx nx"]) -> bool:
     return bool(np.linalg.eigvalsh(P / np.outer(size, size)).min(initial=0.0) > -LOST)
 
 
-@np.errstate(over="ignore", invalid="ignore")
-def rooted(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[np.ndarray, "nx nf"]) -> Law:
-    """Return the law of `recursion` by orthogonal transformations of a root F of P = FᵀF, which is ⪰ 0 by construction.
+def step_root(
+    stage: Stage, F: Float[np.ndarray, "m nx"], cost: Float[np.ndarray, "n n"]
+) -> tuple[Float[np.ndarray, "nu nx"], Float[np.ndarray, "nu nu"], Float[np.ndarray, "k nx"]]:
+    """Return K, L and F of the stage before, P = FᵀF ⪰ 0 by construction; `cost` is a root of the stage's weight.
 
     With a root [W_u W_x] of the stage cost, the triangular factor of [W_u W_x; F B  F A] is [Lᵀ LᵀK; 0 F] of the stage
     before. It is the same to rounding whatever the units of x and u are.
@@ -129,44 +147,30 @@ def rooted(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Float[
     Raises
     ------
     DefinitenessError
-        R + BᵀPB is not positive definite at some stage.
-    DataError
-        The model grows so fast that its cost is no number.
+        R + BᵀPB is not positive definite.
+    OverflowError
+        The model's forecast overflows.
 
     References
     ----------
     Kailath, Sayed & Hassibi, "Linear Estimation", 2000, chapter 12: array algorithms.
     """
-    nx, nu = stages[0].B.shape
-    N = len(stages)
-    K, L, v = np.empty((N, nu, nx)), np.empty((N, nu, nu)), np.empty((N, nu, p_N.shape[1]))
-    F, p = root(P_N), p_N
-    costs = {id(stage): root(_joint(stage)) for stage in stages}
-    for k in range(N - 1, -1, -1):
-        A, B, _, _, _, e, q, r = stages[k]
-        rows = np.vstack([costs[id(stages[k])], np.hstack([F @ B, F @ A])])
-        size = np.sqrt(np.einsum("ij,ij->j", rows, rows))
-        if not np.isfinite(size).all():
-            raise DataError(
-                f"the model grows beyond all numbers in {N - k} steps; fit it anew, or take a shorter horizon"
-            )
-        size[size == 0] = 1.0
-        T = np.asarray(np.linalg.qr(rows / size, mode="r"))
-        if (np.abs(T.diagonal()[:nu]) <= nx * np.finfo(float).eps).any():
-            raise DefinitenessError(
-                "R + BᵀPB is not positive definite: some change of the inputs costs nothing; raise R, or weight a state"
-                " that every input moves"
-            )
-        T = np.where(T.diagonal() < 0, -1.0, 1.0)[:, None] * T * size
-        upper = T[:nu, :nu]
-        K[k], L[k] = scipy.linalg.solve_triangular(upper, T[:nu, nu:]), upper.T
-        p = p if e is None else p + F.T @ (F @ e)
-        g = B.T @ p if r is None else B.T @ p + r
-        v[k] = -solved(np.asfortranarray(L[k]), g)
-        p = (A - B @ K[k]).T @ p if r is None else (A - B @ K[k]).T @ p - K[k].T @ r
-        p = p if q is None else p + q
-        F = T[nu:, nu:]
-    return Law(K, L, v, F.T @ F, p)
+    nx, nu = stage.B.shape
+    rows = np.vstack([cost, np.hstack([F @ stage.B, F @ stage.A])])
+    size = np.sqrt(np.einsum("ij,ij->j", rows, rows))
+    if not np.isfinite(size).all():
+        raise OverflowError
+    size[size == 0] = 1.0
+    T = np.asarray(np.linalg.qr(rows / size, mode="r"), dtype=np.float64)
+    if (np.abs(T.diagonal()[:nu]) <= nx * np.finfo(float).eps).any():
+        raise DefinitenessError(
+            "R + BᵀPB is not positive definite: some change of the inputs costs nothing; raise R, or weight a state"
+            " that every input moves"
+        )
+    T = np.asarray(np.where(T.diagonal() < 0, -1.0, 1.0)[:, None] * T * size, dtype=np.float64)
+    upper: np.ndarray = T[:nu, :nu]
+    right: np.ndarray = T[:nu, nu:]
+    return np.asarray(solve_triangular(upper, right)), upper.T, T[nu:, nu:]
 
 
 def _joint(stage: Stage) -> Float[np.ndarray, "n n"]:
@@ -180,14 +184,16 @@ def step(
 ) -> tuple[Float[np.ndarray, "nu nz"], Float[np.ndarray, "nu nu"], Float[np.ndarray, "nz nz"]]:
     """Return K, L and P of the stage before: P ← Q + AᵀPA − KᵀSK."""
     A, B, Q, M = stage.A, stage.B, stage.Q, stage.M
-    K, L = gain(stage, P)
+    K, L = find_gain(stage, P)
     P = Q + A.T @ (P @ (A - B @ K))
     if M is not None:
         P = P - M @ K
     return K, L, 0.5 * (P + P.T)
 
 
-def gain(stage: Stage, P: Float[np.ndarray, "nz nz"]) -> tuple[Float[np.ndarray, "nu nz"], Float[np.ndarray, "nu nu"]]:
+def find_gain(
+    stage: Stage, P: Float[np.ndarray, "nz nz"]
+) -> tuple[Float[np.ndarray, "nu nz"], Float[np.ndarray, "nu nu"]]:
     """Return K = S⁻¹(BᵀPA + Mᵀ) and the L of S = R + BᵀPB = L Lᵀ."""
     A, B, M = stage.A, stage.B, stage.M
     BP = B.T @ P
@@ -199,10 +205,10 @@ def gain(stage: Stage, P: Float[np.ndarray, "nz nz"]) -> tuple[Float[np.ndarray,
             f"R + BᵀPB is not positive definite: its least eigenvalue is {least:.3g}; raise R, or weight a state"
             " that every input moves"
         )
-    return solved(L, BP @ A if M is None else BP @ A + M.T), L
+    return solve_factored(L, BP @ A if M is None else BP @ A + M.T), L
 
 
-def solved(L: Float[np.ndarray, "nu nu"], right: Float[np.ndarray, "nu n"]) -> Float[np.ndarray, "nu n"]:
+def solve_factored(L: Float[np.ndarray, "nu nu"], right: Float[np.ndarray, "nu n"]) -> Float[np.ndarray, "nu n"]:
     """Return S⁻¹ right for S = L Lᵀ; LAPACK itself, for SciPy's own checks take ten times as long."""
     return np.ascontiguousarray(dpotrs(L, right, lower=1)[0])
 
@@ -242,7 +248,7 @@ def leap(stage: Stage, most: int) -> tuple[Float[np.ndarray, "nz nz"], int]:
     """
     A, B, Q = stage.A, stage.B, stage.Q
     K, L, P = step(stage, Q)
-    H, G, Phi, taken = P - Q, B @ solved(L, B.T), A - B @ K, 1
+    H, G, Phi, taken = P - Q, B @ solve_factored(L, B.T), A - B @ K, 1
     nz, one = len(A), np.eye(len(A))
     large = LEAPT * max(1.0, float(abs(Phi).max()))
     while 2 * taken < most:
@@ -254,7 +260,7 @@ def leap(stage: Stage, most: int) -> tuple[Float[np.ndarray, "nz nz"], int]:
         if info or not abs(Phi).max() <= large:
             break
         H, G, taken = H + new, G + 0.5 * (G_new + G_new.T), 2 * taken
-        K_last, K = K, gain(stage, Q + H)[0]
+        K_last, K = K, find_gain(stage, Q + H)[0]
         if abs(K - K_last).max() <= SETTLED * abs(K).max():
             break
     return Q + H, taken

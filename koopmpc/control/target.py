@@ -11,13 +11,14 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost, LiftedTracking, Sizes
 from koopmpc.control.limits import Interval, magnitude
 from koopmpc.control.move import Status
-from koopmpc.control.solvers.base import QP, QPSolver
+from koopmpc.control.solvers import FINISHER
+from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.predict.predictors import LinearPredictor
 
 TOLERANCE = 1e-8  # singular values of [A − I, B] below this share of the largest span the equilibria
 ROUNDING = 1e-9  # by how much of its value and its limit a target may stand outside before it is moved
-KEPT = 10_000  # coordinates remembered before the memory starts anew
+KEPT = 10_000  # coordinates kept in memory; it is cleared beyond
 _SHARES = (1.0, 0.7, 0.45)  # of the states' sizes at which observables are read for theirs
 _LEAST = 1e-150  # what an observable that vanishes there is smaller than
 
@@ -48,7 +49,7 @@ class Targets:
     weighted: Float[np.ndarray, "nr na"]
     from_disturbance: Float[np.ndarray, "na nz"]
     _known: dict[bytes, Float[np.ndarray, " na"]] = field(default_factory=dict[bytes, Float[np.ndarray, " na"]])
-    _solvers: dict[int, QPSolver] = field(default_factory=dict[int, QPSolver])
+    _solvers: dict[int, DAQP] = field(default_factory=dict[int, DAQP])
 
     def nearest(
         self, R: Float[np.ndarray, "T nr"], e: Float[np.ndarray, " nz"] | None = None
@@ -82,7 +83,7 @@ class Targets:
         """Return the nearest α inside all limits, or inside the input limits where there is none."""
         moved = self.rows @ alpha
         for count in (len(self.rows), self.hard):
-            solver = self._solver(count)
+            solver = self.solver(count)
             solver.reset()
             solver.set_bounds(low[:count] - moved[:count], high[:count] - moved[:count])
             solution = solver.solve(np.zeros(len(alpha)), np.zeros(count))
@@ -90,7 +91,7 @@ class Targets:
                 return alpha + solution.v
         return np.zeros_like(alpha)
 
-    def _solver(self, count: int) -> QPSolver:
+    def solver(self, count: int) -> DAQP:
         """Return the solver of ‖weighted β‖² → min within limits on the first `count` rows of β."""
         if count not in self._solvers:
             # H of trace 1: the tolerance is relative to the weight, and cost in other units has the same target
@@ -98,7 +99,7 @@ class Targets:
             H = H / max(float(np.trace(H)), 1e-300) + 1e-9 * np.eye(len(H))
             free = np.full(count, np.inf)
             qp = QP(H, np.zeros(len(H)), self.rows[:count], -free, free)
-            self._solvers[count] = DAQP(qp)
+            self._solvers[count] = FINISHER(qp)
         return self._solvers[count]
 
 

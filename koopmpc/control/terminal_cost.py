@@ -18,10 +18,10 @@ from koopmpc.control.riccati import (
     SETTLED,
     Stage,
     controllable,
-    gain,
+    find_gain,
     one_step,
     recursion,
-    solved,
+    solve_factored,
     stationary,
     step,
 )
@@ -30,15 +30,18 @@ from koopmpc.errors import DefinitenessError, ShapeError
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import LinearPredictor
 
-ITERATIONS = 10_000  # steps after which a tail that shall rest ends, rested or not
+ITERATIONS = 10_000  # end an infinite tail after this many steps, settled or not
 EXACT = 1e-14  # the feedforward rests when it moves by less, relative to its size
 GROWS = 1 + 1e-5  # modulus beyond which a mode grows: two integrators in a row come out as 1 ± 1e-8, three as 1 ± 1e-5
 APART = 1e6  # entries of the eigenvectors' transform up to which modes can be told apart
-AXES, FARTHEST = 8, 20.0  # of trial loops: axes of starts, standard deviations that states go
+AXES = 8  # trial loops start along this many principal axes of the states
+FARTHEST = 20.0  # states of trial loops stay within this many standard deviations
 ALIKE = 0.01  # share of a law, over the data, by which others may differ and need no trial
-LATE, WORTH = 0.5, 0.005  # steps that an input comes late; share that a trial loop with a shorter tail may cost more
-LITTLE = 1e-3  # share of that which a step may cost when a trial loop is at rest
-AHEAD, SHORT = 10, 20  # horizons of a trial loop, and within which a gain is to rest; the least N that counts there
+LATE = 0.5  # in trial loops an input acts this many steps late
+WORTH = 0.005  # accept a shorter tail if its trial loop costs at most this share more
+LITTLE = 1e-3  # a trial loop rests if a step costs at most this share of WORTH
+AHEAD = 10  # a trial loop lasts this many horizons, and a gain must rest within them
+SHORT = 20  # a horizon counts there as at least this many steps
 
 
 def terminal_of(
@@ -82,7 +85,7 @@ def _given(predictor: LinearPredictor, cost: Cost, h: Horizon, targets: Targets)
     Q_N = np.asarray(cost.Q_N)
     (nz, nu), nx = h.B.shape, predictor.nx
     own = len(Q_N) if Q_N.ndim else nx
-    on_state = own == nx and isinstance(cost.of, State) and cost.of.whole
+    on_state = own == nx and isinstance(cost.of, State) and cost.of.selects_all
     if own == nx != nz and not on_state:
         raise ShapeError(f"Q_N ({nx}, {nx}) weighs x_N − r_N, but the reference is not of the state; pass ({nz}, {nz})")
     if own not in (nx, nz):
@@ -129,9 +132,9 @@ def tail_stage(
 
     The known signals are g = [e; r; u_r], held from step to step. With R_delta the step is on [z; u_{k−1}] and
     ‖u − u_{k−1}‖²_{R_delta} is added.
-    Modes that grow and that no input moves are kept from growing, see `held`.
+    Modes that grow and that no input moves are kept from growing, see `stop_growing_modes`.
     """
-    plain = one_step(held(A, B), B, C.T @ Q @ C, R, R_delta)
+    plain = one_step(stop_growing_modes(A, B), B, C.T @ Q @ C, R, R_delta)
     (nz, ne), nr, (n, nu) = D.shape, len(C), plain.B.shape
     e, q, r = np.zeros((n, ne + nr + nu)), np.zeros((n, ne + nr + nu)), np.zeros((nu, ne + nr + nu))
     e[:nz, :ne] = D
@@ -158,9 +161,9 @@ def tail_of(stage: Stage, steps: int | None) -> Tail:
         law = recursion([stage] * max(steps, 1), last, q)
         return Tail(law.P, law.p, law.K[0], law.v[0]) if steps else Tail(last, q, law.K[0], law.v[0])
     P = stationary(stage, ITERATIONS).P
-    K, L = gain(stage, P)
+    K, L = find_gain(stage, P)
     p = _resting(A - B @ K, q + (A - B @ K).T @ (P @ e) - K.T @ r, B)
-    return Tail(P, p, K, -solved(L, B.T @ (p + P @ e) + r))
+    return Tail(P, p, K, -solve_factored(L, B.T @ (p + P @ e) + r))
 
 
 def learned_steps(
@@ -329,7 +332,7 @@ def _resting(
     return p
 
 
-def held(A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"]) -> Float[np.ndarray, "nz nz"]:
+def stop_growing_modes(A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"]) -> Float[np.ndarray, "nz nz"]:
     """Return A with every eigenvalue |λ| > 1 of a mode that no input moves replaced by λ/|λ|.
 
     Beyond the horizon such a mode stays as large as it is at its end; its growth, which no input can answer, would
@@ -345,11 +348,11 @@ def held(A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"]) -> Float[
     unmoved = U.T @ balanced @ U
     if np.abs(np.linalg.eigvals(unmoved)).max() <= GROWS:
         return A
-    change = U @ (_stilled(unmoved) - unmoved) @ U.T
+    change = U @ (_scale_to_unit_circle(unmoved) - unmoved) @ U.T
     return A + size[:, None] * change / size
 
 
-def _stilled(A: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+def _scale_to_unit_circle(A: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Return A with its eigenvalues beyond 1 scaled back to 1, all other modes as they were.
 
     Where the two groups of modes cannot be told apart by their eigenvectors, the others are no longer pushed as much.

@@ -6,10 +6,10 @@ from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
     from koopmpc.data.episodes import Snapshots as Snapshots
+    from koopmpc.data.files.folder import Files as Files
     from koopmpc.data.smoother import Mender as Mender
     from koopmpc.data.smoother import Smoother as Smoother
     from koopmpc.data.source import Source as Source
     from koopmpc.data.source import Stream as Stream
-    from koopmpc.data.storage import Files as Files
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -12,7 +12,7 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Excitation, OpenLoop, Policy
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.plants.plant import Plant, reading, require_plant
+from koopmpc.plants.plant import Plant, read_measurement, require_plant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.values import Value, freeze
 
@@ -120,10 +120,10 @@ def _drive(
     """Run one episode of a plant that holds its state, until the plant ends it."""
     ny = len(plant.outputs)
     Y, U = np.empty((steps + 1, ny)), np.empty((steps, len(plant.inputs)))
-    Y[0] = reading(plant.reset(x0, rng), ny, 0)
+    Y[0] = read_measurement(plant.reset(x0, rng), ny, 0)
     for k in range(steps):
         U[k] = policy(k, Y[k])
-        Y[k + 1] = reading(plant.step(U[k]), ny, k + 1)
+        Y[k + 1] = read_measurement(plant.step(U[k]), ny, k + 1)
         _finite(Y[None, k + 1 : k + 2], e, k + 1)
         if getattr(plant, "ended", ""):
             return Episode(X=Y[: k + 2], U=U[: k + 1])

@@ -1,19 +1,79 @@
 """Episodes: what a plant did, run by run, and the snapshots that a fit reads from them."""
 
+import csv
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from math import isclose
 from os import PathLike
+from pathlib import Path
 from typing import cast, overload
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.values import Named, Value, freeze
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """Where the rows of an episode stand in a table, for messages.
+
+    Attributes
+    ----------
+    file
+        Path of the table.
+    states
+        Names of its states.
+    numbers
+        (K,) number of each row of the table that was read, 1 for the first one.
+    X
+        (K, nx) states in these rows.
+    at
+        (T+1,) index into them for each row of the episode; after resampling, of the row at or before it.
+    resampled
+        Whether a row of the episode lies between two rows of the table.
+    """
+
+    file: str
+    states: tuple[str, ...]
+    numbers: Int[np.ndarray, " K"]
+    X: Float[np.ndarray, "K nx"]
+    at: Int[np.ndarray, " rows"]
+    resampled: bool
+
+    def cut(self, first: int, last: int) -> "Origin":
+        """Return the origin of rows first … last − 1 of the episode."""
+        return replace(self, at=self.at[first:last])
+
+    def locate(self, row: int, state: str, sound: float) -> tuple[int, float]:
+        """Return the number and the value of the row that a row of the episode comes from.
+
+        Of the two rows that a resampled one lies between it is the one whose state is farther from `sound`.
+        """
+        first = int(self.at[row])
+        column = self.X[first : first + 1 + self.resampled, self.states.index(state)]
+        worst = int(np.argmax(np.abs(column - sound)))
+        return int(self.numbers[first + worst]), float(column[worst])
+
+    def place(self, first: int, last: int | None = None) -> str:
+        """Return file and lines of the rows with these numbers: lines as an editor shows them, else rows."""
+        numbers = [first] if last is None or last == first else [first, last]
+        unit = "row"
+        if self.file.endswith(".csv"):
+            unit, numbers = "line", [self._line(number) for number in numbers]
+        return f"{self.file}, {unit}{'s' * (len(numbers) > 1)} {' to '.join(map(str, numbers))}"
+
+    def _line(self, number: int) -> int:
+        """Return the line of a row of a .csv file, below comments, the names of columns and empty lines."""
+        with Path(self.file).open(newline="", encoding="utf-8", errors="replace") as stream:
+            lines = csv.reader(stream)
+            rows = (lines.line_num for cells in lines if cells and not cells[0].startswith("#"))
+            return next(islice(rows, number, None))
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -28,6 +88,8 @@ class Episode(Value):
         (T, nu); without it the plant is autonomous and nu is 0.
     W
         (T, nw) disturbances w_0 … w_{T−1} that were measured; without it nw is 0.
+    origin
+        Where the rows stand in a table; neither saved nor compared.
 
     Raises
     ------
@@ -48,8 +110,16 @@ class Episode(Value):
     U: Float[np.ndarray, "T nu"]
     X: Float[np.ndarray, "T+1 nx"]
     W: Float[np.ndarray, "T nw"]
+    origin: Origin | None = field(compare=False, repr=False)
 
-    def __init__(self, *, X: ArrayLike, U: ArrayLike | None = None, W: ArrayLike | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        X: ArrayLike,
+        U: ArrayLike | None = None,
+        W: ArrayLike | None = None,
+        origin: Origin | None = None,
+    ) -> None:
         states = checks.array(X, "X", (None, None))
         if len(states) == 0:
             raise ShapeError("X has no row; an episode holds x_0 at least")
@@ -62,11 +132,20 @@ class Episode(Value):
         disturbances = np.empty((len(inputs), 0)) if W is None else checks.array(W, "W", (None, None))
         if len(disturbances) != len(inputs):
             raise ShapeError(f"W has {len(disturbances)} rows and U {len(inputs)}; both have one a step")
-        freeze(self, U=inputs, X=states, W=disturbances)
+        freeze(self, U=inputs, X=states, W=disturbances, origin=origin)
 
     def __len__(self) -> int:
         """Return the number of steps T."""
         return len(self.U)
+
+    def cut(self, first: int, last: int) -> "Episode":
+        """Return the episode of the steps first … last − 1, which has the states x_first … x_last."""
+        origin = None if self.origin is None else self.origin.cut(first, last + 1)
+        return Episode(X=self.X[first : last + 1], U=self.U[first:last], W=self.W[first:last], origin=origin)
+
+    def with_states(self, X: Float[np.ndarray, "rows nx"]) -> "Episode":
+        """Return the episode with other states."""
+        return Episode(X=X, U=self.U, W=self.W, origin=self.origin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,14 +310,16 @@ class Episodes(Named, Value):
     def save(self, path: str | PathLike[str]) -> None:
         """Write a .npz, .parquet or .csv file, its folders made, which `load_episodes` reads back to the bit.
 
+        The first two hold checksums; a .csv is a plain table, in which a change goes unnoticed.
+
         Raises
         ------
         DataError
-            The suffix is another, or a state is named like a column that .parquet and .csv files add.
+            The suffix is another, or a .parquet or .csv file would not keep a name.
         LogError
             The path cannot be written.
         """
-        from koopmpc.data.storage import save_episodes  # storage builds Episodes, so it imports this file
+        from koopmpc.data.files.load import save_episodes  # readers build Episodes, so it imports this file
 
         save_episodes(self, path)
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from koopmpc.data.episodes import Episode, Episodes, episodes_of
+from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.data.state_space import (
     DELAYS,
     StateSpace,
@@ -158,7 +158,7 @@ class Smoother(Value):
             found = unstacked(self.states(given), self.delays, nx) * self.scale[:nx] + self.mean[:nx]
             for row, piece in zip(found, pieces, strict=True):
                 changed[piece.episode][piece.low : piece.high] = row[piece.low - piece.first : piece.high - piece.first]
-        return data.with_episodes([Episode(X=X, U=e.U, W=e.W) for X, e in zip(changed, data, strict=True)])
+        return data.with_episodes([e.with_states(X) for X, e in zip(changed, data, strict=True)])
 
     def states(self, given: Stretches) -> Float[np.ndarray, "E L N"]:
         """Return E[s_k | all measurements]; products are those of the smoothed states."""
@@ -404,4 +404,4 @@ def _replaced(data: Episodes, glitches: list[Glitch]) -> Episodes:
     changed = {one.episode: data[one.episode].X.copy() for one in glitches}
     for one in glitches:
         changed[one.episode][one.row, one.state] = one.now
-    return data.with_episodes([Episode(X=changed[i], U=e.U, W=e.W) if i in changed else e for i, e in enumerate(data)])
+    return data.with_episodes([e.with_states(changed[i]) if i in changed else e for i, e in enumerate(data)])

@@ -5,14 +5,14 @@ from math import exp
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
-from koopmpc.estimate.observer import Measured, StateModel
-from koopmpc.plants.routines import interpreter
+from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
+from koopmpc.plants.routines import bind_interpreter
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value, Viewing
 
@@ -77,6 +77,25 @@ class LiftedDisturbance(Value):
         return DisturbanceObserver(model, max(1 - exp(-4 / horizon), GAIN) if self.gain is None else self.gain)
 
 
+@dataclass(frozen=True, eq=False)
+class DisturbanceProgram(EstimatorProgram):
+    """z = ψ(ζ), and d by the rule of `LiftedDisturbance`.
+
+    Attributes
+    ----------
+    gain
+        Weight of the newest misfit.
+    known
+        (nz,) the entries of z that have no disturbance.
+    C
+        (ny, nz) z → states.
+    """
+
+    gain: float
+    known: Bool[np.ndarray, " _"]
+    C: Float[np.ndarray, "_ _"]
+
+
 class DisturbanceObserver(Viewing, Measured):
     """The observer of a `LiftedDisturbance`; a missed sample leaves d as it is.
 
@@ -102,6 +121,7 @@ class DisturbanceObserver(Viewing, Measured):
             constant = model.lifting.constant_index
             known = slice(0, 0) if constant is None else slice(constant, constant + 1)
         self._sizes = own.nz, own.nu, own.nw
+        self._known = np.isin(np.arange(own.nz), np.arange(own.nz)[known])
         self._rule = _rule(self._sizes, self.ny, known, gain, None if self.lift is None else self.lift.function)
         self._memory, self._C = np.zeros(self._rule.numel_in(2)), np.zeros(self.ny * own.nz)
         self._predicted, self._still = np.zeros(own.nz), np.zeros(own.nz)
@@ -115,7 +135,7 @@ class DisturbanceObserver(Viewing, Measured):
         self._driven, self._seen = self._memory[: nz + nu + nw], self._memory[-1:]
         self._x, self._after = np.zeros(self._rule.numel_in(0)), np.zeros(len(self._memory))
         arguments = self._x, self._predicted, self._memory, self._C
-        self._evaluate, self._buffer = interpreter(self._rule, arguments, (self._after,))
+        self._evaluate, self._buffer = bind_interpreter(self._rule, arguments, (self._after,))
 
     def _take(self, model: LinearPredictor | StateModel) -> None:
         """Take over the matrices of a model."""
@@ -127,6 +147,10 @@ class DisturbanceObserver(Viewing, Measured):
         """Forget the last state, all misfits, d and the past; x0 will come as the first measurement."""
         super().reset(x0)
         self._memory[:] = 0.0
+
+    def program(self) -> DisturbanceProgram:
+        """Return the data with which z and d are found."""
+        return DisturbanceProgram(self.gain, self._known, self._C.reshape((self.ny, -1), order="F").copy())
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""

@@ -19,15 +19,18 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError, ObservableError, ShapeError
 from koopmpc.estimate.disturbance import GAIN
-from koopmpc.estimate.observer import StateModel
-from koopmpc.lifting.base import Lifting, short
+from koopmpc.estimate.observer import EstimatorProgram, StateModel
+from koopmpc.lifting.base import Lifting, strip_unit
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value, Viewing
 
-PROCESS, NOISE = 1e-4, 1e-4  # default variances, in the model's units
-DRIFTS = 10.0 ** np.arange(-8.0, 1.0)  # the same of a step of d: the least that settles in time is taken
+PROCESS = 1e-4  # default variance of the process noise, in the model's units
+NOISE = 1e-4  # default variance of the measurement noise, in the model's units
+DRIFTS = 10.0 ** np.arange(
+    -8.0, 1.0
+)  # candidate variances of d's random walk; the smallest one that settles in time is used
 SLOWEST = -1 / log(1 - GAIN)  # steps that d takes to settle, at most: those of a mean of this gain
-LEAST = 1e-8  # the same of a noise that a fit without residual leaves
+LEAST = 1e-8  # variance of the noise if a fit leaves no residual
 TOLERANCE = 1e-6  # singular values below this share of the largest, or of |λ|; |λ| as near to 1 does not die out
 
 
@@ -68,6 +71,37 @@ FilterModel = tuple[Augmented, Float[np.ndarray, "n n"], Float[np.ndarray, "ny n
 """The data of a filter: the augmented system, the covariance P before a measurement, and R of the noise of y."""
 
 
+@dataclass(frozen=True, eq=False)
+class FilterProgram(EstimatorProgram):
+    """s⁺ = F s + G [u; w] + f; s ← s + P Mᵀ(M P Mᵀ + R)⁻¹(y − M s − h); z = to_z s + one, d = to_d s.
+
+    Attributes
+    ----------
+    F, G, f, M, h, to_z, one, to_d
+        See `Augmented`.
+    P, R
+        Covariances of s before a measurement, and of the noise of y. Entries of y that are NaN are left out.
+    kept
+        The entries of z at a known start with which s begins; d begins at zero.
+    delay, patience
+        Steps that y is old; samples in sequence without any measurement that are bridged.
+    """
+
+    F: Float[np.ndarray, "_ _"]
+    G: Float[np.ndarray, "_ _"]
+    f: Float[np.ndarray, " _"]
+    M: Float[np.ndarray, "_ _"]
+    h: Float[np.ndarray, " _"]
+    to_z: Float[np.ndarray, "_ _"]
+    one: Float[np.ndarray, " _"]
+    to_d: Float[np.ndarray, "_ _"]
+    P: Float[np.ndarray, "_ _"]
+    R: Float[np.ndarray, "_ _"]
+    kept: Int[np.ndarray, " _"]
+    delay: int
+    patience: int
+
+
 class KalmanFilter(Viewing):
     """The observer of a `LiftedKalman`: s ← s + K (y − M s − h), the gain K from the stationary covariance P.
 
@@ -95,6 +129,11 @@ class KalmanFilter(Viewing):
         self._s, self._uw, self._y, _ = np.split(self._known, [n, n + inputs, n + inputs + self.ny])
         self._s_new, self.z, self.d = np.split(self._found, [n, n + nz])
 
+    def program(self) -> FilterProgram:
+        """Return the data with which z and d are found."""
+        parts = {name: getattr(self._system, name) for name in ("F", "G", "f", "M", "h", "to_z", "one", "to_d", "kept")}
+        return FilterProgram(**parts, P=self._P, R=self._R, delay=self._delay, patience=self._patience)
+
     def update(self, predictor: LinearPredictor) -> None:
         """Go on with another model, from the same state."""
         self._take(predictor)
@@ -116,7 +155,7 @@ class KalmanFilter(Viewing):
         start = checks.start(x0, system.predictor.nx)
         start = np.zeros(system.predictor.nx) if start is None else start
         self._s[:] = 0.0
-        self._s[: len(system.kept)] = system.predictor.lift(system.predictor.held(start))[system.kept]
+        self._s[: len(system.kept)] = system.predictor.lift(system.predictor.rest_point(start))[system.kept]
         self._inputs.clear()
         self._started = False
         self._missed = 0
@@ -136,9 +175,9 @@ class KalmanFilter(Viewing):
                 self._s[:] = self._s_new
                 self._missed = 0
                 return True
-        return self._corrected(y, u, w)
+        return self._correct(y, u, w)
 
-    def _corrected(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
+    def _correct(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Predict, and correct with the entries of y that have come."""
         system = self._system
         if self._started:
@@ -307,7 +346,7 @@ class LiftedKalman(Value):
             Cd[:nu] = 0.0
         model = Augmented(predictor, kept, H, Bd, Cd)
         unit, y_unit = _sizes(predictor, kept, H, Cd)
-        size, y_size = (unit, y_unit) if predictor.scale is not None else _balanced(model.F, model.M, len(kept))
+        size, y_size = (unit, y_unit) if predictor.scale is not None else _balance(model.F, model.M, len(kept))
         F, M = model.F * size / size[:, None], model.M * size / y_size[:, None]
         lost = hidden(F, M)
         if lost is not None:
@@ -373,7 +412,7 @@ def _sizes(
     return np.concatenate([z, d]), y
 
 
-def _balanced(
+def _balance(
     F: Float[np.ndarray, "n n"], M: Float[np.ndarray, "ny n"], nz: int
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " ny"]]:
     """Return units of [z; d] and of y in which a given model's rows and columns are alike, so that ranks are clear."""
@@ -449,7 +488,7 @@ def _places(lifting: Lifting, names: tuple[str, ...]) -> list[int]:
     ObservableError
         The lifting lacks one of them.
     """
-    place = {short(name): i for i, name in enumerate(lifting.names)}
+    place = {strip_unit(name): i for i, name in enumerate(lifting.names)}
     place |= {name: i for i, name in enumerate(lifting.names)}
     for name in names:
         if name not in place:

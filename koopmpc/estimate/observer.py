@@ -1,5 +1,6 @@
 """What an observer is: z and d of z⁺ = A z + B u + d now. `Measured` is the observer where the state is measured."""
 
+from dataclasses import dataclass
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -9,8 +10,9 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
-from koopmpc.lifting.base import Lifting, buffered
+from koopmpc.lifting.base import Lifting, buffer_lifting
 from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.values import Value
 
 
 @runtime_checkable
@@ -138,6 +140,14 @@ class Estimator(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class EstimatorProgram(Value):
+    """The data with which an observer finds z and d of y. As it stands: z = ψ(ζ), ζ of the measured y, and d = 0.
+
+    The other kinds are `DisturbanceProgram` and `FilterProgram`.
+    """
+
+
 class History:
     """ζ_k = [x_k, u_{k−1}, x_{k−1}, …] of a run.
 
@@ -187,7 +197,7 @@ class Measured:
         self.ny = model.ny
         self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
-        self.lift = None if model.lifting is None else buffered(model.lifting)
+        self.lift = None if model.lifting is None else buffer_lifting(model.lifting)
 
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Forget d and the past; x0 will come as the first measurement."""
@@ -195,6 +205,10 @@ class Measured:
         self.d[:] = 0.0
         if self._history is not None:
             self._history.reset()
+
+    def program(self) -> EstimatorProgram:
+        """Return the data with which z and d are found."""
+        return EstimatorProgram()
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""
@@ -213,7 +227,7 @@ class Measured:
         return True
 
 
-def started(estimator: Estimator | None, model: LinearPredictor | StateModel, horizon: int) -> StateObserver:
+def start_observer(estimator: Estimator | None, model: LinearPredictor | StateModel, horizon: int) -> StateObserver:
     """Return the observer of one controller with plans of this many steps; without an estimator y is the state.
 
     Raises
@@ -226,3 +240,18 @@ def started(estimator: Estimator | None, model: LinearPredictor | StateModel, ho
     if isinstance(estimator, type) or not isinstance(cast(object, estimator), Estimator):
         raise DataError(f"estimator is {estimator!r}; pass an object, for example km.LiftedDisturbance()")
     return estimator.start(model, horizon)
+
+
+def estimator_program(observer: StateObserver, estimator: Estimator | None) -> EstimatorProgram:
+    """Return the data of an observer.
+
+    Raises
+    ------
+    DataError
+        Its class publishes none; a class that inherits from one that does may find z in another way.
+    """
+    if "program" not in vars(type(observer)):
+        raise DataError(
+            f"the estimator {type(estimator).__name__} cannot be written in C; use LiftedDisturbance or LiftedKalman"
+        )
+    return cast("Measured", observer).program()

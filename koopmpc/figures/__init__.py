@@ -1,4 +1,4 @@
-"""The figures of the library, and all that touches matplotlib: `km.plot.spectrum(model)`, saved by `km.plot.save`."""
+"""Figures of models and runs, by matplotlib: `km.plot.spectrum(model)` draws one, and `km.plot.save` writes it."""
 
 from typing import TYPE_CHECKING
 

@@ -1,5 +1,5 @@
 # pyright: basic
-"""draw_frames and save_video: line drawings over time as pictures, and as a .gif or .mp4, without a screen."""
+"""Line drawings over time: `draw_frames` renders pictures without a screen, `save_video` writes a .gif or .mp4."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from jaxtyping import Float, UInt8
 from koopmpc import disk
 from koopmpc.errors import DataError, LogError, install
 
-_MARGIN = 0.06  # around what is drawn, as a share of its size
-_SHADES = 48  # colours of a .gif
-_EYE = np.deg2rad((-65.0, 25.0))  # where a scene in space is seen from: angle from the x-axis, and above the horizon
+_MARGIN = 0.06  # margin around the drawing, as a share of its size
+_GIF_COLORS = 48  # number of colours of a .gif
+_VIEW = np.deg2rad((-65.0, 25.0))  # direction to the eye [rad]: azimuth from the x-axis, elevation above the horizon
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """A line with round ends: `points` (n, 2) and `width` in m, y up, and a colour; `filled`, it is a face.
+    """A line with round ends: `points` (n, 2) and `width` in m, y up, with a colour; if `filled`, a polygon.
 
-    `near` is how much nearer than the origin it is to the eye [m].
+    `near` is the distance [m] by which it is closer to the eye than the origin.
     """
 
     points: Float[np.ndarray, "n 2"]
@@ -34,8 +34,8 @@ class Stroke:
 
 
 def project(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return points in space, z up, as they are seen from afar: to the right, upwards, and towards the eye."""
-    (a, e), (b, f) = ((np.cos(angle), np.sin(angle)) for angle in _EYE)
+    """Return the parallel projection of points in space (z up): coordinates to the right, upwards, and to the eye."""
+    (a, e), (b, f) = ((np.cos(angle), np.sin(angle)) for angle in _VIEW)
     return points @ np.array([[-e, -f * a, b * a], [a, -f * e, b * e], [0.0, b, f]])
 
 
@@ -48,7 +48,7 @@ def draw_frames(
     width: int,
     background: tuple[int, int, int],
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Yield one picture a frame, `width` pixels wide, of the box from `low` to `high` [m], with its caption above."""
+    """Yield a picture of each frame, `width` pixels wide, of the box from `low` to `high` [m], with a caption above."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -57,8 +57,8 @@ def draw_frames(
     box = size + 2 * pad
     caption = max(18, width // 22)
     height = int(np.clip(width * box[1] / box[0], 0.3 * width, 1.5 * width)) + caption
-    even = (width - width % 2, height - height % 2)  # video codecs want even numbers
-    figure = Figure(figsize=(even[0] / 100, even[1] / 100), dpi=100, facecolor=_share(background))
+    even = (width - width % 2, height - height % 2)  # video codecs need even numbers
+    figure = Figure(figsize=(even[0] / 100, even[1] / 100), dpi=100, facecolor=_to_unit_range(background))
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, 1 - caption / even[1]))
     axes.set_axis_off()
@@ -72,24 +72,24 @@ def draw_frames(
         for old in [*axes.lines, *axes.patches]:
             old.remove()
         for stroke in strokes:
-            axes.add_artist(_drawn(stroke, scale))
+            axes.add_artist(_make_artist(stroke, scale))
         text.set_text(words)
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _drawn(stroke: Stroke, scale: float) -> Any:
-    """Return the stroke for matplotlib; `scale` is in pixels a metre, of which there are 100 in 72 points."""
+def _make_artist(stroke: Stroke, scale: float) -> Any:
+    """Return the matplotlib artist of a stroke; `scale` is in pixels a metre, and 100 pixels are 72 points."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Polygon
 
     x, y = stroke.points.T
-    thick, shade = max(0.72 * stroke.width * scale, 0.5), _share(stroke.color)
+    linewidth, color = max(0.72 * stroke.width * scale, 0.5), _to_unit_range(stroke.color)
     if stroke.filled:
-        return Polygon(stroke.points, facecolor=shade, edgecolor=_share((70, 80, 90)), linewidth=0.5, zorder=2)
-    if np.ptp(stroke.points, axis=0).max() < 0.01 * stroke.width:  # matplotlib draws no ends of so short a line
-        return Line2D(x[:1], y[:1], linestyle="none", marker="o", markersize=thick, color=shade, markeredgewidth=0)
-    return Line2D(x, y, linewidth=thick, color=shade, solid_capstyle="round", solid_joinstyle="round")
+        return Polygon(stroke.points, facecolor=color, edgecolor=_to_unit_range((70, 80, 90)), linewidth=0.5, zorder=2)
+    if np.ptp(stroke.points, axis=0).max() < 0.01 * stroke.width:  # matplotlib draws no round ends of so short a line
+        return Line2D(x[:1], y[:1], linestyle="none", marker="o", markersize=linewidth, color=color, markeredgewidth=0)
+    return Line2D(x, y, linewidth=linewidth, color=color, solid_capstyle="round", solid_joinstyle="round")
 
 
 def save_video(pictures: Iterator[UInt8[np.ndarray, "height width 3"]], path: str | Path, fps: int) -> None:
@@ -98,7 +98,7 @@ def save_video(pictures: Iterator[UInt8[np.ndarray, "height width 3"]], path: st
     Raises
     ------
     DataError
-        The path ends in neither.
+        The path does not end in .gif or .mp4.
     LogError
         imageio-ffmpeg is not installed, or the path cannot be written.
     """
@@ -116,14 +116,14 @@ def save_video(pictures: Iterator[UInt8[np.ndarray, "height width 3"]], path: st
         ) from error
     first = next(pictures)
     with TemporaryDirectory() as folder:
-        made = Path(folder) / "video.mp4"
-        writer = imageio_ffmpeg.write_frames(str(made), (first.shape[1], first.shape[0]), fps=fps, macro_block_size=2)
+        video = Path(folder) / "video.mp4"
+        writer = imageio_ffmpeg.write_frames(str(video), (first.shape[1], first.shape[0]), fps=fps, macro_block_size=2)
         writer.send(None)
         for picture in chain([first], pictures):
             writer.send(np.ascontiguousarray(picture))
         writer.close()
         with disk.writing(path) as file:
-            file.write(made.read_bytes())
+            file.write(video.read_bytes())
 
 
 def _save_gif(pictures: Iterator[UInt8[np.ndarray, "height width 3"]], path: str | Path, fps: int) -> None:
@@ -131,7 +131,7 @@ def _save_gif(pictures: Iterator[UInt8[np.ndarray, "height width 3"]], path: str
 
     images = [Image.fromarray(picture) for picture in pictures]
     sample = Image.fromarray(np.concatenate([np.asarray(image) for image in images[:: max(1, len(images) // 8)]]))
-    palette = sample.quantize(_SHADES, dither=Image.Dither.NONE)
+    palette = sample.quantize(_GIF_COLORS, dither=Image.Dither.NONE)
     flat = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     with disk.writing(path) as file:
         flat[0].save(
@@ -139,6 +139,6 @@ def _save_gif(pictures: Iterator[UInt8[np.ndarray, "height width 3"]], path: str
         )
 
 
-def _share(color: tuple[int, int, int]) -> tuple[float, float, float]:
+def _to_unit_range(color: tuple[int, int, int]) -> tuple[float, float, float]:
     r, g, b = (c / 255 for c in color)
     return r, g, b

@@ -1,5 +1,5 @@
 # pyright: basic
-"""The spectrum of a model: its eigenvalues over the unit circle, and its eigenfunctions over a plane of two states."""
+"""Figures of the spectrum of a model: eigenvalues in the complex plane, eigenfunctions over a plane of two states."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,22 +12,23 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
-from koopmpc.figures.style import CYCLIC, SEQUENTIAL, Width, figure, styled
-from koopmpc.lifting.base import index
+from koopmpc.figures.style import CYCLIC, SEQUENTIAL, Width, make_figure, styled
+from koopmpc.lifting.base import find_state
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.validate.residuals import ResidualDMD, eigenpairs
+from koopmpc.validate.residuals import ResidualDMD, check_residuals
 from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_LEAST, _MOST = 1e-12, 1e3  # residuals below are rounding; those above are drawn as if they were the second
-_CROWDED = 0.35  # share of the picture below which the eigenvalues get a closer picture
-_ROWS = 4096  # states that are lifted at once
-_CUT = 0.8 * np.pi  # lines of equal phase end here, because the phase jumps at ±π
-_EDGE = 0.08  # share of the width next to each side that stays free of labels, which would be cut there
-_PAPER: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.8}
+_LEAST_RESIDUAL = 1e-12  # smaller residuals are rounding, and are drawn with this value
+_MOST_RESIDUAL = 1e3  # larger residuals are drawn with this value
+_CROWDED = 0.35  # draw a second, closer panel if the eigenvalues fill less than this share of the first
+_BLOCK_ROWS = 4096  # states that are lifted in one block
+_CUT = 0.8 * np.pi  # [rad] lines of equal phase end here, because the phase jumps at ±π
+_EDGE = 0.08  # keep labels away from each side by this share of the width, so that they are not cut
+_LABEL_BOX: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.8}
 _QUARTERS = {-np.pi / 2: "−π/2", 0.0: "0", np.pi / 2: "π/2"}
 Axes = tuple[int | str, int | str]
 Over = Episodes | Sequence[tuple[float, float]]
@@ -37,76 +38,76 @@ Over = Episodes | Sequence[tuple[float, float]]
 def spectrum(predictor: AnyPredictor, residuals: ResidualDMD | ArrayLike | None = None) -> "Figure":
     """Draw the eigenvalues λ of A in the complex plane with |λ| = 1, and the residual of each eigenpair.
 
-    The darker and larger a point the smaller its residual; an eigenvalue with a residual above the tolerance is a
-    cross: it may be spurious.
+    A point with a smaller residual is darker and larger. A cross marks an eigenvalue with a residual above the
+    tolerance, which may be spurious.
 
     Parameters
     ----------
     predictor
         The model whose `eigenvalues` are drawn.
     residuals
-        A `ResidualDMD`, as `trust` and `residual_dmd` return, with its tolerance; or (nz,) in the order of
-        ``predictor.eigenvalues``, with a tolerance of 0.05. Without them all points look alike.
+        A `ResidualDMD` with its tolerance, as `trust` and `residual_dmd` return it; or an array (nz,) in the order of
+        ``predictor.eigenvalues``, with a tolerance of 0.05. Without residuals all points look alike.
 
     Raises
     ------
     ShapeError
-        There is not one residual for each eigenvalue.
+        The number of residuals differs from the number of eigenvalues.
     DataError
         A residual is negative or NaN.
     """
     from matplotlib.lines import Line2D
 
-    known = None if residuals is None else eigenpairs(predictor, residuals)
-    values: Any = predictor.eigenvalues if known is None else known.eigenvalues
+    checked = None if residuals is None else check_residuals(predictor, residuals)
+    values: Any = predictor.eigenvalues if checked is None else checked.eigenvalues
     whole = 1.12 * max(1.0, float(np.abs(values).max(initial=0.0)))
     views = [(0.0, 0.0, whole)]
-    middle, half = _box(values)
+    middle, half = _find_square(values)
     if half < _CROWDED * whole:
         views.append((middle.real, middle.imag, 1.4 * half + 1e-3))
-    made, grid = figure(1, len(views), width="one column" if len(views) == 1 else "two columns", height=3.1)
+    drawing, grid = make_figure(1, len(views), width="one column" if len(views) == 1 else "two columns", height=3.1)
     turn = np.linspace(0, 2 * np.pi, 721)
     points: Any = None
     for axes, (x, y, size) in zip(grid[0], views, strict=True):
         axes.plot(np.cos(turn), np.sin(turn), color="#555555", linewidth=0.9, gid="unit circle")
-        if known is None:
+        if checked is None:
             axes.plot(values.real, values.imag, "o", color="#0072b2", markeredgecolor="black", gid="eigenvalues")
         else:
-            points = _with_residuals(axes, values, known)
+            points = _draw_residuals(axes, values, checked)
         axes.set(xlim=(x - size, x + size), ylim=(y - size, y + size), aspect="equal")
         axes.set(xlabel="Re λ", ylabel="Im λ", title="closer" if size < whole else "")
-    if known is not None:
-        made.colorbar(points, ax=grid[0, -1], label="residual of the eigenpair", shrink=0.85)
-        fine: dict[str, Any] = {"marker": "o", "color": "#404040", "label": f"residual ≤ {known.tolerance:g}"}
+    if checked is not None:
+        drawing.colorbar(points, ax=grid[0, -1], label="residual of the eigenpair", shrink=0.85)
+        good: dict[str, Any] = {"marker": "o", "color": "#404040", "label": f"residual ≤ {checked.tolerance:g}"}
         bad: dict[str, Any] = {
             "marker": "x",
             "color": "black",
-            "label": f"above: may be spurious ({np.sum(known.spurious)} of {len(values)})",
+            "label": f"above: may be spurious ({np.sum(checked.spurious)} of {len(values)})",
         }
-        handles = [Line2D([], [], linestyle="none", **look) for look in (fine, bad)]
-        made.legend(handles=handles, loc="outside lower center", ncols=2, handlelength=1.0)
-    return made
+        handles = [Line2D([], [], linestyle="none", **look) for look in (good, bad)]
+        drawing.legend(handles=handles, loc="outside lower center", ncols=2, handlelength=1.0)
+    return drawing
 
 
-def _box(values: Any) -> tuple[complex, float]:
-    """Return the middle of the eigenvalues and half the side of a square that holds them."""
+def _find_square(values: Any) -> tuple[complex, float]:
+    """Return the middle and half the side of a square that contains the eigenvalues."""
     low, high = values.real.min() + 1j * values.imag.min(), values.real.max() + 1j * values.imag.max()
     return (low + high) / 2, max((high - low).real, (high - low).imag) / 2
 
 
-def _with_residuals(axes: Any, values: Any, known: ResidualDMD) -> Any:
-    """Draw the points and return them: the smaller the residual the darker and larger."""
+def _draw_residuals(axes: Any, values: Any, checked: ResidualDMD) -> Any:
+    """Draw the eigenvalues, darker and larger for smaller residuals, and return the points."""
     import matplotlib as mpl
     from matplotlib.colors import ListedColormap, LogNorm
 
-    shown = np.clip(known.residuals, _LEAST, _MOST)
-    low, high = min(float(shown.min()), known.tolerance / 10), max(float(shown.max()), known.tolerance * 10)
+    shown = np.clip(checked.residuals, _LEAST_RESIDUAL, _MOST_RESIDUAL)
+    low, high = min(float(shown.min()), checked.tolerance / 10), max(float(shown.max()), checked.tolerance * 10)
     norm = LogNorm(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
     sizes = 12.0 + 40.0 * (1.0 - np.asarray(norm(shown)))
     darker = np.linspace(0, 0.85, 256)  # the light end of the scale is too light for points
-    shades = ListedColormap(mpl.colormaps[SEQUENTIAL](darker))
+    map_colors = ListedColormap(mpl.colormaps[SEQUENTIAL](darker))
     points = None
-    for chosen, marker in ((~known.spurious, "o"), (known.spurious, "x")):
+    for chosen, marker in ((~checked.spurious, "o"), (checked.spurious, "x")):
         look: dict[str, Any] = {"edgecolors": "black"} if marker == "o" else {}
         points = axes.scatter(
             values.real[chosen],
@@ -114,7 +115,7 @@ def _with_residuals(axes: Any, values: Any, known: ResidualDMD) -> Any:
             c=shown[chosen],
             s=sizes[chosen],
             marker=marker,
-            cmap=shades,
+            cmap=map_colors,
             norm=norm,
             linewidths=0.5 if marker == "o" else 1.3,
             zorder=3,
@@ -126,7 +127,7 @@ def _with_residuals(axes: Any, values: Any, known: ResidualDMD) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Plane(Value):
-    """A grid over two states, all others held.
+    """A grid over two states, with all other states fixed.
 
     Attributes
     ----------
@@ -135,9 +136,9 @@ class Plane(Value):
     names
         Their names with units.
     across, up
-        Grid lines of the first state and of the second.
+        Grid lines of the first and of the second state.
     at
-        (nx,) the state that the plane goes through.
+        (nx,) a state in the plane; it fixes the other states.
     """
 
     axes: tuple[int, int]
@@ -148,45 +149,43 @@ class Plane(Value):
 
     @property
     def points(self) -> Float[np.ndarray, "M nx"]:
-        """States of the grid, one a row: `up` is the slow index."""
+        """States of the grid, one a row; `up` is the slow index."""
         X = np.tile(self.at, (len(self.up) * len(self.across), 1))
         X[:, self.axes[0]] = np.tile(self.across, len(self.up))
         X[:, self.axes[1]] = np.repeat(self.up, len(self.across))
         return X
 
 
-def plane_through(
-    states: Sequence[str], axes: Axes, over: Over, at: ArrayLike | None = None, points: int = 121
-) -> Plane:
+def make_plane(states: Sequence[str], axes: Axes, over: Over, at: ArrayLike | None = None, points: int = 121) -> Plane:
     """Return the plane over the two states `axes`.
 
     Parameters
     ----------
     states
-        Names of all.
+        Names of all states.
     axes
-        The two, by index or name.
+        The two states of the plane, by index or name.
     over
-        Two ranges (low, high), or episodes: then what they cover.
+        Two ranges (low, high), or episodes: then the ranges of their states.
     at
-        (nx,) what the other states are held at; by default the median of the episodes, else 0.
+        (nx,) values at which the other states are fixed; by default the median of the episodes, or 0 without them.
     points
         Grid lines along each axis.
 
     Raises
     ------
     DataError
-        There is no such state, both are one, or a range is empty.
+        There is no such state, both axes are the same state, or a range is empty.
     """
-    first, second = (index(state, states, "the plane") for state in axes)
+    first, second = (find_state(state, states, "the plane") for state in axes)
     if first == second:
-        raise DataError(f"the plane is asked for {states[first]} twice; name two states")
+        raise DataError(f"both axes of the plane are {states[first]}; name two different states")
     if isinstance(over, Episodes):
         X = np.concatenate([episode.X for episode in over])
         ranges = np.column_stack([X.min(axis=0), X.max(axis=0)])[[first, second]]
-        held = np.median(X, axis=0)
+        fixed = np.median(X, axis=0)
     else:
-        ranges, held = checks.array(cast(ArrayLike, over), "over", (2, 2)), np.zeros(len(states))
+        ranges, fixed = checks.array(cast(ArrayLike, over), "over", (2, 2)), np.zeros(len(states))
     for name, (low, high) in zip((states[first], states[second]), ranges, strict=True):
         if not low < high:
             raise DataError(f"the range of {name} is {low:g} to {high:g}; pass (low, high) with low < high")
@@ -196,35 +195,35 @@ def plane_through(
         (states[first], states[second]),
         np.linspace(float(ranges[0, 0]), float(ranges[0, 1]), lines),
         np.linspace(float(ranges[1, 0]), float(ranges[1, 1]), lines),
-        held if at is None else checks.array(at, "at", (len(states),)),
+        fixed if at is None else checks.array(at, "at", (len(states),)),
     )
 
 
-def eigenfunctions_on(
+def evaluate_eigenfunctions(
     predictor: LinearPredictor, which: int | Sequence[int], plane: Plane
 ) -> Complex[np.ndarray, "k nr nc"]:
-    """Return φ_j on the grid for each j of `which`, scaled so that the largest |φ_j| on it is 1.
+    """Return φ_j on the grid for each j of `which`, scaled so that the largest |φ_j| on the grid is 1.
 
-    An eigenfunction is defined up to a factor: the phase of a complex one starts anywhere.
+    An eigenfunction is unique up to a factor, so the phase of a complex one has an arbitrary offset.
 
     Raises
     ------
     DataError
-        There is no such eigenvalue, φ_j is 0 on all of the plane, or A is defective.
+        There is no such eigenvalue, φ_j is 0 on the whole plane, or A is defective.
     """
     chosen = [which] if isinstance(which, int | np.integer) else list(which)
     for j in chosen:
         if not 0 <= j < predictor.nz:
             raise DataError(f"there is no eigenfunction {j}; the predictor has 0 … {predictor.nz - 1}")
     if not chosen:
-        raise DataError("which names no eigenfunction; pass an index, or several")
+        raise DataError("which is empty; pass the index of an eigenfunction, or several")
     left, X = predictor.left_eigenvectors[chosen].T, plane.points
-    parts = [predictor.lift(X[i : i + _ROWS]) @ left for i in range(0, len(X), _ROWS)]
+    parts = [predictor.lift(X[i : i + _BLOCK_ROWS]) @ left for i in range(0, len(X), _BLOCK_ROWS)]
     phi = np.concatenate(parts).T.reshape(len(chosen), len(plane.up), len(plane.across))
     largest = np.abs(phi).max(axis=(1, 2))
     if (largest == 0).any():
         j = chosen[int(np.argmin(largest))]
-        raise DataError(f"eigenfunction {j} is 0 on all of the plane; hold the other states elsewhere (at=…)")
+        raise DataError(f"eigenfunction {j} is 0 on the whole plane; fix the other states at other values (at=…)")
     return phi / largest[:, None, None]
 
 
@@ -238,10 +237,10 @@ def eigenfunctions(
     at: ArrayLike | None = None,
     points: int = 121,
 ) -> "Figure":
-    """Draw φ_j(x) = ξ_jᴴ ψ(x) over two states: |φ_j| and its phase; of a real eigenvalue φ_j itself.
+    """Draw φ_j(x) = ξ_jᴴ ψ(x) over two states: |φ_j| and its phase, or φ_j itself if its eigenvalue is real.
 
-    The largest |φ_j| of the plane is 1. Without input, states on one line of equal |φ_j| move to another such line
-    together, and so do states on one line of equal phase.
+    The largest |φ_j| of the plane is 1. Without inputs, all states on one line of equal |φ_j| move to one other such
+    line; the same holds for lines of equal phase.
 
     Parameters
     ----------
@@ -250,11 +249,11 @@ def eigenfunctions(
     which
         Indices j in the order of ``predictor.eigenvalues``.
     plane
-        The two states, by index or name: across, up.
+        The states of the horizontal and of the vertical axis, by index or name.
     over
-        Two ranges ((low, high), (low, high)), or episodes: then what they cover.
+        Two ranges ((low, high), (low, high)), or episodes: then the ranges of their states.
     at
-        (nx,) what the other states are held at; by default the median of the episodes, else 0.
+        (nx,) values at which the other states are fixed; by default the median of the episodes, or 0 without them.
     points
         Grid lines along each axis.
 
@@ -263,65 +262,66 @@ def eigenfunctions(
     DataError
         There is no such eigenfunction or state, a range is empty, A is defective, or φ_j is 0 on the plane.
     """
-    covered = predictor.embed(over) if isinstance(over, Episodes) else over
-    grid = plane_through(predictor.point_names, plane, covered, at, points)
-    phi = eigenfunctions_on(predictor, which, grid)
+    embedded = predictor.embed(over) if isinstance(over, Episodes) else over
+    grid = make_plane(predictor.point_names, plane, embedded, at, points)
+    phi = evaluate_eigenfunctions(predictor, which, grid)
     chosen = [which] if isinstance(which, int | np.integer) else list(which)
     values: Any = predictor.eigenvalues[chosen]
     real = values.imag == 0
     cells: list[tuple[int, str]] = []
-    for k, alone in enumerate(real):
-        if not alone and len(cells) % 2:
-            cells.append((k, "empty"))  # magnitude and phase stand side by side
-        cells += [(k, "real")] if alone else [(k, "magnitude"), (k, "phase")]
+    for k, is_real in enumerate(real):
+        if not is_real and len(cells) % 2:
+            cells.append((k, "empty"))  # magnitude and phase are drawn side by side
+        cells += [(k, "real")] if is_real else [(k, "magnitude"), (k, "phase")]
     columns = min(len(cells), 2)
     rows = -(-len(cells) // columns)
     width: Width = "one column" if columns == 1 else "two columns"
-    made, axes = figure(rows, columns, width=width, height=0.4 + 2.4 * rows)
-    drawn = axes.flat[: len(cells)]
-    for panel, (k, kind) in zip(drawn, cells, strict=True):
-        _draw(made, panel, grid, phi[k], values[k], f"φ{_subscript(chosen[k])}", kind)
-    for empty in (*axes.flat[len(cells) :], *(p for p, (_, kind) in zip(drawn, cells, strict=True) if kind == "empty")):
-        empty.remove()
-    return made
+    drawing, axes = make_figure(rows, columns, width=width, height=0.4 + 2.4 * rows)
+    panels = axes.flat[: len(cells)]
+    for panel, (k, kind) in zip(panels, cells, strict=True):
+        _draw_cell(drawing, panel, grid, phi[k], values[k], f"φ{_format_subscript(chosen[k])}", kind)
+    unused = [panel for panel, (_, kind) in zip(panels, cells, strict=True) if kind == "empty"]
+    for panel in (*axes.flat[len(cells) :], *unused):
+        panel.remove()
+    return drawing
 
 
-def _draw(made: Any, axes: Any, plane: Plane, phi: Any, value: complex, name: str, kind: str) -> None:
+def _draw_cell(drawing: Any, axes: Any, plane: Plane, phi: Any, value: complex, name: str, kind: str) -> None:
     match kind:
         case "real":
-            _surface(made, axes, plane, phi.real, name)
+            _draw_surface(drawing, axes, plane, phi.real, name)
         case "magnitude":
-            _surface(made, axes, plane, np.abs(phi), f"|{name}|")
+            _draw_surface(drawing, axes, plane, np.abs(phi), f"|{name}|")
         case "phase":
-            _phase(made, axes, plane, np.angle(phi), f"phase of {name} [rad]")
+            _draw_phase(drawing, axes, plane, np.angle(phi), f"phase of {name} [rad]")
         case _:
             return
-    turn = "" if value.imag == 0 else f" {'+' if value.imag > 0 else '−'} {abs(value.imag):.4g}i"
-    axes.set(title=f"λ = {value.real:.4g}{turn}", xlabel=plane.names[0], ylabel=plane.names[1])
+    imaginary = "" if value.imag == 0 else f" {'+' if value.imag > 0 else '−'} {abs(value.imag):.4g}i"
+    axes.set(title=f"λ = {value.real:.4g}{imaginary}", xlabel=plane.names[0], ylabel=plane.names[1])
     axes.grid(visible=False)
 
 
-def _subscript(j: int) -> str:
+def _format_subscript(j: int) -> str:
     return str(j).translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))
 
 
-def _surface(made: Any, axes: Any, plane: Plane, values: np.ndarray, label: str) -> None:
-    """Draw the values as shades, and lines of equal value that are labelled; dashed below zero."""
+def _draw_surface(drawing: Any, axes: Any, plane: Plane, values: np.ndarray, label: str) -> None:
+    """Draw the values as colours, with labelled lines of equal value; lines below zero are dashed."""
     mesh = axes.pcolormesh(plane.across, plane.up, values, cmap=SEQUENTIAL, shading="gouraud", rasterized=True)
-    made.colorbar(mesh, ax=axes, label=label)
+    drawing.colorbar(mesh, ax=axes, label=label)
     if np.ptp(values) > 1e-9:
         lines = axes.contour(plane.across, plane.up, values, levels=6, colors="white", linewidths=0.7)
         axes.clabel(lines, fontsize=6, fmt="%g")
 
 
-def _phase(made: Any, axes: Any, plane: Plane, phase: np.ndarray, label: str) -> None:
-    """Draw the phase in colours that close at ±π, with lines at the quarters that can be read in grey."""
+def _draw_phase(drawing: Any, axes: Any, plane: Plane, phase: np.ndarray, label: str) -> None:
+    """Draw the phase in cyclic colours, with lines at −π/2, 0 and π/2 that are readable in black and white."""
     from matplotlib.patheffects import withStroke
 
     mesh = axes.pcolormesh(
         plane.across, plane.up, phase, cmap=CYCLIC, vmin=-np.pi, vmax=np.pi, shading="nearest", rasterized=True
     )
-    bar = made.colorbar(mesh, ax=axes, label=label)
+    bar = drawing.colorbar(mesh, ax=axes, label=label)
     bar.set_ticks([-np.pi, *_QUARTERS, np.pi], labels=["−π", *_QUARTERS.values(), "π"])
     inner = np.where(np.abs(phase) < _CUT, phase, np.nan)
     inside = np.abs(inner[np.isfinite(inner)])
@@ -333,9 +333,9 @@ def _phase(made: Any, axes: Any, plane: Plane, phase: np.ndarray, label: str) ->
             "linestyles": ["--", "-", ":"],
         }
         lines = axes.contour(plane.across, plane.up, inner, **look)
-        halo = withStroke(linewidth=2.0, foreground="white")  # a halo, because the darkest shade is as dark as the line
+        halo = withStroke(linewidth=2.0, foreground="white")  # the darkest colour is as dark as the line
         lines.set_path_effects([halo])
         across = np.quantile(plane.across, [_EDGE, 1 - _EDGE])
         texts: Any = axes.clabel(lines, fontsize=6, fmt=_QUARTERS, inline=False)
         for text in texts:
-            text.set(x=np.clip(text.get_position()[0], *across), bbox=_PAPER)
+            text.set(x=np.clip(text.get_position()[0], *across), bbox=_LABEL_BOX)

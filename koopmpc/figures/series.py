@@ -1,5 +1,5 @@
 # pyright: basic
-"""Curves over time, a panel for each state and input: a forecast, closed loops, reconstructions, errors by horizon."""
+"""Figures over time with a panel for each state and input: forecasts, closed loops, reconstructions, errors."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -16,16 +16,16 @@ from koopmpc.figures.style import (
     REFERENCE,
     TRUTH,
     Width,
-    band,
-    chosen_states,
-    figure,
-    followed,
-    interval,
-    legend,
-    line,
+    choose_states,
+    draw_band,
+    draw_legend,
+    follow_truth,
+    limit_axis,
+    line_style,
+    make_figure,
     styled,
 )
-from koopmpc.lifting.base import Chosen
+from koopmpc.lifting.base import StateChoice
 from koopmpc.loop.run import Run
 from koopmpc.validate.bands import Bands, forecast
 from koopmpc.validate.scoring import AnyPredictor, Score
@@ -33,13 +33,15 @@ from koopmpc.validate.scoring import AnyPredictor, Score
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_STATE, _INPUT = 1.05, 0.75  # heights of a panel [in]
-_NEAR = 1.0  # how far the axis follows a prediction beyond the truth, in spans of the truth
-_BEYOND = 3.5  # how far the axis follows other models beyond the best one's errors, in spans of those
-_LEAVES = 0.5  # how far the axis follows a curve beyond the truth or the median run, in spans of those
-_LEAST, _HIGHEST = 1e-13, 1e3  # relative errors below the first are rounding, and those above the second look alike
-_TICKS = 5  # ticks of the relative error, at most
-_BENEATH: dict[str, Any] = TRUTH | {"linewidth": 2.4}  # wide enough to show on both sides of a curve that lies on it
+_STATE_HEIGHT = 1.05  # height of the panel of a state [in]
+_INPUT_HEIGHT = 0.75  # height of the panel of an input [in]
+_BEYOND_TRUTH = 1.0  # the axis shows a prediction up to this many spans of the truth outside the truth
+_BEYOND_BEST = 3.5  # the axis shows errors of other models up to this many spans of the best model's errors outside
+_BEYOND_MEDIAN = 0.5  # the axis shows a curve up to this many spans outside the truth or the median run
+_LEAST_ERROR = 1e-13  # smaller relative errors are rounding, and are drawn with this value
+_MOST_ERROR = 1e3  # the axis of the relative error ends here
+_MOST_TICKS = 5  # largest number of ticks of the relative error
+_WIDE_TRUTH: dict[str, Any] = TRUTH | {"linewidth": 2.4}  # visible on both sides of a curve that covers it
 
 
 @styled
@@ -51,16 +53,16 @@ def rollout(
     *,
     start: int = 0,
     relift: bool = False,
-    states: Chosen | None = None,
+    states: StateChoice | None = None,
     width: Width = "one column",
 ) -> "Figure":
-    """Draw x_{k+h} of the episode, its prediction from x_k and the inputs, and a band around that.
+    """Draw x_{k+h} of the episode, its prediction from x_k and the inputs, and a band around the prediction.
 
     Parameters
     ----------
     predictor, episode, horizon, bands, start, relift
-        As in `koopmpc.validate.forecast`: bands are a conformal band, a score, or half-widths (horizon, nx) in the
-        state's unit.
+        Arguments of `koopmpc.validate.forecast`: bands are a conformal band, a score, or half-widths (horizon, nx) in
+        the state's unit.
     states
         States to draw, by index or name; all by default.
     width
@@ -69,31 +71,31 @@ def rollout(
     Raises
     ------
     ShapeError
-        The episode, or the bands, do not fit the predictor.
+        The episode or the bands have other shapes than the predictor needs.
     DataError
-        The episode ends before the horizon; there are too many states for one figure.
+        The episode ends before the horizon, or there are too many states for one figure.
     """
     ahead = forecast(predictor, episode, horizon, bands=bands, start=start, relift=relift)
-    chosen, nu, t = chosen_states(states, ahead.states), len(ahead.inputs), ahead.time
-    made, axes = _panels(len(chosen), nu, 0, width)
+    chosen, nu, t = choose_states(states, ahead.states), len(ahead.inputs), ahead.time
+    drawing, axes = _stack_panels(len(chosen), nu, 0, width)
     for panel, i in zip(axes, chosen, strict=False):
         if ahead.band:
-            band(panel, t, *_within(ahead.low[:, i], ahead.high[:, i]), 0, ahead.band)
+            draw_band(panel, t, *_mask_infinite(ahead.low[:, i], ahead.high[:, i]), 0, ahead.band)
         panel.plot(t, ahead.truth[:, i], **TRUTH, label="truth")
-        panel.plot(t, ahead.predicted[:, i], **line(0, len(t)), label="prediction")
-        shown = followed(ahead.truth[:, i], [ahead.predicted[:, i]], _NEAR)
-        panel.set(ylabel=ahead.states[i], ylim=shown)
+        panel.plot(t, ahead.predicted[:, i], **line_style(0, len(t)), label="prediction")
+        ylim = follow_truth(ahead.truth[:, i], [ahead.predicted[:, i]], _BEYOND_TRUTH)
+        panel.set(ylabel=ahead.states[i], ylim=ylim)
     for panel, name, u in zip(axes[len(chosen) :], ahead.inputs, ahead.U.T, strict=True):
         panel.stairs(u, t, baseline=None, **TRUTH)
         panel.set_ylabel(name)
     axes[-1].set(xlabel="time ahead [s]", xlim=(0, t[-1]))
-    legend(made, axes[:1], 3)
-    return made
+    draw_legend(drawing, axes[:1], 3)
+    return drawing
 
 
 @styled
-def run(run: Run, *, states: Chosen | None = None, width: Width = "one column") -> "Figure":
-    """Draw a closed loop: states with reference and limits, inputs with limits, and how each step ended.
+def run(run: Run, *, states: StateChoice | None = None, width: Width = "one column") -> "Figure":
+    """Draw a closed loop: states with reference and limits, inputs with limits, and the status of each step.
 
     Parameters
     ----------
@@ -109,51 +111,54 @@ def run(run: Run, *, states: Chosen | None = None, width: Width = "one column") 
     DataError
         There are too many states for one figure.
     """
-    chosen, nu, t = chosen_states(states, run.states), len(run.inputs), run.time
-    made, axes = _panels(len(chosen), nu, 1, width)
+    chosen, nu, t = choose_states(states, run.states), len(run.inputs), run.time
+    drawing, axes = _stack_panels(len(chosen), nu, 1, width)
     tracked = run.tracked(run.reference.shape[1])
     for panel, i in zip(axes, chosen, strict=False):
         if run.states[i] in tracked:
             panel.plot(t, run.reference[:, tracked.index(run.states[i])], **REFERENCE, label="reference")
         panel.plot(t, run.X[:, i], **TRUTH, label="state")
-        _limits(panel, run, "states", i)
+        _draw_limits(panel, run, "states", i)
         panel.set_ylabel(run.states[i])
     for j, panel in enumerate(axes[len(chosen) : -1]):
         panel.stairs(run.U[:, j], t, baseline=None, **TRUTH)
-        _limits(panel, run, "inputs", j)
+        _draw_limits(panel, run, "inputs", j)
         panel.set_ylabel(run.inputs[j])
-    _statuses(axes[-1], run)
+    _draw_statuses(axes[-1], run)
     axes[-1].set(xlabel="time [s]", xlim=(0, t[-1]))
-    legend(made, axes[:-1], 3)
-    return made
+    draw_legend(drawing, axes[:-1], 3)
+    return drawing
 
 
-def _panels(nx: int, nu: int, more: int, width: Width) -> "tuple[Figure, list[Any]]":
-    heights = [_STATE] * nx + [_INPUT] * nu + [0.6 * _INPUT] * more
-    made, axes = figure(len(heights), width=width, height=0.7 + sum(heights), sharex=True, height_ratios=heights)
-    made.align_ylabels(list(axes[:, 0]))
-    return made, list(axes[:, 0])
+def _stack_panels(nx: int, nu: int, more: int, width: Width) -> "tuple[Figure, list[Any]]":
+    """Return a figure and its panels: states, inputs, and `more` low panels."""
+    heights = [_STATE_HEIGHT] * nx + [_INPUT_HEIGHT] * nu + [0.6 * _INPUT_HEIGHT] * more
+    drawing, axes = make_figure(
+        len(heights), width=width, height=0.7 + sum(heights), sharex=True, height_ratios=heights
+    )
+    drawing.align_ylabels(list(axes[:, 0]))
+    return drawing, list(axes[:, 0])
 
 
-def _within(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the band where it is finite, NaN elsewhere."""
+def _mask_infinite(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the band with NaN where it is infinite."""
     finite = np.isfinite(low) & np.isfinite(high)
     return np.where(finite, low, np.nan), np.where(finite, high, np.nan)
 
 
-def _limits(axes: Any, run: Run, what: str, i: int) -> list[float]:
+def _draw_limits(axes: Any, run: Run, kind: str, i: int) -> list[float]:
     """Draw the finite limits of the i-th of the "states" or "inputs", and return them."""
     if run.limits is None:
         return []
-    ends = getattr(run.limits, what)(len(getattr(run, what)))
+    ends = getattr(run.limits, kind)(len(getattr(run, kind)))
     finite = [float(end[i]) for end in ends if np.isfinite(end[i])]
     for value in finite:
         axes.axhline(value, **LIMIT, label="limit")
     return finite
 
 
-def _statuses(axes: Any, run: Run) -> None:
-    """Draw one row for each status that occurs, a tick for each step, and a cross where a fallback was applied."""
+def _draw_statuses(axes: Any, run: Run) -> None:
+    """Draw a row for each status that occurs, with a tick for each step and a cross for each applied fallback."""
     kinds = sorted(set(run.status), key=lambda status: status.value)
     t, row = run.time[:-1], np.array([kinds.index(status) for status in run.status])
     failed = np.array([fallback is not Fallback.NONE for fallback in run.fallback], dtype=bool)
@@ -166,16 +171,16 @@ def _statuses(axes: Any, run: Run) -> None:
 
 @styled
 def error(
-    scores: Score | Mapping[str, Score], *, states: Chosen | None = None, width: Width = "one column"
+    scores: Score | Mapping[str, Score], *, states: StateChoice | None = None, width: Width = "one column"
 ) -> "Figure":
-    """Draw the root-mean-square error and the 5 to 95 % band of the errors against the steps ahead, a panel a state.
+    """Draw the root-mean-square error and the 5 to 95 % band of the errors over the steps ahead, a panel a state.
 
-    The axis spans at most eight times the errors of the best model; worse models leave the picture.
+    The axis spans at most eight times the errors of the best model; larger errors lie outside it.
 
     Parameters
     ----------
     scores
-        One score, or several by the names of their models; all of the same states.
+        One score, or several by the names of their models; all must have the same states.
     states
         States to draw, by index or name; all by default.
     width
@@ -184,9 +189,9 @@ def error(
     Raises
     ------
     ShapeError
-        The scores are of different states.
+        The scores have different states.
     DataError
-        There is no score; there are too many states for one figure.
+        There is no score, or there are too many states for one figure.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -200,45 +205,45 @@ def error(
                 f"one score is of ({', '.join(first.states)}), another of ({', '.join(other.states)}); "
                 "compare models of the same states"
             )
-    chosen = chosen_states(states, first.states)
+    chosen = choose_states(states, first.states)
     columns = 1 if width == "one column" or len(chosen) == 1 else 2
     rows = -(-len(chosen) // columns)
-    made, axes = figure(rows, columns, width=width, height=0.7 + 1.35 * rows, sharex=True)
+    drawing, axes = make_figure(rows, columns, width=width, height=0.7 + 1.35 * rows, sharex=True)
     for panel, i in zip(axes.flat, chosen, strict=False):
         for j, (name, score) in enumerate(named.items()):
             ahead = np.arange(1, score.horizon + 1)
             low, high, rmse = (
                 np.where(np.isfinite(v[:, i]), v[:, i], np.nan) for v in (score.low, score.high, score.rmse)
             )
-            band(panel, ahead, low, high, j, f"{name} 5 to 95 %".strip())
-            panel.plot(ahead, rmse, **line(j, score.horizon), label=f"{name} RMSE".strip())
+            draw_band(panel, ahead, low, high, j, f"{name} 5 to 95 %".strip())
+            panel.plot(ahead, rmse, **line_style(j, score.horizon), label=f"{name} RMSE".strip())
         panel.set(ylabel=f"error of\n{first.states[i]}", xlim=(1, max(s.horizon for s in named.values())))
-        panel.set_ylim(*_error_interval([_extent(score, i) for score in named.values()]))
-    for empty in axes.flat[len(chosen) :]:
-        empty.remove()
+        panel.set_ylim(*_choose_error_axis([_find_extent(score, i) for score in named.values()]))
+    for unused in axes.flat[len(chosen) :]:
+        unused.remove()
     for panel in axes.flat[max(len(chosen) - columns, 0) : len(chosen)]:
         panel.set_xlabel("steps ahead")
         panel.xaxis.set_major_locator(MaxNLocator(integer=True))
         panel.tick_params(labelbottom=True)
-    most = 2 if width == "one column" else 4  # models stand beside one another in the legend
-    legend(made, axes.flat[:1], 2 if len(named) == 1 else min(len(named), most))
-    return made
+    most = 2 if width == "one column" else 4  # columns of the legend, one for each model
+    draw_legend(drawing, axes.flat[:1], 2 if len(named) == 1 else min(len(named), most))
+    return drawing
 
 
-def _extent(score: Score, i: int) -> tuple[float, float]:
-    """Return the least and the largest finite error of state i."""
+def _find_extent(score: Score, i: int) -> tuple[float, float]:
+    """Return the smallest and the largest finite error of state i."""
     rows = np.concatenate([score.low[:, i], score.high[:, i], score.rmse[:, i]])
     finite = rows[np.isfinite(rows)]
     return float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
 
 
-def _error_interval(extents: list[tuple[float, float]]) -> tuple[float, float]:
-    """Return an axis for all errors of the best model, and for those of others that are not far beyond them."""
+def _choose_error_axis(extents: list[tuple[float, float]]) -> tuple[float, float]:
+    """Return the limits of an axis that shows all errors of the best model, and not too large ones of the others."""
     low, high = min(extents, key=lambda extent: extent[1] - extent[0])
     lowest, highest = min(low for low, _ in extents), max(high for _, high in extents)
     if low == high:  # a model without errors sets no scale
-        return interval(lowest, highest, lowest, highest, 0.0)
-    return interval(low, high, lowest, highest, _BEYOND)
+        return limit_axis(lowest, highest, lowest, highest, 0.0)
+    return limit_axis(low, high, lowest, highest, _BEYOND_BEST)
 
 
 @styled
@@ -248,45 +253,45 @@ def runs(tasks: Mapping[str, Mapping[str, Run]]) -> "Figure":
     Parameters
     ----------
     tasks
-        A column each: its title, and its runs by the name of the controller. All of one plant.
+        For each column its title, and its runs by the names of the controllers. All runs have the same plant.
 
     Raises
     ------
     DataError
-        There is no run, or the runs are of different plants.
+        There is no run, or the runs have different plants.
     """
-    every = [run for each in tasks.values() for run in each.values()]
-    if not every or not all(tasks.values()):
+    all_runs = [run for task in tasks.values() for run in task.values()]
+    if not all_runs or not all(tasks.values()):
         raise DataError("there is no run to draw; pass at least one a column")
-    states, inputs = every[0].states, every[0].inputs
-    if any((run.states, run.inputs) != (states, inputs) for run in every):
+    states, inputs = all_runs[0].states, all_runs[0].inputs
+    if any((run.states, run.inputs) != (states, inputs) for run in all_runs):
         raise DataError("the runs have different states or inputs; draw one plant a figure")
-    made, grid = _columns([*states, *inputs], list(tasks), 0.95)
-    names = list(dict.fromkeys(name for each in tasks.values() for name in each))
-    for column, each in zip(grid.T, tasks.values(), strict=True):
-        _loops(column, each, names)
-    legend(made, grid.flat, 4)
-    return made
+    drawing, grid = _arrange_columns([*states, *inputs], list(tasks), 0.95)
+    names = list(dict.fromkeys(name for task in tasks.values() for name in task))
+    for column, task in zip(grid.T, tasks.values(), strict=True):
+        _draw_task(column, task, names)
+    draw_legend(drawing, grid.flat, 4)
+    return drawing
 
 
-def _loops(panels: Any, runs: Mapping[str, Run], names: list[str]) -> None:
+def _draw_task(panels: Any, runs: Mapping[str, Run], names: list[str]) -> None:
     """Draw the runs of one task in a column of panels, states first."""
     first = next(iter(runs.values()))
     nx = len(first.states)
     tracked = first.tracked(first.reference.shape[1]) == first.states
     for i, panel in enumerate(panels):
-        drawn = [run.X[:, i] if i < nx else run.U[:, i - nx] for run in runs.values()]
-        for name, run, values in zip(runs, runs.values(), drawn, strict=True):
-            panel.plot(run.time[: len(values)], values, **line(names.index(name), len(values)), label=name)
-        asked: list[float] = []  # what the axis has to show besides the runs
+        curves = [run.X[:, i] if i < nx else run.U[:, i - nx] for run in runs.values()]
+        for name, run, values in zip(runs, runs.values(), curves, strict=True):
+            panel.plot(run.time[: len(values)], values, **line_style(names.index(name), len(values)), label=name)
+        required: list[float] = []  # values that the axis must show in addition to the runs
         if i < nx and tracked:
             panel.plot(first.time, first.reference[:, i], **REFERENCE, label="reference")
-            asked = first.reference[:, i].tolist()
+            required = first.reference[:, i].tolist()
         elif i >= nx:
-            asked = _limits(panel, first, "inputs", i - nx)
-        lows, highs = [float(v.min()) for v in drawn], [float(v.max()) for v in drawn]
-        low, high = min([float(np.median(lows)), *asked]), max([float(np.median(highs)), *asked])
-        panel.set_ylim(*interval(low, high, min(lows), max(highs), _LEAVES))
+            required = _draw_limits(panel, first, "inputs", i - nx)
+        lows, highs = [float(v.min()) for v in curves], [float(v.max()) for v in curves]
+        low, high = min([float(np.median(lows)), *required]), max([float(np.median(highs)), *required])
+        panel.set_ylim(*limit_axis(low, high, min(lows), max(highs), _BEYOND_MEDIAN))
         panel.set_xlim(0.0, first.time[-1])
 
 
@@ -299,8 +304,8 @@ def reconstruction(
     Parameters
     ----------
     cases
-        A column each: its title, the truth (T+1, nx), and the reconstructions (T+1, nx) by name. What leaves the
-        truth by far leaves the picture; the error shows how far.
+        For each column its title, the truth (T+1, nx), and the reconstructions (T+1, nx) by name. Parts of a
+        reconstruction far from the truth lie outside the axis; the relative error shows them.
     dt
         Sample time [s].
     states
@@ -316,35 +321,35 @@ def reconstruction(
     dt = checks.positive(dt, "dt", "s")
     if not cases:
         raise DataError("there is no case to draw; pass at least one")
-    made, grid = _columns([*states, "relative error"], list(cases), 0.92)
+    drawing, grid = _arrange_columns([*states, "relative error"], list(cases), 0.92)
     names = list(dict.fromkeys(name for _, curves in cases.values() for name in curves))
-    for column, (title, (given, curves)) in zip(grid.T, cases.items(), strict=True):
-        truth = checks.array(given, f"the truth of {title!r}", (None, len(states)))
-        told = {name: checks.array(curve, name, finite=False) for name, curve in curves.items()}
-        for name, curve in told.items():
+    for column, (title, (true_states, reconstructions)) in zip(grid.T, cases.items(), strict=True):
+        truth = checks.array(true_states, f"the truth of {title!r}", (None, len(states)))
+        curves = {name: checks.array(curve, name, finite=False) for name, curve in reconstructions.items()}
+        for name, curve in curves.items():
             if curve.shape != truth.shape:
                 raise ShapeError(
                     f"{name} has shape {curve.shape}, the truth {truth.shape}; pass the same steps and states"
                 )
         t = np.arange(len(truth)) * dt
-        _trajectories(column[:-1], t, truth, told, names)
-        _relative_errors(column[-1], t, truth, told, names)
+        _draw_states(column[:-1], t, truth, curves, names)
+        _draw_relative_errors(column[-1], t, truth, curves, names)
         column[-1].set_xlim(0.0, t[-1])
-    legend(made, grid[0], 4 if len(cases) > 1 else 3)
-    return made
+    draw_legend(drawing, grid[0], 4 if len(cases) > 1 else 3)
+    return drawing
 
 
-def _trajectories(
+def _draw_states(
     panels: Any, t: np.ndarray, truth: np.ndarray, curves: Mapping[str, np.ndarray], names: Sequence[str]
 ) -> None:
     for panel, i in zip(panels, range(truth.shape[1]), strict=True):
-        panel.plot(t, truth[:, i], **_BENEATH, label="truth")
+        panel.plot(t, truth[:, i], **_WIDE_TRUTH, label="truth")
         for name, curve in curves.items():
-            panel.plot(t, curve[:, i], **line(names.index(name), len(t)), label=name)
-        panel.set_ylim(*followed(truth[:, i], [curve[:, i] for curve in curves.values()], _LEAVES))
+            panel.plot(t, curve[:, i], **line_style(names.index(name), len(t)), label=name)
+        panel.set_ylim(*follow_truth(truth[:, i], [curve[:, i] for curve in curves.values()], _BEYOND_MEDIAN))
 
 
-def _relative_errors(
+def _draw_relative_errors(
     panel: Any, t: np.ndarray, truth: np.ndarray, curves: Mapping[str, np.ndarray], names: Sequence[str]
 ) -> None:
     from matplotlib.ticker import LogLocator, NullLocator
@@ -354,28 +359,28 @@ def _relative_errors(
     for name, curve in curves.items():
         with np.errstate(over="ignore"):
             relative = np.nan_to_num(np.linalg.norm(curve - truth, axis=1) / size, nan=np.inf)
-        panel.semilogy(t, np.clip(relative, _LEAST, 10 * _HIGHEST), **line(names.index(name), len(t)))
+        panel.semilogy(t, np.clip(relative, _LEAST_ERROR, 10 * _MOST_ERROR), **line_style(names.index(name), len(t)))
         errors.append(relative[1:])
-    if not errors:  # nothing to scale an axis by
+    if not errors:
         return
     # errors start at rounding and may pass through 0, so the axis starts at their 2 % quantile
     usual = min(float(np.quantile(relative, 0.02)) for relative in errors)
     highest = max(float(relative.max()) for relative in errors)
-    low, high = (float(np.log10(np.clip(v, _LEAST, _HIGHEST))) for v in (usual, highest))
+    low, high = (float(np.log10(np.clip(v, _LEAST_ERROR, _MOST_ERROR))) for v in (usual, highest))
     panel.set_ylim(10.0 ** np.floor(low), 10.0 ** max(np.ceil(high), np.floor(low) + 2))
-    panel.yaxis.set_major_locator(LogLocator(numticks=_TICKS))
+    panel.yaxis.set_major_locator(LogLocator(numticks=_MOST_TICKS))
     panel.yaxis.set_minor_locator(NullLocator())
 
 
-def _columns(labels: Sequence[str], titles: Sequence[str], height: float) -> "tuple[Figure, np.ndarray]":
-    """Return a figure with a column of panels for each title, a row for each label, and time below."""
+def _arrange_columns(labels: Sequence[str], titles: Sequence[str], height: float) -> "tuple[Figure, np.ndarray]":
+    """Return a figure with a column of panels for each title, a row for each label, and a common time axis."""
     width: Width = "two columns" if len(titles) > 1 else "one column"
-    made, grid = figure(len(labels), len(titles), width=width, height=0.8 + height * len(labels), sharex="col")
+    drawing, grid = make_figure(len(labels), len(titles), width=width, height=0.8 + height * len(labels), sharex="col")
     for panel, title in zip(grid[0], titles, strict=True):
         panel.set_title(title)
     for panel, label in zip(grid[:, 0], labels, strict=True):
         panel.set_ylabel(label)
     for panel in grid[-1]:
         panel.set_xlabel("time [s]")
-    made.align_ylabels(list(grid[:, 0]))
-    return made, grid
+    drawing.align_ylabels(list(grid[:, 0]))
+    return drawing, grid

@@ -1,8 +1,8 @@
 # pyright: basic
-"""The style of every figure: for one column or two of a page, readable in black and white, the same bytes each time.
+"""The common style of figures: one or two columns of a page, readable in black and white, reproducible to the byte.
 
-A figure is a `matplotlib.figure.Figure` of its own: nothing of pyplot, so no display, no backend, and nothing that
-stays when it is let go. matplotlib is imported where it is used.
+Figures are made as `matplotlib.figure.Figure`, without pyplot. They need no display and no backend, and leave no global
+state. matplotlib is imported only when a figure is drawn.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 
 from koopmpc import disk
 from koopmpc.errors import DataError
-from koopmpc.lifting.base import Chosen, indices
+from koopmpc.lifting.base import StateChoice, find_states
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,12 +28,12 @@ WIDTHS: dict[str, float] = {"one column": 3.5, "two columns": 7.16}  # widths on
 TRUTH: dict[str, Any] = {"color": "#000000", "linestyle": "-", "linewidth": 1.4}
 REFERENCE: dict[str, Any] = {"color": "#000000", "linestyle": ":", "linewidth": 1.1}
 LIMIT: dict[str, Any] = {"color": "#8c1d18", "linestyle": (0, (6, 2)), "linewidth": 0.9}
-SEQUENTIAL = "viridis"  # its lightness grows evenly, so it reads in grey
-CYCLIC = "twilight"  # it ends with its first colour, light; its middle is dark
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#7b3294", "#c28e00", "#5a5a5a")  # colour-blind readers can tell them
+SEQUENTIAL = "viridis"  # colour map for magnitudes; its lightness rises evenly, so it is readable in grey
+CYCLIC = "twilight"  # colour map for phases; it ends with its first colour
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#7b3294", "#c28e00", "#5a5a5a")  # distinct for colour-blind readers
 _DASHES = ((0, (5, 1.5)), "-", (0, (1, 1)), "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (8, 2)))
 _MARKERS = ("o", "s", "^", "D", "v", "x")
-_MOST = 12  # states in one figure, at most
+_MOST_STATES = 12  # largest number of states in one figure
 _SUFFIXES = (".png", ".pdf", ".svg")
 _RC: dict[str, Any] = {
     "font.size": 8.0,
@@ -79,45 +79,47 @@ def _settings() -> Iterator[None]:
 
 
 styled = _settings()
-"""Decorator: what a function draws is in this style whatever the user's own settings are; those come back after it."""
+"""Decorator: the function draws in this style; the user's own matplotlib settings are restored afterwards."""
 
 
-def figure(rows: int, columns: int = 1, *, width: Width, height: float, **more: Any) -> "tuple[Figure, np.ndarray]":
+def make_figure(
+    rows: int, columns: int = 1, *, width: Width, height: float, **more: Any
+) -> "tuple[Figure, np.ndarray]":
     """Return a figure and its (rows, columns) axes, an array of objects.
 
     Parameters
     ----------
     rows, columns
-        How many axes.
+        Number of axes.
     width
         "one column" or "two columns" of a page.
     height
         Height of the figure [in].
     more
-        For `Figure.subplots`: ``sharex``, ``height_ratios``, …
+        Further arguments of `Figure.subplots`: ``sharex``, ``height_ratios``, …
 
     Raises
     ------
     DataError
-        The width is another word.
+        The width has another value.
     """
     from matplotlib.figure import Figure
 
     if width not in WIDTHS:
         raise DataError(f"width is {width!r}; pass one of {', '.join(WIDTHS)}")
-    made = Figure(figsize=(WIDTHS[width], height), layout="constrained")
-    return made, made.subplots(rows, columns, squeeze=False, **more)
+    drawing = Figure(figsize=(WIDTHS[width], height), layout="constrained")
+    return drawing, drawing.subplots(rows, columns, squeeze=False, **more)
 
 
-def line(i: int, points: int = 0) -> dict[str, Any]:
-    """Return the look of the i-th of several curves: colour, dashes and marker all differ.
+def line_style(i: int, points: int = 0) -> dict[str, Any]:
+    """Return the style of the i-th curve; curves differ in colour, dashes and marker.
 
     Parameters
     ----------
     i
         Number of the curve in the panel, from 0 on.
     points
-        How many points the curve has: about eight of them get the marker; 0 for no markers.
+        Number of points of the curve, about eight of which get a marker; 0 for no markers.
     """
     look: dict[str, Any] = {"color": _COLORS[i % len(_COLORS)], "linestyle": _DASHES[i % len(_DASHES)]}
     if points:
@@ -126,34 +128,34 @@ def line(i: int, points: int = 0) -> dict[str, Any]:
     return look
 
 
-def band(axes: "Axes", x: Any, low: Any, high: Any, i: int, label: str | None = None) -> None:
-    """Shade from `low` to `high` in the colour of the i-th curve, with thin edges in its dashes that print in grey."""
-    look = line(i)
+def draw_band(axes: "Axes", x: Any, low: Any, high: Any, i: int, label: str | None = None) -> None:
+    """Shade from `low` to `high` in the colour of the i-th curve, with thin edges in its dashes."""
+    look = line_style(i)
     axes.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0.0, label=label)
     for edge in (low, high):
         axes.plot(x, edge, color=look["color"], linestyle=look["linestyle"], linewidth=0.6)
 
 
-def shades(values: Float[np.ndarray, "..."], scale: str) -> UInt8[np.ndarray, "... 3"]:
-    """Return the red, green and blue of values from 0 to 1 on a scale, `SEQUENTIAL` or `CYCLIC`."""
+def map_colors(values: Float[np.ndarray, "..."], scale: str) -> UInt8[np.ndarray, "... 3"]:
+    """Return the red, green and blue of values from 0 to 1 in a colour map, `SEQUENTIAL` or `CYCLIC`."""
     import matplotlib as mpl
 
     return np.asarray(mpl.colormaps[scale](np.clip(values, 0.0, 1.0), bytes=True))[..., :3]
 
 
-def legend(made: "Figure", axes: "Iterable[Axes]", columns: int) -> None:
-    """Write every label of these axes once, above all panels, in at most so many columns."""
-    found: dict[str, Any] = {}
+def draw_legend(drawing: "Figure", axes: "Iterable[Axes]", columns: int) -> None:
+    """Draw a legend above all panels, with each label of these axes once, in at most `columns` columns."""
+    entries: dict[str, Any] = {}
     for panel in axes:
         handles, labels = panel.get_legend_handles_labels()
-        found |= dict(zip(labels, handles, strict=True))
-    made.legend(list(found.values()), list(found), loc="outside upper center", ncols=min(len(found), columns))
+        entries |= dict(zip(labels, handles, strict=True))
+    drawing.legend(list(entries.values()), list(entries), loc="outside upper center", ncols=min(len(entries), columns))
 
 
-def interval(low: float, high: float, lowest: float, highest: float, beyond: float) -> tuple[float, float]:
-    """Return an axis for all of low … high, and for lowest … highest up to `beyond` such spans outside of it.
+def limit_axis(low: float, high: float, lowest: float, highest: float, beyond: float) -> tuple[float, float]:
+    """Return the limits of an axis that shows low … high, and of lowest … highest at most `beyond` spans more.
 
-    So a curve that runs away cannot flatten those that the picture is about.
+    A span is high − low. The bound keeps the main curves readable if another curve diverges.
     """
     span = (high - low) or max(abs(high), 1.0)
     bottom, top = max(min(low, lowest), low - beyond * span), min(max(high, highest), high + beyond * span)
@@ -161,28 +163,28 @@ def interval(low: float, high: float, lowest: float, highest: float, beyond: flo
     return bottom - margin, top + margin
 
 
-def followed(truth: np.ndarray, curves: Iterable[np.ndarray], beyond: float) -> tuple[float, float]:
-    """Return an axis for the truth, and for curves that do not run away from it by more than `beyond` of its spans."""
+def follow_truth(truth: np.ndarray, curves: Iterable[np.ndarray], beyond: float) -> tuple[float, float]:
+    """Return the limits of an axis that shows the truth, and the curves up to `beyond` spans of the truth outside."""
     low, high = float(truth.min()), float(truth.max())
     shown = np.concatenate([[low, high], *(curve[np.isfinite(curve)] for curve in curves)])
-    return interval(low, high, float(shown.min()), float(shown.max()), beyond)
+    return limit_axis(low, high, float(shown.min()), float(shown.max()), beyond)
 
 
-def chosen_states(states: Chosen | None, names: Sequence[str]) -> list[int]:
-    """Return the indices of the states to draw, all by default; raise where they are none or too many."""
-    chosen = indices(states, names, "the figure")
-    if not 1 <= len(chosen) <= _MOST:
-        raise DataError(f"the figure is asked for {len(chosen)} states; choose 1 to {_MOST} with states=…")
+def choose_states(states: StateChoice | None, names: Sequence[str]) -> list[int]:
+    """Return the indices of the states to draw, by default all; raise if there are no states or too many."""
+    chosen = find_states(states, names, "the figure")
+    if not 1 <= len(chosen) <= _MOST_STATES:
+        raise DataError(f"the figure is asked for {len(chosen)} states; choose 1 to {_MOST_STATES} with states=…")
     return chosen
 
 
 @styled
-def save(made: "Figure", path: str | PathLike[str]) -> None:
-    """Write the figure as .png, .pdf or .svg, by the path's ending: the same figure, the same bytes.
+def save(drawing: "Figure", path: str | PathLike[str]) -> None:
+    """Write the figure as .png, .pdf or .svg, by the path's suffix; equal figures give equal bytes.
 
     Parameters
     ----------
-    made
+    drawing
         A figure of `km.plot`, or any `matplotlib.figure.Figure`.
     path
         The file to write; its folders are made.
@@ -190,38 +192,38 @@ def save(made: "Figure", path: str | PathLike[str]) -> None:
     Raises
     ------
     DataError
-        The path ends otherwise.
+        The path has another suffix.
     LogError
         The path cannot be written.
     """
     suffix = disk.path_of(path).suffix.lower()
     if suffix not in _SUFFIXES:
-        raise DataError(f"{path} is no picture by its name; end it with one of {', '.join(_SUFFIXES)}")
+        raise DataError(f"{path} does not end like a picture; end it with one of {', '.join(_SUFFIXES)}")
     with disk.writing(path) as stream:
         if suffix == ".png":
-            _save_png(made, stream)
+            _save_png(drawing, stream)
         else:
-            made.savefig(stream, format=suffix[1:], metadata=_METADATA[suffix])
+            drawing.savefig(stream, format=suffix[1:], metadata=_METADATA[suffix])
 
 
 @styled
-def svg(made: "Figure") -> str:
-    """Return the figure as an <svg> element, to stand in a page; it scales with the width that it has."""
+def render_svg(drawing: "Figure") -> str:
+    """Return the figure as an <svg> element of a page; it scales to the width of the page."""
     out = StringIO()
-    made.savefig(out, format="svg", metadata=_METADATA[".svg"])
+    drawing.savefig(out, format="svg", metadata=_METADATA[".svg"])
     text = out.getvalue()
     return text[text.index("<svg") :]
 
 
-def _save_png(made: "Figure", stream: BinaryIO) -> None:
-    """Write a .png: lines in 256 colours, a third of the bytes and no change to the eye; shades in all of theirs."""
+def _save_png(drawing: "Figure", stream: BinaryIO) -> None:
+    """Write a .png; line drawings get 256 colours, which saves two thirds of the bytes without a visible change."""
     from PIL import Image
 
-    drawn = BytesIO()
-    made.savefig(drawn, format="png", metadata=_METADATA[".png"])
-    picture = Image.open(drawn)
+    buffer = BytesIO()
+    drawing.savefig(buffer, format="png", metadata=_METADATA[".png"])
+    picture = Image.open(buffer)
     resolution = picture.info["dpi"]
-    shaded = any(part.get_array() is not None for axes in made.axes for part in axes.collections)
+    shaded = any(part.get_array() is not None for axes in drawing.axes for part in axes.collections)
     if not shaded:
         picture = picture.convert("RGB").quantize(256, kmeans=1, dither=Image.Dither.NONE)
     picture.save(stream, "PNG", optimize=True, dpi=resolution)

@@ -11,17 +11,18 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.limits import Interval
-from koopmpc.control.move import Move, Status
+from koopmpc.control.move import Status
 from koopmpc.errors import LogError
-from koopmpc.lifting.state import State
 from koopmpc.loop.faults import ActuatorLoss, DroppedSamples, Fault, FrozenSensor, NaNSensor, SensorDelay, SolverFailure
-from koopmpc.loop.metrics import duration
-from koopmpc.loop.simulate import simulate
+from koopmpc.loop.metrics import metrics, tracking_error, violation_shares
+from koopmpc.loop.run import Step
+from koopmpc.page import Page
 from koopmpc.parallel import StageProgress
-from koopmpc.recording.page import Page
-from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign, made, saved_controller
-from koopmpc.synthesis.judging import Fenced, LostError
-from koopmpc.validate.text import percent, table, written
+from koopmpc.plants.step_map import StepMap
+from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign, read_controller, rebuild_controller
+from koopmpc.synthesis.judging import run_on_surrogate
+from koopmpc.terminal import build_table, render_text
+from koopmpc.text import format_duration, to_percent
 
 ALLOWED, ALLOWED_OFF = 0.01, 0.05  # violation, as a share of the range: as in the data, and with noise or inputs off
 ARRIVED = 0.05  # error over the last tenth of a run, as a share of the data's range
@@ -117,12 +118,12 @@ class Checked:
         """Return the verdict and a line for each kind of run."""
         verdict = "the goal is kept" if self.kept else "THE GOAL IS NOT KEPT"
         rows = [_row(one) for one in self.figures]
-        hot, cold, dt = map(duration, (self.hot, self.cold, self.dt))
+        hot, cold, dt = map(format_duration, (self.hot, self.cold, self.dt))
         times = f"a step takes {hot} (99 %), the first one {cold}; dt is {dt}"
         aside = [f"- {one}" for one in self.broken if one not in self.reasons]
         aside = ["with faults, which do not count (--faults counts them):", *aside] if aside else []
         reasons = [f"- {reason}" for reason in self.reasons]
-        return written(verdict, *reasons, *aside, "", table(_HEADINGS, rows), "", times)
+        return render_text(verdict, *reasons, *aside, "", build_table(_HEADINGS, rows), "", times)
 
 
 _NUMBERS = ("lost", "median\ncost", "worst\nviolation", "error\nat the end", "steps without\na good status")
@@ -131,7 +132,7 @@ _HEADINGS = ("kind of run", *_NUMBERS)
 
 def _row(one: Figures) -> list[str]:
     lost = f"{one.lost} of {one.runs}"
-    numbers = [f"{one.cost:.4g}", percent(one.violation), percent(one.error)]
+    numbers = [f"{one.cost:.4g}", to_percent(one.violation), to_percent(one.error)]
     return [one.kind.name, lost, *(numbers if one.lost < one.runs else ["-"] * 3), str(one.bad)]
 
 
@@ -174,32 +175,32 @@ def check_controller(
     LogError
         The file holds no design, or is damaged.
     """
-    saved, draw, runs = saved_controller(path), checks.generator(rng), checks.count(runs, "runs")
+    saved, draw, runs = read_controller(path), checks.generator(rng), checks.count(runs, "runs")
     if not isinstance(saved, SavedDesign):
         raise LogError(
             f"{path} holds a controller without the evidence that a check needs; pass what `koopmpc fit --goal` or the "
             "save of a km.design wrote"
         )
     evidence = saved.evidence
-    controller = made(saved, path)
+    controller = rebuild_controller(saved, path)
     asked = evidence.asked
     controller.reset(asked.starts[0])
     start = perf_counter()
     controller(asked.starts[0], asked.reference[: controller.horizon + 1])
     cold = perf_counter() - start
     every = kinds(asked.horizon, bounded=bool(np.isfinite(asked.limits.inputs(controller.nu)).all()))
-    times, figures = list[float](), list[Figures]()
+    bench, figures = _TestBench(evidence, controller), list[Figures]()
     done, total = 0, runs * len(every)
     picked = draw.integers(len(asked.first_states), size=runs)
     for kind in every:
         outcomes: list[_Outcome] = []
         for j in range(runs):
-            outcomes.append(_driven(evidence, controller, kind, asked.first_states[picked[j]], j, times))
+            outcomes.append(bench.run(kind, asked.first_states[picked[j]], j))
             done += 1
             if progress is not None:
                 progress(kind.name, done, total)
         figures.append(_figures(kind, outcomes))
-    hot = float(np.quantile(times, 0.99)) if times else np.inf
+    hot = float(np.quantile(bench.times, 0.99)) if bench.times else np.inf
     reasons, broken = _reasons(evidence, figures, cold, hot, controller.dt)
     reasons += broken if faults else []
     page = Path(folder, "check.md")
@@ -217,76 +218,68 @@ class _Outcome:
     outside: int
 
 
-class _Timed:
-    """A controller that records the status and the time of each step, and whether its input is inside the limits."""
+class _StepWatch:
+    """An observer that records status and time of each step, and how often the input is outside its limits."""
 
-    def __init__(self, controller: AnyMPC, times: list[float], inputs: Interval) -> None:
-        self._controller, self._times, self._inputs, self.outside = controller, times, inputs, 0
-        self.dt, self.nu, self.horizon = controller.dt, controller.nu, controller.horizon
-        self.reset, self.statuses = controller.reset, Counter[str]()
+    def __init__(self, times: list[float], inputs: Interval) -> None:
+        self._times, self._inputs, self.outside, self.statuses = times, inputs, 0, Counter[str]()
 
-    @property
-    def solver_fails(self) -> bool:
-        """Whether the solver loses its answers."""
-        return self._controller.solver_fails
-
-    @solver_fails.setter
-    def solver_fails(self, fails: bool) -> None:
-        self._controller.solver_fails = fails
-
-    def __call__(self, y: object, reference: object, applied: object = None, w: object = None) -> Move:
-        move = self._controller(y, reference, applied, w)  # pyright: ignore[reportArgumentType]  # as simulate asks
-        self.statuses[move.status.name] += 1
-        self._times.append(move.solve_time)
-        low, high = self._inputs
-        self.outside += not bool(((move.u >= low) & (move.u <= high)).all())
-        return move
+    def __call__(self, step: Step) -> None:
+        """Record a step."""
+        if (move := step.move) is not None:
+            low, high = self._inputs
+            self.statuses[move.status.name] += 1
+            self._times.append(move.solve_time)
+            self.outside += not bool(((move.u >= low) & (move.u <= high)).all())
 
 
-def _driven(
-    evidence: Evidence,
-    controller: AnyMPC,
-    kind: RunKind,
-    first: Float[np.ndarray, " n"],
-    seed: int,
-    times: list[float],
-) -> _Outcome:
-    asked, one = evidence.asked, evidence.surrogates[seed % len(evidence.surrogates)]
-    timed = _Timed(controller, times, asked.limits.inputs(controller.nu))
-    reference, judged = asked.reference[: asked.steps + 1], asked.steps
-    if evidence.goal_can_be_held:
-        reference = np.repeat(reference[:1], LONGER * judged + 1, axis=0)
-    try:
-        run = simulate(
-            Fenced(one.plant(kind.gain), evidence.low, evidence.high),
-            timed,  # pyright: ignore[reportArgumentType]
-            x0=one.start(first),
-            reference=reference,
-            steps=len(reference) - 1,
-            noise=kind.noise * one.noise,
-            measured=one.w if len(one.w) else None,
-            limits=asked.limits,
-            faults=kind.faults,
+class _TestBench:
+    """The surrogates of a design as plants, with the inputs that hold the reference on each, built when first used."""
+
+    def __init__(self, evidence: Evidence, controller: AnyMPC) -> None:
+        self._evidence, self._controller, self.times = evidence, controller, list[float]()
+        asked = evidence.asked
+        self._reference = asked.reference[: asked.steps + 1]
+        if evidence.goal_can_be_held:
+            self._reference = np.repeat(self._reference[:1], LONGER * asked.steps + 1, axis=0)
+        self._plants: dict[tuple[int, float], tuple[StepMap, Float[np.ndarray, "T nu"]]] = {}
+
+    def run(self, kind: RunKind, first: Float[np.ndarray, " n"], seed: int) -> _Outcome:
+        """Run the controller from a state, and return what `metrics` says of the run."""
+        evidence, asked, place = self._evidence, self._evidence.asked, seed % len(self._evidence.surrogates)
+        surrogate, key = evidence.surrogates[place], (place, kind.gain)
+        if key not in self._plants:
+            inputs = surrogate.find_reference_inputs(asked.cost, asked.limits, self._reference[:-1], kind.gain)
+            self._plants[key] = surrogate.plant(kind.gain), inputs
+        plant, inputs = self._plants[key]
+        watch = _StepWatch(self.times, asked.limits.inputs(self._controller.nu))
+        run = run_on_surrogate(
+            asked,
+            surrogate,
+            plant,
+            self._controller,
+            first,
+            box=(evidence.low, evidence.high),
+            reference=self._reference,
+            u_reference=inputs,
             rng=seed,
+            noise=kind.noise,
+            faults=kind.faults,
+            observers=[watch],
         )
-    except LostError:
-        return _Outcome(np.inf, np.inf, np.inf, timed.statuses, timed.outside)
-    nx, states = len(evidence.low), one.model.states
-    X = run.X[:, :nx]
-    of = asked.cost.of.bind(states)
-    error = of(X) - run.reference
-    if isinstance(of, State):
-        for column, i in enumerate(of.chosen):
-            if i in asked.angles:
-                error[:, column] = np.pi - np.mod(np.pi - error[:, column], 2 * np.pi)
-    Q, R = asked.cost.matrices(of.nz, run.U.shape[1])
-    e, U = error[1 : judged + 1], run.U[:judged]
-    cost = float(np.einsum("ki,ij,kj->", e, Q, e) + np.einsum("ki,ij,kj->", U, R, U))
-    size = np.abs(np.diff(of(np.array([asked.low, asked.high])), axis=0))[0]
-    weighed = np.diag(Q) > 0
-    late = np.abs(error[-max(len(error) // 10, 1) :]) / np.where(size > 0, size, 1.0)
-    violation, left = float(asked.beyond(X[1:], states).max()), float(late[:, weighed].max())
-    return _Outcome(cost, violation, left, timed.statuses, timed.outside)
+        if run is None:
+            return _Outcome(np.inf, np.inf, np.inf, watch.statuses, watch.outside)
+        of, error = asked.cost.of.bind(run.states), tracking_error(run)
+        size = np.abs(np.diff(of(np.array([asked.low, asked.high])), axis=0))[0]
+        last = np.abs(error[-max(len(error) // 10, 1) :]) / np.where(size > 0, size, 1.0)
+        weighed = np.diag(asked.cost.matrices(of.nz, run.U.shape[1])[0]) > 0
+        return _Outcome(
+            cost=metrics(run.take_first(asked.steps)).cost,
+            violation=float(violation_shares(run, asked.limit_sizes).max()),
+            error=float(last[:, weighed].max(initial=0.0)),
+            statuses=watch.statuses,
+            outside=watch.outside,
+        )
 
 
 def _figures(kind: RunKind, outcomes: Sequence[_Outcome]) -> Figures:
@@ -316,7 +309,7 @@ def _reasons(
         if one.lost:
             counted.append(f"{name}: {one.lost} of {one.runs} runs left the data, or their states became NaN")
         if one.lost < one.runs and one.violation > one.kind.allowed:
-            much, allowed = percent(one.violation), percent(one.kind.allowed)
+            much, allowed = to_percent(one.violation), to_percent(one.kind.allowed)
             counted.append(f"{name}: a limit is violated by {much} of its range, {allowed} are allowed")
         if one.outside:
             said.append(f"{name}: {one.outside} inputs were outside their limits")
@@ -326,12 +319,12 @@ def _reasons(
     as_learned = figures[0]
     if evidence.goal_can_be_held and as_learned.lost < as_learned.runs and as_learned.error > ARRIVED:
         said.append(
-            f"{as_learned.kind.name}: a run ends {percent(as_learned.error)} of the data's range off its reference, "
-            f"{percent(ARRIVED)} are allowed"
+            f"{as_learned.kind.name}: a run ends {to_percent(as_learned.error)} of the data's range off its reference, "
+            f"{to_percent(ARRIVED)} are allowed"
         )
     for what, taken in (("the first step", cold), ("one step in a hundred", hot)):
         if taken > dt:
-            said.append(f"{what} takes {duration(taken)} or more, and dt is {duration(dt)}")
+            said.append(f"{what} takes {format_duration(taken)} or more, and dt is {format_duration(dt)}")
     return said, broken
 
 
@@ -349,7 +342,7 @@ def _page(result: Checked, folder: Path, path: str | Path, saved: SavedDesign) -
     page.text("## With faults")
     if set(result.broken) - set(result.reasons):
         page.text("A goal says nothing of what breaks, so this does not count. `koopmpc check --faults` counts it.")
-    nothing = f"no run was lost, and no limit violated by more than {percent(ALLOWED_OFF)} of its range"
+    nothing = f"no run was lost, and no limit violated by more than {to_percent(ALLOWED_OFF)} of its range"
     page.items(result.broken or [nothing])
     page.text("## Statuses")
     page.table(
@@ -357,7 +350,7 @@ def _page(result: Checked, folder: Path, path: str | Path, saved: SavedDesign) -
         [[f.kind.name, ", ".join(f"{count} {name}" for name, count in f.statuses)] for f in result.figures],
     )
     page.text("## Times")
-    cold, hot = duration(result.cold), duration(result.hot)
+    cold, hot = format_duration(result.cold), format_duration(result.hot)
     page.items([f"the first step of a fresh controller: {cold}", f"99 % of all others: at most {hot}"])
     page.text("## What was expected at its design")
     page.code(str(saved.evidence.expected))

@@ -15,25 +15,26 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import FullDiskError
 from koopmpc.figures.eigenvalues import spectrum
 from koopmpc.figures.series import error, rollout
-from koopmpc.fitting.repair import IN_MEMORY, PAST, Data, Divided, noted, read
+from koopmpc.figures.style import save
+from koopmpc.fitting.repair import IN_MEMORY, PAST, Data, DividedData, collect_notes, read_logs
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
+from koopmpc.page import Page
 from koopmpc.parallel import StageProgress
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.recording.model import record_model
-from koopmpc.recording.page import Page
 from koopmpc.synthesis.select import Selection, select
+from koopmpc.terminal import label_lines, render_text
 from koopmpc.validate.report import TrustReport, trust
 from koopmpc.validate.scoring import Score, score
-from koopmpc.validate.text import labelled, written
 
 Say = Callable[[str], None]
-_ROLLOUTS = 3  # held-out episodes that are drawn
+_ROLLOUTS = 3  # draw forecasts of this many held-out episodes
 LINEAR = "linear.npz"  # beside a bilinear model.npz
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FittedData:
     """The model that was chosen, its report, and the files that were written.
 
     Attributes
@@ -80,7 +81,7 @@ def fit_data(
     progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
     **reading: Any,
-) -> Fitted:
+) -> FittedData:
     """Read data, hold some out, choose and fit a model, judge it, and write model.npz, report.md and model.rrd.
 
     Parameters
@@ -118,12 +119,12 @@ def fit_data(
     workers = None if workers is None else checks.count(workers, "workers")
     if scheduler is not None:
         address_of(scheduler, workers)
-    tell = silent if say is None else say
-    split, notes = read(data, horizon, draw, memory, reading)
-    about = understood(split, notes)
+    tell = ignore_text if say is None else say
+    split = read_logs(data, horizon, draw, memory, reading)
+    about = describe_data(split)
     tell(about)
     doubts: list[str] = []
-    with noted(doubts):
+    with collect_notes(doubts):
         selection = select(
             split.fitted,
             horizon=split.horizon,
@@ -141,13 +142,13 @@ def fit_data(
         selection.linear.save(place / LINEAR)
     chosen = "\n".join([str(selection), *(f"! {doubt}" for doubt in doubts)])
     tell(chosen)
-    with noted([]):  # the fits repeat the doubts that were told above
+    with collect_notes([]):  # the fits repeat the doubts that stand above
         report = trust(selection.predictor, split.held_out, split.horizon, train=split.seen, rng=draw)
         plain = score(edmd(split.seen, State() + Constant()), split.held_out, split.horizon)
-    judged = f"{report}\n\n{_beside(report.score, plain)}"
+    judged = f"{report}\n\n{_compare_with_plain(report.score, plain)}"
     tell(judged)
     failures: list[str] = []
-    pictures = drawn(selection, report, plain, split.held_out)
+    pictures = list_pictures(selection, report, plain, split.held_out)
     recording = place / "model.rrd"
     try:
         record_model(selection.predictor, split.held_out, recording, report=report)
@@ -155,7 +156,7 @@ def fit_data(
         raise
     except Exception as failure:  # a log that cannot be written must not cost the model
         failures.append(f"{recording.name}: {type(failure).__name__}: {failure}")
-    usage = _usage(selection, model)
+    usage = _format_usage(selection, model)
     page = Page(place)
     page.text("# Model report", judged.partition("\n")[0])
     page.code(usage, "python")
@@ -165,7 +166,7 @@ def fit_data(
     page.code(judged)
     for name, caption, draw_picture in pictures:
         try:
-            page.picture(name, caption, draw_picture())
+            page.picture(name, caption, partial(save, draw_picture()))
         except FullDiskError:
             raise
         except Exception as failure:  # a picture that cannot be drawn must not cost the model
@@ -175,7 +176,7 @@ def fit_data(
     if failures:
         page.text("## What could not be made")
         page.items(failures)
-    return Fitted(
+    return FittedData(
         selection=selection,
         report=report,
         plain=plain,
@@ -188,7 +189,7 @@ def fit_data(
     )
 
 
-def _usage(selection: Selection, path: Path) -> str:
+def _format_usage(selection: Selection, path: Path) -> str:
     lines = ["import koopmpc as km"]
     if isinstance(selection.predictor, BilinearPredictor):
         lines.append(f'model = km.load_model("{path.as_posix()}")  # for BilinearMPC')
@@ -199,7 +200,7 @@ def _usage(selection: Selection, path: Path) -> str:
     return "\n".join(lines)
 
 
-def drawn(
+def list_pictures(
     selection: Selection, report: TrustReport, plain: Score, held_out: Episodes
 ) -> Iterator[tuple[str, str, Callable[[], Any]]]:
     """Yield the name of each picture, its caption, and the call that draws it.
@@ -235,7 +236,7 @@ def drawn(
     yield "spectrum", caption, partial(spectrum, predictor, report.residuals)
 
 
-def understood(split: Divided, notes: list[str]) -> str:
+def describe_data(split: DividedData) -> str:
     """Return lines on the data: sizes, sample time, names and ranges, and all repairs."""
     seen, X = split.seen, np.concatenate([e.X for e in split.seen])
     pairs = [("data", split.size), ("step", f"dt = {seen.dt:g} s")]
@@ -254,10 +255,10 @@ def understood(split: Divided, notes: list[str]) -> str:
     steps = sum(map(len, split.held_out))
     ahead = f"horizon {split.horizon} steps = {split.horizon * seen.dt:.3g} s"
     pairs.append(("held out", f"{len(split.held_out)} episodes, {steps} steps; {ahead}"))
-    return "\n".join([written(labelled(pairs)), *(f"! {note}" for note in (*notes, *split.notes))])
+    return "\n".join([render_text(label_lines(pairs)), *(f"! {note}" for note in split.notes)])
 
 
-def _beside(score: Score, plain: Score) -> str:
+def _compare_with_plain(score: Score, plain: Score) -> str:
     """Return the last errors as shares of those of the plain linear fit."""
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = score.rmse[-1] / plain.rmse[-1]
@@ -265,5 +266,5 @@ def _beside(score: Score, plain: Score) -> str:
     return f"RMSE {score.horizon} steps ahead over that of the plain linear fit x⁺ = A x + B u + c:\n  {named}"
 
 
-def silent(_: str) -> None:
+def ignore_text(_: str) -> None:
     """Say nothing."""

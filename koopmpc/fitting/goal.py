@@ -4,6 +4,7 @@ import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from inspect import Parameter, signature
 from os import PathLike
 from pathlib import Path
 from typing import Any, cast
@@ -15,18 +16,22 @@ from koopmpc import checks, disk
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
+from koopmpc.data.files.load import load_episodes
 from koopmpc.errors import DataError, LogError
-from koopmpc.fitting.fit import Say, silent, understood
-from koopmpc.fitting.repair import IN_MEMORY, Data, noted, read
+from koopmpc.fitting.fit import Say, describe_data, ignore_text
+from koopmpc.fitting.repair import IN_MEMORY, Data, collect_notes, read_logs
 from koopmpc.lifting.state import State
+from koopmpc.page import Page
 from koopmpc.parallel import StageProgress
-from koopmpc.recording.page import Page
 from koopmpc.synthesis.cross_validation import usual_horizon
 from koopmpc.synthesis.design import design
 from koopmpc.synthesis.designed import Design
 
 _SHORT = "record more episodes, or longer ones"  # what to do where logs are too few
-_TOP = {"horizon", "states", "inputs"}
+_TOP = {"horizon", "logs", "states", "inputs"}
+_READING = {
+    name for name, argument in signature(load_episodes).parameters.items() if argument.kind is Parameter.KEYWORD_ONLY
+}
 _STATE = {"reference", "weight", "limits", "angle"}
 _INPUT = {"weight", "limits", "change", "change_weight"}
 
@@ -98,11 +103,12 @@ def design_data(
     data, folder
         As for `fit_data`.
     goal
-        A file as `template_of` writes it.
+        A file as `write_template` writes it.
     bilinear, workers, scheduler, memory, say, progress, rng
         As for `fit_data`.
     reading
-        Keywords of `load_episodes` for plain tables; without ``inputs`` the inputs of the goal are inputs.
+        Keywords of `load_episodes` for plain tables, which replace those in the section [logs] of the goal. Without
+        ``inputs`` the inputs of the goal are inputs.
 
     Raises
     ------
@@ -112,18 +118,19 @@ def design_data(
         The data are not of one plant, or too few; the goal names what the data do not have.
     """
     place, draw = Path(folder), checks.generator(rng)
-    tell = silent if say is None else say
-    pushed = inputs_of(goal)
-    split, notes = read(data, None, draw, memory, reading, _SHORT)
+    tell = ignore_text if say is None else say
+    pushed = list_goal_inputs(goal)
+    reading = load_reading(goal) | {name: value for name, value in reading.items() if value is not None}
+    split = read_logs(data, None, draw, memory, reading, _SHORT)
     missed = tuple(name for name in pushed if name in split.seen.states)
-    if missed and reading.get("inputs") is None:  # the goal knows inputs that no name in the logs shows
+    if missed and "inputs" not in reading:  # the goal knows inputs that no name in the logs shows
         reading["inputs"] = (*split.seen.inputs, *missed)
-        split, notes = read(data, None, draw, memory, reading, _SHORT)
-    about = understood(split, notes)
+        split = read_logs(data, None, draw, memory, reading, _SHORT)
+    about = describe_data(split)
     tell(about)
     asked = read_goal(goal, split.seen)
-    with noted([]):  # its advice says the same
-        found = design(
+    with collect_notes([]):  # its advice says the same
+        designed = design(
             split.fitted,
             asked.cost,
             asked.limits,
@@ -136,50 +143,59 @@ def design_data(
             progress=progress,
             rng=draw,
         )
-    tell(str(found))
+    tell(str(designed))
     file = place / "controller.npz"
-    found.save(file)
+    designed.save(file)
     usage = f'import koopmpc as km\ncontroller = km.load_controller("{file.as_posix()}")'
     page = Page(place)
-    page.text("# Controller report", f"Chosen: {found.best.title}.")
+    page.text("# Controller report", f"Chosen: {designed.best.title}.")
     page.code(usage, "python")
-    if found.advice:
+    if designed.advice:
         page.text("## Advice")
-        page.items(found.advice)
+        page.items(designed.advice)
     page.text("## What to expect")
-    page.code(str(found.expected))
+    page.code(str(designed.expected))
     page.text("## Choice")
-    page.code(str(found))
+    page.code(str(designed))
     page.text("## Goal")
     page.code(Path(goal).read_text(), "toml")
     page.text("## Data")
     page.code(about)
-    return DesignedData(found, asked, file, page.write("controller.md"), usage)
+    return DesignedData(designed, asked, file, page.write("controller.md"), usage)
 
 
-def template_of(data: Data, *, memory: int = IN_MEMORY, **reading: Any) -> str:
-    """Return the text of a goal file for the plant of some logs, with the ranges found.
+def write_template(data: Data, *, horizon: int | None = None, memory: int = IN_MEMORY, **reading: Any) -> str:
+    """Return the text of a goal file for the plant of some logs, with the ranges found and how the logs are read.
+
+    Parameters
+    ----------
+    data, memory, reading
+        As for `fit_data`.
+    horizon
+        Steps ahead that the controller looks; by default it follows from the lengths of the episodes.
 
     Raises
     ------
     DataError
         No column is an input.
     """
-    split, notes = read(data, None, checks.generator(0), memory, reading, _SHORT)
+    split = read_logs(data, horizon, checks.generator(0), memory, reading, _SHORT)
     if not split.seen.nu:
-        raise DataError("\n".join(["the logs have no input, so nothing can be controlled; pass --inputs u,v", *notes]))
-    return goal_template(split.seen.with_episodes([*split.seen, *split.held_out]))
+        advice = "the logs have no input, so nothing can be controlled; pass --inputs u,v"
+        raise DataError("\n".join([advice, *split.notes]))
+    both = split.seen.with_episodes([*split.seen, *split.held_out])
+    return format_template(both, horizon=horizon, reading=split.reading)
 
 
-def goal_template(data: Episodes) -> str:
+def format_template(data: Episodes, *, horizon: int | None = None, reading: Mapping[str, Any] | None = None) -> str:
     """Return the text of a goal file for these data: hold the medians of the last states, with inputs in their range.
 
     The weight of a state is 1 / (half its range)², so that errors as large as the data weigh alike; that of an input is
-    a tenth of this.
+    a tenth of this. `reading` holds the keywords of `load_episodes` that the logs are to be read with again.
     """
     X = np.concatenate([episode.X for episode in data])
     U = np.concatenate([episode.U for episode in data])
-    horizon = usual_horizon(data)[0]
+    horizon = usual_horizon(data)[0] if horizon is None else checks.count(horizon, "horizon")
     rest = np.median([episode.X[-1] for episode in data], axis=0)
     lines = [
         "# What the controller shall do. Numbers are in the units of the names; inf is no limit.",
@@ -188,39 +204,60 @@ def goal_template(data: Episodes) -> str:
         "",
         f"horizon = {horizon}  # steps of {data.dt:g} s that the controller looks ahead: {horizon * data.dt:.3g} s",
     ]
+    if reading:
+        lines += ["", "[logs]  # how koopmpc fit reads them; an option such as --resample replaces the value here"]
+        lines += [f"{name} = {_format_toml(value)}" for name, value in reading.items()]
     for i, name in enumerate(data.states):
         low, high = X[:, i].min(), X[:, i].max()
-        unit = _unit(name)
+        unit = _find_unit(name)
         lines += [
             "",
-            f'[states."{_escaped(name)}"]  # in the data from {low:.4g} to {high:.4g}',
-            f"reference = {_number(rest[i])}  # [{unit}] where it shall be; or a list, one value a step",
-            f"weight = {_number(4 / max(high - low, 1e-12) ** 2)}  # of its squared error, per [{unit}]²; 0 for none",
+            f'[states."{_escape_text(name)}"]  # in the data from {low:.4g} to {high:.4g}',
+            f"reference = {_format_number(rest[i])}  # [{unit}] where it shall be; or a list, one value a step",
+            f"weight = {_format_number(4 / max(high - low, 1e-12) ** 2)}  # of its squared error, per [{unit}]²; 0 for "
+            "none",
             f"limits = [-inf, inf]  # [{unit}] kept wherever that is possible",
             "angle = false  # true where errors wrap at ±pi",
         ]
     for i, name in enumerate(data.inputs):
         low, high = U[:, i].min(), U[:, i].max()
-        unit = _unit(name)
+        unit = _find_unit(name)
         lines += [
             "",
-            f'[inputs."{_escaped(name)}"]  # in the data from {low:.4g} to {high:.4g}',
-            f"weight = {_number(0.4 / max(high - low, 1e-12) ** 2)}  # of its squared distance from the input that "
-            f"holds the reference, per [{unit}]²",
-            f"limits = [{_number(low)}, {_number(high)}]  # [{unit}] always kept",
+            f'[inputs."{_escape_text(name)}"]  # in the data from {low:.4g} to {high:.4g}',
+            f"weight = {_format_number(0.4 / max(high - low, 1e-12) ** 2)}  # of its squared distance from the input "
+            f"that holds the reference, per [{unit}]²",
+            f"limits = [{_format_number(low)}, {_format_number(high)}]  # [{unit}] always kept",
             f"change = inf  # [{unit}] most change from step to step",
             f"change_weight = 0.0  # of its squared change, per [{unit}]²",
         ]
     return "\n".join(lines) + "\n"
 
 
-def inputs_of(path: str | PathLike[str]) -> tuple[str, ...]:
+def list_goal_inputs(path: str | PathLike[str]) -> tuple[str, ...]:
     """Return the names of the inputs that a goal file has sections for."""
-    given = _tree(Path(path)).get("inputs", {})
+    given = _load_toml(Path(path)).get("inputs", {})
     return tuple(cast("dict[str, Any]", given)) if isinstance(given, dict) else ()
 
 
-def _tree(file: Path) -> dict[str, Any]:
+def load_reading(path: str | PathLike[str]) -> dict[str, Any]:
+    """Return the keywords of `load_episodes` in the section [logs] of a goal file; none where it has no such section.
+
+    Raises
+    ------
+    DataError
+        It is no section, or has a key that is no such keyword.
+    """
+    file = Path(path)
+    given = _load_toml(file).get("logs", {})
+    if not isinstance(given, dict):
+        raise DataError(f"{file}: logs is {given!r}; write a section [logs] with keys {', '.join(sorted(_READING))}")
+    reading = cast("dict[str, Any]", given)
+    _check_keys(reading, _READING, f"{file}: [logs]")
+    return reading
+
+
+def _load_toml(file: Path) -> dict[str, Any]:
     """Return the content of a TOML file.
 
     Raises
@@ -247,10 +284,10 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
         state with a weight.
     """
     file = Path(path)
-    tree = _tree(file)
-    _known(tree, _TOP, str(file))
-    states = _sections(tree, "states", data.states, _STATE, file)
-    inputs = _sections(tree, "inputs", data.inputs, _INPUT, file)
+    tree = _load_toml(file)
+    _check_keys(tree, _TOP, str(file))
+    states = _find_sections(tree, "states", data.states, _STATE, file)
+    inputs = _find_sections(tree, "inputs", data.inputs, _INPUT, file)
     nx, nu = data.nx, data.nu
     Q, R, R_delta = np.zeros(nx), np.zeros(nu), np.zeros(nu)
     low, high = np.full(nx, -np.inf), np.full(nx, np.inf)
@@ -259,21 +296,21 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
     rows: dict[int, Float[np.ndarray, ...]] = {}
     for i, (name, section) in enumerate(zip(data.states, states, strict=True)):
         where = f"{file}, {name}"
-        Q[i] = _one(section, "weight", 0.0, where)
-        low[i], high[i] = _pair(section, where)
+        Q[i] = _read_number(section, "weight", 0.0, where)
+        low[i], high[i] = _read_limits(section, where)
         if section.get("angle", False) not in (True, False):
             raise DataError(f"{where}: angle is {section['angle']!r}; write true or false")
         angles += [i] * bool(section.get("angle", False))
         if "reference" in section:
-            rows[i] = checks.array(_numbers(section["reference"], f"{where}: reference"), f"{where}: reference")
+            rows[i] = checks.array(_check_numbers(section["reference"], f"{where}: reference"), f"{where}: reference")
         elif Q[i] > 0:
             raise DataError(f"{where} has a weight and no reference; say where it shall be, or set weight = 0")
     for i, (name, section) in enumerate(zip(data.inputs, inputs, strict=True)):
         where = f"{file}, {name}"
-        R[i] = _one(section, "weight", 0.0, where)
-        R_delta[i] = _one(section, "change_weight", 0.0, where)
-        change[i] = _one(section, "change", np.inf, where)
-        u_low[i], u_high[i] = _pair(section, where)
+        R[i] = _read_number(section, "weight", 0.0, where)
+        R_delta[i] = _read_number(section, "change_weight", 0.0, where)
+        change[i] = _read_number(section, "change", np.inf, where)
+        u_low[i], u_high[i] = _read_limits(section, where)
     tracked = [i for i in range(nx) if Q[i] > 0]
     if not tracked:
         raise DataError(f"{file} gives no state a weight above 0, so nothing is asked; set one")
@@ -302,7 +339,7 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
     )
 
 
-def _sections(
+def _find_sections(
     tree: Mapping[str, Any], what: str, names: tuple[str, ...], keys: set[str], file: Path
 ) -> list[Mapping[str, Any]]:
     """Return the section of each name, empty where there is none.
@@ -319,9 +356,9 @@ def _sections(
     for name, section in sections.items():
         where = f'{file}: [{what}."{name}"]'
         if name not in names:
-            own = next((known for known in names if _stem(known) == _stem(name)), None)
+            own = next((known for known in names if _drop_unit(known) == _drop_unit(name)), None)
             if own is not None:
-                if _unit(own) == _unit(name) or "[" not in name:
+                if _find_unit(own) == _find_unit(name) or "[" not in name:
                     raise DataError(f"{where} is not written as in the logs, which have {own!r}; write that")
                 raise DataError(
                     f"{where} is in another unit than the logs, which have {own!r}; write its numbers in that"
@@ -331,25 +368,25 @@ def _sections(
             )
         if not isinstance(section, dict):
             raise DataError(f"{where} is {section!r}; write it as a section with keys {', '.join(sorted(keys))}")
-        _known(cast("dict[str, Any]", section), keys, where)
+        _check_keys(cast("dict[str, Any]", section), keys, where)
     return [cast("Mapping[str, Any]", sections.get(name, {})) for name in names]
 
 
-def _known(tree: Mapping[str, Any], keys: set[str], where: str) -> None:
+def _check_keys(tree: Mapping[str, Any], keys: set[str], where: str) -> None:
     for key in tree:
         if key not in keys:
             raise DataError(f"{where} has {key!r}{checks.nearest(key, keys)}; there are {', '.join(sorted(keys))}")
 
 
-def _one(section: Mapping[str, Any], key: str, default: float, where: str) -> float:
+def _read_number(section: Mapping[str, Any], key: str, default: float, where: str) -> float:
     value = section.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value) or value < 0:
         raise DataError(f"{where}: {key} is {value!r}; write a number of 0 or above")
     return float(value)
 
 
-def _pair(section: Mapping[str, Any], where: str) -> tuple[float, float]:
-    value = _numbers(section.get("limits", [-math.inf, math.inf]), f"{where}: limits")
+def _read_limits(section: Mapping[str, Any], where: str) -> tuple[float, float]:
+    value = _check_numbers(section.get("limits", [-math.inf, math.inf]), f"{where}: limits")
     if not isinstance(value, list) or len(value) != 2:
         raise DataError(f"{where}: limits is {value!r}; write [low, high], with -inf or inf where there is none")
     low, high = value
@@ -358,7 +395,7 @@ def _pair(section: Mapping[str, Any], where: str) -> tuple[float, float]:
     return low, high
 
 
-def _numbers(value: Any, where: str) -> float | list[float]:
+def _check_numbers(value: Any, where: str) -> float | list[float]:
     """Return a number, or a list of numbers."""
     many = cast("list[Any]", value) if isinstance(value, list) else [value]
     for one in many:
@@ -367,19 +404,28 @@ def _numbers(value: Any, where: str) -> float | list[float]:
     return [float(one) for one in many] if isinstance(value, list) else float(value)
 
 
-def _stem(name: str) -> str:
+def _drop_unit(name: str) -> str:
     return name.partition("[")[0].strip().lower()
 
 
-def _unit(name: str) -> str:
+def _find_unit(name: str) -> str:
     return name.partition("[")[2].rstrip("] ") or "1"
 
 
-def _escaped(name: str) -> str:
+def _escape_text(name: str) -> str:
     return name.replace("\\", "\\\\").replace('"', '\\"')
 
 
-def _number(value: float) -> str:
+def _format_toml(value: Any) -> str:
+    """Return a number, a text or a sequence of these as TOML."""
+    if isinstance(value, bool | int | float):
+        return repr(value).lower()
+    if isinstance(value, str):
+        return f'"{_escape_text(value)}"'
+    return f"[{', '.join(map(_format_toml, value))}]"
+
+
+def _format_number(value: float) -> str:
     """Return three digits as TOML writes a float."""
     text = f"{float(value):.3g}"
     return text if any(letter in text for letter in ".en") else f"{text}.0"

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -12,71 +12,75 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.bench.store import RESULTS
+from koopmpc.data.angles import count_wraps
 from koopmpc.data.episodes import Episode, Episodes, joined
-from koopmpc.data.sampling import UnevenSamplingError
+from koopmpc.data.files.folder import Files
+from koopmpc.data.files.sampling import UnevenSamplingError
+from koopmpc.data.files.tables import SAVED
 from koopmpc.data.source import Changed, Held, Source, Subset
-from koopmpc.data.storage import Files
 from koopmpc.errors import ColumnWarning, DataError, FitWarning
-from koopmpc.synthesis.candidates import jumps
-from koopmpc.synthesis.cross_validation import blocks, sampled, usual_horizon
+from koopmpc.synthesis.cross_validation import cut_blocks, replace_glitches, take_sample, usual_horizon
+from koopmpc.text import with_unit
 from koopmpc.validate.logs.audit import audit
+from koopmpc.validate.logs.log import LogFault, Place, list_places
 
 Data = str | PathLike[str] | Iterable[str | PathLike[str]]
-_OWN = b"# koopmpc.episodes"  # a table that begins so was written by Episodes.save
-_SHORTER = "pass a shorter --horizon, or more data"  # what to do where too few episodes are as long as the horizon
+_SHORTER = "pass a shorter --horizon, or more data"  # advice if too few episodes are as long as the horizon
 
 
-def read(
+def read_logs(
     data: Data,
     horizon: int | None,
     rng: np.random.Generator,
     memory: int,
-    told: Mapping[str, Any],
+    options: Mapping[str, Any],
     short: str = _SHORTER,
-) -> tuple["Divided", list[str]]:
-    """Return the data of logs as `divided` makes them, and notes on how they were read.
+) -> "DividedData":
+    """Return the data of logs as `divide_files` makes them; the notes begin with how the logs were read.
 
-    Where their steps are unequal they are interpolated, and a note says so. `told` holds keywords of `load_episodes`,
-    None for those that nobody gave; with ``resample`` among them the steps are left to that.
+    `options` holds keywords of `load_episodes`; those that are None count as not given. Unequal steps are interpolated
+    to their median unless ``resample`` is given, and a note says so.
     """
-    told = {name: value for name, value in told.items() if value is not None}
-    logs, notes = logs_of(data), list[str]()
-    with noted(notes):
+    reading = {name: value for name, value in options.items() if value is not None}
+    logs, notes = find_logs(data), list[str]()
+    with collect_notes(notes):
         try:
-            files = Files(logs, **told)
-            split = divided(files, horizon, rng, memory, short)
+            files = Files(logs, **reading)
+            split = divide_files(files, horizon, rng, memory, short)
         except UnevenSamplingError as uneven:
-            if "resample" in told:
+            if "resample" in reading:
                 raise
             notes.append(f"{str(uneven).rpartition('; pass')[0]}; interpolated to {uneven.dt:g} s")
-            files = Files(logs, **told, resample=uneven.dt)
-            split = divided(files, horizon, rng, memory, short)
-    return split, [*shortened(notes, files.files), *guessed(files.files, told)]
+            reading["resample"] = uneven.dt
+            files = Files(logs, **reading)
+            split = divide_files(files, horizon, rng, memory, short)
+    how = [*shorten_notes(notes, files.files), *describe_guesses(files.files, reading)]
+    return replace(split, notes=(*how, *split.notes), reading=reading)
 
 
-def logs_of(data: Data) -> Data:
+def find_logs(data: Data) -> Data:
     """Return the .rrd logs of a folder of runs, which also holds their table; anything else is returned as it is."""
     if isinstance(data, str | PathLike) and (Path(data) / RESULTS).is_file():
         return sorted(Path(data).glob("*.rrd"))
     return data
 
 
-def guessed(files: Iterable[str | PathLike[str]], told: Mapping[str, Any]) -> list[str]:
-    """Return a sentence where names of columns alone say which are inputs: tables, and nobody told the roles."""
+def describe_guesses(files: Iterable[str | PathLike[str]], reading: Mapping[str, Any]) -> list[str]:
+    """Return a sentence if the names of columns alone say which are inputs: tables, and no roles in `reading`."""
     tables = [Path(file) for file in files if Path(file).suffix.lower() == ".csv"]
-    if "inputs" in told or not tables:
+    if "inputs" in reading or not tables:
         return []
     with tables[0].open("rb") as stream:
-        if stream.read(len(_OWN)) == _OWN:  # episodes that were saved, with their roles
+        if stream.readline().startswith(",".join(SAVED).encode()):  # episodes that were saved, with their roles
             return []
     return ["which columns are inputs was guessed from their names; --inputs u,v and --states a,b say it"]
 
 
-_REPAIRED = ("constant input", "repeated column", "wrapped angle")  # `needed` puts these right, and says so
-_LEAST = 0.5  # share of the steps that must be left once rows at fault are left out
+_REPAIRED = ("constant input", "repeated column", "wrapped angle")  # faults that `find_repairs` mends
+_LEAST = 0.5  # rows at fault are left out if at least this share of the steps remains
 
 
-def audited(episodes: Episodes, *, cut: bool = True) -> tuple[Episodes, tuple[str, ...], int]:
+def audit_episodes(episodes: Episodes, *, cut: bool = True) -> tuple[Episodes, tuple[str, ...], int]:
     """Return the episodes without the rows at fault, unless that would leave less than half of the steps.
 
     Beside them stand the faults, with what was done about each, in sentences, and the steps of the past that a model
@@ -100,8 +104,33 @@ def audited(episodes: Episodes, *, cut: bool = True) -> tuple[Episodes, tuple[st
             done = f"models that see {fault.steps} steps of the past are tried: embedding=km.Delay({fault.steps})"
         else:
             done = fault.do
-        notes.append(f"{fault.name}: {fault.says}; {done}")
+        notes.append(f"{fault.name}: {_locate_fault(fault, episodes)}; {done}")
     return rest, tuple(notes), report.delay
+
+
+_NAMED = 3  # places of a fault that a note names
+
+
+def _locate_fault(fault: LogFault, episodes: Episodes) -> str:
+    """Return what is wrong; of episodes that were read from tables the places are named by file, line and value."""
+    if any(episodes[place.episode].origin is None for place in fault.places):
+        return fault.says
+    named = "; ".join(_locate(place, fault.columns, episodes) for place in fault.places[:_NAMED])
+    rest = f"; and {len(fault.places) - _NAMED} more" if len(fault.places) > _NAMED else ""
+    return fault.says.replace(list_places(fault.places), named + rest)
+
+
+def _locate(place: Place, columns: tuple[str, ...], episodes: Episodes) -> str:
+    """Return file and lines of the rows at fault; for a single row of a single state its value too."""
+    episode = episodes[place.episode]
+    assert episode.origin is not None
+    state = next((name for name in columns if name in episodes.states), None)
+    if state is None or place.last > place.first + 1:
+        first, last = episode.origin.numbers[episode.origin.at[[place.first, place.last - 1]]]
+        return episode.origin.place(int(first), int(last))
+    sound = episode.X[max(place.first - 1, 0), episodes.states.index(state)]
+    number, value = episode.origin.locate(place.first, state, float(sound))
+    return f"{episode.origin.place(number)} ({with_unit(state, f'= {value:.5g}')})"
 
 
 @dataclass(frozen=True)
@@ -128,13 +157,14 @@ class Repair:
         """Return the repaired episodes, or the episodes themselves where there is nothing to repair."""
         if not self.notes:
             return episodes
-        made: list[Episode] = []
+        repaired: list[Episode] = []
         for e in episodes:
             X = e.X.copy()
             if self.unwrapped:
                 X[:, self.unwrapped] = np.unwrap(X[:, self.unwrapped], axis=0)
-            made.append(Episode(X=X[:, self.states], U=e.U[:, self.inputs], W=e.W[:, self.disturbances]))
-        return Episodes(made, episodes.dt, *self._names(episodes))
+            U, W = e.U[:, self.inputs], e.W[:, self.disturbances]
+            repaired.append(Episode(X=X[:, self.states], U=U, W=W, origin=e.origin))
+        return Episodes(repaired, episodes.dt, *self._names(episodes))
 
     def source(self, source: Source) -> Source:
         """Return the source of repaired episodes."""
@@ -148,7 +178,7 @@ class Repair:
         )
 
 
-def needed(episodes: Episodes) -> Repair:
+def find_repairs(episodes: Episodes) -> Repair:
     """Return the repairs that these episodes need.
 
     Raises
@@ -160,13 +190,13 @@ def needed(episodes: Episodes) -> Repair:
     X = np.concatenate([e.X for e in episodes])
     driven = np.concatenate([np.hstack([e.U, e.W]) for e in episodes])
     nu = episodes.nu
-    states = _useful(X, episodes.states, notes)
-    both = _useful(driven, (*episodes.inputs, *episodes.disturbances), notes)
+    states = _find_useful(X, episodes.states, notes)
+    both = _find_useful(driven, (*episodes.inputs, *episodes.disturbances), notes)
     if not states:
         raise DataError(
             f"no state moves: {', '.join(episodes.states)} are constant; check the columns, or pass --states"
         )
-    turns = {i: count for i, count in jumps(episodes).items() if i in states}
+    turns = {i: count for i, count in count_wraps(episodes).items() if i in states}
     for i, count in turns.items():
         notes.append(
             f"{episodes.states[i]} jumped by 2π {count} times and was unwrapped along each episode; the model "
@@ -181,7 +211,7 @@ def needed(episodes: Episodes) -> Repair:
     )
 
 
-def _useful(columns: Float[np.ndarray, "m n"], names: tuple[str, ...], notes: list[str]) -> list[int]:
+def _find_useful(columns: Float[np.ndarray, "m n"], names: tuple[str, ...], notes: list[str]) -> list[int]:
     """Return the columns that move and are no copy of an earlier one."""
     kept: list[int] = []
     for i, name in enumerate(names):
@@ -196,14 +226,14 @@ def _useful(columns: Float[np.ndarray, "m n"], names: tuple[str, ...], notes: li
     return kept
 
 
-_SHOWN = 6  # files of which a report says what each of them needs
+_SHOWN = 6  # a report shows the notes of this many files
 
 
 @contextmanager
-def noted(notes: list[str]) -> Generator[None]:
+def collect_notes(notes: list[str]) -> Generator[None]:
     """Collect the text of each FitWarning, once, instead of showing it.
 
-    A ColumnWarning is about one file and is dropped: `needed` judges each column by all files.
+    A ColumnWarning is about one file and is dropped: `find_repairs` judges each column by all files.
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", FitWarning)
@@ -215,40 +245,40 @@ def noted(notes: list[str]) -> Generator[None]:
             notes.append(str(one.message))
 
 
-def shortened(notes: Iterable[str], files: Iterable[Path]) -> list[str]:
+def shorten_notes(notes: Iterable[str], files: Iterable[Path]) -> list[str]:
     """Return the notes: one line for a note that files share, and the first few of those that only one file has."""
     known = {str(file) for file in files}
     of: dict[str, list[str]] = {}
     for note in notes:
-        file, _, said = note.partition(": ")
+        file, _, text = note.partition(": ")
         if file in known:
-            of.setdefault(said, []).append(file)
+            of.setdefault(text, []).append(file)
         else:
             of[note] = []
     short: list[str] = []
     alone = 0
-    for said, where in of.items():
+    for text, where in of.items():
         if len(where) > 1:
-            short.append(f"{where[0]} and {len(where) - 1} more files: {said}")
+            short.append(f"{where[0]} and {len(where) - 1} more files: {text}")
         elif where and alone < _SHOWN:
-            short.append(f"{where[0]}: {said}")
+            short.append(f"{where[0]}: {text}")
         elif not where:
-            short.append(said)
+            short.append(text)
         alone += len(where) == 1
     if alone > _SHOWN:
         short.append(f"{alone - _SHOWN} more files have notes of their own; load_episodes shows them")
     return short
 
 
-IN_MEMORY = 150_000_000  # bytes of files that are read as a whole
-PAST = 2  # steps that a model may look back
-_SHARE = 0.2  # share of the episodes that is held out
-_ENOUGH = 12  # held-out episodes from which on bands are finite
-_JUDGED = 10_000  # steps that a report is made of
+IN_MEMORY = 150_000_000  # files up to this size [bytes] are read as a whole
+PAST = 2  # models look back at most this many steps
+_SHARE = 0.2  # hold out this share of the episodes
+_ENOUGH = 12  # bands are finite with at least this many held-out episodes
+_JUDGED = 10_000  # a report is made of at most about this many steps
 
 
 @dataclass(frozen=True, eq=False)
-class Divided:
+class DividedData:
     """The data that a model is fitted to, and the held-out episodes that judge it.
 
     Attributes
@@ -264,9 +294,11 @@ class Divided:
     size
         The amount of data, in words.
     notes
-        What was done to the data, in sentences.
+        How the logs were read and what was done to the data, in sentences.
     delay
         Steps of the past that a model needs for signals that are late.
+    reading
+        Keywords of `load_episodes` that read the same data again.
     """
 
     fitted: Source | Episodes
@@ -276,15 +308,16 @@ class Divided:
     size: str
     notes: tuple[str, ...]
     delay: int
+    reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
-def divided(
+def divide_files(
     files: Files,
     horizon: int | None,
     rng: np.random.Generator,
     memory: int,
     short: str = _SHORTER,
-) -> Divided:
+) -> DividedData:
     """Hold out a fifth of the episodes, or of blocks of a few long ones; beyond `memory` a tenth of the parts.
 
     `short` is what to do where too few episodes are as long as the horizon.
@@ -296,42 +329,45 @@ def divided(
     """
     parts = files.parts()
     size = sum(file.stat().st_size for file in files.files)
-    told = f"{len(files.files)} file{'s' * (len(files.files) > 1)}, {_bytes(size)}"
+    amount = f"{len(files.files)} file{'s' * (len(files.files) > 1)}, {_format_bytes(size)}"
     if size <= memory or len(parts) < 2:
-        episodes, faults, delay = audited(joined([part.load() for part in parts]))
-        repair = needed(episodes)
-        return _in_memory(repair(episodes), horizon, rng, told, (*faults, *repair.notes), delay, short)
-    episodes, faults, delay = audited(sampled(files, _JUDGED)[0], cut=False)
-    repair = needed(episodes)
+        episodes, faults, delay = audit_episodes(joined([part.load() for part in parts]))
+        repair = find_repairs(episodes)
+        whole = repair(episodes)
+        _, sound, replaced = replace_glitches(Held(whole), whole)
+        notes = (*faults, *repair.notes, *replaced)
+        return _divide_episodes(drop_origins(sound), horizon, rng, amount, notes, delay, short)
+    episodes, faults, delay = audit_episodes(take_sample(files, _JUDGED)[0], cut=False)
+    repair = find_repairs(episodes)
     past = max(PAST, delay)
-    source = repair.source(files)
+    source, _, replaced = replace_glitches(repair.source(files), repair(episodes))
     count = max(len(parts) // 10, 1)
     out = {int((i + 0.5) * len(parts) / count) for i in range(count)}
     rest = Subset(source, [i for i in range(len(parts)) if i not in out])
-    judged, _ = sampled(Subset(source, sorted(out)), _JUDGED)
+    judged, _ = take_sample(Subset(source, sorted(out)), _JUDGED)
     ahead = usual_horizon(judged, past)[0] if horizon is None else horizon
-    held_out = _long(list(judged), ahead + past)
+    held_out = _keep_long(list(judged), ahead + past)
     if len(held_out) < 2:
-        held_out = _long([b for e in judged for b in blocks(e, 2 * (ahead + past))], ahead + past)
+        held_out = _keep_long([b for e in judged for b in cut_blocks(e, 2 * (ahead + past))], ahead + past)
     if len(held_out) < 2:
-        raise DataError(_too_short(len(judged), ahead, short))
-    seen, _ = sampled(rest, _JUDGED)
+        raise DataError(_say_too_short(len(judged), ahead, short))
+    seen, _ = take_sample(rest, _JUDGED)
     note = (
-        f"larger than {_bytes(memory)}, so read in {len(parts)} parts: {len(out)} of them "
+        f"larger than {_format_bytes(memory)}, so read in {len(parts)} parts: {len(out)} of them "
         f"{'is' if len(out) == 1 else 'are'} held out, and the fit reads the others one by one"
     )
-    return Divided(
+    return DividedData(
         rest,
-        judged.with_episodes(_long(list(seen), ahead + past)),
+        judged.with_episodes(_keep_long(list(seen), ahead + past)),
         judged.with_episodes(held_out),
         ahead,
-        told,
-        (*faults, *repair.notes, note),
+        amount,
+        (*faults, *repair.notes, *replaced, note),
         delay,
     )
 
 
-def _in_memory(
+def _divide_episodes(
     episodes: Episodes,
     horizon: int | None,
     rng: np.random.Generator,
@@ -339,52 +375,63 @@ def _in_memory(
     repaired: tuple[str, ...],
     delay: int,
     short: str,
-) -> Divided:
+) -> DividedData:
     past = max(PAST, delay)
     lengths = [len(episode) for episode in episodes]
     same = "" if min(lengths) == max(lengths) else f"{min(lengths)} to "
     number = len(episodes)
-    told = f"{files}: {number} episode{'s' * (number > 1)} of {same}{max(lengths)} steps, {sum(lengths)} in all"
+    size = f"{files}: {number} episode{'s' * (number > 1)} of {same}{max(lengths)} steps, {sum(lengths)} in all"
     ahead = usual_horizon(episodes, past)[0] if horizon is None else horizon
-    needed = ahead + past
+    shortest = ahead + past
     whole = list(episodes)
     notes: tuple[str, ...] = ()
-    if len(_long(whole, needed)) < _ENOUGH:
-        block = max(2 * needed, min(sum(lengths) // (4 * _ENOUGH), _JUDGED // _ENOUGH))
-        whole = [piece for episode in episodes for piece in blocks(episode, block)]
+    if len(_keep_long(whole, shortest)) < _ENOUGH:
+        block = max(2 * shortest, min(sum(lengths) // (4 * _ENOUGH), _JUDGED // _ENOUGH))
+        whole = [piece for episode in episodes for piece in cut_blocks(episode, block)]
         if len(whole) > number:
             notes = (
                 f"too few episodes to hold some out: cut into {len(whole)} blocks of about {block} steps; a held-out "
                 "block lies between those of the fit, so its errors may be too small",
             )
-    long = [i for i, episode in enumerate(whole) if len(episode) >= needed]
+    long = [i for i, episode in enumerate(whole) if len(episode) >= shortest]
     if len(long) < 4:
-        raise DataError(_too_short(len(episodes), ahead, short))
+        raise DataError(_say_too_short(len(episodes), ahead, short))
     count = max(round(_SHARE * len(long)), min(_ENOUGH, len(long) // 3), 2)
     # blocks in order are held out evenly spread, episodes at random
     order = [int((i + 0.5) * len(long) / count) for i in range(count)]
     drawn = order if notes else [int(i) for i in rng.permutation(len(long))[:count]]
     out = {long[i] for i in drawn}
     train = episodes.with_episodes([episode for i, episode in enumerate(whole) if i not in out])
-    seen, _ = sampled(Held(episodes.with_episodes(_long(list(train), needed))), _JUDGED)
-    held_out, _ = sampled(Held(episodes.with_episodes([whole[i] for i in sorted(out)])), _JUDGED)
-    return Divided(
-        train, episodes.with_episodes(_long(list(seen), needed)), held_out, ahead, told, (*repaired, *notes), delay
+    seen, _ = take_sample(Held(episodes.with_episodes(_keep_long(list(train), shortest))), _JUDGED)
+    held_out, _ = take_sample(Held(episodes.with_episodes([whole[i] for i in sorted(out)])), _JUDGED)
+    return DividedData(
+        train,
+        episodes.with_episodes(_keep_long(list(seen), shortest)),
+        held_out,
+        ahead,
+        size,
+        (*repaired, *notes),
+        delay,
     )
 
 
-def _long(episodes: Sequence[Episode], needed: int) -> list[Episode]:
-    return [episode for episode in episodes if len(episode) >= needed]
+def drop_origins(episodes: Episodes) -> Episodes:
+    """Return the episodes without their places in files, which other processes need not be sent."""
+    return episodes.with_episodes([Episode(X=e.X, U=e.U, W=e.W) for e in episodes])
 
 
-def _too_short(episodes: int, horizon: int, advice: str) -> str:
+def _keep_long(episodes: Sequence[Episode], shortest: int) -> list[Episode]:
+    return [episode for episode in episodes if len(episode) >= shortest]
+
+
+def _say_too_short(episodes: int, horizon: int, advice: str) -> str:
     return (
         f"{episodes} episode{'s' * (episodes > 1)} of these lengths give too few of {horizon + PAST} steps, horizon "
         f"and delays, to fit to some and judge by others; {advice}"
     )
 
 
-def _bytes(size: int) -> str:
+def _format_bytes(size: int) -> str:
     for unit, one in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if size >= one:
             return f"{size / one:.3g} {unit}"

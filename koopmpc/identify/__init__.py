@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from koopmpc.identify.fits.prior import Combination as Combination
     from koopmpc.identify.fits.prior import Dissipation as Dissipation
     from koopmpc.identify.fits.prior import Prior as Prior
+    from koopmpc.identify.fits.refinement import refine as refine
     from koopmpc.identify.fits.regressor import KoopmanRegressor as KoopmanRegressor
     from koopmpc.identify.fits.sparse import sparse_edmd as sparse_edmd
     from koopmpc.identify.fits.stable import stable_edmd as stable_edmd

@@ -1,4 +1,4 @@
-"""The regression of ψ(x⁺) on [ψ(x) u], as a few rows, with all that a predictor of it needs."""
+"""The regression of ψ(x⁺) on [ψ(x) u]: its rows, its result, and the predictor and the report made of them."""
 
 import warnings
 from collections.abc import Sequence
@@ -17,23 +17,25 @@ from koopmpc.data.source import Source, source_of
 from koopmpc.errors import FitWarning
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
-from koopmpc.identify.solve import RegressionRows, norms, scaled_rank
+from koopmpc.identify.solve import RegressionRows, column_norms, scaled_rank
 from koopmpc.lifting.base import CONSTANT, Lifting
 from koopmpc.lifting.composed import Projected
 from koopmpc.predict.base import FitReport
 from koopmpc.predict.predictors import LinearPredictor
 
-_HALF = float(np.sqrt(np.finfo(float).eps))  # half of the digits
+_HALF = float(
+    np.sqrt(np.finfo(float).eps)
+)  # added to unit-norm columns: a scale then keeps at least half of the digits
 
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """ψ(x⁺) on [ψ(x) u], ready to be solved.
+    """The regression of ψ(x⁺) on [ψ(x) u], before it is solved.
 
     Attributes
     ----------
     method, route
-        Name of the method, and how the data were read, as the report gives them.
+        Name of the fit, and how the data were read, as in the report.
     rows
         P = [ψ(x) u]; T begins with ψ(x⁺).
     x_next
@@ -41,13 +43,13 @@ class Regression:
     lifting, states, inputs, dt
         As in the predictor.
     C, state_residual
-        (nx, nz), None where ψ(x) is x; and the root-mean-square of x − C ψ(x).
+        (nx, nz), or None if ψ(x) is x; and the root-mean-square of x − C ψ(x).
     disturbances
-        Names of the measured disturbances w, which stand last among the inputs.
+        Names of the measured disturbances w, the last of the inputs.
     B
-        (nz, nu) where it is known; None where it is fitted.
+        (nz, nu) if it is known; None if it is fitted.
     scaled
-        True where the regression is solved on columns of unit norm.
+        True if the regression is solved on columns of unit norm.
     embedding
         As in the predictor.
     """
@@ -73,18 +75,18 @@ class Regression:
         return self.rows.P.shape[1] - (0 if self.B is None else self.B.shape[1])
 
     @property
-    def affine(self) -> list[int]:
+    def affine_columns(self) -> list[int]:
         """The columns of P that hold states, the Constant and inputs: those of x⁺ = A x + B u + c."""
         names = self.lifting.names
-        own = [i for i, name in enumerate(names) if name == CONSTANT or name in self.states]
-        return [*own, *range(len(names), self.rows.P.shape[1])]
+        affine = [i for i, name in enumerate(names) if name == CONSTANT or name in self.states]
+        return [*affine, *range(len(names), self.rows.P.shape[1])]
 
-    def decoded(self, K: Float[np.ndarray, "n nz"]) -> Float[np.ndarray, "n nx"]:
+    def decode(self, K: Float[np.ndarray, "n nz"]) -> Float[np.ndarray, "n nx"]:
         """Return K Cᵀ, the coefficients of C ψ(x⁺)."""
         return K if self.C is None else K @ self.C.T
 
 
-def read(
+def read_regression(
     episodes: Episodes | Source,
     lifting: Lifting,
     embedding: Delay | None,
@@ -93,21 +95,22 @@ def read(
     noisy: bool = False,
     **options: Unpack[ReadOptions],
 ) -> Regression:
-    """Return the regression on [ψ(x) u w] that these episodes hold, read as `second_moments` says."""
+    """Return the regression on [ψ(x) u w] of these episodes; `second_moments` explains the options."""
     source = source_of(episodes)
     if embedding is not None:
         checks.kind(embedding, "embedding", Delay, "pass km.Delay(2), or leave it out")
-    sized = None if embedding is None else embedding.fitted(source.states, source.inputs)
-    total = second_moments(source.driven(), lifting, embedding=sized, **options)
-    return regression_of(total, method, noisy=noisy, disturbances=source.disturbances)
+    bound_embedding = None if embedding is None else embedding.fitted(source.states, source.inputs)
+    total = second_moments(source.driven(), lifting, embedding=bound_embedding, **options)
+    return build_regression(total, method, noisy=noisy, disturbances=source.disturbances)
 
 
-def regression_of(
+def build_regression(
     total: Moments, method: str, *, noisy: bool = False, disturbances: tuple[str, ...] = ()
 ) -> Regression:
-    """Return the regression of ψ(x⁺) on [ψ(x) u] that these moments hold, C included.
+    """Return the regression of ψ(x⁺) on [ψ(x) u] with these moments, and its C.
 
-    `noisy` says that x and x⁺ hold noise alike: the rows then hold all of ψ(x⁺), not only what ψ(x) and u reach.
+    With `noisy`, for methods that treat noise in x and x⁺ alike, the rows hold all of ψ(x⁺), not only its projection
+    on ψ(x) and u.
     """
     columns, states = total.columns, total.states
     place = {name: i for i, name in enumerate(columns.full.names)}
@@ -116,7 +119,7 @@ def regression_of(
     return Regression(
         method=method,
         route=total.route,
-        rows=(total.complete if noisy else total.rows)(columns.regressors, columns.targets),
+        rows=(total.complete_rows if noisy else total.rows)(columns.regressors, columns.targets),
         x_next=where,
         lifting=total.lifting,
         states=states,
@@ -130,14 +133,14 @@ def regression_of(
 
 
 class FitResult(NamedTuple):
-    """The result of a method: z⁺ = A z + B u, where B has the columns of w too, and what the report says of it.
+    """The result of a fit: z⁺ = A z + B u, where B has the columns of w too, and the entries of its report.
 
     Attributes
     ----------
     rule
-        How it was solved, in words.
+        How the regression was solved, in words.
     doubts, changes
-        Sentences of the report: its warnings, and what a prior, a limit or a penalty changed.
+        Sentences of the report: its warnings, and the changes by a prior, a limit or a penalty.
     """
 
     A: Float[np.ndarray, "nz nz"]
@@ -155,7 +158,7 @@ class FitResult(NamedTuple):
     modes: Complex[np.ndarray, "nl nz"] | None = None
 
 
-def unreduced(
+def build_result(
     regression: Regression,
     K: Float[np.ndarray, "n nz"],
     *,
@@ -166,9 +169,9 @@ def unreduced(
     doubts: Sequence[str] = (),
     changes: Sequence[str] = (),
 ) -> FitResult:
-    """Return the result of K = [A B E]ᵀ, in the lifting of the regression.
+    """Return the result for K = [A B E]ᵀ, in the lifting of the regression.
 
-    Rank and condition number are those of the regressors, computed here where they are not given.
+    Rank and condition number are those of the regressors; this computes them if no rank is passed.
     """
     nz = regression.lifting.nz
     if rank is None:
@@ -178,7 +181,7 @@ def unreduced(
         B=K[nz:].T,
         C=np.eye(nz) if regression.C is None else regression.C,
         lifting=regression.lifting,
-        residual=regression.rows.residual(regression.x_next, regression.decoded(K)),
+        residual=regression.rows.residual(regression.x_next, regression.decode(K)),
         state_residual=regression.state_residual,
         rank=rank,
         condition=condition,
@@ -189,8 +192,8 @@ def unreduced(
     )
 
 
-def fit_report(regression: Regression, result: FitResult, *, warn: bool = True) -> FitReport:
-    """Return the report. Each doubt in it is also a FitWarning, at the line outside of koopmpc that called the fit."""
+def build_report(regression: Regression, result: FitResult, *, warn: bool = True) -> FitReport:
+    """Return the report. Each doubt in it also becomes a FitWarning at the user's line that called the fit."""
     for sentence in result.doubts if warn else ():
         warnings.warn(sentence, FitWarning, stacklevel=_level_outside())
     return FitReport(
@@ -209,15 +212,15 @@ def fit_report(regression: Regression, result: FitResult, *, warn: bool = True) 
 
 
 def _level_outside() -> int:
-    """Return the stacklevel with which the caller's warning points at the first line outside of koopmpc."""
+    """Return the stacklevel by which a warning of the caller points at the first line outside of koopmpc."""
     frame, level = currentframe(), 0
     while frame is not None and frame.f_globals.get("__name__", "").startswith("koopmpc."):
         frame, level = frame.f_back, level + 1
     return level
 
 
-def linear_predictor(regression: Regression, result: FitResult, *, warn: bool = True) -> LinearPredictor:
-    """Return z⁺ = A z + B u + E w with its report, whose doubts are warnings."""
+def build_predictor(regression: Regression, result: FitResult, *, warn: bool = True) -> LinearPredictor:
+    """Return z⁺ = A z + B u + E w with its report; `warn` makes each doubt in it a FitWarning."""
     nu = len(regression.inputs) - len(regression.disturbances)
     return LinearPredictor(
         result.A,
@@ -227,38 +230,38 @@ def linear_predictor(regression: Regression, result: FitResult, *, warn: bool = 
         regression.dt,
         regression.states,
         regression.inputs[:nu],
-        fit_report(regression, result, warn=warn),
+        build_report(regression, result, warn=warn),
         result.modes,
         E=result.B[:, nu:],
         disturbances=regression.disturbances,
         embedding=regression.embedding,
-        scale=scale_of(regression, result.lifting),
+        scale=compute_scale(regression, result.lifting),
     )
 
 
-def scale_of(regression: Regression, lifting: Lifting) -> Float[np.ndarray, "nz nz"]:
+def compute_scale(regression: Regression, lifting: Lifting) -> Float[np.ndarray, "nz nz"]:
     """Return the upper triangular R with RᵀR = Σ w z zᵀ / Σ w, where z is the lifted data of the regression."""
     Z = regression.rows.P[:, : regression.lifting.nz]
     if lifting is not regression.lifting and isinstance(lifting, Projected):
         Z = Z @ lifting.basis
-    return scale_factor(Z, regression.rows.samples)
+    return compute_scale_factor(Z, regression.rows.samples)
 
 
-def scale_factor(P: Float[np.ndarray, "m n"], samples: int) -> Float[np.ndarray, "n n"]:
-    """Return the upper triangular R with RᵀR = PᵀP / M, and a diagonal above 0, so that P R⁻¹ has orthogonal columns.
+def compute_scale_factor(P: Float[np.ndarray, "m n"], samples: int) -> Float[np.ndarray, "n n"]:
+    """Return the upper triangular R with RᵀR = PᵀP / M and a positive diagonal, so that P R⁻¹ has orthogonal columns.
 
-    It is invertible even where columns depend on others: on columns of unit norm eps is added to PᵀP, so that R and R⁻¹
+    R is invertible even if columns are dependent: on columns of unit norm eps is added to PᵀP, so that R and R⁻¹
     together lose at most half of the digits. A column of zeros counts as one of size 1.
     """
-    size = norms(P)
+    size = column_norms(P)
     live = size > 0
     size = np.where(live, size, np.sqrt(samples))
     R = np.asarray(qr(np.vstack([P / size, np.diag(np.where(live, _HALF, 1.0))]), mode="r")[0])[: len(size)]
     return np.ascontiguousarray(np.where(R.diagonal() < 0, -1.0, 1.0)[:, None] * R * (size / np.sqrt(samples)))
 
 
-def growth(rows: RegressionRows, K: Float[np.ndarray, "n nz"], plain: Float[np.ndarray, "n nz"]) -> str:
-    """Return in words how far K and the plain fit miss the observables, each relative to its size."""
+def describe_misfit(rows: RegressionRows, K: Float[np.ndarray, "n nz"], plain: Float[np.ndarray, "n nz"]) -> str:
+    """Return a sentence with the one-step errors of K and of the plain fit, relative to each observable's size."""
     before, after = relative_misfit(rows, plain), relative_misfit(rows, K)
     return f"relative one-step misfit of the observables {after:.3g}, of the plain fit {before:.3g}"
 

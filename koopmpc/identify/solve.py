@@ -1,4 +1,4 @@
-"""Least squares min ‖T − P K‖ on a few rows that stand for all snapshots, and the ridge that data ask for."""
+"""Least squares min ‖T − P K‖ on a few rows with the moments of all snapshots, and the choice of the ridge."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,25 +14,25 @@ from koopmpc.errors import DataError
 
 Ridge = float | Literal["gcv"]
 
-_STILL = 1e-7  # share of a column's norm below which its deviations from its mean may be rounding of Gram sums
-_CLEAR = 1e-8  # ratio of squared singular values down to which a Gram matrix shows them to 8 digits
-_ILL_CONDITIONED = 1e10
-_LIGHT = 1e-3  # factor of the norm of columns on which a ridge counts a millionth
-_NAMED = 3  # dependent columns that a message names
-_ROUNDING = 1e3 * np.finfo(float).eps  # share of a target's energy below which a residual is rounding of sums
-_NOTHING = 1e-14  # share of the smallest σ² below which a ridge changes nothing
-_LARGEST = 1e3  # share of σ₁² above which a ridge leaves next to nothing of K
-_POINTS = 300  # points of the first grid, about ten a decade
-_ZOOMS = 5  # refinements of the grid, each ten times finer than the one before
+_STILL = 1e-7  # set deviations from the mean to 0 below this share of the column's norm: they may be rounding errors
+_CLEAR = 1e-8  # use the Gram matrix if its smallest eigenvalue is above this share of the largest, else an SVD
+_ILL_CONDITIONED = 1e10  # warn if the condition number on unit-norm columns is above this
+_LIGHT = 1e-3  # factor on the norm of `light` columns: the ridge on their coefficients is a million times smaller
+_NAMED = 3  # a message names at most so many dependent columns
+_ROUNDING = 1e3 * np.finfo(float).eps  # a residual below this share of a target's energy is a rounding error
+_NOTHING = 1e-14  # lower end of the ridges tried, as a share of the smallest σ²: a smaller ridge changes nothing
+_LARGEST = 1e3  # upper end of the ridges tried, as a share of σ₁²: a larger ridge makes K almost 0
+_POINTS = 300  # points of the first grid of ridges, about ten a decade
+_ZOOMS = 5  # grids of ridges in all; each is ten times finer than the one before
 
 
-def ridge_of(given: object) -> Ridge:
+def check_ridge(value: object) -> Ridge:
     """Return a ridge that is 0 or above, or "gcv"; raise DataError for anything else."""
-    if isinstance(given, str):
-        if given != "gcv":
-            raise DataError(f'ridge is {given!r}; pass a number, or "gcv"')
+    if isinstance(value, str):
+        if value != "gcv":
+            raise DataError(f'ridge is {value!r}; pass a number, or "gcv"')
         return "gcv"
-    ridge = float(checks.array(given, "ridge", ()))  # pyright: ignore[reportArgumentType]  # array refuses what is none
+    ridge = float(checks.array(value, "ridge", ()))  # pyright: ignore[reportArgumentType]  # it checks the type
     if ridge < 0:
         raise DataError(f"ridge is {ridge:g}; it must be 0 or above")
     return ridge
@@ -47,13 +47,13 @@ class RegressionRows:
     P
         (m, n) regressors.
     T
-        (m, nt) targets, as far as they lie in these rows.
+        (m, nt) targets.
     rest
-        (nt,) the energy Σt² of the part of each target outside these rows, which no K can fit.
+        (nt,) energy Σt² of the part of each target that is not in these rows; no K can fit it.
     samples
         The number M of snapshots.
     constant
-        The column of P that is 1 in every snapshot; None where there is none.
+        The column of P that is 1 in every snapshot, or None.
     """
 
     P: Float[np.ndarray, "m n"]
@@ -68,25 +68,25 @@ class RegressionRows:
         np.subtract(self.T[:, columns], error, out=error)
         return np.sqrt((np.einsum("ij,ij->j", error, error) + self.rest[columns]) / self.samples)
 
-    def leading(self, targets: int) -> "RegressionRows":
+    def keep_targets(self, targets: int) -> "RegressionRows":
         """Return these rows with the first targets only."""
         return replace(self, T=self.T[:, :targets], rest=self.rest[:targets])
 
-    def part(self, columns: Int[np.ndarray, " c"]) -> "RegressionRows":
+    def keep_regressors(self, columns: Int[np.ndarray, " c"]) -> "RegressionRows":
         """Return these rows with some columns of P only."""
         place = np.flatnonzero(columns == (-1 if self.constant is None else self.constant))
         return replace(self, P=self.P[:, columns], constant=int(place[0]) if place.size else None)
 
-    def centred(self) -> "RegressionRows":
-        """Return the rows of the deviations from the mean: what the constant column explains is taken out of P and T.
+    def subtract_means(self) -> "RegressionRows":
+        """Return the rows of the deviations from the mean: P and T less their projections on the constant column.
 
-        Columns that do not move become zero. Without a constant column the rows stay as they are.
+        Columns that do not vary become zero. Without a constant column the same rows are returned.
         """
         if self.constant is None:
             return self
-        one = self.P[:, self.constant] / np.linalg.norm(self.P[:, self.constant])
-        P, T = (full - np.outer(one, one @ full) for full in (self.P, self.T))
-        P[:, norms(P) <= _STILL * norms(self.P)] = 0.0
+        unit = self.P[:, self.constant] / np.linalg.norm(self.P[:, self.constant])
+        P, T = (full - np.outer(unit, unit @ full) for full in (self.P, self.T))
+        P[:, column_norms(P) <= _STILL * column_norms(self.P)] = 0.0
         still = np.sum(T**2, axis=0) + self.rest <= _STILL**2 * (np.sum(self.T**2, axis=0) + self.rest)
         T[:, still] = P[:, self.constant] = 0.0
         return replace(self, P=P, T=T, rest=np.where(still, 0.0, self.rest), constant=None)
@@ -94,89 +94,93 @@ class RegressionRows:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """K (n, nt), how many singular directions of P it uses, and the ridge that it was found with."""
+    """K (n, nt), the number of singular directions of P that it uses, and its ridge."""
 
     K: Float[np.ndarray, "n nt"]
     rank: int
     ridge: float
 
 
-def norms(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, " n"]:
+def column_norms(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, " n"]:
     """Return the Euclidean norm of each column."""
     return np.sqrt(np.einsum("ij,ij->j", P, P))
 
 
-def unit(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+def scale_to_unit_norm(P: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
     """Return P with columns of norm 1; a column of zeros stays as it is."""
-    size = norms(P)
+    size = column_norms(P)
     return P / np.where(size > 0, size, 1.0)
 
 
-def cutoff(rows: RegressionRows) -> float:
-    """Return eps · max(M, n): below it, relative to the largest, a singular value is rounding."""
+def rounding_cutoff(rows: RegressionRows) -> float:
+    """Return eps · max(M, n): a singular value below this share of the largest one is a rounding error."""
     return float(np.finfo(float).eps * max(rows.samples, rows.P.shape[1]))
 
 
 def solve(rows: RegressionRows, *, ridge: Ridge = 0.0, scaled: bool = True, light: Sequence[int] = ()) -> Solution:
     """Return K = argmin ‖T − P K‖² + ridge ‖S K‖², S = diag(‖pⱼ − p̄ⱼ‖), p̄ⱼ the mean of column j, S = 0 for a constant.
 
-    So neither the units of the data nor where their zero is change what a ridge does: the constant column takes up the
-    mean, as an intercept does, and the other coefficients are shrunk as those of deviations. Without a constant column
-    p̄ = 0. With ridge = 0 it is the minimum-norm solution of the truncated SVD, cut at eps · max(M, n) · σ₁; `scaled`
-    takes norm and cut on columns of unit norm, so that units of the data mean nothing. "gcv" chooses the ridge by
-    generalised cross-validation. A ridge above 0 counts a millionth on the columns `light`.
+    The ridge acts on deviations from the mean, and the coefficients of the constant column are intercepts without a
+    ridge. So neither the units nor the origin of the data change its effect. Without a constant column p̄ = 0.
+
+    With ridge = 0, K is the minimum-norm solution of the truncated SVD, cut at eps · max(M, n) · σ₁; with `scaled`,
+    norm and cut refer to columns of unit norm, so that the units of the data do not matter. "gcv" chooses the ridge by
+    generalised cross-validation. On the columns `light` the ridge is a million times smaller.
     """
-    return path(rows, (ridge,), scaled=scaled, light=light if ridge else ())[0]
+    return solve_path(rows, (ridge,), scaled=scaled, light=light if ridge else ())[0]
 
 
-def path(
+def solve_path(
     rows: RegressionRows, ridges: Sequence[Ridge], *, scaled: bool = True, light: Sequence[int] = ()
 ) -> list[Solution]:
-    """Return the solution for each ridge, from one decomposition, or from two where some are 0 and some are not."""
-    plain, shrunk = cache(partial(_Factors, rows, scaled)), cache(partial(_Factors, rows.centred(), scaled, light))
-    found: list[Solution] = []
-    for each in ridges:
-        ridge = shrunk().cross_validated(free=rows.constant is not None) if each == "gcv" else each
+    """Return the solution for each ridge; all ridges above 0 share one decomposition."""
+    plain, shrunk = (
+        cache(partial(_Factors, rows, scaled)),
+        cache(partial(_Factors, rows.subtract_means(), scaled, light)),
+    )
+    solutions: list[Solution] = []
+    for rule in ridges:
+        ridge = shrunk().choose_ridge(free=rows.constant is not None) if rule == "gcv" else rule
         factors = shrunk() if ridge > 0 else plain()
         K, rank = factors.least_squares(ridge), factors.rank
         if ridge > 0 and rows.constant is not None:
-            one, rank = rows.P[:, rows.constant], rank + 1
-            K[rows.constant] = one @ (rows.T - rows.P @ K) / (one @ one)  # the intercept, once the others are known
-        found.append(Solution(K, rank, ridge))
-    return found
+            ones, rank = rows.P[:, rows.constant], rank + 1
+            K[rows.constant] = ones @ (rows.T - rows.P @ K) / (ones @ ones)  # the intercept, from the other rows of K
+        solutions.append(Solution(K, rank, ridge))
+    return solutions
 
 
 class _Factors:
-    """P = U diag(s) Vᵀ diag(size) of these rows, and the shares Uᵀ T of the targets."""
+    """The decomposition P = U diag(s) Vᵀ diag(size) of these rows, and the shares Uᵀ T of the targets."""
 
     def __init__(self, rows: RegressionRows, scaled: bool, light: Sequence[int] = ()) -> None:
-        self._rows, self._cut = rows, cutoff(rows)
-        size = norms(rows.P) if scaled else np.ones(rows.P.shape[1])
+        self._rows, self._cut = rows, rounding_cutoff(rows)
+        size = column_norms(rows.P) if scaled else np.ones(rows.P.shape[1])
         self._size = np.where(size > 0, size, 1.0)
         self._size[list(light)] *= _LIGHT
         self._U, self._s, self._Vt = np.linalg.svd(rows.P / self._size, full_matrices=False)
         self._shares = self._U.T @ rows.T
-        self._held = self._s > self._cut * self._s.max(initial=0.0)
+        self._resolved = self._s > self._cut * self._s.max(initial=0.0)
 
     @property
     def rank(self) -> int:
         """Number of singular values above rounding."""
-        return int(self._held.sum())
+        return int(self._resolved.sum())
 
     def least_squares(self, ridge: float) -> Float[np.ndarray, "n nt"]:
-        """Return K of this ridge on unit-norm columns; of the truncated decomposition where it is 0."""
-        s, held = self._s, self._held
-        gain = s / (s**2 + ridge) if ridge > 0 else np.where(held, 1.0, 0.0) / np.where(held, s, 1.0)
+        """Return K for this ridge on unit-norm columns; a ridge of 0 means the truncated decomposition."""
+        s, resolved = self._s, self._resolved
+        gain = s / (s**2 + ridge) if ridge > 0 else np.where(resolved, 1.0, 0.0) / np.where(resolved, s, 1.0)
         return (self._Vt.T * gain) @ self._shares / self._size[:, None]
 
-    def cross_validated(self, *, free: bool) -> float:
-        """Return the ridge of generalised cross-validation; `free` counts the mean that was taken out."""
+    def choose_ridge(self, *, free: bool) -> float:
+        """Return the ridge of generalised cross-validation; `free` says that a mean was subtracted from P and T."""
         rows = self._rows
         outside = np.sum((rows.T - self._U @ self._shares) ** 2, axis=0) + rows.rest
-        return cross_validated(self._s, self._shares, outside, rows.samples - free, self._cut)
+        return choose_ridge(self._s, self._shares, outside, rows.samples - free, self._cut)
 
 
-def cross_validated(
+def choose_ridge(
     s: Float[np.ndarray, " k"],
     shares: Float[np.ndarray, "k nt"],
     outside: Float[np.ndarray, " nt"],
@@ -185,9 +189,9 @@ def cross_validated(
 ) -> float:
     """Return λ = argmin Σ_t M ‖t − H t‖² / ‖t‖² / (M − tr H)², H = P (PᵀP + λ I)⁻¹ Pᵀ, P = U diag(s) Vᵀ.
 
-    Each target counts relative to its own size, so that λ does not depend on units. Where P fits all targets to
-    rounding, there is no noise, and λ is 0. The errors are those of one step; `select` chooses a ridge by errors over a
-    horizon, on held-out folds.
+    Each target counts relative to its own size, so that λ does not depend on units. If P fits all targets to rounding
+    error, the data have no noise and λ is 0. The errors are those of one step; `select` chooses a ridge by errors over
+    a horizon on held-out folds.
 
     Parameters
     ----------
@@ -196,22 +200,22 @@ def cross_validated(
     shares
         Uᵀ T.
     outside
-        Energy of each target that P cannot reach.
+        Energy of each target outside the span of P.
     samples
         The number M of snapshot pairs.
     cut
-        Singular values below cut · σ₁ are rounding.
+        Singular values below cut · σ₁ are rounding errors.
 
     References
     ----------
     Golub, Heath & Wahba, "Generalized cross-validation as a method for choosing a good ridge parameter",
     Technometrics 21, 1979.
     """
-    live = s > cut * s.max(initial=0.0)
+    resolved = s > cut * s.max(initial=0.0)
     energy = np.sum(shares**2, axis=0) + outside
-    lost = outside + np.sum(shares[~live] ** 2, axis=0)
-    exact = samples > live.sum() and not (lost > _ROUNDING * energy).any()
-    if exact or not live.any():
+    residual = outside + np.sum(shares[~resolved] ** 2, axis=0)
+    exact = samples > resolved.sum() and not (residual > _ROUNDING * energy).any()
+    if exact or not resolved.any():
         return 0.0
     size = np.where(energy > 0, energy, 1.0)
     power = np.sum(shares**2 / size, axis=1)
@@ -223,7 +227,7 @@ def cross_validated(
         free = samples - len(s) + np.sum(left, axis=1)
         return samples * (left**2 @ power + rest) / free**2
 
-    smallest = float(s[live].min())  # a ridge far below its square changes nothing
+    smallest = float(s[resolved].min())
     low, high, points = np.log(_NOTHING * smallest**2), np.log(_LARGEST * float(s[0]) ** 2), _POINTS
     for _ in range(_ZOOMS):
         grid = np.linspace(low, high, points)
@@ -232,19 +236,20 @@ def cross_validated(
     return float(np.exp(0.5 * (low + high)))
 
 
-def about_means(
+def centre_products(
     rows: RegressionRows, nu: int, which: Int[np.ndarray, " np"]
 ) -> tuple[RegressionRows, Float[np.ndarray, "n n"]]:
     """Return the rows with products (u − ū)(ψ − ψ̄) in place of u ψ, and the matrix that turns their K into that of u ψ.
 
-    Both span the same models. A ridge on the products of deviations shrinks a model to the same one wherever the data
-    have their zero; u ψ is nearly ū ψ + ψ̄ u where the data lie far from it. Without a constant the rows stay as given.
+    Both span the same models. A ridge on the products of deviations gives the same model for any origin of the data,
+    while far from the origin u ψ is nearly dependent: u ψ ≈ ū ψ + ψ̄ u. Without a constant column the rows stay the
+    same.
     """
     back = np.eye(rows.P.shape[1])
     if rows.constant is None:
         return rows, back
-    one, first = rows.P[:, rows.constant], rows.P.shape[1] - nu * (len(which) + 1)
-    mean = np.array(one @ rows.P / (one @ one))
+    ones, first = rows.P[:, rows.constant], rows.P.shape[1] - nu * (len(which) + 1)
+    mean = np.array(ones @ rows.P / (ones @ ones))
     for i in range(nu):
         products = first + nu + i * len(which) + np.arange(len(which))
         back[which, products] = -mean[first + i]
@@ -254,47 +259,50 @@ def about_means(
 
 
 def scaled_rank(rows: RegressionRows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:
-    """Return rank and condition number of the columns P of `rows`, scaled to unit norm; inf if dependent."""
+    """Return rank and condition number of the columns P of `rows`, scaled to unit norm; inf if they are dependent."""
     if P.shape[1] == 0:
         return 0, 1.0
-    columns = unit(P)
+    columns = scale_to_unit_norm(P)
     squares = np.linalg.eigvalsh(columns.T @ columns)
     if squares[0] > _CLEAR * squares[-1]:
         return P.shape[1], float(np.sqrt(squares[-1] / squares[0]))
     s = np.linalg.svd(columns, compute_uv=False)
-    rank = int(np.sum(s > cutoff(rows) * s[0]))
+    rank = int(np.sum(s > rounding_cutoff(rows) * s[0]))
     return rank, float(s[0] / s[-1]) if rank == P.shape[1] else np.inf
 
 
-def orthonormal(columns: Float[np.ndarray, "m n"], cut: float) -> Float[np.ndarray, "m r"]:
+def orthonormal_basis(columns: Float[np.ndarray, "m n"], cut: float) -> Float[np.ndarray, "m r"]:
     """Return an orthonormal basis of the span of these columns; columns of norm 0 are left out."""
-    U, s, _ = np.linalg.svd(unit(columns[:, norms(columns) > 0]), full_matrices=False)
+    U, s, _ = np.linalg.svd(scale_to_unit_norm(columns[:, column_norms(columns) > 0]), full_matrices=False)
     return U[:, s > cut * s.max(initial=0.0)]
 
 
-def onto(basis: Float[np.ndarray, "m k"], columns: Float[np.ndarray, "m c"]) -> Float[np.ndarray, "m c"]:
-    """Return the columns projected on the span of the basis."""
-    U = orthonormal(basis, float(np.finfo(float).eps * max(basis.shape)))
+def project_onto(basis: Float[np.ndarray, "m k"], columns: Float[np.ndarray, "m c"]) -> Float[np.ndarray, "m c"]:
+    """Return the projection of the columns on the span of the basis."""
+    U = orthonormal_basis(basis, float(np.finfo(float).eps * max(basis.shape)))
     return U @ (U.T @ columns)
 
 
-def rule(rows: RegressionRows, asked: Ridge, ridge: float, *, scaled: bool = True, light: Sequence[int] = ()) -> str:
-    """Return what a solve without a rank cut or added, in words."""
+def describe_solve(
+    rows: RegressionRows, asked: Ridge, ridge: float, *, scaled: bool = True, light: Sequence[int] = ()
+) -> str:
+    """Return in words the ridge, or the cut of singular values, of a solve without a rank."""
     columns = "unit-norm" if scaled else "unscaled"
     columns += " columns" if rows.constant is None or ridge == 0 else " deviations"
     spared = ", a millionth of it on states, Constant and inputs" if light else ""
     how = ", chosen by generalised cross-validation" if asked == "gcv" else ""
     if ridge > 0:
         return f"ridge {ridge:.6g} on {columns}{spared}{how}"
-    return f"singular values cut at {cutoff(rows):.1e} of the largest on {columns}" + (", ridge 0" + how if how else "")
+    zero = f", ridge 0{how}" if how else ""
+    return f"singular values cut at {rounding_cutoff(rows):.1e} of the largest on {columns}{zero}"
 
 
-def doubts(
+def find_doubts(
     rows: RegressionRows, observables: Sequence[str], inputs: Sequence[str], *, regular: bool
 ) -> tuple[list[str], float]:
     """Return a sentence for each reason to doubt the regression on P = [ψ(x) u], and its condition number.
 
-    The condition number is that of columns scaled to unit norm; inf where they are dependent.
+    The condition number is that of columns scaled to unit norm; inf if they are dependent.
 
     Parameters
     ----------
@@ -303,17 +311,17 @@ def doubts(
     observables, inputs
         Names of the columns of P.
     regular
-        The user asked for a ridge or a rank: dependent or ill-conditioned observables are no surprise then.
+        The user passed a ridge or a rank; dependent or ill-conditioned observables then cause no doubt.
     """
     nz, nu = len(observables), len(inputs)
     names = [*observables, *inputs]
-    size = norms(rows.P)
+    size = column_norms(rows.P)
     zero = np.flatnonzero(size == 0)
     zero = zero[zero >= nz] if regular else zero
     sentences: list[str] = []
     if zero.size:
         sentences.append(
-            f"{_listed([names[j] for j in zero])} was 0 in all snapshots, so its coefficients are set to 0; "
+            f"{_list_names([names[j] for j in zero])} was 0 in all snapshots, so its coefficients are set to 0; "
             "excite it or drop it"
         )
     if rows.samples < nz + nu:
@@ -334,12 +342,12 @@ def doubts(
             )
         return sentences, condition if rank == nz + nu else np.inf
     rank_z, rank_u = scaled_rank(rows, Z)[0], scaled_rank(rows, U)[0]
-    for P, own, part, what in ((Z, rank_z, live[live < nz], "observables"), (U, rank_u, live[live >= nz], "inputs")):
-        if own < P.shape[1] and not (regular and what == "observables"):
+    for P, rank_P, part, what in ((Z, rank_z, live[live < nz], "observables"), (U, rank_u, live[live >= nz], "inputs")):
+        if rank_P < P.shape[1] and not (regular and what == "observables"):
+            dependent = _name_dependent_columns(P, rank_P, [names[int(j)] for j in part])
             sentences.append(
-                f"rank-deficient: {P.shape[1] - own} of {P.shape[1]} {what} are linear functions of others "
-                f"on these data ({_dependent(P, own, [names[int(j)] for j in part])}); the minimum-norm solution "
-                "is taken; drop them, or collect richer data"
+                f"rank-deficient: {P.shape[1] - rank_P} of {P.shape[1]} {what} are linear functions of others "
+                f"on these data ({dependent}); the minimum-norm solution is taken; drop them, or collect richer data"
             )
     if rank < rank_z + rank_u:
         sentences.append(
@@ -350,17 +358,17 @@ def doubts(
     return sentences, condition
 
 
-def _dependent(P: Float[np.ndarray, "m n"], rank: int, names: Sequence[str]) -> str:
-    """Return, for each column beyond `rank`, the other columns on which it depends."""
-    R, pivots = qr(unit(P), mode="r", pivoting=True)
+def _name_dependent_columns(P: Float[np.ndarray, "m n"], rank: int, names: Sequence[str]) -> str:
+    """Return in words, for each column beyond `rank`, the columns on which it depends."""
+    R, pivots = qr(scale_to_unit_norm(P), mode="r", pivoting=True)
     sorted_names = [names[int(j)] for j in pivots]
     weights = np.abs(solve_triangular(R[:rank, :rank], R[:rank, rank:]))
-    said: list[str] = []
+    dependences: list[str] = []
     for name, column in zip(sorted_names[rank : rank + _NAMED], weights.T, strict=False):
         sources = [sorted_names[int(i)] for i in np.argsort(-column, kind="stable") if column[i] > 1e-6]
-        said.append(f"{name!r} of {_listed(sources)}")
-    return ", ".join(said) + (", …" if P.shape[1] - rank > _NAMED else "")
+        dependences.append(f"{name!r} of {_list_names(sources)}")
+    return ", ".join(dependences) + (", …" if P.shape[1] - rank > _NAMED else "")
 
 
-def _listed(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     return ", ".join(repr(name) for name in names[:_NAMED]) + (", …" if len(names) > _NAMED else "")

@@ -16,24 +16,24 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.plants.graph import Graph
 from koopmpc.values import freeze
 
-_CHUNK = 4096  # rows at a time
-_DECODED = 1e-12  # ridge of C, where the lifting does not hold all states
-_LOST = 1e3  # the objective, a logarithm, where a prediction leaves the finite numbers
+_CHUNK = 4096  # rows that are lifted at once
+_DECODED = 1e-12  # ridge of the fit of C, for states that the lifting does not hold
+_LOST = 1e3  # value of the objective, a logarithm, if a forecast overflows
 
 
 class _Field(NamedTuple):
-    """A field of one of the liftings in a lifting: its value now, its unit, and whether it stays above zero."""
+    """A tunable field of a lifting or of a lifting in it: its value, its unit, and whether it must stay above zero."""
 
     value: Float[np.ndarray, "..."]
     unit: float
     positive: bool
 
 
-class Tuning:
-    """ψ(x; p): a bound lifting as a function of its tunable numbers p; p = 0 is the lifting as it is.
+class TunableLifting:
+    """ψ(x; p): a bound lifting as a function of its tunable numbers p; p = 0 is the lifting itself.
 
-    A field that stays above zero is its value times exp(p). Any other is its value plus p times a unit: the width of
-    the family where it has one, else the spread of the field's rows. So p does not depend on the units of the states.
+    A field that must stay above zero is its value times exp(p). Any other is its value plus p times a unit: the width
+    of the family if it has one, else the spread of the field's rows. So p does not depend on the units of the states.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Tuning:
     Raises
     ------
     DataError
-        The lifting has nothing that could be tuned.
+        The lifting has no tunable field.
     """
 
     def __init__(self, lifting: Lifting) -> None:
@@ -57,14 +57,14 @@ class Tuning:
                 "RandomFourier in it, or a family of your own that names its `tunable` fields"
             )
         x, p, w = ca.SX.sym("x", nx), ca.SX.sym("p", self.n), ca.SX.sym("w", nz)
-        z = _copied(lifting, iter(self._placed(p)), symbols=True).formula(x)
+        z = _copy_with(lifting, iter(self._evaluate_fields(p)), symbols=True).formula(x)
         options = {"cse": True}
         self._value = Graph.trace(ca.Function("value", [x, p], [z], options))
         self._pullback = Graph.trace(ca.Function("pullback", [x, p, w], [ca.jtimes(z, p, w, True)], options))
 
     @property
     def positive(self) -> "np.ndarray":
-        """Which entries of p are logarithms."""
+        """Mask of the entries of p that are logarithms."""
         return np.concatenate([np.full(field.value.size, field.positive) for field in self._fields])
 
     def __call__(self, X: Float[np.ndarray, "M nx"], p: Float[np.ndarray, " n"]) -> Float[np.ndarray, "M nz"]:
@@ -82,36 +82,36 @@ class Tuning:
         total = np.zeros(self.n)
         for first in range(0, len(X), _CHUNK):
             x, w = (np.ascontiguousarray(rows[first : first + _CHUNK].T) for rows in (X, W))
-            each = np.empty((self.n, x.shape[1]))
-            self._pullback.run(_inputs(x, p, w), each, self._pullback.scratch(x.shape[1]))
-            total += each.sum(axis=1)
+            row_gradients = np.empty((self.n, x.shape[1]))
+            self._pullback.run(_inputs(x, p, w), row_gradients, self._pullback.scratch(x.shape[1]))
+            total += row_gradients.sum(axis=1)
         return total
 
     def at(self, p: Float[np.ndarray, " n"]) -> Lifting:
         """Return the lifting with these numbers."""
-        return _copied(self.lifting, iter(self._placed(p)), symbols=False)
+        return _copy_with(self.lifting, iter(self._evaluate_fields(p)), symbols=False)
 
-    def _placed(self, p: Any) -> Iterator[Any]:
+    def _evaluate_fields(self, p: Any) -> Iterator[Any]:
         """Yield the value of each field at p, an array or symbols."""
         start = 0
         for value, unit, positive in self._fields:
-            own = p[start : start + value.size]
+            change = p[start : start + value.size]
             start += value.size
-            if isinstance(own, ca.SX):
-                own = ca.reshape(own, *value.shape[::-1]).T if value.ndim == 2 else own
-                yield ca.SX(value) * ca.exp(own) if positive else ca.SX(value) + unit * own
+            if isinstance(change, ca.SX):
+                change = ca.reshape(change, *value.shape[::-1]).T if value.ndim == 2 else change
+                yield ca.SX(value) * ca.exp(change) if positive else ca.SX(value) + unit * change
             else:
-                own = own.reshape(value.shape)
-                yield value * np.exp(own) if positive else value + unit * own
+                change = change.reshape(value.shape)
+                yield value * np.exp(change) if positive else value + unit * change
 
 
 def _inputs(*arguments: np.ndarray) -> Any:
-    """Return the rows of matrices and the entries of vectors, one after the other, as a graph reads them."""
+    """Return the arguments of a graph: the rows of matrices and the entries of vectors, one after the other."""
     return [row if argument.ndim == 2 else float(row) for argument in arguments for row in argument]
 
 
 def _inside(lifting: Lifting) -> Iterator[tuple[str, Lifting | tuple[Lifting, ...]]]:
-    """Yield the fields that hold liftings: one, or a tuple of them."""
+    """Yield name and value of the fields that hold a lifting or a tuple of liftings."""
     for field in fields(lifting):
         value: Any = getattr(lifting, field.name)
         if isinstance(value, Lifting):
@@ -133,18 +133,18 @@ def _tunable(lifting: Lifting) -> Iterator[_Field]:
             yield from _tunable(part)
 
 
-def _copied(lifting: Lifting, values: Iterator[Any], *, symbols: bool) -> Lifting:
+def _copy_with(lifting: Lifting, values: Iterator[Any], *, symbols: bool) -> Lifting:
     """Return the lifting with the next of `values` in each tunable field, in the order of `_tunable`."""
     changes: dict[str, Any] = {name: next(values) for name in lifting.tunable}
     for name, value in _inside(lifting):
         if isinstance(value, tuple):
-            changes[name] = tuple(_copied(part, values, symbols=symbols) for part in value)
+            changes[name] = tuple(_copy_with(part, values, symbols=symbols) for part in value)
         else:
-            changes[name] = _copied(value, values, symbols=symbols)
+            changes[name] = _copy_with(value, values, symbols=symbols)
     if not symbols:
         changes = {name: float(v) if np.ndim(v) == 0 and name in lifting.tunable else v for name, v in changes.items()}
         return replace(lifting, **changes)
-    _ = lifting.names  # a copy keeps the names of the original, which symbols have none of
+    _ = lifting.names  # compute the names now: the copy below keeps them, and symbols have no names
     twin = copy(lifting)
     freeze(twin, **changes)
     return twin
@@ -152,7 +152,7 @@ def _copied(lifting: Lifting, values: Iterator[Any], *, symbols: bool) -> Liftin
 
 @dataclass(frozen=True)
 class Windows:
-    """Pieces of N steps: X, what ψ acts on, the states first; V, all inputs; the weights 1 / (N nx Σ x²) of errors."""
+    """Pieces of N steps: points X, states first; all inputs V; the weights 1 / (N nx Σ x²) of squared errors."""
 
     X: Float[np.ndarray, "M N1 np"]
     V: Float[np.ndarray, "M N nv"]
@@ -168,9 +168,10 @@ class Windows:
 
 
 class _LeastSquares:
-    """K = argmin ‖T − P K‖² + ridge ‖D K‖², and the way back through it.
+    """K = argmin ‖T − P K‖² + ridge ‖D K‖², and its derivatives.
 
-    D holds the norms of P's columns, less their mean where one of them is `constant`, as in `edmd`.
+    D holds the norms of P's columns; if P has a `constant` column, those of their deviations from the mean, as in
+    `edmd`.
     """
 
     def __init__(
@@ -188,7 +189,7 @@ class _LeastSquares:
         return cast("Any", cho_solve(self.factor, right / self.norms[:, None])) / self.norms[:, None]
 
     def pullback(self, dK: Float[np.ndarray, "n k"]) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m k"]]:
-        """Return the derivatives by P and T of what has the derivative dK by K."""
+        """Return the derivatives by P and T of a function whose derivative by K is dK."""
         right = self._solve(dK)
         dG = -right @ self.K.T
         by_norms = 2 * self.ridge * dG.diagonal()
@@ -196,7 +197,7 @@ class _LeastSquares:
 
 
 class VariableProjection:
-    """J(p) = log of the relative error over the horizon, with the A, B and C that p's least squares give.
+    """J(p) = log of the relative forecast error over the horizon, with A, B and C by least squares for each p.
 
     Parameters
     ----------
@@ -208,36 +209,36 @@ class VariableProjection:
         Ridge of the least squares, as in `edmd`.
     """
 
-    def __init__(self, tuning: Tuning, windows: Windows, ridge: float) -> None:
+    def __init__(self, tuning: TunableLifting, windows: Windows, ridge: float) -> None:
         self.tuning, self.windows, self.ridge = tuning, windows, ridge
         names, states = tuning.lifting.names, tuning.lifting.bound_states[: windows.weight.shape[1]]
-        self.held = [(i, names.index(state)) for i, state in enumerate(states) if state in names]
+        self.state_places = [(i, names.index(state)) for i, state in enumerate(states) if state in names]
         self.missing = [i for i, state in enumerate(states) if state not in names]
 
     def __call__(self, p: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
         """Return J and its gradient."""
         with np.errstate(over="ignore", invalid="ignore"):
             try:
-                return self._both(p)
-            except (LinAlgError, ValueError):  # the observables, or the forecasts, left the finite numbers
+                return self._value_and_gradient(p)
+            except (LinAlgError, ValueError):  # the observables or the forecasts overflow
                 return _LOST, np.zeros(len(p))
 
-    def elsewhere(self, p: Float[np.ndarray, " n"], other: Windows) -> float:
-        """Return J on other windows, with the matrices that these give."""
+    def evaluate_on(self, p: Float[np.ndarray, " n"], other: Windows) -> float:
+        """Return J on other windows, with the A, B and C that were fitted to `windows`."""
         with np.errstate(over="ignore", invalid="ignore"):
             try:
-                Z = self._lifted(p, self.windows)
-                fit, decode = self._fitted(Z)
-                error = _forecast(self._lifted(p, other), fit.K, self._decoder(decode), other)[0]
+                Z = self._lift(p, self.windows)
+                fit, decode = self._fit(Z)
+                error = _forecast_error(self._lift(p, other), fit.K, self._decoder(decode), other)[0]
             except (LinAlgError, ValueError):
                 return _LOST
         return 0.5 * float(np.log(max(error, 1e-300))) if np.isfinite(error) else _LOST
 
-    def _both(self, p: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
+    def _value_and_gradient(self, p: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
         data, nz = self.windows, self.tuning.lifting.nz
-        Z = self._lifted(p, data)
-        fit, decode = self._fitted(Z)
-        error, back = _forecast(Z, fit.K, self._decoder(decode), data)
+        Z = self._lift(p, data)
+        fit, decode = self._fit(Z)
+        error, back = _forecast_error(Z, fit.K, self._decoder(decode), data)
         if not np.isfinite(error) or error == 0:
             return (_LOST if error else -_LOST), np.zeros(len(p))
         dZ0, dK, dC = back()
@@ -252,12 +253,12 @@ class VariableProjection:
         gradient = self.tuning.pullback(flat, p, dZ.reshape(len(flat), nz))
         return 0.5 * float(np.log(error)), gradient / (2 * error)
 
-    def _lifted(self, p: Float[np.ndarray, " n"], data: Windows) -> Float[np.ndarray, "M N1 nz"]:
+    def _lift(self, p: Float[np.ndarray, " n"], data: Windows) -> Float[np.ndarray, "M N1 nz"]:
         M, N1, n = data.X.shape
         return self.tuning(data.X.reshape(-1, n), p).reshape(M, N1, -1)
 
-    def _fitted(self, Z: Float[np.ndarray, "M N1 nz"]) -> "tuple[_LeastSquares, _LeastSquares | None]":
-        """Return the fit of [A B]ᵀ, and that of C where the lifting does not hold all states."""
+    def _fit(self, Z: Float[np.ndarray, "M N1 nz"]) -> "tuple[_LeastSquares, _LeastSquares | None]":
+        """Return the fit of [A B]ᵀ, and the fit of C for the states that the lifting lacks, or None."""
         nz, X = Z.shape[2], self.windows.X
         now, ahead = Z[:, :-1].reshape(-1, nz), Z[:, 1:].reshape(-1, nz)
         V = self.windows.V.reshape(len(now), -1)
@@ -269,8 +270,8 @@ class VariableProjection:
 
     def _decoder(self, decode: "_LeastSquares | None") -> Float[np.ndarray, "nz nx"]:
         """Return Cᵀ: rows of the identity for the states that the lifting holds, least squares for the others."""
-        C = np.zeros((self.tuning.lifting.nz, len(self.held) + len(self.missing)))
-        for state, place in self.held:
+        C = np.zeros((self.tuning.lifting.nz, len(self.state_places) + len(self.missing)))
+        for state, place in self.state_places:
             C[place, state] = 1.0
         if decode is not None:
             C[:, self.missing] = decode.K
@@ -280,10 +281,10 @@ class VariableProjection:
 _Back = Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
-def _forecast(
+def _forecast_error(
     Z: Float[np.ndarray, "M N1 nz"], K: Float[np.ndarray, "n nz"], C: Float[np.ndarray, "nz nx"], data: Windows
 ) -> tuple[float, _Back]:
-    """Return the mean relative squared error over the horizon, and what gives its derivatives by z_0, K and C."""
+    """Return the mean relative squared error over the horizon, and a function for its derivatives by z_0, K and C."""
     nz, N, nx = Z.shape[2], data.V.shape[1], C.shape[1]
     A, B = K[:nz], K[nz:]
     path = [Z[:, 0]]

@@ -1,4 +1,4 @@
-"""Lifting z = ψ(x), and the traced form that a file holds.
+"""The base class of liftings z = ψ(x), and the traced form in which a file holds a user's lifting.
 
 A lifting is a frozen rule ("all monomials up to degree 3"). `bind` gives it the names of the states and so
 its size; from then on it evaluates arrays (`lifting(X)`) and CasADi symbols (`lifting.symbolic(x)`), the
@@ -26,10 +26,10 @@ from koopmpc.values import Value
 
 Indices = Int[np.ndarray, " n"]
 CONSTANT = "1"  # the name of the observable that is always 1
-_BLOCK = 1024  # about the number of rows evaluated at once, so that their observables stay in the cache
+_BLOCK = 1024  # evaluate about so many rows at once: their observables then stay in the cache
 
 
-def short(state: str) -> str:
+def strip_unit(state: str) -> str:
     """Return the name of a state without its unit: ``"theta [rad]"`` is ``"theta"``."""
     return state.split(" [")[0]
 
@@ -38,9 +38,9 @@ def short(state: str) -> str:
 class Lifting(Value, ABC):
     """Observables z = ψ(x), x in R^nx, z in R^nz.
 
-    A user's own family is a frozen dataclass with `observables` and `formula`; arrays then go through the
-    traced formula, and so do files. A family that `km.train` may change names in `tunable` the fields that are tuned,
-    each "real" or, where it must stay above zero, "positive"; `formula` then takes CasADi symbols in their place, too.
+    A user's own family is a frozen dataclass with `observables` and `formula`; arrays and files then use the traced
+    formula. A family that `km.train` may tune lists its tuned fields in `tunable`: "positive" for a field that must
+    stay above zero, else "real". Its `formula` must then accept CasADi symbols in place of these fields.
     """
 
     tunable: ClassVar[Mapping[str, str]] = {}
@@ -48,14 +48,14 @@ class Lifting(Value, ABC):
 
     @abstractmethod
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the names of the observables on states of these names; raise where they do not fit."""
+        """Return the names of the observables on states of these names; raise if the states do not fit."""
 
     @abstractmethod
     def formula(self, x: ca.SX) -> ca.SX:
         """Return ψ(x) as a column, in CasADi operations."""
 
     def bind(self, states: Sequence[str]) -> "Lifting":
-        """Return the sized copy, on states of these names.
+        """Return a copy bound to states of these names; it knows its size.
 
         Raises
         ------
@@ -89,7 +89,7 @@ class Lifting(Value, ABC):
 
     @cached_property
     def constant_index(self) -> int | None:
-        """Index of the observable ``"1"``, which is always 1; None where the lifting holds no `Constant`."""
+        """Index of the observable ``"1"``, which is always 1; None if the lifting holds no `Constant`."""
         return self.names.index(CONSTANT) if CONSTANT in self.names else None
 
     def __call__(self, X: ArrayLike) -> Float[np.ndarray, "..."]:
@@ -126,17 +126,17 @@ class Lifting(Value, ABC):
             )
         return z
 
-    def measured(self) -> ca.Function:
-        """Return ψ of one measured state; NaN where one of its entries is NaN or beyond 1e30."""
+    def guarded_function(self) -> ca.Function:
+        """Return ψ as a CasADi function of one state; its result is NaN if an entry of x is NaN or beyond 1e30."""
         x = ca.SX.sym("x", len(self.bound_states))
-        kept = ca.if_else(ca.sum1(ca.fabs(x)) < HUGE, 1.0, np.nan) * x
-        return ca.Function("psi", [x], [ca.densify(self.symbolic(kept))], {"cse": True})
+        guarded = ca.if_else(ca.sum1(ca.fabs(x)) < HUGE, 1.0, np.nan) * x
+        return ca.Function("psi", [x], [ca.densify(self.symbolic(guarded))], {"cse": True})
 
     def __add__(self, other: "Lifting") -> "Lifting":
-        """Return both liftings one under the other; an observable that both name is held once."""
+        """Return the observables of both liftings, one under the other; a name that both have occurs once."""
         from koopmpc.lifting.composed import Sum  # here, because that file imports this one
 
-        other = lifting_of(other)
+        other = check_lifting(other)
         parts = [part for side in (self, other) for part in (side.parts if isinstance(side, Sum) else (side,))]
         total, bound = Sum(tuple(parts)), self._common(other)
         return total if bound is None else total.bind(bound)
@@ -145,13 +145,13 @@ class Lifting(Value, ABC):
         """Return all products of this lifting's observables with the other's."""
         from koopmpc.lifting.composed import Product  # here, because that file imports this one
 
-        product = Product(self, lifting_of(other))
+        product = Product(self, check_lifting(other))
         bound = self._common(other)
         return product if bound is None else product.bind(bound)
 
     def as_saved(self) -> Value:
-        """Return the lifting itself, or for a class that koopmpc does not hold its traced formula."""
-        if Value._kinds.get(type(self).__name__) is type(self):
+        """Return the lifting itself, or the traced formula of a class that is not koopmpc's own."""
+        if self.is_registered():
             return self
         return Traced(self._graph, self.names, bound=self.bound_states)
 
@@ -180,7 +180,7 @@ class Lifting(Value, ABC):
         return self.observables(self.bound_states)
 
     def _common(self, other: "Lifting") -> tuple[str, ...] | None:
-        """Return the states that one of the two is bound to, None where neither is."""
+        """Return the states to which one of the two is bound, or None if neither is bound."""
         if None not in (self.bound, other.bound) and self.bound != other.bound:
             raise DataError(f"the liftings are bound to other states: {self.bound} and {other.bound}")
         return self.bound if other.bound is None else other.bound
@@ -192,17 +192,17 @@ class Lifting(Value, ABC):
 
 @dataclass(frozen=True, eq=False)
 class Traced(Lifting):
-    """ψ as a list of plain operations: a file holds a user's own function in this form."""
+    """ψ as a list of plain operations; a file holds a user's own function in this form."""
 
     graph: Graph
     labels: tuple[str, ...]
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the names given when it was traced."""
+        """Return the names that it had when it was traced."""
         return self.labels
 
     def formula(self, x: ca.SX) -> ca.SX:
-        """Return the operations, done on symbols."""
+        """Return the result of the operations on symbols."""
         return self.graph.symbolic(x)
 
     @cached_property
@@ -210,31 +210,31 @@ class Traced(Lifting):
         return self.graph
 
 
-def lifting_of(given: object) -> Lifting:
-    """Return `given` if it is a Lifting.
+def check_lifting(value: object) -> Lifting:
+    """Return `value` if it is a Lifting.
 
     Raises
     ------
     DataError
-        `given` is something else, or a class of liftings.
+        `value` is something else, or a class instead of an instance.
     """
-    if isinstance(given, Lifting):
-        return given
-    if isinstance(given, type) and issubclass(given, Lifting):
-        raise DataError(f"the lifting is the class {given.__name__}; pass one of it: {given.__name__}(…)")
-    raise DataError(f"{given!r} is no lifting; pass one, or a sum: State() + Constant()")
+    if isinstance(value, Lifting):
+        return value
+    if isinstance(value, type) and issubclass(value, Lifting):
+        raise DataError(f"the lifting is the class {value.__name__}; pass an instance: {value.__name__}(…)")
+    raise DataError(f"{value!r} is not a lifting; pass one, or a sum: State() + Constant()")
 
 
-def buffered(lifting: Lifting) -> Buffered:
+def buffer_lifting(lifting: Lifting) -> Buffered:
     """Return ψ as a function of one state, at about a microsecond a call.
 
-    One state that is NaN, or beyond 1e30, makes all of them NaN: a bad measurement shows in every product with z,
-    and NaN, unlike inf, passes through products in silence.
+    If one state is NaN or beyond 1e30, all observables are NaN. A bad measurement then shows in every product with z;
+    NaN, unlike inf, causes no warning in a product.
     """
-    return Buffered(lifting.measured())
+    return Buffered(lifting.guarded_function())
 
 
-def rows(lifting: Lifting, wanted: Lifting) -> Indices:
+def find_observables(lifting: Lifting, wanted: Lifting) -> Indices:
     """Return the indices in the bound `lifting` of the observables of the bound `wanted`, found by name.
 
     Raises
@@ -251,37 +251,37 @@ def rows(lifting: Lifting, wanted: Lifting) -> Indices:
     return np.array([place[name] for name in wanted.names], dtype=np.intp)
 
 
-Chosen = int | str | Sequence[int | str]
+StateChoice = int | str | Sequence[int | str]
 
 
-def index(state: int | str, states: Sequence[str], who: str) -> int:
+def find_state(state: int | str, states: Sequence[str], who: str) -> int:
     """Return the index of a state given by its index, or by its name with or without the unit.
 
     Raises
     ------
     DataError
-        There is no such state; `who` asked for it.
+        There is no such state; the message names `who` asked for it.
     """
     if isinstance(state, str):
-        found = [i for i, name in enumerate(states) if state in (name, short(name))]
-        if len(found) == 1:
-            return found[0]
+        matches = [i for i, name in enumerate(states) if state in (name, strip_unit(name))]
+        if len(matches) == 1:
+            return matches[0]
     elif -len(states) <= state < len(states):
         return state % len(states)
     raise DataError(f"{who} is asked for state {state!r}; the states are {', '.join(states)}, or 0 … {len(states) - 1}")
 
 
-def indices(chosen: Chosen | None, states: Sequence[str], who: str) -> list[int]:
-    """Return the indices of the chosen states; of all of them where `chosen` is None."""
+def find_states(chosen: StateChoice | None, states: Sequence[str], who: str) -> list[int]:
+    """Return the indices of the chosen states, or of all states if `chosen` is None."""
     if chosen is None:
         return list(range(len(states)))
-    some = [chosen] if isinstance(chosen, int | str) else chosen
-    return [index(state, states, who) for state in some]
+    choices = [chosen] if isinstance(chosen, int | str) else chosen
+    return [find_state(state, states, who) for state in choices]
 
 
-def frozen(chosen: Chosen | None) -> tuple[int | str, ...] | None:
-    """Return a choice of states as a frozen dataclass holds it: a tuple of ints and names, or None for all."""
+def freeze_choice(chosen: StateChoice | None) -> tuple[int | str, ...] | None:
+    """Return a choice of states as an immutable tuple of indices and names, or None for all states."""
     if chosen is None:
         return None
-    some = [chosen] if isinstance(chosen, int | str | np.integer) else chosen
-    return tuple(state if isinstance(state, str) else int(state) for state in some)
+    choices = [chosen] if isinstance(chosen, int | str | np.integer) else chosen
+    return tuple(state if isinstance(state, str) else int(state) for state in choices)

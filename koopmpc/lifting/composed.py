@@ -1,4 +1,4 @@
-"""Liftings made of others: sums, products, directions, picks, of the present or standardized states; eigenfunctions."""
+"""Liftings made of other liftings: sums, products, projections, selections, scaled states and eigenfunctions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,14 +15,14 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import CONSTANT, Indices, Lifting, lifting_of, short
+from koopmpc.lifting.base import CONSTANT, Indices, Lifting, check_lifting, strip_unit
 from koopmpc.plants.graph import Graph
 from koopmpc.values import freeze
 
 
 @dataclass(frozen=True, eq=False)
 class Sum(Lifting):
-    """ψ(x) = [ψ₁(x); ψ₂(x); …] without observables that an earlier part holds by name; written ``a + b``."""
+    """ψ(x) = [ψ₁(x); ψ₂(x); …], written ``a + b``; an observable whose name an earlier part has is left out."""
 
     parts: tuple[Lifting, ...]
 
@@ -42,22 +42,22 @@ class Sum(Lifting):
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         ends = accumulate(len(new) for new in self._new)
         for part, new, end in zip(self.parts, self._new, ends, strict=True):
-            own = Z[:, end - len(new) : end]
+            columns = Z[:, end - len(new) : end]
             if len(new) == part.nz:
-                part._fill(x, own)
+                part._fill(x, columns)
             elif len(new):
                 whole = np.empty((len(Z), part.nz))
                 part._fill(x, whole)
-                own[:] = whole[:, new]
+                columns[:] = whole[:, new]
 
     @cached_property
     def _new(self) -> tuple[Indices, ...]:
         """For each part the indices of the observables that no earlier part names."""
-        held: set[str] = set()
+        earlier: set[str] = set()
         new: list[Indices] = []
         for part in self.parts:
-            new.append(np.array([i for i, name in enumerate(part.names) if name not in held], dtype=np.intp))
-            held.update(part.names)
+            new.append(np.array([i for i, name in enumerate(part.names) if name not in earlier], dtype=np.intp))
+            earlier.update(part.names)
         return tuple(new)
 
 
@@ -65,8 +65,8 @@ class Sum(Lifting):
 class Product(Lifting):
     """ψ(x) = aᵢ(x) bⱼ(x) for every i and j; written ``a * b``.
 
-    A product that comes twice, as x₁ x₂ and x₂ x₁ do, is held once. Factors of a name stand in one order,
-    states first and without their units, so ``State() * State()`` names what ``Monomials(2)`` does.
+    Equal products, such as x₁ x₂ and x₂ x₁, occur once. A name lists its factors in one order, states first and
+    without units, so ``State() * State()`` has the names of ``Monomials(2)``.
     """
 
     first: Lifting
@@ -83,7 +83,7 @@ class Product(Lifting):
         return tuple(self._pairs)
 
     def formula(self, x: ca.SX) -> ca.SX:
-        """Return the products, the first lifting's observables the slow index."""
+        """Return the products; the index of the second lifting runs fastest."""
         a, b = self.first.formula(x), self.second.formula(x)
         return ca.vertcat(*(a[int(i)] * b[int(j)] for i, j in self._pairs.values()))
 
@@ -96,19 +96,19 @@ class Product(Lifting):
 
     @cached_property
     def _pairs(self) -> dict[str, tuple[int, int]]:
-        """Indices of the two factors by the name of their product; of those with one name the first."""
-        plain = [short(state) for state in self.bound_states]
+        """Indices of the two factors by the name of their product; of equal names the first pair counts."""
+        plain = [strip_unit(state) for state in self.bound_states]
         names = plain if len(set(plain)) == len(plain) else list(self.bound_states)
         order = {state: (i, name) for i, (state, name) in enumerate(zip(self.bound_states, names, strict=True))}
-        found: dict[str, tuple[int, int]] = {}
+        pairs: dict[str, tuple[int, int]] = {}
         for i, left in enumerate(self.first.names):
             for j, right in enumerate(self.second.names):
-                found.setdefault(_name(left, right, order), (i, j))
-        return found
+                pairs.setdefault(_name_product(left, right, order), (i, j))
+        return pairs
 
 
-def _name(left: str, right: str, states: dict[str, tuple[int, str]]) -> str:
-    """Return the name of the product; `states` gives the place and the plain name of each state."""
+def _name_product(left: str, right: str, states: dict[str, tuple[int, str]]) -> str:
+    """Return the name of the product; `states` holds the position and the name without unit of each state."""
     if CONSTANT in (left, right):
         return right if left == CONSTANT else left
     pair = sorted((left, right), key=lambda name: (name not in states, states.get(name, (0, ""))[0], name))
@@ -127,12 +127,12 @@ class Projected(Lifting):
     lifting
         ψ, of nz observables.
     basis
-        (nz, r), a direction a column.
+        (nz, r), one direction a column.
 
     Raises
     ------
     ShapeError
-        The basis has not one row for each observable.
+        The number of rows in the basis differs from the number of observables.
     """
 
     lifting: Lifting
@@ -167,7 +167,7 @@ class Projected(Lifting):
 
 @dataclass(frozen=True, eq=False)
 class Picked(Lifting):
-    """ψ(x) = the observables of another lifting at `which`, under their own names; the others are not computed.
+    """ψ(x) = the observables of another lifting at the indices `which`, with their names; no other one is computed.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ class Picked(Lifting):
 
 @dataclass(frozen=True, eq=False)
 class Present(Lifting):
-    """ψ(ζ) = ψ(x) of a ζ = [x; u_{k−1}; x_{k−1}; …] that begins with the state x: its observables, under their names.
+    """ψ(ζ) = ψ(x) for a point ζ = [x; u_{k−1}; x_{k−1}; …] of delays: the observables of the present state x.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ class Present(Lifting):
         return self.lifting.names
 
     def formula(self, x: ca.SX) -> ca.SX:
-        """Return the lifting's formula of the first entries."""
+        """Return ψ of the first entries of ζ."""
         return self.lifting.formula(x[: len(self.lifting.bound_states)])
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
@@ -256,7 +256,7 @@ class Standardized(Lifting):
     Raises
     ------
     ShapeError
-        Mean and scale have not one entry for each state.
+        Mean or scale has more or fewer entries than there are states.
     DataError
         A scale is not above zero.
     """
@@ -272,30 +272,29 @@ class Standardized(Lifting):
         spread = checks.array(scale, "scale", center.shape)
         if (spread <= 0).any():
             raise DataError(f"scale holds {spread.min():g}; it must be above zero for every state")
-        freeze(self, lifting=lifting_of(lifting), mean=center, scale=spread, bound=bound)
+        freeze(self, lifting=check_lifting(lifting), mean=center, scale=spread, bound=bound)
 
     @classmethod
     def of(cls, episodes: Episodes | Source, lifting: Lifting) -> "Standardized":
         """Return the lifting standardized by the mean and the standard deviation of the states in these data.
 
-        The states are x_0 … x_{T−1} of each episode, read part by part. A state that does not move keeps its unit:
-        its scale is 1.
+        The states are x_0 … x_{T−1} of each episode, read part by part. A state that does not move has scale 1.
 
         Raises
         ------
         DataError
-            The source can be read once only, and the fit needs it too.
+            The source can be read only once, and the fit must read it.
         """
         source = source_of(episodes)
         if not source.replayable:
             raise DataError("a stream is read once, by the fit; take Standardized.of from some episodes of it")
         rows, mean, squares = 0, np.zeros(source.nx), np.zeros(source.nx)
         for part in source.parts():
-            for episode in part.load():  # Chan, Golub & LeVeque 1983: two means and sums of squares become one
+            for episode in part.load():  # Chan, Golub & LeVeque 1983: merge the means and sums of squares of two sets
                 X = episode.X[:-1]
-                own, rows = X.mean(axis=0), rows + len(X)
-                step = (own - mean) * len(X) / rows
-                squares += ((X - own) ** 2).sum(axis=0) + (own - mean) * step * (rows - len(X))
+                episode_mean, rows = X.mean(axis=0), rows + len(X)
+                step = (episode_mean - mean) * len(X) / rows
+                squares += ((X - episode_mean) ** 2).sum(axis=0) + (episode_mean - mean) * step * (rows - len(X))
                 mean = mean + step
         scale = np.sqrt(squares / max(rows, 1))
         still = scale <= 1e-12 * np.abs(mean)
@@ -313,7 +312,7 @@ class Standardized(Lifting):
         return bound
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the inner names with ``~`` and a checksum of mean and scale: other numbers give other observables."""
+        """Return the inner names, each with ``~`` and a checksum of mean and scale: a name fixes the function."""
         tag = f"~{crc32(self.mean.tobytes() + self.scale.tobytes()):08x}"
         return tuple(name if name == CONSTANT else name + tag for name in self.lifting.bind(states).names)
 
@@ -329,8 +328,8 @@ class Standardized(Lifting):
 class Eigenfunction(Lifting):
     """φ(x) = Σ cⱼ ψⱼ(x) with φ̇ = λ φ + Σᵢ βᵢ(x) uᵢ along the motion of the plant; a conserved energy has λ = 0.
 
-    As a lifting it has one observable, φ, or two where λ is complex, Re φ and Im φ: costs, limits, models and
-    controllers take it as they take any other.
+    As a lifting it has the observable φ, or Re φ and Im φ if λ is complex. Costs, limits, models and controllers
+    accept it like any other lifting.
 
     Attributes
     ----------
@@ -341,7 +340,7 @@ class Eigenfunction(Lifting):
     rates
         λ [1/s] as (Re,) or (Re, Im).
     drive
-        (1 or 2, nu, nz), βᵢ(x) = Σⱼ drive[i, j] ψⱼ(x); nu is 0 where the data had no inputs.
+        (1 or 2, nu, nz), βᵢ(x) = Σⱼ drive[i, j] ψⱼ(x); nu is 0 if the data had no inputs.
     label
         Name of the observable.
     residual
@@ -349,7 +348,7 @@ class Eigenfunction(Lifting):
         their standard deviations.
     error
         Root-mean-square error of φ over whole held-out episodes, predicted from its first value, as a share of
-        ‖∇φ‖ in standard deviations of the states: 1 means that φ moves as any function does.
+        ‖∇φ‖ in standard deviations of the states. An error of 1 means that the prediction is worthless.
     """
 
     lifting: Lifting
@@ -367,9 +366,9 @@ class Eigenfunction(Lifting):
         freeze(self, coefficients=c, drive=drive, bound=self.lifting.bound_states)
 
     def bind(self, states: Sequence[str]) -> "Eigenfunction":
-        """Return itself: it is bound to the states of its data."""
+        """Return itself: it is already bound to the states of its data."""
         if len(states) != len(self.bound_states):
-            raise ShapeError(f"{self.label} is of {len(self.bound_states)} states, and there are {len(states)}")
+            raise ShapeError(f"{self.label} is a function of {len(self.bound_states)} states, got {len(states)}")
         return self
 
     @property
@@ -379,15 +378,15 @@ class Eigenfunction(Lifting):
 
     @property
     def nu(self) -> int:
-        """Number of inputs whose effect is known."""
+        """Number of inputs."""
         return self.drive.shape[1]
 
     def scaled(self, by: float, label: str | None = None) -> "Eigenfunction":
-        """Return `by` times φ: an eigenfunction is found up to a factor."""
+        """Return `by` times φ, which is an eigenfunction too."""
         return replace(self, coefficients=by * self.coefficients, drive=by * self.drive, label=label or self.label)
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the label, or those of real and imaginary part."""
+        """Return the label, or the names of the real and the imaginary part."""
         return (self.label,) if len(self.rates) == 1 else (f"Re {self.label}", f"Im {self.label}")
 
     def formula(self, x: ca.SX) -> ca.SX:
@@ -399,27 +398,27 @@ class Eigenfunction(Lifting):
         return (ca.DM(self.drive[0]) @ self.lifting.formula(x)).T
 
     def values(self, X: ArrayLike) -> Complex[np.ndarray, " M"] | Float[np.ndarray, " M"]:
-        """Return φ at rows of states (M, nx): real, or complex where λ is."""
-        return _joined(self(checks.array(X, "X", (None, len(self.bound_states)))).T)
+        """Return φ at rows of states (M, nx): complex if λ is, else real."""
+        return _combine_parts(self(checks.array(X, "X", (None, len(self.bound_states)))).T)
 
     def gradient(self, X: ArrayLike) -> Complex[np.ndarray, "M nx"] | Float[np.ndarray, "M nx"]:
         """Return ∂φ/∂x at rows of states (M, nx)."""
-        J = jacobians(self.lifting, checks.array(X, "X", (None, len(self.bound_states))))
-        return _joined(np.einsum("pj,mji->pmi", self.coefficients, J))
+        J = evaluate_jacobians(self.lifting, checks.array(X, "X", (None, len(self.bound_states))))
+        return _combine_parts(np.einsum("pj,mji->pmi", self.coefficients, J))
 
     def __str__(self) -> str:
         """Return the formula with four digits, and λ."""
-        c = _joined(self.coefficients)
-        terms = [f"({v:.4g}) {short(name)}" for v, name in zip(c, self.lifting.names, strict=True) if v != 0]
+        c = _combine_parts(self.coefficients)
+        terms = [f"({v:.4g}) {strip_unit(name)}" for v, name in zip(c, self.lifting.names, strict=True) if v != 0]
         value = self.rates[0] if len(self.rates) == 1 else self.eigenvalue
         return f"{self.label} = {' + '.join(terms)}, λ = {value:.4g} 1/s, error {self.error:.2g}"
 
 
-def _joined(parts: Float[np.ndarray, "p ..."]) -> Complex[np.ndarray, "..."] | Float[np.ndarray, "..."]:
+def _combine_parts(parts: Float[np.ndarray, "p ..."]) -> Complex[np.ndarray, "..."] | Float[np.ndarray, "..."]:
     return parts[0] if len(parts) == 1 else parts[0] + 1j * parts[1]
 
 
-def jacobians(lifting: Lifting, X: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M nz nx"]:
+def evaluate_jacobians(lifting: Lifting, X: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M nz nx"]:
     """Return ∂ψ/∂x at rows of states, exactly, by CasADi's derivatives."""
     x = ca.SX.sym("x", X.shape[1])
     J = ca.densify(ca.jacobian(lifting.symbolic(x), x))

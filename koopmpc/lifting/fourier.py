@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import Chosen, Lifting, frozen, indices, short
+from koopmpc.lifting.base import Lifting, StateChoice, find_states, freeze_choice, strip_unit
 from koopmpc.values import freeze
 
 
@@ -31,7 +31,7 @@ class Fourier(Lifting):
     Raises
     ------
     DataError
-        harmonics is below 1, or, when it is bound, there is no such state.
+        harmonics is below 1. When the lifting is bound: there is no such state.
 
     Examples
     --------
@@ -42,28 +42,28 @@ class Fourier(Lifting):
     """
 
     harmonics: int
-    states: Chosen | None = None
+    states: StateChoice | None = None
 
     def __post_init__(self) -> None:
-        freeze(self, harmonics=checks.count(self.harmonics, "harmonics"), states=frozen(self.states))
+        freeze(self, harmonics=checks.count(self.harmonics, "harmonics"), states=freeze_choice(self.states))
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"sin(theta)"`` and ``"cos(2 theta)"``."""
         return tuple(
-            f"{function}({'' if k == 1 else f'{k} '}{short(states[i])})"
-            for i in indices(self.states, states, "Fourier")
+            f"{function}({'' if k == 1 else f'{k} '}{strip_unit(states[i])})"
+            for i in find_states(self.states, states, "Fourier")
             for k in range(1, self.harmonics + 1)
             for function in ("sin", "cos")
         )
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return the harmonics, state by state."""
-        angles = [k * x[i] for i in self._chosen for k in range(1, self.harmonics + 1)]
+        angles = [k * x[i] for i in self._state_indices for k in range(1, self.harmonics + 1)]
         return ca.vertcat(*(function(angle) for angle in angles for function in (ca.sin, ca.cos)))
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         j = 0
-        for i in self._chosen:
+        for i in self._state_indices:
             for k in range(1, self.harmonics + 1):
                 angle = k * x[i]
                 Z[:, j] = np.sin(angle)
@@ -71,11 +71,11 @@ class Fourier(Lifting):
                 j += 2
 
     @cached_property
-    def _chosen(self) -> list[int]:
-        return indices(self.states, self.bound_states, "Fourier")
+    def _state_indices(self) -> list[int]:
+        return find_states(self.states, self.bound_states, "Fourier")
 
 
-_SEEDS = 2**32
+_SEEDS = 2**32  # a Generator draws the seed below this number
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -92,7 +92,7 @@ class RandomFourier(Lifting):
     width
         Standard deviation of the kernel, in the unit of the states; standardize states that differ much.
     rng
-        A seed, or a Generator that one is drawn from.
+        A seed, or a Generator that draws the seed.
 
     Raises
     ------
@@ -121,31 +121,31 @@ class RandomFourier(Lifting):
         phases: ArrayLike | None = None,
         bound: tuple[str, ...] | None = None,
     ) -> None:
-        """Check the arguments; a bound copy passes the `frequencies` and `phases` that it has drawn."""
+        """Check the arguments; `bind` passes the `frequencies` and `phases` that it has drawn."""
         n = checks.count(count, "count")
         source = checks.generator(rng)
         seed = int(source.integers(_SEEDS)) if isinstance(rng, np.random.Generator) else int(rng)
-        drawn = None if frequencies is None else checks.array(frequencies, "frequencies", (n, None))
-        turned = None if phases is None else checks.array(phases, "phases", (n,))
-        if (drawn is None) != (turned is None):
+        omegas = None if frequencies is None else checks.array(frequencies, "frequencies", (n, None))
+        shifts = None if phases is None else checks.array(phases, "phases", (n,))
+        if (omegas is None) != (shifts is None):
             raise DataError("frequencies and phases belong together; pass both or none")
-        if drawn is not None and bound is not None and drawn.shape[1] != len(bound):
-            raise ShapeError(f"frequencies has {drawn.shape[1]} columns and there are {len(bound)} states")
+        if omegas is not None and bound is not None and omegas.shape[1] != len(bound):
+            raise ShapeError(f"frequencies has {omegas.shape[1]} columns and there are {len(bound)} states")
         freeze(
             self,
             count=n,
             width=checks.positive(width, "width"),
             rng=seed,
-            frequencies=drawn,
-            phases=turned,
+            frequencies=omegas,
+            phases=shifts,
             bound=bound,
         )
 
     def bind(self, states: Sequence[str]) -> "RandomFourier":
-        """Return the copy with its frequencies and phases: the same seed draws the same ones."""
+        """Return the copy with frequencies and phases; the same seed draws the same numbers."""
         frequencies, phases = self.frequencies, self.phases
         if frequencies is None or frequencies.shape[1] != len(states):
-            frequencies, phases = self._seeded(len(states))
+            frequencies, phases = self._draw_features(len(states))
         bound = RandomFourier(
             self.count, self.width, self.rng, frequencies=frequencies, phases=phases, bound=tuple(states)
         )
@@ -153,29 +153,29 @@ class RandomFourier(Lifting):
         return bound
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return names such as ``"randomfourier(3 of 100; 0.5; seed 0)"``; other numbers add their checksum."""
+        """Return names such as ``"randomfourier(3 of 100; 0.5; seed 0)"``; tuned numbers add a checksum to the name."""
         tag = ""
         if self.frequencies is not None and self.phases is not None:
-            drawn, turned = self._seeded(self.frequencies.shape[1])
-            if not (np.array_equal(drawn, self.frequencies) and np.array_equal(turned, self.phases)):
+            omegas, shifts = self._draw_features(self.frequencies.shape[1])
+            if not (np.array_equal(omegas, self.frequencies) and np.array_equal(shifts, self.phases)):
                 tag = f"; {crc32(self.frequencies.tobytes() + self.phases.tobytes()):08x}"
         every = range(self.count)
         return tuple(f"randomfourier({j} of {self.count}; {self.width!r}; seed {self.rng}{tag})" for j in every)
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return √(2/count) cos(ωⱼ·x + bⱼ) for each j."""
-        frequencies, phases = self._drawn
+        frequencies, phases = self._features
         return self._amplitude * ca.cos(ca.SX(frequencies) @ x + ca.SX(phases))
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
-        frequencies, phases = self._drawn
+        frequencies, phases = self._features
         Z[:] = phases
-        for values, coordinates in zip(x, frequencies.T, strict=True):  # in one order for one row and for many
+        for values, coordinates in zip(x, frequencies.T, strict=True):  # one order of sums for any number of rows
             Z += values[:, None] * coordinates
         np.cos(Z, out=Z)
         Z *= self._amplitude
 
-    def _seeded(self, nx: int) -> tuple[Float[np.ndarray, "count nx"], Float[np.ndarray, " count"]]:
+    def _draw_features(self, nx: int) -> tuple[Float[np.ndarray, "count nx"], Float[np.ndarray, " count"]]:
         """Return the frequencies and phases that the seed draws on `nx` states."""
         source = checks.generator(self.rng)
         phases = source.uniform(0.0, 2 * np.pi, self.count)
@@ -186,8 +186,8 @@ class RandomFourier(Lifting):
         return float(np.sqrt(2.0 / self.count))
 
     @property
-    def _drawn(self) -> tuple[Any, Any]:
+    def _features(self) -> tuple[Any, Any]:
         """The frequencies (count, nx) and phases (count,): numbers, or symbols while they are tuned."""
         if self.frequencies is None or self.phases is None:
-            raise DataError("RandomFourier has drawn nothing yet; call .bind(states) or pass it to edmd")
+            raise DataError("RandomFourier has not drawn its frequencies yet; call .bind(states) or pass it to edmd")
         return self.frequencies, self.phases

@@ -1,4 +1,4 @@
-"""Gaussian, ThinPlate and PolynomialKernel: functions of the state and given centres."""
+"""Gaussian, ThinPlate and PolynomialKernel: functions of the state and of fixed centres."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.values import freeze
 
-_CANCELS = 1e-3  # share of ‖x‖² + ‖c‖² below which a distance squared has lost three digits
+_CANCELS = 1e-3  # sum ‖x − c‖² again if it is below this share of ‖x‖² + ‖c‖²: it has then lost three digits
 
 
-def checked_centers(centers: ArrayLike) -> Float[np.ndarray, "nc nx"]:
-    """Return the centres as rows; raise where there are none, or not in rows."""
+def check_centers(centers: ArrayLike) -> Float[np.ndarray, "nc nx"]:
+    """Return the centres as rows; raise if there are none, or if they are not rows."""
     rows = checks.array(centers, "centers", (None, None))
     if rows.size == 0:
-        raise DataError(f"centers has shape {rows.shape}; pass at least one row, a row a centre")
+        raise DataError(f"centers has shape {rows.shape}; pass at least one row, one row for each centre")
     return rows
 
 
-def written(centers: Float[np.ndarray, "nc nx"], states: tuple[str, ...]) -> list[str]:
-    """Return each centre as ``"0.5, -1"``, to the last digit, so that one name is one function."""
+def format_centers(centers: Float[np.ndarray, "nc nx"], states: tuple[str, ...]) -> list[str]:
+    """Return each centre as text such as ``"0.5, -1"``, with all digits, so that a name fixes the function."""
     if centers.shape[1] != len(states):
         raise ShapeError(
             f"centers has {centers.shape[1]} columns and there are {len(states)} states "
@@ -35,26 +35,27 @@ def written(centers: Float[np.ndarray, "nc nx"], states: tuple[str, ...]) -> lis
     return [", ".join(repr(value).removesuffix(".0") for value in row) for row in centers.tolist()]
 
 
-def squared_distances(
+def write_squared_distances(
     x: Float[np.ndarray, "nx M"], centers: Float[np.ndarray, "nc nx"], out: Float[np.ndarray, "M nc"]
 ) -> None:
     """Write ‖x − c‖² for each column of x and each centre to `out`.
 
-    It is one matrix product, ‖x‖² − 2 xᵀc + ‖c‖² about the mean of the centres. Where that cancels, for x near c, it is
-    summed from the differences again, so that its relative error is below 1e-12 everywhere.
+    The distances come from one matrix product, ‖x‖² − 2 xᵀc + ‖c‖² about the mean of the centres. For x near c the
+    terms cancel; these distances are summed again from the differences. The relative error is below 1e-12 everywhere.
     """
-    middle = centers.mean(axis=0)
-    near, far = x - middle[:, None], centers - middle
-    own, square = np.einsum("ij,ij->j", near, near), np.einsum("ij,ij->i", far, far)
-    left = np.vstack([near, own, np.ones(len(own))])
-    np.matmul(left.T, np.vstack([-2.0 * far.T, np.ones(len(square)), square]), out=out)
-    rows, which = divmod(np.flatnonzero(out < (_CANCELS * (own + square.max()))[:, None]), len(centers))
+    mean = centers.mean(axis=0)
+    x_shifted, c_shifted = x - mean[:, None], centers - mean
+    x_squares = np.einsum("ij,ij->j", x_shifted, x_shifted)
+    c_squares = np.einsum("ij,ij->i", c_shifted, c_shifted)
+    left = np.vstack([x_shifted, x_squares, np.ones(len(x_squares))])
+    np.matmul(left.T, np.vstack([-2.0 * c_shifted.T, np.ones(len(c_squares)), c_squares]), out=out)
+    rows, which = divmod(np.flatnonzero(out < (_CANCELS * (x_squares + c_squares.max()))[:, None]), len(centers))
     difference = x[:, rows] - centers[which].T
     out[rows, which] = np.einsum("ij,ij->j", difference, difference)
 
 
 def symbolic_squared_distances(x: ca.SX, centers: "Float[np.ndarray, 'nc nx'] | ca.SX") -> list[ca.SX]:
-    """Return ‖x − c‖² for each centre, given or a symbol itself, summed in the same order."""
+    """Return ‖x − c‖² for each centre; the centres are numbers or symbols, and the sums run in one order."""
     rows, totals = ca.SX(centers), list[ca.SX]()
     for j in range(rows.shape[0]):
         total = ca.SX(0)
@@ -73,15 +74,16 @@ class Gaussian(Lifting):
     centers
         (nc, nx), one centre a row.
     width
-        Standard deviation of the bell, in the unit of the states; one for all centres, or (nc,), one for each. Scale
-        states that differ much.
+        Standard deviation of the bell, in the unit of the states: one number, or (nc,) with one for each centre. Scale
+        states of very different sizes, by `Standardized`.
 
     Raises
     ------
     DataError
         There is no centre, or a width is not above zero.
     ShapeError
-        The centres are no rows, there are more or fewer widths, or, when it is bound, states.
+        The centres are not rows, or there are more or fewer widths than centres. When the lifting is bound: the
+        centres have more or fewer columns than there are states.
     """
 
     tunable: ClassVar[Mapping[str, str]] = {"centers": "real", "width": "positive"}
@@ -89,18 +91,18 @@ class Gaussian(Lifting):
     width: float | Float[np.ndarray, " nc"]
 
     def __init__(self, centers: ArrayLike, width: ArrayLike, *, bound: tuple[str, ...] | None = None) -> None:
-        rows = checked_centers(centers)
+        rows = check_centers(centers)
         if np.ndim(width) == 0:
             freeze(self, centers=rows, width=checks.positive(cast("float", width), "width"), bound=bound)
             return
-        each = checks.array(width, "width", (len(rows),))
-        if not (each > 0).all():
-            raise DataError(f"width holds {each.min():g}; every width must be above zero")
-        freeze(self, centers=rows, width=each, bound=bound)
+        widths = checks.array(width, "width", (len(rows),))
+        if not (widths > 0).all():
+            raise DataError(f"width holds {widths.min():g}; every width must be above zero")
+        freeze(self, centers=rows, width=widths, bound=bound)
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"gaussian(0.5, -1; 0.3)"``, which hold the centre and the width."""
-        centers, widths = written(self.centers, states), np.broadcast_to(self.width, len(self.centers)).tolist()
+        centers, widths = format_centers(self.centers, states), np.broadcast_to(self.width, len(self.centers)).tolist()
         return tuple(f"gaussian({c}; {width!r})" for c, width in zip(centers, widths, strict=True))
 
     def formula(self, x: ca.SX) -> ca.SX:
@@ -109,12 +111,12 @@ class Gaussian(Lifting):
         return ca.exp(ca.SX(-0.5 / self.width**2) * distances)
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
-        squared_distances(x, self.centers, Z)
+        write_squared_distances(x, self.centers, Z)
         np.multiply(Z, -0.5 / self.width**2, out=Z)
         np.exp(Z, out=Z)
 
 
-_TINY = 1e-100  # keeps ln and its first two derivatives finite at the centre, and is below rounding elsewhere
+_TINY = 1e-100  # added to r²: keeps ln r² and its first two derivatives finite at the centre, is rounded off elsewhere
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -131,25 +133,25 @@ class ThinPlate(Lifting):
     DataError
         There is no centre.
     ShapeError
-        The centres are no rows, or, when it is bound, are made for another number of states.
+        The centres are not rows. When the lifting is bound: they are made for another number of states.
     """
 
     tunable: ClassVar[Mapping[str, str]] = {"centers": "real"}
     centers: Float[np.ndarray, "nc nx"]
 
     def __init__(self, centers: ArrayLike, *, bound: tuple[str, ...] | None = None) -> None:
-        freeze(self, centers=checked_centers(centers), bound=bound)
+        freeze(self, centers=check_centers(centers), bound=bound)
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"thinplate(0.5, -1)"``, which hold the centre."""
-        return tuple(f"thinplate({c})" for c in written(self.centers, states))
+        return tuple(f"thinplate({c})" for c in format_centers(self.centers, states))
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return ½ r² ln r²."""
         return ca.vertcat(*(0.5 * r2 * ca.log(r2 + _TINY) for r2 in symbolic_squared_distances(x, self.centers)))
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
-        squared_distances(x, self.centers, Z)
+        write_squared_distances(x, self.centers, Z)
         logarithm = np.log(Z + _TINY)
         np.multiply(Z, 0.5, out=Z)
         np.multiply(Z, logarithm, out=Z)
@@ -173,11 +175,11 @@ class PolynomialKernel(Lifting):
 
     def __init__(self, centers: ArrayLike, degree: int, *, bound: tuple[str, ...] | None = None) -> None:
         checks.count(degree, "degree")
-        freeze(self, centers=checked_centers(centers), degree=int(degree), bound=bound)
+        freeze(self, centers=check_centers(centers), degree=int(degree), bound=bound)
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"polynomial(0.5, -1; 3)"``, which hold the centre and the degree."""
-        return tuple(f"polynomial({c}; {self.degree})" for c in written(self.centers, states))
+        return tuple(f"polynomial({c}; {self.degree})" for c in format_centers(self.centers, states))
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return (1 + xᵀc)^degree for each centre."""

@@ -1,4 +1,4 @@
-"""State (degree 1), Constant (degree 0), Monomials (degrees from 2 on), and a user's own: Expressions, or Numeric."""
+"""State, Constant and Monomials, and a user's own functions: Expressions."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.checks import HUGE
-from koopmpc.errors import DataError, ObservableError
-from koopmpc.lifting.base import CONSTANT, Chosen, Lifting, Traced, frozen, indices, short
+from koopmpc.errors import DataError
+from koopmpc.lifting.base import CONSTANT, Lifting, StateChoice, Traced, find_states, freeze_choice, strip_unit
 from koopmpc.plants.graph import Graph
 from koopmpc.values import Value, freeze
 
@@ -40,35 +39,35 @@ class State(Lifting):
     ('theta [rad]', 'omega [rad/s]', 'sin(theta)', 'cos(theta)', '1')
     """
 
-    states: Chosen | None = None
+    states: StateChoice | None = None
 
     def __post_init__(self) -> None:
-        freeze(self, states=frozen(self.states))
+        freeze(self, states=freeze_choice(self.states))
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names of the chosen states."""
-        return tuple(states[i] for i in indices(self.states, states, "State"))
+        return tuple(states[i] for i in find_states(self.states, states, "State"))
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return the chosen states."""
-        return x if self.whole else x[self.chosen]
+        return x if self.selects_all else x[self.state_indices]
 
     def lift_into(self, X: Float[np.ndarray, "M nx"], Z: Float[np.ndarray, "M nz"]) -> None:
-        """Write the chosen states of the rows of X, without the detour over columns."""
-        Z[:] = X if self.whole else X[:, self.chosen]
+        """Write the chosen states of the rows of X; copying rows is faster than `_fill`, which takes columns."""
+        Z[:] = X if self.selects_all else X[:, self.state_indices]
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
-        Z[:] = (x if self.whole else x[self.chosen]).T
+        Z[:] = (x if self.selects_all else x[self.state_indices]).T
 
     @property
-    def whole(self) -> bool:
-        """True where all states are chosen, in their order."""
+    def selects_all(self) -> bool:
+        """True if all states are chosen, in their order."""
         return self.states is None
 
     @cached_property
-    def chosen(self) -> list[int]:
+    def state_indices(self) -> list[int]:
         """Indices of the chosen states, once bound."""
-        return indices(self.states, self.bound_states, "State")
+        return find_states(self.states, self.bound_states, "State")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +90,7 @@ class Constant(Lifting):
 class Monomials(Lifting):
     """ψ(x) = all x₁^a₁ … xₙ^aₙ of total degree a₁ + … + aₙ from 2 to `degree`, in graded order.
 
-    Degree 1 is `State`, degree 0 is `Constant`; add them where they are wanted.
+    Add `State` for degree 1 and `Constant` for degree 0.
 
     Parameters
     ----------
@@ -118,12 +117,12 @@ class Monomials(Lifting):
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"theta^2*omega"``."""
-        names = [short(state) for state in states]
-        powers = (Counter(factors) for factors in _factors(len(states), self.degree))
-        return tuple("*".join(names[i] + (f"^{p}" if p > 1 else "") for i, p in each.items()) for each in powers)
+        names = [strip_unit(state) for state in states]
+        monomials = (Counter(factors) for factors in _list_monomials(len(states), self.degree))
+        return tuple("*".join(names[i] + (f"^{p}" if p > 1 else "") for i, p in powers.items()) for powers in monomials)
 
     def formula(self, x: ca.SX) -> ca.SX:
-        """Return each monomial as one of a degree less times a state."""
+        """Return each monomial as the product of a state and a monomial of the next lower degree."""
         known: dict[tuple[int, ...], ca.SX] = {(i,): x[i] for i in range(x.shape[0])}
         for factors in self._all:
             known[factors] = known[factors[:-1]] * x[factors[-1]]
@@ -139,10 +138,10 @@ class Monomials(Lifting):
 
     @cached_property
     def _all(self) -> list[tuple[int, ...]]:
-        return _factors(len(self.bound_states), self.degree)
+        return _list_monomials(len(self.bound_states), self.degree)
 
 
-def _factors(nx: int, degree: int) -> list[tuple[int, ...]]:
+def _list_monomials(nx: int, degree: int) -> list[tuple[int, ...]]:
     """Return the monomials of degree 2 … `degree` as ascending lists of state indices."""
     return [c for d in range(2, degree + 1) for c in combinations_with_replacement(range(nx), d)]
 
@@ -156,12 +155,12 @@ class Expressions(Lifting):
     fn
         Takes the column x and returns a list of expressions: ``lambda x: [x[1] * ca.sin(x[0])]``.
     names
-        The name of each expression, by which limits and costs find it.
+        The name of each expression; limits and costs find it by this name.
 
     Raises
     ------
     DataError
-        When it is bound: fn does not return one expression for each name. When it is saved unbound.
+        When it is bound: fn does not return one expression for each name. When it is saved: it is not bound.
 
     Examples
     --------
@@ -179,7 +178,7 @@ class Expressions(Lifting):
         freeze(self, fn=fn, labels=checks.texts((names,) if isinstance(names, str) else names, "names"), bound=None)
 
     def bind(self, states: Sequence[str]) -> Traced:
-        """Return the traced list of operations, which needs `fn` no more."""
+        """Return the traced list of operations, which does not need `fn`."""
         x = ca.SX.sym("x", len(states))
         z = self.formula(x)
         if z.shape != (len(self.labels), 1):
@@ -193,86 +192,13 @@ class Expressions(Lifting):
         return traced
 
     def as_saved(self) -> Value:
-        """Refuse: a file holds the traced operations, never `fn`."""
+        """Raise a DataError: a file holds the traced operations, never `fn`."""
         raise DataError("Expressions holds a Python function; call .bind(states), which traces it, and save that")
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the names given."""
+        """Return the names that were passed."""
         return self.labels
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return the expressions of `fn` as a column."""
         return ca.SX(ca.vertcat(*self.fn(x)))
-
-
-RowFunction = Callable[[Float[np.ndarray, "M nx"]], Float[np.ndarray, "M nz"]]
-
-
-@dataclass(frozen=True, eq=False)
-class Numeric(Lifting):
-    """ψ(x) = fn(x), a function of numbers: rows (M, nx) to rows (M, nz).
-
-    `LQR` and `KoopmanMPC` need no more. What linearises the lifting, such as `BilinearMPC` or an equilibrium that is
-    not the origin, and every file needs a formula: write ψ as `Expressions`.
-
-    Parameters
-    ----------
-    fn
-        Takes (M, nx) states and returns (M, nz) observables.
-    labels
-        The name of each observable.
-    """
-
-    fn: RowFunction
-    labels: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        freeze(self, labels=tuple(self.labels))
-
-    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the names given."""
-        return self.labels
-
-    def formula(self, x: ca.SX) -> ca.SX:
-        """Raise: numbers have no formula."""
-        raise ObservableError(
-            "this lifting is a function of numbers, and a formula is needed here; write it with km.Expressions or the "
-            "families of koopmpc, and pass it as lifting="
-        )
-
-    def measured(self) -> ca.Function:
-        """Return ψ of one measured state, as a CasADi function that calls Python."""
-        return _Called(self)
-
-    def as_saved(self) -> Value:
-        """Refuse: a file holds no function."""
-        raise DataError("the lifting is a Python function, which no file holds; write it with km.Expressions")
-
-    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
-        found = np.asarray(self.fn(np.ascontiguousarray(x.T)), dtype=np.float64)
-        if found.shape != Z.shape:
-            raise DataError(f"the lifting returns shape {found.shape} for {Z.shape[0]} states, expected {Z.shape}")
-        Z[:] = found
-
-
-class _Called(ca.Callback):
-    """ψ of one state, NaN where the state is NaN or beyond 1e30."""
-
-    def __init__(self, lifting: Numeric) -> None:
-        super().__init__()
-        self._lifting, self._nx, self._nz = lifting, len(lifting.bound_states), lifting.nz
-        self.construct("psi", {})
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Return that of a column of states."""
-        return ca.Sparsity.dense(self._nx, 1)
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Return that of a column of observables."""
-        return ca.Sparsity.dense(self._nz, 1)
-
-    def eval(self, arg: Sequence[ca.DM]) -> list[ca.DM]:
-        """Return [ψ(x)]."""
-        x = np.array(arg[0]).reshape(1, self._nx)
-        z = self._lifting(x)[0] if np.abs(x).sum() < HUGE else np.full(self._nz, np.nan)
-        return [ca.DM(z)]

@@ -11,7 +11,8 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost, Sizes
 from koopmpc.control.limits import SOFTENED, Interval, Limits
 from koopmpc.errors import ShapeError
-from koopmpc.loop.run import Run
+from koopmpc.loop.run import Run, bind_outputs
+from koopmpc.text import format_duration
 from koopmpc.values import Value
 
 SETTLED = 0.02  # the band of the settling time, as a share of the first error
@@ -34,8 +35,7 @@ class Metrics(Value):
     violation
         Largest violation of any state, output or rate limit, in the unit of that limit.
     violation_share
-        Largest violation of any state, output or rate limit as a share of the limit's size, by which the default slack
-        counts, too: half the width between two finite ends, else see `Sizes`.
+        Largest violation of any state, output or rate limit as a share of the limit's range; see `violation_shares`.
     input_violation
         Largest violation of any input limit, in its unit; every controller of this library keeps it at zero.
     effort
@@ -94,25 +94,17 @@ class Metrics(Value):
             **_by_output("tracking rmse", self.tracking_rmse, tracked),
             **_by_output("final error", self.final_error, tracked),
             "violation": f"{self.violation:.3g}"
-            + (f" ({self.violation_share:.3g} of the size)" if self.violation else ""),
+            + (f" ({self.violation_share:.3g} of the range)" if self.violation else ""),
             "input violation": f"{self.input_violation:.3g}",
             "effort": f"{self.effort:.6g}",
             "settling time": settles,
-            "solve time p50, p99, max": ", ".join(duration(t) for t in times),
+            "solve time p50, p99, max": ", ".join(format_duration(t) for t in times),
             "steps later than dt": str(self.late),
             "status": _counts(self.status),
             "fallback": _counts(self.fallback),
             **({"solver": _counts(self.solver)} if self.solver else {}),
             **({} if self.unknown is None else {"unknown steps": str(self.unknown)}),
         }
-
-
-def duration(seconds: float) -> str:
-    """Return a time in µs, ms or s with three digits: ``"13.0 µs"``."""
-    for unit, size in (("s", 1.0), ("ms", 1e-3)):
-        if seconds >= size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds / 1e-6:.3g} µs"
 
 
 @np.errstate(invalid="ignore", over="ignore")  # a state that diverged, a sensor that showed inf: the cost says so
@@ -159,7 +151,6 @@ def metrics(run: Run) -> Metrics:
     moved, changed = run.U - run.u_reference, np.diff(run.U, axis=0)
     R_delta = None if run.cost is None else run.cost.rate(nu)
     rates = 0.0 if R_delta is None else float(np.einsum("ki,ij,kj->", changed, R_delta, changed))
-    violation, share = _violation(run)
     p50, p99 = np.quantile(run.solve_time, [0.5, 0.99])
     return Metrics(
         cost=float("nan")
@@ -167,8 +158,8 @@ def metrics(run: Run) -> Metrics:
         else float(stage[1:].sum() + np.einsum("ki,ij,kj->", moved, R, moved)) + rates,
         tracking_rmse=np.sqrt(np.mean(error[1:] ** 2, axis=0)),
         final_error=error[-1].copy(),
-        violation=violation,
-        violation_share=share,
+        violation=float(beyond(run).max()),
+        violation_share=float(violation_shares(run).max()),
         input_violation=0.0 if run.limits is None else float(_excess(run.U, *run.limits.inputs(nu)).max(initial=0.0)),
         effort=float((run.U**2).sum() * run.dt),
         settling_time=_settling_time(stage, run.dt),
@@ -200,7 +191,7 @@ def running_cost(run: Run) -> Float[np.ndarray, " T1"]:
 def tracking_error(run: Run) -> Float[np.ndarray, "T1 nr"]:
     """Return of(x_k) − r_k, the angles among tracked states wrapped to (−π, π]."""
     X = _states(run)
-    tracked = None if run.cost is None else run.cost.of.bind(run.states)
+    tracked = None if run.cost is None else bind_outputs(run.cost.of, run.states)
     outputs = X if tracked is None else tracked(X)
     if outputs.shape != run.reference.shape:
         raise ShapeError(
@@ -223,20 +214,32 @@ def _states(run: Run) -> Float[np.ndarray, "T1 nx"]:
     return run.X
 
 
-def _violation(run: Run) -> tuple[float, float]:
-    """Return the largest violation of a limit in its unit, and the largest as a share of the limit's size."""
+def violation_shares(run: Run, ranges: Float[np.ndarray, " n"] | None = None) -> Float[np.ndarray, " T1"]:
+    """Return by which share of its range each x_k, with u_{k−1} − u_{k−2}, is beyond the limit that it breaks most.
+
+    x_0 is given, so its row is 0. The range of a limit is the width between its two finite ends. Where there is one
+    end alone, it is that of the data, or twice the size by which the default slack counts.
+
+    Parameters
+    ----------
+    run
+        The closed loop; its own limits and cost judge it.
+    ranges
+        (nx + ny,) range of each state and limited output, where that of the data is known; by default from `Sizes`.
+    """
+    shares = np.zeros(len(run.X))
     if run.limits is None:
-        return 0.0, 0.0
-    nu, cost, (states, rates) = run.U.shape[1], run.cost or Cost(1, 1), _broken(run, run.limits)
-    if not states.any() and not rates.any():
-        return 0.0, 0.0
-    tracked = cost.of.bind(run.states)
-    size = Sizes.of(tracked, *cost.matrices(tracked.nz, nu), run.limits, run.states, None).rows
-    most = states.max(axis=0, initial=0.0)
-    if run.limits.rates(nu) is not None:
-        most = np.concatenate([most, rates.max(axis=0, initial=0.0)])
-        size = np.concatenate([size, run.limits.rate_softness(nu).allowance / SOFTENED])
-    return float(most.max(initial=0.0)), float((most / size).max(initial=0.0))
+        return shares
+    nu, (states, rates) = run.U.shape[1], _broken(run, run.limits)
+    if states.any() or rates.any():
+        if ranges is None:
+            cost = run.cost or Cost(1, 1)
+            tracked = cost.of.bind(run.states)
+            ranges = 2 * Sizes.of(tracked, *cost.matrices(tracked.nz, nu), run.limits, run.states, None).rows
+        rate_ranges = 2 * run.limits.rate_softness(nu).allowance / SOFTENED
+        shares[1:] = (states / ranges).max(axis=1, initial=0.0)
+        shares[2:] = np.maximum(shares[2:], (rates / rate_ranges).max(axis=1, initial=0.0))
+    return shares
 
 
 def beyond(run: Run) -> Float[np.ndarray, " T1"]:

@@ -24,7 +24,7 @@ from koopmpc.control.move import Controller, Fallback, Move, Status
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.loop.run import Step
 from koopmpc.loop.simulate import CONTROLLER, HOW, checked_input, predictor_of, rows_ahead
-from koopmpc.plants.plant import Plant, reading, require_plant
+from koopmpc.plants.plant import Plant, read_measurement, require_plant
 
 Late = Literal["skip", "hold"]
 _SPIN = 3e-4  # the last part of a wait keeps the processor busy, because a sleep ends up to 0.2 ms late [s]
@@ -198,7 +198,7 @@ def realtime(
     rows.setflags(write=False)
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
 
-    y = reading(plant.reset(x0, np.random.default_rng(0)), None, 0)
+    y = read_measurement(plant.reset(x0, np.random.default_rng(0)), None, 0)
     own = getattr(predictor_of(controller) or getattr(controller, "step_map", None), "states", None)
     controller.reset(x0 if x0 is None or own is None or len(own) == len(x0) else None)
     main = threading.current_thread() is threading.main_thread()
@@ -267,7 +267,7 @@ class _Loop:
         try:
             if read is not None:
                 dog.busy = "the plant"
-                y = reading(read(), len(y), k)
+                y = read_measurement(read(), len(y), k)
             dog.busy = "the controller"
             move = self.controller(y.copy(), self.rows[row : row + self.ahead], self.applied)
             u = checked_input(move, len(self.kept), k)
@@ -276,7 +276,7 @@ class _Loop:
             if not dog.may_act():
                 return False
             answer = self.give(u.copy())
-            y_next = None if read is not None and answer is None else reading(answer, len(y), k + 1)
+            y_next = None if read is not None and answer is None else read_measurement(answer, len(y), k + 1)
             dog.busy = "the recorder"
             if self.recorder is not None:
                 self.recorder(Step(k, y, u, self.rows[row], move, None, None, y_next, self.rows[row + 1], own=True))

@@ -1,8 +1,13 @@
-"""Run: everything that happened in one closed loop, and the steps and rows that it is made of."""
+"""Run: everything that happened in one closed loop, and the steps and rows that it is made of.
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Any
+`StepRows` is the one place that lists what is kept of a `Move`: its columns say what a missing value counts as, and
+under which name a log keeps them.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from operator import attrgetter
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,6 +15,8 @@ from jaxtyping import Float, Int
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Plan, Status
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.state import State
 from koopmpc.predict.base import Predictor
 from koopmpc.scene import Scene
 from koopmpc.values import Value
@@ -48,6 +55,42 @@ class Step:
         return None if self.look_ahead is None else self.look_ahead()
 
 
+@dataclass(frozen=True)
+class MoveColumn:
+    """One field of `Move` over all steps of a loop.
+
+    Attributes
+    ----------
+    absent
+        Value of a step whose move lacks the field, or has None there.
+    dtype
+        Type of the numbers in an array; None: the values stay Python objects, in a tuple.
+    log
+        Entity of a log that keeps the values which differ from `absent`, or the words where they change. Empty: the
+        writer of logs draws this column, and keeps it in a form of its own.
+    timed
+        Whether the value depends on the clock, so that a repeated run has others.
+    name
+        Name of the field, the same in `Move` and in `StepRows`.
+    """
+
+    absent: Any
+    dtype: type | None = None
+    log: str = ""
+    timed: bool = False
+    name: str = ""
+
+    def collect(self, values: Iterable[Any]) -> Any:
+        """Return the values of consecutive steps as a column."""
+        filled = [self.absent if value is None else value for value in values]
+        return tuple(filled) if self.dtype is None else cast("Any", np.array(filled, dtype=self.dtype))
+
+
+def _no_numbers() -> Float[np.ndarray, " none"]:
+    """Return the place of a column of numbers that is not given; the rows fill it."""
+    return np.empty(0)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepRows(Value):
     """Consecutive steps of a closed loop as arrays; row k of each belongs to step k.
@@ -84,24 +127,27 @@ class StepRows(Value):
     Y: Float[np.ndarray, "n ny"]
     U: Float[np.ndarray, "m nu"]
     reference: Float[np.ndarray, "n nr"]
-    status: tuple[Status, ...]
-    fallback: tuple[Fallback, ...]
-    solve_time: Float[np.ndarray, " m"]
-    iterations: Int[np.ndarray, " m"]
+    status: tuple[Status, ...] = field(default_factory=tuple, metadata={"move": MoveColumn(Status.OPTIMAL)})
+    fallback: tuple[Fallback, ...] = field(default_factory=tuple, metadata={"move": MoveColumn(Fallback.NONE)})
+    solve_time: Float[np.ndarray, " m"] = field(
+        default_factory=_no_numbers, metadata={"move": MoveColumn(0.0, np.float64, timed=True)}
+    )
+    iterations: Int[np.ndarray, " m"] = field(default_factory=_no_numbers, metadata={"move": MoveColumn(0, np.int64)})
+    slack: Float[np.ndarray, " ms"] = field(
+        default_factory=_no_numbers, metadata={"move": MoveColumn(0.0, np.float64, "solver/slack")}
+    )
+    known: Int[np.ndarray, " mk"] = field(
+        default_factory=_no_numbers, metadata={"move": MoveColumn(-1, np.int64, "solver/known")}
+    )
+    solver: tuple[str, ...] = field(default_factory=tuple, metadata={"move": MoveColumn("", log="solver/qp")})
     u_reference: Float[np.ndarray, "m nu"] = field(default_factory=lambda: np.empty((0, 0)))
-    slack: Float[np.ndarray, " ms"] = field(default_factory=lambda: np.empty(0))
-    known: Int[np.ndarray, " mk"] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    solver: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.u_reference.size:
             object.__setattr__(self, "u_reference", np.zeros(self.U.shape))
-        if not self.slack.size:
-            object.__setattr__(self, "slack", np.zeros(len(self.U)))
-        if not self.known.size:
-            object.__setattr__(self, "known", np.full(len(self.U), -1, dtype=np.int64))
-        if not self.solver:
-            object.__setattr__(self, "solver", ("",) * len(self.U))
+        for column in MOVE_COLUMNS:
+            if not len(getattr(self, column.name)):
+                object.__setattr__(self, column.name, column.collect([None] * len(self.U)))
 
     @staticmethod
     def of(steps: Sequence[Step], nx: int, *, end: bool) -> "StepRows":
@@ -117,21 +163,13 @@ class StepRows(Value):
             Y.append(last.y_next)
             reference.append(last.reference if last.reference_next is None else last.reference_next)
         held = [np.zeros(len(s.u)) if s.u_reference is None else s.u_reference for s in steps]
-        moves = [s.move for s in steps]
-        known = [getattr(m, "known", None) for m in moves]  # a user's own Move may lack it
         return StepRows(
             X=np.array(X, dtype=np.float64),
             Y=np.array(Y, dtype=np.float64),
             U=np.array([s.u for s in steps], dtype=np.float64),
             reference=np.array(reference, dtype=np.float64),
-            status=tuple([Status.OPTIMAL if m is None else m.status for m in moves]),
-            fallback=tuple([Fallback.NONE if m is None else m.fallback for m in moves]),
-            solve_time=np.array([0.0 if m is None else m.solve_time for m in moves], dtype=np.float64),
-            iterations=np.array([0 if m is None else m.iterations for m in moves], dtype=np.int64),
-            slack=np.array([0.0 if m is None else m.slack for m in moves], dtype=np.float64),
-            known=np.array([-1 if looked is None else int(looked) for looked in known], dtype=np.int64),
-            solver=tuple([str(getattr(m, "solver", "")) for m in moves]),
             u_reference=np.array(held, dtype=np.float64),
+            **columns_of_moves(s.move for s in steps),
         )
 
     @staticmethod
@@ -155,6 +193,27 @@ class StepRows(Value):
 
 
 _OF_STATES = ("X", "Y", "reference")  # the columns with a row for each state; the others have one for each move
+MOVE_COLUMNS = tuple(replace(f.metadata["move"], name=f.name) for f in fields(StepRows) if "move" in f.metadata)
+"""What is kept of each `Move`, in the order of the columns of `StepRows`."""
+_read_move = attrgetter(*(column.name for column in MOVE_COLUMNS))
+
+
+def read_move(move: Move | None) -> tuple[Any, ...]:
+    """Return what is kept of a move, in the order of `MOVE_COLUMNS`; None for a field that a user's own move lacks."""
+    if type(move) is Move:
+        return _read_move(move)
+    return tuple(getattr(move, column.name, None) for column in MOVE_COLUMNS)
+
+
+def columns_of_moves(moves: Iterable[Move | None]) -> dict[str, Any]:
+    """Return the columns of consecutive moves as keywords of `StepRows`; without a Move a step counts as solved."""
+    return collect_columns([value for move in moves for value in read_move(move)])
+
+
+def collect_columns(values: Sequence[Any]) -> dict[str, Any]:
+    """Return what `read_move` gave of consecutive moves, one after the other, as keywords of `StepRows`."""
+    width = len(MOVE_COLUMNS)
+    return {column.name: column.collect(values[i::width]) for i, column in enumerate(MOVE_COLUMNS)}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -190,8 +249,15 @@ class About(Value):
 
     def tracked(self, nr: int) -> tuple[str, ...]:
         """Return the names of the `nr` outputs that the references belong to."""
-        names = self.states if self.cost is None else self.cost.of.bind(self.states).names
+        tracked = None if self.cost is None else bind_outputs(self.cost.of, self.states)
+        names = self.states if tracked is None else tracked.names
         return tuple(names) if len(names) == nr else tuple(f"reference {i}" for i in range(nr))
+
+
+def bind_outputs(outputs: Lifting, states: Sequence[str]) -> Lifting | None:
+    """Return what a cost tracks or limits are of, bound to these states; None where it is the states themselves."""
+    whole = isinstance(outputs, State) and outputs.states is None
+    return None if whole else outputs.bind(tuple(states))
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,6 +306,13 @@ class Run(About, StepRows):
     plans: Plans | None = None
     scene: Scene | None = field(default=None, compare=False)
     model: Predictor | None = field(default=None, compare=False)
+
+    def take_first(self, steps: int) -> "Run":
+        """Return the first steps of this run as a run without plans; itself where it has no more."""
+        if steps >= self.steps:
+            return self
+        rows = {name: values[: steps + (name in _OF_STATES)] for name, values in self.columns().items()}
+        return replace(self, **rows, plans=None)
 
     @property
     def steps(self) -> int:

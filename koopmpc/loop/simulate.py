@@ -1,8 +1,11 @@
-"""simulate: one controller on one plant, step by step; every step has a status, every input is finite."""
+"""simulate: one controller on one plant, step by step; every step has a status, every input is finite.
+
+`_Wiring` is the loop that is asked for, checked. `_step_through` makes the steps. `_KeptRows` keeps what happened.
+"""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from dataclasses import MISSING, dataclass, fields
 from math import isfinite
 from typing import Any
 
@@ -13,25 +16,24 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
-from koopmpc.control.move import Controller, Fallback, Fallible, Move, Plan, Status, WholeRun
+from koopmpc.control.move import Controller, Fallible, Move, Plan
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.faults import Fault, Injections, Wiring
-from koopmpc.loop.run import Plans, Run, Step
-from koopmpc.plants.plant import Plant, SimulatedPlant, reading, require_plant
+from koopmpc.loop.run import Plans, Run, Step, bind_outputs, collect_columns, read_move
+from koopmpc.plants.plant import Plant, SimulatedPlant, read_measurement, require_plant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import Predictor
 
 Signal = ArrayLike | Callable[[int, np.random.Generator], ArrayLike]
 StepObserver = Callable[[Step], None]
-
+_Draw = Callable[[int, np.random.Generator], Float[np.ndarray, " n"]]  # (k, rng) → a signal at step k
 
 CONTROLLER = ("dt", "nu", "horizon", "reset", "__call__")
 HOW = (
     "a Controller has dt [s], nu, horizon (0 if it reads no preview), reset(x0, u_prev), and is called as "
     "controller(y, reference, applied) -> Move; make it a class, see km.control.Controller"
 )
-_STATUS, _FALLBACK = list(Status), list(Fallback)
-_MOVE = ("u", "status", "fallback", "solve_time", "iterations", "slack")
+_MOVE = tuple(f.name for f in fields(Move) if f.default is MISSING)  # what a user's own move needs
 
 
 def simulate(
@@ -121,94 +123,121 @@ def simulate(
     """
     steps, rng = checks.count(steps, "steps"), checks.generator(rng)
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
-    checks.members(controller, "the controller", CONTROLLER, HOW)
-    if not isinstance(plant, StepMap):
-        require_plant(plant)
-    if abs(plant.dt - controller.dt) > 1e-12 * plant.dt:
-        raise DataError(f"the controller has dt = {controller.dt:g} s, the plant {plant.dt:g} s; use one dt for both")
-    states, inputs, outputs = tuple(plant.states), tuple(plant.inputs), tuple(plant.outputs)
-    nx, nu, N = len(states), controller.nu, controller.horizon
-    if nu != len(inputs):
-        raise ShapeError(f"the controller returns {nu} inputs, the plant takes {len(inputs)} ({inputs})")
-    rows = rows_ahead(reference, "reference", "nr", steps + 1, N, "steps+1")
-    if cost is not None:
-        checks.kind(cost, "cost", Cost, "pass km.Cost(Q=…, R=…)")
-    nr = rows.shape[1] if cost is None else cost.of.bind(states).nz
-    if rows.shape[1] != nr:
-        raise ShapeError(f"reference has {rows.shape[1]} columns, the cost tracks {nr} outputs; pass one a column")
-    outside = [i for i in angles if not 0 <= i < nx]
-    if outside:
-        raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
-    disturbed = _signal(disturbance, "disturbance", steps, nx)
-    if disturbed is not None and not isinstance(plant, StepMap | SimulatedPlant):
-        raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
-    held = _held(u_reference, cost, steps, nu)
-    metadata, model = {"controller": type(controller).__name__, **(metadata or {})}, predictor_of(controller)
-    W = None
-    if measured is not None:
-        W = rows_ahead(measured, "measured", "nw", steps, N, "steps")
-        metadata["measured"] = W[:steps].tolist()
-    if isinstance(plant, StepMap):
-        if x0 is None:
-            raise DataError("a simulated plant has no state of its own to begin in; pass x0")
-        state = checks.array(x0, "x0", (nx,))
-        first = plant.measure(state)
-    else:
-        first, state = reading(plant.reset(x0, rng), None, 0), plant.state
-    ny = len(first)
-    noisy = None if noise is None else _noise(noise, steps, ny)
-    if state is not None and np.shape(state) != (nx,):
-        raise ShapeError(f"the plant's state has shape {np.shape(state)}, its states name {nx}; they must agree")
-    broken = None
+    _require_match(plant, controller, angles)
+    nx, nu, N = len(plant.states), controller.nu, controller.horizon
+    wiring = _Wiring(
+        plant=plant,
+        controller=controller,
+        steps=steps,
+        reference=_tracked_rows(reference, cost, plant.states, steps, N),
+        u_reference=_reference_inputs(u_reference, cost, steps, nu),
+        measured=None if measured is None else rows_ahead(measured, "measured", "nw", steps, N, "steps"),
+        preview=preview,
+        disturbance=_signal(disturbance, "disturbance", steps, nx),
+        rng=rng,
+    )
+    y0, state = wiring.start_plant(x0)
+    wiring.noise = None if noise is None else _noise(noise, steps, len(y0))
     if faults:
-        broken = Injections(faults, Wiring(ny, (limits or Limits()).inputs(nu)), rng)
+        wiring.faults = Injections(faults, Wiring(len(y0), (limits or Limits()).inputs(nu)), rng)
+    rows = _KeptRows(wiring, wiring.sense(0, y0), state, plans=plans)
+    model = predictor_of(controller)
+    known = getattr(model or getattr(controller, "step_map", None), "states", None)
+    controller.reset(x0 if known is None or len(known) == nx else None)  # a model of other states knows no such x0
+    metadata = {"controller": type(controller).__name__, **(metadata or {})}
+    if wiring.measured is not None:
+        metadata["measured"] = wiring.measured[:steps].tolist()
+    if faults:
         metadata["faults"] = [str(fault) for fault in faults]
-    spoilt = noisy is not None or broken is not None
-    seen = isinstance(plant, StepMap) and plant.measures_all and not spoilt  # y_k is x_k
+    if observers or plans or not _run_at_once(wiring, rows):
+        ended = _step_through(wiring, rows, observers)
+        if ended:
+            metadata["ended"] = ended
+            warnings.warn(
+                f"the plant ended the run after {rows.steps} of {steps} steps: {ended}", UserWarning, stacklevel=2
+            )
+    return Run(
+        **rows.columns(),
+        cost=cost,
+        limits=limits,
+        dt=plant.dt,
+        states=tuple(plant.states),
+        inputs=tuple(plant.inputs),
+        outputs=tuple(plant.outputs),
+        plans=rows.kept_plans(),
+        angles=tuple(angles),
+        metadata=metadata,
+        scene=getattr(plant, "scene", None),
+        model=model,
+    )
 
-    def sensed(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+
+@dataclass(eq=False)
+class _Wiring:
+    """The loop that is asked for, checked: plant, controller, and every signal as rows or as a function of (k, rng).
+
+    `reference` holds T + 1 + N rows and `measured` T + N, the last one repeated for the preview. `u_reference` are the
+    (T, nu) inputs that hold the reference. A signal that is not asked for is None.
+    """
+
+    plant: StepMap | Plant
+    controller: Controller
+    steps: int
+    reference: Float[np.ndarray, "rows nr"]
+    u_reference: Float[np.ndarray, "T nu"]
+    measured: Float[np.ndarray, "wrows nw"] | None
+    preview: bool
+    disturbance: _Draw | None
+    rng: np.random.Generator
+    noise: _Draw | None = None
+    faults: Injections | None = None
+
+    def __post_init__(self) -> None:
+        if self.disturbance is not None and not isinstance(self.plant, StepMap | SimulatedPlant):
+            raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
+        self.reference.setflags(write=False)  # the Run keeps these rows, so a controller must not write into them
+
+    @property
+    def sees_state(self) -> bool:
+        """Whether y_k is x_k."""
+        whole = isinstance(self.plant, StepMap) and self.plant.measures_all
+        return whole and self.noise is None and self.faults is None
+
+    def start_plant(
+        self, x0: Float[np.ndarray, " nx"] | None
+    ) -> tuple[Float[np.ndarray, " ny"], Float[np.ndarray, " nx"] | None]:
+        """Return the first measurement, and the first state; None where the plant hides it."""
+        plant, shape = self.plant, (len(self.plant.states),)
+        if isinstance(plant, StepMap):
+            if x0 is None:
+                raise DataError("a simulated plant has no state of its own to begin in; pass x0")
+            state = checks.array(x0, "x0", shape)
+            return plant.measure(state), state
+        y0, state = read_measurement(plant.reset(x0, self.rng), None, 0), plant.state
+        if state is not None and np.shape(state) != shape:
+            raise ShapeError(
+                f"the plant's state has shape {np.shape(state)}, its states name {shape[0]}; they must agree"
+            )
+        return y0, state
+
+    def sense(self, k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
         """Return what the controller gets of what the plant measured: NaN passes, and it says BAD_MEASUREMENT."""
-        if noisy is not None:
-            y += noisy(k, rng)
-        return y if broken is None else np.array(broken.measured(k, y), dtype=np.float64)
+        if self.noise is not None:
+            y += self.noise(k, self.rng)
+        return y if self.faults is None else np.array(self.faults.measured(k, y), dtype=np.float64)
 
-    rows.setflags(write=False)  # the Run keeps these rows, so a controller must not write into them
-    Y, U = np.empty((steps + 1, ny)), np.empty((steps, nu))
-    X = Y if seen else np.full((steps + 1, nx), np.nan)
-    status: list[Status] = []
-    fallback: list[Fallback] = []
-    solver: list[str] = []
-    solve_time: list[float] = []
-    iterations: list[int] = []
-    slack, known = np.zeros(steps), np.full(steps, -1)
-    found, plan, ended = None, None, ""
-    fallible = controller if isinstance(controller, Fallible) else None
-    look_ahead: Callable[[], Plan | None] | None = getattr(controller, "plan", None)
-    applied, end = None, steps
-    if state is not None:
-        X[0] = state
-    Y[0] = y = sensed(0, first) if spoilt else first
-    own = getattr(model or getattr(controller, "step_map", None), "states", None)
-    controller.reset(x0 if own is None or len(own) == nx else None)  # a model of other states knows no such x0
-    begin, whole = 0, getattr(controller, "whole_run", None)  # of a compiled controller
-    if whole is not None and isinstance(plant, StepMap) and not (spoilt or disturbed or observers or plans):
-        done: WholeRun | None = whole(plant, rows, W, X, Y, U, preview=preview)
-        if done is not None:
-            begin = steps
-            status = [_STATUS[i] for i in done.status.tolist()]
-            fallback = [_FALLBACK[i] for i in done.fallback.tolist()]
-            solver = ["daqp" if i else "" for i in done.iterations.tolist()]
-            solve_time, iterations, slack = done.solve_time.tolist(), done.iterations.tolist(), done.slack
-    for k in range(begin, steps):
-        ahead = rows[k : k + N + 1] if preview else np.broadcast_to(rows[k], (N + 1, nr))
-        failing = fallible if broken is not None and broken.solver_fails(k) else None
-        if failing is not None:
-            failing.solver_fails = True
+    def ask(self, k: int, y: Float[np.ndarray, " ny"], applied: Float[np.ndarray, " nu"] | None) -> Move:
+        """Return the move of the controller at step k."""
+        controller, rows, W, N = self.controller, self.reference, self.measured, self.controller.horizon
+        ahead = rows[k : k + N + 1] if self.preview else np.broadcast_to(rows[k], (N + 1, rows.shape[1]))
+        fails = self.faults is not None and self.faults.solver_fails(k)
+        failing = controller if fails and isinstance(controller, Fallible) else None
         try:
+            if failing is not None:
+                failing.solver_fails = True
             if W is None:
-                move = controller(y, ahead, applied)
-            else:
-                move = controller(y, ahead, applied, w=W[k : k + max(N, 1)] if preview else W[k])
+                return controller(y, ahead, applied)
+            return controller(y, ahead, applied, w=W[k : k + max(N, 1)] if self.preview else W[k])
         except ValueError as error:
             if "read-only" not in str(error):
                 raise
@@ -216,78 +245,114 @@ def simulate(
         finally:
             if failing is not None:
                 failing.solver_fails = False
-        u = checked_input(move, nu, k)
-        if broken is not None:
-            u = np.array(broken.applied(k, u), dtype=np.float64)
-        U[k] = u
-        if plans and look_ahead is not None and (plan := look_ahead()) is not None:
-            if found is None:
-                found = Plans(*(np.full((steps, *part.shape), np.nan) for part in (plan.X, plan.U)))
-            found.X[k], found.U[k] = plan.X, plan.U
-        push = None if disturbed is None else disturbed(k, rng)
+
+    def advance(self, k: int, u: Float[np.ndarray, " nu"], rows: "_KeptRows") -> Float[np.ndarray, " ny"]:
+        """Drive the plant with u_k, write x_{k+1} and y_{k+1} into the rows, and return a copy of y_{k+1}."""
+        plant = self.plant
+        push = None if self.disturbance is None else self.disturbance(k, self.rng)
         if isinstance(plant, StepMap):
-            x = X[k + 1]
-            plant.advance(X[k], u, x)
+            x = rows.X[k + 1]
+            plant.advance(rows.X[k], u, x)
             if push is not None:
                 x += push
-            y = x.copy() if seen else plant.measure(x)
+            y = x.copy() if rows.X is rows.Y else plant.measure(x)
         else:
             pushed = () if push is None else (push,)  # of a SimulatedPlant alone
-            y = reading(plant.step(u.copy(), *pushed), ny, k + 1)
-            u = U[k].copy()  # the controller may keep the other one
+            y = read_measurement(plant.step(u.copy(), *pushed), rows.Y.shape[1], k + 1)
             if (state := plant.state) is not None:
-                X[k + 1] = state
-            ended = str(getattr(plant, "ended", ""))
-        if spoilt:
-            y = sensed(k + 1, y)
-        if not seen:
-            Y[k + 1] = y
-        status.append(move.status)  # not the Move itself: thousands of objects keep the garbage collector busy
-        fallback.append(move.fallback)
-        solver.append(move.solver if type(move) is Move else str(getattr(move, "solver", "")))
-        solve_time.append(move.solve_time)
-        iterations.append(move.iterations)
-        if move.slack:
-            slack[k] = move.slack
-        looked = move.known if type(move) is Move else getattr(move, "known", None)  # a user's own Move may lack it
-        if looked is not None:
-            known[k] = looked
+                rows.X[k + 1] = state
+        if rows.X is not rows.Y:
+            y = self.sense(k + 1, y)
+            rows.Y[k + 1] = y
+        return y
+
+
+class _KeptRows:
+    """What happens in a loop, row by row; one array holds states and measurements where they are the same."""
+
+    def __init__(
+        self,
+        wiring: _Wiring,
+        y0: Float[np.ndarray, " ny"],
+        state: Float[np.ndarray, " nx"] | None,
+        *,
+        plans: bool,
+    ) -> None:
+        self.steps, self.reference, self.u_reference = wiring.steps, wiring.reference, wiring.u_reference
+        self.Y, self.U = np.empty((self.steps + 1, len(y0))), np.empty((self.steps, wiring.controller.nu))
+        self.X = self.Y if wiring.sees_state else np.full((self.steps + 1, len(wiring.plant.states)), np.nan)
+        if state is not None:
+            self.X[0] = state
+        self.Y[0] = y0
+        self.at_once: dict[str, Any] | None = None  # the columns of all moves, where they were made at once
+        self._moves: list[Any] = []  # no Move itself: thousands of objects keep the garbage collector busy
+        self._plans: list[Plan | None] | None = [] if plans else None
+
+    def keep(self, move: Move, look_ahead: Callable[[], Plan | None] | None) -> Callable[[], Plan | None] | None:
+        """Keep the move of a step, and its plan where plans are kept; return what an observer asks for the plan."""
+        self._moves.extend(read_move(move))
+        if self._plans is None or look_ahead is None:
+            return look_ahead
+        plan = look_ahead()
+        self._plans.append(None if plan is None else Plan(plan.X.copy(), plan.U.copy()))
+        return lambda: plan
+
+    def columns(self) -> dict[str, Any]:
+        """Return the rows as keywords of a Run."""
+        T = self.steps
+        X = self.Y.copy() if self.X is self.Y else self.X[: T + 1]
+        moves = collect_columns(self._moves) if self.at_once is None else self.at_once
+        own = {"U": self.U[:T], "reference": self.reference[: T + 1], "u_reference": self.u_reference[:T]}
+        return {"X": X, "Y": self.Y[: T + 1], **own, **moves}
+
+    def kept_plans(self) -> Plans | None:
+        """Return the plans of all steps; None where none was kept."""
+        return Plans.of(self._plans or [])
+
+
+def _step_through(wiring: _Wiring, rows: _KeptRows, observers: Sequence[StepObserver]) -> str:
+    """Run the loop step by step; return why the plant ended it early, or an empty text."""
+    nu, reference, faults = wiring.controller.nu, wiring.reference, wiring.faults
+    look_ahead: Callable[[], Plan | None] | None = getattr(wiring.controller, "plan", None)
+    X, Y, U, held = rows.X, rows.Y, rows.U, rows.u_reference
+    simulated = isinstance(wiring.plant, StepMap)
+    y, applied = Y[0].copy(), None
+    for k in range(wiring.steps):
+        move = wiring.ask(k, y, applied)
+        u = checked_input(move, nu, k)
+        if faults is not None:
+            u = np.array(faults.applied(k, u), dtype=np.float64)
+        U[k] = u
+        ask = rows.keep(move, look_ahead)
+        y = wiring.advance(k, u, rows)
         for observer in observers:
-            ask = look_ahead if plan is None else partial(_same, plan)
-            step = Step(k, Y[k], U[k], rows[k], move, X[k], X[k + 1], Y[k + 1], rows[k + 1], held[k], ask)
+            step = Step(k, Y[k], U[k], reference[k], move, X[k], X[k + 1], Y[k + 1], reference[k + 1], held[k], ask)
             observer(step)
-            if ask is not None and plan is None:
-                step.look_ahead = _gone  # the controller goes on to the next step
+            if ask is look_ahead and ask is not None:
+                step.look_ahead = _refuse_plan
         applied = u
-        if ended and k + 1 < steps:
-            end, metadata["ended"] = k + 1, ended
-            warnings.warn(f"the plant ended the run after {end} of {steps} steps: {ended}", UserWarning, stacklevel=2)
-            break
-    return Run(
-        X=Y.copy() if seen else X[: end + 1],
-        Y=Y[: end + 1],
-        U=U[:end],
-        reference=rows[: end + 1],
-        u_reference=held[:end],
-        status=tuple(status),
-        fallback=tuple(fallback),
-        solve_time=np.array(solve_time, dtype=np.float64),
-        iterations=np.array(iterations, dtype=np.int64),
-        slack=slack[:end],
-        known=known[:end],
-        solver=tuple(solver),
-        cost=cost,
-        limits=limits,
-        dt=plant.dt,
-        states=states,
-        inputs=inputs,
-        outputs=outputs,
-        plans=None if found is None else Plans(found.X[:end], found.U[:end]),
-        angles=tuple(angles),
-        metadata=metadata,
-        scene=getattr(plant, "scene", None),
-        model=model,
-    )
+        if not simulated:
+            applied = U[k].copy()  # the controller may keep the other one
+            ended = str(getattr(wiring.plant, "ended", ""))
+            if ended and k + 1 < wiring.steps:
+                rows.steps = k + 1
+                return ended
+    return ""
+
+
+def _run_at_once(wiring: _Wiring, rows: _KeptRows) -> bool:
+    """Let a compiled controller make the whole run; return False where it cannot, or the loop needs Python."""
+    make_run = getattr(wiring.controller, "whole_run", None)
+    plant, plain = wiring.plant, wiring.noise is None and wiring.faults is None and wiring.disturbance is None
+    if make_run is None or not plain or not isinstance(plant, StepMap):
+        return False
+    rows.at_once = make_run(plant, wiring.reference, wiring.measured, rows.X, rows.Y, rows.U, preview=wiring.preview)
+    return rows.at_once is not None
+
+
+def _refuse_plan() -> Plan | None:
+    """Raise where the plan of a step is asked for after the controller has gone on to the next one."""
+    raise DataError("the controller has gone on: read step.plan while the observer is called, or pass plans=True")
 
 
 def checked_input(move: Move, nu: int, k: int) -> Float[np.ndarray, " nu"]:
@@ -303,13 +368,33 @@ def checked_input(move: Move, nu: int, k: int) -> Float[np.ndarray, " nu"]:
     return u
 
 
-def _same(plan: Plan) -> Plan:
-    """Return the plan that is kept."""
-    return plan
+def _require_match(plant: StepMap | Plant, controller: Controller, angles: Sequence[int]) -> None:
+    """Raise where plant and controller lack a member, or do not fit each other."""
+    checks.members(controller, "the controller", CONTROLLER, HOW)
+    if not isinstance(plant, StepMap):
+        require_plant(plant)
+    if abs(plant.dt - controller.dt) > 1e-12 * plant.dt:
+        raise DataError(f"the controller has dt = {controller.dt:g} s, the plant {plant.dt:g} s; use one dt for both")
+    inputs, nx = tuple(plant.inputs), len(plant.states)
+    if controller.nu != len(inputs):
+        raise ShapeError(f"the controller returns {controller.nu} inputs, the plant takes {len(inputs)} ({inputs})")
+    outside = [i for i in angles if not 0 <= i < nx]
+    if outside:
+        raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
 
 
-def _gone() -> Plan | None:
-    raise DataError("the controller has gone on: read step.plan while the observer is called, or pass plans=True")
+def _tracked_rows(
+    reference: ArrayLike, cost: Cost | None, states: Sequence[str], steps: int, horizon: int
+) -> Float[np.ndarray, "rows nr"]:
+    """Return the rows of the reference, one column for each output that the cost tracks."""
+    rows = rows_ahead(reference, "reference", "nr", steps + 1, horizon, "steps+1")
+    if cost is not None:
+        checks.kind(cost, "cost", Cost, "pass km.Cost(Q=…, R=…)")
+        tracked = bind_outputs(cost.of, states)
+        nr = len(states) if tracked is None else tracked.nz
+        if rows.shape[1] != nr:
+            raise ShapeError(f"reference has {rows.shape[1]} columns, the cost tracks {nr} outputs; pass one a column")
+    return rows
 
 
 def predictor_of(controller: object) -> Predictor | None:
@@ -331,13 +416,15 @@ def rows_ahead(
     return np.vstack([rows, np.broadcast_to(rows[-1], (horizon, rows.shape[1]))])
 
 
-def _held(u_reference: ArrayLike | None, cost: Cost | None, steps: int, nu: int) -> Float[np.ndarray, "T nu"]:
+def _reference_inputs(
+    u_reference: ArrayLike | None, cost: Cost | None, steps: int, nu: int
+) -> Float[np.ndarray, "T nu"]:
     """Return the reference input of each step, for the metrics.
 
     It is `u_reference` if given, else the cost's u_target if that is given as numbers, else zero.
     """
     if u_reference is None:
-        given = None if cost is None else cost.given_inputs(nu)
+        given = None if cost is None or isinstance(cost.u_target, str) else cost.given_inputs(nu)
         if given is None:
             return np.zeros((steps, nu))
         if 1 < len(given) < steps:
@@ -349,9 +436,7 @@ def _held(u_reference: ArrayLike | None, cost: Cost | None, steps: int, nu: int)
     return checks.array(values, "u_reference", (steps, nu))
 
 
-def _signal(
-    signal: Signal | None, name: str, rows: int, n: int
-) -> Callable[[int, np.random.Generator], Float[np.ndarray, " n"]] | None:
+def _signal(signal: Signal | None, name: str, rows: int, n: int) -> _Draw | None:
     """Return the signal as a function of (k, rng); None where there is none."""
     if signal is None:
         return None
@@ -365,7 +450,7 @@ def _signal(
     return lambda k, rng: values[k]
 
 
-def _noise(noise: Signal, steps: int, ny: int) -> Callable[[int, np.random.Generator], Float[np.ndarray, " ny"]] | None:
+def _noise(noise: Signal, steps: int, ny: int) -> _Draw | None:
     """Return the measurement noise as a function of (k, rng); a vector holds standard deviations."""
     if callable(noise) or np.ndim(noise) == 2:
         return _signal(noise, "noise", steps + 1, ny)

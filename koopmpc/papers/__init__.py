@@ -1,1 +1,1 @@
-"""Papers whose published results `koopmpc reproduce` computes anew."""
+"""Papers whose published results `koopmpc reproduce` computes again."""

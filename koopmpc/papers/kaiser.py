@@ -32,21 +32,21 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Eigenfunction
 from koopmpc.lifting.state import Constant, Expressions, Monomials, State
 from koopmpc.loop.simulate import simulate
-from koopmpc.papers.plants import closed_loop, trajectories
-from koopmpc.papers.registry import Claim, Tell, compared, judged, percent, short, show
+from koopmpc.page import Page
+from koopmpc.papers.plants import integrate_closed_loop, integrate_trajectories
+from koopmpc.papers.registry import Claim, TellPart, compare_value, draw_curves, judge_claim, make_paper, percent
 from koopmpc.plants.dynamics import RK4, Dynamics
 from koopmpc.plants.step_map import discretize
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.recording.page import Page
 
-DT = 0.01
-KNOWN = {  # J of the pendulum by B and H_r, each to three digits
+DT = 0.01  # sample time [s]
+KNOWN = {  # J of the pendulum in the paper by B and H_r, and the rounding of its digits
     ("[0; 1]", 1.0): (3.996, 0.005), ("[0; 1]", 0.0): (1.208, 0.005), ("[0; 1]", 2.0): (7.274, 0.005),
     ("[0; 1]", -1.0): (0.2355, 0.0005), ("[1; 0]", 1.0): (3.616, 0.005), ("[1; 0]", 0.0): (0.764, 0.0005),
     ("[1; 0]", 2.0): (10.16, 0.05), ("[1; 0]", -1.0): (0.1593, 0.0005),
 }  # fmt: skip
 WELLS = {(-2.0, 2.5): (11.58, 0.05), (0.0, 2.5): (5.280, 0.005), (2.5, 0.001): (35.70, 0.05)}
-A = -0.25  # of the asymmetric well
+A = -0.25  # a in the energy of the asymmetric well
 SADDLE = float(np.sort(np.roots([1.0, -A, -1.0, A]))[1])
 POTENTIALS: dict[str, Callable[[ca.SX], ca.SX]] = {
     "pendulum": lambda q: -ca.cos(q),
@@ -58,19 +58,19 @@ MATRICES = {"[0; 1]": ((0.0,), (1.0,)), "[1; 0]": ((1.0,), (0.0,)), "I": ((1.0, 
 LIBRARY = State() + Monomials(4) + Constant()
 
 
-def work(page: Page, quick: bool, tell: Tell) -> list[Claim]:
-    """Control energies that are known, find them in data, and control what was found."""
-    tell("costs of the pendulum and of the double well")
-    claims, energies = _costs(page, quick)
-    show(page, "energy", "Energy of the pendulum, B = [0; 1]", DT, ("H",), energies)
-    tell("discovery")
-    found = _discovery(page, claims)
-    tell("control of what was found")
-    _controlled(page, claims, found)
+def reproduce_kaiser(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+    """Control known energies, find energies in data, and control by the energies from data."""
+    progress("costs of the pendulum and of the double well")
+    claims, energies = _control_known_energies(page, quick)
+    draw_curves(page, "energy", "Energy of the pendulum, B = [0; 1]", DT, ("H",), energies)
+    progress("discovery")
+    found = _discover_energy(page, claims)
+    progress("control of what was found")
+    _control_found_energies(page, claims, found)
     return claims
 
 
-def energy(name: str) -> Lifting:
+def make_energy(name: str) -> Lifting:
     """Return H = x₂²/2 + V(x₁) of a plant, as a lifting of one observable."""
     return Expressions(lambda x: [x[1] ** 2 / 2 + POTENTIALS[name](x[0])], ["H"]).bind(Well.states)
 
@@ -91,17 +91,17 @@ class Well(Dynamics):
 
 
 class TwoInputs(Well):
-    """The same with an input for each state."""
+    """A well with an input for each state."""
 
     inputs = ("u0", "u1")
 
 
-def law_of(H: Lifting, B: str, R: float = 1.0, eigenvalue: float | None = 0.0) -> EigenfunctionLQR:
+def make_controller(H: Lifting, B: str, R: float = 1.0, eigenvalue: float | None = 0.0) -> EigenfunctionLQR:
     """Return the controller of H with Q = 1."""
     return EigenfunctionLQR(H, Cost(Q=1.0, R=R, of=H), dt=DT, B=MATRICES[B], eigenvalue=eigenvalue)
 
 
-def _costs(page: Page, quick: bool) -> tuple[list[Claim], dict[str, np.ndarray]]:
+def _control_known_energies(page: Page, quick: bool) -> tuple[list[Claim], dict[str, np.ndarray]]:
     cases: list[tuple[str, str, Sequence[float], float, float, tuple[float, float]]] = [
         ("pendulum", B, (0.5, 0.5), target, 100.0, known) for (B, target), known in KNOWN.items()
     ]
@@ -111,9 +111,9 @@ def _costs(page: Page, quick: bool) -> tuple[list[Claim], dict[str, np.ndarray]]
     curves: dict[str, np.ndarray] = {}
     arrivals: list[float] = []
     for name, B, start, target, seconds, (known, spread) in cases:
-        H, plant = energy(name), Well(name, MATRICES[B])
-        law = law_of(H, B)
-        run = closed_loop(
+        H, plant = make_energy(name), Well(name, MATRICES[B])
+        law = make_controller(H, B)
+        run = integrate_closed_loop(
             plant,
             lambda x, law=law, r=target: law.law(x, r),
             lambda x, u, H=H, r=target: (H.symbolic(x) - r) ** 2 + ca.sumsqr(u),
@@ -122,7 +122,7 @@ def _costs(page: Page, quick: bool) -> tuple[list[Claim], dict[str, np.ndarray]]
             seconds=seconds,
         )
         where = f"{name}, B = {B}, from {[*start]}, H_r = {target:g}"
-        claims.append(compared(f"J: {where}", known, run.cost, spread, digits=4))
+        claims.append(compare_value(f"J: {where}", known, run.cost, spread, digits=4))
         off = np.abs(H(run.X)[:, 0] - target)
         late = np.flatnonzero(off > 1e-3)
         arrived = DT * (late[-1] + 1) if len(late) and late[-1] + 1 < len(off) else np.nan
@@ -130,38 +130,40 @@ def _costs(page: Page, quick: bool) -> tuple[list[Claim], dict[str, np.ndarray]]
             arrivals.append(float(arrived))
         if name == "pendulum" and B == "[0; 1]":
             curves[f"H_r = {target:g}"] = H(run.X)[:4001]
-        sampled = _sampled(law, plant, H, start, target, 2.0 if quick else seconds)
+        sampled = _simulate_sampled(law, plant, H, start, target, 2.0 if quick else seconds)
         rows.append((where, f"{run.cost:.4g}", "–" if quick else f"{sampled:.4g}", f"{arrived:.4g}", f"{off[-1]:.1e}"))
     page.text("## Known energies", "*Within* is the time from which on |H − H_r| < 10⁻³.")
     page.table(("plant", "J", "J in the sampled loop", "within [s]", "|H − H_r| at the end"), rows)
-    says = "H stays within 1e-3 of H_r, from 5 to 12 s on, but for H_r = −1"
+    says = "H stays within 1e-3 of H_r, from 5 to 12 s on, except for H_r = −1"
     why = f"from {min(arrivals):.1f} to {max(arrivals):.1f} s on"
-    claims.append(judged("pendulum", says, holds=min(arrivals) > 4.5 and max(arrivals) < 12.5, why=why, required=True))
+    claims.append(
+        judge_claim("pendulum", says, holds=min(arrivals) > 4.5 and max(arrivals) < 12.5, why=why, required=True)
+    )
     return claims, curves
 
 
-def _sampled(
+def _simulate_sampled(
     law: EigenfunctionLQR, plant: Well, H: Lifting, start: Sequence[float], target: float, seconds: float
 ) -> float:
-    """Return J in the library's loop with the input held over each sample."""
+    """Return J in the library's closed loop, where the input is constant over each sample."""
     step_map = discretize(plant, DT, RK4(2))
     run = simulate(step_map, law, x0=start, reference=[target], steps=round(seconds / DT), cost=law.cost)
     e = H(run.X)[:, 0] - target
     return DT * float(np.sum((e[1:] ** 2 + e[:-1] ** 2) / 2) + np.sum(run.U**2))
 
 
-def _discovery(page: Page, claims: list[Claim]) -> Eigenfunction:
-    """Find H of the double well, and ask EDMDc of the same degree for it; return φ from forced data."""
+def _discover_energy(page: Page, claims: list[Claim]) -> Eigenfunction:
+    """Find H of the double well by eigenfunctions and by EDMDc of the same degree; return φ from forced data."""
     plant = Well("double well")
-    one = trajectories(plant, [0.0, -2.8], dt=DT, steps=1000)
+    one = integrate_trajectories(plant, [0.0, -2.8], dt=DT, steps=1000)
     t = DT * np.arange(1000)
     u = 2 * np.sin(0.2 * np.pi * t) * np.sin(2 * np.pi * t)
     forced = collect(discretize(plant, DT, RK4(4)), [0.0, -2.8], lambda k, y, rng: u[[k]], episodes=1, steps=1000)
-    others = trajectories(plant, np.random.default_rng(0).uniform(-1.5, 1.5, (20, 2)), dt=DT, steps=500)
+    others = integrate_trajectories(plant, np.random.default_rng(0).uniform(-1.5, 1.5, (20, 2)), dt=DT, steps=500)
     found = {
         "differences": eigenfunctions(one, LIBRARY, by="derivatives", held_out=others)[0],
         "steps": eigenfunctions(one, LIBRARY, held_out=others)[0],
-        "forced data": eigenfunctions(forced, LIBRARY, held_out=_undriven(others))[0],
+        "forced data": eigenfunctions(forced, LIBRARY, held_out=_add_zero_inputs(others))[0],
     }
     names = found["steps"].lifting.names
     exact = np.zeros(len(names))
@@ -170,16 +172,18 @@ def _discovery(page: Page, claims: list[Claim]) -> Eigenfunction:
         c = phi.coefficients[0]
         rest = int(np.sum(c[exact == 0] != 0))
         claims += [
-            compared(f"φ from {name}: x₁², x₂², x₁⁴", [-1.0, 1.0, 0.5], c[exact != 0], spread, digits=4),
-            judged(f"φ from {name}", "no other observable", holds=not rest, why=f"{rest} others", required=True),
+            compare_value(f"φ from {name}: x₁², x₂², x₁⁴", [-1.0, 1.0, 0.5], c[exact != 0], spread, digits=4),
+            judge_claim(f"φ from {name}", "no other observable", holds=not rest, why=f"{rest} others", required=True),
         ]
     unit = found["differences"].coefficients[0]
     unit = unit / np.linalg.norm(unit)
-    claims.append(compared("φ from differences, of length 1", [-2 / 3, 2 / 3], unit[exact != 0][:2], 1e-5, digits=5))
+    claims.append(
+        compare_value("φ from differences, of length 1", [-2 / 3, 2 / 3], unit[exact != 0][:2], 1e-5, digits=5)
+    )
     with unwarned():
         model = edmd(forced, LIBRARY)
-    H = np.array([energy("double well")(e.X)[0, 0] for e in others])
-    told = {"EDMDc, H = cᵀz": _lifted(model, others, exact)}
+    H = np.array([make_energy("double well")(e.X)[0, 0] for e in others])
+    told = {"EDMDc, H = cᵀz": _predict_energy(model, others, exact)}
     told |= {f"φ from {name}": np.array([phi.values(e.X) / 2 for e in others]) for name, phi in found.items()}
     later = (10, 100, 500)
     errors = {
@@ -196,7 +200,7 @@ def _discovery(page: Page, claims: list[Claim]) -> Eigenfunction:
         [(name, *map(percent, each)) for name, each in errors.items()],
     )
     claims.append(
-        judged(
+        judge_claim(
             "EDMDc of the same degree on forced data",
             "does not carry H",
             holds=errors["EDMDc, H = cᵀz"][-1] > 100 * errors["φ from forced data"][-1],
@@ -208,12 +212,12 @@ def _discovery(page: Page, claims: list[Claim]) -> Eigenfunction:
     return found["forced data"]
 
 
-def _undriven(data: Episodes) -> Episodes:
+def _add_zero_inputs(data: Episodes) -> Episodes:
     """Return the episodes with an input that is 0."""
     return Episodes([Episode(X=e.X, U=np.zeros((len(e.X) - 1, 1))) for e in data], data.dt, data.states, Well.inputs)
 
 
-def _lifted(model: LinearPredictor, data: Episodes, c: np.ndarray) -> np.ndarray:
+def _predict_energy(model: LinearPredictor, data: Episodes, c: np.ndarray) -> np.ndarray:
     """Return cᵀ Aᵏ ψ(x₀) / 2 of each episode."""
     Z = model.lift(np.array([e.X[0] for e in data]))
     rows = [Z @ c / 2]
@@ -223,30 +227,30 @@ def _lifted(model: LinearPredictor, data: Episodes, c: np.ndarray) -> np.ndarray
     return np.column_stack(rows)
 
 
-def _controlled(page: Page, claims: list[Claim], phi: Eigenfunction) -> None:
-    """Control the double well by φ alone, and the two other wells by φ from one unforced trajectory each."""
+def _control_found_energies(page: Page, claims: list[Claim], phi: Eigenfunction) -> None:
+    """Control the double well by φ from forced data, and the two other wells by φ from two unforced trajectories."""
     H = phi.scaled(0.5, "H")
     law = EigenfunctionLQR(H, Cost(Q=1.0, R=1.0, of=H), dt=DT)
-    run = closed_loop(
+    run = integrate_closed_loop(
         Well("double well"),
         lambda x: law.law(x, 0.0),
-        lambda x, u: energy("double well").symbolic(x) ** 2 + ca.sumsqr(u),
+        lambda x, u: make_energy("double well").symbolic(x) ** 2 + ca.sumsqr(u),
         (-2.0, 2.5),
         dt=DT,
         seconds=25.0,
     )
-    claims.append(compared("J from [-2, 2.5] by φ from forced data", 11.58, run.cost, 0.05, digits=4))
+    claims.append(compare_value("J from [-2, 2.5] by φ from forced data", 11.58, run.cost, 0.05, digits=4))
     curves: dict[str, np.ndarray] = {}
     for name, start, R in (("quartic well", (0.001, 0.001), 1.0), ("asymmetric well", (-1.1, 0.0), 0.05)):
         plant, other = TwoInputs(name, MATRICES["I"]), (0.3, -0.9)
-        data = trajectories(Well(name), [other, (-1.0, 0.5)], dt=DT, steps=1000)
+        data = integrate_trajectories(Well(name), [other, (-1.0, 0.5)], dt=DT, steps=1000)
         (H,) = eigenfunctions(data, LIBRARY)
         H = H.scaled(0.5 / H.coefficients[0, H.lifting.names.index("x2^2")], "H")
-        loop, step = law_of(H, "I", R, None), discretize(plant, DT, RK4(2))
+        loop, step = make_controller(H, "I", R, None), discretize(plant, DT, RK4(2))
         top, low = (float(H([q, 0.0])[0]) for q in (SADDLE, 1.0))
         X = [np.array(start)]
         for _ in range(4000):
-            target = 0.15 - float(energy(name)([0.0, 0.0])[0]) if name == "quartic well" else low
+            target = 0.15 - float(make_energy(name)([0.0, 0.0])[0]) if name == "quartic well" else low
             if name == "asymmetric well" and X[-1][0] < SADDLE + 0.05:
                 target = top + 0.02  # over the saddle first
             X.append(step(X[-1], loop(X[-1], [target]).u))
@@ -259,8 +263,8 @@ def _controlled(page: Page, claims: list[Claim], phi: Eigenfunction) -> None:
                 f"x = [{x[0]:.3f}, {x[1]:.3f}] at the end",
             )
             holds = bool(np.linalg.norm(x - [1.0, 0.0]) < 0.1)
-        claims.append(judged(f"{name}, φ from two trajectories", says, holds=holds, why=why, required=True))
-    show(page, "wells", "Asymmetric and quartic well, by their φ from data", DT, ("x₁", "x₂", "H"), curves)
+        claims.append(judge_claim(f"{name}, φ from two trajectories", says, holds=holds, why=why, required=True))
+    draw_curves(page, "wells", "Asymmetric and quartic well, by their φ from data", DT, ("x₁", "x₂", "H"), curves)
 
 
-paper = short("kaiser", __doc__, work)
+paper = make_paper("kaiser", __doc__, reproduce_kaiser)

@@ -1,6 +1,7 @@
-"""Three papers with I. Kevrekidis: EDMD on monomials, on a kernel that stands for them, and on trained Gaussians."""
+"""Three papers with I. Kevrekidis: EDMD on monomials, on a polynomial kernel, and on trained Gaussians."""
 
 from collections.abc import Callable
+from functools import partial
 from time import perf_counter
 
 import casadi as ca
@@ -12,30 +13,32 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Noise
 from koopmpc.errors import unwarned
 from koopmpc.figures.eigenvalues import eigenfunctions
-from koopmpc.figures.reports import Plot, plots
+from koopmpc.figures.reports import CurvePanel, draw_panels
+from koopmpc.figures.style import save
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.kernel import kernel_edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.radial import Gaussian
 from koopmpc.lifting.state import Constant, Monomials, State
-from koopmpc.papers.registry import Claim, Tell, judged, percent, short
+from koopmpc.page import Page
+from koopmpc.papers.registry import Claim, TellPart, judge_claim, make_paper, percent
 from koopmpc.plants.dynamics import RK4, Dynamics
 from koopmpc.plants.step_map import discretize
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.recording.page import Page
 from koopmpc.synthesis.train import train
 from koopmpc.validate.scoring import score
 
 A = np.array([[0.9, -0.04], [0.0, 0.8]])
-W = np.array([[1.0, -0.4], [0.0, 1.0]])  # rows: left eigenvectors of A
-SAMPLES, DEGREE = 100, 4
+W = np.array([[1.0, -0.4], [0.0, 1.0]])  # rows are the left eigenvectors of A
+SAMPLES = 100  # pairs (x, A x) of the linear plant
+DEGREE = 4  # total degree of the monomials
 POWERS = [(i, n - i) for n in range(DEGREE + 1) for i in range(n, -1, -1)]
-SIZES = (2, 4, 6, 8, 10)  # numbers of states
-LANDMARKS = (25, 50, 100, 200, 400)
-LAW = 1e-8
+SIZES = (2, 4, 6, 8, 10)  # numbers of states in the comparison of times
+LANDMARKS = (25, 50, 100, 200, 400)  # numbers of landmarks
+KERNEL_GAP = 1e-8  # eigenvalues of the kernel and of all monomials may differ by this
 
 
-def of_edmd(page: Page, quick: bool, tell: Tell) -> list[Claim]:
+def reproduce_williams(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     """Williams et al. 2015: EDMD finds eigenvalues and eigenfunctions.
 
     M. Williams, I. Kevrekidis and C. Rowley, *A Data-Driven Approximation of the Koopman Operator: Extending
@@ -46,8 +49,8 @@ def of_edmd(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     (w₂ᵀx)ʲ, where w are the left eigenvectors of A. The data are {samples} states from a normal distribution and
     their successors.
     """
-    tell("EDMD")
-    model = edmd(_pairs(A, SAMPLES), _monomials(DEGREE))
+    progress("EDMD")
+    model = edmd(_make_pairs(A, SAMPLES), _monomials(DEGREE))
     exact = np.array([0.9**i * 0.8**j for i, j in POWERS])
     order = [int(np.abs(model.eigenvalues - value).argmin()) for value in exact]
     found = model.eigenvalues[order]
@@ -67,20 +70,20 @@ def of_edmd(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     page.picture(
         "eigenfunctions",
         "Eigenfunctions of λ = .9, .8 and .72",
-        eigenfunctions(model, [order[k] for k in (1, 2, 4)], (0, 1), ((-2.0, 2.0), (-2.0, 2.0))),
+        partial(save, eigenfunctions(model, [order[k] for k in (1, 2, 4)], (0, 1), ((-2.0, 2.0), (-2.0, 2.0)))),
     )
     steps = np.arange(31)[:, None]
     curves = {"EDMD": (np.real(found) ** steps), "exact": exact**steps}
     page.curve("Powers of the eigenvalues", 1.0, [f"λ {i},{j}" for i, j in POWERS], curves)
     return [
-        judged(
+        judge_claim(
             "eigenvalues",
             "all 15 are .9ⁱ·.8ʲ, ± 1e-10",
             holds=gap <= 1e-10 and len(set(order)) == len(POWERS),
             why=f"farthest off by {gap:.0e}",
             required=True,
         ),
-        judged(
+        judge_claim(
             "eigenfunctions",
             "(w₁ᵀx)ⁱ (w₂ᵀx)ʲ, ± 1e-9 (ours)",
             holds=farthest <= 1e-9,
@@ -91,15 +94,15 @@ def of_edmd(page: Page, quick: bool, tell: Tell) -> list[Claim]:
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the sine of the angle between two vectors."""
+    """Return the sine of the angle between two complex vectors."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     return float(np.linalg.norm(a - np.vdot(b, a) * b))
 
 
-edmd_paper = short("williams", of_edmd.__doc__, of_edmd, samples=SAMPLES)
+edmd_paper = make_paper("williams", reproduce_williams.__doc__, reproduce_williams, samples=SAMPLES)
 
 
-def of_kernel(page: Page, quick: bool, tell: Tell) -> list[Claim]:
+def reproduce_kernel(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     """Williams, Rowley & Kevrekidis 2015: kernel EDMD, and Nyström's approximation for many samples.
 
     M. Williams, C. Rowley and I. Kevrekidis, *A Kernel-Based Method for Data-Driven Koopman Spectral Analysis*, J.
@@ -111,39 +114,45 @@ def of_kernel(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     time of both fits for plants of 2 to {largest} states, degree 4, from 120 samples; and for the Gaussian kernel
     and 2,000 samples of Duffing the error on held-out samples with 25 to 400 of them as landmarks.
     """
-    tell("the law of the polynomial kernel")
-    claims = [*_law(page)]
-    tell("cost")
-    claims += _cost(page, SIZES[:-1] if quick else SIZES)
-    tell("landmarks")
-    return claims + _landmarks(page)
+    progress("the law of the polynomial kernel")
+    claims = [*_check_kernel_law(page)]
+    progress("cost")
+    claims += _measure_cost(page, SIZES[:-1] if quick else SIZES)
+    progress("landmarks")
+    return claims + _measure_landmarks(page)
 
 
-def _duffing(episodes: int, steps: int, seed: int = 0) -> Episodes:
+def _collect_sampled_duffing(episodes: int, steps: int, seed: int = 0) -> Episodes:
     plant = discretize(load_problem("duffing").dynamics, 0.1, RK4(4))
     data = collect(plant, Uniform([-2.0, -2.0], [2.0, 2.0]), Noise(0.0, 0.0), episodes=episodes, steps=steps, rng=seed)
     return Episodes([Episode(X=e.X) for e in data], data.dt, data.states)
 
 
-def _pairs(matrix: np.ndarray, count: int) -> Episodes:
+def _make_pairs(matrix: np.ndarray, count: int) -> Episodes:
     X = np.random.default_rng(0).standard_normal((count, len(matrix)))
     return Episodes([Episode(X=np.stack([x, matrix @ x])) for x in X], 1.0)
 
 
-def _law(page: Page) -> list[Claim]:
-    cases = {"linear plant": _pairs(A, SAMPLES), "Duffing": _duffing(60, 3)}
+def _check_kernel_law(page: Page) -> list[Claim]:
+    cases = {"linear plant": _make_pairs(A, SAMPLES), "Duffing": _collect_sampled_duffing(60, 3)}
     rows: list[tuple[object, ...]] = []
     worst: dict[str, float] = {}
     for name, data in cases.items():
         for p in (1, 2, 3, 4):
             full, kernel = edmd(data, _monomials(p)), kernel_edmd(data, "polynomial", degree=p)
-            gap = _apart(full.eigenvalues, kernel.eigenvalues)
+            gap = _distance(full.eigenvalues, kernel.eigenvalues)
             worst[name] = max(worst.get(name, 0.0), gap)
             rows.append((name, p, full.nz, kernel.nz, f"{gap:.0e}"))
     page.text("## The law", "*Apart* is the largest distance of an eigenvalue of one from the nearest of the other.")
     page.table(("data", "degree", "monomials", "coordinates of the kernel", "apart"), rows)
     return [
-        judged(name, f"eigenvalues of all monomials, ± {LAW:g}", holds=gap <= LAW, why=f"{gap:.0e}", required=True)
+        judge_claim(
+            name,
+            f"eigenvalues of all monomials, ± {KERNEL_GAP:g}",
+            holds=gap <= KERNEL_GAP,
+            why=f"{gap:.0e}",
+            required=True,
+        )
         for name, gap in worst.items()
     ]
 
@@ -152,42 +161,46 @@ def _monomials(degree: int) -> Lifting:
     return Constant() + State() + (Monomials(degree) if degree > 1 else Constant())
 
 
-def _apart(a: np.ndarray, b: np.ndarray) -> float:
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
     distances = np.abs(a[:, None] - b)
     return float(max(distances.min(axis=0).max(), distances.min(axis=1).max()))
 
 
-def _cost(page: Page, sizes: tuple[int, ...]) -> list[Claim]:
+def _measure_cost(page: Page, sizes: tuple[int, ...]) -> list[Claim]:
     times: dict[str, list[float]] = {"EDMD on monomials": [], "kernel EDMD": []}
     rows: list[tuple[object, ...]] = []
     for nx in sizes:
         rng = np.random.default_rng(nx)
-        data = _pairs(0.9 * np.linalg.qr(rng.standard_normal((nx, nx)))[0], 120)
+        data = _make_pairs(0.9 * np.linalg.qr(rng.standard_normal((nx, nx)))[0], 120)
         with unwarned():
-            full, first = _timed(lambda data=data: edmd(data, _monomials(4)))
-            kernel, second = _timed(lambda data=data: kernel_edmd(data, "polynomial", degree=4))
+            full, first = _time_fit(lambda data=data: edmd(data, _monomials(4)))
+            kernel, second = _time_fit(lambda data=data: kernel_edmd(data, "polynomial", degree=4))
         for name, value in zip(times, (first, second), strict=True):
             times[name].append(value)
         rows.append((nx, full.nz, kernel.nz, f"{1e3 * first:.3g}", f"{1e3 * second:.3g}"))
     page.text("## Cost", "Times of one run on the machine that wrote this page; their growth is what counts.")
     page.table(("states", "monomials", "coordinates of the kernel", "EDMD [ms]", "kernel EDMD [ms]"), rows)
     drawn = {name: (np.array(sizes), 1e3 * np.array(each)) for name, each in times.items()}
-    page.picture("cost", "Time of a fit, degree 4, 120 samples", plots([Plot("states", "time [ms]", drawn, log="y")]))
+    page.picture(
+        "cost",
+        "Time of a fit, degree 4, 120 samples",
+        partial(save, draw_panels([CurvePanel("states", "time [ms]", drawn, log="y")])),
+    )
     growth = {name: each[-1] / each[0] for name, each in times.items()}
     why = f"{growth['EDMD on monomials']:.0f} times for EDMD, {growth['kernel EDMD']:.1f} times for the kernel"
     says = f"from {sizes[0]} to {sizes[-1]} states, cost goes with the samples and not with the monomials"
     holds = growth["kernel EDMD"] < growth["EDMD on monomials"] / 4
-    return [judged("cost", says, holds=holds, why=why)]
+    return [judge_claim("cost", says, holds=holds, why=why)]
 
 
-def _timed(fit: Callable[[], LinearPredictor]) -> tuple[LinearPredictor, float]:
+def _time_fit(fit: Callable[[], LinearPredictor]) -> tuple[LinearPredictor, float]:
     start = perf_counter()
     model = fit()
     return model, perf_counter() - start
 
 
-def _landmarks(page: Page) -> list[Claim]:
-    train, test = _duffing(100, 20), _duffing(50, 20, seed=1)
+def _measure_landmarks(page: Page) -> list[Claim]:
+    train, test = _collect_sampled_duffing(100, 20), _collect_sampled_duffing(50, 20, seed=1)
     errors: list[float] = []
     for m in LANDMARKS:
         with unwarned():
@@ -198,20 +211,29 @@ def _landmarks(page: Page) -> list[Claim]:
     page.table(("landmarks", "error [%]"), [(m, percent(e)) for m, e in zip(LANDMARKS, errors, strict=True)])
     curve = np.array(errors)[:, None]
     drawn = {"Gaussian kernel": (np.array(LANDMARKS), 100 * curve[:, 0])}
-    page.picture("landmarks", "Error after 1 s", plots([Plot("landmarks", "error [%]", drawn, log="y")]))
+    page.picture(
+        "landmarks",
+        "Error after 1 s",
+        partial(save, draw_panels([CurvePanel("landmarks", "error [%]", drawn, log="y")])),
+    )
     page.curve("Error by landmarks, in the order of the table", 1.0, ("error",), {"Gaussian kernel": curve})
     says = "few landmarks of many samples suffice: the error falls with their number"
     why = f"from {percent(errors[0])} % at {LANDMARKS[0]} to {percent(errors[-1])} % at {LANDMARKS[-1]}"
-    return [judged("Nyström", says, holds=errors[-1] < errors[0] / 10, in_part=errors[-1] < errors[0], why=why)]
+    return [judge_claim("Nyström", says, holds=errors[-1] < errors[0] / 10, in_part=errors[-1] < errors[0], why=why)]
 
 
-kernel_paper = short("kernel", of_kernel.__doc__, of_kernel, largest=SIZES[-1])
+kernel_paper = make_paper("kernel", reproduce_kernel.__doc__, reproduce_kernel, largest=SIZES[-1])
 
 
-DT, STEPS, COUNT, RIDGE = 0.25, 10, 1000, 1e-8  # of dictionary learning
-WIDTHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.2)
-FEW, MANY = 25, 100
-WINDOWS = 300  # trajectories that the training works on
+# Settings of dictionary learning
+DT = 0.25  # sample time [s]
+STEPS = 10  # steps of a trajectory, and horizon of the errors
+COUNT = 1000  # trajectories in each data set
+RIDGE = 1e-8
+WIDTHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.2)  # candidate widths of fixed Gaussians
+FEW = 25  # number of Gaussians in a small dictionary
+MANY = 100  # number of Gaussians in a large dictionary
+WINDOWS = 300  # trajectories that the training reads
 
 
 class Duffing(Dynamics):
@@ -225,7 +247,7 @@ class Duffing(Dynamics):
         return ca.vertcat(x[1], -0.5 * x[1] + x[0] - x[0] ** 3)
 
 
-def of_dictionary(page: Page, quick: bool, tell: Tell) -> list[Claim]:
+def reproduce_dictionary(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     """Dictionary learning: 25 trained Gaussians against 100 fixed ones.
 
     Q. Li, F. Dietrich, E. Bollt and I. Kevrekidis, *Extended dynamic mode decomposition with dictionary learning: a
@@ -240,24 +262,24 @@ def of_dictionary(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     steps and {count} unseen trajectories, relative to the size of each state.
     """
     seeds, iterations, count = (1, 30, 200) if quick else (3, 800, COUNT)
-    data, held, unseen = (_data(count, seed) for seed in range(3))
+    data, held, unseen = (_collect_duffing(count, seed) for seed in range(3))
     found: dict[str, list[LinearPredictor]] = {name: [] for name in ("25 fixed", "100 fixed", "25 trained")}
     widths: dict[str, list[float]] = {"25 fixed": [], "100 fixed": []}
     changes: list[str] = []
     for seed in range(seeds):
-        tell(f"dictionary {seed + 1} of {seeds}")
+        progress(f"dictionary {seed + 1} of {seeds}")
         centers = np.random.default_rng(10 + seed).uniform(-2, 2, (MANY, 2))
         for name, some in (("25 fixed", centers[:FEW]), ("100 fixed", centers)):
-            fits = {width: _fitted(data, some, width) for width in WIDTHS}
-            best = min(fits, key=lambda width: _error(fits[width], held))
+            fits = {width: _fit_gaussians(data, some, width) for width in WIDTHS}
+            best = min(fits, key=lambda width: _total_error(fits[width], held))
             found[name].append(fits[best])
             widths[name].append(best)
-        start = _lifting(centers[:FEW], np.full(FEW, widths["100 fixed"][-1]))
+        start = _make_lifting(centers[:FEW], np.full(FEW, widths["100 fixed"][-1]))
         trained = train(start, data, horizon=STEPS, held_out=held, ridge=RIDGE, windows=WINDOWS, iterations=iterations)
         found["25 trained"].append(trained)
         assert trained.report is not None
         changes.append(trained.report.changes[-1])
-    errors = {name: np.array([_error(model, unseen) for model in models]) for name, models in found.items()}
+    errors = {name: np.array([_total_error(model, unseen) for model in models]) for name, models in found.items()}
     columns = [errors["25 fixed"], widths["25 fixed"], errors["25 trained"], errors["100 fixed"], widths["100 fixed"]]
     page.text("## Errors on unseen trajectories", "One row for each draw of the centres.")
     page.table(
@@ -266,18 +288,18 @@ def of_dictionary(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     )
     page.items(changes)
     centers = np.random.default_rng(10).uniform(-2, 2, (MANY, 2))
-    by_width = np.array([_error(_fitted(data, centers, width), unseen) for width in WIDTHS])
+    by_width = np.array([_total_error(_fit_gaussians(data, centers, width), unseen) for width in WIDTHS])
     said = ", ".join(f"{percent(error)} % at {width}" for error, width in zip(by_width, WIDTHS, strict=True))
     page.text(f"The 100 depend on their width: with the centres of the first row the errors are {said}.")
-    _pictures(page, {name: models[0] for name, models in found.items()}, unseen)
+    _draw_dictionary(page, {name: models[0] for name, models in found.items()}, unseen)
     few, own = (float(np.median(errors[name])) for name in ("25 fixed", "25 trained"))
     best, many = (
-        float(errors[name][int(np.argmin([_error(model, held) for model in found[name]]))])
+        float(errors[name][int(np.argmin([_total_error(model, held) for model in found[name]]))])
         for name in ("25 trained", "100 fixed")
     )
     usual = float(np.median(by_width))
     return [
-        judged(
+        judge_claim(
             "25 trained, 25 fixed",
             "training makes a dictionary better",
             holds=bool((errors["25 trained"] < 0.7 * errors["25 fixed"]).all()),
@@ -285,7 +307,7 @@ def of_dictionary(page: Page, quick: bool, tell: Tell) -> list[Claim]:
             why=f"{percent(own)} % against {percent(few)} %, medians",
             required=not quick,
         ),
-        judged(
+        judge_claim(
             "25 trained, 100 fixed",
             "25 trained Gaussians predict as well as 100 fixed ones",
             holds=best <= many,
@@ -293,7 +315,7 @@ def of_dictionary(page: Page, quick: bool, tell: Tell) -> list[Claim]:
             why=f"{percent(best)} % against {percent(many)} %, the draws that held-out data choose. The width of the "
             f"100 is chosen, too; the median of the {len(WIDTHS)} gives {percent(usual)} %",
         ),
-        judged(
+        judge_claim(
             "held-out data",
             "a trained dictionary is never worse than untrained (ours)",
             holds=bool((errors["25 trained"] <= errors["25 fixed"]).all()),
@@ -303,8 +325,8 @@ def of_dictionary(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     ]
 
 
-def _pictures(page: Page, models: dict[str, LinearPredictor], unseen: Episodes) -> None:
-    """Draw the error by steps ahead, where the Gaussians stand, and one long prediction."""
+def _draw_dictionary(page: Page, models: dict[str, LinearPredictor], unseen: Episodes) -> None:
+    """Draw the error by steps ahead, the centres of the Gaussians, and one long prediction."""
     ahead = DT * np.arange(1, STEPS + 1)
     by_step = {
         name: (ahead, np.sqrt(np.mean(score(model, unseen, STEPS).relative ** 2, axis=1)))
@@ -312,24 +334,26 @@ def _pictures(page: Page, models: dict[str, LinearPredictor], unseen: Episodes) 
     }
     spots = {name: _centers(model.lifting) for name, model in models.items() if name != "100 fixed"}
     panels = [
-        Plot("time ahead [s]", "relative error", by_step, log="y", title="Unseen trajectories"),
-        Plot("x", "v", {name: (c[:, 0], c[:, 1]) for name, c in spots.items()}, points=True, title="Centres"),
+        CurvePanel("time ahead [s]", "relative error", by_step, log="y", title="Unseen trajectories"),
+        CurvePanel("x", "v", {name: (c[:, 0], c[:, 1]) for name, c in spots.items()}, points=True, title="Centres"),
     ]
-    page.picture("errors", "Error by time ahead, and where the Gaussians stand", plots(panels))
+    page.picture("errors", "Error by time ahead, and where the Gaussians stand", partial(save, draw_panels(panels)))
     truth = discretize(Duffing(), DT).rollout([-1.6, 1.2], np.zeros((2 * STEPS, 0)))
     curves = {"truth": truth}
     curves |= {name: model.rollout(truth[0], np.zeros((2 * STEPS, 0))) for name, model in models.items()}
     drawn = [
-        Plot(
+        CurvePanel(
             "time [s]", state, {name: (DT * np.arange(len(X)), X[:, i]) for name, X in curves.items()}, ylim=(-2.5, 2.5)
         )
         for i, state in enumerate(("x", "v"))
     ]
-    page.picture("prediction", "A prediction over twice the horizon that was trained for", plots(drawn))
+    page.picture(
+        "prediction", "A prediction over twice the horizon that was trained for", partial(save, draw_panels(drawn))
+    )
     page.curve("A prediction over 5 s", DT, ("x", "v"), curves)
 
 
-def _lifting(centers: np.ndarray, width: float | np.ndarray) -> Lifting:
+def _make_lifting(centers: np.ndarray, width: float | np.ndarray) -> Lifting:
     return State() + Constant() + Gaussian(centers, width)
 
 
@@ -339,21 +363,21 @@ def _centers(lifting: Lifting) -> np.ndarray:
     return bells.centers
 
 
-def _fitted(data: Episodes, centers: np.ndarray, width: float) -> LinearPredictor:
+def _fit_gaussians(data: Episodes, centers: np.ndarray, width: float) -> LinearPredictor:
     with unwarned():
-        return edmd(data, _lifting(centers, width), ridge=RIDGE)
+        return edmd(data, _make_lifting(centers, width), ridge=RIDGE)
 
 
-def _error(model: LinearPredictor, episodes: Episodes) -> float:
+def _total_error(model: LinearPredictor, episodes: Episodes) -> float:
     return score(model, episodes, STEPS).total
 
 
-def _data(count: int, seed: int) -> Episodes:
+def _collect_duffing(count: int, seed: int) -> Episodes:
     plant = discretize(Duffing(), DT)
     X = plant.rollouts(np.random.default_rng(seed).uniform(-2, 2, (count, 2)), np.zeros((count, STEPS, 0)))
     return Episodes([Episode(X=x) for x in X], DT, plant.states)
 
 
-dictionary_paper = short(
-    "dictionary", of_dictionary.__doc__, of_dictionary, count=COUNT, widths=", ".join(map(str, WIDTHS))
+dictionary_paper = make_paper(
+    "dictionary", reproduce_dictionary.__doc__, reproduce_dictionary, count=COUNT, widths=", ".join(map(str, WIDTHS))
 )

@@ -17,8 +17,8 @@ Korteweg–de Vries: y_t + y y_x + y_xxx = Σ uᵢ exp(−25(x − cᵢ)²) with
 0.01 s a step. 1000 trajectories of 200 steps, the lifting [y, 1, yᵢyᵢ₊₁, y²], MPC with N = 10, Q = I and R = 0 over
 50 s.
 
-Data are random, so figures have a spread; where the paper leaves a choice open, the section says ours. Times are those
-of the machine that wrote this page, and no requirement of it.
+Data are random, so the values have a spread. If the paper leaves a choice open, the section states ours. Times are
+those of the machine that wrote this page; they are not required.
 """
 
 from math import comb
@@ -42,60 +42,78 @@ from koopmpc.lifting.radial import ThinPlate
 from koopmpc.lifting.state import Expressions, State
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.simulate import simulate
-from koopmpc.papers.registry import Claim, Tell, compared, judged, percent, relative, short, show
+from koopmpc.page import Page
+from koopmpc.papers.registry import (
+    Claim,
+    TellPart,
+    compare_value,
+    draw_curves,
+    judge_claim,
+    make_paper,
+    percent,
+    relative_error,
+)
 from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.recording.page import Page
 
-SIZES = (5, 10, 25, 50, 75, 100)
-PAPER = (66.5, 44.9, 47.0, 38.7, 30.6, 24.4)
-DT, STEPS = 0.01, 300  # of Van der Pol's predictions and of the motor's loops
-STARTS = 100
-SQUARE = ((-1.0) ** np.floor(np.arange(STEPS) / 30 + 0.5))[:, None]
-DEGREES = (5, 13)  # of Carleman's linearisation: 20 and 104 monomials
-_SAID = {"linearisation at x₀": "thousands", "linearisation at 0": "900 to 1400"}
+DT = 0.01  # sample time of all three plants [s]
+STEPS = 300  # steps of the predictions of Van der Pol and of the closed loops of the motor
+SIZES = (5, 10, 25, 50, 75, 100)  # numbers of thin plates
+PAPER = (66.5, 44.9, 47.0, 38.7, 30.6, 24.4)  # errors in the paper for these numbers [%]
+STARTS = 100  # starts of the predictions
+SQUARE = ((-1.0) ** np.floor(np.arange(STEPS) / 30 + 0.5))[:, None]  # input of the predictions
+DEGREES = (5, 13)  # degrees of Carleman's linearisation: 20 and 104 monomials
+_PAPER_ERRORS = {"linearisation at x₀": "thousands", "linearisation at 0": "900 to 1400"}  # [%]
 
-HORIZON, LIMIT = 100, 0.4  # of the motor
+HORIZON = 100  # horizon of the motor's controllers in steps
+LIMIT = 0.4  # limit on |y| of the motor in the case cosine
 K = np.arange(STEPS + 1)
-STEP, COSINE = np.where(K <= 150, -0.3, 0.3), 0.5 * np.cos(2 * np.pi * K / STEPS)
+STEP = np.where(K <= 150, -0.3, 0.3)  # reference of the motor in the case step
+COSINE = 0.5 * np.cos(2 * np.pi * K / STEPS)  # reference of the motor in the case cosine
 SOLVED = (Status.UNCONSTRAINED, Status.OPTIMAL)
 
-POINTS, SECONDS, WAVE_HORIZON = 128, 50.0, 10
+POINTS = 128  # points on the ring of Korteweg–de Vries
+SECONDS = 50.0  # length of its closed loop [s]
+WAVE_HORIZON = 10  # horizon of its controller in steps
 PLACE = 2 * np.pi * np.arange(POINTS) / POINTS - np.pi
-WAVE = np.arange(POINTS // 2 + 1) * (np.arange(POINTS // 2 + 1) < POINTS // 2)  # the highest wave has no slope
+WAVE = np.arange(POINTS // 2 + 1) * (np.arange(POINTS // 2 + 1) < POINTS // 2)  # wave numbers; 0 for the highest
 FORCES = np.exp(-25.0 * (PLACE - np.array([[-np.pi / 2], [0.0], [np.pi / 2]])) ** 2)
 SHAPES = np.stack([np.exp(-((PLACE - np.pi / 2) ** 2)), -(np.sin(PLACE / 2) ** 2), np.exp(-((PLACE + np.pi / 2) ** 2))])
-LEVELS = (0.5, 0.0, 0.75)  # of the mean, from 0, T/4 and 2T/3 on
+LEVELS = (0.5, 0.0, 0.75)  # references of the mean from t = 0, T/4 and 2T/3 on
 
 
-def work(page: Page, quick: bool, tell: Tell) -> list[Claim]:
+def reproduce_korda(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     """Reproduce the three examples."""
-    return [claim for part in (van_der_pol, motor, kdv) for claim in part(page, quick, tell)]
+    return [
+        claim
+        for part in (reproduce_van_der_pol, reproduce_motor, reproduce_kdv)
+        for claim in part(page, quick, progress)
+    ]
 
 
-def van_der_pol(page: Page, quick: bool, tell: Tell) -> list[Claim]:
-    """Predict 3 s from 100 starts, with each number of thin plates and each construction."""
-    tell("Van der Pol: linear predictors")
+def reproduce_van_der_pol(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+    """Predict 3 s from 100 starts with thin plates, with local linearisations, and with Carleman's."""
+    progress("Van der Pol: linear predictors")
     plant = discretize(load_problem("van_der_pol").dynamics, DT)
     starts = np.random.default_rng(100).uniform(-1, 1, (STARTS, 2))
     truth = plant.rollouts(starts, np.tile(SQUARE, (STARTS, 1, 1)))
     seeds = 2 if quick else 5
-    found = np.empty((seeds, len(SIZES)))
+    errors = np.empty((seeds, len(SIZES)))
     model: LinearPredictor | None = None
     for seed in range(seeds):
-        data = _data(plant, np.random.default_rng(seed), 100 if quick else 1000, 200)
+        data = _collect_data(plant, np.random.default_rng(seed), 100 if quick else 1000, 200)
         centers = np.random.default_rng(1000 + seed).uniform(-1, 1, (SIZES[-1], 2))
         for j, size in enumerate(SIZES):
             with unwarned():
                 model = edmd(data, State() + ThinPlate(centers[:size]))
-            found[seed, j] = _error(model, truth)
+            errors[seed, j] = _mean_error(model, truth)
     assert model is not None
     at_rest = LinearPredictor.local(plant, [0, 0], [0])
     local = [LinearPredictor.local(plant, x[0], [0]).rollout(x[0], SQUARE) for x in truth]
     other = {
-        "linearisation at x₀": float(np.mean([relative(X, x) for X, x in zip(local, truth, strict=True)])),
-        "linearisation at 0": _error(at_rest, truth),
-        **{f"Carleman, degree {degree}": _error(carleman(plant, degree), truth) for degree in DEGREES},
+        "linearisation at x₀": float(np.mean([relative_error(X, x) for X, x in zip(local, truth, strict=True)])),
+        "linearisation at 0": _mean_error(at_rest, truth),
+        **{f"Carleman, degree {degree}": _mean_error(linearise_carleman(plant, degree), truth) for degree in DEGREES},
     }
     page.text(
         "## Van der Pol: prediction over 3 s",
@@ -106,47 +124,47 @@ def van_der_pol(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     page.table(
         ("predictor", "the paper [%]", "ours [%]"),
         [
-            (f"N = {n}", f"{said}", f"{100 * own.mean():.1f} ± {100 * own.std():.1f}")
-            for n, said, own in zip(SIZES, PAPER, found.T, strict=True)
+            (f"N = {n}", f"{paper_error}", f"{100 * ours.mean():.1f} ± {100 * ours.std():.1f}")
+            for n, paper_error, ours in zip(SIZES, PAPER, errors.T, strict=True)
         ]
-        + [(name, _SAID.get(name, "diverges"), _large(error)) for name, error in other.items()],
+        + [(name, _PAPER_ERRORS.get(name, "diverges"), _format_large(error)) for name, error in other.items()],
     )
     at = int(np.argmin(np.abs(starts - [0.5, 0.5]).sum(axis=1)))
     curves = {
         "truth": truth[at],
         f"N = {SIZES[-1]}": model.rollout(starts[at], SQUARE),
-        "linearisation at x₀": _shown(local[at]),
-        "linearisation at 0": _shown(at_rest.rollout(starts[at], SQUARE)),
+        "linearisation at x₀": _cut_far(local[at]),
+        "linearisation at 0": _cut_far(at_rest.rollout(starts[at], SQUARE)),
     }
-    show(page, "van-der-pol", "Van der Pol: predictions from one start", DT, ("x₁", "x₂"), curves)
-    mean = 100 * found.mean(axis=0)
+    draw_curves(page, "van-der-pol", "Van der Pol: predictions from one start", DT, ("x₁", "x₂"), curves)
+    mean = 100 * errors.mean(axis=0)
     least = min(other.values())
     return [
-        judged(
+        judge_claim(
             "Van der Pol, N = 100",
             "24.4 % (15 to 45 % over draws of the data)",
             holds=15 <= mean[-1] <= 45,
             why=f"{mean[-1]:.1f} %",
             required=True,
         ),
-        judged(
+        judge_claim(
             "Van der Pol, trend",
             "the error falls from N = 5 to N = 100, from 66.5 to 24.4 %",
             holds=bool(mean[-1] < 0.6 * mean[0] and (np.diff(mean) < 5).all()),
             why=", ".join(f"{value:.0f}" for value in mean) + " %",
             required=True,
         ),
-        judged(
+        judge_claim(
             "Van der Pol, comparison",
             "linearisations at x₀ and 0 and Carleman's are off by hundreds of % and more",
             holds=100 * least > 300,
-            why=f"the best of them by {_large(least)} %",
+            why=f"the best of them by {_format_large(least)} %",
             required=True,
         ),
     ]
 
 
-def carleman(plant: StepMap, degree: int) -> LinearPredictor:
+def linearise_carleman(plant: StepMap, degree: int) -> LinearPredictor:
     """Return Carleman's linearisation of ẋ₁ = 2x₂, ẋ₂ = −.8x₁ + 2x₂ − 10x₁²x₂ + u on all monomials to `degree`."""
     powers = [(i, n - i) for n in range(1, degree + 1) for i in range(n, -1, -1)]
     place = {power: k for k, power in enumerate(powers)}
@@ -169,26 +187,26 @@ def carleman(plant: StepMap, degree: int) -> LinearPredictor:
     return LinearPredictor(both[:-1, :-1], both[:-1, -1:], C, lifting, DT, plant.states, plant.inputs)
 
 
-def _data(plant: StepMap, rng: np.random.Generator, episodes: int, steps: int, first: int = 0) -> Episodes:
-    """Return trajectories under inputs in ±1 from starts in [−1, 1]², of the states from number `first` on."""
+def _collect_data(plant: StepMap, rng: np.random.Generator, episodes: int, steps: int, first: int = 0) -> Episodes:
+    """Return trajectories under inputs in ±1 from starts in [−1, 1]²; they keep the states from index `first` on."""
     U = rng.uniform(-1, 1, (episodes, steps, 1))
     X = plant.rollouts(rng.uniform(-1, 1, (episodes, 2)), U)
-    each = [Episode(X=x[:, first:], U=u) for x, u in zip(X, U, strict=True)]
-    return Episodes(each, DT, plant.states[first:], plant.inputs)
+    parts = [Episode(X=x[:, first:], U=u) for x, u in zip(X, U, strict=True)]
+    return Episodes(parts, DT, plant.states[first:], plant.inputs)
 
 
-def _error(model: LinearPredictor, truth: Float[np.ndarray, "E T1 2"]) -> float:
+def _mean_error(model: LinearPredictor, truth: Float[np.ndarray, "E T1 2"]) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.mean([relative(model.rollout(x[0], SQUARE), x) for x in truth]))
+        return float(np.mean([relative_error(model.rollout(x[0], SQUARE), x) for x in truth]))
 
 
-def _shown(X: Float[np.ndarray, "T1 2"]) -> Float[np.ndarray, "T1 2"]:
-    """Return the rows up to the first that is far outside of the picture."""
+def _cut_far(X: Float[np.ndarray, "T1 2"]) -> Float[np.ndarray, "T1 2"]:
+    """Return the rows before the first one that is far outside the picture."""
     far = np.abs(X).max(axis=1) > 2
     return X[: int(far.argmax())] if far.any() else X
 
 
-def _large(error: float) -> str:
+def _format_large(error: float) -> str:
     return f"{100 * error:.2g}" if error > 10 else percent(error)
 
 
@@ -203,32 +221,32 @@ class Loop(NamedTuple):
 
     @property
     def solved(self) -> int:
-        """How many steps ended with every limit kept."""
+        """Number of steps whose plan kept every limit."""
         return sum(status in SOLVED for status in self.statuses)
 
 
-def motor(page: Page, quick: bool, tell: Tell) -> list[Claim]:
-    """Follow a step and a cosine, with lifted models of several draws and with local linearisations."""
-    tell("motor: models")
+def reproduce_motor(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+    """Follow a step and a cosine with lifted models of several draws of data, and with local linearisations."""
+    progress("motor: models")
     plant = discretize(load_problem("bilinear_motor").dynamics, DT)
     seeds, episodes = (1, 50) if quick else (3, 200)
-    models = [_model(plant, seed, episodes) for seed in range(seeds)]
-    tell("motor: closed loops")
+    models = [_fit_motor(plant, seed, episodes) for seed in range(seeds)]
+    progress("motor: closed loops")
     free = Limits(u_min=-1, u_max=1)
     cost = Cost(Q=1.0, R=0.01, tail=0, u_target="zero")
     on_speed = Cost(Q=1.0, R=0.01, tail=0, of=State("speed"), u_target="zero")
     narrow = Limits(u_min=-1, u_max=1, x_min=[-LIMIT], x_max=[LIMIT], slack=None)
     wide = Limits(u_min=-1, u_max=1, x_min=[-np.inf, -LIMIT], x_max=[np.inf, LIMIT], slack=None)
-    steps = [loop(plant, KoopmanMPC(m, cost, free, HORIZON), [0.0, 0.6], STEP) for m in models]
-    turns = [loop(plant, KoopmanMPC(m, cost, narrow, HORIZON), [-0.1, 0.1], COSINE) for m in models]
-    local_step = loop(plant, linearised(plant, [0.0, 0.6], on_speed, free), [0.0, 0.6], STEP)
-    local_turn = loop(plant, linearised(plant, [-0.1, 0.1], on_speed, wide), [-0.1, 0.1], COSINE)
+    steps = [run_loop(plant, KoopmanMPC(m, cost, free, HORIZON), [0.0, 0.6], STEP) for m in models]
+    turns = [run_loop(plant, KoopmanMPC(m, cost, narrow, HORIZON), [-0.1, 0.1], COSINE) for m in models]
+    local_step = run_loop(plant, make_local_mpc(plant, [0.0, 0.6], on_speed, free), [0.0, 0.6], STEP)
+    local_turn = run_loop(plant, make_local_mpc(plant, [-0.1, 0.1], on_speed, wide), [-0.1, 0.1], COSINE)
     lost = next((k for k, status in enumerate(local_turn.statuses) if status not in SOLVED), None)
     page.text(
         "## The motor: control from the speed alone",
-        f"""{seeds} draws of data and centres. The local MPC knows the equations and both states, and is linearised
-        anew at every step, at the state and the last input. Both have hard limits; where no input
-        keeps them, the last plan goes on.""",
+        f"""{seeds} draws of data and centres. The local MPC knows the equations and both states; it is linearised
+        at every step, at the state and the last input. Both controllers have hard limits. If no input keeps
+        them, the last plan is continued.""",
     )
     page.table(
         ("case", "controller", "cost", "steps solved", "max |y|", "median step"),
@@ -258,12 +276,12 @@ def motor(page: Page, quick: bool, tell: Tell) -> list[Claim]:
             "Koopman MPC": np.column_stack([lifted.y, lifted.u]),
             "local MPC": np.column_stack([other.y, other.u]),
         }
-        show(page, name, caption, DT, ("speed y", "field u"), curves)
+        draw_curves(page, name, caption, DT, ("speed y", "field u"), curves)
     totals = [one.cost for one in steps]
     spread = f"{min(totals):.3f} to {max(totals):.3f}" if seeds > 1 else f"{totals[0]:.3f}"
     widest, worst = max(float(np.abs(one.y).max()) for one in turns), min(one.solved for one in turns)
     return [
-        judged(
+        judge_claim(
             "motor, step: cost",
             "3.31 to 3.34",
             holds=min(totals) >= 3.305 and max(totals) <= 3.345,
@@ -271,17 +289,19 @@ def motor(page: Page, quick: bool, tell: Tell) -> list[Claim]:
             why=spread,
             required=True,
         ),
-        compared("motor, step: cost of the local MPC", 3.318, local_step.cost, 0.005, digits=4),
-        judged(
+        compare_value("motor, step: cost of the local MPC", 3.318, local_step.cost, 0.005, digits=4),
+        judge_claim(
             "motor, cosine: solved",
             "all 300 of 300 steps",
             holds=worst == STEPS,
             why=f"{worst} of {STEPS}",
             required=True,
         ),
-        judged("motor, cosine: |y|", "never beyond 0.41", holds=widest <= 0.41, why=f"{widest:.4f}", required=True),
-        compared("motor, cosine: cost", 2.36, float(np.mean([one.cost for one in turns])), 0.05 * 2.36, digits=3),
-        judged(
+        judge_claim(
+            "motor, cosine: |y|", "never beyond 0.41", holds=widest <= 0.41, why=f"{widest:.4f}", required=True
+        ),
+        compare_value("motor, cosine: cost", 2.36, float(np.mean([one.cost for one in turns])), 0.05 * 2.36, digits=3),
+        judge_claim(
             "motor, cosine: local MPC",
             "infeasible at about 0.2 s",
             holds=lost is not None and 0.1 <= (lost + 1) * DT <= 0.3,
@@ -289,7 +309,7 @@ def motor(page: Page, quick: bool, tell: Tell) -> list[Claim]:
             why="never" if lost is None else f"at {(lost + 1) * DT:.2f} s",
             required=True,
         ),
-        judged(
+        judge_claim(
             "motor: time of a step",
             "6.86 ms, local MPC 103 ms",
             holds=steps[0].time < 6.86e-3 and steps[0].time < local_step.time,
@@ -298,15 +318,15 @@ def motor(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     ]
 
 
-def linearised(plant: StepMap, x: list[float], cost: Cost, limits: Limits) -> LinearMPC:
-    """Return MPC with the horizon of the motor that `loop` linearises at every step."""
+def make_local_mpc(plant: StepMap, x: list[float], cost: Cost, limits: Limits) -> LinearMPC:
+    """Return an MPC with the motor's horizon; `run_loop` linearises it at every step."""
     return LinearMPC(plant, x, [0.0], cost, limits, HORIZON)
 
 
-def loop(plant: StepMap, controller: KoopmanMPC, x0: list[float], reference: Float[np.ndarray, " T1"]) -> Loop:
-    """Run 300 steps after one with u = 0, which fills the delay; the reference is held over the horizon.
+def run_loop(plant: StepMap, controller: KoopmanMPC, x0: list[float], reference: Float[np.ndarray, " T1"]) -> Loop:
+    """Run 300 steps after one with u = 0, which fills the delay; the reference is constant over the horizon.
 
-    A `LinearMPC` measures both states, and is linearised anew at every step.
+    A `LinearMPC` measures both states and is linearised at every step.
     """
     local = isinstance(controller, LinearMPC)
     controller.reset(u_prev=[0.0])
@@ -316,38 +336,38 @@ def loop(plant: StepMap, controller: KoopmanMPC, x0: list[float], reference: Flo
     x = plant(x, u)
     Y, U, statuses, times = np.empty(STEPS), np.empty(STEPS), list[Status](), list[float]()
     for k in range(STEPS):
-        own = 0.0
+        update_time = 0.0
         if local:
-            began = perf_counter()
+            start = perf_counter()
             controller.update(LinearPredictor.local(plant, x, u))
-            own = perf_counter() - began
+            update_time = perf_counter() - start
         move = controller(x if local else x[1:], reference[k + 1 : k + 2], applied=u)
         u = move.u
         Y[k], U[k] = x[1], u[0]
         statuses.append(move.status)
-        times.append(own + move.solve_time)
+        times.append(update_time + move.solve_time)
         x = plant(x, u)
     cost = float(np.sum((Y - reference[1:]) ** 2 + 0.01 * U**2))
     return Loop(Y, U, cost, statuses, float(np.median(times)))
 
 
-def _model(plant: StepMap, seed: int, episodes: int) -> LinearPredictor:
+def _fit_motor(plant: StepMap, seed: int, episodes: int) -> LinearPredictor:
     """Fit thin plates on ζ = [y_k, u_k₋₁, y_k₋₁] to the speed and the input."""
     rng = np.random.default_rng(seed)
-    data = _data(plant, rng, episodes, 1000, first=1)
+    data = _collect_data(plant, rng, episodes, 1000, first=1)
     with unwarned():
         return edmd(data, State() + ThinPlate(rng.uniform(-1, 1, (100, 3))), embedding=Delay(1))
 
 
-def kdv(page: Page, quick: bool, tell: Tell) -> list[Claim]:
-    """Fit [y, 1, yᵢyᵢ₊₁, y²] to data, and move the wave along three levels."""
-    tell("Korteweg–de Vries: data and model")
+def reproduce_kdv(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+    """Fit [y, 1, yᵢyᵢ₊₁, y²] to data, and control the mean of the wave to three levels."""
+    progress("Korteweg–de Vries: data and model")
     problem = load_problem("kdv")
     plant = discretize(problem.dynamics, problem.dt, problem.integrator)
-    data = _waves(40 if quick else 1000, plant.states, plant.inputs)
+    data = _collect_waves(40 if quick else 1000, plant.states, plant.inputs)
     with unwarned():
         model = edmd(data, problem.lifting, ridge=1e-9)
-    tell("Korteweg–de Vries: closed loop")
+    progress("Korteweg–de Vries: closed loop")
     steps = round((5.0 if quick else SECONDS) / DT)
     rows = np.searchsorted([1 / 4, 2 / 3], np.arange(steps + 1) / steps, side="right")
     reference = np.tile(np.array(LEVELS)[rows, None], (1, POINTS))
@@ -372,21 +392,21 @@ def kdv(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     none = np.full((steps + 1, 4), np.nan)
     curves = {"reference": np.column_stack([asked, none]), "Koopman MPC": np.column_stack([mean, bend, held])}
     columns = ("mean of y", "standard deviation of y", *(f"u, {name.split(' [')[0]}" for name in plant.inputs))
-    show(page, "kdv", "Korteweg–de Vries: three levels of the mean", DT, columns, curves)
+    draw_curves(page, "kdv", "Korteweg–de Vries: three levels of the mean", DT, columns, curves)
     limited = np.array([status is not Status.UNCONSTRAINED for status in run.status])
     time, busy = 1e3 * seen.solve_time_p50, 1e3 * float(np.median(run.solve_time[limited]))
     return [
-        judged(
+        judge_claim(
             "KdV: levels",
             "the mean follows .5, 0 and .75",
             holds=max(off) < 0.02,
             why="off by " + ", ".join(f"{value:.4f}" for value in off) + " at the end of each",
             required=not quick,
         ),
-        judged(
+        judge_claim(
             "KdV: forces", "|u| ≤ 1 in all steps", holds=float(np.abs(run.U).max()) <= 1 + 1e-9, why=f"{steps} steps"
         ),
-        judged(
+        judge_claim(
             "KdV: time of a step",
             "0.28 ms",
             holds=max(time, busy) <= 0.28,
@@ -395,8 +415,8 @@ def kdv(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     ]
 
 
-def advanced(y: Float[np.ndarray, "E 128"], u: Float[np.ndarray, "E 3"]) -> Float[np.ndarray, "E 128"]:
-    """Return y a step later: half a step of y_xxx, one of RK4 of u's forces less y y_x, half a step of y_xxx."""
+def advance_wave(y: Float[np.ndarray, "E 128"], u: Float[np.ndarray, "E 3"]) -> Float[np.ndarray, "E 128"]:
+    """Return y one step later by splitting: half a step of −y_xxx, an RK4 step of u's forces − y y_x, half a step."""
     half, force = np.exp(0.5j * DT * WAVE**3), u @ FORCES
 
     def rest(y: Float[np.ndarray, "E 128"]) -> Float[np.ndarray, "E 128"]:
@@ -410,14 +430,14 @@ def advanced(y: Float[np.ndarray, "E 128"], u: Float[np.ndarray, "E 3"]) -> Floa
     return np.fft.irfft(half * np.fft.rfft(y), POINTS)
 
 
-def _waves(episodes: int, states: tuple[str, ...], inputs: tuple[str, ...], steps: int = 200) -> Episodes:
-    """Return trajectories from mixtures of the three shapes, under forces that are drawn anew at every step."""
+def _collect_waves(episodes: int, states: tuple[str, ...], inputs: tuple[str, ...], steps: int = 200) -> Episodes:
+    """Return trajectories from mixtures of the three shapes, under random forces that change at every step."""
     rng = np.random.default_rng(0)
     X, U = np.empty((steps + 1, episodes, POINTS)), rng.uniform(-1, 1, (steps, episodes, 3))
     X[0] = rng.dirichlet([1.0, 1.0, 1.0], episodes) @ SHAPES
     for k in range(steps):
-        X[k + 1] = advanced(X[k], U[k])
+        X[k + 1] = advance_wave(X[k], U[k])
     return Episodes([Episode(X=X[:, e], U=U[:, e]) for e in range(episodes)], DT, states, inputs)
 
 
-paper = short("korda", __doc__, work)
+paper = make_paper("korda", __doc__, reproduce_korda)

@@ -1,4 +1,4 @@
-"""The plants of the papers, and their trajectories, integrated far below every error that is reported.
+"""The plants of the papers and their trajectories; integration errors are far below all reported errors.
 
 Pendulum and cart-pole as in Snyder & Song, "Koopman operator theory for nonlinear dynamic modeling using dynamic mode
 decomposition", 2021; the cart-pole with damping is that of Brunton & Kutz, "Data-Driven Science and Engineering",
@@ -18,15 +18,15 @@ from koopmpc import checks
 from koopmpc.control.lqr import lqr
 from koopmpc.control.riccati import Gain
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.plants.dynamics import RK4, Dynamics, right_side
+from koopmpc.plants.dynamics import RK4, Dynamics, build_right_side
 from koopmpc.plants.step_map import StepMap
 
-SUBSTEPS = 8  # RK4 steps in a sample of 0.01 s, for an error below 1e-12
+SUBSTEPS = 8  # RK4 steps in a sample; in a sample of 0.01 s the error is below 1e-12
 
 
 @dataclass(frozen=True)
 class Pendulum(Dynamics):
-    """θ̈ = ∓(g/L) sin θ + u / (m L²): θ = 0 hangs, or with `upright` stands."""
+    """θ̈ = ∓(g/L) sin θ + u / (m L²); θ = 0 is hanging, or upright if `upright`."""
 
     states = ("theta [rad]", "omega [rad/s]")
     inputs = ("torque [N m]",)
@@ -63,10 +63,12 @@ class CartPole(Dynamics):
         return ca.vertcat(x[1], acceleration, x[3], -(acceleration * C + self.g * S) / self.L)
 
 
-def jacobians(dynamics: Dynamics, x: ArrayLike) -> tuple[Float[np.ndarray, "nx nx"], Float[np.ndarray, "nx nu"]]:
-    """Return A = ∂f/∂x and B = ∂f/∂u of ẋ = f(x, u) at (x, 0), exactly."""
+def linearize_exactly(
+    dynamics: Dynamics, x: ArrayLike
+) -> tuple[Float[np.ndarray, "nx nx"], Float[np.ndarray, "nx nu"]]:
+    """Return the exact A = ∂f/∂x and B = ∂f/∂u of ẋ = f(x, u) at (x, 0)."""
     point = checks.array(x, "x", (dynamics.nx,))
-    f = right_side(dynamics)
+    f = build_right_side(dynamics)
     a, b = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
     value = f(a, b)
     both = ca.Function("jacobians", [a, b], [ca.jacobian(value, a), ca.jacobian(value, b)])
@@ -74,20 +76,20 @@ def jacobians(dynamics: Dynamics, x: ArrayLike) -> tuple[Float[np.ndarray, "nx n
     return np.array(ca.DM(A).full()), np.array(ca.DM(B).full())
 
 
-def gain(dynamics: Dynamics, x: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
+def design_feedback(dynamics: Dynamics, x: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
     """Return the continuous-time LQR of the linearisation at (x, 0)."""
-    return lqr(*jacobians(dynamics, x), Q, R)
+    return lqr(*linearize_exactly(dynamics, x), Q, R)
 
 
-def printed_gain(plant: CartPole, Q: ArrayLike, R: ArrayLike) -> Gain:
+def design_printed_feedback(plant: CartPole, Q: ArrayLike, R: ArrayLike) -> Gain:
     """Return the LQR of the Jacobian as the databook prints it, with the wrong sign of ∂v̇/∂θ at θ = π."""
-    A, B = jacobians(plant, [0.0, 0.0, np.pi, 0.0])
+    A, B = linearize_exactly(plant, [0.0, 0.0, np.pi, 0.0])
     A[1, 2] = -A[1, 2]
     return lqr(A, B, Q, R)
 
 
-def frequency(plant: Pendulum, amplitude: float) -> float:
-    """Return ω = π √(g/L) / (2 K(sin² θ₀/2)) [rad/s] of the hanging pendulum let go at θ₀.
+def swing_frequency(plant: Pendulum, amplitude: float) -> float:
+    """Return ω = π √(g/L) / (2 K(sin² θ₀/2)) [rad/s] of the hanging pendulum released at rest at θ₀.
 
     K is the complete elliptic integral of the first kind, and the period 4 √(L/g) K.
     """
@@ -95,7 +97,7 @@ def frequency(plant: Pendulum, amplitude: float) -> float:
     return float(np.pi / 2 * np.sqrt(plant.g / plant.L)) / quarter
 
 
-def trajectories(
+def integrate_trajectories(
     dynamics: Dynamics,
     starts: ArrayLike,
     *,
@@ -105,7 +107,7 @@ def trajectories(
     x_ref: ArrayLike = 0.0,
     held: bool = False,
 ) -> Episodes:
-    """Return x(k dt), k = 0 … steps, of ẋ = f(x, −K (x − x_ref)) from each start, without its inputs.
+    """Return x(k dt), k = 0 … steps, of ẋ = f(x, −K (x − x_ref)) from each start, without the inputs.
 
     Parameters
     ----------
@@ -114,11 +116,11 @@ def trajectories(
     dt
         Sample time [s].
     K
-        (nu, nx), or (nx,) where nu is 1; no input by default.
+        (nu, nx), or (nx,) if nu is 1; no input by default.
     x_ref
         Scalar or (nx,), the target of the feedback.
     held
-        Whether u = −K (x_k − x_ref) is held over a sample; by default the feedback is continuous.
+        True: u = −K (x_k − x_ref) is held over a sample. False: the feedback is continuous.
     """
     nx, nu = dynamics.nx, dynamics.nu
     rows = np.atleast_2d(checks.array(starts, "starts"))
@@ -126,24 +128,24 @@ def trajectories(
     matrix = np.zeros((nu, nx)) if K is None else checks.array(K, "K").reshape(nu, nx)
     x, u, none = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("none", 0)
     law = -ca.DM(matrix) @ (x - ca.DM(target))
-    f = right_side(dynamics)
+    f = build_right_side(dynamics)
     F = RK4(SUBSTEPS).step(f if held else ca.Function("f", [x, u], [f(x, law)]), dt)
     sampled = ca.Function("F", [x, none], [F(x, law)])
     X = StepMap(sampled, dt, states=dynamics.states, inputs=()).rollouts(rows, np.empty((len(rows), steps, 0)))
-    return Episodes([Episode(X=each) for each in X], dt, dynamics.states)
+    return Episodes([Episode(X=rows) for rows in X], dt, dynamics.states)
 
 
-def inputs_of(data: Episodes, names: tuple[str, ...], K: ArrayLike, x_ref: ArrayLike = 0.0) -> Episodes:
-    """Return the same episodes with the inputs u_k = −K (x_k − x_ref) that drove them."""
+def attach_inputs(data: Episodes, names: tuple[str, ...], K: ArrayLike, x_ref: ArrayLike = 0.0) -> Episodes:
+    """Return the episodes with the inputs u_k = −K (x_k − x_ref) that drove them."""
     matrix = checks.array(K, "K").reshape(len(names), data.nx)
     target = checks.vector(x_ref, "x_ref", data.nx)
-    known = [Episode(X=e.X, U=-(e.X[:-1] - target) @ matrix.T) for e in data]
-    return Episodes(known, data.dt, data.states, names)
+    episodes = [Episode(X=e.X, U=-(e.X[:-1] - target) @ matrix.T) for e in data]
+    return Episodes(episodes, data.dt, data.states, names)
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """ẋ = f(x, u(x)) from one start: X (T+1, nx), U (T+1, nu), and the cost so far J (T+1,) = ∫ l(x, u) dt."""
+    """ẋ = f(x, u(x)) from one start: X (T+1, nx), U (T+1, nu), and the accumulated cost J (T+1,) = ∫ l(x, u) dt."""
 
     X: Float[np.ndarray, "T1 nx"]
     U: Float[np.ndarray, "T1 nu"]
@@ -155,7 +157,7 @@ class ClosedLoop:
         return float(self.J[-1])
 
 
-def closed_loop(
+def integrate_closed_loop(
     dynamics: Dynamics,
     law: Callable[[ca.SX], ca.SX],
     stage: Callable[[ca.SX, ca.SX], ca.SX],
@@ -175,16 +177,16 @@ def closed_loop(
     x0
         (nx,).
     dt
-        Sample time [s], of `SUBSTEPS` RK4 steps.
+        Sample time [s]; each sample has `SUBSTEPS` RK4 steps.
     seconds
         Length of the run [s].
     """
     nx = dynamics.nx
     x, none = ca.SX.sym("x", nx + 1), ca.SX.sym("none", 0)
     u = ca.SX(ca.vertcat(law(x[:nx])))
-    rate = ca.vertcat(right_side(dynamics)(x[:nx], u), stage(x[:nx], u))
+    rate = ca.vertcat(build_right_side(dynamics)(x[:nx], u), stage(x[:nx], u))
     F = RK4(SUBSTEPS).step(ca.Function("f", [x, none], [rate]), dt)
     step_map = StepMap(F, dt, states=(*dynamics.states, "J"), inputs=())
-    found = step_map.rollout([*checks.array(x0, "x0", (nx,)), 0.0], np.empty((round(seconds / dt), 0)))
-    U = np.array(ca.Function("u", [x], [u]).map(len(found))(found.T)).T
-    return ClosedLoop(found[:, :nx], U, found[:, nx])
+    XJ = step_map.rollout([*checks.array(x0, "x0", (nx,)), 0.0], np.empty((round(seconds / dt), 0)))
+    U = np.array(ca.Function("u", [x], [u]).map(len(XJ))(XJ.T)).T
+    return ClosedLoop(XJ[:, :nx], U, XJ[:, nx])

@@ -1,4 +1,4 @@
-"""Three papers of Brunton, Proctor & Kutz: an exact lifting, DMD with control, and observables that hold the inputs."""
+"""Three papers of Brunton, Proctor & Kutz: an exact lifting, DMD with control, and observables of the inputs."""
 
 import warnings
 from collections.abc import Callable
@@ -19,20 +19,25 @@ from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.kic import InputPredictor, kic
 from koopmpc.lifting.state import Expressions, State
-from koopmpc.papers.plants import closed_loop
-from koopmpc.papers.registry import Claim, Tell, compared, judged, short, show, written
+from koopmpc.page import Page
+from koopmpc.papers.plants import integrate_closed_loop
+from koopmpc.papers.registry import Claim, TellPart, compare_value, draw_curves, format_values, judge_claim, make_paper
 from koopmpc.plants.dynamics import RK4
 from koopmpc.plants.step_map import discretize
-from koopmpc.recording.page import Page
 
+# The slow manifold
+START = (-5.0, 5.0)
+SECONDS = 50.0  # length of a run [s]
+DT = 0.01  # sample time [s]
+# DMD with control: the paper's data (rows are samples) and its plant x⁺ = A x + B u
 X = np.array([[4.0, 2.0, 1.0, 0.5, 0.25], [7.0, 0.7, 0.07, 0.007, 0.0007]]).T
 U = np.array([[-4.0, -2.0, -1.0, -0.5]]).T
-A, B = np.diag([1.5, 0.1]), np.array([[1.0], [0.0]])
-FREE = np.array([1.0, 1.0])  # a start from which nothing holds the plant
-START, SECONDS, DT = (-5.0, 5.0), 50.0, 0.01  # of the slow manifold
+A = np.diag([1.5, 0.1])
+B = np.array([[1.0], [0.0]])
+FREE = np.array([1.0, 1.0])  # start of the runs without input
 
 
-def of_brunton(page: Page, quick: bool, tell: Tell) -> list[Claim]:
+def reproduce_brunton(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     """Brunton et al. 2016: the slow manifold, which three observables make linear.
 
     S. Brunton, B. Brunton, J. Proctor and N. Kutz, *Koopman Invariant Subspaces and Finite Linear Representations of
@@ -48,7 +53,7 @@ def of_brunton(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     A = np.array([[mu, 0.0, 0.0], [0.0, lam, -lam], [0.0, 0.0, 2 * mu]])
     B = np.array([[0.0], [1.0], [0.0]])
     plant = load_problem("slow_manifold").dynamics
-    tell("three feedbacks")
+    progress("three feedbacks")
     local, lifted = lqr(A[:2, :2], B[:2], [1.0, 1.0], 1.0).K.ravel(), lqr(A, B, [1.0, 1.0, 0.0], 1.0)
     K = lifted.K.ravel()
     gains = {  # u = −k · [x₁, x₂, x₁²]
@@ -57,7 +62,7 @@ def of_brunton(page: Page, quick: bool, tell: Tell) -> list[Claim]:
         "feedback linearisation": [*local, -lam],
     }
     runs = {
-        name: closed_loop(
+        name: integrate_closed_loop(
             plant,
             lambda x, k=tuple(k): -ca.dot(ca.DM(k), ca.vertcat(x, x[0] ** 2)),
             lambda x, u: ca.sumsqr(x) + ca.sumsqr(u),
@@ -69,8 +74,8 @@ def of_brunton(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     }
     curves = {name: np.column_stack([run.X, run.U, run.J]) for name, run in runs.items()}
     page.text("## The three feedbacks")
-    show(page, "costs", "States, input and cost so far", DT, ("x₁", "x₂", "u", "J"), curves)
-    tell("the plant from data")
+    draw_curves(page, "costs", "States, input and cost so far", DT, ("x₁", "x₂", "u", "J"), curves)
+    progress("the plant from data")
     step_map = discretize(plant, 0.05, RK4(10))
     data = collect(step_map, Uniform([-2.0, -2.0], [2.0, 2.0]), Noise(-1.0, 1.0), episodes=20, steps=40)
     model = edmd(data, State() + Expressions(lambda x: [x[0] ** 2], ["x1²"]))
@@ -89,31 +94,31 @@ def of_brunton(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     page.table(("eigenvalue", "exact", "from data"), rows)
     start = np.array([*START, START[0] ** 2])
     return [
-        compared("K of the linearisation", [0.0, 2.414214], local, 5e-7, digits=7),
-        compared("K of the lifted plant", [0.0, 2.414214, -1.495597], K, 5e-7, digits=7),
-        compared("J, LQR of the linearisation", 4485.19, runs["LQR, linearisation"].cost, 0.005),
-        compared("J, LQR of the lifted plant", 990.174, runs["LQR, [x₁, x₂, x₁²]"].cost, 0.0005),
-        compared("z₀ᵀPz₀, its endless horizon", 990.180, float(start @ lifted.P @ start), 0.0005),
-        compared("J, feedback linearisation", 1373.95, runs["feedback linearisation"].cost, 0.005),
-        compared("K from data", [0.0, 2.414214, -1.495597], learned, 5e-6, digits=7),
+        compare_value("K of the linearisation", [0.0, 2.414214], local, 5e-7, digits=7),
+        compare_value("K of the lifted plant", [0.0, 2.414214, -1.495597], K, 5e-7, digits=7),
+        compare_value("J, LQR of the linearisation", 4485.19, runs["LQR, linearisation"].cost, 0.005),
+        compare_value("J, LQR of the lifted plant", 990.174, runs["LQR, [x₁, x₂, x₁²]"].cost, 0.0005),
+        compare_value("z₀ᵀPz₀, its endless horizon", 990.180, float(start @ lifted.P @ start), 0.0005),
+        compare_value("J, feedback linearisation", 1373.95, runs["feedback linearisation"].cost, 0.005),
+        compare_value("K from data", [0.0, 2.414214, -1.495597], learned, 5e-6, digits=7),
     ]
 
 
-brunton_paper = short("brunton", of_brunton.__doc__, of_brunton)
+brunton_paper = make_paper("brunton", reproduce_brunton.__doc__, reproduce_brunton)
 
 
-def of_dmdc(page: Page, quick: bool, tell: Tell) -> list[Claim]:
+def reproduce_proctor(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     """Proctor et al. 2016: DMD with control, and why feedback hides the input.
 
     J. Proctor, S. Brunton and J. N. Kutz, *Dynamic Mode Decomposition with Control*, SIAM J. Appl. Dyn. Syst. 15
     (2016), its first example.
 
-    x⁺ = diag(1.5, 0.1) x + [1, 0] u is unstable, and u = −x₁ holds it: X = [4 2 1 .5 .25; 7 .7 .07 .007 .0007], U =
-    [−4 −2 −1 −.5]. DMD leaves the input out and sees the closed loop, which is stable. DMDc with B known finds A.
-    With B unknown the rows of [X; U] are dependent: infinitely many A and B fit these data, and the fit has to say
-    so. Beyond the paper: the same plant and feedback with small noise on the input, where both are found.
+    x⁺ = diag(1.5, 0.1) x + [1, 0] u is unstable, and u = −x₁ stabilises it: X = [4 2 1 .5 .25; 7 .7 .07 .007 .0007],
+    U = [−4 −2 −1 −.5]. DMD leaves the input out and sees the closed loop, which is stable. DMDc with B known finds A.
+    With B unknown the rows of [X; U] are dependent: infinitely many A and B fit these data, and the fit must warn.
+    Beyond the paper: with small noise on the input of the same plant and feedback, the fit finds both.
     """
-    tell("fits")
+    progress("fits")
     fed = Episodes([Episode(X=X, U=U)], 1.0)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -123,7 +128,7 @@ def of_dmdc(page: Page, quick: bool, tell: Tell) -> list[Claim]:
         "DMD": dmd(Episodes([Episode(X=X)], 1.0)),
         "DMDc, B known": dmdc(fed, B=B),
         "DMDc, B unknown": blind,
-        "DMDc, B unknown, noise on u": dmdc(_shaken()),
+        "DMDc, B unknown, noise on u": dmdc(_collect_noisy()),
     }
     steps = 6
     truth = np.array([np.linalg.matrix_power(A, k) @ FREE for k in range(steps + 1)])
@@ -134,31 +139,31 @@ def of_dmdc(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     page.table(
         ("model", "A", "B", "ρ(A)"),
         [
-            (name, written(m.A, 5), written(m.B, 5) if m.nu else "–", f"{np.abs(m.eigenvalues).max():.4g}")
+            (name, format_values(m.A, 5), format_values(m.B, 5) if m.nu else "–", f"{np.abs(m.eigenvalues).max():.4g}")
             for name, m in models.items()
         ],
     )
     page.text(f"Without input from [1, 1], the plant and the models ({steps} steps):")
     free = {name: m.rollout(FREE, np.zeros((steps, m.nu))) for name, m in models.items()}
-    show(page, "free", "Without input", 1.0, ("x₁", "x₂"), {"plant": truth, **free})
+    draw_curves(page, "free", "Without input", 1.0, ("x₁", "x₂"), {"plant": truth, **free})
     noisy = models["DMDc, B unknown, noise on u"]
     return [
-        compared("DMD, A", np.diag([0.5, 0.1]), models["DMD"].A, 1e-12),
-        compared("DMDc with B known, A", A, models["DMDc, B known"].A, 1e-12),
-        compared("DMDc with B unknown, A", np.diag([0.25, 0.1]), blind.A, 1e-12),
-        compared("DMDc with B unknown, B", [[-0.25], [0.0]], blind.B, 1e-12),
-        judged(
+        compare_value("DMD, A", np.diag([0.5, 0.1]), models["DMD"].A, 1e-12),
+        compare_value("DMDc with B known, A", A, models["DMDc, B known"].A, 1e-12),
+        compare_value("DMDc with B unknown, A", np.diag([0.25, 0.1]), blind.A, 1e-12),
+        compare_value("DMDc with B unknown, B", [[-0.25], [0.0]], blind.B, 1e-12),
+        judge_claim(
             "DMDc with B unknown",
             "A and B cannot be told apart: a warning",
             holds=any("feedback made A and B inseparable" in sentence for sentence in said),
             why=said[0].split(":")[0] if said else "no warning",
             required=True,
         ),
-        compared("noise on the input (ours), A and B", np.hstack([A, B]), np.hstack([noisy.A, noisy.B]), 1e-10),
+        compare_value("noise on the input (ours), A and B", np.hstack([A, B]), np.hstack([noisy.A, noisy.B]), 1e-10),
     ]
 
 
-def _shaken() -> Episodes:
+def _collect_noisy() -> Episodes:
     """Return 20 steps of the plant under u = −x₁ and noise of ±0.1."""
     noise, states, inputs = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 1)), np.zeros((21, 2)), np.zeros((20, 1))
     states[0] = X[0]
@@ -168,14 +173,17 @@ def _shaken() -> Episodes:
     return Episodes([Episode(X=states, U=inputs)], 1.0)
 
 
-dmdc_paper = short("proctor", of_dmdc.__doc__, of_dmdc)
+dmdc_paper = make_paper("proctor", reproduce_proctor.__doc__, reproduce_proctor)
 
 
-LAM, MU, DELTA, FEEDBACK = 0.9, 0.5, 1.0, -0.3
+LAM = 0.9  # λ
+MU = 0.5  # μ
+DELTA = 1.0  # δ
+FEEDBACK = -0.3  # u = FEEDBACK x₁² in the data with feedback
 LIFTING = State() + Expressions(lambda x: [x[0] ** 2], ["x₁²"])  # x₁, x₂, u, x₁²
 STATES = [[LAM, 0.0, 0.0, 0.0], [0.0, MU, DELTA, LAM**2 - MU]]  # rows of K
 ROWS = {"exogenous": [0.0] * 4, "constant": [0.0, 0.0, 1.0, 0.0], "state": [0.0, 0.0, 0.0, FEEDBACK * LAM**2]}
-# An input of x, the signal of the episode, and the generator.
+# Input as a function of x, the constant signal of the episode, and the random generator
 InputRule = Callable[[np.ndarray, float, np.random.Generator], float]
 LAWS: dict[str, InputRule] = {
     "exogenous": lambda x, held, rng: float(rng.uniform(-1, 1)),
@@ -185,7 +193,7 @@ LAWS: dict[str, InputRule] = {
 SAF = State() + Expressions(lambda x: [x[1] - 0.2 * x[0] ** 2], ["x₂ − 0.2 x₁²"])
 
 
-def of_kic(page: Page, quick: bool, tell: Tell) -> list[Claim]:
+def reproduce_kic(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     """Proctor, Brunton & Kutz 2018: observables that hold inputs.
 
     J. Proctor, S. Brunton and J. N. Kutz, *Generalizing Koopman Theory to Allow for Inputs and Control*, SIAM J.
@@ -197,12 +205,12 @@ def of_kic(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     input is 0, the feedback, or 1. λ = 0.9, μ = 0.5, δ = 1; 20 episodes of 15 steps each. `km.identify.kic` is the
     fit.
 
-    Beside it the system of SafEDMD (Strässer et al. 2024), ẋ₁ = μ x₁, ẋ₂ = λ (x₂ − x₁²) + u with μ = −2, λ = 1,
-    sampled at 0.01 s: on [x₁, x₂, x₂ − 0.2 x₁²] its input enters as it is, and the model is exact.
+    In addition the system of SafEDMD (Strässer et al. 2024), ẋ₁ = μ x₁, ẋ₂ = λ (x₂ − x₁²) + u with μ = −2, λ = 1,
+    sampled at 0.01 s: on [x₁, x₂, x₂ − 0.2 x₁²] its input enters linearly, and the model is exact.
     """
-    tell("three kinds of input")
+    progress("three kinds of input")
     claims: list[Claim] = []
-    data = {kind: _episodes(law) for kind, law in LAWS.items()}
+    data = {kind: _collect_inputs(law) for kind, law in LAWS.items()}
     with unwarned():
         found = {kind: kic(each, LIFTING, inputs=cast("Any", kind)) for kind, each in data.items()}
     page.text(
@@ -213,50 +221,50 @@ def of_kic(page: Page, quick: bool, tell: Tell) -> list[Claim]:
     rows: list[tuple[object, ...]] = []
     for kind, fit in found.items():
         exact, m = np.array([*STATES, ROWS[kind], [0.0, 0.0, 0.0, LAM**2]]), fit.model
-        rows.append((kind, written(m.A, 4), written(np.sort(np.real(m.eigenvalues)), 4)))
+        rows.append((kind, format_values(m.A, 4), format_values(np.sort(np.real(m.eigenvalues)), 4)))
         Z = m.lift(np.vstack([np.hstack([e.X[:-1], e.U]) for e in data[kind]]))
         missed = float(np.abs(Z @ (m.A - exact).T).max())
-        claims.append(compared(f"{kind}: largest misfit of K ψ on the data", 0.0, missed, 1e-10))
+        claims.append(compare_value(f"{kind}: largest misfit of K ψ on the data", 0.0, missed, 1e-10))
         if kind != "state":
-            claims.append(compared(f"{kind}: K", exact, m.A, 1e-10))
+            claims.append(compare_value(f"{kind}: K", exact, m.A, 1e-10))
     page.table(("input", "K", "eigenvalues"), rows)
     free = found["exogenous"]
     linear, exact = free.linear(), [[LAM, 0, 0, 0], [0, MU, LAM**2 - MU, DELTA], [0, 0, LAM**2, 0]]
-    claims.append(compared("exogenous: [A B] of z⁺ = A z + B u", exact, np.hstack([linear.A, linear.B]), 1e-10))
-    _ahead(page, free, claims)
-    tell("an input that enters as it is")
-    claims += _safe(page)
+    claims.append(compare_value("exogenous: [A B] of z⁺ = A z + B u", exact, np.hstack([linear.A, linear.B]), 1e-10))
+    _predict_sine(page, free, claims)
+    progress("an input that enters as it is")
+    claims += _check_safedmd(page)
     return claims
 
 
-def _episodes(law: InputRule) -> Episodes:
+def _collect_inputs(law: InputRule) -> Episodes:
     rng, found = np.random.default_rng(0), list[Episode]()
     for _ in range(20):
         X, U, held = np.zeros((16, 2)), np.zeros((15, 1)), float(rng.uniform(-1, 1))
         X[0] = rng.uniform(-1, 1, 2)
         for k in range(15):
             U[k] = law(X[k], held, rng)
-            X[k + 1] = _step(X[k], U[k])
+            X[k + 1] = _step_plant(X[k], U[k])
         found.append(Episode(X=X, U=U))
     return Episodes(found, 1.0, ("x1", "x2"), ("u",))
 
 
-def _step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+def _step_plant(x: np.ndarray, u: np.ndarray) -> np.ndarray:
     return np.array([LAM * x[0], MU * x[1] + (LAM**2 - MU) * x[0] ** 2 + DELTA * u[0]])
 
 
-def _ahead(page: Page, free: InputPredictor, claims: list[Claim]) -> None:
-    """Predict an input that was not in the data."""
+def _predict_sine(page: Page, free: InputPredictor, claims: list[Claim]) -> None:
+    """Predict the response to an input that the data do not contain."""
     U = np.sin(np.arange(40) / 4)[:, None]
     X = [np.array([1.0, -1.0])]
     for u in U:
-        X.append(_step(X[-1], u))
+        X.append(_step_plant(X[-1], u))
     told = free.rollout(X[0], U)
-    claims.append(compared("40 steps under a sine", 0.0, float(np.abs(told - X).max()), 1e-9))
-    show(page, "sine", "Under a sine, which no data held", 1.0, ("x₁", "x₂"), {"plant": np.array(X), "K": told})
+    claims.append(compare_value("40 steps under a sine", 0.0, float(np.abs(told - X).max()), 1e-9))
+    draw_curves(page, "sine", "Under a sine, which no data held", 1.0, ("x₁", "x₂"), {"plant": np.array(X), "K": told})
 
 
-def _safe(page: Page) -> list[Claim]:
+def _check_safedmd(page: Page) -> list[Claim]:
     slow = replace(cast("Any", load_problem("slow_manifold").dynamics), mu=-2.0, lam=1.0)
     plant = discretize(slow, 0.01, RK4(4))
     data = collect(plant, Uniform([-1.0, -1.0], [1.0, 1.0]), Noise(-1.0, 1.0), episodes=20, steps=20)
@@ -265,12 +273,12 @@ def _safe(page: Page) -> list[Claim]:
     missed = model.lift(pairs.X_next) - model.lift(pairs.X) @ model.A.T - pairs.U @ model.B.T
     values: np.ndarray = np.sort(np.real(model.eigenvalues))
     page.text("## The system of SafEDMD")
-    page.table(("A", "B"), [(written(model.A, 8), written(model.B, 8))])
+    page.table(("A", "B"), [(format_values(model.A, 8), format_values(model.B, 8))])
     return [
-        compared("SafEDMD: eigenvalues", [0.960789, 0.980199, 1.010050], values, 5e-7, digits=7),
-        compared("SafEDMD: B", [[0.0], [0.01005017], [0.01005017]], model.B, 5e-9, digits=8),
-        compared("SafEDMD: residual of a step", 0.0, float(np.abs(missed).max()), 1e-12),
+        compare_value("SafEDMD: eigenvalues", [0.960789, 0.980199, 1.010050], values, 5e-7, digits=7),
+        compare_value("SafEDMD: B", [[0.0], [0.01005017], [0.01005017]], model.B, 5e-9, digits=8),
+        compare_value("SafEDMD: residual of a step", 0.0, float(np.abs(missed).max()), 1e-12),
     ]
 
 
-kic_paper = short("kic", of_kic.__doc__, of_kic)
+kic_paper = make_paper("kic", reproduce_kic.__doc__, reproduce_kic)

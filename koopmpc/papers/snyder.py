@@ -1,6 +1,7 @@
-"""Snyder & Song 2021, done again: the verdicts on its claims, what it left open, its figures and their numbers."""
+"""Snyder & Song 2021, reproduced: verdicts on its claims, choices that it leaves open, its figures and their values."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -8,36 +9,46 @@ from koopmpc.data.collect import collect
 from koopmpc.data.excitation import Noise
 from koopmpc.errors import unwarned
 from koopmpc.figures.series import reconstruction
+from koopmpc.figures.style import save
 from koopmpc.identify.fits.dmd import dmd, dmdc
+from koopmpc.page import Page
 from koopmpc.papers import snyder_control as control
 from koopmpc.papers import snyder_theory as theory
-from koopmpc.papers.plants import Pendulum, inputs_of, trajectories
-from koopmpc.papers.registry import Claim, Paper, Tell, judged, percent, relative, summary, verdicts
+from koopmpc.papers.plants import Pendulum, attach_inputs, integrate_trajectories
+from koopmpc.papers.registry import (
+    Claim,
+    Paper,
+    TellPart,
+    add_verdicts,
+    judge_claim,
+    percent,
+    relative_error,
+    summarise_claims,
+)
 from koopmpc.papers.snyder_settings import (
     FIGURES,
     SHAKINGS,
     TASKS,
     VARIANTS,
     Fits,
+    PaperFigure,
     Reconstruction,
     Setting,
-    Shown,
     all_settings,
-    gains,
-    held_change,
-    rebuilt,
+    design_feedbacks,
+    measure_hold_change,
+    reconstruct_all,
 )
 from koopmpc.plants.dynamics import RK4
 from koopmpc.plants.step_map import discretize
-from koopmpc.recording.page import Page
 
-SMALL = 0.05  # relative error up to which a reader takes two curves for one
-SAME = 1.25  # errors within this factor are no change in a picture
-MARGINAL = 3.0  # a gain below this factor is marginal
-BETTER = 10.0  # a gain above this factor is plain
-PLAIN = 1e-3  # costs that differ by less, relative, are alike
-GOOD = 1.1  # a controller works where its cost is below this factor of the best
-GENERAL = 0.05  # relative error on trajectories that were not fitted, up to which a model generalises
+SMALL = 0.05  # two curves look equal in a picture up to this relative error
+SAME = 1.25  # errors look equal in a picture if they differ by at most this factor
+MARGINAL = 3.0  # an error that is smaller by less than this factor is a marginal gain
+BETTER = 10.0  # an error that is smaller by more than this factor is a clear gain
+PLAIN = 1e-3  # costs are equal if they differ by less than this share
+GOOD = 1.1  # a controller works if its cost is below this factor of the best
+GENERAL = 0.05  # a model generalises up to this relative error on trajectories that it was not fitted to
 
 OPENING = """\
 G. Snyder and Z. Song, *Koopman Operator Theory for Nonlinear Dynamic Modeling using Dynamic Mode
@@ -85,46 +96,46 @@ GAINS = "u = −K (x − x_ref), continuous-time LQR on the exact Jacobian unles
 HEAD = ("data", "observables", "rank", "σ₁/σ_r", "error [%]", "held out [%]", "leading φ [%]", "φ within 5 %")
 
 
-def work(page: Page, quick: bool, progress: Tell) -> list[Claim]:
-    """Fill the page and return all claims; `quick` shortens what takes long."""
+def reproduce_snyder(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+    """Write the page and return all claims; `quick` shortens long computations."""
     progress("trajectories and their reconstructions")
     others = 3 if quick else 10
     settings = all_settings(others)
-    fits = {name: rebuilt(setting) for name, setting in settings.items()}
-    change = held_change(settings, fits)
+    fits = {name: reconstruct_all(setting) for name, setting in settings.items()}
+    change = measure_hold_change(settings, fits)
     causes = theory.causes(settings["cart-pole-lqr"])
     progress("models of exciting data")
     exciting = 10 if quick else 40
     predicted = {
-        name: control.predictions(settings[f"{name}-lqr"], shaking, exciting) for name, shaking in SHAKINGS.items()
+        name: control.predict_held_out(settings[f"{name}-lqr"], shaking, exciting) for name, shaking in SHAKINGS.items()
     }
     progress("control on lifted models")
     length = {"steps": 20, "horizon": 8, "episodes": 30} if quick else {"steps": 200, "horizon": 60, "episodes": 100}
-    tasks = {title: control.contest(title, **length) for title in TASKS}
+    tasks = {title: control.prepare_contest(title, **length) for title in TASKS}
     runs = {title: task.runs() for title, task in tasks.items()}
     progress("figures")
-    said = of_text(fits, causes["DMD on x − x_ref"].error, predicted, control.ratios(runs))
-    shown = of_figures(fits)
-    aside = Page(page.folder, page.beside)  # its claim counts in the opening, and its part comes later
-    warned = theory.caution(aside, settings, fits)
-    opening(page, [*said, *shown, *warned], change, others)
+    said = judge_text(fits, causes["DMD on x − x_ref"].error, predicted, control.compute_ratios(runs))
+    shown = judge_figures(fits)
+    aside = Page(page.folder, page.beside)  # the opening counts its claim, and its text follows later
+    warned = theory.add_caution(aside, settings, fits)
+    add_opening(page, [*said, *shown, *warned], change, others)
     page.text("## What the paper says in words")
-    verdicts(page, said)
+    add_verdicts(page, said)
     numbers(page, settings, fits, shown)
     pictures(page, settings, fits)
     appendix_dmdc(page, settings["pendulum"], settings["pendulum-lqr"])
-    variants(page, settings, fits)
-    feedbacks(page)
-    theory.frequencies(page, fits)
-    theory.formulas(page, settings["pendulum"], fits)
+    add_variants(page, settings, fits)
+    add_feedbacks(page)
+    theory.add_frequencies(page, fits)
+    theory.add_equations(page, settings["pendulum"], fits)
     page.parts += aside.parts
-    theory.failure(page, settings["cart-pole-lqr"], causes)
-    control.inputs(page, predicted, exciting)
-    control.loops(page, tasks, runs, length["episodes"])
+    theory.add_failure(page, settings["cart-pole-lqr"], causes)
+    control.add_inputs(page, predicted, exciting)
+    control.add_loops(page, tasks, runs, length["episodes"])
     return [*said, *shown, *warned]
 
 
-def of_figure(shown: Shown, setting: str, says: str, fits: Fits) -> Claim:
+def judge_figure(shown: PaperFigure, setting: str, says: str, fits: Fits) -> Claim:
     """Return the claim of one picture of the paper."""
     own, base = fits[setting][shown.method, True], fits[setting]["DMD", True]
     cut = fits[setting].get((shown.method, False), own)
@@ -132,43 +143,45 @@ def of_figure(shown: Shown, setting: str, says: str, fits: Fits) -> Claim:
     where = f"{shown.name}, {setting}"
     errors = f"{percent(own.error)} % against {percent(base.error)} % of DMD"
     if says == "small error":
-        return judged(where, says, holds=own.error < SMALL, why=f"{percent(own.error)} %")
+        return judge_claim(where, says, holds=own.error < SMALL, why=f"{percent(own.error)} %")
     if says == "fails":
-        return judged(where, says, holds=own.error > 0.5, why=f"{percent(own.error)} %, where x̂ = 0 would be 100 % off")
+        return judge_claim(
+            where, says, holds=own.error > 0.5, why=f"{percent(own.error)} %, where x̂ = 0 would be 100 % off"
+        )
     if says == "partly captured":
-        moved = _moved(own)
+        moved = _motion_error(own)
         why = f"{percent(own.error)} % of ‖x‖, which is mostly θ = π; {percent(moved)} % of the motion x − x_ref"
-        return judged(where, says, holds=own.error < SMALL < moved, why=why)
+        return judge_claim(where, says, holds=own.error < SMALL < moved, why=why)
     if says == "no change against DMD":
         why = f"{errors}: sin θ is odd, and products of two states are even"
-        return judged(where, says, holds=1 / SAME < gain < SAME, why=why)
+        return judge_claim(where, says, holds=1 / SAME < gain < SAME, why=why)
     if says == "a marginal gain on DMD":
-        return judged(where, says, holds=1 < gain < MARGINAL, why=errors)
+        return judge_claim(where, says, holds=1 < gain < MARGINAL, why=errors)
     if says.startswith("better"):
-        return judged(where, says, holds=gain > BETTER, in_part=gain > 1, why=errors)
+        return judge_claim(where, says, holds=gain > BETTER, in_part=gain > 1, why=errors)
     if says == "no gain on Fourier 1":
         first = fits[setting]["EDMD Fourier 1", True].error
         factor = first / own.error
         why = f"{percent(own.error)} % against {percent(first)} %: better by a factor of {factor:.2g}"
         why += ", at errors that a picture hardly shows" if first < SMALL else ""
-        return judged(where, says, holds=factor < SAME, in_part=factor < MARGINAL, why=why)
+        return judge_claim(where, says, holds=factor < SAME, in_part=factor < MARGINAL, why=why)
     why = f"at rank {cut.rank} {percent(cut.error)} %, at rank {own.rank} {errors}"
-    return judged(where, says, holds=gain < SAME, in_part=cut_gain < BETTER, why=why)
+    return judge_claim(where, says, holds=gain < SAME, in_part=cut_gain < BETTER, why=why)
 
 
-def of_figures(fits: Fits) -> list[Claim]:
+def judge_figures(fits: Fits) -> list[Claim]:
     """Return the claims of all pictures, in the order of `FIGURES`."""
     return [
-        of_figure(shown, setting, says, fits)
+        judge_figure(shown, setting, says, fits)
         for shown in FIGURES
         for setting, says in zip(shown.settings, shown.says, strict=True)
     ]
 
 
-def of_text(
+def judge_text(
     fits: Fits,
     centred: float,
-    predictions: Mapping[str, Mapping[str, control.Prediction]],
+    predict_held_out: Mapping[str, Mapping[str, control.Prediction]],
     ratios: Mapping[str, Mapping[str, float]],
 ) -> list[Claim]:
     """Return the claims of abstract, results and discussion, in our words.
@@ -191,15 +204,15 @@ def of_text(
     squares, cubes = (fits["cart-pole"][f"EDMD monomials {degree}", True] for degree in (2, 3))
     led = float(cubic.evolution[cubic.leading])
     box_led = float(box.evolution[box.leading])
-    paper = [p["DMD, feedback data"] for p in predictions.values()]
-    blind = [p["DMDc, feedback data"] for p in predictions.values()]
-    rich = [p["EDMDc, exciting data"] for p in predictions.values()]
+    paper = [p["DMD, feedback data"] for p in predict_held_out.values()]
+    blind = [p["DMDc, feedback data"] for p in predict_held_out.values()]
+    rich = [p["EDMDc, exciting data"] for p in predict_held_out.values()]
     lifted = [min(value for name, value in by.items() if "Fourier" in name) for by in ratios.values()]
     local = [by["LQR, linearisation"] for by in ratios.values()]
     wins = sum(ours < theirs - PLAIN for ours, theirs in zip(lifted, local, strict=True))
     losses = sum(theirs < ours - PLAIN for ours, theirs in zip(lifted, local, strict=True))
     return [
-        judged(
+        judge_claim(
             "abstract",
             "DMD and EDMD give a finite-dimensional linear model of a nonlinear system",
             holds=cubic.held_out < GENERAL and box.held_out < GENERAL,
@@ -207,7 +220,7 @@ def of_text(
             why=f"of the fitted trajectory (pendulum, monomials 3: {percent(cubic.error)} %), not of the "
             f"system: {percent(cubic.held_out)} % from other starts, for the frequency depends on the amplitude",
         ),
-        judged(
+        judge_claim(
             "abstract",
             "EDMD finds the leading Koopman eigenfunctions",
             holds=led < SMALL and box_led < SMALL,
@@ -215,7 +228,7 @@ def of_text(
             why=f"pendulum, monomials 3: φ(x_k) = λᵏ φ(x₀) to {percent(led)} % over 10 s; cart-pole, "
             f"Fourier 1: {percent(box_led)} %; on one trajectory φ is known along a curve alone",
         ),
-        judged(
+        judge_claim(
             "abstract",
             "linear control acts on the nonlinear system without linearisation at a fixed point",
             holds=max(lifted) < GOOD and wins > losses,
@@ -224,31 +237,31 @@ def of_text(
             f"cost of nonlinear MPC; LQR on the linearisation takes {min(local):.4f} to {max(local):.4f}: of "
             f"{len(local)} tasks the lifted model does better in {wins} and worse in {losses} by more than 0.1 %",
         ),
-        judged(
+        judge_claim(
             "results",
             "the pendulum is inverted",
             holds=upright.error < SMALL,
             why=f"DMD, uncontrolled: {percent(upright.error)} % upright, {percent(hanging.error)} % hanging; "
             "only θ = 0 hanging agrees with what the paper reports",
         ),
-        judged(
+        judge_claim(
             "results",
             "data under LQR show a controlled system, and models of them stand for it",
             holds=max(p.excited for p in paper) < GENERAL,
             in_part=max(p.feedback for p in paper) < 3 * GENERAL,
             why="reconstruction, no control model: fitted without B, "
-            f"{_listed(p.excited for p in paper)} % off where noise is added to u (pendulum and cart-pole), and with u "
+            f"{_join(p.excited for p in paper)} % off where noise is added to u (pendulum and cart-pole), and with u "
             f"known A and B cannot be told apart: B is {_shares(blind)} times the true one. Models of exciting data "
-            f"are {_listed(p.excited for p in rich)} % off, and B is {_shares(rich)} times the true one",
+            f"are {_join(p.excited for p in rich)} % off, and B is {_shares(rich)} times the true one",
         ),
-        judged(
+        judge_claim(
             "discussion",
             "truncation has to be avoided with monomials 3",
             holds=small.error > BETTER * cubic.error,
             why=f"pendulum: {percent(cubic.error)} % at rank {cubic.rank}, {percent(small.error)} % "
             f"at rank {small.rank}",
         ),
-        judged(
+        judge_claim(
             "discussion",
             "the cart-pole is beyond these observables",
             holds=shift.error > raw.error / SAME,
@@ -257,9 +270,9 @@ def of_text(
             f"{percent(centred)} % of ‖x − x_ref‖ off, DMD on x {percent(raw.error)} % of ‖x‖, monomials 2 at rank "
             f"{shift.rank} {percent(shift.error)} %; uncontrolled, the large swing stays at "
             f"{percent(squares.error)} % with monomials 2 and {percent(box.error)} % with Fourier 1; monomials 3 "
-            f"rebuild it to {percent(cubes.error)} %, but from other starts {_outcome(cubes.held_out)}",
+            f"rebuild it to {percent(cubes.error)} %, but from other starts {_describe_outcome(cubes.held_out)}",
         ),
-        judged(
+        judge_claim(
             "discussion",
             "control on the lifted model is future work",
             holds=max(lifted) < GOOD,
@@ -269,16 +282,16 @@ def of_text(
     ]
 
 
-def _moved(fit: Reconstruction) -> float:
-    """Return the error relative to the motion away from the last state."""
+def _motion_error(fit: Reconstruction) -> float:
+    """Return the error relative to the distance from the last state."""
     return float(np.linalg.norm(fit.X - fit.truth) / np.linalg.norm(fit.truth - fit.truth[-1]))
 
 
-def _outcome(error: float) -> str:
+def _describe_outcome(error: float) -> str:
     return "the reconstruction diverges" if percent(error) == "diverges" else f"to {percent(error)} %"
 
 
-def _listed(errors: Iterable[float]) -> str:
+def _join(errors: Iterable[float]) -> str:
     return " and ".join(percent(error) for error in errors)
 
 
@@ -286,8 +299,8 @@ def _shares(found: list[control.Prediction]) -> str:
     return " and ".join(f"{p.b:.3f}" for p in found)
 
 
-def opening(page: Page, claims: Sequence[Claim], change: float, others: int) -> None:
-    """Open the report: what the paper is, what it left open, and how its claims fared.
+def add_opening(page: Page, claims: Sequence[Claim], change: float, others: int) -> None:
+    """Write the opening of the report: the paper, the choices that it leaves open, and a summary of the verdicts.
 
     Parameters
     ----------
@@ -302,7 +315,7 @@ def opening(page: Page, claims: Sequence[Claim], change: float, others: int) -> 
     """
     page.text(
         "# Snyder & Song 2021, done again",
-        OPENING.format(total=len(claims), summary=summary(claims)),
+        OPENING.format(total=len(claims), summary=summarise_claims(claims)),
         SETTINGS,
         FEEDBACK.format(change=percent(change)),
         MEASURES.format(others=others),
@@ -310,36 +323,36 @@ def opening(page: Page, claims: Sequence[Claim], change: float, others: int) -> 
 
 
 def numbers(page: Page, settings: Mapping[str, Setting], fits: Fits, claims: Sequence[Claim]) -> None:
-    """Add a line for each figure, trajectory and rank, with the paper's claim, the verdict and why."""
+    """Add a table with a line for each figure, trajectory and rank: the paper's claim, the verdict and the reason."""
     page.text("## The figures, in numbers")
     rows: list[tuple[object, ...]] = []
-    told = iter(claims)
+    remaining = iter(claims)
     for shown in FIGURES:
         for setting in shown.settings:
-            claim = next(told)
+            claim = next(remaining)
             for full in (True, False):
                 fit = fits[setting].get((shown.method, full))
                 if fit is not None:
                     said = (claim.says, f"**{claim.verdict.value}**", claim.why) if full else ("", "", "")
-                    rows.append((shown.name, *_row(settings[setting], shown.method, fit), *said))
+                    rows.append((shown.name, *_make_row(settings[setting], shown.method, fit), *said))
     page.table(("figure", *HEAD, "the paper", "verdict", "why"), rows)
 
 
 def pictures(page: Page, settings: Mapping[str, Setting], fits: Fits) -> None:
-    """Draw the figures of the paper; those of its appendix come last."""
+    """Draw the figures of the paper, those of its appendix last."""
     page.text("## The figures", LAYOUT)
     for shown in sorted(FIGURES, key=lambda shown: shown.appendix):
         cases = {
-            settings[setting].title: (settings[setting].trajectory[0].X, _curves(shown.method, fits[setting]))
+            settings[setting].title: (settings[setting].trajectory[0].X, _select_curves(shown.method, fits[setting]))
             for setting in shown.settings
         }
         first = settings[shown.settings[0]]
         data = " and ".join(settings[setting].title.split(", ")[-1] for setting in shown.settings)
         caption = f"{first.title.split(',')[0]}, {data}: {shown.method}" + (" (appendix)" if shown.appendix else "")
-        draw(page, shown.name, caption, cases, first)
+        draw_case(page, shown.name, caption, cases, first)
 
 
-def draw(
+def draw_case(
     page: Page,
     name: str,
     caption: str,
@@ -348,7 +361,7 @@ def draw(
 ) -> None:
     """Draw reconstructions with a column for each case, and add a tab with the curves of each case to the recording."""
     states = setting.dynamics.states
-    page.picture(name, caption, reconstruction(cases, setting.dt, states))
+    page.picture(name, caption, partial(save, reconstruction(cases, setting.dt, states)))
     for title, (truth, curves) in cases.items():
         size = float(np.linalg.norm(truth, axis=1).max())
         table = {"truth": np.hstack([truth, np.full((len(truth), 1), np.nan)])}
@@ -358,14 +371,14 @@ def draw(
         page.curve(f"{name}, {title}", setting.dt, (*states, "log10 of the relative error"), table)
 
 
-def variants(page: Page, settings: Mapping[str, Setting], fits: Fits) -> None:
-    """Add what the paper's words also allow: the upright pendulum, g = 10 m/s², the databook's cart-pole."""
+def add_variants(page: Page, settings: Mapping[str, Setting], fits: Fits) -> None:
+    """Add other readings of the paper: the upright pendulum, g = 10 m/s², the databook's cart-pole."""
     page.text("## Other readings of the paper", READINGS)
     seen = {(setting, shown.method) for shown in FIGURES for setting in shown.settings}
     page.table(
         HEAD,
         [
-            _row(settings[setting], method, fit)
+            _make_row(settings[setting], method, fit)
             for setting in (*VARIANTS, "cart-pole", "cart-pole-lqr")
             for (method, _), fit in fits[setting].items()
             if (setting, method) not in seen
@@ -383,10 +396,10 @@ def variants(page: Page, settings: Mapping[str, Setting], fits: Fits) -> None:
             )
             for setting in names
         }
-        draw(page, f"variant-{name}", caption, cases, settings[names[0]])
+        draw_case(page, f"variant-{name}", caption, cases, settings[names[0]])
 
 
-def feedbacks(page: Page) -> None:
+def add_feedbacks(page: Page) -> None:
     """Add the gains of all feedbacks."""
     page.text("## The feedbacks", GAINS)
     titles = {
@@ -399,16 +412,16 @@ def feedbacks(page: Page) -> None:
     }
     page.table(
         ("plant and weights", "K"),
-        [(titles[name], ", ".join(f"{k + 0.0:.4f}" for k in K.ravel())) for name, K in gains().items()],
+        [(titles[name], ", ".join(f"{k + 0.0:.4f}" for k in K.ravel())) for name, K in design_feedbacks().items()],
     )
 
 
 def appendix_dmdc(page: Page, free: Setting, driven: Setting) -> None:
     """Add DMDc of the pendulum, with the input of the feedback and with an exciting input."""
-    K = gains()["pendulum"]
+    K = design_feedbacks()["pendulum"]
     plant = discretize(Pendulum(), driven.dt, RK4(8))
-    held = trajectories(driven.dynamics, driven.x0, dt=driven.dt, steps=driven.steps, K=K, held=True)
-    fed = inputs_of(held, plant.inputs, K)
+    held = integrate_trajectories(driven.dynamics, driven.x0, dt=driven.dt, steps=driven.steps, K=K, held=True)
+    fed = attach_inputs(held, plant.inputs, K)
     rich = collect(plant, driven.x0, Noise(-1.0, 1.0, hold=20), episodes=1, steps=driven.steps)
     other = collect(plant, driven.x0, Noise(-1.0, 1.0, hold=20), episodes=1, steps=driven.steps, rng=1)
     B = plant.linearize([0.0, 0.0], [0.0]).B
@@ -431,8 +444,8 @@ def appendix_dmdc(page: Page, free: Setting, driven: Setting) -> None:
             (
                 name,
                 f"{report.rank} of {report.columns}",
-                percent(relative(curves[name], episode.X)),
-                "–" if elsewhere is None else percent(relative(elsewhere, other[0].X)),
+                percent(relative_error(curves[name], episode.X)),
+                "–" if elsewhere is None else percent(relative_error(elsewhere, other[0].X)),
                 "–" if not model.nu else f"{float(model.B[1, 0] / B[1, 0]):.4g}",
             )
         )
@@ -441,10 +454,10 @@ def appendix_dmdc(page: Page, free: Setting, driven: Setting) -> None:
         "LQR data": (held[0].X, {n: curves[n] for n in ("DMDc, LQR data", "DMDc, LQR data, B known")}),
         "Exciting input": (rich[0].X, {"DMDc, exciting input": curves["DMDc, exciting input"]}),
     }
-    draw(page, "appendix-pendulum-dmdc", "Pendulum: DMDc (appendix)", cases, driven)
+    draw_case(page, "appendix-pendulum-dmdc", "Pendulum: DMDc (appendix)", cases, driven)
 
 
-def _row(setting: Setting, method: str, fit: Reconstruction) -> tuple[object, ...]:
+def _make_row(setting: Setting, method: str, fit: Reconstruction) -> tuple[object, ...]:
     return (
         setting.title,
         method,
@@ -457,10 +470,10 @@ def _row(setting: Setting, method: str, fit: Reconstruction) -> tuple[object, ..
     )
 
 
-def _curves(method: str, found: Mapping[tuple[str, bool], Reconstruction]) -> dict[str, np.ndarray]:
+def _select_curves(method: str, found: Mapping[tuple[str, bool], Reconstruction]) -> dict[str, np.ndarray]:
     """Return the reconstructions of one method, named after their rank."""
     fits = [found[method, full] for full in (True, False) if (method, full) in found]
     return {"full rank" if i == 0 else f"rank {fit.rank}": fit.X for i, fit in enumerate(fits)}
 
 
-paper = Paper("snyder", "Snyder & Song 2021, DMD and EDMD of pendulum and cart-pole", work)
+paper = Paper("snyder", "Snyder & Song 2021, DMD and EDMD of pendulum and cart-pole", reproduce_snyder)

@@ -1,7 +1,8 @@
-"""Past Snyder & Song (2021): data that show what the input does, and control on models of them."""
+"""Beyond Snyder & Song (2021): data from exciting inputs, and control on models of these data."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +19,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.excitation import Feedback, Noise
 from koopmpc.errors import unwarned
 from koopmpc.figures.series import runs as plot_runs
+from koopmpc.figures.style import save
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
@@ -26,15 +28,15 @@ from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import simulate
-from koopmpc.papers.registry import percent, relative
-from koopmpc.papers.snyder_settings import SHAKINGS, TASKS, Setting, Shaking, centred, gains
+from koopmpc.page import Page
+from koopmpc.papers.registry import percent, relative_error
+from koopmpc.papers.snyder_settings import SHAKINGS, TASKS, Excitement, Setting, centre_episodes, design_feedbacks
 from koopmpc.plants.dynamics import RK4
 from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.recording.page import Page
 
 ORACLE = "nonlinear MPC"
-_LOST = 1e3  # times the best cost beyond which a loop has diverged
+_DIVERGED = 1e3  # a closed loop has diverged if its cost is above this many times the best
 Runs = Mapping[str, Mapping[tuple[str, bool], Run]]  # by title of the task, then as `Contest.runs`
 DRAWN = ("LQR, linearisation", "MPC, Fourier 1", "MPC, monomials 3", ORACLE)
 DT = 0.05  # sample time of the controllers [s]
@@ -100,7 +102,7 @@ class Prediction:
     warned: str
 
 
-def predictions(setting: Setting, shaking: Shaking, episodes: int) -> dict[str, Prediction]:
+def predict_held_out(setting: Setting, shaking: Excitement, episodes: int) -> dict[str, Prediction]:
     """Return the prediction errors of models fitted to one trajectory under feedback, or to exciting data.
 
     Inputs are held over a sample, and the coordinates are x − x_ref.
@@ -119,12 +121,12 @@ def predictions(setting: Setting, shaking: Shaking, episodes: int) -> dict[str, 
     assert K is not None
     x_ref = np.broadcast_to(setting.x_ref, plant.nx)
     law = Feedback(K, x_ref=x_ref)
-    one = centred(collect(plant, setting.x0, law, episodes=1, steps=setting.steps), x_ref)
+    one = centre_episodes(collect(plant, setting.x0, law, episodes=1, steps=setting.steps), x_ref)
     steps = round(LASTING / setting.dt)
-    rich = centred(_excited(plant, x_ref, K, shaking, episodes=episodes, steps=steps), x_ref)
+    rich = centre_episodes(_collect_excited(plant, x_ref, K, shaking, episodes=episodes, steps=steps), x_ref)
     starts = Uniform(x_ref - shaking.spread, x_ref + shaking.spread)
-    feedback = centred(collect(plant, starts, law, episodes=10, steps=200, rng=1), x_ref)
-    excited = centred(_excited(plant, x_ref, K, shaking, episodes=10, steps=200, seed=2), x_ref)
+    feedback = centre_episodes(collect(plant, starts, law, episodes=10, steps=200, rng=1), x_ref)
+    excited = centre_episodes(_collect_excited(plant, x_ref, K, shaking, episodes=10, steps=200, seed=2), x_ref)
     B = plant.linearize(x_ref, np.zeros(plant.nu)).B
     with unwarned():
         models = {
@@ -133,18 +135,18 @@ def predictions(setting: Setting, shaking: Shaking, episodes: int) -> dict[str, 
             "DMDc, exciting data": dmdc(rich),
             "EDMDc, exciting data": edmd(rich, State() + Fourier(1)),
         }
-    return {name: _prediction(name, model, feedback, excited, B) for name, model in models.items()}
+    return {name: _measure_prediction(name, model, feedback, excited, B) for name, model in models.items()}
 
 
-def _prediction(
+def _measure_prediction(
     name: str, model: LinearPredictor, feedback: Episodes, excited: Episodes, B: Float[np.ndarray, "nx nu"]
 ) -> Prediction:
-    """Return the errors of `model` over whole episodes; a model without inputs predicts without them.
+    """Return the errors of `model` over whole episodes; a model without inputs ignores them.
 
     Parameters
     ----------
     name, model
-        The model and how the table calls it.
+        The model and its name in the table.
     feedback, excited
         Held-out episodes with inputs.
     B
@@ -153,23 +155,30 @@ def _prediction(
     i, j = np.unravel_index(int(np.abs(B).argmax()), B.shape)
     share = float((model.C @ model.B)[i, j] / B[i, j]) if model.nu else np.nan
     said = () if model.report is None else model.report.warnings
-    short = "A and B inseparable" if any("inseparable" in sentence for sentence in said) else "–"
-    return Prediction(name, _error(model, feedback), _error(model, excited), share, short)
+    make_paper = "A and B inseparable" if any("inseparable" in sentence for sentence in said) else "–"
+    return Prediction(name, _median_error(model, feedback), _median_error(model, excited), share, make_paper)
 
 
-def _error(model: LinearPredictor, episodes: Episodes) -> float:
-    errors = [relative(model.rollout(e.X[0], e.U[:, : model.nu]), e.X) for e in episodes]
+def _median_error(model: LinearPredictor, episodes: Episodes) -> float:
+    errors = [relative_error(model.rollout(e.X[0], e.U[:, : model.nu]), e.X) for e in episodes]
     return float(np.median(errors))
 
 
-def inputs(page: Page, predicted: Mapping[str, Mapping[str, Prediction]], episodes: int) -> None:
-    """Add a table of these predictions; the exciting data have so many episodes."""
+def add_inputs(page: Page, predicted: Mapping[str, Mapping[str, Prediction]], episodes: int) -> None:
+    """Add a table of these predictions; `episodes` is the number of exciting episodes."""
     noise = {name.replace("-", "_"): shaking.noise for name, shaking in SHAKINGS.items()}
     page.text("## Data that show what the input does", INPUTS.format(episodes=episodes, lasting=LASTING, **noise))
     page.table(
         ("plant", "model", "under feedback [%]", "feedback and noise [%]", "B, of the true one", "the fit says"),
         [
-            (plant, p.name, percent(p.feedback), percent(p.excited), "–" if np.isnan(p.b) else f"{p.b:.4f}", p.warned)
+            (
+                plant,
+                p.name,
+                percent(p.feedback),
+                percent(p.excited),
+                "–" if np.isnan(p.b) else f"{p.b:.4f}",
+                p.warned,
+            )
             for plant, each in predicted.items()
             for p in each.values()
         ],
@@ -227,36 +236,36 @@ class Contest:
         return found
 
 
-def costs(runs: "Mapping[tuple[str, bool], Run]", limited: bool) -> dict[str, float]:
-    """Return dt Σ (‖x − r‖²_Q + ‖u‖²_R) of each controller; inf where the loop diverged."""
-    found = {name: run.dt * metrics(run).cost for (name, kind), run in runs.items() if kind is limited}
-    best = found[ORACLE]
-    return {name: value if value < _LOST * best else np.inf for name, value in found.items()}
+def compute_costs(runs: "Mapping[tuple[str, bool], Run]", limited: bool) -> dict[str, float]:
+    """Return dt Σ (‖x − r‖²_Q + ‖u‖²_R) of each controller; inf if the loop diverged."""
+    totals = {name: run.dt * metrics(run).cost for (name, kind), run in runs.items() if kind is limited}
+    best = totals[ORACLE]
+    return {name: value if value < _DIVERGED * best else np.inf for name, value in totals.items()}
 
 
-def contest(title: str, steps: int, horizon: int, episodes: int) -> Contest:
-    """Return one of `TASKS` as a contest, its models fitted to so many exciting episodes."""
+def prepare_contest(title: str, steps: int, horizon: int, episodes: int) -> Contest:
+    """Return one of `TASKS` as a contest, with models fitted to `episodes` exciting episodes."""
     task = TASKS[title]
     plant = discretize(task.dynamics, DT, RK4(4))
-    K = None if task.K is None else gains()[task.K]
-    data = _excited(plant, task.x_eq, K, task.shaking, episodes=episodes, steps=round(LASTING / DT))
+    K = None if task.K is None else design_feedbacks()[task.K]
+    data = _collect_excited(plant, task.x_eq, K, task.shaking, episodes=episodes, steps=round(LASTING / DT))
     with unwarned():
         models = {name: edmd(data, lifting) for name, lifting in LIFTINGS.items()}
     return Contest(title, plant, models, steps, horizon)
 
 
-def ratios(runs: Runs) -> dict[str, dict[str, float]]:
+def compute_ratios(runs: Runs) -> dict[str, dict[str, float]]:
     """Return each controller's cost divided by that of nonlinear MPC, for each task with and without limits."""
-    found: dict[str, dict[str, float]] = {}
-    for title, each in runs.items():
+    result: dict[str, dict[str, float]] = {}
+    for title, task_runs in runs.items():
         for limited in (False, True):
-            table = costs(each, limited)
+            table = compute_costs(task_runs, limited)
             name = f"{title}, {'limited' if limited else 'without limits'}"
-            found[name] = {controller: cost / table[ORACLE] for controller, cost in table.items()}
-    return found
+            result[name] = {controller: cost / table[ORACLE] for controller, cost in table.items()}
+    return result
 
 
-def loops(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: int) -> None:
+def add_loops(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: int) -> None:
     """Add a table of the closed-loop costs with and without limits, the lessons, and a figure for each plant.
 
     Parameters
@@ -280,14 +289,17 @@ def loops(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: int) -
         ),
     )
     for limited in (False, True):
-        table = {title: costs(each, limited) for title, each in runs.items()}
+        table = {title: compute_costs(each, limited) for title, each in runs.items()}
         limits = {title: f"|u| ≤ {TASKS[title].limit:g}" for title in tasks}
         page.text("Inputs limited:" if limited else "Inputs without limits:")
         page.table(
             ("controller", *(f"{title}, {limits[title]}" if limited else title for title in table)),
-            [(name, *(_cost(by[name], by[ORACLE]) for by in table.values())) for name in next(iter(table.values()))],
+            [
+                (name, *(_format_cost(by[name], by[ORACLE]) for by in table.values()))
+                for name in next(iter(table.values()))
+            ],
         )
-    ratio = ratios(runs)
+    ratio = compute_ratios(runs)
     hanging, upright = (ratio[f"pendulum, {what}, π/4, without limits"] for what in ("hanging", "upright"))
     page.items(
         lesson.format(
@@ -302,24 +314,24 @@ def loops(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: int) -
             if title.startswith(plant)
         }
         caption = f"{plant.capitalize()}: closed loops with limited inputs"
-        page.picture(f"control-{plant}", caption, plot_runs(shown))
+        page.picture(f"control-{plant}", caption, partial(save, plot_runs(shown)))
         for title, each in shown.items():
             first = next(iter(each.values()))
             values = {name: np.hstack([run.X[:-1], run.U]) for name, run in each.items()}
             page.curve(f"control, {plant}, {title}", first.dt, (*first.states, *first.inputs), values)
 
 
-def _excited(
+def _collect_excited(
     plant: StepMap,
     x_ref: ArrayLike,
     K: Float[np.ndarray, "nu nx"] | None,
-    shaking: Shaking,
+    shaking: Excitement,
     *,
     episodes: int,
     steps: int,
     seed: int = 0,
 ) -> Episodes:
-    """Collect episodes that start in x_ref ± spread under noise, on top of the feedback where there is K."""
+    """Collect episodes that start in x_ref ± spread under noise, on top of the feedback if K is given."""
     middle = checks.vector(x_ref, "x_ref", plant.nx)
     shaken = Noise(-shaking.noise, shaking.noise, hold=max(1, round(0.05 / plant.dt)))
     excitation = shaken if K is None else Feedback(K, shaken, x_ref=middle)
@@ -327,5 +339,5 @@ def _excited(
     return collect(plant, starts, excitation, episodes=episodes, steps=steps, rng=seed)
 
 
-def _cost(value: float, best: float) -> str:
+def _format_cost(value: float, best: float) -> str:
     return f"{value:.2f} ({value / best:.4f})" if np.isfinite(value) else "diverges"

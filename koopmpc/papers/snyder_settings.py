@@ -1,4 +1,4 @@
-"""What is fitted for Snyder & Song (2021): trajectories and what rebuilds them, the paper's settings, and our tasks."""
+"""Settings for Snyder & Song (2021): trajectories, reconstructions, the paper's figures, and our control tasks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +16,8 @@ from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.state import Constant, Monomials, State
-from koopmpc.papers.plants import CartPole, Pendulum, gain, printed_gain, trajectories
-from koopmpc.papers.registry import relative
+from koopmpc.papers.plants import CartPole, Pendulum, design_feedback, design_printed_feedback, integrate_trajectories
+from koopmpc.papers.registry import relative_error
 from koopmpc.plants.dynamics import Dynamics
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.predict.spectrum import amplitudes, evolution_error, reconstruct
@@ -25,8 +25,8 @@ from koopmpc.values import Value
 
 RESOLVED = 1e-6  # smaller errors are rounding and differ from machine to machine
 CUT = 1e-10  # "full rank" keeps the singular values above this share of the largest
-LINEAR = 0.05  # relative error over a whole run below which an eigenfunction counts as one
-_STEADY = 1e-4  # an eigenfunction with |λ − 1| below it is a constant
+LINEAR = 0.05  # an eigenfunction is accepted below this relative error over a whole run
+_CONSTANT = 1e-4  # an eigenfunction with |λ − 1| below this is a constant
 PENDULUM_WEIGHTS: tuple[list[float], float] = ([0.0, 10.0], 1.0)  # Q and R of the paper
 CART_POLE_WEIGHTS: tuple[list[float], float] = ([5.0, 10.0, 0.0, 0.0], 1.0)
 DATABOOK_WEIGHTS: tuple[list[float], float] = ([1.0, 1.0, 1.0, 1.0], 1e-4)  # Brunton & Kutz 2019, section 8.7
@@ -44,7 +44,7 @@ OBSERVABLES: dict[str, Lifting] = {
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction(Value):
-    """The error of rebuilding a trajectory from its first state by z⁺ = A z, z = ψ(x): x(t) = Re Φ exp(Ωt) b.
+    """Reconstruction of a trajectory from its first state by z⁺ = A z, z = ψ(x): x(t) = Re Φ exp(Ωt) b.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Reconstruction(Value):
         return int(np.sum(self.evolution < LINEAR))
 
 
-def reconstructed(
+def fit_reconstruction(
     trajectory: Episodes, lifting: Lifting, held_out: Episodes, rank: int | None = None
 ) -> Reconstruction:
     """Fit ψ(x⁺) = A ψ(x) to one trajectory by truncated SVD of the unscaled snapshots, and rebuild it.
@@ -109,10 +109,10 @@ def reconstructed(
     kept = full if rank is None else min(rank, full)
     with unwarned():
         model = edmd(trajectory, bound, rank=kept)
-    X = predicted(model, episode)
+    X = predict_episode(model, episode)
     share = np.abs(amplitudes(model, episode.X[0])) * np.linalg.norm(model.modes, axis=0)
     values = model.eigenvalues
-    moving = (np.abs(values - 1) > _STEADY) & (np.imag(values) >= 0)
+    moving = (np.abs(values - 1) > _CONSTANT) & (np.imag(values) >= 0)
     return Reconstruction(
         model=model,
         X=X,
@@ -120,14 +120,14 @@ def reconstructed(
         rank=kept,
         width=bound.nz,
         condition=float(s[0] / s[kept - 1]),
-        error=relative(X, episode.X),
-        held_out=float(np.median([relative(predicted(model, e), e.X) for e in held_out])),
+        error=relative_error(X, episode.X),
+        held_out=float(np.median([relative_error(predict_episode(model, e), e.X) for e in held_out])),
         evolution=evolution_error(model, trajectory),
         leading=int(np.argmax(np.where(moving, share, -1.0))),
     )
 
 
-def predicted(model: LinearPredictor, episode: Episode) -> Float[np.ndarray, "T1 nx"]:
+def predict_episode(model: LinearPredictor, episode: Episode) -> Float[np.ndarray, "T1 nx"]:
     """Return x(t) = Re Φ exp(Ωt) b at the times of the episode, from its first state."""
     with np.errstate(over="ignore", invalid="ignore"):
         return reconstruct(model, episode.X[0], np.arange(len(episode.X)) * model.dt)
@@ -135,7 +135,7 @@ def predicted(model: LinearPredictor, episode: Episode) -> Float[np.ndarray, "T1
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """One trajectory of one plant, and others of it that are held out.
+    """One trajectory of one plant, and held-out trajectories of it.
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ class Setting:
     K, x_ref
         The feedback u = −K (x − x_ref); none by default.
     held
-        Whether u is held over a sample; by default the feedback is continuous.
+        True: u is constant over a sample. False: the feedback is continuous.
     dt, steps
         Sample time [s] and length of a trajectory.
     others
@@ -175,54 +175,54 @@ class Setting:
 
     @cached_property
     def held_out(self) -> Episodes:
-        """The held-out trajectories, from the same starts each time."""
+        """The held-out trajectories; their starts are reproducible."""
         away = np.random.default_rng(0).uniform(-1.0, 1.0, (self.others, len(self.x0)))
         return self._run(np.asarray(self.x0) + away * np.asarray(self.spread))
 
     def _run(self, starts: Float[np.ndarray, "E nx"]) -> Episodes:
-        return trajectories(
+        return integrate_trajectories(
             self.dynamics, starts, dt=self.dt, steps=self.steps, K=self.K, x_ref=self.x_ref, held=self.held
         )
 
 
-def rebuilt(setting: Setting) -> dict[tuple[str, bool], Reconstruction]:
-    """Return the reconstruction with each of `OBSERVABLES`, by its name and by whether all singular values were kept.
+def reconstruct_all(setting: Setting) -> dict[tuple[str, bool], Reconstruction]:
+    """Return the reconstructions with each of `OBSERVABLES`, by name and by whether all singular values were kept.
 
-    Where not all are kept, as many are as there are states; no more observables than states are fitted at full rank
-    alone.
+    The others keep as many singular values as there are states. Observables that are no more than the states have only
+    a reconstruction at full rank.
     """
-    found: dict[tuple[str, bool], Reconstruction] = {}
+    fits: dict[tuple[str, bool], Reconstruction] = {}
     for name, lifting in OBSERVABLES.items():
         for rank in (None, setting.dynamics.nx):
-            fit = reconstructed(setting.trajectory, lifting, setting.held_out, rank)
+            fit = fit_reconstruction(setting.trajectory, lifting, setting.held_out, rank)
             if rank is None or fit.width > rank:
-                found[name, rank is None] = fit
-    return found
+                fits[name, rank is None] = fit
+    return fits
 
 
-Fits = Mapping[str, Mapping[tuple[str, bool], Reconstruction]]  # by setting, then as `rebuilt` returns them
+Fits = Mapping[str, Mapping[tuple[str, bool], Reconstruction]]  # by setting, then as `reconstruct_all` returns them
 
 
-def held_change(settings: Mapping[str, Setting], fits: Fits) -> float:
-    """Return the largest relative change of an error above `RESOLVED` where the feedback is held over a sample."""
+def measure_hold_change(settings: Mapping[str, Setting], fits: Fits) -> float:
+    """Return the largest relative change of an error above `RESOLVED` if the feedback is held over a sample."""
     changes: list[float] = []
     for name in ("pendulum-lqr", "cart-pole-lqr"):
-        held = rebuilt(replace(settings[name], held=True, others=1))
+        held = reconstruct_all(replace(settings[name], held=True, others=1))
         changes += [abs(held[key].error / fit.error - 1) for key, fit in fits[name].items() if fit.error > RESOLVED]
     return max(changes)
 
 
-def centred(episodes: Episodes, x_ref: ArrayLike) -> Episodes:
-    """Return the same episodes in the coordinates x − x_ref."""
+def centre_episodes(episodes: Episodes, x_ref: ArrayLike) -> Episodes:
+    """Return the episodes in the coordinates x − x_ref."""
     target = checks.vector(x_ref, "x_ref", episodes.nx)
     return episodes.with_episodes([Episode(X=e.X - target, U=e.U, W=e.W) for e in episodes])
 
 
 @dataclass(frozen=True)
-class Shown:
-    """One figure of the paper: its name, the observables, the settings side by side, and what the paper says of each.
+class PaperFigure:
+    """One figure of the paper: its name, the observables, the settings side by side, and the paper's statements.
 
-    `says` is in our words and has one entry for each setting.
+    `says` holds one statement, in our words, for each setting.
     """
 
     name: str
@@ -234,16 +234,18 @@ class Shown:
 
 _BOTH = ("pendulum", "pendulum-lqr")
 FIGURES = (
-    Shown("pendulum-dmd", "DMD", _BOTH, ("small error",) * 2),
-    Shown("pendulum-monomials-2", "EDMD monomials 2", _BOTH, ("no change against DMD", "a marginal gain on DMD")),
-    Shown("pendulum-monomials-3", "EDMD monomials 3", _BOTH, ("better, without truncation",) * 2),
-    Shown("pendulum-fourier-1", "EDMD Fourier 1", _BOTH, ("better",) * 2),
-    Shown("pendulum-fourier-2", "EDMD Fourier 2", _BOTH, ("no gain on Fourier 1",) * 2),
-    Shown("cart-pole-dmd", "DMD", ("cart-pole", "cart-pole-lqr"), ("fails", "partly captured")),
-    Shown("cart-pole-monomials-2", "EDMD monomials 2", ("cart-pole-lqr",), ("no gain on DMD",)),
-    Shown("cart-pole-fourier-1", "EDMD Fourier 1", ("cart-pole-lqr",), ("no gain on DMD",)),
-    Shown("appendix-cart-pole-monomials-2", "EDMD monomials 2", ("cart-pole",), ("no gain on DMD",), appendix=True),
-    Shown("appendix-cart-pole-fourier-1", "EDMD Fourier 1", ("cart-pole",), ("no gain on DMD",), appendix=True),
+    PaperFigure("pendulum-dmd", "DMD", _BOTH, ("small error",) * 2),
+    PaperFigure("pendulum-monomials-2", "EDMD monomials 2", _BOTH, ("no change against DMD", "a marginal gain on DMD")),
+    PaperFigure("pendulum-monomials-3", "EDMD monomials 3", _BOTH, ("better, without truncation",) * 2),
+    PaperFigure("pendulum-fourier-1", "EDMD Fourier 1", _BOTH, ("better",) * 2),
+    PaperFigure("pendulum-fourier-2", "EDMD Fourier 2", _BOTH, ("no gain on Fourier 1",) * 2),
+    PaperFigure("cart-pole-dmd", "DMD", ("cart-pole", "cart-pole-lqr"), ("fails", "partly captured")),
+    PaperFigure("cart-pole-monomials-2", "EDMD monomials 2", ("cart-pole-lqr",), ("no gain on DMD",)),
+    PaperFigure("cart-pole-fourier-1", "EDMD Fourier 1", ("cart-pole-lqr",), ("no gain on DMD",)),
+    PaperFigure(
+        "appendix-cart-pole-monomials-2", "EDMD monomials 2", ("cart-pole",), ("no gain on DMD",), appendix=True
+    ),
+    PaperFigure("appendix-cart-pole-fourier-1", "EDMD Fourier 1", ("cart-pole",), ("no gain on DMD",), appendix=True),
 )
 VARIANTS = ("upright", "upright-lqr", "cart-pole-g10", "databook", "databook-legacy")
 
@@ -255,7 +257,7 @@ def all_settings(others: int = 10) -> dict[str, Setting]:
     start, swing = (np.pi / 4, 0.0), (np.pi / 6, 0.5)
     off, tilt = (-1.0, 0.0, np.pi + 0.1, 0.0), (0.5, 0.2, 0.1, 0.1)
     shift, near = (-1.0, 0.0, np.pi, 0.0), (1.0, 0.2, 0.02, 0.02)
-    K = gains()
+    K = design_feedbacks()
     found = {
         "pendulum": Setting("Pendulum, hanging, uncontrolled", pendulum, start, swing),
         "pendulum-lqr": Setting("Pendulum, hanging, LQR", pendulum, start, swing, K["pendulum"]),
@@ -272,30 +274,30 @@ def all_settings(others: int = 10) -> dict[str, Setting]:
     return {name: replace(setting, others=others) for name, setting in found.items()}
 
 
-def gains() -> dict[str, np.ndarray]:
+def design_feedbacks() -> dict[str, np.ndarray]:
     """Return K of each feedback by the name of its setting without "-lqr"."""
     databook = CartPole(g=10.0, d=1.0)
     return {
-        "pendulum": gain(Pendulum(), [0.0, 0.0], *PENDULUM_WEIGHTS).K,
-        "upright": gain(Pendulum(upright=True), [0.0, 0.0], *PENDULUM_WEIGHTS).K,
-        "cart-pole": gain(CartPole(), UP, *CART_POLE_WEIGHTS).K,
-        "cart-pole-g10": gain(CartPole(g=10.0), UP, *CART_POLE_WEIGHTS).K,
-        "databook": gain(databook, UP, *DATABOOK_WEIGHTS).K,
-        "databook-legacy": printed_gain(databook, *DATABOOK_WEIGHTS).K,
+        "pendulum": design_feedback(Pendulum(), [0.0, 0.0], *PENDULUM_WEIGHTS).K,
+        "upright": design_feedback(Pendulum(upright=True), [0.0, 0.0], *PENDULUM_WEIGHTS).K,
+        "cart-pole": design_feedback(CartPole(), UP, *CART_POLE_WEIGHTS).K,
+        "cart-pole-g10": design_feedback(CartPole(g=10.0), UP, *CART_POLE_WEIGHTS).K,
+        "databook": design_feedback(databook, UP, *DATABOOK_WEIGHTS).K,
+        "databook-legacy": design_printed_feedback(databook, *DATABOOK_WEIGHTS).K,
     }
 
 
 @dataclass(frozen=True)
-class Shaking:
-    """Excitation of a plant for data: episodes start in x ± spread, and uniform noise of ± `noise` is added to u."""
+class Excitement:
+    """Settings to collect data: episodes start in x ± spread, and uniform noise of ± `noise` is added to u."""
 
     spread: Sequence[float]
     noise: float
 
 
-SHAKINGS: Mapping[str, Shaking] = {
-    "pendulum": Shaking((1.0, 1.0), 4.0),
-    "cart-pole": Shaking((1.0, 0.5, 0.1, 0.1), 10.0),
+SHAKINGS: Mapping[str, Excitement] = {
+    "pendulum": Excitement((1.0, 1.0), 4.0),
+    "cart-pole": Excitement((1.0, 0.5, 0.1, 0.1), 10.0),
 }
 
 
@@ -308,39 +310,42 @@ class ControlTask:
     dynamics, x_eq
         The plant and its equilibrium.
     K
-        Name of the feedback that holds the plant while data are collected; None where it needs none.
+        Name of the feedback that stabilises the plant while data are collected; None for a stable plant.
     shaking
         Excitation of the data about x_eq.
     cost, limit
-        The paper's weights, and the bound on |u| in the runs with limits, which is below what LQR would take.
+        The paper's weights, and the bound on |u| in the runs with limits, which is below the largest |u| of LQR.
     x0, reference
-        Where the run starts, and where it has to go.
+        Start and target of the run.
     """
 
     dynamics: Dynamics
     x_eq: Sequence[float]
     K: str | None
-    shaking: Shaking
+    shaking: Excitement
     cost: Cost
     limit: float
     x0: Sequence[float]
     reference: Sequence[float]
 
 
-_DRIVEN, _CARRIED = Cost(*PENDULUM_WEIGHTS), Cost(*CART_POLE_WEIGHTS)
-_REST, _START = (0.0, 0.0), (np.pi / 4, 0.0)
-_SHIFTED, _LEANING = (-1.0, 0.0, np.pi, 0.0), (0.0, 0.0, np.pi + 0.3, 0.0)
+_PENDULUM_COST = Cost(*PENDULUM_WEIGHTS)
+_CART_POLE_COST = Cost(*CART_POLE_WEIGHTS)
+_REST = (0.0, 0.0)
+_START = (np.pi / 4, 0.0)
+_SHIFTED = (-1.0, 0.0, np.pi, 0.0)
+_LEANING = (0.0, 0.0, np.pi + 0.3, 0.0)
 TASKS: Mapping[str, ControlTask] = {
     "pendulum, hanging, π/4": ControlTask(
-        Pendulum(), _REST, None, Shaking((1.2, 2.0), 4.0), _DRIVEN, 2.0, _START, _REST
+        Pendulum(), _REST, None, Excitement((1.2, 2.0), 4.0), _PENDULUM_COST, 2.0, _START, _REST
     ),
     "pendulum, upright, π/4": ControlTask(
-        Pendulum(upright=True), _REST, "upright", Shaking((1.0, 1.0), 10.0), _DRIVEN, 20.0, _START, _REST
+        Pendulum(upright=True), _REST, "upright", Excitement((1.0, 1.0), 10.0), _PENDULUM_COST, 20.0, _START, _REST
     ),
     "cart-pole, 2 m shift": ControlTask(
-        CartPole(), UP, "cart-pole", Shaking((2.0, 1.0, 0.1, 0.1), 5.0), _CARRIED, 3.0, _SHIFTED, TARGET
+        CartPole(), UP, "cart-pole", Excitement((2.0, 1.0, 0.1, 0.1), 5.0), _CART_POLE_COST, 3.0, _SHIFTED, TARGET
     ),
     "cart-pole, 0.3 rad off": ControlTask(
-        CartPole(), UP, "cart-pole", Shaking((2.0, 1.0, 0.4, 0.4), 10.0), _CARRIED, 40.0, _LEANING, UP
+        CartPole(), UP, "cart-pole", Excitement((2.0, 1.0, 0.4, 0.4), 10.0), _CART_POLE_COST, 40.0, _LEANING, UP
     ),
 }

@@ -1,21 +1,24 @@
-"""The theory of Snyder & Song (2021): equations, eigenvalues, why the cart-pole failed, and a caution they cite."""
+"""Theory of Snyder & Song (2021): equations, eigenvalues, the failure on the cart-pole, and a caution they cite."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from koopmpc.data.episodes import Episodes
 from koopmpc.figures.eigenvalues import eigenfunctions
-from koopmpc.figures.reports import Plot, plots
+from koopmpc.figures.reports import CurvePanel, draw_panels
 from koopmpc.figures.series import reconstruction
+from koopmpc.figures.style import save
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant, State
-from koopmpc.papers.plants import Pendulum, frequency
-from koopmpc.papers.registry import Claim, judged, percent, relative
+from koopmpc.page import Page
+from koopmpc.papers.plants import Pendulum, swing_frequency
+from koopmpc.papers.registry import Claim, judge_claim, percent, relative_error
 from koopmpc.papers.snyder_settings import (
     LINEAR,
     OBSERVABLES,
@@ -23,12 +26,11 @@ from koopmpc.papers.snyder_settings import (
     Fits,
     Reconstruction,
     Setting,
-    centred,
-    predicted,
-    reconstructed,
+    centre_episodes,
+    fit_reconstruction,
+    predict_episode,
 )
 from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
-from koopmpc.recording.page import Page
 
 CAUSES = """\
 Under LQR the state settles at (1, 0, π, 0). Its motion about that point has four eigenvalues of its own, and
@@ -73,15 +75,15 @@ class Equation:
     residual: float
 
 
-def equations(trajectory: Episodes, lifting: Lifting, rank: int) -> list[Equation]:
-    """Compute each equation of the paper on one trajectory, by our function and by the formula written out.
+def check_equations(trajectory: Episodes, lifting: Lifting, rank: int) -> list[Equation]:
+    """Compute each equation of the paper on one trajectory by our function and by its formula in NumPy.
 
     Parameters
     ----------
     trajectory
         One episode without inputs.
     lifting
-        Θ, whose observables are the snapshots Y; with `State()` alone Y is X.
+        Θ; the snapshots Y are its observables. With `State()` Y is X.
     rank
         r of the truncated SVD.
     """
@@ -126,7 +128,7 @@ def equations(trajectory: Episodes, lifting: Lifting, rank: int) -> list[Equatio
     ]  # fmt: skip
 
 
-def sides(trajectory: Episodes, lifting: Lifting) -> tuple[float, float]:
+def compare_sides(trajectory: Episodes, lifting: Lifting) -> tuple[float, float]:
     """Return the medians of ‖φ(x⁺) − λ φ(x)‖ / ‖φ(x)‖ for φ = ξᴴψ with left and for φ = vᵀψ with right eigenvectors.
 
     Θ⁺Θ′ is Aᵀ, so its right eigenvectors are the left eigenvectors of A. The right eigenvectors of A are the modes;
@@ -135,14 +137,14 @@ def sides(trajectory: Episodes, lifting: Lifting) -> tuple[float, float]:
     model = edmd(trajectory, lifting)
     snapshots = trajectory.snapshots()
     Z, Z_next = model.lift(snapshots.X), model.lift(snapshots.X_next)
-    left = _linear(Z, Z_next, model.left_eigenvectors.T, model.eigenvalues)
-    return left, _linear(Z, Z_next, model.eigenvectors, model.eigenvalues)
+    left = _median_linearity(Z, Z_next, model.left_eigenvectors.T, model.eigenvalues)
+    return left, _median_linearity(Z, Z_next, model.eigenvectors, model.eigenvalues)
 
 
-def frequencies(page: Page, fits: Fits) -> None:
+def add_frequencies(page: Page, fits: Fits) -> None:
     """Add the eigenvalues of the pendulum's fits beside the exact frequencies."""
     plant = Pendulum()
-    small, right = frequency(plant, 0.0), frequency(plant, np.pi / 4)
+    small, right = swing_frequency(plant, 0.0), swing_frequency(plant, np.pi / 4)
     page.text("## The frequency of the pendulum", FREQUENCY.format(small=small, right=right))
     rows: list[tuple[object, ...]] = []
     for method in OBSERVABLES:
@@ -163,7 +165,7 @@ def frequencies(page: Page, fits: Fits) -> None:
     )
 
 
-def formulas(page: Page, setting: Setting, fits: Fits) -> None:
+def add_equations(page: Page, setting: Setting, fits: Fits) -> None:
     """Add each equation with the function that computes it, and a picture of the leading eigenfunction."""
     lifting = OBSERVABLES["EDMD Fourier 1"]
     width, rank = lifting.bind(setting.dynamics.states).nz, 4
@@ -172,18 +174,18 @@ def formulas(page: Page, setting: Setting, fits: Fits) -> None:
         ("equations", "formula", "function", "distance"),
         [
             (e.number, e.formula, f"`{e.function}`", "0" if e.residual == 0 else f"{e.residual:.0e}")
-            for e in equations(setting.trajectory, lifting, rank)
+            for e in check_equations(setting.trajectory, lifting, rank)
         ],
     )
-    left, right = sides(setting.trajectory, OBSERVABLES["EDMD monomials 3"])
+    left, right = compare_sides(setting.trajectory, OBSERVABLES["EDMD monomials 3"])
     page.text(SIDES.format(left=percent(left), right=percent(right)))
     fit = fits["pendulum"]["EDMD monomials 3", True]
     made = eigenfunctions(fit.model, fit.leading, (0, 1), ((-1.0, 1.0), (-2.0, 2.0)))
-    page.picture("pendulum-eigenfunctions", "Pendulum, monomials 3: the leading eigenfunction", made)
+    page.picture("pendulum-eigenfunctions", "Pendulum, monomials 3: the leading eigenfunction", partial(save, made))
 
 
 def causes(setting: Setting) -> dict[str, Reconstruction]:
-    """Rebuild the cart-pole under LQR with the origin at zero or at the target, and with or without a constant in ψ."""
+    """Return fits of the cart-pole under LQR: origin at zero or at the target, with or without a constant."""
     squares = OBSERVABLES["EDMD monomials 2"]
     cases = {
         "DMD": (State(), False, None),
@@ -196,13 +198,13 @@ def causes(setting: Setting) -> dict[str, Reconstruction]:
     }
     found: dict[str, Reconstruction] = {}
     for name, (lifting, moved, rank) in cases.items():
-        data = [centred(each, TARGET) if moved else each for each in (setting.trajectory, setting.held_out)]
-        found[name] = reconstructed(data[0], lifting, data[1], rank)
+        data = [centre_episodes(each, TARGET) if moved else each for each in (setting.trajectory, setting.held_out)]
+        found[name] = fit_reconstruction(data[0], lifting, data[1], rank)
     return found
 
 
-def failure(page: Page, setting: Setting, found: Mapping[str, Reconstruction]) -> None:
-    """Add how the origin of the coordinates and the truncation spoil the fit of the cart-pole under LQR."""
+def add_failure(page: Page, setting: Setting, found: Mapping[str, Reconstruction]) -> None:
+    """Add the effects of the origin of the coordinates and of the truncation on the fit of the cart-pole under LQR."""
     page.text("## Why the cart-pole failed", CAUSES)
     truth = setting.trajectory[0].X
     size, motion = float(np.linalg.norm(truth)), float(np.linalg.norm(truth - TARGET))
@@ -210,7 +212,13 @@ def failure(page: Page, setting: Setting, found: Mapping[str, Reconstruction]) -
     for name, fit in found.items():
         gap = float(np.linalg.norm(fit.X - fit.truth))
         rows.append(
-            (name, f"{fit.rank} of {fit.width}", f"{fit.condition:.1e}", percent(gap / size), percent(gap / motion))
+            (
+                name,
+                f"{fit.rank} of {fit.width}",
+                f"{fit.condition:.1e}",
+                percent(gap / size),
+                percent(gap / motion),
+            )
         )
     page.table(("model", "rank", "σ₁/σ_r", "error, of ‖x‖ [%]", "of ‖x − x_ref‖ [%]"), rows)
     curves = {
@@ -218,15 +226,15 @@ def failure(page: Page, setting: Setting, found: Mapping[str, Reconstruction]) -
         for name in ("DMD", "DMD with a constant", "DMD on x − x_ref", "EDMD monomials 2")
     }
     made = reconstruction({setting.title: (truth, curves)}, setting.dt, setting.dynamics.states)
-    page.picture("why-cart-pole", "Cart-pole under LQR: origin and truncation", made)
+    page.picture("why-cart-pole", "Cart-pole under LQR: origin and truncation", partial(save, made))
     page.curve("why cart-pole", setting.dt, setting.dynamics.states, {"truth": truth, **curves})
 
 
-def caution(page: Page, settings: Mapping[str, Setting], fits: Fits) -> list[Claim]:
-    """Add reconstruction against prediction from unseen starts, horizon by horizon, and return what it says."""
+def add_caution(page: Page, settings: Mapping[str, Setting], fits: Fits) -> list[Claim]:
+    """Add errors of reconstruction and of prediction from unseen starts by horizon, and return the claim."""
     plants = ("pendulum", "pendulum-lqr", "cart-pole", "cart-pole-lqr")
     errors = {
-        (name, method): by_horizon(settings[name], fits[name][method, True], HORIZONS)
+        (name, method): measure_by_horizon(settings[name], fits[name][method, True], HORIZONS)
         for name in plants
         for method in OBSERVABLES
     }
@@ -241,7 +249,7 @@ def caution(page: Page, settings: Mapping[str, Setting], fits: Fits) -> list[Cla
     best = min(OBSERVABLES, key=lambda method: errors["cart-pole", method][-1][1])
     missed = [each for each in errors.values() if each[-1][0] < LINEAR and each[-1][1] > 10 * max(each[-1][0], 1e-3)]
     drawn = [
-        Plot(
+        CurvePanel(
             "horizon [s]",
             "error [%]",
             {
@@ -255,9 +263,9 @@ def caution(page: Page, settings: Mapping[str, Setting], fits: Fits) -> list[Cla
         )
         for name in plants
     ]
-    page.picture("caution", "Reconstruction and prediction from unseen starts", plots(drawn))
+    page.picture("caution", "Reconstruction and prediction from unseen starts", partial(save, draw_panels(drawn)))
     return [
-        judged(
+        judge_claim(
             "Gonzalez et al. 2021",
             "a model may rebuild a trajectory and miss the system",
             holds=bool(missed),
@@ -268,19 +276,19 @@ def caution(page: Page, settings: Mapping[str, Setting], fits: Fits) -> list[Cla
     ]
 
 
-def by_horizon(setting: Setting, fit: Reconstruction, horizons: Sequence[float]) -> list[tuple[float, float]]:
+def measure_by_horizon(setting: Setting, fit: Reconstruction, horizons: Sequence[float]) -> list[tuple[float, float]]:
     """Return the relative errors over the first h seconds: of the fitted trajectory, and the median of the held-out."""
 
     def errors(data: Episodes) -> np.ndarray:
-        told = [(predicted(fit.model, e), e.X) for e in data]
+        pairs = [(predict_episode(fit.model, e), e.X) for e in data]
         ends = [round(h / setting.dt) + 1 for h in horizons]
-        return np.array([[relative(X[:end], truth[:end]) for end in ends] for X, truth in told])
+        return np.array([[relative_error(X[:end], truth[:end]) for end in ends] for X, truth in pairs])
 
     own, new = errors(setting.trajectory)[0], np.median(errors(setting.held_out), axis=0)
     return [(float(a), float(b)) for a, b in zip(own, new, strict=True)]
 
 
-def _linear(
+def _median_linearity(
     Z: Float[np.ndarray, "M nz"],
     Z_next: Float[np.ndarray, "M nz"],
     V: Complex[np.ndarray, "nz nz"],

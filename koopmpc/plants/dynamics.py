@@ -45,17 +45,17 @@ class Dynamics(Named, ABC):
         return x
 
     def scene(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape] | None:
-        """Return the shapes that draw x (nx,) and u (nu,), always with the same names; None: nothing is drawn."""
+        """Return the shapes that draw x (nx,) and u (nu,), with the same names at each call; None draws nothing."""
         return None
 
 
-def drawn_by(dynamics: Dynamics) -> Scene | None:
-    """Return the scene of `dynamics`; None where its class draws none."""
+def find_scene(dynamics: Dynamics) -> Scene | None:
+    """Return the `scene` method of `dynamics`, or None if its class does not define one."""
     draw = dynamics.scene
     return None if type(dynamics).scene is Dynamics.scene else lambda x, u: draw(x, u) or ()
 
 
-def right_side(dynamics: Dynamics) -> ca.Function:
+def build_right_side(dynamics: Dynamics) -> ca.Function:
     """Return f of ẋ = f(x, u) as a CasADi function of x (nx) and u (nu).
 
     Raises
@@ -63,31 +63,31 @@ def right_side(dynamics: Dynamics) -> ca.Function:
     ShapeError
         `rhs` returns another number of rows than there are states.
     DataError
-        `rhs` returns no CasADi expression, or one with symbols other than x and u.
+        `rhs` does not return a CasADi expression, or returns one with symbols other than x and u.
     """
     checks.members(dynamics, "dynamics", ("states", "inputs", "rhs"), "pass one of your subclass of km.Dynamics")
     _check_names(dynamics)
     x, u = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
-    value = _expression(dynamics.rhs(x, u), f"{type(dynamics).__name__}.rhs", ca.vertcat(x, u), dynamics.nx)
+    value = _check_expression(dynamics.rhs(x, u), f"{type(dynamics).__name__}.rhs", ca.vertcat(x, u), dynamics.nx)
     return ca.Function("f", [x, u], [value], ["x", "u"], ["dx"])
 
 
-def output(dynamics: Dynamics) -> tuple[ca.Function, tuple[str, ...]]:
-    """Return h of y = h(x), and the names of y: a state's own name where h passes that state on."""
+def build_output(dynamics: Dynamics) -> tuple[ca.Function, tuple[str, ...]]:
+    """Return h of y = h(x), and the names of y: an output that is a state has the state's name."""
     _check_names(dynamics)
     x = ca.SX.sym("x", dynamics.nx)
-    value = _expression(dynamics.measure(x), f"{type(dynamics).__name__}.measure", x)
+    value = _check_expression(dynamics.measure(x), f"{type(dynamics).__name__}.measure", x)
     names: list[str] = []
     states = [(name, x[j]) for j, name in enumerate(dynamics.states)]
     for i in range(value.size1()):
         measured = value[i]
-        passed = [name for name, state in states if ca.is_equal(measured, state)]
-        names.append(passed[0] if passed else f"y{i}")
+        equal_states = [name for name, state in states if ca.is_equal(measured, state)]
+        names.append(equal_states[0] if equal_states else f"y{i}")
     return ca.Function("h", [x], [value], ["x"], ["y"]), tuple(names)
 
 
-def _expression(value: object, name: str, known: ca.SX, rows: int | None = None) -> ca.SX:
-    """Return the value as a dense column; raise where it is no expression, or holds symbols other than `known`."""
+def _check_expression(value: object, name: str, known: ca.SX, rows: int | None = None) -> ca.SX:
+    """Return the value as a dense column; raise if it is not an expression, or holds symbols other than `known`."""
     if not isinstance(value, ca.SX | ca.DM):
         raise DataError(f"{name} returned a {type(value).__name__}; return one column, ca.vertcat(...)")
     column = ca.SX(value)
@@ -111,7 +111,7 @@ def _check_names(dynamics: Dynamics) -> None:
 
 
 class Integrator(ABC):
-    """A one-step method that turns ẋ = f(x, u) into x⁺ = F(x, u), with u held."""
+    """A one-step method that turns ẋ = f(x, u) into x⁺ = F(x, u), with u constant over the step."""
 
     @abstractmethod
     def step(self, f: ca.Function, dt: float) -> ca.Function:
@@ -124,8 +124,8 @@ class Euler(Integrator):
 
     def step(self, f: ca.Function, dt: float) -> ca.Function:
         """Return F of x⁺ = F(x, u)."""
-        x, u = _symbols(f)
-        return _explicit(x, u, x + dt * f(x, u))
+        x, u = _make_symbols(f)
+        return _explicit_step(x, u, x + dt * f(x, u))
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class RK4(Integrator):
 
     def step(self, f: ca.Function, dt: float) -> ca.Function:
         """Return F of x⁺ = F(x, u)."""
-        x, u = _symbols(f)
+        x, u = _make_symbols(f)
         x_next, h = x, dt / self.substeps
         for _ in range(self.substeps):
             k1 = f(x_next, u)
@@ -153,7 +153,7 @@ class RK4(Integrator):
             k3 = f(x_next + h / 2 * k2, u)
             k4 = f(x_next + h * k3, u)
             x_next = x_next + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return _explicit(x, u, x_next)
+        return _explicit_step(x, u, x_next)
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class ImplicitMidpoint(Integrator):
 
     def step(self, f: ca.Function, dt: float) -> ca.Function:
         """Return F of x⁺ = F(x, u)."""
-        return _gauss(f, dt, 1)
+        return _build_collocation(f, dt, 1)
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ class Collocation(Integrator):
 
     def step(self, f: ca.Function, dt: float) -> ca.Function:
         """Return F of x⁺ = F(x, u)."""
-        return _gauss(f, dt, self.degree)
+        return _build_collocation(f, dt, self.degree)
 
 
 @dataclass(frozen=True)
@@ -206,21 +206,21 @@ class CVODES(Integrator):
         """Return F of x⁺ = F(x, u)."""
         if not ca.has_integrator("cvodes"):
             raise DataError("this CasADi has no CVODES; use Collocation or RK4 with substeps")
-        x, u = _symbols(f)
+        x, u = _make_symbols(f)
         options = {"reltol": self.rtol, "abstol": self.atol, "disable_internal_warnings": True}
         flow = ca.integrator("flow", "cvodes", {"x": x, "u": u, "ode": f(x, u)}, 0, dt, options)
         X, U = ca.MX.sym("x", x.size1()), ca.MX.sym("u", u.size1())
-        return _implicit(X, U, flow(x0=X, u=U)["xf"])
+        return _implicit_step(X, U, flow(x0=X, u=U)["xf"])
 
 
-def _gauss(f: ca.Function, dt: float, stages: int) -> ca.Function:
+def _build_collocation(f: ca.Function, dt: float, stages: int) -> ca.Function:
     """x⁺ = x + Σ bⱼ kⱼ with kᵢ = dt f(x + Σ aᵢⱼ kⱼ, u), solved by Newton and differentiated implicitly.
 
-    The unknowns are kᵢ / s with s = 1 + |x| + |dt f(x, u)|, so that one tolerance on Newton's step fits all units
-    and stiff plants too, whose residual never falls to the rounding of its terms.
+    The unknowns are kᵢ / s with s = 1 + |x| + |dt f(x, u)|. Newton's method stops when its step is small: one tolerance
+    then suits all units. It also suits stiff plants, whose residual never falls to the rounding error of its terms.
     """
     a, b = gauss_legendre(stages)
-    x, u = _symbols(f)
+    x, u = _make_symbols(f)
     nx = x.size1()
     slope = dt * f(x, u)
     scale = 1 + ca.fabs(x) + ca.fabs(slope)
@@ -228,13 +228,13 @@ def _gauss(f: ca.Function, dt: float, stages: int) -> ca.Function:
     K = unknown * ca.repmat(scale, 1, stages)
     rows = [unknown[:, i] - dt * f(x + K @ ca.DM(a[i]), u) / scale for i in range(stages)]
     residual = ca.Function("residual", [ca.vec(unknown), x, u], [ca.vertcat(*rows)])
-    options = {"max_iter": 50, "abstol": 1e-15, "abstolStep": 1e-11}  # Newton squares its error in the last step
+    options = {"max_iter": 50, "abstol": 1e-15, "abstolStep": 1e-11}  # the last Newton step squares the error
     newton = ca.rootfinder("newton", "fast_newton", residual, options)
     start = ca.Function("start", [x, u], [ca.repmat(slope / scale, stages, 1), scale])
     X, U = ca.MX.sym("x", nx), ca.MX.sym("u", u.size1())
     guess, unit = start(X, U)
     K_solved = ca.reshape(newton(guess, X, U), nx, stages)
-    return _implicit(X, U, X + unit * (K_solved @ ca.DM(b)))
+    return _implicit_step(X, U, X + unit * (K_solved @ ca.DM(b)))
 
 
 def gauss_legendre(stages: int) -> tuple[Float[np.ndarray, "s s"], Float[np.ndarray, " s"]]:
@@ -251,13 +251,13 @@ def gauss_legendre(stages: int) -> tuple[Float[np.ndarray, "s s"], Float[np.ndar
     return a, b
 
 
-def _symbols(f: ca.Function) -> tuple[ca.SX, ca.SX]:
+def _make_symbols(f: ca.Function) -> tuple[ca.SX, ca.SX]:
     return ca.SX.sym("x", f.size1_in(0)), ca.SX.sym("u", f.size1_in(1))
 
 
-def _explicit(x: ca.SX, u: ca.SX, x_next: ca.SX) -> ca.Function:
+def _explicit_step(x: ca.SX, u: ca.SX, x_next: ca.SX) -> ca.Function:
     return ca.Function("F", [x, u], [x_next], ["x", "u"], ["x_next"], {"cse": True})
 
 
-def _implicit(x: ca.MX, u: ca.MX, x_next: ca.MX) -> ca.Function:
+def _implicit_step(x: ca.MX, u: ca.MX, x_next: ca.MX) -> ca.Function:
     return ca.Function("F", [x, u], [x_next], ["x", "u"], ["x_next"])

@@ -1,4 +1,4 @@
-"""A traced CasADi expression as a list of whitelisted operations: over numpy columns, as symbols, as data."""
+"""A CasADi expression as a list of whitelisted operations, for numpy columns, for symbols and for files."""
 
 import operator
 from collections.abc import Callable, Iterator, Sequence
@@ -13,14 +13,14 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.plants.routines import dense
+from koopmpc.plants.routines import make_dense
 from koopmpc.values import Value
 
 Columns = np.ndarray | float
 
 
 class Operation(NamedTuple):
-    """One operation, twice: `columns(*operands, out)` for numpy and `symbol(*operands)` for CasADi."""
+    """One operation in two forms: `columns(*operands, out)` for numpy and `symbol(*operands)` for CasADi."""
 
     operands: int
     columns: Callable[..., Any]
@@ -95,12 +95,12 @@ _NAMES = {cast("int", getattr(ca, f"OP_{name.upper()}")): name for name in OPERA
     ca.OP_CONST: "constant",
     ca.OP_OUTPUT: "output",
 }
-_CHUNK = 4096  # rows at a time: a few dozen registers of 32 KiB stay in the cache
+_CHUNK = 4096  # rows that are evaluated at once: a few dozen registers of 32 KiB stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Graph(Value):
-    """The function y = g(v) of `n` scalars as steps of a register machine, without its CasADi original.
+    """The function y = g(v) of `n` scalars as steps of a register machine; it does not need CasADi to run.
 
     Step i writes register ``places[i, 0]``: the operation ``steps[i]`` of registers ``places[i, 1:]``, or the
     element ``places[i, 1]`` of v (step "input") or of `constants` (step "constant"). A step "output" makes
@@ -146,13 +146,13 @@ class Graph(Value):
         steps: list[str] = []
         places: list[tuple[int, int, int]] = []
         constants: list[float] = []
-        scalar = _scalar(function)
+        scalar = _expand_to_scalars(function)
         starts = np.cumsum([0] + [scalar.numel_in(i) for i in range(scalar.n_in())]).tolist()
         for k in range(scalar.n_instructions()):
-            code, read, written = (scalar.instruction_id(k), scalar.instruction_input(k), scalar.instruction_output(k))
+            code, read, written = scalar.instruction_id(k), scalar.instruction_input(k), scalar.instruction_output(k)
             if code not in _NAMES:
                 raise DataError(
-                    f"{function.name()} uses the operation {_refused(code)!r}, which cannot be written as data; "
+                    f"{function.name()} uses the operation {_name_operation(code)!r}, which cannot be written as data; "
                     "use those of koopmpc.plants.graph.OPERATIONS"
                 )
             name = _NAMES[code]
@@ -190,11 +190,11 @@ class Graph(Value):
         return ca.vertcat(*results) if results else ca.SX(0, 1)
 
     def scratch(self, rows: int) -> list[np.ndarray]:
-        """Return the registers that `run` needs for `rows` columns."""
+        """Return the registers that `run` needs for a batch of `rows`."""
         return list(np.empty((int(self.places[:, 0].max(initial=0)) + 1, rows)))
 
     def run(self, inputs: np.ndarray | Sequence[Columns], results: np.ndarray, scratch: list[np.ndarray]) -> None:
-        """Write y = g(v) into `results` (m, M) from `inputs`, (n, M) or n rows and numbers: the loop of a batch."""
+        """Write y = g(v) into `results` (m, M); `inputs` is v, (n, M), or n items that are rows (M,) or numbers."""
         with np.errstate(all="ignore"):
             for target, value in self._walk(inputs, scratch):
                 results[target] = value
@@ -205,12 +205,12 @@ class Graph(Value):
         return [(step, OPERATIONS.get(step), *place) for step, place in rows]
 
     def _walk(self, inputs: Any, scratch: list[np.ndarray] | None) -> Iterator[tuple[int, Any]]:
-        """Yield (result, value) for each output: numpy columns in `scratch`, or symbols where it is None."""
+        """Yield (result, value) for each output: numpy columns in `scratch`, or symbols if `scratch` is None."""
         registers: dict[int, Any] = {}
         for step, operation, target, first, second in self._program:
             if operation is not None:
-                one = operation.operands == 1
-                operands = (registers[first],) if one else (registers[first], registers[second])
+                unary = operation.operands == 1
+                operands = (registers[first],) if unary else (registers[first], registers[second])
                 if scratch is None:
                     registers[target] = operation.symbol(*operands)
                 else:
@@ -225,19 +225,19 @@ class Graph(Value):
                 yield target, registers[first]
 
 
-def _scalar(function: ca.Function) -> ca.Function:
+def _expand_to_scalars(function: ca.Function) -> ca.Function:
     """Return `function` as an SX function of dense scalars."""
     if function.n_out() != 1:
         raise ShapeError(f"{function.name()} has {function.n_out()} results, expected one")
     if function.is_a("SXFunction"):
-        return dense(function)
+        return make_dense(function)
     try:
-        return dense(function.expand())
+        return make_dense(function.expand())
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1]
         raise DataError(f"{function.name()} cannot be written as scalar operations: {reason}") from error
 
 
-def _refused(code: int) -> str:
+def _name_operation(code: int) -> str:
     """Return CasADi's name of an operation."""
     return next(name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == code)[3:].lower()

@@ -17,40 +17,40 @@ try:
 except ImportError as error:
     raise ImportError(f"GymPlant needs gymnasium, which is not installed: {install('gym')}") from error
 
-_ROUNDING = 1e-5  # of an action, which many environments hold in float32
+_ROUNDING = 1e-5  # relative tolerance for actions and states, which many environments hold in float32
 
 
 class GymPlant:
     """y = the observation after env.step(u): a Gymnasium environment for `collect` and `simulate`.
 
-    The observation is both y and the state, for nothing more is known of an environment; rewards are not used.
-    An environment decides when an episode ends: `ended` then says "terminated" or "truncated", `collect` ends that
-    episode and `simulate` that run, and only `reset` goes on. No data stand across an end.
+    The observation is both y and the state, because an environment shows nothing else. Rewards are not used. The
+    environment decides when an episode ends: `ended` is then "terminated" or "truncated", and `collect` ends the
+    episode or `simulate` the run. Only `reset` begins another episode. No pair of samples crosses an end.
 
     Parameters
     ----------
     env
-        An environment, or its name for ``gymnasium.make``: "Pendulum-v1". Observations and actions are vectors
-        (Box); an environment with numbered actions is refused.
+        An environment, or its name for ``gymnasium.make``: "Pendulum-v1". Its observations and actions must be vectors
+        (Box), not numbered actions.
     dt
-        Sample time [s]; by default what the environment tells.
+        Sample time [s]; by default the attribute `dt` of the environment.
     states, inputs
         Names with units; by default x0, x1, … and u0, ….
     sin_cos
-        Pairs of observations (sin θ, cos θ), by index; θ [rad] takes the place of the first of the two that comes, and
-        the other is left out. It is continuous within an episode and starts between −π and π.
+        Pairs of observations (sin θ, cos θ), by index. θ [rad] replaces the one with the lower index, and the other
+        is left out. θ is continuous within an episode and starts between −π and π.
         ``km.plants.GymPlant("Pendulum-v1", sin_cos=[(1, 0)])`` has the states θ and its rate.
     start
-        start(env, x0) puts the environment into x0. By default MuJoCo's environments get their positions and
-        velocities, others their attribute `state`, and the observation must then be x0.
+        start(env, x0) puts the environment into x0. By default x0 is written into the positions and velocities of a
+        MuJoCo environment, and into the attribute `state` of any other; the observation must then equal x0.
     scene
         scene(x, u) → shapes, for the animation in the logs.
 
     Raises
     ------
     DataError
-        The environment's observations or actions are no vectors; its sample time is unknown; a pair of `sin_cos` names
-        no two observations.
+        The environment's observations or actions are not vectors; its sample time is unknown; a pair of `sin_cos` does
+        not name two observations.
     ShapeError
         There are more or fewer names than states or inputs.
     """
@@ -96,7 +96,7 @@ class GymPlant:
         return None if self._x is None else self._x.copy()
 
     def reset(self, x0: ArrayLike | None, rng: np.random.Generator | int = 0) -> Float[np.ndarray, " nx"]:
-        """Begin an episode at x0 (nx,), or where the environment itself starts, drawn with `rng`, and return y (nx,).
+        """Begin an episode at x0 (nx,) and return y (nx,); if x0 is None, the environment draws its start by `rng`.
 
         Raises
         ------
@@ -109,16 +109,16 @@ class GymPlant:
         if x0 is not None:
             wanted = checks.array(x0, "x0", (len(self.states),))
             observation = self._put(wanted)
-            got = self._converted(observation)
-            off, turning = got - wanted, list(self.angles)
-            off[turning] = np.angle(np.exp(1j * off[turning]))
-            if self._start is None and np.abs(off).max() > _ROUNDING * (1 + np.abs(wanted).max()):
+            observed = self._convert(observation)
+            error, angles = observed - wanted, list(self.angles)
+            error[angles] = np.angle(np.exp(1j * error[angles]))
+            if self._start is None and np.abs(error).max() > _ROUNDING * (1 + np.abs(wanted).max()):
                 raise DataError(
-                    f"{self._name} was put into x0 = {wanted}, but observes {got}; pass start=function(env, x0), "
+                    f"{self._name} was put into x0 = {wanted}, but observes {observed}; pass start=function(env, x0), "
                     "or x0=None to begin where the environment does"
                 )
-            self._x = wanted  # the angles go on from here
-        self._x = self._converted(observation)
+            self._x = wanted  # the angles stay continuous with those of x0
+        self._x = self._convert(observation)
         return self._x.copy()
 
     def step(self, u: ArrayLike) -> Float[np.ndarray, " nx"]:
@@ -127,8 +127,7 @@ class GymPlant:
         Raises
         ------
         DataError
-            The episode has ended or never begun; u is not within `u_min` and `u_max`, where environments cut in
-            silence what they are given.
+            The episode has ended or never begun; u is outside `u_min` … `u_max`, which environments clip silently.
         """
         if self.ended:
             raise DataError(f"the episode of {self._name} has ended ({self.ended}); call reset(x0, rng) before step")
@@ -137,14 +136,14 @@ class GymPlant:
         if (action < self.u_min - _ROUNDING * size).any() or (action > self.u_max + _ROUNDING * size).any():
             raise DataError(
                 f"u = {action} is beyond the actions of {self._name}, {self.u_min} to {self.u_max}; give the "
-                "controller km.Limits(plant.u_min, plant.u_max), and the excitation no more"
+                "controller km.Limits(plant.u_min, plant.u_max), and keep the excitation inside them"
             )
         space = self.env.action_space
         observation, _, terminated, truncated, _ = self.env.step(
             np.clip(action, self.u_min, self.u_max).astype(space.dtype).reshape(space.shape)
         )
         self.ended = "terminated" if terminated else "truncated" if truncated else ""
-        self._x = self._converted(observation)
+        self._x = self._convert(observation)
         return self._x.copy()
 
     def _width(self, what: str, space: Any) -> int:
@@ -157,14 +156,14 @@ class GymPlant:
         return space.shape[0]
 
     def _sample_time(self) -> float:
-        """Return the attribute dt of the environment, which the classic and MuJoCo's environments have."""
+        """Return the attribute dt of the environment; the classic and the MuJoCo environments have it."""
         dt = getattr(self._core, "dt", None)
         if dt is None:
             raise DataError(f"{self._name} does not tell its sample time; pass dt= in s")
         return checks.positive(dt, "dt", "s")
 
-    def _converted(self, observation: Any) -> Float[np.ndarray, " nx"]:
-        """Return the observation with angles in place of their sines and cosines, near those of the step before."""
+    def _convert(self, observation: Any) -> Float[np.ndarray, " nx"]:
+        """Return the observation with angles in place of sines and cosines; each is near its value one step before."""
         y = np.array(observation, dtype=np.float64)
         x = y[self._kept]
         for place, (s, c) in zip(self.angles, self._pairs, strict=True):
@@ -174,7 +173,7 @@ class GymPlant:
         return x
 
     def _put(self, x0: Float[np.ndarray, " nx"]) -> Any:
-        """Put the environment into x0 and return what it observes, through all of its wrappers."""
+        """Put the environment into x0 and return the observation that all of its wrappers make of it."""
         core = self._core
         if self._start is not None:
             self._start(self.env, x0.copy())

@@ -1,4 +1,4 @@
-"""Plants that run: what `simulate` and `collect` ask of one, a map that remembers its state, a function behind it."""
+"""Plants that run: the protocol that `simulate` and `collect` use, a step map with a state, and black-box functions."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ MeasureFunction = Callable[[Float[np.ndarray, " nx"]], ArrayLike]
 
 
 class Sampled(Protocol):
-    """What has a sample time, and names for its states, inputs and outputs."""
+    """An object with a sample time, and with names of its states, inputs and outputs."""
 
     @property
     def dt(self) -> float:
@@ -46,17 +46,17 @@ class Sampled(Protocol):
 class Plant(Sampled, Protocol):
     """A plant that `simulate` and `collect` drive: hardware, another simulator, or a `SimulatedPlant`.
 
-    Two members more are used where a plant has them: `ended`, a text that is empty until the plant itself ends the
-    episode and then says why, and `scene`, scene(x, u) → shapes for the animation in the logs.
+    Two more members are optional. `ended` is a text: empty while the episode goes on, then the reason why the plant
+    ended it. `scene` is a function scene(x, u) → shapes for the animation in the logs.
     """
 
     @property
     def state(self) -> np.ndarray | None:
-        """The true x (nx,), where it can be known."""
+        """The true x (nx,), or None if it is hidden."""
         ...
 
     def reset(self, x0: ArrayLike | None, rng: np.random.Generator | int) -> np.ndarray:
-        """Go to x0 (nx,), or begin where the plant is when it is None, and return y (ny,)."""
+        """Begin an episode at x0 (nx,), or in the plant's present state if x0 is None, and return y (ny,)."""
         ...
 
     def step(self, u: ArrayLike) -> np.ndarray:
@@ -65,14 +65,14 @@ class Plant(Sampled, Protocol):
 
 
 def require_plant(plant: object) -> None:
-    """Raise a DataError that names the missing member where `plant` is no Plant."""
+    """Raise a DataError that names the missing member if `plant` is not a Plant."""
     if isinstance(plant, Dynamics):
         raise DataError(
             f"the plant is {type(plant).__name__}, ẋ = f(x, u) without a sample time; discretize it first: "
             "km.discretize(dynamics, dt)"
         )
     advice = (
-        "a Plant has dt [s], states, inputs and outputs (names), state (x, or None where it is hidden), "
+        "a Plant has dt [s], states, inputs and outputs (names), state (x, or None if it is hidden), "
         "reset(x0, rng) -> y and step(u) -> y; or pass a StepMap, or km.black_box(f, dt=…, states=…, inputs=…) of "
         "a function x⁺ = f(x, u)"
     )
@@ -80,15 +80,15 @@ def require_plant(plant: object) -> None:
     checks.members(plant, "the plant", needed, advice)
 
 
-def reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
-    """Return what a plant measured at step k as an array of its own."""
+def read_measurement(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
+    """Return the measurement of a plant at step k as a new array."""
     try:
         y = None if value is None else np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
         y = None
     if y is None:
         raise DataError(
-            f"the plant returned {type(value).__name__} at step {k}; reset and step return y, a number each"
+            f"the plant returned {type(value).__name__} at step {k}; reset and step must return y, one number an output"
         )
     if y.ndim != 1 or (ny is not None and len(y) != ny):
         expected = "(ny,)" if ny is None else f"({ny},), as at reset"
@@ -98,7 +98,7 @@ def reading(value: object, ny: int | None, k: int) -> Float[np.ndarray, " ny"]:
 
 @runtime_checkable
 class Transition(Sampled, Protocol):
-    """x⁺ = F(x, u), y = h(x): what a `SimulatedPlant` needs of a step map."""
+    """The members of a step map x⁺ = F(x, u), y = h(x) that a `SimulatedPlant` uses."""
 
     @property
     def nx(self) -> int:
@@ -107,7 +107,7 @@ class Transition(Sampled, Protocol):
 
     @property
     def scene(self) -> Scene | None:
-        """scene(x, u) → shapes, None where there is none."""
+        """scene(x, u) → shapes, or None."""
         ...
 
     def __call__(self, x: ArrayLike, u: ArrayLike) -> Float[np.ndarray, " nx"]:
@@ -124,7 +124,7 @@ class SimulatedPlant:
 
     def __init__(self, step_map: Transition) -> None:
         checks.members(
-            step_map, "the step map", ("dt", "nx", "measure"), "discretize dynamics; a Plant is one as it is"
+            step_map, "the step map", ("dt", "nx", "measure"), "discretize dynamics; pass a Plant without a wrapper"
         )
         self.step_map, self.dt, self.scene = step_map, step_map.dt, step_map.scene
         self.states, self.inputs, self.outputs = step_map.states, step_map.inputs, step_map.outputs
@@ -136,9 +136,9 @@ class SimulatedPlant:
         return None if self._x is None else self._x.copy()
 
     def reset(self, x0: ArrayLike | None, rng: np.random.Generator | int = 0) -> Float[np.ndarray, " ny"]:
-        """Go to x0 (nx,) and return y (ny,); nothing here is random, `rng` is the protocol's."""
+        """Set the state to x0 (nx,) and return y (ny,); `rng` is not used, because nothing here is random."""
         if x0 is None:
-            raise DataError("a simulated plant has no state of its own to begin in; pass x0")
+            raise DataError("a simulated plant has no present state to begin in; pass x0")
         self._x = checks.array(x0, "x0", (self.step_map.nx,))
         return self.step_map.measure(self._x)
 
@@ -174,8 +174,8 @@ def black_box(
     """Return the plant x⁺ = step(x, u), y = measure(x), for `collect` and `simulate`.
 
     The function is called once a sample and may hold anything: another simulator, a table, compiled code. It gets
-    copies of x (nx,) and u (nu,), and must depend on nothing else. A plant with a state of its own, such as hardware,
-    is any object with the members of `km.Plant` instead.
+    copies of x (nx,) and u (nu,), and must depend on nothing else. For a plant that keeps its own state, such as
+    hardware, pass an object with the members of `km.Plant` instead.
 
     Parameters
     ----------
@@ -247,16 +247,16 @@ class BlackBox(Named):
         """x⁺ (nx,) from x (nx,) and u (nu,)."""
         state = checks.array(x, "x", (self.nx,), finite=False)
         move = checks.vector(u, "u", self.nu)
-        return _returned(self.function(state, move), "step(x, u)", self.states)
+        return _check_result(self.function(state, move), "step(x, u)", self.states)
 
     def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
         """Return y (ny,) from x (nx,)."""
         state = checks.array(x, "x", (self.nx,), finite=False)
-        return state if self.output is None else _returned(self.output(state), "measure(x)", self.outputs)
+        return state if self.output is None else _check_result(self.output(state), "measure(x)", self.outputs)
 
 
-def _returned(value: ArrayLike | None, what: str, names: tuple[str, ...]) -> Float[np.ndarray, " n"]:
-    """Return what a function gave as a vector of its own; a scalar is one value."""
+def _check_result(value: ArrayLike | None, what: str, names: tuple[str, ...]) -> Float[np.ndarray, " n"]:
+    """Return what a user's function returned as a new vector; a scalar counts as one value."""
     if value is None:
         raise DataError(f"{what} returned None; return {len(names)} values: {', '.join(names)}")
     result = np.atleast_1d(checks.array(value, f"what {what} returned", finite=False))

@@ -1,4 +1,4 @@
-"""A CasADi function behind numpy arrays: by the interpreter, or as machine code from the C that CasADi generates."""
+"""CasADi functions on numpy arrays, run by the interpreter or as machine code from the C that CasADi generates."""
 
 import ctypes
 import hashlib
@@ -20,13 +20,13 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.interrupts import heard
+from koopmpc.interrupts import raise_swallowed
 
 Kernel = Callable[[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]], None]
 
-# No fused multiply-adds and no -march: the interpreter's numbers, on any machine of this kind.
+# Without fused multiply-adds and -march the machine code gives the interpreter's numbers on all machines of a kind.
 _FLAGS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
-_STEPS_A_THREAD = 50_000  # they take about 5 ms, and starting a thread 0.1 ms
+_STEPS_A_THREAD = 50_000  # least steps for one thread: they take about 5 ms, and starting a thread takes 0.1 ms
 _LOOP = """
 #ifdef _WIN32
 __declspec(dllexport)
@@ -52,19 +52,19 @@ void koopmpc_rollouts(long long episodes, long long steps, double* X, const doub
 
 
 class Buffered(threading.local):
-    """`function` of float64 vectors at half a microsecond a call; matrices come out flat, column after column.
+    """A CasADi function of float64 vectors at half a microsecond a call; a matrix result is flat, column after column.
 
-    CasADi's FunctionBuffer writes into arrays that we own, a set for each thread: fill `arguments`, call `evaluate`,
-    and read `results` before the next call. A call of the object itself returns fresh copies.
+    CasADi's FunctionBuffer reads and writes the arrays of this object, a set for each thread: fill `arguments`, call
+    `evaluate`, and read `results` before the next call. Calling the object itself returns fresh copies.
     """
 
     def __init__(self, function: ca.Function) -> None:
         self.function = function
         self.arguments = tuple(np.zeros(function.size1_in(i)) for i in range(function.n_in()))
         self.results = tuple(np.zeros(function.nnz_out(i)) for i in range(function.n_out()))
-        self.evaluate, self._buffer = interpreter(function, self.arguments, self.results)
-        if not function.is_a("SXFunction"):  # it may hold an integrator
-            self.evaluate = heard(self.evaluate)
+        self.evaluate, self._buffer = bind_interpreter(function, self.arguments, self.results)
+        if not function.is_a("SXFunction"):  # it may hold an integrator, and those swallow Ctrl-C
+            self.evaluate = raise_swallowed()(self.evaluate)
 
     def __call__(self, *arguments: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return fresh results; `arguments` have the shapes of the function's inputs, (n,) each."""
@@ -77,8 +77,8 @@ class Buffered(threading.local):
         return Buffered, (self.function,)
 
 
-def dense(function: ca.Function) -> ca.Function:
-    """Return `function` with dense inputs and outputs; a buffer of a sparse one holds nonzeros alone."""
+def make_dense(function: ca.Function) -> ca.Function:
+    """Return `function` with dense inputs and outputs; the buffer of a sparse function would hold only nonzeros."""
     sparsities = [function.sparsity_in(i) for i in range(function.n_in())]
     sparsities += [function.sparsity_out(i) for i in range(function.n_out())]
     if all(sparsity.is_dense() for sparsity in sparsities):
@@ -89,23 +89,23 @@ def dense(function: ca.Function) -> ca.Function:
     return result.expand() if function.is_a("SXFunction") else result
 
 
-def _rollouts_text(F: ca.Function) -> str:
+def _generate_rollouts(F: ca.Function) -> str:
     """Return C with ``koopmpc_rollouts(E, T, X, U)``: X (E, T+1, nx) from its first rows and U (E, T, nu)."""
     x, u = ca.SX.sym("x", F.size1_in(0)), ca.SX.sym("u", F.size1_in(1))
     step = ca.Function("koopmpc_step", [x, u], [F(x, u)])
     sizes = {f"sz_{name}": getattr(step, f"sz_{name}")() + 1 for name in ("arg", "res", "iw", "w")}
-    return _generated(step) + _LOOP.format(nx=x.numel(), nu=u.numel(), **sizes)
+    return _generate_code(step) + _LOOP.format(nx=x.numel(), nu=u.numel(), **sizes)
 
 
-def _generated(function: ca.Function) -> str:
-    """Return CasADi's C, static, because an exported name could clash with the same name elsewhere in the process."""
+def _generate_code(function: ca.Function) -> str:
+    """Return CasADi's C with static functions: an exported name could clash with the same name in the process."""
     generator = ca.CodeGenerator("koopmpc", {"with_header": False})
     generator.add(function)
     return "#define CASADI_SYMBOL_EXPORT static\n" + generator.dump()
 
 
-def compiler() -> list[str] | None:
-    """Return the command of a C compiler: $CC, cc, gcc or clang, the first that is found."""
+def find_compiler() -> list[str] | None:
+    """Return the command of the first C compiler found among $CC, cc, gcc and clang, or None."""
     for command in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
         words = shlex.split(command)
         if words and shutil.which(words[0]):
@@ -113,15 +113,15 @@ def compiler() -> list[str] | None:
     return None
 
 
-def kernel(F: ca.Function, command: list[str], cache: Path | None) -> Kernel:
-    """Return F's machine code, loaded from `cache` or compiled into it; without a cache nothing is left on disk.
+def compile_kernel(F: ca.Function, command: list[str], cache: Path | None) -> Kernel:
+    """Return F's machine code, loaded from `cache` or compiled into it; without a cache no file remains on disk.
 
     Raises
     ------
     OSError, subprocess.SubprocessError
         The compiler fails or its output does not load.
     """
-    rollouts = library(_rollouts_text(F), command, cache).koopmpc_rollouts
+    rollouts = load_library(_generate_rollouts(F), command, cache).koopmpc_rollouts
     rollouts.argtypes = [ctypes.c_longlong, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p]
     rollouts.restype = None
 
@@ -144,10 +144,11 @@ def kernel(F: ca.Function, command: list[str], cache: Path | None) -> Kernel:
     return run
 
 
-def library(text: str, command: list[str], cache: Path | None) -> ctypes.CDLL:
-    """Return the machine code of this C, loaded from `cache` or compiled into it; without one nothing is left on disk.
+def load_library(text: str, command: list[str], cache: Path | None) -> ctypes.CDLL:
+    """Return the machine code of this C, loaded from `cache` or compiled into it; without a cache no file remains.
 
-    The flags in the environment variable KOOPMPC_CFLAGS come after our own, and code of other flags is another file.
+    The flags in the environment variable KOOPMPC_CFLAGS follow the library's own flags. The name of a cached file
+    depends on the flags, so code compiled with other flags is another file.
 
     Raises
     ------
@@ -156,36 +157,36 @@ def library(text: str, command: list[str], cache: Path | None) -> ctypes.CDLL:
     """
     command = [*command, *_FLAGS, *shlex.split(os.environ.get("KOOPMPC_CFLAGS", ""))]
     if cache is None:
-        with tempfile.TemporaryDirectory() as folder:  # code that is loaded outlives its file
+        with tempfile.TemporaryDirectory() as folder:  # loaded code stays valid when its file is gone
             return ctypes.CDLL(str(_compile(text, command, Path(folder) / "step.so")))
     key = "\0".join([text, *command, platform.machine(), platform.system()])
     path = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.so"
     if path.is_file():
         try:
             return ctypes.CDLL(str(path))
-        except OSError:  # the file is of another kind of machine: write it again
+        except OSError:  # another kind of machine wrote the file: compile again
             path.unlink()
     return ctypes.CDLL(str(_compile(text, command, path)))
 
 
-def private_cache() -> Path | None:
-    """Return this user's folder for machine code, or None where others could write into it."""
+def find_private_cache() -> Path | None:
+    """Return this user's folder for machine code, or None if other users could write into it."""
     if not hasattr(os, "getuid"):
         return None
     base = os.environ.get("XDG_CACHE_HOME", "")
     folder = (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "koopmpc"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        ours = _private(folder) and os.access(folder, os.W_OK)
+        ours = _is_private(folder) and os.access(folder, os.W_OK)
     except OSError:
         return None
     return folder if ours else None
 
 
-def _private(folder: Path) -> bool:
-    """Return True where only this user and root can write into `folder` or change its path."""
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+def _is_private(folder: Path) -> bool:
+    """Return True if only this user and root can write into `folder` or change its path."""
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o022:
         return False
     above = [parent.stat() for parent in folder.resolve().parents]
     return all(
@@ -215,10 +216,10 @@ int koopmpc_call(const double** arg, double** res, casadi_int* iw, double* w) {
 
 
 class Routine:
-    """`function` that reads `arguments` and writes `results`, float64 arrays that hold matrices column by column.
+    """A CasADi function that reads `arguments` and writes `results`, float64 arrays with matrices column by column.
 
-    Machine code and the interpreter give the same numbers. Implicit integrators run in the interpreter, and so does all
-    where `compiles` is False.
+    Machine code and the interpreter give the same numbers. Implicit integrators always run in the interpreter; with
+    `compiles` False every function does.
     """
 
     def __init__(
@@ -235,23 +236,23 @@ class Routine:
             assert array.dtype == np.float64, "machine code reads float64"
             assert array.flags.c_contiguous, "machine code reads contiguous arrays"
             assert array.size == size, f"an array has {array.size} entries, the function {size}"
-        self._kept: list[Any] = [*arguments, *results]  # both routes hold pointers, and no reference to the arrays
-        call = _machine(function, arguments, results, self._kept) if compiles else None
+        self._kept: list[Any] = [*arguments, *results]  # keeps the arrays alive: both routes hold only pointers to them
+        call = _bind_machine_code(function, arguments, results, self._kept) if compiles else None
         self.compiled = call is not None
         if call is None:
-            call, buffer = interpreter(function, arguments, results)
+            call, buffer = bind_interpreter(function, arguments, results)
             self._kept.append(buffer)
         self.call: Callable[[], object] = call
 
 
-def _machine(
+def _bind_machine_code(
     function: ca.Function, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], kept: list[Any]
 ) -> Callable[[], object] | None:
-    command = compiler()
+    command = find_compiler()
     if command is None:
         return None
     try:
-        code = library(_generated(function) + _CALL % function.name(), command, private_cache())
+        code = load_library(_generate_code(function) + _CALL % function.name(), command, find_private_cache())
     except (OSError, RuntimeError, subprocess.SubprocessError):
         return None
     call = code.koopmpc_call
@@ -265,10 +266,13 @@ def _machine(
     return lambda: call(*pointers)
 
 
-def interpreter(
+def bind_interpreter(
     function: ca.Function, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
 ) -> tuple[Callable[[], None], Any]:
-    """Return the call that evaluates `function` on these arrays, and its buffer: CasADi keeps no reference to them."""
+    """Return a call that evaluates `function` on these arrays, and its buffer.
+
+    The caller must keep the arrays and the buffer alive, because CasADi holds no reference to them.
+    """
     buffer, evaluate = cast("tuple[Any, Callable[[], None]]", function.buffer())
     for i, array in enumerate(arguments):
         if array.size:

@@ -15,16 +15,16 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.plants import routines
-from koopmpc.plants.dynamics import RK4, Dynamics, Integrator, drawn_by, output, right_side
+from koopmpc.plants.dynamics import RK4, Dynamics, Integrator, build_output, build_right_side, find_scene
 from koopmpc.plants.graph import Graph
-from koopmpc.plants.routines import Buffered, dense
+from koopmpc.plants.routines import Buffered, make_dense
 from koopmpc.scene import Scene
 from koopmpc.values import Named, Value, freeze
 
-_WORTH_COMPILING = 20_000  # steps that the interpreter makes in 0.2 s, the time of a compiler
-_LONGEST = 5_000  # operations of F; the compiler's time grows faster than its code
-_WIDE = 64  # episodes from which numpy columns beat one call a step
-_CHUNK = 4096  # episodes at a time, so that the columns stay in the cache
+_WORTH_COMPILING = 20_000  # compile F for a batch of at least so many steps: interpreting them takes as long, 0.2 s
+_LONGEST = 5_000  # do not compile an F of more operations: the compiler's time grows faster than the code
+_WIDE = 64  # use numpy columns from so many episodes on: they are then faster than one call a step
+_CHUNK = 4096  # episodes that run at once, so that their columns stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class StepMap(Named):
     Parameters
     ----------
     F
-        CasADi function of x (nx) and u (nu, may be 0) that returns x⁺ (nx). Made of SX it runs in batches.
+        CasADi function of x (nx) and u (nu, may be 0) that returns x⁺ (nx). An F made of SX runs in batches.
     dt
         Sample time [s].
     h
@@ -92,8 +92,8 @@ class StepMap(Named):
             raise ShapeError(f"h takes {h.size1_in(0)} states, F has {nx}; pass h of the same x")
         freeze(
             self,
-            F=dense(F),
-            h=dense(h),
+            F=make_dense(F),
+            h=make_dense(h),
             dt=checks.positive(dt, "dt", "s"),
             states=checks.names(states, "states", "x", nx),
             inputs=checks.names(inputs, "inputs", "u", nu),
@@ -109,9 +109,9 @@ class StepMap(Named):
     def __call__(self, x: ArrayLike, u: ArrayLike) -> Float[np.ndarray, " nx"]:
         """x⁺ = F(x, u): (nx,) from x (nx,) and u (nu,).
 
-        NaN passes through; where an implicit method finds no x⁺ the answer is NaN, with a RuntimeWarning.
+        NaN passes through. If an implicit method finds no x⁺, the result is NaN and a RuntimeWarning says so.
         """
-        x, u = _vector(x, "x", len(self.states)), _vector(u, "u", len(self.inputs))
+        x, u = _as_vector(x, "x", len(self.states)), _as_vector(u, "u", len(self.inputs))
         x_next = np.empty(self.nx)
         self.advance(x, u, x_next)
         return x_next
@@ -119,14 +119,14 @@ class StepMap(Named):
     def advance(
         self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"], x_next: Float[np.ndarray, " nx"]
     ) -> None:
-        """Write F(x, u) into `x_next`, as a call returns it, but without looking at the arguments."""
+        """Write F(x, u) into `x_next`; unlike a call, this does not check the arguments."""
         step = self._step
         x_place, u_place = step.arguments
         x_place[:], u_place[:] = x, u
         try:
             step.evaluate()
         except RuntimeError as error:
-            _warn_of(error, x, u)
+            _warn_unsolved(error, x, u)
             x_next[:] = np.nan
         else:
             x_next[:] = step.results[0]
@@ -134,19 +134,19 @@ class StepMap(Named):
     def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
         """Return y = h(x): (ny,) from x (nx,)."""
         if self.measures_all:
-            return _vector(x, "x", len(self.states)).copy()
+            return _as_vector(x, "x", len(self.states)).copy()
         output = self._output
-        output.arguments[0][:] = _vector(x, "x", len(self.states))
+        output.arguments[0][:] = _as_vector(x, "x", len(self.states))
         output.evaluate()
         return output.results[0].copy()
 
     def rollout(self, x0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "steps nx"]:
-        """x_{k+1} = F(x_k, u_k): X (T+1, nx) from x0 (nx,) and U (T, nu); the bits of T single calls."""
+        """x_{k+1} = F(x_k, u_k): X (T+1, nx) from x0 (nx,) and U (T, nu), equal to T single calls to the bit."""
         start = checks.array(x0, "x0", (self.nx,))
         moves = checks.array(U, "U", (None, self.nu))
         X = np.empty((len(moves) + 1, self.nx))
         X[0] = start
-        _march(self._step, X, moves)
+        _roll_out(self._step, X, moves)
         return X
 
     def rollouts(self, X0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "episodes steps nx"]:
@@ -176,9 +176,10 @@ class StepMap(Named):
 
     @cached_property
     def measures_all(self) -> bool:
-        """Whether y = x."""
-        x = ca.SX.sym("x", self.nx)
-        return self.ny == self.nx and self.h.is_a("SXFunction") and ca.is_equal(self.h(x), x, 1)
+        """True if y = x."""
+        nx = len(self.states)
+        x = ca.SX.sym("x", nx)
+        return len(self.outputs) == nx and self.h.is_a("SXFunction") and ca.is_equal(self.h(x), x, 1)
 
     @cached_property
     def _output(self) -> Buffered:
@@ -197,7 +198,7 @@ class StepMap(Named):
 
 
 def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) -> StepMap:  # noqa: B008
-    """Return x⁺ = F(x, u) of ẋ = f(x, u) over one sample, u held.
+    """Return x⁺ = F(x, u) of ẋ = f(x, u) over one sample with constant u.
 
     Parameters
     ----------
@@ -226,13 +227,13 @@ def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) ->
            [0.0125]])
     """
     checks.positive(dt, "dt", "s")
-    F = integrator.step(right_side(dynamics), dt)
-    h, outputs = output(dynamics)
-    return StepMap(F, dt, h, dynamics.states, dynamics.inputs, outputs, drawn_by(dynamics))
+    F = integrator.step(build_right_side(dynamics), dt)
+    h, outputs = build_output(dynamics)
+    return StepMap(F, dt, h, dynamics.states, dynamics.inputs, outputs, find_scene(dynamics))
 
 
-def _vector(value: ArrayLike, name: str, length: int) -> Float[np.ndarray, " n"]:
-    """Return `value` as float64 (length,): itself where it is one, for this is the control path."""
+def _as_vector(value: ArrayLike, name: str, length: int) -> Float[np.ndarray, " n"]:
+    """Return `value` as float64 (length,), without a copy if it is one already: a control loop calls this each step."""
     if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == (length,):
         return value
     result = checks.array(value, name, finite=False)
@@ -257,7 +258,7 @@ def _check_signature(function: ca.Function, name: str, arguments: int) -> None:
 class _Batch:
     """Fills X (E, T+1, nx) from X[:, 0] and U (E, T, nu).
 
-    F made of SX operations runs as generated C where there is a compiler and the batch is large enough, else as its
+    An F made of SX operations runs as generated C if there is a compiler and the batch is large enough, else as its
     expression graph over numpy columns. Any other F (implicit integrators, matrices) is called step by step.
     """
 
@@ -268,27 +269,27 @@ class _Batch:
         """Write x_{k+1} = F(x_k, u_k) for every episode."""
         episodes, steps = U.shape[:2]
         scalar = self._step.function.is_a("SXFunction")
-        worth = episodes * steps >= _WORTH_COMPILING or "_kernel" in self.__dict__
-        if scalar and worth and self._kernel is not None:
+        compiles = episodes * steps >= _WORTH_COMPILING or "_kernel" in self.__dict__
+        if scalar and compiles and self._kernel is not None:
             self._kernel(X, U)
         elif scalar and episodes >= _WIDE and self._graph is not None:
-            vectorised(self._graph, X, U)
+            roll_out_columns(self._graph, X, U)
         else:
             for episode, moves in zip(X, U, strict=True):
-                _march(self._step, episode, moves)
+                _roll_out(self._step, episode, moves)
 
     @cached_property
     def _kernel(self) -> routines.Kernel | None:
-        F, command = self._step.function, routines.compiler()
+        F, command = self._step.function, routines.find_compiler()
         if command is None or F.n_instructions() > _LONGEST:
             return None
         try:
-            return routines.kernel(F, command, routines.private_cache())
+            return routines.compile_kernel(F, command, routines.find_private_cache())
         except (OSError, AttributeError, subprocess.SubprocessError) as error:
             failed = isinstance(error, subprocess.CalledProcessError)
-            said = error.stderr.decode(errors="replace")[-500:] if failed else ""
+            stderr = error.stderr.decode(errors="replace")[-500:] if failed else ""
             warnings.warn(
-                f"{command[0]} could not compile the step map, batches run slower: {error} {said}",
+                f"{command[0]} could not compile the step map, batches run slower: {error} {stderr}",
                 RuntimeWarning,
                 stacklevel=5,
             )
@@ -302,8 +303,8 @@ class _Batch:
             return None
 
 
-def _march(step: Buffered, X: Float[np.ndarray, "rows nx"], U: Float[np.ndarray, "T nu"]) -> None:
-    """Write x_1 … x_T after X[0], call by call; NaN from where an implicit method fails."""
+def _roll_out(step: Buffered, X: Float[np.ndarray, "rows nx"], U: Float[np.ndarray, "T nu"]) -> None:
+    """Write x_1 … x_T after X[0], call by call; after a failure of an implicit method all rows are NaN."""
     (x, u), (x_next,), evaluate = step.arguments, step.results, step.evaluate
     x[:] = X[0]
     for k in range(len(U)):
@@ -311,15 +312,15 @@ def _march(step: Buffered, X: Float[np.ndarray, "rows nx"], U: Float[np.ndarray,
         try:
             evaluate()
         except RuntimeError as error:
-            _warn_of(error, x, u)
+            _warn_unsolved(error, x, u)
             X[k + 1 :] = np.nan
             return
         X[k + 1] = x_next
         x[:] = x_next
 
 
-def vectorised(graph: Graph, X: Float[np.ndarray, "E rows nx"], U: Float[np.ndarray, "E T nu"]) -> None:
-    """Write x_1 … x_T after X[:, 0], all episodes of a chunk in one numpy column."""
+def roll_out_columns(graph: Graph, X: Float[np.ndarray, "E rows nx"], U: Float[np.ndarray, "E T nu"]) -> None:
+    """Write x_1 … x_T after X[:, 0]; a numpy column holds one state of all episodes in a chunk."""
     nx = X.shape[2]
     for start in range(0, len(X), _CHUNK):
         states, moves = X[start : start + _CHUNK], U[start : start + _CHUNK]
@@ -333,8 +334,8 @@ def vectorised(graph: Graph, X: Float[np.ndarray, "E rows nx"], U: Float[np.ndar
             v[:nx] = x_next
 
 
-def _warn_of(error: RuntimeError, x: np.ndarray, u: np.ndarray) -> None:
-    """Warn that an implicit step from (x, u) has no solution; a numerical outcome raises nothing."""
+def _warn_unsolved(error: RuntimeError, x: np.ndarray, u: np.ndarray) -> None:
+    """Warn that an implicit step from (x, u) has no solution; this is a numerical outcome, so nothing is raised."""
     reason = str(error).strip().splitlines()[-1]
     warnings.warn(
         f"the integrator found no x⁺ from x={x}, u={u}; x⁺ is NaN, try a smaller dt ({reason})",

@@ -1,4 +1,4 @@
-"""What all lifted predictors share: x ≈ C z, z₀ = ψ(x₀), the eigenvalues of A, the report of their fit, their files."""
+"""The base class of lifted predictors: x ≈ C z, z₀ = ψ(x₀), the eigenvalues of A, the fit report, the file format."""
 
 import json
 from dataclasses import dataclass, field
@@ -50,33 +50,33 @@ def load_value(path: str | Path, *kinds: type[V]) -> V:
     try:
         with disk.Members(source) as arrays:
             arrays.require("tree")
-            value = _built(arrays)
+            value = _build_value(arrays)
     except LogError as error:
         raise LogError(f"{path}: {error}") from error
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise LogError(f"{path} is damaged: the text in it cannot be read; {advice}") from error
     except (OSError, ValueError) as error:
-        raise LogError(f"{path} is no file that koopmpc saved, or is damaged: {error}; {advice}") from error
+        raise LogError(f"{path} is damaged, or koopmpc did not save it: {error}; {advice}") from error
     if not isinstance(value, kinds):
         raise LogError(f"{path} holds a {type(value).__name__}, not a {wanted}")
     return value
 
 
-def _built(arrays: disk.Members) -> object:
-    """Build what the text of the file describes, and read the arrays that it names."""
+def _build_value(arrays: disk.Members) -> object:
+    """Return the object that the file's JSON text describes, with the arrays that it names."""
     tree = cast("object", json.loads(arrays["tree"].tobytes().decode()))
     node = cast("dict[str, object]", tree) if isinstance(tree, dict) else {}
     if node.get("format") != _FORMAT:
-        raise LogError(f"it is no {_FORMAT} file; save it again with this version")
+        raise LogError(f"it is not a {_FORMAT} file; save it again with this version")
     try:
         return from_data(node.get("value"), arrays)
     except LogError:
         raise
-    except Exception as error:  # a damaged file gave a class something that it was never meant to hold
+    except Exception as error:  # a damaged file passed a class wrong arguments
         raise LogError(f"it is damaged, or was made by hand: {error}") from error
 
 
-_DEFECTIVE = 1e14  # condition number of eigenvectors beyond which they are dependent
+_DEFECTIVE = 1e14  # A counts as defective if the condition number of its eigenvectors is above this
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +86,13 @@ class FitReport(Value):
     Attributes
     ----------
     method
-        The function that made it: "dmd", "dmdc", "edmd", "bilinear_edmd".
+        The function that fitted the model: "dmd", "dmdc", "edmd", "bilinear_edmd", ….
     route
-        How the least squares was solved: "gram", "qr", "svd", and what was cut or added.
+        How the least squares was solved: "gram", "qr" or "svd", then the ridge, or the cut of singular values.
     samples
         Snapshot pairs M.
     condition
-        Condition number of the regressors on unit-norm columns; inf where they are dependent.
+        Condition number of the regressors on unit-norm columns; inf if they are dependent.
     rank, columns
         Numerical rank of the regressors, and how many columns they have.
     ridge
@@ -101,11 +101,11 @@ class FitReport(Value):
         Root-mean-square one-step residual of each state, in the state's unit; the "gram" route resolves it to
         about 1e-8 of the state's size.
     state_residual
-        Root-mean-square of x − C ψ(x) for each state: zero where the lifting holds the state itself.
+        Root-mean-square of x − C ψ(x) for each state: zero if the lifting holds the state itself.
     warnings
         Sentences, one for each doubt.
     changes
-        Sentences, one for each thing that a prior, a limit on the spectral radius or a penalty changed.
+        Sentences, one for each change that a prior, a limit on the spectral radius or a penalty made.
     """
 
     method: str
@@ -140,12 +140,12 @@ class Predictor(Value):
     states, inputs
         Names with units.
     report
-        How it was fitted; None for a model that was not.
+        Report of the fit; None for a model that was not fitted.
     embedding
-        Makes ζ of x and its past; then z₀ = ψ(ζ₀).
+        Makes the point ζ of x and its past; then z₀ = ψ(ζ₀). None without delays.
     scale
-        (nz, nz) upper triangular R with RᵀR = Σ w z zᵀ / Σ w over the lifted states that the model was fitted to: R⁻ᵀ z
-        has root-mean-square 1 in every direction. None for a model that was given, and in older files.
+        (nz, nz) upper triangular R with RᵀR = Σ w z zᵀ / Σ w over the lifted data of the fit: R⁻ᵀ z has
+        root-mean-square 1 in every direction. None for a model that was not fitted.
     nx, nu, nz
         How many states, inputs and lifted coordinates there are.
     """
@@ -166,7 +166,7 @@ class Predictor(Value):
 
     @property
     def point_names(self) -> tuple[str, ...]:
-        """Names of what ψ acts on: the states, or those of ζ under an embedding."""
+        """Names of the arguments of ψ: the states, or the entries of ζ under an embedding."""
         return self.states if self.embedding is None else self.embedding.names
 
     def lift(self, x: ArrayLike, history: Episode | None = None) -> Float[np.ndarray, "*batch nz"]:
@@ -177,7 +177,7 @@ class Predictor(Value):
         x
             With an embedding one state (nx,) and its history, or points ζ, (nζ,) or (M, nζ).
         history
-            The steps that led to x, its last row x itself; only with an embedding.
+            The steps that led to x; its last row is x. Only with an embedding.
 
         Raises
         ------
@@ -186,13 +186,13 @@ class Predictor(Value):
         """
         return self.lifting(self._point(checks.array(x, "x"), history))
 
-    def held(self, x: ArrayLike) -> Float[np.ndarray, " npoint"]:
-        """Return the point of a plant that has been at rest in x without input: x itself without an embedding."""
+    def rest_point(self, x: ArrayLike) -> Float[np.ndarray, " npoint"]:
+        """Return the point ζ of a plant that has rested in x without input; without an embedding it is x itself."""
         state = checks.array(x, "x", (self.nx,))
         return state if self.embedding is None else self.embedding.held(state, np.zeros(self.nu))
 
     def embed(self, episodes: Episodes) -> Episodes:
-        """Return the episodes of what ψ acts on, the states first in each row: themselves without an embedding."""
+        """Return the episodes of points ζ, the states first in each row; without an embedding, the same episodes."""
         return episodes if self.embedding is None else self.embedding(episodes)
 
     def save(self, path: str | Path) -> None:
@@ -200,7 +200,7 @@ class Predictor(Value):
         save_value(self, path)
 
     def start(self, x0: ArrayLike, history: Episode | None = None) -> Float[np.ndarray, " npoint"]:
-        """Return the point that a rollout starts from: x0, or ζ_0 of x0 and its history, or a ζ_0 that x0 is."""
+        """Return the first point of a rollout: x0, or with an embedding ζ_0, which x0 is or x0 and its history give."""
         point = self._point(checks.array(x0, "x0"), history)
         return checks.array(point, "x0", (len(self.point_names),))
 
@@ -211,7 +211,7 @@ class Predictor(Value):
 
     @property
     def eigenvectors(self) -> Complex[np.ndarray, "nz nz"]:
-        """Right eigenvectors v_j of A, one a column, of length 1, in the order of `eigenvalues`."""
+        """Right eigenvectors v_j of A, one a column, with norm 1, in the order of `eigenvalues`."""
         return self._eigen[1]
 
     @cached_property
@@ -243,7 +243,7 @@ class Predictor(Value):
 
     @cached_property
     def _eigen(self) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
-        return eigen(self.A)
+        return sorted_eigen(self.A)
 
     def _point(self, x: Float[np.ndarray, "..."], history: Episode | None) -> Float[np.ndarray, "..."]:
         if self.embedding is None:
@@ -257,12 +257,12 @@ class Predictor(Value):
         if x.shape[-1:] == (self.nx,):
             raise DataError(
                 f"the predictor remembers {self.embedding.steps} steps: pass history=Episode(X=…, U=…) that ends at x, "
-                "or predictor.held(x) for a plant at rest there"
+                "or predictor.rest_point(x) for a plant at rest there"
             )
         return x
 
 
-def eigen(A: Float[np.ndarray, "nz nz"]) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
+def sorted_eigen(A: Float[np.ndarray, "nz nz"]) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
     """Return eigenvalues of A, the largest magnitude first, and its right eigenvectors, one a column."""
     result = np.linalg.eig(A)
     values, vectors = np.asarray(result.eigenvalues, complex), np.asarray(result.eigenvectors, complex)

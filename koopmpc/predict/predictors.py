@@ -1,6 +1,6 @@
 """The predictors: z⁺ = A z + B u + E w, and z⁺ = A z + B u + Σ uᵢ Nᵢ z; x ≈ C z, z₀ = ψ(x₀).
 
-`load_model` reads one from a file, `from_peer` takes one over from another package.
+`load_model` reads one from a file.
 """
 
 from collections.abc import Sequence
@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -20,28 +19,27 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import Lifting, lifting_of
+from koopmpc.lifting.base import Lifting, check_lifting
 from koopmpc.lifting.composed import Projected
-from koopmpc.lifting.state import Constant, Numeric, State
+from koopmpc.lifting.state import Constant, State
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import FitReport, Predictor, load_value
 from koopmpc.values import freeze
 
-_PROBES = 7  # states at which liftings of two packages are compared
-_LARGEST = 1e300  # entry of A: sums of as many as it has are finite
+_LARGEST = 1e300  # refuse an A with a larger entry: sums of its entries would overflow
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class LinearPredictor(Predictor):
-    """A lifted linear predictor z⁺ = A z + B u + E w, x ≈ C z, z₀ = ψ(x₀), w disturbances that are measured.
+    """A lifted linear predictor z⁺ = A z + B u + E w, x ≈ C z, z₀ = ψ(x₀), with measured disturbances w.
 
     Attributes
     ----------
     A, B, C, lifting, dt, states, inputs, report, embedding, scale
         Those of every `Predictor`: A is (nz, nz), B (nz, nu), C (nx, nz), names have units, dt is in seconds.
     exact_modes
-        (nl, nz) exact DMD modes X′ V Σ⁻¹ W in the observables of the unreduced lifting, one a column, where a
-        rank-truncated fit computed them; its `lifting` is then a Projected one.
+        (nl, nz) exact DMD modes X′ V Σ⁻¹ W of a rank-truncated fit, one a column, in the observables of the unreduced
+        lifting; `lifting` is then a Projected one. None for other models.
     E
         (nz, nw); (nz, 0) without measured disturbances.
     disturbances
@@ -81,7 +79,7 @@ class LinearPredictor(Predictor):
         embedding: Delay | None = None,
         scale: ArrayLike | None = None,
     ) -> None:
-        _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
+        _store_fields(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
         modes = exact_modes
         if modes is not None:
             if not isinstance(self.lifting, Projected) or modes.shape != self.lifting.basis.shape:
@@ -120,7 +118,7 @@ class LinearPredictor(Predictor):
         if W is not None:
             Z[1:] += checks.array(W, "W", (len(inputs), self.nw)) @ self.E.T
         transposed, rows = self.A.T, list(Z)
-        for z, z_next in pairwise(rows):  # z_next += A z in place: BLAS has no faster way for one vector
+        for z, z_next in pairwise(rows):  # z_next += A z in place, the fastest BLAS call for one vector
             dgemv(1.0, transposed, z, 1.0, z_next, 0, 1, 0, 1, 1, 1)
         X = Z @ self.C.T
         X[0] = start[: self.nx]
@@ -131,7 +129,7 @@ class LinearPredictor(Predictor):
 
         With an embedding it is a map of ζ: ζ⁺ = [C (A ψ(ζ) + B u), u, ζ without its oldest step].
         """
-        return _re_lifted(self, ())
+        return _build_step_map(self, ())
 
     @cached_property
     def modes(self) -> Complex[np.ndarray, "nx nz"]:
@@ -163,8 +161,8 @@ class LinearPredictor(Predictor):
 class BilinearPredictor(Predictor):
     """A lifted bilinear predictor z⁺ = A z + B u + Σ uᵢ Nᵢ z, x ≈ C z, z₀ = ψ(x₀).
 
-    What an input does may depend on the state, as it does wherever a force turns with the body that it acts on;
-    a linear predictor has one B for all states.
+    The effect of an input may depend on the state, as for a force that turns with the body on which it acts. A linear
+    predictor has one B for all states.
 
     Attributes
     ----------
@@ -200,7 +198,7 @@ class BilinearPredictor(Predictor):
         embedding: Delay | None = None,
         scale: ArrayLike | None = None,
     ) -> None:
-        _store(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
+        _store_fields(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
         freeze(self, N=checks.array(N, "N", (len(inputs), self.nz, self.nz)))
 
     def rollout(self, x0: ArrayLike, U: ArrayLike, *, history: Episode | None = None) -> Float[np.ndarray, "steps nx"]:
@@ -227,21 +225,21 @@ class BilinearPredictor(Predictor):
 
     def step_map(self) -> StepMap:
         """Return the re-lifted map x⁺ = C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)) as a StepMap; with an embedding, of ζ."""
-        return _re_lifted(self, self.N)
+        return _build_step_map(self, self.N)
 
 
 def load_model(path: str | Path) -> LinearPredictor | BilinearPredictor:
-    """Read a predictor that its `save` wrote, of whichever kind; runs no code of the file.
+    """Read a LinearPredictor or a BilinearPredictor that its `save` wrote; this runs no code of the file.
 
     Raises
     ------
     LogError
-        The file is missing, damaged, or no predictor.
+        The file is missing, damaged, or does not hold a predictor.
     """
     return load_value(path, LinearPredictor, BilinearPredictor)
 
 
-def _store(
+def _store_fields(
     predictor: Predictor,
     A: ArrayLike,
     B: ArrayLike,
@@ -256,13 +254,13 @@ def _store(
 ) -> None:
     """Check the fields that all predictors share and store them."""
     states, inputs = checks.texts(states, "states"), checks.texts(inputs, "inputs")
-    embedded = None if embedding is None else embedding.bind(states, inputs)
-    bound = lifting_of(lifting).bind(states if embedded is None else embedded.names)
+    bound_embedding = None if embedding is None else embedding.bind(states, inputs)
+    bound = check_lifting(lifting).bind(states if bound_embedding is None else bound_embedding.names)
     nz, nx, nu = bound.nz, len(states), len(inputs)
     transition = checks.array(A, "A")
     largest = float(np.abs(transition).max(initial=0.0))
     if largest > _LARGEST:
-        raise DataError(f"A holds {largest:.3g}, with which nothing can be computed; scale the states, or fit anew")
+        raise DataError(f"A holds {largest:.3g}, so products with A overflow; scale the states, or fit again")
     if transition.shape != (nz, nz):
         raise ShapeError(
             f"A has shape {transition.shape}, but the lifting returns {nz} observables; "
@@ -278,132 +276,32 @@ def _store(
         states=states,
         inputs=inputs,
         report=report,
-        embedding=embedded,
-        scale=None if scale is None else _triangular(scale, nz),
+        embedding=bound_embedding,
+        scale=None if scale is None else _check_scale(scale, nz),
         nx=nx,
         nu=nu,
         nz=nz,
     )
 
 
-def _triangular(scale: ArrayLike, nz: int) -> Float[np.ndarray, "nz nz"]:
-    """Return the scale, checked: upper triangular, with no zero on its diagonal."""
+def _check_scale(scale: ArrayLike, nz: int) -> Float[np.ndarray, "nz nz"]:
+    """Return the scale as an array; raise if it is not upper triangular or has a zero on its diagonal."""
     R = checks.array(scale, "scale", (nz, nz))
     if np.tril(R, -1).any() or not R.diagonal().all():
         raise DataError(
-            "scale is not upper triangular with a diagonal that nowhere is 0; pass the triangular factor of the lifted "
+            "scale is not upper triangular with a nonzero diagonal; pass the triangular factor of the lifted "
             "data, np.linalg.qr(Z, mode='r') / sqrt(len(Z)), or leave it out"
         )
     return R
 
 
-def _re_lifted(predictor: Predictor, N: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray) -> StepMap:
-    """Return x⁺ = C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)) as a StepMap of the point that ψ acts on."""
+def _build_step_map(predictor: Predictor, N: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray) -> StepMap:
+    """Return x⁺ = C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)) as a StepMap of x, or of ζ under an embedding."""
     x, u = ca.SX.sym("x", len(predictor.point_names)), ca.SX.sym("u", predictor.nu)
     C, z = predictor.C, predictor.lifting.symbolic(x)
     x_next = ca.DM(C @ predictor.A) @ z + ca.DM(C @ predictor.B) @ u
     for i, Ni in enumerate(N):
         x_next += u[i] * (ca.DM(C @ Ni) @ z)
-    moved = x_next if predictor.embedding is None else predictor.embedding.symbolic(x, u, x_next)
-    F = ca.Function("F", [x, u], [ca.densify(moved)], ["x", "u"], ["x_next"], {"cse": True})
+    point_next = x_next if predictor.embedding is None else predictor.embedding.symbolic(x, u, x_next)
+    F = ca.Function("F", [x, u], [ca.densify(point_next)], ["x", "u"], ["x_next"], {"cse": True})
     return StepMap(F, predictor.dt, states=predictor.point_names, inputs=predictor.inputs)
-
-
-def from_peer(
-    fitted: Any,
-    *,
-    dt: float,
-    states: Sequence[str] | None = None,
-    inputs: Sequence[str] | None = None,
-    lifting: Lifting | None = None,
-) -> LinearPredictor:
-    """Return a model of PyDMD (DMD and its kin, DMDc) or a KoopmanPipeline of pykoop as a LinearPredictor.
-
-    A model that was found by hand needs no help: ``km.LinearPredictor(A, B, C, lifting, dt, states, inputs)``.
-
-    Parameters
-    ----------
-    fitted
-        The fitted object. Of PyDMD A = Φ Λ Φ⁺ and B are taken, on the state; of pykoop A and B of its regressor, on
-        its lifting.
-    dt
-        Sample time [s], of which these packages know nothing.
-    states, inputs
-        Names with units; by default ``x0, x1, …`` and ``u0, u1, …``.
-    lifting
-        The same lifting in the families of koopmpc, where a formula is needed or the model is to be saved. It is
-        compared with the package's own at a few states.
-
-    Raises
-    ------
-    DataError
-        It is of no known package or not fitted; it has delays, or lifts its inputs; its lifting does not hold the
-        states; `lifting` is another function.
-    """
-    if hasattr(fitted, "regressor_") and hasattr(fitted, "lift_state"):
-        return _of_pykoop(fitted, dt, states, inputs, lifting)
-    if hasattr(fitted, "eigs") and hasattr(fitted, "modes"):
-        return _of_pydmd(fitted, dt, states, inputs)
-    raise DataError(
-        f"a {type(fitted).__name__} is no fitted DMD of PyDMD nor a fitted KoopmanPipeline of pykoop; with its "
-        "matrices km.LinearPredictor(A, B, C, lifting, dt, states, inputs) is the model"
-    )
-
-
-def _of_pydmd(fitted: Any, dt: float, states: Sequence[str] | None, inputs: Sequence[str] | None) -> LinearPredictor:
-    """Return x⁺ = Φ Λ Φ⁺ x + B u."""
-    try:
-        modes, eigenvalues = np.asarray(fitted.modes), np.asarray(fitted.eigs)
-    except (ValueError, AttributeError) as error:
-        raise DataError(f"the {type(fitted).__name__} is not fitted; call its fit first") from error
-    A = (modes * eigenvalues) @ np.linalg.pinv(modes)
-    nx = len(A)
-    if np.abs(A.imag).max() > 1e-9 * np.abs(A).max():
-        raise DataError("its operator Φ Λ Φ⁺ is not real; fit it to real snapshots")
-    known = getattr(fitted, "B", None)
-    B = np.zeros((nx, 0)) if known is None else np.asarray(known, dtype=np.float64)
-    return LinearPredictor(A.real, B, np.eye(nx), State(), dt, _names(states, "x", nx), _names(inputs, "u", B.shape[1]))
-
-
-def _of_pykoop(
-    fitted: Any, dt: float, states: Sequence[str] | None, inputs: Sequence[str] | None, lifting: Lifting | None
-) -> LinearPredictor:
-    """Return z⁺ = A z + B u of the regressor, z = ψ(x) of the pipeline's lifting functions."""
-    nx, nu, nz = fitted.n_states_in_, fitted.n_inputs_in_, fitted.n_states_out_
-    if fitted.min_samples_ > 1:
-        raise DataError(
-            "the pipeline has delays; fit km.edmd(data, lifting, embedding=km.Delay(…)), which has them too"
-        )
-    if fitted.n_inputs_out_ != nu:
-        raise DataError(
-            f"the pipeline makes {fitted.n_inputs_out_} inputs of {nu}: it lifts them. Lift the states alone, in a "
-            "pykoop.SplitPipeline with lifting_functions_input=None"
-        )
-    matrix = np.asarray(fitted.regressor_.coef_, dtype=np.float64).T
-    named = _names(states, "x", nx)
-
-    def lift(X: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M nz"]:
-        return np.asarray(fitted.lift_state(X, episode_feature=False), dtype=np.float64)
-
-    probes = np.random.default_rng(0).uniform(-1.0, 1.0, (_PROBES, nx))
-    Z = lift(probes)
-    C = np.zeros((nx, nz))
-    for i, column in enumerate(probes.T):
-        equal = np.flatnonzero(np.abs(Z - column[:, None]).max(axis=0) < 1e-9)
-        if not len(equal):
-            raise DataError(f"the pipeline's lifting does not hold {named[i]}; keep the states among its observables")
-        C[i, equal[0]] = 1.0
-    if lifting is None:
-        lifting = Numeric(lift, tuple(f"z{j}" for j in range(nz)))
-    else:
-        own = lifting.bind(named)(probes)
-        if own.shape != Z.shape or not np.allclose(own, Z, rtol=1e-9, atol=1e-9):
-            raise DataError(
-                "lifting has other observables than the pipeline, or another order: "
-                f"{', '.join(lifting.bind(named).names)}"
-            )
-    return LinearPredictor(matrix[:, :nz], matrix[:, nz:], C, lifting, dt, named, _names(inputs, "u", nu))
-
-
-def _names(given: Sequence[str] | None, letter: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{letter}{i}" for i in range(count)) if given is None else tuple(given)

@@ -20,7 +20,7 @@ from koopmpc.lifting.composed import Projected
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 _ROUNDING = float(np.finfo(float).eps)
-_ROWS = 4096  # states whose eigenfunctions are held at once
+_ROWS = 4096  # evaluate the eigenfunctions of so many states at once, to bound the memory
 
 
 def continuous_eigenvalues(predictor: LinearPredictor) -> Complex[np.ndarray, " nz"]:
@@ -35,10 +35,10 @@ def continuous_eigenvalues(predictor: LinearPredictor) -> Complex[np.ndarray, " 
 
 
 def amplitudes(predictor: LinearPredictor, x: ArrayLike) -> Complex[np.ndarray, " nz"]:
-    """Return b = Φ⁺ ψ(x), the share of each mode in the state x, or the best shares over a whole run.
+    """Return b = Φ⁺ ψ(x), the amplitude of each mode in the state x, or the best amplitudes over a whole run.
 
     Φ holds the modes in the lifted coordinates, one a column: the exact modes of a rank-truncated fit, else
-    the eigenvectors of A. Of a run it is b = argmin Σ_k ‖ψ(x_k) − Φ Λᵏ b‖², which noise in x_0 alone moves less.
+    the eigenvectors of A. For a run b = argmin Σ_k ‖ψ(x_k) − Φ Λᵏ b‖², which depends less on the noise in x_0.
 
     Parameters
     ----------
@@ -54,20 +54,20 @@ def amplitudes(predictor: LinearPredictor, x: ArrayLike) -> Complex[np.ndarray, 
         x has another number of columns than the predictor has states.
     """
     states, width = checks.array(x, "x"), len(predictor.point_names)
-    modes, lifting = _lifted_modes(predictor)
+    modes, lifting = _lift_modes(predictor)
     if states.ndim == 1:
         z = lifting(checks.array(states, "x", (width,)))
         return lstsq(modes, z.astype(complex), cond=_ROUNDING * max(modes.shape), lapack_driver="gelsy")[0]
     Z = lifting(checks.array(states, "x", (None, width)))
-    basis, small = np.linalg.qr(modes)  # no b can reach what lies outside the span of Φ
+    basis, R = np.linalg.qr(modes)  # the part of ψ(x_k) outside the span of Φ does not depend on b
     powers = np.power(predictor.eigenvalues, np.arange(len(Z))[:, None])
-    stacked = (small * powers[:, None, :]).reshape(-1, modes.shape[1])
-    seen = (Z @ basis.conj()).ravel()
-    return lstsq(stacked, seen, cond=_ROUNDING * max(stacked.shape), lapack_driver="gelsy")[0]
+    stacked = (R * powers[:, None, :]).reshape(-1, modes.shape[1])
+    coordinates = (Z @ basis.conj()).ravel()
+    return lstsq(stacked, coordinates, cond=_ROUNDING * max(stacked.shape), lapack_driver="gelsy")[0]
 
 
 def reconstruct(predictor: LinearPredictor, x0: ArrayLike, times: ArrayLike) -> Float[np.ndarray, "steps nx"]:
-    """Return x(t) = Re Φ exp(Ωt) b, b = Φ⁺ ψ(x0): the free motion at any times, without input.
+    """Return x(t) = Re Φ exp(Ωt) b, b = Φ⁺ ψ(x0): the motion without input at any times.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def reconstruct(predictor: LinearPredictor, x0: ArrayLike, times: ArrayLike) -> 
     Raises
     ------
     ShapeError
-        x0 has another number of columns than the predictor has states, or the times are no vector.
+        x0 has another number of columns than the predictor has states, or the times are not a vector.
     """
     t = checks.array(times, "times", (None,))
     b = amplitudes(predictor, x0)
@@ -109,9 +109,9 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
     ShapeError
         The data have other states or inputs.
     DataError
-        They have another dt, an eigenfunction is 0 on all of them, or A is defective.
+        The data have another dt, an eigenfunction is 0 on all of them, or A is defective.
     """
-    same_names(predictor, episodes)
+    check_same_names(predictor, episodes)
     forced = predictor.left_eigenvectors @ np.hstack([predictor.B, predictor.E])
     error, size = np.zeros(predictor.nz), np.zeros(predictor.nz)
     points = predictor.embed(episodes)
@@ -121,22 +121,22 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
             gap = phi[1:] - phi[:-1] * predictor.eigenvalues - episode.U[first : first + _ROWS] @ forced.T
             error += np.sum(np.abs(gap) ** 2, axis=0)
             size += np.sum(np.abs(phi[:-1]) ** 2, axis=0)
-    return _relative(error, size)
+    return _divide_errors(error, size)
 
 
-def same_names(predictor: LinearPredictor | BilinearPredictor, episodes: Episodes | Source) -> None:
-    """Raise where data and predictor differ in states, inputs, the disturbances that it knows, or dt."""
+def check_same_names(predictor: LinearPredictor | BilinearPredictor, episodes: Episodes | Source) -> None:
+    """Raise if data and predictor differ in states, inputs, dt, or the disturbances of the predictor."""
     checks.members(predictor, "the model", ("states", "inputs", "dt"), "pass one that edmd or bilinear_edmd returned")
     checks.members(episodes, "episodes", ("states", "inputs", "dt"), "pass Episodes, of collect or load_episodes")
     known = predictor.disturbances if isinstance(predictor, LinearPredictor) else ()
-    for mine, theirs, what in (
+    for model_names, data_names, what in (
         (predictor.states, episodes.states, "states"),
         (predictor.inputs, episodes.inputs, "inputs"),
         (known, episodes.disturbances if known else (), "disturbances"),
     ):
-        if mine != theirs:
+        if model_names != data_names:
             raise ShapeError(
-                f"the episodes have {what} ({', '.join(theirs)}), the predictor has ({', '.join(mine)}); "
+                f"the episodes have {what} ({', '.join(data_names)}), the predictor has ({', '.join(model_names)}); "
                 "pass data of the same plant"
             )
     if episodes.dt != predictor.dt:
@@ -145,7 +145,7 @@ def same_names(predictor: LinearPredictor | BilinearPredictor, episodes: Episode
         )
 
 
-def _lifted_modes(predictor: LinearPredictor) -> tuple[Complex[np.ndarray, "nl nz"], Lifting]:
+def _lift_modes(predictor: LinearPredictor) -> tuple[Complex[np.ndarray, "nl nz"], Lifting]:
     if predictor.exact_modes is not None and isinstance(predictor.lifting, Projected):
         return predictor.exact_modes, predictor.lifting.lifting
     return predictor.eigenvectors, predictor.lifting
@@ -154,8 +154,8 @@ def _lifted_modes(predictor: LinearPredictor) -> tuple[Complex[np.ndarray, "nl n
 def evolution_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.ndarray, " nz"]:
     """Return ‖φ(x_k) − λᵏ φ(x₀)‖ / ‖φ(x_k)‖, k = 0 … T, for each eigenfunction: 0 where it evolves linearly.
 
-    The norm runs over all steps of all episodes; the order is that of ``predictor.eigenvalues``. One step is what
-    `linearity_error` checks; here errors add up over the run.
+    The norm runs over all steps of all episodes; the order is that of ``predictor.eigenvalues``. Here errors add up
+    over the run, while `linearity_error` checks single steps.
 
     Parameters
     ----------
@@ -177,21 +177,21 @@ def evolution_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
     """
     if predictor.nu + predictor.nw:
         raise DataError(
-            "the predictor has inputs, and φ(x_k) = λᵏ φ(x₀) holds without; pass an autonomous fit, or use "
+            "the predictor has inputs, and φ(x_k) = λᵏ φ(x₀) holds only without inputs; pass an autonomous fit, or use "
             "linearity_error"
         )
-    same_names(predictor, episodes)
+    check_same_names(predictor, episodes)
     error, size = np.zeros(predictor.nz), np.zeros(predictor.nz)
     for episode in episodes:
         phi = predictor.eigenfunctions(episode.X)
         with np.errstate(over="ignore", invalid="ignore"):
-            promised = predictor.eigenvalues ** np.arange(len(phi))[:, None] * phi[0]
-            error += np.sum(np.abs(phi - promised) ** 2, axis=0)
+            predicted = predictor.eigenvalues ** np.arange(len(phi))[:, None] * phi[0]
+            error += np.sum(np.abs(phi - predicted) ** 2, axis=0)
         size += np.sum(np.abs(phi) ** 2, axis=0)
-    return _relative(error, size)
+    return _divide_errors(error, size)
 
 
-def _relative(error: Float[np.ndarray, " nz"], size: Float[np.ndarray, " nz"]) -> Float[np.ndarray, " nz"]:
+def _divide_errors(error: Float[np.ndarray, " nz"], size: Float[np.ndarray, " nz"]) -> Float[np.ndarray, " nz"]:
     """Return the root of the error as a share of the size, both sums of squares for each eigenfunction."""
     if (size == 0).any():
         raise DataError(f"eigenfunction {int(np.argmin(size))} is 0 in all snapshots; pass episodes that excite it")

@@ -4,20 +4,21 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from koopmpc.control.move import Fallback, Status
-from koopmpc.figures.animation import project
-from koopmpc.figures.style import SEQUENTIAL, shades
+from koopmpc.figures.style import SEQUENTIAL, map_colors
 from koopmpc.loop.run import About
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.description import drawable, status_words
 from koopmpc.recording.rrd import times
 from koopmpc.recording.scenes import BACKGROUND, Extent
 from koopmpc.scene import Color
-from koopmpc.validate.residuals import ResidualDMD
+
+if TYPE_CHECKING:
+    from koopmpc.validate.residuals import ResidualDMD
 
 PALETTE: tuple[Color, ...] = (
     (88, 166, 255), (255, 166, 87), (86, 211, 160), (240, 120, 170),
@@ -319,6 +320,8 @@ def _animation(extent: Extent) -> Any:
 
     ranges, name = extent.ranges(), "Animation; fainter: the plan, grey: the reference"
     if ranges is not None and extent.in_space:
+        from koopmpc.figures.animation import project
+
         low, high = np.array(ranges).T
         middle, away = (low + high) / 2, _DISTANCE * float(np.linalg.norm(high - low))
         eye = rrb.EyeControls3D(position=middle + away * project(np.eye(3))[:, 2], look_target=middle, eye_up=(0, 0, 1))
@@ -363,7 +366,7 @@ def readable(values: Sequence[float], ticks: float) -> Any:
     return rrb.ScalarAxis(range=[low - margin, high + margin])
 
 
-def draw_eigenvalues(model: Predictor, residuals: ResidualDMD | None = None) -> dict[str, Any]:
+def draw_eigenvalues(model: Predictor, residuals: "ResidualDMD | None" = None) -> dict[str, Any]:
     """Return static archetypes by entity. Rerun's y points down.
 
     Without residuals eigenvalues outside the unit circle are red. With them a point is the darker the smaller its
@@ -384,7 +387,7 @@ def draw_eigenvalues(model: Predictor, residuals: ResidualDMD | None = None) -> 
         labels = [f"{label}, residual {r:.2g}" for label, r in zip(labels, residuals.residuals, strict=True)]
         share = np.clip(residuals.residuals / residuals.tolerance, _BELOW, _ABOVE)
         level = np.log(share / _BELOW) / np.log(_ABOVE / _BELOW)
-        colors = shades(_LIGHT * level, SEQUENTIAL)
+        colors = map_colors(_LIGHT * level, SEQUENTIAL)
     drawn = {
         "model/axes": rr.LineStrips2D(axes, radii=rr.Radius.ui_points(0.5), colors=[205, 210, 216], draw_order=1),
         "model/circle": rr.LineStrips2D(

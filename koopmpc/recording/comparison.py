@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from koopmpc.errors import KoopmpcError, LogError
-from koopmpc.interrupts import heard
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.loop.metrics import metrics, running_cost
 from koopmpc.loop.run import Run
 from koopmpc.recording.blueprint import (
@@ -26,12 +26,12 @@ from koopmpc.recording.blueprint import (
 from koopmpc.recording.description import drawable, table_figures, title_of
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.rrd import file_recording
-from koopmpc.validate.text import markdown_table
+from koopmpc.text import format_markdown_table
 
 _MOST = 8  # plots of states and inputs in one column
 
 
-@heard  # Python drops a Ctrl-C that comes while a recording is deleted
+@raise_swallowed()  # Python drops a Ctrl-C that comes while a recording is deleted
 def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
     """Write the runs of several logs as one .rrd, with a colour each run in every plot.
 
@@ -160,4 +160,4 @@ def _table(runs: Sequence[Run], names: Sequence[str]) -> str:
         except (KoopmpcError, ValueError) as error:
             columns.append({"cost": f"cannot be computed: {error}"})
     rows = _in_order([list(column) for column in columns])
-    return markdown_table(("metric", *names), [(row, *(c.get(row, "") for c in columns)) for row in rows])
+    return format_markdown_table(("metric", *names), [(row, *(c.get(row, "") for c in columns)) for row in rows])

@@ -1,10 +1,11 @@
-"""Description of a run, the data that do not change from step to step: as exact JSON and as a page to read."""
+"""What a log holds: its columns, and the description of a run as exact JSON and as a page to read."""
 
 import dataclasses
 import json
 import re
 import unicodedata
 from collections.abc import Mapping
+from enum import StrEnum
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, cast
@@ -17,12 +18,40 @@ from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import LogError
 from koopmpc.lifting.base import Lifting
 from koopmpc.loop.metrics import Metrics
-from koopmpc.loop.run import About
-from koopmpc.validate.text import markdown_table
+from koopmpc.loop.run import About, bind_outputs
+from koopmpc.text import format_markdown_table
 from koopmpc.values import from_data, to_data
 
 _FORMAT = "koopmpc-log-2"
-_OLDER = ("koopmpc-log-1",)  # has "seconds" and "iterations" in every row, and copies of columns for the plots
+
+
+class Entity(StrEnum):
+    """Where the columns of a log stand.
+
+    An entity holds rows of numbers in its component "scalars", row k at step k; other components are named beside it.
+    What only the viewer draws is not in it: `world`, `model`, `plots`, `title`, and components `koopmpc.View:…`:
+    one state alone in single precision, the power of ten of a time. `MOVE_COLUMNS` names further columns: numbers in
+    the rows where they differ from the column's absent value, words in "state" in the rows where they change.
+    """
+
+    DESCRIPTION = "description"  # static: the page that people read, and "json", the same data to the bit
+    STATE = "state"  # x_k, NaN where the plant hides it; written last, so a row that has its state is whole
+    MEASUREMENT = "measurement"  # y_k, in the rows where it is not x_k to the bit
+    REFERENCE = "reference"  # r_k
+    INPUT = "control/u"  # u_k as applied
+    INPUT_REFERENCE = "control/u_reference"  # the input that holds r_k, in the rows where it is not 0
+    INPUT_LIMITS = "control/limits"  # the finite limits of u, at the first and last step of a run or live block
+    SOLVER = "solver/time_ms"  # solve time [ms]; "seconds" where it is not ms / 1000 to the bit; "iterations" above 0
+    DEADLINE = "solver/deadline_ms"  # dt [ms], at the same steps
+    STATUS = "solver/status"  # "state": STATUS or STATUS → FALLBACK, in the rows where it changes
+    PLAN_STATES = "prediction/x"  # the planned states of a step, flat; "last_width" is nx
+    PLAN_INPUTS = "prediction/u"  # the planned inputs of a step, flat; "last_width" is nu
+    FALLBACKS = "log"  # text: a line where a fallback sets in
+    METRICS = "metrics"  # static, at the end: a page, "steps", "cost", "effort", "violation", checksums of all columns
+
+
+DRAWN = (Entity.INPUT_LIMITS, Entity.DEADLINE, Entity.FALLBACKS)  # for people who look; `load_run` needs all others
+NO_WORD = "none"  # word of a step without one, such as the solver of a step that asked none; also before all rows
 
 
 def application_of(about: About) -> str:
@@ -78,7 +107,7 @@ def from_json(text: str) -> tuple[About, int | None]:
     """
     try:
         tree: Any = json.loads(text)
-        if tree["format"] not in (_FORMAT, *_OLDER):
+        if tree["format"] != _FORMAT:
             raise LogError(f"the description has format {tree['format']!r}, this koopmpc reads {_FORMAT!r}")
         about, steps = from_data(tree["about"]), tree["steps"]
     except (ValueError, KeyError, TypeError) as error:
@@ -130,13 +159,16 @@ def _with_unit(name: str, about: About) -> str:
 
 def _table(heading: str, values: Mapping[str, Any]) -> str:
     """Return a table of two columns: names and values."""
-    return markdown_table((heading, "value"), [(name, _short(value)) for name, value in values.items()])
+    return format_markdown_table((heading, "value"), [(name, _short(value)) for name, value in values.items()])
 
 
 def _fields(value: Cost | Limits, about: About) -> dict[str, Any]:
     """Return the fields of a cost or of limits that are given, a lifting by the names of its observables."""
     fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    fields = {n: ", ".join(v.bind(about.states).names) if isinstance(v, Lifting) else v for n, v in fields.items()}
+    for name, lifting in fields.items():
+        if isinstance(lifting, Lifting):
+            bound = bind_outputs(lifting, about.states)
+            fields[name] = ", ".join(about.states if bound is None else bound.names)
     return {name: v for name, v in fields.items() if v is not None}
 
 

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, LogError
-from koopmpc.figures.eigenvalues import Axes, Plane, eigenfunctions_on, plane_through
-from koopmpc.figures.style import CYCLIC, SEQUENTIAL, shades
-from koopmpc.interrupts import heard
+from koopmpc.figures.eigenvalues import Axes, Plane, evaluate_eigenfunctions, make_plane
+from koopmpc.figures.style import CYCLIC, SEQUENTIAL, map_colors
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.recording.blueprint import (
     color,
@@ -27,14 +27,14 @@ from koopmpc.recording.blueprint import (
     shared_time,
     write_page,
 )
-from koopmpc.recording.description import drawable, written_with
-from koopmpc.recording.reader import Entity, naming, read_columns
+from koopmpc.recording.description import Entity, drawable, written_with
+from koopmpc.recording.reader import naming, read_columns
 from koopmpc.recording.rrd import file_recording, times
 from koopmpc.scene import Color
+from koopmpc.text import format_markdown_table, shorten_observable
 from koopmpc.validate.bands import Forecast, forecast
 from koopmpc.validate.report import TrustReport
 from koopmpc.validate.scoring import AnyPredictor, Score, score
-from koopmpc.validate.text import markdown_table, observable
 
 _TRUTH: Color = (225, 228, 232)
 _PREDICTED = color(0)
@@ -49,7 +49,7 @@ Curve = tuple[str, Color, float, np.ndarray]  # name, colour, width [points], on
 Picture = tuple[str, str, dict[str, Any]]  # entity, title, archetypes by entity
 
 
-@heard  # Python drops a Ctrl-C that comes while a recording is deleted
+@raise_swallowed()  # Python drops a Ctrl-C that comes while a recording is deleted
 def record_model(
     predictor: AnyPredictor,
     episodes: Episodes,
@@ -173,7 +173,7 @@ def _pictures(
         if which is not None:
             raise DataError("a bilinear predictor has no eigenfunctions; leave `which` out")
         return [], None, f"The predictor {why}."
-    surface = plane_through(predictor.point_names, plane, predictor.embed(episodes), at, points=181)
+    surface = make_plane(predictor.point_names, plane, predictor.embed(episodes), at, points=181)
     chosen = _leading(predictor, report) if which is None else list(which)
     try:
         return _eigenfunctions(predictor, chosen, surface), surface, ""
@@ -186,18 +186,18 @@ def _pictures(
 def _eigenfunctions(predictor: LinearPredictor, which: Sequence[int], plane: Plane) -> list[Picture]:
     """Return the pictures of eigenfunctions: of a real one itself, of a complex one its magnitude and its phase."""
     pictures: list[Picture] = []
-    for j, phi in zip(which, eigenfunctions_on(predictor, which, plane), strict=True):
+    for j, phi in zip(which, evaluate_eigenfunctions(predictor, which, plane), strict=True):
         value = predictor.eigenvalues[j]
         if value.imag == 0:
             low, high = float(phi.real.min()), float(phi.real.max())
             level = (phi.real - low) / ((high - low) or 1.0)
-            shown = {"value": (f"φ{j}, λ = {value.real:.4g}", shades(level, SEQUENTIAL))}
+            shown = {"value": (f"φ{j}, λ = {value.real:.4g}", map_colors(level, SEQUENTIAL))}
         else:
             title = f"|φ{j}|, λ = {value.real:.4g} {'+' if value.imag > 0 else '−'} {abs(value.imag):.4g}i"
             turns = np.angle(phi) / (2 * np.pi) + 0.5  # dark at 0, blue below, red above, light at ±π
             shown = {
-                "magnitude": (title, shades(np.abs(phi), SEQUENTIAL)),
-                "phase": (f"Phase of φ{j}", shades(turns, CYCLIC)),
+                "magnitude": (title, map_colors(np.abs(phi), SEQUENTIAL)),
+                "phase": (f"Phase of φ{j}", map_colors(turns, CYCLIC)),
             }
         for part, (title, pixels) in shown.items():
             entity = f"eigenfunction/{j}/{part}"
@@ -253,7 +253,7 @@ def _page(predictor: AnyPredictor, report: TrustReport | None, note: str) -> str
         note or "Eigenfunctions: dark is the least value, light the largest; of a phase, dark is 0, light ±π.",
         "",
     ]
-    table = markdown_table(
+    table = format_markdown_table(
         ("model", ""), [(key, _ESCAPED.sub(_BEFORE, value)) for key, value in _facts(predictor).items()]
     )
     return "\n".join([*lines, table])
@@ -265,7 +265,7 @@ def _facts(predictor: AnyPredictor) -> dict[str, str]:
         "kind": type(predictor).__name__,
         "inputs": ", ".join(predictor.inputs) or "none",
         "sampling time": f"{predictor.dt:g} s",
-        "observables": f"{predictor.nz}: {', '.join(map(observable, predictor.lifting.names[:12]))}"
+        "observables": f"{predictor.nz}: {', '.join(map(shorten_observable, predictor.lifting.names[:12]))}"
         + (" …" if predictor.nz > 12 else ""),
         "spectral radius": f"{abs(predictor.eigenvalues[0]):.6g}",
     }

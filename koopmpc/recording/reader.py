@@ -1,11 +1,10 @@
 # pyright: basic
-"""The columns of a log, one table for the writer and the reader; load_run makes them the Run that was written."""
+"""load_run makes the columns of a log the Run that was written."""
 
 import json
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -14,43 +13,13 @@ import numpy as np
 
 from koopmpc.control.move import Fallback, Status
 from koopmpc.data.episodes import Episodes
-from koopmpc.data.sampling import Signals, episodes_from
+from koopmpc.data.files.formats import LogFormat, register_format
+from koopmpc.data.files.sampling import Signals, episodes_from
 from koopmpc.disk import path_of
 from koopmpc.errors import DataError, LogError
-from koopmpc.loop.run import About, Plans, Run
-from koopmpc.recording.description import from_json
+from koopmpc.loop.run import MOVE_COLUMNS, About, MoveColumn, Plans, Run
+from koopmpc.recording.description import DRAWN, NO_WORD, Entity, from_json
 from koopmpc.recording.rrd import Column, check_log, read
-
-
-class Entity(StrEnum):
-    """Where the columns of a log stand.
-
-    An entity holds rows of numbers in its component "scalars", row k at step k; other components are named beside it.
-    What only the viewer draws is not in it: `world`, `model`, `plots`, `title`, and components `koopmpc.View:…`:
-    one state alone in single precision, the power of ten of a time.
-    """
-
-    DESCRIPTION = "description"  # static: the page that people read, and "json", the same data to the bit
-    STATE = "state"  # x_k, NaN where the plant hides it; written last, so a row that has its state is whole
-    MEASUREMENT = "measurement"  # y_k, in the rows where it is not x_k to the bit
-    REFERENCE = "reference"  # r_k
-    INPUT = "control/u"  # u_k as applied
-    INPUT_REFERENCE = "control/u_reference"  # the input that holds r_k, in the rows where it is not 0
-    INPUT_LIMITS = "control/limits"  # the finite limits of u, at the first and last step of a run or live block
-    SLACK = "solver/slack"  # how far the plan breaks a soft limit, in the rows where it does
-    KNOWN = "solver/known"  # 1 where the model knows and 0 where it does not, in the rows where a monitor looked
-    SOLVER = "solver/time_ms"  # solve time [ms]; "seconds" where it is not ms / 1000 to the bit; "iterations" above 0
-    QP = "solver/qp"  # "state": which solver made the move, or "none", in the rows where it changes; "none" before all
-    DEADLINE = "solver/deadline_ms"  # dt [ms], at the same steps
-    STATUS = "solver/status"  # "state": STATUS or STATUS → FALLBACK, in the rows where it changes
-    PLAN_STATES = "prediction/x"  # the planned states of a step, flat; "last_width" is nx
-    PLAN_INPUTS = "prediction/u"  # the planned inputs of a step, flat; "last_width" is nu
-    FALLBACKS = "log"  # text: a line where a fallback sets in
-    METRICS = "metrics"  # static, at the end: a page, "steps", "cost", "effort", "violation", checksums of all columns
-
-
-DRAWN = (Entity.INPUT_LIMITS, Entity.DEADLINE, Entity.FALLBACKS)  # for people who look; `load_run` needs all others
-NO_SOLVER = "none"  # the solver of a step that asked none
 
 
 class LogColumns:
@@ -193,7 +162,9 @@ def load_run(path: str | Path) -> Run:
         The file is missing, no log of koopmpc, damaged, or holds no whole step.
     """
     path = path_of(path)
-    log = read_columns(path, tuple(f"/{entity}" for entity in Entity if entity not in DRAWN))
+    entities = [entity for entity in Entity if entity not in DRAWN]
+    entities += [column.log for column in MOVE_COLUMNS if column.log]
+    log = read_columns(path, tuple(f"/{entity}" for entity in entities))
     with naming(path):
         return _run(log, path)
 
@@ -236,9 +207,7 @@ def _run(log: LogColumns, path: Path) -> Run:
         iterations=iterations[:steps].astype(np.int64),
         plans=_plans(log, steps),
         u_reference=_sparse(log, Entity.INPUT_REFERENCE, steps, len(about.inputs)),
-        slack=_sparse(log, Entity.SLACK, steps, 1)[:, 0],
-        known=_sparse(log, Entity.KNOWN, steps, 1, absent=-1.0)[:, 0].astype(np.int64),
-        solver=_solvers(log, steps),
+        **{column.name: _move_column(log, column, steps) for column in MOVE_COLUMNS if column.log},
         **about.about(),
     )
 
@@ -284,12 +253,14 @@ def _statuses(log: LogColumns, steps: int, path: Path) -> tuple[tuple[Status, ..
     return tuple(s for s, _ in held), tuple(f for _, f in held)
 
 
-def _solvers(log: LogColumns, steps: int) -> tuple[str, ...]:
-    """Return the solver of each step: the last change at or before it; older logs have none."""
-    k, _, words = log.rows(Entity.QP, "state")
-    names = [NO_SOLVER, *(words.to_pylist() if len(k) else [])]
-    held = np.searchsorted(k, np.arange(steps), side="right")
-    return tuple("" if names[i] == NO_SOLVER else names[i] for i in held)
+def _move_column(log: LogColumns, column: MoveColumn, steps: int) -> Any:
+    """Return a column that a log keeps where it differs from the absent value, or where its words change."""
+    if column.dtype is not None:
+        return _sparse(log, column.log, steps, 1, float(column.absent))[:, 0].astype(column.dtype)
+    k, _, words = log.rows(column.log, "state")
+    names = [NO_WORD, *(words.to_pylist() if len(k) else [])]
+    last = np.searchsorted(k, np.arange(steps), side="right")
+    return tuple(column.absent if names[i] == NO_WORD else names[i] for i in last)
 
 
 def _pair(word: str) -> tuple[Status, Fallback]:
@@ -329,3 +300,6 @@ def run_episodes(path: Path) -> Episodes:
     X, names = (run.Y, run.outputs) if hidden else (run.X, run.states)
     signals = Signals(None, X, U, np.empty((steps + 1, 0)), np.arange(steps + 1))
     return Episodes(episodes_from([signals], run.dt, str(path)), run.dt, names, run.inputs)
+
+
+register_format(LogFormat((".rrd",), run_episodes))

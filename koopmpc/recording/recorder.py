@@ -1,4 +1,4 @@
-"""record writes a Run at once; a Recorder writes it step by step while the loop runs. The log is the same."""
+"""A Recorder writes a log step by step while the loop runs: the log that `record` writes of the whole run."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -16,11 +16,10 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.move import Plan
 from koopmpc.disk import path_of
 from koopmpc.errors import DataError
-from koopmpc.interrupts import heard
 from koopmpc.loop.run import About, Run, Step, StepRows
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.viewer import PORT, find_viewer, is_up, quiet, why_none
-from koopmpc.recording.writer import Writer, block_of_run, block_of_steps
+from koopmpc.recording.writer import Writer, block_of_steps
 from koopmpc.scene import Scene
 
 _BATCH = 0.2  # time between two batches [s]
@@ -83,48 +82,6 @@ class BackgroundWriter:
 
 
 _PATIENCE_FILE, _PATIENCE_VIEWER = 60.0, 5.0  # longest wait at the end [s]
-
-
-@heard  # Rerun's own code may swallow a Ctrl-C
-def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Predictor | None = None) -> None:
-    """Write `run` as a complete Rerun log; `load_run(path)` equals `run` to the bit.
-
-    Parameters
-    ----------
-    path
-        The .rrd to write; its folders are made.
-    scene
-        scene(x, u) → shapes, drawn for every state and for a few stages of every plan; by default the run's own.
-    model
-        The predictor whose eigenvalues are shown; by default the run's own.
-
-    Raises
-    ------
-    DataError
-        The metadata hold something other than numbers, names, lists and arrays; the scene's shapes come and go.
-    LogError
-        The path is no .rrd, or cannot be written.
-
-    Examples
-    --------
-    >>> import koopmpc as km
-    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
-    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
-    >>> gain = km.LQR(km.LinearPredictor.local(plant, [0, 0], [0]), cost, limits)
-    >>> run = km.simulate(plant, gain, x0=[0.5, 0], reference=[0, 0], steps=100, cost=cost, limits=limits)
-    >>> km.record(run, "pendulum.rrd")  # then: koopmpc view pendulum.rrd
-    >>> km.load_run("pendulum.rrd") == run
-    True
-    """
-    checks.kind(run, "run", Run, "pass what simulate returned; a model is written by km.recording.record_model")
-    scene, model = scene or run.scene, run.model if model is None else model
-    writer = Writer(About(**run.about()), path=path_of(path), scene=scene, model=model, steps=run.steps)
-    try:
-        writer.write(block_of_run(run))
-        writer.end(run)
-    except BaseException:
-        writer.discard()
-        raise
 
 
 class Recorder:

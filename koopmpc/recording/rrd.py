@@ -26,7 +26,7 @@ import numpy as np
 
 from koopmpc import disk
 from koopmpc.errors import LogError
-from koopmpc.interrupts import deferred
+from koopmpc.interrupts import defer_interrupts
 
 _MARK, _BLANK = b"koopmpc-crc32:", b"x7k2q9zp"
 _CHECK = re.compile(rb"koopmpc-crc32:([0-9a-f]{8})")
@@ -173,7 +173,7 @@ def new_recording(application: str) -> Any:
     import rerun as rr
     import rerun_bindings
 
-    with deferred():  # Python drops a Ctrl-C that comes in a deletion
+    with defer_interrupts():  # Python drops a Ctrl-C that comes in a deletion
         if rr.get_global_data_recording() is None:
             rerun_bindings.flush_and_cleanup_orphaned_recordings()
         return rr.RecordingStream(application, recording_id=uuid.uuid4())
@@ -184,7 +184,7 @@ def send_blueprint(rec: Any, application: str, layout: Any) -> None:
     import rerun as rr
     import rerun_bindings
 
-    with deferred():
+    with defer_interrupts():
         own = rerun_bindings.new_blueprint(
             application_id=application, make_default=False, make_thread_default=False, default_enabled=True
         )

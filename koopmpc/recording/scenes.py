@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from koopmpc.errors import DataError
-from koopmpc.loop.run import About, StepRows
+from koopmpc.loop.run import About, StepRows, bind_outputs
 from koopmpc.scene import Box, Color, Disk, Line, Scene, Shape
 
 _STROKES = np.linspace(-1.0, 1.0, 5)  # places of the strokes that fill a box
@@ -306,10 +306,10 @@ class ReferenceScenes:
 
     def _found(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
         assert self._about.cost is not None
-        of = self._about.cost.of.bind(self._about.states)
+        of = bind_outputs(self._about.cost.of, self._about.states)
         if not (np.abs(reference) < _DRAWN).all():
             return None
-        if of.names == self._about.states:
+        if of is None or of.names == self._about.states:
             return reference.copy()
         from scipy.optimize import least_squares
 

@@ -1,5 +1,5 @@
 # pyright: basic
-"""Writer: the rows of a run as a Rerun recording, the same for a finished run and for a running loop."""
+"""record and Writer: the rows of a run as a Rerun recording, the same for a finished run and for a running loop."""
 
 import json
 import zlib
@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc import checks
 from koopmpc.control.move import Fallback
+from koopmpc.disk import path_of
 from koopmpc.errors import KoopmpcError
-from koopmpc.interrupts import deferred
+from koopmpc.interrupts import defer_interrupts, raise_swallowed
 from koopmpc.loop.metrics import metrics
-from koopmpc.loop.run import About, Plans, Run, Step, StepRows
+from koopmpc.loop.run import MOVE_COLUMNS, About, Plans, Run, Step, StepRows
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.blueprint import (
     LOG_TIME,
@@ -31,6 +33,8 @@ from koopmpc.recording.blueprint import (
     write_page,
 )
 from koopmpc.recording.description import (
+    NO_WORD,
+    Entity,
     application_of,
     drawable,
     metrics_to_markdown,
@@ -39,7 +43,6 @@ from koopmpc.recording.description import (
     to_json,
     to_markdown,
 )
-from koopmpc.recording.reader import NO_SOLVER, Entity
 from koopmpc.recording.rrd import CHECK, LogFile, new_recording, send_blueprint, times
 from koopmpc.recording.scenes import Drawing, Scenes
 from koopmpc.scene import Scene
@@ -134,7 +137,8 @@ class Writer:
         self._spans: dict[str, list[float]] = {}
         self._horizon, self._nr = 0, 0  # of the plans, 0 where there is none; of the reference
         self._shown = self._scenes.extent.ranges()
-        self._last = {Entity.QP: NO_SOLVER}  # the last word of each column that is written where it changes
+        # the last word of each column that is written where it changes
+        self._last = {column.log: NO_WORD for column in MOVE_COLUMNS if column.log and column.dtype is None}
         self._looks: dict[str, Any] = {}  # styles of the curves, by entity
         self._looked = -1  # the horizon that they were made for, −1 before any
         self._styled: set[str] = set()
@@ -144,7 +148,7 @@ class Writer:
         self._file: LogFile | None = None
         self._rec: Any = None
         try:
-            with deferred():  # no interrupt between the file and its name leaves it behind
+            with defer_interrupts():  # no interrupt between the file and its name leaves it behind
                 self._file = None if path is None else LogFile(path, growing=growing)
             self._rec = new_recording(application_of(about))
         except BaseException:  # a Ctrl-C
@@ -159,8 +163,7 @@ class Writer:
         self._horizon = max(self._horizon, rows.horizon)
         parts = blocks(rows)
         drawings = [  # all, because the layout is as wide as the widest
-            self._scenes.drawn(part.k, part, list(zip(part.planned.tolist(), part.plan_X, part.plan_U, strict=True)))
-            for part in parts
+            self._scenes.drawn(part.k, part, self._plans_of(part)) for part in parts
         ]
         if not self._opened:
             self._open()
@@ -207,10 +210,11 @@ class Writer:
         self._vectors(Entity.INPUT, k, rows.U)
         held = _differ(np.zeros_like(rows.u_reference), rows.u_reference)
         self._vectors(Entity.INPUT_REFERENCE, k[held], rows.u_reference[held])
-        gave = np.flatnonzero(rows.slack)
-        self._vectors(Entity.SLACK, k[gave], rows.slack[gave, None])
-        looked = np.flatnonzero(rows.known >= 0)
-        self._vectors(Entity.KNOWN, k[looked], rows.known[looked, None].astype(np.float64))
+        for column in MOVE_COLUMNS:
+            if column.log and column.dtype is not None:
+                values = getattr(rows, column.name)
+                kept = np.flatnonzero(values != column.absent)
+                self._vectors(column.log, k[kept], values[kept, None].astype(np.float64))
         ends = self._ends(k)
         limits = [value for _, value in input_limits(self._about)]
         self._vectors(Entity.INPUT_LIMITS, ends, np.tile(limits, (len(ends), 1)))
@@ -273,7 +277,7 @@ class Writer:
 
     def _release(self) -> None:
         """Close the recording and let go of it."""
-        with deferred():
+        with defer_interrupts():
             if self._rec is not None:
                 self._rec.disconnect()
             self._rec = None
@@ -362,8 +366,7 @@ class Writer:
         The plots show the latter j dt after the cursor. Nothing is written beyond the last row, so that the timeline
         ends with the run.
         """
-        plans = zip(rows.planned.tolist(), rows.plan_X, rows.plan_U, strict=True)
-        self._plans |= {step: (X, U) for step, X, U in plans if np.isfinite(X).any()}
+        self._plans |= {step: (X, U) for step, X, U in self._plans_of(rows) if np.isfinite(U).any()}
         N = len(next(iter(self._plans.values()))[1]) if self._plans else 0
         shown, ends = panels(self._about, self._nr), self._ends(k)
         for panel in shown:
@@ -377,9 +380,23 @@ class Writer:
             X = np.array([self._plans[step][0][j] for step in of]).reshape(len(of), -1)
             U = [self._plans[step][1][min(j, N - 1)] for step in of]
             for panel in shown:
-                self._vectors(f"{panel.entity}/ahead/{j}", at, X[:, panel.states])
+                if not np.isnan(predicted := X[:, panel.states]).all():
+                    self._vectors(f"{panel.entity}/ahead/{j}", at, predicted)
             self._vectors(f"plots/u/ahead/{j}", at, np.array(U))
         self._plans = {step: plan for step, plan in self._plans.items() if step + N > k[-1]}
+
+    def _plans_of(self, rows: LogBlock) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        """Return the step, the states and the inputs of each plan; NaN for a state that the plan does not hold.
+
+        A model may have other states than the plant: those of its outputs. States of one name are the same.
+        """
+        states, width = self._about.states, rows.plan_X.shape[-1]
+        known = [() if self._model is None else self._model.states, states, self._about.outputs]
+        names = next((each for each in known if len(each) == width), ())
+        X = np.full((*rows.plan_X.shape[:-1], len(states)), np.nan)
+        both = [(i, names.index(name)) for i, name in enumerate(states) if name in names]
+        X[..., [i for i, _ in both]] = rows.plan_X[..., [j for _, j in both]]
+        return list(zip(rows.planned.tolist(), X, rows.plan_U, strict=True))
 
     def _sum(self, column: str, data: Any, k: np.ndarray | None = None) -> None:
         """Take data of a column, and the steps k of its rows, into their checksums."""
@@ -400,14 +417,16 @@ class Writer:
 
         pairs = list(zip(rows.status, rows.fallback, strict=True))
         changed = self._changes(Entity.STATUS, rows.k, [status_value(*pair) for pair in pairs])
-        self._changes(Entity.QP, rows.k, [name or NO_SOLVER for name in rows.solver])
+        for column in MOVE_COLUMNS:
+            if column.log and column.dtype is None:
+                self._changes(column.log, rows.k, [str(word) or NO_WORD for word in getattr(rows, column.name)])
         fallen = [i for i in changed if pairs[i][1] is not Fallback.NONE]
         if fallen:
             texts = [f"step {rows.k + i}: {status_words(*pairs[i])}" for i in fallen]
             columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
             self._send(Entity.FALLBACKS, rows.k + np.array(fallen), columns)
 
-    def _changes(self, entity: Entity, first: int, words: Sequence[str]) -> list[int]:
+    def _changes(self, entity: str, first: int, words: Sequence[str]) -> list[int]:
         """Write the words of the rows first, first + 1, … where they change; return which of the rows these are."""
         import rerun as rr
 
@@ -435,3 +454,45 @@ def _differ(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
     return np.flatnonzero(
         (np.ascontiguousarray(X).view(np.int64) != np.ascontiguousarray(Y).view(np.int64)).any(axis=1)
     )
+
+
+@raise_swallowed()  # Rerun's own code may swallow a Ctrl-C
+def record(run: Run, path: str | Path, *, scene: Scene | None = None, model: Predictor | None = None) -> None:
+    """Write `run` as a complete Rerun log; `load_run(path)` equals `run` to the bit.
+
+    Parameters
+    ----------
+    path
+        The .rrd to write; its folders are made.
+    scene
+        scene(x, u) → shapes, drawn for every state and for a few stages of every plan; by default the run's own.
+    model
+        The predictor whose eigenvalues are shown; by default the run's own.
+
+    Raises
+    ------
+    DataError
+        The metadata hold something other than numbers, names, lists and arrays; the scene's shapes come and go.
+    LogError
+        The path is no .rrd, or cannot be written.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    >>> gain = km.LQR(km.LinearPredictor.local(plant, [0, 0], [0]), cost, limits)
+    >>> run = km.simulate(plant, gain, x0=[0.5, 0], reference=[0, 0], steps=100, cost=cost, limits=limits)
+    >>> km.record(run, "pendulum.rrd")  # then: koopmpc view pendulum.rrd
+    >>> km.load_run("pendulum.rrd") == run
+    True
+    """
+    checks.kind(run, "run", Run, "pass what simulate returned; a model is written by km.recording.record_model")
+    scene, model = scene or run.scene, run.model if model is None else model
+    writer = Writer(About(**run.about()), path=path_of(path), scene=scene, model=model, steps=run.steps)
+    try:
+        writer.write(block_of_run(run))
+        writer.end(run)
+    except BaseException:
+        writer.discard()
+        raise

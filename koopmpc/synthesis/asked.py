@@ -1,4 +1,4 @@
-"""What a design is asked for: cost, limits, horizon, reference and starts, checked against the data."""
+"""The task of a design: cost, limits, horizon, reference and starts, checked against the data."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,18 +12,18 @@ from koopmpc.control.cost import Cost, checked
 from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import short
+from koopmpc.lifting.base import strip_unit
 from koopmpc.lifting.state import State
 from koopmpc.loop.metrics import limited
-from koopmpc.validate.text import quantity
+from koopmpc.text import with_unit
 from koopmpc.values import Value
 
-RUN = 3  # horizons that a run lasts
-STARTS = 12  # episodes whose first states are the default starts: one for each condition of a design
-_FEW = 4  # of them are enough, inside the limits and near the others
-ROOM = 0.5  # share of the data's range by which a run may leave the data
-FAR = 1.0  # widths of the others' box by which an episode leaves it that is left out
-MOST = 0.9  # share of the episodes that this box holds
+RUN = 3  # length of a run in horizons
+STARTS = 12  # default number of starts: one for each condition of a design
+_FEW = 4  # if at least this many first states are inside the limits, only those are used
+ROOM = 0.5  # a run may leave the data by this share of their range
+FAR = 1.0  # an episode is left out if it leaves the box of the others by more than this many widths
+MOST = 0.9  # share of the episodes inside this box
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,14 +33,14 @@ class Asked(Value):
     Attributes
     ----------
     cost, limits, horizon
-        What every controller gets.
+        Settings of every controller.
     reference
         (T+1, nr) rows, T at least `steps`.
     starts
         (n, nx) states from which runs begin.
     first_states
-        (m, nx) first states of all episodes, of those inside the limits where there are enough; random starts are
-        drawn from these.
+        (m, nx) first states of all episodes, or only those inside the limits if there are enough; random starts are
+        drawn from them.
     steps
         Length of a run: three horizons, or the steps of the reference.
     angles
@@ -48,7 +48,8 @@ class Asked(Value):
     low, high
         (nx,) range of the data.
     limit_sizes
-        (nx + ny,) range of each limited row, of which violations are shares: between its two limits, else of the data.
+        (nx + ny,) size of each limited row, in which violations are measured: the distance of its two limits, or the
+        range of the data.
     """
 
     cost: Cost
@@ -73,16 +74,11 @@ class Asked(Value):
         """The last reference row at which a run can begin."""
         return len(self.reference) - 1 - self.steps
 
-    def beyond(self, X: Float[np.ndarray, "T nx"], states: Sequence[str]) -> Float[np.ndarray, " T"]:
-        """Return for each state its largest violation of a limit, as a share of that limit's size."""
-        values, (low, high) = limited(self.limits, X, states)
-        return (np.maximum(np.maximum(low - values, values - high), 0.0) / self.limit_sizes).max(axis=1)
-
     def hull(self, free: Sequence[int], tracked: Sequence[int]) -> tuple[Float[np.ndarray, " nx"], ...]:
-        """Return the box that a run must not leave: data, starts and reference with half of the data's range around.
+        """Return the box that a run must not leave: data, starts and reference, widened by half of the data's range.
 
-        The states `free` are not limited. The columns of the reference belong to the states `tracked`; where that is
-        empty, they belong to none.
+        The states `free` have no bounds. The columns of the reference belong to the states `tracked`, which may be
+        empty.
         """
         low, high = np.minimum(self.low, self.starts.min(axis=0)), np.maximum(self.high, self.starts.max(axis=0))
         for column, i in enumerate(tracked):
@@ -94,7 +90,7 @@ class Asked(Value):
         return low, high
 
 
-def asked_of(
+def check_task(
     data: Episodes,
     cost: Cost,
     limits: Limits | None,
@@ -134,7 +130,7 @@ def asked_of(
     low, high = X.min(axis=0), X.max(axis=0)
     firsts = _first_states(data, limits)
     if starts is None:
-        points = _spread(firsts)
+        points = _choose_spread(firsts)
     else:
         points = checks.array(starts, "starts")
         points = checks.array(
@@ -160,50 +156,50 @@ def asked_of(
     )
 
 
-def margin_room(asked: Asked, data: Episodes) -> Float[np.ndarray, " nx"]:
+def limit_margins(asked: Asked, data: Episodes) -> Float[np.ndarray, " nx"]:
     """Return the largest margin of each state (nx,): half of the way from the reference to the nearest limit.
 
-    Errors of a poor model ask for margins that exclude the reference itself, where the loop shall rest. A reference
-    that lies on or beyond a limit, or that has no weight, caps nothing.
+    Without this bound, errors of a poor model could lead to margins that exclude the reference itself. A reference on
+    or beyond a limit, or without a weight, bounds no margin.
     """
     low, high = asked.limits.states(data.nx)
     room = np.full(data.nx, np.inf)
-    for i, aims in _aims(asked, data).items():
+    for i, aims in _weighted_references(asked, data).items():
         way = min(aims.min() - low[i], high[i] - aims.max())
         if way > 0:
             room[i] = way / 2
     return room
 
 
-def strays(data: Episodes, asked: Asked) -> dict[int, str]:
+def find_stray_episodes(data: Episodes, asked: Asked) -> dict[int, str]:
     """Return the episodes that went far away with ordinary inputs, each with a sentence that says how far.
 
-    A sensor that jumped, or a plant that fell over, once in many episodes: its squares outweigh all others in fits and
-    in errors. Such an episode goes beyond the box that holds nine tenths of the episodes, the starts, the reference and
-    the limits by more than that box's width, where every run would count as lost; and its inputs stay within half a
-    width of those of the others. Stronger inputs are an experiment, which is worth more than the others.
+    A sensor may have jumped, or the plant fallen over; the squares of such an episode outweigh all others in fits and
+    in errors. An episode is far away if it leaves, by more than its width, the box of nine tenths of the episodes, the
+    starts, the reference and the limits. Its inputs are ordinary if they stay within half a width of those of the
+    others. Episodes with stronger inputs are kept, because they are valuable experiments.
     """
     low, high = asked.limits.states(data.nx)
     low, high = np.where(np.isfinite(low), low, np.inf), np.where(np.isfinite(high), high, -np.inf)
     low, high = np.minimum(low, asked.starts.min(axis=0)), np.maximum(high, asked.starts.max(axis=0))
-    for i, aims in _aims(asked, data).items():
+    for i, aims in _weighted_references(asked, data).items():
         low[i], high[i] = min(low[i], aims.min()), max(high[i], aims.max())
     X, U = [episode.X for episode in data], [episode.U for episode in data]
-    x_far, x_low, x_high = _beyond(X, low, high)
-    u_far, _, _ = _beyond(U, np.full(data.nu, np.inf), np.full(data.nu, -np.inf))
+    x_far, x_low, x_high = _measure_departures(X, low, high)
+    u_far, _, _ = _measure_departures(U, np.full(data.nu, np.inf), np.full(data.nu, -np.inf))
     found: dict[int, str] = {}
     for k in np.flatnonzero((x_far.max(axis=1) > FAR) & (u_far.max(axis=1) <= ROOM)).tolist():
         i = int(x_far[k].argmax())
         furthest = X[k][np.abs(X[k][:, i] - (x_low[i] + x_high[i]) / 2).argmax(), i]
         found[k] = (
             f"episode {k} of 0 … {len(data) - 1} is left out: it goes to "
-            f"{quantity(data.states[i], f'= {furthest:.4g}')}, and nine in ten stay between {x_low[i]:.4g} and "
+            f"{with_unit(data.states[i], f'= {furthest:.4g}')}, and nine in ten stay between {x_low[i]:.4g} and "
             f"{x_high[i]:.4g} under such inputs; look at it: a sensor may have jumped, or the plant have fallen over"
         )
     return found
 
 
-def _beyond(
+def _measure_departures(
     rows: Sequence[Float[np.ndarray, "_ n"]], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "e n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return how far each episode leaves the box of nine tenths of them, in widths (episodes, n), and the box.
@@ -217,7 +213,7 @@ def _beyond(
     return np.maximum(low - least, most - high) / width, low, high
 
 
-def outside_data(asked: Asked, data: Episodes, tracked: Sequence[int], free: Sequence[int]) -> list[str]:
+def find_outside_data(asked: Asked, data: Episodes, tracked: Sequence[int], free: Sequence[int]) -> list[str]:
     """Return a sentence for each state whose start or reference lies outside the data, where no model was fitted."""
     said: list[str] = []
     room = 0.01 * (asked.high - asked.low)
@@ -228,17 +224,17 @@ def outside_data(asked: Asked, data: Episodes, tracked: Sequence[int], free: Seq
             far = values[(values < low - room[i]) | (values > high + room[i])]
             if far.size and i not in free:
                 said.append(
-                    f"{what} has {quantity(name, f'= {far[np.abs(far - (low + high) / 2).argmax()]:.4g}')}, outside "
+                    f"{what} has {with_unit(name, f'= {far[np.abs(far - (low + high) / 2).argmax()]:.4g}')}, outside "
                     f"the data, which go from {low:.4g} to {high:.4g}: no model was fitted there; collect data there, "
                     "or ask for less"
                 )
     return said
 
 
-def outside_limits(asked: Asked, data: Episodes) -> list[str]:
+def find_outside_limits(asked: Asked, data: Episodes) -> list[str]:
     """Return a sentence for each limit that a start or a moving reference lies beyond.
 
-    A reference that rests is not looked at here: `unheld` says what can be held instead.
+    A constant reference is not checked here; `explain_unreachable` says what can be held instead.
     """
     limits, states = asked.limits, data.states
     names = states if limits.of is None else (*states, *limits.of.bind(states).names)
@@ -254,35 +250,35 @@ def outside_limits(asked: Asked, data: Episodes) -> list[str]:
             over = np.zeros(1) if values is None else np.maximum(low - values, values - high)
             if values is not None and over.max() > 1e-9 * np.abs(values).max():
                 value = values[over.argmax()]
-                limit = quantity(name, f"= {low if value < low else high:.4g}")
-                said.append(f"{what} has {quantity(name, f'= {value:.4g}')}, beyond the limit {limit}: {meaning}")
+                limit = with_unit(name, f"= {low if value < low else high:.4g}")
+                said.append(f"{what} has {with_unit(name, f'= {value:.4g}')}, beyond the limit {limit}: {meaning}")
     return said
 
 
-def unweighted(asked: Asked, data: Episodes) -> list[str]:
+def find_unweighted_limits(asked: Asked, data: Episodes) -> list[str]:
     """Return a sentence for each limited state that the cost does not weigh."""
     of = asked.cost.of.bind(data.states)
     if not isinstance(of, State):
         return []
-    weighed = _aims(asked, data)
+    weighed = _weighted_references(asked, data)
     box = asked.limits.states(data.nx)
     idle = [i for i in range(data.nx) if i not in weighed and (np.isfinite(box.low[i]) or np.isfinite(box.high[i]))]
     if not idle:
         return []
-    names = ", ".join(short(data.states[i]) for i in idle)
+    names = ", ".join(strip_unit(data.states[i]) for i in idle)
     return [
         f"{names} {'has' if len(idle) == 1 else 'have'} limits and no weight in Q: only the limit itself keeps the "
         "loop away from it; a small weight would make it keep a distance"
     ]
 
 
-def _aims(asked: Asked, data: Episodes) -> dict[int, Float[np.ndarray, " T1"]]:
+def _weighted_references(asked: Asked, data: Episodes) -> dict[int, Float[np.ndarray, " T1"]]:
     """Return the reference rows of each state that the cost weighs; none for a cost on other observables."""
     of = asked.cost.of.bind(data.states)
     if not isinstance(of, State):
         return {}
     Q, _ = asked.cost.matrices(of.nz, data.nu)
-    return {int(i): asked.reference[:, column] for column, i in enumerate(of.chosen) if Q[column, column] > 0}
+    return {int(i): asked.reference[:, column] for column, i in enumerate(of.state_indices) if Q[column, column] > 0}
 
 
 def _first_states(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
@@ -293,7 +289,7 @@ def _first_states(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
     return inside if len(inside) >= _FEW else points
 
 
-def _spread(points: Float[np.ndarray, "n nx"]) -> Float[np.ndarray, "m nx"]:
+def _choose_spread(points: Float[np.ndarray, "n nx"]) -> Float[np.ndarray, "m nx"]:
     """Return a few of the points: of the half nearest to their median, far from each other."""
     size = np.ptp(points, axis=0)
     Z = (points - np.median(points, axis=0)) / np.where(size > 0, size, 1.0)

@@ -1,6 +1,5 @@
 """Candidate and Recipe: a model to try, and how it and its controller are made; the candidates for an unknown plant."""
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import comb
@@ -12,9 +11,11 @@ from scipy.spatial import KDTree
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
+from koopmpc.control.kinds import kind_for
 from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
+from koopmpc.data.angles import find_angles
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source
@@ -23,12 +24,11 @@ from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import Towards, edmd
 from koopmpc.identify.moments.read import ReadOptions
-from koopmpc.lifting.base import Lifting, lifting_of, short
+from koopmpc.lifting.base import Lifting, check_lifting, strip_unit
 from koopmpc.lifting.composed import Standardized, Sum
 from koopmpc.lifting.fourier import Fourier, RandomFourier
 from koopmpc.lifting.radial import Gaussian, ThinPlate
 from koopmpc.lifting.state import Constant, Monomials, State
-from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Arrays, Value, from_data, to_data
 
@@ -39,7 +39,6 @@ _POINTS = 2000  # of the data that distances are taken of
 _FLOOR = 1e-3  # weight of data that are far from every visited state
 _NEAR = 0.3  # this quantile of the squared distances is the square of the weights' width
 _VISITED = 300  # visited states that distances are taken to, at most
-_ANGLE = re.compile(r"(.*[\W_\d])?(theta|phi|psi|alpha|beta|gamma|angle|roll|pitch|yaw|heading|attitude)[\W_\d]*")
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +96,7 @@ class Candidate(Value):
         return Candidate(self.name, bound, sized, self.bilinear)
 
 
-def model_of(candidate: Candidate, data: Episodes | Source, ridge: float, read: ReadOptions) -> AnyPredictor:
+def fit_candidate(candidate: Candidate, data: Episodes | Source, ridge: float, read: ReadOptions) -> AnyPredictor:
     """Return the model of these data; the ridge of a bilinear one pulls it towards z⁺ = z."""
     psi, embedding = candidate.lifting, candidate.embedding
     if candidate.bilinear:
@@ -105,7 +104,7 @@ def model_of(candidate: Candidate, data: Episodes | Source, ridge: float, read: 
     return edmd(data, psi, embedding=embedding, ridge=ridge, towards=candidate.towards, **read)
 
 
-def past_steps(delays: Sequence[int]) -> list[int]:
+def check_delays(delays: Sequence[int]) -> list[int]:
     """Return the numbers of past steps to try, each once, the least first.
 
     Raises
@@ -120,7 +119,7 @@ def past_steps(delays: Sequence[int]) -> list[int]:
     return past
 
 
-def expanded(
+def expand_candidates(
     given: Sequence[Candidate | Lifting], episodes: Episodes, delays: Sequence[int], bilinear: bool
 ) -> list[Candidate]:
     """Return the candidates bound to the data; a plain lifting becomes one for each number of delays and each kind.
@@ -133,7 +132,7 @@ def expanded(
         if isinstance(one, Candidate):
             found.append(one.bind(episodes.states, episodes.inputs))
             continue
-        psi = lifting_of(one)
+        psi = check_lifting(one)
         parts = psi.parts if isinstance(psi, Sum) else (psi,)
         name = f"{i}: {' + '.join(type(part).__name__ for part in parts)}"
         for d in delays:
@@ -150,7 +149,9 @@ def expanded(
     return found
 
 
-def usual(episodes: Episodes, delays: Sequence[int], bilinear: bool, rng: np.random.Generator) -> list[Candidate]:
+def propose_candidates(
+    episodes: Episodes, delays: Sequence[int], bilinear: bool, rng: np.random.Generator
+) -> list[Candidate]:
     """Return the candidates for an unknown plant: linear, polynomial, trigonometric, radial and random ones.
 
     A candidate is left out if it has more than 120 observables, more than 260 regressors, or fewer than 10 snapshot
@@ -165,7 +166,7 @@ def usual(episodes: Episodes, delays: Sequence[int], bilinear: bool, rng: np.ran
     for d in delays:
         embedding = Delay(d) if d else None
         families = [("x, 1", base), *_trigonometric(episodes.states, X)]
-        families += _scaled(episodes, X, rng) if d == 0 else [("monomials 2", base + present * present)]
+        families += _scale_liftings(episodes, X, rng) if d == 0 else [("monomials 2", base + present * present)]
         for name, lifting in families:
             one = Candidate(name, lifting, embedding).bind(episodes.states, episodes.inputs)
             nz, nu = one.lifting.nz, episodes.nu
@@ -177,46 +178,18 @@ def usual(episodes: Episodes, delays: Sequence[int], bilinear: bool, rng: np.ran
     return found
 
 
-def angles(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> list[int]:
-    """Return the states that look like angles, by their unit rad, else by their name, and that move by 0.2 rad or more.
-
-    The sine of an angle that moves less is the angle itself.
-    """
-    moving = np.ptp(X, axis=0) > 0.2
-    return [i for i, name in enumerate(states) if moving[i] and _angle(name)]
-
-
-def jumps(episodes: Episodes) -> dict[int, int]:
-    """Return how often each angle jumps by 2π, for the angles that were wrapped."""
-    X = np.concatenate([episode.X for episode in episodes])
-    found: dict[int, int] = {}
-    for i in angles(episodes.states, X):
-        steps = np.abs(np.concatenate([np.diff(episode.X[:, i]) for episode in episodes]))
-        count = int(np.sum(np.abs(steps - 2 * np.pi) < 1.0))
-        if count and np.median(steps) < 1.0:
-            found[i] = count
-    return found
-
-
-def still(episodes: Episodes) -> list[str]:
+def find_constant_states(episodes: Episodes) -> list[str]:
     """Return the names of the states and inputs that are constant throughout."""
     table = np.concatenate([np.hstack([episode.X[:-1], episode.U]) for episode in episodes])
     names = (*episodes.states, *episodes.inputs)
     return [name for name, low, high in zip(names, table.min(axis=0), table.max(axis=0), strict=True) if low == high]
 
 
-def _angle(name: str) -> bool:
-    stem, bracket, unit = name.partition("[")
-    if bracket:
-        return unit.strip(" ]").lower() in ("rad", "radian", "radians")
-    return _ANGLE.fullmatch(stem.strip().lower()) is not None and not stem.lower().startswith("d")
-
-
 def _trigonometric(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> Iterator[tuple[str, Lifting]]:
     """Yield sines and cosines of the angles, alone and times the other states; or else of the states without a unit."""
-    found, base = angles(states, X), State() + Constant()
+    found, base = find_angles(states, X), State() + Constant()
     if found:
-        which, where = found, ", ".join(short(states[i]) for i in found)
+        which, where = found, ", ".join(strip_unit(states[i]) for i in found)
     else:
         which = [i for i, name in enumerate(states) if "[" not in name and 0.2 < np.ptp(X[:, i]) < 50]
         where = "all"
@@ -233,7 +206,7 @@ def _trigonometric(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> Itera
             yield f"fourier {k} ({where}) × squares", base + circle + squares + circle * (others + squares)
 
 
-def _scaled(
+def _scale_liftings(
     episodes: Episodes, X: Float[np.ndarray, "M nx"], rng: np.random.Generator
 ) -> Iterator[tuple[str, Lifting]]:
     """Yield polynomials, bells, splines and random features of the standardized states."""
@@ -243,21 +216,21 @@ def _scaled(
     rng.shuffle(points)
     base = State() + Constant()
 
-    def scaled(lifting: Lifting) -> Lifting:
+    def scale(lifting: Lifting) -> Lifting:
         return base + Standardized(lifting, whole.mean, whole.scale)
 
     for degree in (2, 3, 4, 5):
         if comb(episodes.nx + degree, degree) <= MOST:
-            yield f"monomials {degree}", scaled(Monomials(degree))
+            yield f"monomials {degree}", scale(Monomials(degree))
     half = len(points) // 2
     apart = np.sqrt(np.sum((points[:half] - points[half : 2 * half]) ** 2, axis=1))
     width = float(f"{np.median(apart):.2g}") if half else 1.0
     for count in (30, 80):
         centers = points[:count]
-        yield f"gaussian {len(centers)}", scaled(Gaussian(centers, width))
-        yield f"thin plate {len(centers)}", scaled(ThinPlate(centers))
+        yield f"gaussian {len(centers)}", scale(Gaussian(centers, width))
+        yield f"thin plate {len(centers)}", scale(ThinPlate(centers))
     for count in (50, 100):
-        yield f"random fourier {count}", scaled(RandomFourier(count, width, rng))
+        yield f"random fourier {count}", scale(RandomFourier(count, width, rng))
 
 
 Designed = KoopmanMPC | BilinearMPC
@@ -351,7 +324,7 @@ class Recipe(Value):
         """Return the model of these data, with the weights `near`. Doubts about the fit stand in its report."""
         with unwarned():
             read = ReadOptions(weights=near, workers=workers, scheduler=scheduler)
-            return model_of(self.candidate, data, self.ridge, read)
+            return fit_candidate(self.candidate, data, self.ridge, read)
 
     def controller(
         self, model: AnyPredictor, cost: Cost, limits: Limits, horizon: int, *, brief: bool = False
@@ -365,17 +338,6 @@ class Recipe(Value):
         """
         if self.tail is not None and cost.Q_N is None and cost.tail is None:
             cost = replace(cost, tail=self.tail)
-        if isinstance(model, BilinearPredictor):
-            kind = BriefMPC if brief else BilinearMPC
-            return kind(model, cost, limits, horizon, estimator=self.estimator)
-        return KoopmanMPC(model, cost, limits, horizon, estimator=self.estimator)
-
-
-class BriefMPC(BilinearMPC):
-    """A BilinearMPC whose model runs in the interpreter: for some hundred steps compiling takes longer than it saves.
-
-    All that does not depend on the model is still machine code, which later controllers find in the cache. The numbers
-    are the same.
-    """
-
-    _compiles_model = False
+        kind = kind_for(model)
+        build: Any = (kind.brief if brief else None) or kind.controller
+        return build(model, cost, limits, horizon, estimator=self.estimator)

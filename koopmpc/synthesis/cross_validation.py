@@ -15,33 +15,33 @@ from jaxtyping import Float, Int
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, joined
-from koopmpc.data.smoother import Mender, Smoother
+from koopmpc.data.smoother import Glitch, Mender, Smoother
 from koopmpc.data.source import Changed, EpisodesMap, Held, Source
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.moments import Moments
-from koopmpc.identify.moments.read import second_moments, spread
-from koopmpc.identify.regression import Regression, regression_of
-from koopmpc.identify.solve import about_means, path
+from koopmpc.identify.moments.read import second_moments, space_evenly
+from koopmpc.identify.regression import Regression, build_regression
+from koopmpc.identify.solve import centre_products, solve_path
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
+from koopmpc.text import with_unit
 from koopmpc.validate.scoring import AnyPredictor, forecast_errors
-from koopmpc.validate.text import quantity
 from koopmpc.values import Value
 
-LEAST = 1e-9  # ridge: without one, observables that are almost dependent get weights that no controller has digits for
-_TINY = 1e-15  # of an error that is zero
-_ALIKE = 1.02  # a larger ridge with errors so little above is worth having
-_STARTS = 256  # forecasts a fold
-EXACT = 1e-6  # relative errors below are what rounding and the least ridge leave
-HALF = 0.5  # the share of the error below which a model with delays, or with fast growth, is worth its risk
-_LOST = 100.0  # a prediction that is so many spreads off is no prediction
-_PARTS = 16  # of a source that a sample is taken from
-_TOLD = 3  # glitches that a note names
+LEAST = 1e-9  # smallest ridge; with less, nearly dependent observables get weights beyond double precision
+_TINY = 1e-15  # stands for an error of zero in logarithms
+_ALIKE = 1.02  # the largest ridge whose errors are within this factor of the smallest ones is chosen
+_STARTS = 256  # number of forecasts in a fold
+EXACT = 1e-6  # smaller relative errors are due to rounding and the smallest ridge
+HALF = 0.5  # a model with delays or fast growth must reduce the error to this share
+_DIVERGED = 100.0  # forecasts diverge if their error exceeds this many spreads of the states
+_PARTS = 16  # a sample is taken from at most this many parts of a source
+_TOLD = 3  # a note names at most this many glitches
 _AHEAD = 20  # steps of the default horizon
 
 
 class Folds(NamedTuple):
-    """Episodes, which fold each is in, and what was done to the data, in sentences."""
+    """Episodes, the fold of each episode, and sentences on changes of the data."""
 
     episodes: Episodes
     fold: tuple[int, ...]
@@ -53,7 +53,7 @@ class Folds(NamedTuple):
         return max(self.fold) + 1
 
 
-def sampled(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
+def take_sample(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
     """Return episodes of about `pairs` snapshot pairs at most, spread over the source, and a sentence if not all.
 
     Raises
@@ -69,7 +69,7 @@ def sampled(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
     parts = source.parts()
     if isinstance(parts, Sized):
         every = list(parts)
-        chosen = [every[i] for i in spread(len(every), _PARTS)] if len(every) > _PARTS else every
+        chosen = [every[i] for i in space_evenly(len(every), _PARTS)] if len(every) > _PARTS else every
         whole = len(chosen) == len(every)
     else:
         chosen, whole = list(islice(parts, _PARTS)), False
@@ -77,7 +77,7 @@ def sampled(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
     taken: list[Episodes] = []
     for part in chosen:
         loaded = part.load()
-        taken.append(_thinned(loaded, quota))
+        taken.append(_thin_episodes(loaded, quota))
         whole = whole and taken[-1] is loaded
     result = joined(taken)
     if whole:
@@ -88,7 +88,7 @@ def sampled(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
     )
 
 
-def mended(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple[str, ...]]:
+def replace_glitches(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple[str, ...]]:
     """Return the source and the episodes `held` of it with glitches replaced, and a sentence if there are any."""
     try:
         mender = Mender.of(held)
@@ -97,17 +97,23 @@ def mended(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple[str,
     found = mender.glitches(held)
     if not found:
         return source, held, ()
-    named = [
-        f"{quantity(held.states[one.state], f'= {one.was:.4g}')} in row {one.row} of episode {one.episode}, "
-        f"now {one.now:.4g}"
-        for one in found[:_TOLD]
-    ]
+    named = [_name_glitch(one, held) for one in found[:_TOLD]]
     rest = f", and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
     note = f"measurements that fit neither those before nor those after were replaced: {'; '.join(named)}{rest}"
-    return *_changed(source, held, mender), (note,)
+    return *_apply_change(source, held, mender), (note,)
 
 
-def smoothed(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple[str, ...], Float[np.ndarray, " nx"]]:
+def _name_glitch(glitch: Glitch, data: Episodes) -> str:
+    """Return what was measured, where, and what stands there now; where the data are of a table, by file and line."""
+    state, origin = data.states[glitch.state], data[glitch.episode].origin
+    was, place = glitch.was, f"in row {glitch.row} of episode {glitch.episode}"
+    if origin is not None:
+        number, was = origin.locate(glitch.row, state, glitch.now)
+        place = f"in {origin.place(number)}"
+    return f"{with_unit(state, f'= {was:.5g}')} {place}, now {glitch.now:.4g}"
+
+
+def smooth_data(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple[str, ...], Float[np.ndarray, " nx"]]:
     """Return source and episodes, smoothed where noise is found, a sentence that says so, and the size of the noise.
 
     The size is the (nx,) standard deviation of what was taken out, zero where that is nothing. The smoother is found
@@ -121,15 +127,15 @@ def smoothed(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple[st
     if not smoother.found.any():
         return nothing
     told = ", ".join(
-        quantity(name, f"± {size:.2g}")
+        with_unit(name, f"± {size:.2g}")
         for name, size, found in zip(held.states, smoother.noise, smoother.found, strict=True)
         if found
     )
     note = f"the measurements hold noise (standard deviations): {told}; models are of smoothed states"
-    return *_changed(source, held, smoother), (note,), smoother.noise
+    return *_apply_change(source, held, smoother), (note,), smoother.noise
 
 
-def _changed(source: Source, held: Episodes, change: EpisodesMap) -> tuple[Source, Episodes]:
+def _apply_change(source: Source, held: Episodes, change: EpisodesMap) -> tuple[Source, Episodes]:
     changed = change(held)
     if isinstance(source, Held) and source.episodes is held:
         return Held(changed), changed
@@ -140,7 +146,7 @@ def usual_horizon(episodes: Episodes, past: int = 0) -> tuple[int, tuple[str, ..
     """Return 20 steps, or as many as whole episodes allow, and a sentence if these are fewer.
 
     At least half of all steps are in episodes that are long enough for this and the `past` that embeddings need, so
-    that the shortest ones do not decide. A single one is cut into four blocks.
+    that the shortest ones do not determine the horizon. A single episode is later cut into four blocks.
     """
     lengths = np.sort([len(episode) for episode in episodes])[::-1]
     held = np.cumsum(lengths) >= lengths.sum() / 2
@@ -155,10 +161,11 @@ def usual_horizon(episodes: Episodes, past: int = 0) -> tuple[int, tuple[str, ..
     )
 
 
-def folded(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator) -> Folds:
+def make_folds(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator) -> Folds:
     """Return the episodes in folds of about equal size; few long ones are first cut into blocks.
 
-    Episodes are dealt out at random. Blocks stay in order, so that a fold is one stretch of time: neighbours are alike.
+    Episodes are dealt out at random. Neighbouring blocks are alike, so blocks keep their order and a fold is one
+    stretch of time.
 
     Parameters
     ----------
@@ -167,7 +174,7 @@ def folded(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator
     needed
         Steps that an episode must have to be scored.
     folds
-        How many folds there are; fewer where there are fewer episodes.
+        Number of folds; fewer if there are fewer episodes.
     rng
         Deals out the episodes.
 
@@ -188,7 +195,7 @@ def folded(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator
     if cut:
         number, total = len(long), sum(map(len, long))
         block = max(2 * needed, total // (4 * folds))
-        long = [piece for episode in long for piece in blocks(episode, block)]
+        long = [piece for episode in long for piece in cut_blocks(episode, block)]
         cut = len(long) > number
         if cut:
             notes.append(
@@ -216,31 +223,31 @@ def folded(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator
     return Folds(episodes.with_episodes(long), tuple(fold.tolist()), tuple(notes))
 
 
-def only(episodes: Episodes, fold: Sequence[int], wanted: int) -> Episodes:
+def select_fold(episodes: Episodes, fold: Sequence[int], wanted: int) -> Episodes:
     """Return the episodes of one fold."""
     return episodes.with_episodes([episode for episode, own in zip(episodes, fold, strict=True) if own == wanted])
 
 
-def without(episodes: Episodes, fold: Sequence[int], out: int) -> Episodes:
+def drop_fold(episodes: Episodes, fold: Sequence[int], out: int) -> Episodes:
     """Return the episodes of all folds but one."""
     return episodes.with_episodes([episode for episode, own in zip(episodes, fold, strict=True) if own != out])
 
 
-def blocks(episode: Episode, steps: int) -> list[Episode]:
-    """Return an episode in equal blocks of `steps` or more; none shares a pair with another."""
+def cut_blocks(episode: Episode, steps: int) -> list[Episode]:
+    """Return an episode in equal blocks of at least `steps` steps; no two blocks share a snapshot pair."""
     count = max(len(episode) // steps, 1)
     at = np.linspace(0, len(episode), count + 1).astype(int)
-    return [Episode(X=episode.X[a : b + 1], U=episode.U[a:b], W=episode.W[a:b]) for a, b in pairwise(at)]
+    return [episode.cut(a, b) for a, b in pairwise(at.tolist())]
 
 
-def _thinned(episodes: Episodes, quota: int) -> Episodes:
-    """Return evenly spread episodes of about `quota` steps in all; of a longer single one, its beginning."""
+def _thin_episodes(episodes: Episodes, quota: int) -> Episodes:
+    """Return evenly spread episodes of about `quota` steps in total; a longer episode is cut to its beginning."""
     total = sum(len(episode) for episode in episodes)
     if total <= quota:
         return episodes
     wanted = max(len(episodes) * quota // total, 1)
-    kept = [episodes[i] for i in spread(len(episodes), wanted)]
-    cut = [e if len(e) <= quota else Episode(X=e.X[: quota + 1], U=e.U[:quota], W=e.W[:quota]) for e in kept]
+    kept = [episodes[i] for i in space_evenly(len(episodes), wanted)]
+    cut = [e if len(e) <= quota else e.cut(0, quota) for e in kept]
     return episodes.with_episodes(cut)
 
 
@@ -253,7 +260,7 @@ class Trial:
     candidate
         Bound to the episodes' names.
     episodes, fold
-        Episodes, and which fold each is in.
+        Episodes, and the fold of each episode.
     horizon
         Steps ahead.
     first
@@ -262,7 +269,7 @@ class Trial:
     ridges
         Weights to try, the least first.
     relift
-        Lift the forecasts of bilinear models anew at every step, as BilinearMPC does.
+        Lift the forecasts of bilinear models at every step, as BilinearMPC does.
     """
 
     candidate: Candidate
@@ -289,7 +296,7 @@ class Tried(Value):
         Tikhonov weights as in `edmd`.
     errors
         (ridges, folds, horizon) root-mean-square error over the states h steps ahead, each relative to the state's
-        spread; infinite from where the forecasts of a fold run away.
+        spread; infinite from the step on at which the forecasts of a fold diverge.
     inputs
         Number of columns of B and E.
     A
@@ -312,17 +319,18 @@ class Tried(Value):
     def scores(self) -> Float[np.ndarray, "ridges folds"]:
         """Geometric mean of the errors over the horizon, of each fold.
 
-        On an unstable plant errors grow from step to step, and a root-mean-square would be that of the last steps: a
-        tame model could win that spoils the next step, and with it every gain. Here each step counts alike.
+        On an unstable plant errors grow from step to step, and the last steps would dominate a root-mean-square. A tame
+        model with a bad next step, and hence with bad gains, could then win. In the geometric mean each step counts
+        alike.
         """
         return np.exp(np.log(np.maximum(self.errors, _TINY)).mean(axis=2))
 
     def best(self, floor: float) -> int:
-        """Return the index of the largest ridge whose mean score over the folds is within 2 % of the least one.
+        """Return the index of the largest ridge whose mean score over the folds is within 2 % of the smallest one.
 
-        Where the data hold noise, ridges below it make no difference, and a larger one makes the model calmer. `floor`
-        is the least ridge of a model with delays, whose observables are almost functions of each other; where every
-        ridge is below it, the largest one stands for it.
+        With noisy data, ridges below the noise make no difference, and a larger ridge makes the model calmer. `floor`
+        is the smallest ridge of a model with delays, whose observables are almost dependent. If every ridge is below
+        `floor`, the largest one is taken.
         """
         first = int(np.searchsorted(self.ridges[:-1], floor)) if self.candidate.delays else 0
         mean = np.exp(np.log(self.scores).mean(axis=1))
@@ -330,36 +338,36 @@ class Tried(Value):
         return max(i for i in range(first, len(mean)) if mean[i] <= alike)
 
 
-def tried(trial: Trial) -> Tried:
+def cross_validate(trial: Trial) -> Tried:
     """Cross-validate one candidate.
 
-    The moments of each fold are read once. Moments add, so those of all data but a fold are the sum of the other
-    folds'. A further ridge costs neither a pass over the data nor a decomposition.
+    The moments of each fold are read once. The moments of all data except a fold are the sum over the other folds. A
+    further ridge costs neither a pass over the data nor a decomposition.
     """
-    begun = perf_counter()
+    start = perf_counter()
     count = max(trial.fold) + 1
-    folds = [only(trial.episodes, trial.fold, i) for i in range(count)]
+    folds = [select_fold(trial.episodes, trial.fold, i) for i in range(count)]
     parts = [_moments(trial.candidate, fold) for fold in folds]
     total, sizes = reduce(Moments.__add__, parts), _sizes(trial.episodes)
     errors = np.empty((len(trial.ridges), count, trial.horizon))
     for i, fold in enumerate(folds):
         rest = reduce(Moments.__add__, (part for j, part in enumerate(parts) if j != i))
-        models = fitted(trial.candidate, rest, trial.episodes, trial.ridges)
+        models = fit_ridges(trial.candidate, rest, trial.episodes, trial.ridges)
         errors[:, i] = _errors(trial, models, fold, sizes)
     return Tried(
         candidate=trial.candidate,
         ridges=trial.ridges,
         errors=errors,
         inputs=trial.episodes.nu + trial.episodes.nw,
-        A=np.array([model.A for model in fitted(trial.candidate, total, trial.episodes, trial.ridges)]),
+        A=np.array([model.A for model in fit_ridges(trial.candidate, total, trial.episodes, trial.ridges)]),
         misfit=_misfit(trial.candidate, total),
-        seconds=perf_counter() - begun,
+        seconds=perf_counter() - start,
     )
 
 
-def fitted(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[float, ...]) -> list[AnyPredictor]:
+def fit_ridges(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[float, ...]) -> list[AnyPredictor]:
     """Return the predictor of each ridge on these moments, without the checks that a report would need."""
-    task, nz, nu, which = regression_of(total, "select"), total.nz, like.nu, total.products
+    task, nz, nu, which = build_regression(total, "select"), total.nz, like.nu, total.products
     C = task.C
     assert C is not None, "an extended regression has its C"
     models: list[AnyPredictor] = []
@@ -379,11 +387,11 @@ def fitted(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[f
 
 
 def _misfit(candidate: Candidate, total: Moments) -> float:
-    task = regression_of(total, "select")
+    task = build_regression(total, "select")
     rows, where = task.rows, task.x_next
     (K,) = _solutions(candidate, task, (LEAST,), total.products)
-    energy = (np.sum(rows.centred().T[:, where] ** 2, axis=0) + rows.rest[where]) / rows.samples
-    return float(np.mean(rows.residual(where, task.decoded(K)) ** 2 / np.where(energy > 0, energy, 1.0)))
+    energy = (np.sum(rows.subtract_means().T[:, where] ** 2, axis=0) + rows.rest[where]) / rows.samples
+    return float(np.mean(rows.residual(where, task.decode(K)) ** 2 / np.where(energy > 0, energy, 1.0)))
 
 
 def _solutions(
@@ -392,16 +400,16 @@ def _solutions(
     """Return K of each ridge. The ridge of a bilinear model pulls it towards z⁺ = z, as in the final fit."""
     P, nz = task.rows.P, task.lifting.nz
     if not candidate.bilinear:
-        light = task.affine if candidate.towards == "affine" else ()
-        return [solution.K for solution in path(task.rows.leading(nz), ridges, light=light)]
+        light = task.affine_columns if candidate.towards == "affine" else ()
+        return [solution.K for solution in solve_path(task.rows.keep_targets(nz), ridges, light=light)]
     start = np.eye(P.shape[1], nz)
     rows = replace(task.rows, T=task.rows.T[:, :nz] - P @ start, rest=task.rows.rest[:nz])
-    shifted, back = about_means(rows, len(task.inputs), which)
-    return [back @ solution.K + start for solution in path(shifted, ridges)]
+    shifted, back = centre_products(rows, len(task.inputs), which)
+    return [back @ solution.K + start for solution in solve_path(shifted, ridges)]
 
 
 def _moments(candidate: Candidate, episodes: Episodes) -> Moments:
-    """Return moments as triangular factors whatever the condition, so that all folds are solved in the same way."""
+    """Return moments as triangular factors, whatever their condition, so that all folds are solved in the same way."""
     return second_moments(
         episodes if candidate.bilinear else episodes.driven(),
         candidate.lifting,
@@ -412,7 +420,7 @@ def _moments(candidate: Candidate, episodes: Episodes) -> Moments:
 
 
 def _sizes(episodes: Episodes) -> Float[np.ndarray, " nx"]:
-    """Return the standard deviation of each state over all episodes; one that does not move keeps its unit."""
+    """Return the standard deviation of each state over all episodes; 1 for a constant state."""
     X = np.concatenate([episode.X for episode in episodes])
     scale = X.std(axis=0)
     return np.where(scale > 1e-12 * np.abs(X.mean(axis=0)), scale, 1.0)
@@ -436,21 +444,21 @@ def _errors(
                 total += ((gap / sizes) ** 2).mean(axis=2).sum(axis=1)
             count += gap.shape[1]
         row[:] = np.sqrt(total / count)
-        lost = np.flatnonzero(~(row < _LOST))
+        lost = np.flatnonzero(~(row < _DIVERGED))
         if lost.size:
             row[lost[0] :] = np.inf
     return result
 
 
-def ridges_of(ridges: object) -> tuple[float, ...]:
-    """Return the ridges, the least first, those below 1e-9 raised to it.
+def check_ridges(ridges: object) -> tuple[float, ...]:
+    """Return the ridges in ascending order; those below 1e-9 are raised to it.
 
     Raises
     ------
     DataError
-        There is none, or one is negative.
+        There is no ridge, or one is negative.
     """
-    given = checks.array(ridges, "ridges", (None,))  # pyright: ignore[reportArgumentType]  # array refuses what is none
+    given = checks.array(ridges, "ridges", (None,))  # pyright: ignore[reportArgumentType]  # checks.array accepts any object
     if not given.size or (given < 0).any():
         raise DataError(f"ridges is {given.tolist()}; pass weights of 0 or above, at least one")
     return tuple(sorted({max(ridge, LEAST) for ridge in given.tolist()}))

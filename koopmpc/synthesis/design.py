@@ -1,4 +1,4 @@
-"""design: a controller with a learned model, chosen by closed loop from data, a cost and limits alone."""
+"""`design` chooses a controller with a learned model from data, a cost and limits, by closed loops on surrogates."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -14,6 +14,7 @@ from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.data.angles import find_angles
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, FitWarning
@@ -22,35 +23,66 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Present
 from koopmpc.lifting.state import State
 from koopmpc.parallel import StageProgress, Workers
-from koopmpc.synthesis.asked import Asked, asked_of, margin_room, outside_data, outside_limits, strays, unweighted
-from koopmpc.synthesis.candidates import Candidate, Designed, Nearness, Recipe, expanded, past_steps, usual
-from koopmpc.synthesis.candidates import angles as angular
+from koopmpc.synthesis.asked import (
+    Asked,
+    check_task,
+    find_outside_data,
+    find_outside_limits,
+    find_stray_episodes,
+    find_unweighted_limits,
+    limit_margins,
+)
+from koopmpc.synthesis.candidates import (
+    Candidate,
+    Designed,
+    Nearness,
+    Recipe,
+    check_delays,
+    expand_candidates,
+    propose_candidates,
+)
 from koopmpc.synthesis.cross_validation import (
     LEAST,
     Folds,
     Trial,
     Tried,
-    folded,
-    mended,
-    only,
-    sampled,
-    smoothed,
-    tried,
-    without,
+    cross_validate,
+    drop_fold,
+    make_folds,
+    replace_glitches,
+    select_fold,
+    smooth_data,
+    take_sample,
 )
-from koopmpc.synthesis.designed import Design, DesignRow, Evidence, Expected, place_of
-from koopmpc.synthesis.judging import Condition, Job, LoopTest, Outcome, confirmed, judged, ratios, scores
-from koopmpc.synthesis.select import RIDGES, stage
-from koopmpc.synthesis.surrogates import Surrogate, stand_ins, surrogate, unfelt, unheld
-from koopmpc.validate.text import percent
+from koopmpc.synthesis.designed import Design, DesignRow, Evidence, Expected, choose_row
+from koopmpc.synthesis.judging import (
+    Condition,
+    Job,
+    LoopTest,
+    Outcome,
+    average_ratios,
+    is_confirmed,
+    judge_job,
+    rate_runs,
+)
+from koopmpc.synthesis.select import RIDGES, report_stage
+from koopmpc.synthesis.surrogates import (
+    Surrogate,
+    choose_surrogates,
+    explain_unreachable,
+    find_ignored_states,
+    fit_surrogate,
+)
+from koopmpc.text import to_percent
 
-FOLDS = 3
-OFF = 0.2  # share by which inputs act more or less in half of the final runs
-_SCREENED = 5  # models of each kind that are judged by closed loop
-_LINEAR, _BILINEAR = 2, 3  # of these those that are tried with estimators, ends of the horizon and weights
-_GAINS = (None, 0.5)  # of the estimators
-_STRETCHES = 4  # of a long reference
-_TURNS = 0.9 * 2 * np.pi  # an angle that went further in the data makes whole turns
+FOLDS = 3  # folds of the data; models are fitted to two of them
+OFF = 0.2  # in half of the final runs the inputs act by this share more or less
+_FIRST_ROUND = 5  # models of each kind that the first round judges by closed loop
+_LINEAR = 2  # linear models of the first round that are tried with estimators and both terminal costs
+_BILINEAR = 3  # bilinear models of the first round that are tried with an estimator or with weights
+_GAINS = (None, 0.5)  # gains of the estimators
+_STRETCHES = 4  # runs start at this many places of a long reference
+_TURNS = 0.9 * 2 * np.pi  # [rad] an angle whose range in the data is larger makes whole turns
 
 
 def design(
@@ -73,67 +105,70 @@ def design(
     progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
 ) -> Design:
-    """Choose model and controller by closed loop on learned stand-ins of the plant, and fit them to all data.
+    """Choose model and controller by closed loop on learned surrogates of the plant, and fit them to all data.
 
-    1. Episodes that went far away under ordinary inputs are left out, the others are cut into three folds. Every
-       candidate model is fitted to two of them and forecasts the third over the horizon, a bilinear one lifted anew at
-       every step, as its controller does. This chooses ridges, the five models of each kind that go on, and the two
-       that stand in for the plant.
-    2. Surrogates: the bilinear model of the least error and the best one of another family of observables, each
-       fitted to every two folds. Their measurements have the noise that their one-step errors show.
-    3. Controllers: each model, fitted to two folds, controls surrogates that know the third fold, for three
-       horizons from several starts: BilinearMPC, KoopmanMPC, and plain KoopmanMPC with Q_N = Q.
-    4. The best go on with every estimator and end of the horizon, one with weights around what its loops visit, and are
-       also judged on surrogates whose inputs act 20 % more and 20 % less: a plant is never quite the one of its logs.
-    5. A run's score is its cost × (1 + 10 max(0, violation − 0.5 %)) over the best on the same surrogate and start, at
-       most 20, and 20 where it leaves the data by half of their range. The least geometric mean wins, in which runs
-       with inputs 20 % off count half; of all within 0.5 % of it the simplest is taken, and fitted to all data. Where
-       it then loses or costs a quarter more on the surrogates than it did when fitted to two folds, the next best is
-       taken, and the notes say so.
+    1. Folds: episodes that went far away under ordinary inputs are left out, and the others are dealt into three folds.
+       Every candidate model is fitted to two folds and forecasts the third over the horizon. A bilinear model is lifted
+       at every step, as in its controller. The errors choose the ridges, the five models of each kind for the first
+       round, and the two surrogates of the plant.
+    2. Surrogates: the bilinear model with the smallest error, and the best one from another family of observables, each
+       fitted to every two folds. Their one-step errors give the noise of their measurements.
+    3. First round: each model, fitted to two folds, controls surrogates that know the third fold, for three horizons
+       from several starts, by BilinearMPC, KoopmanMPC, and plain KoopmanMPC with Q_N = Q.
+    4. Final round: the best models are tried with every estimator and terminal cost, and one is fitted with weights
+       around the states that its loops visit. Some surrogates have inputs that act 20 % more or less, since a plant
+       differs from its logs.
+    5. Choice: the score of a run is its cost × (1 + 10 max(0, violation − 0.5 %)), divided by the best on the same
+       surrogate and start. It is at most 20, and 20 if the run leaves the data by half of their range. A controller is
+       judged by the geometric mean of its scores, in which runs with inputs 20 % off count half. Of all controllers
+       within 0.5 % of the best, the simplest is chosen and fitted to all data.
+    6. Confirmation: if the fitted controller loses a run, or costs a quarter more on the surrogates than when fitted to
+       two folds, the next best is chosen, and the notes say so.
 
-    The choice depends on the data and `rng` alone, never on time or on the number of workers.
+    The choice depends only on the data and `rng`, never on time or on the number of workers.
 
     Parameters
     ----------
     data
-        Episodes, or a Source that can be read again; of one larger than memory a sample is judged on.
+        Episodes, or a Source that can be read again; the choice uses a sample of a source larger than memory.
     cost, limits
-        What to minimise, within what.
+        Cost to minimise and limits to keep.
     horizon
-        Steps that the controllers look ahead.
+        Horizon of the controllers in steps.
     reference
         (nr,) of the tracked outputs, or rows (T+1, nr), of which the runs take stretches of three horizons.
     starts
         (nx,) or (n, nx) states from which runs begin; by default first states of up to twelve episodes, inside the
         limits.
     angles
-        Indices of states whose errors wrap at ±π. They may leave the data; so may angles that made whole turns in the
-        data, and positions on which nothing depends.
+        Indices of states whose errors wrap at ±π. These states may leave the range of the data, and so may angles that
+        made whole turns in the data, and positions on which nothing depends.
     candidates
-        Models to try, as for `select`.
+        Models to try, as in `select`.
     delays
         Past steps to try in an embedding.
     bilinear
-        Try bilinear models too, where there are no measured disturbances; the surrogates are then bilinear.
+        Try bilinear models too, unless there are measured disturbances; the surrogates are then bilinear.
     tighten
-        Give every controller limits that are `tightened` by its model's errors on the fold that it does not know, by at
-        most half of the way from the reference to the limit.
+        Tighten the limits of every controller (`Limits.tightened`) by its model's errors on the fold that it does not
+        know, by at most half of the distance from the reference to the limit.
     smooth
-        Replace glitches, and where the states hold noise, learn from smoothed states, see `select`; the surrogates
-        measure with that noise.
+        Replace glitches, and learn from smoothed states if the states contain noise (see `select`); the surrogates
+        then measure with this noise.
     sample
-        Snapshot pairs to judge on, about.
+        Approximate number of snapshot pairs that the choice uses.
     workers, scheduler
-        As in `koopmpc.parallel.map_tasks`: a model is a task, and then a controller with all its runs.
+        As in `koopmpc.parallel.map_tasks`; a task is a model, or a controller with all its runs.
     progress
-        Called with what is done, how many of it are, and how many there are.
+        Called with the name of the stage, and the numbers of finished tasks and of all tasks.
     rng
-        Deals out the episodes, draws centres and features.
+        Random generator or seed for the folds, centres and features.
 
     Raises
     ------
     DataError
-        Fewer than three folds of episodes that are long enough; no inputs; NaN; a stream that can be read once only.
+        There are too few long episodes for three folds, no inputs, or NaN; or the data are a stream that can be read
+        only once.
     ShapeError
         Reference, starts, weights or limits have other sizes than the data.
     DefinitenessError
@@ -149,31 +184,31 @@ def design(
     source = source_of(data)
     if source.nu == 0:
         raise DataError("the data have no inputs, so there is nothing to control; give each Episode its U")
-    held, notes = sampled(source, checks.count(sample, "sample"))
+    held, notes = take_sample(source, checks.count(sample, "sample"))
     if smooth:
-        source, held, replaced = mended(source, held)
+        source, held, replaced = replace_glitches(source, held)
         notes = (*notes, *replaced)
-    asked = asked_of(held, cost, limits, ahead, reference, starts, angles)
-    left = strays(held, asked)
+    asked = check_task(held, cost, limits, ahead, reference, starts, angles)
+    left = find_stray_episodes(held, asked)
     if left:
         held = held.with_episodes([episode for k, episode in enumerate(held) if k not in left])
-        asked = asked_of(held, cost, limits, ahead, reference, starts, angles)
+        asked = check_task(held, cost, limits, ahead, reference, starts, angles)
         source = source_of(held)
         if notes:
             notes = (f"chosen on and fitted to a sample of {len(held)} episodes, without those left out",)
     noise = np.zeros(held.nx)
     if smooth:
-        source, held, freed, noise = smoothed(source, held)
+        source, held, freed, noise = smooth_data(source, held)
         notes = (*notes, *freed)
-    past = past_steps(delays)
-    models = _models(held, asked, candidates, past, bilinear and held.nw == 0, draw)
+    past = check_delays(delays)
+    models = _list_models(held, asked, candidates, past, bilinear and held.nw == 0, draw)
     first = max(one.delays for one in models)
     room = int(np.median([len(episode) for episode in held])) - first
     forecast = min(ahead, max(room, 1))
     short: list[str] = []
     if forecast < ahead:
         short = [f"models were judged {forecast} steps ahead, not {ahead}, for episodes are no longer"]
-    folds = folded(held, forecast + first, FOLDS, draw)
+    folds = make_folds(held, forecast + first, FOLDS, draw)
     if folds.number < FOLDS:
         raise DataError(
             f"{len(held)} episodes give {folds.number} folds, and a design needs {FOLDS}: one to judge on and two to "
@@ -181,24 +216,26 @@ def design(
         )
     trials = [Trial(one, folds.episodes, folds.fold, forecast, first, RIDGES, relift=True) for one in models]
     with Workers(workers, scheduler) as pool:
-        results = pool.map(tried, trials, stage(progress, "models"), size=lambda trial: trial.candidate.size)
+        results = pool.map(
+            cross_validate, trials, report_stage(progress, "models"), size=lambda trial: trial.candidate.size
+        )
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
-        test, doubts, holds = _test(folds, asked, stand_ins(results, floor), tighten, noise, pool)
+        test, doubts, holds = _prepare_test(folds, asked, choose_surrogates(results, floor), tighten, noise, pool)
         doubts = [*left.values(), *doubts]
         for sentence in doubts:
             warnings.warn(sentence, FitWarning, stacklevel=2)
-        rows, outcomes = _rounds(test, _screened(results, floor), pool, progress)
-    best, linear = place_of(rows), place_of(rows, "linear")
+        rows, outcomes = _judge_rounds(test, _list_first_round(results, floor), pool, progress)
+    best, linear = choose_row(rows), choose_row(rows, "linear")
     assert best is not None, "the last round is never empty"
 
-    def made(place: int) -> Designed | None:
+    def fit_row(place: int) -> Designed | None:
         recipe, near, outcome = rows[place].recipe, None, outcomes[place]
         if recipe.weighted:
             near = Nearness.of(outcome.visited, test.episodes)
         for data in sets:
             model = recipe.fit(data, near, workers=workers, scheduler=scheduler)
             controller = recipe.controller(model, asked.cost, test.limits(outcome.band), ahead)
-            if confirmed(test, controller, outcome):
+            if is_confirmed(test, controller, outcome):
                 if data is not source:
                     turned.append(
                         f"{rows[place].title} is fitted without the episodes that took no part in the choice: with "
@@ -213,14 +250,14 @@ def design(
 
     turned: list[str] = []
     sets = [source, source_of(folds.episodes)] if any(len(one) < forecast + first for one in held) else [source]
-    controller, best = _first(made, rows, best)
-    simple, linear = (controller, best) if linear == best else _first(made, rows, linear)
+    controller, best = _confirm_first(fit_row, rows, best)
+    simple, linear = (controller, best) if linear == best else _confirm_first(fit_row, rows, linear)
     if controller is None or best is None:
         raise DataError(
             "no controller that was fitted to all data does on the surrogates what it did when fitted to two folds; "
             "collect more episodes, which cover the reference and the way to it"
         )
-    expected = _expected(test, outcomes[best])
+    expected = _summarise_expected(test, outcomes[best])
     return Design(
         controller=controller,
         linear=simple if isinstance(simple, KoopmanMPC) else None,
@@ -230,30 +267,30 @@ def design(
         evidence=Evidence(asked, test.surrogates, test.low, test.high, expected, holds),
         advice=(
             *doubts,
-            *_advice(rows, best, linear, expected),
+            *_give_advice(rows, best, linear, expected),
             *test.limits(outcomes[best].band).capped,
-            *unweighted(asked, held),
+            *find_unweighted_limits(asked, held),
         ),
         notes=(*notes, *short, *folds.notes, *turned),
     )
 
 
-def _first(
-    made: Callable[[int], Designed | None], rows: Sequence[DesignRow], place: int | None
+def _confirm_first(
+    fit_row: Callable[[int], Designed | None], rows: Sequence[DesignRow], place: int | None
 ) -> tuple[Designed | None, int | None]:
-    """Return the first controller that is confirmed, the chosen one or the next best of its kind, and its place."""
+    """Return the first confirmed controller and its row, trying the chosen row and then the next best of its kind."""
     if place is None:
         return None, None
     kind = None if rows[place].recipe.candidate.bilinear else "linear"
     others = [i for i, row in enumerate(rows) if row.off and i != place and kind in (None, row.recipe.candidate.kind)]
     for i in (place, *others):
-        controller = made(i)
+        controller = fit_row(i)
         if controller is not None:
             return controller, i
     return None, None
 
 
-def _models(
+def _list_models(
     held: Episodes,
     asked: Asked,
     given: Sequence[Candidate | Lifting] | None,
@@ -261,22 +298,22 @@ def _models(
     both: bool,
     draw: np.random.Generator,
 ) -> list[Candidate]:
-    """Return the models to try; each lifting also has the observables that cost and limits are of."""
-    models = usual(held, past, both, draw) if given is None else expanded(given, held, past, both)
+    """Return the models to try; each lifting includes the observables of cost and limits."""
+    models = propose_candidates(held, past, both, draw) if given is None else expand_candidates(given, held, past, both)
     asking = [of for of in (asked.cost.of, asked.limits.of) if of is not None and not isinstance(of, State)]
     needed = [of.bind(held.states) for of in asking]
     if not needed:
         return models
 
     def complete(one: Candidate) -> Candidate:
-        """Return the candidate with these observables first: of two with one name it is the first that stays."""
+        """Return the candidate with these observables first; of two observables with one name the first is kept."""
         first = [Present(of).bind(one.lifting.bound_states) for of in needed] if one.delays else needed
         return replace(one, lifting=sum([*first[1:], one.lifting], first[0])).bind(held.states, held.inputs)
 
     return [complete(one) for one in models]
 
 
-def _test(
+def _prepare_test(
     folds: Folds,
     asked: Asked,
     pair: Sequence[Recipe],
@@ -284,10 +321,10 @@ def _test(
     noise: Float[np.ndarray, " nx"],
     pool: Workers,
 ) -> tuple[LoopTest, list[str], bool]:
-    """Return the conditions of all closed loops, doubts about what is asked, and whether the goal can be held.
+    """Return the conditions of all closed loops, doubts about the task, and whether the goal can be held.
 
-    Each fold has a surrogate of either family that is fitted to the two others. The model that does not know fold k
-    meets surrogates of which one does not know fold k + 1, the other fold k + 2.
+    For each fold and each family there is a surrogate that is fitted to the two other folds. A model that does not know
+    fold k is tested on two surrogates, which do not know fold k + 1 and fold k + 2.
     """
     data = folds.episodes
     wanted: list[Condition] = []
@@ -306,62 +343,58 @@ def _test(
     ]
     surrogates: list[Surrogate] = []
     conditions = list(wanted)
-    for places, (one, inputs) in zip(mine, pool.map(partial(_stood_in, folds, asked, noise), tasks), strict=True):
+    for places, (one, inputs) in zip(mine, pool.map(partial(_fit_task, folds, asked, noise), tasks), strict=True):
         surrogates.append(one)
         for j, rows in zip(places, inputs, strict=True):
             conditions[j] = replace(wanted[j], u_reference=rows)
     X = np.concatenate([episode.X for episode in data])
-    turning = [i for i in angular(data.states, X) if asked.high[i] - asked.low[i] > _TURNS]
-    free = sorted({*asked.angles, *turning, *unfelt(surrogates[0], X)})
+    turning = [i for i in find_angles(data.states, X) if asked.high[i] - asked.low[i] > _TURNS]
+    free = sorted({*asked.angles, *turning, *find_ignored_states(surrogates[0], X)})
     of = asked.cost.of.bind(data.states)
-    tracked = [int(i) for i in of.chosen] if isinstance(of, State) else []
+    tracked = [int(i) for i in of.state_indices] if isinstance(of, State) else []
     low, high = asked.hull(free, tracked)
-    room = margin_room(asked, data) if tighten else None
+    room = limit_margins(asked, data) if tighten else None
     test = LoopTest(asked, data, folds.fold, tuple(surrogates), tuple(conditions), low, high, room, noise)
-    unreachable = unheld(surrogates[0], asked)
+    unreachable = explain_unreachable(surrogates[0], asked)
     holds = not asked.moves and not unreachable
-    return test, [*unreachable, *outside_limits(asked, data), *outside_data(asked, data, tracked, free)], holds
+    return (
+        test,
+        [*unreachable, *find_outside_limits(asked, data), *find_outside_data(asked, data, tracked, free)],
+        holds,
+    )
 
 
 class _StandIn(NamedTuple):
-    """A task: the surrogate of a recipe that does not know a fold, and (gain, first row) of each run on it."""
+    """A task: fit the surrogate of a recipe without a fold, for runs with (gain, first row of the reference)."""
 
     recipe: Recipe
     out: int
     runs: tuple[tuple[float, int], ...]
 
 
-def _stood_in(
+def _fit_task(
     folds: Folds, asked: Asked, noise: Float[np.ndarray, " nx"], task: _StandIn
 ) -> tuple[Surrogate, list[Float[np.ndarray, "T nu"]]]:
-    """Return the surrogate, and for each run the inputs that cost nothing: those of `Condition.u_reference`."""
+    """Return the surrogate and the `Condition.u_reference` of each run on it."""
     data, fold = folds.episodes, folds.fold
-    one = surrogate(task.recipe, without(data, fold, task.out), only(data, fold, task.out), noise)
-    steps, nu, cost = asked.steps, data.nu, asked.cost
-    given = cost.given_inputs(nu)
-    inputs: list[Float[np.ndarray, "T nu"]] = []
-    for gain, row in task.runs:
-        if given is not None:
-            inputs.append(given[np.minimum(np.arange(steps), len(given) - 1)])
-        elif cost.u_target != "equilibrium":
-            inputs.append(np.zeros((steps, nu)))
-        else:
-            held = one.holding(cost, asked.limits, gain)
-            inputs.append(np.array([held(each).u for each in asked.reference[row : row + steps]]))
+    one = fit_surrogate(task.recipe, drop_fold(data, fold, task.out), select_fold(data, fold, task.out), noise)
+    cost, limits = asked.cost, asked.limits
+    rows = [(gain, asked.reference[first : first + asked.steps]) for gain, first in task.runs]
+    inputs = [one.find_reference_inputs(cost, limits, part, gain) for gain, part in rows]
     return one, inputs
 
 
-def _screened(results: Sequence[Tried], floor: float) -> list[Recipe]:
+def _list_first_round(results: Sequence[Tried], floor: float) -> list[Recipe]:
     """Return the recipes of the first round: the five best models of each kind, and plain linear ones with Q_N = Q.
 
-    Plain linear models are tried with next to no ridge too, as a textbook fits them.
+    Plain linear models are also tried with the smallest ridge, as in a textbook fit.
     """
     places = [tried.best(floor) for tried in results]
     worst = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
     ranked = sorted(range(len(results)), key=lambda i: (worst[i], i))
     found: list[Recipe] = []
     for bilinear in (False, True):
-        best = [i for i in ranked if results[i].candidate.bilinear == bilinear][:_SCREENED]
+        best = [i for i in ranked if results[i].candidate.bilinear == bilinear][:_FIRST_ROUND]
         found += [Recipe(results[i].candidate, results[i].ridges[places[i]]) for i in best]
     for one, place in zip(results, places, strict=True):
         if one.candidate.name == "x, 1" and not one.candidate.bilinear:
@@ -372,19 +405,21 @@ def _screened(results: Sequence[Tried], floor: float) -> list[Recipe]:
 Judged = tuple[Sequence[Recipe], Sequence[Outcome]]  # the recipes of a round, and the outcome of each
 
 
-def _rounds(
+def _judge_rounds(
     test: LoopTest, screened: Sequence[Recipe], pool: Workers, progress: StageProgress | None
 ) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
     """Return the leaderboard and the outcome of each row.
 
-    First all models, in the conditions of the data. Then in all conditions the best bilinear one with every estimator,
-    and the two best linear ones with every estimator and end. Last the next bilinear ones, and the best with weights,
-    with the estimator that was best. This takes longest, and so it begins as soon as that estimator is known; the
-    second linear model fills the other workers meanwhile.
+    The first round judges all models with inputs as in the data. The second judges, in all conditions, the best
+    bilinear model with every estimator, and the best linear model with every estimator and terminal cost. The third
+    judges the second linear model likewise, the next bilinear models with the best estimator, and the best bilinear
+    one with weights.
     """
-    run, every = partial(judged, test), range(len(test.conditions))
-    first = pool.map(run, [Job(one, test.nominal) for one in screened], stage(progress, "closed loops"), size=Job.size)
-    score = scores(ratios(first), test.weights[test.nominal])
+    run, every = partial(judge_job, test), range(len(test.conditions))
+    first = pool.map(
+        run, [Job(one, test.nominal) for one in screened], report_stage(progress, "closed loops"), size=Job.size
+    )
+    score = average_ratios(rate_runs(first), test.weights[test.nominal])
     ranked = [screened[i] for i in sorted(range(len(screened)), key=lambda i: (score[i], i))]
     linear = [one for one in ranked if not one.candidate.bilinear][:_LINEAR]
     bilinear = [one for one in ranked if one.candidate.bilinear][:_BILINEAR]
@@ -395,22 +430,22 @@ def _rounds(
         ends = (None, 0) if one.tail is None else (0,)
         some = [replace(one, estimator=each, tail=tail) for tail in ends for each in estimators]
         (second if place == 0 else third).extend(some)
-    jobs = _jobs(second, screened, first, every)
-    outcomes = pool.map(run, jobs, stage(progress, "closed loops of the best"), size=Job.size)
+    jobs = _list_jobs(second, screened, first, every)
+    outcomes = pool.map(run, jobs, report_stage(progress, "closed loops of the best"), size=Job.size)
     if bilinear:
-        tried_ones = scores(ratios(outcomes[: len(estimators)]), test.weights)
+        tried_ones = average_ratios(rate_runs(outcomes[: len(estimators)]), test.weights)
         best = estimators[int(np.argmin(tried_ones))]
         third.append(replace(bilinear[0], estimator=best, weighted=True))
         third += [replace(one, estimator=best) for one in bilinear[1:]]
-    jobs = _jobs(third, screened, first, every)
-    outcomes += pool.map(run, jobs, stage(progress, "closed loops of the last"), size=Job.size)
-    return _leaderboard(test, (screened, first), ([*second, *third], outcomes))
+    jobs = _list_jobs(third, screened, first, every)
+    outcomes += pool.map(run, jobs, report_stage(progress, "closed loops of the last"), size=Job.size)
+    return _build_leaderboard(test, (screened, first), ([*second, *third], outcomes))
 
 
-def _jobs(
+def _list_jobs(
     chosen: Sequence[Recipe], screened: Sequence[Recipe], outcomes: Sequence[Outcome], every: Sequence[int]
 ) -> list[Job]:
-    """Return the jobs of a later round; models and runs of earlier rounds are not made again."""
+    """Return the jobs of a later round; they reuse models and runs of the first round."""
     jobs: list[Job] = []
     for one in chosen:
         same = [i for i, other in enumerate(screened) if other == one]
@@ -420,14 +455,14 @@ def _jobs(
     return jobs
 
 
-def _leaderboard(test: LoopTest, screened: Judged, last: Judged) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
-    """Return the rows and the outcome of each: the last round before the others, and the best first in each."""
+def _build_leaderboard(test: LoopTest, screened: Judged, last: Judged) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
+    """Return the rows and their outcomes: first the recipes of the final round, the best first, then the others."""
     both: list[tuple[DesignRow, Outcome]] = []
     nominal = test.weights[test.nominal]
     for off, (recipes, outcomes), weights in ((True, last, test.weights), (False, screened, nominal)):
         part: list[tuple[DesignRow, Outcome]] = []
-        each = ratios(outcomes)
-        for recipe, outcome, ratio, score in zip(recipes, outcomes, each, scores(each, weights), strict=True):
+        each = rate_runs(outcomes)
+        for recipe, outcome, ratio, score in zip(recipes, outcomes, each, average_ratios(each, weights), strict=True):
             known = outcome.violation[np.isfinite(outcome.violation)]
             row = DesignRow(
                 recipe=recipe,
@@ -443,7 +478,7 @@ def _leaderboard(test: LoopTest, screened: Judged, last: Judged) -> tuple[tuple[
     return tuple(row for row, _ in both), [outcome for _, outcome in both]
 
 
-def _expected(test: LoopTest, outcome: Outcome) -> Expected:
+def _summarise_expected(test: LoopTest, outcome: Outcome) -> Expected:
     nominal = test.nominal
     off = [j for j in range(len(test.conditions)) if j not in nominal]
     near = [test.conditions[j] for j in nominal]
@@ -460,8 +495,8 @@ def _expected(test: LoopTest, outcome: Outcome) -> Expected:
     )
 
 
-def _advice(rows: Sequence[DesignRow], best: int, linear: int | None, expected: Expected) -> list[str]:
-    """Return what limits the closed loop, and which data would help."""
+def _give_advice(rows: Sequence[DesignRow], best: int, linear: int | None, expected: Expected) -> list[str]:
+    """Return sentences on what limits the closed loop, and which data would help."""
     said: list[str] = []
     row, runs = rows[best], len(expected.cost) + len(expected.cost_off)
     if expected.lost:
@@ -476,8 +511,8 @@ def _advice(rows: Sequence[DesignRow], best: int, linear: int | None, expected: 
         said.append("every run with inputs as in the data was lost: trust no controller of these data")
     if row.violation > 0.01:
         said.append(
-            f"limits are violated by up to {percent(row.violation)} of their range; collect data near the limits, or "
-            "ask for limits further inside"
+            f"limits are violated by up to {to_percent(row.violation)} of their range; collect data near the limits, "
+            "or ask for limits further inside"
         )
     if row.worst > 2 and not expected.lost:
         said.append(

@@ -3,26 +3,28 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from rich.console import RenderableType
 
-from koopmpc.control.base import SavedController
+from koopmpc.control.kinds import build_controller
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
+from koopmpc.control.program import SavedController
 from koopmpc.errors import KoopmpcError, LogError
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.asked import Asked
 from koopmpc.synthesis.candidates import Designed, Recipe
 from koopmpc.synthesis.surrogates import Surrogate
-from koopmpc.validate.text import labelled, percent, table, written
+from koopmpc.terminal import build_table, label_lines, render_text
+from koopmpc.text import to_percent
 from koopmpc.values import Value
 
 AnyMPC = KoopmanMPC | BilinearMPC | NonlinearMPC
-_KINDS: dict[str, type[AnyMPC]] = {kind.__name__: kind for kind in (KoopmanMPC, BilinearMPC, NonlinearMPC)}
-_SHOWN = 15  # rows of the leaderboard that are printed
+_SHOWN = 15  # print at most this many rows of the leaderboard
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +42,11 @@ class DesignRow(Value):
     violation
         Largest violation of a limit in any run that was not lost, as a share of its range.
     lost
-        How many runs were lost: they left the data by more than half of its range, or became NaN or infinite.
+        Number of lost runs: they left the data by more than half of its range, or became NaN or infinite.
     runs
-        How many runs it was judged by.
+        Number of runs.
     off
-        Whether runs with inputs 20 % off are among them. Only scores of rows that agree in this can be compared.
+        True if runs with inputs 20 % off are among them. Only scores of rows with equal `off` can be compared.
     """
 
     recipe: Recipe
@@ -63,9 +65,9 @@ class DesignRow(Value):
 
 @dataclass(frozen=True, eq=False)
 class Expected(Value):
-    """What to expect of a design's closed loop, from runs on surrogates that know data which its model does not know.
+    """Expected closed loop of a design, from runs on surrogates that were fitted to data unknown to its model.
 
-    It is an estimate from data alone, and no promise: what all models have learned wrongly shows on no surrogate.
+    It is an estimate from data alone and no guarantee: no surrogate shows an error that all models share.
 
     Attributes
     ----------
@@ -102,18 +104,21 @@ class Expected(Value):
     def __str__(self) -> str:
         """Return what to expect in words."""
         pairs = [
-            ("cost", _spread(self.cost)),
-            ("with inputs 20 % off", _spread(self.cost_off)),
-            ("largest violation", f"{_worst(self.violation)}; with inputs 20 % off {_worst(self.violation_off)}"),
-            ("steps that violate", f"{percent(self.broken)}, an estimate from held-out surrogates and no promise"),
+            ("cost", _format_spread(self.cost)),
+            ("with inputs 20 % off", _format_spread(self.cost_off)),
+            (
+                "largest violation",
+                f"{_format_worst(self.violation)}; with inputs 20 % off {_format_worst(self.violation_off)}",
+            ),
+            ("steps that violate", f"{to_percent(self.broken)}, an estimate from held-out surrogates and no promise"),
             ("lost runs", f"{self.lost} of {len(self.cost) + len(self.cost_off)}"),
         ]
-        return written(labelled(pairs))
+        return render_text(label_lines(pairs))
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence(Value):
-    """What a design rests on: the task, the surrogates, and what is expected.
+    """The evidence of a design: the task, the surrogates, and the expected closed loop.
 
     Attributes
     ----------
@@ -126,7 +131,7 @@ class Evidence(Value):
     expected
         What to expect of the chosen controller.
     goal_can_be_held
-        Whether the reference rests, and an input inside the limits holds it.
+        True if the reference is constant and an input inside the limits holds it.
     """
 
     asked: Asked
@@ -154,9 +159,9 @@ class Design:
     controller
         KoopmanMPC or BilinearMPC, fitted to all data.
     linear
-        The best KoopmanMPC: `controller` itself where that is one; None where no KoopmanMPC was confirmed.
+        The best KoopmanMPC, which may be `controller` itself; None if no KoopmanMPC was confirmed.
     leaderboard
-        All recipes, the best first; those that were judged in all conditions stand before those of the first round.
+        All recipes: first those that were judged in all conditions, the best first, then those of the first round.
     chosen, chosen_linear
         Places of the two in the leaderboard.
     evidence
@@ -209,41 +214,41 @@ class Design:
         for i in shown:
             row = self.leaderboard[i]
             mark = "→" if i == self.chosen else ("l" if i == place else "")
-            figures = [f"{row.score:.3f}", f"{row.worst:.3f}", percent(row.violation), f"{row.lost} of {row.runs}"]
+            figures = [f"{row.score:.3f}", f"{row.worst:.3f}", to_percent(row.violation), f"{row.lost} of {row.runs}"]
             rows.append([mark, row.title, *figures])
-        parts.append(table(["", "controller", "score", "worst\nrun", "viol-\nation", "lost\nruns"], rows, left=2))
+        parts.append(build_table(["", "controller", "score", "worst\nrun", "viol-\nation", "lost\nruns"], rows, left=2))
         parts += [
             "",
             "A score is the mean over closed loops on surrogates of the cost, with a price on violations, relative to "
             "the best controller in the same loop. → marks the chosen controller, the simplest within 0.5 % of the "
             "best; l the best linear one. Rows without inputs 20 % off are of the first round and stand last.",
         ]
-        said = [written(*parts)]
+        said = [render_text(*parts)]
         if self.advice:
-            said += ["", written(*(f"- {sentence}" for sentence in self.advice))]
+            said += ["", render_text(*(f"- {sentence}" for sentence in self.advice))]
         if self.notes:
             said += ["", *self.notes]
         return "\n".join(said)
 
 
-def _spread(values: Float[np.ndarray, " runs"]) -> str:
+def _format_spread(values: Float[np.ndarray, " runs"]) -> str:
     known = values[np.isfinite(values)]
     if not known.size:
         return "every run was lost"
     return f"median {np.median(known):.4g}, from {known.min():.4g} to {known.max():.4g} over surrogates and starts"
 
 
-def _worst(values: Float[np.ndarray, " runs"]) -> str:
+def _format_worst(values: Float[np.ndarray, " runs"]) -> str:
     known = values[np.isfinite(values)]
-    return f"{percent(known.max())} of the range" if known.size else "unknown"
+    return f"{to_percent(known.max())} of the range" if known.size else "unknown"
 
 
-def place_of(rows: Sequence[DesignRow], kind: str | None = None) -> int | None:
+def choose_row(rows: Sequence[DesignRow], kind: str | None = None) -> int | None:
     """Return the place of the simplest row within 0.5 % of the best, among those that were judged in all conditions.
 
-    A row without weights is simpler, then the one with the smaller model: a bilinear one counts twice its observables.
-    An estimator may cost 2 % more than the same controller without one, for it forgives what surrogates and models have
-    learned alike.
+    A row without weights is simpler than one with weights, then the one with the smaller model is; a bilinear model
+    counts twice its observables. A controller with an estimator may cost 2 % more than without one, since it corrects
+    errors that surrogates and models share.
     """
     places = [i for i, row in enumerate(rows) if row.off and kind in (None, row.recipe.candidate.kind)]
     if not places:
@@ -266,7 +271,7 @@ def place_of(rows: Sequence[DesignRow], kind: str | None = None) -> int | None:
     return min(estimating, key=lambda i: (rows[i].score, i), default=place)
 
 
-def load_controller(path: str | Path) -> AnyMPC:
+def load_controller(path: str | Path) -> Any:
     """Return the controller that `save`, of a controller or of a Design, wrote. It begins as after `reset`.
 
     The file holds numbers and names only; reading it runs no code of it.
@@ -276,15 +281,15 @@ def load_controller(path: str | Path) -> AnyMPC:
     LogError
         The file is missing, cut or damaged, holds something else, or is of another version.
     """
-    return made(saved_controller(path), path)
+    return rebuild_controller(read_controller(path), path)
 
 
-def saved_controller(path: str | Path) -> SavedController | SavedDesign:
+def read_controller(path: str | Path) -> SavedController | SavedDesign:
     """Return the content of the file: a controller, or a design."""
     return load_value(path, SavedController, SavedDesign)
 
 
-def made(saved: SavedController | SavedDesign, path: str | Path) -> AnyMPC:
+def rebuild_controller(saved: SavedController | SavedDesign, path: str | Path) -> Any:
     """Return the controller that was saved.
 
     Raises
@@ -292,19 +297,9 @@ def made(saved: SavedController | SavedDesign, path: str | Path) -> AnyMPC:
     LogError
         Its parts do not go together.
     """
-    one = saved.controller if isinstance(saved, SavedDesign) else saved
     try:
-        return _KINDS[one.name](
-            one.model,  # pyright: ignore[reportArgumentType]  # a KoopmanMPC refuses what is not linear
-            one.cost,
-            one.limits,
-            one.horizon,
-            estimator=one.estimator,  # pyright: ignore[reportArgumentType]  # it starts an observer, or is refused
-            latency=one.latency,
-            moves=one.moves,
-            time_limit=one.time_limit,
-            monitor=one.monitor,
-            **one.options,
-        )
-    except (KoopmpcError, TypeError) as error:
+        return build_controller(saved.controller if isinstance(saved, SavedDesign) else saved)
+    except LogError:
+        raise
+    except (KoopmpcError, AttributeError, KeyError, TypeError) as error:
         raise LogError(f"{path} holds a controller whose parts do not go together: {error}") from error

@@ -10,32 +10,34 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc.control.limits import Limits
+from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError
-from koopmpc.lifting.base import short
-from koopmpc.loop.metrics import metrics
+from koopmpc.lifting.base import strip_unit
+from koopmpc.loop.faults import Fault
+from koopmpc.loop.metrics import metrics, violation_shares
 from koopmpc.loop.run import Run
-from koopmpc.loop.simulate import simulate
+from koopmpc.loop.simulate import StepObserver, simulate
 from koopmpc.plants.plant import SimulatedPlant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.synthesis.asked import Asked
 from koopmpc.synthesis.candidates import Designed, Nearness, Recipe
-from koopmpc.synthesis.cross_validation import only, without
+from koopmpc.synthesis.cross_validation import drop_fold, select_fold
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.validate.scoring import AnyPredictor, score
 
-LOST = 20.0  # what a lost run counts, and the most that one counts: times the best on the same surrogate and start
-FREE = 0.005  # violation that costs nothing, as a share of the limits' range
-PRICE = 10.0  # a violation of 1 % beyond costs a tenth of the cost
-LITTLE = 0.01  # of the usual cost: so much more is no loss, as where a run starts at its goal
-_WEIGHTED = 4  # times as long takes a recipe with weights, for its models are fitted and judged again
-_NINETY = 1.645  # standard deviations within which 90 % of normal errors are
-_BAND = 5  # steps ahead of the errors that tighten limits
-CONFIRMED = 1.25  # times the cost of the fold's controllers that the one of all data may cost on the same surrogates
-LESS = 0.5  # weight of a run in which the inputs act more or less than in the data, beside 1 of the others
-BROKEN = 1e-3  # share of the range beyond which a step counts as one that violates
+LOST = 20.0  # ratio to the best of a lost run, and the largest ratio of any run
+FREE = 0.005  # a violation up to this share of the limits' range costs nothing
+PRICE = 10.0  # each further 1 % of violation adds this many percent to the cost
+LITTLE = 0.01  # this share of the usual cost is added to all costs, because some runs start at their goal
+_WEIGHTED = 4  # a recipe with weights takes about this many times as long, since its models are fitted again
+_NINETY = 1.645  # 90 % of normal errors lie within this many standard deviations
+_BAND = 5  # limits are tightened by errors up to this many steps ahead
+CONFIRMED = 1.25  # fitted to all data, a controller may cost this factor of its cost with two folds
+LESS = 0.5  # weight of a run with inputs 20 % off; other runs have weight 1
+BROKEN = 1e-3  # a step violates a limit if it exceeds the limit by more than this share of its range
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +51,14 @@ class Condition:
     surrogate
         Number of the surrogate that is controlled; it knows that fold.
     gain
-        How strongly the inputs act; 1 is as in the data.
+        Factor on the effect of the inputs; 1 is as in the data.
     x0
         (nx,) start.
     first
         Row of the reference at which the run begins.
     u_reference
-        (T, nu) inputs that cost nothing: those that hold the reference on this surrogate, unless the cost names others.
+        (T, nu) inputs without cost: those of the cost if it names them, else those that hold the reference on this
+        surrogate.
     """
 
     fold: int
@@ -68,10 +71,11 @@ class Condition:
 
 @dataclass(frozen=True, eq=False)
 class LoopTest:
-    """The task, the data in folds, the surrogates and the conditions, which all runs share.
+    """The task, the data in folds, the surrogates and the conditions of all runs.
 
-    A run that leaves the box from `low` to `high` is lost. Controllers have margins to the limits, of at most `room`
-    (nx,); None for no margins. `noise` is the (nx,) standard deviation of measurements that the data no longer hold.
+    A run that leaves the box from `low` to `high` is lost. The margins of controllers to the limits are at most `room`
+    (nx,); None for no margins. `noise` is the (nx,) standard deviation of the noise that a smoother took out of the
+    data.
     """
 
     asked: Asked
@@ -85,14 +89,14 @@ class LoopTest:
     noise: Float[np.ndarray, " nx"]
 
     def limits(self, band: Float[np.ndarray, "h nx"]) -> Limits:
-        """Return the limits that a controller gets if its model has these errors."""
+        """Return the limits of a controller whose model has these errors."""
         if self.room is None:
             return self.asked.limits
         width = np.where(np.isfinite(band), band, self.asked.high - self.asked.low)
         limits = self.asked.limits.tightened(np.minimum(width, self.room), states=self.episodes.states)
         said = tuple(
-            f"{short(self.episodes.states[i])}: the margin is {self.room[i]:.4g}, half way from the reference to the "
-            f"limit, though the errors ask for up to {width[:, i].max():.4g}"
+            f"{strip_unit(self.episodes.states[i])}: the margin is {self.room[i]:.4g}, half way from the reference to "
+            f"the limit, though the errors ask for up to {width[:, i].max():.4g}"
             for i in np.flatnonzero((np.asarray(limits.margin) == self.room).any(axis=0))
         )
         return replace(limits, capped=(*limits.capped, *said))
@@ -104,7 +108,7 @@ class LoopTest:
 
     @property
     def weights(self) -> Float[np.ndarray, " conditions"]:
-        """The weight of each condition in a score: a plant is likelier the one of its logs."""
+        """The weight of each condition in a score; inputs as in the data weigh more."""
         return np.array([1.0 if one.gain == 1.0 else LESS for one in self.conditions])
 
     def plant(self, condition: Condition) -> StepMap:
@@ -153,9 +157,9 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A recipe, the conditions that it is judged in, and what is known of its model from an earlier job.
+    """A recipe, the conditions in which it is judged, and the outcome `known` of an earlier job with its model.
 
-    Where `known_runs` is True that job was of the same controller, and its runs are the first of these conditions.
+    If `known_runs` is True, the earlier job had the same controller, and its runs are the first of these conditions.
     """
 
     recipe: Recipe
@@ -197,7 +201,7 @@ class _Models(NamedTuple):
     band: Float[np.ndarray, "h nx"]
 
 
-def judged(test: LoopTest, job: Job) -> Outcome:
+def judge_job(test: LoopTest, job: Job) -> Outcome:
     """Return the result of a job, run by run.
 
     The model of a weighted recipe is fitted with weights around the states that its own runs visit, on the same
@@ -205,31 +209,31 @@ def judged(test: LoopTest, job: Job) -> Outcome:
     """
     recipe, known = job.recipe, job.known
     try:
-        models = _fitted(test, recipe) if known is None else _Models(known.models, known.band)
+        models = _fit_folds(test, recipe) if known is None else _Models(known.models, known.band)
         if recipe.weighted:
             visited = None if known is None else known.visited
             for _ in range(2):
                 if visited is None:
-                    visited = _outcome(test, recipe, models, test.nominal).visited
+                    visited = _judge_models(test, recipe, models, test.nominal).visited
                 if len(visited):
-                    models = _fitted(test, recipe, Nearness.of(visited, test.episodes))
+                    models = _fit_folds(test, recipe, Nearness.of(visited, test.episodes))
                 visited = None
         if known is None or not job.known_runs:
-            return _outcome(test, recipe, models, job.conditions)
-        return _joined(known, _outcome(test, recipe, models, job.conditions[len(known.cost) :]))
+            return _judge_models(test, recipe, models, job.conditions)
+        return _join_outcomes(known, _judge_models(test, recipe, models, job.conditions[len(known.cost) :]))
     except (KoopmpcError, ArithmeticError, np.linalg.LinAlgError) as error:
         nothing, none = np.full(len(job.conditions), np.inf), np.zeros((0, test.episodes.nx))
         return Outcome(nothing, nothing, np.ones(len(nothing)), none, none, (), f"{type(error).__name__}: {error}")
 
 
-def _fitted(test: LoopTest, recipe: Recipe, near: Nearness | None = None) -> _Models:
+def _fit_folds(test: LoopTest, recipe: Recipe, near: Nearness | None = None) -> _Models:
     folds = range(max(test.fold) + 1)
-    models = [recipe.fit(without(test.episodes, test.fold, k), near) for k in folds]
-    bands = [error_band(model, only(test.episodes, test.fold, k)) for k, model in enumerate(models)]
+    models = [recipe.fit(drop_fold(test.episodes, test.fold, k), near) for k in folds]
+    bands = [measure_band(model, select_fold(test.episodes, test.fold, k)) for k, model in enumerate(models)]
     return _Models(tuple(models), np.hypot(np.max(bands, axis=0), _NINETY * test.noise))
 
 
-def _joined(first: Outcome, rest: Outcome) -> Outcome:
+def _join_outcomes(first: Outcome, rest: Outcome) -> Outcome:
     """Return the runs of both results, which are of the same models."""
     cost, violation, broken, visited = (
         np.concatenate([getattr(each, name) for each in (first, rest)])
@@ -238,7 +242,7 @@ def _joined(first: Outcome, rest: Outcome) -> Outcome:
     return Outcome(cost, violation, broken, visited, first.band, first.models)
 
 
-def _outcome(test: LoopTest, recipe: Recipe, models: _Models, conditions: Sequence[int]) -> Outcome:
+def _judge_models(test: LoopTest, recipe: Recipe, models: _Models, conditions: Sequence[int]) -> Outcome:
     """Return the result of controllers of these models; all have the limits that the final controller gets."""
     n, asked, limits = len(conditions), test.asked, test.limits(models.band)
     cost, violation, broken = np.full(n, np.inf), np.full(n, np.inf), np.ones(n)
@@ -254,10 +258,10 @@ def _outcome(test: LoopTest, recipe: Recipe, models: _Models, conditions: Sequen
             controller = recipe.controller(model, asked.cost, limits, asked.horizon, brief=True)
         for j in mine:
             one = test.conditions[conditions[j]]
-            run, cost[j] = _run(test, one, controller, conditions[j])
+            run, cost[j] = _run_condition(test, one, controller, conditions[j])
             if run is None:
                 continue
-            over = asked.beyond(run.X[1:], run.states)
+            over = violation_shares(run, asked.limit_sizes)[1:]
             violation[j], broken[j] = over.max(), np.mean(over > BROKEN)
             if one.gain == 1.0:
                 visited[j] = run.X
@@ -265,7 +269,7 @@ def _outcome(test: LoopTest, recipe: Recipe, models: _Models, conditions: Sequen
     return Outcome(cost, violation, broken, states, models.band, models.each)
 
 
-def error_band(model: AnyPredictor, episodes: Episodes) -> Float[np.ndarray, "h nx"]:
+def measure_band(model: AnyPredictor, episodes: Episodes) -> Float[np.ndarray, "h nx"]:
     """Return half-widths of a band that holds 90 % of the errors 1 … 5 steps ahead; bilinear models are re-lifted."""
     past = 0 if model.embedding is None else model.embedding.steps
     horizon = min(_BAND, *(len(episode) - past for episode in episodes))
@@ -273,13 +277,13 @@ def error_band(model: AnyPredictor, episodes: Episodes) -> Float[np.ndarray, "h 
     return np.maximum(np.abs(errors.low), np.abs(errors.high))
 
 
-def confirmed(test: LoopTest, controller: Designed, outcome: Outcome) -> bool:
-    """Return whether the controller fitted to all data does as well on the surrogates as those of the folds did.
+def is_confirmed(test: LoopTest, controller: Designed, outcome: Outcome) -> bool:
+    """Return True if the controller fitted to all data does as well on the surrogates as those of the folds did.
 
-    It may lose no more runs than they, and cost a quarter more, as a geometric mean. A few more data can change a
-    lifted model much: its observables are not invariant, so its forecasts of many steps rest on small numbers.
+    It may not lose more runs, and its geometric mean cost may be up to a quarter higher. A few more data can change the
+    long forecasts of a lifted model much, since its observables are not invariant.
     """
-    cost = np.array([_run(test, one, controller, j)[1] for j, one in enumerate(test.conditions)])
+    cost = np.array([_run_condition(test, one, controller, j)[1] for j, one in enumerate(test.conditions)])
     both = np.isfinite(cost) & np.isfinite(outcome.cost)
     if np.sum(~np.isfinite(cost)) > np.sum(~np.isfinite(outcome.cost)):
         return False
@@ -288,40 +292,71 @@ def confirmed(test: LoopTest, controller: Designed, outcome: Outcome) -> bool:
     return not both.any() or bool(change.mean() <= np.log(CONFIRMED))
 
 
-def _run(test: LoopTest, one: Condition, controller: Designed, seed: int) -> tuple[Run | None, float]:
-    """Return the closed loop, with the states without their past, and its cost; None and inf where it is lost."""
-    asked, surrogate = test.asked, test.surrogates[one.surrogate]
-    try:
-        run = simulate(
-            Fenced(test.plant(one), test.low, test.high),
-            controller,
-            x0=surrogate.start(one.x0),
-            reference=asked.reference[one.first : one.first + asked.steps + 1],
-            steps=asked.steps,
-            noise=surrogate.noise,
-            measured=surrogate.w if len(surrogate.w) else None,
-            rng=seed,
-        )
-    except LostError:
-        return None, np.inf
-    run = replace(
-        run,
-        X=run.X[:, : test.episodes.nx],
-        states=test.episodes.states,
-        cost=asked.cost,
-        limits=asked.limits,
-        angles=asked.angles,
+def _run_condition(test: LoopTest, one: Condition, controller: Designed, seed: int) -> tuple[Run | None, float]:
+    """Return the closed loop of a condition and its cost; None and inf if it is lost."""
+    asked = test.asked
+    run = run_on_surrogate(
+        asked,
+        test.surrogates[one.surrogate],
+        test.plant(one),
+        controller,
+        one.x0,
+        box=(test.low, test.high),
+        reference=asked.reference[one.first : one.first + asked.steps + 1],
         u_reference=one.u_reference,
+        rng=seed,
     )
-    cost = metrics(run).cost
+    cost = np.inf if run is None else metrics(run).cost
     return (run, cost) if np.isfinite(cost) else (None, np.inf)
 
 
-def ratios(outcomes: Sequence[Outcome]) -> Float[np.ndarray, "jobs runs"]:
+def run_on_surrogate(
+    asked: Asked,
+    surrogate: Surrogate,
+    plant: StepMap,
+    controller: Controller,
+    x0: Float[np.ndarray, " nx"],
+    *,
+    box: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
+    reference: Float[np.ndarray, "T1 nr"],
+    u_reference: Float[np.ndarray, "T nu"],
+    rng: int,
+    noise: float = 1.0,
+    faults: Sequence[Fault] = (),
+    observers: Sequence[StepObserver] = (),
+) -> Run | None:
+    """Return a closed loop on the plant of a surrogate, with the states without their past; None if it is lost.
+
+    The run is lost if a state leaves the box. It is judged by the cost and the limits of the task. `noise` is a factor
+    on the noise of the surrogate.
+    """
+    states = surrogate.model.states
+    try:
+        run = simulate(
+            Fenced(plant, *box),
+            controller,
+            x0=surrogate.start(x0),
+            reference=reference,
+            steps=len(reference) - 1,
+            noise=noise * surrogate.noise,
+            measured=surrogate.w if len(surrogate.w) else None,
+            limits=asked.limits,
+            faults=faults,
+            observers=observers,
+            rng=rng,
+        )
+    except LostError:
+        return None
+    return replace(
+        run, X=run.X[:, : len(states)], states=states, cost=asked.cost, angles=asked.angles, u_reference=u_reference
+    )
+
+
+def rate_runs(outcomes: Sequence[Outcome]) -> Float[np.ndarray, "jobs runs"]:
     """Return cost × (1 + 10 max(0, violation − 0.5 %)) of each run over the best of its condition, at most 20.
 
-    Of a violation only what exceeds the least one of that condition counts, for from some starts no controller keeps
-    the limits. Where every run of a condition is lost, all ratios are 20.
+    The smallest violation of a condition is subtracted first, because from some starts no controller keeps the limits.
+    If every run of a condition is lost, all its ratios are 20.
     """
     cost, violation = (np.array([getattr(each, name) for each in outcomes]) for name in ("cost", "violation"))
     least = np.where(np.isfinite(violation), violation, np.inf).min(axis=0)
@@ -335,9 +370,11 @@ def ratios(outcomes: Sequence[Outcome]) -> Float[np.ndarray, "jobs runs"]:
     return np.where(np.isfinite(ratio), np.minimum(ratio, LOST), LOST)
 
 
-def scores(ratio: Float[np.ndarray, "jobs runs"], weights: Float[np.ndarray, " runs"]) -> Float[np.ndarray, " jobs"]:
+def average_ratios(
+    ratio: Float[np.ndarray, "jobs runs"], weights: Float[np.ndarray, " runs"]
+) -> Float[np.ndarray, " jobs"]:
     """Return the weighted geometric mean of each job's ratios.
 
-    Of six runs with inputs as in the data and six others a lost one counts as 40 % more cost in all, or 18 %.
+    With six runs with inputs as in the data and six with inputs 20 % off, one lost run raises the mean by 40 % or 18 %.
     """
     return np.exp(np.average(np.log(ratio), axis=1, weights=weights))

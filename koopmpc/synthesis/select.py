@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from rich.console import RenderableType
 
 from koopmpc import checks
+from koopmpc.data.angles import count_wraps
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
@@ -20,25 +21,32 @@ from koopmpc.errors import FitWarning
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.lifting.base import Lifting
 from koopmpc.parallel import Progress, StageProgress, map_tasks
-from koopmpc.predict.base import eigen
+from koopmpc.predict.base import sorted_eigen
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.synthesis.candidates import Candidate, expanded, jumps, model_of, past_steps, still, usual
+from koopmpc.synthesis.candidates import (
+    Candidate,
+    check_delays,
+    expand_candidates,
+    find_constant_states,
+    fit_candidate,
+    propose_candidates,
+)
 from koopmpc.synthesis.cross_validation import (
     EXACT,
     HALF,
     LEAST,
     Trial,
     Tried,
-    folded,
-    mended,
-    ridges_of,
-    sampled,
-    smoothed,
-    tried,
+    check_ridges,
+    cross_validate,
+    make_folds,
+    replace_glitches,
+    smooth_data,
+    take_sample,
     usual_horizon,
 )
+from koopmpc.terminal import build_table, render_text
 from koopmpc.validate.scoring import AnyPredictor
-from koopmpc.validate.text import table, written
 from koopmpc.values import Value
 
 ENOUGH = 1e-2  # error of a forecast, as a share of the states' spread, below which a controller gains nothing
@@ -186,8 +194,8 @@ class Selection(Value):
         hidden = len(self.leaderboard) - len(shown)
         if hidden:
             legend += f" The leaderboard has {hidden} more models."
-        parts += ["", table(headings, rows, left=2), "", legend]
-        return "\n".join([written(*parts), *([""] if self.notes else []), *self.notes])
+        parts += ["", build_table(headings, rows, left=2), "", legend]
+        return "\n".join([render_text(*parts), *([""] if self.notes else []), *self.notes])
 
 
 def _sentence(role: str, row: LeaderboardRow) -> str:
@@ -286,42 +294,46 @@ def select(
     Breiman, Friedman, Olshen & Stone, "Classification and Regression Trees", 1984, section 3.4.3.
     """
     source, draw = source_of(episodes), checks.generator(rng)
-    weights = RIDGES if ridges is None else ridges_of(ridges)
+    weights = RIDGES if ridges is None else check_ridges(ridges)
     folds = checks.count(folds, "folds", 2)
-    past = past_steps(delays)
-    held, notes = sampled(source, checks.count(sample, "sample"))
-    for i, count in jumps(held).items():
+    past = check_delays(delays)
+    held, notes = take_sample(source, checks.count(sample, "sample"))
+    for i, count in count_wraps(held).items():
         warnings.warn(
             f"{held.states[i]} jumps by 2π {count} times: it was wrapped, and a model of it as a state cannot follow; "
             "unwrap it first, with numpy.unwrap along each episode",
             FitWarning,
             stacklevel=2,
         )
-    for name in still(held):
+    for name in find_constant_states(held):
         warnings.warn(
             f"{name} is constant in these data, so what it does cannot be learned; excite it, or leave it out",
             FitWarning,
             stacklevel=2,
         )
     if smooth:
-        source, held, replaced = mended(source, held)
-        source, held, freed, _ = smoothed(source, held)
+        source, held, replaced = replace_glitches(source, held)
+        source, held, freed, _ = smooth_data(source, held)
         notes = (*notes, *replaced, *freed)
     checks.kind(bilinear, "bilinear", bool, "pass True or False")
     both = bilinear and source.nu > 0 and source.nw == 0
-    given = usual(held, past, both, draw) if candidates is None else expanded(candidates, held, past, both)
+    given = (
+        propose_candidates(held, past, both, draw)
+        if candidates is None
+        else expand_candidates(candidates, held, past, both)
+    )
     first = max(one.delays for one in given)
     ahead, short = usual_horizon(held, first) if horizon is None else (checks.count(horizon, "horizon"), ())
-    data = folded(held, ahead + first, folds, draw)
+    data = make_folds(held, ahead + first, folds, draw)
     trials = [Trial(one, data.episodes, data.fold, ahead, first, weights, relift=relift) for one in given]
-    told = stage(progress, "candidates")
-    results = list(map_tasks(tried, trials, workers=workers, scheduler=scheduler, progress=told))
+    told = report_stage(progress, "candidates")
+    results = list(map_tasks(cross_validate, trials, workers=workers, scheduler=scheduler, progress=told))
     # on a grid of decades the one nearest to ε² is the first
     floor = LEAST if ridges is not None else min(result.misfit for result in results) / np.sqrt(10)
-    rows = tuple(sorted((row_of(result, floor) for result in results), key=lambda row: (row.worst, row.size)))
+    rows = tuple(sorted((make_row(result, floor) for result in results), key=lambda row: (row.worst, row.size)))
     alike = ENOUGH if relift else EXACT
-    chosen = choice(rows, alike=alike)
-    linear = choice(rows, "linear", alike) if any(row.kind == "linear" for row in rows) else chosen
+    chosen = choose_model(rows, alike=alike)
+    linear = choose_model(rows, "linear", alike) if any(row.kind == "linear" for row in rows) else chosen
     for place, which in ((chosen, f"all {len(rows)} candidates"), (linear, "all linear candidates")):
         if not np.isfinite(rows[place].worst):
             warnings.warn(
@@ -333,14 +345,14 @@ def select(
             break
 
     def refit(row: LeaderboardRow) -> AnyPredictor:
-        read = ReadOptions(workers=workers, scheduler=scheduler, progress=stage(progress, f"fit of {row.title}"))
-        return model_of(Candidate(row.name, row.lifting, row.embedding, row.bilinear), source, row.ridge, read)
+        read = ReadOptions(workers=workers, scheduler=scheduler, progress=report_stage(progress, f"fit of {row.title}"))
+        return fit_candidate(Candidate(row.name, row.lifting, row.embedding, row.bilinear), source, row.ridge, read)
 
     predictor = refit(rows[chosen])
     best_linear = predictor if linear == chosen else refit(rows[linear])
     best_bilinear = predictor
     if rows[chosen].kind == "linear" and any(row.bilinear for row in rows):
-        best_bilinear = refit(rows[choice(rows, "bilinear", alike)])
+        best_bilinear = refit(rows[choose_model(rows, "bilinear", alike)])
     return Selection(
         predictor=predictor,
         linear=best_linear if isinstance(best_linear, LinearPredictor) else None,
@@ -354,18 +366,18 @@ def select(
     )
 
 
-def stage(progress: StageProgress | None, name: str) -> Progress | None:
+def report_stage(progress: StageProgress | None, name: str) -> Progress | None:
     """Return what is called with the progress of one stage."""
     return None if progress is None else partial(progress, name)
 
 
-def row_of(trial: Tried, floor: float) -> LeaderboardRow:
+def make_row(trial: Tried, floor: float) -> LeaderboardRow:
     """Return the line of the leaderboard for a trial, with the best of its ridges from `floor` on."""
     best = trial.best(floor)
     candidate, scores, error = trial.candidate, trial.scores[best], trial.errors[best]
     horizon = error.shape[1]
     nz, nu = candidate.lifting.nz, trial.inputs
-    radius = float(np.abs(eigen(trial.A[best])[0][0]))
+    radius = float(np.abs(sorted_eigen(trial.A[best])[0][0]))
     with np.errstate(invalid="ignore", over="ignore"):
         middle = np.median(error, axis=0)
         growth = float(np.float64(max(radius, 1.0)) ** horizon)
@@ -391,7 +403,7 @@ def row_of(trial: Tried, floor: float) -> LeaderboardRow:
     )
 
 
-def choice(rows: tuple[LeaderboardRow, ...], kind: str | None = None, alike: float = EXACT) -> int:
+def choose_model(rows: tuple[LeaderboardRow, ...], kind: str | None = None, alike: float = EXACT) -> int:
     """Return the smallest model whose worst fold is within one standard error of the best one's.
 
     Errors below `alike` count as equal; by default these are errors of rounding and of the least ridge. Where every

@@ -1,4 +1,4 @@
-"""Surrogates: learned maps that stand in for the plant where controllers are judged."""
+"""Surrogates: learned maps that replace the plant when controllers are judged."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,14 +16,14 @@ from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.asked import Asked
 from koopmpc.synthesis.candidates import Recipe
 from koopmpc.synthesis.cross_validation import HALF, Tried
+from koopmpc.text import with_unit
 from koopmpc.validate.scoring import AnyPredictor, score
-from koopmpc.validate.text import quantity
 from koopmpc.values import Value
 
-SECOND = 3.0  # times the error of the best that a surrogate of another family may have
-INVARIANT = 0.25  # share of an increment that a state may decide which the plant does not feel: models err as much
-UNHELD = 0.02  # share of the data's range by which an equilibrium may miss the reference
-_SAMPLE = 500  # states that this is tried on
+SECOND = 3.0  # the error of the second surrogate may be this many times that of the best
+INVARIANT = 0.25  # the plant ignores a state that changes increments by less than this share; models err as much
+UNHELD = 0.02  # an equilibrium may miss the reference by this share of the data's range
+_SAMPLE = 500  # number of states on which ignored states are searched
 _FAMILIES = ("monomials", "fourier", "gaussian", "thin plate", "random fourier")
 
 
@@ -67,6 +67,18 @@ class Surrogate(Value):
         outputs = state_tracking(self.model.states, self.model.nu, cost, limits, given.nx)
         return Holding(Equilibria(given, cost, outputs), given.E @ self.w)
 
+    def find_reference_inputs(
+        self, cost: Cost, limits: Limits, rows: Float[np.ndarray, "T nr"], gain: float = 1.0
+    ) -> Float[np.ndarray, "T nu"]:
+        """Return the inputs that cost nothing: those that hold each reference row, unless the cost names others."""
+        given, nu = cost.given_inputs(self.model.nu), self.model.nu
+        if given is not None:
+            return given[np.minimum(np.arange(len(rows)), len(given) - 1)]
+        if cost.u_target != "equilibrium":
+            return np.zeros((len(rows), nu))
+        find = self.holding(cost, limits, gain)
+        return np.array([find(row).u for row in rows])
+
     def _map(self, gain: float) -> LearnedMap:
         given = learned_map(self.model)
         if gain == 1.0:
@@ -101,13 +113,13 @@ class Holding:
         return self._known[key]
 
 
-def stand_ins(results: Sequence[Tried], floor: float) -> list[Recipe]:
-    """Return the two models that stand in for the plant: the one of the least error, and the best of another family.
+def choose_surrogates(results: Sequence[Tried], floor: float) -> list[Recipe]:
+    """Return the two models of the surrogates: the one with the smallest error, and the best of another family.
 
-    They are bilinear where bilinear models were tried. A model with delays is taken only where it halves the error, as
-    it does where some of the state is not measured. The second model is of another family because that extrapolates
-    otherwise: what both have learned wrongly, no closed loop shows. Where the best of another family errs more than
-    three times as much, the second best of the same family is taken, or the best itself.
+    They are bilinear if bilinear models were tried. A model with delays is taken only if it halves the error, which
+    happens if a part of the state is not measured. The second family extrapolates differently, so closed loops show
+    errors that only one of the models has. If the error of the best of another family is more than three times as
+    large, the second best of the same family is taken, or the best itself.
     """
     places = [tried.best(floor) for tried in results]
     error = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
@@ -119,12 +131,14 @@ def stand_ins(results: Sequence[Tried], floor: float) -> list[Recipe]:
         pool = late
     first = pool[0]
     rest = [i for i in pool[1:] if error[i] <= SECOND * error[first]]
-    other = [i for i in rest if _family(results[i]) != _family(results[first])]
+    other = [i for i in rest if _find_family(results[i]) != _find_family(results[first])]
     second = [*other, *rest, first][0]
     return [Recipe(results[i].candidate, results[i].ridges[places[i]]) for i in (first, second)]
 
 
-def surrogate(recipe: Recipe, fitted: Episodes, held_out: Episodes, smoothed: Float[np.ndarray, " nx"]) -> Surrogate:
+def fit_surrogate(
+    recipe: Recipe, fitted: Episodes, held_out: Episodes, smoothed: Float[np.ndarray, " nx"]
+) -> Surrogate:
     """Return the surrogate of a recipe that is fitted to some episodes; its noise is measured on others.
 
     `smoothed` is the (nx,) standard deviation of the noise that these data no longer hold.
@@ -136,7 +150,7 @@ def surrogate(recipe: Recipe, fitted: Episodes, held_out: Episodes, smoothed: Fl
     return Surrogate(model, driven[: fitted.nu], driven[fitted.nu :], noise)
 
 
-def unfelt(one: Surrogate, X: Float[np.ndarray, "M nx"]) -> list[int]:
+def find_ignored_states(one: Surrogate, X: Float[np.ndarray, "M nx"]) -> list[int]:
     """Return the states on which no increment x⁺ − x depends by more than a quarter: positions, mostly.
 
     Each state is exchanged for that of other data, and the change of the increments compared with their spread. On
@@ -164,16 +178,16 @@ def unfelt(one: Surrogate, X: Float[np.ndarray, "M nx"]) -> list[int]:
     return found
 
 
-def _family(tried: Tried) -> str:
+def _find_family(tried: Tried) -> str:
     name = tried.candidate.name
     return next((family for family in reversed(_FAMILIES) if name.startswith(family)), name)
 
 
-def unheld(one: Surrogate, asked: Asked) -> list[str]:
-    """Return a sentence where no input holds a reference that rests: which limit is in the way, and what can be held.
+def explain_unreachable(one: Surrogate, asked: Asked) -> list[str]:
+    """Return a sentence if no input holds a constant reference; it names the limit and the nearest equilibrium.
 
-    Outputs without a weight in the cost do not count. Up to 2 % of the data's range are taken for an error of the
-    surrogate.
+    Outputs without a weight in the cost are ignored, and so are deviations up to 2 % of the data's range, which may be
+    errors of the surrogate.
     """
     if asked.moves:
         return []
@@ -186,17 +200,17 @@ def unheld(one: Surrogate, asked: Asked) -> list[str]:
     def values(at: Equilibrium) -> Float[np.ndarray, " nr"]:
         return of(at.x[:nx])
 
-    def missed(at: Equilibrium) -> bool:
+    def is_missed(at: Equilibrium) -> bool:
         return bool((np.abs(values(at) - row) > tolerance).any())
 
-    def told(numbers: Float[np.ndarray, " nr"]) -> str:
+    def format_outputs(numbers: Float[np.ndarray, " nr"]) -> str:
         weighed = np.isfinite(tolerance)
         shown = np.where(np.abs(numbers) > 1e-3 * tolerance, numbers, 0.0)
-        return ", ".join(quantity(of.names[i], f"= {shown[i]:.4g}") for i in np.flatnonzero(weighed))
+        return ", ".join(with_unit(of.names[i], f"= {shown[i]:.4g}") for i in np.flatnonzero(weighed))
 
     room = UNHELD * (asked.high - asked.low)  # of the states
 
-    def broken(at: Equilibrium) -> list[str]:
+    def list_broken(at: Equilibrium) -> list[str]:
         ways: list[str] = []
         for names, values, box, off in (
             (model.inputs, at.u, asked.limits.inputs(model.nu), 1e-6 * np.abs(at.u)),
@@ -204,22 +218,24 @@ def unheld(one: Surrogate, asked: Asked) -> list[str]:
         ):
             for i, (name, value, low, high) in enumerate(zip(names, values, *box, strict=True)):
                 if not low - off[i] <= value <= high + off[i]:
-                    shown = quantity(name, f"= {value if abs(value) > 1e-3 * off[i] else 0:.4g}")
+                    shown = with_unit(name, f"= {value if abs(value) > 1e-3 * off[i] else 0:.4g}")
                     ways.append(f"{shown}, and its limit is {low if value < low else high:.4g}")
         return ways
 
     inside = one.holding(cost, asked.limits)(row)
-    rests = not broken(inside)  # where no equilibrium is inside all limits, the search keeps those of inputs alone
-    if rests and not missed(inside):
+    rests = not list_broken(inside)  # where no equilibrium is inside all limits, the search keeps those of inputs alone
+    if rests and not is_missed(inside):
         return []
     free = one.holding(cost, Limits())(row)
-    nearest = f"the nearest that can be held is {told(values(inside))}"
+    nearest = f"the nearest that can be held is {format_outputs(values(inside))}"
     if not rests:
         nearest = "the plant rests nowhere inside these limits: widen them"
-    if missed(free):
-        return [f"no input holds {told(row)}: this is no equilibrium of the plant, as the data show it; {nearest}"]
-    ways = broken(free) or broken(inside)
+    if is_missed(free):
+        return [
+            f"no input holds {format_outputs(row)}: this is no equilibrium of the plant, as the data show it; {nearest}"
+        ]
+    ways = list_broken(free) or list_broken(inside)
     if not ways and asked.limits.of is None:
         return []
     needs = "; ".join(ways) if ways else "what the limits of its observables forbid"
-    return [f"no input inside the limits holds {told(row)}: it needs {needs}; {nearest}"]
+    return [f"no input inside the limits holds {format_outputs(row)}: it needs {needs}; {nearest}"]

@@ -13,8 +13,8 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, unwarned
 from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.variable_projection import Tuning, VariableProjection, Windows
-from koopmpc.lifting.base import Lifting, lifting_of
+from koopmpc.identify.variable_projection import TunableLifting, VariableProjection, Windows
+from koopmpc.lifting.base import Lifting, check_lifting
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.validate.scoring import score
 
@@ -96,10 +96,14 @@ def train(
     if not source.replayable:
         raise DataError("a stream is read once, and train needs it more often; save it, and pass that")
     sized = None if embedding is None else embedding.fitted(source.states, source.inputs)
-    given = lifting_of(lifting).bind(source.states if sized is None else sized.names)
-    pieces = _drawn(source, N + (0 if sized is None else sized.steps), most, generator)
+    given = check_lifting(lifting).bind(source.states if sized is None else sized.names)
+    pieces = _draw_pieces(source, N + (0 if sized is None else sized.steps), most, generator)
     if isinstance(held_out, Episodes):
-        fitted, judge, other = pieces.all, held_out, _drawn(source_of(held_out), pieces.length, most, generator).all
+        fitted, judge, other = (
+            pieces.all,
+            held_out,
+            _draw_pieces(source_of(held_out), pieces.length, most, generator).all,
+        )
         data: Episodes | Source = episodes
     else:
         share = checks.positive(held_out, "held_out")
@@ -107,11 +111,11 @@ def train(
             raise DataError(f"held_out is {share:g}; pass a share below 1, or episodes")
         fitted, other = pieces.split(share, generator)
         data, judge = fitted, other
-    tuning = Tuning(given)
+    tuning = TunableLifting(given)
     own, test = (Windows.of(e if sized is None else sized(e), N, source.nx) for e in (fitted, other))
     p, taken = _search(VariableProjection(tuning, own, weight), test, iterations)
     chosen = tuning.at(p)
-    before, after = (_held(data, one, judge, N, embedding, weight) for one in (given, chosen))
+    before, after = (_hold_out(data, one, judge, N, embedding, weight) for one in (given, chosen))
     better = before > _EXACT and after <= (1 - _GAIN) * before
     model = edmd(episodes, chosen if better else given, embedding=embedding, ridge=weight)
     fell = f"fell from {before:.3g} to {after:.3g}" if better else "did not fall, and the lifting is as it was"
@@ -121,7 +125,7 @@ def train(
     return replace(model, report=replace(report, method="train", changes=(*report.changes, said)))
 
 
-def _held(
+def _hold_out(
     data: Episodes | Source, lifting: Lifting, judge: Episodes, horizon: int, embedding: Delay | None, ridge: float
 ) -> float:
     """Return the relative error over the horizon, on other episodes, of the fit to these data."""
@@ -159,7 +163,7 @@ class _Pieces(NamedTuple):
         return first, last
 
 
-def _drawn(source: Source, length: int, count: int, rng: np.random.Generator) -> _Pieces:
+def _draw_pieces(source: Source, length: int, count: int, rng: np.random.Generator) -> _Pieces:
     """Return `count` pieces of `length` steps, any as likely as any other, in the order of the data."""
     kept: list[tuple[float, tuple[int, int], Episode]] = []
     number = 0
@@ -169,8 +173,8 @@ def _drawn(source: Source, length: int, count: int, rng: np.random.Generator) ->
             keys = rng.random(max(len(episode) - length + 1, 0))
             for k in np.argsort(keys)[:count].tolist():
                 rows = slice(k, k + length)
-                parts = (a.copy() for a in (episode.X[k : k + length + 1], episode.U[rows], episode.W[rows]))
-                piece = Episode(**dict(zip("XUW", parts, strict=True)))  # copies, which do not hold the whole episode
+                X, U, W = (a.copy() for a in (episode.X[k : k + length + 1], episode.U[rows], episode.W[rows]))
+                piece = Episode(X=X, U=U, W=W)  # copies, which do not hold the whole episode
                 kept.append((float(keys[k]), (number, k), piece))
             kept = sorted(kept, key=lambda one: one[0])[:count]
             number += 1
@@ -186,13 +190,13 @@ def _drawn(source: Source, length: int, count: int, rng: np.random.Generator) ->
 def _search(objective: VariableProjection, test: Windows, iterations: int) -> tuple[Float[np.ndarray, " n"], int]:
     """Return the iterate of L-BFGS with the least error on the test windows, and how many iterations there were."""
     tuning = objective.tuning
-    best, least, taken, at = np.zeros(tuning.n), objective.elsewhere(np.zeros(tuning.n), test), 0, 0
+    best, least, taken, at = np.zeros(tuning.n), objective.evaluate_on(np.zeros(tuning.n), test), 0, 0
 
-    def judged(intermediate_result: Any) -> None:
+    def record_iterate(intermediate_result: Any) -> None:
         nonlocal best, least, taken, at
         taken += 1
         p = np.array(intermediate_result.x)
-        error = objective.elsewhere(p, test)
+        error = objective.evaluate_on(p, test)
         if error < least:
             best, least, at = p, error, taken
         elif taken - at >= _PATIENCE:
@@ -201,6 +205,12 @@ def _search(objective: VariableProjection, test: Windows, iterations: int) -> tu
     ends = [(-_FAR, _FAR) if one else (-np.inf, np.inf) for one in tuning.positive]
     options = {"maxiter": iterations, "maxcor": 20}
     cast("Any", minimize)(
-        objective, np.zeros(tuning.n), jac=True, method="L-BFGS-B", bounds=ends, callback=judged, options=options
+        objective,
+        np.zeros(tuning.n),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=ends,
+        callback=record_iterate,
+        options=options,
     )
     return best, taken

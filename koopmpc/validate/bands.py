@@ -1,4 +1,4 @@
-"""Split-conformal bands |x_{k+h} − x̂_{k+h}| ≤ q s_h, and one forecast with its band beside what happened."""
+"""Split-conformal bands |x_{k+h} − x̂_{k+h}| ≤ q s_h, and one forecast with its band beside the measured states."""
 
 from dataclasses import dataclass, replace
 
@@ -10,23 +10,23 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.validate.scoring import AnyPredictor, Score, comparable, forecast_errors, score
+from koopmpc.validate.scoring import AnyPredictor, Score, embed_episodes, forecast_errors, score
 from koopmpc.values import Value
 
 Rng = np.random.Generator | int
 
-_SCALED = 0.25  # share of the episodes that give the scale
-_NORMAL = 1.959964  # two-sided 95 % of a normal law
+_SCALE_SHARE = 0.25  # share of the episodes that determine the scale s_h; the others calibrate q
+_NORMAL = 1.959964  # two-sided 95 % quantile of the normal distribution
 
 
 @dataclass(frozen=True, eq=False)
-class Covered(Value):
-    """The number of forecasts that lay in a band at all of their steps.
+class BandCoverage(Value):
+    """Share of forecasts that lie in a band at all of their steps.
 
     Attributes
     ----------
     share
-        Share of the episodes whose forecast did.
+        Share of the forecasts inside the band, 0 … 1.
     low, high
         Wilson's 95 % interval of that share.
     episodes
@@ -43,22 +43,23 @@ class Covered(Value):
 class ConformalBand(Value):
     """x_{k+h} ∈ x̂_{k+h} ± q s_h for all states and all h = 1 … horizon at once, with probability ≥ level.
 
-    The promise is for a forecast that starts at a random moment of a new episode of the same law, inputs and
-    initial states included, as those of the calibration. A controller changes the law of the inputs: measure
-    (`measured`) and calibrate again (`recalibrated`) on episodes of its closed loop.
+    The probability is that of a forecast that starts at a random moment of a new episode. This episode must have the
+    distribution of the calibration episodes, inputs and initial states included. A controller changes the distribution
+    of the inputs: measure the share in the band (`measure_coverage`) and calibrate again (`recalibrate`) on episodes
+    of its closed loop.
 
     Attributes
     ----------
     scale
-        (horizon, nx) s_h, root-mean-square errors of episodes apart, in the state's unit.
+        (horizon, nx) s_h, root-mean-square errors on episodes that do not calibrate, in the state's unit.
     quantile
-        q, the ⌈(n+1) level⌉-th smallest of the n scores max |x − x̂| / s; infinite where that is beyond n.
+        q, the ⌈(n+1) level⌉-th smallest of the n scores max |x − x̂| / s; infinite if this rank is above n.
     level
         1 − α.
     episodes
         n, the number of calibration episodes.
     relift
-        The forecasts lift x̂ anew at every step.
+        True if the forecasts lift x̂ at every step, False if they lift x_k once.
     states
         Names of the columns.
     """
@@ -78,69 +79,70 @@ class ConformalBand(Value):
 
     @property
     def needed(self) -> int:
-        """Calibration episodes from which the band is finite: 9 for 90 %."""
+        """Least number of calibration episodes for a finite band: 9 for 90 %."""
         return int(np.ceil(self.level / (1 - self.level) - 1e-9))
 
-    def measured(self, predictor: AnyPredictor, episodes: Episodes, *, rng: Rng = 0) -> Covered:
-        """Return the share of these episodes whose forecast, from one random start each, stays in the band."""
+    def measure_coverage(self, predictor: AnyPredictor, episodes: Episodes, *, rng: Rng = 0) -> BandCoverage:
+        """Return the share of forecasts that stay in the band; each episode gives one forecast from a random start."""
         n = len(episodes)
         inside = self._scores(predictor, episodes, rng) <= self.quantile
         p, w = float(np.mean(inside)), _NORMAL**2 / n
         middle, reach = (p + w / 2) / (1 + w), np.sqrt(w * (p * (1 - p) + w / 4)) / (1 + w)
-        return Covered(p, float(max(middle - reach, 0.0)), float(min(middle + reach, 1.0)), n)
+        return BandCoverage(p, float(max(middle - reach, 0.0)), float(min(middle + reach, 1.0)), n)
 
-    def recalibrated(self, predictor: AnyPredictor, episodes: Episodes, *, rng: Rng = 0) -> "ConformalBand":
-        """Return the band of the same scale whose q comes from these episodes: its promise holds for their law."""
+    def recalibrate(self, predictor: AnyPredictor, episodes: Episodes, *, rng: Rng = 0) -> "ConformalBand":
+        """Return a band of the same scale with q from these episodes; its level holds for their distribution."""
         scores = np.sort(self._scores(predictor, episodes, rng))
         rank = int(np.ceil((len(scores) + 1) * self.level - 1e-9))
         quantile = float(scores[rank - 1]) if rank <= len(scores) else np.inf
         return replace(self, quantile=quantile, episodes=len(scores))
 
     def _scores(self, predictor: AnyPredictor, episodes: Episodes, rng: Rng) -> Float[np.ndarray, " n"]:
-        """Return max over h and states of |x − x̂| / s, one forecast an episode."""
+        """Return the maximum of |x − x̂| / s over h and states, for one forecast an episode."""
         horizon, source = len(self.scale), checks.generator(rng)
-        points = comparable(predictor, episodes, horizon)
+        points = embed_episodes(predictor, episodes, horizon)
         starts = list(source.integers(0, [len(episode) - horizon + 1 for episode in points])[:, None])
         blocks = forecast_errors(predictor, points, starts, horizon, relift=self.relift)
-        with np.errstate(over="ignore"):  # an error far beyond a tiny scale
+        with np.errstate(over="ignore"):  # a large error over a tiny scale is an infinite score
             return np.concatenate([np.max(np.abs(gap) / self.scale[:, None], axis=(0, 2)) for gap, _ in blocks])
 
 
 def conformal(
     predictor: AnyPredictor, episodes: Episodes, horizon: int, *, level: float = 0.9, relift: bool = False, rng: Rng = 0
 ) -> ConformalBand:
-    """Return the band x̂_{k+h} ± q s_h that holds a whole forecast with probability ≥ level, whatever the law.
+    """Return the band x̂_{k+h} ± q s_h that contains a whole forecast with probability ≥ level, for any distribution.
 
-    A quarter of the episodes, drawn at random, gives s_h, the root-mean-square error over all starts. Each of
-    the others gives one score: the largest |x − x̂| / s over states and steps of one forecast from a random
-    start, for the steps of an episode are not exchangeable and episodes are. q is the ⌈(n+1) level⌉-th smallest
-    of the n scores. Where the scores have no ties, the coverage is ⌈(n+1) level⌉ / (n+1) on average.
+    A random quarter of the episodes determines s_h, the root-mean-square error over all starts. Each of the other
+    episodes gives one score: the largest |x − x̂| / s over states and steps of one forecast from a random start. There
+    is one score an episode because episodes are exchangeable and steps of one episode are not. q is the
+    ⌈(n+1) level⌉-th smallest of the n scores. If no two scores are equal, the average coverage is
+    ⌈(n+1) level⌉ / (n+1).
 
     Parameters
     ----------
     predictor
-        Fitted to other episodes.
+        A model that was fitted to other episodes.
     episodes
-        At least two, each at least `horizon` steps long. With fewer than level / (1 − level) of them left for
-        the calibration (9 for 90 %) no finite band can promise the level, and the band is infinite.
+        At least two, each at least `horizon` steps long. If fewer than level / (1 − level) of them remain for the
+        calibration (9 for 90 %), no finite band reaches the level, and the band is infinite.
     horizon
         Steps ahead.
     level
         1 − α, between 0 and 1.
     relift
-        Forecast with the map of `step_map`, which lifts x̂ anew at every step.
+        Forecast with the map of `step_map`, which lifts x̂ at every step.
     rng
-        Draws the split and the starts.
+        Random generator or seed for the split and the starts.
 
     Raises
     ------
     DataError
-        There is one episode, one is shorter than the horizon, or the level is not between 0 and 1.
+        There is only one episode, one is shorter than the horizon, or the level is not between 0 and 1.
 
     References
     ----------
     Vovk, Gammerman & Shafer, "Algorithmic Learning in a Random World", 2005; Lei et al., "Distribution-free
-    predictive inference for regression", J. Am. Stat. Assoc. 113, 2018; the maximum over the steps of a
+    predictive inference for regression", J. Am. Stat. Assoc. 113, 2018. For the maximum over the steps of a
     trajectory: Cleaveland et al., "Conformal prediction regions for time series using linear complementarity
     programming", AAAI 2024.
     """
@@ -150,14 +152,14 @@ def conformal(
     if len(episodes) < 2:
         raise DataError("a conformal band needs two episodes, one for the scale and one to calibrate; got 1")
     source = checks.generator(rng)
-    share = max(round(_SCALED * len(episodes)), 1) / len(episodes)
+    share = max(round(_SCALE_SHARE * len(episodes)), 1) / len(episodes)
     scaling, calibration = episodes.split(share, source)
     errors = score(predictor, scaling, horizon, relift=relift)
     scale = np.where(np.isfinite(errors.rmse), errors.rmse, np.finfo(float).max)
     size = np.max([np.abs(episode.X).max(axis=0) for episode in scaling], axis=0)
-    floor = np.maximum(np.finfo(float).eps * size, np.finfo(float).tiny)  # a perfect model has no error to scale by
-    unset = ConformalBand(np.maximum(scale, floor), np.inf, level, len(calibration), relift, predictor.states)
-    return unset.recalibrated(predictor, calibration, rng=source)
+    floor = np.maximum(np.finfo(float).eps * size, np.finfo(float).tiny)  # the scale of a model without errors
+    uncalibrated = ConformalBand(np.maximum(scale, floor), np.inf, level, len(calibration), relift, predictor.states)
+    return uncalibrated.recalibrate(predictor, calibration, rng=source)
 
 
 Bands = ConformalBand | Score | ArrayLike
@@ -170,13 +172,13 @@ class Forecast(Value):
     Attributes
     ----------
     U
-        (T, nu) inputs as applied.
+        (T, nu) applied inputs.
     truth, predicted
-        (T+1, nx), row 0 is x_k; a prediction that leaves the finite numbers is NaN from there on.
+        (T+1, nx), row 0 is x_k; predictions are NaN from the first one on that overflows.
     low, high
-        (T+1, nx) ends of the band, at the prediction where there is none.
+        (T+1, nx) ends of the band; without a band they equal the prediction.
     band
-        What the band is, in words; empty where there is none.
+        Name of the band; empty without one.
     dt, states, inputs
         Sample time [s] and names of the predictor.
     """
@@ -206,30 +208,30 @@ def forecast(
     start: int = 0,
     relift: bool = False,
 ) -> Forecast:
-    """Return x̂_{k+h} for h = 0 … horizon beside the episode's x_{k+h}.
+    """Return the forecast x̂_{k+h} together with the measured x_{k+h}, h = 0 … horizon.
 
     Parameters
     ----------
     predictor
         A model of the states and inputs of the episode.
     episode
-        An episode, best one that is not of the fit.
+        An episode, best one that the model was not fitted to.
     horizon
-        Steps ahead; to the end of the episode by default.
+        Steps ahead; by default to the end of the episode.
     bands
         A conformal band, a score (its 5 and 95 % quantiles of the error), or half-widths (horizon, nx) in the
-        state's unit; for the horizon or longer.
+        state's unit; of `horizon` rows or more.
     start
-        k; with an embedding counted from the first moment whose past is known.
+        k; with an embedding, k counts from the first row that has a complete history.
     relift
-        Predict by the map of `step_map`, which lifts x̂ anew at every step.
+        Predict by the map of `step_map`, which lifts x̂ at every step.
 
     Raises
     ------
     ShapeError
-        The episode, or the bands, do not fit the predictor.
+        The episode or the bands have other shapes than the predictor needs.
     DataError
-        The episode ends before the horizon; the conformal band is for predictions that are lifted otherwise.
+        The episode ends before the horizon, or the conformal band was made with the other value of `relift`.
     """
     nx, nu = episode.X.shape[1], episode.U.shape[1]
     if (nx, nu) != (predictor.nx, predictor.nu):
@@ -240,30 +242,30 @@ def forecast(
     start = checks.count(start, "start", least=0)
     if predictor.embedding is not None:
         episode = predictor.embed(Episodes([episode], predictor.dt, predictor.states, predictor.inputs))[0]
-    left = len(episode) - start
-    steps = checks.count(left if horizon is None else horizon, "horizon")
-    if steps > left:
+    available = len(episode) - start
+    steps = checks.count(available if horizon is None else horizon, "horizon")
+    if steps > available:
         raise DataError(
-            f"the episode has {left} steps from step {start} on, the horizon is {steps}; shorten the horizon"
+            f"the episode has {available} steps from step {start} on, the horizon is {steps}; shorten the horizon"
         )
     U, x, W = episode.U[start : start + steps], episode.X[start], episode.W[start : start + steps]
     with np.errstate(over="ignore", invalid="ignore"):
         if relift:
             predicted = predictor.step_map().rollout(x, U)[:, :nx]
         else:
-            known = (W,) if isinstance(predictor, LinearPredictor) and predictor.nw else ()
-            predicted = predictor.rollout(x, U, *known)
-    lost = ~np.logical_and.accumulate(np.isfinite(predicted).all(axis=1))
-    predicted[lost] = np.nan
-    below, above, words = _offsets(bands, steps, nx, relift)
+            disturbances = (W,) if isinstance(predictor, LinearPredictor) and predictor.nw else ()
+            predicted = predictor.rollout(x, U, *disturbances)
+    overflowed = ~np.logical_and.accumulate(np.isfinite(predicted).all(axis=1))
+    predicted[overflowed] = np.nan
+    below, above, name = _band_offsets(bands, steps, nx, relift)
     truth = episode.X[start : start + steps + 1, :nx]
     U, truth, predicted = map(np.ascontiguousarray, (U, truth, predicted))
     low, high = predicted + below, predicted + above
-    return Forecast(U, truth, predicted, low, high, words, predictor.dt, predictor.states, predictor.inputs)
+    return Forecast(U, truth, predicted, low, high, name, predictor.dt, predictor.states, predictor.inputs)
 
 
-def _offsets(bands: Bands | None, steps: int, nx: int, relift: bool) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return the widths of the band below and above the prediction, in rows h = 0 … steps, and the name of the band."""
+def _band_offsets(bands: Bands | None, steps: int, nx: int, relift: bool) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return both ends of the band less the prediction, in rows h = 0 … steps, and the name of the band."""
     if bands is None:
         return np.zeros((steps + 1, nx)), np.zeros((steps + 1, nx)), ""
     if isinstance(bands, ConformalBand):
@@ -273,18 +275,18 @@ def _offsets(bands: Bands | None, steps: int, nx: int, relift: bool) -> tuple[np
             )
         below, above = -bands.width, bands.width
         finite = "" if np.isfinite(bands.quantile) else f", infinite: calibrate on {bands.needed} episodes"
-        words = f"{100 * bands.level:g} % conformal band{finite}"
+        name = f"{100 * bands.level:g} % conformal band{finite}"
     elif isinstance(bands, Score):
-        below, above, words = bands.low, bands.high, "5 to 95 % of the errors"
+        below, above, name = bands.low, bands.high, "5 to 95 % of the errors"
     else:
         above = checks.array(bands, "bands", (None, nx), infinite=True, finite=False)
         if (above < 0).any():
             raise DataError(f"bands holds {above.min():g}; half-widths are 0 or above")
-        below, words = -above, "band"
+        below, name = -above, "band"
     if len(above) < steps or above.shape[1] != nx:
         raise ShapeError(
             f"bands has {len(above)} rows of {above.shape[1]}, expected {steps} of {nx}; "
-            "make it for the horizon, or shorten that"
+            "make the band for this horizon, or shorten the horizon"
         )
     zero = np.zeros((1, nx))
-    return np.vstack([zero, below[:steps]]), np.vstack([zero, above[:steps]]), words
+    return np.vstack([zero, below[:steps]]), np.vstack([zero, above[:steps]]), name

@@ -1,6 +1,6 @@
-"""Residuals of one step: of each eigenpair, and of the invariance of the dictionary.
+"""One-step residuals of each eigenpair, and the invariance of the dictionary.
 
-Both are read from the second moments of the rows [ψ(x) u ψ(x⁺)], so that a pass over the data serves all of them.
+Both follow from the second moments of the rows [ψ(x) u ψ(x⁺)], so one pass over the data suffices.
 """
 
 from dataclasses import dataclass
@@ -16,18 +16,18 @@ from koopmpc.data.source import Source
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.moments.moments import Moments, both_sides
 from koopmpc.identify.moments.read import second_moments
-from koopmpc.identify.solve import norms, orthonormal
+from koopmpc.identify.solve import column_norms, orthonormal_basis
 from koopmpc.lifting.base import Lifting
-from koopmpc.predict.base import eigen
+from koopmpc.predict.base import sorted_eigen
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.predict.spectrum import same_names
+from koopmpc.predict.spectrum import check_same_names
 from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Value
 
-TOLERANCE = 0.05  # residual of one step beyond which an eigenpair is spurious
+_SPURIOUS = 0.05  # an eigenpair with a larger one-step residual is spurious, unless the caller sets a tolerance
 
 
-def moments_of(
+def compute_moments(
     episodes: Episodes | Source,
     model: Lifting | AnyPredictor,
     *,
@@ -37,18 +37,18 @@ def moments_of(
     """Return the second moments of these episodes in a lifting, or in the lifting and the inputs of a predictor.
 
     They are triangular factors (``route="qr"``), which resolve residuals down to rounding. Measured disturbances
-    count as inputs; for a predictor only where it knows them, and for a bilinear model not.
+    count as inputs for a lifting and for a linear predictor with disturbances, not for a bilinear model.
 
     Parameters
     ----------
     episodes
         Episodes, or a source of them.
     model
-        A lifting ψ, or a predictor, which brings its own embedding and kind.
+        A lifting ψ, or a predictor; a predictor has its own embedding and kind.
     embedding
-        What ψ acts on where it is a lifting of the state and its past.
+        The delay embedding that a lifting ψ acts on.
     bilinear
-        The rows hold the products u⊗ψ(x) too.
+        With a lifting: include the products u⊗ψ(x) in the rows.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def moments_of(
     if isinstance(model, Lifting):
         lifting, driven = model, not bilinear
     else:
-        same_names(model, episodes)
+        check_same_names(model, episodes)
         lifting, embedding, bilinear = model.lifting, model.embedding, isinstance(model, BilinearPredictor)
         driven = isinstance(model, LinearPredictor) and model.nw > 0
     rows = episodes.driven() if driven else episodes
@@ -67,19 +67,19 @@ def moments_of(
 
 @dataclass(frozen=True, eq=False)
 class ResidualDMD(Value):
-    """The distance of each eigenfunction of a predictor from one of the Koopman operator.
+    """One-step residuals of the eigenpairs of a predictor.
 
     Attributes
     ----------
     eigenvalues
         (nz,) λ of A, the largest magnitude first.
     residuals
-        (nz,) ‖φ(x⁺) − λ φ(x) − (what the inputs do)‖ / ‖φ(x)‖ over the snapshots; infinite where φ was 0
-        throughout.
+        (nz,) ‖φ(x⁺) − λ φ(x) − (effect of the inputs)‖ / ‖φ(x)‖ over the snapshots; infinite if φ is 0 on all of
+        them.
     tolerance
-        Beyond it an eigenpair is `spurious`.
+        An eigenpair with a larger residual is `spurious`.
     samples
-        M.
+        M, the number of snapshots.
     """
 
     eigenvalues: Complex[np.ndarray, " nz"]
@@ -89,34 +89,34 @@ class ResidualDMD(Value):
 
     @property
     def spurious(self) -> Bool[np.ndarray, " nz"]:
-        """Eigenpairs whose residual is above the tolerance: in one step φ differs from λ φ by more than that share."""
+        """(nz,) True for each eigenpair whose residual is above the tolerance."""
         return self.residuals > self.tolerance
 
 
-def residual_dmd(predictor: AnyPredictor, episodes: Episodes | Source, *, tolerance: float = TOLERANCE) -> ResidualDMD:
+def residual_dmd(predictor: AnyPredictor, episodes: Episodes | Source, *, tolerance: float = _SPURIOUS) -> ResidualDMD:
     """Return ‖Ψ(x⁺) v − λ Ψ(x) v − U Bᵀ v‖ / ‖Ψ(x) v‖ for each left eigenvector v of A, φ = ψ · v.
 
-    The squared norm is v*(Ψy*Ψy − λ Ψy*Ψx − λ̄ Ψx*Ψy + |λ|² Ψx*Ψx)v, which the second moments of the data hold. It
-    is taken as a norm, on a factor of the moments, since a difference of squares would lose half the digits. Without
+    The squared norm v*(Ψy*Ψy − λ Ψy*Ψx − λ̄ Ψx*Ψy + |λ|² Ψx*Ψx)v follows from the second moments of the data. The code
+    computes the norm on a factor of the moments, because a difference of squares would lose half the digits. Without
     inputs it bounds the distance from λ to the (pseudo)spectrum of the Koopman operator. With inputs the operator is
-    that of the drift ψ(x⁺) − B u: what the inputs do by the predictor's own B (E, Nᵢ) is subtracted, and the residual
-    is the energy of what is left, whether λ, v or B is to blame.
+    that of the drift ψ(x⁺) − B u, where B (and E, Nᵢ) are the predictor's own. The residual then contains the errors of
+    λ, v and B.
 
     Parameters
     ----------
     predictor
-        Linear or bilinear; its A gives λ and v.
+        Linear or bilinear; its A determines λ and v.
     episodes
-        Episodes, or a source of them: those of the fit, or better others.
+        Episodes, or a source of them; best episodes that the model was not fitted to.
     tolerance
-        Residual above which `ResidualDMD.spurious` calls an eigenpair spurious.
+        `ResidualDMD.spurious` marks the eigenpairs with a larger residual.
 
     Raises
     ------
     ShapeError
         The episodes have other states, inputs or disturbances than the predictor.
     DataError
-        They have another dt, or the tolerance is not above zero.
+        The episodes have another dt, or the tolerance is not above zero.
 
     References
     ----------
@@ -124,49 +124,49 @@ def residual_dmd(predictor: AnyPredictor, episodes: Episodes | Source, *, tolera
     dynamical systems", Commun. Pure Appl. Math. 77, 2024.
     """
     tolerance = checks.positive(tolerance, "tolerance")
-    return eigen_residuals(predictor, moments_of(episodes, predictor), tolerance)
+    return measure_eigenpairs(predictor, compute_moments(episodes, predictor), tolerance)
 
 
-def eigen_residuals(predictor: AnyPredictor, total: Moments, tolerance: float = TOLERANCE) -> ResidualDMD:
-    """Return the result of `residual_dmd` from the moments in the predictor's own lifting."""
-    values, V = eigen(np.ascontiguousarray(predictor.A.T))
+def measure_eigenpairs(predictor: AnyPredictor, total: Moments, tolerance: float = _SPURIOUS) -> ResidualDMD:
+    """Return the result of `residual_dmd` from moments in the predictor's own lifting."""
+    values, V = sorted_eigen(np.ascontiguousarray(predictor.A.T))
     P, T, _ = both_sides(total)
     with np.errstate(over="ignore", invalid="ignore"):
-        gap = _sizes((T - P @ _one_step(predictor, total)) @ V)
-    gap[np.isnan(gap)] = np.inf  # A held entries so large that the product is no number
-    size = _sizes(P[:, : total.nz] @ V)
-    floor = np.finfo(float).eps * _sizes(np.abs(P[:, : total.nz]) @ np.abs(V))  # a φ below it is 0 but for rounding
-    live = size > floor
-    residuals = np.divide(gap, size, out=np.full(len(size), np.inf), where=live)
+        gap = _column_norms((T - P @ _step_matrix(predictor, total)) @ V)
+    gap[np.isnan(gap)] = np.inf  # the product with very large entries of A overflowed
+    size = _column_norms(P[:, : total.nz] @ V)
+    floor = np.finfo(float).eps * _column_norms(np.abs(P[:, : total.nz]) @ np.abs(V))  # a smaller φ is rounding
+    nonzero = size > floor
+    residuals = np.divide(gap, size, out=np.full(len(size), np.inf), where=nonzero)
     return ResidualDMD(values, residuals, tolerance, total.samples)
 
 
-def _one_step(predictor: AnyPredictor, total: Moments) -> Float[np.ndarray, "n nz"]:
-    """Return K with z⁺ = [z u u⊗z] K as the predictor has it."""
+def _step_matrix(predictor: AnyPredictor, total: Moments) -> Float[np.ndarray, "n nz"]:
+    """Return the predictor's K in z⁺ = [z u u⊗z] K."""
     A = predictor.A.T
     if not isinstance(predictor, BilinearPredictor):
         return np.vstack([A, predictor.B.T, predictor.E.T])
     products = total.products
-    constant = np.setdiff1d(np.arange(total.nz), products)  # u times the Constant is u, which stands among the inputs
+    constant = np.setdiff1d(np.arange(total.nz), products)  # u times the Constant is u: add it to the inputs
     B = predictor.B.T + predictor.N[:, :, constant].sum(axis=2)
     N = predictor.N[:, :, products].transpose(0, 2, 1).reshape(-1, total.nz)
     return np.vstack([A, B, N])
 
 
-def _sizes(columns: np.ndarray) -> Float[np.ndarray, " n"]:
+def _column_norms(columns: np.ndarray) -> Float[np.ndarray, " n"]:
     """Return the Euclidean norms of real or complex columns."""
     return np.asarray(np.linalg.norm(columns, axis=0), dtype=np.float64)
 
 
-def eigenpairs(predictor: AnyPredictor, residuals: "ResidualDMD | ArrayLike") -> ResidualDMD:
+def check_residuals(predictor: AnyPredictor, residuals: "ResidualDMD | ArrayLike") -> ResidualDMD:
     """Return the residuals as a ResidualDMD; an array is in the order of ``predictor.eigenvalues``.
 
     Raises
     ------
     ShapeError
-        There is not one residual for each eigenvalue.
+        The number of residuals differs from the number of eigenvalues.
     DataError
-        A residual is negative or NaN, or they are those of another predictor.
+        A residual is negative or NaN, or the residuals belong to another predictor.
     """
     if isinstance(residuals, ResidualDMD):
         if len(residuals.residuals) != predictor.nz:
@@ -174,30 +174,30 @@ def eigenpairs(predictor: AnyPredictor, residuals: "ResidualDMD | ArrayLike") ->
                 f"there are {len(residuals.residuals)} residuals and {predictor.nz} eigenvalues; "
                 "pass the residuals of this predictor"
             )
-        mine, theirs = (np.sort_complex(v) for v in (predictor.eigenvalues, residuals.eigenvalues))
-        if not np.allclose(np.abs(mine), np.abs(theirs), rtol=1e-3, atol=1e-6):
+        expected, received = (np.sort_complex(v) for v in (predictor.eigenvalues, residuals.eigenvalues))
+        if not np.allclose(np.abs(expected), np.abs(received), rtol=1e-3, atol=1e-6):
             raise DataError("the residuals are those of another predictor; pass residual_dmd(predictor, …)")
         return residuals
-    known = checks.array(residuals, "residuals", (predictor.nz,), infinite=True, finite=False)
-    if np.isnan(known).any() or (known < 0).any():
-        raise DataError(f"residuals holds {known.min():g}; they are norms, from 0 on")
-    return ResidualDMD(predictor.eigenvalues, known, TOLERANCE, 0)
+    values = checks.array(residuals, "residuals", (predictor.nz,), infinite=True, finite=False)
+    if np.isnan(values).any() or (values < 0).any():
+        raise DataError(f"residuals holds {values.min():g}; residuals are norms, 0 or above")
+    return ResidualDMD(predictor.eigenvalues, values, _SPURIOUS, 0)
 
 
 @dataclass(frozen=True, eq=False)
 class Invariance(Value):
-    """The distance of span ψ from invariance, by the data.
+    """Distance of span ψ from an invariant subspace, on the data.
 
     Attributes
     ----------
     proximity
         sup over f in span ψ of min_g ‖f(x⁺) − g‖ / ‖f(x⁺)‖, g in the span of ψ(x) (and of u, and of u⊗ψ(x) for a
-        bilinear model): the sine of the largest principal angle, 0 … 1. 0: the dictionary is invariant. 1: it
-        holds a function of whose next value nothing is known.
+        bilinear model): the sine of the largest principal angle, 0 … 1. At 0 the dictionary is invariant. At 1 the
+        data do not predict the next value of `worst` at all.
     worst
-        (nz,) that function, f = ψ · worst, of root-mean-square 1.
+        (nz,) coefficients of the f that attains the supremum, f = ψ · worst, of root-mean-square 1.
     errors
-        (nz,) the same error for each observable itself; 0 for one that is 0 throughout.
+        (nz,) min_g ‖f(x⁺) − g‖ / ‖f(x⁺)‖ of each observable f; 0 for an observable that is always 0.
     names
         Names of the observables.
     """
@@ -209,7 +209,7 @@ class Invariance(Value):
 
     @property
     def index(self) -> float:
-        """Consistency index ρ = λ_max(I − M_f M_b) = proximity², M_f and M_b the EDMD forward and backward in time."""
+        """Consistency index ρ = λ_max(I − M_f M_b) = proximity²; M_f, M_b are EDMD forward and backward in time."""
         return self.proximity**2
 
 
@@ -220,12 +220,12 @@ def invariance(
     embedding: Delay | None = None,
     bilinear: bool = False,
 ) -> Invariance:
-    """Return the invariance proximity of a dictionary on these episodes; no choice of its basis changes it.
+    """Return the invariance proximity of a dictionary on these episodes; it does not depend on the basis.
 
-    With inputs the dictionary predicts with their help: what u explains is no lack of invariance. Directions of
-    span ψ that are rounding on the data (relative size eps · M) are left out. Measurement noise counts, for noise is
-    not predictable: a nearly dependent dictionary holds a function that is mostly noise, and its proximity is near 1
-    even where `errors` are small.
+    With inputs, g may also use u: the part of f(x⁺) that u explains does not count as an error. Directions of span ψ
+    that are rounding on the data (relative size eps · M) are left out. Measurement noise counts as an error. The span
+    of a nearly dependent dictionary contains a function that is mostly noise. Its proximity is then near 1, although
+    its `errors` may be small.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def invariance(
     lifting
         The dictionary ψ; or a predictor, for its dictionary, embedding and kind.
     embedding
-        What a lifting of the state and its past acts on.
+        The delay embedding that a lifting ψ acts on.
     bilinear
         Predict with u⊗ψ(x) too, as a bilinear model does.
 
@@ -246,25 +246,27 @@ def invariance(
     References
     ----------
     Haseli & Cortés, "Temporal forward-backward consistency, not residual error, measures the prediction accuracy
-    of extended dynamic mode decomposition", IEEE Control Syst. Lett. 7, 2023; the same, "Invariance proximity:
-    closed-form error bounds for finite-dimensional Koopman-based models", 2023.
+    of extended dynamic mode decomposition", IEEE Control Syst. Lett. 7, 2023; by the same authors "Invariance
+    proximity: closed-form error bounds for finite-dimensional Koopman-based models", 2023.
     """
-    return proximity_of(moments_of(episodes, lifting, embedding=embedding, bilinear=bilinear))
+    return measure_invariance(compute_moments(episodes, lifting, embedding=embedding, bilinear=bilinear))
 
 
-def proximity_of(total: Moments) -> Invariance:
-    """Return the result of `invariance` from the moments; Gram sums resolve it to 1e-8 times the condition number."""
+def measure_invariance(total: Moments) -> Invariance:
+    """Return the result of `invariance` from moments; Gram sums resolve it to 1e-8 times the condition number."""
     P, T, cut = both_sides(total)
-    known = orthonormal(P, cut)
-    size = norms(T)
+    basis = orthonormal_basis(P, cut)
+    size = column_norms(T)
     scale = np.where(size > 0, size, 1.0)
-    unexplained = T / scale - known @ (known.T @ (T / scale))
+    unexplained = T / scale - basis @ (basis.T @ (T / scale))
     U, s, Vt = np.linalg.svd(T / scale, full_matrices=False)
-    held = s > cut * s.max(initial=0.0)
-    span = U[:, held]
-    _, angles, directions = np.linalg.svd(span - known @ (known.T @ span), full_matrices=False)
+    resolved = s > cut * s.max(initial=0.0)
+    span = U[:, resolved]
+    _, angles, directions = np.linalg.svd(span - basis @ (basis.T @ span), full_matrices=False)
     nz = total.nz
-    if not held.any():
+    if not resolved.any():
         return Invariance(0.0, np.zeros(nz), np.zeros(nz), total.lifting.names)
-    worst = (Vt[held].T / s[held]) @ directions[0] / scale * np.sqrt(total.samples)
-    return Invariance(float(min(angles[0], 1.0)), worst, np.minimum(norms(unexplained), 1.0), total.lifting.names)
+    worst = (Vt[resolved].T / s[resolved]) @ directions[0] / scale * np.sqrt(total.samples)
+    return Invariance(
+        float(min(angles[0], 1.0)), worst, np.minimum(column_norms(unexplained), 1.0), total.lifting.names
+    )

@@ -1,6 +1,7 @@
 """The library of problems: each file is self-contained, and each of its controllers runs within hard limits."""
 
 import ast
+import sys
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -11,9 +12,12 @@ import pytest
 
 import koopmpc as km
 from koopmpc.bench.controllers import CONTROLLERS, Prepared, controller_names
-from koopmpc.bench.measured import BASELINE, best_learned, frugal, goals, in_words, markdown, measured, standings
+from koopmpc.bench.measured import BASELINE, describe_best, find_best_learned, read_standings
 from koopmpc.bench.store import ORACLE, RunRow
 from koopmpc.loop.metrics import Metrics
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "tools"))
+from standings import compute_standings, find_frugal, format_goals, format_standings
 
 FILES = {path.stem: path for path in km.bench.shipped()}
 MOST_LINES = 120
@@ -35,11 +39,11 @@ def few(path: Path) -> Prepared:
 
 
 def test_the_library_holds_what_its_page_lists():
-    assert set(measured()) <= set(FILES)
+    assert set(read_standings()) <= set(FILES)
     named = Path(__file__).parents[2].joinpath("docs", "library.md").read_text("utf-8")
     assert [name for name in FILES if f"`{name}`" not in named] == []
-    assert markdown(measured()) in named
-    assert goals(measured()) in named
+    assert format_standings(read_standings()) in named
+    assert format_goals(read_standings()) in named
     pages = Path(__file__).parents[2] / "docs" / "problems"
     for name, path in FILES.items():
         text = (pages / f"{name}.md").read_text("utf-8")
@@ -50,7 +54,7 @@ def test_the_library_holds_what_its_page_lists():
 
 
 def test_on_a_dozen_problems_a_learned_controller_is_as_good_as_nonlinear_mpc_and_much_faster():
-    assert sum(frugal(found) is not None for found in measured().values() if ORACLE in found) >= 12
+    assert sum(find_frugal(found) is not None for found in read_standings().values() if ORACLE in found) >= 12
 
 
 def test_a_problem_is_one_short_file_that_imports_numpy_casadi_and_koopmpc_alone(path: Path):
@@ -84,7 +88,7 @@ def test_each_controller_runs_on_each_problem_and_keeps_its_hard_limits(path: Pa
         for controller in all_of_them if name == first else ("lqr",) if large else ("koopman-mpc",):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", km.FitWarning)  # of models that were fitted to less than they need
-                built = CONTROLLERS[controller](parts, limits)
+                built = CONTROLLERS[controller].build(parts, limits)
             run = km.simulate(
                 parts.truth_of(name),
                 built,
@@ -140,12 +144,20 @@ def test_a_case_has_noise_and_broken_parts_of_its_own(tmp_path: Path):
     np.testing.assert_allclose(run.X[1], Prepared(problem).step_map(run.X[0], [0.0]))  # nothing has come through yet
 
 
-def _row(problem: km.Problem, case: str, controller: str, cost: float, violation: float = 0.0) -> RunRow:
+def _row(problem: km.Problem, case: str, controller: str, cost: float, share: float = 0.0) -> RunRow:
     figures = dict.fromkeys(("tracking_rmse", "final_error"), np.zeros(2))
     numbers = dict.fromkeys(("input_violation", "effort", "settling_time", "solve_time_p99", "solve_time_max"), 0.0)
     time = 1e-3 if controller == "nonlinear-mpc" else 1e-5
     measured = Metrics(
-        **figures, **numbers, cost=cost, violation=violation, solve_time_p50=time, late=0, status={}, fallback={}
+        **figures,
+        **numbers,
+        cost=cost,
+        violation=share,
+        violation_share=share,
+        solve_time_p50=time,
+        late=0,
+        status={},
+        fallback={},
     )
     return RunRow(problem.name, case, controller, measured)
 
@@ -158,30 +170,30 @@ def test_a_standing_is_the_worst_ratio_over_the_cases_in_which_the_model_is_the_
         _row(problem, case, "koopman-mpc", {"reach": 2.4}.get(case, 2.1) if case in plain else 900.0)
         for case in problem.cases
     ]
-    rows += [_row(problem, case, "lqr", 1.0, violation=0.3) for case in problem.cases]
+    rows += [_row(problem, case, "lqr", 1.0, share=0.3) for case in problem.cases]
     rows += [RunRow(problem.name, case, "bilinear-mpc") for case in problem.cases]
-    found = standings(rows, [problem])["van_der_pol"]
+    found = compute_standings(rows, [problem])["van_der_pol"]
     koopman = found["koopman-mpc"]
     assert (koopman.ratio, koopman.over, koopman.time) == (pytest.approx(1.2), False, pytest.approx(0.01))
     assert (str(found["lqr"]), str(found["bilinear-mpc"])) == ("0.5†", "lost")
-    assert best_learned(found) == "koopman-mpc"
-    assert "| `van_der_pol` | **1.2** | 0.5† | lost |" in markdown({"van_der_pol": found})
+    assert find_best_learned(found) == "koopman-mpc"
+    assert "| `van_der_pol` | **1.2** | 0.5† | lost |" in format_standings({"van_der_pol": found})
 
 
 def test_each_problem_of_the_list_has_its_number():
-    for name, found in measured().items():
-        assert best_learned(
+    for name, found in read_standings().items():
+        assert find_best_learned(
             found
-        ) is None or f"× the cost of {'nonlinear-mpc' if 'nonlinear-mpc' in found else BASELINE}" in in_words(name)
-    assert in_words("no such problem") == ""
+        ) is None or f"× the cost of {'nonlinear-mpc' if 'nonlinear-mpc' in found else BASELINE}" in describe_best(name)
+    assert describe_best("no such problem") == ""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(measured()))
+@pytest.mark.parametrize("name", sorted(read_standings()))
 def test_what_is_said_of_the_best_learned_controller_is_what_a_run_gives(name: str, tmp_path: Path):
-    problem, said = km.load_problem(FILES[name]), measured()[name]
-    best, baseline = best_learned(said), "nonlinear-mpc" if "nonlinear-mpc" in said else BASELINE
+    problem, said = km.load_problem(FILES[name]), read_standings()[name]
+    best, baseline = find_best_learned(said), "nonlinear-mpc" if "nonlinear-mpc" in said else BASELINE
     assert best is not None
     rows = km.sweep([replace(problem, scene=lambda x, u: [])], [best, baseline], folder=tmp_path)
     assert [row.failure for row in rows if row.failure] == []
-    assert standings(rows, [problem])[name][best].ratio == pytest.approx(said[best].ratio, rel=0.05)
+    assert compute_standings(rows, [problem])[name][best].ratio == pytest.approx(said[best].ratio, rel=0.05)

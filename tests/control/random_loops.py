@@ -86,8 +86,8 @@ def lifted(rng, A, B, nz, given):
     return km.LinearPredictor(whole, np.vstack([B, below]), C, lifting, 0.1, *names, **given)
 
 
-def loop(seed, solver=None, large=False, bilinear=False):
-    """Run the loop of a seed and return its Outcome."""
+def loop(seed, solver=None, large=False, bilinear=False, build=None):
+    """Run the loop of a seed, with the controller that `build` makes of its parts, and return its Outcome."""
     rng = np.random.default_rng(seed)
     nx, nu, N = int(rng.integers(1, 5)), int(rng.integers(1, 3)), int(rng.integers(1, 31))
     if large:
@@ -130,7 +130,8 @@ def loop(seed, solver=None, large=False, bilinear=False):
     try:
         if bilinear:
             options.pop("solver")
-        mpc = (km.BilinearMPC if bilinear else km.KoopmanMPC)(model, km.Cost(**weights), limits, N, **options)
+        build = build or (km.BilinearMPC if bilinear else km.KoopmanMPC)
+        mpc = build(model, km.Cost(**weights), limits, N, **options)
         path = goal * np.cos(0.2 * np.arange(STEPS + N + 3))[:, None] if moving else np.tile(goal, (STEPS + N + 3, 1))
         box, pending = limits.inputs(nu), [np.clip(np.zeros(nu), *limits.inputs(nu))] * options.get("latency", 0)
         most = FAR * (1 + np.abs(x).max())
@@ -198,7 +199,7 @@ if __name__ == "__main__":
     )
     given = parser.parse_args()
     if given.bilinear:
-        koopmpc.plants.routines.compiler = lambda: None
+        koopmpc.plants.routines.find_compiler = lambda: None
     seeds = range(given.first, given.first + given.count)
     found = outcomes_of(seeds, given.processes, given.solver, given.large, given.bilinear)
     sys.stdout.write("\n".join(table(found)) + "\n")

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from tests.control.kkt import CheckedOSQP
+from tests.control.kkt import CheckedDAQP, CheckedOSQP
 from tests.control.models import PRECISE, dense_plan, equilibrium, linear, random_pair, step_map
 from tests.control.oracle import oracle
 from tests.tiers import slow
@@ -390,6 +390,11 @@ def test_messages():
         (
             km.errors.DataError,
             r"OSQP refuses the problem or its settings \{.*'eps': 1\}: Unrecognized settings",
+            lambda: km.KoopmanMPC(model, cost, solver="osqp", settings={"eps": 1}),
+        ),
+        (
+            km.errors.DataError,
+            r"DAQP has no setting 'eps'; it has primal_tol, ",
             lambda: km.KoopmanMPC(model, cost, settings={"eps": 1}),
         ),
         (
@@ -418,10 +423,26 @@ def test_messages():
             call()
 
 
-def test_every_qp_was_checked():
-    before = CheckedOSQP.checked
+@pytest.mark.parametrize(("solver", "kind"), [("auto", CheckedDAQP), ("osqp", CheckedOSQP)])
+def test_every_qp_was_checked(solver, kind):
+    before = kind.checked
     A, B = UNSTABLE
-    mpc = km.KoopmanMPC(linear(A, B), km.Cost(1, 0.1), km.Limits(-0.2, 0.2), 8)
+    mpc = km.KoopmanMPC(linear(A, B), km.Cost(1, 0.1), km.Limits(-0.2, 0.2), 8, solver=solver)
     with warnings.catch_warnings():
         mpc([0.9, 0.5], [0, 0])
-    assert CheckedOSQP.checked == before + 1
+    assert kind.checked == before + 1
+
+
+def test_the_solver_asked_first_is_named_by_the_user_by_its_settings_or_by_the_rule():
+    A, B = UNSTABLE
+    make = lambda **o: km.KoopmanMPC(linear(A, B), km.Cost(1, 0.1), km.Limits(-0.2, 0.2), 8, **o)  # noqa: E731
+    for options, name in (
+        ({}, "daqp"),
+        ({"solver": "osqp"}, "osqp"),
+        ({"settings": {"max_iter": 200}}, "osqp"),
+        ({"settings": {"iter_limit": 200}}, "daqp"),
+        ({"settings": {"time_limit": 1.0}}, "daqp"),
+    ):
+        mpc = make(**options)
+        assert mpc.solver == name
+        assert mpc([0.9, 0.5], [0, 0]).solver == name

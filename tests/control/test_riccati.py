@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.control import riccati
-from koopmpc.control.riccati import Stage, _growth, iterate, leap, one_step, recursion, rooted, stationary
+from koopmpc.control.riccati import Stage, _growth, iterate, leap, one_step, recursion, stationary, sweep_backwards
 from tests.control.models import random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -308,7 +308,9 @@ def moved(stage, T):
 def test_roots_find_the_law_of_the_plain_recursion(nx, nu, rate):
     stage = stage_of(np.random.default_rng(nx), nx, nu, rate)
     for one, other in zip(
-        recursion([stage] * 15, stage.Q, stage.q), rooted([stage] * 15, stage.Q, stage.q), strict=True
+        recursion([stage] * 15, stage.Q, stage.q),
+        sweep_backwards([stage] * 15, stage.Q, stage.q, rooted=True),
+        strict=True,
     ):
         assert other == pytest.approx(one, rel=1e-9, abs=1e-9 * np.abs(one).max())
 
@@ -359,7 +361,7 @@ def test_an_input_that_costs_nothing_is_refused_in_any_units():
     for unit in (1e-9, 1.0, 1e9):
         stage = Stage(np.eye(2), unit * np.array([[1.0, 1.0], [0.0, 0.0]]), np.eye(2), None, np.zeros((2, 2)))
         with pytest.raises(km.errors.DefinitenessError, match="raise R"):
-            rooted([stage] * 3, stage.Q, np.zeros((2, 1)))
+            sweep_backwards([stage] * 3, stage.Q, np.zeros((2, 1)), rooted=True)
 
 
 def test_a_slow_loop_takes_few_steps_for_most_are_taken_by_doubling(monkeypatch):

@@ -15,8 +15,8 @@ from koopmpc.control.nonlinear.stagewise import (
     RiccatiSweeps,
     interior_step,
     linearisation,
+    list_sides,
     plan_cost,
-    sides,
     simulation,
     unconstrained,
     weights,
@@ -182,7 +182,7 @@ def test_stages_with_rates_hold_the_last_input_and_soft_changes_and_are_weighed_
 @each_kind
 def test_the_sides_are_the_finite_ends_and_cost_half_of_what_the_limits_cost(kind):
     problem = PROBLEMS[kind]
-    found = sides(problem)
+    found = list_sides(problem)
     low, high = (np.concatenate([problem.inputs[i], problem.box[i]]) for i in (0, 1))
     linear, quadratic = (np.concatenate([np.full(2, first), problem.softness[i]]) for i, first in ((0, np.inf), (1, 0)))
     size = np.concatenate([problem.input_sizes, problem.softness.allowance / SOFTENED])
@@ -207,7 +207,7 @@ class Dense:
     def __init__(self, kind: str, seed: int) -> None:
         self.problem, rng = PROBLEMS[kind], np.random.default_rng(seed)
         problem = self.problem
-        self.N, self.nx, self.ng, self.s = len(problem.free), problem.nx, len(problem.box.low), sides(problem)
+        self.N, self.nx, self.ng, self.s = len(problem.free), problem.nx, len(problem.box.low), list_sides(problem)
         N, nx, ns, nsoft = self.N, self.nx, len(self.s.row), self.s.soft
         roots = rng.standard_normal((N, nx, nx))
         self.A, self.B = rng.standard_normal((N, nx, nx)), rng.standard_normal((N, nx, 2)) * problem.free[:, None, None]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.control import terminal_cost
-from koopmpc.control.terminal_cost import believed_steps, held, tail_stage
+from koopmpc.control.terminal_cost import believed_steps, stop_growing_modes, tail_stage
 from tests.bare import shown
 from tests.control.models import Told, linear, random_pair, step_map
 
@@ -300,7 +300,7 @@ def test_only_modes_that_grow_and_that_no_input_moves_are_held(seed, nc, nu, siz
     units = np.diag(10.0 ** rng.uniform(-abs(size), abs(size), n))
     T = units @ np.linalg.qr(rng.normal(size=(n, n)))[0]
     A, B = T @ A @ np.linalg.inv(T), T @ B
-    still = held(A, B)
+    still = stop_growing_modes(A, B)
     before, after = np.linalg.eigvals(A), np.linalg.eigvals(still)
     expected = np.concatenate([np.linalg.eigvals(Ac), np.exp([1j * turn, -1j * turn]), [1, -1, 0.8]])
     for value in expected:

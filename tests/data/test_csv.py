@@ -160,16 +160,44 @@ def test_what_is_no_table_is_refused(tmp_path: Path, content: str, error: type[E
         km.load_episodes(text(tmp_path / "log.csv", content))
 
 
-def test_a_changed_file_of_our_own_is_refused(tmp_path: Path) -> None:
-    file = text(tmp_path / "log.csv", "t,x,u\n0,1,2\n1,2,3\n2,3,4\n")
-    km.load_episodes(file).save(tmp_path / "own.csv")
-    lines = (tmp_path / "own.csv").read_text().splitlines()
-    text(tmp_path / "own.csv", "\n".join([*lines[:3], *lines[4:]]))
-    with pytest.raises(
-        km.errors.LogError,
-        match="holds no episodes that can be read: it has 2 rows of 3, and they are not those that were written",
-    ):
-        km.load_episodes(tmp_path / "own.csv")
+def test_a_saved_table_is_plain_and_keeps_names_roles_and_dt_whatever_the_names(tmp_path: Path) -> None:
+    runs = [km.Episode(X=np.full((2, 2), k), U=[[k]], W=[[-k]]) for k in (0.1, 7.0)]
+    data = km.Episodes(runs, 1 / 30, ["u1 [m]", "index"], ["position [m], left"], ["w [N]"])
+    data.save(tmp_path / "own.csv")
+    assert (tmp_path / "own.csv").read_text().splitlines()[:3] == [
+        'episode,step,time [s],u1 [m],index,"position [m], left",w [N]',
+        "0,0,0.0,0.1,0.1,0.1,-0.1",
+        f"0,1,{1 / 30!r},0.1,0.1,,",
+    ]
+    assert km.load_episodes(tmp_path / "own.csv") == data
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        {"states": ["step"]},
+        {"states": ["time [s]"]},
+        {"states": [" padded"]},
+        {"states": ["1.5"]},
+        {"disturbances": ["wind [N]"]},
+        {"inputs": ["w1"]},
+    ],
+)
+def test_a_name_that_a_plain_table_would_not_keep_is_refused(tmp_path: Path, names: dict[str, list[str]]) -> None:
+    data = km.Episodes([km.Episode(X=[[0], [1]], U=[[0]], W=[[0]])], 0.1, **names)
+    ((name,),) = names.values()
+    with pytest.raises(km.errors.DataError, match=rf"a \.csv file would not keep the name {re.escape(repr(name))}"):
+        data.save(tmp_path / "own.csv")
+    assert not any(tmp_path.iterdir())
+    if name != "step":
+        data.save(tmp_path / "own.parquet")
+        assert km.load_episodes(tmp_path / "own.parquet") == data
+
+
+def test_a_table_with_a_checksum_of_an_earlier_edition_is_refused(tmp_path: Path) -> None:
+    file = text(tmp_path / "own.csv", "# koopmpc.episodes rows=2 crc32=00000000 {}\nepisode,step,x\n0,0,1\n0,1,2\n")
+    with pytest.raises(km.errors.LogError, match=r"it is of an edition before 0\.1\.0, with a checksum"):
+        km.load_episodes(file)
 
 
 def table(tmp_path: Path, cells: list[str], header: str = "t,x,v,u") -> Path:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.data.sampling import Signals, episodes_from, resampled, restarts, sample_time
-from koopmpc.data.tables import Told, _numbered, _plausible, label, roles
+from koopmpc.data.files.sampling import Signals, episodes_from, resampled, restarts, sample_time
+from koopmpc.data.files.tables import TableSettings, _numbered, _plausible, find_roles, is_label
 from koopmpc.errors import ColumnWarning
 
 
@@ -54,31 +54,51 @@ def test_a_step_back_in_time_begins_a_part_and_one_to_another_time_than_the_firs
     assert [part.rows.tolist() for part in restarts(signals([4.0, 4.0, 5.0]), "f")] == [[1, 2, 3]]
 
 
+def on_grid(part, dt):
+    return said(lambda: resampled([part], dt, "f"))[0]
+
+
 def test_states_are_interpolated_and_inputs_held_on_a_grid_from_the_first_time():
-    (part,) = resampled(signals([3, 4, 4, 5, 6], X=[0, 10, 99, 30, 40], U=[1, 2, 3, 4, 5]), 0.5)
+    (part,) = on_grid(signals([3, 4, 4, 5, 6], X=[0, 10, 99, 30, 40], U=[1, 2, 3, 4, 5]), 0.5)
     np.testing.assert_allclose(part.time, np.arange(3, 6.1, 0.5))
     np.testing.assert_allclose(part.X[:, 0], [0, 5, 10, 20, 30, 35, 40])
     np.testing.assert_array_equal(part.U[:, 0], [1, 1, 2, 2, 4, 4, 5])  # of rows at one time the first counts
     np.testing.assert_array_equal(part.W, part.U)
     np.testing.assert_array_equal(part.rows, [1, 1, 2, 2, 4, 4, 5])
-    (part,) = resampled(signals([0, 1, 2]), 0.75)
+    (part,) = on_grid(signals([0, 1, 2]), 0.75)
     np.testing.assert_allclose(part.time, [0, 0.75, 1.5])
 
 
 def test_resampling_leaves_missing_rows_out_and_cuts_at_gaps():
     """A gap is more than 1.5 times the median step, and more than 1.5 times dt."""
     time = np.array([0, 1, 2, 3.4, 4.4, 6.0, 7.0, 8.0, 20.0, 30.0, 31.0])
-    found = resampled(signals(time), 0.5)
+    found = on_grid(signals(time), 0.5)
     assert [part.rows.tolist()[0] for part in found] == [1, 6, 10]
     assert [part.rows.tolist()[-1] for part in found] == [4, 8, 11]  # a row alone is no part
-    assert [part.rows.tolist()[0] for part in resampled(signals(time), 1.2)] == [1, 10]
+    assert [part.rows.tolist()[0] for part in on_grid(signals(time), 1.2)] == [1, 10]
     holes = signals([0, 1, 2, 3, 4], X=[0, 1, np.nan, 3, 4])
-    (part,) = resampled(holes, 2.0)  # 2 is no gap for a dt of 2
+    (part,) = on_grid(holes, 2.0)  # 2 is no gap for a dt of 2
     np.testing.assert_allclose(part.X[:, 0], [0, 2, 4])
     late = signals([0, 1, np.nan, 3, 4])
-    assert [part.rows.tolist()[-1] for part in resampled(late, 1.0)] == [2, 5]
-    assert resampled(signals([1.0]), 1.0) == []
-    assert resampled(signals([1.0, 2.0], X=[np.nan, 1.0]), 1.0) == []
+    assert [part.rows.tolist()[-1] for part in on_grid(late, 1.0)] == [2, 5]
+    assert on_grid(signals([1.0]), 1.0) == []
+    assert on_grid(signals([1.0, 2.0], X=[np.nan, 1.0]), 1.0) == []
+
+
+def test_what_resampling_cuts_and_leaves_out_is_told():
+    def words(*parts, dt=1.0):
+        return said(lambda: resampled(list(parts), dt, "f"))[1]
+
+    assert words(signals(np.arange(6))) == words(signals([0, 1, 2.2, 3.1, 4, 4.9])) == []
+    uneven = signals([0, 1, 2, 3.9, 5, 6])
+    (said_of_gaps,) = words(uneven, signals(np.arange(4), first=7))
+    assert said_of_gaps.startswith("f: 1 gaps (after row 3) cut 2 episodes into 3; 0 of 10 rows are lost")
+    assert said_of_gaps.endswith("a gap is a step between complete rows of more than 1.5 times the usual one")
+    empty = signals(np.arange(6), X=[0, 1, np.nan, 3, 4, 5])
+    assert words(empty)[0].startswith("f: 1 gaps (after row 2) cut 1 episodes into 2; 1 of 6 rows are lost")
+    left_out = "f: 1 of 6 rows have an empty cell or repeat a time; they were left out before resampling"
+    assert words(empty, dt=2.0) == [left_out]  # a step of 2 is no gap for a dt of 2
+    assert words(signals([0, 1, 2, 2, 3, 4])) == [left_out]
 
 
 def test_episodes_end_at_gaps_and_what_is_lost_is_counted():
@@ -129,12 +149,12 @@ NAMES = {
 @pytest.mark.parametrize(("role", "name"), [(role, name) for role, names in NAMES.items() for name in names])
 def test_a_name_says_what_a_column_is(role, name):
     names = ["x", name]
-    found = roles(names, names, Told(), "f")
+    found = find_roles(names, names, TableSettings(), "f")
     held = getattr(found, role)
     assert held == name if role in ("time", "episode") else name in held
     others = {other for other in NAMES if other != role}
     assert not any(name == getattr(found, other) or name in (getattr(found, other) or ()) for other in others)
-    assert label(name) == (role in ("time", "episode"))
+    assert is_label(name) == (role in ("time", "episode"))
     assert found.guessed
     assert found.values == found.states + found.inputs + found.disturbances
 
@@ -144,45 +164,45 @@ def test_a_name_says_what_a_column_is(role, name):
 )
 def test_a_unit_of_time_is_a_number_of_seconds(unit, scale):
     for name in (f"time [{unit}]", f"time( {unit} )"):
-        assert roles(["x", name], ["x", name], Told(), "f").scale == scale
+        assert find_roles(["x", name], ["x", name], TableSettings(), "f").scale == scale
 
 
 def test_the_first_of_two_columns_of_time_counts_and_what_is_told_is_not_guessed():
     names = ["time", "t", "run", "trial", "x", "u", "w", "step", "note"]
     numbers = names[:-1]
-    found = roles(names, numbers, Told(), "f")
+    found = find_roles(names, numbers, TableSettings(), "f")
     assert (found.time, found.episode, found.step) == ("time", "run", "step")
     assert (found.states, found.inputs, found.disturbances) == (("t", "trial", "x"), ("u",), ("w",))
-    found = roles(names, numbers, Told(states=["x"], inputs=["u"]), "f")
+    found = find_roles(names, numbers, TableSettings(states=["x"], inputs=["u"]), "f")
     assert (found.states, found.inputs, found.disturbances, found.guessed) == (("x",), ("u",), (), False)
-    found = roles(names, numbers, Told(states=["time", "step", "run"]), "f")
+    found = find_roles(names, numbers, TableSettings(states=["time", "step", "run"]), "f")
     assert (found.time, found.episode, found.step) == ("t", "trial", None)
     assert (found.states, found.inputs, found.guessed) == (("time", "step", "run"), ("u",), True)
-    found = roles(names, numbers, Told(inputs=["w"]), "f")
+    found = find_roles(names, numbers, TableSettings(inputs=["w"]), "f")
     assert (found.inputs, found.disturbances) == (("w",), ())
     assert found.states == ("t", "trial", "x", "u")
-    found = roles(names, numbers, Told(disturbances=["u"], inputs=[]), "f")
+    found = find_roles(names, numbers, TableSettings(disturbances=["u"], inputs=[]), "f")
     assert (found.inputs, found.disturbances, "u" in found.states) == ((), ("u",), False)
 
 
 def test_two_columns_of_one_name_are_refused_where_they_would_be_guessed_from():
     names = ["x", "x", "v", "u"]
     with pytest.raises(km.errors.DataError, match="f has two columns 'x'; rename one"):
-        roles(names, names, Told(), "f")
+        find_roles(names, names, TableSettings(), "f")
     with pytest.raises(km.errors.DataError, match="f has two columns 'x'; its columns are x, x, v, u"):
-        roles(names, names, Told(states=["x"], inputs=["u"]), "f")
-    assert roles(names, names, Told(states=["v"], inputs=["u"]), "f").states == ("v",)
+        find_roles(names, names, TableSettings(states=["x"], inputs=["u"]), "f")
+    assert find_roles(names, names, TableSettings(states=["v"], inputs=["u"]), "f").states == ("v",)
     with pytest.raises(km.errors.DataError, match="f has two columns 'x'; rename one"):
-        roles(names, names, Told(states=["v"]), "f")
+        find_roles(names, names, TableSettings(states=["v"]), "f")
 
 
 def test_what_a_caller_knows_is_nothing_only_where_all_of_it_is():
-    assert Told().nothing
-    assert not Told(dt=0.1).nothing
-    assert Told(states=["a"], inputs=["b"], disturbances=["c"]).columns == {"a", "b", "c"}
+    assert TableSettings().nothing
+    assert not TableSettings(dt=0.1).nothing
+    assert TableSettings(states=["a"], inputs=["b"], disturbances=["c"]).columns == {"a", "b", "c"}
     for name in ("dt", "resample"):
         with pytest.raises(km.errors.DataError, match=f"{name} is -1 s"):
-            Told(**{name: -1.0})
+            TableSettings(**{name: -1.0})
 
 
 @pytest.mark.parametrize(
@@ -228,7 +248,8 @@ def test_more_rows_than_memory_holds_are_refused_before_they_are_made(tmp_path, 
     for free, fits in ((1.01 * needed, True), (0.99 * needed, False), (None, True)):
         monkeypatch.setattr("koopmpc.disk.memory", lambda free=free: free)
         if fits:
-            assert len(km.load_episodes(tmp_path / "log.csv", resample=0.01)) == 3
+            with pytest.warns(km.FitWarning, match=r"1 gaps \(after row 2\) cut 2 episodes into 3; 0 of 6 rows"):
+                assert len(km.load_episodes(tmp_path / "log.csv", resample=0.01)) == 3
         else:
             with pytest.raises(
                 km.errors.DataError, match=r"resample=0.01 makes 1.1e\+03 rows of 2 columns, 3.52e-05 GB"

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.data.formats import row_groups
+from koopmpc.data.files.parquet import split_groups
 from koopmpc.data.source import Changed, Part, Subset, source_of
 from tests.bare import shown
 from tests.example_plants import brute_force, random_episodes
@@ -46,9 +46,9 @@ def test_small_files_share_a_part_and_large_ones_do_not(tmp_path: Path, monkeypa
     source = km.data.Files(folder_of(tmp_path, sets()))
     assert [str(part) for part in source.parts()] == [f"{tmp_path}/0.npz and 3 files after it"]
     size = (tmp_path / "0.npz").stat().st_size
-    monkeypatch.setattr("koopmpc.data.storage._PART", 2 * size)
+    monkeypatch.setattr("koopmpc.data.files.folder._PART", 2 * size)
     assert [len(part.load()) for part in source.parts()] == [4, 4]
-    monkeypatch.setattr("koopmpc.data.storage._PART", 10)
+    monkeypatch.setattr("koopmpc.data.files.folder._PART", 10)
     assert [str(part) for part in source.parts()] == [str(tmp_path / f"{i}.npz") for i in range(4)]
 
 
@@ -222,9 +222,10 @@ def test_row_groups_hold_each_pair_once_in_order(
         rng = np.random.default_rng(seed)
         data = km.Episodes([km.Episode(X=e.X, U=e.U, W=rng.normal(size=(len(e), 1))) for e in data], 0.1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("koopmpc.data.formats._GROUP", 8 * rows * (5 + disturbed))
+        patch.setattr("koopmpc.data.files.parquet._GROUP", 8 * rows * (5 + disturbed))
         data.save(tmp_path / "a.parquet")
-    parts = row_groups(tmp_path / "a.parquet", history, None)
+        patch.setattr("koopmpc.data.files.parquet._LARGE", 0)
+        parts = split_groups(tmp_path / "a.parquet", history, None)
     assert parts is not None
     for part in parts:
         assert sum(map(len, part.load())) <= rows + history + 1
@@ -234,10 +235,10 @@ def test_row_groups_hold_each_pair_once_in_order(
 
 def test_a_folder_cuts_its_large_files_and_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sets = [random_episodes(i, [n, n], 2, 1) for i, n in enumerate((20, 3000, 20))]
-    monkeypatch.setattr("koopmpc.data.formats._GROUP", 64_000)
+    monkeypatch.setattr("koopmpc.data.files.parquet._GROUP", 64_000)
     for i, one in enumerate(sets):
         one.save(tmp_path / f"{i}.parquet")
-    monkeypatch.setattr("koopmpc.data.storage._LARGE", 20_000)
+    monkeypatch.setattr("koopmpc.data.files.parquet._LARGE", 20_000)
     source = km.data.Files(tmp_path)
     parts = source.parts()
     assert ["(rows " in str(part) for part in parts] == [False, True, True, True, True, False]
@@ -270,9 +271,9 @@ def test_files_that_cannot_be_cut_are_read_whole_and_damage_is_named(
     data = random_episodes(0, [50], 2, 1)
     a, b, c, d, e = (tmp_path / f"{name}.parquet" for name in "abcde")
     data.save(a)
-    monkeypatch.setattr("koopmpc.data.storage._LARGE", 0)
+    monkeypatch.setattr("koopmpc.data.files.parquet._LARGE", 0)
     pq.write_table(pa.table({"time": [0.0, 0.1, 0.2], "x": [1.0, 2.0, 3.0], "u": [0.0, 1.0, 0.0]}), b)
-    assert row_groups(b, 0, None) is None
+    assert split_groups(b, 0, None) is None
     assert [len(one) for part in km.data.Files(b).parts() for one in part.load()] == [2]
     c.write_bytes(b"no table")
     with pytest.raises(km.errors.LogError, match=r"c\.parquet"):
@@ -320,7 +321,8 @@ def test_a_row_group_that_was_changed_is_told_wherever_the_change_is(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    monkeypatch.setattr("koopmpc.data.formats._GROUP", 8 * 5 * 16)  # sixteen rows of five columns
+    monkeypatch.setattr("koopmpc.data.files.parquet._GROUP", 8 * 5 * 16)  # sixteen rows of five columns
+    monkeypatch.setattr("koopmpc.data.files.parquet._LARGE", 0)
     data = random_episodes(0, [20, 7, 12, 10], 2, 1)  # 53 rows: three blocks and five rows
     data.save(tmp_path / "whole.parquet")
     table = pq.read_table(tmp_path / "whole.parquet")
@@ -336,6 +338,6 @@ def test_a_row_group_that_was_changed_is_told_wherever_the_change_is(
             pq.write_table(changed, tmp_path / "changed.parquet", row_group_size=16)
             with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
                 km.load_episodes(tmp_path / "changed.parquet")
-            parts = row_groups(tmp_path / "changed.parquet", 0, None)
+            parts = split_groups(tmp_path / "changed.parquet", 0, None)
             with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
                 parts[row // 16].load()

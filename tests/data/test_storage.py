@@ -66,7 +66,7 @@ def test_a_parquet_file_is_a_table_for_other_tools(tmp_path: Path) -> None:
     assert table["u0 [N m]"].to_pylist() == [u for run in data for u in [*run.U[:, 0].tolist(), None]]
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", SUFFIXES[:2])
 def test_a_cut_file_is_refused(tmp_path: Path, suffix: str) -> None:
     file = tmp_path / f"data{suffix}"
     random_episodes([5, 5], 2, 1, 0).save(file)
@@ -104,6 +104,15 @@ def test_foreign_contents_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", X=np.zeros((3, 1)))
     with pytest.raises(km.errors.LogError, match="it is of another program: it holds X, and lacks U, steps, about"):
         km.load_episodes(tmp_path / "other.npz")
+
+
+def test_a_parquet_file_of_an_edition_without_checksums_is_refused(tmp_path: Path) -> None:
+    random_episodes([3], 1, 1, 0).save(tmp_path / "old.parquet")
+    table = pq.read_table(tmp_path / "old.parquet")
+    named = {key: value for key, value in table.schema.metadata.items() if key == b"koopmpc.episodes"}
+    pq.write_table(table.replace_schema_metadata(named), tmp_path / "old.parquet")
+    with pytest.raises(km.errors.LogError, match=r"it is of an edition before 0\.1\.0, without checksums"):
+        km.load_episodes(tmp_path / "old.parquet")
 
 
 def test_no_pickle_is_opened(tmp_path: Path) -> None:

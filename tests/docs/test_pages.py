@@ -17,6 +17,7 @@ ELSEWHERE = {  # pages whose claims are tested beyond what they print, and where
     "faults.md": "tests/bench/test_docs.py",
     "how/gymnasium.md": "tests/test_docs_plants.py",
     "how/own_step_function.md": "tests/test_docs_plants.py",
+    "how/peers.md": "tests/predict/test_peers.py",
     "identification.md": "tests/test_docs_identification.py",
     "offset_free.md": "tests/estimate/test_docs.py",
     "on_the_machine.md": "tests/test_docs_on_the_machine.py",

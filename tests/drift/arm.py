@@ -90,7 +90,7 @@ def controllers(m: np.ndarray, seed: int = 0, noise: float = 0.0) -> dict:
     online = km.OnlineEDMD.start(train, LIFTING, forgetting=0.98)
     return {
         "told": Told(m, seed, noise),
-        "adaptive": km.control.Adaptive(km.KoopmanMPC(model, COST, LIMITS, HORIZON), online),
+        "adaptive": km.supervise.Adaptive(km.KoopmanMPC(model, COST, LIMITS, HORIZON), online),
         "fixed": km.KoopmanMPC(model, COST, LIMITS, HORIZON),
         "offset-free": km.KoopmanMPC(model, COST, LIMITS, HORIZON, estimator=km.LiftedDisturbance()),
     }

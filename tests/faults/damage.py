@@ -12,8 +12,9 @@ import numpy as np
 
 import koopmpc as km
 from koopmpc.bench.store import Journal, RunRow, record_of, write_results
-from koopmpc.recording.page import Curves, Page, record_curves
-from koopmpc.synthesis.designed import SavedDesign, saved_controller
+from koopmpc.page import Curves, Page
+from koopmpc.recording.curves import record_curves
+from koopmpc.synthesis.designed import SavedDesign, read_controller
 from tests.recording.runs import make_run
 from tests.synthesis.test_design import usual
 
@@ -43,7 +44,7 @@ def controller() -> km.KoopmanMPC:
 def saved(path: Path) -> Any:
     """Return what is in the file of a controller or a design, of which a controller was made."""
     km.load_controller(path)
-    return saved_controller(path)
+    return read_controller(path)
 
 
 @cache
@@ -122,7 +123,6 @@ READERS: dict[str, tuple[Callable[[], Any], Callable[[Path], Any]]] = {
     "controller.npz": (lambda: controller().as_data(), saved),
     "design.npz": (lambda: SavedDesign(usual().controller.as_data(), usual().evidence), saved),
     "episodes.npz": (episodes, km.load_episodes),
-    "episodes.csv": (episodes, km.load_episodes),
     "episodes.parquet": (episodes, km.load_episodes),
     "run.rrd": (lambda: make_run(T=60), km.load_run),
     "rows.jsonl": (lambda: texts(rows()), lambda path: texts(Journal(path).rows.values())),

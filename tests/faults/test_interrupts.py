@@ -17,7 +17,7 @@ import pytest
 import rerun as rr
 
 import koopmpc as km
-from koopmpc.cli.ending import kept
+from koopmpc.interrupts import clean_folder
 from tests.bench.tiny import write
 from tests.faults.test_controllers import BUILD, controllers, models  # noqa: F401  # fixtures
 
@@ -185,7 +185,7 @@ def test_an_interrupt_in_the_last_iteration_of_a_solve_is_raised() -> None:
 
     from osqp import ext_builtin
 
-    from koopmpc.control.solvers.osqp import _uninterrupted
+    from koopmpc.control.solvers.osqp import _solve_uninterrupted
 
     library = CDLL(ext_builtin.__file__)
 
@@ -196,8 +196,8 @@ def test_an_interrupt_in_the_last_iteration_of_a_solve_is_raised() -> None:
         library.osqp_end_interrupt_listener()
 
     with pytest.raises(KeyboardInterrupt):
-        _uninterrupted(solve)
-    _uninterrupted(lambda: (library.osqp_start_interrupt_listener(), library.osqp_end_interrupt_listener()))
+        _solve_uninterrupted(solve)
+    _solve_uninterrupted(lambda: (library.osqp_start_interrupt_listener(), library.osqp_end_interrupt_listener()))
 
 
 @pytest.mark.parametrize(("kind", "method"), [(threading.Thread, "start"), (rr.RecordingStream, "set_sinks")])
@@ -288,7 +288,7 @@ def test_a_command_ends_at_once_with_one_line_and_whole_files(
 def test_an_interrupt_while_the_program_begins_to_listen_ends_it_with_one_line() -> None:
     code = """
 import os, signal, threading
-from koopmpc.cli.ending import ENDING
+from koopmpc.interrupts import ENDING
 threading.Thread.start = lambda _: os.kill(os.getpid(), signal.SIGINT)
 with ENDING:
     print("entered")
@@ -298,13 +298,13 @@ with ENDING:
 
 
 def test_what_was_kept_is_said_and_half_files_go(tmp_path: Path) -> None:
-    assert kept(None) == "nothing was written"
+    assert clean_folder(None) == "nothing was written"
     folder = tmp_path / "logs"
     (folder / "pictures").mkdir(parents=True)
-    assert kept(folder) == "nothing was written"
+    assert clean_folder(folder) == "nothing was written"
     assert not folder.exists()
     folder.mkdir()
     for name in ("a.rrd", "b.rrd", "results.parquet", ".c.rrd.1234.part"):
         (folder / name).write_text("x")
-    assert kept(folder) == f"kept in {folder}: 2 finished runs, results.parquet"
+    assert clean_folder(folder) == f"kept in {folder}: 2 finished runs, results.parquet"
     assert not list(folder.glob(".*"))

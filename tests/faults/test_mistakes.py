@@ -52,8 +52,8 @@ def stateful(model):
         "filtered": km.KoopmanMPC(model, cost, limits, 8, estimator=km.LiftedKalman(model.states)),
         "BilinearMPC": km.BilinearMPC(PLANT, cost, limits, 5),
         "NonlinearMPC": km.NonlinearMPC(PLANT, cost, limits, 3),
-        "Adaptive": km.control.Adaptive(km.KoopmanMPC(model, cost, limits, 8), online),
-        "Guarded": km.control.Guarded(watched, km.LQR(model, cost)),
+        "Adaptive": km.supervise.Adaptive(km.KoopmanMPC(model, cost, limits, 8), online),
+        "Guarded": km.supervise.Guarded(watched, km.LQR(model, cost)),
         "plant": km.plants.SimulatedPlant(PLANT),
     }
     return found | {f"observer of {name}": found[name].observer for name in ("KoopmanMPC", "estimated", "filtered")}
@@ -213,7 +213,7 @@ def test_a_class_is_no_controller_and_no_plant():
 
 
 def test_a_model_whose_cost_overflows_makes_no_controller(model):
-    with pytest.raises(km.errors.DataError, match=r"grows beyond all numbers in \d+ steps"):
+    with pytest.raises(km.errors.DataError, match=r"forecast overflows within \d+ steps"):
         km.KoopmanMPC(replace(model, A=np.full_like(model.A, 1e49)), km.Cost(Q=[1.0, 1.0], R=1.0), km.Limits(-1, 1), 20)
 
 
@@ -294,5 +294,7 @@ def test_a_function_is_told_how_to_become_a_plant():
     with pytest.raises(km.errors.DataError, match=r"km.black_box\(f, dt=…, states=…, inputs=…\)"):
         km.collect(tank, km.Uniform(0, 1), km.Noise(0, 1), episodes=1, steps=2)
     plant = km.black_box(tank, dt=0.1, states=["level [m]"], inputs=["inflow [m³/s]"])
-    with pytest.raises(km.errors.DataError, match=r"the step map .* has no nx, measure; .* a Plant is one as it is"):
+    with pytest.raises(
+        km.errors.DataError, match=r"the step map .* has no nx, measure; .* pass a Plant without a wrapper"
+    ):
         km.plants.SimulatedPlant(plant)

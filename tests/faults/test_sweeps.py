@@ -120,7 +120,7 @@ def test_twenty_workers_killed_at_random_lose_nothing_of_what_was_finished(probl
     done = 0
     while process.poll() is None and done < kills:
         time.sleep(rng.uniform(0.05, 0.6))
-        found = subprocess.run(["pgrep", "-P", str(process.pid), "-f", "spawn_main"], capture_output=True, text=True)
+        found = subprocess.run(["pgrep", "-P", str(process.pid), "-f", "popen_loky"], capture_output=True, text=True)
         workers = list(map(int, found.stdout.split()))
         if workers and once_each(folder):
             os.kill(int(rng.choice(workers)), signal.SIGKILL)

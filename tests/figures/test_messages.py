@@ -59,7 +59,7 @@ MISTAKES = [
         r"the plane is asked for state 'd'; the states are a \[m\], b",
         lambda: planes(0, ("a", "d"), SQUARE),
     ),
-    (DATA, r"asked for b \[m/s\] twice; name two states", lambda: planes(0, ("b", 1), SQUARE)),
+    (DATA, r"both axes of the plane are b \[m/s\]; name two different states", lambda: planes(0, ("b", 1), SQUARE)),
     (
         DATA,
         r"the range of a \[m\] is 1 to -1; pass \(low, high\)",
@@ -67,10 +67,10 @@ MISTAKES = [
     ),
     (SHAPE, r"at has shape \(2,\), expected \(3,\)", lambda: planes(0, (0, 1), SQUARE, [0, 0])),
     (DATA, r"there is no eigenfunction 3; the predictor has 0 … 2", lambda: planes(3, (0, 1), SQUARE)),
-    (DATA, "which names no eigenfunction", lambda: planes([], (0, 1), SQUARE)),
+    (DATA, "which is empty; pass the index of an eigenfunction", lambda: planes([], (0, 1), SQUARE)),
     (
         DATA,
-        r"eigenfunction 2 is 0 on all of the plane; hold the other states",
+        r"eigenfunction 2 is 0 on the whole plane; fix the other states",
         lambda: planes([0, 2], (0, 1), SQUARE),
     ),
     (
@@ -84,7 +84,7 @@ MISTAKES = [
         lambda: km.plot.eigenfunctions(turning(), 0, ("x", 1), SQUARE),
     ),
     (SHAPE, r"residuals has shape \(3,\), expected \(2,\)", lambda: km.plot.spectrum(turning(), [0, 0, 0])),
-    (DATA, "residuals holds -1; they are norms, from 0 on", lambda: km.plot.spectrum(turning(), [0, -1])),
+    (DATA, "residuals holds -1; residuals are norms, 0 or above", lambda: km.plot.spectrum(turning(), [0, -1])),
     (
         SHAPE,
         "there are 2 residuals and 4 eigenvalues; pass the residuals of this",
@@ -105,7 +105,7 @@ def test_a_mistake_says_what_was_got_and_what_to_do(error: Any, text: str, mista
 
 
 def test_a_picture_that_cannot_be_written_is_told(tmp_path: Path) -> None:
-    with pytest.raises(DATA, match=r"a\.gif is no picture by its name; end it with one of \.png, \.pdf"):
+    with pytest.raises(DATA, match=r"a\.gif does not end like a picture; end it with one of \.png, \.pdf"):
         km.plot.save(Figure(), tmp_path / "a.gif")
     (tmp_path / "file").write_text("")
     with pytest.raises(km.errors.LogError, match=r"cannot be written: .*; pass another path"):

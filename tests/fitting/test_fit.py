@@ -15,7 +15,7 @@ import koopmpc.fitting.fit
 from koopmpc.bench.store import RESULTS
 from koopmpc.cli.app import app
 from koopmpc.fitting.fit import fit_data
-from koopmpc.fitting.repair import divided, guessed, needed, shortened
+from koopmpc.fitting.repair import describe_guesses, divide_files, find_repairs, shorten_notes
 from tests.bench.tiny import write
 
 
@@ -59,13 +59,13 @@ def few(monkeypatch):
         tried += [km.synthesis.Candidate("squares", tried[1].lifting, bilinear=True)] * bilinear
         return [one.bind(episodes.states, episodes.inputs) for one in tried]
 
-    monkeypatch.setattr("koopmpc.synthesis.select.usual", usual)
+    monkeypatch.setattr("koopmpc.synthesis.select.propose_candidates", usual)
 
 
 @pytest.fixture
 def quick(few, monkeypatch):
     """Draw and record nothing either."""
-    monkeypatch.setattr(koopmpc.fitting.fit, "drawn", lambda *_: [])
+    monkeypatch.setattr(koopmpc.fitting.fit, "list_pictures", lambda *_: [])
     monkeypatch.setattr(koopmpc.fitting.fit, "record_model", lambda *_, **__: None)
 
 
@@ -149,7 +149,7 @@ def test_the_report_is_of_episodes_that_no_fit_saw(tmp_path):
 
 @pytest.mark.usefixtures("quick")
 def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path, monkeypatch):
-    monkeypatch.setattr("koopmpc.data.storage._PART", 1)
+    monkeypatch.setattr("koopmpc.data.files.folder._PART", 1)
     data = cart_pole(24)
     for i in range(12):
         data[2 * i : 2 * i + 2].save(tmp_path / "in" / f"{i:02d}.npz")
@@ -188,7 +188,7 @@ def test_one_long_log_is_cut_into_blocks_and_that_is_said(tmp_path):
 def test_columns_that_say_nothing_are_left_out_and_wrapped_angles_unwrapped_and_that_is_said(
     tmp_path, monkeypatch, memory
 ):
-    monkeypatch.setattr("koopmpc.data.storage._PART", 1)
+    monkeypatch.setattr("koopmpc.data.files.folder._PART", 1)
     for i, e in enumerate(cart_pole(24)):
         turning = e.X[:, 1] + 0.1 * np.arange(len(e.X))
         wrapped = (turning + np.pi) % (2 * np.pi) - np.pi
@@ -215,7 +215,7 @@ def test_columns_that_say_nothing_are_left_out_and_wrapped_angles_unwrapped_and_
 def test_data_in_which_nothing_moves_are_refused():
     still = km.Episodes([km.Episode(X=np.ones((9, 2)), U=np.zeros((8, 0)))], 0.1)
     with pytest.raises(km.errors.DataError, match="no state moves"):
-        needed(still)
+        find_repairs(still)
 
 
 @pytest.mark.usefixtures("quick")
@@ -294,10 +294,10 @@ def test_a_mistake_gives_one_message_and_exit_code_2(tmp_path, monkeypatch, argu
 def test_roles_that_names_alone_tell_are_said_to_be_guessed(tmp_path):
     folder = write_csv(cart_pole(1, steps=5), tmp_path / "csv", header="time [s],x,theta,v,omega,inflow")
     cart_pole(1, steps=5).save(tmp_path / "own.csv")
-    (sentence,) = guessed([folder / "00.csv"], {})
+    (sentence,) = describe_guesses([folder / "00.csv"], {})
     assert "guessed from their names; --inputs u,v and --states a,b say it" in sentence
-    assert guessed([folder / "00.csv"], {"inputs": ["inflow"]}) == []
-    assert guessed([tmp_path / "own.csv"], {}) == guessed([tmp_path / "own.npz"], {}) == []
+    assert describe_guesses([folder / "00.csv"], {"inputs": ["inflow"]}) == []
+    assert describe_guesses([tmp_path / "own.csv"], {}) == describe_guesses([tmp_path / "own.npz"], {}) == []
 
 
 def test_states_and_inputs_may_be_told(tmp_path, monkeypatch, quick):
@@ -315,7 +315,7 @@ def test_states_and_inputs_may_be_told(tmp_path, monkeypatch, quick):
 def test_too_little_data_is_told(tmp_path):
     cart_pole(2, steps=20).save(tmp_path / "data.npz")
     with pytest.raises(km.errors.DataError, match="too few of 22 steps"):
-        divided(km.data.Files(tmp_path / "data.npz"), 20, np.random.default_rng(0), 10**9)
+        divide_files(km.data.Files(tmp_path / "data.npz"), 20, np.random.default_rng(0), 10**9)
 
 
 @pytest.mark.usefixtures("quick")
@@ -337,7 +337,7 @@ def test_what_files_have_in_common_is_said_once_and_no_column_of_one_file_is_jud
 
 def test_of_notes_that_differ_from_file_to_file_the_first_are_shown_and_the_others_counted(tmp_path):
     files = [tmp_path / f"{i}.csv" for i in range(9)]
-    short = shortened([*(f"{file}: gap {i}" for i, file in enumerate(files)), "of all: one"], files)
+    short = shorten_notes([*(f"{file}: gap {i}" for i, file in enumerate(files)), "of all: one"], files)
     assert short[:2] == [f"{files[0]}: gap 0", f"{files[1]}: gap 1"]
     assert short[6:] == ["of all: one", "3 more files have notes of their own; load_episodes shows them"]
 
@@ -359,7 +359,7 @@ def test_logs_are_audited_and_what_is_safe_is_done_and_said(tmp_path):
     )
     assert re.search(r"! input delay: force acts 3 steps late; models that see 3 steps of the past are", told[0])
     assert max(np.abs(e.X[:, 1]).max() for e in found.held_out) < 20
-    assert divided(km.data.Files(tmp_path / "in"), 10, np.random.default_rng(0), 10**9).delay == 3
+    assert divide_files(km.data.Files(tmp_path / "in"), 10, np.random.default_rng(0), 10**9).delay == 3
 
 
 @pytest.mark.usefixtures("quick")

@@ -1,5 +1,10 @@
 """From logs and a goal to a controller and its check: the files, the verdicts, and what a goal file must not say."""
 
+import re
+import shlex
+import tomllib
+from dataclasses import replace
+from inspect import Parameter, signature
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +15,10 @@ import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.control.base import MPCBase
 from koopmpc.fitting.check import RunKind, check_controller
-from koopmpc.fitting.goal import design_data, goal_template, read_goal
+from koopmpc.fitting.goal import design_data, format_template, load_reading, read_goal, write_template
+from koopmpc.fitting.repair import read_logs
+from koopmpc.predict.base import load_value, save_value
+from koopmpc.synthesis.designed import SavedDesign
 
 A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])
 NAMES = ("position [m]", "speed [m/s]"), ("force [N/kg]",)
@@ -66,6 +74,115 @@ def test_inputs_that_only_the_goal_file_names_are_inputs(tmp_path, monkeypatch):
     assert written.exit_code == 0
     found = design_data(".", "goal.toml", "out", bilinear=False).design.controller
     assert (found.predictor.states, found.predictor.inputs) == (NAMES[0], ("pump [V]",))
+
+
+def tank_logs(folder, files=4, rows=300, glitch=None):
+    """Write logs of a tank: level and temperature by inflow and heater, beside the set-point of an old controller.
+
+    Of the second file the row number `glitch` has a level of 999.99.
+    """
+    rng = np.random.default_rng(0)
+    folder.mkdir()
+    for number in range(files):
+        level, warmth, lines = rng.uniform(60, 120), rng.uniform(20, 30), []
+        for k in range(rows):
+            if k % 15 == 0:
+                inflow, heater, target = rng.uniform([0, 0, 60], [10, 5, 150])
+            seen = level + rng.normal(0, 0.02), warmth + rng.normal(0, 0.005)
+            if (number, k) == (1, glitch):
+                seen = 999.99, seen[1]
+            lines.append([1.001 * k, *seen, inflow, heater, target])
+            level += 1.001 * (0.4 * inflow - 0.2 * np.sqrt(level))
+            warmth += 1.001 * (0.05 * heater - 0.01 * (warmth - 15))
+        head = "time [s],level [cm],temperature [degC],inflow [l/s],heater [kW],setpoint [cm]"
+        np.savetxt(folder / f"{number}.csv", lines, delimiter=",", header=head, comments="", fmt="%.4f")
+
+
+def test_the_line_that_a_template_prints_designs_with_all_that_the_template_was_told(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tank_logs(tmp_path / "csv")
+    told = "--states level,temperature --inputs inflow,heater --resample 1 --horizon 8 --linear --name tank"
+    result = CliRunner().invoke(app, ["fit", "csv", *told.split(), "--goal-template"])
+    assert result.exit_code == 0, result.output
+    line = shlex.split(result.stdout.partition("then: ")[2])
+    result = CliRunner().invoke(app, line[line.index("fit") :])
+    assert result.exit_code == 0, result.output
+    (file,) = (tmp_path / "logs").glob("*-tank/controller.npz")
+    controller = km.load_controller(file)
+    assert controller.predictor.states == ("level [cm]", "temperature [degC]")
+    assert controller.predictor.inputs == ("inflow [l/s]", "heater [kW]")
+    assert (controller.dt, tomllib.loads(Path("goal.toml").read_text())["horizon"]) == (1.0, 8)
+    assert isinstance(controller.predictor, km.LinearPredictor)
+
+
+@pytest.mark.parametrize("how", ["", "--resample 1"])
+def test_an_outlier_is_named_by_file_line_and_value_and_is_in_no_range(tmp_path, monkeypatch, how):
+    monkeypatch.chdir(tmp_path)
+    tank_logs(tmp_path / "csv", glitch=150)
+    file = Path("csv/1.csv")
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join(["# plant A", *lines[:20], "", *lines[20:]]))
+    number = 1 + next(i for i, line in enumerate(file.read_text().splitlines()) if "999.99" in line)
+    reading = {"states": ["level", "temperature"], "inputs": ["inflow", "heater"]}
+    if how:
+        reading["resample"] = 1.0
+    split = read_logs("csv", 10, np.random.default_rng(0), 10**9, reading)
+    named = [note for note in split.notes if f"csv/1.csv, line {number}" in note]
+    assert named
+    assert all("level = 999.99 cm" in note for note in named)
+    assert not any("row " in note for note in named)
+    for data in (split.seen, split.held_out):
+        assert max(episode.X[:, 0].max() for episode in data) < 260
+        assert all(episode.origin is None for episode in data)
+    told = f"--states level,temperature --inputs inflow,heater {how}"
+    assert CliRunner().invoke(app, ["fit", "csv", *told.split(), "--goal-template"]).exit_code == 0
+    (line,) = re.findall("level.*in the data from .* to (.*)", Path("goal.toml").read_text())
+    assert float(line) < 260
+
+
+def test_a_goal_file_keeps_every_keyword_that_reads_the_logs_and_a_call_replaces_one(tmp_path, monkeypatch):
+    given = {
+        "dt": 0.5,
+        "states": ["level [cm]", 'a "quoted" \\ name'],
+        "inputs": [],
+        "disturbances": ["rain"],
+        "resample": 2,
+    }
+    keywords = {p.name for p in signature(km.load_episodes).parameters.values() if p.kind is Parameter.KEYWORD_ONLY}
+    assert given.keys() == keywords
+    path = tmp_path / "goal.toml"
+    path.write_text(format_template(logs(4), horizon=7, reading=given))
+    assert load_reading(path) == given
+    assert read_goal(path, logs(4)).horizon == 7
+    asked = {}
+
+    def stop(*arguments):
+        asked.update(arguments[4])
+        raise km.KoopmpcError("read")
+
+    monkeypatch.setattr("koopmpc.fitting.goal.read_logs", stop)
+    with pytest.raises(km.KoopmpcError, match="read"):
+        design_data("logs", path, tmp_path, dt=0.25, inputs=None)
+    assert asked == given | {"dt": 0.25}
+    for wrong, words in (
+        ("logs = 3", "logs is 3; write a section"),
+        ("[logs]\nresampel = 1", "has 'resampel'.*resample"),
+    ):
+        path.write_text(wrong)
+        with pytest.raises(km.KoopmpcError, match=words):
+            load_reading(path)
+
+
+def test_a_goal_file_keeps_the_step_that_an_uneven_clock_was_brought_to(tmp_path):
+    data, rng = logs(), np.random.default_rng(0)
+    for i, episode in enumerate(data):
+        times = 0.1 * (np.arange(40) + rng.uniform(-0.1, 0.1, 40))
+        rows = np.column_stack([times, episode.X[:-1], episode.U])
+        np.savetxt(tmp_path / f"{i}.csv", rows, delimiter=",", header="time [s],x,v,force", comments="")
+    (tmp_path / "goal.toml").write_text(write_template(tmp_path))
+    step = load_reading(tmp_path / "goal.toml")["resample"]
+    assert step == pytest.approx(0.1, rel=0.05)
+    assert f"steps of {step:g} s" in (tmp_path / "goal.toml").read_text()
 
 
 def goal_of(text, tmp_path):
@@ -164,7 +281,7 @@ def test_a_controller_without_evidence_cannot_be_checked(tmp_path):
 
 def test_the_template_is_a_goal_file_with_the_ranges_of_the_logs(tmp_path):
     data = logs()
-    text = goal_template(data)
+    text = format_template(data)
     goal = goal_of(text, tmp_path)
     U = np.concatenate([episode.U for episode in data])
     np.testing.assert_allclose(goal.limits.inputs(1), [[U.min()], [U.max()]], rtol=1e-2)
@@ -270,3 +387,19 @@ def test_the_check_exits_with_1_where_the_goal_is_not_kept(tmp_path, monkeypatch
     result = CliRunner().invoke(app, ["check", str(made.controller), "--runs", "1"])
     assert result.exit_code == 1, result.output
     assert "THE GOAL IS NOT KEPT" in result.stdout
+
+
+def test_a_check_judges_by_the_cost_of_the_design_with_its_target_inputs_and_input_changes(made, tmp_path):
+    """Σ ‖u − c‖² over T steps has the second difference 2 T in c; Σ ‖u_k − u_{k−1}‖² is charged on top."""
+    saved = load_value(made.controller, SavedDesign)
+
+    def checked_cost(**weights):
+        asked = replace(saved.evidence.asked, cost=km.Cost(Q=[0, 0], R=1.0, **weights))
+        save_value(replace(saved, evidence=replace(saved.evidence, asked=asked)), tmp_path / "design.npz")
+        return check_controller(tmp_path / "design.npz", tmp_path, runs=1).figures[0].cost
+
+    zero, one, two = (checked_cost(u_target=[c]) for c in (0.0, 1.0, 2.0))
+    assert two - 2 * one + zero == pytest.approx(2 * saved.evidence.asked.steps)
+    changes = checked_cost(u_target=[0.0], R_delta=1.0) - zero
+    assert changes > 0
+    assert checked_cost(u_target=[0.0], R_delta=3.0) - zero == pytest.approx(3 * changes)

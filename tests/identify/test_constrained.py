@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.fits.constrained import violation
-from koopmpc.identify.fits.prior import entries_of
+from koopmpc.identify.fits.constrained import largest_violation
+from koopmpc.identify.fits.prior import build_entries
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
 from tests.roundtrip import returned
 
@@ -311,22 +311,24 @@ def test_a_violation_is_how_far_a_combination_lies_outside_its_limits(share: flo
     A, B = np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[5.0], [6.0]])
     total = 1.0 * A[0, 1] - 2 * A[1, 0] + 3 * B[1, 0]
     each = km.identify.Combination(total - share, total - share + 1, A=[[0, 1], [-2, 0]], B=[[0], [3]])
-    own = violation(km.identify.Prior(combinations=[each]), A, B, np.ones(3))
+    own = largest_violation(km.identify.Prior(combinations=[each]), A, B, np.ones(3))
     assert own == pytest.approx(max(-share, share - 1, 0.0), abs=1e-12)
 
 
 def test_a_violation_of_symmetry_and_of_dissipation_is_relative_to_what_is_there() -> None:
     A, B = np.array([[1.0, 0.5], [0.3, 0.2]]), np.zeros((2, 1))
     for size in (1e-6, 1.0, 1e6):
-        own = violation(km.identify.Prior(symmetric=True), size * A, B, np.ones(3))
+        own = largest_violation(km.identify.Prior(symmetric=True), size * A, B, np.ones(3))
         assert own == pytest.approx(0.2)
         contraction = km.identify.Prior(dissipation=km.identify.Dissipation(np.diag([2.0, 1.0]) / size**2, decay=0.9))
         L = np.diag(np.sqrt([2.0, 1.0]))  # in units of the sizes and of the largest energy
         M = np.block([[0.81 * L @ L / 2, (L @ A).T / np.sqrt(2)], [L @ A / np.sqrt(2), np.eye(2)]])
-        found = violation(contraction, A, B, np.array([size, size, 1.0]))
+        found = largest_violation(contraction, A, B, np.array([size, size, 1.0]))
         assert found == pytest.approx(-np.linalg.eigvalsh(M)[0], rel=1e-9)
     assert (
-        violation(km.identify.Prior(dissipation=km.identify.Dissipation(np.eye(2))), 0.5 * np.eye(2), B, np.ones(3))
+        largest_violation(
+            km.identify.Prior(dissipation=km.identify.Dissipation(np.eye(2))), 0.5 * np.eye(2), B, np.ones(3)
+        )
         == 0
     )
 
@@ -335,7 +337,7 @@ PSI, U = ("a [m]", "b [m/s]"), ("u [N]", "v [N]", "w")
 
 
 def entries(**parts):
-    return entries_of(km.identify.Prior(**parts), PSI, U)
+    return build_entries(km.identify.Prior(**parts), PSI, U)
 
 
 def test_without_parts_all_is_free():
@@ -414,11 +416,11 @@ def test_what_fits_is_taken():
         combinations=[km.identify.Combination(0, 0, B=np.ones((2, 3)))],
         dissipation=km.identify.Dissipation(np.eye(2), C=np.ones((3, 2)), D=np.eye(3)),
     )
-    for prior, coupled in (
+    for prior, couples in (
         (km.identify.Prior(), False),
         (km.identify.Prior(lower_A=0.0, rows={"a": {}}), False),
         (km.identify.Prior(symmetric=True), True),
         (km.identify.Prior(combinations=[km.identify.Combination(0, 1, A=np.eye(2))]), True),
         (km.identify.Prior(dissipation=km.identify.Dissipation(np.eye(2))), True),
     ):
-        assert prior.coupled == coupled
+        assert prior.couples_rows == couples

@@ -185,7 +185,7 @@ def test_bad_input_is_refused_in_a_sentence(one):
     with pytest.raises(km.KoopmpcError, match="too short to hold its last quarter out"):
         km.identify.eigenfunctions(km.Episodes([km.Episode(X=one[0].X[:2])], 0.01), QUARTIC)
     (H,) = km.identify.eigenfunctions(one, QUARTIC)
-    with pytest.raises(km.KoopmpcError, match="φ is of 2 states, and there are 3"):
+    with pytest.raises(km.KoopmpcError, match="φ is a function of 2 states, got 3"):
         H.bind(("a", "b", "c"))
 
 

@@ -99,7 +99,7 @@ def test_what_it_cannot_take_is_told():
     told = shown('show(lambda: km.identify.kernel_edmd(km.Episodes([km.Episode(X=np.ones((5, 2)))], 0.1), "cubic"))')
     assert told == ['DataError kernel is \'cubic\'; pass "polynomial" or "gaussian"']
     still = km.Episodes([km.Episode(X=np.ones((5, 2)))], 0.1)
-    with pytest.raises(km.errors.DataError, match="all one state"):
+    with pytest.raises(km.errors.DataError, match="all landmarks are the same state"):
         km.identify.kernel_edmd(still)
 
 

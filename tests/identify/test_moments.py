@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.moments.rows import ROWS, chunks, lifted_chunks, row_columns
+from koopmpc.identify.moments.rows import ROWS, lift_chunks, row_columns, split_chunks
 from koopmpc.identify.solve import solve
 from tests.identify.plants import brute_force, random_episodes
 
@@ -41,7 +41,7 @@ def test_moments_are_the_products_of_the_rows_of_each_episode(
 @given(LENGTHS, st.integers(1, 7), st.integers(0, 999))
 def test_chunks_hold_each_pair_once_in_order(lengths: list[int], rows: int, seed: int) -> None:
     data = random_episodes(seed, lengths, 2, 1)
-    pieces = chunks(data, rows)
+    pieces = split_chunks(data, rows)
     assert all(sum(p.last - p.first for p in chunk) == rows for chunk in pieces[:-1])
     pairs = [(p.episode, k) for chunk in pieces for p in chunk for k in range(p.first, p.last)]
     assert pairs == [(i, k) for i, length in enumerate(lengths) for k in range(length)]
@@ -50,7 +50,7 @@ def test_chunks_hold_each_pair_once_in_order(lengths: list[int], rows: int, seed
 def test_lifted_chunks_hold_the_rows_of_all_pairs() -> None:
     data = random_episodes(0, [500, 1, 2000, 30], 2, 1)
     lifting = km.State().bind(data.states)
-    every = lifted_chunks(data, row_columns(lifting, data.inputs, bilinear=False))
+    every = lift_chunks(data, row_columns(lifting, data.inputs, bilinear=False))
     assert np.array_equal(np.vstack([chunk.pairs() for chunk in every]), brute_force(data, lifting))
 
 

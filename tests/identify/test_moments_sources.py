@@ -30,7 +30,7 @@ def sets() -> list[km.Episodes]:
 
 @pytest.fixture
 def folder(tmp_path: Path, sets: list[km.Episodes], monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr("koopmpc.data.storage._PART", 10)
+    monkeypatch.setattr("koopmpc.data.files.folder._PART", 10)
     monkeypatch.setattr("koopmpc.data.source._PART", 10)
     for i, one in enumerate(sets):
         one.save(tmp_path / f"{i}.npz")
@@ -105,7 +105,7 @@ def test_a_stream_that_is_read_once_is_summed_in_qr_unless_told(sets: list[km.Ep
 def test_a_folder_that_turns_out_worse_than_its_pilot_is_read_again_in_qr(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("koopmpc.data.storage._PART", 10)
+    monkeypatch.setattr("koopmpc.data.files.folder._PART", 10)
     for i in range(8):  # the pilot reads 0, 2, 5 and 7
         data = random_episodes(i, [200], 2, 0)
         X = np.array(data[0].X)
@@ -240,6 +240,6 @@ def test_weights_that_do_not_fit_are_refused() -> None:
     with pytest.raises(km.errors.DataError, match="all weights are 0; give some pair a weight above 0"):
         km.moments.second_moments(data, km.State(), weights=[0.0, 0.0])
     with pytest.raises(
-        km.errors.DataError, match="weights are a list, which only Episodes have an order for; pass a function"
+        km.errors.DataError, match="weights are a list, which needs the order of Episodes; pass a function"
     ):
         km.moments.second_moments(km.data.Stream([data]), km.State(), weights=[1.0, 1.0])

@@ -163,7 +163,7 @@ def test_what_has_no_sound_form_is_refused() -> None:
     ):
         km.dmdc(few, rank=4, method="tls")
     dead = km.Episodes([km.Episode(X=[x, [0.5 * x[0], 0]]) for x in np.random.default_rng(0).random((20, 2))], 0.1)
-    with pytest.raises(km.errors.DataError, match=r"a direction of ψ.x. dies in one step"):
+    with pytest.raises(km.errors.DataError, match=r"a direction of ψ.x. decays to 0 in one step"):
         km.dmd(dead, method="fb")
     turned = random_episodes(5, [12], 3, 0)
     with pytest.raises(km.errors.DataError, match="no real square root"):

@@ -7,7 +7,7 @@ from scipy.linalg import eigh
 
 import koopmpc as km
 from koopmpc.identify.fits import eigenfunctions as null_space
-from koopmpc.identify.fits.eigenfunctions import EigenfunctionRows, _sparsest, _turned, weights
+from koopmpc.identify.fits.eigenfunctions import EigenfunctionRows, _find_sparsest, _rotate_to_real, hold_weights
 
 DT = 0.1
 LIBRARY = km.State() + km.Monomials(2)
@@ -77,7 +77,7 @@ def matrices(value, data, velocities, by, constant=False):
 
 @pytest.mark.parametrize("a", [0.0, 1e-5, 9.99e-4, 1.001e-3, 0.3, -0.7, 3e-4 + 5e-4j, 0.2 + 3j])
 def test_the_weights_of_an_effect_are_those_of_quadrature(a):
-    np.testing.assert_allclose(weights(a / DT, DT), shares(a / DT), rtol=2e-9)
+    np.testing.assert_allclose(hold_weights(a / DT, DT), shares(a / DT), rtol=2e-9)
 
 
 @pytest.mark.parametrize("by", ["steps", "derivatives"])
@@ -133,7 +133,7 @@ def test_the_null_space_is_that_of_the_generalised_eigenvalue_problem(by, consta
     ):  # fmt: skip
         null = rows._null(complex(value), every, below, count)
         assert null.shape == (len(every), expected)
-        found = [rows._solved(complex(value), c) for c in null.T]
+        found = [rows._solve_effect(complex(value), c) for c in null.T]
         np.testing.assert_allclose([each.residual for each in found], least[:expected], rtol=1e-6)
         for each, exact in zip(found, best.T, strict=False):
             assert np.linalg.norm(rows.G @ each.c) == pytest.approx(1.0)
@@ -147,7 +147,7 @@ def test_the_null_space_is_that_of_the_generalised_eigenvalue_problem(by, consta
     assert not null[[1, 3]].any()
     own = eigh((M.conj().T @ M)[np.ix_(few, few)], (G.T @ G).astype(M.dtype)[np.ix_(few, few)])[0]
     if not constant:
-        assert rows._solved(complex(value), null).residual == pytest.approx(np.sqrt(own[0]), rel=1e-6)
+        assert rows._solve_effect(complex(value), null).residual == pytest.approx(np.sqrt(own[0]), rel=1e-6)
 
 
 @pytest.mark.parametrize("by", ["steps", "derivatives"])
@@ -227,9 +227,9 @@ def test_a_free_eigenvalue_is_refined_to_that_of_the_data(by, rate):
     xi = np.array([1, 1j, 0, 0, 0, 0]) / np.linalg.norm(rows.G[:, :2] @ [1, 1j])
     support = np.array([0, 1, 5])
     start = rate * (1 + 0.02j) + 0.01
-    kept, solved = rows._refined(start, support, xi, 1e-9, free=False)
+    kept, solved = rows._refine(start, support, xi, 1e-9, free=False)
     assert kept == start
-    value, refined = rows._refined(start, support, xi, 1e-9, free=True)
+    value, refined = rows._refine(start, support, xi, 1e-9, free=True)
     far = 1e-2 if by == "steps" else 0.8  # smooth inputs tell λ less, and five rounds do not end there
     assert abs(value - rate) < far * abs(start - rate)
     assert refined.residual < far * solved.residual
@@ -272,7 +272,7 @@ def test_a_growth_of_one_keeps_all_observables_and_all_terms_of_the_effect():
 
 def test_a_vector_is_turned_until_its_largest_entry_is_real():
     c = np.array([1.0 + 1j, -3j, 0.5])
-    turned = _turned(c)
+    turned = _rotate_to_real(c)
     assert turned[1] == pytest.approx(3.0)
     assert abs(np.vdot(turned, c)) == pytest.approx(np.linalg.norm(c) ** 2)
 
@@ -286,12 +286,12 @@ def test_sparse_vectors_are_found_in_the_span_of_their_mixtures():
         size = np.logspace(-2, 2, 30)[:, None]
         size[29] = 0.0  # an observable without a gradient
         mixed = planted @ rng.normal(size=(3, 3))
-        found = _sparsest(mixed, size)
+        found = _find_sparsest(mixed, size)
         assert len(found) == 3
         for own, v in zip(planted.T, found, strict=True):  # the sparsest first
             expected = own / np.where(size > 0, size, 1.0)[:, 0]
             assert abs(np.vdot(expected, v)) == pytest.approx(np.linalg.norm(expected) * np.linalg.norm(v), rel=1e-6)
-        (one,) = _sparsest(mixed[:, :1], size)
+        (one,) = _find_sparsest(mixed[:, :1], size)
         np.testing.assert_allclose(one * np.where(size > 0, size, 1.0)[:, 0], mixed[:, 0])
 
 

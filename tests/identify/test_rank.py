@@ -6,7 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.fits.edmd import kept_rank, known_factor, leading_directions, optimal_factor, truncation_loss
+from koopmpc.identify.fits.edmd import (
+    choose_rank,
+    known_noise_threshold,
+    leading_directions,
+    median_threshold,
+    truncation_loss,
+)
 from koopmpc.identify.solve import RegressionRows
 from tests.bare import shown
 from tests.identify.plants import one_step_pairs, random_episodes
@@ -16,18 +22,18 @@ LIFTING = km.Constant() + km.State() + km.Monomials(2)
 
 def test_the_factors_are_those_that_are_printed() -> None:
     # Gavish & Donoho 2014: λ(1) = 4/√3, ω(1) ≈ 2.858, and the cubic fit of ω, good to 0.02
-    assert known_factor(1.0) == pytest.approx(4 / np.sqrt(3), abs=1e-14)
-    assert optimal_factor(1.0) == pytest.approx(2.858, abs=5e-4)
+    assert known_noise_threshold(1.0) == pytest.approx(4 / np.sqrt(3), abs=1e-14)
+    assert median_threshold(1.0) == pytest.approx(2.858, abs=5e-4)
     for beta in np.linspace(0.02, 1, 50):
         cubic = 0.56 * beta**3 - 0.95 * beta**2 + 1.82 * beta + 1.43
-        assert optimal_factor(beta) == pytest.approx(cubic, abs=0.02)
+        assert median_threshold(beta) == pytest.approx(cubic, abs=0.02)
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(600, 600), (900, 90), (300, 600)])
 def test_the_median_is_that_of_noise(rows: int, columns: int) -> None:
     beta = min(rows, columns) / max(rows, columns)
     noise = np.random.default_rng(0).standard_normal((rows, columns)) / np.sqrt(max(rows, columns))
-    median = known_factor(beta) / optimal_factor(beta)
+    median = known_noise_threshold(beta) / median_threshold(beta)
     assert np.median(np.linalg.svd(noise, compute_uv=False)) == pytest.approx(median, rel=0.02)
 
 
@@ -54,8 +60,8 @@ def test_the_hard_threshold_is_that_of_all_singular_values_whether_given_or_zero
     every = np.array([20.0, 9.0, 0.3, 0.2, 0.1])
     s = np.pad(every, (0, 3))[:given_values]
     median = np.median(np.where(np.arange(5) < given_values, every, 0.0))
-    count, words = kept_rank("hard-threshold", s, samples=5, nz=40)
-    assert words.endswith(f"{optimal_factor(5 / 40) * median:.3g}")
+    count, words = choose_rank("hard-threshold", s, samples=5, nz=40)
+    assert words.endswith(f"{median_threshold(5 / 40) * median:.3g}")
     assert count == 2
 
 
@@ -172,18 +178,18 @@ def test_a_rank_that_cannot_be_kept_is_refused() -> None:
 @pytest.mark.parametrize("share", [0.0, 1.0, -0.1, 1.5])
 def test_a_share_of_energy_that_is_none_is_refused(share: float) -> None:
     with pytest.raises(km.errors.DataError, match=f"rank is {share:g}; .*a share of energy between 0 and 1"):
-        kept_rank(share, np.array([2.0, 1.0]), 9, 2)
+        choose_rank(share, np.array([2.0, 1.0]), 9, 2)
 
 
 @pytest.mark.parametrize(("share", "rank"), [(0.1, 1), (16 / 21, 1), (0.77, 2), (20 / 21, 2), (0.96, 3), (0.999, 3)])
 def test_the_least_number_of_directions_that_hold_the_share_is_kept(share: float, rank: int) -> None:
-    assert kept_rank(share, np.array([4.0, 2.0, 1.0]), 9, 3)[0] == rank
+    assert choose_rank(share, np.array([4.0, 2.0, 1.0]), 9, 3)[0] == rank
 
 
 def test_a_rank_is_at_most_the_number_of_observables() -> None:
-    assert kept_rank(2, np.ones(2), 9, 2) == (2, "")
+    assert choose_rank(2, np.ones(2), 9, 2) == (2, "")
     with pytest.raises(km.errors.DataError, match="rank is 3, but the lifting has 2 observables"):
-        kept_rank(3, np.ones(2), 9, 2)
+        choose_rank(3, np.ones(2), 9, 2)
 
 
 @pytest.mark.parametrize("decoded", [False, True])

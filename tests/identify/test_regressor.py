@@ -109,7 +109,7 @@ def test_it_stands_at_the_end_of_a_pipeline_and_clones():
         ({"n_inputs": 3}, "at least one must be a state"),
         ({"degree": 0}, "degree is 0"),
         ({"harmonics": -1}, "harmonics is -1"),
-        ({"lifting": "state"}, "is no lifting"),
+        ({"lifting": "state"}, "is not a lifting"),
     ],
 )
 def test_a_mistake_is_told_at_fit(parameters, words):

@@ -3,21 +3,21 @@
 import numpy as np
 import pytest
 
-from koopmpc.identify.fits.online import Gate, Rival
-from koopmpc.identify.moments.rows import Forgetting, Window, absorb, empty
+from koopmpc.identify.fits.online import OutlierGate, ShadowModel
+from koopmpc.identify.moments.rows import ForgettingMemory, WindowMemory, absorb, empty_factor
 
 K = np.array([[1.0, 2.0], [-0.5, 0.3]])  # t = Kᵀ r, of two regressors
 
 
 def factor(rows):
-    R = empty(rows.shape[1])
+    R = empty_factor(rows.shape[1])
     absorb(R, rows)
     return R
 
 
 def ready(nz=1, spread=0.0, size=1.0):
     """A gate that forecasts by K, with these mean squares, whose spread has been seen."""
-    gate = Gate(4, 2, nz)
+    gate = OutlierGate(4, 2, nz)
     rng = np.random.default_rng(0)
     r = rng.normal(size=(40, 2))
     gate.first(np.hstack([r, r @ K]))
@@ -34,7 +34,7 @@ def row(r, off=(0.0, 0.0)):
 def test_a_factor_that_forgets_is_that_of_the_weighted_rows(count, forgetting):
     rng = np.random.default_rng(1)
     blocks, waiting = [rng.normal(size=(count, 4)) for _ in range(6)], rng.normal(size=(3, 4))
-    memory = Forgetting(4, 2, forgetting, 1e-12)
+    memory = ForgettingMemory(4, 2, forgetting, 1e-12)
     for block in blocks:
         memory.push(block)
     rows = np.vstack([*blocks, waiting])
@@ -50,7 +50,7 @@ def test_a_factor_that_forgets_is_that_of_the_weighted_rows(count, forgetting):
 def test_a_direction_without_news_keeps_its_floor_and_what_it_says():
     rng = np.random.default_rng(2)
     r = rng.normal(size=(50, 2))
-    memory = Forgetting(4, 2, 0.8, 1e-4)
+    memory = ForgettingMemory(4, 2, 0.8, 1e-4)
     memory.push(np.hstack([r, r @ K]))
     most = np.abs(memory.R.diagonal()[:2]).copy()
     for _ in range(30):  # the second regressor is silent
@@ -66,7 +66,7 @@ def test_a_direction_without_news_keeps_its_floor_and_what_it_says():
 @pytest.mark.parametrize(("length", "block"), [(7, 3), (6, 3), (2, 4), (20, 5)])
 def test_a_window_is_the_factor_of_its_last_rows(length, block):
     rng = np.random.default_rng(3)
-    window, rows = Window(3, length, block), np.empty((0, 3))
+    window, rows = WindowMemory(3, length, block), np.empty((0, 3))
     for _ in range(12):
         new = rng.normal(size=(block, 3))
         window.push(new)
@@ -81,7 +81,7 @@ def test_a_window_is_the_factor_of_its_last_rows(length, block):
 
 def test_spreads_and_sizes_are_means_over_the_first_hundred_rows_and_fade_by_a_hundredth_after_them():
     rng = np.random.default_rng(4)
-    r, gate = rng.normal(size=(180, 2)), Gate(4, 2, 1)
+    r, gate = rng.normal(size=(180, 2)), OutlierGate(4, 2, 1)
     rows = np.hstack([r, r @ K + 0.1 * rng.normal(size=(180, 2))])
     gate.first(rows[:10])
     assert gate.begun
@@ -104,7 +104,7 @@ def test_spreads_and_sizes_are_means_over_the_first_hundred_rows_and_fade_by_a_h
 @pytest.mark.parametrize(("rows", "learned"), [(8, False), (9, True)])
 def test_forecasts_begin_after_four_rows_for_each_regressor(rows, learned):
     r = np.random.default_rng(0).normal(size=(rows, 2))
-    gate = Gate(4, 2, 1)
+    gate = OutlierGate(4, 2, 1)
     gate.first(np.hstack([r, r @ K]))
     gate.learn(factor(np.hstack([r, r @ K])))
     assert (gate.K is not None) == learned
@@ -144,21 +144,21 @@ def test_innovations_are_judged_once_twenty_have_been_seen():
 def test_without_forecasts_a_value_beyond_a_thousand_sizes_is_an_outlier_except_in_an_input():
     rng = np.random.default_rng(0)
     for column, off, kept in ((0, 999.0, 1), (0, 1001.0, 0), (2, 1001.0, 0), (3, -1001.0, 0), (1, 1e9, 1)):
-        gate = Gate(4, 2, 1)  # one observable, one input, two targets
+        gate = OutlierGate(4, 2, 1)  # one observable, one input, two targets
         gate.first(rng.choice([-1.0, 1.0], size=(40, 4)))
         one = np.ones((1, 4))
         one[0, column] = off
         assert gate.keep(one) == kept
-        few = Gate(4, 2, 1)  # twenty rows say nothing of their size yet
+        few = OutlierGate(4, 2, 1)  # twenty rows say nothing of their size yet
         few.first(rng.choice([-1.0, 1.0], size=(20, 4)))
         assert few.keep(one.copy()) == 1
-    gate = Gate(4, 2, 1)  # a column that has been zero has no size
+    gate = OutlierGate(4, 2, 1)  # a column that has been zero has no size
     gate.first(np.hstack([np.zeros((40, 1)), np.ones((40, 3))]))
     assert gate.keep(np.full((1, 4), 5.0)) == 1
 
 
 def test_a_far_value_counts_as_if_it_stood_at_a_thousand_sizes_while_it_is_not_judged():
-    gate = Gate(4, 2, 1)
+    gate = OutlierGate(4, 2, 1)
     gate.first(np.ones((99, 4)))
     far = np.ones((1, 4))
     far[0, 0] = 1e8
@@ -177,17 +177,17 @@ def test_kept_rows_move_to_the_front_in_their_order():
 def test_the_first_rows_are_compared_with_all_others():
     rows = np.ones((32, 4)) + 0.1 * np.random.default_rng(0).normal(size=(32, 4))
     rows[5, 0], rows[9, 3], rows[12, 1] = 1e4, -1e4, 1e9  # an observable, a target, an input
-    whole, gate = rows.copy(), Gate(4, 2, 1)
+    whole, gate = rows.copy(), OutlierGate(4, 2, 1)
     assert gate.first(rows) == 30
     kept = np.delete(whole, [5, 9], axis=0)
     np.testing.assert_array_equal(rows[:30], kept)
     np.testing.assert_allclose(gate._size, (kept**2).mean(axis=0))
     silent = np.zeros((32, 4))
     silent[3] = 1.0  # a column that was zero but once is no outlier
-    assert Gate(4, 2, 1).first(silent) == 32
+    assert OutlierGate(4, 2, 1).first(silent) == 32
     two = np.ones((32, 4))
     two[3:5, 0] = 1e4, 1.1e4  # two that agree are no accident
-    assert Gate(4, 2, 1).first(two) == 32
+    assert OutlierGate(4, 2, 1).first(two) == 32
 
 
 def test_signals_have_fallen_after_twenty_rows_in_sequence_below_a_hundredth():
@@ -207,9 +207,9 @@ def test_signals_have_fallen_after_twenty_rows_in_sequence_below_a_hundredth():
     assert not gate.fell
 
 
-def test_a_rival_is_judged_by_means_over_the_second_half():
+def test_a_shadow_model_is_judged_by_means_over_the_second_half():
     rng = np.random.default_rng(0)
-    rival, first = Rival(Forgetting(4, 2, 0.9, 0.01), 2, 10.0), 1.5 * K
+    rival, first = ShadowModel(ForgettingMemory(4, 2, 0.9, 0.01), 2, 10.0), 1.5 * K
     pushed, errors, squares = [], [], []
     for k in range(33):  # blocks of three: 99 rows of a period of 100
         r = rng.normal(size=(3, 2))
@@ -229,10 +229,10 @@ def test_a_rival_is_judged_by_means_over_the_second_half():
 
 
 @pytest.mark.parametrize(("noise", "takes_over"), [((0.1, 0.1), True), ((0.3, 0.1), True), ((0.1, 4.0), False)])
-def test_a_rival_must_be_twice_as_good_in_one_column_and_no_worse_in_the_others(noise, takes_over):
+def test_a_shadow_model_must_be_twice_as_good_in_one_column_and_no_worse_in_the_others(noise, takes_over):
     """The first factor is off by half a unit in the first column, and exact in the second."""
     rng = np.random.default_rng(0)
-    rival = Rival(Forgetting(4, 2, 0.95, 0.01), 2, 10.0)
+    rival = ShadowModel(ForgettingMemory(4, 2, 0.95, 0.01), 2, 10.0)
     first = K + np.array([0.5, 0.0])
     answers = []
     for _ in range(100):
@@ -244,13 +244,13 @@ def test_a_rival_must_be_twice_as_good_in_one_column_and_no_worse_in_the_others(
     assert any(answers) == takes_over
 
 
-def test_a_rival_needs_both_forecasts():
+def test_a_shadow_model_needs_both_forecasts():
     rng = np.random.default_rng(0)
-    rival = Rival(Forgetting(4, 2, 0.9, 0.01), 2, 10.0)
+    rival = ShadowModel(ForgettingMemory(4, 2, 0.9, 0.01), 2, 10.0)
     for _ in range(150):
         r = rng.normal(size=(1, 2))
         assert not rival.push(np.hstack([r, r @ K]), None)
-    silent = Rival(Forgetting(4, 2, 0.9, 0.01), 2, 10.0)
+    silent = ShadowModel(ForgettingMemory(4, 2, 0.9, 0.01), 2, 10.0)
     assert not any(silent.push(np.zeros((1, 4)), K) for _ in range(150))
 
 
@@ -267,8 +267,8 @@ def test_a_rival_needs_both_forecasts():
         ([1.0, 1.0], [0.0, 0.0], 1.1e6, False),
     ],
 )
-def test_when_a_rival_is_better(first, second, size, better):
-    rival = Rival(Forgetting(4, 2, 0.9, 0.01), 2, 10.0)
+def test_when_a_shadow_model_is_better(first, second, size, better):
+    rival = ShadowModel(ForgettingMemory(4, 2, 0.9, 0.01), 2, 10.0)
     rival.rows, rival._judged = 99, 10**12  # the last row of a period changes no mean
     rival._errors, rival.size = np.array([first, second]), np.full(4, size)
     r = np.random.default_rng(0).normal(size=(20, 2))
@@ -278,18 +278,18 @@ def test_when_a_rival_is_better(first, second, size, better):
 
 
 @pytest.mark.parametrize(("off", "takes_over"), [(0.0012, True), (0.0008, False)])
-def test_a_rival_takes_over_where_the_first_factor_is_off_by_more_than_a_thousandth(off, takes_over):
+def test_a_shadow_model_takes_over_where_the_first_factor_is_off_by_more_than_a_thousandth(off, takes_over):
     rng, K = np.random.default_rng(0), np.array([[1.0], [-0.5]])
-    rival = Rival(Forgetting(3, 2, 0.9, 0.01), 2, 10.0)
+    rival = ShadowModel(ForgettingMemory(3, 2, 0.9, 0.01), 2, 10.0)
     first = K * (1 + off)  # t is forecast as (1 + off) t: off by this share of it
     answers = [rival.push(np.hstack([r, r @ K]), first) for r in rng.normal(size=(200, 1, 2))]
     assert any(answers) == takes_over
 
 
-def test_a_rival_judges_by_the_second_half_of_each_of_its_periods():
+def test_a_shadow_model_judges_by_the_second_half_of_each_of_its_periods():
     rng, K = np.random.default_rng(0), np.array([[1.0], [-0.5]])
     for begin, takes_over in ((0, False), (50, True)):  # where the first factor is off
-        rival = Rival(Forgetting(3, 2, 0.9, 0.01), 2, 10.0)
+        rival = ShadowModel(ForgettingMemory(3, 2, 0.9, 0.01), 2, 10.0)
         answers = [
             rival.push(np.hstack([r, r @ K]), K * (1 + 0.1 * (begin <= k % 100 < begin + 50)))
             for k, r in enumerate(rng.normal(size=(300, 1, 2)))

@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.identify.fits.edmd import _root_next_to
-from koopmpc.identify.regression import read, relative_misfit, scale_factor
+from koopmpc.identify.fits.edmd import _nearest_root
+from koopmpc.identify.regression import compute_scale_factor, read_regression, relative_misfit
 from koopmpc.identify.solve import (
     RegressionRows,
-    about_means,
-    cutoff,
-    norms,
-    onto,
-    orthonormal,
-    path,
-    rule,
+    centre_products,
+    column_norms,
+    describe_solve,
+    orthonormal_basis,
+    project_onto,
+    rounding_cutoff,
+    scale_to_unit_norm,
     scaled_rank,
     solve,
-    unit,
+    solve_path,
 )
 from tests.identify.plants import random_episodes
 
@@ -45,7 +45,7 @@ def shrunk(rows, ridge, light=()):
 def test_each_ridge_of_a_path_is_the_least_squares_of_its_own_penalty(constant):
     rows = rows_of(constant=constant)
     ridges = (1e-3, 0.0, 2.0)
-    for ridge, found in zip(ridges, path(rows, ridges), strict=True):
+    for ridge, found in zip(ridges, solve_path(rows, ridges), strict=True):
         np.testing.assert_allclose(found.K, shrunk(rows, ridge), rtol=1e-7, atol=1e-10)
         assert (found.rank, found.ridge) == (4, ridge)
         np.testing.assert_allclose(found.K, solve(rows, ridge=ridge).K)
@@ -66,7 +66,7 @@ def test_unscaled_columns_shrink_by_the_ridge_itself_and_are_cut_by_their_own_si
 @pytest.mark.parametrize(("m", "n", "samples"), [(30, 4, 30), (30, 4, 1000), (3, 8, 3)])
 def test_the_cut_is_rounding_of_so_many_numbers(m, n, samples):
     rows = rows_of(m=m, n=n, samples=samples)
-    assert cutoff(rows) == EPS * max(samples, n)
+    assert rounding_cutoff(rows) == EPS * max(samples, n)
 
 
 def test_a_direction_below_the_cut_takes_the_minimum_norm():
@@ -90,20 +90,20 @@ def test_the_residual_counts_what_lies_outside_the_rows():
 
 def test_leading_targets_and_some_regressors_are_the_same_rows():
     rows = rows_of(nt=3, constant=2, rest=1.0)
-    few = rows.leading(2)
+    few = rows.keep_targets(2)
     np.testing.assert_array_equal(few.T, rows.T[:, :2])
     np.testing.assert_array_equal(few.rest, rows.rest[:2])
     for columns, constant in (([3, 2], 1), ([0, 1], None), ([2], 0)):
-        part = rows.part(np.array(columns))
+        part = rows.keep_regressors(np.array(columns))
         np.testing.assert_array_equal(part.P, rows.P[:, columns])
         assert part.constant == constant
-    assert rows_of().part(np.array([0, 1])).constant is None
+    assert rows_of().keep_regressors(np.array([0, 1])).constant is None
 
 
 def test_rows_about_their_means_are_deviations_and_what_does_not_move_is_zero():
     rows = rows_of(constant=1, rest=0.0)
     rows.P[:, 2], rows.T[:, 0] = 7.0, -2.0
-    about = rows.centred()
+    about = rows.subtract_means()
     assert about.constant is None
     expected = rows.P - rows.P.mean(axis=0)
     expected[:, [1, 2]] = 0.0
@@ -111,12 +111,12 @@ def test_rows_about_their_means_are_deviations_and_what_does_not_move_is_zero():
     np.testing.assert_array_equal(about.P[:, [1, 2]], 0.0)
     np.testing.assert_array_equal(about.T[:, 0], 0.0)
     np.testing.assert_allclose(about.T[:, 1], rows.T[:, 1] - rows.T[:, 1].mean())
-    outside = RegressionRows(rows.P, rows.T, np.array([1e-20, 4.0]), 30, 1).centred()
+    outside = RegressionRows(rows.P, rows.T, np.array([1e-20, 4.0]), 30, 1).subtract_means()
     np.testing.assert_array_equal(outside.rest, [0.0, 4.0])  # of a target that does not move it is rounding
-    moving = RegressionRows(rows.P, rows.T, np.array([1.0, 4.0]), 30, 1).centred()
+    moving = RegressionRows(rows.P, rows.T, np.array([1.0, 4.0]), 30, 1).subtract_means()
     np.testing.assert_array_equal(moving.rest, [1.0, 4.0])
     plain = rows_of()
-    assert plain.centred() is plain
+    assert plain.subtract_means() is plain
 
 
 @pytest.mark.parametrize("nu", [1, 2])
@@ -127,11 +127,11 @@ def test_products_of_deviations_span_the_same_models(nu):
     U = rng.normal(size=(M, nu)) - 3.0
     products = [u[:, None] * psi[:, which] for u in U.T]
     rows = RegressionRows(np.hstack([psi, U, *products]), psi[:, :1], np.zeros(1), M, 0)
-    about, back = about_means(rows, nu, which)
+    about, back = centre_products(rows, nu, which)
     deviations = [(u - u.mean())[:, None] * (psi[:, which] - psi[:, which].mean(axis=0)) for u in U.T]
     np.testing.assert_allclose(about.P, np.hstack([psi, U, *deviations]), atol=1e-9)
     np.testing.assert_allclose(rows.P @ back, about.P, atol=1e-9)
-    same, eye = about_means(RegressionRows(rows.P, rows.T, rows.rest, M), nu, which)
+    same, eye = centre_products(RegressionRows(rows.P, rows.T, rows.rest, M), nu, which)
     assert same.P is rows.P
     np.testing.assert_array_equal(eye, np.eye(len(eye)))
 
@@ -155,12 +155,12 @@ def test_a_projection_is_that_on_the_span():
     exact = basis @ np.linalg.lstsq(basis, columns, rcond=1e-20)[0]
     twice = np.column_stack([basis, basis[:, 1], np.zeros(20)])
     for given in (basis, twice):
-        np.testing.assert_allclose(onto(given, columns), exact, atol=1e-7)
-    U = orthonormal(twice, 1e-12)
+        np.testing.assert_allclose(project_onto(given, columns), exact, atol=1e-7)
+    U = orthonormal_basis(twice, 1e-12)
     assert U.shape == (20, 3)
     np.testing.assert_allclose(U.T @ U, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(norms(columns), np.linalg.norm(columns, axis=0))
-    np.testing.assert_allclose(norms(unit(twice)), [1, 1, 1, 1, 0])
+    np.testing.assert_allclose(column_norms(columns), np.linalg.norm(columns, axis=0))
+    np.testing.assert_allclose(column_norms(scale_to_unit_norm(twice)), [1, 1, 1, 1, 0])
 
 
 @pytest.mark.parametrize(
@@ -176,18 +176,20 @@ def test_a_projection_is_that_on_the_span():
     ],
 )
 def test_a_rule_says_what_was_done(constant, ridge, options, words):
-    assert rule(rows_of(constant=constant), ridge, ridge, **options) == words
+    assert describe_solve(rows_of(constant=constant), ridge, ridge, **options) == words
 
 
 def test_a_rule_of_cross_validation_says_so():
     rows = rows_of()
-    assert rule(rows, "gcv", 0.5).endswith("ridge 0.5 on unit-norm columns, chosen by generalised cross-validation")
-    assert rule(rows, "gcv", 0.0).endswith(", ridge 0, chosen by generalised cross-validation")
+    assert describe_solve(rows, "gcv", 0.5).endswith(
+        "ridge 0.5 on unit-norm columns, chosen by generalised cross-validation"
+    )
+    assert describe_solve(rows, "gcv", 0.0).endswith(", ridge 0, chosen by generalised cross-validation")
 
 
 def test_the_units_of_the_data_are_a_triangle_with_their_second_moments():
     P = np.random.default_rng(0).normal(size=(40, 4)) * [1e-6, 1.0, 1e6, 3.0]
-    R = scale_factor(P, 160)
+    R = compute_scale_factor(P, 160)
     size = np.linalg.norm(P, axis=0)
     np.testing.assert_allclose((R.T @ R) / np.outer(size, size), (P.T @ P) / 160 / np.outer(size, size), atol=1e-13)
     np.testing.assert_array_equal(R, np.triu(R))
@@ -196,7 +198,7 @@ def test_the_units_of_the_data_are_a_triangle_with_their_second_moments():
 
 def test_units_are_found_where_columns_are_zero_or_depend_on_each_other():
     P = np.random.default_rng(0).normal(size=(40, 2))
-    R = scale_factor(np.column_stack([P, np.zeros(40), 5 * P[:, 0]]), 40)
+    R = compute_scale_factor(np.column_stack([P, np.zeros(40), 5 * P[:, 0]]), 40)
     np.testing.assert_allclose(R[:, 2], [0, 0, 1, 0], atol=1e-12)
     assert np.isfinite(np.linalg.inv(R)).all()
     assert 1e-9 < R[3, 3] / np.linalg.norm(R[:, 3]) < 1e-7
@@ -216,9 +218,9 @@ def test_a_relative_misfit_is_the_mean_over_observables_of_those_to_their_own_si
 def test_the_affine_columns_are_those_of_states_the_constant_and_all_inputs():
     data = random_episodes(0, [40], 2, 2)
     lifting = km.Monomials(2) + km.State() + km.Fourier(1) + km.Constant()
-    regression = read(data, lifting, None, "edmd")
+    regression = read_regression(data, lifting, None, "edmd")
     names = [*regression.lifting.names, *data.inputs]
-    assert {names[i] for i in regression.affine} == {*data.states, "1", *data.inputs}
+    assert {names[i] for i in regression.affine_columns} == {*data.states, "1", *data.inputs}
     assert regression.columns == len(names)
 
 
@@ -230,14 +232,14 @@ def test_of_exact_fits_forward_and_backward_the_root_is_the_matrix(eigenvalues):
         V[:, 1] += 1j * rng.normal(size=3)
         V[:, 2] = V[:, 1].conj()
     A = ((V * eigenvalues) @ np.linalg.inv(V)).real
-    np.testing.assert_allclose(_root_next_to(A, np.linalg.inv(A)), A, atol=1e-9)
-    np.testing.assert_allclose(_root_next_to(0.99 * A, 0.99 * np.linalg.inv(A)), A, atol=1e-9)  # shrunk alike
+    np.testing.assert_allclose(_nearest_root(A, np.linalg.inv(A)), A, atol=1e-9)
+    np.testing.assert_allclose(_nearest_root(0.99 * A, 0.99 * np.linalg.inv(A)), A, atol=1e-9)  # shrunk alike
 
 
 def test_a_root_of_a_defective_matrix_and_of_what_has_none():
     jordan = np.array([[0.5, 1.0], [0.0, 0.5]])
-    np.testing.assert_allclose(_root_next_to(jordan, np.linalg.inv(jordan)), jordan, atol=1e-6)
+    np.testing.assert_allclose(_nearest_root(jordan, np.linalg.inv(jordan)), jordan, atol=1e-6)
     with pytest.raises(km.errors.DataError, match='method "fb" has no real square root'):
-        _root_next_to(np.diag([0.5, 0.3]), np.diag([2.0, -3.0]))
-    with pytest.raises(km.errors.DataError, match='method "fb" needs a motion that can be run backward'):
-        _root_next_to(np.eye(2), np.diag([1.0, 1e-17]))
+        _nearest_root(np.diag([0.5, 0.3]), np.diag([2.0, -3.0]))
+    with pytest.raises(km.errors.DataError, match='method "fb" needs a motion that can be reversed'):
+        _nearest_root(np.eye(2), np.diag([1.0, 1e-17]))

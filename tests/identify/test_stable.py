@@ -10,14 +10,14 @@ from scipy.optimize import approx_fprime
 import koopmpc as km
 from koopmpc.identify.fits.stable import (
     Misfit,
-    _ball,
     _Descent,
-    _metric,
-    clipped,
-    inside,
-    lyapunov_fit,
-    nearest,
-    radius_of,
+    _find_metric,
+    _project_on_ball,
+    clip_eigenvalues,
+    find_nearest_stable,
+    fit_lyapunov,
+    scale_inside,
+    spectral_radius,
 )
 from tests.identify.plants import brute_force, random_episodes
 
@@ -26,7 +26,7 @@ def runs(seed: int, nx: int, nu: int, *, radius: float, noise: float, offset: fl
     """Noisy measurements of a linear plant with this spectral radius."""
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((nx, nx))
-    A *= radius / radius_of(A)
+    A *= radius / spectral_radius(A)
     B = rng.standard_normal((nx, nu))
     parts: list[km.Episode] = []
     for _ in range(2 + nx // 10):
@@ -61,17 +61,20 @@ def refitted(data: km.Episodes, model, A: np.ndarray) -> float:
 def test_it_is_stable_and_closer_than_clipping(seed: int, nx: int, nu: int, radius: float) -> None:
     data = runs(seed, nx, nu, radius=1.0, noise=0.3)
     plain, model = km.edmd(data, km.State()), km.identify.stable_edmd(data, km.State(), radius=radius)
-    assert radius_of(model.A) <= radius + 1e-9
-    if radius_of(plain.A) <= radius:
+    assert spectral_radius(model.A) <= radius + 1e-9
+    if spectral_radius(plain.A) <= radius:
         assert np.allclose(model.A, plain.A, rtol=0, atol=1e-12)
         assert np.allclose(model.B, plain.B, rtol=0, atol=1e-12)
         assert "the plain fit stays" in model.report.changes[0]
         return
     own = objective(data, model)
     assert own == pytest.approx(refitted(data, model, model.A), rel=1e-9)  # B is the best for this A
-    others = (clipped(plain.A, radius), plain.A * radius / radius_of(plain.A))
+    others = (clip_eigenvalues(plain.A, radius), plain.A * radius / spectral_radius(plain.A))
     assert own <= min(refitted(data, model, A) for A in others) * (1 + 1e-9)
-    assert f"spectral radius {radius_of(plain.A):.6g} before, {radius_of(model.A):.6g} after" in model.report.changes
+    assert (
+        f"spectral radius {spectral_radius(plain.A):.6g} before, {spectral_radius(model.A):.6g} after"
+        in model.report.changes
+    )
     losses = zip(data.states, plain.report.residual, model.report.residual, strict=True)
     said = tuple(f"one-step residual of {n!r}: {b:.3g} before, {a:.3g} after" for n, b, a in losses)
     assert model.report.changes[2:] == said
@@ -89,22 +92,22 @@ def test_normal_A_under_white_data_has_the_closed_form() -> None:
     Q = np.linalg.qr(rng.standard_normal((5, 5)))[0]
     A0 = (Q * [1.5, 1.1, 0.5, -0.3, -1.2]) @ Q.T
     best = (Q * [1.0, 1.0, 0.5, -0.3, -1.0]) @ Q.T
-    found = nearest(Misfit(A0, np.eye(5)), 1.0, [clipped(A0, 1.0)])
+    found = find_nearest_stable(Misfit(A0, np.eye(5)), 1.0, [clip_eigenvalues(A0, 1.0)])
     assert Misfit(A0, np.eye(5))(found) <= Misfit(A0, np.eye(5))(best) * (1 + 1e-9)
-    assert radius_of(found) <= 1 + 1e-9
+    assert spectral_radius(found) <= 1 + 1e-9
 
 
 def test_the_misfit_never_exceeds_that_of_the_matrix_inequality() -> None:
     rng = np.random.default_rng(1)
     for n in (2, 5, 8):
         A0 = rng.standard_normal((n, n))
-        A0 *= 1.1 / radius_of(A0)
+        A0 *= 1.1 / spectral_radius(A0)
         Z = rng.standard_normal((40, n)) * np.logspace(0, -2, n)
         misfit = Misfit(A0, Z.T @ Z)
-        convex = lyapunov_fit(A0, misfit.G, 1.0)
+        convex = fit_lyapunov(A0, misfit.G, 1.0)
         assert convex is not None
-        assert radius_of(convex) <= 1 + 1e-6
-        assert misfit(nearest(misfit, 1.0, [convex])) <= misfit(convex) * (1 + 1e-5)
+        assert spectral_radius(convex) <= 1 + 1e-6
+        assert misfit(find_nearest_stable(misfit, 1.0, [convex])) <= misfit(convex) * (1 + 1e-5)
 
 
 def test_the_matrix_inequality_is_solved_to_its_optimum() -> None:
@@ -120,7 +123,7 @@ def test_the_matrix_inequality_is_solved_to_its_optimum() -> None:
     constraints = [blocks >> 0, white - 1e-3 * np.eye(2) >> 0, cp.trace(white) == 2]
     problem = cp.Problem(cp.Minimize(cp.norm((Y - A0 @ P) @ Hi, "fro")), constraints)
     problem.solve(solver=cp.SCS, eps=1e-9, max_iters=200_000)
-    assert np.allclose(lyapunov_fit(A0, G, 1.0), Y.value @ np.linalg.inv(P.value), atol=1e-3)
+    assert np.allclose(fit_lyapunov(A0, G, 1.0), Y.value @ np.linalg.inv(P.value), atol=1e-3)
 
 
 def test_a_constant_keeps_its_row_and_its_eigenvalue() -> None:
@@ -140,7 +143,7 @@ def test_a_ridge_counts_in_the_plain_and_in_the_stable_fit() -> None:
     plain = km.identify.stable_edmd(data, km.State(), ridge=0.1, radius=5.0)
     assert np.allclose(plain.A, km.edmd(data, km.State(), ridge=0.1).A, atol=1e-12)
     model = km.identify.stable_edmd(data, km.State(), ridge=0.1, radius=0.5)
-    assert radius_of(model.A) <= 0.5 + 1e-9
+    assert spectral_radius(model.A) <= 0.5 + 1e-9
     assert model.report.ridge == 0.1
 
 
@@ -177,9 +180,9 @@ def test_the_ridge_of_cross_validation_is_that_of_the_plain_fit() -> None:
 def test_more_observables_than_the_inequality_takes() -> None:
     data = runs(0, 24, 2, radius=1.02, noise=0.3)
     model = km.identify.stable_edmd(data, km.State(), radius=0.9)
-    assert radius_of(model.A) <= 0.9 + 1e-9
+    assert spectral_radius(model.A) <= 0.9 + 1e-9
     plain = km.edmd(data, km.State())
-    assert objective(data, model) <= refitted(data, model, clipped(plain.A, 0.9))
+    assert objective(data, model) <= refitted(data, model, clip_eigenvalues(plain.A, 0.9))
 
 
 def test_nearly_dependent_observables_stay_as_close_as_a_ridge_would_have_them() -> None:
@@ -198,7 +201,7 @@ def test_nearly_dependent_observables_stay_as_close_as_a_ridge_would_have_them()
         km.identify.stable_edmd(data, lifting),
         km.identify.stable_edmd(data, lifting, ridge=1e-10),
     )
-    assert radius_of(plain.A) > 1 >= radius_of(model.A) - 1e-9
+    assert spectral_radius(plain.A) > 1 >= spectral_radius(model.A) - 1e-9
     least, with_ridge = objective(data, plain), objective(data, ridged)
     assert objective(data, model) - least <= 1.01 * (with_ridge - least)
 
@@ -220,8 +223,8 @@ def test_two_hundred_observables_take_a_few_seconds() -> None:
     start = time.perf_counter()
     model = km.identify.stable_edmd(data, km.State(), radius=0.95)
     seconds = time.perf_counter() - start
-    assert radius_of(model.A) <= 0.95 + 1e-9
-    clip = refitted(data, model, clipped(plain.A, 0.95))
+    assert spectral_radius(model.A) <= 0.95 + 1e-9
+    clip = refitted(data, model, clip_eigenvalues(plain.A, 0.95))
     loss, worst = objective(data, model) - objective(data, plain), clip - objective(data, plain)
     assert loss <= worst
     said = f"nz 200, {total.samples} pairs: {seconds:.1f} s, loss / clipping's {loss / worst:.3f}"
@@ -258,11 +261,11 @@ def test_a_wrong_radius_or_ridge_is_refused() -> None:
 def test_the_size_of_the_data_does_not_change_how_near_the_descent_comes() -> None:
     rng = np.random.default_rng(3)
     A0, Z = 0.9 * rng.standard_normal((4, 4)), rng.standard_normal((30, 4))
-    misfit, start = Misfit(A0, Z.T @ Z), clipped(A0, 1.0)
-    least = misfit(nearest(misfit, 1.0, [start]))
+    misfit, start = Misfit(A0, Z.T @ Z), clip_eigenvalues(A0, 1.0)
+    least = misfit(find_nearest_stable(misfit, 1.0, [start]))
     assert least < 0.8 * misfit(start)
     for size in (1e-12, 1e12):
-        assert misfit(nearest(Misfit(A0, size * Z.T @ Z), 1.0, [start])) == pytest.approx(least, rel=0.02)
+        assert misfit(find_nearest_stable(Misfit(A0, size * Z.T @ Z), 1.0, [start])) == pytest.approx(least, rel=0.02)
 
 
 def test_the_nearest_matrix_in_a_ball_has_its_singular_values_clipped() -> None:
@@ -270,7 +273,7 @@ def test_the_nearest_matrix_in_a_ball_has_its_singular_values_clipped() -> None:
     for radius in (0.5, 1.0, 3.0, 100.0):
         X = rng.standard_normal((5, 5))
         U, s, Vt = np.linalg.svd(X)
-        assert np.allclose(_ball(X, radius), (U * np.minimum(s, radius)) @ Vt, rtol=0, atol=1e-12)
+        assert np.allclose(_project_on_ball(X, radius), (U * np.minimum(s, radius)) @ Vt, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("radius", [0.5, 1.0, 2.0])
@@ -278,8 +281,8 @@ def test_in_the_metric_of_a_stable_matrix_it_is_a_contraction(radius: float) -> 
     rng = np.random.default_rng(1)
     A = rng.standard_normal((4, 4))
     for share in (0.3, 0.9, 0.999):
-        stable = A * share * radius / radius_of(A)
-        S = _metric(stable, radius)
+        stable = A * share * radius / spectral_radius(A)
+        S = _find_metric(stable, radius)
         assert np.linalg.norm(S @ stable @ np.linalg.inv(S), 2) <= radius * 1.1 * (1 + 1e-9)
         assert np.linalg.cond(S) <= 1.001e3
         if share == 0.3:  # the least margin that is tried
@@ -290,19 +293,19 @@ def test_clipping_moves_the_eigenvalues_that_are_outside_and_no_other() -> None:
     rng = np.random.default_rng(2)
     V = rng.standard_normal((4, 4))
     A = V @ np.diag([1.5, -2.0, 0.7, 0.0]) @ np.linalg.inv(V)
-    assert np.allclose(clipped(A, 0.9), V @ np.diag([0.9, -0.9, 0.7, 0.0]) @ np.linalg.inv(V), atol=1e-12)
+    assert np.allclose(clip_eigenvalues(A, 0.9), V @ np.diag([0.9, -0.9, 0.7, 0.0]) @ np.linalg.inv(V), atol=1e-12)
     turning = 1.3 * np.array([[np.cos(1), -np.sin(1)], [np.sin(1), np.cos(1)]])
-    assert np.allclose(clipped(turning, 0.9), turning * 0.9 / 1.3, atol=1e-12)
+    assert np.allclose(clip_eigenvalues(turning, 0.9), turning * 0.9 / 1.3, atol=1e-12)
     jordan = np.array([[2.0, 1.0], [0.0, 2.0]])
-    assert np.allclose(clipped(jordan, 0.5), jordan / 4, atol=1e-12)
+    assert np.allclose(clip_eigenvalues(jordan, 0.5), jordan / 4, atol=1e-12)
 
 
 def test_what_is_inside_stays_and_what_is_not_is_scaled_onto_the_circle() -> None:
     A = np.array([[0.5, 3.0], [0.0, 0.8]])
-    assert np.array_equal(inside(A, 0.8), A)
+    assert np.array_equal(scale_inside(A, 0.8), A)
     for radius in (0.3, 0.7999):
-        assert radius_of(inside(A, radius)) <= radius
-        assert np.allclose(inside(A, radius), A * radius / 0.8, rtol=1e-12)
+        assert spectral_radius(scale_inside(A, radius)) <= radius
+        assert np.allclose(scale_inside(A, radius), A * radius / 0.8, rtol=1e-12)
 
 
 def test_a_step_of_the_descent_goes_against_the_gradient_and_lowers_the_misfit() -> None:

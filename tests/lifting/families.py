@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import koopmpc as km
-from koopmpc.lifting.base import buffered as buffered
+from koopmpc.lifting.base import buffer_lifting as buffer_lifting
 
 NAMES = ("theta [rad]", "omega [rad/s]", "p [m]")
 

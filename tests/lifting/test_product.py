@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 
 import koopmpc as km
-from tests.lifting.families import NAMES, Case, buffered, cases, made
+from tests.lifting.families import NAMES, Case, buffer_lifting, cases, made
 from tests.roundtrip import returned
 
 
@@ -30,7 +30,7 @@ def test_a_rotating_frame_s_observables() -> None:
         "omega*cos(2 theta)",
     )
     assert np.array_equal(lifting(X), np.column_stack(expected))
-    assert buffered(lifting)(X[3])[0] == pytest.approx(lifting(X[3]), rel=1e-14)
+    assert buffer_lifting(lifting)(X[3])[0] == pytest.approx(lifting(X[3]), rel=1e-14)
 
 
 def test_products_of_states_are_the_monomials() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from tests.lifting.families import NAMES, buffered
+from tests.lifting.families import NAMES, buffer_lifting
 from tests.roundtrip import returned
 
 
@@ -50,4 +50,4 @@ def test_a_bound_copy_keeps_what_it_drew_in_a_file_too() -> None:
     assert again == lifting
     x = np.array([0.2, -1.0])
     assert np.array_equal(again(x), lifting(x))
-    assert buffered(lifting)(x)[0] == pytest.approx(lifting(x), rel=1e-12)
+    assert buffer_lifting(lifting)(x)[0] == pytest.approx(lifting(x), rel=1e-12)

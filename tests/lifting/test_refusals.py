@@ -101,7 +101,7 @@ MISTAKES = [
     (DATA, r"state 'phi'; the states are theta \[rad\], omega", lambda: km.Fourier(1, "phi").bind(NAMES)),
     (DATA, r"state 3; the states are .* or 0 … 2", lambda: km.Fourier(1, 3).bind(NAMES)),
     (SHAPE, "centers has 2 columns and there are 3 states", lambda: km.ThinPlate([[0, 1]]).bind(NAMES)),
-    (DATA, "pass at least one row, a row a centre", lambda: km.ThinPlate(np.zeros((0, 3)))),
+    (DATA, "pass at least one row, one row for each centre", lambda: km.ThinPlate(np.zeros((0, 3)))),
     (SHAPE, r"centers has shape \(2,\), expected \(any, any\)", lambda: km.ThinPlate([0, 1])),
     (DATA, "centers holds 1 NaN or inf", lambda: km.Gaussian([[0, np.nan]], 1)),
     (DATA, "width is 0; it must be above zero", lambda: km.Gaussian([[0, 1]], 0)),
@@ -171,8 +171,8 @@ show(lambda: km.edmd(data, "State"))
 """
     )
     assert lines == [
-        "DataError 3 is no lifting; pass one, or a sum: State() + Constant()",
-        "DataError the lifting is the class Constant; pass one of it: Constant(…)",
-        "DataError the lifting is the class State; pass one of it: State(…)",
-        "DataError 'State' is no lifting; pass one, or a sum: State() + Constant()",
+        "DataError 3 is not a lifting; pass one, or a sum: State() + Constant()",
+        "DataError the lifting is the class Constant; pass an instance: Constant(…)",
+        "DataError the lifting is the class State; pass an instance: State(…)",
+        "DataError 'State' is not a lifting; pass one, or a sum: State() + Constant()",
     ]

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from tests.lifting.families import NAMES, buffered
+from tests.lifting.families import NAMES, buffer_lifting
 from tests.roundtrip import returned
 
 CENTERS = np.random.default_rng(3).normal(size=(6, 2))
@@ -31,7 +31,7 @@ def test_it_is_the_inner_lifting_of_standardized_states() -> None:
     assert lifting.mean == pytest.approx(X.mean(0), rel=1e-13)
     assert lifting.scale == pytest.approx(X.std(0), rel=1e-13)
     assert np.allclose(lifting(X), km.Gaussian(CENTERS, 0.7).bind(NAMES[:2])((X - X.mean(0)) / X.std(0)), atol=1e-12)
-    assert buffered(lifting)(X[7])[0] == pytest.approx(lifting(X[7]), rel=1e-12)
+    assert buffer_lifting(lifting)(X[7])[0] == pytest.approx(lifting(X[7]), rel=1e-12)
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: type(family).__name__)

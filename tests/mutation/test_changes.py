@@ -56,7 +56,7 @@ def test_what_stands_in_for_a_divisor_of_zero_and_a_most_of_rounds_stay() -> Non
     assert not any(line.endswith("size, 2.0)") or "201" in line for line in found)
 
 
-@pytest.mark.parametrize("name", ["control/lqr.py", *slow(["data/formats.py", "loop/simulate.py"])])
+@pytest.mark.parametrize("name", ["control/lqr.py", *slow(["data/files/parquet.py", "loop/simulate.py"])])
 def test_every_change_of_the_library_is_a_program_that_differs(name: str) -> None:
     source = (Path(__file__).parents[2] / "koopmpc" / name).read_bytes()
     whole, made = ast.dump(ast.parse(source)), list(mutants(name, source))

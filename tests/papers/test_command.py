@@ -11,8 +11,18 @@ from typer.testing import CliRunner
 import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.papers import korda, registry
-from koopmpc.papers.registry import PAPERS, Claim, Verdict, compared, find_paper, judged, percent, short, show
-from koopmpc.papers.snyder_control import ORACLE, contest, costs, predictions
+from koopmpc.papers.registry import (
+    PAPERS,
+    Claim,
+    Verdict,
+    compare_value,
+    draw_curves,
+    find_paper,
+    judge_claim,
+    make_paper,
+    percent,
+)
+from koopmpc.papers.snyder_control import ORACLE, compute_costs, predict_held_out, prepare_contest
 from koopmpc.papers.snyder_settings import SHAKINGS, TASKS, all_settings
 
 PAGES = Path(__file__).parents[2] / "docs" / "papers"
@@ -42,7 +52,7 @@ def test_the_shortened_paper_writes_all_its_files(tmp_path):
 
 
 def test_data_that_excite_find_B_and_feedback_data_do_not():
-    each = predictions(all_settings()["pendulum-lqr"], SHAKINGS["pendulum"], episodes=10)
+    each = predict_held_out(all_settings()["pendulum-lqr"], SHAKINGS["pendulum"], episodes=10)
     assert each["DMDc, exciting data"].b == pytest.approx(1.0, abs=0.02)
     assert each["EDMDc, exciting data"].b == pytest.approx(1.0, abs=0.02)
     assert each["DMDc, feedback data"].warned == "A and B inseparable"
@@ -55,10 +65,10 @@ def test_energy_bounds_the_cost_of_the_hanging_pendulum_from_below():
     def value(x):  # V = 2√10 E solves min over u of 10 ω² + u² + ∇V·f(x, u) = 0
         return 2 * np.sqrt(10) * (2 * x[1] ** 2 + 19.62 * (1 - np.cos(x[0])))
 
-    task = contest("pendulum, hanging, π/4", 40, 20, episodes=20)  # horizon and tail see most of a swing
+    task = prepare_contest("pendulum, hanging, π/4", 40, 20, episodes=20)  # horizon and tail see most of a swing
     task = replace(task, models={"Fourier 1": task.models["Fourier 1"]})
     runs = task.runs()
-    free, limited = costs(runs, False), costs(runs, True)
+    free, limited = compute_costs(runs, False), compute_costs(runs, True)
     total = {name: free[name] + value(runs[name, False].X[-1]) for name in free}
     assert total["LQR, linearisation"] == pytest.approx(value(TASKS[task.title].x0), rel=5e-3)
     assert total[ORACLE] == pytest.approx(value(TASKS[task.title].x0), rel=5e-3)
@@ -88,10 +98,10 @@ def test_the_command_prints_verdicts_and_paths_and_fails_where_a_required_number
     def work(page, quick, progress):
         assert not quick
         progress("working")
-        show(page, "curve", "A curve", 0.1, ("x",), {"a": np.zeros((5, 1)), "b": np.ones((3, 1))})
-        return [Claim("abstract", "it works", Verdict.FAILS, "half of it"), compared("π", 3.14159, ours, 0.005)]
+        draw_curves(page, "curve", "A curve", 0.1, ("x",), {"a": np.zeros((5, 1)), "b": np.ones((3, 1))})
+        return [Claim("abstract", "it works", Verdict.FAILS, "half of it"), compare_value("π", 3.14159, ours, 0.005)]
 
-    paper = short("mine", "Mine and yours.\n\nA paper\nof ours.\n", work)
+    paper = make_paper("mine", "Mine and yours.\n\nA paper\nof ours.\n", work)
     monkeypatch.setattr(registry, "PAPERS", ("mine",))
     monkeypatch.setattr(registry, "import_module", lambda name: type("M", (), {"paper": paper}))
     result = CliRunner().invoke(app, ["reproduce", "mine", "--logs", str(tmp_path)])
@@ -114,7 +124,7 @@ def test_all_papers_go_to_one_folder_with_a_table_of_them(tmp_path, monkeypatch)
         claims = len(each.outcome.claims)
         assert f"({each.paper}.md) | {claims} | {claims} | 0 | 0 |" in text
         assert (tmp_path / f"{each.paper}.rrd").is_file()
-    assert registry.summary_table(found).row_count == 2
+    assert registry.make_summary_table(found).row_count == 2
     result = CliRunner().invoke(app, ["reproduce"])
     assert result.exit_code == 2
     assert "name one paper, or pass --all" in result.output
@@ -122,9 +132,9 @@ def test_all_papers_go_to_one_folder_with_a_table_of_them(tmp_path, monkeypatch)
 
 
 def test_a_claim_holds_or_holds_in_part_or_fails_and_an_error_has_three_digits():
-    assert judged("a", "b", holds=True, why="c").verdict is Verdict.HOLDS
-    assert judged("a", "b", holds=False, in_part=True, why="c").verdict is Verdict.IN_PART
-    assert judged("a", "b", holds=False, why="c").verdict is Verdict.FAILS
+    assert judge_claim("a", "b", holds=True, why="c").verdict is Verdict.HOLDS
+    assert judge_claim("a", "b", holds=False, in_part=True, why="c").verdict is Verdict.IN_PART
+    assert judge_claim("a", "b", holds=False, why="c").verdict is Verdict.FAILS
     assert [percent(v) for v in (0.0, 0.0111, 3.4e-6, np.inf, np.nan, 1e3)] == [
         "0", "1.11", "3.4e-04", "diverges", "diverges", "diverges",
     ]  # fmt: skip
@@ -133,7 +143,7 @@ def test_a_claim_holds_or_holds_in_part_or_fails_and_an_error_has_three_digits()
 @pytest.mark.parametrize("name", QUICK)
 def test_a_paper_reproduces_its_required_numbers_and_writes_its_page(tmp_path, name):
     outcome = find_paper(name).reproduce(tmp_path, True, lambda words: None)
-    assert outcome.failed == ()
+    assert outcome.failures == ()
     assert any(claim.required for claim in outcome.claims)
     assert outcome.recording.stat().st_size > 1e3
     assert outcome.report.read_text(encoding="utf-8").count("| **holds** |") > 0
@@ -154,7 +164,7 @@ def test_carleman_s_linearisation_is_exact_to_its_degree_near_rest():
     plant = km.discretize(km.load_problem("van_der_pol").dynamics, korda.DT)
     U, x0 = np.zeros((40, 1)), np.array([2e-2, -1e-2])
     truth = plant.rollout(x0, U)
-    off = [np.abs(korda.carleman(plant, d).rollout(x0, U) - truth).max() for d in (1, 3, 5)]
+    off = [np.abs(korda.linearise_carleman(plant, d).rollout(x0, U) - truth).max() for d in (1, 3, 5)]
     assert off[1] < 0.02 * off[0]
     assert off[2] < 0.02 * off[1] + 1e-9
 
@@ -164,7 +174,7 @@ def test_the_waves_of_the_data_are_those_of_the_plant():
     plant = km.discretize(problem.dynamics, problem.dt, problem.integrator)
     rng = np.random.default_rng(0)
     y, u = rng.dirichlet([1, 1, 1], 3) @ korda.SHAPES, rng.uniform(-1, 1, (3, 3))
-    for row, push, ahead in zip(y, u, korda.advanced(y, u), strict=True):
+    for row, push, ahead in zip(y, u, korda.advance_wave(y, u), strict=True):
         np.testing.assert_allclose(plant(row, push), ahead, atol=1e-11)
 
 
@@ -172,8 +182,8 @@ def test_the_waves_of_the_data_are_those_of_the_plant():
 def test_the_local_mpc_of_the_motor_costs_what_the_paper_says():
     plant = km.discretize(km.load_problem("bilinear_motor").dynamics, korda.DT)
     cost = km.Cost(Q=1.0, R=0.01, tail=0, of=km.State("speed"), u_target="zero")
-    local = korda.linearised(plant, [0.0, 0.6], cost, km.Limits(u_min=-1, u_max=1))
-    run = korda.loop(plant, local, [0.0, 0.6], korda.STEP)
+    local = korda.make_local_mpc(plant, [0.0, 0.6], cost, km.Limits(u_min=-1, u_max=1))
+    run = korda.run_loop(plant, local, [0.0, 0.6], korda.STEP)
     assert run.solved == korda.STEPS
     assert abs(run.cost - 3.318) < 0.005
 

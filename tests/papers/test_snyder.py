@@ -8,15 +8,21 @@ import pytest
 from scipy.integrate import quad
 
 import koopmpc as km
+from koopmpc.page import Page
 from koopmpc.papers import snyder as report
 from koopmpc.papers import snyder_theory as theory
-from koopmpc.papers.plants import Pendulum, frequency
-from koopmpc.papers.registry import Verdict, verdicts
-from koopmpc.papers.snyder import of_figures, of_text
+from koopmpc.papers.plants import Pendulum, swing_frequency
+from koopmpc.papers.registry import Verdict, add_verdicts
+from koopmpc.papers.snyder import judge_figures, judge_text
 from koopmpc.papers.snyder_control import ORACLE, Prediction
-from koopmpc.papers.snyder_settings import FIGURES, OBSERVABLES, all_settings, gains, held_change, rebuilt
-from koopmpc.recording import page as pages
-from koopmpc.recording.page import Page
+from koopmpc.papers.snyder_settings import (
+    FIGURES,
+    OBSERVABLES,
+    all_settings,
+    design_feedbacks,
+    measure_hold_change,
+    reconstruct_all,
+)
 
 PAGE = Path(__file__).parents[2] / "docs" / "papers" / "snyder.md"
 # Relative reconstruction errors in %, computed independently: (setting, observables, full rank).
@@ -58,7 +64,7 @@ def settings():
 
 @pytest.fixture(scope="module")
 def fits(settings):
-    return {name: rebuilt(setting) for name, setting in settings.items()}
+    return {name: reconstruct_all(setting) for name, setting in settings.items()}
 
 
 @pytest.mark.parametrize("key", KNOWN)
@@ -76,7 +82,7 @@ def test_full_rank_leaves_the_known_number_of_singular_values(fits):
 
 
 def test_gains_agree_to_the_digits():
-    got = {name: K.ravel() for name, K in gains().items()}
+    got = {name: K.ravel() for name, K in design_feedbacks().items()}
     for name, known, digits in (
         ("pendulum", [0.0, 3.1623], 4),
         ("upright", [39.24, 17.998], 3),
@@ -91,7 +97,7 @@ def test_gains_agree_to_the_digits():
 def test_the_shift_stays_upright(settings):
     X = settings["cart-pole-lqr"].trajectory[0].X
     assert np.abs(X[:, 2] - np.pi).max() == pytest.approx(0.032, abs=6e-4)
-    u = -(X - [1.0, 0.0, np.pi, 0.0]) @ gains()["cart-pole"].ravel()
+    u = -(X - [1.0, 0.0, np.pi, 0.0]) @ design_feedbacks()["cart-pole"].ravel()
     assert np.abs(u).max() == pytest.approx(4.47, abs=6e-3)
 
 
@@ -101,11 +107,11 @@ def test_the_frequency_is_that_of_the_elliptic_integral(amplitude):
     k = np.sin(amplitude / 2)
     quarter = quad(lambda phi: 1 / np.sqrt(1 - (k * np.sin(phi)) ** 2), 0, np.pi / 2, epsabs=1e-14)[0]  # of a period
     exact = np.sqrt(plant.g / plant.L) * np.pi / 2 / quarter
-    assert frequency(plant, amplitude) == pytest.approx(exact, rel=1e-12)
+    assert swing_frequency(plant, amplitude) == pytest.approx(exact, rel=1e-12)
 
 
 def test_eigenvalues_are_those_of_the_amplitude_and_not_of_small_angles(fits):
-    small, right = frequency(Pendulum(), 0.0), frequency(Pendulum(), np.pi / 4)
+    small, right = swing_frequency(Pendulum(), 0.0), swing_frequency(Pendulum(), np.pi / 4)
     assert small == pytest.approx(np.sqrt(9.81 / 2))
     for method in OBSERVABLES:
         fit = fits["pendulum"][method, True]
@@ -138,7 +144,7 @@ def test_the_origin_and_truncation_explain_the_cart_pole(settings):
 def test_over_the_whole_run_the_caution_has_the_errors_of_the_figures(settings, fits):
     for method in ("DMD", "EDMD monomials 3", "EDMD Fourier 1"):
         fit = fits["cart-pole"][method, True]
-        ((first, _), (own, new)) = theory.by_horizon(settings["cart-pole"], fit, (0.1, 10.0))
+        ((first, _), (own, new)) = theory.measure_by_horizon(settings["cart-pole"], fit, (0.1, 10.0))
         assert own == pytest.approx(fit.error, rel=1e-12)
         assert new == pytest.approx(fit.held_out, rel=1e-12)
         assert first < 0.1 * own
@@ -147,26 +153,26 @@ def test_over_the_whole_run_the_caution_has_the_errors_of_the_figures(settings, 
 
 
 def test_a_held_input_changes_little(settings, fits):
-    assert 1e-4 < held_change(settings, fits) < 0.02
+    assert 1e-4 < measure_hold_change(settings, fits) < 0.02
 
 
 @pytest.mark.parametrize(("method", "rank"), [("DMD", 2), ("EDMD monomials 3", 10), ("EDMD Fourier 1", 4)])
 def test_each_equation_equals_its_function(settings, method, rank):
     lifting = OBSERVABLES[method]
     trajectory = settings["pendulum"].trajectory
-    checked = theory.equations(trajectory, lifting, rank)
+    checked = theory.check_equations(trajectory, lifting, rank)
     assert {e.number for e in checked} == {"10–12", "14–17", "18–23", "24–26", "27–31"}
     for equation in checked:
         assert equation.residual < 1e-8, equation
 
 
 def test_eigenfunctions_are_left_eigenvectors(settings):
-    left, right = theory.sides(settings["pendulum"].trajectory, OBSERVABLES["EDMD monomials 3"])
+    left, right = theory.compare_sides(settings["pendulum"].trajectory, OBSERVABLES["EDMD monomials 3"])
     assert left < 0.05 * right
 
 
 def test_each_figure_has_its_verdict(fits):
-    found = {claim.where: claim.verdict for claim in of_figures(fits)}
+    found = {claim.where: claim.verdict for claim in judge_figures(fits)}
     assert len(found) == sum(len(shown.settings) for shown in FIGURES)
     for where, verdict in {
         "pendulum-dmd, pendulum": Verdict.HOLDS,
@@ -182,7 +188,7 @@ def test_each_figure_has_its_verdict(fits):
 def test_the_page_holds_these_numbers_and_verdicts(settings, fits):
     text = PAGE.read_text(encoding="utf-8")
     titles = {setting.title: name for name, setting in settings.items()}
-    verdicts = {claim.where: claim.verdict.value for claim in of_figures(fits)}
+    verdicts = {claim.where: claim.verdict.value for claim in judge_figures(fits)}
     seen = 0
     for line in text.split("## The figures, in numbers")[1].split("## The figures\n")[0].splitlines():
         cells = [cell.strip() for cell in line.split("|")[1:-1]]
@@ -226,7 +232,7 @@ def told(fits, *, ours, feedback, excited):
     names = ("DMD, feedback data", "DMDc, feedback data", "EDMDc, exciting data")
     predicted = {"pendulum": {name: Prediction(name, feedback, excited, 1.0, "–") for name in names}}
     ratios = {"a task": {"LQR, linearisation": 1.05, "LQR, Fourier 1": ours, ORACLE: 1.0}}
-    return {claim.says: claim.verdict for claim in of_text(fits, 3e-5, predicted, ratios)}
+    return {claim.says: claim.verdict for claim in judge_text(fits, 3e-5, predicted, ratios)}
 
 
 def test_verdicts_of_the_text_follow_the_numbers(fits):
@@ -250,15 +256,16 @@ def test_verdicts_of_the_text_follow_the_numbers(fits):
 
 def test_the_parts_of_the_report_hold_their_tables_and_pictures(settings, fits, tmp_path, monkeypatch):
     saved = []
-    monkeypatch.setattr(pages, "save", lambda made, path: saved.append(path.stem))
+    for module in (report, theory):
+        monkeypatch.setattr(module, "save", lambda made, path: saved.append(path.stem))
     page = Page(tmp_path, beside="snyder")
-    claims = of_figures(fits)
-    report.opening(page, claims, 0.01, 10)
-    verdicts(page, claims)
+    claims = judge_figures(fits)
+    report.add_opening(page, claims, 0.01, 10)
+    add_verdicts(page, claims)
     report.numbers(page, settings, fits, claims)
-    report.feedbacks(page)
-    theory.frequencies(page, fits)
-    theory.formulas(page, settings["pendulum"], fits)
+    report.add_feedbacks(page)
+    theory.add_frequencies(page, fits)
+    theory.add_equations(page, settings["pendulum"], fits)
     report.appendix_dmdc(page, settings["pendulum"], settings["pendulum-lqr"])
     gains_of_page = PAGE.read_text(encoding="utf-8").split("## The feedbacks")[1].split("\n## ")[0]
     assert gains_of_page.strip() in page.markdown

@@ -15,7 +15,7 @@ from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Routine
 from tests.example_plants import CartPole, Pendulum
 
-needs_compiler = pytest.mark.skipif(routines.compiler() is None, reason="no C compiler here")
+needs_compiler = pytest.mark.skipif(routines.find_compiler() is None, reason="no C compiler here")
 MAPS = {
     "euler": km.discretize(CartPole(), 0.02, km.Euler()),
     "rk4": km.discretize(CartPole(), 0.02),
@@ -25,10 +25,10 @@ MAPS = {
 
 @pytest.fixture(scope="module")
 def kernels(tmp_path_factory):
-    command = routines.compiler()
+    command = routines.find_compiler()
     assert command is not None
     cache = tmp_path_factory.mktemp("cache")
-    return {name: routines.kernel(plant.F, command, cache) for name, plant in MAPS.items()}
+    return {name: routines.compile_kernel(plant.F, command, cache) for name, plant in MAPS.items()}
 
 
 def empty(X0, U):
@@ -50,7 +50,7 @@ def test_machine_code_graph_and_interpreter_agree_to_1e12_a_step(kernels, name, 
     X0, U = random_episodes(plant, episodes, steps, seed)
     by_code, by_columns = empty(X0, U), empty(X0, U)
     kernels[name](by_code, U)
-    step_map.vectorised(Graph.trace(plant.F), by_columns, U)
+    step_map.roll_out_columns(Graph.trace(plant.F), by_columns, U)
     for X in (by_code, by_columns):
         assert X[:, 0].tolist() == X0.tolist()
         for e, k in np.ndindex(episodes, steps):
@@ -73,7 +73,7 @@ def test_columns_beyond_one_chunk():
     plant = MAPS["rk4"]
     X0, U = random_episodes(plant, step_map._CHUNK + 3, 2)
     X = empty(X0, U)
-    step_map.vectorised(Graph.trace(plant.F), X, U)
+    step_map.roll_out_columns(Graph.trace(plant.F), X, U)
     for e in (0, step_map._CHUNK - 1, step_map._CHUNK, step_map._CHUNK + 2):
         np.testing.assert_allclose(X[e], plant.rollout(X0[e], U[e]), rtol=1e-12, atol=1e-12)
 
@@ -152,7 +152,7 @@ def test_a_broken_file_in_the_cache_is_written_again(cache):
 def test_without_a_private_folder_nothing_is_left_on_disk(tmp_path, monkeypatch):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
-    monkeypatch.setattr(routines, "private_cache", lambda: None)
+    monkeypatch.setattr(routines, "find_private_cache", lambda: None)
     X0, U = random_episodes(MAPS["rk4"], 100, 200)
     plant = km.discretize(CartPole(), 0.02)
     np.testing.assert_allclose(plant.rollouts(X0, U)[3, 1], plant(X0[3], U[3, 0]), rtol=1e-12)
@@ -160,21 +160,21 @@ def test_without_a_private_folder_nothing_is_left_on_disk(tmp_path, monkeypatch)
 
 
 def test_folders_that_others_can_write_are_not_trusted(cache):
-    assert routines.private_cache() == cache
+    assert routines.find_private_cache() == cache
     cache.chmod(0o722)
-    assert routines.private_cache() is None
+    assert routines.find_private_cache() is None
     cache.chmod(0o700)
     cache.parent.chmod(0o777)
-    assert routines.private_cache() is None
+    assert routines.find_private_cache() is None
     cache.parent.chmod(0o700)
     cache.rmdir()
     real = cache.parent / "elsewhere"
     real.mkdir(0o700)
     cache.symlink_to(real)
-    assert routines.private_cache() is None
+    assert routines.find_private_cache() is None
     cache.unlink()
     cache.write_text("a file")
-    assert routines.private_cache() is None
+    assert routines.find_private_cache() is None
 
 
 def test_a_compiler_that_fails_costs_one_warning(cache, tmp_path, monkeypatch):
@@ -195,24 +195,24 @@ def test_a_compiler_that_fails_costs_one_warning(cache, tmp_path, monkeypatch):
 
 def test_the_compiler_may_have_arguments(tmp_path, monkeypatch):
     monkeypatch.setenv("CC", "sh -c")
-    assert routines.compiler() == ["sh", "-c"]
+    assert routines.find_compiler() == ["sh", "-c"]
     monkeypatch.setenv("CC", "no-such-compiler -m64")
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert routines.compiler() is None
+    assert routines.find_compiler() is None
 
 
 @needs_compiler
 def test_flags_of_the_environment_come_last_and_code_of_other_flags_is_another_file(tmp_path, monkeypatch):
-    command, text = routines.compiler(), "#ifdef __OPTIMIZE__\n#error\n#endif\nint told(void) { return TOLD; }"
+    command, text = routines.find_compiler(), "#ifdef __OPTIMIZE__\n#error\n#endif\nint told(void) { return TOLD; }"
     for told in (3, 4):
         monkeypatch.setenv("KOOPMPC_CFLAGS", f"-O0 -DTOLD={told}")
         for cache in (tmp_path, tmp_path, None):
-            assert routines.library(text, command, cache).told() == told
+            assert routines.load_library(text, command, cache).told() == told
     assert len(list(tmp_path.glob("*.so"))) == 2
 
 
 def test_without_a_compiler_batches_run_over_columns(monkeypatch):
-    monkeypatch.setattr(routines, "compiler", lambda: None)
+    monkeypatch.setattr(routines, "find_compiler", lambda: None)
     plant = km.discretize(CartPole(), 0.02)
     X0, U = random_episodes(plant, 100, 200)
     X = plant.rollouts(X0, U)
@@ -240,10 +240,10 @@ def results(routine_of) -> tuple[np.ndarray, np.ndarray, bool]:
     return X, sums, routine.compiled
 
 
-@pytest.mark.skipif(routines.compiler() is None, reason="no C compiler here")
+@pytest.mark.skipif(routines.find_compiler() is None, reason="no C compiler here")
 def test_machine_code_is_the_interpreter_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     fast = results(Routine)
-    monkeypatch.setattr(routines, "compiler", lambda: None)
+    monkeypatch.setattr(routines, "find_compiler", lambda: None)
     slow = results(Routine)
     assert (fast[2], slow[2]) == (True, False)
     assert np.array_equal(fast[0], slow[0])

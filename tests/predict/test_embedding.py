@@ -131,5 +131,5 @@ def test_refusals(model: km.LinearPredictor) -> None:
     plain = km.edmd(hidden_state(0), km.State())
     with pytest.raises(km.errors.DataError, match="history was passed, but the predictor has no embedding"):
         plain.lift([1.0], past)
-    assert np.array_equal(model.held([2.0]), [2.0, 0.0, 2.0])
-    assert np.array_equal(plain.held([2.0]), [2.0])
+    assert np.array_equal(model.rest_point([2.0]), [2.0, 0.0, 2.0])
+    assert np.array_equal(plain.rest_point([2.0]), [2.0])

@@ -62,7 +62,7 @@ def test_a_missing_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04 no zip", pickle.dumps([1, 2])])
 def test_a_file_of_something_else(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "model.npz").write_bytes(content)
-    told = "is no file that koopmpc saved, or is damaged: it is no .npz file, or was cut; pass the .npz of a saved"
+    told = "is damaged, or koopmpc did not save it: it is no .npz file, or was cut; pass the .npz of a saved"
     with pytest.raises(km.errors.LogError, match=told) as caught:
         km.load_model(tmp_path / "model.npz")
     assert "pickle" not in str(caught.value)
@@ -142,8 +142,8 @@ def edited(source: Path, target: Path, change) -> Path:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (lambda t: t | {"format": "koopmpc-99"}, "is no koopmpc-1 file; save it again with this version"),
-        (lambda t: [1, 2], "is no koopmpc-1 file"),
+        (lambda t: t | {"format": "koopmpc-99"}, "is not a koopmpc-1 file; save it again with this version"),
+        (lambda t: [1, 2], "is not a koopmpc-1 file"),
         (value(kind="os.system"), "holds a 'os.system', which this version"),
         (value(lifting={"kind": "Popen", "args": ["ls"]}), "holds a 'Popen', which this version"),
         (value(lifting="State"), "is damaged, or was made by hand|cannot be built"),

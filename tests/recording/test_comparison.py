@@ -1,6 +1,7 @@
 """Several runs or curves in one set of plots, a page of words and pictures, the animation of a log as a video."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import matplotlib.figure
@@ -8,9 +9,11 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.figures.style import save
 from koopmpc.loop.metrics import running_cost
+from koopmpc.page import Curves, Page
 from koopmpc.recording.comparison import record_comparison
-from koopmpc.recording.page import Curves, Page, record_curves
+from koopmpc.recording.curves import record_curves
 from koopmpc.recording.reader import read_columns
 from koopmpc.recording.video import export_video
 from tests.recording.runs import make_run
@@ -149,7 +152,7 @@ def test_a_report_holds_its_parts_in_order_and_its_pictures_beside_it(tmp_path):
     page.table(("|u|", "b"), [(1, "x")])
     page.code("a  b")
     page.items(["one", "two"])
-    page.picture("one", "A picture", matplotlib.figure.Figure())
+    page.picture("one", "A picture", partial(save, matplotlib.figure.Figure()))
     assert (tmp_path / "mine" / "one.png").read_bytes().startswith(b"\x89PNG")
     assert page.write().read_text(encoding="utf-8") == (
         "## Title\n\ntwo lines\n\n| \\|u\\| | b |\n| --- | --- |\n| 1 | x |\n\n```text\na  b\n```\n\n- one\n- two\n\n"
@@ -163,5 +166,5 @@ def test_a_picture_that_cannot_be_saved_leaves_the_report_as_it_was(tmp_path):
     (tmp_path / "one.png").mkdir()
     page = Page(tmp_path)
     with pytest.raises(km.errors.LogError, match="is a folder"):
-        page.picture("one", "A picture", matplotlib.figure.Figure())
+        page.picture("one", "A picture", partial(save, matplotlib.figure.Figure()))
     assert page.parts == []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.figures.eigenvalues import eigenfunctions_on, plane_through
+from koopmpc.figures.eigenvalues import evaluate_eigenfunctions, make_plane
 from koopmpc.recording.reader import LogColumns, read_columns
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning
 from tests.recording.viewing import drawn
@@ -85,8 +85,8 @@ def test_eigenvalues_stand_upright_with_their_residuals(log: Path, report: km.va
 
 
 def test_pictures_are_the_eigenfunctions_with_the_second_state_upwards(log: Path) -> None:
-    plane = plane_through(STATES, (0, 1), DATA, points=181)
-    (phi,) = eigenfunctions_on(turning(0.9), 0, plane)
+    plane = make_plane(STATES, (0, 1), DATA, points=181)
+    (phi,) = evaluate_eigenfunctions(turning(0.9), 0, plane)
     scaled = {"magnitude": ("viridis", np.abs(phi)), "phase": ("twilight", np.angle(phi) / (2 * np.pi) + 0.5)}
     for part, (scale, values) in scaled.items():
         entity = f"/eigenfunction/0/{part}/picture"

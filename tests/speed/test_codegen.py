@@ -42,7 +42,7 @@ def test_c_step_with_nothing_active(benchmark, model):
     report(
         benchmark,
         **{
-            "C step, with its clock µs": float(np.median(found.solve_time)) * 1e6,
+            "C step, with its clock µs": float(np.median(found["solve_time"])) * 1e6,
             "from Python µs": ours * 1e6,
             "Python's step µs": theirs * 1e6,
             "a look at the clock µs": empty * 1e6,

@@ -13,8 +13,8 @@ from scipy.optimize import lsq_linear
 
 import koopmpc as km
 from koopmpc.synthesis.candidates import Candidate, Recipe
-from koopmpc.synthesis.designed import place_of
-from koopmpc.synthesis.judging import LOST, Outcome, ratios, scores
+from koopmpc.synthesis.designed import choose_row
+from koopmpc.synthesis.judging import LOST, Outcome, average_ratios, rate_runs
 from tests.synthesis.test_select import PLAIN, SQUARES, episodes_of, noisy
 
 A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])  # a mass with friction; its position is free
@@ -113,13 +113,13 @@ def test_a_recipe_that_is_lost_on_every_surrogate_is_never_chosen():
         outcomes = [
             Outcome(c, np.where(np.isfinite(c), 0.0, np.inf), np.zeros(12), *[np.zeros((0, 2))] * 2) for c in costs
         ]
-        each = ratios(outcomes)
+        each = rate_runs(outcomes)
         assert (each[lost] == LOST).all()
         rows = [
             replace(usual().best, score=float(score), off=True)
-            for score in scores(each, np.array([1.0] * 6 + [0.5] * 6))
+            for score in average_ratios(each, np.array([1.0] * 6 + [0.5] * 6))
         ]
-        assert place_of(rows) != lost
+        assert choose_row(rows) != lost
 
 
 def test_of_equal_rows_the_smallest_model_is_taken_and_of_one_model_the_controller_with_an_estimator():
@@ -134,7 +134,7 @@ def test_of_equal_rows_the_smallest_model_is_taken_and_of_one_model_the_controll
         rows = [
             replace(best, recipe=recipe, score=score, off=True) for recipe, score in zip(recipes, scores, strict=True)
         ]
-        return place_of(rows)
+        return choose_row(rows)
 
     assert chosen(1.0, 1.001, 1.004) == 2
     assert chosen(1.0, 1.001, 1.02) == 2
@@ -143,7 +143,7 @@ def test_of_equal_rows_the_smallest_model_is_taken_and_of_one_model_the_controll
 
 
 def test_a_run_with_inputs_off_counts_half():
-    one, two = scores(np.array([[1.0, 4.0], [4.0, 1.0]]), np.array([1.0, 0.5]))
+    one, two = average_ratios(np.array([[1.0, 4.0], [4.0, 1.0]]), np.array([1.0, 0.5]))
     np.testing.assert_allclose([one, two], [4 ** (1 / 3), 4 ** (2 / 3)])
 
 
@@ -156,7 +156,7 @@ def test_by_default_each_loop_of_a_design_has_a_start_of_its_own():
 def test_violations_count_beyond_half_a_percent_and_beyond_what_nobody_avoids():
     ones, none = np.ones(2), np.zeros((0, 2))
     kept, broken = np.array([0.0, 0.3]), np.array([0.105, 0.4])
-    each = ratios([Outcome(ones, kept, ones, none, none), Outcome(ones, broken, ones, none, none)])
+    each = rate_runs([Outcome(ones, kept, ones, none, none), Outcome(ones, broken, ones, none, none)])
     np.testing.assert_allclose(each[0], 1.0)
     np.testing.assert_allclose(each[1], 1 + 0.99**-1 * 0.99 * np.array([1.0, 0.95]) / 1.01, rtol=1e-9)
 
@@ -383,13 +383,13 @@ def test_an_experiment_with_stronger_inputs_is_kept():
 
 
 def test_a_controller_that_turns_when_it_is_fitted_to_all_data_is_passed_over(monkeypatch):
-    confirmed, seen = room.confirmed, []
+    confirmed, seen = room.is_confirmed, []
 
     def first_fails(test, controller, outcome):
         seen.append(controller)
         return len(seen) > 1 and confirmed(test, controller, outcome)
 
-    monkeypatch.setattr(room, "confirmed", first_fails)
+    monkeypatch.setattr(room, "is_confirmed", first_fails)
     found = designed(data())
     assert found.controller is not seen[0]
     assert any(note.startswith("passed over: ") for note in found.notes)
@@ -398,7 +398,7 @@ def test_a_controller_that_turns_when_it_is_fitted_to_all_data_is_passed_over(mo
 
 def test_a_model_that_is_not_that_of_the_folds_is_not_confirmed():
     test, jobs = [], []
-    judged = room.judged
+    judged = room.judge_job
 
     def kept(one, job):
         test.append(one)
@@ -406,14 +406,14 @@ def test_a_model_that_is_not_that_of_the_folds_is_not_confirmed():
         return judged(one, job)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(room, "judged", kept)
+        patch.setattr(room, "judge_job", kept)
         found = designed(data())
     last = next(job for job in jobs if job.recipe == found.best.recipe and len(job.conditions) == 12)
     outcome = judged(test[-1], last)
-    assert room.confirmed(test[-1], found.controller, outcome)
+    assert room.is_confirmed(test[-1], found.controller, outcome)
     model = found.controller.predictor
     wrong = km.KoopmanMPC(replace(model, B=-model.B), COST, LIMITS, 8)
-    assert not room.confirmed(test[-1], wrong, outcome)
+    assert not room.is_confirmed(test[-1], wrong, outcome)
 
 
 def test_a_single_wrong_measurement_is_replaced_and_its_episode_kept():

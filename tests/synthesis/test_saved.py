@@ -3,6 +3,7 @@
 import json
 import zipfile
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -24,6 +25,10 @@ def controllers():
         km.KoopmanMPC(linear, COST, LIMITS, 9, settings={"max_iter": 50}),
         km.BilinearMPC(bilinear, COST, LIMITS, 9, sqp_iterations=2, estimator=estimator),
         km.NonlinearMPC(bilinear, COST, LIMITS, 6, starts=2),
+        km.LQR(linear, COST, LIMITS),
+        km.supervise.Guarded(
+            km.KoopmanMPC(linear, COST, LIMITS, 9, monitor=data()), km.LQR(linear, COST, LIMITS), patience=2
+        ),
     ]
 
 
@@ -33,13 +38,32 @@ def moves(controller):
     return np.array([controller(rng.uniform(-0.4, 0.4, 2), [1.0, 0.0]).u for _ in range(4)])
 
 
-@pytest.mark.parametrize("place", range(4))
+@pytest.mark.parametrize("place", range(6))
 def test_a_loaded_controller_is_of_the_same_kind_and_steers_to_the_bit_as_the_saved_one(place, tmp_path):
     controller = controllers()[place]
     controller.save(tmp_path / "c.npz")
     loaded = km.load_controller(tmp_path / "c.npz")
     assert type(loaded) is type(controller)
     np.testing.assert_array_equal(moves(loaded), moves(controller))
+
+
+@pytest.mark.parametrize("B", [[[0.0], [1.0]], lambda x: ca.vertcat(0, ca.cos(x[0]))])
+def test_a_loaded_law_of_an_eigenfunction_steers_to_the_bit_as_the_saved_one(B, tmp_path):
+    energy = km.Expressions(lambda x: [x[1] ** 2 / 2 - ca.cos(x[0])], ["E"]).bind(("a", "b"))
+    cost = km.Cost(Q=2, R=0.5, of=energy)
+    law = km.control.EigenfunctionLQR(energy, cost, km.Limits(-1, 1), dt=0.02, B=B, eigenvalue=0.0)
+    law.save(tmp_path / "law.npz")
+    loaded = km.load_controller(tmp_path / "law.npz")
+    assert isinstance(loaded, km.control.EigenfunctionLQR)
+    for x in np.random.default_rng(0).uniform(-2, 2, (10, 2)):
+        np.testing.assert_array_equal(loaded(x, [0.3]).u, law(x, [0.3]).u)
+
+
+def test_a_controller_that_goes_on_learning_is_refused_with_what_to_save_instead(tmp_path):
+    mpc = km.KoopmanMPC(models()[0], COST, LIMITS, 5)
+    learning = km.supervise.Adaptive(mpc, km.OnlineEDMD.start(data(), mpc.predictor.lifting))
+    with pytest.raises(km.errors.DataError, match="save the controller inside it"):
+        learning.save(tmp_path / "c.npz")
 
 
 def test_a_linear_mpc_comes_back_as_the_koopman_mpc_that_it_is(tmp_path):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.synthesis.candidates import angles
-from koopmpc.synthesis.cross_validation import Trial, folded, sampled, tried, usual_horizon
-from koopmpc.synthesis.select import choice
+from koopmpc.data.angles import find_angles
+from koopmpc.synthesis.cross_validation import Trial, cross_validate, make_folds, take_sample, usual_horizon
+from koopmpc.synthesis.select import choose_model
 from tests.roundtrip import returned
 
 A, B = np.array([[0.9, 0.2], [-0.1, 0.95]]), np.array([[0.0], [0.3]])
@@ -117,7 +117,7 @@ def test_a_score_is_the_relative_error_of_fits_that_never_saw_the_fold():
     data = noisy(episodes_of(quadratic, count=6, steps=14), 0.02)
     fold, horizon, ridge = (0, 1, 2, 0, 1, 2), 5, 1e-3
     lifting = SQUARES.bind(data.states)
-    result = tried(Trial(km.synthesis.Candidate("", lifting), data, fold, horizon, 2, (ridge,)))
+    result = cross_validate(Trial(km.synthesis.Candidate("", lifting), data, fold, horizon, 2, (ridge,)))
     spread = np.concatenate([e.X for e in data]).std(axis=0)
     for f in range(3):
         train = km.Episodes([e for e, g in zip(data, fold, strict=True) if g != f], data.dt)
@@ -227,10 +227,10 @@ def test_a_linear_model_that_grows_for_nothing_is_not_chosen():
         replace(found.leaderboard[0], worst=1.0, deviation=0.0, last=1.0, growth=2.0, size=2),
         replace(found.leaderboard[0], worst=0.1, deviation=0.0, last=0.9, growth=7.0, size=50),
     )
-    assert choice((wild, plain)) == 1
-    assert choice((replace(wild, growth=5.0), plain)) == 0  # less than three times
-    assert choice((replace(wild, last=0.4), plain)) == 0  # the data bear it out
-    assert choice((replace(wild, bilinear=True), plain)) == 0  # lifted anew at each step
+    assert choose_model((wild, plain)) == 1
+    assert choose_model((replace(wild, growth=5.0), plain)) == 0  # less than three times
+    assert choose_model((replace(wild, last=0.4), plain)) == 0  # the data bear it out
+    assert choose_model((replace(wild, bilinear=True), plain)) == 0  # lifted anew at each step
 
 
 def test_the_smallest_model_within_one_standard_error_is_chosen():
@@ -239,8 +239,8 @@ def test_the_smallest_model_within_one_standard_error_is_chosen():
         replace(found.leaderboard[0], worst=w, deviation=d, size=s)
         for w, d, s in [(1.0, 0.2, 50), (1.1, 0.0, 20), (1.19, 0.0, 30), (1.3, 0.0, 2)]
     ]
-    assert choice(tuple(rows)) == 1
-    assert choice((replace(rows[0], worst=np.inf, deviation=0.0), replace(rows[3], worst=np.inf))) == 1
+    assert choose_model(tuple(rows)) == 1
+    assert choose_model((replace(rows[0], worst=np.inf, deviation=0.0), replace(rows[3], worst=np.inf))) == 1
 
 
 def test_workers_change_nothing_and_a_lifting_of_ones_own_reaches_them():
@@ -287,7 +287,7 @@ def test_one_long_episode_is_cut_into_blocks_and_the_choice_says_so():
 
 def test_blocks_share_no_pair_and_a_fold_of_them_is_one_stretch():
     (whole,) = data = episodes_of(linear, count=1, steps=203)
-    found = folded(data, 6, 5, np.random.default_rng(0))
+    found = make_folds(data, 6, 5, np.random.default_rng(0))
     assert sum(len(e) for e in found.episodes) == 203
     assert np.array_equal(np.concatenate([e.X[:-1] for e in found.episodes]), whole.X[:-1])
     assert list(found.fold) == sorted(found.fold)
@@ -299,20 +299,20 @@ def test_whole_episodes_are_dealt_out_evenly_and_short_ones_are_counted():
     data = km.Episodes(
         [km.Episode(X=rng.standard_normal((n + 1, 1)), U=np.zeros((n, 0))) for n in [40] * 12 + [3] * 2], 0.1
     )
-    found = folded(data, 10, 4, rng)
+    found = make_folds(data, 10, 4, rng)
     assert "2 of 14 episodes are shorter than the 10 steps" in found.notes[0]
     assert np.bincount(found.fold).tolist() == [3, 3, 3, 3]
     with pytest.raises(km.errors.DataError, match="pass a shorter horizon, or longer episodes"):
-        folded(data[12:], 10, 4, rng)
+        make_folds(data[12:], 10, 4, rng)
 
 
 def test_a_sample_is_whole_episodes_or_the_beginning_of_one():
     data = episodes_of(linear, count=50, steps=20)
-    held, notes = sampled(km.data.Stream([data]), 200)
+    held, notes = take_sample(km.data.Stream([data]), 200)
     assert sum(map(len, held)) == 200
     assert all(any(np.array_equal(one.X, e.X) for e in data) for one in held)
     assert notes
-    held, _ = sampled(km.data.Stream([episodes_of(linear, count=1, steps=500)]), 100)
+    held, _ = take_sample(km.data.Stream([episodes_of(linear, count=1, steps=500)]), 100)
     assert [len(e) for e in held] == [100]
 
 
@@ -326,7 +326,7 @@ def test_the_usual_horizon_is_twenty_steps_or_what_most_data_allow_and_then_a_no
     ahead, notes = usual_horizon(data, 2)
     assert ahead == expected
     assert [f"judged {expected} steps ahead, not 20" in note for note in notes] == [True] * (expected < 20)
-    assert folded(data, ahead + 2, 5, np.random.default_rng(0)).number > 1
+    assert make_folds(data, ahead + 2, 5, np.random.default_rng(0)).number > 1
 
 
 def test_a_few_short_episodes_do_not_shorten_the_horizon():
@@ -374,9 +374,9 @@ def test_what_is_constant_in_the_data_is_named():
 def test_angles_are_told_by_unit_then_by_name():
     names = ["theta [rad]", "omega [rad/s]", "roll [deg]", "phi", "dtheta", "x", "pole_angle", "theta2"]
     X = np.random.default_rng(0).uniform(-2, 2, (50, 8))
-    assert angles(names, X) == [0, 3, 6, 7]
+    assert find_angles(names, X) == [0, 3, 6, 7]
     X[:, 3] *= 0.01
-    assert angles(names, X) == [0, 6, 7]
+    assert find_angles(names, X) == [0, 6, 7]
 
 
 def test_a_wrapped_angle_is_named():

@@ -12,8 +12,8 @@ from scipy.optimize import approx_fprime
 
 import koopmpc as km
 from koopmpc.data.source import source_of
-from koopmpc.identify.variable_projection import Tuning, VariableProjection, Windows
-from koopmpc.synthesis.train import _drawn
+from koopmpc.identify.variable_projection import TunableLifting, VariableProjection, Windows
+from koopmpc.synthesis.train import _draw_pieces
 
 PLANT = km.black_box(
     lambda x, u: [x[0] + 0.1 * x[1], 0.95 * x[1] - 0.1 * np.sin(2 * x[0]) + 0.1 * u[0]],
@@ -61,8 +61,8 @@ LIFTINGS = {
 
 @pytest.mark.parametrize("lifting", LIFTINGS.values(), ids=LIFTINGS.keys())
 def test_the_gradient_is_that_of_differences_and_the_error_is_the_score_of_the_fit(data, lifting):
-    points = _drawn(source_of(data), 5, 200, np.random.default_rng(0)).all
-    tuning = Tuning(lifting.bind(data.states))
+    points = _draw_pieces(source_of(data), 5, 200, np.random.default_rng(0)).all
+    tuning = TunableLifting(lifting.bind(data.states))
     objective = VariableProjection(tuning, Windows.of(points, 5, 2), 1e-6)
     p = 0.05 * np.random.default_rng(1).standard_normal(tuning.n)
     value, gradient = objective(p)
@@ -75,7 +75,7 @@ def test_the_gradient_is_that_of_differences_and_the_error_is_the_score_of_the_f
 
 
 def test_a_state_counts_by_its_own_size_and_one_that_stays_zero_counts_nothing(data):
-    points = _drawn(source_of(data), 5, 200, np.random.default_rng(0)).all
+    points = _draw_pieces(source_of(data), 5, 200, np.random.default_rng(0)).all
     small = km.Episodes([km.Episode(X=e.X * [1e-6, 0.0], U=e.U) for e in points], points.dt)
     windows = Windows.of(small, 5, 2)
     size = np.sum(np.stack([e.X[1:] for e in small]) ** 2, axis=0)
@@ -138,7 +138,7 @@ def test_memory_goes_with_the_windows_and_not_with_the_data(tmp_path, monkeypatc
     lifting = km.State() + km.Gaussian(CENTERS, 0.8)
     one = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-1, 1), episodes=4, steps=1000, rng=0)
     peaks = []
-    monkeypatch.setattr("koopmpc.data.storage._PART", 100_000)  # bytes that are read at once
+    monkeypatch.setattr("koopmpc.data.files.folder._PART", 100_000)  # bytes that are read at once
     for count in (4, 24):
         folder = tmp_path / str(count)
         folder.mkdir()
@@ -153,7 +153,7 @@ def test_memory_goes_with_the_windows_and_not_with_the_data(tmp_path, monkeypatc
 
 def test_ctrl_c_stops_it(data, monkeypatch):
     calls = []
-    own = Tuning.pullback
+    own = TunableLifting.pullback
 
     def pressed(self, *arguments):
         calls.append(0)
@@ -162,7 +162,7 @@ def test_ctrl_c_stops_it(data, monkeypatch):
         return own(self, *arguments)
 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    monkeypatch.setattr(Tuning, "pullback", pressed)
+    monkeypatch.setattr(TunableLifting, "pullback", pressed)
     try:
         with pytest.raises(KeyboardInterrupt):
             km.train(LIFTINGS["thin plates"], data, horizon=4)
@@ -193,8 +193,8 @@ def test_bad_input_is_refused_in_a_sentence(data):
 
 def test_small_states_count_relative_to_their_size_as_in_the_score(data):
     small = km.Episodes([km.Episode(X=1e-3 * e.X, U=e.U) for e in data], 0.1, data.states, data.inputs)
-    points = _drawn(source_of(small), 5, 200, np.random.default_rng(0)).all
-    tuning = Tuning((km.State() + km.Gaussian(1e-3 * CENTERS, 0.8e-3)).bind(data.states))
+    points = _draw_pieces(source_of(small), 5, 200, np.random.default_rng(0)).all
+    tuning = TunableLifting((km.State() + km.Gaussian(1e-3 * CENTERS, 0.8e-3)).bind(data.states))
     value, _ = VariableProjection(tuning, Windows.of(points, 5, 2), 1e-6)(np.zeros(tuning.n))
     model = km.edmd(points, tuning.at(np.zeros(tuning.n)), ridge=1e-6)
     assert np.exp(value) == pytest.approx(km.score(model, points, 5, stride=5).total, rel=1e-5)

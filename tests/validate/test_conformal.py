@@ -30,11 +30,11 @@ def test_the_band_is_the_ranked_score_times_the_scale() -> None:
     for e in fresh:
         gap = np.abs(e.X[1:] - MODEL.rollout(e.X[0], e.U)[1:])
         worst.append(np.max(gap / band.scale))
-    again = band.recalibrated(MODEL, fresh)
+    again = band.recalibrate(MODEL, fresh)
     assert again.quantile == pytest.approx(np.sort(worst)[26], rel=1e-12)  # ⌈30 · 0.9⌉ = 27th of 29
     assert np.array_equal(again.scale, band.scale)
     assert np.allclose(again.width, again.quantile * band.scale)
-    assert again.measured(MODEL, fresh).share == pytest.approx(27 / 29)
+    assert again.measure_coverage(MODEL, fresh).share == pytest.approx(27 / 29)
 
 
 @pytest.mark.parametrize(("level", "needed"), [(0.9, 9), (0.95, 19), (0.5, 1)])
@@ -42,11 +42,11 @@ def test_too_few_episodes_give_an_infinite_band(level: float, needed: int) -> No
     rng = np.random.default_rng(1)
     band = km.validate.conformal(MODEL, nonlinear(40, rng), STEPS, level=level)
     assert band.needed == needed
-    assert np.isfinite(band.recalibrated(MODEL, nonlinear(needed, rng)).width).all()
+    assert np.isfinite(band.recalibrate(MODEL, nonlinear(needed, rng)).width).all()
     if needed > 1:
-        few = band.recalibrated(MODEL, nonlinear(needed - 1, rng))
+        few = band.recalibrate(MODEL, nonlinear(needed - 1, rng))
         assert np.isinf(few.width).all()
-        assert few.measured(MODEL, nonlinear(5, rng)).share == 1.0
+        assert few.measure_coverage(MODEL, nonlinear(5, rng)).share == 1.0
 
 
 def test_a_perfect_model_has_a_band_of_rounding() -> None:
@@ -62,7 +62,7 @@ def test_a_perfect_model_has_a_band_of_rounding() -> None:
 def test_wilsons_interval_holds_the_share() -> None:
     rng = np.random.default_rng(3)
     band = km.validate.conformal(MODEL, nonlinear(60, rng), STEPS)
-    covered = band.measured(MODEL, nonlinear(50, rng))
+    covered = band.measure_coverage(MODEL, nonlinear(50, rng))
     assert 0 <= covered.low <= covered.share <= covered.high <= 1
     assert covered.episodes == 50
     # p̂ = 45/50: Wilson's interval is [0.786, 0.957] (Brown, Cai & DasGupta, Stat. Sci. 16, 2001)
@@ -78,7 +78,7 @@ def mean_coverage(redraws: int, seed: int) -> float:
     for _ in range(redraws):
         band = km.validate.conformal(MODEL, nonlinear(132, rng, steps=12), STEPS, rng=rng)
         assert band.episodes == 99
-        shares.append(band.measured(MODEL, nonlinear(100, rng, steps=12), rng=rng).share)
+        shares.append(band.measure_coverage(MODEL, nonlinear(100, rng, steps=12), rng=rng).share)
     return float(np.mean(shares))
 
 
@@ -96,12 +96,12 @@ def test_feedback_breaks_the_promise_and_calibrating_on_it_restores_it() -> None
     rng = np.random.default_rng(6)
     chance = 4 * np.sqrt(0.9 * 0.1 * (1 / 300 + 1 / 400))  # calibration and test both draw
     band = km.validate.conformal(MODEL, nonlinear(400, rng), STEPS, rng=rng)
-    assert abs(band.measured(MODEL, nonlinear(400, rng), rng=rng).share - 0.9) < chance
+    assert abs(band.measure_coverage(MODEL, nonlinear(400, rng), rng=rng).share - 0.9) < chance
     loop = nonlinear(300, rng, gain=0.8)  # holds x where sin 3x is largest
-    assert band.measured(MODEL, loop, rng=rng).share < 0.9 - chance
-    again = band.recalibrated(MODEL, loop, rng=rng)
+    assert band.measure_coverage(MODEL, loop, rng=rng).share < 0.9 - chance
+    again = band.recalibrate(MODEL, loop, rng=rng)
     assert again.quantile > band.quantile
-    fresh = again.measured(MODEL, nonlinear(400, rng, gain=0.8), rng=rng)
+    fresh = again.measure_coverage(MODEL, nonlinear(400, rng, gain=0.8), rng=rng)
     assert abs(fresh.share - 0.9) < chance
 
 

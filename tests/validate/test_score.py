@@ -124,9 +124,9 @@ def test_an_embedding_is_scored_from_the_first_start_with_a_past(inputs: bool) -
 
 
 def test_of_many_starts_evenly_spread_ones_give_the_quantiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("koopmpc.validate.scoring._KEPT", 1)
-    monkeypatch.setattr("koopmpc.validate.scoring._LEAST", 40)
-    monkeypatch.setattr("koopmpc.validate.scoring._STARTS", 17)
+    monkeypatch.setattr("koopmpc.validate.scoring._QUANTILE_ERRORS", 1)
+    monkeypatch.setattr("koopmpc.validate.scoring._QUANTILE_STARTS", 40)
+    monkeypatch.setattr("koopmpc.validate.scoring._BLOCK_STARTS", 17)
     model = random_predictor(3, 2, 1, km.State() + km.Fourier(1))
     data = runs(random_predictor(3, 2, 1), [40, 55, 30], 3, noise=0.1)
     errors = brute_errors(lambda x, U: model.rollout(x, U)[1:], data, 3)

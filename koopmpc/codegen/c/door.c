@@ -1,4 +1,4 @@
-/** @file door.c @brief How Python calls a controller: stands at the end of what is compiled, and is never exported. */
+/** @file door.c @brief The functions by which Python calls a controller; appended to its C before compiling, never exported. */
 #ifdef _WIN32
 #define DOOR __declspec(dllexport)
 #else
@@ -52,7 +52,7 @@ DOOR void koopmpc_run(koopmpc_frame *f, const koopmpc_whole *run) {
     run->measure(x + run->nx, run->Y + (k + 1) * run->ny);
   }
 }
-/* ManyRuns from many states, one after the other, each from the beginning; Y holds one run. */
+/* Runs from many states, one after the other, each after a reset; Y holds one run. */
 DOOR void koopmpc_runs(koopmpc_frame *f, koopmpc_whole *run, long runs) {
 #if KOOPMPC_IS_STAGED
   const koopmpc_real *targets = f->state->targets;

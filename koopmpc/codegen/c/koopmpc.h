@@ -2,7 +2,7 @@
  * @file koopmpc.h
  * @brief One controller as C99: no heap, no file, no clock, no library but math.h, no global variable.
  *
- * Everything that moves lives in one koopmpc_state, which the caller owns; copy it by assignment. Two states may be
+ * The state of a controller is one koopmpc_state, which the caller owns; copy it by assignment. Two states may be
  * stepped by two threads at once. Arrays hold one value after the other; matrices and previews hold row after row.
  */
 #ifndef KOOPMPC_H
@@ -20,7 +20,7 @@ typedef float koopmpc_real;
 typedef double koopmpc_real;
 #endif
 
-/** How a step ended. The first four are as intended; the others come with a fallback. */
+/** How a step ended. The first four are regular; the others come with a fallback. */
 typedef enum {
   KOOPMPC_UNCONSTRAINED = 0,   /**< the unconstrained optimum meets every limit */
   KOOPMPC_OPTIMAL = 1,         /**< the QP was solved */
@@ -33,50 +33,50 @@ typedef enum {
   KOOPMPC_FAILED = 8           /**< the solver gave no usable answer */
 } koopmpc_status;
 
-/** What replaced the answer of a failed step; always inside the input limits. */
+/** The input that replaces the answer of a failed step; always inside the input limits. */
 typedef enum {
-  KOOPMPC_NONE = 0,         /**< nothing had to */
+  KOOPMPC_NONE = 0,         /**< the answer of the step */
   KOOPMPC_SHIFTED_PLAN = 1, /**< the last good plan, moved on by one step */
   KOOPMPC_CLIPPED_LQR = 2,  /**< the unconstrained optimum, clipped to the input limits */
   KOOPMPC_HOLD = 3          /**< the last input again */
 } koopmpc_fallback;
 
-/** Rows of a preview: `count` rows from this step on; the last one is repeated as long as rows are missing. */
+/** Rows of a preview from this step on. If there are fewer than the horizon has steps, the last one is repeated. */
 typedef struct {
   const koopmpc_real *values; /**< row after row */
   int count;                  /**< number of rows, at least 1 */
 } koopmpc_rows;
 
-/** What a step says of itself. */
+/** How a step ended, and the work of the QP solver. */
 typedef struct {
   koopmpc_status status;
   koopmpc_fallback fallback;
   int iterations;     /**< iterations of the QP solver */
-  koopmpc_real slack; /**< how far the plan breaks the soft limit that gives way most, in its unit; 0 but SOFTENED */
+  koopmpc_real slack; /**< the largest violation of a soft limit, in its unit; 0 unless SOFTENED */
 } koopmpc_report;
 
 #if KOOPMPC_IS_LQR
 
-/** All that moves from step to step. */
+/** The state of the controller between two steps. */
 typedef struct {
   koopmpc_real last[KOOPMPC_NU]; /**< the last input */
   koopmpc_real zeta[KOOPMPC_NZETA];
   koopmpc_real z[KOOPMPC_NZ];
   koopmpc_real target_reals[KOOPMPC_TARGET_REALS]; /**< memory of the solver of targets */
   int target_ints[KOOPMPC_TARGET_INTS];
-  int seen; /**< whether a past is known, where the model needs one */
+  int seen; /**< whether zeta holds a past; only for models with delays */
   int row;  /**< row of given input targets */
 } koopmpc_state;
 
 #else
 
-/** All that moves from step to step. */
+/** The state of the controller between two steps. */
 typedef struct {
   koopmpc_real known[KOOPMPC_KNOWN + 1];   /**< [z; u_{-1}; w_0 ...; d], where the plan starts */
   koopmpc_real reference[(KOOPMPC_N + 1) * KOOPMPC_NR]; /**< rows of the last step */
   koopmpc_real kept[KOOPMPC_MOVES];        /**< inputs of the last good plan */
   koopmpc_real given[KOOPMPC_NU];          /**< the last input returned */
-  koopmpc_real sent[(KOOPMPC_LATENCY + 1) * KOOPMPC_NU]; /**< inputs computed and not yet acted */
+  koopmpc_real sent[(KOOPMPC_LATENCY + 1) * KOOPMPC_NU]; /**< computed inputs that have not acted yet */
   koopmpc_real ahead[(KOOPMPC_LATENCY + 1) * KOOPMPC_NW1];
   koopmpc_real w[KOOPMPC_NW1];
   koopmpc_real zeta[KOOPMPC_NZETA];
@@ -134,10 +134,10 @@ typedef struct {
 #endif
   const koopmpc_real *targets; /**< the table of targets, see koopmpc_use_targets */
   int finishing;               /**< whether the active-set method finished the last program of this step */
-  int target_count, found;     /**< its rows, and the one that was found last */
+  int target_count, found;     /**< number of its rows, and the row that was found last */
   int moved_on;                /**< whether the disturbance or the row of given input targets has moved */
 #else
-  koopmpc_real t[KOOPMPC_NT];              /**< the plan of this step and what its targets come to */
+  koopmpc_real t[KOOPMPC_NT];              /**< the plan of this step, and the extreme values of its targets */
   koopmpc_real column[KOOPMPC_NT];         /**< the reference's part of the plan */
   koopmpc_real dual[KOOPMPC_QP_M1];        /**< multipliers of the last solve, from which the next one starts */
   koopmpc_real target_reals[KOOPMPC_TARGET_REALS]; /**< memory of the solver of targets */
@@ -145,17 +145,17 @@ typedef struct {
   koopmpc_real qp_reals[KOOPMPC_QP_REALS]; /**< memory of the QP solver, and the rows that it ended with */
   int qp_ints[KOOPMPC_QP_INTS];
 #if KOOPMPC_STEEP
-  koopmpc_real eased[KOOPMPC_QP_M * KOOPMPC_MOVES + 4 * KOOPMPC_QP_M]; /**< rows of a problem that a weight eases */
+  koopmpc_real eased[KOOPMPC_QP_M * KOOPMPC_MOVES + 4 * KOOPMPC_QP_M]; /**< rows of the problem with an added weight */
 #endif
-  int far;        /**< whether the last solution had to be approached */
-  int resumes;    /**< whether the solver may go on from the few rows that it holds */
+  int far;        /**< whether the last solution took proximal points */
+  int resumes;    /**< whether the next solve continues from the active rows of this one */
   int unmet;      /**< whether the hard limits of the last solve contradicted each other */
 #endif
   int aimed;      /**< whether the targets are those of `reference` */
   int row;        /**< row of given input targets */
   int warm;       /**< whether the next step starts from the last one */
   int has_kept, age, planned;
-  int seen;       /**< whether a past is known, where the model needs one */
+  int seen;       /**< whether zeta holds a past; only for models with delays */
 } koopmpc_state;
 
 #endif
@@ -173,7 +173,7 @@ void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *
  * @param s         the state
  * @param y         KOOPMPC_NY measurements; NaN is a missed one
  * @param reference rows of KOOPMPC_NR numbers from this step on, up to KOOPMPC_HORIZON + 1 of them are read
- * @param applied   KOOPMPC_NU numbers, what the plant really got last; NULL for the last u returned
+ * @param applied   KOOPMPC_NU numbers, the input that acted last; NULL for the last u returned
  * @param w         rows of KOOPMPC_NW measured disturbances from this step on; NULL for zero
  * @param u         KOOPMPC_NU numbers, the input to apply; always inside its limits
  * @param report    how the step ended; may be NULL
@@ -185,7 +185,7 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
  * Write the inputs of the last plan.
  * @param s the state
  * @param U KOOPMPC_N rows of KOOPMPC_NU inputs
- * @return 1; 0 where the last step had no plan, and U is as it was
+ * @return 1; 0 if the last step had no plan: then U is not written
  */
 int koopmpc_plan(const koopmpc_state *s, koopmpc_real *U);
 
@@ -205,8 +205,8 @@ int koopmpc_plan_states(const koopmpc_state *s, koopmpc_real *X);
  * Take the targets of reference rows from another table than that of koopmpc_table.h. A step whose reference holds a
  * row that the table lacks is KOOPMPC_BAD_MEASUREMENT.
  * @param s       the state
- * @param targets `count` rows of KOOPMPC_TARGET numbers, which stay where they are
- * @param count   how many
+ * @param targets `count` rows of KOOPMPC_TARGET numbers; the memory must stay valid
+ * @param count   number of rows
  */
 void koopmpc_use_targets(koopmpc_state *s, const koopmpc_real *targets, int count);
 

@@ -8,7 +8,7 @@
 
 static inline koopmpc_real koopmpc_abs(koopmpc_real a) { return a < 0 ? -a : a; }
 
-/** Whether all are numbers below 1e30 in size. */
+/** Whether all entries are numbers below 1e30 in size. */
 static inline int koopmpc_usable(const koopmpc_real *a, int n) {
   int good = 1;
   for (int i = 0; i < n; i++) good &= koopmpc_abs(a[i]) < KOOPMPC_HUGE;
@@ -45,13 +45,13 @@ void koopmpc_add(koopmpc_real *to, const koopmpc_real *map, int rows, const koop
 /** Move zeta = [x_k, u_{k-1}, x_{k-1}, ...] on by a step that led to x under u, and write z = psi(zeta). */
 void koopmpc_observe(koopmpc_real *zeta, int *seen, koopmpc_real *z, const koopmpc_real *x, const koopmpc_real *u);
 
-/** The nearest coordinates of a target without limits; e is what disturbances add to z, NULL for nothing. */
+/** Coordinates of the target nearest to r, without limits; disturbances add e to z, NULL for none. */
 void koopmpc_nearest(const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha);
 
-/** The same inside the limits; 1 where they had to be moved. */
+/** Coordinates of the nearest target inside the limits; 1 if a limit moved it. */
 int koopmpc_target(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha);
 
-/** Move u inside its change since `last` within (low, high), where `low` is not NULL, and inside its limits. */
+/** Clip the change of u since `last` to (low, high), unless `low` is NULL; then clip u to its limits. */
 void koopmpc_admit(koopmpc_real *u, const koopmpc_real *low, const koopmpc_real *high, const koopmpc_real *last);
 
 #endif

@@ -1,6 +1,6 @@
 /**
  * @file koopmpc_finish.c
- * @brief The program of the stages in condensed form, for an active-set method that ends where interior points do not.
+ * @brief The program of the stages in condensed form, for an active-set method that ends where interior points fail.
  *
  * With dx = dx_free + x and du_k = du_free,k - K_k x_k + L_k^-T w_k, R + B'PB = L_k L_k', the cost is that of the
  * program without limits and 0.5 |w|^2: the Hessian is the identity also where the plant is unstable.
@@ -45,7 +45,7 @@ static koopmpc_real moved_by(const koopmpc_state *s, int place) {
   return i < NV ? s->newU[k * NV + i] : koopmpc_dot(s->G + (k * NG + i - NV) * NS, s->newX + k * NS, NS);
 }
 
-/** Rows of length 1, and prices of those that give way; 0 where the recursion has no digits left. */
+/** Rows of length 1, and prices of the soft ones; 0 if the recursion has lost all digits. */
 static int condense(koopmpc_state *s) {
   koopmpc_real w[WIDTH];
   int good = 1;
@@ -72,7 +72,7 @@ static int condense(koopmpc_state *s) {
   return good;
 }
 
-/** Set the limits: those of the rows less what the plan without limits is, in units of the rows. */
+/** Set the limits: distances from the plan without limits, in units of the rows. */
 static void room(const koopmpc_state *s, koopmpc_qp_memory *qp, int hard_alone) {
   for (int r = 0; r < COUNT; r++) {
     const int k = koopmpc_finish_row[r] / NQ, i = koopmpc_finish_row[r] % NQ, off = hard_alone && koopmpc_finish_sense[r];
@@ -137,5 +137,5 @@ koopmpc_status koopmpc_finish(koopmpc_state *s, int *iterations) {
   return KOOPMPC_OPTIMAL;
 }
 #else
-typedef int koopmpc_no_limits; /* a file of C holds something */
+typedef int koopmpc_no_limits; /* C forbids an empty file */
 #endif

@@ -2,8 +2,8 @@
  * @file koopmpc_mpc.c
  * @brief A predictive controller: the unconstrained plan first, a quadratic program only where a limit is active.
  *
- * t = M [z; u_{-1}; w; d] + (what the reference asks for) is the unconstrained plan. Where it meets every limit it is
- * the optimum. Otherwise the least deviation from it inside the limits is found, and if that fails a fallback acts.
+ * t = M [z; u_{-1}; w; d] + (a part of the reference) is the unconstrained plan. If it meets every limit it is the
+ * optimum. Otherwise DAQP finds the least deviation from it inside the limits; if that fails a fallback acts.
  */
 #include <math.h>
 
@@ -58,7 +58,7 @@ static void aim(koopmpc_state *s, const koopmpc_rows *reference) {
         for (int i = 0; i < KOOPMPC_NR && repeated; i++) repeated = row[i] == row[i - KOOPMPC_NR];
         if (!repeated) {
           if (KOOPMPC_CHECKED_LIMITS)
-            koopmpc_nearest(row, 0, alpha); /* limits are looked at when the disturbance is known */
+            koopmpc_nearest(row, 0, alpha); /* limits are checked when the disturbance is known */
           else
             koopmpc_target(s, row, 0, alpha);
         }
@@ -108,14 +108,14 @@ static const koopmpc_qp problem = {MOVES,           ROWS,         KOOPMPC_QP_SOF
                                    koopmpc_scaling, 0,            koopmpc_sense,   koopmpc_linear,
                                    koopmpc_rho};
 
-/** Set this solve's limits: those of the plan less what it is, rates as wide as the input limits need; see `room`. */
+/** Set the limits of a solve: distances from the plan. A rate limit widens if it excludes the input limits. */
 static koopmpc_real set_limits(const koopmpc_state *s, koopmpc_qp_memory *qp, int hard_alone) {
   koopmpc_real conflict = 0;
   for (int i = 0; i < ROWS; i++) {
     const koopmpc_real moved = s->t[koopmpc_source[i]] * koopmpc_scale[i];
     koopmpc_real low = koopmpc_qp_low[i], high = koopmpc_qp_high[i];
     const int which = koopmpc_rate_input[i];
-    if (which >= 0) { /* the first change of an input, hard: where the two exclude each other the input limit wins */
+    if (which >= 0) { /* the first change of an input, hard: the input limit has precedence */
       const koopmpc_real last = s->known[KOOPMPC_U_PREV + which];
       const koopmpc_real highest = (koopmpc_input_high[which] - last) * koopmpc_scale[i];
       const koopmpc_real lowest = (koopmpc_input_low[which] - last) * koopmpc_scale[i];
@@ -153,9 +153,9 @@ static int contradictory(koopmpc_state *s, koopmpc_qp_memory *qp) {
 /**
  * Solve by proximal points: x <- least 0.5 |x|^2 + 0.5 c |A (x - last)|^2 within the limits, A the hard rows.
  *
- * In plans of unstable plants some combinations of hard rows take an x a million times as large as others, and DAQP
- * takes independent rows for dependent ones. The added weight makes them alike, and two or three steps lead to the
- * solution. In the basis V of A'A, x = V a, each of these problems is that of a least distance.
+ * In plans of unstable plants some combinations of hard rows need an x a million times as large as others; DAQP then
+ * mistakes independent rows for dependent ones. The added weight makes the rows alike, and two or three steps lead to
+ * the solution. In the basis V of A'A, x = V a, each of these problems is a least-distance problem.
  */
 static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const koopmpc_real *push, int *iterations) {
   enum { PASSES = 20 };
@@ -234,7 +234,7 @@ static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const ko
 }
 #endif
 
-/** Find the least deviation from the plan inside the limits; its status, and how far a limit gave way. */
+/** Find the least deviation from the plan inside the limits; writes how far a limit gave way. */
 static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_report *report) {
   koopmpc_real push[KOOPMPC_QP_M1], conflict;
   koopmpc_qp_end end;
@@ -242,7 +242,7 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   koopmpc_status status;
   int good = 0, active = 0;
   s->resumes = 0;
-  for (int i = 0; i < ROWS; i++) /* the last answer, moved on by a step */
+  for (int i = 0; i < ROWS; i++) /* the last answer, shifted by one step */
     push[i] = s->warm && koopmpc_shift[i] < ROWS ? s->dual[koopmpc_shift[i]] : 0;
   if (!resume && s->unmet && contradictory(s, qp)) return KOOPMPC_INFEASIBLE;
   conflict = set_limits(s, qp, 0);
@@ -300,7 +300,7 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
     return;
   }
 #if KOOPMPC_CHECKED > 0
-  if (!within(s->t, PLANNED, KOOPMPC_NT)) { /* the disturbance puts a target outside its limits: the nearest inside */
+  if (!within(s->t, PLANNED, KOOPMPC_NT)) { /* the disturbance moves a target outside its limits: take the nearest one inside */
     koopmpc_real e[KOOPMPC_NZ], alpha[KOOPMPC_NA], nearest[KOOPMPC_NA];
     koopmpc_fill(e, 0, KOOPMPC_NZ);
     koopmpc_add(e, koopmpc_disturbance, KOOPMPC_NZ, s->known + KOOPMPC_PREVIEW, KOOPMPC_DRIVEN);

@@ -55,7 +55,7 @@ koopmpc_qp_memory koopmpc_qp_on(const koopmpc_qp *qp, koopmpc_real *reals, int *
   return mem;
 }
 
-/** Mark the rows from which to start, and those whose two limits are one; 0 where limits cross. */
+/** Mark the rows from which to start, and rows with two equal limits; 0 if limits cross. */
 static int marked(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_real *push, int resume) {
   const int one = DAQP_ACTIVE | DAQP_IMMUTABLE | DAQP_AUTO_EQUALITY;
   int result = 1;
@@ -104,7 +104,7 @@ koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, co
   work.m = m;
   work.M = (koopmpc_real *)qp->M; /* DAQP reads it only */
   work.scaling = (koopmpc_real *)qp->scaling;
-  work.Rinv = 0; /* rows of M hold it, and the solution is taken back below */
+  work.Rinv = 0; /* rows of M hold it; the solution is transformed back below */
   work.dlower = mem->dlow;
   work.dupper = mem->dhigh;
   work.sense = mem->sense;

@@ -14,14 +14,14 @@ typedef struct {
   const koopmpc_real *scaling; /**< (m) */
   const koopmpc_real *rinv;    /**< inverse of R, its upper triangle row by row; NULL for the identity */
   const int *sense;            /**< (m) 8 for a soft row, else 0 */
-  const koopmpc_real *linear;  /**< (m) price of the first bit of a soft row's violation */
+  const koopmpc_real *linear;  /**< (m) linear price of a soft row's violation */
   const koopmpc_real *rho;     /**< (m) reciprocal of the price's slope */
 } koopmpc_qp;
 
 /** The solver's memory: limits, answer, and the rows that it ended with, in two arrays of the caller. */
 typedef struct {
   koopmpc_real *low, *high;         /**< (m) limits of this solve */
-  koopmpc_real *dlow, *dhigh;       /**< (m) the same as the solver scales them */
+  koopmpc_real *dlow, *dhigh;       /**< (m) these limits in the scale of the solver */
   koopmpc_real *product, *dual;     /**< (m) M v, and multipliers */
   koopmpc_real *primal, *u;         /**< (n) */
   koopmpc_real *lam, *lam_star, *D; /**< (k), k = n + soft + 1 */
@@ -42,13 +42,13 @@ typedef struct {
 /**
  * Solve within mem->low and mem->high, made `wider` by this share of 1 + their size.
  * The solution is mem->primal, its multipliers mem->dual; both are zero where there is none.
- * @param resume whether to go on from the rows that the last solve of the same problem ended with
- * @param push  (m) multipliers whose signs tell from which rows to start; NULL for none
+ * @param resume whether to continue from the active rows of the last solve of this problem
+ * @param push  (m) the solve starts from the rows whose multipliers are not zero; NULL for none
  */
 koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_real *push,
                                 koopmpc_real wider, int resume);
 
-/** The same; `good` tells whether the answer is the solution, looked at again where rows give way. */
+/** Solve, and check the answer where rows give way; `good` says whether it is the solution. */
 koopmpc_qp_end koopmpc_qp_attempt(const koopmpc_qp *problem, koopmpc_qp_memory *qp, const koopmpc_real *push,
                                   koopmpc_real wider, int resume, int *good);
 

@@ -1,4 +1,4 @@
-/** @file koopmpc_receding.c @brief Where a plan starts, and what a failed step does. */
+/** @file koopmpc_receding.c @brief The start of a plan, and the fallback of a failed step. */
 #include <math.h>
 
 #include "koopmpc_limits.h"
@@ -25,7 +25,7 @@ static void advance(koopmpc_real *next, const koopmpc_real *z, const koopmpc_rea
 
 #if KOOPMPC_ESTIMATOR == 1
 
-/** Move d towards the mean of the misfits, by the share of them that was constant. */
+/** Move d towards the mean of the misfits, by their constant share. */
 static void learn(koopmpc_state *s, koopmpc_real *misfit) {
   enum { NZ = KOOPMPC_NZ, NX = KOOPMPC_NX };
   koopmpc_real states[KOOPMPC_NX], step[KOOPMPC_NX], believed[KOOPMPC_NX], varied = 0, most = 0;
@@ -132,7 +132,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
     for (int i = 0; i < s->queued * DRIVE; i++) s->queue[i] = s->queue[i + DRIVE];
   }
   for (int i = 0; i < KOOPMPC_NY; i++) any |= koopmpc_abs(y[i]) < KOOPMPC_HUGE;
-  if (s->queued >= KOOPMPC_DELAY_Y && any) correct(s, y); /* else y is older than the start */
+  if (s->queued >= KOOPMPC_DELAY_Y && any) correct(s, y); /* else y was measured before the start */
   s->missed = any ? 0 : s->missed + 1;
   s->started = 1;
   koopmpc_copy(now, s->s, KOOPMPC_NS);
@@ -157,7 +157,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
 
 #endif
 
-/** Write down the preview of the measured disturbances. */
+/** Store the preview of the measured disturbances. */
 static void preview(koopmpc_state *s, const koopmpc_rows *w) {
   for (int k = 0; k < KOOPMPC_N + KOOPMPC_LATENCY; k++) {
     const koopmpc_real *row = w ? koopmpc_row(w, k, KOOPMPC_NW) : 0;
@@ -179,7 +179,7 @@ void koopmpc_take(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *a
   koopmpc_copy(s->sent + KOOPMPC_LATENCY * KOOPMPC_NU, s->given, KOOPMPC_NU);
   if (applied && koopmpc_usable(applied, KOOPMPC_NU)) acted = applied;
   good = observe(s, y, acted);
-  for (int i = 0; i < KOOPMPC_NW; i++) /* an unknown one stays as it was */
+  for (int i = 0; i < KOOPMPC_NW; i++) /* one that is not finite keeps its last value */
     if (koopmpc_abs(s->ahead[i]) < KOOPMPC_HUGE) s->w[i] = s->ahead[i];
   if (good)
     koopmpc_copy(s->known, s->z, KOOPMPC_NZ);

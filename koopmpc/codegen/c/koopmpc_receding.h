@@ -1,4 +1,4 @@
-/** @file koopmpc_receding.h @brief What predictive controllers share: where a plan starts, and what a failed step does. */
+/** @file koopmpc_receding.h @brief Predictive controllers: the start of a plan, and the fallback of a failed step. */
 #ifndef KOOPMPC_RECEDING_H
 #define KOOPMPC_RECEDING_H
 
@@ -15,10 +15,10 @@ enum {
 /** Forget all earlier steps. */
 void koopmpc_start(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *u_prev);
 
-/** Write down in `known` where the plan starts; z is NaN where y cannot be used. */
+/** Write the start of the plan into `known`; z is NaN if y cannot be used. */
 void koopmpc_take(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *applied, const koopmpc_rows *w);
 
-/** Write what stands in for a failed step; `free_input` is the unconstrained optimum, NULL where it is not known. */
+/** Write the fallback of a failed step; `free_input` is the unconstrained optimum, NULL if it is not known. */
 void koopmpc_fail(koopmpc_state *s, const koopmpc_real *free_input, const koopmpc_real *applied, koopmpc_real *u,
                   koopmpc_report *report, koopmpc_status status);
 

@@ -26,7 +26,7 @@ enum {
 #define RANK ((koopmpc_real)KOOPMPC_RANK)
 #define CLOSE ((koopmpc_real)1e-2)
 
-/** Parts of what the model says at (x, u): F, its derivatives A and B, of and J, the limited g and G. */
+/** Parts of koopmpc_local at (x, u): F, its derivatives A and B, of and J, the limited g and G. */
 enum { AT_A = NX, AT_B = AT_A + NX * NX, AT_OF = AT_B + NX * NV, AT_J = AT_OF + ROWS_R, AT_G = AT_J + ROWS_R * NX };
 enum { AT_DG = AT_G + BOX, AT = AT_DG + BOX * NX };
 
@@ -91,7 +91,7 @@ static int inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_rea
   return count;
 }
 
-/** Rows of the residuals on (x, u) by sizes: of(x) first, then (x, u) at next to no weight. */
+/** Rows of the residuals on (x, u) by sizes: of(x) first, then (x, u) with a small weight. */
 static void residuals(const koopmpc_real *at, koopmpc_real *W) {
   koopmpc_fill(W, 0, LEFT * SIZE);
   for (int i = 0; i < ROWS_R; i++)
@@ -101,7 +101,7 @@ static void residuals(const koopmpc_real *at, koopmpc_real *W) {
   for (int i = 0; i < SIZE; i++) W[(ROWS_R + i) * SIZE + i] = KOOPMPC_SMALL;
 }
 
-/** Rows A - I, B by sizes: what holds the equilibrium. */
+/** Rows A - I, B by sizes: the conditions of an equilibrium. */
 static void holding(const koopmpc_real *at, koopmpc_real *E) {
   for (int i = 0; i < NX; i++)
     for (int j = 0; j < SIZE; j++) {
@@ -110,7 +110,7 @@ static void holding(const koopmpc_real *at, koopmpc_real *E) {
     }
 }
 
-/** What is left of the residuals at s. */
+/** The residuals at s. */
 static void residual(const koopmpc_real *row, const koopmpc_real *of, const koopmpc_real *s, koopmpc_real *left) {
   for (int i = 0; i < ROWS_R; i++) {
     left[i] = 0;
@@ -122,7 +122,7 @@ static void residual(const koopmpc_real *row, const koopmpc_real *of, const koop
 /** to = least |W (free to') - left|, to = free to': (SIZE) from left (LEFT); `back` (SIZE, LEFT) is that map. */
 static void least(const koopmpc_real *W, const koopmpc_real *null, int count, koopmpc_real *back) {
   koopmpc_real turned[LEFT * SIZE], inverted[SIZE * LEFT];
-  const koopmpc_real rounding = RANK * largest_of(W, LEFT * SIZE); /* what the outputs miss would move inputs along it */
+  const koopmpc_real rounding = RANK * largest_of(W, LEFT * SIZE); /* else the residual of the outputs would move inputs along rounding */
   for (int i = 0; i < LEFT; i++)
     for (int j = 0; j < count; j++) {
       turned[i * count + j] = 0;
@@ -142,7 +142,7 @@ static void scaled(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *s
   for (int i = 0; i < SIZE; i++) s[i] = (i < NX ? x[i] : u[i - NX]) / koopmpc_rest_size[i];
 }
 
-/** One step with the factors of an earlier equilibrium as long as that was close by; 0 where it is not close. */
+/** One step with the factors of an earlier equilibrium close by; 0 if the step leads far. */
 static int chord(koopmpc_state *k, koopmpc_real *x, koopmpc_real *u, const koopmpc_real *row, const koopmpc_real *e) {
   koopmpc_real s[SIZE], at[AT], left[LEFT], step[SIZE], missed[NX], close, far = 0;
   scaled(x, u, s);
@@ -190,7 +190,7 @@ static int chord(koopmpc_state *k, koopmpc_real *x, koopmpc_real *u, const koopm
   return 1;
 }
 
-/** Gauss-Newton steps that hold the active limits, add one that is broken and release one that pulls; 0 if they fail. */
+/** Gauss-Newton steps with active limits: a violated one is added, one with a wrong sign released; 0 if they fail. */
 static int near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *e) {
   koopmpc_real s[SIZE], held_now[LIMITS];
   scaled(x, u, s);
@@ -310,5 +310,5 @@ void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_re
   }
 }
 #else
-typedef int koopmpc_no_disturbance; /* a file of C holds something */
+typedef int koopmpc_no_disturbance; /* C forbids an empty file */
 #endif

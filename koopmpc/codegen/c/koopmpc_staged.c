@@ -15,11 +15,11 @@
 #include "koopmpc_table.h"
 
 enum { EACH = 12, AGAIN = 10, PLAN_S = (STEPS + 1) * NS, PLAN_V = STEPS * NV };
-#define NEAR_OF ((koopmpc_real)0.2)      /* of a change: how far F may be from its linearisation */
-#define SHORTEST ((koopmpc_real)0.001)   /* of a step */
-#define FOLLOWED ((koopmpc_real)0.02)    /* a plan follows the model whose defects are below this share of a range */
-#define NEARLY ((koopmpc_real)1e-2)      /* share of a plan that moves when it is compared with others */
-#define FAR_OFF ((koopmpc_real)3)        /* sizes of a state between y and what was expected: the plan begins anew */
+#define NEAR_OF ((koopmpc_real)0.2)      /* F may differ from its linearisation by this share of a change */
+#define SHORTEST ((koopmpc_real)0.001)   /* shortest length of a step */
+#define FOLLOWED ((koopmpc_real)0.02)    /* a plan follows the model if its defects are below this share of a range */
+#define NEARLY ((koopmpc_real)1e-2)      /* plans are compared once an iteration moves them by less than this share */
+#define FAR_OFF ((koopmpc_real)3)        /* the plan restarts if y is more than this many state sizes from the prediction */
 
 static int is_good(koopmpc_status status) { return status <= KOOPMPC_SOFTENED; }
 
@@ -51,7 +51,7 @@ static void enter(koopmpc_state *s, const koopmpc_real *X, const koopmpc_real *U
   (void)u_prev;
 }
 
-/** Write the states and the inputs of the plan, these inside their limits. */
+/** Write the states and the inputs of the plan, the inputs inside their limits. */
 static void trajectory(const koopmpc_state *s, koopmpc_real *X, koopmpc_real *U) {
   for (int k = 0; k <= STEPS; k++) koopmpc_copy(X + k * NX, s->S + k * NS, NX);
   for (int i = 0; i < NV; i++) {
@@ -68,7 +68,7 @@ static void trajectory(const koopmpc_state *s, koopmpc_real *X, koopmpc_real *U)
   }
 }
 
-/** One step of the model from a stage, disturbed as the plan is. */
+/** One step of the model from a stage, with the disturbance of the plan. */
 static void follow(const koopmpc_state *s, int k, const koopmpc_real *x, const koopmpc_real *v, koopmpc_real *next) {
   koopmpc_stage_map(x, v, next);
   if (KOOPMPC_DISTURBED)
@@ -79,7 +79,7 @@ static void follow(const koopmpc_state *s, int k, const koopmpc_real *x, const k
 static void add_program(koopmpc_state *s, const koopmpc_real *x) {
   koopmpc_real reach[NS], gap[NS], *left = s->c;
   int fits = 0;
-  for (int i = 0; i < NS; i++) left[i] += koopmpc_dot(s->A + i * NS, s->start, NS); /* dx_0 is taken whole */
+  for (int i = 0; i < NS; i++) left[i] += koopmpc_dot(s->A + i * NS, s->start, NS); /* dx_0 has no step length */
   for (int i = 0; i < NS; i++) {
     koopmpc_real change = 0, size = 0;
     gap[i] = 0;
@@ -160,7 +160,7 @@ static int rests(const koopmpc_state *s, koopmpc_real settled) {
   return moved <= settled * (1 + size) && input <= settled * (1 + plan);
 }
 
-/** At most this many iterations from the plan; how the last one ended. */
+/** Iterate at most this many times from the plan; returns how the last iteration ended. */
 static koopmpc_status improve(koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev, int most,
                               koopmpc_real settled, int *iterations) {
   koopmpc_status status = KOOPMPC_FAILED;
@@ -215,7 +215,7 @@ static int begin(koopmpc_state *s, int which, const koopmpc_real *x, const koopm
   return 1;
 }
 
-/** Keep the plan, or take back the one that was kept. */
+/** Keep the plan, or restore the kept one. */
 static void save(koopmpc_state *s) {
   koopmpc_copy(s->bestS, s->S, PLAN_S);
   koopmpc_copy(s->bestV, s->V, PLAN_V);
@@ -228,7 +228,7 @@ static void restore(koopmpc_state *s) {
   s->slack = s->best_slack;
 }
 
-/** Take the cheapest of the plans to which several starts lead; those that follow the model come first. */
+/** Choose the cheapest plan of several starts; plans that follow the model come first. */
 static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev,
                                  int *iterations) {
   koopmpc_status status = KOOPMPC_FAILED, polished;
@@ -264,7 +264,7 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
   return polished;
 }
 
-/** Write down e_k = E w_k + d; whether it is finite. */
+/** Store e_k = E w_k + d; returns whether it is finite. */
 static int disturb(koopmpc_state *s) {
 #if KOOPMPC_DISTURBED
   koopmpc_real last[NX];
@@ -288,7 +288,7 @@ static int disturb(koopmpc_state *s) {
   return 1;
 }
 
-/** The target of a reference row, looked for from the one that was found last; NULL where the table lacks it. */
+/** The target of a reference row; the search starts at the last one found. NULL if the table lacks the row. */
 static const koopmpc_real *target_of(koopmpc_state *s, const koopmpc_real *row) {
   for (int tried = 0; tried < s->target_count; tried++) {
     const koopmpc_real *target = s->targets + s->found * KOOPMPC_TARGET;
@@ -392,7 +392,7 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference) {
   return 1;
 }
 
-/** Write s_0 and the limits of v_0; whether rates were widened because they exclude the limits of u. */
+/** Write s_0 and the limits of v_0; returns whether rates widened because they exclude the limits of u. */
 static int first_stage(koopmpc_state *s, const koopmpc_real *u_prev, koopmpc_real *stage) {
   int conflict = 0;
   koopmpc_fill(stage, 0, NS);

@@ -12,7 +12,7 @@
 #include "koopmpc_solver.h"
 #include "koopmpc_stages.h"
 
-enum { STALLED = 5 }; /* steps without half the mu before one is centred */
+enum { STALLED = 5 }; /* a step is centred if mu has not halved in this many steps */
 #define CENTRING ((koopmpc_real)0.3)
 #define SHORT_OF ((koopmpc_real)0.995)
 
@@ -86,7 +86,7 @@ static void factor(koopmpc_state *s, const koopmpc_real *barrier) {
   for (int k = STEPS - 1; k >= 0; k--) {
     const koopmpc_real *R = koopmpc_free[k] ? koopmpc_R : koopmpc_R_held;
     koopmpc_real A[NS * NS], B[NS * NV], K[NV * NS], half[NV * NV], WA[NS * NS], WB[NS * NV], H[NV * NV];
-    koopmpc_copy(A, s->A + k * NS * NS, NS * NS); /* on the stack a compiler knows that none is another */
+    koopmpc_copy(A, s->A + k * NS * NS, NS * NS); /* on the stack a compiler knows that the arrays do not overlap */
     koopmpc_copy(B, s->B + k * NS * NV, NS * NV);
     for (int i = 0; i < NS * NS; i++) P[i] += s->Q[k * NS * NS + i];
     if (barrier)
@@ -195,7 +195,7 @@ static koopmpc_real reached(const koopmpc_state *s, int k, int i, const koopmpc_
 
 #if KOOPMPC_SIDES > 0
 
-/** Pairs of a limit stand side after side, each over all stages: what a compiler computes several of at once. */
+/** Pairs of a limit stand side after side, each over all stages, so that a compiler vectorises the loops. */
 enum { PAIRS = SIDES * STEPS, EASED = SOFT * STEPS };
 
 /** How far the quantities that have limits move under a step, one after the other over all stages. */
@@ -204,7 +204,7 @@ static void reach_of(koopmpc_state *s, const koopmpc_real *X, const koopmpc_real
     for (int i = 0; i < NQ; i++) s->reach[i * STEPS + k] = reached(s, k, i, X, U);
 }
 
-/** What a soft side's row pulls beside its multiplier, and what its slack takes of it. */
+/** The pull of a soft side's row beside its multiplier, and the part of its slack in it. */
 static koopmpc_real soft_pull(const koopmpc_state *s, int i, int soft, koopmpc_real lam, koopmpc_real over) {
   return lam - koopmpc_soft_linear[i - HARD] - koopmpc_soft_quadratic[i - HARD] * s->eps[soft] + over;
 }
@@ -248,7 +248,7 @@ static void newton(koopmpc_state *s, koopmpc_real centre) {
 
 static koopmpc_real larger(koopmpc_real a, koopmpc_real b) { return a < b ? b : a; } /* NaN in a stays */
 
-/** The largest of -step / at and `most`; NaN if one is. Four at a time, for none waits for another. */
+/** The largest of -step / at and `most`; NaN if one is. Four at a time, which do not depend on each other. */
 static koopmpc_real toward_zero(const koopmpc_real *step, const koopmpc_real *at, int n, koopmpc_real most) {
   koopmpc_real best[4], sum[4] = {0, 0, 0, 0};
   koopmpc_fill(best, most, 4);
@@ -361,7 +361,7 @@ static koopmpc_status limited(koopmpc_state *s, int *iterations) {
   const koopmpc_real unit = unit_of(s);
   koopmpc_real least = KOOPMPC_HUGE, worst, start, price = 0, left = 1, initial, best = KOOPMPC_HUGE, mu, most = 0;
   int since = 0, enough = 0, narrow = 0;
-  for (int i = 0; i < HARD; i++) /* interior points have nowhere to go between two equal limits */
+  for (int i = 0; i < HARD; i++) /* between two equal limits there is no interior point */
     for (int k = 0; k < STEPS; k++)
       narrow |= !(koopmpc_low_of(s, k, koopmpc_side_row[i]) < koopmpc_high_of(s, k, koopmpc_side_row[i]));
   if (s->finishing || narrow) return koopmpc_finish(s, iterations);

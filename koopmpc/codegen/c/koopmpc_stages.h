@@ -32,18 +32,18 @@ enum {
   TARGET_FOUND = TARGET_GOAL + KOOPMPC_GOAL
 };
 
-/** A and B, row after row, and F of a stage; its next state alone. */
+/** Slopes: A and B of a stage, row after row, and its next state. Stage map: the next state alone. */
 void koopmpc_slopes(const koopmpc_real *s, const koopmpc_real *v, koopmpc_real *out);
 void koopmpc_stage_map(const koopmpc_real *s, const koopmpc_real *v, koopmpc_real *next);
 
-/** Tracked outputs of a stage and their derivative, row after row; the same of limited ones. */
+/** Tracked outputs of a stage and their derivative, row after row; limited outputs and theirs. */
 void koopmpc_tracked(const koopmpc_real *s, koopmpc_real *out);
 void koopmpc_limited(const koopmpc_real *s, koopmpc_real *out);
 
 /** Q, row after row, and q of a stage that tracks r, by Gauss-Newton. */
 void koopmpc_stage(const koopmpc_real *s, const koopmpc_real *r, koopmpc_real *out);
 
-/** F, A, B, of, J, g and G at (x, u): all that an equilibrium is found from. */
+/** F, A, B, of, J, g and G at (x, u), for the search of an equilibrium. */
 void koopmpc_local(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *out);
 
 /** The lower and the upper limit of entry i of [v_k; g(s_{k+1})]. */
@@ -59,7 +59,7 @@ koopmpc_status koopmpc_program(koopmpc_state *s, const koopmpc_real *x, koopmpc_
 /** Solve the program of newX and newU, its solution without limits, and their Riccati recursion, by an active set. */
 koopmpc_status koopmpc_finish(koopmpc_state *s, int *iterations);
 
-/** What the plan costs, its breaches of soft limits included. */
+/** The cost of the plan, with the price of violated soft limits. */
 koopmpc_real koopmpc_cost(const koopmpc_state *s);
 
 /** Move the equilibrium of a target, and its cost, to where x = F(x, u) + e. */

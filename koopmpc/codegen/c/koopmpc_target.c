@@ -1,4 +1,4 @@
-/** @file koopmpc_target.c @brief Where a reference row can be held, inside the limits. */
+/** @file koopmpc_target.c @brief The equilibrium nearest to a reference row, inside the limits. */
 #include "koopmpc_common.h"
 #include "koopmpc_qp.h"
 #include "koopmpc_solver.h"
@@ -29,7 +29,7 @@ int koopmpc_target(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *
   for (int which = 0; which < 2; which++) { /* inside all limits, or inside those of the inputs alone */
     const koopmpc_qp *qp = &koopmpc_target_qps[which];
     koopmpc_qp_memory mem = koopmpc_qp_on(qp, s->target_reals, s->target_ints);
-    for (int wider = 0; wider < 2; wider++) { /* believed to have no solution only with limits a tolerance wider */
+    for (int wider = 0; wider < 2; wider++) { /* infeasible only if it is so with limits a tolerance wider */
       for (int i = 0; i < qp->m; i++) {
         mem.low[i] = koopmpc_clip(low[i] - value[i], -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_target_unit[which][i];
         mem.high[i] = koopmpc_clip(high[i] - value[i], -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_target_unit[which][i];

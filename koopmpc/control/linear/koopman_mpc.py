@@ -1,29 +1,94 @@
 """KoopmanMPC: the Riccati solution first, a QP only where a limit is active; LinearMPC is one on a linearisation."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
-from koopmpc.control.base import Kind, MPCBase
+from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.horizon import Coordinates
-from koopmpc.control.limits import Interval, Limits, admitted
+from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
+from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.linear.plan import plan_map, planned_states
-from koopmpc.control.monitor import Monitor, monitor_of
 from koopmpc.control.move import Move, Plan, Status, alone, busy
-from koopmpc.control.solvers import SOLVERS, SolverName
-from koopmpc.control.solvers.base import Choice, StepSolver
+from koopmpc.control.program import LinearProgram, linear_parts, publish_estimator, reference_table
+from koopmpc.control.solvers import FINISHER, order_solvers
+from koopmpc.control.solvers.base import StepQP, StepSolver
+from koopmpc.control.solvers.daqp import DAQP, DAQPSetup
+from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
-from koopmpc.estimate.observer import Estimator, started
+from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.estimate.observer import Estimator, EstimatorProgram, start_observer
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import LinearPredictor
+
+_OTHER_SOLVER = (
+    "The controller solves with OSQP; this C solves with DAQP, to rounding: inputs differ by OSQP's tolerance."
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CondensedProgram(LinearProgram):
+    """t = M [z; u_{−1}; g] + m(r), g = [w_0 … w_{N−1}; d]: the plan, and the QP of the deviation w where a limit acts.
+
+    The first entries of t are the moves; they become t + deviation w. m(r) = offset + from_reference [r_0; …; r_N]
+    + from_given [u_r; …] + from_target [α_0; …; α_N]. The last entries of t are the lowest and highest values of the
+    limits `checked` of the targets. Where one is outside [low, high], g has moved a target outside its limits, and
+    from_target moves the plan to the nearest one inside.
+
+    Attributes
+    ----------
+    N, latency
+        Steps of the plan, and steps until its first input acts.
+    move_of
+        (N,) the move that is the input of each step.
+    with_rates
+        Whether u_{−1} is part of what the plan starts from.
+    hard_rates
+        Hard limits of the changes of inputs, ±inf where one has none; None without.
+    M, low, high
+        The plan's matrix, and the limits of t.
+    offset, from_reference, from_target, from_given
+        The parts of m(r).
+    aimed
+        Whether a target enters the plan.
+    checked, disturbance
+        The limits of the targets that g may break; (nz, ng) what g adds to z⁺ at the end of the horizon.
+    qp, deviation
+        ½ wᵀw → min within low ≤ A w + scale t[source] ≤ high, and how w moves the moves.
+    solver
+        The same QP as DAQP solves it.
+    estimator
+        How z and d follow from y.
+    """
+
+    N: int
+    latency: int
+    move_of: Int[np.ndarray, " _"]
+    with_rates: bool
+    hard_rates: Interval | None
+    M: Float[np.ndarray, "_ _"]
+    low: Float[np.ndarray, " _"]
+    high: Float[np.ndarray, " _"]
+    offset: Float[np.ndarray, " _"]
+    from_reference: Float[np.ndarray, "_ _"]
+    from_target: Float[np.ndarray, "_ _"]
+    from_given: Float[np.ndarray, "_ _"]
+    aimed: bool
+    checked: Bool[np.ndarray, " _"]
+    disturbance: Float[np.ndarray, "_ _"]
+    qp: StepQP
+    deviation: Float[np.ndarray, "_ _"]
+    solver: DAQPSetup
+    estimator: EstimatorProgram
 
 
 class KoopmanMPC(MPCBase):
@@ -58,10 +123,12 @@ class KoopmanMPC(MPCBase):
         assumes that the `u_prev` of `reset` acts: by default zero, or the limit nearest to zero if zero is not
         allowed.
     solver
-        The solver that is asked first: "osqp", an operator-splitting method, or "daqp", an active-set method. A QP that
-        OSQP has not solved in 100 iterations, or in the ``max_iter`` of `settings`, is handed over to DAQP.
+        The solver that is asked first: "daqp", an active-set method, exact to rounding; "osqp", an operator-splitting
+        method; or "auto", the one that was measured to be faster, which the attribute `solver` names. If OSQP has not
+        solved a QP in 100 iterations, or in the ``max_iter`` of `settings`, DAQP solves it.
     settings
-        The solver's own settings, for example ``{"eps_abs": 1e-9, "eps_rel": 1e-9}``.
+        The solver's own settings, for example ``{"eps_abs": 1e-9, "eps_rel": 1e-9}`` of OSQP. With "auto", the solver
+        that has them is asked first.
     time_limit
         Wall-clock time that a step may take [s]. A QP that is not solved in this time is given up, and the fallback
         acts. A solution that was found, but late, is used. In both cases the status is TIME_LIMIT.
@@ -108,45 +175,95 @@ class KoopmanMPC(MPCBase):
         estimator: Estimator | None = None,
         latency: int = 0,
         moves: int | Sequence[int] | None = None,
-        solver: SolverName = "osqp",
+        solver: str = "auto",
         settings: Mapping[str, Any] | None = None,
         time_limit: float | None = None,
-        monitor: Monitor | Episodes | None = None,
+        monitor: StepMonitor | Episodes | None = None,
     ) -> None:
-        if solver not in SOLVERS:
-            raise DataError(f"solver is {solver!r}; there are {', '.join(map(repr, SOLVERS))}")
         if settings is not None:
             checks.kind(settings, "settings", Mapping, 'pass the solver\'s own by name, for example {"max_iter": 100}')
         checks.kind(predictor, "predictor", LinearPredictor, "fit one with edmd, or use LinearMPC for a StepMap")
-        track, asked, disturbed = lifted_tracking(predictor, cost, limits), SOLVERS[solver], estimator is not None
+        settings = dict(settings or {})
+        turns = order_solvers(solver, settings)
+        self._solver = turns[0].solver.name
+        track, disturbed = lifted_tracking(predictor, cost, limits), estimator is not None
         super().__init__(
             predictor.dt,
             predictor,
             track,
             moves,
             horizon,
-            started(estimator, predictor, checks.count(horizon, "horizon")),
+            start_observer(estimator, predictor, checks.count(horizon, "horizon")),
             estimator,
             latency,
             time_limit,
             stagewise=False,
-            monitor=None if monitor is None else monitor_of(monitor, predictor),
+            monitor=None if monitor is None else find_monitor(monitor, predictor),
         )
         self.predictor, self._disturbed = predictor, disturbed
-        coordinates = self._wanted or asked.coordinates
+        coordinates = self._wanted or turns[0].solver.coordinates
         self._map = plan_map(predictor, track, self._blocks, coordinates, disturbed=disturbed)
-        self._options = {"solver": solver, "settings": dict(settings or {})}
-        exact = [] if asked.exact else [Choice(SOLVERS["daqp"], {})]
-        choices = [Choice(asked, {**asked.impatient, **(settings or {})}), *exact]
-        self._qps = StepSolver(self._map.qp, [*choices, Choice(SOLVERS["osqp"], {}, late=True)])
+        self._options = {"solver": self._solver, "settings": settings}
+        self._qps = StepSolver(self._map.qp, turns)
         rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference_key: bytes | None = None
         self._given_row, self._rows_left = 0, False  # u_target in rows: which is this step's, and whether others follow
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # the states of a plan, once somebody asks for one
 
-    def _made_of(self) -> tuple[Kind, LinearPredictor, dict[str, Any]]:
+    def _made_of(self) -> tuple[str, LinearPredictor, dict[str, Any]]:
         return "KoopmanMPC", self.predictor, self._options
+
+    def build_program(self, reference: ArrayLike | None) -> CondensedProgram:
+        """Return the data of a step."""
+        plan, track = self._map, self._map.track
+        rows = reference_table(reference, len(track.Q))
+        estimator = publish_estimator(
+            self._initial.observer,
+            self._estimator,
+            self._time_limit,
+            self._watch,
+            'solver="daqp", settings={"iter_limit": 100}',
+        )
+        if self._solver != FINISHER.name:
+            saved = self.as_data()
+            twin = KoopmanMPC.from_data(replace(saved, options={"solver": FINISHER.name}))
+            return replace(twin.build_program(rows), controller=type(self).__name__, notes=(_OTHER_SOLVER,))
+        setup = cast("DAQP", self._qps.first).setup
+        return CondensedProgram(
+            controller=type(self).__name__,
+            **linear_parts(self.predictor, plan.targets),
+            inputs=track.inputs,
+            rates=track.rates,
+            given=track.given,
+            reference=rows,
+            gain=plan.matrix[: plan.moves, : self.predictor.nz],
+            settings=setup.settings,
+            N=self._N,
+            latency=self._latency,
+            move_of=self._move_of,
+            with_rates=self._with_rates,
+            hard_rates=track.hard_rates,
+            M=plan.matrix[:, :-1],
+            low=plan.low,
+            high=plan.high,
+            offset=plan.maps.offset,
+            from_reference=plan.maps.from_reference,
+            from_target=plan.maps.from_target,
+            from_given=plan.maps.from_given,
+            aimed=bool(plan.aimed and plan.targets.Z.shape[1]),
+            checked=plan.checked,
+            disturbance=plan.disturbance,
+            qp=plan.qp,
+            deviation=plan.deviation,
+            solver=setup,
+            estimator=estimator,
+        )
+
+    @property
+    def solver(self) -> str:
+        """Name of the QP solver that is asked first."""
+        return self._solver
 
     @property
     def coordinates(self) -> str:
@@ -234,7 +351,7 @@ class KoopmanMPC(MPCBase):
             # no 0 byte: every limit is met, and nothing is NaN (NaN meets no limit)
             move = self._limited(t, applied, start) if 0 in plan.met else self._unconstrained(t, start)
             watch = self._watch
-            return move if watch is None else self._watched(watch, move, applied, start)
+            return move if watch is None else self._judge_step(watch, move, applied, start)
         finally:
             self._token.append(held)
 
@@ -310,7 +427,7 @@ class KoopmanMPC(MPCBase):
         np.minimum(U, high, out=U)
         u = U[: self.nu]
         if self._hard_rates is not None:
-            u[:] = admitted(u, inputs, self._hard_rates, u_prev)
+            u[:] = clip_input(u, inputs, self._hard_rates, u_prev)
         self._plan, self._spare = t, self._plan  # swap: the previous plan's array becomes the spare
         self._keep(t)
         status = Status.SOFTENED if gave_way else Status.OPTIMAL
@@ -374,3 +491,42 @@ class LinearMPC(KoopmanMPC):
     ) -> None:
         checks.kind(step_map, "step_map", StepMap, "discretize the dynamics, or use KoopmanMPC for a predictor")
         super().__init__(LinearPredictor.local(step_map, x, u), cost, limits, horizon, **options)
+
+
+def _build_linear_mpc(parts: Any, limits: Limits) -> LinearMPC:
+    problem = parts.problem
+    x, u = problem.equilibrium
+    return LinearMPC(parts.step_map, x, u, problem.cost, limits, problem.horizon)
+
+
+def _build_mpc(parts: Any, limits: Limits, estimator: Estimator | None = None) -> KoopmanMPC:
+    problem, monitor = parts.problem, parts.monitor_data
+    return KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, estimator=estimator, monitor=monitor)
+
+
+register_controller(
+    ControllerKind(
+        KoopmanMPC,
+        bench=(
+            BenchEntry(
+                "linear-mpc",
+                "Predictive control on your equations, linearised at the equilibrium.",
+                "equations",
+                _build_linear_mpc,
+            ),
+            BenchEntry(
+                "koopman-mpc",
+                "Predictive control on the linear lifted model that was learned from data.",
+                "linear",
+                _build_mpc,
+            ),
+            BenchEntry(
+                "offset-free",
+                "koopman-mpc with an estimate of what the model misses, so that no error remains at rest.",
+                "linear",
+                lambda parts, limits: _build_mpc(parts, limits, LiftedDisturbance()),
+            ),
+        ),
+        designed_for=LinearPredictor,
+    )
+)

@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import LiftedTracking
-from koopmpc.control.horizon import Condensed, Coordinates, Horizon, condense, horizon_of, stages
-from koopmpc.control.limits import Interval, Softness, ahead
+from koopmpc.control.horizon import Condensed, Coordinates, Horizon, build_stages, condense, horizon_of
+from koopmpc.control.limits import Interval, Softness, preview_margin
 from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
@@ -124,14 +124,14 @@ def plan_map(
     aims, cost = units.targets(targets), units.cost(track.cost)
     horizon = horizon_of(predictor, track, blocks, disturbed=disturbed)
     own = horizon.in_units(units)
-    parts = stages(own, aims)
+    parts = build_stages(own, aims)
     end = terminal_of(predictor, cost, own, aims, units.inverse)
     law = recursion(parts, end.P, end.p)
     maps = condense(own, law, end, aims, units, coordinates)
-    return PlanMap(track, targets, horizon, _scaled(maps, track.inputs, len(blocks)))
+    return PlanMap(track, targets, horizon, _scale_deviation(maps, track.inputs, len(blocks)))
 
 
-def _scaled(maps: Condensed, inputs: Interval, stages: int) -> Condensed:
+def _scale_deviation(maps: Condensed, inputs: Interval, stages: int) -> Condensed:
     """Return the same maps for a w of which 1 moves the input with the most room, of its span, to its limit."""
     D, n = maps.deviation, len(maps.hessian)
     curvature = np.diag(maps.hessian).reshape(stages, -1).mean(axis=0)
@@ -196,7 +196,7 @@ def _plan_limits(track: LiftedTracking, horizon: Horizon, D: Float[np.ndarray, "
         first += stages * width
     low, high, linear, quadratic, allowance, size, place = (np.concatenate(part) for part in zip(*parts, strict=True))
     if track.margin.any():
-        margin = ahead(track.margin, N).ravel()
+        margin = preview_margin(track.margin, N).ravel()
         low[len(low) - len(margin) :] += margin
         high[len(high) - len(margin) :] -= margin
     return PlanLimits(low, high, Softness(linear, quadratic, allowance), size, place)

@@ -7,28 +7,36 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import HUGE
-from koopmpc.control.base import Kind
 from koopmpc.control.cost import Cost
+from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits
-from koopmpc.control.monitor import Monitor
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
+from koopmpc.control.nonlinear.staged_program import StagedProgram, find_targets, first_gain, trace_functions
+from koopmpc.control.nonlinear.stagewise import list_sides, weights
+from koopmpc.control.program import publish_estimator, reference_table, trace_lifting
+from koopmpc.control.solvers.daqp import daqp_settings
+from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
+from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.estimate.observer import Estimator
-from koopmpc.interrupts import heard
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.step_map import StepMap
+from koopmpc.predict.predictors import BilinearPredictor
 
-EACH, FIRST = 12, 10  # iterations from each start of a first step, and of its best plan, at most
+EACH = 12  # linearisations from each start of a first step, at most
+FIRST = 10  # further linearisations of the best of these plans, at most
 FOLLOWED = 0.02  # a plan follows the model whose defects are below this share of the range of their state
 SETTLED = (
     1e-6  # a plan is a solution when no input and no state moves by more than this share of its size and the plan's
 )
-FAR = 3.0  # sizes of a state: where y is farther from the expected state, the plan begins anew, for one was a glitch
+FAR = 3.0  # begin a new plan if y is more than this many state sizes from the expected state
 NEARLY = 1e-2  # the same for a plan that is compared with others
 _COPIED = (
     "_initial",
@@ -113,7 +121,7 @@ class BilinearMPC(StagedMPC):
 
     _compiles_model = True  # a subclass that is used briefly leaves it to the interpreter
 
-    @heard  # CasADi swallows a Ctrl-C while it builds expressions
+    @raise_swallowed()  # CasADi swallows a Ctrl-C while it builds expressions
     def __init__(
         self,
         model: ModelOrMap,
@@ -126,7 +134,7 @@ class BilinearMPC(StagedMPC):
         latency: int = 0,
         moves: int | Sequence[int] | None = None,
         time_limit: float | None = None,
-        monitor: Monitor | Episodes | None = None,
+        monitor: StepMonitor | Episodes | None = None,
     ) -> None:
         super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
         self._sqp_iterations = checks.count(sqp_iterations, "sqp_iterations")
@@ -135,8 +143,64 @@ class BilinearMPC(StagedMPC):
         self._e = self._iteration.e[:, : self._map.nx]
         self._X, self._U = self._iteration.X[:, : self._map.nx], np.zeros((self._N, self.nu))
 
-    def _made_of(self) -> tuple[Kind, ModelOrMap, dict[str, Any]]:
+    def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
         return "BilinearMPC", self.model, {"sqp_iterations": self._sqp_iterations}
+
+    def find_targets(self, reference: Float[np.ndarray, "rows nr"]) -> Float[np.ndarray, "found size"]:
+        """Return the `table` of the StagedProgram for these reference rows, each row once."""
+        return find_targets(self._terminal, self._map.nx, reference)
+
+    def build_program(self, reference: ArrayLike | None) -> StagedProgram:
+        """Return the data of a step."""
+        problem, outputs, model = self._problem, self._outputs, self._map
+        estimator = publish_estimator(
+            self._initial.observer, self._estimator, self._time_limit, self._watch, "sqp_iterations=1"
+        )
+        rows, terminal, cost = reference_table(reference, len(outputs.Q)), self._terminal, self.cost
+        R, held = weights(problem), int((~problem.free).argmax()) * (not problem.free.all())
+        return StagedProgram(
+            controller=type(self).__name__,
+            model=model.model,
+            lifting=trace_lifting(lambda zeta: zeta, model.nx, model.embedding, model.nu),
+            inputs=outputs.inputs,
+            rates=outputs.rates,
+            given=outputs.given,
+            reference=rows,
+            sizes=terminal.equilibria.size[: model.nx],
+            gain=first_gain(terminal, outputs, self._N, rows[0]) if len(rows) else np.zeros((self.nu, model.nx)),
+            settings=daqp_settings(),
+            functions=trace_functions(problem, outputs, model, disturbed=self._disturbed),
+            N=self._N,
+            latency=self._latency,
+            iterations=self._sqp_iterations,
+            nx=model.nx,
+            ny=model.ny,
+            ns=problem.nx,
+            E=model.E,
+            with_rates=problem.with_rates,
+            weighs_changes=outputs.R_delta is not None,
+            soft_rates=problem.soft_rates,
+            free=problem.free,
+            held_from=problem.held_from,
+            hard_rates=outputs.hard_rates,
+            Q=problem.Q,
+            R=problem.R,
+            R_held=R[:, self.nu * held :][:, : self.nu],
+            Q_root=outputs.Q_root,
+            R_root=outputs.R_root,
+            v_limits=problem.inputs,
+            box=problem.box,
+            margin=problem.margin,
+            softness=problem.softness,
+            sides=list_sides(problem),
+            stage_sizes=problem.sizes,
+            input_sizes=problem.input_sizes,
+            holds=isinstance(cost.u_target, str) and cost.u_target == "equilibrium",
+            end="given" if cost.Q_N is not None else "stage" if cost.tail == 0 else "tail",
+            table=self.find_targets(rows) if len(rows) else np.zeros((0, 1)),
+            rest=terminal.equilibria.program() if self._disturbed else None,
+            estimator=estimator,
+        )
 
     def __reduce__(self) -> tuple[Callable[..., "BilinearMPC"], tuple[Any, ...], dict[str, Any]]:
         build = partial(
@@ -293,3 +357,42 @@ class BilinearMPC(StagedMPC):
         X[:-1], U[:-1] = X[1:], U[1:]
         X[-1] = self._map.step(X[-2], U[-1]) + self._e[-1]
         self._enter(X, U, u_prev)
+
+
+class BriefMPC(BilinearMPC):
+    """A BilinearMPC whose model runs in the interpreter: for some hundred steps compiling takes longer than it saves.
+
+    All that does not depend on the model is still machine code, which later controllers find in the cache. The numbers
+    are the same.
+    """
+
+    _compiles_model = False
+
+
+def _build_mpc(parts: Any, limits: Limits, estimator: Estimator | None = None) -> BilinearMPC:
+    problem, monitor = parts.problem, parts.monitor_data
+    return BilinearMPC(parts.bilinear, problem.cost, limits, problem.horizon, estimator=estimator, monitor=monitor)
+
+
+register_controller(
+    ControllerKind(
+        BilinearMPC,
+        bench=(
+            BenchEntry(
+                "bilinear-mpc",
+                "Predictive control on the bilinear lifted model that was learned from data. It linearises the model "
+                "along its plan once a step.",
+                "bilinear",
+                _build_mpc,
+            ),
+            BenchEntry(
+                "bilinear-offset",
+                "bilinear-mpc with an estimate of what the model misses, so that no error remains at rest.",
+                "bilinear",
+                lambda parts, limits: _build_mpc(parts, limits, LiftedDisturbance()),
+            ),
+        ),
+        designed_for=BilinearPredictor,
+        brief=BriefMPC,
+    )
+)

@@ -4,6 +4,7 @@ Near a guess it is found by Gauss–Newton steps that hold the active limits; fr
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import casadi as ca
@@ -17,9 +18,10 @@ from koopmpc.control.nonlinear.problem import LearnedMap, point_sizes
 from koopmpc.control.riccati import one_step, stationary
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import ShapeError
-from koopmpc.interrupts import listening
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.state import State
 from koopmpc.plants.routines import Buffered
+from koopmpc.values import Value
 
 SETTLED = 1e-10  # the last Gauss–Newton step is at most this share of the size of (x, u)
 RANK = 1e-12  # singular values below this share of the largest are rounding; ipopt meets all others too
@@ -38,7 +40,7 @@ _BESIDE = 0.3  # share of a reference row within which the next one is sought fr
 _STARTS = 12  # guesses of an equilibrium where the reference is not of the state
 _MISSED = 1e-6  # share of ‖r‖²_Q that a good equilibrium may leave
 _FAR = 3.0  # standard deviations from the mean of the data, beyond which another equilibrium is looked for
-_MOST = 10_000  # terminal targets remembered before the memory starts anew
+_MOST = 10_000  # terminal targets kept in memory; it is cleared beyond
 
 
 class Equilibrium(NamedTuple):
@@ -89,6 +91,27 @@ class Chord(NamedTuple):
     limited: Float[np.ndarray, "nl n"]
 
 
+@dataclass(frozen=True, eq=False)
+class RestProgram(Value):
+    """The search for the equilibrium x = F(x, u) + e that holds a reference, from the last one, where e moves it.
+
+    Attributes
+    ----------
+    weight
+        (nr, nr) S with SᵀS = Q, by the size of the cost.
+    size, limit_size
+        Sizes of (x, u), and of the limited values [u; g(x)].
+    low, high
+        Limits of [u; g(x)].
+    """
+
+    weight: Float[np.ndarray, "nr nr"]
+    size: Float[np.ndarray, " n"]
+    limit_size: Float[np.ndarray, " nl"]
+    low: Float[np.ndarray, " nl"]
+    high: Float[np.ndarray, " nl"]
+
+
 class Equilibria:
     """Reference row and disturbance e → Equilibrium: minimises ‖of(x) − r‖²_Q inside all limits.
 
@@ -98,7 +121,7 @@ class Equilibria:
 
     def __init__(self, model: LearnedMap, cost: Cost, outputs: StateTracking) -> None:
         self.model, self._cost, self._outputs, o = model, cost, outputs, outputs
-        self.of_state = isinstance(cost.of, State) and cost.of.whole
+        self.of_state = isinstance(cost.of, State) and cost.of.selects_all
         self._names = model.model.states
         x, u, theta = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.nu), ca.MX.sym("t", len(model.theta))
         F, of, g = model.F(x, u, theta), o.tracked(x), o.limited(x)
@@ -124,6 +147,10 @@ class Equilibria:
 
     def __reduce__(self) -> tuple[type["Equilibria"], tuple[LearnedMap, Cost, StateTracking]]:
         return Equilibria, (self.model, self._cost, self._outputs)
+
+    def program(self) -> RestProgram:
+        """Return the data of the search from a last equilibrium."""
+        return RestProgram(self._weight, self.size, self._limit_size, self._low, self._high)
 
     def update(self, model: LearnedMap) -> None:
         """Go on with another θ."""
@@ -265,11 +292,15 @@ class Equilibria:
         if near is None and not self.of_state:  # the nearest stationary point may be wrong: hanging, not upright
             scatter = np.random.default_rng(0).uniform(-np.pi, np.pi, (_STARTS - 1, self.model.nx))
             guesses += [np.concatenate([x, u]) for x in scatter]
-        first = self._solved(row, e, guesses)
+        first = self._minimise(row, e, guesses)
         if near is not None or first is None or not self._outside(first.x):
             return first
-        others = [self._solved(row, e, [guess]) for guess in self._among(row, u)]
-        held = [each for each in others if each is not None and self._missed(each.x, row) <= self._missed(first.x, row)]
+        others = [self._minimise(row, e, [guess]) for guess in self._among(row, u)]
+        held = [
+            each
+            for each in others
+            if each is not None and self._measure_miss(each.x, row) <= self._measure_miss(first.x, row)
+        ]
         return min([first, *held], key=lambda each: self._outside(each.x))
 
     def _among(self, row: Float[np.ndarray, " nr"], u: Float[np.ndarray, " nu"]) -> list[Float[np.ndarray, " n"]]:
@@ -278,7 +309,7 @@ class Equilibria:
         assert model.center is not None, "outside of data that are known"
         y, both, amid = model.center.copy(), np.isfinite(low) & np.isfinite(high), u.copy()
         if isinstance(of, State):
-            chosen = cast("State", of.bind(self._names)).chosen
+            chosen = cast("State", of.bind(self._names)).state_indices
             weighed = [bool(column.any()) for column in self._outputs.Q.T]
             for i, value, counts in zip(chosen, row, weighed, strict=True):
                 y[i] = value if counts else y[i]
@@ -294,12 +325,12 @@ class Equilibria:
         away = np.abs(x[: len(center)] - center) / np.maximum(spread, 1e-12 * (1 + np.abs(center)))
         return max(float(away.max()) - _FAR, 0.0)
 
-    def _missed(self, x: Float[np.ndarray, " nx"], row: Float[np.ndarray, " nr"]) -> float:
+    def _measure_miss(self, x: Float[np.ndarray, " nx"], row: Float[np.ndarray, " nr"]) -> float:
         """Return ‖of(x) − r‖²_Q by its size; what a good equilibrium may leave counts as that."""
         off = self.values(x, np.zeros(self.model.nu))[1] - row
         return max(float(off @ self._outputs.Q @ off), _MISSED * float(row @ self._outputs.Q @ row))
 
-    def _solved(
+    def _minimise(
         self,
         row: Float[np.ndarray, " nr"],
         e: Float[np.ndarray, " nx"] | None,
@@ -322,7 +353,7 @@ class Equilibria:
                     "ubg": np.concatenate([np.zeros(nx), limits.high / limit_size[model.nu :]]),
                 }
                 p = np.concatenate([row, model.theta, e])
-                with listening():
+                with raise_swallowed():
                     solved = cast("dict[str, Any]", self._solver(p=p, x0=guess / size, **bounds))
                     success, f, s = self._solver.stats()["success"], float(solved["f"]), solved["x"].full().ravel()
                 if success and f < least:
@@ -387,6 +418,10 @@ class TerminalTargets:
         self._missed: set[bytes] = set()  # reference rows whose equilibrium was not found
         self._last: tuple[Float[np.ndarray, " nr"], Equilibrium] | None = None  # the row found last, and where
 
+    def is_missed(self, row: Float[np.ndarray, " nr"]) -> bool:
+        """Return whether no equilibrium was found for a row that was asked for."""
+        return row.tobytes() in self._missed
+
     def forget_missed(self) -> None:
         """Look again for the equilibria that were not found."""
         for key in self._missed:
@@ -416,7 +451,7 @@ class TerminalTargets:
             self._last = None if found is None else (row.copy(), found)
             if found is None:
                 self._missed.add(key)
-            self._known[key] = self._unheld(row) if found is None else self._target(row, found)
+            self._known[key] = self._target_without_equilibrium(row) if found is None else self._target(row, found)
         return self._known[key]
 
     def _beside(self, row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
@@ -429,7 +464,7 @@ class TerminalTargets:
             return None
         return self.equilibria.near(begin, row, np.zeros(self.equilibria.model.nx))
 
-    def _unheld(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
+    def _target_without_equilibrium(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
         """Return the target of a row whose equilibrium was not found: ‖of(x_N) − r‖²_Q, and inputs at zero."""
         o, (nx, nu, nr) = self._outputs, (self.equilibria.model.nx, self.equilibria.model.nu, len(row))
         n = nx + nu * (o.R_delta is not None and self._cost.Q_N is None) + nr
@@ -449,7 +484,7 @@ class TerminalTargets:
         begin = (target if last is None else last).equilibrium
         each = self.equilibria
         found = each.follow(begin, row, e) or each.near(begin, row, e, CLOSE) or each.find(row, e, begin)
-        if found is None or row.tobytes() in self._missed:
+        if found is None or self.is_missed(row):
             return target
         u, m = found.u * self._hold, target.m
         if self._cost.Q_N is None:

@@ -22,21 +22,24 @@ from koopmpc.control.nonlinear.stagewise import (
     RiccatiSweeps,
     interior_step,
     linearisation,
+    list_sides,
     plan_cost,
-    sides,
     simulation,
     unconstrained,
     weights,
 )
+from koopmpc.control.riccati import Stage, step
+from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.base import QP
-from koopmpc.control.solvers.daqp import DAQP
+from koopmpc.errors import DefinitenessError
 from koopmpc.plants.routines import Routine
 
 MOST = 100  # interior-point steps, before an active-set method finishes the program
-STALLED, CENTRING = 5, 0.3  # steps without half the μ, then one aims at this share of μ for every pair
-# Of spans for distances, of the curvature along an input's span for μ and what is left of residuals: what is aimed
-# at, and what is good enough where large weights of slacks leave no digits for more.
-PRECISE, ENOUGH = 1e-11, 1e-9
+STALLED = 5  # after this many steps without half the μ, one step only returns to the central path
+CENTRING = 0.3  # that step aims at this share of μ for every pair
+# Relative tolerances of distances (by spans), of μ (by the curvature along an input's span) and of residuals
+PRECISE = 1e-11  # stop here
+ENOUGH = 1e-9  # accept this if large weights of slacks exhaust double precision
 DIGITS = 1e-13  # share of the largest multiplier that rounding leaves in μ
 NEAR = 0.2  # of a change: how far F may be from its linearisation
 SHORTEST = 0.001  # of a step
@@ -70,7 +73,7 @@ class RealTimeIteration:
         N, nx, nu = len(problem.free), problem.nx, problem.F.size1_in(1)
         nr, ng = len(problem.Q), len(problem.box.low)
         self._shape = N, nx, nu, ng
-        self._sides, cost, R = sides(problem), plan_cost(problem), weights(problem)
+        self._sides, cost, R = list_sides(problem), plan_cost(problem), weights(problem)
         linear, quadratic, allowance = problem.softness
         none = np.zeros(nu)  # half of the prices, as of the cost
         prices = [np.full(nu, np.inf), 0.5 * linear], [none, 0.5 * quadratic], [none, allowance]
@@ -140,13 +143,13 @@ class RealTimeIteration:
         self._free.call()
         self.without_limits = self.U[0] + self._dU[0]
         y = self._quantities()
-        free = np.concatenate([self.U + self._dU, y[:, self._shape[2] :] + self._moved()], axis=1)
+        free = np.concatenate([self.U + self._dU, y[:, self._shape[2] :] + self._move_outputs()], axis=1)
         nothing = np.zeros_like(self._eps)
         if ((free >= self.low) & (free <= self.high)).all() and np.isfinite(self._dX).all():
             return StageStep(self._dX, self._dU, nothing, Status.UNCONSTRAINED, 0)
         if self._interior is None or not np.isfinite(free).all():
             return StageStep(self._dX, self._dU, nothing, Status.FAILED, 0)
-        return self._limited(y, free, deadline)
+        return self._solve_limited(y, free, deadline)
 
     def take(self, x: Float[np.ndarray, " nx"], found: StageStep) -> None:
         """Add the step to the plan, all of it or the half, quarter, … along which F is near its linearisation.
@@ -193,7 +196,9 @@ class RealTimeIteration:
         self._weigh.call()
         return float(self._cost[0])
 
-    def _limited(self, y: Float[np.ndarray, "N nq"], free: Float[np.ndarray, "N nq"], deadline: float) -> StageStep:
+    def _solve_limited(
+        self, y: Float[np.ndarray, "N nq"], free: Float[np.ndarray, "N nq"], deadline: float
+    ) -> StageStep:
         """Follow the central path from the unconstrained solution; where it ends early, an active-set method finishes.
 
         Interior points have nowhere to go between two equal limits; and they end early where a plant is lost, some
@@ -203,7 +208,7 @@ class RealTimeIteration:
         rows = s.row
         unlimited = self._dX.copy(), self._dU.copy()
         if self.multipliers is not None or not self._roomy():
-            return self._finished(free, *unlimited, deadline, 0)
+            return self._finish(free, *unlimited, deadline, 0)
         bound = np.where(s.sign > 0, self.low[:, rows], self.high[:, rows])
         self._d[:] = s.sign * (y[:, rows] - bound) / s.span
         distance = s.sign * (free[:, rows] - bound) / s.span
@@ -242,9 +247,9 @@ class RealTimeIteration:
                 break
         if enough:
             return StageStep(self._dX, self._dU, self._eps * s.span[hard:], Status.OPTIMAL, iterations)
-        return self._finished(free, *unlimited, deadline, iterations)
+        return self._finish(free, *unlimited, deadline, iterations)
 
-    def _finished(
+    def _finish(
         self,
         free: Float[np.ndarray, "N nq"],
         dX: Float[np.ndarray, "N nx"],
@@ -273,7 +278,7 @@ class RealTimeIteration:
     def _quantities(self) -> Float[np.ndarray, "N nq"]:
         return np.concatenate([self.U, self._g], axis=1)
 
-    def _moved(self) -> Float[np.ndarray, "N ng"]:
+    def _move_outputs(self) -> Float[np.ndarray, "N ng"]:
         return np.matmul(self._dX[:, None, :], self._G)[:, 0]
 
     def _unit(self) -> float:
@@ -331,22 +336,17 @@ def least_deviation(
     A, B, Q, R, G, free = stages
     N, nu, nx = len(B), B.shape[1], B.shape[2]
     K, spread = np.zeros((N, nu, nx)), np.zeros((N, nu, nu))
-    P = np.zeros((nx, nx))
+    P, nothing = Q[-1], np.zeros((nx, nx))
     for k in reversed(range(N)):
-        whole, to = P + Q[k], A[k].T
-        PA = whole @ to
-        P = to.T @ PA
-        if free[k]:
-            BP = B[k] @ whole
-            S = R + BP @ B[k].T
-            try:
-                L = np.asarray(np.linalg.cholesky(0.5 * (S + S.T)), dtype=np.float64)
-            except np.linalg.LinAlgError:
-                return None
-            spread[k] = np.linalg.inv(L).T
-            K[k] = spread[k] @ (spread[k].T @ (B[k] @ PA))
-            P -= (B[k] @ PA).T @ K[k]
-        P = 0.5 * (P + P.T)
+        weight = Q[k - 1] if k else nothing  # of x̃_k; that of x̃_N is where P begins
+        if not free[k]:
+            P = weight + A[k] @ P @ A[k].T
+            continue
+        try:
+            K[k], L, P = step(Stage(A[k].T, B[k].T, weight, None, R), P)
+        except (DefinitenessError, np.linalg.LinAlgError):
+            return None
+        spread[k] = np.linalg.inv(L).T
     at = np.cumsum(free) - free
     n = nu * np.count_nonzero(free)
     X, U = np.zeros((N + 1, nx, n)), np.zeros((N, nu, n))
@@ -365,7 +365,7 @@ def least_deviation(
     none = np.zeros((n,))
     qp = QP(np.eye(n), none, rows[kept], low[kept], high[kept], Softness(linear, quadratic, allowance))
     y = np.zeros(len(linear)) if multipliers is None else multipliers
-    found = DAQP(qp).solve(none, y, seconds if np.isfinite(seconds) else None)
+    found = FINISHER(qp).solve(none, y, seconds if np.isfinite(seconds) else None)
     status = found.status
     if status is Status.FAILED and _contradictory(qp):
         status = Status.INFEASIBLE

@@ -7,19 +7,21 @@ from typing import Any, Literal, NamedTuple, cast
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.base import Kind
 from koopmpc.control.cost import Cost
+from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import SOFTENED, Interval, Limits
-from koopmpc.control.monitor import Monitor
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import ModelOrMap, StagedProblem, StageTargets
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC, StagePlan
+from koopmpc.control.program import Program, no_export
+from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator
-from koopmpc.interrupts import heard, listening
+from koopmpc.interrupts import raise_swallowed
 
 NLPSolver = Literal["ipopt", "fatrop", "sqpmethod"]
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
@@ -126,9 +128,9 @@ class Shooting:
         ahead = F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U) + ca.vertcat(e, ca.MX(nx - moved, N))
         gaps = W[nu : nu + nx, :] - ahead / ca.DM(p.sizes)
         end = M @ p.tracked(X[:, N - 1]) + L @ X[:, N - 1] - m
-        f = _weighted(U - u_r, p.R) + ca.sumsqr(end)
+        f = _weigh(U - u_r, p.R) + ca.sumsqr(end)
         if N > 1:
-            f += _weighted(p.tracked.map(N - 1)(X[:, : N - 1]) - r[:, : N - 1], p.Q)
+            f += _weigh(p.tracked.map(N - 1)(X[:, : N - 1]) - r[:, : N - 1], p.Q)
         path, low, high = ca.MX(0, N), np.zeros(0), np.zeros(0)
         if ng:
             values, infinite = p.limited.map(N)(X), np.full(ng, np.inf)
@@ -179,7 +181,7 @@ class Shooting:
                 "ng": [0] + [npath] * N,
             }
         try:
-            with listening():
+            with raise_swallowed():
                 self._solver = ca.nlpsol("shooting", solver, nlp, {**_QUIET, **OPTIONS[solver], **given, **settings})
         except (RuntimeError, NotImplementedError, TypeError) as error:
             reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
@@ -213,7 +215,7 @@ class Shooting:
         if self._start_is_number is not None and not float(self._start_is_number(start.v, np.concatenate(p))):
             U, X, slacks = np.split(start.v.reshape(self._shape) * self._sizes, self._split, axis=1)
             return NLPSolution(U, X, slacks, np.inf, Status.FAILED, 0, start)
-        with listening():
+        with raise_swallowed():
             found = cast("dict[str, Any]", self._solver(p=np.concatenate(p), **self._bounds, **begin))
             stats = self._solver.stats()
             v, bounds, constraints = (found[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
@@ -238,7 +240,7 @@ def _is_number(nlp: Mapping[str, ca.MX]) -> ca.Function:
     return ca.Function("is_number", [v, nlp["p"]], [size < ca.inf])
 
 
-def _weighted(columns: ca.MX, Q: Float[np.ndarray, "n n"]) -> ca.MX:
+def _weigh(columns: ca.MX, Q: Float[np.ndarray, "n n"]) -> ca.MX:
     """Return Σ over columns of eᵀQe."""
     return ca.sum1(ca.sum2(columns * ca.mtimes(ca.DM(Q), columns)))
 
@@ -305,7 +307,7 @@ class NonlinearMPC(StagedMPC):
     'OPTIMAL'
     """
 
-    @heard  # CasADi swallows a Ctrl-C while it builds expressions
+    @raise_swallowed()  # CasADi swallows a Ctrl-C while it builds expressions
     def __init__(
         self,
         model: ModelOrMap,
@@ -320,7 +322,7 @@ class NonlinearMPC(StagedMPC):
         latency: int = 0,
         moves: int | Sequence[int] | None = None,
         time_limit: float | None = None,
-        monitor: Monitor | Episodes | None = None,
+        monitor: StepMonitor | Episodes | None = None,
     ) -> None:
         super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
         if solver not in OPTIONS:
@@ -332,8 +334,16 @@ class NonlinearMPC(StagedMPC):
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
         self._e = np.zeros((self._N, self._map.nx))
 
-    def _made_of(self) -> tuple[Kind, ModelOrMap, dict[str, Any]]:
+    def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
         return "NonlinearMPC", self.model, self._own
+
+    def build_program(self, reference: ArrayLike | None) -> Program:
+        """Raise the DataError that says why no C code can be generated."""
+        raise no_export(
+            self,
+            "it uses ipopt or a CasADi solver; C code cannot be generated for these",
+            "a BilinearMPC of the same model",
+        )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "NonlinearMPC":
         """Return a copy with solvers of its own: CasADi's copies share one, and two threads in one end the process."""
@@ -377,3 +387,23 @@ class NonlinearMPC(StagedMPC):
                 guesses.append((np.array(X), U))
         stages = [self._stages(X, U, u_prev) for X, U in guesses]
         return [self._shooting.at(S[1:], V) for S, V in stages]
+
+
+def _build_oracle(parts: Any, limits: Limits) -> NonlinearMPC:
+    """Plan with the model itself, from the best of twelve initial guesses: the oracle where the model is the plant."""
+    return NonlinearMPC(parts.step_map, parts.problem.cost, limits, parts.problem.horizon, starts=12)
+
+
+register_controller(
+    ControllerKind(
+        NonlinearMPC,
+        bench=(
+            BenchEntry(
+                "nonlinear-mpc",
+                "Predictive control on your equations as they are, solved to the end: slow, and the measure for all.",
+                "equations",
+                _build_oracle,
+            ),
+        ),
+    )
+)

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from koopmpc import checks
 from koopmpc.control.cost import StateTracking
-from koopmpc.control.limits import SOFTENED, Interval, Softness, ahead
+from koopmpc.control.limits import SOFTENED, Interval, Softness, preview_margin
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.plants.routines import Buffered
@@ -69,7 +69,7 @@ class LearnedMap:
         object.__setattr__(self, "center", center)
         object.__setattr__(self, "spread", spread)
 
-    def updated(self, model: ModelOrMap) -> "LearnedMap":
+    def replace_model(self, model: ModelOrMap) -> "LearnedMap":
         """Return the map of another predictor with the same lifting.
 
         Raises
@@ -91,7 +91,7 @@ class LearnedMap:
 
     def step(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nx"]:
         """Return F(x, u, θ)."""
-        return self._buffered(x, u, self.theta)[0]
+        return self._buffer(x, u, self.theta)[0]
 
     def advance(
         self,
@@ -104,7 +104,7 @@ class LearnedMap:
         return self.step(z, u) + self.E @ w + d
 
     @cached_property
-    def _buffered(self) -> Buffered:
+    def _buffer(self) -> Buffered:
         return Buffered(self.F)
 
 
@@ -229,7 +229,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
         nx=nx,
         sizes=point_sizes(model, o),
         input_sizes=o.sizes.inputs,
-        margin=ahead(o.margin, N),
+        margin=preview_margin(o.margin, N),
         scale=o.sizes.scale,
     )
     if not o.with_rates and len(blocks) == N:

@@ -13,13 +13,13 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, data_ranges, state_tracking
-from koopmpc.control.limits import Interval, Limits, admitted, beyond
-from koopmpc.control.monitor import Monitor, monitor_of
+from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation
 from koopmpc.control.move import Move, Plan, Status, alone
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
+from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
-from koopmpc.estimate.observer import Estimator, started
+from koopmpc.estimate.observer import Estimator, start_observer
 from koopmpc.plants.step_map import StepMap
 
 GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
@@ -70,7 +70,7 @@ class StagedMPC(MPCBase):
         estimator: Estimator | None,
         latency: int,
         time_limit: float | None,
-        monitor: Monitor | Episodes | None,
+        monitor: StepMonitor | Episodes | None,
     ) -> None:
         self._warm, self._moved, self._row = False, False, 0  # the row is that of a u_target given in rows
         self._forget_targets()
@@ -83,12 +83,12 @@ class StagedMPC(MPCBase):
             o,
             moves,
             horizon,
-            started(estimator, given, checks.count(horizon, "horizon")),
+            start_observer(estimator, given, checks.count(horizon, "horizon")),
             estimator,
             latency,
             time_limit,
             stagewise=True,
-            monitor=None if monitor is None else monitor_of(monitor, model),
+            monitor=None if monitor is None else find_monitor(monitor, model),
         )
         self._problem = staged_problem(given, o, self._blocks)
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
@@ -122,7 +122,7 @@ class StagedMPC(MPCBase):
         DataError
             The model is of another kind, has another lifting, dt, states, inputs or disturbances, or is a StepMap.
         """
-        self._map = self._map.updated(model)
+        self._map = self._map.replace_model(model)
         self._terminal.update(self._map)
         self._initial.update(self._map)
         if self._watch is not None:
@@ -150,7 +150,7 @@ class StagedMPC(MPCBase):
         start = perf_counter()
         move = self._step(y, reference, applied, w, start)
         watch = self._watch
-        return move if watch is None else self._watched(watch, move, applied, start)
+        return move if watch is None else self._judge_step(watch, move, applied, start)
 
     def _step(
         self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None, w: ArrayLike | None, start: float
@@ -171,9 +171,9 @@ class StagedMPC(MPCBase):
         self._X, self._U = self._trajectory(found.S, found.V)
         slack, u = found.slack, self._U[0]
         if self._hard_rates is not None:
-            u[:] = admitted(u, self._outputs.inputs, self._hard_rates, u_prev)
+            u[:] = clip_input(u, self._outputs.inputs, self._hard_rates, u_prev)
             if conflict:
-                slack = max(slack, beyond(u - u_prev, self._hard_rates))
+                slack = max(slack, measure_violation(u - u_prev, self._hard_rates))
         self._keep(self._U.ravel())
         return self._move(u.copy(), Status.SOFTENED if conflict else status, found.iterations, start, slack)
 
@@ -238,10 +238,10 @@ class StagedMPC(MPCBase):
             M[:nr] = self._outputs.Q_root
             end = end._replace(M=M, L=np.zeros_like(end.L), V=np.zeros_like(end.V), m=M @ R[-1])
         rated = self._with_rates
-        self._targets = self._rated(R[1:], U, end) if rated else StageTargets(R[1:], U, end.M, end.L, end.m)
+        self._targets = self._add_last_input(R[1:], U, end) if rated else StageTargets(R[1:], U, end.M, end.L, end.m)
         return True
 
-    def _rated(
+    def _add_last_input(
         self, R: Float[np.ndarray, "N nr"], U: Float[np.ndarray, "N nu"], target: TerminalTarget
     ) -> StageTargets:
         """Return reference rows, reference inputs and a terminal target for stages whose state holds the last input."""

@@ -35,7 +35,7 @@ class Sides(NamedTuple):
     quadratic: Float[np.ndarray, " nsoft"]
 
 
-def sides(problem: StagedProblem) -> Sides:
+def list_sides(problem: StagedProblem) -> Sides:
     """Return the finite ends of all limits, those that are hard first."""
     nu, inputs, box = len(problem.R), problem.inputs, problem.box
     low, high = np.concatenate([inputs.low, box.low]), np.concatenate([inputs.high, box.high])
@@ -181,7 +181,7 @@ class RiccatiSweeps:
         step = [ca.densify(closed_ @ x + B @ k_ + c), ca.densify(k_ - K_ @ x)]
         self._forward = ca.Function("forward", [x, closed_, B, c, K_, k_], step, {"cse": True}).mapaccum("forwards", N)
 
-    def turned(self, M: ca.MX, columns: int) -> ca.MX:
+    def reverse(self, M: ca.MX, columns: int) -> ca.MX:
         """Return the stages of M, `columns` wide, in the opposite order."""
         order = np.arange(self.N * columns).reshape(self.N, columns)[::-1].ravel()
         return M[:, order.tolist()]
@@ -189,16 +189,16 @@ class RiccatiSweeps:
     def factors(self, A: ca.MX, B: ca.MX, c: ca.MX, Q: ca.MX, R: ca.MX) -> list[ca.MX]:
         """Return what the sweeps for these matrices need, last stage first: B, K, L, A − B K, P c; LᵀL = R + BᵀPB."""
         nx, nu = self.nx, self.nu
-        turned = [self.turned(M, n) for M, n in ((A, nx), (B, nu), (c, 1), (Q, nx), (R, nu))]
+        turned = [self.reverse(M, n) for M, n in ((A, nx), (B, nu), (c, 1), (Q, nx), (R, nu))]
         _, K, half, closed, Pc = self._factor(ca.DM(nx, nx), *turned)
         return [turned[1], K, half, closed, Pc]
 
     def solve(self, factors: list[ca.MX], B: ca.MX, c: ca.MX, q: ca.MX, r: ca.MX, x0: ca.MX) -> tuple[ca.MX, ca.MX]:
         """Return (δX, δU) for gradients q and r."""
         _, K, _, closed, _ = factors
-        _, k = self._costate(ca.DM(self.nx, 1), *factors, self.turned(q, 1), self.turned(r, 1))
+        _, k = self._costate(ca.DM(self.nx, 1), *factors, self.reverse(q, 1), self.reverse(r, 1))
         nx = self.nx
-        X, U = self._forward(x0, self.turned(closed, nx), B, c, self.turned(K, nx), self.turned(k, 1))
+        X, U = self._forward(x0, self.reverse(closed, nx), B, c, self.reverse(K, nx), self.reverse(k, 1))
         return X, U
 
 
@@ -233,7 +233,7 @@ def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"], sides: Si
     l1 = ca.repmat(ca.MX(ca.DM(sides.linear)), 1, N)
     l2 = ca.repmat(ca.MX(ca.DM(sides.quadratic)), 1, N)
 
-    def padded(soft: ca.MX) -> ca.MX:
+    def pad(soft: ca.MX) -> ca.MX:
         return ca.vertcat(ca.MX(ns - nsoft, N), soft) if ns > nsoft else soft
 
     row, g = ca.SX.sym("G", ng, nx), ca.SX.sym("w", ng)
@@ -249,9 +249,9 @@ def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"], sides: Si
     moved = distances(X, U)
     w = lam / t
     kappa = 1 / (l2 + nu_ / eps)
-    K = padded(kappa)
+    K = pad(kappa)
     eased = w / (1 + w * K)
-    gap = d + moved + padded(eps) - t
+    gap = d + moved + pad(eps) - t
     weights = (S.T**2) @ eased
     R_k = ca.MX(ca.DM(R)) + diagonal(weights[:nu, :])
     Q_k = Q + gram(G, weights[nu:, :]) if ng else Q
@@ -259,14 +259,14 @@ def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"], sides: Si
 
     def solve(c1: ca.MX | float, c2: ca.MX | float) -> tuple[ca.MX, ...]:
         rho = lam[ns - nsoft :, :] - l1 - l2 * eps + c2 / eps
-        base = lam + (-w * (K * padded(rho) + gap) - lam + c1 / t) / (1 + w * K)
+        base = lam + (-w * (K * pad(rho) + gap) - lam + c1 / t) / (1 + w * K)
         gradient = -S.T @ (base + eased * moved)
         q_k = q + pulled(G, gradient[nu:, :]) if ng else q
         X_new, U_new = sweeps.solve(factors, B, c, q_k, r + gradient[:nu, :], x0)
         reached = distances(X_new, U_new) - moved
         d_lam = base - eased * reached - lam
         d_eps = kappa * (rho + d_lam[ns - nsoft :, :])
-        d_t = reached + padded(d_eps) + gap
+        d_t = reached + pad(d_eps) + gap
         d_nu = -(nu_ / eps) * d_eps - nu_ + c2 / eps
         return X_new - X, U_new - U, d_t, d_lam, d_eps, d_nu
 

@@ -1,10 +1,5 @@
-"""The QP solvers by name. A new one is a subclass of `QPSolver` in its own file here, imported and listed below."""
+"""One QP in, one solution out: the solvers, and the order in which a step asks them (order.py)."""
 
-from typing import Literal
-
-from koopmpc.control.solvers.base import QPSolver
-from koopmpc.control.solvers.daqp import DAQP
-from koopmpc.control.solvers.osqp import OSQP
-
-SolverName = Literal["osqp", "daqp"]
-SOLVERS: dict[str, type[QPSolver]] = {"osqp": OSQP, "daqp": DAQP}
+from koopmpc.control.solvers.order import FINISHER as FINISHER
+from koopmpc.control.solvers.order import SOLVERS as SOLVERS
+from koopmpc.control.solvers.order import order_solvers as order_solvers

@@ -55,7 +55,7 @@ class StepQP(QP):
 
 @dataclass(slots=True)
 class QPSolution:
-    """Minimiser v, multipliers y of low ≤ A v ≤ high (positive at the upper end), how the solve ended, and in whom."""
+    """Minimiser v, multipliers y of low ≤ A v ≤ high (positive at the upper end), status, and the solver's name."""
 
     v: Float[np.ndarray, " n"]
     y: Float[np.ndarray, " m"]
@@ -88,6 +88,11 @@ class QPSolver(ABC):
         self._settings, self._stale = dict(settings or {}), False
         self._hold(qp)
         self._setup()
+
+    @staticmethod
+    @abstractmethod
+    def setting_names() -> frozenset[str]:
+        """Return the names of the solver's own settings."""
 
     @abstractmethod
     def _setup(self) -> None:
@@ -194,7 +199,7 @@ class QPSolver(ABC):
         """Solve within the limits `low` and `high`."""
 
 
-class Choice(NamedTuple):
+class SolverTurn(NamedTuple):
     """A solver and its own settings; a `late` one is set up when it is first needed."""
 
     solver: type[QPSolver]
@@ -213,16 +218,23 @@ class StepSolver:
     ----------
     qp
         The QP; its limits move with the plan.
-    choices
+    turns
         The solvers in the order in which they are asked.
     """
 
-    def __init__(self, qp: StepQP, choices: Sequence[Choice]) -> None:
-        self._choices = choices
+    def __init__(self, qp: StepQP, turns: Sequence[SolverTurn]) -> None:
+        self._turns = turns
         self._turn = 0
         self._last: QPSolution | None = None
         self._hold(qp)
-        self._solvers = [None if choice.late else choice.solver(qp, choice.settings) for choice in choices]
+        self._solvers = [None if turn.late else turn.solver(qp, turn.settings) for turn in turns]
+
+    @property
+    def first(self) -> QPSolver:
+        """The solver that is asked first."""
+        solver = self._solvers[0]
+        assert solver is not None, "the first solver is set up at once"
+        return solver
 
     def _hold(self, qp: StepQP) -> None:
         """Make this the QP; its rows are often those of the plan, one after the other."""
@@ -271,7 +283,7 @@ class StepSolver:
         qp, moved, limits, conflict = self.qp, self._moved, None, 0.0
         np.multiply(plan[self._rows], qp.scale, out=moved)
         if room is not None:
-            limits, conflict = self._widened(room)
+            limits, conflict = self._widen_rates(room)
         found, answers = self._ask_all(moved, limits, deadline)
         if not answers or found.status is not Status.OPTIMAL:
             self._last = None
@@ -307,7 +319,7 @@ class StepSolver:
         """Return what solver i finds, and whether it is the answer; one that is not exact has half of the time."""
         solver = self._solvers[i]
         if solver is None:
-            solver = self._solvers[i] = self._choices[i].solver(self.qp, self._choices[i].settings)
+            solver = self._solvers[i] = self._turns[i].solver(self.qp, self._turns[i].settings)
         if limits is None:
             solver.shift(moved)
         else:
@@ -342,7 +354,7 @@ class StepSolver:
         past = np.maximum(value - high[rows], low[rows] - value) / qp.scale[rows]
         return float(past[past > qp.softness.allowance[rows]].max(initial=0.0))
 
-    def _widened(self, room: Interval) -> tuple[Interval, float]:
+    def _widen_rates(self, room: Interval) -> tuple[Interval, float]:
         """Return the limits with the first rates as wide as the input limits need, and by how much, in their unit."""
         qp = self.qp
         low, high = qp.low.copy(), qp.high.copy()

@@ -14,17 +14,19 @@ updates", IEEE Trans. Automatic Control 67(8), 2022.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from koopmpc import checks
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver
 from koopmpc.errors import DataError
+from koopmpc.values import Value
 
 # eta_prox: DAQP's own 1e-6 is all that remains of its accuracy where P is singular.
 DEFAULTS: Mapping[str, Any] = {"primal_tol": 1e-8, "eta_prox": 1e-9}
@@ -32,9 +34,10 @@ _WIDER = 1e-8  # relative widening of the limits before a problem is believed to
 _ACCURACY = 1e-6  # of the scaled KKT conditions where P is not diagonal and definite, relative
 
 _STEEP = 1e-8  # smallest over largest eigenvalue of AᵀA of the hard rows below which rounding makes them look dependent
-# Weight of a change of the hard rows, by the size of P, in the first step towards the solution of a steep problem; its
-# factor where it has to be another; its end; how many steps there are at most.
-_DAMPING, _EASING, _MOST_DAMPING, _PASSES = 1e7, 10.0, 1e9, 20
+_DAMPING = 1e7  # weight of a change of the hard rows in the first proximal step, by the size of P
+_EASING = 10.0  # the weight changes by this factor if the step fails
+_MOST_DAMPING = 1e9  # give up above this weight
+_PASSES = 20  # proximal steps, at most
 _LEAST = np.full(1, 1e-300)
 _SLOW = 0.1  # share of what the step before missed above which the weight is eased
 _CURVED = 1e-8  # least curvature of a price by its slope, per unit of a row: DAQP divides by it, and with 1e-10 it errs
@@ -42,13 +45,62 @@ _CURVED = 1e-8  # least curvature of a price by its slope, per unit of a row: DA
 FEW = 20  # active rows up to which the next solve goes on from them
 _MANY = 16  # iterations of a solve that tell how long one takes
 
-_OPTIMAL, _INFEASIBLE, _ITERATIONS, _TIME_LIMIT = 1, -1, -4, -7
-_UPPER, _LOWER, _SOFT = 1, 3, 8  # senses of rows: active at an end, and soft, which may be added
+# DAQP's exit flags
+_OPTIMAL = 1
+_INFEASIBLE = -1
+_ITERATIONS = -4
+_TIME_LIMIT = -7
+# DAQP's senses of rows; _SOFT is added to another
+_UPPER = 1  # active at the upper end
+_LOWER = 3  # active at the lower end
+_SOFT = 8
 _STATUS = {
     _INFEASIBLE: Status.INFEASIBLE,
     _ITERATIONS: Status.MAX_ITERATIONS,
     _TIME_LIMIT: Status.TIME_LIMIT,
 }
+
+
+@dataclass(frozen=True, eq=False)
+class DAQPSetup(Value):
+    """½ xᵀH x → min, low ≤ M x ≤ high, v = D x: a QP with q = 0 as DAQP solves it.
+
+    Attributes
+    ----------
+    H, M
+        (n, n), (m, n).
+    columns, rows
+        (n,) the diagonal D, (m,) the factor of each row and of its limits.
+    soft
+        (m,) whether a row may be broken by ε ≥ 0 at the price linear ε + ½ curvature ε².
+    linear, curvature
+        (m,) these prices, by the scaled row.
+    metric
+        (n, n) AᵀA of the hard rows where these are so close to dependent that proximal points solve the QP; else None.
+    settings
+        All settings of DAQP.
+    """
+
+    H: Float[np.ndarray, "n n"]
+    M: Float[np.ndarray, "m n"]
+    columns: Float[np.ndarray, " n"]
+    rows: Float[np.ndarray, " m"]
+    soft: Bool[np.ndarray, " m"]
+    linear: Float[np.ndarray, " m"]
+    curvature: Float[np.ndarray, " m"]
+    metric: Float[np.ndarray, "n n"] | None
+    settings: Mapping[str, Any]
+
+
+def daqp_settings(settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return all settings of DAQP: ours, and those that are given.
+
+    Raises
+    ------
+    DataError
+        DAQP has no such setting, or the value is out of range.
+    """
+    return dict(_model(settings or {}).settings)
 
 
 class DAQP(QPSolver):
@@ -69,6 +121,11 @@ class DAQP(QPSolver):
 
     name = "daqp"
     exact = True  # to rounding in any coordinates, but its time grows with cond(H)
+
+    @staticmethod
+    def setting_names() -> frozenset[str]:
+        """Return the names of DAQP's settings."""
+        return frozenset(_model({}).settings)
 
     def _setup(self) -> None:
         self._model = _model(self._settings)
@@ -106,6 +163,21 @@ class DAQP(QPSolver):
         """Take over the limits that the original had, and how far from them its last solution was."""
         limits, self._far = state
         self.set_bounds(*limits)
+
+    @property
+    def setup(self) -> DAQPSetup:
+        """The scaled problem and the settings."""
+        return DAQPSetup(
+            self._H,
+            self._M,
+            self._columns,
+            self._rows,
+            self._sense != 0,
+            self._linear,
+            self._curved,
+            self._metric() if len(self._rows) and self._steep() else None,
+            dict(self._model.settings),
+        )
 
     def update(self, qp: QP) -> None:
         """Go on with another QP of the same size: DAQP's setup is one factorisation."""
@@ -217,7 +289,7 @@ class DAQP(QPSolver):
         center, rows, weight, least, missed, iterations = np.zeros_like(v), y, _DAMPING, 0.0, np.inf, 0
         found, last = QPSolution(v.copy(), y.copy(), Status.INFEASIBLE, 0, self.name), None
         for _ in range(_PASSES):
-            solver = self._eased(weight, metric)
+            solver = self._weigh_changes(weight, metric)
             solver.pull(qp.q - weight * metric @ center)
             left = limit - (perf_counter() - start) if limit else None
             again = solver is last and found.status is Status.MAX_ITERATIONS  # the step before led here
@@ -240,7 +312,7 @@ class DAQP(QPSolver):
         self._far = found.status is Status.OPTIMAL and bool(2 * np.count_nonzero(found.y) > len(v))
         return found
 
-    def _eased(self, weight: float, metric: Float[np.ndarray, "n n"]) -> "DAQP":
+    def _weigh_changes(self, weight: float, metric: Float[np.ndarray, "n n"]) -> "DAQP":
         """Return the solver of the same rows with the cost that this weight eases, whose INFEASIBLE is believed."""
         qp, solver = self._qp, self._lighter.get(weight)
         if solver is None:

@@ -23,10 +23,7 @@ from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolution, QPSolver
 from koopmpc.errors import DataError
-
-_MASK = getattr(signal, "pthread_sigmask", None)  # Windows has none
-_BLOCK, _UNBLOCK, _SET = (int(getattr(signal, f"SIG_{name}", 0)) for name in ("BLOCK", "UNBLOCK", "SETMASK"))
-_SIGINT = (int(signal.SIGINT),)  # numbers, of which Python looks up no names: 1 µs less
+from koopmpc.interrupts import call_uninterrupted
 
 # sigma: on plans of an unstable plant that saturate for many steps, half the iterations of OSQP's own 1e-6.
 # eps_prim_inf: its 1e-4 calls 5 % of feasible degenerate problems infeasible, and 18 % of badly scaled ones; 1e-7
@@ -42,9 +39,9 @@ DEFAULTS: Mapping[str, Any] = {
 }
 
 _STRICT = 1e-12  # eps_prim_inf where a first certificate was rounding
-# By how much a certificate must exceed its own residual, and rounding: of 29 false ones all but one reach 3 times the
-# residual, that one 23 times, and of 1489 true ones all reach 6600 times.
-_CERTAIN, _ROUNDING = 1000.0, 1e-9
+# Of 29 false certificates all but one reach 3 times their residual, that one 23 times; 1489 true ones reach 6600 times
+_CERTAIN = 1000.0  # believe a certificate that exceeds its own residual by this factor
+_ROUNDING = 1e-9  # and exceeds this share of its terms
 _SHORTEST = 1e-6  # seconds that a solve gets at least
 _NO_LIMIT = 1e9  # seconds; OSQP's own default is above it
 
@@ -102,6 +99,13 @@ class OSQP(QPSolver):
     # Total time of a step, measured on random closed loops: where it has not converged by then it rarely does soon.
     impatient: ClassVar[Mapping[str, Any]] = {"max_iter": 100}
     coordinates = "auto"
+
+    @staticmethod
+    def setting_names() -> frozenset[str]:
+        """Return the names of OSQP's settings."""
+        from osqp import ext_builtin
+
+        return frozenset(name for name in dir(ext_builtin.OSQPSettings) if not name.startswith("_"))
 
     def _setup(self) -> None:
         import osqp
@@ -193,7 +197,7 @@ class OSQP(QPSolver):
         self._solver.update_data_vec(q=None, l=self.low, u=self.high)
         self._allow(limit)
         self._solver.warm_start(np.ascontiguousarray(v), np.ascontiguousarray(y))
-        _uninterrupted(self._solver.solve)
+        _solve_uninterrupted(self._solver.solve)
         info, solution = self._solver.info, self._solver.solution
         status = self._status.get(int(info.status_val), Status.FAILED)
         if status is Status.MAX_ITERATIONS and info.iter < self._most:  # nearly solved when its time was over
@@ -212,7 +216,7 @@ class OSQP(QPSolver):
 
 
 @cache
-def _interrupted() -> Callable[[], int]:
+def _load_interrupt_flag() -> Callable[[], int]:
     """Return OSQP's own function that says whether a SIGINT came during the last solve."""
     from ctypes import CDLL
 
@@ -221,23 +225,12 @@ def _interrupted() -> Callable[[], int]:
     return getattr(CDLL(ext_builtin.__file__), "osqp_is_interrupted", lambda: 0)  # Windows exports no such name
 
 
-def _uninterrupted(solve: Callable[[], object]) -> None:
-    """Solve while SIGINT waits: Python raises KeyboardInterrupt right after, some milliseconds later.
+def _solve_uninterrupted(solve: Callable[[], object]) -> None:
+    """Solve while SIGINT waits.
 
     OSQP takes the signal for itself. In a program with threads another thread may still receive it; OSQP then ends
     with a status that says so, or forgets it in its last iteration. It is therefore sent once more.
     """
-    if _MASK is None:
-        solve()
-    else:
-        try:
-            before = _MASK(_BLOCK, _SIGINT)
-        except BaseException:  # a KeyboardInterrupt that came just before is raised once the signal is blocked
-            _MASK(_UNBLOCK, _SIGINT)
-            raise
-        try:
-            solve()
-        finally:
-            _MASK(_SET, before)
-    if _interrupted()():
+    call_uninterrupted(solve)
+    if _load_interrupt_flag()():
         signal.raise_signal(signal.SIGINT)

@@ -14,8 +14,16 @@ from koopmpc.errors import DataError, ObservableError
 from koopmpc.identify.fits.edmd import Rank, leading_directions, truncation_loss
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
-from koopmpc.identify.regression import FitResult, fit_report, regression_of, scale_factor
-from koopmpc.identify.solve import RegressionRows, Ridge, about_means, doubts, ridge_of, rule, solve
+from koopmpc.identify.regression import FitResult, build_regression, build_report, compute_scale_factor
+from koopmpc.identify.solve import (
+    RegressionRows,
+    Ridge,
+    centre_products,
+    check_ridge,
+    describe_solve,
+    find_doubts,
+    solve,
+)
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Projected
 from koopmpc.predict.predictors import BilinearPredictor
@@ -34,14 +42,14 @@ def bilinear_edmd(
 ) -> BilinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x) by least squares on M snapshot pairs.
 
-    The lifting is used as given. Where it holds a Constant, the columns of Nᵢ for it are zero: B multiplies uᵢ · 1.
+    Nothing is added to the lifting. If it holds a Constant, the columns of Nᵢ for it are zero, because B multiplies uᵢ.
 
     Parameters
     ----------
     episodes
         Episodes with inputs, or a Source of them; no pair spans two episodes.
     lifting
-        ψ: R^nx → R^nz. C picks the states where it holds them, by name, else it is fitted.
+        ψ: R^nx → R^nz. C selects by name the states that ψ holds, and is fitted for the others.
     embedding
         ψ acts on the state and its past, as in `edmd`.
     ridge
@@ -54,9 +62,9 @@ def bilinear_edmd(
         Names of the observables that inputs multiply, for an input-affine model ψ(x⁺) = A ψ(x) + G(x) u whose G
         is spanned by 1 and these; all by default.
     difference
-        Regress ψ(x⁺) − ψ(x) and add I to A. Without a ridge and on independent columns the model is the same. A
-        ridge, or a cut of singular values, then draws z⁺ towards z instead of towards zero, which is nearer the truth
-        for a short dt.
+        Regress ψ(x⁺) − ψ(x) and add I to A. Without a ridge and on independent columns the model is the same. With a
+        ridge, or a cut of singular values, the model is drawn towards z⁺ = z instead of z⁺ = 0. For a short dt this is
+        closer to the plant.
     **options
         ``weights``, ``workers``, ``scheduler`` and ``progress``, as in `km.moments.second_moments`.
 
@@ -93,35 +101,35 @@ def bilinear_edmd(
         raise DataError("the episodes have no inputs; pass them to edmd, or give each Episode its U")
     if source.nw:
         raise DataError("the episodes hold measured disturbances, which a bilinear fit leaves out; use edmd")
-    ridge = ridge_of(ridge)
+    ridge = check_ridge(ridge)
     if rank is not None and products is not None:
         raise DataError("a rank mixes all observables, so inputs cannot multiply some of them; pass one of the two")
     total = second_moments(source, lifting, bilinear=True, embedding=embedding, **options)
-    regression = regression_of(total, "bilinear_edmd")
+    regression = build_regression(total, "bilinear_edmd")
     assert regression.C is not None, "an extended regression has its C"
     bound, nz, nu = regression.lifting, total.nz, source.nu
-    which = total.products if products is None else _named(total, products)
-    given = _with_products(regression.rows, total, which)
+    which = total.products if products is None else _find_products(total, products)
+    rows = _keep_products(regression.rows, total, which)
     names = tuple(f"{u} * {bound.names[int(i)]}" for u in total.inputs for i in which)
     regular = ridge != 0 or rank is not None
-    sentences, condition = doubts(given, bound.names, (*total.inputs, *names), regular=regular)
-    P, C, basis, state_residual, words = given.P, regression.C, np.eye(nz), regression.state_residual, ""
+    sentences, condition = find_doubts(rows, bound.names, (*total.inputs, *names), regular=regular)
+    P, C, basis, state_residual, words = rows.P, regression.C, np.eye(nz), regression.state_residual, ""
     if rank is not None:
-        basis, words = leading_directions(given, nz, rank, sentences)
-        P, C, bound = _projected(P, basis, nu, which), C @ basis, Projected(bound, basis)
-        state_residual = np.hypot(state_residual, truncation_loss(given.P[:, :nz], basis, regression.C, given.samples))
+        basis, words = leading_directions(rows, nz, rank, sentences)
+        P, C, bound = _project_rows(P, basis, nu, which), C @ basis, Projected(bound, basis)
+        state_residual = np.hypot(state_residual, truncation_loss(rows.P[:, :nz], basis, regression.C, rows.samples))
         which = np.arange(len(basis.T))
     r = len(basis.T)
     start = np.eye(P.shape[1], r) @ basis.T * difference  # K of the model z⁺ = z, or zero
-    one = given.constant if rank is None else None
-    change = RegressionRows(P, given.T[:, :nz] - P @ start, given.rest[:nz], given.samples, one)
-    shifted, back = about_means(change, nu, which)
+    constant = rows.constant if rank is None else None
+    change = RegressionRows(P, rows.T[:, :nz] - P @ start, rows.rest[:nz], rows.samples, constant)
+    shifted, back = centre_products(change, nu, which)
     solution = solve(shifted, ridge=ridge)
     K = (back @ solution.K + start) @ basis
     N = np.zeros((nu, r, r))
     N[:, :, which] = K[r + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
-    regression = replace(regression, rows=replace(given, P=P, constant=one))
-    solved = rule(regression.rows, ridge, solution.ridge)
+    regression = replace(regression, rows=replace(rows, P=P, constant=constant))
+    solved = describe_solve(regression.rows, ridge, solution.ridge)
     result = FitResult(
         A=K[:r].T,
         B=K[r : r + nu].T,
@@ -144,14 +152,14 @@ def bilinear_edmd(
         regression.dt,
         regression.states,
         regression.inputs,
-        fit_report(regression, result),
+        build_report(regression, result),
         regression.embedding,
-        scale_factor(P[:, :r], given.samples),
+        compute_scale_factor(P[:, :r], rows.samples),
     )
 
 
-def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:
-    """Return the indices of the observables with these names, without a Constant, whose product with u is u itself."""
+def _find_products(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:
+    """Return the indices of the observables with these names, without the Constant, because u · 1 is u."""
     place = {name: i for i, name in enumerate(total.lifting.names)}
     for name in products:
         if name not in place:
@@ -161,18 +169,18 @@ def _named(total: Moments, products: Sequence[str]) -> Int[np.ndarray, " np"]:
     return np.intersect1d([place[name] for name in products], total.products).astype(np.intp)
 
 
-def _with_products(rows: RegressionRows, total: Moments, which: Int[np.ndarray, " np"]) -> RegressionRows:
-    """Return the rows with the products u⊗ψ(x) of the observables `which` alone."""
+def _keep_products(rows: RegressionRows, total: Moments, which: Int[np.ndarray, " np"]) -> RegressionRows:
+    """Return the rows with only those products u⊗ψ(x) whose observables are in `which`."""
     first = total.nz + len(total.inputs)
     block = np.flatnonzero(np.isin(total.products, which))
     columns = [first + i * len(total.products) + block for i in range(len(total.inputs))]
     return replace(rows, P=rows.P[:, np.concatenate([np.arange(first), *columns])])
 
 
-def _projected(
+def _project_rows(
     P: Float[np.ndarray, "m n"], basis: Float[np.ndarray, "nz r"], nu: int, which: Int[np.ndarray, " np"]
 ) -> Float[np.ndarray, "m _"]:
-    """Return [z u u⊗z], z = basisᵀ ψ, from [ψ u u⊗ψ], whose products leave out a Constant: u · 1 is u."""
+    """Return [z u u⊗z], z = basisᵀ ψ, from [ψ u u⊗ψ]; for the Constant, which u⊗ψ leaves out, it uses u · 1 = u."""
     nz = len(basis)
     U = P[:, nz : nz + nu]
     constant = np.delete(basis, which, axis=0).sum(axis=0)

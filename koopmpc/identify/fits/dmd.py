@@ -10,10 +10,10 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Held, Source, source_of
 from koopmpc.errors import DataError
-from koopmpc.identify.fits.edmd import Method, Rank, fit
+from koopmpc.identify.fits.edmd import Method, Rank, fit_regression
 from koopmpc.identify.moments.read import ReadOptions, second_moments
-from koopmpc.identify.moments.rows import joined
-from koopmpc.identify.regression import Regression, linear_predictor
+from koopmpc.identify.moments.rows import concatenate_parts
+from koopmpc.identify.regression import Regression, build_predictor
 from koopmpc.identify.solve import RegressionRows
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import LinearPredictor
@@ -37,15 +37,15 @@ def dmd(
         optimal threshold for white noise of unknown size (Gavish & Donoho 2014).
     method
         "ls", least squares: noise in x shrinks A, so that modes seem to decay faster. "tls", total least
-        squares, takes x and x⁺ as noisy alike; "fb" fits forward and backward, A = (A_f A_b⁻¹)^½, which needs
-        no noise of one size, but a motion that can be run backward.
+        squares, assumes equal noise in x and x⁺. "fb" fits forward and backward, A = (A_f A_b⁻¹)^½; it assumes nothing
+        about the size of the noise, but the motion must be reversible in time.
     **options
         ``weights``, ``workers``, ``scheduler`` and ``progress``, as in `km.moments.second_moments`.
 
     Raises
     ------
     DataError
-        rank is above nx, there are too few pairs for "tls", or the motion cannot be run backward for "fb".
+        rank is above nx, there are too few pairs for "tls", or the motion cannot be reversed for "fb".
 
     Warns
     -----
@@ -69,7 +69,7 @@ def dmd(
     array([2., 2.])
     """
     regression = _regression(source_of(episodes), "dmd", inputs=(), noisy=method != "ls", options=options)
-    return linear_predictor(regression, fit(regression, rank=rank, method=method))
+    return build_predictor(regression, fit_regression(regression, rank=rank, method=method))
 
 
 def dmdc(
@@ -89,7 +89,7 @@ def dmdc(
     rank
         Keep r singular vectors of X, as in `dmd`; the cut without it is also that of `dmd`.
     B
-        (nx, nu), known; identified by default.
+        (nx, nu) if it is known; identified by default.
     method
         As in `dmd`; inputs are exact in "tls" and "fb".
     **options
@@ -116,7 +116,7 @@ def dmdc(
         raise DataError("the episodes hold measured disturbances, which dmdc does not fit; use edmd on State()")
     known = None if B is None else checks.array(B, "B", (source.nx, source.nu))
     regression = _regression(source, "dmdc", inputs=source.inputs, B=known, noisy=method != "ls", options=options)
-    return linear_predictor(regression, fit(regression, rank=rank, method=method))
+    return build_predictor(regression, fit_regression(regression, rank=rank, method=method))
 
 
 def _regression(
@@ -128,19 +128,19 @@ def _regression(
     noisy: bool,
     options: ReadOptions,
 ) -> Regression:
-    """Return the regression of x⁺ on [x u], or on x alone where no inputs are named."""
+    """Return the regression of x⁺ on [x u], or on x alone if `inputs` is empty."""
     lifting = State().bind(source.states)
     nx, nu = source.nx, len(inputs)
     episodes = source.episodes if isinstance(source, Held) and options.get("weights") is None else ()
     pairs = sum(len(e) for e in episodes)
-    if 0 < pairs <= 2 * nx + nu:  # few snapshots have no more rows than their moments would
-        X, X_next = joined([e.X[:-1] for e in episodes]), joined([e.X[1:] for e in episodes])
-        P = np.hstack([X, joined([e.U for e in episodes])]) if nu else X
+    if 0 < pairs <= 2 * nx + nu:  # few snapshots: their moments would have as many rows
+        X, X_next = concatenate_parts([e.X[:-1] for e in episodes]), concatenate_parts([e.X[1:] for e in episodes])
+        P = np.hstack([X, concatenate_parts([e.U for e in episodes])]) if nu else X
         rows = RegressionRows(P, X_next, np.zeros(nx), pairs)
     else:
         total = second_moments(source, lifting, route="qr", **options)
         columns = total.columns.regressors[: nx + nu]
-        rows = (total.complete if noisy else total.rows)(columns, total.columns.targets)
+        rows = (total.complete_rows if noisy else total.rows)(columns, total.columns.targets)
     return Regression(
         method=method,
         route="svd",

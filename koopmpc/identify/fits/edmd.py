@@ -1,4 +1,4 @@
-"""Extended dynamic mode decomposition z⁺ = A z + B u, z = ψ(x), the rank of a reduced one, and fits of noisy states."""
+"""Extended dynamic mode decomposition z⁺ = A z + B u, z = ψ(x), with reduced rank and for noisy states."""
 
 from dataclasses import replace
 from typing import Literal, Unpack, cast
@@ -13,24 +13,34 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.read import ReadOptions
-from koopmpc.identify.regression import FitResult, Regression, linear_predictor, read
-from koopmpc.identify.solve import RegressionRows, Ridge, Solution, cutoff, doubts, orthonormal, ridge_of, rule, solve
+from koopmpc.identify.regression import FitResult, Regression, build_predictor, read_regression
+from koopmpc.identify.solve import (
+    RegressionRows,
+    Ridge,
+    Solution,
+    check_ridge,
+    describe_solve,
+    find_doubts,
+    orthonormal_basis,
+    rounding_cutoff,
+    solve,
+)
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Projected
-from koopmpc.predict.base import eigen
+from koopmpc.predict.base import sorted_eigen
 from koopmpc.predict.predictors import LinearPredictor
 
 Method = Literal["ls", "tls", "fb"]
 Rank = int | float | Literal["hard-threshold"] | None
 Towards = Literal["zero", "affine"]
-_DEFECTIVE = 1e7  # condition of the eigenvectors beyond which the principal root is taken
-_REAL = 1e-6  # share of the size of A below which an imaginary part is rounding
+_DEFECTIVE = 1e7  # take the principal square root if the condition number of the eigenvectors is above this
+_REAL = 1e-6  # an imaginary part below this share of the size of A is a rounding error
 _NODES = 200  # nodes of the quadrature of the Marchenko–Pastur law, which is smooth in the angle
-_HALVINGS = 60
+_HALVINGS = 60  # bisection steps for the median of that law: the interval shrinks to rounding error
 _WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward, "}
 
 
-def fit(
+def fit_regression(
     regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls", towards: Towards = "zero"
 ) -> FitResult:
     """Solve min Σ ‖ψ(x⁺) − A ψ(x) − B u‖².
@@ -44,38 +54,41 @@ def fit(
         rank where the regression is not `scaled`. 0: the minimum-norm solution. "gcv": chosen by generalised
         cross-validation.
     rank
-        How many left singular vectors U_r of the unscaled snapshots ψ(x) to keep; then z = U_rᵀ ψ(x). A share or
-        "hard-threshold" as in `edmd`.
+        Number of left singular vectors U_r of the unscaled snapshots ψ(x) to keep; then z = U_rᵀ ψ(x). Or a share, or
+        "hard-threshold", as in `edmd`.
     method
         "ls"; for noisy snapshots "tls" or "fb". These two need a regression that was read with ``noisy=True``, so
         that the rows hold all of T.
     towards
-        What the ridge pulls to, as in `edmd`.
+        The model that a large ridge leads to, as in `edmd`.
     """
-    ridge = ridge_of(ridge)
+    ridge = check_ridge(ridge)
     if not checks.among(towards, ("zero", "affine")):
         raise DataError(f'towards is {towards!r}; pass "zero" or "affine"')
     if towards == "affine" and rank is not None:
-        raise DataError('towards="affine" tells columns apart, and rank mixes them; pass one of the two')
+        raise DataError('towards="affine" treats columns differently, and rank mixes them; pass one of the two')
     if not checks.among(method, _WORDS):
         raise DataError(f"method is {method!r}; pass one of {', '.join(map(repr, _WORDS))}")
     if method != "ls" and ridge != 0:
         raise DataError(f'a ridge shrinks A, and method="{method}" undoes what noise shrank; pass one of the two')
     rows, nz = regression.rows, regression.lifting.nz
-    if regression.B is not None:  # a given B: subtract B u from the targets, and fit A alone
+    if regression.B is not None:  # B is known: subtract B u from the targets, and fit A alone
         known = rows.P[:, nz:] @ regression.B.T
-        rows = replace(rows.part(np.arange(nz)), T=rows.T - known)
+        rows = replace(rows.keep_regressors(np.arange(nz)), T=rows.T - known)
     free = regression.inputs if regression.B is None else ()
-    sentences, condition = doubts(rows, regression.lifting.names, free, regular=ridge != 0 or rank is not None)
+    sentences, condition = find_doubts(rows, regression.lifting.names, free, regular=ridge != 0 or rank is not None)
     if rank is not None:
-        result = _reduced(regression, rows, ridge, rank, method, condition, sentences)
+        result = _fit_reduced(regression, rows, ridge, rank, method, condition, sentences)
         return result._replace(rule=_WORDS[method] + result.rule, doubts=sentences)
-    given, C = rows.leading(nz), regression.C
-    light = [i for i in regression.affine if i < rows.P.shape[1]] if towards == "affine" else []
+    fit_rows, C = rows.keep_targets(nz), regression.C
+    light = [i for i in regression.affine_columns if i < rows.P.shape[1]] if towards == "affine" else []
     if method == "tls":
-        given = _denoised(regression, given, nz)
+        fit_rows = _remove_noise(regression, fit_rows, nz)
     scaled = regression.scaled
-    solution = _forward_backward(given, nz) if method == "fb" else solve(given, ridge=ridge, scaled=scaled, light=light)
+    if method == "fb":
+        solution = _fit_forward_backward(fit_rows, nz)
+    else:
+        solution = solve(fit_rows, ridge=ridge, scaled=scaled, light=light)
     K = solution.K if regression.B is None else np.vstack([solution.K, regression.B.T])
     return FitResult(
         A=K[:nz].T,
@@ -86,13 +99,13 @@ def fit(
         state_residual=regression.state_residual,
         rank=solution.rank,
         condition=condition,
-        rule=_WORDS[method] + rule(rows, ridge, solution.ridge, scaled=scaled, light=light),
+        rule=_WORDS[method] + describe_solve(rows, ridge, solution.ridge, scaled=scaled, light=light),
         ridge=solution.ridge,
         doubts=sentences,
     )
 
 
-def _reduced(
+def _fit_reduced(
     regression: Regression,
     rows: RegressionRows,
     ridge: Ridge,
@@ -105,16 +118,16 @@ def _reduced(
     nz = regression.lifting.nz
     basis, words = leading_directions(rows, nz, rank, sentences)
     r = len(basis.T)
-    given = rows.leading(nz)
+    fit_rows = rows.keep_targets(nz)
     if method == "tls":
-        given = _denoised(regression, given, r)
-        basis = leading_directions(given, nz, r, [])[0]
-    P = np.hstack([given.P[:, :nz] @ basis, given.P[:, nz:]])
+        fit_rows = _remove_noise(regression, fit_rows, r)
+        basis = leading_directions(fit_rows, nz, r, [])[0]
+    P = np.hstack([fit_rows.P[:, :nz] @ basis, fit_rows.P[:, nz:]])
     if method == "fb":
-        solution = _forward_backward(RegressionRows(P, given.T @ basis, np.zeros(r), rows.samples), r)
+        solution = _fit_forward_backward(RegressionRows(P, fit_rows.T @ basis, np.zeros(r), rows.samples), r)
         forward, drive = basis @ solution.K[:r].T, basis @ solution.K[r:].T
     else:
-        solution = solve(RegressionRows(P, given.T, given.rest, rows.samples), ridge=ridge)
+        solution = solve(RegressionRows(P, fit_rows.T, fit_rows.rest, rows.samples), ridge=ridge)
         forward, drive = solution.K[:r].T, solution.K[r:].T  # forward = X′ V_r Σ_r⁻¹, (nz, r)
     A = basis.T @ forward
     B = basis.T @ (drive if regression.B is None else regression.B)
@@ -130,16 +143,16 @@ def _reduced(
         state_residual=np.hypot(regression.state_residual, truncation_loss(Z, basis, regression.C, rows.samples)),
         rank=r,
         condition=condition,
-        rule=words if ridge == 0 else f"{words}, {rule(seen, ridge, solution.ridge)}",
+        rule=words if ridge == 0 else f"{words}, {describe_solve(seen, ridge, solution.ridge)}",
         ridge=solution.ridge,
-        modes=forward @ eigen(A)[1],
+        modes=forward @ sorted_eigen(A)[1],
     )
 
 
 def leading_directions(
     rows: RegressionRows, nz: int, rank: Rank, sentences: list[str]
 ) -> tuple[Float[np.ndarray, "nz r"], str]:
-    """Return U_r, the leading left singular vectors of the snapshots ψ(x), columns unscaled, and the rule in words.
+    """Return U_r, the leading left singular vectors of the unscaled snapshots ψ(x), and the rule in words.
 
     Parameters
     ----------
@@ -151,7 +164,7 @@ def leading_directions(
         A whole number; the least number of directions that hold this share of Σσ², between 0 and 1; or
         "hard-threshold", all σ above ω(β) times their median.
     sentences
-        The list that gets a sentence where the snapshots have a lower rank than asked for; the lower one is then taken.
+        List of doubts. If the snapshots have a lower rank, that one is used and a sentence is appended here.
     """
     Z = rows.P[:, :nz]
     if len(Z) < nz:  # LAPACK is faster on the tall side
@@ -159,26 +172,26 @@ def leading_directions(
     else:
         _, s, Vt = np.linalg.svd(Z, full_matrices=False)
         U = Vt.T
-    held = int(np.sum(s > cutoff(rows) * s[0]))
-    r, words = kept_rank(rank, s, rows.samples, nz)
-    if held < r:
+    numerical_rank = int(np.sum(s > rounding_cutoff(rows) * s[0]))
+    r, words = choose_rank(rank, s, rows.samples, nz)
+    if numerical_rank < r:
         sentences.append(
-            f"rank-deficient: rank {r} was asked for, the snapshots have rank {held}, which is taken; "
-            f"pass rank={held}, or collect richer data"
+            f"rank-deficient: rank {r} was asked for, the snapshots have rank {numerical_rank}, which is taken; "
+            f"pass rank={numerical_rank}, or collect richer data"
         )
-    r = max(min(held, r), 1)
+    r = max(min(numerical_rank, r), 1)
     return np.ascontiguousarray(U[:, :r]), f"truncated SVD of unscaled columns at rank {r}{words}"
 
 
-def kept_rank(rank: Rank, s: Float[np.ndarray, " k"], samples: int, nz: int) -> tuple[int, str]:
+def choose_rank(rank: Rank, s: Float[np.ndarray, " k"], samples: int, nz: int) -> tuple[int, str]:
     """Return the number of singular values of (samples, nz) snapshots that a rank keeps, and the rule in words."""
     if isinstance(rank, str):
         if rank != "hard-threshold":
             raise DataError(f'rank is {rank!r}; pass a whole number, a share of energy in (0, 1), or "hard-threshold"')
         short, long = sorted((samples, nz))
-        every = np.zeros(short)
-        every[: len(s)] = s[:short]
-        threshold = optimal_factor(short / long) * float(np.median(every))
+        padded = np.zeros(short)
+        padded[: len(s)] = s[:short]
+        threshold = median_threshold(short / long) * float(np.median(padded))
         r = int(np.sum(s > threshold))
         if r == 0:
             raise DataError(
@@ -208,12 +221,12 @@ def truncation_loss(
     return np.sqrt(np.einsum("ij,ij->j", gap, gap) / samples)
 
 
-def known_factor(beta: float) -> float:
+def known_noise_threshold(beta: float) -> float:
     """Return λ(β), the optimal threshold in units of √(long side) · σ for noise of known σ; λ(1) = 4/√3."""
     return float(np.sqrt(2 * (beta + 1) + 8 * beta / (beta + 1 + np.sqrt(beta**2 + 14 * beta + 1))))
 
 
-def optimal_factor(beta: float) -> float:
+def median_threshold(beta: float) -> float:
     """Return ω(β) = λ(β) / √μ(β), the optimal threshold in units of the median singular value, 0 < β ≤ 1.
 
     μ(β) is the median of the Marchenko–Pastur law. With t = 1 + β + 2√β cos φ its density is
@@ -225,7 +238,7 @@ def optimal_factor(beta: float) -> float:
     """
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
 
-    def above(phi: float) -> float:  # the share of the law's mass with t above t(φ)
+    def mass_above(phi: float) -> float:  # the share of the law's mass with t above t(φ)
         angles = 0.5 * phi * (nodes + 1)
         t = 1 + beta + 2 * np.sqrt(beta) * np.cos(angles)
         return float(0.5 * phi * weights @ (2 * np.sin(angles) ** 2 / (np.pi * t)))
@@ -233,27 +246,27 @@ def optimal_factor(beta: float) -> float:
     low, high = 0.0, np.pi
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if above(middle) < 0.5 else (low, middle)
+        low, high = (middle, high) if mass_above(middle) < 0.5 else (low, middle)
     median = 1 + beta + 2 * np.sqrt(beta) * np.cos(low)
-    return float(known_factor(beta) / np.sqrt(median))
+    return float(known_noise_threshold(beta) / np.sqrt(median))
 
 
-def _denoised(regression: Regression, rows: RegressionRows, directions: int) -> RegressionRows:
-    """Return the rows projected on the leading directions that [ψ(x) ψ(x⁺)] span together.
+def _remove_noise(regression: Regression, rows: RegressionRows, directions: int) -> RegressionRows:
+    """Return the projection of the rows on the leading directions of [ψ(x) ψ(x⁺)].
 
-    Least squares on the result is the total least squares solution: with D = [ψ(x) ψ(x⁺)] freed of the exact
-    columns E, D ≈ L Σ Rᵀ and r singular vectors L_r, the rows are multiplied by [E, L_r]ᵀ. The inputs and the Constant
-    are exact. All other columns are taken to hold white noise of one size: relative to each observable's own size where
-    the regression is `scaled`, else in the data's own units.
+    Least squares on the result is the total least squares solution. E is a basis of the exact columns, which are the
+    inputs and the Constant; D = [ψ(x) ψ(x⁺)] less its projection on E. With D ≈ L Σ Rᵀ and its r first singular vectors
+    L_r, the rows are multiplied by [E, L_r]ᵀ. All other columns are assumed to hold white noise of one size: relative
+    to each observable's size if the regression is `scaled`, else in the units of the data.
 
     Parameters
     ----------
     regression
-        What the rows are made for.
+        The regression of these rows.
     rows
         P = [ψ(x) u]; T = ψ(x⁺), all of it inside the rows (`rest` is 0).
     directions
-        Number of directions that the signal spans, the Constant counted.
+        Number of directions that the signal spans, the Constant included.
 
     References
     ----------
@@ -271,7 +284,7 @@ def _denoised(regression: Regression, rows: RegressionRows, directions: int) -> 
             f"signal; pass a rank below {max(most, 1)}, or collect more"
         )
     noisy = np.setdiff1d(np.arange(nz), exact)
-    E = orthonormal(rows.P[:, exact], float(np.finfo(float).eps * len(rows.P)))
+    E = orthonormal_basis(rows.P[:, exact], float(np.finfo(float).eps * len(rows.P)))
     D = np.hstack([rows.P[:, noisy], rows.T[:, noisy]])
     if regression.scaled:
         size = np.sqrt(np.sum(D.reshape(len(D), 2, -1) ** 2, axis=(0, 1)))
@@ -281,12 +294,12 @@ def _denoised(regression: Regression, rows: RegressionRows, directions: int) -> 
     return RegressionRows(onto @ rows.P, onto @ rows.T, rows.rest, rows.samples)
 
 
-def _forward_backward(rows: RegressionRows, nz: int) -> Solution:
-    """Return K = [Aᵀ; Bᵀ] of z⁺ = A z + B u with the A whose bias by noise cancels to first order.
+def _fit_forward_backward(rows: RegressionRows, nz: int) -> Solution:
+    """Return K = [Aᵀ; Bᵀ] of z⁺ = A z + B u, where the bias of A by noise cancels to first order.
 
-    A_f is the fit of z⁺ by [z u], A_b that of z by [z⁺ u]. Without noise they are A and A⁻¹. Noise shrinks both, so in
-    A_f A_b⁻¹, about A², the shrinking cancels to first order. Of its square roots the one next to A_f is taken. B is
-    the least squares fit of z⁺ − A z by u.
+    A_f is the fit of z⁺ by [z u], A_b that of z by [z⁺ u]. Without noise they are A and A⁻¹. Noise shrinks both, and in
+    A_f A_b⁻¹ ≈ A² the shrinking cancels to first order. A is the square root of it that is nearest to A_f. B is the
+    least squares fit of z⁺ − A z by u.
 
     Parameters
     ----------
@@ -298,7 +311,7 @@ def _forward_backward(rows: RegressionRows, nz: int) -> Solution:
     Raises
     ------
     DataError
-        A_b is singular, or the square root is not real: the motion cannot be run backward from these data.
+        A_b is singular, or the square root is not real: the motion in these data cannot be reversed.
 
     References
     ----------
@@ -308,20 +321,20 @@ def _forward_backward(rows: RegressionRows, nz: int) -> Solution:
     now, U, ahead = rows.P[:, :nz], rows.P[:, nz:], rows.T
     forward = solve(rows)
     backward = solve(RegressionRows(np.hstack([ahead, U]), now, rows.rest, rows.samples))
-    A = _root_next_to(forward.K[:nz].T, backward.K[:nz].T)
+    A = _nearest_root(forward.K[:nz].T, backward.K[:nz].T)
     B = solve(RegressionRows(U, ahead - now @ A.T, rows.rest, rows.samples)).K
     return Solution(np.vstack([A.T, B]), forward.rank, 0.0)
 
 
-def _root_next_to(forward: Float[np.ndarray, "r r"], backward: Float[np.ndarray, "r r"]) -> Float[np.ndarray, "r r"]:
+def _nearest_root(forward: Float[np.ndarray, "r r"], backward: Float[np.ndarray, "r r"]) -> Float[np.ndarray, "r r"]:
     """Return (A_f A_b⁻¹)^½ with the sign of each eigenvalue that A_f has along its eigenvector."""
     if np.linalg.cond(backward) > 1 / np.finfo(float).eps:
         raise DataError(
-            'method "fb" needs a motion that can be run backward, and on these data a direction of ψ(x) dies in '
+            'method "fb" needs a motion that can be reversed, and on these data a direction of ψ(x) decays to 0 in '
             'one step; pass a rank, or method="tls"'
         )
     square = np.linalg.solve(backward.T, forward.T).T
-    squares, V = eigen(square)
+    squares, V = sorted_eigen(square)
     A: Complex[np.ndarray, "r r"]
     if np.linalg.cond(V) > _DEFECTIVE:
         A = np.asarray(sqrtm(square), dtype=np.complex128)
@@ -416,5 +429,9 @@ def edmd(
     >>> model.rollout([0.5, 0.0], [[0.0], [1.0]]).shape  # x_0 … x_2
     (3, 2)
     """
-    regression = read(episodes, lifting, embedding, "edmd", noisy=not checks.among(method, ("ls",)), **options)
-    return linear_predictor(regression, fit(regression, ridge=ridge, rank=rank, method=method, towards=towards))
+    regression = read_regression(
+        episodes, lifting, embedding, "edmd", noisy=not checks.among(method, ("ls",)), **options
+    )
+    return build_predictor(
+        regression, fit_regression(regression, ridge=ridge, rank=rank, method=method, towards=towards)
+    )

@@ -1,4 +1,4 @@
-"""Kernel EDMD: the observables are those of a kernel, and are never written down."""
+"""Kernel EDMD: a kernel defines the observables, without a formula for each."""
 
 from typing import Literal, Unpack
 
@@ -17,7 +17,7 @@ from koopmpc.lifting.composed import Projected, Standardized
 from koopmpc.lifting.radial import Gaussian, PolynomialKernel
 from koopmpc.predict.predictors import LinearPredictor
 
-_CUT = 1e-11  # eigenvalue of the kernel's matrix, relative to the largest, below which rounding decides
+_CUT = 1e-11  # drop eigenvalues of the kernel's matrix below this share of the largest: they are rounding errors
 
 
 def kernel_edmd(
@@ -34,29 +34,28 @@ def kernel_edmd(
 ) -> LinearPredictor:
     """Fit z⁺ = A z + B u, z = Λ^(−½) Vᵀ k(x, landmarks), where k(landmarks, landmarks) = V Λ Vᵀ.
 
-    The coordinates z are those of the kernel's own observables φ, k(x, y) = φ(x)ᵀφ(y), on the span of φ at the
-    landmarks. Where every state of the data is a landmark, this is kernel EDMD; with fewer it is its Nyström
-    approximation. All data enter the fit: they are read in parts, and memory and time go with the number of landmarks
-    and not with the number of observables that the kernel stands for.
+    A kernel k(x, y) = φ(x)ᵀφ(y) has observables φ, and z are the coordinates of φ(x) in the span of φ at the landmarks.
+    If every state of the data is a landmark, this is kernel EDMD; with fewer landmarks it is its Nyström approximation.
+    All data enter the fit in parts. Memory and time depend on the number of landmarks, not on the number of observables
+    in φ.
 
     Parameters
     ----------
     episodes
         As in `edmd`.
     kernel
-        "polynomial", k = (1 + xᵀy)^degree: A has the eigenvalues of EDMD on all monomials up to that degree, where the
-        landmarks are at least as many as these. "gaussian", k = exp(−‖x − y‖² / (2 width²)). In both, x stands for
-        the states less their mean, in standard deviations, so that units do not matter.
+        "polynomial", k = (1 + xᵀy)^degree: with at least as many landmarks as there are monomials up to that degree, A
+        has the eigenvalues of EDMD on these monomials. "gaussian", k = exp(−‖x − y‖² / (2 width²)). In both, x are
+        deviations of the states from their mean in standard deviations, so that units do not matter.
     degree
         Degree of the polynomial kernel.
     width
         Width of the Gaussian kernel in standard deviations; by default the median distance of two landmarks.
     landmarks
-        Number of states, drawn from the data at random, that span the observables; all states where the data hold no
-        more.
+        Number of states that are drawn from the data at random; all states if the data hold no more.
     rank
-        Largest number of coordinates z, those of the largest eigenvalues in Λ; by default all above 1e-11 of the
-        largest.
+        Largest number of coordinates z, which belong to the largest eigenvalues in Λ; by default all eigenvalues above
+        1e-11 of the largest are used.
     ridge, **options
         As in `edmd`.
     rng
@@ -65,14 +64,14 @@ def kernel_edmd(
     Returns
     -------
     predictor
-        Controllers take it like that of `edmd`. C is fitted by least squares, with the residual in
-        ``report.state_residual``: a polynomial kernel holds the states exactly, a Gaussian one nearly.
+        Controllers accept it like that of `edmd`. C is fitted by least squares, with the residual in
+        ``report.state_residual``. A polynomial kernel represents the states exactly, a Gaussian one nearly.
 
     Raises
     ------
     DataError
-        There is no such kernel, or a number is not above zero; the source can be read once only; the landmarks are
-        all one state.
+        There is no such kernel; a number is not above zero; the source can be read only once; all landmarks are the
+        same state.
 
     Warns
     -----
@@ -93,41 +92,41 @@ def kernel_edmd(
             "a stream is read once, and kernel_edmd needs it for its landmarks first; save it, and pass that"
         )
     frame = Standardized.of(source, PolynomialKernel(np.ones((1, source.nx)), 1))
-    centers = (_drawn(source, landmarks, checks.generator(rng)) - frame.mean) / frame.scale
+    centers = (_draw_landmarks(source, landmarks, checks.generator(rng)) - frame.mean) / frame.scale
     if kernel == "polynomial":
         inner: Lifting = PolynomialKernel(centers, degree)
     else:
         inner = Gaussian(centers, _median_distance(centers) if width is None else width)
     lifting = Standardized(inner, frame.mean, frame.scale)
     at_landmarks = lifting.bind(source.states)(centers * frame.scale + frame.mean)
-    return edmd(source, Projected(lifting, _basis(at_landmarks, rank)), ridge=ridge, **options)
+    return edmd(source, Projected(lifting, _kernel_basis(at_landmarks, rank)), ridge=ridge, **options)
 
 
-def _drawn(source: Source, count: int, rng: np.random.Generator) -> Float[np.ndarray, "m nx"]:
-    """Return `count` different rows x_0 … x_{T−1} of the data, each as likely as any other, from one reading."""
-    kept, keys = np.empty((0, source.nx)), np.empty(0)
+def _draw_landmarks(source: Source, count: int, rng: np.random.Generator) -> Float[np.ndarray, "m nx"]:
+    """Return up to `count` different states x_0 … x_{T−1}, drawn with equal probability in one pass over the data."""
+    rows, keys = np.empty((0, source.nx)), np.empty(0)
     for part in source.parts():
         for episode in part.load():
-            kept, keys = np.vstack([kept, episode.X[:-1]]), np.append(keys, rng.random(len(episode.X) - 1))
-            first = np.sort(np.argsort(keys)[:count])  # the rows with the smallest keys, in the order of the data
-            kept, keys = kept[first], keys[first]
-    return np.unique(kept, axis=0)
+            rows, keys = np.vstack([rows, episode.X[:-1]]), np.append(keys, rng.random(len(episode.X) - 1))
+            smallest = np.sort(np.argsort(keys)[:count])  # the rows with the smallest keys, in the order of the data
+            rows, keys = rows[smallest], keys[smallest]
+    return np.unique(rows, axis=0)
 
 
-def _basis(K: Float[np.ndarray, "m m"], rank: int | None) -> Float[np.ndarray, "m r"]:
+def _kernel_basis(K: Float[np.ndarray, "m m"], rank: int | None) -> Float[np.ndarray, "m r"]:
     """Return V Λ^(−½) of K = V Λ Vᵀ, for the largest eigenvalues."""
     values, vectors = np.linalg.eigh((K + K.T) / 2)
-    kept = np.flatnonzero(values > _CUT * values[-1])[::-1]
+    largest = np.flatnonzero(values > _CUT * values[-1])[::-1]
     if rank is not None:
         checks.count(rank, "rank")
-        kept = kept[:rank]
-    return vectors[:, kept] / np.sqrt(values[kept])
+        largest = largest[:rank]
+    return vectors[:, largest] / np.sqrt(values[largest])
 
 
 def _median_distance(centers: Float[np.ndarray, "m nx"]) -> float:
     """Return the median distance of two centres."""
-    some = centers[:: max(1, len(centers) // 300)]
-    distances = np.linalg.norm(some[:, None] - some, axis=2)[np.triu_indices(len(some), 1)]
+    sample = centers[:: max(1, len(centers) // 300)]
+    distances = np.linalg.norm(sample[:, None] - sample, axis=2)[np.triu_indices(len(sample), 1)]
     if not (distances > 0).any():
-        raise DataError("the landmarks are all one state; pass data that move, or more landmarks")
+        raise DataError("all landmarks are the same state; pass data that move, or more landmarks")
     return float(np.median(distances[distances > 0]))

@@ -28,14 +28,14 @@ def kic(
 ) -> "InputPredictor":
     """Fit ψ(x⁺, ∗) = K ψ(x, u) by least squares on observables of states and inputs.
 
-    ∗ is what the input becomes, and says what the data are: 0 where u is exogenous, so that K holds what one input does
-    and nothing of the next; u⁺ where u is a function of the state, so that K is the closed loop; u where each signal is
-    constant, so that K holds a family of plants.
+    ∗ is the next input, by the kind of data. For an exogenous input it is 0: K holds the effect of one input and
+    nothing of the next. For a function of the state it is u⁺: K is the closed loop. For constant signals it is u: K
+    holds a family of plants.
 
     Parameters
     ----------
     episodes
-        With inputs.
+        Episodes with inputs.
     lifting
         ψ over the states and then the inputs, by their names: ``km.State() * km.State("u")`` holds products. It must
         hold the states.
@@ -47,7 +47,7 @@ def kic(
     Raises
     ------
     DataError
-        The episodes have no inputs; `inputs` is none of the three; a signal that is said to be constant changes.
+        The episodes have no inputs; `inputs` is not one of the three; or it is "constant" and a signal changes.
 
     References
     ----------
@@ -78,9 +78,9 @@ def kic(
 class InputPredictor(Value):
     """z⁺ = K z with z = ψ(x, u): a model of states and inputs together.
 
-    It answers what an input does to observables that mix it with the state, and its eigenvalues and eigenfunctions are
-    those of `model`, of (x, u). A plan needs a model in which inputs are free: `step_map` is one for BilinearMPC and
-    NonlinearMPC, whatever ψ does with u; `linear` one for KoopmanMPC and LQR, where u enters as it is.
+    The observables may mix inputs with states; eigenvalues and eigenfunctions of (x, u) are those of `model`. A
+    controller needs a model in which inputs are free: `step_map` returns one for BilinearMPC and NonlinearMPC, for any
+    ψ. `linear` returns one for KoopmanMPC and LQR if ψ holds u itself.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class InputPredictor(Value):
     nu
         Number of inputs.
     inputs
-        What the data were: "exogenous", "state" or "constant".
+        The kind of the data's inputs: "exogenous", "state" or "constant".
     """
 
     model: LinearPredictor
@@ -102,7 +102,7 @@ class InputPredictor(Value):
         return self.model.nx - self.nu
 
     def rollout(self, x0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "T1 nx"]:
-        """Return X (T+1, nx) from x0 under U (T, nu), lifted anew at each step."""
+        """Return X (T+1, nx) from x0 under U (T, nu), lifted again at each step."""
         return self.step_map().rollout(x0, U)
 
     def step_map(self) -> StepMap:
@@ -120,29 +120,29 @@ class InputPredictor(Value):
         Raises
         ------
         DataError
-            An observable mixes states and inputs, or is a function of u other than u itself; or the data were not those
-            of an exogenous input, so that K does not say what a free input does.
+            An observable mixes states and inputs, or is a function of u other than u itself; or the inputs of the data
+            were not exogenous, so that K does not hold the effect of a free input.
         """
         m, names = self.model, self.model.lifting.names
         if self.inputs != "exogenous":
             raise DataError(
-                f'the inputs of the data are "{self.inputs}", and a plan needs free ones; fit exogenous inputs'
+                f'the inputs of the data are "{self.inputs}", and a controller needs free ones; fit exogenous inputs'
             )
         x, u = ca.SX.sym("x", self.nx), ca.SX.sym("u", self.nu)
         z = m.lifting.symbolic(ca.vertcat(x, u))
-        own = [i for i in range(m.nz) if not ca.depends_on(z[i], u)]
-        free = [names.index(name) for name in m.states[self.nx :] if name in names]
-        other = [names[i] for i in range(m.nz) if i not in own and i not in free]
-        if other or len(free) < self.nu:
-            what = f"{other[0]!r} mixes or bends inputs" if other else "ψ lacks an input"
+        of_state = [i for i in range(m.nz) if not ca.depends_on(z[i], u)]
+        of_input = [names.index(name) for name in m.states[self.nx :] if name in names]
+        other = [names[i] for i in range(m.nz) if i not in of_state and i not in of_input]
+        if other or len(of_input) < self.nu:
+            what = f"{other[0]!r} is not linear in the inputs" if other else "ψ lacks an input"
             raise DataError(f"{what}; use step_map() with BilinearMPC or NonlinearMPC, or fit bilinear_edmd")
         return LinearPredictor(
-            A=m.A[np.ix_(own, own)],
-            B=m.A[np.ix_(own, free)],
-            C=m.C[: self.nx, own],
+            A=m.A[np.ix_(of_state, of_state)],
+            B=m.A[np.ix_(of_state, of_input)],
+            C=m.C[: self.nx, of_state],
             lifting=Traced(
-                Graph.trace(ca.Function("lifting", [x], [ca.substitute(z[own], u, 0)])),
-                tuple(names[i] for i in own),
+                Graph.trace(ca.Function("lifting", [x], [ca.substitute(z[of_state], u, 0)])),
+                tuple(names[i] for i in of_state),
                 bound=m.states[: self.nx],
             ),
             dt=m.dt,

@@ -1,4 +1,4 @@
-"""OnlineEDMD: recursive EDMD that learns while the plant runs, and which rows it does not learn from."""
+"""OnlineEDMD, a recursive EDMD that learns while the plant runs, and the gate that keeps outliers from it."""
 
 from collections.abc import Sequence
 
@@ -11,37 +11,40 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.moments.moments import Moments
-from koopmpc.identify.moments.rows import Forgetting, Table, Triangle, Window, row_columns
-from koopmpc.identify.regression import linear_predictor, regression_of, unreduced
-from koopmpc.identify.solve import Ridge, doubts, ridge_of, rule, solve
-from koopmpc.lifting.base import Lifting, buffered, lifting_of
+from koopmpc.identify.moments.rows import ForgettingMemory, Table, Triangle, WindowMemory, row_columns
+from koopmpc.identify.regression import build_predictor, build_regression, build_result
+from koopmpc.identify.solve import Ridge, check_ridge, describe_solve, find_doubts, solve
+from koopmpc.lifting.base import Lifting, buffer_lifting, check_lifting
 from koopmpc.predict.predictors import LinearPredictor
 
-_BLOCK = 32  # rows that the factor takes in at once
+_BLOCK = 32  # rows that the factor absorbs at once
 # The gate of outliers:
-BEYOND, LEAST, MEMORY = 30.0, 0.01, 0.01  # of a spread; of a column's size; share that a new row has in both
-FEW = 20  # innovations, or rows, that say nothing of their spread yet
-FAR = 1000.0  # of a column's size: what no signal reaches, where there is no forecast to compare it with
-FALLEN = 0.01  # of a column's size: what stays below it for FEW rows was another signal before
+BEYOND = 30.0  # a row is an outlier if an innovation is above so many times the spread of its column
+LEAST = 0.01  # the spread of a column counts as at least this share of the column's size
+MEMORY = 0.01  # weight of a new row in the running spread and size
+FEW = 20  # the gate judges innovations after so many of them, and sizes after so many rows
+FAR = 1000.0  # without a forecast, a row is an outlier if a value is above so many times its column's size
+FALLEN = 0.01  # signals have fallen if a column stays below this share of its size for FEW rows
 
 
 class OnlineEDMD:
     """Recursive least squares ψ(x⁺) = A ψ(x) + B u + E w over all pairs so far, weighted by forgetting^age.
 
-    It keeps the triangular factor of the rows [ψ(x) u w ψ(x⁺)], never a covariance: updates are orthogonal
+    It keeps the triangular factor of the rows [ψ(x) u w ψ(x⁺)], never a covariance. Updates are orthogonal
     transformations, so errors do not grow with their number. With a window it is the fit of the last `window` pairs.
     With neither forgetting nor a window it is the batch fit.
 
-    With forgetting, a pair whose innovation, ψ(x⁺) less its forecast, is beyond 30 times the spread of innovations so
-    far is an outlier: it is not learned, and counted in `outliers`. Otherwise one reading that is far off would be
-    remembered for thousands of pairs. As long as there are no forecasts, a pair with a value beyond 1000 times the size
-    of its observable is an outlier. A plant that has changed is learned after a few pairs, because outliers widen the
-    spread. Outliers are not looked for with a memory of less than four pairs a regressor. Readings that stay bad for
-    longer are learned, and spoil the model for as long as the memory holds them. Where they are so far off that it
-    would hold them for good, a second memory, begun once they are over, takes its place after ten to twenty times
-    1 / (1 − λ) pairs.
+    With forgetting, outliers are counted in `outliers` and not learned: one bad reading would be remembered for
+    thousands of pairs. A pair is an outlier if its innovation, ψ(x⁺) less its forecast, is above 30 times the spread of
+    the innovations so far. Before the first forecasts, it is one if a value is above 1000 times the size of its
+    observable. Outliers widen the spread, so a changed plant is learned after a few pairs. A memory of less than four
+    pairs a regressor looks for no outliers.
 
-    It takes no embedding, because it keeps no past steps. A model with delays learns from points ζ as states:
+    Readings that stay bad for longer are learned, and spoil the model until the memory forgets them. If they are so
+    large that it never would, a second memory, begun after them, replaces it after ten to twenty times 1 / (1 − λ)
+    pairs.
+
+    There is no embedding, because no past steps are kept. A model with delays learns from points ζ as states:
     ``OnlineEDMD.start(Delay(2)(episodes), lifting)``, then ``learn(zeta, u, zeta_next)``.
 
     Parameters
@@ -55,18 +58,18 @@ class OnlineEDMD:
     forgetting
         λ in (0, 1]; the memory is about 1 / (1 − λ) pairs.
     window
-        Number of pairs that count; None for all.
+        Number of pairs in the fit; None for all.
     ridge
-        Tikhonov weight as in `edmd`; "gcv" chooses it anew for each predictor.
+        Tikhonov weight as in `edmd`; "gcv" chooses it for each predictor.
     keep
-        In (0, 1): the information along each direction is not forgotten below this share of its maximum so far, so that
-        a plant at rest does not lose its model. Lower `keep` where later signals are more than 1/√keep times smaller
-        than the first.
+        In (0, 1): forgetting stops when the information along a direction falls to this share of its maximum, so that a
+        plant at rest does not lose its model. Pass a smaller `keep` if later signals are more than 1/√keep times
+        smaller than the first.
 
     Raises
     ------
     DataError
-        forgetting lies outside (0, 1], or a window is asked for beside it.
+        forgetting lies outside (0, 1], or both forgetting and a window are passed.
 
     References
     ----------
@@ -87,13 +90,13 @@ class OnlineEDMD:
         ridge: Ridge = 0.0,
         keep: float = 1e-6,
     ) -> None:
-        self._lifting = lifting_of(lifting).bind(checks.texts(states, "states"))
+        self._lifting = check_lifting(lifting).bind(checks.texts(states, "states"))
         self._full = row_columns(self._lifting, (), bilinear=False).full
-        self._psi, self._pair = buffered(self._full), np.empty((2, self._full.nz))  # for single pairs
+        self._psi, self._pair = buffer_lifting(self._full), np.empty((2, self._full.nz))  # for single pairs
         self._inputs = checks.texts(inputs, "inputs")
         self._disturbances = checks.texts(disturbances, "disturbances")
         self._dt = checks.positive(dt, "dt", "s")
-        self._ridge: Ridge = ridge_of(ridge)
+        self._ridge: Ridge = check_ridge(ridge)
         factor = checks.positive(forgetting, "forgetting")
         if factor > 1:
             raise DataError(f"forgetting is {factor:g}; it must lie in (0, 1], 1 forgets nothing")
@@ -101,19 +104,19 @@ class OnlineEDMD:
             raise DataError(f"keep is {keep:g}; it must lie between 0 and 1")
         nz, nf = self._lifting.nz, len(self._inputs) + len(self._disturbances)
         self._n, width = nz + nf, nf + 2 * self._full.nz
-        self._memory: Forgetting | Window
+        self._memory: ForgettingMemory | WindowMemory
         if window is None:
             self._forgetting = width, self._n, factor, float(keep)
-            self._memory = Forgetting(*self._forgetting)
+            self._memory = ForgettingMemory(*self._forgetting)
         elif factor < 1:
             raise DataError(f"window is {window} and forgetting {factor:g}; choose one of them")
         else:
-            self._memory = Window(width, checks.count(window, "window"), max(_BLOCK, width))
+            self._memory = WindowMemory(width, checks.count(window, "window"), max(_BLOCK, width))
         self._rows = np.empty((_BLOCK if window is None else max(_BLOCK, width), width))
         self._waiting: int = 0
-        long = factor < 1 and 1 / (1 - factor) >= 4 * self._n  # else forecasts say nothing of outliers
-        self._gate = Gate(width, self._n, nz) if long else None
-        self._rival: Rival | None = None
+        long = factor < 1 and 1 / (1 - factor) >= 4 * self._n  # forecasts from a short memory cannot reveal outliers
+        self._gate = OutlierGate(width, self._n, nz) if long else None
+        self._shadow: ShadowModel | None = None
         self.pairs = self.outliers = 0
 
     @classmethod
@@ -127,7 +130,7 @@ class OnlineEDMD:
         ridge: Ridge = 0.0,
         keep: float = 1e-6,
     ) -> "OnlineEDMD":
-        """Return an OnlineEDMD with the names and dt of these episodes that has learned from them in their order."""
+        """Return an OnlineEDMD with the names and dt of these episodes, after it has learned from them in order."""
         episodes = episodes_of(episodes)
         online = cls(
             lifting,
@@ -145,25 +148,25 @@ class OnlineEDMD:
         return online
 
     def check(self, model: LinearPredictor) -> None:
-        """Check that what is learned can take the place of this model.
+        """Check that a learned predictor can replace this model.
 
         Raises
         ------
         DataError
             The model has another lifting, dt, states, inputs or disturbances.
         """
-        own = {
+        pairs = {
             "lifting": (self._lifting, model.lifting),
             "dt": (self._dt, model.dt),
             "inputs": (self._inputs, model.inputs),
             "disturbances": (self._disturbances, model.disturbances),
         }
-        for name, (learned, given) in own.items():
-            if learned != given:
+        for name, (learned, expected) in pairs.items():
+            if learned != expected:
                 raise DataError(f"OnlineEDMD learns another {name} than the model's; start it with those of the model")
 
     def learn(self, x: ArrayLike, u: ArrayLike, x_next: ArrayLike, w: ArrayLike | None = None) -> None:
-        """Learn that u (and w) led from x to x_next: one pair, or rows of pairs, the newest last.
+        """Learn from one pair, in which u and w lead from x to x_next, or from rows of pairs, the newest last.
 
         Parameters
         ----------
@@ -172,7 +175,7 @@ class OnlineEDMD:
         u
             (nu,) or (M, nu).
         w
-            (nw,) or (M, nw), where the model has measured disturbances.
+            (nw,) or (M, nw), if the model has measured disturbances.
 
         Raises
         ------
@@ -191,8 +194,8 @@ class OnlineEDMD:
             raise DataError(f"the model has {nw} measured disturbances; pass w")
         pushed = checks.array(np.zeros((*lead, 0)) if w is None else w, "w", (*lead, nw)) if nw else None
         count = 1 if single else len(now)
-        Z = self._lifted(now, after) if single else None
-        if Z is None or not np.isfinite(Z).all():  # many rows, or one that the fast path cannot lift
+        Z = self._lift_pair(now, after) if single else None
+        if Z is None or not np.isfinite(Z).all():  # many rows, or one row that the fast path could not lift
             with np.errstate(all="ignore"):  # the check below names an observable that is not finite
                 Z = self._full(np.concatenate([now.reshape(count, nx), after.reshape(count, nx)]))
             if not np.isfinite(Z).all():
@@ -217,41 +220,41 @@ class OnlineEDMD:
                     self._judge(self._gate)
         self.pairs = self.pairs + count - (self.outliers - before)
 
-    def _judge(self, gate: "Gate") -> None:
-        """Begin a rival once signals have fallen, let it take over where it is better, and renew the forecasts."""
+    def _judge(self, gate: "OutlierGate") -> None:
+        """Start a shadow model when signals have fallen; let it take over if it is better; update the forecasts."""
         if gate.fell:
             factor = self._forgetting[2]
-            gate.fell, self._rival = False, Rival(Forgetting(*self._forgetting), self._n, 1 / (1 - factor))
-        elif self._rival is not None and self._rival.push(self._rows, gate.K):
-            self._memory, self.pairs = self._rival.memory, self._rival.rows
-            gate.renew(self._rival.memory.R, self._rival.spread, self._rival.size)
-            self._rival = None
-        assert isinstance(self._memory, Forgetting)
+            gate.fell, self._shadow = False, ShadowModel(ForgettingMemory(*self._forgetting), self._n, 1 / (1 - factor))
+        elif self._shadow is not None and self._shadow.push(self._rows, gate.K):
+            self._memory, self.pairs = self._shadow.memory, self._shadow.rows
+            gate.renew(self._shadow.memory.R, self._shadow.spread, self._shadow.size)
+            self._shadow = None
+        assert isinstance(self._memory, ForgettingMemory)
         gate.learn(self._memory.R)
 
     def predictor(self) -> LinearPredictor:
-        """Return the fit of all pairs that count now. Doubts stand in its report; no warning is raised.
+        """Return the fit of all pairs in the memory. Its report holds the doubts; no warning is raised.
 
         Raises
         ------
         DataError
-            Nothing was learned yet.
+            No pair was learned yet.
         """
         if self.pairs == 0:
             raise DataError("no pair was learned yet; call learn first")
         R, weight = self._memory.factor(self._rows[: self._waiting])
-        regression = regression_of(self._moments(R, weight), "online_edmd", disturbances=self._disturbances)
-        rows = regression.rows.leading(self._lifting.nz)
-        sentences = doubts(rows, regression.lifting.names, regression.inputs, regular=self._ridge != 0)[0]
+        regression = build_regression(self._moments(R, weight), "online_edmd", disturbances=self._disturbances)
+        rows = regression.rows.keep_targets(self._lifting.nz)
+        sentences = find_doubts(rows, regression.lifting.names, regression.inputs, regular=self._ridge != 0)[0]
         solution = solve(rows, ridge=self._ridge)
-        said = f"triangular factor of {self.pairs} pairs, their weights {weight:.6g} in all, "
+        rule = f"triangular factor of {self.pairs} pairs, their weights {weight:.6g} in all, "
         if self.outliers:
-            said += f"{self.outliers} pairs were outliers and were not learned, "
-        said += rule(rows, self._ridge, solution.ridge)
-        result = unreduced(regression, solution.K, rule=said, ridge=solution.ridge, doubts=sentences)
-        return linear_predictor(regression, result, warn=False)
+            rule += f"{self.outliers} pairs were outliers and were not learned, "
+        rule += describe_solve(rows, self._ridge, solution.ridge)
+        result = build_result(regression, solution.K, rule=rule, ridge=solution.ridge, doubts=sentences)
+        return build_predictor(regression, result, warn=False)
 
-    def _lifted(self, now: Float[np.ndarray, " nx"], after: Float[np.ndarray, " nx"]) -> Float[np.ndarray, "2 nf"]:
+    def _lift_pair(self, now: Float[np.ndarray, " nx"], after: Float[np.ndarray, " nx"]) -> Float[np.ndarray, "2 nf"]:
         """Return ψ of both states, in memory that the next call overwrites; NaN for a state beyond 1e30."""
         memory = self._psi
         for z, point in zip(self._pair, (now, after), strict=True):
@@ -270,14 +273,14 @@ class OnlineEDMD:
     ) -> None:
         """Write rows [ψ(x) u w, states that ψ lacks, ψ(x⁺) …] into the buffer."""
         count, nz, full, nu = len(forced), self._lifting.nz, self._full.nz, forced.shape[1]
-        some = slice(first, first + take)
+        taken = slice(first, first + take)
         rows = self._rows[self._waiting : self._waiting + take]
-        rows[:, :nz] = Z[some, :nz]
-        rows[:, nz : nz + nu] = forced[some]
+        rows[:, :nz] = Z[taken, :nz]
+        rows[:, nz : nz + nu] = forced[taken]
         if pushed is not None:
-            rows[:, nz + nu : self._n] = pushed.reshape(count, -1)[some]
+            rows[:, nz + nu : self._n] = pushed.reshape(count, -1)[taken]
         last = rows.shape[1] - full
-        rows[:, self._n : last] = Z[some, nz:]
+        rows[:, self._n : last] = Z[taken, nz:]
         rows[:, last:] = Z[count + first : count + first + take]
         self._waiting += take
 
@@ -298,17 +301,17 @@ class OnlineEDMD:
         )
 
 
-class Gate:
-    """Which rows are no outliers: those whose innovation t − Kᵀr is within 30 spreads in every column.
+class OutlierGate:
+    """A gate for rows [r t]: it rejects a row as an outlier if an innovation t − Kᵀr is above 30 spreads of its column.
 
-    The spread of a column is the root-mean-square of its innovations, over about 100 rows, and counts as at least 1 %
-    of the column's own. An innovation beyond the gate counts there as if it stood at the gate: the spread grows
-    tenfold with four of them in sequence, so that a plant that has changed is learned after a few rows.
+    The spread of a column is the root-mean-square of its innovations over about 100 rows, and at least 1 % of the
+    column's size. An innovation above the gate enters the spread with the value of the gate. Four of them in sequence
+    widen the spread tenfold, so that a changed plant is learned after a few rows.
 
-    As long as there is no forecast, a value beyond 1000 times the size of its column makes its row an outlier; the size
-    is the root-mean-square over about 100 rows. The very first rows have no size to compare with: among them a value is
-    compared with all others of its column. Inputs never make an outlier. `fell` is True once 20 rows in sequence have
-    stayed below 1 % of the size of some column: the plant came to rest, or what was learned before was no signal.
+    Without a forecast, a row is an outlier if a value is above 1000 times the size of its column, the root-mean-square
+    over about 100 rows. Among the very first rows, a value is compared with all others of its column. Inputs never make
+    an outlier. `fell` becomes True when some column has stayed below 1 % of its size for 20 rows: either the plant came
+    to rest, or the rows before were bad readings.
 
     Parameters
     ----------
@@ -317,36 +320,36 @@ class Gate:
     """
 
     def __init__(self, nd: int, n: int, nz: int) -> None:
-        self._n, self._rows, self._seen = n, 0, 0  # _seen: innovations
+        self._n, self._rows, self._seen = n, 0, 0  # _seen counts innovations
         self.begun, self._measured = False, (np.arange(nd) < nz) | (np.arange(nd) >= n)
         self._K: Float[np.ndarray, "n nt"] | None = None
         self._spread, self._size = np.zeros(nd - n), np.zeros(nd)  # mean squares
-        self.fell, self._low = False, np.zeros(nd)  # _low: rows in sequence below FALLEN
+        self.fell, self._low = False, np.zeros(nd)  # _low counts rows in sequence below FALLEN
 
     def learn(self, R: Triangle) -> None:
-        """Take over the regression R K = T of all rows so far."""
-        if self._rows > 4 * self._n and (K := _forecaster(R, self._n)) is not None:
+        """Take the forecast from the regression R K = T of all rows so far."""
+        if self._rows > 4 * self._n and (K := _solve_forecast(R, self._n)) is not None:
             self._K = K
 
     def renew(self, R: Triangle, spread: np.ndarray, size: np.ndarray) -> None:
-        """Begin anew with the regression R K = T, and mean squares of innovations and columns."""
-        self._K, self._spread, self._size = _forecaster(R, self._n), spread, size
+        """Replace the forecast by that of R K = T, and the mean squares of innovations and columns by these."""
+        self._K, self._spread, self._size = _solve_forecast(R, self._n), spread, size
 
     @property
     def K(self) -> Float[np.ndarray, "n nt"] | None:
-        """The forecast t = Kᵀr that innovations are taken from; None as long as there is none."""
+        """K of the forecast t = Kᵀr, or None before the first one."""
         return self._K
 
     def first(self, rows: Table) -> int:
-        """Look at the first rows as a whole: move those that are no outliers to the front, and return their number."""
-        most = FAR * np.sort(np.abs(rows), axis=0)[-2]  # without the one that may be far off
+        """Judge the first rows together: move the rows without outliers to the front, and return their number."""
+        most = FAR * np.sort(np.abs(rows), axis=0)[-2]  # the largest value itself may be an outlier
         kept = rows[((np.abs(rows) <= most) | (most == 0) | ~self._measured).all(axis=1)]
         rows[: len(kept)] = kept
         self._rows, self._size, self.begun = len(kept), np.mean(kept**2, axis=0), True
         return len(kept)
 
     def keep(self, rows: Table) -> int:
-        """Move the rows that are no outliers to the front, and return how many they are."""
+        """Move the rows without outliers to the front, and return their number."""
         n, kept = self._n, 0
         row: Table
         for row in rows:
@@ -374,14 +377,14 @@ class Gate:
         return kept
 
 
-class Rival:
-    """A second factor, of the rows since signals fell, which takes over where the first one is spoilt.
+class ShadowModel:
+    """A second factor, of the rows since signals fell; it replaces the first factor if bad readings have spoilt that.
 
-    Bad readings that went on until they were learned leave information in the first factor that a thousand ordinary
-    rows cannot outweigh, and that `keep` holds for ever. Over the second half of each ten memories both forecast the
-    rows that come: the rival is better where the first is off by more than 0.1 % of some column, and by more than twice
-    as much as the rival. A plant that came to rest keeps its model: in that time the first one has adapted to what is
-    left to forecast.
+    Bad readings that lasted until they were learned leave information in the first factor that a thousand ordinary rows
+    cannot outweigh, and `keep` never lets it fade. So both factors forecast the new rows in the second half of each
+    period of ten memories. The shadow is better if the error of the first exceeds 0.1 % of some column's size and twice
+    the error of the shadow. A plant that came to rest keeps its model, because the first factor has then adapted to the
+    small signals.
 
     Parameters
     ----------
@@ -390,10 +393,10 @@ class Rival:
     n
         Regressors.
     memory_rows
-        Rows that it remembers, 1 / (1 − λ).
+        Length of its memory in rows, 1 / (1 − λ).
     """
 
-    def __init__(self, memory: Forgetting, n: int, memory_rows: float) -> None:
+    def __init__(self, memory: ForgettingMemory, n: int, memory_rows: float) -> None:
         self.memory, self._n, self._period = memory, n, int(10 * memory_rows)
         self.rows, self._judged = 0, 0
         self._errors = np.zeros((2, len(memory.R) - n))
@@ -401,31 +404,31 @@ class Rival:
 
     @property
     def spread(self) -> np.ndarray:
-        """The mean square of innovations of each column."""
+        """Mean square of the innovations of each column."""
         return self._errors[1]
 
     def push(self, rows: Table, K: Float[np.ndarray, "n nt"] | None) -> bool:
-        """Take in rows that the first factor forecasts by K; return whether the rival takes its place from now on."""
-        n, own = self._n, _forecaster(self.memory.R, self._n)
-        if 2 * (self.rows % self._period) >= self._period and K is not None and own is not None:
+        """Absorb rows that the first factor forecasts by K; return True if the shadow is to replace that factor."""
+        n, K_shadow = self._n, _solve_forecast(self.memory.R, self._n)
+        if 2 * (self.rows % self._period) >= self._period and K is not None and K_shadow is not None:
             r, t = rows[:, :n], rows[:, n:]
             share = len(rows) / (self._judged + len(rows))
             self._judged += len(rows)
-            self._errors += share * (np.array([((t - r @ k) ** 2).mean(axis=0) for k in (K, own)]) - self._errors)
+            self._errors += share * (np.array([((t - r @ k) ** 2).mean(axis=0) for k in (K, K_shadow)]) - self._errors)
             self.size += share * ((rows**2).mean(axis=0) - self.size)
         self.memory.push(rows)
         self.rows += len(rows)
         if self.rows // self._period == (self.rows - len(rows)) // self._period or not self._judged:
             return False
         first, second = self._errors
-        off = (first > 1e-6 * self.size[n:]) & (first > 4 * second)
-        better = bool(off.any() and (second <= np.maximum(first, 0.01 * self.size[n:])).all())
+        worse = (first > 1e-6 * self.size[n:]) & (first > 4 * second)
+        better = bool(worse.any() and (second <= np.maximum(first, 0.01 * self.size[n:])).all())
         self._judged = 0
         return better
 
 
-def _forecaster(R: Triangle, n: int) -> Float[np.ndarray, "n nt"] | None:
-    """Return K of R K = T, with which t is forecast as Kᵀr; None where the rows do not say what it is."""
+def _solve_forecast(R: Triangle, n: int) -> Float[np.ndarray, "n nt"] | None:
+    """Return K of R K = T for the forecast t = Kᵀr, or None if the rows do not determine it."""
     diagonal = np.abs(R.diagonal()[:n])
     if diagonal.min(initial=np.inf) <= 1e-12 * diagonal.max(initial=0.0):
         return None

@@ -1,4 +1,4 @@
-"""Prior: known entries, rows, zeros, bounds, sums, symmetry and stored energy of A and B, given before the data."""
+"""Prior knowledge of A and B: known entries and rows, zeros, bounds, weighted sums, symmetry and dissipation."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,27 +10,27 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import short
+from koopmpc.lifting.base import strip_unit
 from koopmpc.values import Value, freeze
 
-Given = TypeVar("Given", bound="np.ndarray | None")
+MaybeArray = TypeVar("MaybeArray", bound="np.ndarray | None")
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Combination(Value):
-    """low ≤ Σ Fᵢⱼ Aᵢⱼ + Σ Gᵢⱼ Bᵢⱼ ≤ high, an equation where low = high.
+    """low ≤ Σ Fᵢⱼ Aᵢⱼ + Σ Gᵢⱼ Bᵢⱼ ≤ high, an equation if low = high.
 
     Parameters
     ----------
     low, high
-        Limits of the sum; −inf and inf where there is none.
+        Limits of the sum; −inf or inf for no limit.
     A, B
         The weights F (nz, nz) and G (nz, nu); zero by default.
 
     Raises
     ------
     ShapeError, DataError
-        There are no weights, they are no matrices, or low is above high.
+        There are no weights, the weights are not matrices, or low is above high.
     """
 
     low: float
@@ -56,8 +56,8 @@ class Combination(Value):
 class Dissipation(Value):
     """Dissipation with V(z) = ½ zᵀP z: V(A z + B u) ≤ decay² V(z) + uᵀ(C z + D u) for every z and u.
 
-    With decay = 1 this is passivity from u to y = C z + D u in discrete time. Without C it is V(A z) ≤ decay² V(z)
-    alone: a contraction, and so a stable A where P ≻ 0. P is given; `stable_edmd` finds one.
+    With decay = 1 this is passivity from u to y = C z + D u in discrete time. Without C it is V(A z) ≤ decay² V(z): a
+    contraction for decay < 1, and a stable A if P ≻ 0. `stable_edmd` finds a P by itself.
 
     Parameters
     ----------
@@ -66,14 +66,14 @@ class Dissipation(Value):
     decay
         Above 0.
     C
-        (nu, nz) of the output y = C z + D u, one output for each input.
+        (nu, nz) of y = C z + D u, which has one output for each input.
     D
         (nu, nu); zero by default. A sampled system whose B is not zero needs D + Dᵀ ≻ 0 to be passive.
 
     Raises
     ------
     ShapeError, DataError
-        P, C or D is no matrix, decay is not above zero, or D comes without C.
+        P, C or D is not a matrix, decay is not above zero, or D comes without C.
     DefinitenessError
         P is not symmetric, or is indefinite.
 
@@ -104,20 +104,20 @@ class Dissipation(Value):
 
 @dataclass(frozen=True, eq=False, init=False)
 class Prior(Value):
-    """Prior knowledge of A and B in z⁺ = A z + B u; `constrained_edmd` fits all that it leaves free.
+    """Prior knowledge of A and B in z⁺ = A z + B u; `constrained_edmd` fits the free entries.
 
     Parameters
     ----------
     A, B
-        Known entries, (nz, nz) and (nz, nu); NaN where an entry is free. With measured disturbances B stands for
-        [B E], here and below.
+        Known entries, (nz, nz) and (nz, nu); NaN for a free entry. With measured disturbances B means [B E] in all
+        parameters.
     rows
-        Known rows by name: ``{"x [m]": {"x [m]": 1.0, "v [m/s]": 0.1}}`` says x⁺ = x + 0.1 v. What a row does not
-        name is zero in it. Names stand with or without the unit.
+        Known rows by name: ``{"x [m]": {"x [m]": 1.0, "v [m/s]": 0.1}}`` says x⁺ = x + 0.1 v. Entries that a row does
+        not name are zero. Names may lack their unit.
     mask_A, mask_B
         True where an entry may differ from zero.
     lower_A, upper_A, lower_B, upper_B
-        Bounds, arrays or one number for all entries; ±inf where there is none. A sign is a bound at 0.
+        Bounds: arrays, or one number for all entries; ±inf for no bound. A known sign is a bound at 0.
     symmetric
         A = Aᵀ.
     combinations
@@ -128,7 +128,7 @@ class Prior(Value):
     Raises
     ------
     ShapeError, DataError
-        The parts are no such arrays, or contradict each other.
+        The arguments are not such arrays, or contradict each other.
     """
 
     A: Float[np.ndarray, "nz nz"] | None
@@ -181,21 +181,21 @@ class Prior(Value):
         )
 
     @property
-    def coupled(self) -> bool:
-        """True where the prior couples rows of [A B]: symmetry, combinations or dissipation."""
+    def couples_rows(self) -> bool:
+        """True if the prior couples rows of [A B] by symmetry, combinations or dissipation."""
         return self.symmetric or bool(self.combinations) or self.dissipation is not None
 
 
 @dataclass(frozen=True, eq=False)
 class Entries:
-    """Known entries of [A B], NaN where an entry is free, and the bounds of all entries."""
+    """Known entries of [A B], NaN for a free one, and the bounds of all entries."""
 
     known: Float[np.ndarray, "nz n"]
     low: Float[np.ndarray, "nz n"]
     high: Float[np.ndarray, "nz n"]
 
 
-def entries_of(prior: Prior, observables: Sequence[str], inputs: Sequence[str]) -> Entries:
+def build_entries(prior: Prior, observables: Sequence[str], inputs: Sequence[str]) -> Entries:
     """Return the known value and the bounds of each entry of [A B], for these observables and inputs.
 
     Raises
@@ -215,18 +215,18 @@ def entries_of(prior: Prior, observables: Sequence[str], inputs: Sequence[str]) 
     for name, columns, values, mask, lower, upper in parts:
         shape = known[:, columns].shape
         for bound, into, what in ((lower, low, f"lower_{name}"), (upper, high, f"upper_{name}")):
-            into[:, columns] = bound if bound.ndim == 0 else _sized(bound, shape, what)
+            into[:, columns] = bound if bound.ndim == 0 else _check_shape(bound, shape, what)
         if mask is not None:
-            known[:, columns][~_sized(mask, shape, f"mask_{name}")] = 0.0
+            known[:, columns][~_check_shape(mask, shape, f"mask_{name}")] = 0.0
         if values is not None:
-            _put(known[:, columns], _sized(values, shape, f"Prior.{name}"), f"Prior.{name}")
+            _write_known(known[:, columns], _check_shape(values, shape, f"Prior.{name}"), f"Prior.{name}")
     names = [*observables, *inputs]
     for name, row in prior.rows.items():
         values = np.zeros((1, nz + nu))
         for other, value in row.items():
-            values[0, _place(other, names)] = value
-        i = _place(name, observables)
-        _put(known[i : i + 1], values, f"rows[{name!r}]")
+            values[0, _find_name(other, names)] = value
+        i = _find_name(name, observables)
+        _write_known(known[i : i + 1], values, f"rows[{name!r}]")
     bad = np.argwhere((known < low) | (known > high) | (low > high))
     if len(bad):
         i, j = map(int, bad[0])
@@ -235,24 +235,24 @@ def entries_of(prior: Prior, observables: Sequence[str], inputs: Sequence[str]) 
             f"bounds {low[i, j]:g} … {high[i, j]:g}; drop one of them"
         )
     for combination in prior.combinations:
-        _sized(combination.A, (nz, nz), "Combination.A")
-        _sized(combination.B, (nz, nu), "Combination.B")
+        _check_shape(combination.A, (nz, nz), "Combination.A")
+        _check_shape(combination.B, (nz, nu), "Combination.B")
     if prior.dissipation is not None:
-        _sized(prior.dissipation.P, (nz, nz), "Dissipation.P")
-        _sized(prior.dissipation.C, (nu, nz), "Dissipation.C")
-        _sized(prior.dissipation.D, (nu, nu), "Dissipation.D")
+        _check_shape(prior.dissipation.P, (nz, nz), "Dissipation.P")
+        _check_shape(prior.dissipation.C, (nu, nz), "Dissipation.C")
+        _check_shape(prior.dissipation.D, (nu, nu), "Dissipation.D")
     return Entries(known, low, high)
 
 
-def _sized(value: Given, shape: tuple[int, ...], name: str) -> Given:
-    """Return the array, or None where the prior does not give it; raise where it has another shape."""
+def _check_shape(value: MaybeArray, shape: tuple[int, ...], name: str) -> MaybeArray:
+    """Return the array, or None for an absent one; raise if it has another shape."""
     if value is not None and value.shape != shape:
         raise ShapeError(f"{name} has shape {value.shape}, expected {shape}: observables by observables or inputs")
     return value
 
 
-def _put(into: Float[np.ndarray, "r n"], values: Float[np.ndarray, "r n"], name: str) -> None:
-    """Write the known values; raise where another value is known already."""
+def _write_known(into: Float[np.ndarray, "r n"], values: Float[np.ndarray, "r n"], name: str) -> None:
+    """Write the known values; raise if an entry already has another known value."""
     clash = np.argwhere(np.isfinite(values) & np.isfinite(into) & (values != into))
     if len(clash):
         i, j = map(int, clash[0])
@@ -264,8 +264,8 @@ def _put(into: Float[np.ndarray, "r n"], values: Float[np.ndarray, "r n"], name:
     np.copyto(into, values, where=np.isfinite(values))
 
 
-def _place(name: str, names: Sequence[str]) -> int:
-    places = [i for i, other in enumerate(names) if name in (other, short(other))]
+def _find_name(name: str, names: Sequence[str]) -> int:
+    places = [i for i, other in enumerate(names) if name in (other, strip_unit(other))]
     if len(places) == 1:
         return places[0]
     raise DataError(f"rows names {name!r}; it can name {', '.join(names)}")

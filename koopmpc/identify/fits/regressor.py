@@ -7,9 +7,9 @@ import numpy as np
 
 from koopmpc import checks
 from koopmpc.errors import DataError, install
-from koopmpc.identify.regression import scale_factor
+from koopmpc.identify.regression import compute_scale_factor
 from koopmpc.identify.solve import RegressionRows, solve
-from koopmpc.lifting.base import Lifting, lifting_of
+from koopmpc.lifting.base import Lifting, check_lifting
 from koopmpc.lifting.fourier import Fourier
 from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.predict.predictors import LinearPredictor
@@ -25,8 +25,8 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
     """y = W [ψ(x) u] by ridge regression, rows of X being [x u]; with y = x⁺ it is the next state of z⁺ = A z + B u.
 
     `fit` takes pairs of a row and its target, so that scikit-learn may shuffle rows; for a dynamic model y holds the
-    next states. Cross-validate over episodes with ``GroupKFold`` and the episode's number of each row. The score is
-    that of one step; `koopmpc.select` scores forecasts of many steps.
+    next states. Cross-validate over episodes with ``GroupKFold``, where the group of a row is its episode. The score
+    measures one-step forecasts; `koopmpc.select` measures forecasts of many steps.
 
     Parameters
     ----------
@@ -35,11 +35,11 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
     harmonics
         Sines and cosines of the states up to this multiple; 0 for none.
     lifting
-        ψ, in place of degree and harmonics.
+        ψ; it replaces degree and harmonics.
     alpha
         Ridge weight as in `edmd`; 0 cuts singular values below rounding.
     n_inputs
-        How many of the last columns of X are inputs.
+        Number of inputs, which are the last columns of X.
     dt
         Sample time of the predictor [s].
 
@@ -50,8 +50,8 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
     lifting_
         ψ, bound to the states.
     predictor_
-        LinearPredictor with z⁺ = A z + B u, whose C is fitted where ψ lacks a state; only where y has one column for
-        each state, as next states have.
+        LinearPredictor with z⁺ = A z + B u; its C is fitted for the states that ψ lacks. It exists only if y has one
+        column for each state, as next states have.
     n_features_in_
         Columns of X.
 
@@ -82,7 +82,7 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
         Raises
         ------
         DataError
-            alpha is negative, degree or harmonics no whole number, or no column is left for a state.
+            alpha is negative, degree or harmonics is not a whole number, or no column is left for a state.
         """
         rows: Any
         targets: Any
@@ -99,25 +99,25 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
         self.lifting_ = self._lifting().bind(names[:nx])
         Z, U = self.lifting_(rows[:, :nx]), rows[:, nx:]
         table = np.asarray(targets, dtype=np.float64).reshape(len(rows), -1)
-        self.coef_ = self._solved(np.hstack([Z, U]), table, alpha)
+        self.coef_ = self._solve(np.hstack([Z, U]), table, alpha)
         self._flat = np.ndim(targets) == 1
         vars(self).pop("predictor_", None)
         if table.shape[1] == nx:
             nz = self.lifting_.nz
-            K = self._solved(np.hstack([Z, U]), self.lifting_(table), alpha)
-            C = self._solved(Z, rows[:, :nx], 0.0)
-            held = [self.lifting_.names.index(name) if name in self.lifting_.names else -1 for name in names[:nx]]
-            for i, place in enumerate(held):
+            K = self._solve(np.hstack([Z, U]), self.lifting_(table), alpha)
+            C = self._solve(Z, rows[:, :nx], 0.0)
+            places = [self.lifting_.names.index(name) if name in self.lifting_.names else -1 for name in names[:nx]]
+            for i, place in enumerate(places):
                 if place >= 0:
                     C[i] = np.eye(nz)[place]
             self.predictor_ = LinearPredictor(
                 *(K[:, :nz], K[:, nz:], C, self.lifting_, self.dt, names[:nx], names[nx:]),
-                scale=scale_factor(Z, len(Z)),
+                scale=compute_scale_factor(Z, len(Z)),
             )
         return self
 
     def predict(self, X: Any) -> np.ndarray:
-        """Return W [ψ(x) u] for rows [x u], (M, n_targets) or (M,): one step ahead."""
+        """Return the forecast W [ψ(x) u] for rows [x u], (M, n_targets) or (M,)."""
         check_is_fitted(self)
         rows: Any = validate_data(self, X, reset=False, dtype=np.float64)
         nx = rows.shape[1] - self.n_inputs
@@ -132,7 +132,7 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
 
     def _lifting(self) -> Lifting:
         if self.lifting is not None:
-            return lifting_of(self.lifting)
+            return check_lifting(self.lifting)
         lifting: Lifting = State() + Constant()
         if checks.count(self.degree, "degree") > 1:
             lifting = lifting + Monomials(self.degree)
@@ -140,6 +140,6 @@ class KoopmanRegressor(RegressorMixin, BaseEstimator):
             lifting = lifting + Fourier(self.harmonics)
         return lifting
 
-    def _solved(self, P: np.ndarray, T: np.ndarray, alpha: float) -> np.ndarray:
+    def _solve(self, P: np.ndarray, T: np.ndarray, alpha: float) -> np.ndarray:
         rows = RegressionRows(P, T, np.zeros(T.shape[1]), len(P), self.lifting_.constant_index)
         return solve(rows, ridge=alpha).K.T

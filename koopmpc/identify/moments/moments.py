@@ -20,8 +20,8 @@ from koopmpc.values import Value
 class Moments(Value):
     """Second moments of the rows d = [ψ(x) u ψ(x⁺)] of M snapshot pairs: G = Σ w dᵀd, or R with RᵀR = Σ w dᵀd.
 
-    They add: ``a + b`` are the moments of both data sets, in any grouping, to rounding. Where ψ lacks a
-    state, the state is appended to it in these rows, so that C and the residuals need no second pass.
+    ``a + b`` are the moments of both data sets; the grouping of such sums changes only rounding errors. A state that ψ
+    lacks is appended to ψ in these rows, so that C and the residuals need no second pass over the data.
 
     Attributes
     ----------
@@ -40,9 +40,9 @@ class Moments(Value):
     sums
         G or R, (nd, nd).
     bilinear
-        The rows are [ψ(x) u u⊗ψ(x) ψ(x⁺)]; a Constant is left out of the products, for u times it is u.
+        The rows are [ψ(x) u u⊗ψ(x) ψ(x⁺)]; the products leave out a Constant, because u · 1 is u.
     embedding
-        The embedding that makes ζ, where ψ acts on ζ; else None.
+        The embedding that makes ζ if ψ acts on ζ; else None.
     """
 
     lifting: Lifting
@@ -57,7 +57,7 @@ class Moments(Value):
 
     @cached_property
     def columns(self) -> RowColumns:
-        """What the columns of the rows are."""
+        """Names and places of the columns."""
         return row_columns(self.lifting, self.inputs, self.bilinear)
 
     @property
@@ -72,12 +72,12 @@ class Moments(Value):
 
     @property
     def products(self) -> Int[np.ndarray, " np"]:
-        """Observables in u⊗ψ(x): all but a Constant, or none."""
+        """Indices of the observables in u⊗ψ(x): all without the Constant; empty if not bilinear."""
         return self.columns.products
 
     @property
     def condition(self) -> float:
-        """Condition number of the regressors on unit-norm columns, those that are 0 throughout left out."""
+        """Condition number of the regressors on unit-norm columns, without columns that are 0 in all rows."""
         P = self.rows(self.columns.regressors, self.columns.targets[:0]).P
         size = np.sqrt(np.einsum("ij,ij->j", P, P))
         unit = P[:, size > 0] / size[size > 0]
@@ -90,9 +90,9 @@ class Moments(Value):
         return float(s[0] / s[-1]) if s.size and s[-1] > 0 else (np.inf if s.size else 1.0)
 
     def __add__(self, other: "Moments") -> "Moments":
-        """Return the moments of both data sets; R + G becomes G and warns, for it loses R's digits."""
-        mine = (self.lifting, self.inputs, self.dt, self.bilinear, self.embedding)
-        if mine != (other.lifting, other.inputs, other.dt, other.bilinear, other.embedding):
+        """Return the moments of both data sets; R + G becomes G, with a warning that half of R's digits are lost."""
+        layout = (self.lifting, self.inputs, self.dt, self.bilinear, self.embedding)
+        if layout != (other.lifting, other.inputs, other.dt, other.bilinear, other.embedding):
             raise DataError(
                 "the moments differ in lifting, inputs or dt, or one is bilinear; "
                 "add moments of one plant in one lifting only"
@@ -114,54 +114,55 @@ class Moments(Value):
     def rows(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> RegressionRows:
         """Return a few rows [P T] with the same second moments as these columns of all M rows.
 
-        Weights are taken with mean 1, so that a root of the mean over M rows is one over the weighted rows.
+        The weights are scaled to mean 1, so that dividing a sum of squares by M gives the weighted mean.
         """
         n, scale = len(regressors), self.samples / self.weight
-        one = self._constant(regressors)
+        constant = self._find_constant(regressors)
         if self.route == "qr":
-            some = np.sqrt(scale) * self.sums[:, np.concatenate([regressors, targets])]
-            R = np.asarray(np.linalg.qr(some, mode="r"), dtype=np.float64)
-            return RegressionRows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples, one)
+            columns = np.sqrt(scale) * self.sums[:, np.concatenate([regressors, targets])]
+            R = np.asarray(np.linalg.qr(columns, mode="r"), dtype=np.float64)
+            return RegressionRows(R[:n, :n], R[:n, n:], np.sum(R[n:, n:] ** 2, axis=0), self.samples, constant)
         G = scale * self.sums
         size = np.sqrt(G.diagonal()[regressors])
         size[size == 0] = 1.0
         values, vectors = np.linalg.eigh(G[np.ix_(regressors, regressors)] / np.outer(size, size))
-        # an eigenvalue below this is rounding of the sums
-        held = values > np.finfo(float).eps * max(self.samples, n) * values.max(initial=0.0)
-        root = np.sqrt(np.where(held, values, 0.0))
+        # an eigenvalue below this is a rounding error of the sums
+        resolved = values > np.finfo(float).eps * max(self.samples, n) * values.max(initial=0.0)
+        root = np.sqrt(np.where(resolved, values, 0.0))
         P = root[:, None] * vectors.T * size
-        inverse = np.where(held, 1.0, 0.0) / np.where(held, root, 1.0)
+        inverse = np.where(resolved, 1.0, 0.0) / np.where(resolved, root, 1.0)
         T = inverse[:, None] * (vectors.T @ (G[np.ix_(regressors, targets)] / size[:, None]))
         rest = np.maximum(G.diagonal()[targets] - np.sum(T**2, axis=0), 0.0)
-        return RegressionRows(P, T, rest, self.samples, one)
+        return RegressionRows(P, T, rest, self.samples, constant)
 
-    def complete(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> RegressionRows:
-        """Return rows [P T] as `rows` does, with all of T inside: TᵀT is that of all M rows, too.
+    def complete_rows(self, regressors: Int[np.ndarray, " n"], targets: Int[np.ndarray, " m"]) -> RegressionRows:
+        """Return rows [P T] like `rows`, but with all of T inside: TᵀT too is that of all M rows.
 
-        From Gram sums they are a root of the whole matrix, and have half the digits.
+        Made from Gram sums, they are a root of the whole matrix and have half the digits.
         """
         n = len(regressors)
-        every = self.rows(np.concatenate([regressors, targets]), targets[:0]).P
-        one = self._constant(regressors)
-        return RegressionRows(every[:, :n], every[:, n:], np.zeros(len(targets)), self.samples, one)
+        both = self.rows(np.concatenate([regressors, targets]), targets[:0]).P
+        constant = self._find_constant(regressors)
+        return RegressionRows(both[:, :n], both[:, n:], np.zeros(len(targets)), self.samples, constant)
 
     def decoder(self, where: Int[np.ndarray, " nx"]) -> tuple[Float[np.ndarray, "nx nz"], Float[np.ndarray, " nx"]]:
-        """Return C = argmin Σ ‖x − C ψ(x)‖² and its root-mean-square residual; a row that ψ holds is picked.
+        """Return C = argmin Σ ‖x − C ψ(x)‖² and its root-mean-square residual.
 
-        `where` holds the index of each state among the observables and the states appended to them.
+        The row of a state that ψ holds selects that state. `where` holds the index of each state among the observables
+        and the states appended to them.
         """
         nz = self.nz
         C, residual = np.zeros((len(where), nz)), np.zeros(len(where))
-        held = where < nz
-        C[held, where[held]] = 1.0
-        if not held.all():
-            rows = self.rows(np.arange(nz), where[~held])
+        lifted = where < nz
+        C[lifted, where[lifted]] = 1.0
+        if not lifted.all():
+            rows = self.rows(np.arange(nz), where[~lifted])
             K = solve(rows).K
-            C[~held] = K.T
-            residual[~held] = rows.residual(np.arange(len(rows.rest)), K)
+            C[~lifted] = K.T
+            residual[~lifted] = rows.residual(np.arange(len(rows.rest)), K)
         return C, residual
 
-    def _constant(self, regressors: Int[np.ndarray, " n"]) -> int | None:
+    def _find_constant(self, regressors: Int[np.ndarray, " n"]) -> int | None:
         place = np.flatnonzero(regressors == self.lifting.constant_index)
         return int(place[0]) if place.size else None
 
@@ -170,7 +171,7 @@ class Moments(Value):
 
 
 class BothSides(NamedTuple):
-    """Rows with PᵀP = Σ pᵀp, PᵀT and TᵀT of the M snapshots, p = [ψ(x) u] and t = ψ(x⁺).
+    """Rows with the PᵀP, PᵀT and TᵀT of the M snapshots, where p = [ψ(x) u] and t = ψ(x⁺).
 
     Attributes
     ----------
@@ -179,7 +180,7 @@ class BothSides(NamedTuple):
     T
         (m, nz) the observables one step later.
     cut
-        Singular values below this part of the largest are rounding, on columns of unit norm.
+        On columns of unit norm, singular values below this share of the largest are rounding errors.
     """
 
     P: Float[np.ndarray, "m n"]
@@ -188,7 +189,7 @@ class BothSides(NamedTuple):
 
 
 def both_sides(total: Moments) -> BothSides:
-    """Return these rows, and where rounding begins: with Gram sums at half the digits."""
-    rows = total.complete(total.columns.regressors, total.columns.targets[: total.nz])
+    """Return these rows and the cut of their singular values; rows from Gram sums have half the digits."""
+    rows = total.complete_rows(total.columns.regressors, total.columns.targets[: total.nz])
     rounding = float(np.finfo(float).eps * max(total.samples, len(total.columns.regressors) + total.nz))
     return BothSides(rows.P, rows.T, rounding if total.route == "qr" else float(np.sqrt(rounding)))

@@ -1,4 +1,4 @@
-"""The moments of all that a source holds: by which route, from which parts, read by whom."""
+"""The moments of a whole source: its parts are read by workers, and a pilot chooses between sums and a factor."""
 
 from collections.abc import Callable, Iterable, Sequence, Sized
 from dataclasses import dataclass, replace
@@ -16,8 +16,8 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Changed, Held, Part, Source, source_of
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.moments.moments import Moments
-from koopmpc.identify.moments.rows import ROWS, Factor, Gram, chunks, lifted_chunks, row_columns
-from koopmpc.lifting.base import Lifting, lifting_of
+from koopmpc.identify.moments.rows import ROWS, GramSums, TriangularFactor, lift_chunks, row_columns, split_chunks
+from koopmpc.lifting.base import Lifting, check_lifting
 from koopmpc.parallel import Progress, map_tasks
 from koopmpc.values import Arrays, from_data, to_data
 
@@ -25,12 +25,12 @@ Route = Literal["gram", "qr"]
 Weights = Callable[[Episode], ArrayLike] | Sequence[ArrayLike] | Float[np.ndarray, "..."]
 Steps = list[Float[np.ndarray, " T"]]  # the weights of each episode, one for each step
 
-_WELL_CONDITIONED = 1e6  # scaled cond(Z) up to which normal equations lose nothing
-_PILOT = 4  # parts, and least number of chunks, that choose the route
+_WELL_CONDITIONED = 1e6  # up to this scaled cond(Z) Gram sums lose no accuracy
+_PILOT = 4  # the pilot reads at most so many parts, and at least so many chunks
 
 
 class ReadOptions(TypedDict, total=False):
-    """Who reads the data, and the weights of the pairs; every fit takes these keywords, `second_moments` explains."""
+    """Options of reading that every fit accepts: the weights of the pairs and the workers; see `second_moments`."""
 
     weights: Weights | None
     workers: int | None
@@ -52,9 +52,9 @@ def second_moments(
 ) -> Moments:
     """Return Σ w dᵀd, or its triangular factor, over the rows d = [ψ(x) u ψ(x⁺)] of all snapshot pairs.
 
-    Each part of the source is summed from zero, in chunks that are lifted, added in order and forgotten, and the
-    parts are added in order: memory does not grow with the data, and with one BLAS build and thread count the
-    result is the same to the bit here, on local processes and on a cluster.
+    Each part of the source is summed from zero, chunk by chunk, and the parts are added in order. So memory does not
+    grow with the data. For one BLAS build and thread count the result is the same to the bit in this process, in local
+    processes and on a cluster.
 
     Parameters
     ----------
@@ -65,25 +65,25 @@ def second_moments(
     embedding
         ψ acts on ζ, the state and its past, as `Delay` makes it.
     route
-        "gram" sums products, "qr" updates a triangular factor. By default a pilot chooses, chunks sampled from up to
-        4 parts: where its scaled condition number is at most 1e6, its Gram sums are kept and the other chunks are
-        added to them. Where it is larger, or that of all data turns out larger, everything is read in QR. A stream
-        that can be read only once is summed in QR.
+        "gram" sums products, "qr" updates a triangular factor. By default a pilot chooses: it sums chunks sampled from
+        up to 4 parts. If their scaled condition number is at most 1e6, the other chunks are added to these Gram sums.
+        If it is larger, or if that of all data is, everything is read by "qr". So is a stream that can be read only
+        once.
     bilinear
         Put u⊗ψ(x) into the rows, for z⁺ = A z + B u + Σ uᵢ Nᵢ z.
     weights
         The weight w ≥ 0 of each pair; by default 1. For Episodes a sequence with one item for each episode: a number,
-        or an array (T,) with a weight for each step. For any source a function from an Episode to such an item. An
-        embedding of d steps uses the last T − d weights of an episode. Residuals are weighted means, so that a common
-        factor changes nothing.
+        or an array (T,) with a weight for each step. For any source: a function from an Episode to such an item. An
+        embedding of d steps uses the last T − d weights of an episode. Residuals are weighted means, so a common factor
+        has no effect.
     workers, scheduler, progress
-        As in `koopmpc.parallel.map_tasks`: local processes, a Dask cluster, and what is called after each part.
+        As in `koopmpc.parallel.map_tasks`: local processes, a Dask cluster, and a function to call after each part.
 
     Raises
     ------
     DataError
-        An observable is not finite on the data; a weight is negative, or all are 0; a file differs from the first
-        one in dt or names; a stream is read twice; an argument is of another kind.
+        An observable is not finite on the data; a weight is negative, or all weights are 0; a file differs from the
+        first one in dt or names; a stream is read twice; an argument has the wrong type.
     ShapeError
         The weights do not fit the episodes.
     LogError
@@ -96,22 +96,22 @@ def second_moments(
         checks.kind(embedding, "embedding", Delay, "pass km.Delay(2), or leave it out")
         embedding = embedding.fitted(source.states, source.inputs)
         source = embedding.source(source)
-    bound = lifting_of(lifting).bind(source.states)
-    reading = _Reading(None, bound, source.inputs, bilinear, _changed(weights, source))
+    bound = check_lifting(lifting).bind(source.states)
+    reading = _ReadTask(None, bound, source.inputs, bilinear, _align_weights(weights, source))
     zero = Moments(bound, source.inputs, source.dt, 0, 0.0, "", np.empty((0, 0)), bilinear, embedding)
 
     def read(route: Route, done: dict[int, tuple[int, ...]]) -> Iterable[Moments]:
-        """Yield the moments of the parts without the chunks that are done, in order."""
+        """Yield the moments of the parts in order, without the chunks in `done`."""
         parts = source.parts()
-        each = (replace(reading, part=p, route=route, done=done.get(i, ())) for i, p in enumerate(parts))
-        tasks = list(each) if isinstance(parts, Sized) else each
+        lazy = (replace(reading, part=p, route=route, done=done.get(i, ())) for i, p in enumerate(parts))
+        tasks = list(lazy) if isinstance(parts, Sized) else lazy
         for sums in map_tasks(read_part, tasks, workers=workers, scheduler=scheduler, progress=progress):
             yield replace(zero, route=route, **sums._asdict())
 
     if route is None and not source.replayable:
         route = "qr"
     if route is None:
-        pilot, done, complete = _pilot(source, reading)
+        pilot, done, complete = _run_pilot(source, reading)
         total = replace(zero, route="gram", **pilot._asdict())
         if not total.samples or total.condition <= _WELL_CONDITIONED:
             if not complete:
@@ -130,7 +130,7 @@ _NO_WEIGHT = "all weights are 0; give some pair a weight above 0"
 
 
 class _Sums(NamedTuple):
-    """Σ w dᵀd or R with RᵀR equal to it, the pairs of weight above 0, and Σ w."""
+    """Σ w dᵀd or its triangular factor, the number of pairs with a weight above 0, and Σ w."""
 
     sums: Float[np.ndarray, "nd nd"]
     samples: int
@@ -138,21 +138,21 @@ class _Sums(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Reading:
-    """What is to be summed: the rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)] of one part.
+class _ReadTask:
+    """A task for a worker: sum the rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)] of one part.
 
     Attributes
     ----------
     part
-        Where the episodes are from; None before one is chosen.
+        The part that holds the episodes; None in a template of tasks.
     lifting, inputs, bilinear
-        What the rows hold; ψ is bound, and crosses processes as data, so that a lifting of the user's own does too.
+        They define the rows. The bound ψ crosses processes as data, so that a user's own lifting can.
     weights
         Weights of the steps; None weighs all by 1.
     route
         "gram" for Σ w dᵀd, "qr" for its triangular factor.
     done
-        Numbers of chunks that are summed already.
+        Numbers of the chunks that the pilot has summed.
     """
 
     part: Part | None
@@ -169,30 +169,30 @@ class _Reading:
     def __reduce__(self) -> tuple[Any, ...]:
         arrays: Arrays = {}
         rest = (self.inputs, self.bilinear, self.weights, self.route, self.done)
-        return _unpacked, (self.part, to_data(self.lifting, arrays), arrays, *rest)
+        return _unpack, (self.part, to_data(self.lifting, arrays), arrays, *rest)
 
 
-def _unpacked(part: Part, lifting: Any, arrays: Arrays, *rest: Any) -> _Reading:
-    return _Reading(part, from_data(lifting, arrays), *rest)
+def _unpack(part: Part, lifting: Any, arrays: Arrays, *rest: Any) -> _ReadTask:
+    return _ReadTask(part, from_data(lifting, arrays), *rest)
 
 
-def read_part(reading: _Reading) -> _Sums:
+def read_part(reading: _ReadTask) -> _Sums:
     """Return the sums of one part: chunks of fixed size, lifted, added in order and forgotten."""
-    assert reading.part is not None, "a reading is of a part"
+    assert reading.part is not None, "a task has a part"
     episodes = reading.part.load()
     done = set(reading.done)
-    which = [i for i in range(len(chunks(episodes))) if i not in done] if done else None
-    return _summed(reading, episodes, which)
+    which = [i for i in range(len(split_chunks(episodes))) if i not in done] if done else None
+    return _sum_chunks(reading, episodes, which)
 
 
-def _summed(reading: _Reading, episodes: Episodes, which: Sequence[int] | None) -> _Sums:
+def _sum_chunks(reading: _ReadTask, episodes: Episodes, which: Sequence[int] | None) -> _Sums:
     """Return the sums of these chunks of the episodes, by default of all."""
-    weights = None if reading.weights is None else _weights_of(reading.weights, episodes)
+    weights = None if reading.weights is None else _check_weights(reading.weights, episodes)
     columns = row_columns(reading.lifting, reading.inputs, reading.bilinear)
     names, total, samples, weight = columns.names, None, 0, 0.0
-    for chunk in lifted_chunks(episodes, columns, which, weights):
+    for chunk in lift_chunks(episodes, columns, which, weights):
         if total is None:
-            total = (Gram if reading.route == "gram" else Factor)(chunk.P.shape[1], chunk.nz)
+            total = (GramSums if reading.route == "gram" else TriangularFactor)(chunk.P.shape[1], chunk.nz)
         count = len(chunk.P) - len(chunk.last)
         samples += count if chunk.weights is None else int(np.count_nonzero(chunk.weights))
         weight += count if chunk.weights is None else float(chunk.weights.sum())
@@ -208,42 +208,42 @@ def _summed(reading: _Reading, episodes: Episodes, which: Sequence[int] | None) 
     return _Sums(sums, samples, weight)
 
 
-def _pilot(source: Source, reading: _Reading) -> tuple[_Sums, dict[int, tuple[int, ...]], bool]:
-    """Return Gram sums of chunks sampled from a few parts, their numbers by part, and whether they are all chunks."""
+def _run_pilot(source: Source, reading: _ReadTask) -> tuple[_Sums, dict[int, tuple[int, ...]], bool]:
+    """Return Gram sums of chunks sampled from a few parts, their numbers by part, and whether these are all chunks."""
     parts = source.parts()
     if isinstance(parts, list):
-        every = len(parts) <= _PILOT
-        chosen = {i: parts[i] for i in (range(len(parts)) if every else spread(len(parts), _PILOT))}
+        complete = len(parts) <= _PILOT
+        chosen = {i: parts[i] for i in (range(len(parts)) if complete else space_evenly(len(parts), _PILOT))}
     else:
-        chosen, every = dict(enumerate(islice(parts, _PILOT))), False
+        chosen, complete = dict(enumerate(islice(parts, _PILOT))), False
     width = reading.lifting.nz + len(reading.inputs) * (1 + reading.lifting.nz * reading.bilinear)
     limit = -(-max(_PILOT, -(-4 * width // ROWS)) // len(chosen))
     done: dict[int, tuple[int, ...]] = {}
-    found: list[_Sums] = []
+    pilots: list[_Sums] = []
     for i, part in chosen.items():
         episodes = part.load()
         count = -(-sum(len(e.U) for e in episodes.episodes) // ROWS)
-        done[i] = tuple(range(count) if count <= limit else spread(count, limit))
-        every = every and len(done[i]) == count
-        found.append(_summed(replace(reading, part=part), episodes, done[i]))
-    sums = reduce(np.add, (each.sums for each in found))
-    return _Sums(sums, sum(each.samples for each in found), sum(each.weight for each in found)), done, every
+        done[i] = tuple(range(count) if count <= limit else space_evenly(count, limit))
+        complete = complete and len(done[i]) == count
+        pilots.append(_sum_chunks(replace(reading, part=part), episodes, done[i]))
+    sums = reduce(np.add, (pilot.sums for pilot in pilots))
+    return _Sums(sums, sum(p.samples for p in pilots), sum(p.weight for p in pilots)), done, complete
 
 
-def spread(total: int, wanted: int) -> list[int]:
+def space_evenly(total: int, wanted: int) -> list[int]:
     """Return at most `wanted` of the indices 0 … total − 1, evenly spread."""
     if wanted == 1:
         return [0]
     return sorted({round(i * (total - 1) / (wanted - 1)) for i in range(wanted)})
 
 
-def _weights_of(weights: Weights, episodes: Episodes) -> Steps:
+def _check_weights(weights: Weights, episodes: Episodes) -> Steps:
     """Return the weight of each step of each episode.
 
     Raises
     ------
     ShapeError
-        There is not one item an episode, or an item is neither a number nor one a step.
+        There are more or fewer items than episodes, or an item is neither a number nor an array of one a step.
     DataError
         A weight is below zero or not finite.
     """
@@ -263,19 +263,19 @@ def _weights_of(weights: Weights, episodes: Episodes) -> Steps:
         checks.vector(item, f"the weight of episode {i}", len(episode))
         for i, (item, episode) in enumerate(zip(given, episodes, strict=True))
     ]
-    for i, own in enumerate(steps):
-        if own.min() < 0:
-            raise DataError(f"the weight of episode {i} is {own.min():g}; weights are 0 or above")
+    for i, step_weights in enumerate(steps):
+        if step_weights.min() < 0:
+            raise DataError(f"the weight of episode {i} is {step_weights.min():g}; weights are 0 or above")
     return steps
 
 
-def _changed(weights: Weights | None, source: Source) -> Weights | None:
-    """Return the weights that belong to the episodes as `source` changes them: an embedding drops their first steps.
+def _align_weights(weights: Weights | None, source: Source) -> Weights | None:
+    """Return the weights of the steps that `source` keeps: an embedding drops the first steps of each episode.
 
     Raises
     ------
     DataError
-        They are a list, and the source is not made from Episodes, which alone have an order that is known.
+        They are a list, and the source is not made from Episodes: another source has no known order.
     """
     if weights is None or callable(weights):
         return weights
@@ -283,5 +283,5 @@ def _changed(weights: Weights | None, source: Source) -> Weights | None:
     while isinstance(inner, Changed):
         dropped, inner = dropped + inner.history, inner.source
     if not isinstance(inner, Held):
-        raise DataError("weights are a list, which only Episodes have an order for; pass a function of an Episode")
-    return [own[dropped:] for own in _weights_of(weights, inner.episodes) if len(own) > dropped]
+        raise DataError("weights are a list, which needs the order of Episodes; pass a function of an Episode")
+    return [steps[dropped:] for steps in _check_weights(weights, inner.episodes) if len(steps) > dropped]

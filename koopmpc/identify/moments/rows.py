@@ -1,4 +1,4 @@
-"""Rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)]: their columns, the chunks in which states are lifted, and what sums them up."""
+"""Rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)]: their columns, the chunks in which states are lifted, their sums and factors."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -13,8 +13,8 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.base import CONSTANT, Lifting
 from koopmpc.lifting.state import State
 
-ROWS = 1023  # snapshot pairs lifted at once: with the last state 1024 rows, which stay in the cache
-_PANEL = 4, 16  # columns that dtpqrt eliminates at once: the fastest for few rows and for many
+ROWS = 1023  # snapshot pairs in a chunk: with the last state they make 1024 rows, which stay in the cache
+_PANEL = 4, 16  # columns that dtpqrt eliminates at once, the fastest numbers below _MANY rows and from _MANY rows on
 _MANY = 256
 
 Triangle = Float[np.ndarray, "nd nd"]
@@ -23,14 +23,14 @@ Table = Float[np.ndarray, "m nd"]
 
 @dataclass(frozen=True, eq=False)
 class RowColumns:
-    """The columns of the rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)]; in them the states that ψ lacks are appended to ψ(x).
+    """The columns of the rows d = [ψ(x) u u⊗ψ(x) ψ(x⁺)], where the states that ψ lacks are appended to ψ(x).
 
     Attributes
     ----------
     full
         ψ, then the states that it lacks.
     products
-        Indices of the observables in u⊗ψ(x): all but a Constant, since u · 1 is u; none unless the model is bilinear.
+        Indices of the observables in u⊗ψ(x): all without the Constant, because u · 1 is u; empty if not bilinear.
     names
         Name of each column.
     regressors
@@ -70,7 +70,7 @@ class Piece(NamedTuple):
     last: int
 
 
-def chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
+def split_chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
     """Return all pairs in order, in lists of pieces of `rows` pairs (the last may hold fewer)."""
     result: list[list[Piece]] = [[]]
     room = rows
@@ -88,14 +88,14 @@ def chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
 
 
 class LiftedChunk(NamedTuple):
-    """A chunk in which each state is lifted once: rows p = [ψ(x) u u⊗ψ(x)]; the last state of a piece has u = 0.
+    """The rows p = [ψ(x) u u⊗ψ(x)] of a chunk, one row for each state; u = 0 in the last row of a piece.
 
     Attributes
     ----------
     P
-        The rows, of one piece after the other.
+        The rows of all pieces, one piece after the other.
     first, last
-        Indices of the first and the last row of each piece. These rows belong to one pair, all others to two.
+        Indices of the first and the last row of each piece. Such a row is part of one pair, any other of two.
     nz
         Number of observables.
     weights
@@ -119,75 +119,75 @@ class LiftedChunk(NamedTuple):
         return D
 
 
-def lifted_chunks(
+def lift_chunks(
     episodes: Episodes,
     columns: RowColumns,
     which: Sequence[int] | None = None,
     weights: list[Float[np.ndarray, " _"]] | None = None,
 ) -> Iterator[LiftedChunk]:
-    """Yield the chunks of these numbers, by default all, lifted; the memory of one is used again for the next.
+    """Yield the lifted chunks with these numbers, by default all; each overwrites the memory of the one before.
 
     Parameters
     ----------
     episodes
         They have as many inputs as the columns name.
     columns
-        What the rows hold.
+        The columns of the rows.
     which
-        Numbers of chunks, in the order of `chunks`.
+        Numbers of chunks, in the order of `split_chunks`.
     weights
         Weight of each step, episode by episode; None weighs all by 1.
     """
     of, lifting, products = episodes.episodes, columns.full, columns.products
     nz, nu = lifting.nz, len(episodes.inputs)
     n = len(columns.names) - nz
-    pieces = chunks(episodes)
+    pieces = split_chunks(episodes)
     space = np.empty((2 * ROWS, n))  # fresh memory costs as much as the rows
     for chunk in pieces if which is None else [pieces[i] for i in which]:
         last = np.cumsum([end - first + 1 for _, first, end in chunk]) - 1
         first = np.concatenate([[0], last[:-1] + 1])
         P = space[: int(last[-1]) + 1]
-        lifting.lift_into(joined([of[i].X[start : end + 1] for i, start, end in chunk]), P[:, :nz])
+        lifting.lift_into(concatenate_parts([of[i].X[start : end + 1] for i, start, end in chunk]), P[:, :nz])
         if nu:
             U = P[:, nz : nz + nu]
-            given = joined([of[i].U[start:end] for i, start, end in chunk])
-            U[:] = np.insert(given, last - np.arange(len(last)), 0.0, axis=0)
+            inputs = concatenate_parts([of[i].U[start:end] for i, start, end in chunk])
+            U[:] = np.insert(inputs, last - np.arange(len(last)), 0.0, axis=0)
             for i, start in enumerate(range(nz + nu, n, max(len(products), 1))):
                 np.multiply(U[:, i : i + 1], P[:, products], out=P[:, start : start + len(products)])
         w = None if weights is None else np.concatenate([weights[i][start:end] for i, start, end in chunk])
         yield LiftedChunk(P, first, last, nz, w)
 
 
-def joined(parts: Sequence[Float[np.ndarray, "_ n"]]) -> Float[np.ndarray, "M n"]:
+def concatenate_parts(parts: Sequence[Float[np.ndarray, "_ n"]]) -> Float[np.ndarray, "M n"]:
     """Return the parts as one array; a single one is not copied."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _without(P: Float[np.ndarray, "m n"], rows: Int[np.ndarray, " k"]) -> Float[np.ndarray, "M n"]:
-    """Return P without these rows, one at each piece's same end; a view where the piece is one."""
+    """Return P without these rows, the first or the last row of each piece; for a single piece this is a view."""
     if len(rows) > 1:
         return np.delete(P, rows, axis=0)
     return P[1:] if rows[0] == 0 else P[:-1]
 
 
 def absorb(R: Triangle, rows: Table) -> None:
-    """Turn R into the triangular factor of [R; rows], in place; R is in Fortran's order."""
+    """Turn R, an array in Fortran order, into the triangular factor of [R; rows] in place."""
     if len(rows):
         panel = min(_PANEL[len(rows) >= _MANY], len(R))
         info = dtpqrt(0, panel, R, np.array(rows, order="F"), overwrite_a=1, overwrite_b=1)[3]
         assert info == 0, f"dtpqrt refused argument {-info}"
 
 
-def empty(nd: int) -> Triangle:
+def empty_factor(nd: int) -> Triangle:
     """Return the factor of no rows."""
     return np.zeros((nd, nd), order="F")
 
 
-class Gram:
-    """Sums of products over chunks, each state multiplied once.
+class GramSums:
+    """Sums of products over chunks, where the products of a state are computed once.
 
-    Inside a piece of consecutive states Σ ψ⁺ψ⁺ᵀ is Σ ψψᵀ but for the first and the last state. So the rows between
-    are multiplied once, and what the ends have of their own is added; nothing is subtracted, so no digits are lost.
+    In a piece of consecutive states, Σ ψψᵀ and Σ ψ⁺ψ⁺ᵀ share all states except the first and the last. So the products
+    of the shared rows are computed once, and those of the end rows are added; no subtraction loses digits.
 
     Parameters
     ----------
@@ -203,12 +203,12 @@ class Gram:
         self._both, self._beside = np.empty((n, n)), np.empty((n, nz))
 
     def add(self, chunk: LiftedChunk) -> None:
-        """Add Σ w dᵀd of one chunk; its rows are used up."""
+        """Add Σ w dᵀd of one chunk; this overwrites rows of the chunk."""
         if chunk.weights is not None:
             self._add_weighted(chunk.pairs())
             return
         P, first, last, nz, _ = chunk
-        at_ends = np.unique(np.concatenate([first, last - 1]))  # pairs that hold the first or the last state of a piece
+        at_ends = np.unique(np.concatenate([first, last - 1]))  # pairs with the first or the last state of a piece
         now, after = P[at_ends], P[at_ends + 1, :nz]
         starts, stops = P[first], P[last, :nz]
         P[first] = P[last] = 0.0
@@ -229,7 +229,7 @@ class Gram:
 
     @property
     def size(self) -> Float[np.ndarray, " nd"]:
-        """A number for each column that is finite only if the column is: Σ w d²."""
+        """Σ w d² of each column, which is finite only if the column is."""
         return np.concatenate([self._now.diagonal(), self._next.diagonal()])
 
     @property
@@ -238,21 +238,21 @@ class Gram:
         return np.block([[self._now, self._cross], [self._cross.T, self._next]])
 
 
-class Factor:
-    """The triangular factor R of the rows of chunks, RᵀR = Σ w dᵀd: twice the digits of the sums.
+class TriangularFactor:
+    """The triangular factor R of the rows of chunks, RᵀR = Σ w dᵀd; it has twice the digits of the sums.
 
     Parameters
     ----------
     n, nz
-        As for `Gram`.
+        As for `GramSums`.
     """
 
     def __init__(self, n: int, nz: int) -> None:
-        self._R = empty(n + nz)
+        self._R = empty_factor(n + nz)
         self.size = np.zeros(n + nz)
 
     def add(self, chunk: LiftedChunk) -> None:
-        """Take in the rows of one chunk."""
+        """Absorb the rows of one chunk."""
         D = chunk.pairs()
         self.size = np.abs(D).max(axis=0)
         absorb(self._R, D)
@@ -263,13 +263,13 @@ class Factor:
         return np.ascontiguousarray(self._R)
 
 
-class Forgetting:
+class ForgettingMemory:
     """The factor of all rows, each weighted by forgetting^age.
 
-    A row of R is one equation r·k = t of the triangular system R K = T. Forgetting multiplies it by √λ. A direction
-    about which new rows say nothing would fade away, until noise alone decided it (wind-up). So an equation whose
-    information r_jj² falls below `keep` times its maximum so far is forgotten no further: it is scaled back to that
-    floor, left side and right side together, which leaves K as it is.
+    A row of R is one equation r·k = t of the triangular system R K = T. Forgetting multiplies it by √λ. Without new
+    rows along a direction its equation would fade until noise alone decides it (wind-up). So forgetting stops at a
+    floor: an equation whose information r_jj² falls below `keep` times its maximum so far is scaled back to that floor.
+    Both sides are scaled, so K does not change.
 
     Parameters
     ----------
@@ -282,31 +282,31 @@ class Forgetting:
     """
 
     def __init__(self, nd: int, n: int, forgetting: float, keep: float) -> None:
-        self._R, self._n = empty(nd), n
+        self._R, self._n = empty_factor(nd), n
         self._forgetting, self._keep = forgetting, keep
         self._most = np.zeros(n)
         self._weight = 0.0
 
     def push(self, rows: Table) -> None:
-        """Take in rows, the newest last."""
-        R, self._weight = self._joined(self._R, rows)
+        """Absorb rows, the newest last."""
+        R, self._weight = self._take_in(self._R, rows)
         if self._forgetting < 1.0:
-            held = np.abs(R.diagonal()[: self._n])
-            np.maximum(self._most, held, out=self._most)
+            diagonal = np.abs(R.diagonal()[: self._n])
+            np.maximum(self._most, diagonal, out=self._most)
             floor = np.sqrt(self._keep) * self._most
-            low = np.flatnonzero((held < floor) & (held > 0))
-            R[low] *= (floor[low] / held[low])[:, None]
+            low = np.flatnonzero((diagonal < floor) & (diagonal > 0))
+            R[low] *= (floor[low] / diagonal[low])[:, None]
 
     @property
     def R(self) -> Triangle:
-        """The factor of the rows that were pushed; it changes with the next ones."""
+        """The factor of the rows pushed so far; `push` overwrites it."""
         return self._R
 
     def factor(self, pending: Table) -> tuple[Triangle, float]:
-        """Return R and the sum of weights of all rows, with those that wait."""
-        return self._joined(self._R.copy(order="F"), pending)
+        """Return R and the sum of weights of all rows, the pending ones included."""
+        return self._take_in(self._R.copy(order="F"), pending)
 
-    def _joined(self, R: Triangle, rows: Table) -> tuple[Triangle, float]:
+    def _take_in(self, R: Triangle, rows: Table) -> tuple[Triangle, float]:
         if self._forgetting == 1.0:
             absorb(R, rows)
             return R, self._weight + len(rows)
@@ -316,13 +316,13 @@ class Forgetting:
         return R, self._weight * self._forgetting ** len(rows) + float(weights.sum())
 
 
-class Window:
-    """The factor of the last `length` rows, kept like a queue made of two stacks: nothing is ever subtracted.
+class WindowMemory:
+    """The factor of the last `length` rows, as a queue made of two stacks, in which nothing is subtracted.
 
-    New blocks are absorbed at the back. For each old block the front holds one factor, that of the block and of all
-    later ones of the front, so that the oldest block leaves when its factor is dropped. When the front is used up, the
-    back becomes the front. Each row is absorbed twice, errors do not add up over time, and about 2 · length rows are
-    held in memory. Turning the back into the front takes one step that costs as much as `length` updates.
+    The back stack absorbs new blocks. The front stack holds a factor for each old block: that of the block and of all
+    later blocks in the front. Dropping a factor therefore removes the oldest block. When the front is empty, the back
+    becomes the front. Each row is absorbed twice, errors do not add up over time, and about 2 · length rows are held in
+    memory. The step that turns the back into the front costs as much as `length` updates.
 
     Parameters
     ----------
@@ -331,23 +331,23 @@ class Window:
     length
         Rows in the window.
     block
-        Rows that come at once.
+        Number of rows in each `push`.
     """
 
     def __init__(self, nd: int, length: int, block: int) -> None:
         self._nd, self._length, self._block = nd, length, block
         self._front: deque[tuple[Triangle, Table]] = deque()
         self._back: list[Table] = []
-        self._R = empty(nd)
+        self._R = empty_factor(nd)
 
     def push(self, rows: Table) -> None:
-        """Take in a block of rows, the newest last."""
+        """Absorb a block of rows, the newest last."""
         absorb(self._R, rows)
         self._back.append(rows.copy())
         self._drop(0)
 
     def factor(self, pending: Table) -> tuple[Triangle, float]:
-        """Return R and the number of rows in the window, the last of them those that wait."""
+        """Return R and the number of rows in the window, whose last rows are the pending ones."""
         pending = pending[-self._length :]
         old = self._drop(len(pending))
         if old:
@@ -358,24 +358,24 @@ class Window:
         if len(self._front) > bool(old):
             absorb(R, self._front[bool(old)][0])
         absorb(R, pending)
-        return R, float(self._held - old + len(pending))
+        return R, float(self._length_held - old + len(pending))
 
     @property
-    def _held(self) -> int:
+    def _length_held(self) -> int:
         return (len(self._front) + len(self._back)) * self._block
 
     def _drop(self, waiting: int) -> int:
-        """Let blocks go that lie before the window; return how many rows of the oldest one do."""
-        while self._held + waiting - self._length >= self._block:
+        """Drop the blocks before the window; return the number of rows of the oldest block that lie before it."""
+        while self._length_held + waiting - self._length >= self._block:
             self._turn()
             self._front.popleft()
-        return max(self._held + waiting - self._length, 0)
+        return max(self._length_held + waiting - self._length, 0)
 
     def _turn(self) -> None:
-        """Make the back the front where that is empty."""
+        """Turn the back into the front if the front is empty."""
         if not self._front:
-            R = empty(self._nd)
+            R = empty_factor(self._nd)
             for rows in reversed(self._back):
                 absorb(R, rows)
                 self._front.appendleft((R.copy(order="F"), rows))
-            self._back, self._R = [], empty(self._nd)
+            self._back, self._R = [], empty_factor(self._nd)

@@ -1,1 +1,1 @@
-"""What is wrong with logs before a model is fitted to them: a kind of evidence a file; `audit` runs all checks."""
+"""Checks of logs before a model is fitted to them; each file holds one kind of evidence, and `audit` runs them all."""

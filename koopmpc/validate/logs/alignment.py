@@ -1,9 +1,9 @@
-"""Faults between signals: one is late, has no effect or follows from others, or an actuator ends before its input.
+"""Faults between signals: late signals, saturated actuators, and inputs without effect or dependent on other signals.
 
-A signal that is late, and an actuator that ends, are found by hypotheses: each undoes its fault in the log, and
-predicts the next row from the present one. It is judged by the information on all states together, −½ log det of the
-residuals in nats a sample: a signal that is put where it belongs raises it, and moving what one sensor knows to another
-does not.
+Late signals and saturated actuators are found by hypotheses. Each hypothesis undoes its fault in the log and predicts
+the next row from the present one. Its score is the information on all states together, −½ log det of the residuals in
+nats a sample. The score rises if a late signal is moved to its true row. It does not rise if the shift only moves
+information from one sensor to another.
 """
 
 from collections.abc import Iterator
@@ -13,32 +13,33 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.lifting.base import short
-from koopmpc.validate.logs.log import Log, LogFault, fitted, information
-from koopmpc.validate.text import percent
+from koopmpc.lifting.base import strip_unit
+from koopmpc.text import to_percent
+from koopmpc.validate.logs.log import Log, LogFault, compute_information, fit_residuals
 
-_LATEST = 8  # steps by which a signal is looked for
-_ENOUGH = 200  # rows without which no lag and no effect is looked for
-_ROWS = 5_000  # rows that are looked at
-_GAIN = 0.02  # nats a sample that a hypothesis must win
-_SURE = 30.0  # nats in all
-_PEAK = 0.95  # share of the gain of a late input that a step more or less may win: a smooth input wins by any delay
-_PREFERRED = 1.15  # of the gain of an input that is late, over that of a sensor: the commoner fault
-_SENSOR = 0.2  # nats a sample that all states must win by putting a sensor right, in a log of noise alone
-_OWN = 0.3  # nats a sample that a late sensor must win of its own residual; of 600 clean logs the most was 0.18
-_OWN_ONE_ROW = 0.5  # the same by a law that reads no earlier row
-_EVEN = 0.25  # share of these gains that each part of the log must show; clean logs win in a few parts only
-_ONE_ROW_LATEST = 5  # steps by which that law looks; by 8, the smooth log of a clean plant won 0.75
-_CLEAR, _CLEAR_OWN = 0.75, 0.5  # shares of the gain of a late sensor that moving another signal may win
-_BLOCKS = 8  # parts of the log of which nearly all must agree
+_LATEST = 8  # try shifts of a signal up to this many steps
+_LEAST_ROWS = 200  # look for lags and effects only if the log has at least this many rows
+_MOST_ROWS = 5_000  # read at most about this many rows
+_GAIN = 0.02  # nats a sample that a hypothesis must gain
+_SURE = 30.0  # nats over all rows that a hypothesis must gain
+_PEAK = 0.95  # reject a late input if one step more or less gains this share too: a smooth input gains by any delay
+_PREFERENCE = 1.15  # weight on the gain of a late input against that of a late sensor, which is rarer
+_SENSOR = 0.2  # nats a sample that all states must gain by the shift of a sensor, in a log of noise only
+_OWN = 0.3  # nats a sample that a late sensor must gain in its own residual; 600 clean logs gained at most 0.18
+_OWN_ONE_ROW = 0.5  # the same limit for the law that reads no earlier row
+_EVEN = 0.25  # share of this gain that every part of the log must show; clean logs gain in a few parts only
+_ONE_ROW_LATEST = 5  # that law tries shifts up to this many steps; up to 8, a smooth clean log gained 0.75
+_CLEAR = 0.75  # another shift may reach at most this share of the gain of a late sensor
+_CLEAR_OWN = 0.5  # the same share if only the sensor's own residual gains
+_BLOCKS = 8  # all but one of this many parts of the log must agree
 
 
 @dataclass(frozen=True)
 class Shift:
-    """State or input `column` (inputs after the states) is read `steps` rows later, or earlier where negative.
+    """State or input `column` (inputs follow the states) is read `steps` rows later, or earlier if negative.
 
-    A sensor is never ahead of the plant, so a state is only read later: the future of the other states would predict an
-    earlier reading all too well.
+    A sensor is never ahead of the plant, so a state is only read later. An earlier reading would be no evidence, since
+    the future of the other states predicts it well in any case.
     """
 
     column: int
@@ -46,8 +47,8 @@ class Shift:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
-    """Present rows, their inputs, the rows before and the next ones."""
+class AlignedRows:
+    """Present rows, their inputs, the rows before and the next rows."""
 
     X: Float[np.ndarray, "M nx"]
     U: Float[np.ndarray, "M nu"]
@@ -56,163 +57,167 @@ class Rows:
 
     def regressors(self, log: Log) -> Float[np.ndarray, "M p"]:
         """Return the regressors of the next rows."""
-        return np.hstack([log.stacked(self.X, self.U), (self.before - log.center) / log.size])
+        return np.hstack([log.stack_regressors(self.X, self.U), (self.before - log.center) / log.size])
 
     def residuals(self, log: Log, more: Float[np.ndarray, "M q"] | None = None) -> Float[np.ndarray, "M nx"]:
-        """Return the residuals of the next rows in sizes of the states; `more` are further regressors."""
+        """Return the residuals of the next rows, in sizes of the states; `more` are further regressors."""
         P = self.regressors(log)
         P = P if more is None else np.hstack([P, more])
-        return fitted(P, (self.after - self.X) / log.size)
+        return fit_residuals(P, (self.after - self.X) / log.size)
 
     def one_row_residuals(self, log: Log) -> Float[np.ndarray, "M nx"]:
-        """Return the residuals of the next rows by a law that does not read the rows before."""
-        return fitted(log.stacked(self.X, self.U), (self.after - self.X) / log.size)
+        """Return the residuals of the next rows under a law that does not read the rows before."""
+        return fit_residuals(log.stack_regressors(self.X, self.U), (self.after - self.X) / log.size)
 
 
-def rows(log: Log, shifts: tuple[Shift, ...] = (), margin: int = _LATEST) -> Rows:
-    """Return the rows of all episodes `margin` away from both ends, every signal moved by its shifts."""
+def align_rows(log: Log, shifts: tuple[Shift, ...] = (), margin: int = _LATEST) -> AlignedRows:
+    """Return the rows of all episodes that are `margin` away from both ends, with every signal moved by its shifts."""
     nx, nu = log.data.nx, log.data.nu
-    states, inputs, moved = np.arange(nx), np.arange(nu), np.zeros(nx + nu, dtype=np.intp)
+    states, inputs, offsets = np.arange(nx), np.arange(nu), np.zeros(nx + nu, dtype=np.intp)
     for shift in shifts:
-        moved[shift.column] += shift.steps
-    none = np.zeros((0, nx))
-    parts, count = [(none, np.zeros((0, nu)), none, none)], 0
+        offsets[shift.column] += shift.steps
+    empty = np.zeros((0, nx))
+    parts, count = [(empty, np.zeros((0, nu)), empty, empty)], 0
     for episode in log.data:
         T = len(episode)
         if 2 * margin + 3 > T:
             continue
-        at = np.arange(margin + 1, T - margin)[:, None] + moved
-        X, U = np.hsplit(at, [nx])
+        indices = np.arange(margin + 1, T - margin)[:, None] + offsets
+        X, U = np.hsplit(indices, [nx])
         parts.append((episode.X[X, states], episode.U[U, inputs], episode.X[X - 1, states], episode.X[X + 1, states]))
-        count += len(at)
-        if count > _ROWS:
+        count += len(indices)
+        if count > _MOST_ROWS:
             break
-    return Rows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return AlignedRows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def won(log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"]) -> float:
-    """Return by how much `other` predicts better than `E`, in nats a sample, by the stricter of both counts."""
-    return float((information(other, log.fine) - information(E, log.fine)).min())
+def compute_gain(log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"]) -> float:
+    """Return the information that the residuals `other` gain over `E`, in nats a sample: the smaller number."""
+    return float((compute_information(other, log.fine) - compute_information(E, log.fine)).min())
 
 
-def better(log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"], least: float = _GAIN) -> bool:
-    """Return True where `other` predicts better than `E` by more than chance, and in nearly all parts of the log."""
+def is_better(log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"], least: float = _GAIN) -> bool:
+    """Return True if `other` predicts better than `E` by more than chance, and in nearly all parts of the log."""
     parts = zip(np.array_split(E, _BLOCKS), np.array_split(other, _BLOCKS), strict=True)
-    agree = sum(won(log, a, b) > 0 for a, b in parts)
-    return won(log, E, other) > max(least, _SURE / len(E)) and agree >= _BLOCKS - 1
+    agree = sum(compute_gain(log, a, b) > 0 for a, b in parts)
+    return compute_gain(log, E, other) > max(least, _SURE / len(E)) and agree >= _BLOCKS - 1
 
 
-def late(log: Log) -> Iterator[LogFault]:
-    """Find inputs that act late, and sensors that are late against the others."""
+def find_late_signals(log: Log) -> Iterator[LogFault]:
+    """Find inputs that act late, and sensors that are late in comparison with the others."""
     data, nx = log.data, log.data.nx
     if not data.nu and nx < 2:
         return
-    plain = rows(log)
-    if len(plain.X) < max(_ENOUGH, 8 * plain.regressors(log).shape[1]):
+    aligned = align_rows(log)
+    if len(aligned.X) < max(_LEAST_ROWS, 8 * aligned.regressors(log).shape[1]):
         return
-    found: tuple[Shift, ...] = ()
-    E = plain.residuals(log)
+    accepted: tuple[Shift, ...] = ()
+    E = aligned.residuals(log)
     for _ in range(2):
-        following = _surest(log, found, E)
-        one = None if found or (following and following[0][0].column >= nx) else _by_one_row(log)
-        if following is None:
-            if one is not None:
-                yield _said(log, (one,), [])
+        candidate = _find_best_shift(log, accepted, E)
+        is_input = candidate is not None and candidate[0][0].column >= nx
+        by_one_row = None if accepted or is_input else _find_shift_by_one_row(log)
+        if candidate is None:
+            if by_one_row is not None:
+                yield _describe_shift(log, (by_one_row,), [])
             return
-        best, E, alike = following
-        if one is not None and one.column == best[0].column and one.steps != best[0].steps:
-            best = (one,)  # with the row before, one step more may predict as well
-            E = rows(log, best).residuals(log)
-        found = (*found, *best)
-        yield _said(log, best, alike)
+        best, E, alike = candidate
+        if by_one_row is not None and by_one_row.column == best[0].column and by_one_row.steps != best[0].steps:
+            best = (by_one_row,)  # a law with the row before may predict as well from one step more
+            E = align_rows(log, best).residuals(log)
+        accepted = (*accepted, *best)
+        yield _describe_shift(log, best, alike)
 
 
-def _surest(
-    log: Log, found: tuple[Shift, ...], E: Float[np.ndarray, "M nx"]
+def _find_best_shift(
+    log: Log, accepted: tuple[Shift, ...], E: Float[np.ndarray, "M nx"]
 ) -> tuple[tuple[Shift, ...], Float[np.ndarray, "M nx"], list[int]] | None:
     """Return the shift that predicts best, its residuals, and the sensors that explain it as well; None if unsure."""
     nx = log.data.nx
-    if won(log, E, 0 * E) < _GAIN:
+    if compute_gain(log, E, 0 * E) < _GAIN:
         return None
-    errors = {shift: rows(log, (*found, *shift)).residuals(log) for shift in _shifts(log, found)}
-    scores = {shift: _score(log, shift[0], E, other) for shift, other in errors.items()}
-    best = max(scores, key=lambda shift: scores[shift] * (_PREFERRED if shift[0].column >= nx else 1.0))
+    errors = {shift: align_rows(log, (*accepted, *shift)).residuals(log) for shift in _list_shifts(log, accepted)}
+    scores = {shift: _score_shift(log, shift[0], E, other) for shift, other in errors.items()}
+    best = max(scores, key=lambda shift: scores[shift] * (_PREFERENCE if shift[0].column >= nx else 1.0))
     rivals = {shift: score for shift, score in scores.items() if shift[0].column != best[0].column}
-    if best[0].column >= nx and not _alone(log, found, best, errors[best]):
+    if best[0].column >= nx and not _replaces_present_input(log, accepted, best, errors[best]):
         sensors = {shift: score for shift, score in scores.items() if shift[0].column < nx}
         if not sensors:
             return None
         best = max(sensors, key=sensors.__getitem__)  # the input seems late only because a sensor is
         rivals = {shift: score for shift, score in sensors.items() if shift[0].column != best[0].column}
     if best[0].column < nx:
-        rival = max(rivals.values(), default=0.0), max((won(log, E, errors[shift]) for shift in rivals), default=0.0)
-        sure = _behind(log, best[0], E, errors[best], *rival)
+        rival_gain = max((compute_gain(log, E, errors[shift]) for shift in rivals), default=0.0)
+        sure = _is_sensor_late(log, best[0], E, errors[best], max(rivals.values(), default=0.0), rival_gain)
     else:
-        near = [tuple(Shift(one.column, one.steps + step) for one in best) for step in (-1, 1)]
-        beside = [scores[shift] for shift in near if shift in scores]
-        sure = better(log, E, errors[best]) and max(beside, default=0.0) < _PEAK * scores[best]
+        neighbours = [tuple(Shift(part.column, part.steps + step) for part in best) for step in (-1, 1)]
+        neighbour_scores = [scores[shift] for shift in neighbours if shift in scores]
+        sure = is_better(log, E, errors[best]) and max(neighbour_scores, default=0.0) < _PEAK * scores[best]
     alike = {shift[0].column for shift, score in rivals.items() if score > _CLEAR * scores[best]}
     return (best, errors[best], sorted(i for i in alike if i < nx)) if sure else None
 
 
-def _score(log: Log, shift: Shift, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"]) -> float:
-    """Return the gain of a shift; of a sensor's, the gain of its own residual where that is less.
+def _score_shift(log: Log, shift: Shift, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"]) -> float:
+    """Return the gain of a shift; for a sensor, at most the gain of its own residual.
 
-    The other states may follow better from the future of a sensor that is in time, but this sensor follows worse from
-    their past.
+    If a sensor is not late, a shift of it may still improve the prediction of other states. But it worsens the
+    prediction of the sensor itself.
     """
-    gain = won(log, E, other)
-    return min(gain, _own(log, shift, E, other)) if shift.column < log.data.nx else gain
+    gain = compute_gain(log, E, other)
+    return min(gain, _compute_own_gain(log, shift, E, other)) if shift.column < log.data.nx else gain
 
 
-def _own(log: Log, shift: Shift, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"]) -> float:
-    """Return by how much `other` predicts the shifted state better than `E`, in nats a sample."""
-    of, floor = slice(shift.column, shift.column + 1), log.fine[shift.column : shift.column + 1]
-    return float((information(other[:, of], floor) - information(E[:, of], floor)).min())
+def _compute_own_gain(log: Log, shift: Shift, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"]) -> float:
+    """Return the information on the shifted state that the residuals `other` gain over `E`, in nats a sample."""
+    own, floor = slice(shift.column, shift.column + 1), log.fine[shift.column : shift.column + 1]
+    return float((compute_information(other[:, own], floor) - compute_information(E[:, own], floor)).min())
 
 
-def _behind(
+def _is_sensor_late(
     log: Log,
     shift: Shift,
     E: Float[np.ndarray, "M nx"],
     other: Float[np.ndarray, "M nx"],
-    rival: float,
-    rival_of_all: float,
+    rival_score: float,
+    rival_gain: float,
 ) -> bool:
-    """Return True where a sensor is late; the rivals are the score and the gain of the best shifts of other signals.
+    """Return True if a sensor is late; the rivals are the best score and the best gain of shifts of other signals.
 
-    Either all states together win much, the more the less noise the log holds, whose errors are then the smooth misfit
-    of the regression and depend on the row that it is read from. Or the sensor itself wins a little, in every part of
-    the log, and no other shift half of it; a misfit may do so by one step.
+    There are two criteria. First, all states together gain much. This limit is higher in a log with little noise: there
+    the errors are a smooth misfit of the regression, which depends on the row that is read. Second, the sensor itself
+    gains a little in every part of the log, and no other shift gains half of it. The second criterion does not hold for
+    a shift by one step in a log with little noise.
     """
-    misfit = float(np.subtract(*information(E, log.fine)))
-    gain = _score(log, shift, E, other)
-    if gain <= 0 or rival > _CLEAR * gain:
+    misfit = float(np.subtract(*compute_information(E, log.fine)))
+    gain = _score_shift(log, shift, E, other)
+    if gain <= 0 or rival_score > _CLEAR * gain:
         return False
-    if rival_of_all <= _CLEAR * won(log, E, other) and better(log, E, other, _SENSOR * (1 + misfit)):
+    if rival_gain <= _CLEAR * compute_gain(log, E, other) and is_better(log, E, other, _SENSOR * (1 + misfit)):
         return True
-    if gain < _OWN or rival > _CLEAR_OWN * gain or (shift.steps == 1 and misfit > 1):
+    if gain < _OWN or rival_score > _CLEAR_OWN * gain or (shift.steps == 1 and misfit > 1):
         return False
     parts = zip(np.array_split(E, _BLOCKS), np.array_split(other, _BLOCKS), strict=True)
-    return all(_own(log, shift, a, b) > _EVEN * gain for a, b in parts)
+    return all(_compute_own_gain(log, shift, a, b) > _EVEN * gain for a, b in parts)
 
 
-def _by_one_row(log: Log) -> Shift | None:
+def _find_shift_by_one_row(log: Log) -> Shift | None:
     """Return the shift of a late sensor that a law of the present row shows, or None.
 
-    A state that moves slowly against its noise follows so well from its last two rows that no other signal adds to
-    them: late or not, its residual is the same. Without the row before, it must follow from the others. Nothing is said
-    where the inputs tell nothing: a motion that repeats itself follows from any of its rows.
+    The last two rows of a slow state predict its next row so well that other signals add nothing; its residual is then
+    the same whether the sensor is late or not. A law without the row before must predict this state from the other
+    signals. The function returns None if the inputs do not improve the prediction: a periodic motion can be predicted
+    from any of its rows.
     """
     if log.data.nx < 2:
         return None
-    plain = rows(log)
-    E = plain.one_row_residuals(log)
-    if won(log, fitted(log.regressors(plain.X), (plain.after - plain.X) / log.size), E) < _GAIN:
+    aligned = align_rows(log)
+    E = aligned.one_row_residuals(log)
+    without_inputs = fit_residuals(log.regressors(aligned.X), (aligned.after - aligned.X) / log.size)
+    if compute_gain(log, without_inputs, E) < _GAIN:
         return None
     best, most = None, _OWN_ONE_ROW
     for i, steps in product(range(log.data.nx), range(1, _ONE_ROW_LATEST + 1)):
-        other = rows(log, (Shift(i, steps),)).one_row_residuals(log)
+        other = align_rows(log, (Shift(i, steps),)).one_row_residuals(log)
         pairs = zip(np.array_split(E[:, i], _BLOCKS), np.array_split(other[:, i], _BLOCKS), strict=True)
         gains = [0.5 * float(np.log((np.mean(a**2) + 1e-20) / (np.mean(b**2) + 1e-20))) for a, b in pairs]
         if np.median(gains) > most and min(gains) > _EVEN * np.median(gains):
@@ -220,9 +225,10 @@ def _by_one_row(log: Log) -> Shift | None:
     return best
 
 
-def _shifts(log: Log, found: tuple[Shift, ...]) -> Iterator[tuple[Shift, ...]]:
+def _list_shifts(log: Log, accepted: tuple[Shift, ...]) -> Iterator[tuple[Shift, ...]]:
+    """Yield the shifts of one signal, or of all inputs together, for signals that have no accepted shift yet."""
     nx, nu = log.data.nx, log.data.nu
-    taken = {shift.column for shift in found}
+    taken = {shift.column for shift in accepted}
     for steps in range(1, _LATEST + 1):
         if nu > 1 and not taken.intersection(range(nx, nx + nu)):
             yield tuple(Shift(nx + j, -steps) for j in range(nu))
@@ -234,89 +240,91 @@ def _shifts(log: Log, found: tuple[Shift, ...]) -> Iterator[tuple[Shift, ...]]:
                 yield (Shift(i, steps),)
 
 
-def _alone(log: Log, found: tuple[Shift, ...], shift: tuple[Shift, ...], E: Float[np.ndarray, "M nx"]) -> bool:
-    """Return True where the input of the present row adds next to nothing to the late one."""
-    now, moved = rows(log, found), rows(log, (*found, *shift))
-    both = moved.residuals(log, log.scaled(now.X, now.U)[1])
-    return won(log, E, both) < 0.1 * won(log, now.residuals(log), both)
+def _replaces_present_input(
+    log: Log, accepted: tuple[Shift, ...], shift: tuple[Shift, ...], E: Float[np.ndarray, "M nx"]
+) -> bool:
+    """Return True if the input of the present row adds almost nothing to the late input."""
+    now, moved = align_rows(log, accepted), align_rows(log, (*accepted, *shift))
+    both = moved.residuals(log, log.scale(now.X, now.U)[1])
+    return compute_gain(log, E, both) < 0.1 * compute_gain(log, now.residuals(log), both)
 
 
-def _said(log: Log, shift: tuple[Shift, ...], alike: list[int]) -> LogFault:
-    """Return the fault; the sensors `alike` explain a late input as well, if they are late instead."""
+def _describe_shift(log: Log, shift: tuple[Shift, ...], alike: list[int]) -> LogFault:
+    """Return the fault of a late signal; a late input is explained as well by a delay of a sensor in `alike`."""
     steps = abs(shift[0].steps)
-    names = tuple(log.names[one.column] for one in shift)
-    said = " and ".join(short(name) for name in names)
+    names = tuple(log.names[part.column] for part in shift)
+    signals = " and ".join(strip_unit(name) for name in names)
     count = f"{steps} step{'s' * (steps > 1)}"
-    past = f"let the model see the past: embedding=km.Delay({steps})"
+    remedy = f"let the model see the past: embedding=km.Delay({steps})"
     if shift[0].column >= log.data.nx:
         acts = "acts" if len(names) == 1 else "act"
-        others = " or ".join(short(log.names[i]) for i in alike)
+        others = " or ".join(strip_unit(log.names[i]) for i in alike)
         instead = f", unless the sensor of {others} is {count} behind" if alike else ""
-        return LogFault("input delay", f"{said} {acts} {count} late{instead}", past, names, steps=steps)
-    behind = f"{said} is {count} behind the other signals"
-    return LogFault("late sensor", behind, f"move its column by {count}, or {past}", names, steps=steps)
+        return LogFault("input delay", f"{signals} {acts} {count} late{instead}", remedy, names, steps=steps)
+    says = f"{signals} is {count} behind the other signals"
+    return LogFault("late sensor", says, f"move its column by {count}, or {remedy}", names, steps=steps)
 
 
-_QUANTILES = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # of an input, at which an actuator may end
-_BENT = (2, 3, 4, 5)  # powers of an input that a clipped one must beat
-_SHARPER = 3.0  # nats in all by which it must; where inputs act through tanh, the polynomial wins by 50 and more
-_LEFT = 0.1  # share of the gain of a clipped input that what is clipped may add
+_LIMIT_QUANTILES = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # try these quantiles of an input as its limits
+_POWERS = (2, 3, 4, 5)  # a clipped input must predict better than these powers of the input
+_SHARPER = 3.0  # nats over all rows by which it must; if inputs act through tanh, the powers win by 50 or more
+_LEFT_OVER = 0.1  # reject a limit if the clipped part adds more than this share of the gain
 
 
-def ending(log: Log) -> Iterator[LogFault]:
-    """Find inputs that have no more effect beyond some value, where the actuator ends."""
-    plain = rows(log, margin=1)
-    if not log.data.nu or len(plain.X) < max(_ENOUGH, 8 * plain.regressors(log).shape[1]):
+def find_saturated_actuators(log: Log) -> Iterator[LogFault]:
+    """Find inputs that have no further effect beyond some value, because the actuator is at its limit."""
+    aligned = align_rows(log, margin=1)
+    if not log.data.nu or len(aligned.X) < max(_LEAST_ROWS, 8 * aligned.regressors(log).shape[1]):
         return
-    E = plain.residuals(log)
+    E = aligned.residuals(log)
     for j in range(log.data.nu):
-        column = plain.U[:, j]
-        ends = list(_ends(column))
-        if not ends:
+        column = aligned.U[:, j]
+        candidates = list(_list_limits(column))
+        if not candidates:
             continue
-        scores = [won(log, E, _clipped(plain, j, *pair).residuals(log)) for pair in ends]
-        low, high = ends[int(np.argmax(scores))]
-        if not better(log, E, _clipped(plain, j, low, high).residuals(log)):
+        gains = [compute_gain(log, E, _clip_input(aligned, j, *pair).residuals(log)) for pair in candidates]
+        low, high = candidates[int(np.argmax(gains))]
+        if not is_better(log, E, _clip_input(aligned, j, low, high).residuals(log)):
             continue
-        low, high = _refined(log, plain, j, low, high)
-        clipped = _clipped(plain, j, low, high)
+        low, high = _refine_limits(log, aligned, j, low, high)
+        clipped = _clip_input(aligned, j, low, high)
         rest = (column - clipped.U[:, j])[:, None] / log.input_size[j]
         inside = clipped.residuals(log)
-        if won(log, inside, clipped.residuals(log, rest)) > _LEFT * won(log, E, inside):
+        if compute_gain(log, inside, clipped.residuals(log, rest)) > _LEFT_OVER * compute_gain(log, E, inside):
             continue
-        v = (plain.U[:, [j]] - log.input_center[j]) / log.input_size[j]
-        bent = plain.residuals(log, np.hstack([v**power for power in _BENT]))
-        if won(log, bent, inside) < _SHARPER / len(bent):  # a smooth curve says as much: no end, but a plant that bends
-            continue
-        name = short(log.data.inputs[j])
-        said = [f"below {low:.3g}"] * bool(low > column.min()) + [f"above {high:.3g}"] * bool(high < column.max())
+        v = (aligned.U[:, [j]] - log.input_center[j]) / log.input_size[j]
+        smooth = aligned.residuals(log, np.hstack([v**power for power in _POWERS]))
+        if compute_gain(log, smooth, inside) < _SHARPER / len(smooth):
+            continue  # a smooth curve predicts as well: the plant is nonlinear, and the actuator has no limit there
+        name = strip_unit(log.data.inputs[j])
+        ends = [f"below {low:.3g}"] * bool(low > column.min()) + [f"above {high:.3g}"] * bool(high < column.max())
         call = [f"u_min={low:.3g}"] * bool(low > column.min()) + [f"u_max={high:.3g}"] * bool(high < column.max())
         yield LogFault(
             "actuator at its limit",
-            f"{name} has no more effect {' and '.join(said)}: the actuator ends there, and the log holds the command",
+            f"{name} has no more effect {' and '.join(ends)}: the actuator ends there, and the log holds the command",
             f"clip {name} in the log to what was applied, and tell the controller: km.Limits({', '.join(call)})",
             (log.data.inputs[j],),
         )
 
 
-def _ends(column: Float[np.ndarray, " M"]) -> Iterator[tuple[float, float]]:
-    """Yield low and high ends at quantiles of the input, of both sides or one."""
-    for side, q in product(("both", "high", "low"), _QUANTILES):
+def _list_limits(column: Float[np.ndarray, " M"]) -> Iterator[tuple[float, float]]:
+    """Yield low and high limits at quantiles of the input, on both sides or on one."""
+    for side, q in product(("both", "high", "low"), _LIMIT_QUANTILES):
         low = float(np.quantile(column, q)) if side != "high" else float(column.min())
         high = float(np.quantile(column, 1 - q)) if side != "low" else float(column.max())
         if low < high and (low > column.min() or high < column.max()):
             yield low, high
 
 
-def _clipped(of: Rows, j: int, low: float, high: float) -> Rows:
-    U = of.U.copy()
+def _clip_input(aligned: AlignedRows, j: int, low: float, high: float) -> AlignedRows:
+    U = aligned.U.copy()
     U[:, j] = np.clip(U[:, j], low, high)
-    return Rows(of.X, U, of.before, of.after)
+    return AlignedRows(aligned.X, U, aligned.before, aligned.after)
 
 
-def _refined(log: Log, of: Rows, j: int, low: float, high: float) -> tuple[float, float]:
-    """Return the ends that predict best, by steps around the quantiles that were best, halved five times."""
-    bottom, top = float(of.U[:, j].min()), float(of.U[:, j].max())
+def _refine_limits(log: Log, aligned: AlignedRows, j: int, low: float, high: float) -> tuple[float, float]:
+    """Return the limits that predict best, by a search around the best quantiles with a step that halves five times."""
+    bottom, top = float(aligned.U[:, j].min()), float(aligned.U[:, j].max())
     width = 0.1 * (top - bottom)
     for _ in range(6):
         tries = [(a, b) for a in (low - width, low, low + width) for b in (high - width, high, high + width)]
@@ -325,53 +333,54 @@ def _refined(log: Log, of: Rows, j: int, low: float, high: float) -> tuple[float
             for a, b in tries
             if bottom <= a < b <= top or low == bottom or high == top
         ]
-        scores = [float(information(_clipped(of, j, a, b).residuals(log), log.fine).sum()) for a, b in tries]
+        clipped = [_clip_input(aligned, j, a, b) for a, b in tries]
+        scores = [float(compute_information(part.residuals(log), log.fine).sum()) for part in clipped]
         low, high = tries[int(np.argmax(scores))]
         width /= 2
     return low, high
 
 
-_PAST = 10  # inputs of the past that may tell the next one
-_EXPLAINED = 0.8  # share of an input that the state of the same row explains: feedback
-_NEWS = 0.02  # share of what is new in an input that this state must explain then
-_FREE = 1e-4  # share of an input that its own past must leave open
+_PAST = 10  # number of past inputs that may predict the next one
+_FEEDBACK = 0.8  # an input is feedback if the state of the same row explains more than this share of it, and
+_INNOVATION = 0.02  # explains more than this share of the part that past inputs do not predict, and
+_UNPREDICTED = 1e-4  # past inputs leave more than this share of the input unpredicted
 
 
-def together(log: Log) -> Iterator[LogFault]:
-    """Find inputs of which one follows from the others."""
+def find_dependent_inputs(log: Log) -> Iterator[LogFault]:
+    """Find inputs that follow from the other inputs."""
     U = log.U
     moving = [j for j in range(log.data.nu) if np.ptp(U[:, j]) > 0]
     V = (U[:, moving] - U[:, moving].mean(axis=0)) / np.maximum(U[:, moving].std(axis=0), 1e-300)
     for n, j in enumerate(moving):
-        if n and float((fitted(V[:, :n], V[:, [n]]) ** 2).mean()) < 1e-4:
-            others = ", ".join(short(log.data.inputs[i]) for i in moving[:n])
+        if n and float((fit_residuals(V[:, :n], V[:, [n]]) ** 2).mean()) < 1e-4:
+            others = ", ".join(strip_unit(log.data.inputs[i]) for i in moving[:n])
             yield LogFault(
                 "inputs together",
-                f"{short(log.data.inputs[j])} follows from {others}: their effects cannot be told apart",
+                f"{strip_unit(log.data.inputs[j])} follows from {others}: their effects cannot be told apart",
                 "excite each input by its own noise",
                 (log.data.inputs[j],),
             )
 
 
-def without_effect(log: Log) -> Iterator[LogFault]:
+def find_inputs_without_effect(log: Log) -> Iterator[LogFault]:
     """Find inputs that move and change no state within a few steps."""
     nu = log.data.nu
-    near = rows(log, margin=6)
-    if not nu or len(near.X) < max(_ENOUGH, 4 * near.regressors(log).shape[1]):
+    aligned = align_rows(log, margin=6)
+    if not nu or len(aligned.X) < max(_LEAST_ROWS, 4 * aligned.regressors(log).shape[1]):
         return
-    V = np.concatenate([_past(e.U, 6, len(e) - 6, 6) for e in log.data if len(e) >= 15])[: len(near.X)]
-    base = [log.regressors(near.X), (near.before - log.center) / log.size]
-    Y = (near.after - near.X) / log.size
+    V = np.concatenate([_stack_past(e.U, 6, len(e) - 6, 6) for e in log.data if len(e) >= 15])[: len(aligned.X)]
+    base = [log.regressors(aligned.X), (aligned.before - log.center) / log.size]
+    Y = (aligned.after - aligned.X) / log.size
     for j in range(nu):
-        own = V[:, j::nu] / log.input_size[j]
-        if np.ptp(own) == 0:
+        history = V[:, j::nu] / log.input_size[j]
+        if np.ptp(history) == 0:
             continue
-        kept = np.hstack([*base, *(V[:, i::nu] / log.input_size[i] for i in range(nu) if i != j)])
-        E, other = fitted(kept, Y), fitted(np.hstack([kept, own]), Y)
-        chance = own.shape[1] * Y.shape[1] / (2 * len(Y))
-        gain = information(other, log.fine)[0] - information(E, log.fine)[0]
-        if gain < 4 * chance + 2e-4 and not better(log, E, other, 1e-3):
-            name = short(log.data.inputs[j])
+        others = np.hstack([*base, *(V[:, i::nu] / log.input_size[i] for i in range(nu) if i != j)])
+        E, other = fit_residuals(others, Y), fit_residuals(np.hstack([others, history]), Y)
+        chance = history.shape[1] * Y.shape[1] / (2 * len(Y))
+        gain = compute_information(other, log.fine)[0] - compute_information(E, log.fine)[0]
+        if gain < 4 * chance + 2e-4 and not is_better(log, E, other, 1e-3):
+            name = strip_unit(log.data.inputs[j])
             yield LogFault(
                 "input without effect",
                 f"{name} moves, and no state follows within 6 steps",
@@ -380,44 +389,45 @@ def without_effect(log: Log) -> Iterator[LogFault]:
             )
 
 
-def _past(U: np.ndarray, first: int, last: int, count: int) -> np.ndarray:
+def _stack_past(U: np.ndarray, first: int, last: int, count: int) -> np.ndarray:
     """Return rows [u_k, u_{k−1}, …, u_{k−count+1}] for k = first + 1 … last − 1."""
     k = np.arange(first + 1, last)
     return np.hstack([U[k - lag] for lag in range(count)])
 
 
-def feedback(log: Log) -> Iterator[LogFault]:
+def find_feedback(log: Log) -> Iterator[LogFault]:
     """Find inputs u_k that follow from the state x_k of the same row.
 
-    An input that was chosen freely may be told by the state as well, where the plant is much faster than the input is
-    changed. Two signs tell a feedback u = K x from that: x_k knows more of u_k than of u_{k−1}, although that one has
-    acted already, and it tells a part of u_k that earlier inputs do not.
+    If the plant is much faster than the changes of the input, the state predicts a freely chosen input too. A feedback
+    u = K x shows two further signs. x_k explains more of u_k than of u_{k−1}, which has already acted on the plant. And
+    x_k explains a part of u_k that earlier inputs do not predict.
     """
     long, nu = [e for e in log.data if len(e) > 2 * _PAST], log.data.nu
     if not long or not nu:
         return
     now = np.concatenate([e.U[_PAST + 1 :] for e in long])
-    past = np.concatenate([_past(e.U, _PAST, len(e), _PAST + 1)[:, nu:] for e in long])
+    past = np.concatenate([_stack_past(e.U, _PAST, len(e), _PAST + 1)[:, nu:] for e in long])
     state = np.concatenate([e.X[_PAST + 1 : -1] for e in long])
-    if len(now) < max(_ENOUGH, 4 * (past.shape[1] + state.shape[1])):
+    if len(now) < max(_LEAST_ROWS, 4 * (past.shape[1] + state.shape[1])):
         return
     V = (now - log.input_center) / log.input_size
-    own = (past - np.tile(log.input_center, _PAST)) / np.tile(log.input_size, _PAST)
-    one, Z = np.ones((len(V), 1)), (state - log.center) / log.size
-    left = (fitted(np.hstack([one, own]), V) ** 2).mean(axis=0)
-    after = (fitted(np.hstack([one, own, Z]), V) ** 2).mean(axis=0)
-    alone, acted = np.split((fitted(np.hstack([one, Z]), np.hstack([V, own[:, :nu]])) ** 2).mean(axis=0), 2)
-    around = np.maximum((V**2).mean(axis=0) - V.mean(axis=0) ** 2, 1e-300)
-    for j in np.flatnonzero(around > 1e-12):
-        told = 1 - after[j] / max(left[j], 1e-300)
-        exact = alone[j] < 1e-8 * around[j]
-        known = alone[j] < (1 - _EXPLAINED) * around[j] and alone[j] < acted[j]
-        if exact or (known and told > _NEWS and left[j] > _FREE * around[j]):
-            name = short(log.data.inputs[j])
+    history = (past - np.tile(log.input_center, _PAST)) / np.tile(log.input_size, _PAST)
+    ones, Z = np.ones((len(V), 1)), (state - log.center) / log.size
+    by_past = (fit_residuals(np.hstack([ones, history]), V) ** 2).mean(axis=0)
+    by_both = (fit_residuals(np.hstack([ones, history, Z]), V) ** 2).mean(axis=0)
+    targets = np.hstack([V, history[:, :nu]])  # u_k and u_{k−1}
+    by_state, previous = np.split((fit_residuals(np.hstack([ones, Z]), targets) ** 2).mean(axis=0), 2)
+    variance = np.maximum((V**2).mean(axis=0) - V.mean(axis=0) ** 2, 1e-300)
+    for j in np.flatnonzero(variance > 1e-12):
+        innovation = 1 - by_both[j] / max(by_past[j], 1e-300)
+        exact = by_state[j] < 1e-8 * variance[j]
+        explained = by_state[j] < (1 - _FEEDBACK) * variance[j] and by_state[j] < previous[j]
+        if exact or (explained and innovation > _INNOVATION and by_past[j] > _UNPREDICTED * variance[j]):
+            name = strip_unit(log.data.inputs[j])
             yield LogFault(
                 "feedback",
-                f"the states tell {percent(1 - alone[j] / around[j])} of {name}: it was a feedback, so that A and B "
-                "cannot be told apart",
+                f"the states explain {to_percent(1 - by_state[j] / variance[j])} of {name}: it was a feedback, so the "
+                "data cannot separate A from B",
                 f"add noise to {name} while logging: km.Feedback(K, km.Noise(…))",
                 (log.data.inputs[j],),
             )

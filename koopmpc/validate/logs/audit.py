@@ -1,4 +1,4 @@
-"""audit: all checks of logs in one call, what the time stamps of rows show, and the report."""
+"""`audit` runs all checks of logs, checks the time stamps of their rows, and reports the faults."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -10,39 +10,51 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
 from koopmpc.errors import DataError
+from koopmpc.terminal import label_lines, render_text
+from koopmpc.text import to_percent
 from koopmpc.validate.logs import values
-from koopmpc.validate.logs.alignment import ending, feedback, late, together, without_effect
-from koopmpc.validate.logs.changes import midway
-from koopmpc.validate.logs.log import Log, LogFault, Place, listed, runs
-from koopmpc.validate.text import labelled, percent, written
+from koopmpc.validate.logs.alignment import (
+    find_dependent_inputs,
+    find_feedback,
+    find_inputs_without_effect,
+    find_late_signals,
+    find_saturated_actuators,
+)
+from koopmpc.validate.logs.changes import find_changes
+from koopmpc.validate.logs.log import Log, LogFault, Place, find_stretches, list_places
 from koopmpc.values import Value
 
 Check = Callable[[Log], Iterator[LogFault]]
-_VALUES: tuple[Check, ...] = (
-    values.repeated_columns,
-    values.repeated_episodes,
-    values.quantised,
-    values.slow,
-    values.wrapped,
-    values.stuck,
-    values.saturated,
-    values.held,
-    values.outliers,
+_VALUE_CHECKS: tuple[Check, ...] = (
+    values.find_repeated_columns,
+    values.find_repeated_episodes,
+    values.find_coarse_sensors,
+    values.find_slow_sensors,
+    values.find_wrapped_angles,
+    values.find_stuck_sensors,
+    values.find_saturated_sensors,
+    values.find_held_samples,
+    values.find_outliers,
 )
-_INPUTS: tuple[Check, ...] = (values.constant, together, values.excitation, feedback)
-_MOST = 200_000  # steps that are looked at
+_INPUT_CHECKS: tuple[Check, ...] = (
+    values.find_constant_inputs,
+    find_dependent_inputs,
+    values.find_low_excitation,
+    find_feedback,
+)
+_MOST_STEPS = 200_000  # check at most this many steps, those of the first episodes
 
 
 @dataclass(frozen=True, eq=False)
 class AuditReport(Value):
-    """The faults of logs; `print` shows each with what to do about it.
+    """The faults of logs; `print` shows each fault with its remedy.
 
     Attributes
     ----------
     faults
-        The faults that were found.
+        The faults.
     episodes, steps
-        How many episodes and steps were looked at.
+        Number of episodes and steps that were checked.
     """
 
     faults: tuple[LogFault, ...]
@@ -56,16 +68,16 @@ class AuditReport(Value):
 
     @property
     def delay(self) -> int:
-        """Steps of the past that a model needs for the signals that are late; 0 where none is."""
+        """Number of past steps that a model needs because signals are late; 0 if every signal is in time."""
         return max((fault.steps for fault in self.faults), default=0)
 
     def without_faults(self, data: Episodes) -> Episodes:
-        """Return the data without the rows at fault: episodes are cut there, and pieces of one row are dropped.
+        """Return the data without the faulty rows: episodes are cut there, and pieces of one row are dropped.
 
         Raises
         ------
         DataError
-            Nothing would be left.
+            Every row is faulty.
         """
         rest = Remainder.of(data).without([place for fault in self.faults for place in fault.places])
         if rest is None:
@@ -73,92 +85,95 @@ class AuditReport(Value):
         return rest.data
 
     def __str__(self) -> str:
-        """Return the report: a verdict, then each fault with what to do."""
-        looked = f"{self.episodes} episode{'s' * (self.episodes > 1)}, {self.steps} steps"
+        """Return the report: a summary, then each fault with its remedy."""
+        checked = f"{self.episodes} episode{'s' * (self.episodes > 1)}, {self.steps} steps"
         if not self.faults:
-            return f"no fault found in {looked}"
+            return f"no fault found in {checked}"
         count = len(self.faults)
         pairs = [(fault.name, f"{fault.says}. {fault.do[0].upper()}{fault.do[1:]}.") for fault in self.faults]
-        return written(f"{count} fault{'s' * (count > 1)} found in {looked}", labelled(pairs))
+        return render_text(f"{count} fault{'s' * (count > 1)} found in {checked}", label_lines(pairs))
 
 
 def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditReport:
     """Look for faults of recorders, sensors and actuators in logs, before a model is fitted to them.
 
-    Values: a live sensor never repeats a number. Repeated numbers show a sensor that is stuck, at its limit, coarse or
-    slow; samples that were held or lost; rows or episodes that stand twice. Inputs: some do not move, move together,
-    have no effect, excite too little, or follow from the state. Alignment: a one-step regression on the present row
-    predicts better once a late input or sensor is put where it belongs, or an input is clipped where its actuator
-    ends. Changes: an episode follows the law of the others once a sign, unit, offset, order of columns or sample time
-    is corrected. Rows that single values show to be at fault are cut out before the regressions.
+    - Values: a live sensor never repeats a number. Repeated numbers show a sensor that is stuck, at its limit, coarse
+      or slow. They also show held or lost samples, and rows or episodes that were recorded twice.
+    - Inputs: some do not move, move together, have no effect, excite too little, or follow from the state.
+    - Alignment: a one-step regression on the present row predicts better after a late signal is shifted to its true
+      row, or after an input is clipped at the limit of its actuator.
+    - Changes: an episode follows the law of the others after a sign, unit, offset, order of columns or sample time is
+      corrected.
+
+    The regressions leave out the rows that the checks of single values report.
 
     Parameters
     ----------
     data
-        The episodes; of more than 200,000 steps the first 200,000 are looked at.
+        The episodes; if there are more than 200,000 steps, the audit checks the first 200,000.
     times
-        (T+1,) time stamps [s] of the rows of each episode, for jitter and resets of the clock; without them the clock
-        is not looked at. `load_episodes` cuts at resets, and refuses steps that differ by more than 2 %.
+        (T+1,) time stamps [s] of the rows of each episode, to find jitter and resets of the clock; without them the
+        audit does not check the clock. `load_episodes` cuts at resets, and refuses steps that differ by more than 2 %.
 
     Raises
     ------
     DataError
-        The data are no Episodes, or the times do not fit them.
+        The data are not Episodes, or the times do not match them.
     """
-    data = _first(episodes_of(data))
-    faults = [] if times is None else list(clock_faults(data, times))
+    data = _take_first(episodes_of(data))
+    faults = [] if times is None else list(find_clock_faults(data, times))
     log = Log(data)
-    for check in (*_VALUES, *(_INPUTS if data.nu else ())):
+    for check in (*_VALUE_CHECKS, *(_INPUT_CHECKS if data.nu else ())):
         faults += check(log)
     kinds = {fault.name for fault in faults}
-    whole = Remainder.of(_unwrapped(data, values.turns(log)))
+    whole = Remainder.of(_unwrap_angles(data, values.find_whole_turns(log)))
     rest = whole.without([p for fault in faults for p in fault.places])
-    for check in (without_effect, midway, values.jumps):
-        if rest is None or (check is without_effect and kinds & {"feedback", "inputs together"}):
+    for check in (find_inputs_without_effect, find_changes, values.find_jumps):
+        if rest is None or (check is find_inputs_without_effect and kinds & {"feedback", "inputs together"}):
             continue
-        found = [rest.original(fault) for fault in check(Log(rest.data))]
-        faults += found
-        rest = whole.without([p for fault in faults for p in fault.places]) if found else rest
-    rough = bool(values.coarse(log) or values.slow_states(log))
+        new_faults = [rest.locate_fault(fault) for fault in check(Log(rest.data))]
+        faults += new_faults
+        rest = whole.without([p for fault in faults for p in fault.places]) if new_faults else rest
+    rough = bool(values.find_coarse_states(log) or values.find_slow_states(log))
     if rest is not None and not rough and "inputs together" not in kinds:
-        lags = list(late(Log(rest.data)))
-        faults += lags or list(ending(Log(rest.data)))
+        late_signals = list(find_late_signals(Log(rest.data)))
+        faults += late_signals or list(find_saturated_actuators(Log(rest.data)))
     return AuditReport(tuple(faults), len(data), sum(map(len, data)))
 
 
-def _first(data: Episodes) -> Episodes:
-    """Return the first episodes, up to the steps that are looked at."""
+def _take_first(data: Episodes) -> Episodes:
+    """Return the first episodes, with at most the number of steps that the audit checks."""
     ends = np.cumsum([len(episode) for episode in data])
-    return data[: max(int(np.searchsorted(ends, _MOST, side="right")), 1)]
+    return data[: max(int(np.searchsorted(ends, _MOST_STEPS, side="right")), 1)]
 
 
-def _unwrapped(data: Episodes, whole_turns: dict[int, float]) -> Episodes:
-    """Return the episodes with these states continued beyond each turn."""
+def _unwrap_angles(data: Episodes, whole_turns: dict[int, float]) -> Episodes:
+    """Return the episodes with these angles unwrapped along time."""
     if not whole_turns:
         return data
-    made: list[Episode] = []
+    unwrapped: list[Episode] = []
     for episode in data:
         X = episode.X.copy()
         for i, turn in whole_turns.items():
             X[:, i] = np.unwrap(X[:, i], period=turn)
-        made.append(Episode(X=X, U=episode.U, W=episode.W))
-    return data.with_episodes(made)
+        unwrapped.append(episode.with_states(X))
+    return data.with_episodes(unwrapped)
 
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """The pieces that are left of episodes once rows are cut out, and where each piece was."""
+    """The pieces of episodes that remain after rows are cut out, and the original place of each piece."""
 
     data: Episodes
     origins: tuple[Place, ...]
 
     @classmethod
     def of(cls, data: Episodes) -> "Remainder":
-        """Return the data as they are, nothing cut out."""
+        """Return the complete data."""
         return cls(data, tuple(Place(e, 0, len(episode) + 1) for e, episode in enumerate(data)))
 
     def without(self, places: Sequence[Place]) -> "Remainder | None":
-        """Return the pieces of two rows or more that are left without these rows; None where there is none."""
+        """Return the pieces of two rows or more that remain without these rows, or None if nothing remains."""
         pieces: list[Episode] = []
         origins: list[Place] = []
         for e, episode in enumerate(self.data):
@@ -171,54 +186,55 @@ class Remainder:
                     joined[place.first] = False
                 else:
                     good[place.first : place.last] = False
-            for a, b in runs(good[:-1] & good[1:] & joined):
-                pieces.append(Episode(X=episode.X[a : b + 1], U=episode.U[a:b], W=episode.W[a:b]))
+            for a, b in find_stretches(good[:-1] & good[1:] & joined):
+                pieces.append(episode.cut(a, b))
                 origins.append(Place(e, a, b + 1))
         return Remainder(self.data.with_episodes(pieces), tuple(origins)) if pieces else None
 
-    def original(self, fault: LogFault) -> LogFault:
+    def locate_fault(self, fault: LogFault) -> LogFault:
         """Return the fault with its places in the original data."""
-        moved: list[Place] = []
+        places: list[Place] = []
         for place in fault.places:
             piece = self.origins[place.episode]
-            moved.append(Place(piece.episode, place.first + piece.first, place.last + piece.first, place.jump))
-        return replace(fault, places=tuple(moved))
+            places.append(Place(piece.episode, place.first + piece.first, place.last + piece.first, place.jump))
+        says = fault.says.replace(list_places(fault.places), list_places(tuple(places)))
+        return replace(fault, says=says, places=tuple(places))
 
 
-_JITTER = 0.02  # share of dt by which a step may differ, as in load_episodes
-_GAP = 1.5  # a step longer than 1.5 dt is a gap
-_OTHER = 0.1  # share of dt by which the median step of an episode must differ to be another rate
+_JITTER = 0.02  # a step may differ from dt by this share, as in load_episodes
+_GAP = 1.5  # a step longer than this many dt is a gap
+_OTHER_RATE = 0.1  # an episode has another rate if its median step differs from dt by more than this share
 
 
-def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFault]:
-    """Find the faults that the time stamps of the rows show.
+def find_clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFault]:
+    """Find faults in the time stamps of the rows.
 
     Raises
     ------
     DataError
-        There are not as many time stamps as rows.
+        The number of time stamps differs from the number of rows.
     """
     if len(times) != len(data):
         raise DataError(f"times are given for {len(times)} episodes, the data have {len(data)}; pass one array each")
     steps = [
-        np.diff(checks.vector(own, f"times of episode {e}", len(episode) + 1))
-        for e, (own, episode) in enumerate(zip(times, data, strict=True))
+        np.diff(checks.vector(stamps, f"times of episode {e}", len(episode) + 1))
+        for e, (stamps, episode) in enumerate(zip(times, data, strict=True))
     ]
-    every = np.concatenate(steps)
-    forward = every[every > 0]
+    all_steps = np.concatenate(steps)
+    forward = all_steps[all_steps > 0]
     if not len(forward):
         raise DataError("the times never advance; pass the time of each row in seconds")
     dt = float(np.median(forward))
-    resets = _places(steps, lambda d: d <= 0)
+    resets = _find_steps(steps, lambda d: d <= 0)
     if resets:
         yield LogFault(
             "clock reset",
-            f"the clock goes back or stands still {len(resets)} times: {listed(resets)}",
+            f"the clock goes back or stands still {len(resets)} times: {list_places(resets)}",
             "cut the episodes there: load_episodes does where it goes back",
             places=resets,
         )
-    gaps = _places(steps, lambda d: d > _GAP * dt)
-    other = [e for e, d in enumerate(steps) if abs(np.median(d) - dt) > _OTHER * dt]
+    gaps = _find_steps(steps, lambda d: d > _GAP * dt)
+    other = [e for e, d in enumerate(steps) if abs(np.median(d) - dt) > _OTHER_RATE * dt]
     if other:
         shown = ", ".join(f"episode {e} {np.median(steps[e]):.4g} s" for e in other[:3])
         yield LogFault(
@@ -231,7 +247,7 @@ def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFaul
     if gaps:
         yield LogFault(
             "jump",
-            f"rows are missing {len(gaps)} times, by the clock: {listed(gaps)}",
+            f"rows are missing {len(gaps)} times, by the clock: {list_places(gaps)}",
             "cut the episodes there: load_episodes does",
             places=gaps,
         )
@@ -242,11 +258,11 @@ def clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[LogFaul
     if uneven.any():
         yield LogFault(
             "jitter",
-            f"{percent(float(uneven.mean()))} of the steps differ from {dt:.4g} s by more than 2 %, from "
+            f"{to_percent(float(uneven.mean()))} of the steps differ from {dt:.4g} s by more than 2 %, from "
             f"{usual.min():.4g} to {usual.max():.4g} s",
             f"interpolate to equal steps: load_episodes(…, resample={dt:.4g})",
         )
 
 
-def _places(steps: list[Float[np.ndarray, " T"]], found: Callable[[np.ndarray], np.ndarray]) -> tuple[Place, ...]:
-    return tuple(Place(e, k, k + 2, jump=True) for e, d in enumerate(steps) for k in np.flatnonzero(found(d)).tolist())
+def _find_steps(steps: list[Float[np.ndarray, " T"]], test: Callable[[np.ndarray], np.ndarray]) -> tuple[Place, ...]:
+    return tuple(Place(e, k, k + 2, jump=True) for e, d in enumerate(steps) for k in np.flatnonzero(test(d)).tolist())

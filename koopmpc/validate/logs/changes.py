@@ -1,8 +1,8 @@
-"""Faults that begin midway: a part of the log follows the law of the rest once a sign, a unit or an order is corrected.
+"""Faults that begin midway: a part of the log follows the law of the rest after a sign, unit or order is corrected.
 
-The log is cut into segments. A consensus of them, found by least trimmed squares, gives a one-step law. Each segment
-that does not follow it is tried under every change that a recorder may have suffered; one that brings the segment back
-to the law is the fault. A segment that no change explains is another regime of the plant, and no fault of the log.
+The log is cut into segments. Least trimmed squares fits a one-step law to a consensus of them. For each segment that
+does not follow this law, every possible change of the recording is undone in turn. If the segment then follows the law,
+the change is the fault. If no change explains a segment, the plant was in another regime, which is not a fault.
 
 References
 ----------
@@ -17,22 +17,23 @@ from itertools import combinations, pairwise
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.lifting.base import short
-from koopmpc.validate.logs.log import Log, LogFault, Place, episodes_of_places, solved
+from koopmpc.lifting.base import strip_unit
+from koopmpc.validate.logs.log import Log, LogFault, Place, name_episodes, solve_weights
 
-_SEGMENTS = 40
-_SHORTEST = 30  # rows of a segment
-_SHARE = 0.6  # of the segments that agree on a law
-_RESTARTS = 12
-_TRIED = 4  # segments by which an offset is found
-_GAIN = 0.5  # nats a row and state that a change must win
-_SHIFTED = 0.8  # the same for an offset, which is fitted: a misfit far away may win 0.75 by one
-_MOST = 0.5  # share of what a segment is off that undoing must win
-_NOTHING, _TURN = 0.05, 0.3  # rad by which the offset of an angle may miss 0, and whole turns: then it is no fault
-_REFINED = 9  # rounds in which an offset is narrowed down, each by a factor of six
-_SURE = 40.0  # nats in all
-_BACK = 0.7  # nats a row and state by which a segment may stay behind the consensus
-_FLOOR = 1e-8  # share of a state's size below which a residual counts as rounding
+_SEGMENTS = 40  # cut the log into about this many segments
+_SHORTEST = 30  # a segment has at least this many rows
+_SHARE = 0.6  # the consensus consists of this share of the segments
+_RESTARTS = 12  # random starts of the search for the consensus, beside two fixed ones
+_OFFSET_SEGMENTS = 4  # fit the offset of a state to at most this many segments
+_GAIN = 0.5  # nats a row and state that a segment must gain if a change is undone
+_OFFSET_GAIN = 0.8  # the same for an offset; it is fitted, and may gain 0.75 in a segment with a misfit
+_GAIN_SHARE = 0.5  # a segment must gain at least this share of the most that it can gain
+_NO_OFFSET = 0.05  # [rad] a smaller offset of an angle is not a fault
+_NO_TURN = 0.3  # [rad] an offset of an angle this close to whole turns is not a fault
+_OFFSET_ROUNDS = 9  # rounds of the search for an offset; each narrows it by a factor of six
+_SURE = 40.0  # nats over all rows that a segment must gain
+_BACK = 0.7  # after a change is undone, a segment may be this many nats a row and state worse than the consensus
+_FLOOR = 1e-8  # a residual below this share of a state's size counts as rounding
 _FACTORS = {
     "180/π": 180 / np.pi,
     "1000": 1e3,
@@ -46,12 +47,12 @@ _FACTORS = {
     "2": 2.0,
 }
 
-Pair = tuple[np.ndarray, np.ndarray]  # X (T+1, nx) and U (T, nu) of a segment
+Segment = tuple[np.ndarray, np.ndarray]  # X (T+1, nx) and U (T, nu)
 
 
 @dataclass(frozen=True, eq=False)
 class OneStepLaw:
-    """The one-step law x⁺ − x = size · W' φ(x, u) of the consensus, and its errors."""
+    """The one-step law x⁺ − x = size · Wᵀ φ(x, u) of the consensus, and its errors."""
 
     log: Log
     W: Float[np.ndarray, "p nx"]
@@ -59,71 +60,73 @@ class OneStepLaw:
 
     def step(self, X: Float[np.ndarray, "M nx"], U: Float[np.ndarray, "M nu"]) -> Float[np.ndarray, "M nx"]:
         """Return the next rows."""
-        return X + self.log.stacked(X, U) @ self.W * self.log.size
+        return X + self.log.stack_regressors(X, U) @ self.W * self.log.size
 
     def errors(self, X: Float[np.ndarray, "T1 nx"], U: Float[np.ndarray, "T nu"]) -> Float[np.ndarray, " nx"]:
-        """Return log of the root-mean-square error of each state, in nats above that of the consensus."""
+        """Return the logarithm of the root-mean-square error of each state, in nats above that of the consensus."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return self.above(X[1:] - self.step(X[:-1], U))
+            return self.rate_residuals(X[1:] - self.step(X[:-1], U))
 
-    def above(self, E: Float[np.ndarray, "T nx"]) -> Float[np.ndarray, " nx"]:
-        """Return the same of these residuals of the next rows."""
+    def rate_residuals(self, E: Float[np.ndarray, "T nx"]) -> Float[np.ndarray, " nx"]:
+        """Return the result of `errors` from residuals of the next rows."""
         E = np.nan_to_num(E / self.log.size, nan=1e6, posinf=1e6, neginf=-1e6)
         return 0.5 * np.log((E**2).mean(axis=0) + _FLOOR**2) - self.level
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """A hypothesis: what the recorder did to a segment, and the errors of the segment once that is undone.
+    """A change of the recording: a hypothesis, with the errors of a segment after the change is undone.
 
-    These errors may be larger than those of the consensus by `charged` nats, which is what undoing adds by itself. With
-    `chosen` a number was fitted or taken from a table, so that one segment can agree with it by accident: two must.
+    These errors may exceed those of the consensus by `allowance` nats, because undoing the change scales errors. If a
+    number was fitted or taken from a table (`tuned`), one segment may agree by accident; then two must agree.
     """
 
     kind: str
     columns: tuple[str, ...]
     says: str
     errors: Callable[[OneStepLaw, np.ndarray, np.ndarray], np.ndarray]
-    charged: float = 0.0
-    chosen: bool = True
+    allowance: float = 0.0
+    tuned: bool = True
 
 
-def midway(log: Log) -> Iterator[LogFault]:
-    """Find the change under which a part of the log follows the law of the rest."""
-    segments = _segments(log)
-    law, agreed = _consensus(log, segments)
+def find_changes(log: Log) -> Iterator[LogFault]:
+    """Find a change after which a part of the log no longer follows the law of the rest."""
+    places = _cut_segments(log)
+    law, agreeing = _fit_consensus(log, places)
     if law is None:
         return
-    pairs: list[Pair] = [_pair(log, place) for place in segments]
-    errors = np.array([law.errors(*pair) for pair in pairs])
-    spread = np.quantile(errors[sorted(agreed)].max(axis=1), 0.9)
-    most = (np.clip(errors, spread, None) - spread).mean(axis=1)  # what a change can win at most
-    apart = [s for s in range(len(pairs)) if s not in agreed and most[s] > _GAIN]
+    segments: list[Segment] = [_read_segment(log, place) for place in places]
+    errors = np.array([law.errors(*segment) for segment in segments])
+    spread = np.quantile(errors[sorted(agreeing)].max(axis=1), 0.9)
+    most = (np.clip(errors, spread, None) - spread).mean(axis=1)  # the most that a change can gain
+    apart = [s for s in range(len(segments)) if s not in agreeing and most[s] > _GAIN]
     if not apart:
         return
     apart = sorted(sorted(apart, key=lambda s: -errors[s].max())[:12])
     best: tuple[float, Change, list[int]] | None = None
-    for change in _hypotheses(log, law, [pairs[s] for s in apart]):
-        won, which = 0.0, list[int]()
+    for change in _list_changes(log, law, [segments[s] for s in apart]):
+        total, explained = 0.0, list[int]()
         for s in apart:
-            undone = change.errors(law, *pairs[s])
+            undone = change.errors(law, *segments[s])
             gain = float((np.clip(errors[s], spread, None) - np.clip(undone, spread, None)).mean())
-            back = undone.max() < spread + _BACK + change.charged and gain > _MOST * most[s]
-            least = _SHIFTED if change.kind == "offset change" else _GAIN
-            if gain > least and back and gain * len(pairs[s][1]) > _SURE:
-                won += gain * len(pairs[s][1])
-                which.append(s)
-        if len(which) == 1 and change.chosen:
+            follows = undone.max() < spread + _BACK + change.allowance and gain > _GAIN_SHARE * most[s]
+            least = _OFFSET_GAIN if change.kind == "offset change" else _GAIN
+            if gain > least and follows and gain * len(segments[s][1]) > _SURE:
+                total += gain * len(segments[s][1])
+                explained.append(s)
+        if len(explained) == 1 and change.tuned:
             continue
-        if which and len(log.data) == 1 and len(agreed.intersection(range(which[0], which[-1]))) > 0.2 * len(which):
-            continue  # within an episode a recorder changes once, and not back
-        if which and (best is None or won > 1.02 * best[0]):
-            best = (won, change, which)
+        if explained and len(log.data) == 1:
+            between = agreeing.intersection(range(explained[0], explained[-1]))
+            if len(between) > 0.2 * len(explained):
+                continue  # within one episode a recorder changes once, and does not change back
+        if explained and (best is None or total > 1.02 * best[0]):
+            best = (total, change, explained)
     if best is None:
         return
-    _, change, which = best
-    places = tuple(segments[s] for s in which)
-    where = episodes_of_places(places) if len(log.data) > 1 else f"from row {places[0].first} on"
+    _, change, explained = best
+    places = tuple(places[s] for s in explained)
+    where = name_episodes(places) if len(log.data) > 1 else f"from row {places[0].first} on"
     yield LogFault(
         change.kind,
         f"{change.says} in {where}: undone, these rows follow the law of the others",
@@ -133,162 +136,176 @@ def midway(log: Log) -> Iterator[LogFault]:
     )
 
 
-def _segments(log: Log) -> list[Place]:
+def _cut_segments(log: Log) -> list[Place]:
     longest = max(_SHORTEST, log.steps // _SEGMENTS)
-    made: list[Place] = []
+    places: list[Place] = []
     for e, episode in enumerate(log.data):
         count = max(len(episode) // longest, 1)
         edges = np.linspace(0, len(episode), count + 1).astype(int)
-        made += [Place(e, int(a), int(b)) for a, b in pairwise(edges)]
-    return [place for place in made if place.last - place.first >= _SHORTEST]
+        places += [Place(e, int(a), int(b)) for a, b in pairwise(edges)]
+    return [place for place in places if place.last - place.first >= _SHORTEST]
 
 
-def _pair(log: Log, place: Place) -> Pair:
+def _read_segment(log: Log, place: Place) -> Segment:
     episode = log.data[place.episode]
     return episode.X[place.first : place.last + 1], episode.U[place.first : place.last]
 
 
-def _consensus(log: Log, segments: list[Place]) -> tuple[OneStepLaw | None, set[int]]:
-    """Return the law of the 60 % of the segments that agree best, and the indices of these."""
+def _fit_consensus(log: Log, segments: list[Place]) -> tuple[OneStepLaw | None, set[int]]:
+    """Return the law of the 60 % of the segments that agree best, and the indices of these segments."""
     if len(segments) < 5:
         return None, set()
     moments: list[tuple[np.ndarray, np.ndarray, np.ndarray, int]] = []
     for place in segments:
-        X, U = _pair(log, place)
-        P, Y = log.stacked(X[:-1], U), np.diff(X, axis=0) / log.size
+        X, U = _read_segment(log, place)
+        P, Y = log.stack_regressors(X[:-1], U), np.diff(X, axis=0) / log.size
         moments.append((P.T @ P, P.T @ Y, (Y**2).sum(axis=0), len(Y)))
     grams, crosses = np.array([m[0] for m in moments]), np.array([m[1] for m in moments])
     squares, counts = np.array([m[2] for m in moments]), np.array([m[3] for m in moments])
-    kept = max(round(_SHARE * len(segments)), 3)
+    count = max(round(_SHARE * len(segments)), 3)
     if counts.sum() * _SHARE < 3 * grams.shape[1]:
         return None, set()
     rng = np.random.default_rng(0)
-    every = np.arange(len(segments))
-    starts = [every[:kept], every[-kept:], *(rng.permutation(every)[:kept] for _ in range(_RESTARTS))]
+    indices = np.arange(len(segments))
+    starts = [indices[:count], indices[-count:], *(rng.permutation(indices)[:count] for _ in range(_RESTARTS))]
     best: tuple[float, np.ndarray, np.ndarray] | None = None
-    for which in starts:
+    for chosen in starts:
         W, level = np.zeros_like(crosses[0]), np.zeros(len(segments))
         for _ in range(8):
-            W = solved(grams[which].sum(axis=0), crosses[which].sum(axis=0))
+            W = solve_weights(grams[chosen].sum(axis=0), crosses[chosen].sum(axis=0))
             missed = squares - 2 * (crosses * W).sum(axis=1) + np.einsum("pi,spq,qi->si", W, grams, W)
             level = 0.5 * np.log(np.maximum(missed, 0) / counts[:, None] + _FLOOR**2).mean(axis=1)
-            again = np.sort(np.argsort(level)[:kept])
-            if np.array_equal(again, which):
+            closest = np.sort(np.argsort(level)[:count])
+            if np.array_equal(closest, chosen):
                 break
-            which = again
-        total = float(np.sum(level[which]))
+            chosen = closest
+        total = float(np.sum(level[chosen]))
         if best is None or total < best[0]:
-            best = (total, which, W)
+            best = (total, chosen, W)
     assert best is not None
     law = OneStepLaw(log, best[2], np.zeros(log.data.nx))
-    level = np.median([law.errors(*_pair(log, segments[int(s)])) for s in best[1]], axis=0)
+    level = np.median([law.errors(*_read_segment(log, segments[int(s)])) for s in best[1]], axis=0)
     return OneStepLaw(log, best[2], level), {int(s) for s in best[1]}
 
 
-def _hypotheses(log: Log, law: OneStepLaw, pairs: list[Pair]) -> Iterator[Change]:
+def _list_changes(log: Log, law: OneStepLaw, segments: list[Segment]) -> Iterator[Change]:
+    """Yield the changes of sign, order, unit, offset and sample time that a recorder may make."""
     data = log.data
     flipped = "has the other sign"
     for i, name in enumerate(data.states):
-        yield Change("sensor sign", (name,), f"{short(name)} {flipped}", partial(_scaled_state, i, -1.0), chosen=False)
+        yield Change(
+            "sensor sign", (name,), f"{strip_unit(name)} {flipped}", partial(_rescale_state, i, -1.0), tuned=False
+        )
     for j, name in enumerate(data.inputs):
-        yield Change("input sign", (name,), f"{short(name)} {flipped}", partial(_scaled_input, j, -1.0), chosen=False)
+        yield Change(
+            "input sign", (name,), f"{strip_unit(name)} {flipped}", partial(_rescale_input, j, -1.0), tuned=False
+        )
     if data.nu > 1:
-        undone = partial(_scaled_input, slice(None), -1.0)
-        yield Change("input sign", data.inputs, f"every input {flipped}", undone, chosen=False)
-    for kind, names, swapped in (
-        ("swapped sensors", data.states, _swapped_states),
-        ("swapped inputs", data.inputs, _swapped_inputs),
+        undone = partial(_rescale_input, slice(None), -1.0)
+        yield Change("input sign", data.inputs, f"every input {flipped}", undone, tuned=False)
+    for kind, names, swap in (
+        ("swapped sensors", data.states, _swap_states),
+        ("swapped inputs", data.inputs, _swap_inputs),
     ):
         for i, j in combinations(range(len(names)), 2):
-            says = f"{short(names[i])} and {short(names[j])} are swapped"
-            yield Change(kind, (names[i], names[j]), says, partial(swapped, i, j), chosen=False)
-    for said, factor in _FACTORS.items():
-        for up, text in ((factor, f"{said} times as large"), (1 / factor, f"{said} times as small")):
+            says = f"{strip_unit(names[i])} and {strip_unit(names[j])} are swapped"
+            yield Change(kind, (names[i], names[j]), says, partial(swap, i, j), tuned=False)
+    for label, factor in _FACTORS.items():
+        for up, text in ((factor, f"{label} times as large"), (1 / factor, f"{label} times as small")):
             for i, name in enumerate(data.states):
-                charged = max(float(np.log(up)), 0.0)
+                allowance = max(float(np.log(up)), 0.0)
                 yield Change(
-                    "unit change", (name,), f"{short(name)} is {text}", partial(_scaled_state, i, 1 / up), charged
+                    "unit change",
+                    (name,),
+                    f"{strip_unit(name)} is {text}",
+                    partial(_rescale_state, i, 1 / up),
+                    allowance,
                 )
             for j, name in enumerate(data.inputs):
-                yield Change("unit change", (name,), f"{short(name)} is {text}", partial(_scaled_input, j, 1 / up))
+                yield Change(
+                    "unit change", (name,), f"{strip_unit(name)} is {text}", partial(_rescale_input, j, 1 / up)
+                )
     for i, name in enumerate(data.states):
-        b = _best_offset(log, law, pairs[:_TRIED], i)
+        b = _find_offset(log, law, segments[:_OFFSET_SEGMENTS], i)
         turns = round(b / (2 * np.pi))
-        if i in log.angles and abs(b - 2 * np.pi * turns) < (_TURN if turns else _NOTHING):
+        if i in log.angles and abs(b - 2 * np.pi * turns) < (_NO_TURN if turns else _NO_OFFSET):
             continue
-        yield Change("offset change", (name,), f"{short(name)} is {b:+.3g} off", partial(_moved, i, -b))
-    for r in (2, 3, 4):  # in r steps a push has moved a speed r times as far, and a position r² times
+        yield Change("offset change", (name,), f"{strip_unit(name)} is {b:+.3g} off", partial(_shift_state, i, -b))
+    for r in (2, 3, 4):  # a disturbance moves a speed r times as far in r steps, and a position r² times
         apart, close = f"as far apart ({r * data.dt:.3g} s)", f"as close ({data.dt / r:.3g} s)"
-        charged = 2 * float(np.log(r))
-        yield Change("mixed sampling", (), f"rows are {r} times {apart}", partial(_slower, r), charged)
-        yield Change("mixed sampling", (), f"rows are {r} times {close}", partial(_faster, r))
+        allowance = 2 * float(np.log(r))
+        yield Change("mixed sampling", (), f"rows are {r} times {apart}", partial(_step_repeatedly, r), allowance)
+        yield Change("mixed sampling", (), f"rows are {r} times {close}", partial(_step_average, r))
 
 
-def _scaled_state(i: int, factor: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+# Each function below returns the errors of a segment after one change is undone.
+
+
+def _rescale_state(i: int, factor: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
     X = X.copy()
     X[:, i] *= factor
-    found = law.errors(X, U)
-    found[i] -= min(float(np.log(abs(factor))), 0.0)  # a state that is scaled down has small errors in any case
-    return found
+    errors = law.errors(X, U)
+    errors[i] -= min(float(np.log(abs(factor))), 0.0)  # a state that is scaled down has small errors in any case
+    return errors
 
 
-def _scaled_input(j: int | slice, factor: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _rescale_input(j: int | slice, factor: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
     U = U.copy()
     U[:, j] *= factor
     return law.errors(X, U)
 
 
-def _swapped_states(i: int, j: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _swap_states(i: int, j: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
     X = X.copy()
     X[:, [i, j]] = X[:, [j, i]]
     return law.errors(X, U)
 
 
-def _swapped_inputs(i: int, j: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _swap_inputs(i: int, j: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
     U = U.copy()
     U[:, [i, j]] = U[:, [j, i]]
     return law.errors(X, U)
 
 
-def _moved(i: int, by: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _shift_state(i: int, by: float, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
     X = X.copy()
     X[:, i] += by
     return law.errors(X, U)
 
 
-def _slower(r: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _step_repeatedly(r: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
         ahead = X[:-1]
         for _ in range(r):
             ahead = law.step(ahead, U)
-        return law.above(X[1:] - ahead)
+        return law.rate_residuals(X[1:] - ahead)
 
 
-def _faster(r: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
+def _step_average(r: int, law: OneStepLaw, X: np.ndarray, U: np.ndarray) -> np.ndarray:
     T = len(U) - r + 1
     mean = np.mean([U[s : s + T] for s in range(r)], axis=0)
     with np.errstate(over="ignore", invalid="ignore"):
-        return law.above(X[r:] - law.step(X[:T], mean))
+        return law.rate_residuals(X[r:] - law.step(X[:T], mean))
 
 
-def _best_offset(log: Log, law: OneStepLaw, pairs: list[Pair], i: int) -> float:
+def _find_offset(log: Log, law: OneStepLaw, segments: list[Segment], i: int) -> float:
     """Return the offset of state i under which the segments follow the law best."""
-    now, after = (np.concatenate([X[part] for X, _ in pairs]) for part in (slice(-1), slice(1, None)))
-    inputs, ends = np.concatenate([U for _, U in pairs]), np.cumsum([len(U) for _, U in pairs])[:-1]
+    now, after = (np.concatenate([X[part] for X, _ in segments]) for part in (slice(-1), slice(1, None)))
+    inputs, ends = np.concatenate([U for _, U in segments]), np.cumsum([len(U) for _, U in segments])[:-1]
 
-    def total(b: float) -> float:
+    def rate_offset(b: float) -> float:
         X, X_next = now.copy(), after.copy()
         X[:, i] -= b
         X_next[:, i] -= b
         with np.errstate(over="ignore", invalid="ignore"):
-            missed = np.split(X_next - law.step(X, inputs), ends)
-            return float(np.median([law.above(part).mean() for part in missed]))
+            residuals = np.split(X_next - law.step(X, inputs), ends)
+            return float(np.median([law.rate_residuals(part).mean() for part in residuals]))
 
     width = 4.0 * float(log.size[i])
     low, high = -width, width
-    for _ in range(_REFINED):
+    for _ in range(_OFFSET_ROUNDS):
         tries = np.linspace(low, high, 13)
-        best = int(np.argmin([total(float(b)) for b in tries]))
+        best = int(np.argmin([rate_offset(float(b)) for b in tries]))
         step = float(tries[1] - tries[0])
         low, high = float(tries[best]) - step, float(tries[best]) + step
     return (low + high) / 2

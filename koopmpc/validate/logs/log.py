@@ -1,4 +1,4 @@
-"""Logs as the audit reads them: columns side by side, faults with their places, and one-step regressions."""
+"""The data that every check of the audit reads: columns, places of faults, and one-step regressions."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -10,17 +10,17 @@ from jaxtyping import Bool, Float, Int
 from koopmpc.data.episodes import Episodes
 from koopmpc.values import Value
 
-_PAIRED = 6  # states up to which their products are regressors too
-_CUBED = 3  # states up to which the products of three are
-_RIDGE = 1e-10  # of the regressions, on columns of unit size
-_FINE = 0.02  # share of a change from row to row that a prediction need not tell
-ALONE = 0.2  # leverage of a row from which on so few rows are like it that nothing is known of what follows
-_SMALLEST = 1e-9  # share of a state's size below which a residual counts as rounding
+_MOST_SQUARED = 6  # up to this number of states, products of two states are regressors
+_MOST_CUBED = 3  # up to this number of states, products of three states are regressors
+_RIDGE = 1e-10  # ridge of the regressions, on columns of unit size
+_FINE = 0.02  # errors below this share of a usual change from row to row are ignored
+ALONE = 0.2  # if the leverage of a row is at least this, too few rows are similar to judge the row after it
+_ROUNDING = 1e-9  # a residual below this share of a state's size counts as rounding
 
 
 @dataclass(frozen=True)
 class Place:
-    """Rows first … last − 1 of one episode are at fault; with `jump`, only the step from the first to the last row."""
+    """Rows first … last − 1 of one episode have a fault; with `jump`, only the step from the first to the last row."""
 
     episode: int
     first: int
@@ -39,17 +39,17 @@ class LogFault(Value):
     Attributes
     ----------
     name
-        Kind of the fault, as docs/identification.md lists them.
+        Kind of the fault; docs/identification.md lists all kinds.
     says
-        What is wrong, with the numbers.
+        The fault, with its numbers.
     do
-        What to do about it, with the call.
+        The remedy, with the call.
     columns
-        Names of the states and inputs that have it.
+        Names of the states and inputs that have the fault.
     places
-        Rows that no model should be fitted to; empty where the fault is not confined to rows.
+        Rows that no model should be fitted to; empty if the fault affects the whole log.
     steps
-        Steps by which a signal is late, 0 for all other kinds.
+        Steps by which a signal is late; 0 for other kinds.
     """
 
     name: str
@@ -62,7 +62,7 @@ class LogFault(Value):
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Episodes, and the quantities that every check reads."""
+    """Episodes, and quantities of them that the checks read."""
 
     data: Episodes
 
@@ -73,27 +73,27 @@ class Log:
 
     @cached_property
     def X(self) -> Float[np.ndarray, "M nx"]:
-        """All measured states, one episode below the other."""
+        """All measured states, stacked over the episodes."""
         return np.concatenate([e.X for e in self.data])
 
     @cached_property
     def U(self) -> Float[np.ndarray, "M nu"]:
-        """All inputs, one episode below the other."""
+        """All inputs, stacked over the episodes."""
         return np.concatenate([e.U for e in self.data])
 
     @cached_property
     def changes(self) -> Float[np.ndarray, "M nx"]:
-        """Change of each state from row to row, one episode below the other."""
+        """Change of each state from row to row, stacked over the episodes."""
         return np.concatenate([np.diff(e.X, axis=0) for e in self.data])
 
     @cached_property
     def center(self) -> Float[np.ndarray, " nx"]:
-        """Median of each state, or its mean."""
+        """Median of each state."""
         return np.median(self.X, axis=0)
 
     @cached_property
     def size(self) -> Float[np.ndarray, " nx"]:
-        """Spread of each state: half of what lies between its quantiles 5 % and 95 %; 1 where it does not move."""
+        """Spread of each state: half the distance between its 5 % and 95 % quantiles; 1 if the state is constant."""
         low, high = np.quantile(self.X, [0.05, 0.95], axis=0)
         half, most = np.asarray(high - low) / 2, np.asarray(self.X.max(axis=0) - self.X.min(axis=0)) / 2
         half = np.where(half > 0, half, most)
@@ -106,32 +106,32 @@ class Log:
 
     @cached_property
     def input_size(self) -> Float[np.ndarray, " nu"]:
-        """Half the range of each input; 1 where it does not move."""
+        """Half the range of each input; 1 if the input is constant."""
         half = np.subtract(self.U.max(axis=0), self.U.min(axis=0), dtype=np.float64) / 2
         return np.where(half > 0, half, 1.0)
 
     @cached_property
     def fine(self) -> Float[np.ndarray, " nx"]:
-        """2 % of the root mean square change of each state from row to row, in its size."""
-        return np.maximum(_FINE * np.sqrt(((self.changes / self.size) ** 2).mean(axis=0)), _SMALLEST)
+        """2 % of the root-mean-square change of each state from row to row, as a share of its size."""
+        return np.maximum(_FINE * np.sqrt(((self.changes / self.size) ** 2).mean(axis=0)), _ROUNDING)
 
     @cached_property
     def steps(self) -> int:
         """Number of steps of all episodes."""
         return sum(len(e) for e in self.data)
 
-    def scaled(self, X: Float[np.ndarray, "M nx"], U: Float[np.ndarray, "M nu"]) -> tuple[np.ndarray, np.ndarray]:
-        """Return states and inputs around 0 with sizes around 1."""
+    def scale(self, X: Float[np.ndarray, "M nx"], U: Float[np.ndarray, "M nu"]) -> tuple[np.ndarray, np.ndarray]:
+        """Return states and inputs, centred and divided by their sizes."""
         return (X - self.center) / self.size, (U - self.input_center) / self.input_size
 
     def regressors(self, X: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M p"]:
-        """Return 1, the states, their products, and sines and cosines where a state may be an angle."""
+        """Return 1, the states, their products, and sines and cosines of states that may be angles."""
         Z = (X - self.center) / self.size
         n = Z.shape[1]
         parts = [np.ones((len(Z), 1)), Z]
-        if n <= _PAIRED:
-            two = _choices(n, 2)
-            three = _choices(n, 3) if n <= _CUBED else np.repeat(_choices(n, 1), 3, axis=0)
+        if n <= _MOST_SQUARED:
+            two = _choose_columns(n, 2)
+            three = _choose_columns(n, 3) if n <= _MOST_CUBED else np.repeat(_choose_columns(n, 1), 3, axis=0)
             parts.append(Z[:, two[0]] * Z[:, two[1]])
             parts.append(Z[:, three[0]] * Z[:, three[1]] * Z[:, three[2]])
         for i in self.angles:
@@ -142,83 +142,83 @@ class Log:
 
     @cached_property
     def residuals(self) -> tuple[Float[np.ndarray, "T nx"], ...]:
-        """One-step residuals of each episode in sizes of the states, of a fit without the worst 3 % of the rows."""
-        P = np.concatenate([self.stacked(e.X[:-1], e.U) for e in self.data])
+        """One-step residuals of each episode, in sizes of the states; the fit leaves out the worst 3 % of the rows."""
+        P = np.concatenate([self.stack_regressors(e.X[:-1], e.U) for e in self.data])
         Y = self.changes / self.size
-        E = fitted(P, Y)
+        E = fit_residuals(P, Y)
         for _ in range(2):
-            size = np.abs(E) / np.maximum(np.quantile(np.abs(E), 0.9, axis=0), _SMALLEST)
+            size = np.abs(E) / np.maximum(np.quantile(np.abs(E), 0.9, axis=0), _ROUNDING)
             kept = size.max(axis=1) <= np.quantile(size.max(axis=1), 0.97)
-            E = Y - P @ solved(P[kept].T @ P[kept], P[kept].T @ Y[kept])
+            E = Y - P @ solve_weights(P[kept].T @ P[kept], P[kept].T @ Y[kept])
         ends = np.cumsum([len(e) for e in self.data])[:-1]
         return tuple(np.split(E, ends))
 
     @cached_property
     def leverage(self) -> tuple[Float[np.ndarray, " T"], ...]:
-        """pᵀ(PᵀP)⁻¹p of each row p of the regressors: how much of the fit there rests on that row alone, 0 to 1."""
-        P = np.concatenate([self.stacked(e.X[:-1], e.U) for e in self.data])
-        found = np.einsum("kp,pk->k", P, solved(P.T @ P, P.T))
-        return tuple(np.split(found, np.cumsum([len(e) for e in self.data])[:-1]))
+        """Leverage pᵀ(PᵀP)⁻¹p, 0 … 1, of each row p of the regressors: the weight of the row in its own fit."""
+        P = np.concatenate([self.stack_regressors(e.X[:-1], e.U) for e in self.data])
+        leverages = np.einsum("kp,pk->k", P, solve_weights(P.T @ P, P.T))
+        return tuple(np.split(leverages, np.cumsum([len(e) for e in self.data])[:-1]))
 
-    def stacked(self, X: Float[np.ndarray, "M nx"], U: Float[np.ndarray, "M nu"]) -> Float[np.ndarray, "M p"]:
+    def stack_regressors(self, X: Float[np.ndarray, "M nx"], U: Float[np.ndarray, "M nu"]) -> Float[np.ndarray, "M p"]:
         """Return the regressors of the states, the inputs, and the products of states and inputs."""
-        Z, V = self.scaled(X, U)
+        Z, V = self.scale(X, U)
         return np.hstack([self.regressors(X), V, *(Z * V[:, [j]] for j in range(V.shape[1]))])
 
     @cached_property
     def angles(self) -> tuple[int, ...]:
-        """States that move by more than 0.3 and are not known to be in another unit than rad."""
-        free = [i for i, name in enumerate(self.data.states) if "[" not in name or "[rad]" in name]
-        return tuple(i for i in free if 0.3 < self.size[i] < 500)
+        """States in rad or without a unit whose size is between 0.3 and 500: they may be angles."""
+        candidates = [i for i, name in enumerate(self.data.states) if "[" not in name or "[rad]" in name]
+        return tuple(i for i in candidates if 0.3 < self.size[i] < 500)
 
 
 @cache
-def _choices(n: int, count: int) -> Int[np.ndarray, "count chosen"]:
-    """Return all ways to choose `count` of n columns, a column of them twice or more too."""
+def _choose_columns(n: int, count: int) -> Int[np.ndarray, "count chosen"]:
+    """Return all combinations of `count` of n columns, with repetition."""
     return np.array(list(combinations_with_replacement(range(n), count))).T
 
 
-def fitted(P: Float[np.ndarray, "M p"], Y: Float[np.ndarray, "M n"]) -> Float[np.ndarray, "M n"]:
-    """Return the residuals of the least-squares fit of Y by P, with a trace of ridge."""
-    W = solved(P.T @ P, P.T @ Y)
+def fit_residuals(P: Float[np.ndarray, "M p"], Y: Float[np.ndarray, "M n"]) -> Float[np.ndarray, "M n"]:
+    """Return the residuals of the least-squares fit of Y by P, with a tiny ridge."""
+    W = solve_weights(P.T @ P, P.T @ Y)
     return Y - P @ W
 
 
-def solved(gram: Float[np.ndarray, "p p"], cross: Float[np.ndarray, "p n"]) -> Float[np.ndarray, "p n"]:
-    """Return the weights of a regression from its moments, the columns scaled to one size."""
+def solve_weights(gram: Float[np.ndarray, "p p"], cross: Float[np.ndarray, "p n"]) -> Float[np.ndarray, "p n"]:
+    """Return the weights of a regression from its moments, with columns scaled to unit norm."""
     norm = np.sqrt(np.diag(gram))
     norm = np.where(norm > 0, norm, 1.0)
     scaled = gram / np.outer(norm, norm) + _RIDGE * np.eye(len(gram))
     return np.linalg.solve(scaled, cross / norm[:, None]) / norm[:, None]
 
 
-def information(E: Float[np.ndarray, "M n"], fine: Float[np.ndarray, " n"]) -> Float[np.ndarray, " two"]:
-    """Return −½ log det of the residuals' mean square, in nats a sample: the larger, the better the prediction.
+def compute_information(E: Float[np.ndarray, "M n"], fine: Float[np.ndarray, " n"]) -> Float[np.ndarray, " two"]:
+    """Return −½ log det of the residuals' mean square, in nats a sample; a larger value is a better prediction.
 
-    The first number counts all errors. The second takes errors below `fine` for as large as `fine`, so that it does not
-    reward a smooth misfit for being small; the first does not reward moving information from one state to another.
+    The first number counts all errors. It does not reward a move of information from one state to another. The second
+    number raises smaller errors to `fine`, so that it does not reward a tiny smooth misfit.
     """
     S = E.T @ E / len(E)
-    floors = (np.full(len(fine), _SMALLEST**2), fine**2)
+    floors = (np.full(len(fine), _ROUNDING**2), fine**2)
     return np.array([-0.5 * np.linalg.slogdet(S + np.diag(floor))[1] for floor in floors])
 
 
-def runs(flags: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
+def find_stretches(flags: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
     """Return [first, last) of each stretch of True."""
     edges = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
     return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))
 
 
-def listed(places: tuple[Place, ...]) -> str:
-    """Return the first three places in words, and how many more there are."""
+def list_places(places: tuple[Place, ...]) -> str:
+    """Return a text with the first three places and the number of further ones."""
     shown = "; ".join(str(place) for place in places[:3])
     return shown + (f"; and {len(places) - 3} more" if len(places) > 3 else "")
 
 
-def episodes_of_places(places: tuple[Place, ...]) -> str:
-    """Return the numbers of the episodes in words: "episodes 3, 4 and 7"."""
-    which = sorted({place.episode for place in places})
-    if len(which) == 1:
-        return f"episode {which[0]}"
-    shown = ", ".join(map(str, which[:6]))
-    return f"episodes {shown}{', …' if len(which) > 6 else ''}"
+def name_episodes(places: tuple[Place, ...]) -> str:
+    """Return a text with the numbers of the episodes, such as "episodes 3, 4, 7"."""
+    numbers = sorted({place.episode for place in places})
+    if len(numbers) == 1:
+        return f"episode {numbers[0]}"
+    shown = ", ".join(map(str, numbers[:6]))
+    return f"episodes {shown}{', …' if len(numbers) > 6 else ''}"

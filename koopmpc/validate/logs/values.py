@@ -1,6 +1,6 @@
-"""Faults that the rows themselves show: numbers repeat or stand still where a live signal moves, or leave its path.
+"""Faults in single values: numbers that repeat or stand still while the plant moves, spikes, jumps and constant inputs.
 
-The noise of a live sensor never repeats a number, a faulty one does.
+A live sensor has noise and never repeats a number; a faulty sensor does.
 """
 
 from collections import Counter
@@ -10,22 +10,24 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.lifting.base import short
-from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, episodes_of_places, listed, runs
+from koopmpc.lifting.base import strip_unit
+from koopmpc.text import to_percent
+from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, find_stretches, list_places, name_episodes
 from koopmpc.validate.sufficiency import persistency
-from koopmpc.validate.text import percent
 
-_GRID = 0.95  # share of a sensor's different values that stand on a grid
-_COARSE = 0.3  # of a usual change from row to row, from which on a grid is coarse
-_LONG = 12  # rows without any change from which on a sensor is stuck
-_AT_LIMIT = 8  # rows at the same extreme value from which on a sensor is at its limit
-_RESTS = 0.1  # of a usual change: where the law misses less than this, a state that stands still is at rest
-_OVERLAP = 10  # rows that two episodes share
-_FAR = 3.0  # times the largest usual step: a jump
+_GRID_SHARE = 0.95  # a sensor has a grid if at least this share of its values are multiples of one step
+_COARSE = 0.3  # a grid is coarse if its step exceeds this share of a usual change from row to row
+_STUCK_ROWS = 12  # a sensor is stuck if it repeats a number for this many rows
+_LIMIT_ROWS = 8  # a sensor is at its limit if at least this many rows have the same extreme value
+_REST = 0.1  # a constant state is at rest if the one-step law predicts it to this share of a usual change
+_OVERLAP = 10  # two episodes repeat one another if they share this many successive rows
+_FAR = 3.0  # a spike is larger than this many times the largest usual change
+_JUMP = 1.5  # a jump is larger than this many times the largest usual change from row to row
+_OFF = 10.0  # at a jump the residual is larger than this many times the largest usual residual
 
 
-def repeated_columns(log: Log) -> Iterator[LogFault]:
-    """Find states that equal another one times a constant: one signal under two names."""
+def find_repeated_columns(log: Log) -> Iterator[LogFault]:
+    """Find states that equal another state times a constant: one signal under two names."""
     Z = log.X - log.X.mean(axis=0)
     norm = np.linalg.norm(Z, axis=0)
     moves = norm > 1e-12 * (1 + np.abs(log.X).max(axis=0)) * np.sqrt(len(Z))
@@ -34,7 +36,7 @@ def repeated_columns(log: Log) -> Iterator[LogFault]:
             if moves[i] and moves[j]:
                 unit = Z[:, j] / norm[j] - np.sign(Z[:, i] @ Z[:, j]) * Z[:, i] / norm[i]
                 if np.abs(unit).max() * np.sqrt(len(Z)) < 1e-7:
-                    first, second = short(log.data.states[i]), short(log.data.states[j])
+                    first, second = strip_unit(log.data.states[i]), strip_unit(log.data.states[j])
                     factor = norm[j] / norm[i] * np.sign(Z[:, i] @ Z[:, j])
                     yield LogFault(
                         "repeated column",
@@ -45,80 +47,80 @@ def repeated_columns(log: Log) -> Iterator[LogFault]:
                     break
 
 
-def repeated_episodes(log: Log) -> Iterator[LogFault]:
-    """Find rows that stand in two episodes: they would train a model and judge it."""
+def find_repeated_episodes(log: Log) -> Iterator[LogFault]:
+    """Find rows that two episodes share: a model would be fitted to them and judged by them."""
     seen: dict[bytes, tuple[int, int]] = {}
     places: list[Place] = []
-    first_of: set[int] = set()
+    originals: set[int] = set()
     for e, episode in enumerate(log.data):
         rows = np.ascontiguousarray(np.hstack([episode.X[:-1], episode.U]))
         moves = np.concatenate([np.ptp(episode.X, axis=0) > 0, np.ptp(episode.U, axis=0) > 0])
         if len(rows) < _OVERLAP or not moves.any():
             continue
         keys = [row.tobytes() for row in rows]
-        again = np.array([key in seen and seen[key][0] != e for key in keys])
-        for a, b in runs(again):
+        repeated = np.array([key in seen and seen[key][0] != e for key in keys])
+        for a, b in find_stretches(repeated):
             if b - a >= _OVERLAP and (np.ptp(rows[a:b], axis=0) > 0).any():
                 places.append(Place(e, a, b + 1))
-                first_of.add(seen[keys[a]][0])
+                originals.add(seen[keys[a]][0])
         for k, key in enumerate(keys):
             seen.setdefault(key, (e, k))
     if places:
         yield LogFault(
             "repeated episode",
-            f"{episodes_of_places(tuple(places))} repeat rows of episode {min(first_of)}"
-            + ("" if len(first_of) == 1 else " and others"),
+            f"{name_episodes(tuple(places))} repeat rows of episode {min(originals)}"
+            + ("" if len(originals) == 1 else " and others"),
             "keep one of them: a model would be judged by rows that it was fitted to",
             places=tuple(places),
         )
 
 
-def grid(column: Float[np.ndarray, " M"]) -> float:
-    """Return the step of the grid on which the values of a sensor stand, 0 where they stand on none."""
+def find_grid_step(column: Float[np.ndarray, " M"]) -> float:
+    """Return the step of the grid of a sensor's values, or 0 if they have no grid."""
     values = np.unique(column)
     if len(values) < 3 or len(values) > max(len(column) / 3, 3):
         return 0.0
     gaps = np.diff(values)
-    whole = gaps[gaps > 1e-9 * np.ptp(values)]
-    if not len(whole):
+    gaps = gaps[gaps > 1e-9 * np.ptp(values)]
+    if not len(gaps):
         return 0.0
-    step = float(np.quantile(whole, 0.02))
-    near = whole / step
-    off = np.abs(near - np.round(near))
-    return step if np.mean(off < 0.01) >= _GRID else 0.0
+    step = float(np.quantile(gaps, 0.02))
+    multiples = gaps / step
+    off = np.abs(multiples - np.round(multiples))
+    return step if np.mean(off < 0.01) >= _GRID_SHARE else 0.0
 
 
-def quantised(log: Log) -> Iterator[LogFault]:
-    """Find sensors whose resolution is coarse against their usual step."""
-    for i, step in coarse(log).items():
-        name, usual = short(log.data.states[i]), np.median(np.abs(log.changes[:, i]))
+def find_coarse_sensors(log: Log) -> Iterator[LogFault]:
+    """Find sensors whose resolution is coarse in comparison with a usual change."""
+    for i, step in find_coarse_states(log).items():
+        name, usual = strip_unit(log.data.states[i]), np.median(np.abs(log.changes[:, i]))
         yield LogFault(
             "quantised",
             f"{name} moves in steps of {step:.3g}, and half of its changes from row to row are below "
-            f"{usual:.3g}: its resolution hides what a model is to learn",
+            f"{usual:.3g}: its resolution hides what a model should learn",
             "log it with more digits, or sample more slowly; else let the model see more rows: embedding=km.Delay(2)",
             (log.data.states[i],),
         )
 
 
-def coarse(log: Log) -> dict[int, float]:
-    """Return the grid of each state whose sensor is too coarse."""
-    found: dict[int, float] = {}
+def find_coarse_states(log: Log) -> dict[int, float]:
+    """Return the grid step of each state whose sensor is too coarse."""
+    steps: dict[int, float] = {}
     for i in range(log.data.nx):
-        step = grid(log.X[:, i])
+        step = find_grid_step(log.X[:, i])
         if step > 0:
             changes = np.abs(log.changes[:, i])
             if step > _COARSE * float(np.quantile(changes, 0.75)) or np.mean(changes == 0) > 0.2:
-                found[i] = step
-    return found
+                steps[i] = step
+    return steps
 
 
-def slow(log: Log) -> Iterator[LogFault]:
-    """Find sensors that show a new value every second row, or less often."""
-    for i in slow_states(log):
+def find_slow_sensors(log: Log) -> Iterator[LogFault]:
+    """Find sensors that show a new value in every second row or less often."""
+    for i in find_slow_states(log):
         zero = log.changes[:, i] == 0
         every = round(1 / max(1 - float(zero.mean()), 1e-3))
-        name = short(log.data.states[i])
+        name = strip_unit(log.data.states[i])
         yield LogFault(
             "slow sensor",
             f"{name} shows a new value every {every} rows only and repeats it in between",
@@ -127,10 +129,10 @@ def slow(log: Log) -> Iterator[LogFault]:
         )
 
 
-def slow_states(log: Log) -> list[int]:
+def find_slow_states(log: Log) -> list[int]:
     """Return the states that repeat their value at regular rows throughout."""
-    found: list[int] = []
-    rough = coarse(log)
+    states: list[int] = []
+    rough = find_coarse_states(log)
     for i in range(log.data.nx):
         gaps: list[int] = []
         for e in log.data:
@@ -139,88 +141,89 @@ def slow_states(log: Log) -> list[int]:
             continue
         usual, count = Counter(gaps).most_common(1)[0]
         if usual > 1 and count > 0.6 * len(gaps):
-            found.append(i)
-    return found
+            states.append(i)
+    return states
 
 
-def stuck(log: Log) -> Iterator[LogFault]:
-    """Find sensors that stand still for a while though the other states move."""
-    rough, lazy = coarse(log), slow_states(log)
+def find_stuck_sensors(log: Log) -> Iterator[LogFault]:
+    """Find sensors that stand still for a while although other signals move."""
+    rough, lazy = find_coarse_states(log), find_slow_states(log)
     places: dict[int, list[Place]] = {}
     at_end: dict[int, list[Place]] = {}
     low, high = log.X.min(axis=0), log.X.max(axis=0)
     moving = [i for i in range(log.data.nx) if i not in lazy and low[i] != high[i]]
-    longest = {i: max(_LONG, 6 * _longest_usual(log, i)) if i in rough else _LONG for i in moving}
+    longest = {i: max(_STUCK_ROWS, 6 * _usual_stay(log, i)) if i in rough else _STUCK_ROWS for i in moving}
     for e, episode in enumerate(log.data):
         for i in moving:
             others = np.delete(episode.X, i, axis=1) / np.delete(log.size, i)
             others = np.hstack([others, np.vstack([episode.U, episode.U[-1:]]) / log.input_size])
-            for a, b in runs(np.diff(episode.X[:, i]) == 0):
+            for a, b in find_stretches(np.diff(episode.X[:, i]) == 0):
                 if b - a < longest[i] or not others.shape[1]:
                     continue
                 moved = np.mean(np.diff(others[a : b + 1], axis=0) != 0, axis=0) > 0.5
                 if np.ptp(others[a : b + 1], axis=0)[moved].max(initial=0.0) > 0.05:
-                    where = at_end if episode.X[a, i] in (low[i], high[i]) else places
-                    where.setdefault(i, []).append(Place(e, a, b + 1))
-    for i, found in at_end.items():
-        values = {float(log.data[p.episode].X[p.first, i]) for p in found}
-        alone = len(found) == 1 or any(p.last - p.first == len(log.data[p.episode].X) for p in found)
-        if i in places or (alone and len(values) == 1 and i not in limits(log)):
-            places.setdefault(i, []).extend(found)
-    for i, found in places.items():
-        name = short(log.data.states[i])
+                    stays = at_end if episode.X[a, i] in (low[i], high[i]) else places
+                    stays.setdefault(i, []).append(Place(e, a, b + 1))
+    for i, stays in at_end.items():
+        values = {float(log.data[p.episode].X[p.first, i]) for p in stays}
+        alone = len(stays) == 1 or any(p.last - p.first == len(log.data[p.episode].X) for p in stays)
+        if i in places or (alone and len(values) == 1 and i not in find_sensor_limits(log)):
+            places.setdefault(i, []).extend(stays)
+    for i, stays in places.items():
+        name = strip_unit(log.data.states[i])
         yield LogFault(
             "stuck sensor",
-            f"{name} stands still while other signals move: {listed(tuple(found))}",
+            f"{name} stands still while other signals move: {list_places(tuple(stays))}",
             "leave these rows out",
             (log.data.states[i],),
-            tuple(found),
+            tuple(stays),
         )
 
 
-def _longest_usual(log: Log, i: int) -> int:
-    lengths = [b - a for e in log.data for a, b in runs(np.diff(e.X[:, i]) == 0)]
+def _usual_stay(log: Log, i: int) -> int:
+    """Return the 90 % quantile of the number of steps for which state i repeats its value."""
+    lengths = [b - a for e in log.data for a, b in find_stretches(np.diff(e.X[:, i]) == 0)]
     return int(np.quantile(lengths, 0.9)) if lengths else 0
 
 
-def limits(log: Log) -> dict[int, tuple[float, ...]]:
-    """Return for each state the extreme values at which its sensor stays, though the others tell that it moves on."""
-    found: dict[int, tuple[float, ...]] = {}
-    known = {*coarse(log), *slow_states(log)}  # their numbers repeat in any case
+def find_sensor_limits(log: Log) -> dict[int, tuple[float, ...]]:
+    """Return for each state the extreme values at which its sensor stays although the state moves on."""
+    ends: dict[int, tuple[float, ...]] = {}
+    repeating = {*find_coarse_states(log), *find_slow_states(log)}  # their numbers repeat in any case
     for i in range(log.data.nx):
         low, high = float(log.X[:, i].min()), float(log.X[:, i].max())
-        if low == high or i in known:
+        if low == high or i in repeating:
             continue
         for end in (low, high):
-            stays = [b - a for e in log.data for a, b in runs(e.X[:, i] == end)]
-            often = sum(stays) >= max(_AT_LIMIT, 0.002 * len(log.X)) and len(stays) > 1
-            if often and np.mean(np.array(stays) > 1) > 0.2 and not _at_rest(log, i, end):
-                found[i] = (*found.get(i, ()), end)
-    return found
+            stays = [b - a for e in log.data for a, b in find_stretches(e.X[:, i] == end)]
+            often = sum(stays) >= max(_LIMIT_ROWS, 0.002 * len(log.X)) and len(stays) > 1
+            if often and np.mean(np.array(stays) > 1) > 0.2 and not _is_at_rest(log, i, end):
+                ends[i] = (*ends.get(i, ()), end)
+    return ends
 
 
-def _at_rest(log: Log, i: int, end: float) -> bool:
-    """Return True where the one-step law has this state stand still at this value: the plant rests there."""
+def _is_at_rest(log: Log, i: int, end: float) -> bool:
+    """Return True if the one-step law predicts that this state stays at this value: then the plant rests there."""
     stays = [(e.X[1:, i] == end) & (e.X[:-1, i] == end) for e in log.data]
-    missed = np.concatenate([E[own, i] for E, own in zip(log.residuals, stays, strict=True)])
+    residuals = np.concatenate([E[stay, i] for E, stay in zip(log.residuals, stays, strict=True)])
     changes = log.changes[:, i] / log.size[i]
-    return bool((missed**2).sum() < _RESTS**2 * len(missed) * (changes**2).mean())
+    return bool((residuals**2).sum() < _REST**2 * len(residuals) * (changes**2).mean())
 
 
-def saturated(log: Log) -> Iterator[LogFault]:
+def find_saturated_sensors(log: Log) -> Iterator[LogFault]:
     """Find sensors that stay at the same extreme value again and again."""
-    for i, ends in limits(log).items():
+    for i, ends in find_sensor_limits(log).items():
         places = tuple(
             Place(e, a, b)
             for e, episode in enumerate(log.data)
-            for a, b in runs(np.isin(episode.X[:, i], ends))
+            for a, b in find_stretches(np.isin(episode.X[:, i], ends))
             if b - a > 1
         )
         share = np.mean(np.isin(log.X[:, i], ends))
-        name, said = short(log.data.states[i]), " and ".join(f"{end:.4g}" for end in ends)
+        name, values = strip_unit(log.data.states[i]), " and ".join(f"{end:.4g}" for end in ends)
         yield LogFault(
             "sensor at its limit",
-            f"{name} stays at {said} in {percent(float(share))} of the rows: the sensor goes no further",
+            f"{name} stays at {values} in {to_percent(float(share))} of the rows: the sensor goes no further",
             "leave these rows out, and hold the controller inside: "
             + " and ".join(f"x_{'min' if end == log.X[:, i].min() else 'max'} of {name} {end:.4g}" for end in ends),
             (log.data.states[i],),
@@ -228,19 +231,19 @@ def saturated(log: Log) -> Iterator[LogFault]:
         )
 
 
-def held(log: Log) -> Iterator[LogFault]:
-    """Find rows in which no sensor moves though the plant did: held samples, or rows written twice."""
-    rough = coarse(log)
-    whole = [i for i in range(log.data.nx) if i not in rough and np.ptp(log.X[:, i]) > 0]
-    if not whole or len(slow_states(log)) == len(whole):
+def find_held_samples(log: Log) -> Iterator[LogFault]:
+    """Find rows in which no sensor moves although the plant did: held samples, or rows written twice."""
+    rough = find_coarse_states(log)
+    live = [i for i in range(log.data.nx) if i not in rough and np.ptp(log.X[:, i]) > 0]
+    if not live or len(find_slow_states(log)) == len(live):
         return
     places: list[Place] = []
     travels: list[float] = []
-    smooth = _smoothest(log, whole)
+    smooth = _find_smoothest_state(log, live)
     for e, episode in enumerate(log.data):
         X, U = episode.X, episode.U
-        same = (np.diff(X[:, whole], axis=0) == 0).all(axis=1)
-        for a, b in runs(same):
+        same = (np.diff(X[:, live], axis=0) == 0).all(axis=1)
+        for a, b in find_stretches(same):
             if b >= len(U) or a == 0:
                 continue
             contradiction = np.array_equal(U[b - 1], U[b]) or (np.ptp(U[a:b], axis=0) > 0).any()
@@ -255,65 +258,66 @@ def held(log: Log) -> Iterator[LogFault]:
     lengths = [p.last - p.first for p in places]
     if not places or (len(places) < 3 and max(lengths) < 3):
         return
-    found, rows, longest = tuple(places), sum(lengths), max(lengths)
+    rows, longest, where = sum(lengths), max(lengths), list_places(tuple(places))
     if longest > 2 or not travels or float(np.median(travels)) > 0.72:
         yield LogFault(
             "held samples",
-            f"no sensor moves in {rows} rows, up to {longest} in sequence, though the plant does: {listed(found)}",
+            f"no sensor moves in {rows} rows, up to {longest} in sequence, though the plant does: {where}",
             "leave these rows out: the logger held its last values",
-            places=found,
+            places=tuple(places),
         )
     else:
         yield LogFault(
             "rows twice",
-            f"{rows} rows repeat the row before them, and the plant goes on from there: {listed(found)}",
+            f"{rows} rows repeat the row before them, and the plant goes on from there: {where}",
             "drop the second of each pair",
-            places=found,
+            places=tuple(places),
         )
 
 
-def _smoothest(log: Log, among: list[int]) -> int:
-    """Return the state whose steps are most like the step before."""
-    likeness: list[float] = []
+def _find_smoothest_state(log: Log, among: list[int]) -> int:
+    """Return the state whose changes have the largest correlation with the change before."""
+    correlations: list[float] = []
     for i in among:
         steps = [np.diff(e.X[:, i]) for e in log.data if len(e) > 2]
-        both = [float(d[1:] @ d[:-1]) for d in steps]
-        own = [float(d @ d) for d in steps]
-        likeness.append(sum(both) / max(sum(own), 1e-300))
-    return among[int(np.argmax(likeness))]
+        products = [float(d[1:] @ d[:-1]) for d in steps]
+        squares = [float(d @ d) for d in steps]
+        correlations.append(sum(products) / max(sum(squares), 1e-300))
+    return among[int(np.argmax(correlations))]
 
 
-def outliers(log: Log) -> Iterator[LogFault]:
-    """Find single rows far off both neighbours: the same number each time, a mark of loss, or spikes."""
-    rough = coarse(log)
+def find_outliers(log: Log) -> Iterator[LogFault]:
+    """Find single rows far from both neighbours: one number that marks lost samples, or spikes."""
+    rough = find_coarse_states(log)
     for i in range(log.data.nx):
-        name = short(log.data.states[i])
+        name = strip_unit(log.data.states[i])
         changes = np.abs(log.changes[:, i])
         if i in rough and np.mean(changes == 0) > 0.9:
             continue
-        marks = _marked(log, i, changes)
-        if marks is not None:
-            value, places = marks
+        mark = _find_loss_mark(log, i, changes)
+        if mark is not None:
+            value, places = mark
             yield LogFault(
                 "lost samples",
-                f"{name} jumps to {value:.6g} and back {len(places)} times: {listed(places)}",
+                f"{name} jumps to {value:.6g} and back {len(places)} times: {list_places(places)}",
                 f"{value:.6g} marks a lost sample: leave these rows out",
                 (log.data.states[i],),
                 places,
             )
             continue
-        places = tuple(_spikes(log, i, changes))
+        places = tuple(_find_spikes(log, i, changes))
         if places and sum(p.last - p.first for p in places) < 0.05 * len(log.X):
             yield LogFault(
                 "spikes",
-                f"{name} leaves its path for single rows {len(places)} times: {listed(places)}",
+                f"{name} leaves its path for single rows {len(places)} times: {list_places(places)}",
                 "leave these rows out",
                 (log.data.states[i],),
                 places,
             )
 
 
-def _marked(log: Log, i: int, changes: np.ndarray) -> tuple[float, tuple[Place, ...]] | None:
+def _find_loss_mark(log: Log, i: int, changes: np.ndarray) -> tuple[float, tuple[Place, ...]] | None:
+    """Return a value to which state i jumps three times or more, and the rows; None if there is no such value."""
     values, counts = np.unique(log.X[:, i], return_counts=True)
     usual = np.quantile(changes, 0.9)
     for value in values[np.argsort(-counts)][:4]:
@@ -321,7 +325,7 @@ def _marked(log: Log, i: int, changes: np.ndarray) -> tuple[float, tuple[Place, 
         sizes: list[float] = []
         for e, episode in enumerate(log.data):
             column = episode.X[:, i]
-            for a, b in runs(column == value):
+            for a, b in find_stretches(column == value):
                 before = column[a - 1] if a else column[min(b, len(column) - 1)]
                 after = column[b] if b < len(column) else column[a - 1]
                 places.append(Place(e, a, b))
@@ -332,65 +336,62 @@ def _marked(log: Log, i: int, changes: np.ndarray) -> tuple[float, tuple[Place, 
     return None
 
 
-def _spikes(log: Log, i: int, changes: np.ndarray) -> Iterator[Place]:
-    there: list[np.ndarray] = []
+def _find_spikes(log: Log, i: int, changes: np.ndarray) -> Iterator[Place]:
+    """Yield the rows in which state i leaves its path and returns, against the one-step law."""
+    heights: list[np.ndarray] = []
     for e in log.data:
         d = np.diff(e.X[:, i])
         opposite = d[1:] * d[:-1] < 0
-        there.append(np.where(opposite, np.minimum(np.abs(d[1:]), np.abs(d[:-1])), 0.0))
-    every = np.concatenate(there)
-    if not len(every):
+        heights.append(np.where(opposite, np.minimum(np.abs(d[1:]), np.abs(d[:-1])), 0.0))
+    all_heights = np.concatenate(heights)
+    if not len(all_heights):
         return
-    far = max(_FAR * float(np.quantile(changes, 0.97)), 5 * float(np.quantile(every, 0.97)))
+    far = max(_FAR * float(np.quantile(changes, 0.97)), 5 * float(np.quantile(all_heights, 0.97)))
     if far <= 0:
         return
-    calm = [np.abs(np.diff(e.X[:, i])) for e in log.data]
-    for d, sizes in zip(calm, there, strict=True):
+    other_steps = [np.abs(np.diff(e.X[:, i])) for e in log.data]
+    for d, sizes in zip(other_steps, heights, strict=True):
         for k in np.flatnonzero(sizes > far):
-            d[k : k + 2] = 0.0  # the jumps away and back; all other steps tell how far a state can move
-    far = max(far, 1.2 * max(float(d.max(initial=0.0)) for d in calm))
+            d[k : k + 2] = 0.0  # leave out the jumps away and back: the other steps show how far the state can move
+    far = max(far, 1.2 * max(float(d.max(initial=0.0)) for d in other_steps))
     usual = 4 * float(np.quantile(np.concatenate([np.abs(E[:, i]) for E in log.residuals]), 0.97))
-    for e, sizes in enumerate(there):
+    for e, sizes in enumerate(heights):
         off = np.abs(log.residuals[e][:, i])
         for k in np.flatnonzero((sizes > far) & (off[:-1] > usual) & (off[:-1] * log.size[i] > 0.5 * sizes)):
             around = np.concatenate([off[max(k - 4, 0) : max(k - 1, 0)], off[k + 3 : k + 6]])
-            known = log.leverage[e][max(k - 1, 0) : k + 1].max() < ALONE
-            if k >= 2 and known and np.max(around, initial=0.0) < 0.3 * off[k]:
+            predictable = log.leverage[e][max(k - 1, 0) : k + 1].max() < ALONE
+            if k >= 2 and predictable and np.max(around, initial=0.0) < 0.3 * off[k]:
                 yield Place(e, int(k) + 1, int(k) + 2)
 
 
-def turns(log: Log) -> dict[int, float]:
+def find_whole_turns(log: Log) -> dict[int, float]:
     """Return the whole turn, 2π or 360, of each angle that jumps by it."""
-    found: dict[int, float] = {}
+    whole_turns: dict[int, float] = {}
     for i in range(log.data.nx):
         changes = np.abs(log.changes[:, i])
         for turn in (2 * np.pi, 360.0):
-            jumps = np.abs(changes - turn) < 0.25 * turn
-            small = np.median(changes) < 0.15 * turn and np.mean(changes[~jumps] > 0.5 * turn) < 0.001
-            if jumps.any() and small and 0.8 * turn < np.ptp(log.X[:, i]) < 1.02 * turn:
-                found[i] = turn
-    return found
+            find_jumps = np.abs(changes - turn) < 0.25 * turn
+            small = np.median(changes) < 0.15 * turn and np.mean(changes[~find_jumps] > 0.5 * turn) < 0.001
+            if find_jumps.any() and small and 0.8 * turn < np.ptp(log.X[:, i]) < 1.02 * turn:
+                whole_turns[i] = turn
+    return whole_turns
 
 
-def wrapped(log: Log) -> Iterator[LogFault]:
+def find_wrapped_angles(log: Log) -> Iterator[LogFault]:
     """Find angles that jump by a whole turn."""
-    for i, turn in turns(log).items():
+    for i, turn in find_whole_turns(log).items():
         changes = np.abs(log.changes[:, i])
         count = int((np.abs(changes - turn) < 0.25 * turn).sum())
         yield LogFault(
             "wrapped angle",
-            f"{short(log.data.states[i])} jumps by {'360' if turn == 360 else '2π'} {count} times: it is wrapped",
+            f"{strip_unit(log.data.states[i])} jumps by {'360' if turn == 360 else '2π'} {count} times: it is wrapped",
             f"unwrap it along each episode (koopmpc fit does), or lift it by km.Fourier(2, states=[{i}]) alone",
             (log.data.states[i],),
         )
 
 
-_JUMP = 1.5  # times the largest usual change from row to row
-_OFF = 10.0  # times the largest usual residual
-
-
-def jumps(log: Log) -> Iterator[LogFault]:
-    """Find places where the states jump, for rows are missing or an episode holds two runs."""
+def find_jumps(log: Log) -> Iterator[LogFault]:
+    """Find places where the states jump because rows are missing or an episode contains two runs."""
     E = np.concatenate(log.residuals)
     usual = np.maximum(np.quantile(np.abs(E), 0.97, axis=0), 1e-9)
     widest = np.quantile(np.abs(log.changes), 0.99, axis=0)
@@ -404,48 +405,46 @@ def jumps(log: Log) -> Iterator[LogFault]:
                 continue
             i = int(np.argmax(np.abs(d[k]) / np.where(widest > 0, widest, np.inf)))
             back = k + 1 < len(d) and d[k + 1, i] * d[k, i] < 0 and abs(d[k + 1, i]) > 0.5 * abs(d[k, i])
-            since = d[k - 1, i] * d[k, i] < 0 and abs(d[k - 1, i]) > 0.5 * abs(d[k, i])
+            returned = d[k - 1, i] * d[k, i] < 0 and abs(d[k - 1, i]) > 0.5 * abs(d[k, i])
             alone = (k + 1 >= len(d) or off[k + 1] < 0.5 * off[k]) and off[k - 1] < 0.5 * off[k]
-            if not back and not since and alone and log.leverage[e][k - 1] < ALONE:
+            if not back and not returned and alone and log.leverage[e][k - 1] < ALONE:
                 places.append(Place(e, int(k), int(k) + 2, jump=True))
     if places and len(places) < 0.02 * log.steps:
         yield LogFault(
             "jump",
-            f"the states go on from elsewhere {len(places)} times: {listed(tuple(places))}",
+            f"the states go on from elsewhere {len(places)} times: {list_places(tuple(places))}",
             "rows are missing there, or a new run begins: cut the episode in two",
             places=tuple(places),
         )
 
 
-def constant(log: Log) -> Iterator[LogFault]:
+def find_constant_inputs(log: Log) -> Iterator[LogFault]:
     """Find inputs that never move."""
     for j in np.flatnonzero(np.ptp(log.U, axis=0) == 0):
-        name = short(log.data.inputs[j])
+        name = strip_unit(log.data.inputs[j])
         yield LogFault(
             "constant input",
-            f"{name} is {log.U[0, j]:.4g} throughout: what it does cannot be learned",
+            f"{name} is {log.U[0, j]:.4g} throughout: its effect cannot be learned",
             f"excite {name}, with km.Noise or km.PRBS, or leave it out",
             (log.data.inputs[j],),
         )
 
 
-def excitation(log: Log) -> Iterator[LogFault]:
-    """Find inputs that excite to a lower order than the plant has states."""
+def find_low_excitation(log: Log) -> Iterator[LogFault]:
+    """Find inputs that are exciting of a lower order than the plant has states."""
     order = log.data.nx + 1
     for j in np.flatnonzero(np.ptp(log.U, axis=0) > 0):
         long = [e for e in log.data if len(e) > order + 1]
         if not long:
             continue
-        # differences, for a constant level raises the order by one and excites nothing
-        alone = Episodes([Episode(X=e.X[1:], U=np.diff(e.U[:, [j]], axis=0)) for e in long], log.data.dt)
-        found = persistency(alone, order)
-        good = int((found.conditions < 1e7).sum())
+        # use differences: a constant level would raise the order by one without exciting the plant
+        differences = Episodes([Episode(X=e.X[1:], U=np.diff(e.U[:, [j]], axis=0)) for e in long], log.data.dt)
+        good = int((persistency(differences, order).conditions < 1e7).sum())
         if good < min(order, 3):
-            name = short(log.data.inputs[j])
+            name = strip_unit(log.data.inputs[j])
             yield LogFault(
                 "little excitation",
-                f"{name} excites to order {good} only, and {log.data.nx} states ask for {order}: a sine, or steps "
-                "that hardly ever come",
+                f"{name} excites to order {good} only, and {log.data.nx} states ask for {order}: a sine, or rare steps",
                 f"excite {name} with km.Noise, km.PRBS or km.Multisine",
                 (log.data.inputs[j],),
             )

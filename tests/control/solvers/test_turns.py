@@ -5,7 +5,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.control.limits import Interval, Softness
-from koopmpc.control.solvers.base import Choice, QPSolution, StepQP, StepSolver
+from koopmpc.control.solvers.base import QPSolution, SolverTurn, StepQP, StepSolver
 
 OPTIMAL, FAILED, MOST = km.Status.OPTIMAL, km.Status.FAILED, km.Status.MAX_ITERATIONS
 INFEASIBLE = km.Status.INFEASIBLE
@@ -71,7 +71,7 @@ PLAN = np.array([9.0, 2.0, -1.0, 0.5, 9.0])
 @pytest.mark.parametrize("source", [(1, 2, 3), (3, 1, 2)])
 def test_the_limits_move_by_the_plan_and_the_start_is_the_last_answer_moved_on_by_a_step(source):
     first, asked = scripted("first", True, GOOD, GOOD, GOOD, GOOD)
-    solver = StepSolver(step_qp(source=source), [Choice(first, {"a": 1})])
+    solver = StepSolver(step_qp(source=source), [SolverTurn(first, {"a": 1})])
     moved = (PLAN[list(source)] * [0.5, 1.0, 2.0]).tolist()
     found, gave_way = solver.solve(PLAN, None, None)
     assert (found.status, gave_way) == (OPTIMAL, 0.0)
@@ -94,7 +94,7 @@ def test_the_one_that_had_the_answer_is_asked_first_until_a_plan_meets_all_limit
     first, a = scripted("first", False, NONE, GOOD)
     second, b = scripted("second", True, GOOD, GOOD, GOOD)
     third, c = scripted("third", False)
-    solver = StepSolver(step_qp(), [Choice(first, {}), Choice(second, {}), Choice(third, {}, late=True)])
+    solver = StepSolver(step_qp(), [SolverTurn(first, {}), SolverTurn(second, {}), SolverTurn(third, {}, late=True)])
 
     def solves(*lists):
         return [sum(each[0] == "solve" for each in asked) for asked in lists]
@@ -116,7 +116,7 @@ def test_where_nobody_has_the_answer_all_are_asked_and_the_last_one_says_why():
     first, _ = scripted("first", False, NONE, NONE)
     second, b = scripted("second", True, (FAILED, [0, 0], [0, 0, 0], 20), GOOD)
     third, c = scripted("third", False, (OPTIMAL, [1, 1], [0, 0, 9], 100))  # a multiplier above the price of a slack
-    solver = StepSolver(step_qp(), [Choice(first, {}), Choice(second, {}), Choice(third, {}, late=True)])
+    solver = StepSolver(step_qp(), [SolverTurn(first, {}), SolverTurn(second, {}), SolverTurn(third, {}, late=True)])
     found, _ = solver.solve(PLAN, None, None)
     assert (found.status, found.solver, found.iterations) == (FAILED, "third", 127)
     assert [each[0] for each in c] == ["made", "shift", "solve"]
@@ -128,11 +128,11 @@ def test_where_nobody_has_the_answer_all_are_asked_and_the_last_one_says_why():
 def test_one_that_knows_no_slacks_has_the_answer_where_no_multiplier_is_above_its_price(multiplier, is_exact, answers):
     first, _ = scripted("first", is_exact, (OPTIMAL, [0, 0], [0, 0, multiplier], 1))
     second, _ = scripted("second", True, GOOD)
-    found, _ = StepSolver(step_qp(), [Choice(first, {}), Choice(second, {})]).solve(PLAN, None, None)
+    found, _ = StepSolver(step_qp(), [SolverTurn(first, {}), SolverTurn(second, {})]).solve(PLAN, None, None)
     assert found.solver == ("first" if answers else "second")
     hard = step_qp(linear=[np.inf] * 3)
     first, _ = scripted("first", is_exact, (OPTIMAL, [0, 0], [0, 0, multiplier], 1))
-    found, _ = StepSolver(hard, [Choice(first, {}), Choice(second, {})]).solve(PLAN, None, None)
+    found, _ = StepSolver(hard, [SolverTurn(first, {}), SolverTurn(second, {})]).solve(PLAN, None, None)
     assert found.solver == "first"
 
 
@@ -140,7 +140,7 @@ def test_one_that_knows_no_slacks_has_the_answer_where_no_multiplier_is_above_it
 def test_infeasible_is_believed_of_an_exact_one_alone(is_exact, who):
     first, _ = scripted("first", is_exact, (INFEASIBLE, [0, 0], [0, 0, 0], 1))
     second, _ = scripted("second", True, (INFEASIBLE, [0, 0], [0, 0, 0], 2))
-    found, _ = StepSolver(step_qp(), [Choice(first, {}), Choice(second, {})]).solve(PLAN, None, None)
+    found, _ = StepSolver(step_qp(), [SolverTurn(first, {}), SolverTurn(second, {})]).solve(PLAN, None, None)
     assert (found.status, found.solver) == (INFEASIBLE, who)
 
 
@@ -151,7 +151,7 @@ def test_time_is_left_for_what_follows(monkeypatch):
     for is_exact, share in ((False, 0.5), (True, 1.0)):
         first, a = scripted("first", is_exact, NONE, GOOD)
         second, b = scripted("second", True, GOOD)
-        solver = StepSolver(step_qp(), [Choice(first, {}), Choice(second, {})])
+        solver = StepSolver(step_qp(), [SolverTurn(first, {}), SolverTurn(second, {})])
         solver.solve(PLAN, None, 100.01)
         assert a[-1][-1] == pytest.approx(share * 0.01 - 5e-5)
         assert b[-1][-1] == pytest.approx(0.01 - 5e-5)
@@ -160,7 +160,7 @@ def test_time_is_left_for_what_follows(monkeypatch):
         assert a[-1][-1] == pytest.approx(share * 1e-5)
     first, _ = scripted("first", False, NONE)
     second, b = scripted("second", True, GOOD)
-    found, _ = StepSolver(step_qp(), [Choice(first, {}), Choice(second, {})]).solve(PLAN, None, 100.0)
+    found, _ = StepSolver(step_qp(), [SolverTurn(first, {}), SolverTurn(second, {})]).solve(PLAN, None, 100.0)
     assert (found.status, found.solver, found.iterations) == (km.Status.TIME_LIMIT, "first", 7)
     assert [each[0] for each in b] == ["made"]
 
@@ -171,12 +171,12 @@ def test_what_a_soft_limit_gives_way_is_told_in_its_unit_above_its_allowance(mul
     moved = 2.0 * PLAN[3]
     for v, past in (([3.0, 1.0], (4.0 + moved - 3.5) / 2), ([-4.0, -1.0], (-3.0 + 5.0 - moved) / 2), ([0.0, 0.5], 0.0)):
         first, _ = scripted("first", True, (OPTIMAL, v, [0, 0, multiplier], 1))
-        _, gave_way = StepSolver(step_qp(), [Choice(first, {})]).solve(PLAN, None, None)
+        _, gave_way = StepSolver(step_qp(), [SolverTurn(first, {})]).solve(PLAN, None, None)
         assert gave_way == pytest.approx(share * past)
     just = (3.5 - moved + 2 * 0.1 * np.array([0.99, 1.01]))[:, None] * [1.0, 0.0]
     for v, told in zip(just, (False, True), strict=True):
         first, _ = scripted("first", True, (OPTIMAL, v, [0, 0, 4.0], 1))
-        _, gave_way = StepSolver(step_qp(), [Choice(first, {})]).solve(PLAN, None, None)
+        _, gave_way = StepSolver(step_qp(), [SolverTurn(first, {})]).solve(PLAN, None, None)
         assert (gave_way > 0) == told
 
 
@@ -192,11 +192,11 @@ def test_the_first_change_may_be_as_large_as_the_limits_of_the_inputs_need(room,
     for allowance, told in ((5e4, 1), (2e5, 0)):
         qp, (free, _) = step_qp(), scripted("first", True, (OPTIMAL, [0, 0], [0, 0, 0], 1))
         qp.softness.allowance[0] = allowance
-        solver = StepSolver(qp, [Choice(free, {})])
+        solver = StepSolver(qp, [SolverTurn(free, {})])
         _, gave_way = solver.solve(PLAN, Interval(np.array([room[0]]), np.array([room[1]])), None)
         assert gave_way == pytest.approx(told * conflict)
     first, asked = scripted("first", True, (OPTIMAL, [0, 0], [0, 0, 0], 1))
-    solver = StepSolver(step_qp(), [Choice(first, {})])
+    solver = StepSolver(step_qp(), [SolverTurn(first, {})])
     _, gave_way = solver.solve(PLAN, Interval(np.array([room[0]]), np.array([room[1]])), None)
     moved = PLAN[1:4] * [0.5, 1.0, 2.0]
     (bounds,) = (each for each in asked if each[0] == "bounds")

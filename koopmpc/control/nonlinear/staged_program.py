@@ -1,0 +1,177 @@
+"""The Program of a BilinearMPC: its map with derivatives as graphs, weights and limits of stages, targets of rows."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.linalg import solve
+
+from koopmpc.control.cost import StateTracking
+from koopmpc.control.limits import Interval, Softness
+from koopmpc.control.nonlinear.equilibrium import RestProgram, TerminalTargets
+from koopmpc.control.nonlinear.problem import LearnedMap, ModelOrMap, StagedProblem
+from koopmpc.control.nonlinear.stagewise import Sides
+from koopmpc.control.program import StepProgram, trace_graph
+from koopmpc.errors import DataError
+from koopmpc.estimate.observer import EstimatorProgram
+from koopmpc.plants.graph import Graph
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StagedProgram(StepProgram):
+    """One linearisation a step of s⁺ = F(s, v) over N stages, and the quadratic program of their deviations.
+
+    s and v are those of `StagedProblem`: x and u, or [x; u_{k−1}; v_{k−1}] and the change of u where changes are
+    weighed or limited, or moves are blocked.
+
+    Attributes
+    ----------
+    functions
+        Name → graph: "map" (x, u) → F; "stage_map" (s, v) → s⁺; "slopes" (s, v) → ∂s⁺/∂s, ∂s⁺/∂v by rows, s⁺;
+        "tracked" and "limited" s → value, Jacobian by rows; "stage" (s, r) → JᵀQJ, JᵀQ(of − r); where disturbances
+        move the target "local" (x, u) → F, ∂F/∂x, ∂F/∂u, of, ∂of/∂x, g, ∂g/∂x.
+    N, latency, iterations
+        Steps of the plan, steps until its first input acts, linearisations a step.
+    nx, ny, ns
+        Entries of x, of the plant's state, and of s.
+    E
+        (nx, nw) gain of the measured disturbances.
+    with_rates, weighs_changes, soft_rates
+        Whether v is the change of u; whether the cost weighs it; the inputs whose changes have soft limits.
+    free, held_from
+        Whether a stage has an input of its own, and the stage whose input each stage takes.
+    hard_rates
+        Hard limits of the changes of inputs, ±inf where one has none; None without.
+    Q, R, R_held
+        Weights of the tracked outputs, of v, and of v in a stage without an input.
+    Q_root, R_root
+        S with SᵀS = Q and R of the cost.
+    v_limits, box, margin, softness
+        Limits of v and of the limited outputs, by how much each stage moves the last of these inwards, and what it
+        costs to break them.
+    sides
+        The finite ends of all limits, for interior points.
+    stage_sizes, input_sizes
+        Sizes of s and v.
+    holds
+        Whether the input target is that of the equilibrium.
+    end
+        Terminal cost: "given" by Q_N, "tail" for the cost of a tail, "stage" for Q itself.
+    table
+        (rows, size) the target of each reference row: [r, x_r, u_r, active limits of (u_r, g), reference input,
+        ∂u/∂e, M, L, V, m, whether an equilibrium was found].
+    rest
+        How a disturbance moves the target; None where there is no disturbance.
+    estimator
+        How x and d follow from y.
+    """
+
+    model: ModelOrMap
+    functions: Mapping[str, Graph]
+    N: int
+    latency: int
+    iterations: int
+    nx: int
+    ny: int
+    ns: int
+    E: Float[np.ndarray, "_ _"]
+    with_rates: bool
+    weighs_changes: bool
+    soft_rates: Int[np.ndarray, " _"]
+    free: Bool[np.ndarray, " _"]
+    held_from: Int[np.ndarray, " _"]
+    hard_rates: Interval | None
+    Q: Float[np.ndarray, "_ _"]
+    R: Float[np.ndarray, "nu nu"]
+    R_held: Float[np.ndarray, "nu nu"]
+    Q_root: Float[np.ndarray, "_ _"]
+    R_root: Float[np.ndarray, "nu nu"]
+    v_limits: Interval
+    box: Interval
+    margin: Float[np.ndarray, "_ _"]
+    softness: Softness
+    sides: Sides
+    stage_sizes: Float[np.ndarray, " _"]
+    input_sizes: Float[np.ndarray, " nu"]
+    holds: bool
+    end: str
+    table: Float[np.ndarray, "_ _"]
+    rest: RestProgram | None
+    estimator: EstimatorProgram
+
+
+def find_targets(
+    terminal: TerminalTargets, nx: int, reference: Float[np.ndarray, "rows nr"]
+) -> Float[np.ndarray, "found size"]:
+    """Return the `table` of a StagedProgram for these reference rows, each row once."""
+    found: list[Float[np.ndarray, " size"]] = []
+    for key in dict.fromkeys(map(bytes, np.ascontiguousarray(reference))):
+        row = np.frombuffer(key)
+        target = terminal(row)
+        x, u, active = target.equilibrium
+        n = nx + len(row) + len(u) * (target.V.shape[0] > nx + len(row))
+        parts = (row, x, u, active, target.u, target.slope, target.M[:n], target.L[:n], target.V[:n], target.m[:n])
+        known = float(not terminal.is_missed(row))
+        found.append(np.concatenate([*(np.ravel(part) for part in parts), [known]]))
+    return np.array(found)
+
+
+def trace_functions(
+    problem: StagedProblem, outputs: StateTracking, model: LearnedMap, *, disturbed: bool
+) -> dict[str, Graph]:
+    """Return the functions of a StagedProgram.
+
+    Raises
+    ------
+    DataError
+        The model's map, or what the cost tracks, cannot be written in C.
+    """
+    nx, nu, ns = model.nx, model.nu, problem.nx
+    s, v, x, u = (ca.SX.sym(name, n) for name, n in (("s", ns), ("v", nu), ("x", nx), ("u", nu)))
+    theta = ca.DM(model.theta)
+    if not model.F.is_a("SXFunction"):
+        raise DataError(
+            "the model's map holds an implicit integrator or a callback, which cannot be written in C; "
+            "discretize with RK4 or Euler, or fit a bilinear model to its data"
+        )
+    F, F_s = ca.SX(model.F(x, u, theta)), ca.SX(problem.F(s, v, theta))
+
+    def slope(value: ca.SX, by: ca.SX) -> ca.SX:
+        return ca.vec(ca.densify(ca.jacobian(value, by)).T)
+
+    r, tracked = ca.SX.sym("r", len(problem.Q)), ca.SX(problem.tracked(s))
+    limited = ca.SX(problem.limited(s)) if len(problem.box.low) else ca.SX(1, 1)
+    J = ca.jacobian(tracked, s)
+    weighed = J.T @ ca.sparsify(ca.DM(problem.Q))
+    functions = {
+        "map": ([x, u], [F]),
+        "stage_map": ([s, v], [F_s]),
+        "slopes": ([s, v], [slope(F_s, s), slope(F_s, v), F_s]),
+        "tracked": ([s], [tracked, slope(tracked, s)]),
+        "limited": ([s], [limited, slope(limited, s)]),
+        "stage": ([s, r], [ca.vec(ca.densify(weighed @ J)), ca.densify(weighed @ (tracked - r))]),
+    }
+    if disturbed:
+        of, g = ca.SX(outputs.tracked(x)), ca.SX(outputs.limited(x))
+        functions["local"] = [x, u], [F, slope(F, x), slope(F, u), of, slope(of, x), g, slope(g, x)]
+    found: dict[str, Graph] = {}
+    for name, (arguments, results) in functions.items():
+        function = ca.Function(f"koopmpc_{name}", arguments, [ca.densify(ca.vertcat(*results))], {"cse": True})
+        found[name] = trace_graph(function, "the model, or what the cost tracks,")
+    return found
+
+
+def first_gain(
+    terminal: TerminalTargets, outputs: StateTracking, N: int, row: Float[np.ndarray, " nr"]
+) -> Float[np.ndarray, "nu nx"]:
+    """Return the gain of the LQR with N steps on the linearisation at the target of a row."""
+    equilibria, rest = terminal.equilibria, terminal(row).equilibrium
+    at = equilibria.linearise(rest.x, rest.u)
+    Q, R = at.J.T @ outputs.Q @ at.J, outputs.R
+    P, K = Q, np.zeros((len(R), len(rest.x)))
+    for _ in range(N):
+        K = solve(R + at.B.T @ P @ at.B + 1e-12 * np.eye(len(R)), at.B.T @ P @ at.A)
+        P = Q + at.A.T @ P @ (at.A - at.B @ K)
+    return K

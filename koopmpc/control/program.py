@@ -1,0 +1,287 @@
+"""What a controller publishes of itself: the data that it is made of, for files, and the data of a step, for code."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.control.cost import Cost
+from koopmpc.control.limits import Interval, Limits
+from koopmpc.control.solvers.daqp import DAQPSetup
+from koopmpc.control.target import Targets
+from koopmpc.control.watching import StepMonitor
+from koopmpc.data.delay import Delay
+from koopmpc.errors import DataError
+from koopmpc.estimate.observer import Estimator, EstimatorProgram, StateObserver, estimator_program
+from koopmpc.plants.graph import Graph
+from koopmpc.plants.step_map import StepMap
+from koopmpc.predict.base import save_value
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.values import Value
+
+_Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
+
+
+@dataclass(frozen=True, eq=False)
+class SavedController(Value):
+    """The data that a controller is made of. A loaded controller begins as after `reset`.
+
+    Attributes
+    ----------
+    name
+        The class of the controller, as in the table of `koopmpc.synthesis.kinds`.
+    model
+        The predictor of the controller; None where it has none.
+    cost, limits, horizon, estimator, latency, moves, time_limit
+        Arguments of the controller; `moves` are the lengths of the blocks of held inputs.
+    options
+        The arguments that only this class has.
+    monitor
+        The monitor, where it has one.
+    """
+
+    name: str
+    model: LinearPredictor | BilinearPredictor | None
+    cost: Cost | None = None
+    limits: Limits | None = None
+    horizon: int = 0
+    estimator: Value | None = None
+    latency: int = 0
+    moves: tuple[int, ...] = ()
+    time_limit: float | None = None
+    options: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    monitor: StepMonitor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Program(Value):
+    """The data that a step of a controller needs, and no function: C code is generated from it alone.
+
+    Attributes
+    ----------
+    controller
+        The class of the controller.
+    obstacle
+        Why no C code can be generated, in a sentence; then nothing else is known. Empty otherwise.
+    """
+
+    controller: str
+    obstacle: str = ""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StepProgram(Program):
+    """What all controllers with C code have in common: z = ψ(ζ), limits of the inputs, a given input target.
+
+    Attributes
+    ----------
+    model
+        The model of the controller: sizes, names, dt, and A, B, C, E where it is linear.
+    lifting
+        ζ → z.
+    inputs, rates
+        The limits to which an input is clipped; `rates` is None where nothing limits its changes.
+    given
+        (k, nu) rows of a given u_target, the last one held; None where the target is found.
+    reference
+        (rows, nr) the reference rows for which the Program was made.
+    sizes
+        (nz,) root mean squares of z in the data, ones where they are not known.
+    gain
+        (n, nz) how z moves the planned inputs: with `sizes` it tells what single precision costs.
+    settings
+        All settings of DAQP.
+    notes
+        Sentences on how the C code differs from the controller.
+    """
+
+    model: LinearPredictor | BilinearPredictor | StepMap
+    lifting: Graph
+    inputs: Interval
+    rates: Interval | None
+    given: Float[np.ndarray, "_ nu"] | None
+    reference: Float[np.ndarray, "_ nr"]
+    sizes: Float[np.ndarray, " _"]
+    gain: Float[np.ndarray, "_ _"]
+    settings: Mapping[str, Any]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def dt(self) -> float:
+        """Sampling time [s]."""
+        return self.model.dt
+
+    @property
+    def nr(self) -> int:
+        """Number of entries of a reference row."""
+        return self.reference.shape[1]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LinearProgram(StepProgram):
+    """A controller on z⁺ = A z + B u + E w: how a reference becomes an equilibrium inside the limits.
+
+    Attributes
+    ----------
+    targets
+        Equilibria z = z₀ + Z α, u = u₀ + W α, and α of a reference.
+    target_solvers
+        The QP that moves α inside all limits, and the one for the limits of the inputs alone; none without equilibria.
+    """
+
+    model: LinearPredictor
+    targets: Targets
+    target_solvers: tuple[DAQPSetup, ...]
+
+
+class Published:
+    """A controller that is saved as data, and whose step may be published as a `Program`.
+
+    A subclass says in `as_data` and `from_data` how it is saved, and in `build_program` what a step needs.
+    """
+
+    def as_data(self) -> SavedController:
+        """Return what the controller was made of.
+
+        Raises
+        ------
+        DataError
+            A part of it is code.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
+        """Return the controller that is made of these data."""
+        raise NotImplementedError
+
+    def save(self, path: str | Path) -> None:
+        """Write the controller as data (.npz: arrays and one JSON text); `km.load_controller` reads it.
+
+        Raises
+        ------
+        DataError
+            A part of it is code: a StepMap, or a user's own estimator.
+        LogError
+            The path cannot be written.
+        """
+        save_value(self.as_data(), path)
+
+    def program(self, reference: ArrayLike | None = None) -> Program:
+        """Return the data of a step; its `obstacle` says why no C code can be generated.
+
+        Parameters
+        ----------
+        reference
+            Rows (k, nr) of the reference that will come, by default one of zeros: a BilinearMPC finds their targets.
+        """
+        try:
+            return self.build_program(reference)
+        except DataError as error:
+            return Program(type(self).__name__, str(error))
+
+    def build_program(self, reference: ArrayLike | None) -> Program:
+        """Return the data of a step.
+
+        Raises
+        ------
+        DataError
+            No C code can be generated; the message says why, and becomes the `obstacle` of the Program.
+        """
+        del reference
+        raise no_export(self)
+
+
+def no_export(
+    controller: object,
+    why: str = "koopmpc has no C code for its law",
+    instead: str = "a BilinearMPC, a LinearMPC or an LQR",
+) -> DataError:
+    """Return the error that says why no C code can be generated for a controller."""
+    name = type(controller).__name__
+    return DataError(f"a {name} cannot be exported: {why}; export a KoopmanMPC, {instead}")
+
+
+def publish_estimator(
+    observer: StateObserver, estimator: Estimator | None, time_limit: float | None, watch: object, bound: str
+) -> EstimatorProgram:
+    """Return how the observer of a predictive controller finds z and d.
+
+    Parameters
+    ----------
+    observer, estimator, time_limit, watch
+        Those of the controller.
+    bound
+        The arguments that bound the iterations of a step of this controller.
+
+    Raises
+    ------
+    DataError
+        The controller has a time_limit, a monitor, or an estimator for which no C code can be generated.
+    """
+    if time_limit is not None:
+        raise DataError(
+            "the controller has a time_limit, and C has no clock; make it without one and bound the iterations: "
+            + bound
+        )
+    if watch is not None:
+        raise DataError(
+            "the controller has a monitor, whose data are not written in C; export the controller without monitor=,"
+            " and have a Python loop or a log ask the monitor"
+        )
+    return estimator_program(observer, estimator)
+
+
+def reference_table(reference: ArrayLike | None, nr: int) -> Float[np.ndarray, "rows nr"]:
+    """Return the rows (k, nr) of a reference, by default one of zeros."""
+    if reference is None:
+        return np.zeros((1, nr))
+    rows = np.atleast_2d(checks.array(reference, "reference"))
+    return checks.array(rows, "reference", (None, nr)) if rows.size else np.zeros((0, nr))
+
+
+def trace_graph(function: ca.Function, what: str) -> Graph:
+    """Return the graph of a function with one result.
+
+    Raises
+    ------
+    DataError
+        It holds what cannot be written in C; the message says what it is and what would do.
+    """
+    try:
+        return Graph.trace(function)
+    except DataError as error:
+        raise DataError(f"{what} cannot be written in C: {error}") from error
+
+
+def trace_lifting(lift: Callable[[ca.SX], ca.SX], nzeta: int, embedding: Delay | None, nu: int) -> Graph:
+    """Return ζ → z as a graph.
+
+    Raises
+    ------
+    DataError
+        It holds an operation that cannot be written in C, or the past holds other inputs than the model has.
+    """
+    if embedding is not None and embedding.inputs and embedding.bound and len(embedding.bound[1]) != nu:
+        raise DataError("the embedding holds other inputs than the predictor; fit both on the same data to export it")
+    zeta = ca.SX.sym("zeta", nzeta)
+    return trace_graph(ca.Function("lifting", [zeta], [ca.densify(lift(zeta))], {"cse": True}), "the lifting")
+
+
+def linear_parts(predictor: LinearPredictor, targets: Targets) -> dict[str, Any]:
+    """Return the fields of a `LinearProgram` that only its predictor and its targets decide."""
+    scale, lifting = predictor.scale, predictor.lifting
+    counts = (len(targets.rows), targets.hard) if targets.Z.shape[1] else ()
+    return {
+        "model": predictor,
+        "lifting": trace_lifting(lifting.symbolic, len(lifting.bound_states), predictor.embedding, predictor.nu),
+        "sizes": np.ones(predictor.nz) if scale is None else np.linalg.norm(scale, axis=0),
+        "targets": targets,
+        "target_solvers": tuple(targets.solver(count).setup for count in counts),
+    }

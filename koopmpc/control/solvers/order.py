@@ -1,0 +1,50 @@
+"""The QP solvers by name: which answers first, which finishes what another leaves, which is asked last.
+
+To add a solver, write a subclass of `QPSolver` in a file of its own in this folder, and name it in `SOLVERS` here.
+Nothing else names solvers: `KoopmanMPC` asks `order_solvers`. If the solver comes with a package of its own,
+pyproject.toml names that package, and an import contract gives it its one door.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from koopmpc.control.solvers.base import QPSolver, SolverTurn
+from koopmpc.control.solvers.daqp import DAQP
+from koopmpc.control.solvers.osqp import OSQP
+from koopmpc.errors import DataError
+
+SOLVERS: dict[str, type[QPSolver]] = {"osqp": OSQP, "daqp": DAQP}
+
+FINISHER = DAQP  # solves to rounding what an inexact solver leaves, the targets of references, and the QPs of C code
+RESCUER = "osqp"  # answers where the finisher has none; it is set up when it is first asked
+
+# The rule of solver="auto": the solver that is asked first. `python -m tests.speed.first_solver` measures it, and
+# docs/controllers.md has the table: the time of steps with a QP, OSQP first over DAQP first, by size and structure.
+# DAQP won the ten tasks, the random loops and all sizes up to N 200 and nu 4. OSQP won loops with limits of inputs
+# alone, n ≥ 400 and more than two thirds of the planned inputs at a limit, by up to 2.8; with few of them at a limit
+# DAQP won the same sizes by up to 46. How many there will be is not known when a controller is built: one row for all.
+FIRST = "daqp"
+
+
+def order_solvers(solver: str, settings: Mapping[str, Any]) -> list[SolverTurn]:
+    """Return the solvers in the order in which a step asks them: the given one first, for "auto" that of the rule.
+
+    Settings that the solver of the rule does not have name the solver that has them all. A first solver that is not
+    exact has its `impatient` settings, and the finisher after it.
+
+    Raises
+    ------
+    DataError
+        There is no such solver.
+    """
+    first = solver
+    if solver == "auto":
+        able = [name for name in (FIRST, *SOLVERS) if not settings or set(settings) <= SOLVERS[name].setting_names()]
+        first = able[0] if able else FIRST
+    if first not in SOLVERS:
+        raise DataError(f"solver is {solver!r}; there are 'auto', {', '.join(map(repr, SOLVERS))}")
+    kind = SOLVERS[first]
+    turns = [SolverTurn(kind, {**kind.impatient, **settings})]
+    if not kind.exact:
+        turns.append(SolverTurn(SOLVERS[FINISHER.name], {}))
+    return [*turns, SolverTurn(SOLVERS[RESCUER], {}, late=True)]

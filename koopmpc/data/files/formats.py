@@ -1,0 +1,129 @@
+"""LogFormat: what a file format of logs registers, and the one register that all readers of logs ask.
+
+A new format is a file with a reader that calls `register_format`, and its line at the joint "log formats" of
+``koopmpc/__init__.py``.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from koopmpc import disk
+from koopmpc.data.episodes import Episodes, PlantSignature
+from koopmpc.data.source import Part
+from koopmpc.errors import DataError, LogError, install
+from koopmpc.lazy import load_joint
+
+ADVICE = "pass a file that Episodes.save wrote, or a table as .csv or .parquet"
+
+
+@dataclass(frozen=True, eq=False)
+class LogTable:
+    """Columns of a log whose roles its file does not state; `load_episodes` infers them or is given them.
+
+    Attributes
+    ----------
+    names
+        Names of all columns, in order; a name that stands twice is here twice.
+    columns
+        The columns whose names stand once, (rows,) each: numbers with NaN where a value is missing, or objects.
+    units
+        Units of columns that the file states beside their names; they join the names as ``"theta [rad]"``.
+    dt
+        Sample time [s], where the file states it. It counts if there is no column of time and the caller gives none.
+    """
+
+    names: tuple[str, ...]
+    columns: Mapping[str, np.ndarray]
+    units: Mapping[str, str] = field(default_factory=dict[str, str])
+    dt: float | None = None
+
+    def with_units(self) -> "LogTable":
+        """Return the table whose names carry the units."""
+        known = {name: f"{name} [{unit}]" for name, unit in self.units.items() if unit and "[" not in name}
+        columns = {known.get(name, name): column for name, column in self.columns.items()}
+        return LogTable(tuple(known.get(name, name) for name in self.names), columns, dt=self.dt)
+
+
+@dataclass(frozen=True, eq=False)
+class LogFormat:
+    """A format of logs.
+
+    Attributes
+    ----------
+    suffixes
+        Ends of file names, with the dot.
+    read
+        Path → Episodes, if the file states sample time and roles; else → LogTable.
+    write
+        Write Episodes to a file that is open; None for a format that is only read.
+    parts
+        (path, history, signature) → the parts of a large file, as `Source.parts` has them, or None if this file cannot
+        be read in parts. None for a format whose files are always read whole.
+    extra
+        The extra of koopmpc that installs what `read` imports.
+    """
+
+    suffixes: tuple[str, ...]
+    read: Callable[[Path], Episodes | LogTable]
+    write: Callable[[BinaryIO, Episodes], None] | None = None
+    parts: Callable[[Path, int, PlantSignature | None], list[Part] | None] | None = None
+    extra: str | None = None
+
+
+_JOINT = "log formats"
+_FORMATS: dict[str, LogFormat] = {}
+
+
+def register_format(log_format: LogFormat) -> None:
+    """Have files with these suffixes read by this format."""
+    _FORMATS.update(dict.fromkeys(log_format.suffixes, log_format))
+
+
+def list_suffixes(*, writable: bool = False) -> list[str]:
+    """Return the suffixes of all formats, or of those that can be written, in the order of the joint."""
+    files = load_joint(_JOINT)
+    order = {suffix: files.index(home) for suffix, f in _FORMATS.items() if (home := f.read.__module__) in files}
+    suffixes = [suffix for suffix, log_format in _FORMATS.items() if not writable or log_format.write is not None]
+    return sorted(suffixes, key=lambda suffix: order.get(suffix, len(files)))
+
+
+def find_format(file: Path, *, writable: bool = False) -> LogFormat:
+    """Return the format of a file by its suffix.
+
+    Raises
+    ------
+    DataError
+        No format has this suffix, or it cannot be written.
+    """
+    load_joint(_JOINT, until=lambda: file.suffix in _FORMATS)
+    log_format = _FORMATS.get(file.suffix)
+    if log_format is None or (writable and log_format.write is None):
+        known = ", ".join(list_suffixes(writable=writable))
+        raise DataError(f"episodes are kept in {known} files, not in {file.name!r}; rename it")
+    return log_format
+
+
+def read_log(file: Path) -> Episodes | LogTable:
+    """Return what the reader of the file's format makes of it.
+
+    Raises
+    ------
+    LogError
+        The file is missing or damaged, or a package that its format needs is not installed.
+    DataError
+        No format has its suffix.
+    """
+    log_format = find_format(file)
+    disk.existing(file, ADVICE)
+    try:
+        return log_format.read(file)
+    except ModuleNotFoundError as error:
+        if log_format.extra is None:
+            raise
+        raise LogError(
+            f"{file}: {error.name} reads {file.suffix} files and is not installed; {install(log_format.extra)}"
+        ) from error

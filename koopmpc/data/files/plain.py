@@ -1,0 +1,139 @@
+# pyright: basic
+"""Tables as text (.csv): a line of names, then a row a time step."""
+
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.files.formats import LogFormat, LogTable, register_format
+from koopmpc.data.files.tables import SAVED, TableSettings, find_roles, is_a_number, pick_driving
+from koopmpc.errors import DataError, KoopmpcError, LogError
+
+_UTF8 = "utf-8-sig"
+_LATIN = "latin-1"
+_WITH_CHECKSUM = b"# koopmpc.episodes "  # began the .csv files of editions before 0.1.0
+_MISSING = ["", "nan", "NaN", "NAN", "null", "NULL", "NA", "N/A", "#N/A"]
+
+
+def write_plain(stream: BinaryIO, episodes: Episodes) -> None:
+    """Write the episodes as a table with the columns episode, step and time [s] before the states and inputs.
+
+    Numbers read back to the bit. The inputs of an episode's last row are empty: none was applied there, and by this the
+    reader knows them.
+
+    Raises
+    ------
+    DataError
+        The table would read back with other names or roles.
+    """
+    driven = episodes.driven()
+    head = ",".join(_quote(name) for name in (*SAVED, *driven.states, *driven.inputs))
+    _check_names(episodes, head)
+    stream.write(f"{head}\n".encode())
+    for e, episode in enumerate(driven):
+        inputs = [",".join(map(repr, u)) for u in episode.U.tolist()] + ["," * (driven.nu - 1)]
+        for k, (x, u) in enumerate(zip(episode.X.tolist(), inputs, strict=True)):
+            cells = [str(e), str(k), repr(k * episodes.dt), *map(repr, x), *([u] if driven.nu else [])]
+            stream.write(f"{','.join(cells)}\n".encode())
+
+
+def _check_names(episodes: Episodes, head: str) -> None:
+    """Raise DataError unless the table reads back with the names and roles of these episodes."""
+    names = (*episodes.states, *episodes.inputs, *episodes.disturbances)
+    numbers = ["0.0"] * (3 + episodes.nx)
+    rows = [",".join(numbers + [cell] * (episodes.nu + episodes.nw)) for cell in ("0.0", "")]
+    wrong = ""
+    try:
+        table = _parse("\n".join([head, *rows, ""]).encode(), Path("table.csv"))
+        every = list(table.names)
+        roles = find_roles(every, every, TableSettings(), "table.csv", pick_driving(every, table.columns))
+        states, inputs, disturbances = map(set, (episodes.states, episodes.inputs, episodes.disturbances))
+        pairs = ((states, roles.states), (inputs, roles.inputs), (disturbances, roles.disturbances))
+        changed = [name for given, read in pairs for name in given ^ set(read)]
+        wrong = next((name for name in names if name in changed), "")
+    except KoopmpcError:
+        wrong = next((n for n in names if n in SAVED or n != n.strip() or is_a_number(n)), names[0])
+    if wrong:
+        raise DataError(
+            f"a .csv file would not keep the name {wrong!r} in its role; rename it (disturbances as w, w0 or "
+            "disturbance), or save as .npz or .parquet"
+        )
+
+
+def _quote(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"' if any(c in name for c in ',"\n;\t') else name
+
+
+def read_plain(file: Path) -> LogTable:
+    """Return the columns of a table.
+
+    Comma, semicolon or tab is found from the header; with semicolons a decimal comma is understood. Lines above the
+    header that begin with # are skipped.
+
+    Raises
+    ------
+    LogError
+        The file is empty, has no header, or a row has another number of cells; koopmpc wrote it with a checksum.
+    """
+    raw = file.read_bytes()
+    if raw.startswith(_WITH_CHECKSUM):
+        raise LogError(
+            f"{file} holds no episodes that can be read: it is of an edition before 0.1.0, with a checksum in its "
+            "first line; remove this line and pass dt=, states= and inputs=, or save the episodes anew"
+        )
+    return _parse(raw, file)
+
+
+def _parse(raw: bytes, file: Path) -> LogTable:
+    import pyarrow as pa
+    from pyarrow import csv
+
+    try:
+        raw.decode(_UTF8)
+        encoding = "utf8"
+    except UnicodeDecodeError:
+        encoding = _LATIN
+    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    while raw.startswith(b"#"):
+        raw = raw.partition(b"\n")[2]
+    head, _, rest = raw.partition(b"\n")
+    if not head.strip():
+        raise LogError(
+            f"{file} holds no episodes that can be read: it is no .csv file, or was cut; pass a file that "
+            "Episodes.save wrote, or a table: a line of names, then a row a time step"
+        )
+    separator = max((b",", b";", b"\t"), key=head.count)
+    comma = separator == b";" and b"," in rest.partition(b"\n")[0]
+    try:
+        table = csv.read_csv(
+            BytesIO(raw),
+            read_options=csv.ReadOptions(encoding=encoding),
+            parse_options=csv.ParseOptions(delimiter=separator.decode()),
+            convert_options=csv.ConvertOptions(
+                decimal_point="," if comma else ".", null_values=_MISSING, strings_can_be_null=True
+            ),
+        )
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise LogError(f"{file} holds no episodes that can be read: {str(error).splitlines()[0]}") from error
+    names = tuple(name.strip() for name in table.column_names)
+    if any(map(is_a_number, names)):
+        raise LogError(f"{file} has no line of names: its first row is {', '.join(names[:4])}; write one above it")
+    return LogTable(names, {name: _convert(table.column(i)) for i, name in enumerate(names)})
+
+
+def _convert(column) -> np.ndarray:
+    """Return an Arrow column as an array: time stamps in seconds, an empty column as NaN."""
+    import pyarrow as pa
+
+    kind = column.type
+    if pa.types.is_timestamp(kind):
+        return column.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy() * 1e-9
+    if pa.types.is_null(kind):
+        return np.full(len(column), np.nan)
+    return column.to_numpy()
+
+
+register_format(LogFormat((".csv",), read_plain, write_plain))

@@ -1,0 +1,202 @@
+"""Rows of a table as uniformly sampled episodes, cut at gaps in time and at missing values."""
+
+import warnings
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from koopmpc.data.episodes import Episode, Origin
+from koopmpc.errors import DataError, FitWarning
+
+_JITTER = 0.02  # share of dt by which a step may differ
+_GAP = 1.5  # a step longer than 1.5 dt is a gap
+
+
+class UnevenSamplingError(DataError):
+    """Steps of time differ; `dt` is the sample time [s] to interpolate to."""
+
+    def __init__(self, message: str, dt: float) -> None:
+        super().__init__(message)
+        self.dt = dt
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Rows of one episode: time [s] or None, states, inputs, disturbances; `rows` are their numbers in the file.
+
+    `states` are names, of a table alone; `origin` is where the rows of a resampled part come from.
+    """
+
+    time: Float[np.ndarray, " M"] | None
+    X: Float[np.ndarray, "M nx"]
+    U: Float[np.ndarray, "M nu"]
+    W: Float[np.ndarray, "M nw"]
+    rows: Int[np.ndarray, " M"]
+    states: tuple[str, ...] = ()
+    origin: Origin | None = None
+
+    def at(self, which: slice | Bool[np.ndarray, " M"]) -> "Signals":
+        """Return these rows."""
+        time = None if self.time is None else self.time[which]
+        return Signals(time, self.X[which], self.U[which], self.W[which], self.rows[which], self.states)
+
+
+def sample_time(times: list[np.ndarray], where: str) -> float:
+    """Return the median step of a time column, given part by part, to six digits.
+
+    Raises
+    ------
+    DataError
+        There are less than two rows, or time stands still.
+    """
+    steps = np.concatenate([np.zeros(0), *map(np.diff, times)])
+    steps = steps[np.isfinite(steps) & (steps > 0)]
+    if not len(steps):
+        raise DataError(f"{where}: time does not advance in any two rows; pass dt=")
+    return float(f"{np.median(steps):.6g}")
+
+
+def restarts(signals: Signals, where: str) -> list[Signals]:
+    """Return the parts between steps back in time, where a recorder was started anew.
+
+    A warning tells where the clock went back to another time than that of the first row: it was set, not started.
+    """
+    if signals.time is None:
+        return [signals]
+    steps = np.diff(signals.time)
+    at = _edges(steps < 0)
+    usual = np.median(np.abs(steps)) if len(steps) else 0.0
+    set_back = [signals.rows[k] for k in at[1:-1] if abs(signals.time[k] - signals.time[0]) > 2 * usual]
+    if set_back:
+        shown = ", ".join(str(row) for row in set_back[:3]) + (", …" if len(set_back) > 3 else "")
+        warnings.warn(
+            f"{where}: the clock is set back {len(set_back)} times, before row {shown}; an episode ends there",
+            FitWarning,
+            stacklevel=2,
+        )
+    return [signals.at(slice(a, b)) for a, b in pairwise(at)]
+
+
+def resampled(parts: list[Signals], dt: float, where: str) -> list[Signals]:
+    """Return the parts on the grid t₀, t₀ + dt, …: states are interpolated, inputs and disturbances held.
+
+    Rows with a missing value are left out first. A step of more than 1.5 times both dt and the median step is a gap,
+    where the signals are cut. A warning counts the gaps and the rows left out.
+    """
+    found: list[Signals] = []
+    gaps: list[int] = []
+    rows = kept = 0
+    for part in parts:
+        assert part.time is not None, "only a table with a time column is resampled"
+        whole = part.at(np.isfinite(part.X).all(axis=1) & np.isfinite(part.time))
+        assert whole.time is not None
+        ahead = np.diff(whole.time)
+        longest = _GAP * max(dt, float(np.median(ahead))) if len(ahead) else dt
+        at = _edges(ahead > longest)
+        pieces = [_advancing(whole.at(slice(a, b))) for a, b in pairwise(at) if b - a > 1]
+        gaps += [int(whole.rows[k - 1]) for k in at[1:-1]]
+        rows += len(part.X)
+        kept += sum(len(piece.X) for piece in pieces)
+        found += [_on_grid(piece, dt, where) for piece in pieces]
+    if gaps:
+        why = "a gap is a step between complete rows of more than 1.5 times the usual one"
+        _warn_of_gaps(where, gaps, len(parts), len(found), f"{rows - kept} of {rows} rows are lost; {why}")
+    elif rows > kept:
+        warnings.warn(
+            f"{where}: {rows - kept} of {rows} rows have an empty cell or repeat a time; they were left out before "
+            "resampling",
+            FitWarning,
+            stacklevel=2,
+        )
+    return found
+
+
+def _warn_of_gaps(where: str, gaps: list[int], before: int, after: int, rest: str) -> None:
+    shown = ", ".join(str(row) for row in gaps[:3]) + (", …" if len(gaps) > 3 else "")
+    at = f" (after row {shown})" if gaps else ""
+    warnings.warn(f"{where}: {len(gaps)} gaps{at} cut {before} episodes into {after}; {rest}", FitWarning, stacklevel=3)
+
+
+def _advancing(part: Signals) -> Signals:
+    """Return the rows whose time is later than that of the row before."""
+    assert part.time is not None
+    return part.at(np.concatenate([[True], np.diff(part.time) > 0]))
+
+
+def _on_grid(part: Signals, dt: float, where: str) -> Signals:
+    t = part.time
+    assert t is not None
+    count = int(np.floor((t[-1] - t[0]) / dt * (1 + 1e-9))) + 1
+    grid = t[0] + dt * np.arange(count)
+    before = np.asarray(np.searchsorted(t, grid + 1e-9 * dt, side="right"), dtype=np.intp)
+    held = np.clip(before - 1, 0, len(t) - 1)
+    states = np.empty((count, part.X.shape[1]))
+    for i in range(part.X.shape[1]):
+        states[:, i] = np.interp(grid, t, part.X[:, i])
+    origin = Origin(where, part.states, part.rows, part.X, held, resampled=True) if part.states else None
+    return Signals(grid, states, part.U[held], part.W[held], part.rows[held], part.states, origin)
+
+
+def episodes_from(parts: list[Signals], dt: float, where: str) -> list[Episode]:
+    """Return the episodes between gaps; a warning counts the gaps and the lost rows.
+
+    A gap is a missing value, a step of time of more than 1.5 dt, or a row without a neighbour.
+
+    Raises
+    ------
+    DataError
+        Sampling is unequal, or nothing is left.
+    """
+    found: list[Episode] = []
+    rows = kept = 0
+    gaps: list[int] = []
+    for part in parts:
+        rows += len(part.X)
+        origin = part.origin
+        if origin is None and part.states:
+            origin = Origin(where, part.states, part.rows, part.X, np.arange(len(part.X)), resampled=False)
+        for first, last in _runs(part, dt, where, gaps):
+            if last - first < 2:
+                continue
+            kept += last - first
+            X, U, W = (values[first:last] for values in (part.X, part.U, part.W))
+            found.append(Episode(X=X, U=U[:-1], W=W[:-1], origin=origin and origin.cut(first, last)))
+    lost = rows - kept
+    if not found:
+        raise DataError(
+            f"{where}: no two rows in sequence hold all states and inputs; a column may be empty, or named as an "
+            "input by mistake"
+        )
+    if gaps or lost:
+        _warn_of_gaps(where, gaps, len(parts), len(found), f"{lost} of {rows} rows are lost")
+    return found
+
+
+def _runs(part: Signals, dt: float, where: str, gaps: list[int]) -> list[tuple[int, int]]:
+    """Return [first, last) of each stretch without a gap; append the file's rows before the gaps to `gaps`."""
+    known = np.asarray(np.isfinite(part.X).all(axis=1), dtype=np.bool_)
+    driven = np.asarray(np.isfinite(np.hstack([part.U, part.W])).all(axis=1), dtype=np.bool_)
+    joined = known[:-1] & known[1:] & driven[:-1]  # row k leads to row k + 1
+    if part.time is not None:
+        steps = np.diff(part.time)
+        joined = joined & np.isfinite(steps) & (steps <= _GAP * dt)
+        uneven = np.flatnonzero(joined & (np.abs(steps - dt) > _JITTER * dt))
+        if len(uneven):
+            k = int(uneven[0])
+            raise UnevenSamplingError(
+                f"{where}: sampling is unequal: {len(uneven)} of {len(steps)} steps differ from dt = {dt:g} s by "
+                f"more than 2 %, the first at row {part.rows[k]}, where it is {steps[k]:g} s; pass resample={dt:g} to "
+                "interpolate",
+                dt,
+            )
+    breaks = np.flatnonzero(~joined)
+    first_of_each = breaks[np.diff(breaks, prepend=-2) > 1]
+    gaps.extend(int(part.rows[k]) for k in first_of_each)
+    return list(pairwise(_edges(~joined)))
+
+
+def _edges(broken: Bool[np.ndarray, " steps"]) -> list[int]:
+    """Return 0, the rows that do not follow the one before them, and the number of rows."""
+    return [0, *(int(k) + 1 for k in np.flatnonzero(broken)), len(broken) + 1]

@@ -1,0 +1,454 @@
+"""A user's own table as episodes: a row a time step, a column a state or an input."""
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal
+from numbers import Real
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc import checks, disk
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.files.formats import LogTable
+from koopmpc.data.files.sampling import Signals, episodes_from, resampled, restarts, sample_time
+from koopmpc.errors import ColumnWarning, DataError, FitWarning, KoopmpcError
+
+SAVED = ("episode", "step", "time [s]")
+"""First columns of a table that `Episodes.save` wrote, in which an empty last row tells the inputs of an episode."""
+
+_TIME = re.compile(r"t|time|timestamp|sim_time|elapsed|seconds")
+_EPISODE = re.compile(r"episode|run|trial|trajectory")
+_INPUT = re.compile(
+    r"u\d*|u_.*|(input|inputs|control|command|cmd|action|force|torque|thrust|voltage|steering|throttle|duty)"
+    r"([\W_\d].*)?|.*_(cmd|command|input|ref_input)"
+)
+_COUNTER = re.compile(r"|unnamed: \d+|index|idx|row|sample|count|counter")
+_DISTURBANCE = re.compile(r"w\d*|w_.*|disturbance([\W_\d].*)?")
+_PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+
+
+@dataclass(frozen=True)
+class ColumnRoles:
+    """The role of each column of a table; `scale` is the unit of the time column in seconds."""
+
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    time: str | None
+    scale: float
+    episode: str | None
+    step: str | None
+    guessed: bool
+
+    @property
+    def values(self) -> tuple[str, ...]:
+        """Names of states, inputs and disturbances."""
+        return self.states + self.inputs + self.disturbances
+
+
+def is_a_number(cell: object) -> bool:
+    """Return whether a cell of a table is a real number, or the text of one."""
+    try:
+        float(str(cell))
+    except ValueError:
+        return False
+    return True
+
+
+def find_roles(
+    names: Sequence[str],
+    numeric: Sequence[str],
+    told: "TableSettings",
+    where: str,
+    driving: Sequence[str] | None = None,
+) -> ColumnRoles:
+    """Return the role of each column.
+
+    ColumnRoles that the caller does not give are read from the names: ``t``, ``time [s]`` and ``timestamp`` are time;
+    ``episode``, ``run``, ``trial`` and ``trajectory`` number the episodes; ``u``, ``u0``, ``u_left``, and names
+    that begin with input, control, command, cmd, action, force, torque, thrust, voltage, steering, throttle or
+    duty, are inputs; ``w``, ``w0`` and ``disturbance`` are measured disturbances; every other column of numbers is
+    a state.
+
+    Parameters
+    ----------
+    names, numeric
+        All columns, and those of numbers.
+    told
+        The names that the caller gives; None leaves the role to the names.
+    where
+        The file, for messages.
+    driving
+        The columns that drive the plant, where the form of the table tells them; None leaves this to the names.
+
+    Raises
+    ------
+    DataError
+        A given column is missing or stands twice, or no column is left for a state.
+    """
+    states, inputs, disturbances = told.states, told.inputs, told.disturbances
+    for what, given in told.given.items():
+        if isinstance(given, str):
+            raise DataError(f"{what} is {given!r}; pass a tuple of names")
+        for name in given:
+            if names.count(name) != 1:
+                has = "has two columns" if name in names else "has no column"
+                raise DataError(f"{where} {has} {name!r}; its columns are {', '.join(names)}")
+    sought = told.columns
+    rest = [name for name in dict.fromkeys(names) if names.count(name) == 1 and name not in sought]
+    time = next((name for name in rest if _TIME.fullmatch(_stem(name))), None)
+    episode = next((name for name in rest if _EPISODE.fullmatch(_stem(name))), None)
+    step = next((name for name in rest if name == "step"), None)
+    free = [name for name in rest if name not in (time, episode, step) and name in numeric]
+    if any(names.count(name) > 1 for name in numeric) and (states is None or inputs is None):
+        twice = next(name for name in numeric if names.count(name) > 1)
+        raise DataError(f"{where} has two columns {twice!r}; rename one")
+    if inputs is None and driving is not None:
+        found_inputs = [n for n in free if n in driving and not _DISTURBANCE.fullmatch(_stem(n))]
+    else:
+        found_inputs = [n for n in free if _INPUT.fullmatch(_stem(n))] if inputs is None else list(inputs)
+    free_pushes = free if driving is None else [n for n in free if n in driving]
+    pushes = [n for n in free_pushes if _DISTURBANCE.fullmatch(_stem(n)) and n not in found_inputs]
+    found_pushes = (pushes if states is None else []) if disturbances is None else list(disturbances)
+    taken = {*found_inputs, *found_pushes}
+    found_states = [name for name in free if name not in taken] if states is None else list(states)
+    if not found_states:
+        raise DataError(
+            f"{where} has no column that could be a state: its columns are {', '.join(names)}; pass states="
+        )
+    unit = "s" if time is None else _unit(time)
+    if unit not in _PER_SECOND:
+        raise DataError(f"{where}: the unit of {time!r} is not one of {', '.join(_PER_SECOND)}; rename it, or pass dt=")
+    return ColumnRoles(
+        tuple(found_states),
+        tuple(found_inputs),
+        tuple(found_pushes),
+        time,
+        _PER_SECOND[unit],
+        episode,
+        step,
+        guessed=(states is None or inputs is None) and driving is None,
+    )
+
+
+def pick_driving(names: Sequence[str], columns: Mapping[str, np.ndarray]) -> list[str] | None:
+    """Return the columns of a saved table that are empty in the last row of each episode; None of any other table."""
+    if tuple(names[: len(SAVED)]) != SAVED or any(name not in columns for name in names):
+        return None
+    episode = columns[SAVED[0]]
+    last = np.append(episode[1:] != episode[:-1], True)
+    return [name for name in names[len(SAVED) :] if np.array_equal(_is_missing(columns[name]), last)]
+
+
+def _is_missing(column: np.ndarray) -> np.ndarray:
+    return np.array([cell is None or cell != cell for cell in column])
+
+
+def is_label(name: str) -> bool:
+    """Return True for the name of a time or episode column, which need not hold numbers."""
+    return _TIME.fullmatch(_stem(name)) is not None or _EPISODE.fullmatch(_stem(name)) is not None
+
+
+def _stem(name: str) -> str:
+    """Return the name without its unit, in lower case."""
+    return re.split(r"\s*[\[(]", name)[0].strip().lower()
+
+
+def _unit(name: str) -> str:
+    found = re.search(r"[\[(]([^\])]*)[\])]", name)
+    return found.group(1).strip() if found else "s"
+
+
+@dataclass(frozen=True)
+class TableSettings:
+    """The caller's knowledge of a table; None is inferred from the table."""
+
+    dt: float | None = None
+    states: Sequence[str] | None = None
+    inputs: Sequence[str] | None = None
+    disturbances: Sequence[str] | None = None
+    resample: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "resample"):
+            if getattr(self, name) is not None:
+                checks.positive(getattr(self, name), name, "s")
+
+    @property
+    def nothing(self) -> bool:
+        """True where the caller gives nothing."""
+        return all(value is None for value in vars(self).values())
+
+    def named_as(self, names: Sequence[str]) -> "TableSettings":
+        """Return the copy with names as a table writes them: ``"pump"`` means ``"pump [V]"`` where no other fits."""
+        stems = [_stem(name) for name in names]
+
+        def own(name: str) -> str:
+            once = name not in names and stems.count(name.strip().lower()) == 1
+            return names[stems.index(name.strip().lower())] if once else name
+
+        own_names = {what: tuple(map(own, some)) for what, some in self.given.items() if not isinstance(some, str)}
+        return replace(self, **own_names)
+
+    @property
+    def given(self) -> dict[str, Sequence[str]]:
+        """The names that the caller gives, by their role."""
+        every = {"states": self.states, "inputs": self.inputs, "disturbances": self.disturbances}
+        return {what: some for what, some in every.items() if some is not None}
+
+    @property
+    def columns(self) -> set[str]:
+        """The columns that the caller names."""
+        return {name for some in self.given.values() for name in some}
+
+
+def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
+    """Return the episodes of a plain table; `load_episodes` says what its columns mean.
+
+    Parameters
+    ----------
+    file
+        The table's file, for messages.
+    table
+        Its columns.
+    told
+        The caller's knowledge, which need not be inferred.
+
+    Raises
+    ------
+    DataError
+        A role or the sample time is neither given nor inferable, a column is missing or holds a cell that is no
+        number, or the rows are no whole episodes.
+    """
+    table = table.with_units()
+    names, columns = list(table.names), table.columns
+    where, told = str(file), told.named_as(names)
+    rows = len(next(iter(columns.values()))) if columns else 0
+    if rows == 0:
+        raise DataError(f"{where} has columns and no row in them; leave the file out")
+    sought = told.columns
+    every = told.states is None or told.inputs is None
+    columns = {
+        name: _numbers(column, name, where) if name in sought or (every and not is_label(name)) else column
+        for name, column in columns.items()
+    }
+    numeric = [name for name in names if name in columns and columns[name].dtype.kind in "fiub"]
+    found = find_roles(list(names), numeric, told, where, pick_driving(names, columns))
+    values = {name: checks.array(columns[name], f"{where}: {name}", (None,), finite=False) for name in found.values}
+    for name, column in values.items():
+        _plausible(column, name, where)
+    if told.states is None and found.guessed:
+        found = _without_counters(found, values, where)
+    text = [name for name, column in columns.items() if every and column.dtype.kind == "O" and not is_label(name)]
+    if text:
+        warnings.warn(
+            f"{where}: {', '.join(map(repr, text))} hold{'s' * (len(text) == 1)} text, and no part of it is a state or "
+            "an input; write numbers, or pass states= and inputs=",
+            FitWarning,
+            stacklevel=2,
+        )
+    time = None
+    if found.time is not None:
+        time = checks.array(columns[found.time], found.time, (None,), finite=False) * found.scale
+    if time is None and told.resample is not None:
+        raise DataError(f"{where} has no column of time to resample by; its columns are {', '.join(names)}")
+    episode = np.zeros(rows, dtype=np.intp)
+    if found.episode is not None:
+        episode = _numbered(columns[found.episode], file)
+    step = None
+    if found.step is not None and time is None:
+        step = checks.array(columns[found.step], f"{where}: step", (None,))
+    X, U, W = (_stacked([values[n] for n in some], rows) for some in (found.states, found.inputs, found.disturbances))
+    parts: list[Signals] = []
+    for e in range(int(episode.max(initial=-1)) + 1):
+        here = np.flatnonzero(episode == e)
+        if step is not None:
+            here = here[np.argsort(step[here], kind="stable")]
+            if (np.diff(step[here]) != 1).any():
+                raise DataError(f"{where}, episode {e}: steps are missing or come twice; split it there")
+        of = None if time is None else time[here]
+        parts += restarts(Signals(of, X[here], U[here], W[here], here + 1, found.states), where)
+    dt = told.resample if told.resample is not None else told.dt
+    if dt is None and time is None:
+        dt = table.dt
+    if dt is None and time is not None and names[: len(SAVED)] == list(SAVED):
+        dt = _find_exact_step(columns[SAVED[1]], time)
+    if dt is None:
+        if time is None:
+            clock = next((f"; {name!r} looks like it" for name in found.states if _even(values[name])), "")
+            raise DataError(
+                f"{where} does not say its sample time: pass dt=, or add a column 'time [s]'{clock}; its columns are "
+                f"{', '.join(names)}"
+            )
+        dt = sample_time([part.time for part in parts if part.time is not None], where)
+    dt = checks.positive(dt, "dt", "s")
+    if told.resample is not None:
+        _affordable(parts, dt, len(found.values), where)
+        parts = resampled(parts, dt, where)
+    if found.guessed:
+        _doubt(found, values, where, alone=told.inputs is None and not found.inputs)
+    try:
+        episodes = episodes_from(parts, dt, where)
+        return Episodes(episodes, dt, found.states, found.inputs, found.disturbances)
+    except KoopmpcError as error:
+        if str(error).startswith(where):
+            raise
+        raise DataError(f"{where}: {error}") from error
+
+
+def _numbers(column: np.ndarray, name: str, where: str) -> np.ndarray:
+    """Return a column of objects as floats, None as NaN; return a column of text unchanged.
+
+    Parameters
+    ----------
+    column
+        (rows,) of any kind.
+    name, where
+        The column and its file, for messages.
+
+    Raises
+    ------
+    DataError
+        At least half of the cells look like numbers, but one is no real number: a decimal comma, a complex number or
+        a word. The whole column would be lost for that cell.
+    """
+    if column.dtype.kind != "O":
+        return column
+    present = [cell for cell in column if cell is not None]
+    if present and all(isinstance(cell, Real | Decimal) for cell in present):
+        return np.array([np.nan if cell is None else float(cell) for cell in column])
+    like = sum(map(_like_a_number, present))
+    if like == 0 or 2 * like < len(present):
+        return column
+    row, cell = next((i, cell) for i, cell in enumerate(column) if cell is not None and not is_a_number(cell))
+    raise DataError(
+        f"{where}: {name!r} holds {str(cell)!r} in row {row + 1}, which is no real number; repair the cell, leave it "
+        "empty where the value is missing, or name the columns to use: pass states= and inputs="
+    )
+
+
+def _like_a_number(cell: object) -> bool:
+    try:
+        complex(str(cell).strip().replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+_USUAL, _ABSURD = 0.99, 1e6  # share of usual cells, and how many times larger none can be
+_MANY = 100  # cells that say what is usual
+
+
+def _plausible(column: Float[np.ndarray, " M"], name: str, where: str) -> None:
+    """Raise where one cell is a million times larger than 99 % of the column, or no model could compute with it.
+
+    Raises
+    ------
+    DataError
+        The message names the row.
+    """
+    size = np.abs(column[np.isfinite(column)])
+    if not len(size):
+        return
+    usual, largest = float(np.quantile(size, _USUAL, method="lower")), float(size.max())
+    if len(size) >= _MANY and (largest > 1e30 or (usual > 0 and largest > _ABSURD * usual)):
+        row = int(np.nanargmax(np.where(np.isfinite(column), np.abs(column), np.nan)))
+        raise DataError(
+            f"{where}: {name!r} is {column[row]:g} in row {row + 1}, where 99 % of its cells are within {usual:.3g}; "
+            "repair the cell, or leave it empty"
+        )
+
+
+def _find_exact_step(step: np.ndarray, time: Float[np.ndarray, " M"]) -> float | None:
+    """Return dt where the times are those of step · dt to the bit, as in a table that was saved; else None."""
+    first = time[step == 1]
+    return float(first[0]) if len(first) and np.array_equal(time, step * first[0]) else None
+
+
+def _affordable(parts: list[Signals], dt: float, columns: int, where: str) -> None:
+    """Raise where the resampled rows do not fit into memory."""
+    rows = sum(float(np.nanmax(p.time) - np.nanmin(p.time)) / dt for p in parts if p.time is not None and len(p.time))
+    free = disk.memory()
+    if free is not None and 16 * rows * columns > free:
+        raise DataError(
+            f"{where}: resample={dt:g} makes {rows:.3g} rows of {columns} columns, {16e-9 * rows * columns:.3g} GB, "
+            f"and {free / 1e9:.3g} GB are free; pass a longer sample time"
+        )
+
+
+def _doubt(found: ColumnRoles, table: dict[str, np.ndarray], where: str, *, alone: bool) -> None:
+    """Warn of roles that may be guessed wrongly, and of columns that are constant or repeat another."""
+    if alone:
+        stepped = [name for name in found.states if _stepped(table[name])]
+        advice = "pass inputs= if some of them are inputs"
+        if 0 < len(stepped) < len(found.states):
+            hold = "holds its" if len(stepped) == 1 else "hold their"
+            advice = f"of these {', '.join(stepped)} {hold} value from row to row, as inputs do: pass inputs="
+        warnings.warn(
+            f"{where}: no column is named as an input, so the plant is taken to run by itself; its states are "
+            f"{', '.join(found.states)}; {advice}",
+            FitWarning,
+            stacklevel=3,
+        )
+    for i, name in enumerate(found.values):
+        column = table[name][np.isfinite(table[name])]
+        if len(column) and np.ptp(column) == 0:
+            warnings.warn(
+                f"{where}: {name!r} is {column[0]:g} throughout; leave it out: pass states= and inputs=",
+                ColumnWarning,
+                stacklevel=3,
+            )
+            continue
+        for other in found.values[:i]:
+            if np.array_equal(table[name], table[other], equal_nan=True):
+                warnings.warn(
+                    f"{where}: {name!r} repeats {other!r}; leave one out: pass states= and inputs=",
+                    ColumnWarning,
+                    stacklevel=3,
+                )
+
+
+def _without_counters(found: ColumnRoles, table: dict[str, np.ndarray], where: str) -> ColumnRoles:
+    """Return the roles without states that number the rows, such as the index that pandas writes."""
+    for name in found.states:
+        if _COUNTER.fullmatch(_stem(name)) and len(found.states) > 1 and (np.diff(table[name]) == 1).all():
+            warnings.warn(f"{where}: {name!r} numbers the rows and is left out", FitWarning, stacklevel=3)
+            found = replace(found, states=tuple(other for other in found.states if other != name))
+        elif found.time is None and _even(table[name]):
+            warnings.warn(
+                f"{where}: {name!r} grows by the same in each row and is taken for a state; where it is time, name it "
+                "'time [s]'",
+                FitWarning,
+                stacklevel=3,
+            )
+    return found
+
+
+def _even(column: Float[np.ndarray, " M"]) -> bool:
+    """Return True for ten rows or more that grow by the same, as time does."""
+    changes = np.diff(column)
+    return len(changes) >= 9 and bool((changes > 0).all() and np.ptp(changes) <= 1e-3 * changes.max())
+
+
+def _stepped(column: Float[np.ndarray, " M"]) -> bool:
+    """Return True for a column that changes, and repeats its last value in more than half of the rows."""
+    changes = np.diff(column[np.isfinite(column)])
+    return 0 < int(np.count_nonzero(changes)) < len(changes) / 2
+
+
+def _numbered(labels: np.ndarray, file: Path) -> np.ndarray:
+    """Return 0, 1, … for the labels in the order in which they first come."""
+    if any(label is None or label != label for label in labels):
+        raise DataError(f"{file} has rows whose episode is null; give each row the name of its episode")
+    _, first, number = np.unique(labels, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), dtype=np.intp)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[number]
+
+
+def _stacked(columns: list[np.ndarray], rows: int) -> Float[np.ndarray, "rows n"]:
+    return np.stack(columns, axis=1) if columns else np.empty((rows, 0))

@@ -1,0 +1,279 @@
+"""Adaptive: a controller whose model goes on learning while it runs."""
+
+from collections import deque
+from dataclasses import replace
+from itertools import pairwise
+from time import perf_counter
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.checks import HUGE, numbers
+from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
+from koopmpc.control.limits import Limits
+from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.move import Move, Plan
+from koopmpc.control.program import Program, Published, SavedController, no_export
+from koopmpc.errors import DataError, KoopmpcError
+from koopmpc.identify.fits.online import OnlineEDMD
+from koopmpc.predict.predictors import LinearPredictor
+
+_BETTER = 1 / 3  # of the error of the model in use that a new one may have on pairs that neither has seen
+_SHORTEST = 20  # pairs that the memory holds by default, where the horizon is shorter
+_WORSE = 1.25  # times the error of an earlier model from which on the model in use is given up for it
+_SUFFICES = 1.5  # times the residuals of its own fit up to which the model in use is left alone
+_PERSISTENT = 3  # samples in sequence that are off before they count as a change of the plant
+_KEPT = 5  # earlier models that can be gone back to
+
+
+class LearnedPair(NamedTuple):
+    """One step as it was: x, what acted, and where it led."""
+
+    x: Float[np.ndarray, " nx"]
+    u: Float[np.ndarray, " nu"]
+    w: Float[np.ndarray, " nw"]
+    x_next: Float[np.ndarray, " nx"]
+
+
+class Adaptive(Published):
+    """A KoopmanMPC that goes on learning its model z⁺ = A z + B u + E w while it runs.
+
+    Each step is a pair (x, u, x⁺), from which `online` learns unless it is faulty: a number is NaN, the state stands
+    still to the bit, the controller's monitor does not know state and input, or the sample is off by far more than
+    those before it. Three such samples in sequence are no spike but a change of the plant, and are learned from.
+
+    Where the model in use predicts a short memory of recent pairs worse than the first one did its own data, the fit
+    of all pairs so far, with the forgetting or the window of `online`, is put on trial: once the memory holds only
+    pairs that came later, both forecast them, from each pair on as far ahead as the memory and the horizon reach, and
+    the new one takes the place of the one in use where its error is less than a third. A fit always predicts well what
+    it was fitted to, and the next step of a path that it has just seen; the plan relies on the steps after that.
+    Where an earlier model forecasts the memory clearly better than the one in use, that one comes back.
+
+    Parameters
+    ----------
+    controller
+        The controller; learning begins with its model, which is also the first to go back to. Its y is the state.
+    online
+        The fit that learns, of the same lifting. Start it with the data of the controller's model:
+        ``OnlineEDMD.start(data, lifting, forgetting=0.98)``.
+    every
+        Steps between two looks at the memory.
+    memory
+        Recent pairs on which models are compared; by default the controller's horizon, at least 20.
+    outlier
+        A sample is off where its misfit is this many times the usual one.
+
+    Attributes
+    ----------
+    learned, skipped
+        Number of pairs that were learned from, and that were not.
+    renewed, returned, refused
+        How often a new model came into use, an earlier one came back, and a new one was no better.
+
+    Raises
+    ------
+    DataError
+        The controller's model has an embedding, or another lifting, dt or names than what `online` learns.
+    """
+
+    def __init__(
+        self,
+        controller: KoopmanMPC,
+        online: OnlineEDMD,
+        *,
+        every: int = 5,
+        memory: int | None = None,
+        outlier: float = 8.0,
+    ) -> None:
+        checks.kind(controller, "controller", KoopmanMPC, "only its model can be learned by OnlineEDMD")
+        checks.kind(online, "online", OnlineEDMD, "start one: km.OnlineEDMD.start(data, lifting, forgetting=0.98)")
+        model = controller.predictor
+        if model.embedding is not None:
+            raise DataError("the controller's model has an embedding, and OnlineEDMD takes none; fit one without")
+        online.check(model)
+        self.controller, self.online = controller, online
+        self.dt, self.nu, self.horizon = controller.dt, controller.nu, controller.horizon
+        self._every, self._outlier = checks.count(every, "every"), checks.positive(outlier, "outlier")
+        self._first = model
+        self._usual = None if model.report is None else model.report.residual
+        held = max(self.horizon, _SHORTEST) if memory is None else checks.count(memory, "memory")
+        self._memory: deque[LearnedPair] = deque(maxlen=held)
+        self._clear()
+
+    def as_data(self) -> SavedController:
+        """Raise DataError: what `online` has learned so far is not data that can be saved."""
+        raise DataError(
+            "an Adaptive controller goes on learning, and its fit cannot be saved as data; save the controller inside "
+            "it, and start an OnlineEDMD again where that is loaded"
+        )
+
+    def build_program(self, reference: ArrayLike | None) -> Program:
+        """Raise the DataError that says why no C code can be generated."""
+        raise no_export(self, "its model changes while it runs; export the controller inside it")
+
+    def _clear(self) -> None:
+        self._memory.clear()
+        self._before: tuple[np.ndarray, np.ndarray, np.ndarray, bool] | None = None
+        self._misfits: deque[float] = deque(maxlen=self._memory.maxlen)
+        self._off = self._steps = 0
+        self.learned = self.skipped = self.renewed = self.returned = self.refused = 0
+        self._good: deque[LinearPredictor] = deque(maxlen=_KEPT)
+        self._on_trial: tuple[LinearPredictor, int] | None = None  # a new model, and the pairs learned before it
+
+    @property
+    def predictor(self) -> LinearPredictor:
+        """The model in use."""
+        return self.controller.predictor
+
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Begin a run with the first model of the controller; `online` keeps what it has learned."""
+        if self.controller.predictor is not self._first:
+            self.controller.update(self._first)
+        self._clear()
+        self.controller.reset(x0, u_prev)
+
+    def plan(self) -> Plan | None:
+        """Return the plan of the last call; None where it had none."""
+        return self.controller.plan()
+
+    def __call__(
+        self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
+    ) -> Move:
+        """Learn from the step that led to y, and return the controller's move; arguments as for KoopmanMPC."""
+        start = perf_counter()
+        x = numbers(y, "y").copy()
+        if self._before is not None:
+            self._take(x, applied)
+        self._steps += 1
+        if self._steps % self._every == 0 and len(self._memory) >= min(self._every, cast("int", self._memory.maxlen)):
+            self._renew()
+        move = self.controller(x, reference, applied, w)
+        watch = self.controller.watch
+        now = np.zeros(self.predictor.nw) if w is None else np.atleast_2d(numbers(w, "w"))[0].copy()
+        self._before = x, move.u.copy(), now, watch is None or watch.inside
+        return replace(move, solve_time=perf_counter() - start)
+
+    def _take(self, x: Float[np.ndarray, " nx"], applied: ArrayLike | None) -> None:
+        """Learn from the step before, which led to x, unless it is faulty."""
+        assert self._before is not None
+        old, u, w, inside = self._before
+        pair = LearnedPair(old, u if applied is None else numbers(applied, "applied").copy(), w, x)
+        together = np.concatenate(pair)
+        if not (inside and (np.abs(together) < HUGE).all()) or np.array_equal(old, x):
+            self.skipped += 1
+            return
+        misfit = float(np.linalg.norm(self._errors(self.predictor, [pair])[0]))
+        usual = float(np.median(self._misfits)) if len(self._misfits) >= _PERSISTENT else np.inf
+        self._off = self._off + 1 if misfit > self._outlier * usual else 0
+        if 0 < self._off < _PERSISTENT:
+            self.skipped += 1
+            return
+        self._misfits.append(misfit)
+        self._memory.append(pair)
+        self.online.learn(pair.x, pair.u, pair.x_next, pair.w if len(w) else None)
+        self.learned += 1
+
+    def _errors(self, model: LinearPredictor, pairs: list[LearnedPair], steps: int = 1) -> Float[np.ndarray, "m nx"]:
+        """Return the errors of forecasts 1 … `steps` ahead from each pair on, as far as pairs follow one another.
+
+        Each state is in the size of its changes from step to step over the memory.
+        """
+        U, W = np.array([pair.u for pair in pairs]), np.array([pair.w for pair in pairs])
+        after = np.array([pair.x_next for pair in pairs])
+        goes_on = np.array([one.x_next is then.x for one, then in pairwise(pairs)] + [False])
+        Z, at, size = np.array([model.lift(pair.x) for pair in pairs]), np.arange(len(pairs)), self._size
+        errors: list[Float[np.ndarray, "m nx"]] = []
+        for _ in range(steps):
+            Z = Z @ model.A.T + U[at] @ model.B.T + W[at] @ model.E.T
+            errors.append((after[at] - Z @ model.C.T) / size)
+            Z, at = Z[goes_on[at]], at[goes_on[at]] + 1
+            if not len(at):
+                break
+        return np.concatenate(errors)
+
+    @property
+    def _size(self) -> Float[np.ndarray, " nx"]:
+        """Root mean square of each state's change from step to step in the memory; 1 where it does not move."""
+        if not self._memory:
+            return np.ones(self.predictor.nx)
+        changes = np.array([pair.x_next - pair.x for pair in self._memory])
+        size = np.sqrt((changes**2).mean(axis=0))
+        return np.where(size > 0, size, 1.0)
+
+    def _renew(self) -> None:
+        """Put a new model on trial where the one in use does not suffice, end a trial, or go back to an earlier one."""
+        pairs, used = list(self._memory), self.predictor
+        if self._suffices(used, pairs):
+            self._on_trial = None
+            return
+        if self._on_trial is None:
+            try:
+                self._on_trial = self.online.predictor(), self.learned
+            except KoopmpcError:  # too little was learned for a fit
+                return
+        error = self._error(used, pairs)
+        candidate, before = self._on_trial
+        if self.learned - before >= cast("int", self._memory.maxlen):
+            self._on_trial = None
+            if self._error(candidate, pairs) < _BETTER * error and self._use(candidate):
+                self._good.append(used)
+                self.renewed += 1
+                return
+            self.refused += 1
+        earlier = [self._first, *self._good]
+        errors = [self._error(model, pairs) for model in earlier]
+        best = int(np.argmin(errors))
+        if earlier[best] is not used and error > _WORSE * errors[best] and self._use(earlier[best]):
+            self.returned += 1
+
+    def _suffices(self, model: LinearPredictor, pairs: list[LearnedPair]) -> bool:
+        """Return whether the model predicts these pairs as well as the first model did its own data."""
+        usual = self._usual
+        if usual is None:
+            return False
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = np.sqrt(((self._errors(model, pairs) * self._size) ** 2).mean(axis=0))
+        return bool((found <= _SUFFICES * usual).all())
+
+    def _error(self, model: LinearPredictor, pairs: list[LearnedPair]) -> float:
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = float(np.sqrt((self._errors(model, pairs, self.horizon) ** 2).mean()))
+        return found if np.isfinite(found) else np.inf
+
+    def _use(self, model: LinearPredictor) -> bool:
+        """Go on with this model; return False where no controller can be made of it."""
+        used = self.predictor
+        try:
+            self.controller.update(model)
+        except KoopmpcError:
+            self.controller.update(used)
+            return False
+        return True
+
+
+_FORGETTING = 0.98  # in the bench a pair of 35 steps ago counts by half
+
+
+def _build_learning(parts: Any, limits: Limits) -> Adaptive:
+    problem = parts.problem
+    mpc = KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, monitor=parts.monitor_data)
+    return Adaptive(mpc, OnlineEDMD.start(parts.data, problem.lifting, forgetting=_FORGETTING, ridge=problem.ridge))
+
+
+register_controller(
+    ControllerKind(
+        Adaptive,
+        bench=(
+            BenchEntry(
+                "adaptive",
+                "koopman-mpc whose model goes on learning from every step of the run.",
+                "linear",
+                _build_learning,
+                on_request=True,  # for plants that drift
+            ),
+        ),
+    )
+)

@@ -1,0 +1,85 @@
+"""Doors only downwards: each import, within functions and by strings too, leads to the own room or to one below it."""
+
+import ast
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import koopmpc as km
+from koopmpc.lazy import load_joint
+
+ROOT = Path(km.__file__).parent
+SETTINGS = tomllib.loads((ROOT.parent / "pyproject.toml").read_text(encoding="utf-8"))
+LAYERS: list[str] = next(c for c in SETTINGS["tool"]["importlinter"]["contracts"] if c.get("exhaustive"))["layers"]
+RANK = {room: -i for i, room in enumerate(LAYERS)}
+MODULES = {
+    ".".join(["koopmpc", *file.relative_to(ROOT).with_suffix("").parts]).removesuffix(".__init__"): file
+    for file in ROOT.rglob("*.py")
+}
+FRONT_DOOR = ("koopmpc", "koopmpc.__main__")
+BY_NAME = ("koopmpc.lazy", "koopmpc.papers.registry")  # import modules by names that they compute
+
+
+def room(module: str) -> str:
+    return module.split(".")[1]
+
+
+def imported(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield the line and the name of each module of koopmpc that the source imports, or names in a string."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "koopmpc":
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                yield node.lineno, inner if inner in MODULES else str(node.module)
+        elif isinstance(node, ast.Import):
+            yield from ((node.lineno, a.name) for a in node.names if a.name.split(".")[0] == "koopmpc")
+        elif isinstance(node, ast.Constant) and node.value in MODULES and node.value not in FRONT_DOOR:
+            yield node.lineno, node.value
+
+
+def upward(module: str, source: str) -> list[str]:
+    """Return the imports of a module that lead to a room above its own, or to the front door."""
+    return [
+        f"{module}:{line} imports {target}"
+        for line, target in imported(ast.parse(source))
+        if target in FRONT_DOOR or RANK[room(target)] > RANK[room(module)]
+    ]
+
+
+def test_no_room_imports_one_above_it_in_any_way() -> None:
+    inside = [name for name in MODULES if name not in FRONT_DOOR]
+    assert [fault for name in inside for fault in upward(name, MODULES[name].read_text(encoding="utf-8"))] == []
+
+
+def test_modules_are_imported_by_computed_names_in_two_files_alone() -> None:
+    computed = {
+        name
+        for name, file in MODULES.items()
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+        and getattr(node.func, "id", getattr(node.func, "attr", "")) in ("import_module", "__import__")
+        and not isinstance(node.args[0], ast.Constant)
+    }
+    assert computed == set(BY_NAME)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from koopmpc.loop.run import Run",
+        "def f():\n    from koopmpc import recording",
+        "if TYPE_CHECKING:\n    import koopmpc.cli.app",
+        "import_module('koopmpc.recording.reader')",
+        "import koopmpc",
+    ],
+)
+def test_each_way_up_is_seen(source: str) -> None:
+    assert len(upward("koopmpc.data.episodes", source)) == 1
+    assert upward("koopmpc.data.episodes", "from koopmpc.values import Value") == []
+
+
+@pytest.mark.parametrize("joint", ["log formats", "monitor", "controllers"])
+def test_modules_of_a_joint_are_there(joint: str) -> None:
+    assert set(load_joint(joint)) <= set(MODULES)

@@ -1,0 +1,112 @@
+"""How plainly the library speaks: counts of names and words that may fall, and may not rise (docs/design.md)."""
+
+import ast
+import io
+import re
+import tokenize
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+import koopmpc as km
+
+MOST = {
+    "functions named by a participle": 143,
+    "lines with two constants": 27,
+    "public names with two homes": 11,
+    "riddling words": 84,
+    "sentences above 40 words": 9,
+}
+IRREGULAR = re.compile(
+    "begun|bound|built|chosen|cut|done|drawn|driven|fed|felt|found|given|gone|got|had|heard|held|kept|known|laid|left|"
+    "lost|made|meant|met|put|read|run|said|seen|sent|set|shown|shut|spent|split|spoken|stood|struck|taken|thought|told|"
+    "torn|understood|unfelt|unheld|won|written|[a-z]{3,}ed"
+)
+NOUNS = re.compile("cut|embed|exceed|feed|hundred|lead|need|proceed|put|read|run|seed|set|speed|split|spread|succeed")
+RIDDLES = re.compile(
+    r"(?<!there )\b(is|are|was|were) (none|no (?!longer|more))\b|\b(is|are) told\b|\bin whom\b|\banew\b|\bof ours\b|"
+    r"\bthat which\b|\bbut for\b|\bcounts? beside\b|\bwhose answer it is\b|\bon its way\b|\bof one's own\b|\bshall\b|"
+    r"\bthe same of\b|\bhas not shown up\b|\blet through\b|\bas little as\b|\bthe one who\b|\bwhat is left of\b",
+    re.I,
+)
+SECTIONS = re.compile(r"\n\s*(?:Parameters|Raises|References|Examples|Returns|Attributes)\n\s*-+")
+
+
+def is_participle(name: str) -> bool:
+    word = name.strip("_")
+    return IRREGULAR.fullmatch(word) is not None and NOUNS.fullmatch(word) is None
+
+
+def sets_two_constants(node: ast.stmt) -> bool:
+    if not isinstance(node, ast.Assign) or not isinstance(node.targets[0], ast.Tuple):
+        return False
+    return all(isinstance(e, ast.Name) and e.id.strip("_").isupper() for e in node.targets[0].elts)
+
+
+def sentences_of(tree: ast.Module):
+    documented = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Module)
+    for node in ast.walk(tree):
+        if isinstance(node, documented) and (text := ast.get_docstring(node)):
+            yield from re.split(r"(?<=[.;:?!])\s+", SECTIONS.split(text)[0])
+
+
+def spoken_lines(text: str):
+    """Yield the comments, and the strings of more than a word that are no docstrings."""
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        plain = token.type == tokenize.STRING and not token.string.startswith(('"""', "'''"))
+        middle = token.type == getattr(tokenize, "FSTRING_MIDDLE", None)  # text of f-strings from Python 3.12 on
+        if token.type == tokenize.COMMENT or ((plain or middle) and " " in token.string):
+            yield token.string
+
+
+def find_places(files: list[tuple[str, str]]) -> dict[str, list[str]]:
+    """Return the places of each kind in files, given as (name, text)."""
+    places: dict[str, list[str]] = defaultdict(list)
+    homes: dict[str, set[str]] = defaultdict(set)
+    for file, text in files:
+        tree = ast.parse(text)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and is_participle(node.name):
+                places["functions named by a participle"].append(f"{file}:{node.lineno} {node.name}")
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                homes[node.name].add(file)
+            if sets_two_constants(node):
+                places["lines with two constants"].append(f"{file}:{node.lineno}")
+        for sentence in sentences_of(tree):
+            if len(sentence.split()) > 40:
+                places["sentences above 40 words"].append(f"{file}: {sentence[:80]}")
+            if RIDDLES.search(sentence):
+                places["riddling words"].append(f"{file}: {sentence[:80]}")
+        places["riddling words"] += [f"{file}: {line[:80]}" for line in spoken_lines(text) if RIDDLES.search(line)]
+    shared = {name: sorted(where) for name, where in homes.items() if len(where) > 1}
+    places["public names with two homes"] = [f"{name}: {', '.join(where)}" for name, where in shared.items()]
+    return places
+
+
+@pytest.fixture(scope="module")
+def places():
+    root = Path(km.__file__).parent
+    files = [(str(path.relative_to(root)), path.read_text()) for path in sorted(root.rglob("*.py"))]
+    return find_places([(name, text) for name, text in files if not name.startswith("problems/")])
+
+
+@pytest.mark.parametrize("kind", MOST)
+def test_the_library_speaks_as_plainly_as_before(places, kind):
+    assert len(places[kind]) <= MOST[kind], "\n".join(places[kind])
+
+
+def test_each_kind_is_found_where_it_stands():
+    long = " ".join(["word"] * 41)
+    text = (
+        f'"""{long}."""\nA, B = 1, 2  # found anew\ndef solved():\n    raise ValueError("x is told")\nclass Box: ...\n'
+    )
+    found = find_places([("one.py", text), ("two.py", "class Box: ...\nC = 1\ndef solve(): ...\n")])
+    assert {kind: len(found[kind]) for kind in MOST} == {
+        "functions named by a participle": 1,
+        "lines with two constants": 1,
+        "public names with two homes": 1,
+        "riddling words": 2,
+        "sentences above 40 words": 1,
+    }
