@@ -30,6 +30,7 @@ from koopmpc.control.program import StepProgram
 from koopmpc.disk import path_of, writing
 from koopmpc.errors import DataError
 from koopmpc.estimate.kalman import FilterProgram
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.routines import find_compiler
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -131,6 +132,7 @@ def _refuse_others(root: Path, known: set[str], prefix: str) -> None:
             raise DataError(f"{root} holds {name}, which no export wrote; pass an empty folder, or remove that file")
 
 
+@raise_swallowed()
 def _write_plant(
     tables: Tables, plant: StepMap | None, x0: ArrayLike | None, steps: int, language: Language
 ) -> dict[str, str]:
@@ -174,6 +176,7 @@ def _write_plant(
     return {"plant.c": code, "plant.h": header}
 
 
+@raise_swallowed()
 def _model_map(program: StepProgram) -> ca.Function:
     """Return the controller's own model as a map of ζ, lifted afresh each step."""
     model = program.model
@@ -189,6 +192,7 @@ def _model_map(program: StepProgram) -> ca.Function:
     return ca.Function("F", [x, u], [ca.densify(x_next)], {"cse": True})
 
 
+@raise_swallowed()
 def _express_measurement(program: StepProgram, plant: StepMap | None, x: ca.SX, ny: int) -> ca.SX:
     """Return y, the measurement of the controller, of the plant's state x."""
     estimator = program.estimator if isinstance(program, CondensedProgram) else None

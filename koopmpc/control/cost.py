@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.limits import Interval, Limits, Softness, half_width, magnitude
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import Lifting, find_observables
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -250,6 +251,7 @@ def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits | Non
     return _tracking(C, lambda kept: np.ascontiguousarray(G[kept]), cost, limits, len(C), states, nu, ranges)
 
 
+@raise_swallowed()
 def state_tracking(
     states: tuple[str, ...],
     nu: int,

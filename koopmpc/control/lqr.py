@@ -26,6 +26,7 @@ from koopmpc.control.target import Targets, Units, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Measured
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Eigenfunction
 from koopmpc.plants.graph import Graph
@@ -408,6 +409,7 @@ class EigenfunctionLQR(FeedbackLaw):
     Technol. 2, 2021 (KRONIC).
     """
 
+    @raise_swallowed()
     def __init__(
         self,
         eigenfunction: Lifting,
@@ -450,6 +452,7 @@ class EigenfunctionLQR(FeedbackLaw):
         sized = Limits() if limits is None else limits
         super().__init__(checks.positive(dt, "dt", "s"), x.numel(), sized.inputs(nu), sized.rates(nu))
 
+    @raise_swallowed()
     def as_data(self) -> SavedController:
         """Return what the controller was made of; a function B becomes its graph.
 

@@ -19,6 +19,7 @@ from koopmpc.control.watching import StepMonitor
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator, EstimatorProgram, StateObserver, estimator_program
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import save_value
@@ -260,6 +261,7 @@ def trace_graph(function: ca.Function, what: str) -> Graph:
         raise DataError(f"{what} cannot be written in C: {error}") from error
 
 
+@raise_swallowed()
 def trace_lifting(lift: Callable[[ca.SX], ca.SX], nzeta: int, embedding: Delay | None, nu: int) -> Graph:
     """Return ζ → z as a graph.
 

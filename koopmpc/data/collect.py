@@ -12,6 +12,7 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Excitation, OpenLoop, Policy
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.plant import Plant, read_measurement, require_plant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.values import Value, freeze
@@ -154,6 +155,7 @@ def _batch(
     return X, moves
 
 
+@raise_swallowed()
 def _measured(plant: StepMap, X: Float[np.ndarray, "E rows nx"]) -> Float[np.ndarray, "E rows ny"]:
     """Return y = h(x) for each row; X itself where all is measured."""
     x = ca.SX.sym("x", plant.nx)

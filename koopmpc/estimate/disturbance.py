@@ -12,6 +12,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.routines import bind_interpreter
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value, Viewing
@@ -173,6 +174,7 @@ class DisturbanceObserver(Viewing, Measured):
         return bool(self._seen[0])
 
 
+@raise_swallowed()
 def _rule(sizes: tuple[int, int, int], nx: int, known: slice, gain: float, lift: ca.Function | None) -> ca.Function:
     """Return (x, A z + B u + E w, memory, C) → memory after x has come; z = ψ(x), or x itself without a `lift`.
 

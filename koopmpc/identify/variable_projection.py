@@ -12,6 +12,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import Lifting
 from koopmpc.plants.graph import Graph
 from koopmpc.values import freeze
@@ -46,6 +47,7 @@ class TunableLifting:
         The lifting has no tunable field.
     """
 
+    @raise_swallowed()
     def __init__(self, lifting: Lifting) -> None:
         self.lifting = lifting
         nx, nz = len(lifting.bound_states), lifting.nz

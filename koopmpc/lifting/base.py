@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError, ObservableError, ShapeError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Buffered
 from koopmpc.values import Value
@@ -126,6 +127,7 @@ class Lifting(Value, ABC):
             )
         return z
 
+    @raise_swallowed()
     def guarded_function(self) -> ca.Function:
         """Return ψ as a CasADi function of one state; its result is NaN if an entry of x is NaN or beyond 1e30."""
         x = ca.SX.sym("x", len(self.bound_states))
@@ -167,6 +169,7 @@ class Lifting(Value, ABC):
         self._graph.run(x, Z.T, self._graph.scratch(x.shape[1]))
 
     @cached_property
+    @raise_swallowed()
     def _graph(self) -> Graph:
         x = ca.SX.sym("x", len(self.bound_states))
         return Graph.trace(ca.Function("lifting", [x], [self.symbolic(x)]))

@@ -15,6 +15,7 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import CONSTANT, Indices, Lifting, check_lifting, strip_unit
 from koopmpc.plants.graph import Graph
 from koopmpc.values import freeze
@@ -418,6 +419,7 @@ def _combine_parts(parts: Float[np.ndarray, "p ..."]) -> Complex[np.ndarray, "..
     return parts[0] if len(parts) == 1 else parts[0] + 1j * parts[1]
 
 
+@raise_swallowed()
 def evaluate_jacobians(lifting: Lifting, X: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M nz nx"]:
     """Return ∂ψ/∂x at rows of states, exactly, by CasADi's derivatives."""
     x = ca.SX.sym("x", X.shape[1])

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.errors import DataError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import CONSTANT, Lifting, StateChoice, Traced, find_states, freeze_choice, strip_unit
 from koopmpc.plants.graph import Graph
 from koopmpc.values import Value, freeze
@@ -177,6 +178,7 @@ class Expressions(Lifting):
     def __init__(self, fn: Callable[[ca.SX], Sequence[ca.SX]], names: Sequence[str]) -> None:
         freeze(self, fn=fn, labels=checks.texts((names,) if isinstance(names, str) else names, "names"), bound=None)
 
+    @raise_swallowed()
     def bind(self, states: Sequence[str]) -> Traced:
         """Return the traced list of operations, which does not need `fn`."""
         x = ca.SX.sym("x", len(states))

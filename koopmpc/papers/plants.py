@@ -18,6 +18,7 @@ from koopmpc import checks
 from koopmpc.control.lqr import lqr
 from koopmpc.control.riccati import Gain
 from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.dynamics import RK4, Dynamics, build_right_side
 from koopmpc.plants.step_map import StepMap
 
@@ -63,6 +64,7 @@ class CartPole(Dynamics):
         return ca.vertcat(x[1], acceleration, x[3], -(acceleration * C + self.g * S) / self.L)
 
 
+@raise_swallowed()
 def linearize_exactly(
     dynamics: Dynamics, x: ArrayLike
 ) -> tuple[Float[np.ndarray, "nx nx"], Float[np.ndarray, "nx nu"]]:
@@ -97,6 +99,7 @@ def swing_frequency(plant: Pendulum, amplitude: float) -> float:
     return float(np.pi / 2 * np.sqrt(plant.g / plant.L)) / quarter
 
 
+@raise_swallowed()
 def integrate_trajectories(
     dynamics: Dynamics,
     starts: ArrayLike,
@@ -157,6 +160,7 @@ class ClosedLoop:
         return float(self.J[-1])
 
 
+@raise_swallowed()
 def integrate_closed_loop(
     dynamics: Dynamics,
     law: Callable[[ca.SX], ca.SX],

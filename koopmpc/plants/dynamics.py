@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.scene import Scene, Shape
 from koopmpc.values import Named
 
@@ -55,6 +56,7 @@ def find_scene(dynamics: Dynamics) -> Scene | None:
     return None if type(dynamics).scene is Dynamics.scene else lambda x, u: draw(x, u) or ()
 
 
+@raise_swallowed()
 def build_right_side(dynamics: Dynamics) -> ca.Function:
     """Return f of ẋ = f(x, u) as a CasADi function of x (nx) and u (nu).
 
@@ -72,6 +74,7 @@ def build_right_side(dynamics: Dynamics) -> ca.Function:
     return ca.Function("f", [x, u], [value], ["x", "u"], ["dx"])
 
 
+@raise_swallowed()
 def build_output(dynamics: Dynamics) -> tuple[ca.Function, tuple[str, ...]]:
     """Return h of y = h(x), and the names of y: an output that is a state has the state's name."""
     _check_names(dynamics)

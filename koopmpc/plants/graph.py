@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.routines import make_dense
 from koopmpc.values import Value
 
@@ -135,6 +136,7 @@ class Graph(Value):
             raise DataError(f"{len(outputs)} of {self.m} results are written")
 
     @classmethod
+    @raise_swallowed()
     def trace(cls, function: ca.Function) -> "Graph":
         """Return the graph of a CasADi function with one result, of any number of arguments.
 

@@ -77,6 +77,7 @@ class Buffered(threading.local):
         return Buffered, (self.function,)
 
 
+@raise_swallowed()
 def make_dense(function: ca.Function) -> ca.Function:
     """Return `function` with dense inputs and outputs; the buffer of a sparse function would hold only nonzeros."""
     sparsities = [function.sparsity_in(i) for i in range(function.n_in())]
@@ -89,6 +90,7 @@ def make_dense(function: ca.Function) -> ca.Function:
     return result.expand() if function.is_a("SXFunction") else result
 
 
+@raise_swallowed()
 def _generate_rollouts(F: ca.Function) -> str:
     """Return C with ``koopmpc_rollouts(E, T, X, U)``: X (E, T+1, nx) from its first rows and U (E, T, nu)."""
     x, u = ca.SX.sym("x", F.size1_in(0)), ca.SX.sym("u", F.size1_in(1))
@@ -97,6 +99,7 @@ def _generate_rollouts(F: ca.Function) -> str:
     return _generate_code(step) + _LOOP.format(nx=x.numel(), nu=u.numel(), **sizes)
 
 
+@raise_swallowed()
 def _generate_code(function: ca.Function) -> str:
     """Return CasADi's C with static functions: an exported name could clash with the same name in the process."""
     generator = ca.CodeGenerator("koopmpc", {"with_header": False})

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants import routines
 from koopmpc.plants.dynamics import RK4, Dynamics, Integrator, build_output, build_right_side, find_scene
 from koopmpc.plants.graph import Graph
@@ -69,6 +70,7 @@ class StepMap(Named):
     outputs: tuple[str, ...]
     scene: Scene | None = field(default=None, compare=False)
 
+    @raise_swallowed()
     def __init__(
         self,
         F: ca.Function,
@@ -175,6 +177,7 @@ class StepMap(Named):
         return _Batch(self._step)
 
     @cached_property
+    @raise_swallowed()
     def measures_all(self) -> bool:
         """True if y = x."""
         nx = len(self.states)
@@ -186,6 +189,7 @@ class StepMap(Named):
         return Buffered(self.h)
 
     @cached_property
+    @raise_swallowed()
     def _jacobians(self) -> Buffered:
         x, u = ca.MX.sym("x", self.nx), ca.MX.sym("u", self.nu)
         x_next = self.F(x, u)
@@ -197,6 +201,7 @@ class StepMap(Named):
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "scene"}
 
 
+@raise_swallowed()
 def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) -> StepMap:  # noqa: B008
     """Return x⁺ = F(x, u) of ẋ = f(x, u) over one sample with constant u.
 

@@ -19,6 +19,7 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import Lifting, check_lifting
 from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant, State
@@ -295,6 +296,7 @@ def _check_scale(scale: ArrayLike, nz: int) -> Float[np.ndarray, "nz nz"]:
     return R
 
 
+@raise_swallowed()
 def _build_step_map(predictor: Predictor, N: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray) -> StepMap:
     """Return x⁺ = C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)) as a StepMap of x, or of ζ under an embedding."""
     x, u = ca.SX.sym("x", len(predictor.point_names)), ca.SX.sym("u", predictor.nu)

@@ -12,6 +12,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.nonlinear.equilibrium import Equilibria, Equilibrium
 from koopmpc.control.nonlinear.problem import LearnedMap, learned_map
 from koopmpc.data.episodes import Episodes
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.asked import Asked
 from koopmpc.synthesis.candidates import Recipe
@@ -47,6 +48,7 @@ class Surrogate(Value):
     w: Float[np.ndarray, " nw"]
     noise: Float[np.ndarray, " nx"]
 
+    @raise_swallowed()
     def plant(self, gain: float = 1.0) -> StepMap:
         """Return the plant whose inputs act `gain` times as much as in the data; y is the state without its past."""
         model, given = self.model, self._map(gain)
@@ -79,6 +81,7 @@ class Surrogate(Value):
         find = self.holding(cost, limits, gain)
         return np.array([find(row).u for row in rows])
 
+    @raise_swallowed()
     def _map(self, gain: float) -> LearnedMap:
         given = learned_map(self.model)
         if gain == 1.0:

@@ -119,6 +119,7 @@ class Equilibria:
     their sizes.
     """
 
+    @raise_swallowed()
     def __init__(self, model: LearnedMap, cost: Cost, outputs: StateTracking) -> None:
         self.model, self._cost, self._outputs, o = model, cost, outputs, outputs
         self.of_state = isinstance(cost.of, State) and cost.of.selects_all

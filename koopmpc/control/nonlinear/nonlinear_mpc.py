@@ -100,6 +100,7 @@ class Shooting:
     Bock & Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", IFAC 1984.
     """
 
+    @raise_swallowed()
     def __init__(
         self,
         problem: StagedProblem,

@@ -14,6 +14,7 @@ from koopmpc.control.cost import StateTracking
 from koopmpc.control.limits import SOFTENED, Interval, Softness, preview_margin
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.routines import Buffered
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -108,6 +109,7 @@ class LearnedMap:
         return Buffered(self.F)
 
 
+@raise_swallowed()
 def learned_map(model: ModelOrMap) -> LearnedMap:
     """Return the map of a predictor or of a StepMap.
 
@@ -206,6 +208,7 @@ class StageTargets(NamedTuple):
     m: Float[np.ndarray, " nt"]
 
 
+@raise_swallowed()
 def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int, ...]) -> StagedProblem:
     """Return the problem of a horizon that is cut into blocks of held inputs."""
     o, N, F = outputs, sum(blocks), model.F

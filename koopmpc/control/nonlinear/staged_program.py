@@ -16,6 +16,7 @@ from koopmpc.control.nonlinear.stagewise import Sides
 from koopmpc.control.program import StepProgram, trace_graph
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import EstimatorProgram
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.graph import Graph
 
 
@@ -118,6 +119,7 @@ def find_targets(
     return np.array(found)
 
 
+@raise_swallowed()
 def trace_functions(
     problem: StagedProblem, outputs: StateTracking, model: LearnedMap, *, disturbed: bool
 ) -> dict[str, Graph]:

@@ -51,9 +51,15 @@ class ColumnRoles:
 
 
 def is_a_number(cell: object) -> bool:
-    """Return whether a cell of a table is a real number, or the text of one."""
+    """Return whether a cell of a table is a real number, or the text of one in ASCII.
+
+    Python reads 1_000 and the digits of all scripts; the parsers of tables do not, and leave such a column as text.
+    """
+    text = str(cell)
+    if not text.isascii() or "_" in text:
+        return False
     try:
-        float(str(cell))
+        float(text)
     except ValueError:
         return False
     return True

@@ -12,6 +12,7 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.solve import Ridge
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import Lifting, Traced
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
@@ -105,6 +106,7 @@ class InputPredictor(Value):
         """Return X (T+1, nx) from x0 under U (T, nu), lifted again at each step."""
         return self.step_map().rollout(x0, U)
 
+    @raise_swallowed()
     def step_map(self) -> StepMap:
         """Return x⁺ = C K ψ(x, u)."""
         m = self.model
@@ -114,6 +116,7 @@ class InputPredictor(Value):
             ca.Function("F", [x, u], [ca.densify(ahead)]), m.dt, states=m.states[: self.nx], inputs=m.states[self.nx :]
         )
 
+    @raise_swallowed()
     def linear(self) -> LinearPredictor:
         """Return z⁺ = A z + B u on the observables of the state alone, from the rows and columns of K.
 

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
 from koopmpc.errors import DataError
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.predict.base import FitReport
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
@@ -41,6 +42,7 @@ class MultiStepError:
     a state. With D_k = ∂x̂_k/∂Θ and J = ∂(Θ φ)/∂ζ the derivative follows D_{k+1} = I ⊗ φᵀ + J ∂ζ̂_k/∂Θ.
     """
 
+    @raise_swallowed()
     def __init__(self, model: LinearPredictor | BilinearPredictor, size: Float[np.ndarray, " nx"]) -> None:
         self.embedding, self.size = model.embedding, size
         zeta, u = ca.SX.sym("zeta", len(model.point_names)), ca.SX.sym("u", model.nu)
@@ -65,11 +67,13 @@ class MultiStepError:
                 point = x if self.embedding is None else self.embedding.shifted(point, u, x)
         return total / data.states.size
 
+    @raise_swallowed()
     def _features_of(self, point: Float[np.ndarray, "m npoint"], u: Float[np.ndarray, "m nu"]) -> np.ndarray:
         """Return φ of every segment, (m, nphi)."""
         values = cast("Any", self._features.map(len(point))(point.T, u.T))
         return np.asarray(values, dtype=np.float64).T
 
+    @raise_swallowed()
     def derivatives(
         self, theta: Float[np.ndarray, "nx nphi"], data: Segments
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
