@@ -205,7 +205,7 @@ def table(tmp_path: Path, cells: list[str], header: str = "t,x,v,u") -> Path:
     return text(tmp_path / "log.csv", "\n".join([header, *rows, ""]))
 
 
-@pytest.mark.parametrize("spoilt", ["oops", "0.3+0.1j", "-", " ", "n/a", '"1,5"', "1_000", "９", "١", "\u00a01"])
+@pytest.mark.parametrize("spoilt", ["oops", "0.3+0.1j", "-", " ", "n/a", '"1,5"', "1_000", "９", "١"])
 def test_a_cell_that_is_no_number_costs_no_column_in_silence(tmp_path: Path, spoilt: str) -> None:
     file = table(tmp_path, ["1.5", "2.5", spoilt, "4.5", "6"])
     shown = re.escape(spoilt.strip('"'))
