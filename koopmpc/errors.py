@@ -57,6 +57,17 @@ class ColumnWarning(FitWarning):
     """A column of a table says nothing: it is constant in it, or repeats another."""
 
 
+class NoInputWarning(FitWarning):
+    """No column of a table has the name of an input, so that its plant seems to run by itself.
+
+    `question` asks for the inputs, for callers who do not go on without an answer.
+    """
+
+    def __init__(self, message: str, question: str) -> None:
+        super().__init__(message)
+        self.question = question
+
+
 @contextmanager
 def unwarned() -> Generator[None]:
     """Show no FitWarning in this block, whose caller says elsewhere what is doubtful."""

@@ -79,8 +79,15 @@ def new(name: Annotated[str, typer.Argument(help="Name of the problem; the file 
 @app.command()
 def fit(
     data: Annotated[list[Path], typer.Argument(help="A folder of .npz, .parquet, .csv and .rrd files, or files.")],
-    states: Annotated[str | None, typer.Option("--states", help="Columns of a table that are states: a,b,…")] = None,
-    inputs: Annotated[str | None, typer.Option("--inputs", help="Columns that are inputs: u,v,…")] = None,
+    states: Annotated[
+        str | None, typer.Option("--states", help="Columns of a table that are states or outputs: a,b,… or 3,4.")
+    ] = None,
+    inputs: Annotated[
+        str | None, typer.Option("--inputs", help='Columns that are inputs: u,v,… or 2; "" where there are none.')
+    ] = None,
+    columns: Annotated[
+        str | None, typer.Option("--columns", help="Names of all columns, for a table without a line of names.")
+    ] = None,
     dt: Annotated[float | None, typer.Option("--dt", help="Sample time in s, where no column tells it.")] = None,
     resample: Annotated[
         float | None, typer.Option("--resample", help="Sample time in s to bring unequal steps to.")
@@ -112,6 +119,7 @@ def fit(
         "states": None if states is None else split(states),
         "inputs": None if inputs is None else split(inputs),
         "resample": resample,
+        "columns": None if columns is None else split(columns),
     }
     if goal_template:
         with friendly():

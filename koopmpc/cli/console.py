@@ -128,13 +128,17 @@ def new_file(path: Path, text: str) -> Path:
     return path
 
 
-_OPTION = re.compile(r"\b(dt|states|inputs|resample|horizon|workers|scheduler)=")
+_OPTION = re.compile(r"\b(dt|states|inputs|columns|resample|horizon|workers|scheduler)=(\[\])?( ?)")
 _SUBJECT = re.compile(r"(^|: )(dt|resample|horizon|workers|scheduler|runs)(?= is )")
 
 
 def as_options(message: str) -> str:
     """Return the message with the options of this program in place of Python's arguments."""
-    told = _OPTION.sub(lambda found: f"--{found.group(1)} ", message).replace(" ;", ";").replace(" ,", ",")
+    told = (
+        _OPTION.sub(lambda f: f"--{f.group(1)} " + ('""' + f.group(3)) * (f.group(2) is not None), message)
+        .replace(" ;", ";")
+        .replace(" ,", ",")
+    )
     return _SUBJECT.sub(r"\1--\2", told)
 
 

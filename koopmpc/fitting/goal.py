@@ -121,7 +121,7 @@ def design_data(
     tell = ignore_text if say is None else say
     pushed = list_goal_inputs(goal)
     reading = load_reading(goal) | {name: value for name, value in reading.items() if value is not None}
-    split = read_logs(data, None, draw, memory, reading, _SHORT)
+    split = read_logs(data, None, draw, memory, reading, _SHORT, ask=not pushed)
     missed = tuple(name for name in pushed if name in split.seen.states)
     if missed and "inputs" not in reading:  # the goal knows inputs that no name in the logs shows
         reading["inputs"] = (*split.seen.inputs, *missed)

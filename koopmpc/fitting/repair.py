@@ -18,7 +18,7 @@ from koopmpc.data.files.folder import Files
 from koopmpc.data.files.sampling import UnevenSamplingError
 from koopmpc.data.files.tables import SAVED
 from koopmpc.data.source import Changed, Held, Source, Subset
-from koopmpc.errors import ColumnWarning, DataError, FitWarning
+from koopmpc.errors import ColumnWarning, DataError, FitWarning, NoInputWarning
 from koopmpc.synthesis.cross_validation import cut_blocks, replace_glitches, take_sample, usual_horizon
 from koopmpc.text import with_unit
 from koopmpc.validate.logs.audit import audit
@@ -35,18 +35,29 @@ def read_logs(
     memory: int,
     options: Mapping[str, Any],
     short: str = _SHORTER,
+    *,
+    ask: bool = True,
 ) -> "DividedData":
     """Return the data of logs as `divide_files` makes them; the notes begin with how the logs were read.
 
     `options` holds keywords of `load_episodes`; those that are None count as not given. Unequal steps are interpolated
     to their median unless ``resample`` is given, and a note says so.
+
+    Raises
+    ------
+    DataError
+        As `divide_files`; with `ask` also where no column has the name of an input and the caller names none.
     """
     reading = {name: value for name, value in options.items() if value is not None}
     logs, notes = find_logs(data), list[str]()
     with collect_notes(notes):
+        if ask:
+            warnings.simplefilter("error", NoInputWarning)
         try:
             files = Files(logs, **reading)
             split = divide_files(files, horizon, rng, memory, short)
+        except NoInputWarning as missing:
+            raise DataError(missing.question) from missing
         except UnevenSamplingError as uneven:
             if "resample" in reading:
                 raise

@@ -132,11 +132,11 @@ def test_the_index_that_pandas_writes_is_no_state_and_a_clock_of_another_name_is
 
 def test_columns_that_hold_their_value_are_named_where_no_name_says_input(tmp_path: Path) -> None:
     rows = [f"{k},{k * k},{k // 5},{k // 7}" for k in range(40)]
-    file = text(tmp_path / "tank.csv", "\n".join(["time [s],level [m],pump [V],valve (%)", *rows]) + "\n")
-    with pytest.warns(km.FitWarning, match=r"of these pump \[V\], valve \(%\) hold their value .*: pass inputs="):
+    file = text(tmp_path / "tank.csv", "\n".join(["time [s],level [m],inflow [V],stroke (%)", *rows]) + "\n")
+    with pytest.warns(km.FitWarning, match=r"of these inflow \[V\], stroke \(%\) hold their value .*: pass inputs="):
         assert km.load_episodes(file).nu == 0
-    read = km.load_episodes(file, states=("Level",), inputs=("pump", "valve"))
-    assert (read.states, read.inputs) == (("level [m]",), ("pump [V]", "valve (%)"))
+    read = km.load_episodes(file, states=("Level",), inputs=("inflow", "stroke"))
+    assert (read.states, read.inputs) == (("level [m]",), ("inflow [V]", "stroke (%)"))
     twins = text(tmp_path / "twins.csv", "t,x [m],x [mm],u\n0,1,2,0\n1,2,4,0\n2,4,9,1\n")
     with pytest.raises(km.errors.DataError, match="has no column 'x'"):
         km.load_episodes(twins, states=("x",))
@@ -148,7 +148,8 @@ def test_columns_that_hold_their_value_are_named_where_no_name_says_input(tmp_pa
         ("", km.errors.LogError, "it is no .csv file, or was cut"),
         ("\n\n", km.errors.LogError, "it is no .csv file"),
         ("t,x,u\n0,1,2\n1,2\n", km.errors.LogError, "can be read: CSV parse error: Expected 3 columns, got 2"),
-        ("0,1,2\n1,2,3\n", km.errors.LogError, "has no line of names: its first row is 0, 1, 2"),
+        ("0,1,2\n1,2,3\n", km.errors.LogError, "has no line of names: its first row is 0, 1, 2; .* pass columns= with 3"),
+        ("0,x,2\n1,2,3\n", km.errors.LogError, "has no line of names: its first row is 0, x, 2; write one above it"),
         ("t,x,x\n0,1,2\n1,2,3\n", km.errors.DataError, "has two columns 'x'; rename one"),
         ("t,u\n0,1\n1,2\n", km.errors.DataError, "has no column that could be a state: its columns are t, u"),
         ("t,x,u\n", km.errors.DataError, "has columns and no row in them; leave the file out"),
@@ -158,6 +159,57 @@ def test_columns_that_hold_their_value_are_named_where_no_name_says_input(tmp_pa
 def test_what_is_no_table_is_refused(tmp_path: Path, content: str, error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
         km.load_episodes(text(tmp_path / "log.csv", content))
+
+
+@pytest.mark.parametrize(
+    ("names", "inputs"),
+    [
+        ("pump voltage [V],level", "pump voltage [V]"),
+        ("valve [%],flow", "valve [%]"),
+        ("heater power,T", "heater power"),
+        ("motor current (A),speed", "motor current (A)"),
+        ("motorVoltage,motor speed,motor current", "motorVoltage"),
+        ("u,setpoint,y", "u"),
+        ("set point,valve,level setpoint,level", "valve"),
+        ("speed,speed_ref,u_speed_cmd", "u_speed_cmd"),
+        ("valve position command,valve position", "valve position command"),
+        ("force sensor,u0,u_left", "u0,u_left"),
+        ("output voltage,duty", "duty"),
+        ("steering angle,heading", "steering angle"),
+        ("temperature setpoint,temperature", ""),
+        ("reference,motor speed,valve temperature", ""),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::koopmpc.FitWarning")
+def test_words_anywhere_in_a_name_tell_inputs_and_a_set_point_is_no_part_of_the_plant(
+    tmp_path: Path, names: str, inputs: str
+) -> None:
+    given = names.split(",")
+    rows = np.random.default_rng(0).normal(size=(9, len(given)))
+    lines = ["sampling_time," + names, *(",".join(map(str, [k, *row])) for k, row in enumerate(rows))]
+    read = km.load_episodes(text(tmp_path / "log.csv", "\n".join(lines)))
+    assert read.dt == 1.0
+    assert read.inputs == tuple(filter(None, inputs.split(",")))
+    assert not any("setpoint" in name or "ref" in name or "set point" in name for name in read.states)
+
+
+@pytest.mark.parametrize("separator", [" ", "\t", " \t ", ",", ";"])
+@pytest.mark.parametrize("suffix", [".dat", ".txt", ".csv"])
+def test_a_file_without_a_line_of_names_is_read_by_names_or_by_numbers_of_columns(
+    tmp_path: Path, separator: str, suffix: str
+) -> None:
+    X = np.random.default_rng(0).normal(size=(20, 2))
+    lines = [separator.join(map(repr, [6.0 * k, *row])) for k, row in enumerate(X.tolist())]
+    file = text(tmp_path / f"log{suffix}", "% of a plant\n" + "\n".join(lines) + "\n")
+    read = km.load_episodes(file, columns=["time [min]", "u", "y"])
+    assert (read.dt, read.states, read.inputs) == (360.0, ("y",), ("u",))
+    assert np.array_equal(read[0].X, X[:, 1:])
+    with pytest.warns(km.FitWarning, match="column 1 grows by the same in each row and is taken for the time in sec"):
+        read = km.load_episodes(file, inputs=["2"])
+    assert (read.dt, read.states, read.inputs) == (6.0, ("column 3",), ("column 2",))
+    assert km.load_episodes(file, inputs=["2"], dt=1.0).states == ("column 3",)
+    with pytest.raises(km.errors.DataError, match="has 3 columns, columns= gives 2 names; pass one for each"):
+        km.load_episodes(file, columns=["u", "y"])
 
 
 def test_a_saved_table_is_plain_and_keeps_names_roles_and_dt_whatever_the_names(tmp_path: Path) -> None:

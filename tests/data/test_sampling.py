@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.data.files.columns import TableSettings, find_roles, is_label
 from koopmpc.data.files.sampling import Signals, episodes_from, resampled, restarts, sample_time
-from koopmpc.data.files.tables import TableSettings, _numbered, _plausible, find_roles, is_label
+from koopmpc.data.files.tables import _numbered, _plausible
 from koopmpc.errors import ColumnWarning
 
 
@@ -199,7 +200,7 @@ def test_two_columns_of_one_name_are_refused_where_they_would_be_guessed_from():
 def test_what_a_caller_knows_is_nothing_only_where_all_of_it_is():
     assert TableSettings().nothing
     assert not TableSettings(dt=0.1).nothing
-    assert TableSettings(states=["a"], inputs=["b"], disturbances=["c"]).columns == {"a", "b", "c"}
+    assert TableSettings(states=["a"], inputs=["b"], disturbances=["c"]).named == {"a", "b", "c"}
     for name in ("dt", "resample"):
         with pytest.raises(km.errors.DataError, match=f"{name} is -1 s"):
             TableSettings(**{name: -1.0})

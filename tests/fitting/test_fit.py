@@ -275,6 +275,12 @@ def test_a_picture_or_a_log_that_fails_costs_neither_model_nor_report(tmp_path, 
         (["nowhere", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "leave out --workers 2"),
         (["nowhere", "--scheduler", "here"], "--scheduler is 'here'"),
         (["csv/00.csv", "csv/00.csv"], "csv/00.csv is given twice"),
+        (
+            ["told.csv"],
+            'its columns are a, b, c; pass --inputs with those that drive the plant, or --inputs "" if noth',
+        ),
+        (["bare.dat"], "or --inputs with the numbers of the columns that are inputs, 1 to 3"),
+        (["bare.dat", "--columns", "t,u"], "has 3 columns, --columns gives 2 names"),
     ],
 )
 @pytest.mark.usefixtures("quick")
@@ -283,6 +289,9 @@ def test_a_mistake_gives_one_message_and_exit_code_2(tmp_path, monkeypatch, argu
     write_csv(cart_pole(14, steps=30), tmp_path / "csv")
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.csv").write_text("a,b\nyes,no\n")
+    rows = np.random.default_rng(0).normal(size=(400, 3))
+    np.savetxt(tmp_path / "bare.dat", rows)
+    np.savetxt(tmp_path / "told.csv", np.c_[0.1 * np.arange(400), rows], delimiter=",", header="t,a,b,c", comments="")
     result = CliRunner().invoke(app, ["fit", *arguments])
     assert result.exit_code == 2, result.output
     assert words in result.stderr

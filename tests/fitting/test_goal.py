@@ -64,16 +64,18 @@ def test_inputs_that_only_the_goal_file_names_are_inputs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for i, episode in enumerate(logs()):
         rows = np.column_stack([0.1 * np.arange(40), episode.X[:-1], episode.U])
-        head = "time [s],position [m],speed [m/s],pump [V]"
+        head = "time [s],position [m],speed [m/s],push [V]"
         np.savetxt(f"{i}.csv", rows, delimiter=",", header=head, comments="")
     refused = CliRunner().invoke(app, ["fit", ".", "--goal-template"])
     assert refused.exit_code == 2
-    assert "no input, so nothing can be controlled; pass --inputs" in refused.stderr
-    assert "pump [V] holds its value" in " ".join(refused.stderr.split())
-    written = CliRunner().invoke(app, ["fit", ".", "--inputs", "pump", "--goal-template"])
+    assert "no column is named as an input; its columns are" in refused.stderr
+    assert "push [V] holds its value" in " ".join(refused.stderr.split())
+    written = CliRunner().invoke(app, ["fit", ".", "--inputs", "push", "--goal-template"])
     assert written.exit_code == 0
+    lines = Path("goal.toml").read_text().splitlines()
+    Path("goal.toml").write_text("\n".join(line for line in lines if not line.startswith("inputs =")))
     found = design_data(".", "goal.toml", "out", bilinear=False).design.controller
-    assert (found.predictor.states, found.predictor.inputs) == (NAMES[0], ("pump [V]",))
+    assert (found.predictor.states, found.predictor.inputs) == (NAMES[0], ("push [V]",))
 
 
 def tank_logs(folder, files=4, rows=300, glitch=None):
@@ -147,6 +149,7 @@ def test_a_goal_file_keeps_every_keyword_that_reads_the_logs_and_a_call_replaces
         "inputs": [],
         "disturbances": ["rain"],
         "resample": 2,
+        "columns": ["time [s]", "y"],
     }
     keywords = {p.name for p in signature(km.load_episodes).parameters.values() if p.kind is Parameter.KEYWORD_ONLY}
     assert given.keys() == keywords
@@ -156,7 +159,7 @@ def test_a_goal_file_keeps_every_keyword_that_reads_the_logs_and_a_call_replaces
     assert read_goal(path, logs(4)).horizon == 7
     asked = {}
 
-    def stop(*arguments):
+    def stop(*arguments, ask):
         asked.update(arguments[4])
         raise km.KoopmpcError("read")
 

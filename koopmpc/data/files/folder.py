@@ -129,7 +129,7 @@ def _found(paths: str | PathLike[str] | Iterable[str | PathLike[str]]) -> tuple[
         return (folder,)
     if not folder.is_dir():
         raise LogError(f"{folder} does not exist; pass a folder of files, or their paths")
-    suffixes = list_suffixes()
+    suffixes = list_suffixes(folders=True)
     files = tuple(sorted(file for file in folder.iterdir() if file.suffix in suffixes and file.is_file()))
     if not files:
         content = ", ".join(sorted(item.name for item in folder.iterdir())[:5]) or "nothing"

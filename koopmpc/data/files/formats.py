@@ -34,18 +34,21 @@ class LogTable:
         Units of columns that the file states beside their names; they join the names as ``"theta [rad]"``.
     dt
         Sample time [s], where the file states it. It counts if there is no column of time and the caller gives none.
+    named
+        False for a file without names: its columns are called ``"column 1"``, ``"column 2"``, ….
     """
 
     names: tuple[str, ...]
     columns: Mapping[str, np.ndarray]
     units: Mapping[str, str] = field(default_factory=dict[str, str])
     dt: float | None = None
+    named: bool = True
 
     def with_units(self) -> "LogTable":
         """Return the table whose names carry the units."""
         known = {name: f"{name} [{unit}]" for name, unit in self.units.items() if unit and "[" not in name}
         columns = {known.get(name, name): column for name, column in self.columns.items()}
-        return LogTable(tuple(known.get(name, name) for name in self.names), columns, dt=self.dt)
+        return LogTable(tuple(known.get(name, name) for name in self.names), columns, {}, self.dt, self.named)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +68,8 @@ class LogFormat:
         be read in parts. None for a format whose files are always read whole.
     extra
         The extra of koopmpc that installs what `read` imports.
+    folders
+        Whether files with these suffixes are read where a folder is given; not for suffixes of many other programs.
     """
 
     suffixes: tuple[str, ...]
@@ -72,6 +77,7 @@ class LogFormat:
     write: Callable[[BinaryIO, Episodes], None] | None = None
     parts: Callable[[Path, int, PlantSignature | None], list[Part] | None] | None = None
     extra: str | None = None
+    folders: bool = True
 
 
 _JOINT = "log formats"
@@ -83,11 +89,15 @@ def register_format(log_format: LogFormat) -> None:
     _FORMATS.update(dict.fromkeys(log_format.suffixes, log_format))
 
 
-def list_suffixes(*, writable: bool = False) -> list[str]:
-    """Return the suffixes of all formats, or of those that can be written, in the order of the joint."""
+def list_suffixes(*, writable: bool = False, folders: bool = False) -> list[str]:
+    """Return the suffixes of formats in the order of the joint; only those written, or read in folders, if asked."""
     files = load_joint(_JOINT)
     order = {suffix: files.index(home) for suffix, f in _FORMATS.items() if (home := f.read.__module__) in files}
-    suffixes = [suffix for suffix, log_format in _FORMATS.items() if not writable or log_format.write is not None]
+    suffixes = [
+        suffix
+        for suffix, log_format in _FORMATS.items()
+        if (log_format.write is not None or not writable) and (log_format.folders or not folders)
+    ]
     return sorted(suffixes, key=lambda suffix: order.get(suffix, len(files)))
 
 

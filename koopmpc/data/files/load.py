@@ -6,8 +6,9 @@ from pathlib import Path
 
 from koopmpc import disk
 from koopmpc.data.episodes import Episodes, PlantSignature, joined
+from koopmpc.data.files.columns import TableSettings
 from koopmpc.data.files.formats import find_format, read_log
-from koopmpc.data.files.tables import TableSettings, read_table
+from koopmpc.data.files.tables import read_table
 from koopmpc.errors import DataError
 
 
@@ -28,27 +29,31 @@ def load_episodes(
     inputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
     resample: float | None = None,
+    columns: Sequence[str] | None = None,
 ) -> Episodes:
     """Read the episodes of one file, or of several as one set.
 
     A .npz or .parquet that `Episodes.save` wrote, and logs of runs, hold their own names and dt. Any other file is a
     table with a row for each time step and a column for each state and input. A column ``t``, ``time [s]``,
     ``time [ms]`` or ``timestamp`` tells the sample time; where it goes back an episode ends. ``episode``, ``run`` or
-    ``trial`` tells episodes apart, by numbers or names; ``step`` orders rows without time. Columns named ``u``, ``u0``,
-    ``u_left``, ``force``, ``torque``, ``cmd``, ``input`` and the like are inputs, ``w`` and ``disturbance``
-    measured disturbances, all other columns of numbers are states; arguments count before such guesses. The inputs of
+    ``trial`` tells episodes apart, by numbers or names; ``step`` orders rows without time. Columns with the words u,
+    command, input, force, torque, voltage, valve, pump, heater and the like in their names are inputs: ``u_left``,
+    ``pump voltage [V]``, ``valve [%]``, but not ``motor speed``. ``w`` and ``disturbance`` are measured disturbances. A
+    set point is left out. All other columns of numbers are states; arguments count before such guesses. The inputs of
     an episode's last row are not read. Missing values and gaps in time cut episodes, and a warning counts them.
 
     Parameters
     ----------
     path, more
-        .npz, .parquet, .csv or .rrd.
+        .npz, .parquet, .csv, .dat, .txt or .rrd.
     dt
         Sample time of a table without a column of time [s].
     states, inputs, disturbances
-        The names of a table's columns; ``inputs=[]`` where there are none.
+        The names of a table's columns, or their numbers from 1; ``inputs=[]`` where there are none.
     resample
         Sample time [s] to interpolate to, for a table whose steps are unequal: states linearly, inputs held.
+    columns
+        Names of all columns of a table, which replace its own: for a file without a line of names.
 
     Raises
     ------
@@ -63,7 +68,7 @@ def load_episodes(
     FitWarning
         There are gaps, columns that are constant or repeat another, or no column with the name of an input.
     """
-    settings = TableSettings(dt, states, inputs, disturbances, resample)
+    settings = TableSettings(dt, states, inputs, disturbances, resample, columns)
     files = [disk.path_of(file) for file in (path, *more)]
     sets = [_load_file(file, settings) for file in files]
     plant = PlantSignature.of(sets[0], str(files[0]))

@@ -1,5 +1,5 @@
 # pyright: basic
-"""Tables as text (.csv): a line of names, then a row a time step."""
+"""Tables as text (.csv, .dat, .txt): a line of names, then a row a time step."""
 
 from io import BytesIO
 from pathlib import Path
@@ -8,8 +8,9 @@ from typing import BinaryIO
 import numpy as np
 
 from koopmpc.data.episodes import Episodes
+from koopmpc.data.files.columns import TableSettings, find_roles
 from koopmpc.data.files.formats import LogFormat, LogTable, register_format
-from koopmpc.data.files.tables import SAVED, TableSettings, find_roles, is_a_number, pick_driving
+from koopmpc.data.files.tables import SAVED, is_a_number, pick_driving
 from koopmpc.errors import DataError, KoopmpcError, LogError
 
 _UTF8 = "utf-8-sig"
@@ -70,13 +71,13 @@ def _quote(name: str) -> str:
 def read_plain(file: Path) -> LogTable:
     """Return the columns of a table.
 
-    Comma, semicolon or tab is found from the header; with semicolons a decimal comma is understood. Lines above the
-    header that begin with # are skipped.
+    Comma, semicolon, tab or spaces are found from the first line; with semicolons a decimal comma is understood. Lines
+    above it that begin with # or % are skipped. A file that begins with numbers has columns 1, 2, ….
 
     Raises
     ------
     LogError
-        The file is empty, has no header, or a row has another number of cells; koopmpc wrote it with a checksum.
+        The file is empty, a row has another number of cells, or a name is a number; koopmpc wrote it with a checksum.
     """
     raw = file.read_bytes()
     if raw.startswith(_WITH_CHECKSUM):
@@ -97,20 +98,27 @@ def _parse(raw: bytes, file: Path) -> LogTable:
     except UnicodeDecodeError:
         encoding = _LATIN
     raw = raw.removeprefix(b"\xef\xbb\xbf")
-    while raw.startswith(b"#"):
+    while raw.startswith((b"#", b"%")):
         raw = raw.partition(b"\n")[2]
     head, _, rest = raw.partition(b"\n")
     if not head.strip():
         raise LogError(
-            f"{file} holds no episodes that can be read: it is no .csv file, or was cut; pass a file that "
+            f"{file} holds no episodes that can be read: it is no {file.suffix} file, or was cut; pass a file that "
             "Episodes.save wrote, or a table: a line of names, then a row a time step"
         )
+    if not any(mark in head for mark in (b",", b";")) and _has_spaces(head, rest.partition(b"\n")[0]):
+        raw = b"\n".join(b"\t".join(line.split()) for line in raw.splitlines() if line.strip())
+        head, _, rest = raw.partition(b"\n")
     separator = max((b",", b";", b"\t"), key=head.count)
     comma = separator == b";" and b"," in rest.partition(b"\n")[0]
+    cells = head.split(separator)
+    named = not _are_numbers([cell.replace(b",", b".") for cell in cells] if comma else cells)
     try:
         table = csv.read_csv(
             BytesIO(raw),
-            read_options=csv.ReadOptions(encoding=encoding),
+            read_options=csv.ReadOptions(
+                encoding=encoding, column_names=None if named else [f"column {i + 1}" for i in range(len(cells))]
+            ),
             parse_options=csv.ParseOptions(delimiter=separator.decode()),
             convert_options=csv.ConvertOptions(
                 decimal_point="," if comma else ".", null_values=_MISSING, strings_can_be_null=True
@@ -121,7 +129,20 @@ def _parse(raw: bytes, file: Path) -> LogTable:
     names = tuple(name.strip() for name in table.column_names)
     if any(map(is_a_number, names)):
         raise LogError(f"{file} has no line of names: its first row is {', '.join(names[:4])}; write one above it")
-    return LogTable(names, {name: _convert(table.column(i)) for i, name in enumerate(names)})
+    return LogTable(names, {name: _convert(table.column(i)) for i, name in enumerate(names)}, named=named)
+
+
+def _has_spaces(first: bytes, second: bytes) -> bool:
+    """Return whether spaces separate the cells of the first two lines of a file, or spaces and tabs."""
+    if b"\t" in first and not _are_numbers(first.split()):
+        return False
+    return len(first.split()) == len(second.split()) > 1
+
+
+def _are_numbers(cells: list[bytes]) -> bool:
+    """Return whether these cells are numbers or empty, as in a file without a line of names."""
+    texts = [cell.decode(_LATIN).strip() for cell in cells]
+    return any(texts) and all(map(is_a_number, filter(None, texts)))
 
 
 def _convert(column) -> np.ndarray:
@@ -137,3 +158,4 @@ def _convert(column) -> np.ndarray:
 
 
 register_format(LogFormat((".csv",), read_plain, write_plain))
+register_format(LogFormat((".dat", ".txt"), read_plain, folders=False))

@@ -3,7 +3,7 @@
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from decimal import Decimal
 from numbers import Real
 from pathlib import Path
@@ -13,41 +13,15 @@ from jaxtyping import Float
 
 from koopmpc import checks, disk
 from koopmpc.data.episodes import Episodes
+from koopmpc.data.files.columns import ColumnRoles, TableSettings, drop_unit, find_roles, is_label
 from koopmpc.data.files.formats import LogTable
 from koopmpc.data.files.sampling import Signals, episodes_from, resampled, restarts, sample_time
-from koopmpc.errors import ColumnWarning, DataError, FitWarning, KoopmpcError
+from koopmpc.errors import ColumnWarning, DataError, FitWarning, KoopmpcError, LogError, NoInputWarning
 
 SAVED = ("episode", "step", "time [s]")
 """First columns of a table that `Episodes.save` wrote, in which an empty last row tells the inputs of an episode."""
 
-_TIME = re.compile(r"t|time|timestamp|sim_time|elapsed|seconds")
-_EPISODE = re.compile(r"episode|run|trial|trajectory")
-_INPUT = re.compile(
-    r"u\d*|u_.*|(input|inputs|control|command|cmd|action|force|torque|thrust|voltage|steering|throttle|duty)"
-    r"([\W_\d].*)?|.*_(cmd|command|input|ref_input)"
-)
 _COUNTER = re.compile(r"|unnamed: \d+|index|idx|row|sample|count|counter")
-_DISTURBANCE = re.compile(r"w\d*|w_.*|disturbance([\W_\d].*)?")
-_PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
-
-
-@dataclass(frozen=True)
-class ColumnRoles:
-    """The role of each column of a table; `scale` is the unit of the time column in seconds."""
-
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    disturbances: tuple[str, ...]
-    time: str | None
-    scale: float
-    episode: str | None
-    step: str | None
-    guessed: bool
-
-    @property
-    def values(self) -> tuple[str, ...]:
-        """Names of states, inputs and disturbances."""
-        return self.states + self.inputs + self.disturbances
 
 
 def is_a_number(cell: object) -> bool:
@@ -65,82 +39,6 @@ def is_a_number(cell: object) -> bool:
     return True
 
 
-def find_roles(
-    names: Sequence[str],
-    numeric: Sequence[str],
-    told: "TableSettings",
-    where: str,
-    driving: Sequence[str] | None = None,
-) -> ColumnRoles:
-    """Return the role of each column.
-
-    ColumnRoles that the caller does not give are read from the names: ``t``, ``time [s]`` and ``timestamp`` are time;
-    ``episode``, ``run``, ``trial`` and ``trajectory`` number the episodes; ``u``, ``u0``, ``u_left``, and names
-    that begin with input, control, command, cmd, action, force, torque, thrust, voltage, steering, throttle or
-    duty, are inputs; ``w``, ``w0`` and ``disturbance`` are measured disturbances; every other column of numbers is
-    a state.
-
-    Parameters
-    ----------
-    names, numeric
-        All columns, and those of numbers.
-    told
-        The names that the caller gives; None leaves the role to the names.
-    where
-        The file, for messages.
-    driving
-        The columns that drive the plant, where the form of the table tells them; None leaves this to the names.
-
-    Raises
-    ------
-    DataError
-        A given column is missing or stands twice, or no column is left for a state.
-    """
-    states, inputs, disturbances = told.states, told.inputs, told.disturbances
-    for what, given in told.given.items():
-        if isinstance(given, str):
-            raise DataError(f"{what} is {given!r}; pass a tuple of names")
-        for name in given:
-            if names.count(name) != 1:
-                has = "has two columns" if name in names else "has no column"
-                raise DataError(f"{where} {has} {name!r}; its columns are {', '.join(names)}")
-    sought = told.columns
-    rest = [name for name in dict.fromkeys(names) if names.count(name) == 1 and name not in sought]
-    time = next((name for name in rest if _TIME.fullmatch(_stem(name))), None)
-    episode = next((name for name in rest if _EPISODE.fullmatch(_stem(name))), None)
-    step = next((name for name in rest if name == "step"), None)
-    free = [name for name in rest if name not in (time, episode, step) and name in numeric]
-    if any(names.count(name) > 1 for name in numeric) and (states is None or inputs is None):
-        twice = next(name for name in numeric if names.count(name) > 1)
-        raise DataError(f"{where} has two columns {twice!r}; rename one")
-    if inputs is None and driving is not None:
-        found_inputs = [n for n in free if n in driving and not _DISTURBANCE.fullmatch(_stem(n))]
-    else:
-        found_inputs = [n for n in free if _INPUT.fullmatch(_stem(n))] if inputs is None else list(inputs)
-    free_pushes = free if driving is None else [n for n in free if n in driving]
-    pushes = [n for n in free_pushes if _DISTURBANCE.fullmatch(_stem(n)) and n not in found_inputs]
-    found_pushes = (pushes if states is None else []) if disturbances is None else list(disturbances)
-    taken = {*found_inputs, *found_pushes}
-    found_states = [name for name in free if name not in taken] if states is None else list(states)
-    if not found_states:
-        raise DataError(
-            f"{where} has no column that could be a state: its columns are {', '.join(names)}; pass states="
-        )
-    unit = "s" if time is None else _unit(time)
-    if unit not in _PER_SECOND:
-        raise DataError(f"{where}: the unit of {time!r} is not one of {', '.join(_PER_SECOND)}; rename it, or pass dt=")
-    return ColumnRoles(
-        tuple(found_states),
-        tuple(found_inputs),
-        tuple(found_pushes),
-        time,
-        _PER_SECOND[unit],
-        episode,
-        step,
-        guessed=(states is None or inputs is None) and driving is None,
-    )
-
-
 def pick_driving(names: Sequence[str], columns: Mapping[str, np.ndarray]) -> list[str] | None:
     """Return the columns of a saved table that are empty in the last row of each episode; None of any other table."""
     if tuple(names[: len(SAVED)]) != SAVED or any(name not in columns for name in names):
@@ -152,64 +50,6 @@ def pick_driving(names: Sequence[str], columns: Mapping[str, np.ndarray]) -> lis
 
 def _is_missing(column: np.ndarray) -> np.ndarray:
     return np.array([cell is None or cell != cell for cell in column])
-
-
-def is_label(name: str) -> bool:
-    """Return True for the name of a time or episode column, which need not hold numbers."""
-    return _TIME.fullmatch(_stem(name)) is not None or _EPISODE.fullmatch(_stem(name)) is not None
-
-
-def _stem(name: str) -> str:
-    """Return the name without its unit, in lower case."""
-    return re.split(r"\s*[\[(]", name)[0].strip().lower()
-
-
-def _unit(name: str) -> str:
-    found = re.search(r"[\[(]([^\])]*)[\])]", name)
-    return found.group(1).strip() if found else "s"
-
-
-@dataclass(frozen=True)
-class TableSettings:
-    """The caller's knowledge of a table; None is inferred from the table."""
-
-    dt: float | None = None
-    states: Sequence[str] | None = None
-    inputs: Sequence[str] | None = None
-    disturbances: Sequence[str] | None = None
-    resample: float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("dt", "resample"):
-            if getattr(self, name) is not None:
-                checks.positive(getattr(self, name), name, "s")
-
-    @property
-    def nothing(self) -> bool:
-        """True where the caller gives nothing."""
-        return all(value is None for value in vars(self).values())
-
-    def named_as(self, names: Sequence[str]) -> "TableSettings":
-        """Return the copy with names as a table writes them: ``"pump"`` means ``"pump [V]"`` where no other fits."""
-        stems = [_stem(name) for name in names]
-
-        def own(name: str) -> str:
-            once = name not in names and stems.count(name.strip().lower()) == 1
-            return names[stems.index(name.strip().lower())] if once else name
-
-        own_names = {what: tuple(map(own, some)) for what, some in self.given.items() if not isinstance(some, str)}
-        return replace(self, **own_names)
-
-    @property
-    def given(self) -> dict[str, Sequence[str]]:
-        """The names that the caller gives, by their role."""
-        every = {"states": self.states, "inputs": self.inputs, "disturbances": self.disturbances}
-        return {what: some for what, some in every.items() if some is not None}
-
-    @property
-    def columns(self) -> set[str]:
-        """The columns that the caller names."""
-        return {name for some in self.given.values() for name in some}
 
 
 def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
@@ -230,20 +70,29 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
         A role or the sample time is neither given nor inferable, a column is missing or holds a cell that is no
         number, or the rows are no whole episodes.
     """
-    table = table.with_units()
+    where = str(file)
+    table = _rename_columns(table, told, where).with_units()
     names, columns = list(table.names), table.columns
-    where, told = str(file), told.named_as(names)
+    told = told.match_names(names)
     rows = len(next(iter(columns.values()))) if columns else 0
     if rows == 0:
         raise DataError(f"{where} has columns and no row in them; leave the file out")
-    sought = told.columns
+    sought = told.named
     every = told.states is None or told.inputs is None
     columns = {
         name: _numbers(column, name, where) if name in sought or (every and not is_label(name)) else column
         for name, column in columns.items()
     }
     numeric = [name for name in names if name in columns and columns[name].dtype.kind in "fiub"]
-    found = find_roles(list(names), numeric, told, where, pick_driving(names, columns))
+    clock = None if table.named else _find_clock(names, columns, told, where)
+    found = find_roles(list(names), numeric, told, where, pick_driving(names, columns), clock)
+    if found.targets:
+        warnings.warn(
+            f"{where}: {', '.join(map(repr, found.targets))} is the set point of a controller by its name, and is left "
+            "out; pass inputs= or states= to use it",
+            FitWarning,
+            stacklevel=2,
+        )
     values = {name: checks.array(columns[name], f"{where}: {name}", (None,), finite=False) for name in found.values}
     for name, column in values.items():
         _plausible(column, name, where)
@@ -258,7 +107,7 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
             stacklevel=2,
         )
     time = None
-    if found.time is not None:
+    if found.time is not None and not (found.time == clock and told.dt is not None):
         time = checks.array(columns[found.time], found.time, (None,), finite=False) * found.scale
     if time is None and told.resample is not None:
         raise DataError(f"{where} has no column of time to resample by; its columns are {', '.join(names)}")
@@ -304,6 +153,47 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
         if str(error).startswith(where):
             raise
         raise DataError(f"{where}: {error}") from error
+
+
+def _rename_columns(table: LogTable, told: TableSettings, where: str) -> LogTable:
+    """Return the table with the names that the caller gives to all columns.
+
+    Raises
+    ------
+    DataError
+        There are more or fewer names than columns.
+    LogError
+        The table has no line of names, and the caller gives neither names nor numbers of columns.
+    """
+    count = len(table.names)
+    if told.columns is None:
+        if not table.named and not told.given:
+            first = ", ".join(f"{table.columns[name][0]:g}" for name in table.names[:4])
+            raise LogError(
+                f"{where} has no line of names: its first row is {first}; write one above it, or pass columns= with "
+                f"{count} names, or inputs= with the numbers of the columns that are inputs, 1 to {count}"
+            )
+        return table
+    if len(told.columns) != count:
+        raise DataError(f"{where} has {count} columns, columns= gives {len(told.columns)} names; pass one for each")
+    names = tuple(map(str, told.columns))
+    columns = {new: table.columns[old] for new, old in zip(names, table.names, strict=True) if old in table.columns}
+    return LogTable(names, columns, dt=table.dt)
+
+
+def _find_clock(names: list[str], columns: Mapping[str, np.ndarray], told: TableSettings, where: str) -> str | None:
+    """Return the first column of a table without names where it grows by the same in each row, as time does."""
+    first = names[0]
+    if first in told.named or columns[first].dtype.kind not in "fiu" or not _even(columns[first]):
+        return None
+    if told.dt is None:
+        warnings.warn(
+            f"{where}: column 1 grows by the same in each row and is taken for the time in seconds; pass dt=, or "
+            "columns= with names such as 'time [min]'",
+            FitWarning,
+            stacklevel=3,
+        )
+    return first
 
 
 def _numbers(column: np.ndarray, name: str, where: str) -> np.ndarray:
@@ -394,12 +284,15 @@ def _doubt(found: ColumnRoles, table: dict[str, np.ndarray], where: str, *, alon
         if 0 < len(stepped) < len(found.states):
             hold = "holds its" if len(stepped) == 1 else "hold their"
             advice = f"of these {', '.join(stepped)} {hold} value from row to row, as inputs do: pass inputs="
-        warnings.warn(
-            f"{where}: no column is named as an input, so the plant is taken to run by itself; its states are "
-            f"{', '.join(found.states)}; {advice}",
-            FitWarning,
-            stacklevel=3,
+        missing = f"{where}: no column is named as an input"
+        others = ", ".join(found.states)
+        doubt = f"{missing}, so the plant is taken to run by itself; its states are {others}; {advice}"
+        question = (
+            f"{missing}; its columns are {others}; "
+            + advice.replace("if some of them are inputs", "with those that drive the plant")
+            + ", or inputs=[] if nothing drives it"
         )
+        warnings.warn(NoInputWarning(doubt, question), stacklevel=3)
     for i, name in enumerate(found.values):
         column = table[name][np.isfinite(table[name])]
         if len(column) and np.ptp(column) == 0:
@@ -421,7 +314,7 @@ def _doubt(found: ColumnRoles, table: dict[str, np.ndarray], where: str, *, alon
 def _without_counters(found: ColumnRoles, table: dict[str, np.ndarray], where: str) -> ColumnRoles:
     """Return the roles without states that number the rows, such as the index that pandas writes."""
     for name in found.states:
-        if _COUNTER.fullmatch(_stem(name)) and len(found.states) > 1 and (np.diff(table[name]) == 1).all():
+        if _COUNTER.fullmatch(drop_unit(name)) and len(found.states) > 1 and (np.diff(table[name]) == 1).all():
             warnings.warn(f"{where}: {name!r} numbers the rows and is left out", FitWarning, stacklevel=3)
             found = replace(found, states=tuple(other for other in found.states if other != name))
         elif found.time is None and _even(table[name]):

@@ -1,0 +1,255 @@
+"""Roles of a table's columns: time, episode, states, inputs and disturbances, as given or as their names say."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from koopmpc import checks
+from koopmpc.errors import DataError
+
+_EPISODE = re.compile(r"episode|run|trial|trajectory")
+_DISTURBANCE = re.compile(r"w\d*|w_.*|disturbance([\W_\d].*)?")
+_PER_SECOND = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+_WORD = re.compile(r"[^\W\d_]+")
+
+_CLOCKS = {"t", "ts", "time", "timestamp", "elapsed", "seconds"}  # a name is of time if it has one of these words …
+_OF_CLOCKS = {"sim", "sampling", "sample", "system", "log", "local"}  # … and besides it only these
+_COMMANDS = {"input", "inputs", "command", "cmd", "action", "excitation", "actuation"}  # inputs of any quantity
+_QUANTITIES = {
+    *("u", "control", "actuator", "manipulated", "force", "torque", "thrust", "voltage", "current", "power", "duty"),
+    *("pwm", "throttle", "steering", "rudder", "aileron", "flap", "pedal", "brake"),
+}  # inputs unless the name has a word of _MEASURED
+_ACTUATORS = {"valve", "heater", "pump", "motor", "fan", "drive", "compressor"}  # the same, for a device's own name
+_MEASURED = {
+    *("output", "measured", "measurement", "sensor", "actual", "feedback", "estimated", "response", "error"),
+    *("temperature", "temp", "speed", "velocity", "acceleration", "position", "displacement", "pressure", "level"),
+    *("height", "flow", "concentration", "frequency", "vibration", "battery", "capacitor", "status", "state"),
+}  # a signal of a device that does not drive it: "motor speed", "output voltage"
+_TARGETS = {"setpoint", "reference", "ref", "target", "desired", "sp"}  # what a controller is asked for
+
+
+@dataclass(frozen=True)
+class TableSettings:
+    """The caller's knowledge of a table; None is inferred from the table.
+
+    `columns` renames all columns, for a table without a line of names.
+    """
+
+    dt: float | None = None
+    states: Sequence[str] | None = None
+    inputs: Sequence[str] | None = None
+    disturbances: Sequence[str] | None = None
+    resample: float | None = None
+    columns: Sequence[str] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "resample"):
+            if getattr(self, name) is not None:
+                checks.positive(getattr(self, name), name, "s")
+        if isinstance(self.columns, str):
+            raise DataError(f"columns is {self.columns!r}; pass a tuple of names")
+
+    @property
+    def nothing(self) -> bool:
+        """True where the caller gives nothing."""
+        return all(value is None for value in vars(self).values())
+
+    def match_names(self, names: Sequence[str]) -> "TableSettings":
+        """Return the copy with names as the table writes them.
+
+        ``"pump"`` means ``"pump [V]"``, and ``"2"`` the second column, where no other column has this name.
+        """
+        stems = [drop_unit(name) for name in names]
+
+        def match_name(name: str) -> str:
+            if name in names:
+                return name
+            if stems.count(name.strip().lower()) == 1:
+                return names[stems.index(name.strip().lower())]
+            number = int(name) if name.strip().isdecimal() else 0
+            return names[number - 1] if 1 <= number <= len(names) else name
+
+        given = {
+            what: tuple(map(match_name, map(str, some)))
+            for what, some in self.given.items()
+            if not isinstance(some, str)
+        }
+        return replace(self, **given)
+
+    @property
+    def given(self) -> dict[str, Sequence[str]]:
+        """The names that the caller gives, by their role."""
+        every = {"states": self.states, "inputs": self.inputs, "disturbances": self.disturbances}
+        return {what: some for what, some in every.items() if some is not None}
+
+    @property
+    def named(self) -> set[str]:
+        """The columns that the caller names."""
+        return {name for some in self.given.values() for name in some}
+
+
+@dataclass(frozen=True)
+class ColumnRoles:
+    """The role of each column of a table.
+
+    `scale` is the unit of the time column in seconds; `targets` are set points, which are no part of the plant.
+    `guessed` says that names alone tell states or inputs.
+    """
+
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    time: str | None
+    scale: float
+    episode: str | None
+    step: str | None
+    targets: tuple[str, ...]
+    guessed: bool
+
+    @property
+    def values(self) -> tuple[str, ...]:
+        """Names of states, inputs and disturbances."""
+        return self.states + self.inputs + self.disturbances
+
+
+def find_roles(
+    names: Sequence[str],
+    numeric: Sequence[str],
+    told: TableSettings,
+    where: str,
+    driving: Sequence[str] | None = None,
+    clock: str | None = None,
+) -> ColumnRoles:
+    """Return the role of each column.
+
+    Roles that the caller does not give are read from the words of the names. ``t``, ``time [s]``, ``sampling_time`` and
+    ``timestamp`` are time; ``episode``, ``run``, ``trial`` and ``trajectory`` number the episodes; `is_input` says
+    which are inputs; ``w``, ``w0`` and ``disturbance`` are measured disturbances; a set point is no part of the plant;
+    every other column of numbers is a state.
+
+    Parameters
+    ----------
+    names, numeric
+        All columns, and those of numbers.
+    told
+        The names that the caller gives; None leaves the role to the names.
+    where
+        The file, for messages.
+    driving
+        The columns that drive the plant, where the form of the table tells them; None leaves this to the names.
+    clock
+        The column of time where no name tells it.
+
+    Raises
+    ------
+    DataError
+        A given column is missing or stands twice, or no column is left for a state.
+    """
+    states, inputs, disturbances = told.states, told.inputs, told.disturbances
+    for what, given in told.given.items():
+        if isinstance(given, str):
+            raise DataError(f"{what} is {given!r}; pass a tuple of names")
+        for name in given:
+            if names.count(name) != 1:
+                has = "has two columns" if name in names else "has no column"
+                raise DataError(f"{where} {has} {name!r}; its columns are {', '.join(names)}")
+    sought = told.named
+    rest = [name for name in dict.fromkeys(names) if names.count(name) == 1 and name not in sought]
+    time = next((name for name in rest if is_clock(name)), clock if clock in rest else None)
+    episode = next((name for name in rest if _EPISODE.fullmatch(drop_unit(name))), None)
+    step = next((name for name in rest if name == "step"), None)
+    free = [name for name in rest if name not in (time, episode, step) and name in numeric]
+    if any(names.count(name) > 1 for name in numeric) and (states is None or inputs is None):
+        twice = next(name for name in numeric if names.count(name) > 1)
+        raise DataError(f"{where} has two columns {twice!r}; rename one")
+    guessed = (states is None or inputs is None) and driving is None
+    targets = [n for n in free if is_target(n)] if guessed else []
+    free = [name for name in free if name not in targets]
+    if inputs is None and driving is not None:
+        found_inputs = [n for n in free if n in driving and not _DISTURBANCE.fullmatch(drop_unit(n))]
+    else:
+        found_inputs = _pick_inputs(free) if inputs is None else list(inputs)
+    free_pushes = free if driving is None else [n for n in free if n in driving]
+    pushes = [n for n in free_pushes if _DISTURBANCE.fullmatch(drop_unit(n)) and n not in found_inputs]
+    found_pushes = (pushes if states is None else []) if disturbances is None else list(disturbances)
+    taken = {*found_inputs, *found_pushes}
+    found_states = [name for name in free if name not in taken] if states is None else list(states)
+    if not found_states:
+        raise DataError(
+            f"{where} has no column that could be a state: its columns are {', '.join(names)}; pass states="
+        )
+    unit = "s" if time is None else _find_unit(time)
+    if unit not in _PER_SECOND:
+        raise DataError(f"{where}: the unit of {time!r} is not one of {', '.join(_PER_SECOND)}; rename it, or pass dt=")
+    return ColumnRoles(
+        tuple(found_states),
+        tuple(found_inputs),
+        tuple(found_pushes),
+        time,
+        _PER_SECOND[unit],
+        episode,
+        step,
+        tuple(targets) if states is None else (),
+        guessed=guessed,
+    )
+
+
+def is_input(name: str) -> bool:
+    """Return whether the words of a column's name say that it drives the plant.
+
+    A word for a command always says so (``speed command``). A word for a driving quantity or for an actuator says so
+    (``pump voltage``, ``valve [%]``, ``u_left``) unless another word names a measurement (``motor speed``, ``output
+    voltage``). A set point is no input.
+    """
+    words = _list_words(name)
+    if words & _COMMANDS:
+        return not words & (_TARGETS - {"ref", "reference"})
+    return bool(words & (_QUANTITIES | _ACTUATORS)) and not words & _MEASURED and not is_target(name)
+
+
+def _pick_inputs(names: Sequence[str]) -> list[str]:
+    """Return the inputs among these columns; a bare current or power is one only where there is no other.
+
+    Beside a voltage the current of a motor is a state.
+    """
+    inputs = [name for name in names if is_input(name)]
+    sure = [name for name in inputs if not _may_be_state(name)]
+    return sure or inputs
+
+
+def _may_be_state(name: str) -> bool:
+    words = _list_words(name)
+    return not words & _COMMANDS and ("current" in words or ("power" in words and not words & _ACTUATORS))
+
+
+def is_target(name: str) -> bool:
+    """Return whether the words of a column's name say that it is a set point of a controller."""
+    words = _list_words(name)
+    return bool(words & _TARGETS or {"set", "point"} <= words) and not words & _COMMANDS
+
+
+def is_clock(name: str) -> bool:
+    """Return whether a column's name says that it holds the time of its rows."""
+    words = _list_words(name)
+    return bool(words & _CLOCKS) and words <= _CLOCKS | _OF_CLOCKS and not re.search(r"\d", drop_unit(name))
+
+
+def is_label(name: str) -> bool:
+    """Return True for the name of a time or episode column, which need not hold numbers."""
+    return is_clock(name) or _EPISODE.fullmatch(drop_unit(name)) is not None
+
+
+def drop_unit(name: str) -> str:
+    """Return the name without its unit, in lower case."""
+    return re.split(r"\s*[\[(]", name)[0].strip().lower()
+
+
+def _find_unit(name: str) -> str:
+    found = re.search(r"[\[(]([^\])]*)[\])]", name)
+    return found.group(1).strip() if found else "s"
+
+
+def _list_words(name: str) -> set[str]:
+    """Return the words of a name without its unit, in lower case: ``"pumpVoltage_2 [V]"`` has pump and voltage."""
+    stem = re.split(r"\s*[\[(]", name)[0]
+    return {word.lower() for word in _WORD.findall(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", stem))}
