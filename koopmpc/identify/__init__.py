@@ -17,5 +17,6 @@ if TYPE_CHECKING:
     from koopmpc.identify.fits.regressor import KoopmanRegressor as KoopmanRegressor
     from koopmpc.identify.fits.sparse import sparse_edmd as sparse_edmd
     from koopmpc.identify.fits.stable import stable_edmd as stable_edmd
+    from koopmpc.identify.records.narx import narx as narx
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -1,0 +1,248 @@
+"""narx: a polynomial of few terms in the past of outputs and inputs, as a predictor lifted afresh at each step."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Unpack
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes, episodes_of
+from koopmpc.data.source import Source, source_of
+from koopmpc.errors import DataError
+from koopmpc.identify.moments.read import ReadOptions
+from koopmpc.identify.records.forward import (
+    Terms,
+    count_terms,
+    evaluate_terms,
+    list_terms,
+    select_forward,
+    solve_nested,
+)
+from koopmpc.identify.records.free_run import Models, Pieces, embed_rows, is_calm, run_freely
+from koopmpc.identify.records.structure import EXACT, HORIZON, Structure, fit_structure
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+
+DELAYS = (0, 1, 2, 3, 4, 6, 8, 12)  # numbers of past rows that are tried
+DEGREES = (1, 2, 3)  # total degrees of the polynomials that are tried
+SIZES = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 22, 28, 36, 46, 60)  # numbers of terms for each state
+FOLDS = 4  # stretches of the record that are left out in turn
+MOST = 2600  # terms to choose from: a structure with more is not tried
+NUMBERS = 8_000_000  # entries of the table that terms are chosen on: of more rows evenly spread ones are taken
+EACH = 4  # rows of data for each chosen term, at least
+
+Ask = Callable[[str, int, int], object]  # name of a structure, done, of how many
+
+
+def narx(
+    episodes: Episodes | Source,
+    *,
+    delays: Sequence[int] | int = DELAYS,
+    degrees: Sequence[int] | int = DEGREES,
+    terms: int = SIZES[-1],
+    **options: Unpack[ReadOptions],
+) -> LinearPredictor | BilinearPredictor:
+    """Fit x⁺ = Σ_t c_t v^{a_t}, v = [ζ_k, u_k], ζ_k = [x_k, u_{k−1}, x_{k−1}, …]: a polynomial NARX model of few terms.
+
+    Terms are products of ζ's entries, and inputs times such products, in standard units; so neither units nor origins
+    change the model. For each number of delays and each degree, forward orthogonal least squares orders the terms. The
+    record is cut into four stretches. Without each of them the terms are chosen and fitted; on it the model is judged
+    by forecasts of 20 steps and by its free run, from the record's first rows and the inputs alone. The least error
+    decides on delays, degree and number of terms, and of all within one standard error the fewest terms are taken. A
+    model whose free run leaves three times the range of the data is taken only where every model's does. All rows then
+    fit the coefficients.
+
+    The result predicts with ψ(ζ) = [ζ, 1, the monomials in these terms], lifted afresh at each step: it is a
+    `BilinearPredictor`, which `step_map`, `score(relift=True)` and `BilinearMPC` use so. Terms of degree 1 alone make
+    an ARX model, a `LinearPredictor`, of which both uses are the same.
+
+    Parameters
+    ----------
+    episodes
+        Records of one plant, long ones: outputs as states. Of more than 12,000 rows the terms are chosen on evenly
+        spread stretches.
+    delays, degrees
+        Numbers of past rows and total degrees to try. Structures of more than 2,600 terms are left out.
+    terms
+        Terms of a state's polynomial, at most.
+    **options
+        ``weights``, ``workers``, ``scheduler`` and ``progress`` of the last fit, as in `km.moments.second_moments`.
+
+    Raises
+    ------
+    DataError
+        The records are too short for the delays, or hold measured disturbances; no structure is small enough.
+
+    References
+    ----------
+    Chen, Billings & Luo, "Orthogonal least squares methods and their application to non-linear system
+    identification", Int. J. Control 50, 1989; one standard error: Breiman et al., "Classification and Regression
+    Trees", 1984.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> import numpy as np
+    >>> u, y = np.random.default_rng(0).uniform(-1, 1, 400), np.zeros(401)
+    >>> for k in range(1, 400):
+    ...     y[k + 1] = 0.6 * y[k] - 0.2 * y[k - 1] ** 2 + 0.5 * u[k] * y[k] + u[k - 1]
+    >>> data = km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["y"], ["u"])
+    >>> model = km.identify.narx(data, delays=[1, 2], degrees=2)
+    >>> float(abs(model.step_map().rollout(model.embed(data)[0].X[0], u[1:, None])[:, 0] - y[1:]).max()) < 1e-6
+    True
+    """
+    source = source_of(episodes)
+    found = search_structures(source_episodes(source), check_list(delays, 0), check_list(degrees, 1), terms)
+    return fit_structure(choose_structure(found), source, **options)
+
+
+def source_episodes(source: Source) -> Episodes:
+    """Return the episodes of a source that can be read again."""
+    if not source.replayable:
+        raise DataError("a stream is read once, and narx reads its data twice; pass Episodes, or km.data.Files(folder)")
+    loaded = [part.load() for part in source.parts()]
+    return episodes_of(loaded[0].with_episodes([episode for part in loaded for episode in part]))
+
+
+def check_list(values: Sequence[int] | int, least: int) -> list[int]:
+    """Return whole numbers, each once, in ascending order."""
+    given = [values] if isinstance(values, int | np.integer) else list(values)
+    found = sorted({checks.count(int(value), "delays and degrees", least) for value in given})
+    if not found:
+        raise DataError("delays or degrees is empty; pass at least one number")
+    return found
+
+
+def choose_structure(found: Sequence[Structure]) -> Structure:
+    """Return the structure of the fewest terms whose error is within one standard error of the least one."""
+    best = min(found, key=lambda one: one.error)
+    return min(
+        (one for one in found if not is_worse(one.errors, best.errors)),
+        key=lambda one: (one.size, one.delays, one.error),
+    )
+
+
+def is_worse(errors: Float[np.ndarray, " blocks"], than: Float[np.ndarray, " blocks"]) -> bool:
+    """Return whether log errors are larger by more than one standard error of their mean difference over the blocks."""
+    gap = np.log(np.maximum(errors, EXACT)) - np.log(np.maximum(than, EXACT))
+    return bool(gap.mean() > gap.std(ddof=1) / np.sqrt(len(gap)))
+
+
+def search_structures(
+    episodes: Episodes,
+    delays: Sequence[int] = DELAYS,
+    degrees: Sequence[int] = DEGREES,
+    terms: int = SIZES[-1],
+    horizon: int = HORIZON,
+    ask: Ask | None = None,
+) -> list[Structure]:
+    """Return structures of all delays, degrees and sizes with their errors in free run; the calm ones if there are any.
+
+    Parameters
+    ----------
+    episodes
+        The records.
+    delays, degrees, terms
+        As in `narx`.
+    ask
+        Called before each pair of delays and degree.
+    """
+    if episodes.nw:
+        raise DataError("the records hold measured disturbances, which narx does not know; pass them as inputs")
+    pieces = Pieces.of(episodes)
+    nx, nu = pieces.nx, pieces.nu
+    longest = max(map(len, pieces.U))
+    room = [d for d in delays if 4 * FOLDS * (d + 1) <= longest]
+    if not room:
+        raise DataError(
+            f"the longest record has {longest} steps, and {min(delays)} delays need {4 * FOLDS * (min(delays) + 1)}; "
+            "pass fewer delays, or a longer record"
+        )
+    first = max(room)
+    usable = [i for i, u in enumerate(pieces.U) if len(u) > first + FOLDS]
+    pieces = Pieces(tuple(pieces.Y[i] for i in usable), tuple(pieces.U[i] for i in usable), pieces.mean, pieces.scale)
+    plans = [(d, g) for d in room for g in degrees if count_terms(nx + d * (nx + nu), nu, g) <= MOST]
+    if not plans:
+        raise DataError(f"every structure has more than {MOST} terms; pass fewer delays, or a lower degree")
+    found: list[tuple[Structure, bool]] = []
+    for i, (d, g) in enumerate(plans):
+        if ask is not None:
+            ask(f"polynomials of degree {g} with {d} past rows", i, len(plans))
+        found += list(_try_plan(pieces, d, g, first, terms, horizon))
+    calm = [structure for structure, keeps in found if keeps]
+    return calm or [structure for structure, _ in found]
+
+
+def _try_plan(
+    pieces: Pieces, delays: int, degree: int, first: int, terms: int, horizon: int
+) -> Iterator[tuple[Structure, bool]]:
+    """Yield the structures of all sizes for these delays and this degree, and whether their free run stays in range."""
+    nx, nu = pieces.nx, pieces.nu
+    candidates = list_terms(nx + delays * (nx + nu), nu, degree)
+    spans = [[round(len(u) * i / FOLDS) for i in range(FOLDS + 1)] for u in pieces.U]
+    sizes = np.array([size for size in SIZES if size <= min(terms, len(candidates))])
+    errors: list[Float[np.ndarray, " s"]] = []
+    for fold in range(FOLDS):
+        out = [(span[fold], span[fold + 1]) for span in spans]
+        models = _fit_models(pieces, candidates, delays, sizes, out)
+        errors += _unseen_errors(models, pieces, [(max(a, first), b) for a, b in out], first, horizon)
+    table = np.array(errors)
+    models = _fit_models(pieces, candidates, delays, sizes, [(0, 0)] * len(pieces.U))
+    calm = is_calm(models, pieces, first)
+    for i, size in enumerate(sizes):
+        chosen = tuple(own[:size] for own in models.terms)
+        yield Structure(delays, degree, chosen, pieces.mean, pieces.scale, table[:, i]), bool(calm[i])
+        if all(len(own) <= size for own in models.terms):
+            return
+
+
+def _unseen_errors(
+    models: Models, pieces: Pieces, out: Sequence[tuple[int, int]], first: int, horizon: int
+) -> list[Float[np.ndarray, " s"]]:
+    """Return the errors of models on both halves of the spans `out`: the geometric mean of two errors.
+
+    One is that of the free run from the first rows of each piece, the other that of forecasts of `horizon` steps, which
+    begin at measured rows. The free run of a chaotic or unstable plant says nothing; a short forecast says little of a
+    slow one.
+    """
+    free = run_freely(models, pieces.Y, [u[:b] for u, (_, b) in zip(pieces.U, out, strict=True)], first)
+    gaps = [free[a - first : b - first, i] - pieces.Y[i][a + 1 : b + 1, None] for i, (a, b) in enumerate(out)]
+    found = [_mean_squares(half) for half in np.array_split(np.concatenate(gaps), 2)]
+    starts = [(i, k) for i, (a, b) in enumerate(out) for k in range(a, b - horizon + 1, horizon)]
+    if len(starts) < 2:
+        return [np.sqrt(square) for square in found]
+    d = models.delays
+    Y = [pieces.Y[i][k - d : k + 1 + horizon] for i, k in starts]
+    short = run_freely(models, Y, [pieces.U[i][k - d : k + horizon] for i, k in starts], d).swapaxes(0, 1)
+    truth = np.stack([y[d + 1 :] for y in Y])[:, :, None]
+    ahead = [_mean_squares(half) for half in np.array_split(short - truth, 2)]
+    return [(one * other) ** 0.25 for one, other in zip(found, ahead, strict=True)]
+
+
+def _mean_squares(gaps: Float[np.ndarray, "*rows s nx"]) -> Float[np.ndarray, " s"]:
+    """Return the mean square of the errors of each model, not below rounding error."""
+    return np.maximum(np.mean(gaps.reshape(-1, *gaps.shape[-2:]) ** 2, axis=(0, 2)), EXACT**2)
+
+
+def _fit_models(
+    pieces: Pieces, candidates: Terms, delays: int, sizes: Int[np.ndarray, " s"], out: Sequence[tuple[int, int]]
+) -> Models:
+    """Return nested models of these sizes, from all rows whose past and target are outside of the spans `out`."""
+    parts: list[tuple[np.ndarray, np.ndarray]] = []
+    for y, u, (a, b) in zip(pieces.Y, pieces.U, out, strict=True):
+        for low, high in ((0, a), (b, len(u))):
+            if high - low > delays:
+                parts.append(embed_rows(y[low : high + 1], u[low:high], delays))
+    if not parts:
+        raise DataError(f"no stretch of the records is longer than {delays} delays; pass fewer, or a longer record")
+    V, T = np.concatenate([v for v, _ in parts]), np.concatenate([t for _, t in parts])
+    apart = -(-len(V) * len(candidates) // NUMBERS)
+    P = evaluate_terms(candidates, V[::apart])
+    most = max(min(int(sizes[-1]), len(P) // EACH), 1)
+    found: list[Terms] = []
+    solved: list[Float[np.ndarray, "s n1"]] = []
+    for target in T.T:
+        own = candidates[select_forward(P, target[::apart], most)]
+        found.append(own)
+        solved.append(solve_nested(evaluate_terms(own, V), target, sizes))
+    return Models(delays, tuple(found), tuple(solved))

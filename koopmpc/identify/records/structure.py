@@ -1,0 +1,220 @@
+"""The structure of a polynomial model, its terms in standard units, and the predictor with these terms."""
+
+from dataclasses import dataclass
+from typing import Unpack
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source, source_of
+from koopmpc.identify.moments.read import ReadOptions, second_moments
+from koopmpc.identify.records.forward import Terms, list_terms
+from koopmpc.identify.regression import (
+    FitResult,
+    Regression,
+    build_predictor,
+    build_regression,
+    build_report,
+    compute_scale,
+)
+from koopmpc.identify.solve import column_norms, scaled_rank, solve
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.composed import Picked, Standardized
+from koopmpc.lifting.state import Constant, Monomials, State
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+
+HORIZON = 20  # steps of the short forecasts that count beside the free run
+EXACT = 1e-6  # smaller errors, in spreads, are alike: they are due to rounding
+_SOFT = 1e-9  # ridge of the observables' own rows, which are almost dependent
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Terms of a polynomial model in standard units, for each state, and its errors on unseen rows.
+
+    Attributes
+    ----------
+    delays, degree
+        Past rows in ζ, and the total degree that terms may have.
+    terms
+        For each state the indices of its terms' factors in [1, ζ, u], padded with 0.
+    mean, scale
+        (nx + nu,) of [x u]: a variable v stands for (v − mean) / scale.
+    errors
+        (blocks,) errors in spreads, of free runs and forecasts alike, on blocks of rows that no coefficient saw.
+    """
+
+    delays: int
+    degree: int
+    terms: tuple[Terms, ...]
+    mean: Float[np.ndarray, " nv"]
+    scale: Float[np.ndarray, " nv"]
+    errors: Float[np.ndarray, " blocks"]
+
+    @property
+    def size(self) -> int:
+        """Number of terms of all states."""
+        return sum(map(len, self.terms))
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.mean) - len(self.terms)
+
+    @property
+    def point_size(self) -> int:
+        """Number of entries of ζ."""
+        return len(self.terms) + self.delays * len(self.mean)
+
+    @property
+    def signals(self) -> Int[np.ndarray, " n"]:
+        """For each entry of ζ the place of its signal in [x u]."""
+        nx, every = len(self.terms), np.arange(len(self.mean))
+        return np.concatenate([every[:nx], np.tile(np.roll(every, self.nu), self.delays)])
+
+    @property
+    def is_nonlinear(self) -> bool:
+        """Whether a term is a product."""
+        return any((np.count_nonzero(own, axis=1) > 1).any() for own in self.terms)
+
+    def describe(self) -> str:
+        """Return a sentence on terms, delays and the error in free run."""
+        past = f"{self.delays} past row{'s' * (self.delays != 1)}"
+        return (
+            f"{self.size} terms of degree {self.degree} at most in {past}, by forward regression; on unseen rows, "
+            f"in free run and {HORIZON} steps ahead, it errs by {self.error:.3g} spreads"
+        )
+
+    @property
+    def error(self) -> float:
+        """Geometric mean of the errors of the blocks."""
+        return float(np.exp(np.log(np.maximum(self.errors, EXACT)).mean()))
+
+
+def fit_structure(
+    structure: Structure, episodes: Episodes | Source, **options: Unpack[ReadOptions]
+) -> LinearPredictor | BilinearPredictor:
+    """Return the predictor of a structure, its coefficients by least squares over all rows of the data."""
+    source = source_of(episodes)
+    nx, nu, n = source.nx, source.nu, structure.point_size
+    mixes = any((np.count_nonzero(own, axis=1) > 1)[own.max(axis=1) > n].any() for own in structure.terms if len(own))
+    embedding = Delay(structure.delays).fitted(source.states, source.inputs) if structure.delays else None
+    lifting, where = _build_lifting(structure)
+    total = second_moments(source, lifting, bilinear=mixes, embedding=embedding, **options)
+    regression = build_regression(total, "narx")
+    nz, rows = total.nz, regression.rows
+    K = np.zeros((rows.P.shape[1], nz))
+    K[n, n] = 1.0
+    if nz > n + 1:  # the monomials' own rows
+        plain = np.arange(nz + nu)
+        K[: nz + nu, n + 1 :] = solve(rows.keep_regressors(plain), ridge=_SOFT).K[:, n + 1 : nz]
+    if structure.delays:  # ζ⁺ = [x⁺, u, ζ without its oldest row]
+        kept = n - nx - nu
+        K[nz : nz + nu, nx : nx + nu] = np.eye(nu)
+        K[:kept, nx + nu : n] = np.eye(kept)
+    rank, condition = 0, 1.0
+    for i, own in enumerate(structure.terms):
+        span = np.zeros((len(K), len(own) + 1))
+        span[n, 0] = 1.0
+        for column, term in zip(span.T[1:], own, strict=True):
+            _write_term(column, tuple(int(v) for v in term if v), structure, where, total.products, nz)
+        regressors = rows.P @ span
+        size = column_norms(regressors)
+        size = np.where(size > 0, size, 1.0)
+        K[:, i] = span @ (np.linalg.lstsq(regressors / size, rows.T[:, i], rcond=None)[0] / size)
+        found = scaled_rank(rows, regressors)
+        rank, condition = max(rank, found[0]), max(condition, found[1])
+    return _build_model(regression, K, structure, total.products, (rank, condition))
+
+
+def _build_lifting(structure: Structure) -> tuple[Lifting, dict[tuple[int, ...], int]]:
+    """Return ψ = [ζ, 1, monomials], and the place of each product of entries of ζ among the observables."""
+    n = structure.point_size
+    where: dict[tuple[int, ...], int] = {(): n}
+    where.update({(v,): v - 1 for v in range(1, n + 1)})
+    used = {tuple(int(v) for v in term if 0 < v <= n) for own in structure.terms for term in own}
+    needed = {factors for factors in used if len(factors) > 1}
+    lifting: Lifting = State() + Constant()
+    if not needed:
+        return lifting, where
+    degree = max(map(len, needed))
+    every = list(list_terms(n, 0, degree)[n:])  # in the order of Monomials
+    which = [i for i, term in enumerate(every) if tuple(int(v) for v in term if v) in needed]
+    for place, i in enumerate(which, n + 1):
+        where[tuple(int(v) for v in every[i] if v)] = place
+    signals = structure.signals
+    monomials = Picked(Monomials(degree), tuple(which))
+    return lifting + Standardized(monomials, structure.mean[signals], structure.scale[signals]), where
+
+
+def _write_term(
+    column: Float[np.ndarray, " n"],
+    factors: tuple[int, ...],
+    structure: Structure,
+    where: dict[tuple[int, ...], int],
+    products: Int[np.ndarray, " np"],
+    nz: int,
+) -> None:
+    """Write a term in standard units as a combination of [ψ(ζ), u, u ⊗ ψ(ζ)], which hold ζ and u in their own units."""
+    n, nu, nx = structure.point_size, structure.nu, len(structure.terms)
+    own = tuple(v for v in factors if v <= n)
+    parts = {where[own]: 1.0}
+    if len(own) == 1:
+        signal = structure.signals[own[0] - 1]
+        parts = {own[0] - 1: 1 / structure.scale[signal], n: -structure.mean[signal] / structure.scale[signal]}
+    if len(own) == len(factors):
+        for place, weight in parts.items():
+            column[place] += weight
+        return
+    i = factors[-1] - n - 1
+    mean, scale = structure.mean[nx + i], structure.scale[nx + i]
+    for place, weight in parts.items():
+        column[place] -= weight * mean / scale
+        if place == n:
+            column[nz + i] += weight / scale
+        else:
+            column[nz + nu + i * len(products) + int(np.flatnonzero(products == place)[0])] += weight / scale
+
+
+def _build_model(
+    regression: Regression,
+    K: Float[np.ndarray, "n nz"],
+    structure: Structure,
+    products: Int[np.ndarray, " np"],
+    numbers: tuple[int, float],
+) -> LinearPredictor | BilinearPredictor:
+    """Return the predictor with [A B N]ᵀ = K, and its report."""
+    nz, nu = regression.lifting.nz, len(regression.inputs)
+    assert regression.C is not None, "ψ holds the states"
+    result = FitResult(
+        A=K[:nz].T,
+        B=K[nz : nz + nu].T,
+        C=regression.C,
+        lifting=regression.lifting,
+        residual=regression.rows.residual(regression.x_next, K @ regression.C.T),
+        state_residual=regression.state_residual,
+        rank=numbers[0],
+        condition=numbers[1],
+        rule="least squares on the terms that forward regression took",
+        changes=(structure.describe(),),
+    )
+    if not structure.is_nonlinear:
+        return build_predictor(regression, result)
+    N = np.zeros((nu, nz, nz))
+    if len(K) > nz + nu:
+        N[:, :, products] = K[nz + nu :].reshape(nu, -1, nz).transpose(0, 2, 1)
+    return BilinearPredictor(
+        result.A,
+        result.B,
+        N,
+        result.C,
+        regression.lifting,
+        regression.dt,
+        regression.states,
+        regression.inputs,
+        build_report(regression, result),
+        regression.embedding,
+        compute_scale(regression, regression.lifting),
+    )

@@ -1,0 +1,165 @@
+"""narx: the greedy choice, exact plants, units, and that its free runs are those of the model it returns."""
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.errors import DataError
+from koopmpc.identify.records.forward import count_terms, evaluate_terms, list_terms, select_forward, solve_nested
+from koopmpc.identify.records.free_run import Pieces, run_freely
+from koopmpc.identify.records.narx import _fit_models, search_structures
+from koopmpc.identify.records.structure import fit_structure
+
+
+def plant(seed=0, rows=500, noise=0.0, episodes=1):
+    """y⁺ = 0.6 y − 0.2 y₁² + 0.5 u y + u₁ + 0.1, with two inputs of which the second does nothing."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for _ in range(episodes):
+        u, y = rng.uniform(-1, 1, (rows, 2)), np.zeros(rows + 1)
+        for k in range(1, rows):
+            y[k + 1] = 0.6 * y[k] - 0.2 * y[k - 1] ** 2 + 0.5 * u[k, 0] * y[k] + u[k - 1, 0] + 0.1
+        parts.append(km.Episode(X=(y + noise * rng.standard_normal(len(y)))[:, None], U=u))
+    return km.Episodes(parts, 0.1, ["y [mm]"], ["u", "idle"])
+
+
+def forecast(model, data):
+    episode = model.embed(data)[0]
+    return model.step_map().rollout(episode.X[0], episode.U)[:, : model.nx]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_greedy_choice_is_that_of_least_squares_on_every_candidate(seed):
+    rng = np.random.default_rng(seed)
+    P = rng.standard_normal((40, 12)) + rng.standard_normal(12)
+    P[:, 7] = P[:, 2] + 0.1 * P[:, 7]
+    y = P[:, [2, 5, 9]] @ [1.0, -2.0, 0.5] + 0.3 * rng.standard_normal(40)
+    taken = []
+    for _ in range(6):
+        errors = {}
+        for j in set(range(12)) - set(taken):
+            A = np.column_stack([np.ones(40), P[:, [*taken, j]]])
+            errors[j] = np.sum((y - A @ np.linalg.lstsq(A, y, rcond=None)[0]) ** 2)
+        taken.append(min(errors, key=errors.get))
+    assert select_forward(P, y, 6) == taken
+    nested = solve_nested(P[:, taken], y, np.array([2, 6]))
+    A = np.column_stack([np.ones(40), P[:, taken[:2]]])
+    assert np.allclose(nested[0, :3], np.linalg.lstsq(A, y, rcond=None)[0])
+    assert not nested[0, 3:].any()
+
+
+def test_a_column_that_others_span_is_never_taken():
+    rng = np.random.default_rng(0)
+    P = rng.standard_normal((30, 5))
+    P[:, 3], P[:, 4] = 2.0, P[:, 0] - P[:, 1]
+    chosen = select_forward(P, rng.standard_normal(30), 5)
+    assert 3 not in chosen
+    assert len(set(chosen) & {0, 1, 4}) == 2
+
+
+def test_terms_are_all_products_and_affine_in_the_inputs():
+    terms = list_terms(3, 2, 3)
+    assert len(terms) == count_terms(3, 2, 3) == len({tuple(t) for t in terms})
+    assert ((terms > 3).sum(axis=1) <= 1).all()
+    V = np.array([1.0, 2.0, 3.0, 5.0, 7.0, 11.0])
+    assert set(evaluate_terms(list_terms(3, 0, 2), V)) == {2, 3, 5, 4, 6, 10, 9, 15, 25}
+
+
+def test_an_exact_polynomial_plant_is_recovered():
+    data = plant()
+    model = km.identify.narx(data, delays=[1, 2, 3], degrees=[1, 2])
+    assert isinstance(model, km.BilinearPredictor)
+    assert model.embedding.steps == 1
+    fresh = plant(seed=1)
+    assert np.abs(forecast(model, fresh) - fresh[0].X[1:]).max() < 1e-7
+    x, y1, u, u1 = 0.3, -0.4, 0.7, 0.2
+    zeta = np.array([x, u1, 0.9, y1])
+    assert model.step_map()(zeta, [u, -0.5])[0] == pytest.approx(0.6 * x - 0.2 * y1**2 + 0.5 * u * x + u1 + 0.1)
+
+
+def test_units_and_origins_change_nothing():
+    data = plant(noise=0.02)
+    size, shift = np.array([1e4]), np.array([300.0])
+    moved = data.with_episodes([km.Episode(X=e.X * size + shift, U=e.U * [1e-3, 50] + [4.0, -7]) for e in data])
+    one, other = (km.identify.narx(d, delays=[0, 1, 3], degrees=[1, 2, 3], terms=12) for d in (data, moved))
+    assert one.nz == other.nz
+    assert np.allclose(forecast(other, moved), forecast(one, data) * size + shift, rtol=1e-9, atol=1e-5)
+
+
+def test_a_linear_plant_gives_an_arx_model_whose_two_uses_agree():
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal(600), np.zeros(601)
+    for k in range(2, 600):
+        y[k + 1] = 1.1 * y[k] - 0.5 * y[k - 1] + 0.1 * y[k - 2] + 0.4 * u[k] - 0.3 * u[k - 2] + 0.3
+    data = km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["y"], ["u"])
+    model = km.identify.narx(data)
+    assert isinstance(model, km.LinearPredictor)
+    assert model.embedding.steps == 2
+    point = model.embed(data)[0]
+    once = model.rollout(point.X[0], point.U)
+    assert np.abs(once - y[2:, None]).max() < 1e-8
+    assert np.abs(once - forecast(model, data)).max() < 1e-8
+
+
+@pytest.mark.parametrize("delays", [0, 2])
+def test_the_free_run_that_chooses_is_that_of_the_model(delays):
+    data = plant(noise=0.05, episodes=2, rows=300)
+    pieces = Pieces.of(data)
+    found = search_structures(data, [delays], [2, 3], 8)
+    structure = max(found, key=lambda one: one.size)
+    model = fit_structure(structure, data)
+    candidates = structure.terms[0]
+    models = _fit_models(pieces, candidates, delays, np.array([len(candidates)]), [(0, 0)] * 2)
+    out = run_freely(models, pieces.Y, pieces.U, delays)[:, 0, 0]
+    assert np.allclose(out * pieces.scale[:1] + pieces.mean[:1], forecast(model, data)[1:], rtol=0, atol=1e-8)
+
+
+def test_a_structure_that_explodes_is_left_out_where_another_stays():
+    data = plant(noise=0.3, rows=250)
+    found = search_structures(data, [1, 3], [3], 60)
+    for one in found:
+        model = fit_structure(one, data)
+        with np.errstate(all="ignore"):
+            assert np.abs(forecast(model, data)).max() < 10 * np.ptp(data[0].X)
+
+
+def test_a_model_is_saved_with_its_terms(tmp_path):
+    data = plant(noise=0.05)
+    model = km.identify.narx(data, delays=2, degrees=3, terms=10)
+    model.save(tmp_path / "m.npz")
+    loaded = km.load_model(tmp_path / "m.npz")
+    assert loaded == model
+    assert np.array_equal(forecast(loaded, data), forecast(model, data))
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "says"),
+    [
+        ({}, {"delays": []}, "pass at least one"),
+        ({}, {"delays": 40}, "pass fewer delays, or a longer record"),
+        ({}, {"delays": 12, "degrees": 4}, "pass fewer delays, or a lower degree"),
+        ({"W": np.ones((500, 1))}, {"delays": 1}, "pass them as inputs"),
+    ],
+)
+def test_bad_input_is_a_sentence(change, options, says):
+    data = plant()
+    if change:
+        data = km.Episodes([km.Episode(X=data[0].X, U=data[0].U, **change)], 0.1, data.states, data.inputs, ["w"])
+    with pytest.raises(DataError, match=says):
+        km.identify.narx(data, **options)
+
+
+def test_a_stream_is_refused():
+    with pytest.raises(DataError, match="read once"):
+        km.identify.narx(km.data.Stream(iter([plant()])))
+
+
+def test_records_without_inputs_are_fitted():
+    y = np.zeros(400)
+    y[:2] = 0.3, 0.5
+    for k in range(1, 399):
+        y[k + 1] = 1.4 - y[k] ** 2 + 0.3 * y[k - 1]  # Hénon's map
+    data = km.Episodes([km.Episode(X=y[:, None])], 1.0, ["y"])
+    model = km.identify.narx(data, delays=[1, 2], degrees=2)
+    assert np.abs(km.score(model, data, 5, relift=True).rmse).max() < 1e-6
+    assert model.report.method == "narx"
