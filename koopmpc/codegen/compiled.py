@@ -154,13 +154,13 @@ _FIELDS = (
 class _Frame(ctypes.Structure):
     """The arguments and results of a call, as in C."""
 
-    _fields_ = (*_FIELDS, ("slack", ctypes.c_double))
+    _fields_ = (*_FIELDS, ("slack", ctypes.c_double), ("refused", ctypes.c_int))
 
 
 class _SingleFrame(ctypes.Structure):
     """A `_Frame` in single precision."""
 
-    _fields_ = (*_FIELDS, ("slack", ctypes.c_float))
+    _fields_ = (*_FIELDS, ("slack", ctypes.c_float), ("refused", ctypes.c_int))
 
 
 class _Whole(ctypes.Structure):
@@ -291,7 +291,7 @@ class Compiled:
                 self._pass_extras(applied, w)
             self._call(self._pointer)
             u = self._u.copy() if self._is_double else self._u.astype(np.float64)
-            if not frame.status:
+            if not frame.status and not frame.refused:
                 return Move(u, Status.UNCONSTRAINED, Fallback.NONE, perf_counter() - start, 0)
             return Move(
                 u,
@@ -301,6 +301,7 @@ class Compiled:
                 frame.iterations,
                 frame.slack,
                 self._solver if frame.iterations else "",
+                refused=bool(frame.refused),
             )
         finally:
             self._token.append(held)
@@ -385,15 +386,16 @@ class Compiled:
             return None
         self._aim(rows)
         rows, W = np.ascontiguousarray(rows), None if W is None else np.ascontiguousarray(W)
-        slack, times, reports = np.zeros(len(U)), np.zeros(len(U)), np.zeros((len(U), 3), dtype=np.intc)
+        slack, times, reports = np.zeros(len(U)), np.zeros(len(U)), np.zeros((len(U), 4), dtype=np.intc)
         arrays = {"rows": rows, "X": X, "Y": Y, "U": U, "slack": slack, "times": times, "reports": reports}
         whole = _run_arguments(code, len(U), arrays, W, preview=preview)
         self._code.koopmpc_run(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)))
-        status, fallback, iterations = reports.T.tolist()
+        status, fallback, iterations = reports.T.tolist()[:3]
         return {
             "status": tuple([_STATUS[i] for i in status]),
             "fallback": tuple([_FALLBACK[i] for i in fallback]),
             "iterations": reports[:, 2].astype(np.int64),
+            "refused": reports[:, 3].astype(np.int64),
             "solver": tuple(["daqp" if i else "" for i in iterations]),
             "slack": slack,
             "solve_time": times,
@@ -437,7 +439,7 @@ class Compiled:
         E = len(starts)
         X, U = np.empty((E, T + 1, starts.shape[1])), np.empty((E, T, self.nu))
         X[:, 0] = starts
-        slack, reports = np.zeros((E, T)), np.zeros((E, T, 3), dtype=np.intc)
+        slack, reports = np.zeros((E, T)), np.zeros((E, T, 4), dtype=np.intc)
         arrays = {"rows": rows, "X": X, "Y": np.empty((T + 1, self._ny)), "U": U, "slack": slack, "reports": reports}
         whole = _run_arguments(code, T, arrays, None, preview=True)
         self._code.koopmpc_runs(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)), ctypes.c_long(E))

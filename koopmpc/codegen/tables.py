@@ -189,6 +189,14 @@ def _add_settings(tables: Tables, *, single: bool) -> None:
     }
 
 
+def _add_gate(tables: Tables, gate: Graph | None, ny: int) -> None:
+    """Write which readings are refused."""
+    tables.sizes["GATE"] = 0 if gate is None else gate.m - 2
+    if gate is not None:
+        arguments = {"y": ny, "predicted": ny, "memory": gate.m - 2}
+        tables.functions["koopmpc_gate"] = CFunction(gate, arguments, "result")
+
+
 def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram) -> None:
     """Write how z and d follow from y, and the linear model where it is advanced."""
     plan, sizes, estimator = tables.observer, tables.sizes, program.estimator
@@ -222,9 +230,10 @@ def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram) ->
     elif isinstance(estimator, DisturbanceProgram):
         sizes["ESTIMATOR"] = 1
         tables.reals["GAIN"] = estimator.gain
+    _add_gate(tables, estimator.gate, sizes["NY"])
     if isinstance(program, StagedProgram):
         plan |= {"C": stack(np.eye(program.ny, program.nx)), "E": stack(program.E)}
-    elif sizes["ESTIMATOR"] == 1 or program.latency:
+    elif sizes["ESTIMATOR"] == 1 or program.latency or estimator.gate is not None:
         model = program.model
         plan |= {
             "C": stack(model.C),
@@ -321,6 +330,9 @@ def _add_feedback(tables: Tables, program: FeedbackProgram) -> None:
         "target_span": stack(targets.W if targets.Z.shape[1] else np.zeros((model.nu, 1))),
         "target_push": stack(targets.u_disturbance),
     }
+    _add_gate(tables, program.gate, model.nx)
+    if program.gate is not None:
+        tables.plan |= {"A": stack(model.A), "B": stack(model.B), "C": stack(model.C)}
     _add_memory(tables, 1, 0, 0)
 
 

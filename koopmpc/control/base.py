@@ -69,6 +69,7 @@ class InitialCondition(Viewing):
         self._shape = (observer.ny,)
         self.known = np.zeros(model.nz + model.nu * with_rates + N * model.nw + model.nz * estimated + 1)
         self.known[-1] = 1.0
+        self.refused = False  # whether the observer refused the last y
         self._ahead = np.zeros((latency + 1, model.nw))
         self._sent: deque[Float[np.ndarray, " nu"]] = deque(maxlen=latency + 1)
         self._see()
@@ -85,6 +86,7 @@ class InitialCondition(Viewing):
     def reset(self, x0: ArrayLike | None, last: Float[np.ndarray, " nu"]) -> None:
         """Start at x0, where it is known, with the input `last` acting until the first one arrives."""
         x0 = checks.start(x0, self._model.ny)
+        self.refused = False
         if self._measured is None:  # else there is nothing that it remembers
             self.observer.reset(x0)
         self.drive[:] = 0.0
@@ -141,6 +143,7 @@ class InitialCondition(Viewing):
         if got is not None:
             acted = got
         good = observer.observe(measured, acted, self._w)
+        self.refused = getattr(observer, "refused", False)
         if self._ahead.size:  # a disturbance that is not finite keeps its last value
             self._w = np.where(np.abs(self._ahead[0]) < HUGE, self._ahead[0], self._w)
         z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d

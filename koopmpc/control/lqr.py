@@ -33,9 +33,6 @@ from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Buffered
 from koopmpc.predict.predictors import LinearPredictor
 
-_NOTHING = np.zeros(0)  # no measured disturbance moves an estimate here
-
-
 _Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 
 
@@ -107,11 +104,14 @@ class FeedbackProgram(LinearProgram):
         (nu, nz), and (nu, nu) where changes of the inputs are weighed, else (nu, 0).
     feedforward
         (nu, nw + nr + nu).
+    gate
+        Which readings are refused; None where no past of them is kept.
     """
 
     K: Float[np.ndarray, "nu _"]
     K_rate: Float[np.ndarray, "nu _"]
     feedforward: Float[np.ndarray, "nu _"]
+    gate: Graph | None = None
 
 
 def feedback_program(
@@ -126,6 +126,7 @@ def feedback_program(
     *,
     K_rate: Float[np.ndarray, "nu m"] | None = None,
     given: Float[np.ndarray, "k nu"] | None = None,
+    gate: Graph | None = None,
 ) -> FeedbackProgram:
     """Return the Program of u = feedforward [w; r; u_r] − K ψ(ζ) − K_rate u_{k−1}; see `FeedbackProgram`."""
     parts = linear_parts(predictor, targets)
@@ -142,6 +143,7 @@ def feedback_program(
         K=K,
         K_rate=np.zeros((len(K), 0)) if K_rate is None else K_rate,
         feedforward=feedforward,
+        gate=gate,
     )
 
 
@@ -197,6 +199,7 @@ class LQR(FeedbackLaw):
         self._targets, self._nr = targets_of(predictor, track), len(C)
         self._given_rows = track.given
         self._observer = Measured(predictor)
+        self._w = self._no_w = np.zeros(predictor.nw)  # the measured disturbance that has acted since the last call
         self._reference_key: tuple[bytes, int] | None = None
         self._feedforward = np.zeros(predictor.nu)
         self._row = 0  # of a given u_target, for the next call
@@ -225,12 +228,14 @@ class LQR(FeedbackLaw):
             self._v,
             K_rate=self._K_rate,
             given=self._given_rows,
+            gate=self._observer.program().gate,
         )
 
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Set the last input, zero inside the limits by default; rows of a given u_target start at the first."""
         self._observer.reset()
+        self._w = self._no_w
         self._row = 0
         super().reset(x0, u_prev)
 
@@ -257,11 +262,14 @@ class LQR(FeedbackLaw):
         if self._given_rows is not None and self._row + 1 < len(self._given_rows):
             self._row += 1
         self.take_applied(applied)
-        self._observer.observe(x, self._last, _NOTHING)
+        self._observer.observe(x, self._last, self._w)
+        self._w = self._no_w if told is None else np.where(np.isfinite(told), told, self._w)
         free = self._feedforward - self._K @ self._observer.z
         if self._K_rate.size:
             free -= self._K_rate @ self._last
-        return self.limit_input(free if (np.abs(free) < HUGE).all() else None, start)
+        move = self.limit_input(free if (np.abs(free) < HUGE).all() else None, start)
+        move.refused = self._observer.refused
+        return move
 
     def _disturbance(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, " nw"]:
         """Return w of this step, NaN where it cannot be."""

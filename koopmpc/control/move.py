@@ -69,6 +69,9 @@ class Move:
     known
         Whether the step is like the data of the model: state and input inside their region, the measurement as
         predicted. None without a monitor.
+    refused
+        Whether the measurement was too far from its prediction: it entered neither the estimate nor the history of
+        delays, and the prediction stood in.
     """
 
     u: Float[np.ndarray, " nu"]
@@ -79,6 +82,7 @@ class Move:
     slack: float = 0.0
     solver: str = ""
     known: bool | None = None
+    refused: bool = False
 
 
 @dataclass(frozen=True, eq=False)

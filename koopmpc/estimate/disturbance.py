@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
+from koopmpc.estimate.gate import gate_graph
 from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.routines import bind_interpreter
@@ -35,6 +36,9 @@ class LiftedDisturbance(Value):
     without half the mean square of its successive differences, which is noise, and s the largest step or misfit that a
     state has shown so far. Where the misfits vary by more than their mean nothing is learned; at rest v = 0 and
     d = m = e.
+
+    A reading far from its prediction is refused: A z + B u + E w + d stands in for at most five steps, and nothing is
+    learned. Once readings are used again, all means begin anew.
 
     Parameters
     ----------
@@ -111,7 +115,7 @@ class DisturbanceObserver(Viewing, Measured):
         Weight of the newest misfit, in (0, 1].
     """
 
-    _VIEWS = ("z", "d", "_seen", "_x", "_driven", "_u", "_w", "_after", "_evaluate", "_buffer")
+    _VIEWS = ("z", "d", "_seen", "_x", "_driven", "_u", "_w", "_after", "_flags", "_evaluate", "_buffer")
 
     def __init__(self, model: LinearPredictor | StateModel, gain: float) -> None:
         super().__init__(model)
@@ -126,6 +130,7 @@ class DisturbanceObserver(Viewing, Measured):
         self._rule = _rule(self._sizes, self.ny, known, gain, None if self.lift is None else self.lift.function)
         self._memory, self._C = np.zeros(self._rule.numel_in(2)), np.zeros(self.ny * own.nz)
         self._predicted, self._still = np.zeros(own.nz), np.zeros(own.nz)
+        self._stood_in = False  # whether a prediction stood in for a part of the last reading
         self._see()
         self._take(model)
 
@@ -135,23 +140,27 @@ class DisturbanceObserver(Viewing, Measured):
         self.z, self._u, self._w, _, self.d = np.split(self._memory, np.cumsum([nz, nu, nw, nz, nz]))[:5]
         self._driven, self._seen = self._memory[: nz + nu + nw], self._memory[-1:]
         self._x, self._after = np.zeros(self._rule.numel_in(0)), np.zeros(len(self._memory))
-        arguments = self._x, self._predicted, self._memory, self._C
+        self._flags = np.zeros(2)
+        arguments = self._x, self._predicted, self._memory, self._C, self._flags
         self._evaluate, self._buffer = bind_interpreter(self._rule, arguments, (self._after,))
 
     def _take(self, model: LinearPredictor | StateModel) -> None:
         """Take over the matrices of a model."""
         linear = isinstance(model, LinearPredictor)
         self._ABE = np.hstack([model.A, model.B, model.E]) if linear else None
-        self._C[:] = (model.C if linear else np.eye(self.ny, len(self.d))).ravel("F")
+        C = model.C if linear else np.eye(self.ny, len(self.d))
+        self._C[:] = C.ravel("F")
+        self._to_y = C
 
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Forget the last state, all misfits, d and the past; x0 will come as the first measurement."""
         super().reset(x0)
         self._memory[:] = 0.0
+        self._stood_in = False
 
     def program(self) -> DisturbanceProgram:
         """Return the data with which z and d are found."""
-        return DisturbanceProgram(self.gain, self._known, self._C.reshape((self.ny, -1), order="F").copy())
+        return DisturbanceProgram(self.gain, self._known, self._to_y.copy(), gate=gate_graph(self.ny))
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""
@@ -159,8 +168,8 @@ class DisturbanceObserver(Viewing, Measured):
         self._take(model)
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
-        """Take y, and learn from the misfit of the step that led here."""
-        self._x[:] = y if self._history is None else self._history.take(y, u)
+        """Take y, and learn from the misfit of the step that led here, if y was neither refused now nor just before."""
+        gate, expected = self._gate, self._nothing
         if self._seen[0]:
             if self._ABE is None:
                 self._predicted[:] = self._model.advance(self.z, u, w, self._still)
@@ -169,6 +178,13 @@ class DisturbanceObserver(Viewing, Measured):
                 if len(w):
                     self._w[:] = w
                 self._ABE.dot(self._driven, self._predicted)
+            expected = self._to_y.dot(self._predicted + self.d)
+        stands_in = gate.judge(y, expected)
+        if stands_in:
+            y = expected
+        self._x[:] = y if self._history is None else self._history.take(y, u)
+        self._flags[0], self._flags[1] = not (stands_in or self._stood_in or gate.opened), gate.opened
+        self._stood_in = stands_in
         self._evaluate()
         self._memory[:] = self._after
         return bool(self._seen[0])
@@ -176,32 +192,36 @@ class DisturbanceObserver(Viewing, Measured):
 
 @raise_swallowed()
 def _rule(sizes: tuple[int, int, int], nx: int, known: slice, gain: float, lift: ca.Function | None) -> ca.Function:
-    """Return (x, A z + B u + E w, memory, C) → memory after x has come; z = ψ(x), or x itself without a `lift`.
+    """Return (x, A z + B u + E w, memory, C, flags) → memory after x has come; z = ψ(x), or x itself without a `lift`.
 
     The memory is [z; u; w; m; d; C e; the mean of (C e)² less half the square of its change; s²; whether there has been
-    a misfit; whether z is known].
+    a misfit; the weight of the next misfit, if it is above the gain; whether z is known]. The flags say whether this
+    misfit is learned, and whether all means begin anew with the next one.
     """
     nz, nu, nw = sizes
     x, C = ca.SX.sym("x", nz if lift is None else lift.numel_in(0)), ca.SX.sym("C", nx, nz)
-    predicted, memory = ca.SX.sym("predicted", nz), ca.SX.sym("memory", 3 * nz + nu + nw + 3 * nx + 2)
-    ends = np.cumsum([0, nz, nu + nw, nz, nz, nx, nx, nx, 1, 1]).tolist()
-    last, driven, m, d, f, rough, squares, learned, seen = ca.vertsplit(memory, ends)
+    predicted, memory = ca.SX.sym("predicted", nz), ca.SX.sym("memory", 3 * nz + nu + nw + 3 * nx + 3)
+    flags = ca.SX.sym("flags", 2)
+    ends = np.cumsum([0, nz, nu + nw, nz, nz, nx, nx, nx, 1, 1, 1]).tolist()
+    last, driven, m, d, f, rough, squares, learned, newest, seen = ca.vertsplit(memory, ends)
     z = x if lift is None else ca.SX(lift(x))
     good = ca.dot(z, z) < HUGE**2  # False for NaN
     unknown = np.ones(nz)
     unknown[known] = 0.0
     e = ca.DM(unknown) * (z - predicted)
-    learns = ca.logic_and(ca.logic_and(good, seen), ca.dot(e, e) < HUGE**2)
+    learns = ca.logic_and(ca.logic_and(good, seen), ca.logic_and(flags[0], ca.dot(e, e) < HUGE**2))
+    weight = ca.fmax(gain, newest)
     f_new, moved = C @ e, C @ (z - last)
     squares_new = ca.fmax(squares, ca.fmax(moved**2, f_new**2))
     weights = ca.if_else(squares_new > 0, 1 / squares_new, 0)
-    m_new = m + gain * (e - m)
-    rough_new = rough + gain * (f_new**2 - 0.5 * learned * (f_new - f) ** 2 - rough)
+    m_new = m + weight * (e - m)
+    rough_new = rough + weight * (f_new**2 - 0.5 * learned * (f_new - f) ** 2 - rough)
     mean = (C @ m_new) ** 2
     varied = ca.dot(ca.fmax(rough_new - mean, 0), weights)
     most = ca.dot(ca.fmax(mean, (C @ d) ** 2), weights)
     d_new = d + ca.if_else(varied < most, 1 - varied / most, 0) * (m_new - d)
-    before = ca.vertcat(m, d, f, rough, squares, learned)
-    after = ca.vertcat(m_new, d_new, f_new, rough_new, squares_new, 1)
+    starts = ca.logic_and(flags[1], good)
+    before = ca.vertcat(m, d, f, rough, squares, ca.if_else(starts, 0, learned), ca.if_else(starts, 1, newest))
+    after = ca.vertcat(m_new, d_new, f_new, rough_new, squares_new, 1, newest / (1 + newest))
     result = ca.vertcat(z, driven, ca.if_else(learns, after, before), good)
-    return ca.Function("rule", [x, predicted, memory, C], [ca.densify(result)], {"cse": True})
+    return ca.Function("rule", [x, predicted, memory, C, flags], [ca.densify(result)], {"cse": True})

@@ -19,6 +19,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError, ObservableError, ShapeError
 from koopmpc.estimate.disturbance import GAIN
+from koopmpc.estimate.gate import ReadingGate, gate_graph
 from koopmpc.estimate.observer import EstimatorProgram, StateModel
 from koopmpc.lifting.base import Lifting, strip_unit
 from koopmpc.predict.predictors import LinearPredictor
@@ -109,7 +110,7 @@ class KalmanFilter(Viewing):
     NaN and there is no delay, a step is one product, [s; z; d] = Ω [s; u; w; y; 1].
     """
 
-    _VIEWS = ("z", "d", "_s", "_uw", "_y", "_s_new")
+    _VIEWS = ("z", "d", "_s", "_uw", "_y", "_s_new", "_expected")
 
     def __init__(
         self, model: Callable[[LinearPredictor], FilterModel], predictor: LinearPredictor, delay: int, patience: int
@@ -119,7 +120,8 @@ class KalmanFilter(Viewing):
         self._take(predictor)
         self.ny, nz = len(self._system.M), len(self._system.one)
         n, inputs = self._system.G.shape
-        self._known, self._found = np.ones(n + inputs + self.ny + 1), np.zeros(n + 2 * nz)
+        self._known, self._found = np.ones(n + inputs + self.ny + 1), np.zeros(n + 2 * nz + self.ny)
+        self._gate = ReadingGate(self.ny)
         self._see()
         self.reset()
 
@@ -127,12 +129,18 @@ class KalmanFilter(Viewing):
         """Make the views of the arrays that the product reads and writes; see `Viewing`."""
         (n, inputs), nz = self._system.G.shape, len(self._system.one)
         self._s, self._uw, self._y, _ = np.split(self._known, [n, n + inputs, n + inputs + self.ny])
-        self._s_new, self.z, self.d = np.split(self._found, [n, n + nz])
+        self._s_new, self.z, self.d, self._expected = np.split(self._found, [n, n + nz, n + 2 * nz])
 
     def program(self) -> FilterProgram:
         """Return the data with which z and d are found."""
         parts = {name: getattr(self._system, name) for name in ("F", "G", "f", "M", "h", "to_z", "one", "to_d", "kept")}
-        return FilterProgram(**parts, P=self._P, R=self._R, delay=self._delay, patience=self._patience)
+        gate = gate_graph(self.ny)
+        return FilterProgram(**parts, P=self._P, R=self._R, delay=self._delay, patience=self._patience, gate=gate)
+
+    @property
+    def refused(self) -> bool:
+        """Whether the last y was refused: the filter only predicted."""
+        return self._gate.refused
 
     def update(self, predictor: LinearPredictor) -> None:
         """Go on with another model, from the same state."""
@@ -146,7 +154,9 @@ class KalmanFilter(Viewing):
         K = self._gain(np.ones(len(system.M), dtype=np.bool_))
         kept = np.eye(len(system.F)) - K @ system.M
         s = np.hstack([kept @ system.F, kept @ system.G, K, (kept @ system.f - K @ system.h)[:, None]])
-        self._omega = np.vstack([s, system.to_z @ s, system.to_d @ s])
+        F, G, M = system.F, system.G, system.M
+        y = np.hstack([M @ F, M @ G, np.zeros((len(M), len(M))), (M @ system.f + system.h)[:, None]])
+        self._omega = np.vstack([s, system.to_z @ s, system.to_d @ s, y])
         self._omega[len(s) : len(s) + len(system.one), -1] += system.one
 
     def reset(self, x0: ArrayLike | None = None) -> None:
@@ -159,6 +169,7 @@ class KalmanFilter(Viewing):
         self._inputs.clear()
         self._started = False
         self._missed = 0
+        self._gate.reset()
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Correct the state of `delay` steps ago with y, and predict it to the present with the inputs since then.
@@ -171,14 +182,15 @@ class KalmanFilter(Viewing):
                 self._uw[len(u) :] = w
             self._y[:] = y
             self._omega.dot(self._known, self._found)
-            if self._found.dot(self._found) < HUGE**2:  # False for NaN: some of y is missing
+            refused = self._gate.judge(y, self._expected)
+            if not refused and self._found.dot(self._found) < HUGE**2:  # False for NaN: some of y is missing
                 self._s[:] = self._s_new
                 self._missed = 0
                 return True
         return self._correct(y, u, w)
 
     def _correct(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
-        """Predict, and correct with the entries of y that have come."""
+        """Predict, and correct with the entries of y that have come, unless y is refused."""
         system = self._system
         if self._started:
             self._inputs.append(np.concatenate([u, w]))
@@ -186,7 +198,9 @@ class KalmanFilter(Viewing):
             self._s[:] = self._next(self._s, self._inputs.popleft())
         came = np.abs(y) < HUGE  # False for NaN
         first = len(self._inputs) < self._delay  # y is older than the start
-        if not first and came.any():
+        if not first and (self._delay or not self._started):
+            self._gate.judge(y, system.M @ self._s + system.h)
+        if not first and came.any() and not self._gate.refused:
             self._s += self._gain(came) @ (y[came] - system.M[came] @ self._s - system.h[came])
         self._missed = 0 if came.any() else self._missed + 1
         self._started = True
@@ -244,7 +258,8 @@ class LiftedKalman(Value):
 
     z is never lifted afresh. There is one disturbance for each measurement, so that at rest the filter explains y
     exactly. The loop has no offset if all tracked outputs are measured, and if there are no more of them than inputs.
-    The Constant is known, and not estimated.
+    The Constant is known, and not estimated. A y that is far from its prediction is refused, for at most five steps in
+    sequence: the filter only predicts.
 
     Parameters
     ----------

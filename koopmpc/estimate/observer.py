@@ -1,6 +1,6 @@
 """What an observer is: z and d of z⁺ = A z + B u + d now. `Measured` is the observer where the state is measured."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
+from koopmpc.estimate.gate import ReadingGate, gate_graph
 from koopmpc.lifting.base import Lifting, buffer_lifting
+from koopmpc.plants.graph import Graph
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 
@@ -145,7 +147,14 @@ class EstimatorProgram(Value):
     """The data with which an observer finds z and d of y. As it stands: z = ψ(ζ), ζ of the measured y, and d = 0.
 
     The other kinds are `DisturbanceProgram` and `FilterProgram`.
+
+    Attributes
+    ----------
+    gate
+        Which readings are refused, see `koopmpc.estimate.gate`; None where an observer remembers no reading.
     """
+
+    gate: Graph | None = field(default=None, kw_only=True)
 
 
 class History:
@@ -183,7 +192,8 @@ class History:
 class Measured:
     """The observer without an estimator: z = ψ(ζ) of the measured y, or ζ itself; d is zero, or what it is set to.
 
-    ζ is y, or under an embedding y with its past.
+    ζ is y, or under an embedding y with its past. Then a reading far from its prediction does not enter the past: the
+    prediction stands in, see `ReadingGate`.
 
     Parameters
     ----------
@@ -192,9 +202,12 @@ class Measured:
     """
 
     def __init__(self, model: LinearPredictor | StateModel) -> None:
+        self._to_y = model.C if isinstance(model, LinearPredictor) else None
         self._model = model = state_model(model)
         self._history = None if model.embedding is None else History(model.embedding)
         self.ny = model.ny
+        self._gate = ReadingGate(model.ny)
+        self._nothing, self._known_z = np.full(model.ny, np.nan), False
         self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.lift = None if model.lifting is None else buffer_lifting(model.lifting)
@@ -203,21 +216,29 @@ class Measured:
         """Forget d and the past; x0 will come as the first measurement."""
         checks.start(x0, self.ny)
         self.d[:] = 0.0
+        self._gate.reset()
+        self._known_z = False
         if self._history is not None:
             self._history.reset()
 
+    @property
+    def refused(self) -> bool:
+        """Whether the last y was refused, and its prediction stood in."""
+        return self._gate.refused
+
     def program(self) -> EstimatorProgram:
         """Return the data with which z and d are found."""
-        return EstimatorProgram()
+        return EstimatorProgram(gate=None if self._history is None else gate_graph(self.ny))
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""
+        self._to_y = model.C if isinstance(model, LinearPredictor) else None
         self._model = state_model(model)
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y as it is; where it is lifted, a bad entry makes all of z NaN, which shows in every plan."""
         if self._history is not None:
-            y = self._history.take(y, u)
+            y = self._history.take(self._check_reading(y, u, w), u)
         if self.lift is None:
             self.z = y
             return True
@@ -225,6 +246,17 @@ class Measured:
         self.lift.evaluate()
         self.z = self.lift.results[0]
         return True
+
+    def _check_reading(
+        self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
+    ) -> Float[np.ndarray, " ny"]:
+        """Return y, or its prediction where y is refused."""
+        predicted = self._nothing
+        if self._known_z:
+            z = self._model.advance(self.z, u, w, self.d)
+            predicted = z[: self.ny] if self._to_y is None else self._to_y.dot(z)
+        self._known_z = True
+        return predicted if self._gate.judge(y, predicted) else y
 
 
 def start_observer(estimator: Estimator | None, model: LinearPredictor | StateModel, horizon: int) -> StateObserver:

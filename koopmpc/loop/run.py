@@ -121,6 +121,8 @@ class StepRows(Value):
         (m,) 1 where the controller's monitor knew the step, 0 where it did not, −1 without a monitor, by default.
     solver
         m entries: which solver made the move, "osqp" or "daqp", "" where none was asked or it is not known, by default.
+    refused
+        (m,) 1 where a measurement was too far from its prediction and was not used; zeros by default.
     """
 
     X: Float[np.ndarray, "n nx"]
@@ -140,6 +142,9 @@ class StepRows(Value):
         default_factory=_no_numbers, metadata={"move": MoveColumn(-1, np.int64, "solver/known")}
     )
     solver: tuple[str, ...] = field(default_factory=tuple, metadata={"move": MoveColumn("", log="solver/qp")})
+    refused: Int[np.ndarray, " mr"] = field(
+        default_factory=_no_numbers, metadata={"move": MoveColumn(0, np.int64, "solver/refused")}
+    )
     u_reference: Float[np.ndarray, "m nu"] = field(default_factory=lambda: np.empty((0, 0)))
 
     def __post_init__(self) -> None:
@@ -290,9 +295,9 @@ class Run(About, StepRows):
         (T+1, nx) true states, (T+1, ny) measurements, (T+1, nr) references.
     U, u_reference
         (T, nu) inputs as applied, and the inputs that hold the reference.
-    status, fallback, solve_time, iterations, slack, known, solver
-        T entries each: how each step ended, how long it took [s], what its solver did, whether its model knew, and
-        which solver it was.
+    status, fallback, solve_time, iterations, slack, known, solver, refused
+        T entries each: how each step ended, how long it took [s], what its solver did, whether its model knew,
+        which solver it was, and whether the measurement was refused.
     plans
         The plan of each step, where asked for.
     cost, limits, dt, states, inputs, outputs, angles, metadata

@@ -29,6 +29,13 @@ BINARY = {
     "pow": lambda a, b: a**b,
     "constpow": lambda a, b: a**b,
     "lt": lambda a, b: float(a < b),
+    "le": lambda a, b: float(a <= b),
+    "eq": lambda a, b: float(a == b),
+    "ne": lambda a, b: float(a != b),
+    "and": lambda a, b: float(a != 0 and b != 0),
+    "or": lambda a, b: float(a != 0 or b != 0),
+    "fmin": lambda a, b: float(np.fmin(a, b)),
+    "fmax": lambda a, b: float(np.fmax(a, b)),
     "if_else_zero": lambda a, b: b if a else 0.0,
 }
 
@@ -96,6 +103,9 @@ class Estimate:
         self.kind = type(self.rule).__name__
         self.last, self.newest, self.mean, self.sizes, self.learned = None, None, 0.0, np.zeros(self.ny), False
         self.missed, self.queue = 0, None
+        self.gate = program.gate if self.rule is None else self.rule.gate
+        self.memory = None if self.gate is None else np.zeros(self.gate.m - 2)
+        self.refused, self.opened, self.fresh, self.first = False, False, 0.0, True
         if self.kind == "FilterProgram":
             zeta = np.zeros(program.lifting.n)
             self.s = np.concatenate([evaluate(program.lifting, zeta)[self.rule.kept], np.zeros(len(self.rule.F))])
@@ -115,13 +125,30 @@ class Estimate:
         self.zeta = np.concatenate([known, zeta[len(x) :]])
         return zeta
 
+    def judge(self, y, expected):
+        """Whether y is refused; NaN in `expected` is no prediction."""
+        refused, opened, *memory = evaluate(self.gate, y, expected, self.memory)
+        self.memory, self.refused, self.opened = np.array(memory), bool(refused), bool(opened)
+        return self.refused
+
     def take(self, y, u, w):
         if self.kind == "FilterProgram":
             return self.filtered(y, u, w)
+        stood_in = self.refused
+        if self.gate is not None:
+            known = self.last if self.kind == "DisturbanceProgram" else self.z
+            expected = np.full(self.ny, np.nan)
+            if not self.first and known is not None and np.isfinite(known).all():
+                z = self.advance(known, u, w, self.d)
+                expected = z[: self.ny] if type(self.program).__name__ == "StagedProgram" else self.program.model.C @ z
+            y = expected if self.judge(y, expected) else y
+        self.first = False
         zeta = self.point(y, u)
         z = evaluate(self.program.lifting, zeta) if np.isfinite(zeta).all() else np.full(self.program.lifting.m, np.nan)
         if self.kind == "DisturbanceProgram" and np.isfinite(z).all():
-            if self.last is not None:
+            if self.opened:
+                self.learned, self.fresh = False, 1.0
+            elif self.last is not None and not (self.refused or stood_in):
                 self.learn(np.where(self.rule.known, 0.0, z - self.advance(self.last, u, w, 0.0)), z - self.last)
             self.last = z
         elif self.kind == "DisturbanceProgram":
@@ -130,7 +157,8 @@ class Estimate:
         return bool(np.isfinite(z).all())
 
     def learn(self, misfit, step):
-        C, gain = self.rule.C, self.rule.gain
+        C, gain = self.rule.C, max(self.rule.gain, self.fresh)
+        self.fresh /= 1 + self.fresh
         f, moved = C @ misfit, C @ step
         self.sizes = np.maximum(self.sizes, np.maximum(f**2, moved**2))
         rough = f**2 - (0.5 * (f - self.newest) ** 2 if self.learned else 0.0)
@@ -153,7 +181,10 @@ class Estimate:
         if len(self.queue) > rule.delay:
             self.s = rule.F @ self.s + rule.G @ self.queue.popleft() + rule.f
         came = np.isfinite(y)
-        if len(self.queue) >= rule.delay and came.any():
+        due = len(self.queue) >= rule.delay
+        if due:
+            self.judge(y, rule.M @ self.s + rule.h)
+        if due and came.any() and not self.refused:
             M = rule.M[came]
             S = M @ rule.P @ M.T + rule.R[np.ix_(came, came)]
             self.s = self.s + rule.P @ M.T @ np.linalg.solve(S, y[came] - M @ self.s - rule.h[came])

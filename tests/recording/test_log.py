@@ -127,6 +127,7 @@ def test_what_is_kept_of_a_move_is_what_the_move_has(tmp_path: Path) -> None:
         "slack": 0.5,
         "solver": "daqp",
         "known": True,
+        "refused": True,
     }
     assert {field.name for field in fields(km.Move)} == {"u", *told}
 

@@ -44,9 +44,10 @@ DOOR void koopmpc_run(koopmpc_frame *f, const koopmpc_whole *run) {
     koopmpc_step(f->state, run->Y + k * run->ny, &reference, k ? u - KOOPMPC_NU : 0, run->measured ? &w : 0, u,
                  &f->report);
     if (run->times) run->times[k] = koopmpc_now() - start;
-    run->reports[3 * k] = (int)f->report.status;
-    run->reports[3 * k + 1] = (int)f->report.fallback;
-    run->reports[3 * k + 2] = f->report.iterations;
+    run->reports[4 * k] = (int)f->report.status;
+    run->reports[4 * k + 1] = (int)f->report.fallback;
+    run->reports[4 * k + 2] = f->report.iterations;
+    run->reports[4 * k + 3] = f->report.refused;
     run->slack[k] = f->report.slack;
     run->step(x, u, x + run->nx);
     run->measure(x + run->nx, run->Y + (k + 1) * run->ny);
@@ -68,7 +69,7 @@ DOOR void koopmpc_runs(koopmpc_frame *f, koopmpc_whole *run, long runs) {
     run->X += (run->steps + 1) * run->nx;
     run->U += run->steps * KOOPMPC_NU;
     run->slack += run->steps;
-    run->reports += 3 * run->steps;
+    run->reports += 4 * run->steps;
   }
 }
 #endif

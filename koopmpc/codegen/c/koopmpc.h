@@ -53,6 +53,7 @@ typedef struct {
   koopmpc_fallback fallback;
   int iterations;     /**< iterations of the QP solver */
   koopmpc_real slack; /**< the largest violation of a soft limit, in its unit; 0 unless SOFTENED */
+  int refused;        /**< 1 if y was too far from its prediction, which stood in */
 } koopmpc_report;
 
 #if KOOPMPC_IS_LQR
@@ -66,6 +67,10 @@ typedef struct {
   int target_ints[KOOPMPC_TARGET_INTS];
   int seen; /**< whether zeta holds a past; only for models with delays */
   int row;  /**< row of given input targets */
+#if KOOPMPC_GATE
+  koopmpc_real gate[KOOPMPC_GATE], w[KOOPMPC_NW1];
+  int has_z;
+#endif
 } koopmpc_state;
 
 #else
@@ -85,13 +90,17 @@ typedef struct {
 #if KOOPMPC_ESTIMATOR == 1
   koopmpc_real last_z[KOOPMPC_NZ];
   koopmpc_real newest[KOOPMPC_NZ + 2 * KOOPMPC_NX], means[KOOPMPC_NZ + 2 * KOOPMPC_NX];
-  koopmpc_real sizes[KOOPMPC_NX], weights[KOOPMPC_NX];
-  int learned, has_last;
+  koopmpc_real sizes[KOOPMPC_NX], weights[KOOPMPC_NX], fresh;
+  int learned, has_last, stood_in;
 #elif KOOPMPC_ESTIMATOR == 2
   koopmpc_real s[KOOPMPC_NS];
   koopmpc_real queue[(KOOPMPC_DELAY_Y + 1) * (KOOPMPC_NU + KOOPMPC_NW1)];
   koopmpc_real innovation[KOOPMPC_NY], factor[KOOPMPC_NY * KOOPMPC_NY];
   int queued, started, missed;
+#endif
+#if KOOPMPC_GATE
+  koopmpc_real gate[KOOPMPC_GATE]; /**< memory of the test of readings */
+  int has_z;
 #endif
 #if KOOPMPC_IS_STAGED
   koopmpc_real S[(KOOPMPC_N + 1) * KOOPMPC_POINT], V[KOOPMPC_MOVES];         /**< the plan: states, inputs of stages */
@@ -156,6 +165,7 @@ typedef struct {
   int warm;       /**< whether the next step starts from the last one */
   int has_kept, age, planned;
   int seen;       /**< whether zeta holds a past; only for models with delays */
+  int refused;    /**< whether the last y was refused */
 } koopmpc_state;
 
 #endif

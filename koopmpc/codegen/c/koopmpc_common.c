@@ -54,6 +54,16 @@ void koopmpc_observe(koopmpc_real *zeta, int *seen, koopmpc_real *z, const koopm
     koopmpc_fill(z, (koopmpc_real)NAN, KOOPMPC_NZ);
 }
 
+#if KOOPMPC_GATE
+int koopmpc_refuse(koopmpc_real *memory, const koopmpc_real *y, const koopmpc_real *predicted, int *opened) {
+  koopmpc_real result[KOOPMPC_GATE + 2];
+  koopmpc_gate(y, predicted, memory, result);
+  koopmpc_copy(memory, result + 2, KOOPMPC_GATE);
+  *opened = result[1] > 0;
+  return result[0] > 0;
+}
+#endif
+
 void koopmpc_admit(koopmpc_real *u, const koopmpc_real *low, const koopmpc_real *high, const koopmpc_real *last) {
   for (int i = 0; i < KOOPMPC_NU; i++) {
     if (low) u[i] = koopmpc_clip(u[i], last[i] + low[i], last[i] + high[i]);

@@ -45,6 +45,15 @@ void koopmpc_add(koopmpc_real *to, const koopmpc_real *map, int rows, const koop
 /** Move zeta = [x_k, u_{k-1}, x_{k-1}, ...] on by a step that led to x under u, and write z = psi(zeta). */
 void koopmpc_observe(koopmpc_real *zeta, int *seen, koopmpc_real *z, const koopmpc_real *x, const koopmpc_real *u);
 
+#if KOOPMPC_GATE
+/** [whether y is refused; whether readings are used again; the new memory]. */
+void koopmpc_gate(const koopmpc_real *y, const koopmpc_real *predicted, const koopmpc_real *memory,
+                  koopmpc_real *result);
+
+/** Whether y is too far from its prediction to be used; NaN in `predicted` is no prediction. */
+int koopmpc_refuse(koopmpc_real *memory, const koopmpc_real *y, const koopmpc_real *predicted, int *opened);
+#endif
+
 /** Coordinates of the target nearest to r, without limits; disturbances add e to z, NULL for none. */
 void koopmpc_nearest(const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha);
 

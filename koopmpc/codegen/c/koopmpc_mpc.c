@@ -355,6 +355,7 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
   report->slack = 0;
   aim(s, reference);
   koopmpc_take(s, y, applied, w);
+  report->refused = s->refused;
   evaluate(s);
   if (within(s->t, 0, KOOPMPC_NT))
     unconstrained(s, u, report);

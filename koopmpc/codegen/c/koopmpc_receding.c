@@ -6,7 +6,7 @@
 #include "koopmpc_receding.h"
 #include "koopmpc_solver.h"
 
-#if KOOPMPC_ESTIMATOR == 1 || KOOPMPC_LATENCY > 0
+#if KOOPMPC_ESTIMATOR == 1 || KOOPMPC_LATENCY > 0 || (KOOPMPC_ESTIMATOR == 0 && KOOPMPC_GATE)
 /** z <- F(z, u) + E w + d; d may be NULL. */
 static void advance(koopmpc_real *next, const koopmpc_real *z, const koopmpc_real *u, const koopmpc_real *w,
                     const koopmpc_real *d) {
@@ -28,6 +28,7 @@ static void advance(koopmpc_real *next, const koopmpc_real *z, const koopmpc_rea
 /** Move d towards the mean of the misfits, by their constant share. */
 static void learn(koopmpc_state *s, koopmpc_real *misfit) {
   enum { NZ = KOOPMPC_NZ, NX = KOOPMPC_NX };
+  const koopmpc_real weight = s->fresh > KOOPMPC_GAIN ? s->fresh : KOOPMPC_GAIN;
   koopmpc_real states[KOOPMPC_NX], step[KOOPMPC_NX], believed[KOOPMPC_NX], varied = 0, most = 0;
   for (int i = 0; i < NZ; i++)
     if (i == KOOPMPC_CONSTANT || i >= KOOPMPC_LEARNED) misfit[i] = 0;
@@ -50,7 +51,8 @@ static void learn(koopmpc_state *s, koopmpc_real *misfit) {
   }
   s->learned = 1;
   koopmpc_copy(s->newest, misfit, NZ);
-  for (int i = 0; i < NZ + 2 * NX; i++) s->means[i] += KOOPMPC_GAIN * (s->newest[i] - s->means[i]);
+  for (int i = 0; i < NZ + 2 * NX; i++) s->means[i] += weight * (s->newest[i] - s->means[i]);
+  s->fresh /= 1 + s->fresh;
   for (int i = 0; i < NX; i++) {
     const koopmpc_real mean = s->means[NZ + i] * s->means[NZ + i], square = believed[i] * believed[i];
     const koopmpc_real spread = s->means[NZ + NX + i] - mean;
@@ -62,14 +64,24 @@ static void learn(koopmpc_state *s, koopmpc_real *misfit) {
 }
 
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
-  koopmpc_observe(s->zeta, &s->seen, s->z, y, u);
+  koopmpc_real misfit[KOOPMPC_NZ], expected[KOOPMPC_NY];
+  int opened, learns = s->has_last && !s->stood_in;
+  koopmpc_fill(expected, s->has_last ? 0 : (koopmpc_real)NAN, KOOPMPC_NY);
+  if (s->has_last) {
+    advance(misfit, s->last_z, u, s->w, 0);
+    for (int i = 0; i < KOOPMPC_NZ; i++) s->scratch[i] = misfit[i] + s->d[i];
+    koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, s->scratch, KOOPMPC_NZ);
+  }
+  s->refused = s->stood_in = koopmpc_refuse(s->gate, y, expected, &opened);
+  koopmpc_observe(s->zeta, &s->seen, s->z, s->refused ? expected : y, u);
   if (!koopmpc_usable(s->z, KOOPMPC_NZ)) {
     s->has_last = 0;
     return 0;
   }
-  if (s->has_last) {
-    koopmpc_real misfit[KOOPMPC_NZ];
-    advance(misfit, s->last_z, u, s->w, 0);
+  if (opened) { /* what the readings show now is new: the means begin anew */
+    s->learned = 0;
+    s->fresh = 1;
+  } else if (learns && !s->refused) {
     for (int i = 0; i < KOOPMPC_NZ; i++) misfit[i] = s->z[i] - misfit[i];
     learn(s, misfit);
   }
@@ -118,8 +130,8 @@ static void correct(koopmpc_state *s, const koopmpc_real *y) {
 }
 
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
-  koopmpc_real *now = s->scratch + KOOPMPC_NS, largest = 0;
-  int any = 0;
+  koopmpc_real *now = s->scratch + KOOPMPC_NS, largest = 0, expected[KOOPMPC_NY];
+  int any = 0, opened;
   if (s->started) {
     koopmpc_real *last = s->queue + s->queued * DRIVE;
     koopmpc_copy(last, u, KOOPMPC_NU);
@@ -132,7 +144,12 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
     for (int i = 0; i < s->queued * DRIVE; i++) s->queue[i] = s->queue[i + DRIVE];
   }
   for (int i = 0; i < KOOPMPC_NY; i++) any |= koopmpc_abs(y[i]) < KOOPMPC_HUGE;
-  if (s->queued >= KOOPMPC_DELAY_Y && any) correct(s, y); /* else y was measured before the start */
+  if (s->queued >= KOOPMPC_DELAY_Y) { /* else y was measured before the start */
+    for (int i = 0; i < KOOPMPC_NY; i++)
+      expected[i] = koopmpc_filter_h[i] + koopmpc_dot(koopmpc_filter_M + i * KOOPMPC_NS, s->s, KOOPMPC_NS);
+    s->refused = koopmpc_refuse(s->gate, y, expected, &opened);
+    if (any && !s->refused) correct(s, y);
+  }
   s->missed = any ? 0 : s->missed + 1;
   s->started = 1;
   koopmpc_copy(now, s->s, KOOPMPC_NS);
@@ -151,6 +168,18 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
 #else
 
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
+#if KOOPMPC_GATE
+  koopmpc_real next[KOOPMPC_NZ], expected[KOOPMPC_NY];
+  int opened;
+  koopmpc_fill(expected, s->has_z ? 0 : (koopmpc_real)NAN, KOOPMPC_NY);
+  if (s->has_z) {
+    advance(next, s->z, u, s->w, 0);
+    koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, next, KOOPMPC_NZ);
+  }
+  s->has_z = 1;
+  s->refused = koopmpc_refuse(s->gate, y, expected, &opened);
+  if (s->refused) y = expected;
+#endif
   koopmpc_observe(s->zeta, &s->seen, s->z, y, u);
   return 1;
 }

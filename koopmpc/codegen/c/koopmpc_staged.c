@@ -452,6 +452,7 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
   report->iterations = 0;
   report->slack = 0;
   koopmpc_take(s, y, applied, w);
+  report->refused = s->refused;
   koopmpc_copy(u_prev, s->given, NV);
   if (KOOPMPC_WITH_RATES) {
     if (koopmpc_usable(s->known + KOOPMPC_U_PREV, NV))

@@ -350,6 +350,8 @@ class KoopmanMPC(MPCBase):
             np.less_equal(t, plan.high, out=plan.met_high)
             # no 0 byte: every limit is met, and nothing is NaN (NaN meets no limit)
             move = self._limited(t, applied, start) if 0 in plan.met else self._unconstrained(t, start)
+            if origin.refused:
+                move.refused = True
             watch = self._watch
             return move if watch is None else self._judge_step(watch, move, applied, start)
         finally:

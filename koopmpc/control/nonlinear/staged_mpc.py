@@ -149,6 +149,7 @@ class StagedMPC(MPCBase):
         """Return the first input of the plan for state y; arguments as for KoopmanMPC."""
         start = perf_counter()
         move = self._step(y, reference, applied, w, start)
+        move.refused = self._initial.refused
         watch = self._watch
         return move if watch is None else self._judge_step(watch, move, applied, start)
 

@@ -1,0 +1,118 @@
+"""ReadingGate: a reading far from its prediction is not used; the prediction stands in for a few steps."""
+
+from functools import cache
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.checks import HUGE
+from koopmpc.plants.graph import Graph
+from koopmpc.plants.routines import bind_interpreter
+from koopmpc.values import Viewing
+
+# A reading is refused if an innovation exceeds this many times the running 0.9 quantile of its size. Of Gaussian
+# innovations the bound is eight standard deviations.
+BEYOND = 5.0
+BRIDGED = 5  # refused readings in sequence for which a prediction stands in; the next one is used
+FEW = 10  # no reading is refused before so many innovations of a run have come
+RISE = 1.4  # an innovation above the running quantile multiplies it by this,
+FALL = RISE ** (-1 / 9)  # and one below it by this: nine of ten are below where the quantile rests
+WIDEN = 4.0  # while all readings are used, the quantile follows the last innovation by at most this factor a step,
+NARROW = 0.7  # and downwards by this one
+LEAST = 0.01  # the quantile counts as at least this share of the largest step that the output has made
+ROUNDING = 1e-9  # and as this share of the prediction's size
+FADING = 0.8  # what a predicted step allows fades by this factor a step
+
+
+@cache
+def gate_function(ny: int) -> ca.Function:
+    """Return (y, prediction, memory) → [whether y is refused; whether the gate has opened; the new memory].
+
+    y is refused if |yᵢ − ŷᵢ| > 5 max(qᵢ, 0.01 Sᵢ, 1e-9 |ŷᵢ|) + ρ Sᵢ for any of its entries. qᵢ is the running 0.9
+    quantile of |yᵢ − ŷᵢ|, and Sᵢ the largest step of this output that was used. ρ is the largest predicted step of all
+    outputs, each in units of its S, and fades by 0.8 a step: in a transient a model may err by as much as the outputs
+    move. After five refused readings in sequence the gate opens, and all readings are used until one is inside the
+    bound. Entries that are NaN, or not predicted, are not judged.
+
+    The memory is q, S, the predicted steps, the last used values, and a count: below 10 the gate is open, and 10 less
+    the count are the least number of readings until it may close; from 10 on the refused ones are added.
+    """
+    y, predicted, memory = (ca.SX.sym(name, n) for name, n in (("y", ny), ("predicted", ny), ("memory", 4 * ny + 1)))
+    quantile, largest, ahead, last, count = ca.vertsplit(memory, [0, ny, 2 * ny, 3 * ny, 4 * ny, 4 * ny + 1])
+    came = ca.logic_and(ca.fabs(y) < HUGE, ca.fabs(predicted) < HUGE)  # False for NaN
+    error = ca.if_else(came, ca.fabs(y - predicted), 0)
+    ahead_new = ca.fmax(ca.if_else(ca.logic_and(came, count > 0), ca.fabs(predicted - last), 0), FADING * ahead)
+    size = ca.fmax(largest, ahead_new)
+    share = ca.mmax(ahead_new / ca.if_else(size > 0, size, 1))
+    least = ca.fmax(LEAST * largest, ca.if_else(came, ROUNDING * ca.fabs(predicted), 0))
+    inside = error <= BEYOND * ca.fmax(quantile, least) + share * size
+    judged, good, closed = ca.mmax(came), ca.mmin(inside), count >= FEW
+    wild = ca.logic_and(ca.logic_and(judged, closed), ca.logic_not(good))
+    refused = ca.logic_and(wild, count < FEW + BRIDGED)
+    opened = ca.logic_and(wild, count >= FEW + BRIDGED)
+    used = ca.if_else(refused, predicted, y)
+    learned = ca.logic_and(came, ca.logic_not(refused))
+    follows = ca.if_else(quantile > 0, ca.fmin(ca.fmax(error, NARROW * quantile), WIDEN * quantile), error)
+    tracks = quantile * ca.if_else(error > quantile, RISE, FALL)
+    step = ca.if_else(ca.logic_and(ca.logic_and(learned, inside), count > 0), ca.fabs(y - last), 0)
+    waited = ca.if_else(count < FEW - 1, count + 1, ca.if_else(good, FEW, FEW - 1))
+    counted = ca.if_else(refused, count + 1, ca.if_else(opened, FEW - 1, ca.if_else(closed, FEW, waited)))
+    after = ca.vertcat(
+        ca.if_else(learned, ca.if_else(ca.logic_and(closed, good), tracks, follows), quantile),
+        ca.fmax(largest, step),
+        ahead_new,
+        ca.if_else(ca.fabs(used) < HUGE, used, last),
+        ca.if_else(judged, counted, count),
+    )
+    return ca.Function("gate", [y, predicted, memory], [ca.densify(ca.vertcat(refused, opened, after))], {"cse": True})
+
+
+def gate_graph(ny: int) -> Graph:
+    """Return `gate_function` as data, for a Program."""
+    return Graph.trace(gate_function(ny))
+
+
+class ReadingGate(Viewing):
+    """The gate of one closed loop; see `gate_function` for its rule.
+
+    Attributes
+    ----------
+    refused
+        Whether the last reading was refused.
+    opened
+        Whether the last reading is used though it is beyond the bound, after refused ones.
+
+    Parameters
+    ----------
+    ny
+        Number of entries of a reading.
+    """
+
+    _VIEWS = ("_y", "_predicted", "_after", "_evaluate", "_buffer")
+
+    def __init__(self, ny: int) -> None:
+        self._ny, self._function = ny, gate_function(ny)
+        self._memory = np.zeros(self._function.numel_in(2))
+        self._see()
+        self.reset()
+
+    def _see(self) -> None:
+        """Make the arrays of the function, and the call on them; see `Viewing`."""
+        self._y, self._predicted, self._after = np.zeros(self._ny), np.zeros(self._ny), np.zeros(len(self._memory) + 2)
+        arguments = self._y, self._predicted, self._memory
+        self._evaluate, self._buffer = bind_interpreter(self._function, arguments, (self._after,))
+
+    def reset(self) -> None:
+        """Forget all readings."""
+        self._memory[:] = 0.0
+        self.refused, self.opened = False, False
+
+    def judge(self, y: Float[np.ndarray, " ny"], predicted: Float[np.ndarray, " ny"]) -> bool:
+        """Return whether y is refused; a NaN in `predicted` says that this entry was not predicted."""
+        after = self._after
+        self._y[:], self._predicted[:] = y, predicted
+        self._evaluate()
+        self._memory[:] = after[2:]
+        self.refused, self.opened = bool(after[0]), bool(after[1])
+        return self.refused

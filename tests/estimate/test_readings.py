@@ -1,0 +1,234 @@
+"""Wild readings: they do not enter an estimate or a history of delays; a real change does, five steps later."""
+
+import copy
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import koopmpc as km
+from koopmpc.estimate.gate import BEYOND, BRIDGED, FEW, LEAST, ReadingGate
+from tests.estimate.pendulums import PROBLEM, truth
+from tests.estimate.plants import linear
+
+NOISE = 1e-3
+WHOLE = km.Cost(Q=[10.0, 1.0], R=0.1)
+LIMITS = km.Limits(u_min=-25, u_max=25)
+TRUE = truth(m=1.2)
+LIFTING = km.State() + km.Fourier(1, states="theta") + km.Constant()
+STEPS, WILD = 70, 45
+
+
+@cache
+def data():
+    plant = km.discretize(PROBLEM.dynamics, PROBLEM.dt)
+    pd = km.Feedback([[40, 15]], km.Noise(-20, 20), u_min=-25, u_max=25)
+    clean, rng = km.collect(plant, km.Uniform([-1, -1], [1, 1]), pd, episodes=60, steps=60), np.random.default_rng(0)
+    seen = [km.Episode(X=e.X + NOISE * rng.normal(size=e.X.shape), U=e.U) for e in clean]
+    return km.Episodes(seen, clean.dt, clean.states, clean.inputs)
+
+
+@cache
+def model(kind):
+    plain, two = km.State() + km.Constant(), km.Delay(2)
+    return {
+        "linear": lambda: km.edmd(data(), LIFTING),
+        "bilinear": lambda: km.bilinear_edmd(data(), LIFTING, ridge=1e-6),
+        "late": lambda: km.edmd(data(), plain, embedding=two, ridge=1e-4),
+        "late bilinear": lambda: km.bilinear_edmd(data(), plain, embedding=km.Delay(1), ridge=1e-3),
+    }[kind]()
+
+
+LEARNS = km.LiftedDisturbance()
+FILTER = km.LiftedKalman(("theta", "omega"))
+KINDS = {
+    "KoopmanMPC, disturbance": lambda: km.KoopmanMPC(model("linear"), WHOLE, LIMITS, 20, estimator=LEARNS),
+    "KoopmanMPC, filter": lambda: km.KoopmanMPC(model("linear"), WHOLE, LIMITS, 20, estimator=FILTER),
+    "LinearMPC": lambda: km.LinearMPC(
+        km.discretize(PROBLEM.dynamics, PROBLEM.dt), [0, 0], [0], WHOLE, LIMITS, 20, estimator=LEARNS
+    ),
+    "BilinearMPC": lambda: km.BilinearMPC(model("bilinear"), WHOLE, LIMITS, 20, estimator=LEARNS),
+    "KoopmanMPC, delays": lambda: km.KoopmanMPC(model("late"), WHOLE, LIMITS, 20, estimator=LEARNS),
+    "BilinearMPC, delays": lambda: km.BilinearMPC(model("late bilinear"), WHOLE, LIMITS, 20, estimator=LEARNS),
+    "LQR, delays": lambda: km.LQR(model("late"), WHOLE, LIMITS),
+}
+
+
+@cache
+def built(kind):
+    return KINDS[kind]()
+
+
+def loop(controller, seed, wild=None, plant=TRUE, steps=STEPS):
+    """A run from a random start; `wild` (steps, 2) is added to the readings from step 45 on. Return X, U, d, refused."""
+    rng = np.random.default_rng(seed)
+    x, reference, noise = rng.uniform(-0.6, 0.6, 2), [rng.uniform(-0.5, 0.5), 0], NOISE * rng.normal(size=(steps, 2))
+    controller.reset(x)
+    X, U, D, refused = [x], [], [], []
+    observer = getattr(controller, "observer", None)
+    for k in range(steps):
+        y = x + noise[k]
+        if wild is not None and 0 <= k - WILD < len(wild):
+            y = y + wild[k - WILD]
+        move = controller(y, reference)
+        x = plant(x, move.u)
+        X.append(x)
+        U.append(move.u)
+        D.append(np.zeros(2) if observer is None else observer.d[:2].copy())
+        refused.append(bool(move.refused))
+    return np.array(X), np.array(U), np.array(D), np.array(refused)
+
+
+def burst(size, length, seed):
+    return size * np.random.default_rng(seed).choice([-1.0, 1.0], (length, 2))
+
+
+@pytest.mark.parametrize("length", [1, 5])
+@pytest.mark.parametrize("size", [50.0, 1e6, 1e29])
+@pytest.mark.parametrize("kind", KINDS)
+def test_ten_steps_after_wild_readings_the_loop_is_where_it_would_be_without_them(kind, size, length):
+    controller = built(kind)
+    plant = km.discretize(PROBLEM.dynamics, PROBLEM.dt) if kind == "LQR, delays" else TRUE  # it learns no disturbance
+    X, U, D, refused = loop(controller, 1, plant=plant)
+    assert not refused.any()
+    X_w, U_w, D_w, refused_w = loop(controller, 1, burst(size, length, 2), plant)
+    assert np.flatnonzero(refused_w).tolist() == list(range(WILD, WILD + length))
+    after, extent = WILD + length + 9, np.ptp(X, axis=0)
+    assert (np.abs(X_w - X)[after:] <= 0.01 * extent).all()
+    assert (np.abs(D_w - D)[after:] <= 0.01 * extent).all()
+    assert np.abs(U_w - U).max() < 0.1 * np.ptp(U)  # what the predictions ask, not what the readings would
+
+
+@pytest.mark.parametrize("length", [1, 5])
+@pytest.mark.parametrize("kind", ["KoopmanMPC, disturbance", "KoopmanMPC, filter", "KoopmanMPC, delays"])
+def test_twenty_spreads_of_the_innovations_are_wild(kind, length):
+    controller = built(kind)
+    gate, innovations = controller.observer._gate, []
+    judge = gate.judge
+    gate.judge = lambda y, predicted: innovations.append(y - predicted) or judge(y, predicted)
+    try:
+        X, _, D, refused = loop(controller, 3, steps=130)
+    finally:
+        del gate.judge
+    spread = np.std(innovations[80:], axis=0)
+    wild = np.zeros((65 + length, 2))
+    wild[65:] = burst(20 * spread, length, 4)
+    X_w, _, D_w, refused_w = loop(controller, 3, wild, steps=130)
+    assert refused_w.sum() == length
+    assert not refused.any()
+    after = WILD + 65 + length + 9
+    assert (np.abs(X_w - X)[after:] <= 0.01 * np.ptp(X, axis=0)).all()
+    assert (np.abs(D_w - D)[after:] <= 0.01 * np.ptp(X, axis=0)).all()
+
+
+A, B = np.array([[0.9, 0.2], [0.0, 0.7]]), np.array([[0.0], [0.3]])
+
+
+@pytest.mark.parametrize(("estimator", "left"), [(km.LiftedDisturbance(), 0.03), (km.LiftedKalman(("x0", "x1")), 0.1)])
+@pytest.mark.parametrize("spreads", [20, 200])
+def test_a_load_step_is_refused_for_five_steps_and_learned_within_ten_more(estimator, left, spreads):
+    cost = km.Cost(Q=[1.0, 0.0], R=0.1)
+    mpc = km.KoopmanMPC(linear(A, B, [0.0, 0.0]), cost, km.Limits(-5, 5), 20, estimator=estimator)
+    rng, x, load, refused = np.random.default_rng(0), np.zeros(2), spreads * NOISE * np.ones(2), []
+    for k in range(200 + 1 + BRIDGED + 10):
+        move = mpc(x + NOISE * rng.normal(size=2), [0.5 if k < 60 else 0.2, 0.0])
+        refused.append(move.refused)
+        x = A @ x + B @ move.u + (load if k >= 200 else 0)
+    assert sum(refused) in ((0, BRIDGED) if spreads == 20 else (BRIDGED,))
+    assert (np.abs(mpc.observer.d[:2] - load) < left * load + 3 * NOISE).all()
+
+
+def test_readings_that_stay_wild_are_used_after_five_steps():
+    controller = built("KoopmanMPC, disturbance")
+    refused = loop(controller, 1, np.full((STEPS - WILD, 2), 0.5))[3]
+    assert np.flatnonzero(refused)[:BRIDGED].tolist() == list(range(WILD, WILD + BRIDGED))
+    assert not refused[WILD + BRIDGED]
+
+
+def test_a_wild_first_reading_does_not_let_the_true_ones_be_refused():
+    mpc = km.KoopmanMPC(model("linear"), WHOLE, LIMITS, 20, estimator=LEARNS)
+    x, refused = np.array([0.3, 0.0]), []
+    for k in range(40):
+        move = mpc(x + 1e4 * (k == 0), [0.0, 0.0])
+        refused.append(move.refused)
+        x = TRUE(x, move.u)
+    assert not any(refused[:FEW])
+    assert np.abs(x).max() < 0.5
+
+
+def test_the_run_of_a_loop_holds_which_readings_were_refused():
+    class Wild(km.faults.Fault):
+        def start(self, wiring, rng):
+            return km.faults.Injection(measured=lambda k, y: y + 1e6 * (20 <= k < 23))
+
+    mpc = built("KoopmanMPC, disturbance")
+    run = km.simulate(TRUE, mpc, x0=[0.4, 0.0], reference=[0.0, 0.0], steps=40, faults=[Wild()])
+    assert np.flatnonzero(run.refused).tolist() == [20, 21, 22]
+    assert run.refused.dtype == np.int64
+
+
+@given(st.integers(0, 10**6), st.lists(st.floats(-6, 6), min_size=2, max_size=2))
+def test_units_do_not_decide_what_is_refused(seed, powers):
+    rng, scale = np.random.default_rng(seed), 10.0 ** np.array(powers)
+    gate, scaled = ReadingGate(2), ReadingGate(2)
+    for _ in range(80):
+        predicted = rng.normal(size=2)
+        y = predicted + rng.normal(size=2) * rng.choice([0.1, 0.1, 0.1, 20.0])
+        assert gate.judge(y, predicted) == scaled.judge(scale * y, scale * predicted)
+
+
+def test_the_bound_follows_the_spread_of_the_innovations_and_the_steps_of_the_output():
+    """At rest: five times the 0.9 quantile, or what 1 % of the largest step makes of it."""
+    for spread in (1e-3, 1e-2):
+        gate, rng = ReadingGate(1), np.random.default_rng(0)
+        for _ in range(400):
+            assert not gate.judge(spread * rng.normal(size=1), np.zeros(1))
+        wild = [
+            size for size in (4, 6, 8, 10, 12, 14) if copy.deepcopy(gate).judge(np.array([size * spread]), np.zeros(1))
+        ]
+        assert 14 in wild
+        assert 4 not in wild
+    gate = ReadingGate(1)
+    for k in range(100):  # exact predictions, and a step of 1 in the middle
+        gate.judge(np.array([float(k > 30)]), np.array([float(k > 30)]))
+    assert not copy.deepcopy(gate).judge(np.array([1 + 0.9 * BEYOND * LEAST]), np.ones(1))
+    assert gate.judge(np.array([1 + 1.1 * BEYOND * LEAST]), np.ones(1))
+
+
+def test_a_missing_entry_is_neither_judged_nor_refused():
+    mpc = built("KoopmanMPC, filter")
+    x = np.array([0.2, 0.0])
+    mpc.reset(x)
+    for k in range(40):
+        move = mpc([x[0], np.nan] if k == 30 else x, [0.0, 0.0])
+        assert not move.refused
+        x = TRUE(x, move.u)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_machine_code_refuses_the_same_readings(kind):
+    if km.compiled(controller := built(kind)) is controller:
+        pytest.skip("no C compiler")
+    code, wild = km.compiled(controller), np.zeros((18, 2))
+    wild[[0, 1, 6, 12, 13, 14, 15, 16]] = burst(50.0, 8, 5)
+    steps = WILD + 40
+    expected, got = loop(controller, 1, wild, steps=steps), loop(code, 1, wild, steps=steps)
+    assert expected[3].sum() == got[3].sum() == 8
+    np.testing.assert_array_equal(got[3], expected[3])
+    np.testing.assert_allclose(got[1], expected[1], atol=5e-4 if "Bilinear" in kind else 1e-6)
+
+
+@pytest.mark.parametrize("count", [pytest.param(1000, marks=pytest.mark.slow), 30])
+def test_no_loop_is_lost_to_wild_readings(count):
+    """Random starts, plants, sizes from 20 noises to 1e29, bursts of one to five at random moments."""
+    controller, rng = built("KoopmanMPC, disturbance"), np.random.default_rng(count)
+    plants, lost = [truth(m=m, load=load) for m in (0.8, 1.0, 1.2) for load in (0.0, 2.0)], 0
+    for seed in range(count):
+        wild, k = np.zeros((STEPS - WILD, 2)), int(rng.integers(0, 15))
+        length = int(rng.integers(1, 6))
+        wild[k : k + length] = burst(10 ** rng.uniform(-1.7, 29), length, seed)
+        X = loop(controller, seed, wild, plants[seed % len(plants)])[0]
+        lost += not bool((np.abs(X) < [np.pi, 8.0]).all())
+    assert lost == 0
