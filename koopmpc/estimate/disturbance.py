@@ -115,6 +115,7 @@ class DisturbanceObserver(Viewing, Measured):
         Weight of the newest misfit, in (0, 1].
     """
 
+    _remembers = True
     _VIEWS = ("z", "d", "_seen", "_x", "_driven", "_u", "_w", "_after", "_flags", "_evaluate", "_buffer")
 
     def __init__(self, model: LinearPredictor | StateModel, gain: float) -> None:
@@ -170,6 +171,7 @@ class DisturbanceObserver(Viewing, Measured):
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y, and learn from the misfit of the step that led here, if y was neither refused now nor just before."""
         gate, expected = self._gate, self._nothing
+        assert gate is not None, "it remembers readings"
         if self._seen[0]:
             if self._ABE is None:
                 self._predicted[:] = self._model.advance(self.z, u, w, self._still)

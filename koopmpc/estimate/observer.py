@@ -201,12 +201,14 @@ class Measured:
         The predictor, or a model whose z is the state.
     """
 
+    _remembers = False  # whether a reading acts on later estimates though the model has no delays
+
     def __init__(self, model: LinearPredictor | StateModel) -> None:
         self._to_y = model.C if isinstance(model, LinearPredictor) else None
         self._model = model = state_model(model)
         self._history = None if model.embedding is None else History(model.embedding)
         self.ny = model.ny
-        self._gate = ReadingGate(model.ny)
+        self._gate = ReadingGate(model.ny) if self._remembers or model.embedding is not None else None
         self._nothing, self._known_z = np.full(model.ny, np.nan), False
         self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
@@ -216,7 +218,8 @@ class Measured:
         """Forget d and the past; x0 will come as the first measurement."""
         checks.start(x0, self.ny)
         self.d[:] = 0.0
-        self._gate.reset()
+        if self._gate is not None:
+            self._gate.reset()
         self._known_z = False
         if self._history is not None:
             self._history.reset()
@@ -224,11 +227,11 @@ class Measured:
     @property
     def refused(self) -> bool:
         """Whether the last y was refused, and its prediction stood in."""
-        return self._gate.refused
+        return self._gate is not None and self._gate.refused
 
     def program(self) -> EstimatorProgram:
         """Return the data with which z and d are found."""
-        return EstimatorProgram(gate=None if self._history is None else gate_graph(self.ny))
+        return EstimatorProgram(gate=None if self._gate is None else gate_graph(self.ny))
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""
@@ -237,8 +240,8 @@ class Measured:
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y as it is; where it is lifted, a bad entry makes all of z NaN, which shows in every plan."""
-        if self._history is not None:
-            y = self._history.take(self._check_reading(y, u, w), u)
+        if self._history is not None and self._gate is not None:
+            y = self._history.take(self._check_reading(self._gate, y, u, w), u)
         if self.lift is None:
             self.z = y
             return True
@@ -248,7 +251,7 @@ class Measured:
         return True
 
     def _check_reading(
-        self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
+        self, gate: ReadingGate, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
     ) -> Float[np.ndarray, " ny"]:
         """Return y, or its prediction where y is refused."""
         predicted = self._nothing
@@ -256,7 +259,7 @@ class Measured:
             z = self._model.advance(self.z, u, w, self.d)
             predicted = z[: self.ny] if self._to_y is None else self._to_y.dot(z)
         self._known_z = True
-        return predicted if self._gate.judge(y, predicted) else y
+        return predicted if gate.judge(y, predicted) else y
 
 
 def start_observer(estimator: Estimator | None, model: LinearPredictor | StateModel, horizon: int) -> StateObserver:
