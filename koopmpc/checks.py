@@ -1,7 +1,8 @@
 """Checks of arguments, with the messages about shapes, dtypes, NaN and definiteness."""
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import cast
 
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 from koopmpc.errors import DataError, DefinitenessError, ShapeError
 
 HUGE = 1e30  # a state or a reference beyond it is a bad one: its square overflows
+LARGEST = 1e100  # refuse a matrix of a model or a weight with a larger entry: products of three of them overflow
 
 
 def array(
@@ -51,7 +53,7 @@ def array(
         if raw.dtype.kind not in "biufO" or (raw.dtype.kind == "O" and any(v is None for v in raw.flat)):
             raise TypeError("None and text are no numbers")
         result = np.array(raw, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:  # an integer beyond 1e308 overflows
         if isinstance(error, DataError):
             raise
         raise DataError(
@@ -71,6 +73,36 @@ def array(
     return result
 
 
+def bounded(value: ArrayLike, name: str, shape: Sequence[int | None] | None = None) -> Float[np.ndarray, "..."]:
+    """Return `value` as `array` does, if none of its entries is beyond 1e100.
+
+    Raises
+    ------
+    ShapeError
+        The shape differs.
+    DataError
+        As `array`, or an entry is beyond 1e100: an SVD of products that overflow may not end.
+    """
+    result = array(value, name, shape)
+    largest = float(np.abs(result).max(initial=0.0))
+    if largest > LARGEST:
+        raise DataError(f"{name} holds {largest:.3g}, so products with {name} overflow; choose other units")
+    return result
+
+
+@contextmanager
+def explain_overflow() -> Generator[None]:
+    """Raise a DataError for a decomposition of numbers that are not finite."""
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except np.linalg.LinAlgError as error:
+        raise DataError(
+            f"products of the model, the weights and the limits overflow ({error}); choose units in which they are "
+            "nearer to one"
+        ) from error
+
+
 def start(x0: ArrayLike | None, nx: int) -> Float[np.ndarray, " nx"] | None:
     """Return the state (nx,) in which a run begins; None where it is not known."""
     return None if x0 is None else array(x0, "x0", (nx,))
@@ -88,7 +120,7 @@ def vector(value: ArrayLike, name: str, length: int, *, infinite: bool = False) 
 
 def weight(value: ArrayLike, name: str, size: int | None = None, *, definite: bool = False) -> Float[np.ndarray, "n n"]:
     """Return a symmetric positive (semi)definite matrix; a scalar or a 1-D `value` is a diagonal."""
-    result = array(value, name)
+    result = bounded(value, name)
     got = result.shape
     if result.ndim == 0:
         result = float(result) * np.eye(1 if size is None else size)

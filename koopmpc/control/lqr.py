@@ -184,6 +184,7 @@ class LQR(FeedbackLaw):
     'UNCONSTRAINED'
     """
 
+    @checks.explain_overflow()
     def __init__(self, predictor: LinearPredictor, cost: Cost, limits: Limits | None = None) -> None:
         advice = "fit one with edmd, or linearise with LinearPredictor.local"
         checks.kind(predictor, "predictor", LinearPredictor, advice)
@@ -315,7 +316,7 @@ def lqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
     A, B, Q, R = _pair(A, B, Q, R)
     try:
         P = scipy.linalg.solve_continuous_are(A, B, Q, R)
-    except np.linalg.LinAlgError as error:
+    except ValueError as error:  # SciPy's own where the pencil is too far from triangular, and LinAlgError
         raise DataError(_UNSTABILISABLE) from error
     K = np.linalg.solve(R, B.T @ P)
     _require(float(np.linalg.eigvals(A - B @ K).real.max()) < 0)
@@ -337,7 +338,7 @@ def dlqr(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
     A, B, Q, R = _pair(A, B, Q, R)
     try:
         P = scipy.linalg.solve_discrete_are(A, B, Q, R)
-    except np.linalg.LinAlgError as error:
+    except ValueError as error:  # SciPy's own where the pencil is too far from triangular, and LinAlgError
         raise DataError(_UNSTABILISABLE) from error
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     _require(float(np.abs(np.linalg.eigvals(A - B @ K)).max()) < 1)
@@ -363,9 +364,9 @@ def _pair(
     Float[np.ndarray, "nx nx"],
     Float[np.ndarray, "nu nu"],
 ]:
-    A = checks.array(A, "A", (None, None))
+    A = checks.bounded(A, "A", (None, None))
     A = checks.array(A, "A", (len(A), len(A)))
-    B = checks.array(B, "B", (len(A), None))
+    B = checks.bounded(B, "B", (len(A), None))
     return A, B, checks.weight(Q, "Q", len(A)), checks.weight(R, "R", B.shape[1], definite=True)
 
 

@@ -201,6 +201,12 @@ def find_gain(
     L, info = dpotrf(S, lower=1)
     if info:
         least = float(np.linalg.eigvalsh(0.5 * (S + S.T)).min())
+        if float(np.linalg.eigvalsh(stage.R).min()) > 0:
+            raise DefinitenessError(
+                f"R + BᵀPB is not positive definite though R is: the cost-to-go of this model grew to "
+                f"{np.abs(P).max():.2g}, and rounding hides R; fit the model with a ridge or fewer observables, or"
+                " bring the states to one size"
+            )
         raise DefinitenessError(
             f"R + BᵀPB is not positive definite: its least eigenvalue is {least:.3g}; raise R, or weight a state"
             " that every input moves"

@@ -88,7 +88,7 @@ class LinearPredictor(Predictor):
                     f"exact_modes has shape {modes.shape}; it needs a Projected lifting with a basis of that shape"
                 )
             modes = np.array(modes, dtype=np.complex128, order="C")
-        drift = np.zeros((self.nz, 0)) if E is None else checks.array(E, "E", (self.nz, None))
+        drift = np.zeros((self.nz, 0)) if E is None else checks.bounded(E, "E", (self.nz, None))
         nw = drift.shape[1]
         names = tuple(f"w{i}" for i in range(nw)) if disturbances is None else tuple(disturbances)
         if len(names) != nw:
@@ -200,7 +200,7 @@ class BilinearPredictor(Predictor):
         scale: ArrayLike | None = None,
     ) -> None:
         _store_fields(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
-        freeze(self, N=checks.array(N, "N", (len(inputs), self.nz, self.nz)))
+        freeze(self, N=checks.bounded(N, "N", (len(inputs), self.nz, self.nz)))
 
     def rollout(self, x0: ArrayLike, U: ArrayLike, *, history: Episode | None = None) -> Float[np.ndarray, "steps nx"]:
         """Return x_k ≈ C z_k of z_{k+1} = (A + Σ uᵢ Nᵢ) z_k + B u_k, z_0 = ψ(x0), lifted once at the start.
@@ -270,8 +270,8 @@ def _store_fields(
     freeze(
         predictor,
         A=transition,
-        B=checks.array(B, "B", (nz, nu)),
-        C=checks.array(C, "C", (nx, nz)),
+        B=checks.bounded(B, "B", (nz, nu)),
+        C=checks.bounded(C, "C", (nx, nz)),
         lifting=bound,
         dt=checks.positive(dt, "dt", "s"),
         states=states,

@@ -217,6 +217,47 @@ def test_a_model_whose_cost_overflows_makes_no_controller(model):
         km.KoopmanMPC(replace(model, A=np.full_like(model.A, 1e49)), km.Cost(Q=[1.0, 1.0], R=1.0), km.Limits(-1, 1), 20)
 
 
+HUGE = [1e101, 1e200, 1e308, -1e308]
+
+
+@pytest.mark.parametrize("value", HUGE)
+@pytest.mark.parametrize("name", ["B", "C", "E", "N"])
+def test_a_model_whose_products_overflow_is_refused_before_a_decomposition_hangs(model, name, value):
+    size = {"B": (model.nz, 1), "C": (2, model.nz), "E": (model.nz, 1), "N": (1, model.nz, model.nz)}[name]
+    fields = {"A": model.A, "B": model.B, "C": model.C, "lifting": model.lifting, "dt": 0.1, name: np.full(size, value)}
+    kind = km.BilinearPredictor if name == "N" else km.LinearPredictor
+    with pytest.raises(
+        km.errors.DataError, match=rf"{name} holds 1e.*, so products with {name} overflow; choose other"
+    ):
+        kind(states=model.states, inputs=model.inputs, **fields)
+
+
+@pytest.mark.parametrize("value", HUGE)
+@pytest.mark.parametrize("law", [km.lqr, km.dlqr])
+@pytest.mark.parametrize("place", range(4))
+def test_a_gain_of_matrices_that_overflow_is_refused_by_name(law, place, value):
+    matrices = [np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]]), np.eye(2), np.eye(1)]
+    matrices[place] = np.full_like(matrices[place], value)
+    with pytest.raises(km.errors.DataError, match=f"^{'ABQR'[place]} holds 1e"):
+        law(*matrices)
+
+
+def test_a_gain_that_rounding_spoils_blames_the_model_and_not_a_positive_R():
+    A = [[-0.095, 0.44, -1.3e-4], [6.1e-6, -2180.0, 305855.0], [381.0, -1.2e-3, 17.6]]
+    lifting = km.State() + km.Constant()
+    model = km.LinearPredictor(A, [[2.7e-3], [-559.4], [153.2]], np.eye(2, 3), lifting, 0.1, ("a", "b"), ("u",))
+    with pytest.raises(km.errors.DefinitenessError, match=r"though R is: the cost-to-go .* rounding hides R; fit"):
+        km.LQR(model, km.Cost(Q=[1, 1], R=1e-6))
+
+
+def test_what_overflows_only_together_is_said_so():
+    A, B, C = [[1, 0.1, 0], [0, 0.9, 0], [0, 0, 1]], [[0], [1e19], [0]], 1e50 * np.eye(2, 3)
+    model = km.LinearPredictor(A, B, C, km.State() + km.Constant(), 0.1, ("a", "b"), ("u",))
+    limits = km.Limits(-1, 1, x_max=[1, 1])
+    with pytest.raises(km.errors.DataError, match=r"products of the model, the weights and the limits overflow"):
+        km.KoopmanMPC(model, km.Cost(Q=[1e-300, 1e-300], R=1), limits, 8)
+
+
 def test_what_cannot_be_used_is_named(model, tmp_path: Path):
     huge = model.A.copy()
     huge[0, 0] = 1e308

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.horizon import Condensed, Coordinates, Horizon, build_stages, condense, horizon_of
@@ -111,6 +112,7 @@ class PlanMap(Viewing):
         self.met_low, self.met_high = met[:rows], met[rows:]
 
 
+@checks.explain_overflow()
 def plan_map(
     predictor: LinearPredictor,
     track: LiftedTracking,

@@ -355,7 +355,10 @@ class Equilibria:
                 }
                 p = np.concatenate([row, model.theta, e])
                 with raise_swallowed():
-                    solved = cast("dict[str, Any]", self._solver(p=p, x0=guess / size, **bounds))
+                    try:
+                        solved = cast("dict[str, Any]", self._solver(p=p, x0=guess / size, **bounds))
+                    except RuntimeError:  # CasADi refuses bounds that overflow
+                        continue
                     success, f, s = self._solver.stats()["success"], float(solved["f"]), solved["x"].full().ravel()
                 if success and f < least:
                     found, least = s * size, f

@@ -213,11 +213,15 @@ class Shooting:
             self._bounds[end][:nu] = value / self._sizes[:nu]
         p = [x0, t.R.ravel(), t.U.ravel(), e.ravel(), t.M.ravel("F"), t.L.ravel("F"), t.m]
         begin = {"x0": start.v, "lam_x0": start.bounds, "lam_g0": start.constraints}
+        U, X, slacks = np.split(start.v.reshape(self._shape) * self._sizes, self._split, axis=1)
+        failed = NLPSolution(U, X, slacks, np.inf, Status.FAILED, 0, start)
         if self._start_is_number is not None and not float(self._start_is_number(start.v, np.concatenate(p))):
-            U, X, slacks = np.split(start.v.reshape(self._shape) * self._sizes, self._split, axis=1)
-            return NLPSolution(U, X, slacks, np.inf, Status.FAILED, 0, start)
+            return failed
         with raise_swallowed():
-            found = cast("dict[str, Any]", self._solver(p=np.concatenate(p), **self._bounds, **begin))
+            try:
+                found = cast("dict[str, Any]", self._solver(p=np.concatenate(p), **self._bounds, **begin))
+            except RuntimeError:  # CasADi refuses bounds that overflow
+                return failed
             stats = self._solver.stats()
             v, bounds, constraints = (found[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
         unified = str(stats.get("unified_return_status"))
