@@ -5,6 +5,7 @@ import pytest
 
 import koopmpc as km
 from tests.docs.page import alike, blocks, run
+from tests.plants import units
 
 
 def test_a_gymnasium_plant_is_swung_up_in_fifteen_lines(tmp_path):
@@ -25,3 +26,13 @@ def test_a_tank_that_is_a_function_is_filled(tmp_path):
     level = names["level"]
     assert abs(level.X[-1, 0] - 1.5) < 0.02
     assert 0 <= level.U.min() <= level.U.max() <= 0.1
+
+
+def test_the_units_of_the_page_on_fmus_are_controlled(tmp_path):
+    pytest.importorskip("fmpy", reason="the extra fmu is not installed")
+    units.build_pendulum(tmp_path / "pendulum.fmu")
+    names, said = run("how/fmu.md", tmp_path)
+    assert len(said) == 2
+    for shown, printed in said:
+        assert alike(shown, printed), printed
+    assert abs(names["run"].U).max() <= 5

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import casadi as ca
 import numpy as np
@@ -14,6 +14,9 @@ from koopmpc.errors import DataError, ShapeError
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.scene import Scene, Shape
 from koopmpc.values import Named
+
+_Symbol = Any  # ca.SX of equations, ca.MX of foreign code
+_Pair = tuple[ca.SX, ca.SX]  # what checkers are told of x and u: both kinds have the same operations
 
 
 class Dynamics(Named, ABC):
@@ -127,7 +130,7 @@ class Euler(Integrator):
 
     def step(self, f: ca.Function, dt: float) -> ca.Function:
         """Return F of x⁺ = F(x, u)."""
-        x, u = _make_symbols(f)
+        x, u = cast("_Pair", _make_symbols(f))
         return _explicit_step(x, u, x + dt * f(x, u))
 
 
@@ -148,7 +151,7 @@ class RK4(Integrator):
 
     def step(self, f: ca.Function, dt: float) -> ca.Function:
         """Return F of x⁺ = F(x, u)."""
-        x, u = _make_symbols(f)
+        x, u = cast("_Pair", _make_symbols(f))
         x_next, h = x, dt / self.substeps
         for _ in range(self.substeps):
             k1 = f(x_next, u)
@@ -209,7 +212,7 @@ class CVODES(Integrator):
         """Return F of x⁺ = F(x, u)."""
         if not ca.has_integrator("cvodes"):
             raise DataError("this CasADi has no CVODES; use Collocation or RK4 with substeps")
-        x, u = _make_symbols(f)
+        x, u = cast("_Pair", _make_symbols(f))
         options = {"reltol": self.rtol, "abstol": self.atol, "disable_internal_warnings": True}
         flow = ca.integrator("flow", "cvodes", {"x": x, "u": u, "ode": f(x, u)}, 0, dt, options)
         X, U = ca.MX.sym("x", x.size1()), ca.MX.sym("u", u.size1())
@@ -223,11 +226,11 @@ def _build_collocation(f: ca.Function, dt: float, stages: int) -> ca.Function:
     then suits all units. It also suits stiff plants, whose residual never falls to the rounding error of its terms.
     """
     a, b = gauss_legendre(stages)
-    x, u = _make_symbols(f)
+    x, u = cast("_Pair", _make_symbols(f))
     nx = x.size1()
     slope = dt * f(x, u)
     scale = 1 + ca.fabs(x) + ca.fabs(slope)
-    unknown = ca.SX.sym("k", nx, stages)
+    unknown = type(x).sym("k", nx, stages)
     K = unknown * ca.repmat(scale, 1, stages)
     rows = [unknown[:, i] - dt * f(x + K @ ca.DM(a[i]), u) / scale for i in range(stages)]
     residual = ca.Function("residual", [ca.vec(unknown), x, u], [ca.vertcat(*rows)])
@@ -254,11 +257,13 @@ def gauss_legendre(stages: int) -> tuple[Float[np.ndarray, "s s"], Float[np.ndar
     return a, b
 
 
-def _make_symbols(f: ca.Function) -> tuple[ca.SX, ca.SX]:
-    return ca.SX.sym("x", f.size1_in(0)), ca.SX.sym("u", f.size1_in(1))
+def _make_symbols(f: ca.Function) -> tuple[_Symbol, _Symbol]:
+    """Return x and u as scalars; as matrices where f is foreign code, which takes no scalar symbols."""
+    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
+    return kind.sym("x", f.size1_in(0)), kind.sym("u", f.size1_in(1))
 
 
-def _explicit_step(x: ca.SX, u: ca.SX, x_next: ca.SX) -> ca.Function:
+def _explicit_step(x: _Symbol, u: _Symbol, x_next: _Symbol) -> ca.Function:
     return ca.Function("F", [x, u], [x_next], ["x", "u"], ["x_next"], {"cse": True})
 
 

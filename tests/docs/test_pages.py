@@ -15,6 +15,7 @@ ELSEWHERE = {  # pages whose claims are tested beyond what they print, and where
     "controllers.md": "tests/test_docs_controllers.py",
     "design-from-data.md": "tests/test_docs_design_from_data.py",
     "faults.md": "tests/bench/test_docs.py",
+    "how/fmu.md": "tests/test_docs_plants.py",
     "how/gymnasium.md": "tests/test_docs_plants.py",
     "how/own_step_function.md": "tests/test_docs_plants.py",
     "how/peers.md": "tests/predict/test_peers.py",

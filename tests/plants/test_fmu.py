@@ -1,0 +1,259 @@
+"""Functional Mock-up Units as plants: km.plants.fmu."""
+
+import copy
+import pickle
+import subprocess
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from tests.plants import units
+
+pytest.importorskip("fmpy", reason="the extra fmu is not installed")
+
+ROD = ["theta", "omega"]
+
+
+class Pendulum(km.Dynamics):
+    """The equations of the units, in CasADi."""
+
+    states, inputs = ("theta [rad]", "omega [rad/s]"), ("tau [N.m]",)
+    g = 9.81
+
+    def rhs(self, x, u):
+        import casadi as ca
+
+        return ca.vertcat(x[1], -self.g * ca.sin(x[0]) - 0.1 * x[1] + u[0])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("units")
+
+
+@pytest.fixture(scope="module")
+def pendulum(folder):
+    return units.build_pendulum(folder / "pendulum.fmu")
+
+
+@pytest.fixture(scope="module")
+def pendulum3(folder):
+    return units.build_pendulum3(folder)
+
+
+@pytest.fixture(scope="module")
+def pendulum_with_slopes(folder):
+    return units.build_pendulum(folder / "slopes.fmu", slopes=True)
+
+
+@pytest.fixture(scope="module")
+def tanks(folder):
+    return {fmi: units.build_tank(folder, fmi) for fmi in (2, 3)}
+
+
+def tank_step(level, inflow, dt, drain=0.5, area=2.0):
+    for _ in range(20):
+        level += dt / 20 * (inflow - drain * np.sqrt(max(level, 0.0))) / area
+    return level
+
+
+@pytest.mark.parametrize("name", ["pendulum", "pendulum_with_slopes", "pendulum3"])
+def test_model_exchange_is_the_step_map_of_the_same_equations(name, request):
+    unit = km.plants.fmu(request.getfixturevalue(name), dt=0.05, outputs=ROD, integrator=km.RK4(2))
+    own = km.discretize(Pendulum(), 0.05, km.RK4(2))
+    assert (unit.states, unit.inputs, unit.outputs) == (own.states, own.inputs, own.outputs)
+    assert unit.measures_all
+    rng = np.random.default_rng(0)
+    for x, u in zip(rng.normal(size=(5, 2)), rng.normal(size=(5, 1)), strict=True):
+        assert unit(x, u) == pytest.approx(own(x, u), abs=1e-12)
+        exact, found = own.linearize(x, u), unit.linearize(x, u)
+        close = 1e-6 if name == "pendulum" else 1e-12  # this unit has no derivatives: they are differences
+        assert pytest.approx(exact.A, abs=close) == found.A
+        assert pytest.approx(exact.B, abs=close) == found.B
+    data = km.collect(unit, km.Uniform([-1, -1], [1, 1]), km.Noise(-2, 2), episodes=3, steps=10)
+    expected = km.collect(own, km.Uniform([-1, -1], [1, 1]), km.Noise(-2, 2), episodes=3, steps=10)
+    assert np.array([e.X for e in data]) == pytest.approx(np.array([e.X for e in expected]), abs=1e-12)
+
+
+@pytest.mark.parametrize("integrator", [km.Euler(), km.ImplicitMidpoint(), km.Collocation(2), km.CVODES()])
+def test_every_integrator_takes_the_equations_of_a_unit(integrator, pendulum3):
+    unit, own = km.plants.fmu(pendulum3, dt=0.05, integrator=integrator), km.discretize(Pendulum(), 0.05, integrator)
+    assert unit([0.4, 1.0], [0.7]) == pytest.approx(own([0.4, 1.0], [0.7]), abs=1e-8)
+
+
+def test_start_values_limits_names_and_units_come_from_the_description(pendulum):
+    for interface in ("model exchange", "co-simulation"):
+        unit = km.plants.fmu(pendulum, interface=interface, start_values={"theta": 0.5})
+        assert unit.dt == 0.05
+        assert unit.states == ("theta [rad]", "omega [rad/s]")
+        assert unit.outputs == ("theta [rad]",)
+        assert unit.x0.tolist() == [0.5, 0.0]
+        assert (unit.u_min, unit.u_max) == (-5, 5)
+        assert unit.x_min.tolist() == [-4, -np.inf]
+        assert unit.x_max.tolist() == [4, np.inf]
+    moon = km.plants.fmu(pendulum, dt=0.05, start_values={"g": 1.62}, outputs=ROD)
+    own = Pendulum()
+    own.g = 1.62
+    assert moon([0.4, 0.0], [0.0]) == pytest.approx(km.discretize(own, 0.05)([0.4, 0.0], [0.0]), abs=1e-12)
+    moon = km.plants.fmu(pendulum, interface="co-simulation", start_values={"g": 1.62}, outputs=ROD)
+    moon.reset([0.4, 0.0])
+    exact = km.discretize(own, 0.05, km.CVODES())([0.4, 0.0], [0.0])
+    assert moon.step([0.0]) == pytest.approx(exact, abs=1e-4)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_co_simulation_steps_resets_and_is_measured_as_the_unit_says(fmi, tanks):
+    tank = km.plants.fmu(tanks[fmi], dt=0.5, start_values={"drain": 0.3})
+    assert isinstance(tank, km.Plant)
+    assert (tank.states, tank.inputs, tank.outputs) == (("level",), ("inflow",), ("level",))
+    assert tank.state is None
+    rng = np.random.default_rng(1)
+    for start in (None, [2.0], [0.5]):
+        level = 1.0 if start is None else start[0]
+        assert tank.reset(start) == [level]
+        for u in rng.uniform(0, 2, 10):
+            level = tank_step(level, u, 0.5, drain=0.3)
+            assert tank.step(u) == pytest.approx([level], abs=1e-14)
+            assert tank.state == pytest.approx([level], abs=1e-14)
+    data = km.collect(tank, km.Uniform(0.5, 2), km.Noise(0, 1), episodes=3, steps=5, rng=2)
+    assert data == km.collect(
+        pickle.loads(pickle.dumps(tank)), km.Uniform(0.5, 2), km.Noise(0, 1), episodes=3, steps=5, rng=2
+    )
+
+
+def test_two_instances_of_a_unit_know_nothing_of_each_other(pendulum):
+    first = km.plants.fmu(pendulum, interface="co-simulation")
+    second = copy.deepcopy(first)
+    first.reset([1.0, 0.0])
+    second.reset(None)
+    first.step([1.0])
+    assert second.state.tolist() == [0.3, 0.0]
+
+
+@pytest.mark.parametrize("name", ["pendulum", "pendulum_with_slopes", "pendulum3"])
+def test_nonlinear_mpc_holds_the_pendulum_of_a_unit_as_it_holds_its_equations(name, request):
+    unit = km.plants.fmu(request.getfixturevalue(name), dt=0.05, outputs=ROD)
+    cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(unit.u_min, unit.u_max)
+    runs = []
+    for plant in (unit, km.discretize(Pendulum(), 0.05)):
+        mpc = km.NonlinearMPC(plant, cost, limits, horizon=8)
+        runs.append(km.simulate(plant, mpc, x0=[0.8, 0.0], reference=[0.3, 0.0], steps=6))
+    assert pytest.approx(runs[1].U, abs=1e-4) == runs[0].U
+    again = copy.deepcopy(mpc)
+    assert again([0.8, 0.0], [0.3, 0.0]).u == pytest.approx(runs[0].U[0], abs=1e-4)
+
+
+def test_a_copy_of_a_controller_on_a_unit_has_a_unit_of_its_own(pendulum):
+    unit = km.plants.fmu(pendulum, dt=0.05, outputs=ROD)
+    mpc = km.NonlinearMPC(unit, km.Cost(Q=[10, 1], R=0.1), horizon=3)
+    assert copy.deepcopy(mpc)([0.5, 0], [0, 0]).u == pytest.approx(mpc([0.5, 0], [0, 0]).u, abs=1e-8)
+
+
+def test_simulate_and_realtime_drive_a_co_simulation_unit(tanks):
+    tank = km.plants.fmu(tanks[2], dt=0.02)
+    data = km.collect(tank, km.Uniform(0.5, 2), km.Noise(0, 1), episodes=10, steps=20)
+    cost, limits = km.Cost(Q=1, R=1e-3), km.Limits(0, 20)
+    mpc = km.KoopmanMPC(km.edmd(data, km.State() + km.Constant()), cost, limits, horizon=10)
+    run = km.simulate(tank, mpc, x0=[1.0], reference=[1.5], steps=100)
+    assert run.X[-1] == pytest.approx([1.5], abs=0.02)
+    moves: list[float] = []
+    km.realtime(
+        mpc,
+        tank,
+        x0=[1.0],
+        reference=[1.5],
+        dt=0.02,
+        steps=5,
+        safe=[0.0],
+        recorder=lambda step: moves.append(step.u[0]),
+    )
+    assert moves[:3] == pytest.approx(run.U[:3, 0], abs=1e-9)
+
+
+def test_a_step_that_the_unit_refuses_names_its_reason_and_a_reset_mends_it(pendulum):
+    unit = km.plants.fmu(pendulum, interface="co-simulation", dt=0.3)
+    unit.reset(None)
+    with pytest.raises(
+        km.KoopmpcError, match=r"refused the step from t = 0 s by 0\.3 s .*discard.*at most 0\.2 s.*another dt"
+    ):
+        unit.step([0.0])
+    with pytest.raises(km.KoopmpcError, match="call reset"):
+        unit.step([0.0])
+    assert unit.reset(None) == [0.3]
+
+
+BAD = {
+    "unknown": ({"outputs": ["thta"]}, "outputs names 'thta', a variable that pendulum.fmu lacks; it has theta"),
+    "unknown start": ({"start_values": {"G": 1.0}}, "start_values names 'G'.* it has "),
+    "calculated": ({"start_values": {"reach": 1.0}}, "reach, which pendulum.fmu calculates itself"),
+    "no input": ({"inputs": ["omega"]}, "omega, which pendulum.fmu does not take as an input"),
+    "states": ({"states": ROD}, "model exchange knows its states"),
+    "interface": ({"interface": "exchange"}, "interface is 'exchange'; pass"),
+    "dt": ({"dt": -1.0}, "dt is -1 s; it must be above zero"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_mistake_is_named_in_a_sentence(case, pendulum):
+    arguments, message = BAD[case]
+    with pytest.raises(km.KoopmpcError, match=message):
+        km.plants.fmu(pendulum, **arguments)
+
+
+def test_units_that_cannot_be_a_plant_say_why(folder, pendulum, pendulum3, tanks):
+    def refuse(path, message, **arguments):
+        with pytest.raises(km.KoopmpcError, match=message):
+            km.plants.fmu(path, **arguments)
+
+    for flaw, built, message in (
+        ("driven", {"driven": True}, "depend on time"),
+        ("direct", {"direct": True}, r"the output reach of direct.fmu depends on an input.*outputs=\['theta'\]"),
+        ("windows", {"folder": "win64"}, "no binary for linux64, only for win64; export the model for linux64"),
+    ):
+        refuse(units.build_pendulum(folder / f"{flaw}.fmu", **built), message)
+    events = units.build_pendulum(folder / "events.fmu", events=2)
+    refuse(events, "has 2 event indicators", interface="model exchange")
+    assert isinstance(km.plants.fmu(events), km.plants.FMUPlant)  # co-simulation handles its events itself
+    refuse(pendulum3, 'offers no co-simulation; pass interface="model exchange"', dt=0.1, interface="co-simulation")
+    refuse(pendulum3, "does not tell a step size; pass dt=")
+    refuse(tanks[2], "count of Tank.fmu, which is Integer", dt=0.1, outputs=["count"])
+    refuse(folder / "none.fmu", "there is no file")
+    (folder / "text.fmu").write_text("no zip")
+    refuse(folder / "text.fmu", "is no .fmu file")
+    texts = {"modelDescription.xml": units.DESCRIPTION.format(events="", reach="local", outputs="", slopes="false")}
+    for name, held, message in (
+        ("one", {"modelDescription.xml": '<fmiModelDescription fmiVersion="1.0" modelName="a" guid="b" numberOfContinuousStates="0" numberOfEventIndicators="0" modelIdentifier="m"/>'}, "is FMI 1.0"),
+        ("slip", texts | {"../evil.so": ""}, "'../evil.so', which leaves the unit's folder; nothing was unpacked"),
+        ("root", texts | {"/etc/evil": ""}, "leaves the unit's folder"),
+        ("empty", {"readme": ""}, "holds no modelDescription.xml"),
+        ("xml", {"modelDescription.xml": "<a"}, "modelDescription.xml of xml.fmu cannot be read"),
+    ):  # fmt: skip
+        with zipfile.ZipFile(folder / f"{name}.fmu", "w") as archive:
+            for inside, text in held.items():
+                archive.writestr(inside, text)
+        refuse(folder / f"{name}.fmu", message)
+
+
+def test_an_episode_cannot_begin_where_the_unit_does_not_let_it(pendulum):
+    unit = km.plants.fmu(pendulum, interface="co-simulation", states=["theta", "reach"], outputs=["theta"])
+    with pytest.raises(km.KoopmpcError, match=r"calculates reach itself; pass x0=None"):
+        unit.reset([0.1, 0.1])
+    unit.reset(None)
+    assert unit.step([1.0]) == unit.state[:1]
+
+
+def test_fmpy_is_imported_by_nothing_else_and_its_absence_is_said():
+    code = (
+        "import sys; sys.modules['fmpy'] = None\n"
+        "import koopmpc as km\n"
+        "km.plants.StepMap if hasattr(km.plants, 'StepMap') else km.StepMap; km.simulate; km.plants.fmu\n"
+        "try:\n    km.plants.fmu('a.fmu')\n"
+        "except ImportError as error:\n    assert 'needs FMPy, which is not installed: pip install' in str(error)\n"
+        "else:\n    raise SystemExit(1)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    code = "import sys, koopmpc as km; km.simulate; km.plants.fmu; assert 'fmpy' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
