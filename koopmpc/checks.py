@@ -51,7 +51,7 @@ def array(
         if np.iscomplexobj(raw):
             raise DataError(f"{name} is complex; pass real numbers")
         if raw.dtype.kind not in "biufO" or (raw.dtype.kind == "O" and any(v is None for v in raw.flat)):
-            raise TypeError("None and text are no numbers")
+            raise TypeError("numbers cannot be None or text")
         result = np.array(raw, dtype=np.float64, order="C")
     except (TypeError, ValueError, OverflowError) as error:  # an integer beyond 1e308 overflows
         if isinstance(error, DataError):
@@ -62,7 +62,7 @@ def array(
     if shape is not None and shape != result.shape:
         fits = len(shape) == result.ndim and all(n is None or n == m for n, m in zip(shape, result.shape, strict=True))
         if not fits:
-            raise ShapeError(f"{name} has shape {result.shape}, expected {_written(shape)}")
+            raise ShapeError(f"{name} has shape {result.shape}, expected {_format_shape(shape)}")
     if finite and not np.isfinite(result).all():
         if not infinite:
             bad = np.argwhere(~np.isfinite(result))
@@ -190,7 +190,7 @@ def texts(given: object, what: str) -> tuple[str, ...]:
 
 
 def among(value: object, known: Iterable[str]) -> bool:
-    """Return whether `value` is one of these words; an array or a list is none."""
+    """Return whether `value` is one of these words; an array or a list does not pass."""
     return isinstance(value, str) and value in known
 
 
@@ -229,7 +229,7 @@ def kind(value: object, name: str, wanted: type | tuple[type, ...], advice: str)
 
 
 def takes(function: Callable[..., object], name: str, count: int, advice: str) -> None:
-    """Raise where a function cannot be called with `count` arguments; one that does not tell is let through."""
+    """Raise where a function cannot be called with `count` arguments; one without a signature passes."""
     try:
         inspect.signature(function).bind(*range(count))
     except TypeError:
@@ -238,7 +238,7 @@ def takes(function: Callable[..., object], name: str, count: int, advice: str) -
         return
 
 
-def crossed(low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], name: str) -> None:
+def refuse_crossed(low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], name: str) -> None:
     """Raise where a lower limit stands above its upper one."""
     bad = np.flatnonzero(low > high)
     if bad.size:
@@ -251,7 +251,7 @@ def crossed(low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], name: s
 def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int, first: int = 0) -> Float[np.ndarray, "N1 nr"]:
     """Return rows first … first + N of a reference (nr,) that is held or (M, nr) whose last row is repeated.
 
-    What is beyond 1e30 comes back as NaN: it is no reference, and its square overflows.
+    What is beyond 1e30 comes back as NaN, for its square may overflow.
     """
     R = array(reference, "reference", finite=False)
     if R.shape[-1:] != (nr,) or R.ndim > 2 or len(R) == 0:
@@ -271,7 +271,7 @@ def generator(rng: np.random.Generator | int) -> np.random.Generator:
     return np.random.default_rng(rng)
 
 
-def _written(shape: Sequence[int | None]) -> str:
+def _format_shape(shape: Sequence[int | None]) -> str:
     sizes = ["any" if n is None else str(n) for n in shape]
     return "(" + ", ".join(sizes) + (",)" if len(sizes) == 1 else ")")
 

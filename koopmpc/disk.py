@@ -28,7 +28,7 @@ def path_of(path: object, advice: str = "pass text or a pathlib.Path") -> Path:
     """Return the path; DataError where it is neither text nor a path."""
     if isinstance(path, str | PathLike):
         return Path(os.fsdecode(cast("str", path)))
-    raise DataError(f"{path!r} is no path; {advice}")
+    raise DataError(f"{path!r} is not a path; {advice}")
 
 
 def existing(path: str | PathLike[str], advice: str) -> Path:
@@ -74,7 +74,7 @@ def writing(path: str | PathLike[str]) -> Generator[BinaryIO]:
         failure = stream.failure if stream is not None else None
         if failure is None and not isinstance(error, OSError):
             raise
-        raise refused(file, failure or cast("OSError", error)) from error
+        raise explain_failure(file, failure or cast("OSError", error)) from error
 
 
 def target(path: str | PathLike[str]) -> Path:
@@ -91,7 +91,7 @@ def target(path: str | PathLike[str]) -> Path:
     with suppress(OSError):  # a loop of links is refused when it is opened
         file = file.resolve() if file.is_symlink() else file
     if file.exists() and not os.access(file, os.W_OK):
-        raise refused(file, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
+        raise explain_failure(file, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
     return file
 
 
@@ -115,8 +115,8 @@ def settle(part: Path, file: Path, number: int) -> None:
     part.replace(file)
 
 
-def refused(file: Path, error: OSError) -> LogError:
-    """Return the error that says that this file cannot be written, and what is left of it."""
+def explain_failure(file: Path, error: OSError) -> LogError:
+    """Return the error that says why this file cannot be written, and whether an old one is still there."""
     kept = "; the file that was there is as it was" if file.is_file() else ""
     why = error.strerror or str(error)
     if error.errno in _FULL:
@@ -152,7 +152,7 @@ class Members:
     def __init__(self, file: Path) -> None:
         if not is_zipfile(file):
             raise ValueError("it is no .npz file, or was cut")
-        with _told():
+        with _translate_errors():
             self._zip = ZipFile(file)
         self._infos = {info.filename.removesuffix(".npy"): info for info in self._zip.infolist()}
 
@@ -165,7 +165,7 @@ class Members:
     def __getitem__(self, name: str) -> np.ndarray:
         """Return the array; ValueError where it is damaged or too large."""
         info = self._infos[name]
-        with _told(), self._zip.open(info) as stream:
+        with _translate_errors(), self._zip.open(info) as stream:
             return _array(info, stream)
 
     def require(self, *names: str) -> None:
@@ -177,7 +177,7 @@ class Members:
 
 
 @contextmanager
-def _told() -> Generator[None]:
+def _translate_errors() -> Generator[None]:
     """Turn the dozen kinds of errors of zipfile and numpy, some of which advise to trust the file, into one."""
     try:
         yield

@@ -38,7 +38,7 @@ class ProblemError(KoopmpcError, LookupError):
 
 
 class LogError(KoopmpcError, OSError):
-    """A file is no log, no model, or no data of koopmpc, or cannot be read to its end."""
+    """A file is not a log, no model, or no data of koopmpc, or cannot be read to its end."""
 
 
 class ThreadError(KoopmpcError, RuntimeError):
@@ -69,7 +69,7 @@ class NoInputWarning(FitWarning):
 
 
 @contextmanager
-def unwarned() -> Generator[None]:
+def hide_fit_warnings() -> Generator[None]:
     """Show no FitWarning in this block, whose caller says elsewhere what is doubtful."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)

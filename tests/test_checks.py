@@ -54,8 +54,8 @@ def test_arrays():
             km.errors.DataError,
             r"x0 is not an array of numbers: got list, .*; pass numbers of one shape",
         ),
-        ("12", {}, km.errors.DataError, r"x0 is not an array of numbers: got str, None and text are no numbers"),
-        ([1, None], {}, km.errors.DataError, r"x0 is not an array of numbers: got list, None and text"),
+        ("12", {}, km.errors.DataError, r"x0 is not an array of numbers: got str, numbers cannot be None or text"),
+        ([1, None], {}, km.errors.DataError, r"x0 is not an array of numbers: got list, numbers cannot be None or text"),
     ):
         with pytest.raises(error, match=text):
             checks.array(value, "x0", **kwargs)
@@ -120,12 +120,12 @@ def test_numbers():
 
 
 def test_crossed_limits():
-    checks.crossed(np.zeros(2), np.zeros(2), "input")
-    checks.crossed(np.full(1, -np.inf), np.full(1, np.inf), "input")
+    checks.refuse_crossed(np.zeros(2), np.zeros(2), "input")
+    checks.refuse_crossed(np.full(1, -np.inf), np.full(1, np.inf), "input")
     with pytest.raises(
         km.errors.DataError, match=r"input limits cross at index 1: lower 2 is above upper 1; swap or widen"
     ):
-        checks.crossed(np.array([0.0, 2]), np.array([0.0, 1]), "input")
+        checks.refuse_crossed(np.array([0.0, 2]), np.array([0.0, 1]), "input")
 
 
 def test_an_int_is_a_seed_and_a_generator_is_itself():
@@ -149,7 +149,7 @@ print(checks.count(np.int64(3), "steps"))
 """
     )
     assert lines == [
-        "DataError x0 is not an array of numbers: got NoneType, None and text are no numbers;"
+        "DataError x0 is not an array of numbers: got NoneType, numbers cannot be None or text;"
         " pass numbers of one shape",
         "DataError x0 is not an array of numbers: got dict, float() argument must be a string or a real number,"
         " not 'dict'; pass numbers of one shape",

@@ -244,12 +244,12 @@ def test_a_word_of_the_tables_is_explained_and_a_wrong_one_finds_its_neighbour(c
 def test_logs_are_served_to_this_machine_alone_until_the_server_is_stopped(call, tmp_path):
     from urllib.request import urlopen
 
-    from koopmpc.recording.viewer import free_port, is_up, served
+    from koopmpc.recording.viewer import free_port, is_up, serve
 
     call("run", f"{write(tmp_path)}:far", "-c", "lqr", "--logs", "l")
     (log,) = (tmp_path / "l").glob("*/*.rrd")
     port = free_port()
-    with served(log, port) as (address, data):
+    with serve(log, port) as (address, data):
         assert address.startswith(f"http://127.0.0.1:{port}?url=")
         assert is_up(data)
         assert b"<html" in urlopen(f"http://127.0.0.1:{port}", timeout=10).read().lower()

@@ -12,11 +12,11 @@ import pytest
 import koopmpc as km
 
 MOST = {
-    "functions named by a participle": 143,
-    "lines with two constants": 27,
-    "public names with two homes": 11,
-    "riddling words": 84,
-    "sentences above 40 words": 9,
+    "functions named by a participle": 24,
+    "lines with two constants": 0,
+    "public names with two homes": 0,
+    "riddling words": 9,
+    "sentences above 40 words": 0,
 }
 IRREGULAR = re.compile(
     "begun|bound|built|chosen|cut|done|drawn|driven|fed|felt|found|given|gone|got|had|heard|held|kept|known|laid|left|"

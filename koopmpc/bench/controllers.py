@@ -24,7 +24,7 @@ from koopmpc.control.nonlinear.equilibrium import Equilibria
 from koopmpc.control.nonlinear.problem import learned_map
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError, ProblemError, unwarned
+from koopmpc.errors import DataError, ProblemError, hide_fit_warnings
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.plants.dynamics import Dynamics
@@ -243,7 +243,7 @@ class Prepared:
             return known
         problem = self.problem
         cases = list(problem.cases.values())
-        with unwarned():  # a case may ask for states that the data do not hold
+        with hide_fit_warnings():  # a case may ask for states that the data do not hold
             found = design(
                 self.data,
                 problem.cost,

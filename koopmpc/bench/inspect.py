@@ -113,7 +113,7 @@ def _inspect(path: Path, *, repair: bool) -> Inspected:
 
 
 def _of_model(path: Path) -> Inspected | None:
-    """Return what the log of a model holds; None where the log is none."""
+    """Return what the log of a model holds; None if the file is not a log."""
     try:
         model = load_model_log(path)
     except LogError:
@@ -198,7 +198,7 @@ def worst_moments(run: Run) -> tuple[Moment, ...]:
 
 
 def inspection_table(found: Sequence[Inspected]) -> Table:
-    """Return one line for each log; logs of one name are told apart by their folders."""
+    """Return one line for each log; logs of one name are distinguished by their folders."""
     names = [each.path.name for each in found]
     shown = [
         f"{each.path.parent.name}/{name}" if names.count(name) > 1 else name
@@ -234,7 +234,7 @@ class Where:
         try:
             self._tree = ast.parse(text, mode="eval").body
         except (SyntaxError, ValueError) as error:
-            raise DataError(f'--where "{text}" is no comparison; write for example "violation > 0.01"') from error
+            raise DataError(f'--where "{text}" is not a comparison; write for example "violation > 0.01"') from error
 
     def holds(self, values: Mapping[str, Any]) -> bool:
         """Return whether it holds for these figures."""
@@ -345,7 +345,7 @@ def compared(a: str | Path, b: str | Path, *, threshold: float = 0.02, times: bo
     Raises
     ------
     LogError
-        One of them holds no sweep and is no log, or they have no run in common.
+        One of them holds no sweep and is not a log, or they have no run in common.
     """
     checks.positive(1.0 + threshold, "1 + threshold", "")
     first, second = _rows(Path(a)), _rows(Path(b))

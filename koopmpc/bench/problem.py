@@ -216,8 +216,8 @@ class Problem:
         if not (np.abs(moved) <= _REST * (1 + np.abs(x))).all():
             i = int(np.argmax(np.abs(moved) / (1 + np.abs(x))))
             warnings.warn(
-                f"the equilibrium is none: from it {self.dynamics.states[i]!r} moves by {moved[i]:.3g} in one step of "
-                f"{self.dt:g} s; give x and u where the plant rests",
+                f"the equilibrium does not rest: from it {self.dynamics.states[i]!r} moves by {moved[i]:.3g} in one "
+                f"step of {self.dt:g} s; give x and u where the plant rests",
                 UserWarning,
                 stacklevel=4,
             )
@@ -309,7 +309,7 @@ def load_problem(problem: str | Path) -> Problem:
     if path is None:
         raise ProblemError(_unknown(text))
     if path.suffix != ".py":
-        raise ProblemError(f"{path} is no problem: a problem is a Python file; `koopmpc fit {path}` reads data")
+        raise ProblemError(f"{path} is not a problem: a problem is a Python file; `koopmpc fit {path}` reads data")
     loaded = _load(path)
     return loaded.select(case) if case else loaded
 
@@ -327,7 +327,7 @@ def new_problem(name: str | Path) -> Path:
     path = Path(name)
     path = path if path.suffix == ".py" else path.with_name(f"{path.name}.py")
     if not path.stem.isidentifier():
-        raise ProblemError(f"{path.stem!r} is no name for a problem; use letters, digits and _, a letter first")
+        raise ProblemError(f"{path.stem!r} is not a name for a problem; use letters, digits and _, a letter first")
     if path.exists():
         raise ProblemError(f"{path} exists already and is kept as it is; choose another name")
     with disk.writing(path) as file:
@@ -384,7 +384,7 @@ def _title(path: Path) -> str:
     try:
         return _first_line(ast.get_docstring(ast.parse(path.read_bytes())))
     except (SyntaxError, ValueError):
-        return "(this file is no valid Python)"
+        return "(this file is not valid Python)"
 
 
 def _first_line(docstring: str | None) -> str:

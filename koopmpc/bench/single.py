@@ -183,7 +183,7 @@ def run_closed_loop(
 
 
 def _warm_up(controller: Controller, parts: Prepared, case: Case) -> None:
-    """Call the controller twice and reset it, so that the cost of first calls is no part of a step's time."""
+    """Call the controller twice and reset it, so that measured step times leave out the cost of first calls."""
     y = parts.step_map.measure(case.x0)
     reference = np.atleast_1d(np.asarray(case.reference))
     row = reference if reference.ndim == 1 else reference[0]

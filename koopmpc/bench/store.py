@@ -2,8 +2,8 @@
 
 A worker writes the line of a run when the run ends, by one system call: kill -9 loses only runs that are under way.
 It holds its file locked meanwhile: a sweep that goes on waits for workers which outlive the sweep that was killed.
-Each line, and the manifest, holds a checksum of the rest: one that no longer matches is told, and left out. The table,
-results.parquet, is written beside and renamed, now and then and at the end; the lines are what counts.
+Each line, and the manifest, holds a checksum of the rest: a line that does not match is reported and left out. The
+table, results.parquet, is a copy of the lines; it is written now and then and at the end, and renamed when complete.
 """
 
 import errno
@@ -173,7 +173,7 @@ def write_results(rows: Sequence[RunRow], path: Path) -> None:
 
 
 def record_of(row: RunRow) -> dict[str, Any]:
-    """Return the row as numbers, names and lists; the figures of a run that raised are None."""
+    """Return the row as numbers, names and lists; a run that raised has None in place of figures."""
     record: dict[str, Any] = {name: getattr(row, name, None) for name in _KINDS}
     record |= {"log": row.log and row.log.name, "x0": list(row.x0)}
     if row.metrics is not None:
@@ -213,7 +213,7 @@ class Journal:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self.path.open("ab", buffering=0)
         except OSError as error:
-            raise disk.refused(self.path, error) from error
+            raise disk.explain_failure(self.path, error) from error
         _lock(self._file)
         if is_orphan():  # a sweep that goes on may not have seen the lock
             raise ProblemError(f"the sweep in {self.path.parent.parent} was killed")
@@ -238,7 +238,7 @@ class Journal:
         try:
             _whole(self._file, line)
         except OSError as error:
-            raise disk.refused(self.path, error) from error
+            raise disk.explain_failure(self.path, error) from error
 
 
 def _whole(file: FileIO, data: bytes) -> None:
@@ -262,7 +262,7 @@ def _unseal(text: bytes) -> dict[str, Any]:
     """
     content: object = json.loads(text)
     if not isinstance(content, dict):
-        raise ValueError("it is no object")
+        raise ValueError("it is not a JSON object")
     content = cast("dict[str, Any]", content)
     if content.pop(_SEAL, None) not in (None, crc32(_LINE.encode(content).encode())):
         raise ValueError("it no longer holds what was written")
@@ -336,7 +336,7 @@ def open_sweep(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, An
         folder.mkdir(parents=True, exist_ok=True)
         file = path.open("a+b", buffering=0)
     except OSError as error:
-        raise disk.refused(path, error) from error
+        raise disk.explain_failure(path, error) from error
     with file:
         _claim(file, folder)
         file.seek(0)
@@ -355,7 +355,7 @@ def open_sweep(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, An
                 _whole(file, json.dumps(_seal(known), indent=1).encode())
             except OSError as error:
                 file.truncate(0)
-                raise disk.refused(path, error) from error
+                raise disk.explain_failure(path, error) from error
         yield known
 
 

@@ -229,7 +229,7 @@ def run_view(
     import tempfile
 
     from koopmpc.recording.comparison import record_comparison
-    from koopmpc.recording.viewer import need_display, served
+    from koopmpc.recording.viewer import need_display, serve
     from koopmpc.recording.viewer import view as open_viewer
 
     with friendly():
@@ -240,7 +240,7 @@ def run_view(
             shown = [Path(tempfile.mkdtemp(prefix="koopmpc-")) / "comparison.rrd"]
             record_comparison(logs, shown[0])
         if web:
-            with served(shown, port) as (address, data):
+            with serve(shown, port) as (address, data):
                 say_page(address, port, data)
                 with suppress(KeyboardInterrupt):
                     Event().wait()
@@ -399,5 +399,6 @@ def reproduce(
         raise typer.Exit(1)
 
 
-for command in (sweeps.run, sweeps.bench, sweeps.report, sweeps.compare, sweeps.inspect, sweeps.replay):
+app.command("run")(sweeps.run_problem)
+for command in (sweeps.bench, sweeps.report, sweeps.compare, sweeps.inspect, sweeps.replay):
     app.command()(command)

@@ -67,7 +67,7 @@ def bar(first: str, *, rate: bool = False) -> Generator[Callable[[str, int, int 
 
 
 def console() -> Console:
-    """Return the console of stdout, 100 columns wide where it is no terminal."""
+    """Return the console of stdout, 100 columns wide if stdout is not a terminal."""
     out = Console()
     return out if out.is_terminal else Console(width=100)
 

@@ -35,7 +35,7 @@ Controllers = Annotated[
 ]
 
 
-def run(
+def run_problem(
     problem: Annotated[str, typer.Argument(help=_PROBLEM)],
     controller: Controllers = None,
     faults: Faults = False,
@@ -157,13 +157,13 @@ def replay(log: Annotated[Path, typer.Argument(help="A log of `koopmpc run` or `
 @contextmanager
 def _page(live: bool) -> Generator[None]:
     """Serve a page in this block, in a terminal until Ctrl-C, where no viewer is up and none can be opened."""
-    from koopmpc.recording.viewer import PORT, WEB_PORT, has_display, is_up, served
+    from koopmpc.recording.viewer import PORT, WEB_PORT, has_display, is_up, serve
 
     with ExitStack() as page:
         shown = None
         if live and not is_up(PORT) and not has_display():
             try:
-                shown = page.enter_context(served((), live=True))
+                shown = page.enter_context(serve((), live=True))
             except LogError as error:
                 warnings.warn(f"--live has no page to show the runs on: {error}", UserWarning, stacklevel=2)
         if shown is not None:

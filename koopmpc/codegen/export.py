@@ -153,7 +153,7 @@ def _write_plant(
     start = _find_start(model, size) if x0 is None else checks.array(x0, "x0", (size,))
     rest = np.clip(np.zeros(nu), *program.inputs)
     if past is not None:  # the plant is the model of ζ, and was in x0 under this input
-        start = past.held(start, rest)
+        start = past.repeat(start, rest)
     arrays = "".join(
         language.array(name, values).replace("static const", "const") + "\n"
         for name, values in (("plant_x0", start), ("plant_u0", rest), ("plant_reference", reference))

@@ -84,7 +84,7 @@ class Cost(Value):
         for name in ("Q", "R", "Q_N", "R_delta"):
             value = getattr(self, name)
             if value is None and name in ("Q", "R"):
-                raise DataError(f"{name} is None; pass a weight, 0 for none")
+                raise DataError(f"{name} must be a weight, got None; pass 0 to leave it out")
             if value is not None:
                 stored = checks.array(value, name)
                 checks.weight(stored, name)
@@ -243,7 +243,7 @@ def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits | Non
     ShapeError
         A weight or a limit has another size than what it weighs or limits.
     """
-    cost, limits = checked(cost, limits)
+    cost, limits = check_cost_and_limits(cost, limits)
     C, G = select_rows(predictor, cost.of), predictor.C
     if limits.of is not None:
         G = np.vstack([G, select_rows(predictor, limits.of)])
@@ -264,7 +264,7 @@ def state_tracking(
 
     The functions take `size` values, the states first; by default the states alone. `ranges` as for `Sizes`.
     """
-    cost, limits = checked(cost, limits)
+    cost, limits = check_cost_and_limits(cost, limits)
     nx = len(states)
     point = ca.SX.sym("x", nx if size is None else size)
     x, of = point[:nx], cost.of.bind(states)
@@ -348,7 +348,7 @@ def select_rows(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "n
     return np.eye(predictor.nz)[find_observables(predictor.lifting, wanted)]
 
 
-def checked(cost: object, limits: object) -> tuple[Cost, Limits]:
+def check_cost_and_limits(cost: object, limits: object) -> tuple[Cost, Limits]:
     """Return the cost and the limits, no limits for None.
 
     Raises

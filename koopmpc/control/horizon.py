@@ -27,7 +27,7 @@ from koopmpc.control.target import Targets, Units
 from koopmpc.predict.predictors import LinearPredictor
 
 Coordinates = Literal["auto", "riccati", "plain"]
-# cond(H) up to which OSQP in plain coordinates is no slower. Measured on random plants: limits on inputs alone take
+# cond(H) up to which OSQP in plain coordinates is as fast. Measured on random plants: limits on inputs alone take
 # up to half the time from 1e3 to 1e5 and 25 times as much beyond 1e6; with limited outputs 4 times as much from 3e4.
 WELL_CONDITIONED = 1e3
 INPUTS_ALONE = 1e5

@@ -255,7 +255,7 @@ class Limits(Value):
         if isinstance(self.slack, str):
             linear, quadratic = LINEAR * scale / size, QUADRATIC * scale / size**2
         else:
-            mine = np.repeat([_given(self.x_min, self.x_max), _given(self.y_min, self.y_max)], [nx, ny])
+            mine = np.repeat([_is_set(self.x_min, self.x_max), _is_set(self.y_min, self.y_max)], [nx, ny])
             given = _prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
             linear[mine], quadratic[mine] = given
         kept = np.isfinite(low) | np.isfinite(high)
@@ -305,7 +305,7 @@ def clip_input(
     return np.clip(u, *inputs)
 
 
-def _given(low: ArrayLike | None, high: ArrayLike | None) -> bool:
+def _is_set(low: ArrayLike | None, high: ArrayLike | None) -> bool:
     return low is not None or high is not None
 
 
@@ -359,7 +359,7 @@ def _require_room(
             f"{low_name} has shape {lower.shape} and {high_name} {upper.shape}; pass one limit a row, or scalars"
         )
     a, b = np.broadcast_arrays(lower, upper)
-    checks.crossed(a, b, name)
+    checks.refuse_crossed(a, b, name)
     if (lower == np.inf).any() or (upper == -np.inf).any():
         raise DataError(f"{low_name} is +inf or {high_name} is −inf somewhere; use −inf, +inf where there is no limit")
 

@@ -244,9 +244,11 @@ def stationary(stage: Stage, most: int) -> Gain:
 def leap(stage: Stage, most: int) -> tuple[Float[np.ndarray, "nz nz"], int]:
     """Return P after n steps of the difference equation, by doubling, and n, a power of two below `most`.
 
-    P = Q + H after n steps, and after 2n with
-        H + ΦᵀH(I + GH)⁻¹Φ,   G + Φ(I + GH)⁻¹GΦᵀ,   Φ(I + GH)⁻¹Φ,
-    from H = P_1 − Q, G = BS⁻¹Bᵀ, Φ = A − BK of the first step: R itself may be singular. It ends where K rests, or
+    P = Q + H after n steps. Doubling replaces H, G, Φ of n steps by those of 2n steps:
+
+        H + ΦᵀH(I + GH)⁻¹Φ,   G + Φ(I + GH)⁻¹GΦᵀ,   Φ(I + GH)⁻¹Φ.
+
+    The first step has H = P_1 − Q, G = BS⁻¹Bᵀ, Φ = A − BK. R itself may be singular. Doubling ends when K rests, or
     before Φ, the closed loop of n steps, is so large that rounding would show.
 
     Chu, Fan, Lin & Wang, "Structure-preserving algorithms for periodic discrete-time algebraic Riccati equations",

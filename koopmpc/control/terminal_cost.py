@@ -62,7 +62,7 @@ def terminal_of(
         Q_N has another size than z or the state, or weighs a state of which there is no reference.
     """
     if cost.Q_N is not None:
-        return _given(predictor, cost, horizon, targets)
+        return _weigh_end(predictor, cost, horizon, targets)
     h, signals, size = horizon, horizon.signals, horizon.size
     last, d = signals.w[h.N - 1], signals.d
     D = np.hstack([h.E, np.eye(len(h.A), signals.nd)])
@@ -80,7 +80,7 @@ def terminal_of(
     return Terminal(P, p, of_r, of_u @ targets.W, of_u)
 
 
-def _given(predictor: LinearPredictor, cost: Cost, h: Horizon, targets: Targets) -> Terminal:
+def _weigh_end(predictor: LinearPredictor, cost: Cost, h: Horizon, targets: Targets) -> Terminal:
     """Return ‖x_N − r_N‖² or ‖z_N − z_r‖² in the weight Q_N."""
     Q_N = np.asarray(cost.Q_N)
     (nz, nu), nx = h.B.shape, predictor.nx
@@ -229,7 +229,7 @@ def believed_steps(
     V, cost = np.zeros((*X.shape[:2], stage.B.shape[1])), np.zeros(len(laws))
     CA, CB = C @ predictor.A, np.linalg.solve(inverse.T, C.T).T @ stage.B[:nz]
     rest, steps = lifting(center[None]), _ahead(N)
-    unsure = min(1.0, (steps * _missed(predictor, scale)) ** 2 / WORTH)
+    unsure = min(1.0, (steps * _measure_residual(predictor, scale)) ** 2 / WORTH)
     with np.errstate(all="ignore"):
         for _ in range(steps):
             moved = lifting(X.reshape(-1, len(center))).reshape(*X.shape[:2], nz) - rest
@@ -268,7 +268,7 @@ def _rested_steps(stage: Stage, predictor: LinearPredictor, N: int, inverse: Flo
     scale = predictor.scale
     if scale is None:
         return 0
-    enough, spread = max(_missed(predictor, scale), SETTLED), _spread(predictor, scale) @ inverse.T
+    enough, spread = max(_measure_residual(predictor, scale), SETTLED), _spread(predictor, scale) @ inverse.T
     P = _last(stage)
     nz, needed, rested = len(scale), len(predictor.lifting.bound or ()), 0
     K = np.zeros(stage.B.T.shape)
@@ -300,7 +300,7 @@ def _spread(predictor: LinearPredictor, scale: Float[np.ndarray, "nz nz"]) -> Fl
     return scale - one @ (one.T @ scale)
 
 
-def _missed(predictor: LinearPredictor, scale: Float[np.ndarray, "nz nz"]) -> float:
+def _measure_residual(predictor: LinearPredictor, scale: Float[np.ndarray, "nz nz"]) -> float:
     """Return what the model misses of its states in a step, as a share of what they vary, root mean square."""
     sizes: Float[np.ndarray, " nx"] = np.linalg.norm(_spread(predictor, scale) @ predictor.C.T, axis=0)
     if predictor.report is None or not (sizes > 0).any():

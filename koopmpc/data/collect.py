@@ -42,7 +42,7 @@ class Uniform(Value):
     def __init__(self, low: ArrayLike, high: ArrayLike) -> None:
         lows = np.atleast_1d(checks.array(low, "low"))
         freeze(self, low=checks.array(lows, "low", (None,)), high=checks.vector(high, "high", len(lows)))
-        checks.crossed(self.low, self.high, "initial state")
+        checks.refuse_crossed(self.low, self.high, "initial state")
 
     def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count nx"]:
         """Return `count` draws, a row each."""
@@ -109,7 +109,7 @@ def collect(
             raise DataError("a step map has no state of its own to begin in; pass x0, such as km.Uniform(low, high)")
         else:
             X, U = _batch(plant, starts, excitation, length, streams)
-            Y = _measured(plant, X)
+            Y = _measure_rows(plant, X)
             _finite(Y)
             runs = [Episode(X=y, U=u) for y, u in zip(Y, U, strict=True)]
     return Episodes(runs, plant.dt, plant.outputs, plant.inputs)
@@ -147,7 +147,7 @@ def _batch(
     moves = np.empty((len(starts), steps, plant.nu))
     X[:, 0] = starts
     for k in range(steps):
-        Y = _measured(plant, X[:, k : k + 1])
+        Y = _measure_rows(plant, X[:, k : k + 1])
         _finite(Y, step=k)
         for e, policy in enumerate(policies):
             moves[e, k] = policy(k, Y[e, 0])
@@ -156,7 +156,7 @@ def _batch(
 
 
 @raise_swallowed()
-def _measured(plant: StepMap, X: Float[np.ndarray, "E rows nx"]) -> Float[np.ndarray, "E rows ny"]:
+def _measure_rows(plant: StepMap, X: Float[np.ndarray, "E rows nx"]) -> Float[np.ndarray, "E rows ny"]:
     """Return y = h(x) for each row; X itself where all is measured."""
     x = ca.SX.sym("x", plant.nx)
     if plant.ny == plant.nx and ca.is_equal(plant.h(x), x):

@@ -61,7 +61,7 @@ class Delay(Value):
         """Return the sized copy, for a plant with these names."""
         return replace(self, bound=(tuple(states), tuple(inputs)))
 
-    def fitted(self, states: Sequence[str], inputs: Sequence[str]) -> "Delay":
+    def match(self, states: Sequence[str], inputs: Sequence[str]) -> "Delay":
         """Return the copy for data with these names; a bound one keeps the past of no inputs but its own.
 
         Raises
@@ -81,17 +81,17 @@ class Delay(Value):
     @property
     def states(self) -> tuple[str, ...]:
         """Names of the states x, without their past."""
-        return self._bound[0]
+        return self._names[0]
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the entries of ζ."""
-        states, inputs = self._bound
+        states, inputs = self._names
         past = (inputs if self.inputs else ()) + states
-        return states + tuple(_delayed(name, i) for i in range(1, self.steps + 1) for name in past)
+        return states + tuple(_name_past(name, i) for i in range(1, self.steps + 1) for name in past)
 
     @property
-    def _bound(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def _names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         if self.bound is None:
             raise DataError("Delay does not know its plant yet; call .bind(states, inputs) or pass it to edmd")
         return self.bound
@@ -99,7 +99,7 @@ class Delay(Value):
     @property
     def _block(self) -> int:
         """Number of entries of ζ that hold one past step."""
-        states, inputs = self._bound
+        states, inputs = self._names
         return len(states) + len(inputs) * self.inputs
 
     def __call__(self, episodes: Episodes) -> Episodes:
@@ -110,7 +110,7 @@ class Delay(Value):
         DataError
             No episode is long enough.
         """
-        d, sized = self.steps, self.fitted(episodes.states, episodes.inputs)
+        d, sized = self.steps, self.match(episodes.states, episodes.inputs)
         long = [episode for episode in episodes if len(episode) > d]
         lost = len(episodes) - len(long)
         if not long:
@@ -129,7 +129,7 @@ class Delay(Value):
 
     def source(self, source: Source) -> Source:
         """Return a source whose episodes hold ζ in place of x."""
-        sized = self.fitted(source.states, source.inputs)
+        sized = self.match(source.states, source.inputs)
         return Changed(source, sized, sized.names, source.inputs, source.disturbances, history=self.steps)
 
     def point(self, x: Float[np.ndarray, " nx"], history: Episode) -> Float[np.ndarray, " nzeta"]:
@@ -142,7 +142,7 @@ class Delay(Value):
         ShapeError
             It has other states or inputs.
         """
-        states, inputs = self._bound
+        states, inputs = self._names
         if history.X.shape[1:] != (len(states),) or history.U.shape[1:] != (len(inputs),):
             raise ShapeError(
                 f"history has {history.X.shape[1]} states and {history.U.shape[1]} inputs, expected {len(states)} and "
@@ -155,12 +155,12 @@ class Delay(Value):
         first = len(history) - self.steps
         return self._points(history.X[first:], history.U[first:])[0]
 
-    def held(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nzeta"]:
+    def repeat(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nzeta"]:
         """Return ζ of a plant that has been in x, under u, for d steps."""
         past = np.concatenate([u, x]) if self.inputs else x
         return np.concatenate([x, *[past] * self.steps])
 
-    def shifted(
+    def shift(
         self,
         zeta: Float[np.ndarray, "*batch nzeta"],
         u: Float[np.ndarray, "*batch nu"],
@@ -180,12 +180,12 @@ class Delay(Value):
     ) -> Float[np.ndarray, "points nzeta"]:
         """Return the rows ζ_d … ζ_T."""
         d = self.steps
-        past = np.hstack([U[:, : len(self._bound[1])], X[:-1]]) if self.inputs else X[:-1]
+        past = np.hstack([U[:, : len(self._names[1])], X[:-1]]) if self.inputs else X[:-1]
         windows = sliding_window_view(past, d, axis=0)[:, :, ::-1]  # (T − d + 1, block, d), the newest first
         return np.hstack([X[d:], windows.transpose(0, 2, 1).reshape(len(windows), -1)])
 
 
-def _delayed(name: str, steps: int) -> str:
+def _name_past(name: str, steps: int) -> str:
     """Return ``"theta[k-1] [rad]"`` for ``"theta [rad]"``."""
     stem, bracket, unit = name.partition(" [")
     return f"{stem}[k-{steps}]{bracket}{unit}"

@@ -375,16 +375,16 @@ class PlantSignature:
             mine, theirs = getattr(self, what), getattr(episodes, what)
             if mine != theirs:
                 raise DataError(
-                    f"{place} names the {what} {_listed(theirs)}, {self.place} {_listed(mine)}; "
+                    f"{place} names the {what} {_quote(theirs)}, {self.place} {_quote(mine)}; "
                     "rename them, or leave it out"
                 )
 
 
-def joined(sets: Sequence[Episodes]) -> Episodes:
+def join_sets(sets: Sequence[Episodes]) -> Episodes:
     """Return sets of one plant as one set, with the sample time and the names of the first."""
     return sets[0] if len(sets) == 1 else sets[0].with_episodes([episode for one in sets for episode in one])
 
 
-def _listed(names: tuple[str, ...]) -> str:
+def _quote(names: tuple[str, ...]) -> str:
     """Return the names in quotes, or "none"."""
     return ", ".join(map(repr, names)) or "none"

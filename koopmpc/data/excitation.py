@@ -55,7 +55,7 @@ class Levels(OpenLoop):
         nu = max(len(lows), len(highs))
         lows = checks.vector(lows[0] if len(lows) == 1 else lows, "low", nu)
         highs = checks.vector(highs[0] if len(highs) == 1 else highs, "high", nu)
-        checks.crossed(lows, highs, "excitation")
+        checks.refuse_crossed(lows, highs, "excitation")
         freeze(self, low=lows, high=highs, hold=checks.count(hold, "hold"))
 
     @property
@@ -65,7 +65,7 @@ class Levels(OpenLoop):
 
 
 class Noise(Levels):
-    """u uniform between `low` and `high`, drawn anew every `hold` steps.
+    """u uniform between `low` and `high`, drawn again every `hold` steps.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def maximal_length(order: int) -> Bool[np.ndarray, " period"]:
     """Return one period of a maximal-length sequence, 2^order − 1 bits, read-only.
 
     Its ones exceed its zeros by one and its periodic autocorrelation is −1 off zero (levels ±1): the spectrum
-    is flat but for the mean.
+    is flat except for the mean.
     """
     from scipy.signal import max_len_seq  # imported here, for scipy.signal takes a quarter of a second
 
@@ -325,7 +325,7 @@ class Feedback(Excitation):
             u_min=checks.vector(u_min, "u_min", len(gain), infinite=True),
             u_max=checks.vector(u_max, "u_max", len(gain), infinite=True),
         )
-        checks.crossed(self.u_min, self.u_max, "u")
+        checks.refuse_crossed(self.u_min, self.u_max, "u")
 
     @property
     def nu(self) -> int:

@@ -16,24 +16,26 @@ from koopmpc.data.state_space import (
     DELAYS,
     StateSpace,
     Stretches,
-    fitted,
+    fit_state_space,
     gains_of,
     left_out,
-    smoothed,
-    stacked,
-    unstacked,
+    smooth,
+    stack_delays,
+    unstack_delays,
 )
 from koopmpc.errors import DataError
 from koopmpc.values import Value
 
 _LARGEST = 30  # entries of x_k … x_{k−d}: the work grows with their third power
-_WINDOW, _WINDOWS = 60, 100  # steps and number of the stretches that a model is fitted to, at most
-_BLOCK, _OVERLAP = 1000, 200  # rows of a part of a long episode, and rows more at either end
+_WINDOW = 60  # a model is fitted to stretches of at most this many steps
+_WINDOWS = 100  # and to at most this many stretches
+_BLOCK = 1000  # episodes of twice this many rows or more are smoothed in parts of about this length
+_OVERLAP = 200  # each part sees this many rows more at either end
 _EACH = 10  # snapshot pairs for each regressor, at least
-_BETTER = 0.05  # of the log-likelihood for each number: what is missed is 5 % smaller
+_BETTER = 0.05  # more delays must raise the log-likelihood a number by this: prediction errors 5 % smaller
 _PASSES = 4  # the products are those of the smoothed states, which the first pass does not have
-_SMALL = 1e-4  # of a state's spread: noise below is none
-_SHARE = 0.5  # of what the model misses in one step: noise below cannot be told from the model's own error
+_SMALL = 1e-4  # noise below this share of a state's spread counts as rounding
+_SHARE = 0.5  # noise below this share of the model's one-step error cannot be distinguished from that error
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +43,12 @@ class Smoother(Value):
     """Estimate x_0 … x_T of an episode from all of its measurements, y_k = x_k + n_k, n_k ~ N(0, R), R diagonal.
 
     Least squares on noisy states shrinks A towards zero, by about R (cov x)⁻¹: an unstable plant looks tame, and a
-    controller that believes it loses such plants. The smoother knows how states move between measurements,
+    controller that believes it loses such plants. The smoother fits a model of how states move between measurements:
 
-        x_{k+1} = Σ_j A_j x_{k−j} + Σ_j B_j u_{k−j} + c + G [x_k ⊗ x_k, u_k ⊗ x_k] + v_k,  j = 0 … d,  v_k ~ N(0, V),
+        x_{k+1} = Σ_j A_j x_{k−j} + Σ_j B_j u_{k−j} + c + G [x_k ⊗ x_k, u_k ⊗ x_k] + v_k,  j = 0 … d;  v_k ~ N(0, V).
 
-    so that it weighs each measurement against those before and after. All of it, R and V too, is the maximum of the
-    likelihood of the measurements, found by expectation–maximisation (Shumway & Stoffer 1982). The products are taken
+    With it each measurement is weighed against those before and after. A, B, c, G, V and R maximise the likelihood of
+    the measurements, found by expectation–maximisation (Shumway & Stoffer 1982). The products are taken
     at the smoothed states; what they do not describe is part of V, and where V is large the measurements are kept.
     Where not all states are measured, the past stands in for them: of d = 0, 1, 2 the smallest is taken whose
     prediction errors are within 5 % of the least. Measured disturbances count as inputs.
@@ -120,10 +122,12 @@ class Smoother(Value):
         both = np.concatenate([np.hstack([episode.X[:-1], episode.U]) for episode in data])
         mean, scale = both.mean(axis=0), both.std(axis=0)
         scale = np.where(scale > 1e-12 * np.abs(mean), scale, 1.0)
-        return cls.made(_state_space(data, mean, scale), mean, scale)
+        return cls.from_model(_state_space(data, mean, scale), mean, scale)
 
     @classmethod
-    def made(cls, model: StateSpace, mean: Float[np.ndarray, " nxu"], scale: Float[np.ndarray, " nxu"]) -> "Smoother":
+    def from_model(
+        cls, model: StateSpace, mean: Float[np.ndarray, " nxu"], scale: Float[np.ndarray, " nxu"]
+    ) -> "Smoother":
         """Return the smoother with this model of data that are standardized so."""
         size = scale[: len(model.V)]
         return cls(
@@ -146,7 +150,7 @@ class Smoother(Value):
         return StateSpace(self.delays, self.products, self.gains, self.spread, R, self.start, self.start_spread)
 
     @property
-    def found(self) -> Bool[np.ndarray, " nx"]:
+    def is_noisy(self) -> Bool[np.ndarray, " nx"]:
         """(nx,) True for each state with noise that can be told from what the model misses, and from rounding."""
         return (self.noise > _SHARE * self.missed) & (self.noise > _SMALL * self.scale[: len(self.noise)])
 
@@ -155,7 +159,7 @@ class Smoother(Value):
         data = episodes_of(episodes)
         nx, changed = data.nx, [episode.X.copy() for episode in data]
         for pieces, given in self.stretches(data):
-            found = unstacked(self.states(given), self.delays, nx) * self.scale[:nx] + self.mean[:nx]
+            found = unstack_delays(self.states(given), self.delays, nx) * self.scale[:nx] + self.mean[:nx]
             for row, piece in zip(found, pieces, strict=True):
                 changed[piece.episode][piece.low : piece.high] = row[piece.low - piece.first : piece.high - piece.first]
         return data.with_episodes([e.with_states(X) for X, e in zip(changed, data, strict=True)])
@@ -163,9 +167,9 @@ class Smoother(Value):
     def states(self, given: Stretches) -> Float[np.ndarray, "E L N"]:
         """Return E[s_k | all measurements]; products are those of the smoothed states."""
         model = self.model
-        gains, states = gains_of(model, given.X.shape[1] - self.delays), stacked(given.X, self.delays)
+        gains, states = gains_of(model, given.X.shape[1] - self.delays), stack_delays(given.X, self.delays)
         for _ in range(_PASSES if self.products else 1):
-            states = smoothed(model, gains, given, model.drive(states, given.U))
+            states = smooth(model, gains, given, model.drive(states, given.U))
         return states
 
     def stretches(self, data: Episodes) -> Iterator[tuple[list["_Passage"], Stretches]]:
@@ -223,10 +227,10 @@ def _state_space(
         if size > _LARGEST or pairs < _EACH * linear:
             continue
         enough = pairs >= _EACH * (linear + data.nx * (data.nx + 1) // 2 + data.nx * data.nu)
-        fits.append(fitted(windows, delays, products=products and enough))
+        fits.append(fit_state_space(windows, delays, products=products and enough))
     if not fits:
         raise DataError(
-            f"{pairs} steps of {data.nx} states are no data for a smoother: it needs {_EACH} steps for each "
+            f"{pairs} steps of {data.nx} states are too few for a smoother: it needs {_EACH} steps for each "
             f"regressor and takes {_LARGEST} states at most"
         )
     best = max(likelihood for likelihood, _ in fits)
@@ -294,7 +298,7 @@ class Mender(Value):
     Least squares squares errors: one sensor that jumped once outweighs thousands of sound rows, and unstable plants
     seem to be what they are not. For each measurement the estimate of a linear `Smoother` without it is known from the
     estimate with it. One that lies further off than 8 of its standard deviations and half of the state's spread, and
-    further than all within three rows, is replaced, and the search begins anew without it. It comes back where the rows
+    further than all within three rows, is replaced, and the search starts again without it. It comes back if the rows
     around it go on to miss by a third of it or more: then the plant jumped, and not a sensor. Sound data stay as they
     are, to the bit.
 
@@ -338,24 +342,24 @@ class Mender(Value):
         scale, whole = (high - low) / 3.29, both.std(axis=0)  # normal data have their standard deviation
         scale = np.where(scale > 0, scale, np.where(whole > 0, whole, 1.0))
 
-        def made(found: list[Glitch]) -> Mender:
+        def fit_without(found: list[Glitch]) -> Mender:
             """Return the mender by a model of the data without these glitches."""
-            model = _state_space(_replaced(data, found), middle, scale, products=False)
+            model = _state_space(_replace(data, found), middle, scale, products=False)
             model = model._replace(R=np.maximum(model.R, _FLOOR * np.diag(model.V)))
-            return cls(Smoother.made(model, middle, scale))
+            return cls(Smoother.from_model(model, middle, scale))
 
-        mender, found = made([]), list[Glitch]()
+        mender, found = fit_without([]), list[Glitch]()
         for _ in range(_FITS - 1):
             before, found = found, mender.glitches(data)
             if [one[:3] for one in found] == [one[:3] for one in before]:
                 break
-            mender = made(found)
+            mender = fit_without(found)
         return mender
 
     def __call__(self, episodes: Episodes) -> Episodes:
         """Return the episodes with their glitches replaced."""
         data = episodes_of(episodes)
-        return _replaced(data, self.glitches(data))
+        return _replace(data, self.glitches(data))
 
     def glitches(self, episodes: Episodes) -> list[Glitch]:
         """Return the glitches of these data, in their order."""
@@ -363,23 +367,23 @@ class Mender(Value):
         found: list[Glitch] = []
         nx = data.nx
         for pieces, given in self.smoother.stretches(data):
-            for row, k, i, value in self._searched(pieces, given):
+            for row, k, i, value in self._search(pieces, given):
                 piece, place = pieces[row], pieces[row].first + k
                 now = float(value * self.smoother.scale[:nx][i] + self.smoother.mean[:nx][i])
                 found.append(Glitch(piece.episode, place, i, float(data[piece.episode].X[place, i]), now))
         return sorted(found)
 
-    def _searched(self, pieces: list[_Passage], given: Stretches) -> list[tuple[int, int, int, float]]:
+    def _search(self, pieces: list[_Passage], given: Stretches) -> list[tuple[int, int, int, float]]:
         """Return (piece, row, state, what stands there now) of each glitch."""
         Y, model = given.X.copy(), self.smoother.model
         gains = gains_of(model, Y.shape[1] - model.delays)
         replaced: set[tuple[int, int, int]] = set()
 
-        def missed() -> tuple[Float[np.ndarray, "E T nx"], Float[np.ndarray, "E T nx"]]:
+        def measure_gaps() -> tuple[Float[np.ndarray, "E T nx"], Float[np.ndarray, "E T nx"]]:
             now = given._replace(X=Y)
             return left_out(model, gains, now, self.smoother.states(now))
 
-        gap, size = missed()
+        gap, size = measure_gaps()
         for _ in range(_ROUNDS):
             largest, fresh = size.max(axis=2), False
             for row, k in np.argwhere(largest > _SIZE).tolist():
@@ -391,7 +395,7 @@ class Mender(Value):
                     fresh = True
             if not fresh:
                 break
-            gap, size = missed()
+            gap, size = measure_gaps()
         return [
             (row, k, i, float(Y[row, k, i]))
             for row, k, i in sorted(replaced)
@@ -400,7 +404,7 @@ class Mender(Value):
         ]
 
 
-def _replaced(data: Episodes, glitches: list[Glitch]) -> Episodes:
+def _replace(data: Episodes, glitches: list[Glitch]) -> Episodes:
     changed = {one.episode: data[one.episode].X.copy() for one in glitches}
     for one in glitches:
         changed[one.episode][one.row, one.state] = one.now

@@ -7,7 +7,7 @@ from functools import partial
 from itertools import chain
 from typing import cast
 
-from koopmpc.data.episodes import Episodes, PlantSignature, joined
+from koopmpc.data.episodes import Episodes, PlantSignature, join_sets
 from koopmpc.errors import DataError
 from koopmpc.values import Named
 
@@ -28,20 +28,20 @@ class Part:
         return self.place
 
     @classmethod
-    def held(cls, episodes: Episodes, place: str) -> "Part":
+    def in_memory(cls, episodes: Episodes, place: str) -> "Part":
         """Return a part that is in memory."""
         return cls(place, partial(_same, episodes))
 
-    def changed(self, change: EpisodesMap) -> "Part":
+    def map(self, change: EpisodesMap) -> "Part":
         """Return a part whose episodes go through `change` when it is loaded."""
-        return Part(self.place, partial(_changed, self.load, change))
+        return Part(self.place, partial(_load_changed, self.load, change))
 
 
 def _same(episodes: Episodes) -> Episodes:
     return episodes
 
 
-def _changed(load: Callable[[], Episodes], change: EpisodesMap) -> Episodes:
+def _load_changed(load: Callable[[], Episodes], change: EpisodesMap) -> Episodes:
     return change(load())
 
 
@@ -106,7 +106,7 @@ class Held(Source):
 
     def parts(self, history: int = 0) -> list[Part]:
         """Return a list of the one part."""
-        return [Part.held(self.episodes, "these data")]
+        return [Part.in_memory(self.episodes, "these data")]
 
 
 class Changed(Source):
@@ -140,7 +140,7 @@ class Changed(Source):
     def parts(self, history: int = 0) -> Iterable[Part]:
         """Return the parts in order."""
         parts = self.source.parts(history + self.history)
-        changed = (part.changed(self.change) for part in parts)
+        changed = (part.map(self.change) for part in parts)
         return list(changed) if isinstance(parts, Sized) else changed
 
 
@@ -169,7 +169,7 @@ class Stream(Source):
     """Episodes from an iterable of sets, in parts of one set, or of several small ones; no part is kept.
 
     An iterator or a generator is read once; a fit of it uses QR sums, which need no second pass. An iterable that
-    begins anew each time, such as a list, is replayable.
+    starts again each time, such as a list, is replayable.
 
     Parameters
     ----------
@@ -214,12 +214,12 @@ class Stream(Source):
             self._plant.check(_set(one, place), place)
             own = sum(e.X.nbytes + e.U.nbytes + e.W.nbytes for e in one)
             if held and size + own > _PART:
-                yield Part.held(joined(held), _place(start, len(held)))
+                yield Part.in_memory(join_sets(held), _place(start, len(held)))
                 held, start, size = [], i, 0
             held.append(one)
             size += own
         if held:
-            yield Part.held(joined(held), _place(start, len(held)))
+            yield Part.in_memory(join_sets(held), _place(start, len(held)))
 
 
 def _set(given: object, place: str) -> Episodes:

@@ -86,15 +86,15 @@ def gains_of(model: StateSpace, length: int) -> SmootherGains:
     return result
 
 
-def smoothed(
+def smooth(
     model: StateSpace, gains: SmootherGains, given: Stretches, drive: Float[np.ndarray, "E _ nx"]
 ) -> Float[np.ndarray, "E L N"]:
     """Return E[s_k | y_0 … y_T] of each episode: forward with the filter, then back (Rauch, Tung & Striebel)."""
-    before, after, _ = _filtered(model, gains, given, drive)
+    before, after, _ = _filter(model, gains, given, drive)
     return _back(gains, before, after, given.last - model.delays)
 
 
-def _filtered(
+def _filter(
     model: StateSpace, gains: SmootherGains, given: Stretches, drive: Float[np.ndarray, "E _ nx"]
 ) -> tuple[Float[np.ndarray, "L E N"], Float[np.ndarray, "L E N"], list[Float[np.ndarray, "E nx"]]]:
     """Return E[s_k | y_0 … y_{k−1}], E[s_k | y_0 … y_k], and what each measurement after the first missed."""
@@ -105,7 +105,7 @@ def _filtered(
     m = np.broadcast_to(model.start, before.shape[1:])
     for k in range(length):
         before[k] = m
-        gap = stacked(X[:, : d + 1], d)[:, 0] - m if k == 0 else X[:, k + d] - m[:, :nx]
+        gap = stack_delays(X[:, : d + 1], d)[:, 0] - m if k == 0 else X[:, k + d] - m[:, :nx]
         if k:
             gaps.append(gap)
         after[k] = m + gap @ gains.filter[min(k, len(gains.filter) - 1)].T
@@ -149,7 +149,7 @@ def left_out(
     R / (1 − h), h = P / R. Rows beyond the end of an episode are zero.
     """
     d, nx = model.delays, len(model.V)
-    gap, size = given.X - unstacked(states, d, nx), np.ones_like(given.X)
+    gap, size = given.X - unstack_delays(states, d, nx), np.ones_like(given.X)
     for steps in np.unique(given.last):
         own = np.array([np.diag(P) for P in _covariances(gains, int(steps) + 1 - d)[0]])
         first = own[0].reshape(d + 1, nx)[:0:-1]
@@ -161,13 +161,13 @@ def left_out(
     return gap, np.abs(gap) / size
 
 
-def fitted(given: Stretches, delays: int, *, products: bool) -> tuple[float, StateSpace]:
+def fit_state_space(given: Stretches, delays: int, *, products: bool) -> tuple[float, StateSpace]:
     """Return the log-likelihood for each number that was measured, and the model, by expectation–maximisation.
 
     The likelihoods of models with other delays are of the same measurements, those from step 3 on.
     """
     X, U = given.X, given.U
-    nx, S = X.shape[2], stacked(X, delays)
+    nx, S = X.shape[2], stack_delays(X, delays)
     N = S.shape[2]
     flat = S.reshape(-1, N)
     spread = np.cov(flat.T).reshape(N, N) + 1e-6 * np.eye(N)
@@ -180,7 +180,7 @@ def fitted(given: Stretches, delays: int, *, products: bool) -> tuple[float, Sta
     model = model._replace(K=K, V=V, R=np.diag(V) / 2)
     reached: list[float] = []
     for _ in range(_ITERATIONS):
-        model, likelihood, D = _improved(model, given, D)
+        model, likelihood, D = _improve(model, given, D)
         reached.append(likelihood)
         if len(reached) > _FEWEST and reached[-1] < reached[-2] + _GAIN:
             break
@@ -188,7 +188,7 @@ def fitted(given: Stretches, delays: int, *, products: bool) -> tuple[float, Sta
     return reached[-1] / numbers, model
 
 
-def _improved(
+def _improve(
     model: StateSpace, given: Stretches, D: Float[np.ndarray, "E _ m"]
 ) -> tuple[StateSpace, float, Float[np.ndarray, "E _ m"]]:
     """One iteration: smooth with the model, then fit it to the smoothed states and their covariances.
@@ -198,7 +198,7 @@ def _improved(
     X, d, nx, N = given.X, model.delays, len(model.V), len(model.start)
     E, length = len(X), X.shape[1] - d
     gains = gains_of(model, length)
-    before, after, gaps = _filtered(model, gains, given, D @ model.K[N:])
+    before, after, gaps = _filter(model, gains, given, D @ model.K[N:])
     S = _back(gains, before, after, given.last - d)
     total, lag = _covariances(gains, length)
     likelihood = 0.0
@@ -216,7 +216,7 @@ def _improved(
     V = ahead.T @ ahead + E * total[1:, :nx, :nx].sum(axis=0) - K.T @ cross - cross.T @ K + K.T @ square @ K
     sizes, axes = np.linalg.eigh((V + V.T) / (2 * len(rows)))
     V = (axes * np.maximum(sizes, _LEAST)) @ axes.T
-    left = np.sum((X - unstacked(S, d, nx)) ** 2, axis=(0, 1))
+    left = np.sum((X - unstack_delays(S, d, nx)) ** 2, axis=(0, 1))
     own = np.diagonal(total, axis1=1, axis2=2)
     left += E * (own[:, :nx].sum(axis=0) + own[0, nx:].reshape(d, nx).sum(axis=0))
     better = model._replace(K=K, V=V, R=left / (E * X.shape[1]) + _LEAST)
@@ -228,13 +228,13 @@ def _rows(S: Float[np.ndarray, "E L N"], D: Float[np.ndarray, "E _ m"]) -> Float
     return np.concatenate([S[:, :-1], D], axis=-1).reshape(-1, S.shape[2] + D.shape[2])
 
 
-def stacked(X: Float[np.ndarray, "E T nx"], delays: int) -> Float[np.ndarray, "E L N"]:
+def stack_delays(X: Float[np.ndarray, "E T nx"], delays: int) -> Float[np.ndarray, "E L N"]:
     """Return s_k = [x_k … x_{k−d}] of k = d … T."""
     steps = X.shape[1]
     return np.concatenate([X[:, delays - j : steps - j] for j in range(delays + 1)], axis=-1)
 
 
-def unstacked(S: Float[np.ndarray, "E L N"], delays: int, nx: int) -> Float[np.ndarray, "E T nx"]:
+def unstack_delays(S: Float[np.ndarray, "E L N"], delays: int, nx: int) -> Float[np.ndarray, "E T nx"]:
     """Return x_0 … x_T of s_d … s_T; the first ones are those that s_d holds."""
     first = S[:, 0].reshape(len(S), delays + 1, nx)[:, :0:-1]
     return np.concatenate([first, S[:, :, :nx]], axis=1)

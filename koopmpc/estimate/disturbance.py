@@ -38,7 +38,7 @@ class LiftedDisturbance(Value):
     d = m = e.
 
     A reading far from its prediction is refused: A z + B u + E w + d stands in for at most five steps, and nothing is
-    learned. Once readings are used again, all means begin anew.
+    learned. Once readings are used again, all means start again.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def _rule(sizes: tuple[int, int, int], nx: int, known: slice, gain: float, lift:
 
     The memory is [z; u; w; m; d; C e; the mean of (C e)² less half the square of its change; s²; whether there has been
     a misfit; the weight of the next misfit, if it is above the gain; whether z is known]. The flags say whether this
-    misfit is learned, and whether all means begin anew with the next one.
+    misfit is learned, and whether all means start again with the next one.
     """
     nz, nu, nw = sizes
     x, C = ca.SX.sym("x", nz if lift is None else lift.numel_in(0)), ca.SX.sym("C", nx, nz)

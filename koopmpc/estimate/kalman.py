@@ -222,7 +222,9 @@ class KalmanFilter(Viewing):
             M, R = self._system.M[came], self._R[np.ix_(came, came)]
             PM = self._P @ M.T
             S = M @ PM + R
-            size = np.sqrt(S.diagonal())[:, None]  # scaled, for different units of the outputs are no ill-conditioning
+            size = np.sqrt(S.diagonal())[
+                :, None
+            ]  # scaled first: different units of the outputs do not count as ill-conditioning
             scaled = np.asarray(scipy.linalg.solve(S / size / size.T, PM.T / size, assume_a="pos"))
             self._gains[key] = (scaled / size).T
         return self._gains[key]

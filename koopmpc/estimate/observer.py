@@ -181,11 +181,11 @@ class History:
         """Return ζ after the step that led to x under u."""
         known, embedding = bool(np.isfinite(x).all()), self._embedding
         if self._zeta is None:
-            zeta = embedding.held(x, u)
+            zeta = embedding.repeat(x, u)
             self._zeta = zeta if known else None
             return zeta
-        zeta = embedding.shifted(self._zeta, u, x)
-        self._zeta = zeta if known else embedding.shifted(self._zeta, u, self._zeta[: self._nx])
+        zeta = embedding.shift(self._zeta, u, x)
+        self._zeta = zeta if known else embedding.shift(self._zeta, u, self._zeta[: self._nx])
         return zeta
 
 

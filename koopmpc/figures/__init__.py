@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
-    from koopmpc.figures.eigenvalues import eigenfunctions as eigenfunctions
+    from koopmpc.figures.eigenvalues import eigenfunction_maps as eigenfunction_maps
     from koopmpc.figures.eigenvalues import spectrum as spectrum
     from koopmpc.figures.series import error as error
     from koopmpc.figures.series import reconstruction as reconstruction

@@ -228,7 +228,7 @@ def evaluate_eigenfunctions(
 
 
 @styled
-def eigenfunctions(
+def eigenfunction_maps(
     predictor: LinearPredictor,
     which: int | Sequence[int],
     plane: Axes,

@@ -113,7 +113,7 @@ def run(run: Run, *, states: StateChoice | None = None, width: Width = "one colu
     """
     chosen, nu, t = choose_states(states, run.states), len(run.inputs), run.time
     drawing, axes = _stack_panels(len(chosen), nu, 1, width)
-    tracked = run.tracked(run.reference.shape[1])
+    tracked = run.name_references(run.reference.shape[1])
     for panel, i in zip(axes, chosen, strict=False):
         if run.states[i] in tracked:
             panel.plot(t, run.reference[:, tracked.index(run.states[i])], **REFERENCE, label="reference")
@@ -278,7 +278,7 @@ def _draw_task(panels: Any, runs: Mapping[str, Run], names: list[str]) -> None:
     """Draw the runs of one task in a column of panels, states first."""
     first = next(iter(runs.values()))
     nx = len(first.states)
-    tracked = first.tracked(first.reference.shape[1]) == first.states
+    tracked = first.name_references(first.reference.shape[1]) == first.states
     for i, panel in enumerate(panels):
         curves = [run.X[:, i] if i < nx else run.U[:, i - nx] for run in runs.values()]
         for name, run, values in zip(runs, runs.values(), curves, strict=True):

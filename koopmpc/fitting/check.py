@@ -24,10 +24,12 @@ from koopmpc.synthesis.judging import run_on_surrogate
 from koopmpc.terminal import build_table, render_text
 from koopmpc.text import format_duration, to_percent
 
-ALLOWED, ALLOWED_OFF = 0.01, 0.05  # violation, as a share of the range: as in the data, and with noise or inputs off
+ALLOWED = 0.01  # allowed violation, as a share of the range, in runs as in the data
+ALLOWED_OFF = 0.05  # the same where noise or inputs differ from the data
 ARRIVED = 0.05  # error over the last tenth of a run, as a share of the data's range
 LONGER = 3  # times the runs of the design that there is for arriving at a reference: a start may be far, a limit slow
-OFF, LOUD = 0.2, 3.0  # share by which inputs are off, and factor of the noise
+OFF = 0.2  # inputs are weaker or stronger by this share
+LOUD = 3.0  # noise is this many times that of the data
 _GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
 
 
@@ -147,13 +149,19 @@ def check_controller(
 ) -> Checked:
     """Run a saved design on its surrogates from random starts, in every kind of run, and judge the results.
 
-    The goal is kept if all of this holds. In runs without faults none is lost, no limit is violated by more than 1 % of
-    its range (5 % with three times the noise, or with inputs 20 % off), every step has a good status, and the first
-    step and 99 % of the others take less than dt. Where inputs and noise are as in the data, a constant reference that
-    can be held is reached to 5 % of the data's range. In all runs, those with faults too, every input that the
-    controller asks for is inside its limits. A goal says nothing of broken sensors, actuators and solvers: runs that
-    are lost under them, and limits violated by more than 5 %, are told apart, and count where `faults` says so. The
-    surrogates are learned from the same logs as the controller: they are no plant.
+    The goal is kept if all of these conditions hold:
+
+    - In all runs, those with faults too, every input that the controller asks for is inside its limits.
+    - No run without faults is lost, and every step of these has a good status.
+    - No run without faults violates a limit by more than 1 % of its range; 5 % with three times the noise, or with
+      inputs 20 % off.
+    - The first step, and 99 % of the others, take less than dt.
+    - Where inputs and noise are as in the data, a constant reference that can be held is reached to 5 % of the data's
+      range.
+
+    A goal says nothing of broken sensors, actuators and solvers. Runs that are lost under them, and limits violated by
+    more than 5 %, are listed separately; they count if `faults` is true. The surrogates are learned from the same logs
+    as the controller, and may share its errors.
 
     Parameters
     ----------
@@ -335,8 +343,8 @@ def _page(result: Checked, folder: Path, path: str | Path, saved: SavedDesign) -
     page.items(result.reasons or ["Nothing speaks against it."])
     page.text(
         f"`{Path(path).name}`: a {one.name} with a horizon of {one.horizon} steps of {result.dt:g} s, driven on "
-        f"{len(saved.evidence.surrogates)} models that were learned from its logs. They are no plant: what all of them "
-        "have learned wrongly shows in none of these runs."
+        f"{len(saved.evidence.surrogates)} models that were learned from its logs. An error that all of these models "
+        "share does not show in these runs."
     )
     page.table(["kind of run", *(heading.replace("\n", " ") for heading in _NUMBERS)], map(_row, result.figures))
     page.text("## With faults")

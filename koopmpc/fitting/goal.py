@@ -198,9 +198,9 @@ def format_template(data: Episodes, *, horizon: int | None = None, reading: Mapp
     horizon = usual_horizon(data)[0] if horizon is None else checks.count(horizon, "horizon")
     rest = np.median([episode.X[-1] for episode in data], axis=0)
     lines = [
-        "# What the controller shall do. Numbers are in the units of the names; inf is no limit.",
+        "# What the controller must do. Numbers are in the units of the names; inf means without limit.",
         "# koopmpc fit LOGS --goal this-file designs it, koopmpc check CONTROLLER says whether it keeps the goal.",
-        "# References are medians of the last rows of the logs: change them to where the plant shall rest or go.",
+        "# References are medians of the last rows of the logs: change them to where the plant must rest or go.",
         "",
         f"horizon = {horizon}  # steps of {data.dt:g} s that the controller looks ahead: {horizon * data.dt:.3g} s",
     ]
@@ -213,7 +213,7 @@ def format_template(data: Episodes, *, horizon: int | None = None, reading: Mapp
         lines += [
             "",
             f'[states."{_escape_text(name)}"]  # in the data from {low:.4g} to {high:.4g}',
-            f"reference = {_format_number(rest[i])}  # [{unit}] where it shall be; or a list, one value a step",
+            f"reference = {_format_number(rest[i])}  # [{unit}] target value; or a list, one value a step",
             f"weight = {_format_number(4 / max(high - low, 1e-12) ** 2)}  # of its squared error, per [{unit}]²; 0 for "
             "none",
             f"limits = [-inf, inf]  # [{unit}] kept wherever that is possible",
@@ -269,7 +269,7 @@ def _load_toml(file: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(file.read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise LogError(f"{file} is no TOML: {error}; koopmpc fit LOGS --goal-template shows one") from error
+        raise LogError(f"{file} is not valid TOML: {error}; koopmpc fit LOGS --goal-template shows one") from error
 
 
 def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
@@ -304,7 +304,7 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
         if "reference" in section:
             rows[i] = checks.array(_check_numbers(section["reference"], f"{where}: reference"), f"{where}: reference")
         elif Q[i] > 0:
-            raise DataError(f"{where} has a weight and no reference; say where it shall be, or set weight = 0")
+            raise DataError(f"{where} has a weight and no reference; give its target value, or set weight = 0")
     for i, (name, section) in enumerate(zip(data.inputs, inputs, strict=True)):
         where = f"{file}, {name}"
         R[i] = _read_number(section, "weight", 0.0, where)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from koopmpc.bench.store import RESULTS
 from koopmpc.data.angles import count_wraps
-from koopmpc.data.episodes import Episode, Episodes, joined
+from koopmpc.data.episodes import Episode, Episodes, join_sets
 from koopmpc.data.files.folder import Files
 from koopmpc.data.files.sampling import UnevenSamplingError
 from koopmpc.data.files.tables import SAVED
@@ -40,7 +40,7 @@ def read_logs(
 ) -> "DividedData":
     """Return the data of logs as `divide_files` makes them; the notes begin with how the logs were read.
 
-    `options` holds keywords of `load_episodes`; those that are None count as not given. Unequal steps are interpolated
+    `options` holds keywords of `load_episodes`; None counts as not given. Unequal steps are interpolated
     to their median unless ``resample`` is given, and a note says so.
 
     Raises
@@ -223,7 +223,7 @@ def find_repairs(episodes: Episodes) -> Repair:
 
 
 def _find_useful(columns: Float[np.ndarray, "m n"], names: tuple[str, ...], notes: list[str]) -> list[int]:
-    """Return the columns that move and are no copy of an earlier one."""
+    """Return the columns that move and do not repeat an earlier one."""
     kept: list[int] = []
     for i, name in enumerate(names):
         column = columns[:, i]
@@ -342,7 +342,7 @@ def divide_files(
     size = sum(file.stat().st_size for file in files.files)
     amount = f"{len(files.files)} file{'s' * (len(files.files) > 1)}, {_format_bytes(size)}"
     if size <= memory or len(parts) < 2:
-        episodes, faults, delay = audit_episodes(joined([part.load() for part in parts]))
+        episodes, faults, delay = audit_episodes(join_sets([part.load() for part in parts]))
         repair = find_repairs(episodes)
         whole = repair(episodes)
         _, sound, replaced = replace_glitches(Held(whole), whole)

@@ -99,7 +99,7 @@ def read_regression(
     source = source_of(episodes)
     if embedding is not None:
         checks.kind(embedding, "embedding", Delay, "pass km.Delay(2), or leave it out")
-    bound_embedding = None if embedding is None else embedding.fitted(source.states, source.inputs)
+    bound_embedding = None if embedding is None else embedding.match(source.states, source.inputs)
     total = second_moments(source.driven(), lifting, embedding=bound_embedding, **options)
     return build_regression(total, method, noisy=noisy, disturbances=source.disturbances)
 

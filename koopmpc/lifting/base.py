@@ -275,7 +275,7 @@ def find_state(state: int | str, states: Sequence[str], who: str) -> int:
 
 
 def find_states(chosen: StateChoice | None, states: Sequence[str], who: str) -> list[int]:
-    """Return the indices of the chosen states, or of all states if `chosen` is None."""
+    """Return the indices of the chosen states; None chooses all states."""
     if chosen is None:
         return list(range(len(states)))
     choices = [chosen] if isinstance(chosen, int | str) else chosen

@@ -131,15 +131,15 @@ class NaNSensor(_Windowed):
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the sensor of one run."""
-        channels = _picked(self.channels, wiring.ny)
+        channels = _check_channels(self.channels, wiring.ny)
 
-        def measured(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+        def drop(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
             if rng.random() < self.probability and self._at(k):
                 y = y.copy()
                 y[channels] = np.nan
             return y
 
-        return Injection(measured=measured)
+        return Injection(measured=drop)
 
 
 @dataclass(frozen=True)
@@ -150,17 +150,17 @@ class FrozenSensor(_Windowed):
 
     def start(self, wiring: Wiring, rng: np.random.Generator) -> Injection:
         """Return the sensor of one run."""
-        channels = _picked(self.channels, wiring.ny)
+        channels = _check_channels(self.channels, wiring.ny)
         frozen: list[Float[np.ndarray, " n"]] = []  # one entry, once the window has begun
 
-        def measured(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+        def freeze(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
             if self._at(k):
                 frozen[:] = frozen or [y[channels]]
                 y = y.copy()
                 y[channels] = frozen[0]
             return y
 
-        return Injection(measured=measured)
+        return Injection(measured=freeze)
 
 
 @dataclass(frozen=True)
@@ -176,13 +176,13 @@ class DroppedSamples(_Windowed):
         """Return the connection of one run, which holds the last measurement that arrived."""
         arrived: list[Float[np.ndarray, " ny"]] = []  # the last measurement that arrived
 
-        def measured(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+        def deliver(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
             lost = rng.random() < self.probability and self._at(k)
             if not (arrived and lost):
                 arrived[:] = [y.copy()]
             return arrived[0].copy()
 
-        return Injection(measured=measured)
+        return Injection(measured=deliver)
 
 
 @dataclass(frozen=True)
@@ -237,11 +237,11 @@ class ActuatorLoss(_Windowed):
         rest = np.clip(np.zeros(len(low)), low, high)
         kept = 1.0 - self.fraction
 
-        def lost(limit: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
+        def narrow(limit: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
             limited = np.isfinite(limit)
             return np.where(limited, rest + kept * (np.where(limited, limit, rest) - rest), limit)
 
-        left = lost(low), lost(high)
+        left = narrow(low), narrow(high)
         return Injection(applied=lambda k, u: np.clip(u, *left) if self._at(k) else u)
 
 
@@ -270,7 +270,7 @@ class SolverFailure(_Windowed):
         return Injection(solver_fails=lambda k: rng.random() < self.probability and self._at(k))
 
 
-def _picked(channels: Sequence[int] | None, ny: int) -> list[int]:
+def _check_channels(channels: Sequence[int] | None, ny: int) -> list[int]:
     """Return the channels of a fault as indices of the ny measurements."""
     picked = list(range(ny)) if channels is None else list(channels)
     outside = [i for i in picked if not 0 <= i < ny]

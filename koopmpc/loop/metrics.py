@@ -257,12 +257,12 @@ def beyond(run: Run) -> Float[np.ndarray, " T1"]:
 
 def _broken(run: Run, limits: Limits) -> tuple[Float[np.ndarray, "T n"], Float[np.ndarray, "T0 nu"]]:
     """Return by how much x_1 … x_T and their limited outputs are beyond their limits, and each change of the input."""
-    values, box = limited(limits, _states(run)[1:], run.states)
+    values, box = stack_limited(limits, _states(run)[1:], run.states)
     changed, rates = np.diff(run.U, axis=0), limits.rates(run.U.shape[1])
     return _excess(values, *box), np.zeros(changed.shape) if rates is None else _excess(changed, *rates)
 
 
-def limited(
+def stack_limited(
     limits: Limits, X: Float[np.ndarray, "M nx"], states: Sequence[str]
 ) -> tuple[Float[np.ndarray, "M n"], Interval]:
     """Return the rows [x; of(x)] of all that limits can be of, and the box of these."""

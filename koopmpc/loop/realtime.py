@@ -75,7 +75,7 @@ class _Stuck(BaseException):
 
 
 class _Watchdog:
-    """Sends the safe input where the loop has not shown up for a while, from a thread of its own."""
+    """Sends the safe input if the loop does not report in time, from a thread of its own."""
 
     def __init__(self, plant: Plant, safe: Float[np.ndarray, " nu"], patience: float, *, main: bool) -> None:
         self.reason = ""
@@ -238,7 +238,7 @@ class _Loop:
     def run(self, end: float) -> None:
         """Step until the end, a signal, the watchdog, or a failure of the plant."""
         k, begin = 0, time.monotonic()
-        while k < end and self._waited(begin + k * self.dt) and self._stepped(k, begin + (k + 1) * self.dt):
+        while k < end and self._wait(begin + k * self.dt) and self._step(k, begin + (k + 1) * self.dt):
             k += 1
             behind = time.monotonic() - begin - k * self.dt
             if behind > 0:
@@ -248,7 +248,7 @@ class _Loop:
                     self._skip(passed)
                 k = due
 
-    def _waited(self, due: float) -> bool:
+    def _wait(self, due: float) -> bool:
         """Wait for a time; return False where a signal or the watchdog ends the loop before."""
         now, dog = time.monotonic, self.dog
         while not (self.told or dog.reason):
@@ -261,7 +261,7 @@ class _Loop:
                 time.sleep(min(left - _SPIN, _NAP))
         return False
 
-    def _stepped(self, k: int, deadline: float) -> bool:
+    def _step(self, k: int, deadline: float) -> bool:
         """Measure, ask the controller, give its input to the plant, and record; return False where the loop ends."""
         dog, row, y, read = self.dog, min(k, self.last), self.y, self.read
         try:
@@ -334,7 +334,7 @@ def _quick_switches() -> Generator[None]:
 def _signals(dog: _Watchdog, told: list[str], *, main: bool) -> Generator[None]:
     """Note the names of SIGTERM and SIGINT, and interrupt a call that the watchdog has given up: in the main thread."""
 
-    def heard(number: int, frame: FrameType | None) -> None:
+    def end(number: int, frame: FrameType | None) -> None:
         if dog.interrupts():
             raise _Stuck
         if not dog.reason:
@@ -343,7 +343,7 @@ def _signals(dog: _Watchdog, told: list[str], *, main: bool) -> Generator[None]:
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)} if main else {}
     try:
         for number in before:
-            signal.signal(number, heard)
+            signal.signal(number, end)
         yield
     finally:
         for number, handler in before.items():

@@ -178,7 +178,7 @@ class StepRows(Value):
         )
 
     @staticmethod
-    def joined(parts: Sequence["StepRows"]) -> "StepRows":
+    def join(parts: Sequence["StepRows"]) -> "StepRows":
         """Return consecutive parts as one, without the last move where the state that it led to is missing."""
         moves = sum(len(part.X) for part in parts) - 1
         whole: dict[str, Any] = {}
@@ -252,7 +252,7 @@ class About(Value):
         """Return these fields as keywords of a Run, or of an About."""
         return {f.name: getattr(self, f.name) for f in fields(About)}
 
-    def tracked(self, nr: int) -> tuple[str, ...]:
+    def name_references(self, nr: int) -> tuple[str, ...]:
         """Return the names of the `nr` outputs that the references belong to."""
         tracked = None if self.cost is None else bind_outputs(self.cost.of, self.states)
         names = self.states if tracked is None else tracked.names

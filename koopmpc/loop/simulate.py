@@ -177,7 +177,7 @@ class _Wiring:
     """The loop that is asked for, checked: plant, controller, and every signal as rows or as a function of (k, rng).
 
     `reference` holds T + 1 + N rows and `measured` T + N, the last one repeated for the preview. `u_reference` are the
-    (T, nu) inputs that hold the reference. A signal that is not asked for is None.
+    (T, nu) inputs that hold the reference. None stands for a signal that is not asked for.
     """
 
     plant: StepMap | Plant
@@ -356,7 +356,7 @@ def _refuse_plan() -> Plan | None:
 
 
 def checked_input(move: Move, nu: int, k: int) -> Float[np.ndarray, " nu"]:
-    """Return the input of what a controller returned at step k; raise where that is no Move, or u not finite."""
+    """Return the input of what a controller returned at step k; raise if the result is not a Move, or u not finite."""
     if type(move) is not Move:
         checks.members(move, "what the controller returned", _MOVE, "return a km.Move")
     u = np.asarray(move.u, dtype=np.float64)

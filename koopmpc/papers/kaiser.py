@@ -9,10 +9,10 @@ Q = R = 1 it is u = −sign(∇H·B) (H − H_r); J = ∫ (H − H_r)² + u² dt
 integration, and beside it sampled at 0.01 s in the library's own loop.
 
 Discovery: `km.identify.eigenfunctions` on one unforced trajectory of the double well (from [0, −2.8], 10 s at 0.01 s),
-monomials to degree 4, by the null space of Γ(x, ẋ) with ẋ from differences of fourth order, as in the paper, and by
-that of ψ(x⁺) − ψ(x). EDMDc on the same monomials is fitted to the paper's forced trajectory, u = 2 sin(0.2πt) sin(2πt),
-held over each sample. The asymmetric well, H = x₂²/2 + x₁⁴/4 − x₁²/2 − a x₁³/3 + a x₁ with a = −¼, and the quartic one,
-H = x₂²/2 + x₁⁴/4, have two inputs, B = I, as in the authors' code.
+with monomials to degree 4. One fit takes the null space of Γ(x, ẋ) with ẋ from differences of fourth order, as in the
+paper; the other takes that of ψ(x⁺) − ψ(x). EDMDc on the same monomials is fitted to the paper's forced trajectory,
+u = 2 sin(0.2πt) sin(2πt), held over each sample. The asymmetric well, H = x₂²/2 + x₁⁴/4 − x₁²/2 − a x₁³/3 + a x₁ with
+a = −¼, and the quartic one, H = x₂²/2 + x₁⁴/4, have two inputs, B = I, as in the authors' code.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.lqr import EigenfunctionLQR
 from koopmpc.data.collect import collect
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import unwarned
+from koopmpc.errors import hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.eigenfunctions import eigenfunctions
 from koopmpc.lifting.base import Lifting
@@ -180,7 +180,7 @@ def _discover_energy(page: Page, claims: list[Claim]) -> Eigenfunction:
     claims.append(
         compare_value("φ from differences, of length 1", [-2 / 3, 2 / 3], unit[exact != 0][:2], 1e-5, digits=5)
     )
-    with unwarned():
+    with hide_fit_warnings():
         model = edmd(forced, LIBRARY)
     H = np.array([make_energy("double well")(e.X)[0, 0] for e in others])
     told = {"EDMDc, H = cᵀz": _predict_energy(model, others, exact)}

@@ -11,8 +11,8 @@ from koopmpc.bench.problem import load_problem
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Noise
-from koopmpc.errors import unwarned
-from koopmpc.figures.eigenvalues import eigenfunctions
+from koopmpc.errors import hide_fit_warnings
+from koopmpc.figures.eigenvalues import eigenfunction_maps
 from koopmpc.figures.reports import CurvePanel, draw_panels
 from koopmpc.figures.style import save
 from koopmpc.identify.fits.edmd import edmd
@@ -70,7 +70,7 @@ def reproduce_williams(page: Page, quick: bool, progress: TellPart) -> list[Clai
     page.picture(
         "eigenfunctions",
         "Eigenfunctions of λ = .9, .8 and .72",
-        partial(save, eigenfunctions(model, [order[k] for k in (1, 2, 4)], (0, 1), ((-2.0, 2.0), (-2.0, 2.0)))),
+        partial(save, eigenfunction_maps(model, [order[k] for k in (1, 2, 4)], (0, 1), ((-2.0, 2.0), (-2.0, 2.0)))),
     )
     steps = np.arange(31)[:, None]
     curves = {"EDMD": (np.real(found) ** steps), "exact": exact**steps}
@@ -172,7 +172,7 @@ def _measure_cost(page: Page, sizes: tuple[int, ...]) -> list[Claim]:
     for nx in sizes:
         rng = np.random.default_rng(nx)
         data = _make_pairs(0.9 * np.linalg.qr(rng.standard_normal((nx, nx)))[0], 120)
-        with unwarned():
+        with hide_fit_warnings():
             full, first = _time_fit(lambda data=data: edmd(data, _monomials(4)))
             kernel, second = _time_fit(lambda data=data: kernel_edmd(data, "polynomial", degree=4))
         for name, value in zip(times, (first, second), strict=True):
@@ -203,7 +203,7 @@ def _measure_landmarks(page: Page) -> list[Claim]:
     train, test = _collect_sampled_duffing(100, 20), _collect_sampled_duffing(50, 20, seed=1)
     errors: list[float] = []
     for m in LANDMARKS:
-        with unwarned():
+        with hide_fit_warnings():
             model = kernel_edmd(train, "gaussian", width=1.0, landmarks=m, ridge=1e-12)
         missed = np.concatenate([model.rollout(e.X[0], np.empty((10, 0)))[-1] - e.X[10] for e in test])
         errors.append(float(np.linalg.norm(missed) / np.linalg.norm([e.X[10] for e in test])))
@@ -364,7 +364,7 @@ def _centers(lifting: Lifting) -> np.ndarray:
 
 
 def _fit_gaussians(data: Episodes, centers: np.ndarray, width: float) -> LinearPredictor:
-    with unwarned():
+    with hide_fit_warnings():
         return edmd(data, _make_lifting(centers, width), ridge=RIDGE)
 
 

@@ -36,7 +36,7 @@ from koopmpc.control.linear.koopman_mpc import KoopmanMPC, LinearMPC
 from koopmpc.control.move import Status
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import unwarned
+from koopmpc.errors import hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.radial import ThinPlate
 from koopmpc.lifting.state import Expressions, State
@@ -104,7 +104,7 @@ def reproduce_van_der_pol(page: Page, quick: bool, progress: TellPart) -> list[C
         data = _collect_data(plant, np.random.default_rng(seed), 100 if quick else 1000, 200)
         centers = np.random.default_rng(1000 + seed).uniform(-1, 1, (SIZES[-1], 2))
         for j, size in enumerate(SIZES):
-            with unwarned():
+            with hide_fit_warnings():
                 model = edmd(data, State() + ThinPlate(centers[:size]))
             errors[seed, j] = _mean_error(model, truth)
     assert model is not None
@@ -220,7 +220,7 @@ class Loop(NamedTuple):
     time: float
 
     @property
-    def solved(self) -> int:
+    def kept_limits(self) -> int:
         """Number of steps whose plan kept every limit."""
         return sum(status in SOLVED for status in self.statuses)
 
@@ -255,7 +255,7 @@ def reproduce_motor(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
                 case,
                 name,
                 f"{one.cost:.3f}",
-                f"{one.solved} of {STEPS}",
+                f"{one.kept_limits} of {STEPS}",
                 f"{np.abs(one.y).max():.4f}",
                 f"{1e3 * one.time:.2g} ms",
             )
@@ -279,7 +279,7 @@ def reproduce_motor(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
         draw_curves(page, name, caption, DT, ("speed y", "field u"), curves)
     totals = [one.cost for one in steps]
     spread = f"{min(totals):.3f} to {max(totals):.3f}" if seeds > 1 else f"{totals[0]:.3f}"
-    widest, worst = max(float(np.abs(one.y).max()) for one in turns), min(one.solved for one in turns)
+    widest, worst = max(float(np.abs(one.y).max()) for one in turns), min(one.kept_limits for one in turns)
     return [
         judge_claim(
             "motor, step: cost",
@@ -355,7 +355,7 @@ def _fit_motor(plant: StepMap, seed: int, episodes: int) -> LinearPredictor:
     """Fit thin plates on ζ = [y_k, u_k₋₁, y_k₋₁] to the speed and the input."""
     rng = np.random.default_rng(seed)
     data = _collect_data(plant, rng, episodes, 1000, first=1)
-    with unwarned():
+    with hide_fit_warnings():
         return edmd(data, State() + ThinPlate(rng.uniform(-1, 1, (100, 3))), embedding=Delay(1))
 
 
@@ -365,7 +365,7 @@ def reproduce_kdv(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     problem = load_problem("kdv")
     plant = discretize(problem.dynamics, problem.dt, problem.integrator)
     data = _collect_waves(40 if quick else 1000, plant.states, plant.inputs)
-    with unwarned():
+    with hide_fit_warnings():
         model = edmd(data, problem.lifting, ridge=1e-9)
     progress("Korteweg–de Vries: closed loop")
     steps = round((5.0 if quick else SECONDS) / DT)

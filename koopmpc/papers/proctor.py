@@ -14,7 +14,7 @@ from koopmpc.control.lqr import lqr
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Noise
-from koopmpc.errors import FitWarning, unwarned
+from koopmpc.errors import FitWarning, hide_fit_warnings
 from koopmpc.identify.fits.dmd import dmd, dmdc
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.fits.kic import InputPredictor, kic
@@ -211,7 +211,7 @@ def reproduce_kic(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     progress("three kinds of input")
     claims: list[Claim] = []
     data = {kind: _collect_inputs(law) for kind, law in LAWS.items()}
-    with unwarned():
+    with hide_fit_warnings():
         found = {kind: kic(each, LIFTING, inputs=cast("Any", kind)) for kind, each in data.items()}
     page.text(
         "## K",

@@ -7,7 +7,7 @@ import numpy as np
 
 from koopmpc.data.collect import collect
 from koopmpc.data.excitation import Noise
-from koopmpc.errors import unwarned
+from koopmpc.errors import hide_fit_warnings
 from koopmpc.figures.series import reconstruction
 from koopmpc.figures.style import save
 from koopmpc.identify.fits.dmd import dmd, dmdc
@@ -121,7 +121,7 @@ def reproduce_snyder(page: Page, quick: bool, progress: TellPart) -> list[Claim]
     add_opening(page, [*said, *shown, *warned], change, others)
     page.text("## What the paper says in words")
     add_verdicts(page, said)
-    numbers(page, settings, fits, shown)
+    tabulate_figures(page, settings, fits, shown)
     pictures(page, settings, fits)
     appendix_dmdc(page, settings["pendulum"], settings["pendulum-lqr"])
     add_variants(page, settings, fits)
@@ -322,7 +322,7 @@ def add_opening(page: Page, claims: Sequence[Claim], change: float, others: int)
     )
 
 
-def numbers(page: Page, settings: Mapping[str, Setting], fits: Fits, claims: Sequence[Claim]) -> None:
+def tabulate_figures(page: Page, settings: Mapping[str, Setting], fits: Fits, claims: Sequence[Claim]) -> None:
     """Add a table with a line for each figure, trajectory and rank: the paper's claim, the verdict and the reason."""
     page.text("## The figures, in numbers")
     rows: list[tuple[object, ...]] = []
@@ -426,7 +426,7 @@ def appendix_dmdc(page: Page, free: Setting, driven: Setting) -> None:
     other = collect(plant, driven.x0, Noise(-1.0, 1.0, hold=20), episodes=1, steps=driven.steps, rng=1)
     B = plant.linearize([0.0, 0.0], [0.0]).B
     page.text("### Appendix: DMDc of the pendulum", DMDC)
-    with unwarned():
+    with hide_fit_warnings():
         models = {
             "DMD, uncontrolled": (dmd(free.trajectory), free.trajectory),
             "DMDc, LQR data": (dmdc(fed), fed),

@@ -17,7 +17,7 @@ from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.excitation import Feedback, Noise
-from koopmpc.errors import unwarned
+from koopmpc.errors import hide_fit_warnings
 from koopmpc.figures.series import runs as plot_runs
 from koopmpc.figures.style import save
 from koopmpc.identify.fits.dmd import dmd, dmdc
@@ -128,7 +128,7 @@ def predict_held_out(setting: Setting, shaking: Excitement, episodes: int) -> di
     feedback = centre_episodes(collect(plant, starts, law, episodes=10, steps=200, rng=1), x_ref)
     excited = centre_episodes(_collect_excited(plant, x_ref, K, shaking, episodes=10, steps=200, seed=2), x_ref)
     B = plant.linearize(x_ref, np.zeros(plant.nu)).B
-    with unwarned():
+    with hide_fit_warnings():
         models = {
             "DMD, feedback data": dmd(one),
             "DMDc, feedback data": dmdc(one),
@@ -249,7 +249,7 @@ def prepare_contest(title: str, steps: int, horizon: int, episodes: int) -> Cont
     plant = discretize(task.dynamics, DT, RK4(4))
     K = None if task.K is None else design_feedbacks()[task.K]
     data = _collect_excited(plant, task.x_eq, K, task.shaking, episodes=episodes, steps=round(LASTING / DT))
-    with unwarned():
+    with hide_fit_warnings():
         models = {name: edmd(data, lifting) for name, lifting in LIFTINGS.items()}
     return Contest(title, plant, models, steps, horizon)
 

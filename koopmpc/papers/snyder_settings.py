@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import unwarned
+from koopmpc.errors import hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.fourier import Fourier
@@ -107,7 +107,7 @@ def fit_reconstruction(
     s = np.linalg.svd(bound(episode.X[:-1]), compute_uv=False)
     full = int(np.sum(s > CUT * s[0]))
     kept = full if rank is None else min(rank, full)
-    with unwarned():
+    with hide_fit_warnings():
         model = edmd(trajectory, bound, rank=kept)
     X = predict_episode(model, episode)
     share = np.abs(amplitudes(model, episode.X[0])) * np.linalg.norm(model.modes, axis=0)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from koopmpc.data.episodes import Episodes
-from koopmpc.figures.eigenvalues import eigenfunctions
+from koopmpc.figures.eigenvalues import eigenfunction_maps
 from koopmpc.figures.reports import CurvePanel, draw_panels
 from koopmpc.figures.series import reconstruction
 from koopmpc.figures.style import save
@@ -180,7 +180,7 @@ def add_equations(page: Page, setting: Setting, fits: Fits) -> None:
     left, right = compare_sides(setting.trajectory, OBSERVABLES["EDMD monomials 3"])
     page.text(SIDES.format(left=percent(left), right=percent(right)))
     fit = fits["pendulum"]["EDMD monomials 3", True]
-    made = eigenfunctions(fit.model, fit.leading, (0, 1), ((-1.0, 1.0), (-2.0, 2.0)))
+    made = eigenfunction_maps(fit.model, fit.leading, (0, 1), ((-1.0, 1.0), (-2.0, 2.0)))
     page.picture("pendulum-eigenfunctions", "Pendulum, monomials 3: the leading eigenfunction", partial(save, made))
 
 

@@ -207,7 +207,7 @@ class Graph(Value):
         return [(step, OPERATIONS.get(step), *place) for step, place in rows]
 
     def _walk(self, inputs: Any, scratch: list[np.ndarray] | None) -> Iterator[tuple[int, Any]]:
-        """Yield (result, value) for each output: numpy columns in `scratch`, or symbols if `scratch` is None."""
+        """Yield (result, value) for each output: numpy columns in `scratch`, or symbols without it."""
         registers: dict[int, Any] = {}
         for step, operation, target, first, second in self._program:
             if operation is not None:

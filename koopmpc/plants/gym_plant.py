@@ -96,7 +96,7 @@ class GymPlant:
         return None if self._x is None else self._x.copy()
 
     def reset(self, x0: ArrayLike | None, rng: np.random.Generator | int = 0) -> Float[np.ndarray, " nx"]:
-        """Begin an episode at x0 (nx,) and return y (nx,); if x0 is None, the environment draws its start by `rng`.
+        """Begin an episode at x0 (nx,) and return y (nx,); without x0 the environment draws its start by `rng`.
 
         Raises
         ------

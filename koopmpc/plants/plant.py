@@ -56,7 +56,7 @@ class Plant(Sampled, Protocol):
         ...
 
     def reset(self, x0: ArrayLike | None, rng: np.random.Generator | int) -> np.ndarray:
-        """Begin an episode at x0 (nx,), or in the plant's present state if x0 is None, and return y (ny,)."""
+        """Begin an episode at x0 (nx,), or without x0 in the plant's present state, and return y (ny,)."""
         ...
 
     def step(self, u: ArrayLike) -> np.ndarray:

@@ -189,7 +189,7 @@ class Predictor(Value):
     def rest_point(self, x: ArrayLike) -> Float[np.ndarray, " npoint"]:
         """Return the point ζ of a plant that has rested in x without input; without an embedding it is x itself."""
         state = checks.array(x, "x", (self.nx,))
-        return state if self.embedding is None else self.embedding.held(state, np.zeros(self.nu))
+        return state if self.embedding is None else self.embedding.repeat(state, np.zeros(self.nu))
 
     def embed(self, episodes: Episodes) -> Episodes:
         """Return the episodes of points ζ, the states first in each row; without an embedding, the same episodes."""

@@ -41,7 +41,8 @@ VIEW = "koopmpc.View"  # components that plots alone show, beside the numbers of
 LOG_TIME = "log10_seconds"  # the one of them that solver/time_ms and solver/deadline_ms have
 _WIDEST = 3.0  # largest half width of the picture of eigenvalues
 _CLOSE = 0.35  # share of the picture below which the eigenvalues get one of their own
-_BELOW, _ABOVE = 1e-2, 1e1  # residuals of the darkest and the lightest shade, over the tolerance
+_BELOW = 1e-2  # residual over tolerance that gets the darkest shade
+_ABOVE = 1e1  # residual over tolerance that gets the lightest shade
 _LIGHT = 0.85  # share of the colour scale in use; the rest is too light for points
 
 _STATUS_COLORS: dict[Status, Color] = {
@@ -74,14 +75,14 @@ class Panel:
     measured: list[int]
     limits: list[_Limit]
 
-    def called(self, what: str, names: Sequence[str]) -> list[str]:
+    def label(self, what: str, names: Sequence[str]) -> list[str]:
         """Return the names of curves that say `what` of these states; where there is one state it goes without."""
         return [what if len(self.states) == 1 else f"{name}, {what}" for name in names]
 
 
 def panels(about: About, nr: int) -> list[Panel]:
     """Return a plot a state, or one plot for all of many states."""
-    tracked, places, limits = about.tracked(nr), range(len(about.states)), state_limits(about)
+    tracked, places, limits = about.name_references(nr), range(len(about.states)), state_limits(about)
     if len(about.states) > SEPARATE:
         return [Panel("plots/states", "States", [*places], [*range(nr)], [*range(len(about.outputs))], limits)]
     return [
@@ -102,7 +103,7 @@ def styles(about: About, nr: int, horizon: int) -> dict[str, Any]:
     stages = ahead(horizon)
     found = {
         "state": _lines(about.states, [color(i) for i in range(len(about.states))], 2.0),
-        "reference": _lines([f"{name}, reference" for name in about.tracked(nr)], REFERENCE, 1.5),
+        "reference": _lines([f"{name}, reference" for name in about.name_references(nr)], REFERENCE, 1.5),
         "measurement": _points([f"{name}, measured" for name in about.outputs], _MEASURED, 1.5),
         "control/u": _lines(
             about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, interpolation_mode="StepAfter"
@@ -114,9 +115,9 @@ def styles(about: About, nr: int, horizon: int) -> dict[str, Any]:
     }
     found |= {f"plots/u/ahead/{j}": _points(["prediction"] * len(about.inputs), _PREDICTION, 1.6) for j in stages}
     for panel in panels(about, nr):
-        limits = panel.called("limits", [name for name, _ in panel.limits])
+        limits = panel.label("limits", [name for name, _ in panel.limits])
         found[f"{panel.entity}/limits"] = _lines(limits, LIMIT, 1.0)
-        predicted = panel.called("prediction", [about.states[i] for i in panel.states])
+        predicted = panel.label("prediction", [about.states[i] for i in panel.states])
         points = _points(predicted, _PREDICTION, 1.6)
         found |= {f"{panel.entity}/ahead/{j}": points for j in stages}
     return found
@@ -202,7 +203,7 @@ def _alone(style: Any, component: str) -> Any:
     return style.visualizer(mappings=[to])
 
 
-def _shown(panel: Panel) -> dict[str, list[Any]]:
+def _draw_panel(panel: Panel) -> dict[str, list[Any]]:
     """Return what the plot of a panel draws of the state, the reference and the measurement, by entity."""
     lines = {
         "/state": [(i, _lines([panel.title], color(i), 2.0)) for i in panel.states],
@@ -236,7 +237,7 @@ def blueprint(
     import rerun.blueprint as rrb
 
     def plot(entity: str, name: str, drawn: Mapping[str, list[Any]], axis_y: Any) -> Any:
-        """Return the plot of an entity and of others, `drawn` as they are told to be, or else as they are."""
+        """Return the plot of an entity and of others, those in `drawn` with the style that it gives them."""
         told = {other: looks for other, looks in drawn.items() if looks}
         return rrb.TimeSeriesView(
             titlebar=roomy,
@@ -251,7 +252,7 @@ def blueprint(
     rows = panels(about, nr)
     roomy = len(rows) < _CROWDED  # else the legends alone name the states, and the plots get the room of the titles
     axes = [readable(spans.get(row.entity, []), _TICKS[roomy]) for row in rows]
-    parts = [_shown(row) for row in rows]
+    parts = [_draw_panel(row) for row in rows]
     shown = [plot(row.entity, row.title, part, axis) for row, axis, part in zip(rows, axes, parts, strict=True)]
     inputs = f"Input: {about.inputs[0]}" if len(about.inputs) == 1 else "Inputs"
     bounds = readable([v for _, v in input_limits(about)], _TICKS[roomy])
@@ -272,10 +273,10 @@ def blueprint(
     if extent is not None:  # without an animation the plots get the room
         right, shares = rrb.Vertical(_animation(extent), right, row_shares=[3.0, 2.0]), [1.0, 1.0]
     title = rrb.TextDocumentView(origin="title", name="Run", titlebar=False)
-    return framed(rrb.Vertical(title, rrb.Horizontal(left, right, column_shares=shares), row_shares=[1.0, 18.0]))
+    return frame_views(rrb.Vertical(title, rrb.Horizontal(left, right, column_shares=shares), row_shares=[1.0, 18.0]))
 
 
-def framed(views: Any) -> Any:
+def frame_views(views: Any) -> Any:
     """Return the layout of a log: `views` over the timeline sim_time, all other panels out of the way."""
     import rerun.blueprint as rrb
 

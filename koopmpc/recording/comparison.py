@@ -16,7 +16,7 @@ from koopmpc.recording.blueprint import (
     REFERENCE,
     color,
     draw_line,
-    framed,
+    frame_views,
     input_limits,
     readable,
     shared_time,
@@ -73,7 +73,7 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
         rrb.TextDocumentView(origin="metrics", name="Metrics"),
         column_shares=[2.0, 1.0],
     )
-    with file_recording(path, "koopmpc-comparison", framed(layout)) as rec:
+    with file_recording(path, "koopmpc-comparison", frame_views(layout)) as rec:
         rec.send_recording_name(drawable(" against ".join(names)))
         for entity, title, curves in plots:
             for r, (run, values) in enumerate(zip(runs, curves, strict=True)):
@@ -126,7 +126,7 @@ def _marks(runs: Sequence[Run], title: str) -> list[tuple[str, Any, np.ndarray, 
     """Return the references and limits of a plot: name, colour, values, sample time; those that are equal once."""
     found: dict[bytes, tuple[str, Any, np.ndarray, float]] = {}
     for run in runs:
-        tracked = run.tracked(run.reference.shape[1])
+        tracked = run.name_references(run.reference.shape[1])
         if title in tracked:
             values = run.reference[:, tracked.index(title)]
             key = b"r" + (values[:1] if np.ptp(values) == 0 else values).tobytes()

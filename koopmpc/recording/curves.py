@@ -12,7 +12,7 @@ from koopmpc import checks
 from koopmpc.errors import DataError
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.page import Curves
-from koopmpc.recording.blueprint import color, draw_line, framed, write_page
+from koopmpc.recording.blueprint import color, draw_line, frame_views, write_page
 from koopmpc.recording.description import drawable
 from koopmpc.recording.rrd import file_recording
 
@@ -77,7 +77,7 @@ def _blueprint(tabs: Sequence[Curves], slugs: Sequence[str]) -> Any:
         ]
         return rrb.Vertical(*views, name=drawable(tab.title))
 
-    return framed(
+    return frame_views(
         rrb.Horizontal(
             rrb.Tabs(*(plots(tab, slug) for tab, slug in zip(tabs, slugs, strict=True))),
             rrb.TextDocumentView(origin="page", name="Report"),

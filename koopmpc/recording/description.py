@@ -140,7 +140,7 @@ def metrics_to_markdown(metrics: Metrics, about: About, nr: int) -> str:
 
 def table_figures(metrics: Metrics, about: About, nr: int) -> dict[str, str]:
     """Return the metrics in words by their names, with the unit of the effort and the statuses in words."""
-    figures = metrics.figures(about.tracked(nr))
+    figures = metrics.figures(about.name_references(nr))
     statuses = [f"{n} {STATUS_WORDS.get(Status[name], name)}" for name, n in metrics.status.items()]
     fallbacks = [f"{n} {name.lower().replace('_', ' ')}" for name, n in metrics.fallback.items() if name != "NONE"]
     figures |= {"status": ", ".join(statuses), "fallback": ", ".join(fallbacks) or "none"}
@@ -212,9 +212,9 @@ _UNKNOWN = "?"
 
 def drawable(text: str) -> str:
     """Return `text` with other spellings of signs that the viewer's font lacks: 𝜓 is ψ, Uᵀ is U^T, the rest "?"."""
-    return "".join(sign if sign in _HELD else _spelled(sign) for sign in text)
+    return "".join(sign if sign in _HELD else _spell(sign) for sign in text)
 
 
-def _spelled(sign: str) -> str:
+def _spell(sign: str) -> str:
     plain = _WORDS.get(sign) or unicodedata.normalize("NFKC", sign)
     return plain if _HELD.issuperset(plain) else _UNKNOWN

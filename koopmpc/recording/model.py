@@ -22,7 +22,7 @@ from koopmpc.recording.blueprint import (
     color,
     draw_eigenvalues,
     eigenvalue_views,
-    framed,
+    frame_views,
     plane_view,
     shared_time,
     write_page,
@@ -39,7 +39,7 @@ from koopmpc.validate.scoring import AnyPredictor, Score, score
 _TRUTH: Color = (225, 228, 232)
 _PREDICTED = color(0)
 _BAND: Color = (70, 125, 185)
-_ESCAPED, _BEFORE = re.compile(r"([*_`])"), r"\\\1"  # signs that Markdown would read as style
+_STYLE_SIGNS = re.compile(r"([*_`])")  # Markdown would read these signs as style: each gets a backslash
 _SHOWN = 6  # plots of states in one column
 _EIGENFUNCTIONS = 2  # drawn unless told
 _FORMAT = "koopmpc-model-1"
@@ -254,7 +254,7 @@ def _page(predictor: AnyPredictor, report: TrustReport | None, note: str) -> str
         "",
     ]
     table = format_markdown_table(
-        ("model", ""), [(key, _ESCAPED.sub(_BEFORE, value)) for key, value in _facts(predictor).items()]
+        ("model", ""), [(key, _STYLE_SIGNS.sub(r"\\\1", value)) for key, value in _facts(predictor).items()]
     )
     return "\n".join([*lines, table])
 
@@ -309,7 +309,7 @@ def _blueprint(
     if surface is not None:
         views = [_picture_view(entity, title, surface) for entity, title, _ in pictures]
         rows.append(rrb.Grid(*views, grid_columns=min(len(views), 2)))
-    return framed(
+    return frame_views(
         rrb.Horizontal(
             left, rrb.Vertical(*rows, text, row_shares=[*[3.0, 4.0][: len(rows)], 3.0]), column_shares=[1.0, 1.2]
         )

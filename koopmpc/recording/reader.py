@@ -82,12 +82,12 @@ class LogColumns:
         gaps = np.flatnonzero(k != np.arange(len(k)))
         return values[: gaps[0]] if len(gaps) else values
 
-    def held(self, entity: str, component: str, column: np.ndarray) -> np.ndarray:
+    def fill(self, entity: str, component: str, column: np.ndarray) -> np.ndarray:
         """Return `column`, with the numbers of this component in the rows that have one."""
         k, widths, values = self.rows(entity, component)
-        return _filled(column, k[widths > 0], np.array(values))
+        return _fill(column, k[widths > 0], np.array(values))
 
-    def changed(self) -> list[str]:
+    def find_changed(self) -> list[str]:
         """Return the columns that differ from the checksums at the end of the log."""
         sums: dict[str, int] = json.loads(self.static(Entity.METRICS, "sums"))
         places: dict[str, int] = json.loads(self.static(Entity.METRICS, "places") or "{}")  # older logs have none
@@ -107,7 +107,7 @@ def _bytes(values: Any) -> Any:
     return np.ascontiguousarray(values).data
 
 
-def _filled(rows: np.ndarray, k: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _fill(rows: np.ndarray, k: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return a copy of `rows` with these values in its rows k; what lies beyond its end is left out."""
     found, inside = rows.copy(), k < len(rows)
     found[k[inside]] = values[inside]
@@ -133,7 +133,7 @@ def read_columns(path: Path, entities: tuple[str, ...]) -> LogColumns:
     except LogError:
         raise
     except Exception as error:  # Rerun's reader raises exceptions of many kinds
-        raise LogError(f"{path} is no log, or is damaged: {error}") from error
+        raise LogError(f"{path} is not a log, or is damaged: {error}") from error
 
 
 @contextmanager
@@ -173,8 +173,8 @@ def _run(log: LogColumns, path: Path) -> Run:
     about, planned_steps = about_of(log, path)
     X, reference = log.vectors(Entity.STATE), log.vectors(Entity.REFERENCE)
     U = log.vectors(Entity.INPUT)
-    seconds = log.held(Entity.SOLVER, "seconds", log.vectors(Entity.SOLVER).reshape(-1) / 1e3)
-    iterations = log.held(Entity.SOLVER, "iterations", np.zeros(len(seconds), dtype=np.int64))
+    seconds = log.fill(Entity.SOLVER, "seconds", log.vectors(Entity.SOLVER).reshape(-1) / 1e3)
+    iterations = log.fill(Entity.SOLVER, "iterations", np.zeros(len(seconds), dtype=np.int64))
     counts = [len(X) - 1, len(seconds)]
     counts += [len(U)] if about.inputs else []
     counts += [len(reference) - 1] if len(reference) else []
@@ -193,12 +193,12 @@ def _run(log: LogColumns, path: Path) -> Run:
         )
     elif end is None or log.torn:
         warnings.warn(f"{path}: its end is cut, all {steps} steps are there", UserWarning, stacklevel=3)
-    if end == steps and (changed := log.changed()):
+    if end == steps and (changed := log.find_changed()):
         raise LogError(f"{path} is damaged: {', '.join(changed)} no longer hold what was written; take another copy")
     status, fallback = _statuses(log, steps, path)
     return Run(
         X=X[: steps + 1],
-        Y=_measured(log, X)[: steps + 1],
+        Y=_read_measurements(log, X)[: steps + 1],
         U=U[:steps] if len(U) else np.empty((steps, 0)),
         reference=reference[: steps + 1] if len(reference) else np.empty((steps + 1, 0)),
         status=status,
@@ -225,19 +225,19 @@ def about_of(log: LogColumns, path: Path) -> tuple[About, int | None]:
         raise LogError(f"{path} is damaged or of another version: {error}") from error
 
 
-def _measured(log: LogColumns, X: np.ndarray) -> np.ndarray:
+def _read_measurements(log: LogColumns, X: np.ndarray) -> np.ndarray:
     """Return the measurements: the states, except in the rows that were written separately."""
     k, values = log.matrix(Entity.MEASUREMENT)
     if not len(k):
         return X.copy()
-    return _filled(X, k, values) if values.shape[1] == X.shape[1] else values
+    return _fill(X, k, values) if values.shape[1] == X.shape[1] else values
 
 
 def _sparse(log: LogColumns, entity: str, steps: int, width: int, absent: float = 0.0) -> np.ndarray:
     """Return the rows of an entity, `absent` where no row was written."""
     k, values = log.matrix(entity)
     held = np.full((steps, width), absent)
-    return _filled(held, k, values) if len(k) else held
+    return _fill(held, k, values) if len(k) else held
 
 
 def _statuses(log: LogColumns, steps: int, path: Path) -> tuple[tuple[Status, ...], tuple[Fallback, ...]]:
@@ -277,7 +277,7 @@ def _plans(log: LogColumns, steps: int) -> Plans | None:
         if width is None or not len(k):
             return None
         whole = np.full((steps, values.shape[1] // width, width), np.nan)
-        parts.append(_filled(whole, k, values.reshape(-1, *whole.shape[1:])))
+        parts.append(_fill(whole, k, values.reshape(-1, *whole.shape[1:])))
     return Plans(*parts)
 
 

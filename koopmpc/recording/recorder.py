@@ -52,7 +52,7 @@ class BackgroundWriter:
         closing = False
         while not closing:
             closing = self._closing.wait(_BATCH)  # the thread looks at the queue five times a second
-            steps = last + self._drained()
+            steps = last + self._drain()
             if self._failure is not None:
                 continue
             try:
@@ -64,14 +64,14 @@ class BackgroundWriter:
                     writer.flush()
                 if closing:
                     whole = sum(len(part.X) for part in written) > 1
-                    columns = StepRows.joined(written).columns() if whole else {}
+                    columns = StepRows.join(written).columns() if whole else {}
                     writer.end(Run(**columns, **self._about.about()) if whole else None)
             except Exception as error:  # whatever a scene, a disk or a viewer raises must not reach the loop
                 self._failure = error
         if self._failure is not None:
             writer.discard()
 
-    def _drained(self) -> list[Step]:
+    def _drain(self) -> list[Step]:
         """Return the steps that are in the queue now."""
         steps: list[Step] = []
         while True:
@@ -81,7 +81,8 @@ class BackgroundWriter:
                 return steps
 
 
-_PATIENCE_FILE, _PATIENCE_VIEWER = 60.0, 5.0  # longest wait at the end [s]
+_PATIENCE_FILE = 60.0  # longest wait at the end for a file [s]
+_PATIENCE_VIEWER = 5.0  # longest wait at the end for a viewer [s]
 
 
 class Recorder:
@@ -155,11 +156,11 @@ class Recorder:
         if self._live:
             quiet()
         if self._path is not None:
-            self._writers[str(self._path)] = self._opened(self._path, None)
+            self._writers[str(self._path)] = self._start_writer(self._path, None)
         if self._live:
             viewer = find_viewer(self._port)
             if viewer is not None:
-                self._writers[viewer] = self._opened(None, viewer)
+                self._writers[viewer] = self._start_writer(None, viewer)
             else:
                 kept = "the log is written all the same" if self._path else "nothing is recorded"
                 warnings.warn(f"{why_none(self._port)}; {kept}", UserWarning, stacklevel=2)
@@ -170,7 +171,7 @@ class Recorder:
         """Queue a copy of one step for each writer; this returns within microseconds."""
         if not self._open:
             raise DataError("the Recorder is not open; call it inside `with Recorder(...) as recorder:`")
-        own = step if step.own else _copied(step)
+        own = step if step.own else _copy(step)
         for writer in self._writers.values():
             writer.put(own)
 
@@ -192,7 +193,7 @@ class Recorder:
                 warnings.warn(f"the viewer {closed} before the end; {kept}", UserWarning, stacklevel=2)
         self._writers = {}
 
-    def _opened(self, path: Path | None, viewer: str | None) -> BackgroundWriter:
+    def _start_writer(self, path: Path | None, viewer: str | None) -> BackgroundWriter:
         writer = Writer(self._about, path=path, viewer=viewer, scene=self._scene, model=self._model, growing=True)
         return BackgroundWriter(self._about, writer)
 
@@ -200,7 +201,7 @@ class Recorder:
 _ARRAYS = ("y", "u", "reference", "x", "x_next", "y_next", "reference_next", "u_reference")
 
 
-def _copied(step: Step) -> Step:
+def _copy(step: Step) -> Step:
     """Return `step` with arrays of its own: a loop may write into its arrays again."""
     plan = step.plan
     kept = None if plan is None else Plan(_floats(plan.X), _floats(plan.U))

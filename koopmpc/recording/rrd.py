@@ -28,16 +28,22 @@ from koopmpc import disk
 from koopmpc.errors import LogError
 from koopmpc.interrupts import defer_interrupts
 
-_MARK, _BLANK = b"koopmpc-crc32:", b"x7k2q9zp"
+_MARK = b"koopmpc-crc32:"  # stands before the checksum of a file
+_BLANK = b"x7k2q9zp"  # holds the place of the checksum until the file is closed
 _CHECK = re.compile(rb"koopmpc-crc32:([0-9a-f]{8})")
 _PIECE = 1 << 20  # bytes
 _CLOSING = 10.0  # longest wait for the thread to end once Rerun has closed the pipe [s]
 _WRITING = 10.0  # longest wait for a file that is written at once [s]
 _PIPES = Path("/dev/fd")  # where a process opens a pipe of its own by name; Windows has no such folder
-_MAGIC, _FOOTER = b"RRF2", b"RRF2FOOT"  # a closed file ends with the second and 4 bytes more
-_FILE_HEADER, _MESSAGE_HEADER, _END, _LAST_KIND = 12, 16, 0, 3
+_MAGIC = b"RRF2"  # first bytes of a file
+_FOOTER = b"RRF2FOOT"  # a closed file ends with these and 4 bytes more
+_FILE_HEADER = 12  # bytes before the first message
+_MESSAGE_HEADER = 16  # bytes: kind and length of a message
+_END = 0  # kind of the message that ends a file
+_LAST_KIND = 3  # largest kind of a message
 _REFUSED = 3  # exit code of a child whose reader said why
-_READING, _RATE = 60.0, 1e6  # [s], and [bytes/s] on top of it, for a child to read a file
+_READING = 60.0  # longest wait for a child that reads an empty file [s]
+_RATE = 1e6  # a child that reads slower than this ends in an error [bytes/s]
 
 # What follows the checksum keeps the compression of a chunk from taking its last digits for a repetition.
 CHECK = (_MARK + _BLANK).decode() + "~Qj5wK"
@@ -74,7 +80,7 @@ class LogFile:
                 self.part = self.path.with_name(f"{self.path.name}{disk.PART}") if self.path.exists() else self.path
             self._file: BinaryIO = self.part.open("wb", buffering=0)
         except OSError as error:
-            raise disk.refused(self.path, error) from error
+            raise disk.explain_failure(self.path, error) from error
         self._failure: OSError | None = None
         self._sum = self._length = 0
         self._place: int | None = None  # of the checksum
@@ -100,7 +106,7 @@ class LogFile:
     def check(self) -> None:
         """Raise LogError where something could not be written."""
         if self._failure is not None:
-            raise disk.refused(self.path, self._failure) from self._failure
+            raise disk.explain_failure(self.path, self._failure) from self._failure
 
     def close(self) -> None:
         """Finish the file, once the recording is disconnected.
@@ -111,7 +117,7 @@ class LogFile:
             Something could not be written.
         """
         try:
-            self._ended()
+            self._join()
             self.check()
             if self._place is not None:
                 self._file.seek(self._place)
@@ -120,7 +126,7 @@ class LogFile:
                 disk.settle(self.part, self.path, self._file.fileno())
         except OSError as error:
             self.discard()
-            raise error if isinstance(error, LogError) else disk.refused(self.path, error) from error
+            raise error if isinstance(error, LogError) else disk.explain_failure(self.path, error) from error
         except BaseException:
             self.discard()
             raise
@@ -129,12 +135,12 @@ class LogFile:
     def discard(self) -> None:
         """Give up: a growing file is left as far as it was written, any other is removed."""
         with suppress(OSError):
-            self._ended()
+            self._join()
             self._file.close()
         if self.part.is_file() and not (self.growing and self._length):
             self.part.unlink(missing_ok=True)
 
-    def _ended(self) -> None:
+    def _join(self) -> None:
         if self._thread is not None:
             self._thread.join(_CLOSING)
             if self._thread.is_alive():
@@ -246,7 +252,7 @@ def check_log(path: Path) -> None:
     except OSError as error:
         raise LogError(f"{path} cannot be read: {error.strerror}") from error
     if start != _MAGIC:
-        raise LogError(f"{path} is no log of koopmpc: it does not start as an .rrd file does")
+        raise LogError(f"{path} is not a log of koopmpc: it does not start as an .rrd file does")
 
 
 class Column(NamedTuple):
@@ -365,11 +371,11 @@ def _read_in_child(path: Path, entities: tuple[str, ...], told: Path) -> list[Co
     except subprocess.TimeoutExpired as error:
         raise LogError(f"{told} is damaged: reading it did not end within {patience:.0f} s") from error
     if done.returncode == _REFUSED:
-        raise LogError(f"{told} is no log, or is damaged: {done.stdout.decode(errors='replace')}")
+        raise LogError(f"{told} is not a log, or is damaged: {done.stdout.decode(errors='replace')}")
     if done.returncode:
         raise LogError(f"{told} is damaged, beyond what can be read: the process that read it ended on it")
     try:
-        return list(_received(done.stdout))
+        return list(_read_batches(done.stdout))
     except (pa.ArrowException, KeyError, IndexError) as error:
         raise LogError(f"{told} is damaged: {error}") from error
 
@@ -385,7 +391,7 @@ def _send(columns: Sequence[Column], out: Any) -> None:
             stream.write_batch(batch)
 
 
-def _received(data: bytes) -> Iterator[Column]:
+def _read_batches(data: bytes) -> Iterator[Column]:
     import pyarrow as pa
 
     source = pa.BufferReader(data)
@@ -405,7 +411,7 @@ def _main() -> int:
     path, *entities = sys.argv[1:]
     try:
         columns = _read_here(Path(path), tuple(entities))
-    except BaseException as error:  # a panic of Rerun's reader is no Exception
+    except BaseException as error:  # a panic of the reader in Rerun derives from BaseException alone
         out.write(str(error).partition("\n")[0].encode())
         out.flush()
         return _REFUSED

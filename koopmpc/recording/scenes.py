@@ -60,7 +60,7 @@ def drawing_of(kind: type[Shape] | None, rows: Sequence[Sequence[tuple[Shape, Co
             columns = rr.Boxes3D.columns(
                 centers=_rows(3, [s.center for s in shapes]),
                 half_sizes=_rows(3, [s.size for s in shapes]) / 2,
-                quaternions=_rows(4, [turned(s).as_quat() for s in shapes]),
+                quaternions=_rows(4, [find_rotation(s).as_quat() for s in shapes]),
                 colors=colors,
             )
     return Drawing(style, columns.partition([len(row) for row in rows]))
@@ -70,7 +70,7 @@ def _rows(n: int, values: Sequence[Any]) -> Float[np.ndarray, "rows n"]:
     return np.array(values, dtype=np.float32).reshape(-1, n)
 
 
-def turned(box: Box) -> Rotation:
+def find_rotation(box: Box) -> Rotation:
     """Return how a box in space is turned."""
     angle = np.ravel(box.angle)
     return Rotation.from_rotvec([0.0, 0.0, angle[0]] if len(angle) == 1 else angle)
@@ -93,7 +93,7 @@ def outline(shape: Shape) -> Float[np.ndarray, "n d"]:
         (x, *rest), length = shape.center, 1e-4 * shape.radius
         return np.array([(x - length, *rest), (x + length, *rest)])
     if len(shape.size) == 3:
-        return faces(shape.center, shape.size, turned(shape)).reshape(-1, 3)
+        return faces(shape.center, shape.size, find_rotation(shape)).reshape(-1, 3)
     width, height = shape.size
     r, upright = line_radius(shape), height > width
     along, across = max(shape.size) / 2 - r, min(shape.size) / 2 - r
@@ -182,7 +182,7 @@ class Names:
         """Return the kind of shape that a name stands for in space, None in the plane."""
         return self._kinds[name] if self._kinds and 3 in self._coordinates else None
 
-    def checked(self, scene: Sequence[Shape], step: int) -> list[Shape]:
+    def check(self, scene: Sequence[Shape], step: int) -> list[Shape]:
         """Return the shapes of `scene`.
 
         Raises
@@ -261,7 +261,7 @@ def draw_ahead(
         for now, futures in zip(scenes, ahead, strict=True):
             here = [s for s in now if s.name == name]
             later = [(i, s) for i, scene in enumerate(futures) for s in scene if s.name == name and s not in here]
-            rows.append([(s, _faded(s.color, (i + 1) / (len(futures) + 1))) for i, s in reversed(later)])
+            rows.append([(s, _fade(s.color, (i + 1) / (len(futures) + 1))) for i, s in reversed(later)])
         drawings[name] = drawing_of(names.kind(name), rows, 10.0)
     return drawings
 
@@ -271,7 +271,7 @@ def draw_reference(
 ) -> dict[str, Drawing]:
     """Return a drawing by name, in grey below all others, for the scene of the reference of each row.
 
-    In space nothing lies below: a shape that is where it shall be is not drawn again.
+    In space nothing lies below: a shape at its reference is not drawn twice.
     """
     extent.drawn.include(aims)
     if extent.in_space:
@@ -301,10 +301,10 @@ class ReferenceScenes:
         """Return x with of(x) = r, of least size; None where r is not finite, or there is no such x."""
         key = reference.tobytes()
         if key not in self._known:
-            self._known[key] = self._found(reference) if len(self._known) < _AIMS else None
+            self._known[key] = self._find_state(reference) if len(self._known) < _AIMS else None
         return self._known[key]
 
-    def _found(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
+    def _find_state(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
         assert self._about.cost is not None
         of = bind_outputs(self._about.cost.of, self._about.states)
         if not (np.abs(reference) < _DRAWN).all():
@@ -333,7 +333,7 @@ class Scenes:
         self._u: np.ndarray | None = None  # the last input
         self._ahead = False  # a plan was drawn before
 
-    def drawn(
+    def draw_rows(
         self, first: int, rows: StepRows, plans: Sequence[tuple[int, np.ndarray, np.ndarray]]
     ) -> dict[str, Drawing]:
         """Return the drawings of rows first, first + 1, … by entity; `plans` are steps with their planned X and U."""
@@ -344,13 +344,13 @@ class Scenes:
         for k, X, U in plans:
             if np.isfinite(X).all() and np.isfinite(U).all():
                 later = ((X[i], U[min(i, len(U) - 1)]) for i in stages(len(U)))
-                ahead[k] = [self._names.checked(scene(x, u), k) for x, u in later]
+                ahead[k] = [self._names.check(scene(x, u), k) for x, u in later]
         now: list[list[Shape]] = []
         for i, (x, y) in enumerate(zip(rows.X, rows.Y, strict=True)):
             self._u = rows.U[i] if i < len(rows.U) else self._u
             x = y if np.isnan(x).any() and len(y) == len(x) else x
             shapes = None if self._u is None or not np.isfinite(x).all() else scene(x, self._u)
-            now.append([] if shapes is None else self._names.checked(shapes, first + i))
+            now.append([] if shapes is None else self._names.check(shapes, first + i))
         layers = {"world": draw(self._names, now, self.extent)}
         if ahead or self._ahead:
             self._ahead = True
@@ -359,7 +359,7 @@ class Scenes:
         aims = self._reference.of(rows, scene)
         if any(aims):
             for aim in filter(None, aims):
-                self._names.checked(aim, first)
+                self._names.check(aim, first)
             layers["world/reference"] = draw_reference(self._names, now, aims, self.extent)
         return {f"{layer}/{name}": drawing for layer, drawn in layers.items() for name, drawing in drawn.items()}
 
@@ -369,7 +369,7 @@ def stages(horizon: int) -> list[int]:
     return sorted({round(horizon * (i + 1) / _STAGES) for i in range(_STAGES)} - {0})
 
 
-def _faded(color: Color, share: float) -> Color:
+def _fade(color: Color, share: float) -> Color:
     """Return `color` mixed with the background: Rerun draws lines without transparency."""
     weight = 0.45 + 0.5 * share
     r, g, b = (round((1 - weight) * c + weight * d) for c, d in zip(color, BACKGROUND, strict=True))

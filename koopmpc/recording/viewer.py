@@ -15,7 +15,8 @@ from pathlib import Path
 from koopmpc.errors import LogError
 from koopmpc.recording.rrd import check_log
 
-PORT, WEB_PORT = 9876, 9090
+PORT = 9876  # data of a viewer: Rerun's default
+WEB_PORT = 9090  # page of a viewer in the browser: Rerun's default
 _START = 15.0  # longest wait for a viewer that was opened [s]
 
 
@@ -135,7 +136,7 @@ def need_display(logs: Sequence[str | Path], *, options: str = "") -> None:
 
 
 @contextmanager
-def served(
+def serve(
     logs: str | Path | Sequence[str | Path], port: int = WEB_PORT, *, live: bool = False
 ) -> Generator[tuple[str, int]]:
     """Serve logs to a browser on this machine; yield the address, and the port of the data beside that of the page.

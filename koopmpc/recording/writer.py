@@ -163,7 +163,7 @@ class Writer:
         self._horizon = max(self._horizon, rows.horizon)
         parts = blocks(rows)
         drawings = [  # all, because the layout is as wide as the widest
-            self._scenes.drawn(part.k, part, self._plans_of(part)) for part in parts
+            self._scenes.draw_rows(part.k, part, self._plans_of(part)) for part in parts
         ]
         if not self._opened:
             self._open()

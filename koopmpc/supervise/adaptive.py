@@ -43,14 +43,14 @@ class Adaptive(Published):
 
     Each step is a pair (x, u, x⁺), from which `online` learns unless it is faulty: a number is NaN, the state stands
     still to the bit, the controller's monitor does not know state and input, or the sample is off by far more than
-    those before it. Three such samples in sequence are no spike but a change of the plant, and are learned from.
+    those before it. Three such samples in sequence count as a change of the plant, and are learned from.
 
-    Where the model in use predicts a short memory of recent pairs worse than the first one did its own data, the fit
-    of all pairs so far, with the forgetting or the window of `online`, is put on trial: once the memory holds only
-    pairs that came later, both forecast them, from each pair on as far ahead as the memory and the horizon reach, and
-    the new one takes the place of the one in use where its error is less than a third. A fit always predicts well what
-    it was fitted to, and the next step of a path that it has just seen; the plan relies on the steps after that.
-    Where an earlier model forecasts the memory clearly better than the one in use, that one comes back.
+    The controller keeps a short memory of recent pairs. If the model in use predicts it worse than the first model
+    predicted its own data, the fit of all pairs so far, with the forgetting or the window of `online`, is put on trial.
+    The trial waits until the memory holds only pairs that came later. Then both models forecast from each pair, as far
+    ahead as the memory and the horizon reach; the new one is used if its error is less than a third of the other's.
+    Pairs that came later are needed because a fit always predicts its own pairs well. If an earlier model forecasts
+    the memory clearly better than the one in use, the earlier one is used again.
 
     Parameters
     ----------

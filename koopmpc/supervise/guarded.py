@@ -65,7 +65,7 @@ class Guarded(Published):
         options: dict[str, Any] = {"patience": self._patience}
         for name, part in (("controller", self.controller), ("standby", self.standby)):
             if not isinstance(part, Published):
-                raise DataError(f"a {type(part).__name__} is no controller of koopmpc and cannot be saved as data")
+                raise DataError(f"a {type(part).__name__} is not a controller of koopmpc and cannot be saved as data")
             options[name] = part.as_data()
         return SavedController("Guarded", None, options=options)
 

@@ -204,7 +204,7 @@ class Watch(Viewing):
                 error += self._extra
             self.fits = bool(error.dot(error) <= 1.0)
         else:
-            self.fits = self._stepped(start, applied)
+            self.fits = self._matches_prediction(start, applied)
         if psi is None and start.drive.size:
             E, C = self._pushed
             extra = E @ start.W[0] if start.W.size else np.zeros(len(C))
@@ -214,7 +214,7 @@ class Watch(Viewing):
             self._old = start.z.copy(), u.copy(), w, start.d.copy() if start.d.size else np.zeros(len(start.z))
         return self.inside and self.fits
 
-    def _stepped(self, start: InitialCondition, applied: ArrayLike | None) -> bool:
+    def _matches_prediction(self, start: InitialCondition, applied: ArrayLike | None) -> bool:
         """Return whether the state is the one that a nonlinear model predicted."""
         model, W = self._model, self.monitor.band
         if self._old is None or isinstance(model, LinearPredictor):

@@ -8,13 +8,13 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost, checked
+from koopmpc.control.cost import Cost, check_cost_and_limits
 from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import strip_unit
 from koopmpc.lifting.state import State
-from koopmpc.loop.metrics import limited
+from koopmpc.loop.metrics import stack_limited
 from koopmpc.text import with_unit
 from koopmpc.values import Value
 
@@ -106,7 +106,7 @@ def check_task(
     DataError, ShapeError
         A size does not fit, NaN, an angle that is no state.
     """
-    cost, limits = checked(cost, limits)
+    cost, limits = check_cost_and_limits(cost, limits)
     nx, states = data.nx, data.states
     of = cost.of.bind(states)
     cost.matrices(of.nz, data.nu)
@@ -138,7 +138,7 @@ def check_task(
         )
         if not len(points):
             raise DataError("starts is empty; pass states (n, nx), or None for first states of the data's episodes")
-    values, box = limited(limits, X, states)
+    values, box = stack_limited(limits, X, states)
     sizes = box.high - box.low
     sizes = np.where(np.isfinite(sizes) & (sizes > 0), sizes, np.maximum(np.ptp(values, axis=0), 1e-300))
     return Asked(
@@ -238,7 +238,7 @@ def find_outside_limits(asked: Asked, data: Episodes) -> list[str]:
     """
     limits, states = asked.limits, data.states
     names = states if limits.of is None else (*states, *limits.of.bind(states).names)
-    starts, box = limited(limits, asked.starts, states)
+    starts, box = stack_limited(limits, asked.starts, states)
     tracked = asked.cost.of.bind(states).names
     targets = dict(zip(tracked, asked.reference.T, strict=True)) if asked.moves else {}
     said: list[str] = []

@@ -19,7 +19,7 @@ from koopmpc.data.angles import find_angles
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source
-from koopmpc.errors import DataError, ShapeError, unwarned
+from koopmpc.errors import DataError, ShapeError, hide_fit_warnings
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import Towards, edmd
@@ -91,7 +91,7 @@ class Candidate(Value):
 
     def bind(self, states: Sequence[str], inputs: Sequence[str]) -> "Candidate":
         """Return the sized copy for a plant with these names."""
-        sized = None if self.embedding is None else self.embedding.fitted(states, inputs)
+        sized = None if self.embedding is None else self.embedding.match(states, inputs)
         bound = self.lifting.bind(states if sized is None else sized.names)
         return Candidate(self.name, bound, sized, self.bilinear)
 
@@ -322,7 +322,7 @@ class Recipe(Value):
         scheduler: str | None = None,
     ) -> AnyPredictor:
         """Return the model of these data, with the weights `near`. Doubts about the fit stand in its report."""
-        with unwarned():
+        with hide_fit_warnings():
             read = ReadOptions(weights=near, workers=workers, scheduler=scheduler)
             return fit_candidate(self.candidate, data, self.ridge, read)
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc import checks
-from koopmpc.data.episodes import Episode, Episodes, joined
+from koopmpc.data.episodes import Episode, Episodes, join_sets
 from koopmpc.data.smoother import Glitch, Mender, Smoother
 from koopmpc.data.source import Changed, EpisodesMap, Held, Source
 from koopmpc.errors import DataError
@@ -79,7 +79,7 @@ def take_sample(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
         loaded = part.load()
         taken.append(_thin_episodes(loaded, quota))
         whole = whole and taken[-1] is loaded
-    result = joined(taken)
+    result = join_sets(taken)
     if whole:
         return result, ()
     steps = sum(len(episode) for episode in result)
@@ -124,11 +124,11 @@ def smooth_data(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple
         smoother = Smoother.of(held)
     except DataError:
         return nothing
-    if not smoother.found.any():
+    if not smoother.is_noisy.any():
         return nothing
     told = ", ".join(
         with_unit(name, f"± {size:.2g}")
-        for name, size, found in zip(held.states, smoother.noise, smoother.found, strict=True)
+        for name, size, found in zip(held.states, smoother.noise, smoother.is_noisy, strict=True)
         if found
     )
     note = f"the measurements hold noise (standard deviations): {told}; models are of smoothed states"

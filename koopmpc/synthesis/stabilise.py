@@ -22,7 +22,7 @@ LOUD = (1.0, 0.5, 0.25, 0.1)  # shares of the input range that the noise of the 
 GROWTH = 2.0  # from round to round, of starts and of lengths, while nothing is lost
 _RIDGE = 1e-9
 _HELD = 20  # runs without noise that the feedback is judged by, from nearer where too few of them stay
-_ENOUGH = 0.95  # share of them that shall stay
+_ENOUGH = 0.95  # share of them that must stay
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ def stabilise(
     u_ref = checks.vector(equilibrium[1], "the equilibrium's input", nu)
     size = checks.vector(reach, "reach", nx)
     low, high = checks.vector(u_min, "u_min", nu), checks.vector(u_max, "u_max", nu)
-    checks.crossed(low, high, "input")
+    checks.refuse_crossed(low, high, "input")
     if (size <= 0).any():
         raise DataError(f"reach is {size}; pass a distance above zero for each state, beyond which an episode ends")
     if ((u_ref < low) | (u_ref > high)).any() or (low == high).any():

@@ -61,7 +61,7 @@ class Surrogate(Value):
     def start(self, x0: Float[np.ndarray, " nx"]) -> Float[np.ndarray, " n"]:
         """Return the state of the plant, its past included, after a rest at x0."""
         embedding = self.model.embedding
-        return x0 if embedding is None else embedding.held(x0, self.middle)
+        return x0 if embedding is None else embedding.repeat(x0, self.middle)
 
     def holding(self, cost: Cost, limits: Limits, gain: float = 1.0) -> "Holding":
         """Return the search for equilibria of this plant."""
@@ -235,7 +235,8 @@ def explain_unreachable(one: Surrogate, asked: Asked) -> list[str]:
         nearest = "the plant rests nowhere inside these limits: widen them"
     if is_missed(free):
         return [
-            f"no input holds {format_outputs(row)}: this is no equilibrium of the plant, as the data show it; {nearest}"
+            f"no input holds {format_outputs(row)}: this is not an equilibrium of the plant as the data show it; "
+            f"{nearest}"
         ]
     ways = list_broken(free) or list_broken(inside)
     if not ways and asked.limits.of is None:

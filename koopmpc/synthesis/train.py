@@ -11,7 +11,7 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, unwarned
+from koopmpc.errors import DataError, hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.variable_projection import TunableLifting, VariableProjection, Windows
 from koopmpc.lifting.base import Lifting, check_lifting
@@ -95,7 +95,7 @@ def train(
     source, generator = source_of(episodes), np.random.default_rng(rng)
     if not source.replayable:
         raise DataError("a stream is read once, and train needs it more often; save it, and pass that")
-    sized = None if embedding is None else embedding.fitted(source.states, source.inputs)
+    sized = None if embedding is None else embedding.match(source.states, source.inputs)
     given = check_lifting(lifting).bind(source.states if sized is None else sized.names)
     pieces = _draw_pieces(source, N + (0 if sized is None else sized.steps), most, generator)
     if isinstance(held_out, Episodes):
@@ -129,7 +129,7 @@ def _hold_out(
     data: Episodes | Source, lifting: Lifting, judge: Episodes, horizon: int, embedding: Delay | None, ridge: float
 ) -> float:
     """Return the relative error over the horizon, on other episodes, of the fit to these data."""
-    with unwarned():  # that of the result is the one to read
+    with hide_fit_warnings():  # that of the result is the one to read
         model = edmd(data, lifting, embedding=embedding, ridge=ridge)
     return score(model, judge, horizon).total
 

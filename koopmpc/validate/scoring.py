@@ -172,7 +172,7 @@ def forecast_errors(
                 np.subtract(truth[h], x, out=gap[h])
                 if relift:
                     past = predictor.embedding
-                    point = x if past is None else past.shifted(point, v[:, : predictor.nu], x)
+                    point = x if past is None else past.shift(point, v[:, : predictor.nu], x)
                     z_next = predictor.lifting(point)
                 z = z_next
         gap[np.isnan(gap)] = np.inf

@@ -226,7 +226,7 @@ def coverage(
     asked_low = np.full(n, np.inf) if low is None else checks.vector(low, "low", n, infinite=True)
     asked_high = np.full(n, -np.inf) if high is None else checks.vector(high, "high", n, infinite=True)
     if low is not None and high is not None:
-        checks.crossed(asked_low, asked_high, "coverage")
+        checks.refuse_crossed(asked_low, asked_high, "coverage")
     box_low = np.where(np.isfinite(asked_low), np.minimum(asked_low, seen_low), seen_low)
     box_high = np.where(np.isfinite(asked_high), np.maximum(asked_high, seen_high), seen_high)
     if not np.isfinite(box_high - box_low).all():

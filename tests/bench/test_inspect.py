@@ -57,7 +57,7 @@ def test_conditions_choose_logs(swept):
     assert chosen == {row.log for row in rows if (row.metrics.cost > 2 and row.controller == "lqr") or not row.reached}
     assert km.bench.Where("0 < -cost <= 3").holds({"cost": -2.0})
     for bad, said in (
-        ("cost >", "is no comparison"),
+        ("cost >", "is not a comparison"),
         ("price > 1", "there is no figure 'price'"),
         ("cost > 'a'", "compares"),
         ("__import__('os').system('true')", "holds more than comparisons"),

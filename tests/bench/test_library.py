@@ -55,7 +55,7 @@ def test_listing_runs_no_file(tmp_path, monkeypatch):
     (folder / "_helper.py").write_text("x = 1\n")
     titles = {entry.name: entry.title for entry in km.bench.list_problems()}
     assert titles["loud"] == "Loud: raises when it runs."
-    assert "no valid Python" in titles["garbled"]
+    assert "not valid Python" in titles["garbled"]
     assert "_helper" not in titles
     assert {"pendulum", "cart_pole"} <= titles.keys()
 
@@ -157,5 +157,5 @@ def test_a_new_problem_is_the_documented_one_and_is_never_overwritten(tmp_path, 
     with pytest.raises(km.KoopmpcError, match="exists already and is kept as it is"):
         km.bench.new_problem("mine.py")
     assert path.read_text() == "kept"
-    with pytest.raises(km.KoopmpcError, match="'my-plant' is no name for a problem"):
+    with pytest.raises(km.KoopmpcError, match="'my-plant' is not a name for a problem"):
         km.bench.new_problem("my-plant")

@@ -99,6 +99,7 @@ def test_select_keeps_all_but_the_other_cases(problem):
 @pytest.mark.parametrize(("name", "wrong"), [("pendulum", ([0.3, 0.0], [0.0])), ("cart_pole", ([0.0] * 4, [5.0]))])
 def test_a_point_where_the_plant_does_not_rest_is_named(name, wrong):
     with pytest.warns(
-        UserWarning, match=r"the equilibrium is none: from it '(omega|velocity).*' moves by .* in one step of 0\.0"
+        UserWarning,
+        match=r"the equilibrium does not rest: from it '(omega|velocity).*' moves by .* in one step of 0\.0",
     ):
         replace(km.load_problem(name), equilibrium=wrong)

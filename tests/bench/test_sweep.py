@@ -287,7 +287,7 @@ def test_live_without_a_viewer_or_a_display_serves_a_page_while_runs_go_on(tmp_p
 
     monkeypatch.setattr("koopmpc.recording.viewer.is_up", lambda port: False)
     monkeypatch.setattr("koopmpc.recording.viewer.has_display", lambda: False)
-    monkeypatch.setattr("koopmpc.recording.viewer.served", served)
+    monkeypatch.setattr("koopmpc.recording.viewer.serve", served)
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
     monkeypatch.setattr("koopmpc.bench.single.Recorder", Unseen)
     tiny = str(write(tmp_path))

@@ -269,7 +269,7 @@ def test_a_disturbance_moves_the_target_to_the_equilibrium_that_it_allows(Q_N) -
     read = state_tracking(plant.states, plant.nu, cost, km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
     targets, last = TerminalTargets(learned_map(plant), cost, read, 1000), None
     for _ in range(4):
-        last = targets.disturbed(row, e, last)
+        last = targets.find_disturbed(row, e, last)
     x, u = last.equilibrium.x, last.equilibrium.u
     np.testing.assert_allclose(plant(x, u) + e, x, atol=1e-9)
     np.testing.assert_allclose(x, row, atol=1e-5)
@@ -287,7 +287,7 @@ def test_a_row_whose_equilibrium_is_not_found_is_aimed_at_itself_until_it_is_loo
             patch.setattr(targets.equilibria, "find", lambda *rest: None)
             target = targets(row)
             assert targets(row) is target
-            assert targets.disturbed(row, np.array([0.01, 0.0]), None) is target
+            assert targets.find_disturbed(row, np.array([0.01, 0.0]), None) is target
         assert targets(row) is target
         for x in np.random.default_rng(0).standard_normal((3, 2)):
             missed = target.M @ x + target.L @ x + target.V @ np.ones(2) - target.m

@@ -51,7 +51,7 @@ def test_nan_holds_the_last_input():
 
 
 def test_an_affine_model_reaches_its_own_equilibrium():
-    """Linearised at a point that is no equilibrium, the law still drives the affine model to the reference."""
+    """Linearised at a point that is not an equilibrium, the law still drives the affine model to the reference."""
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
     f = ca.vertcat(x[0] + 0.1 * x[1], x[1] + 0.1 * (ca.sin(x[0]) + u))
     plant = km.StepMap(ca.Function("F", [x, u], [f]), 0.1)

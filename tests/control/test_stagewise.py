@@ -18,7 +18,7 @@ from koopmpc.control.nonlinear.stagewise import (
     list_sides,
     plan_cost,
     simulation,
-    unconstrained,
+    solve_unconstrained,
     weights,
 )
 
@@ -306,7 +306,7 @@ def test_without_limits_the_sweeps_solve_the_equations_of_all_stages(kind):
     n, m = len(H), len(E)
     K = np.block([[H, E.T], [E, np.zeros((m, m))]])
     v = np.linalg.solve(K, np.concatenate([-dense.q.ravel(), -dense.r.ravel(), e]))[:n]
-    X, U, curvature = unconstrained(dense.sweeps, weights(dense.problem))(*dense.stages)
+    X, U, curvature = solve_unconstrained(dense.sweeps, weights(dense.problem))(*dense.stages)
     np.testing.assert_allclose(flat(X), v[: dense.N * dense.nx], atol=1e-8)
     np.testing.assert_allclose(flat(U), v[dense.N * dense.nx :], atol=1e-8)
     # S_k is the curvature of the cost along u_k, with all later inputs at their best: a Schur complement

@@ -261,7 +261,7 @@ def table(tmp_path: Path, cells: list[str], header: str = "t,x,v,u") -> Path:
 def test_a_cell_that_is_no_number_costs_no_column_in_silence(tmp_path: Path, spoilt: str) -> None:
     file = table(tmp_path, ["1.5", "2.5", spoilt, "4.5", "6"])
     shown = re.escape(spoilt.strip('"'))
-    said = rf"log\.csv: 'x' holds '{shown}' in row 3, which is no real number; repair the cell"
+    said = rf"log\.csv: 'x' holds '{shown}' in row 3, which is not a real number; repair the cell"
     with pytest.raises(km.errors.DataError, match=said):
         km.load_episodes(file)
     with pytest.raises(km.errors.DataError, match=said):
@@ -270,7 +270,7 @@ def test_a_cell_that_is_no_number_costs_no_column_in_silence(tmp_path: Path, spo
 
 
 def test_complex_cells_are_not_left_out_in_silence(tmp_path: Path) -> None:
-    with pytest.raises(km.errors.DataError, match=r"'x' holds '\(1\+2j\)' in row 1, which is no real number"):
+    with pytest.raises(km.errors.DataError, match=r"'x' holds '\(1\+2j\)' in row 1, which is not a real number"):
         km.load_episodes(table(tmp_path, ["(1+2j)", "(2+1j)", "(3-1j)"]))
 
 

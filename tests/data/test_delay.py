@@ -51,10 +51,10 @@ def test_a_point_a_shift_and_a_rest_agree(d: int, inputs: bool, seed: int) -> No
         history = km.Episode(X=episode.X[: k + 1], U=episode.U[:k])
         assert np.array_equal(embedding.point(episode.X[k], history), points[k - d])
     for zeta, u, zeta_next in zip(points, episode.U[d:], points[1:], strict=False):
-        assert np.array_equal(embedding.shifted(zeta, u, zeta_next[:2]), zeta_next)
+        assert np.array_equal(embedding.shift(zeta, u, zeta_next[:2]), zeta_next)
     x, u = episode.X[0], episode.U[0]
     long = km.Episode(X=np.tile(x, (d + 2, 1)), U=np.tile(u, (d + 1, 1)))
-    assert np.array_equal(embedding(km.Episodes([long], 0.1))[0].X[0], embedding.held(x, u))
+    assert np.array_equal(embedding(km.Episodes([long], 0.1))[0].X[0], embedding.repeat(x, u))
 
 
 def test_names_say_how_long_ago_and_keep_the_unit() -> None:

@@ -129,7 +129,7 @@ show(lambda: km.bilinear_edmd(X, km.State()))
         "DataError episodes is a ndarray; pass a list of Episode(X=…, U=…)",
         "DataError episodes is a Episode; pass a list of Episode(X=…, U=…)",
         "DataError fraction holds 1 NaN or inf, the first at (); remove or repair them first",
-        "DataError fraction is not an array of numbers: got str, None and text are no numbers;"
+        "DataError fraction is not an array of numbers: got str, numbers cannot be None or text;"
         " pass numbers of one shape",
         "DataError rng is 'a'; pass a seed (a whole number from 0 on) or a numpy Generator",
         f"DataError episodes is a list{episodes}",

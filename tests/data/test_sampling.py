@@ -8,8 +8,8 @@ import pytest
 
 import koopmpc as km
 from koopmpc.data.files.columns import TableSettings, find_roles, is_label
-from koopmpc.data.files.sampling import Signals, episodes_from, resampled, restarts, sample_time
-from koopmpc.data.files.tables import _numbered, _plausible
+from koopmpc.data.files.sampling import Signals, episodes_from, resample, restarts, sample_time
+from koopmpc.data.files.tables import _number_episodes, _plausible
 from koopmpc.errors import ColumnWarning
 
 
@@ -56,7 +56,7 @@ def test_a_step_back_in_time_begins_a_part_and_one_to_another_time_than_the_firs
 
 
 def on_grid(part, dt):
-    return said(lambda: resampled([part], dt, "f"))[0]
+    return said(lambda: resample([part], dt, "f"))[0]
 
 
 def test_states_are_interpolated_and_inputs_held_on_a_grid_from_the_first_time():
@@ -88,7 +88,7 @@ def test_resampling_leaves_missing_rows_out_and_cuts_at_gaps():
 
 def test_what_resampling_cuts_and_leaves_out_is_told():
     def words(*parts, dt=1.0):
-        return said(lambda: resampled(list(parts), dt, "f"))[1]
+        return said(lambda: resample(list(parts), dt, "f"))[1]
 
     assert words(signals(np.arange(6))) == words(signals([0, 1, 2.2, 3.1, 4, 4.9])) == []
     uneven = signals([0, 1, 2, 3.9, 5, 6])
@@ -236,11 +236,11 @@ def test_a_column_that_is_mostly_zero_or_empty_is_plausible_and_one_that_nobody_
 
 def test_episodes_are_numbered_in_the_order_in_which_they_first_come(tmp_path):
     file = tmp_path / "f"
-    assert _numbered(np.array(["b", "a", "b", "c"], dtype=object), file).tolist() == [0, 1, 0, 2]
-    assert _numbered(np.array([7.0, 3.0, 3.0, 9.0, 7.0]), file).tolist() == [0, 1, 1, 2, 0]
+    assert _number_episodes(np.array(["b", "a", "b", "c"], dtype=object), file).tolist() == [0, 1, 0, 2]
+    assert _number_episodes(np.array([7.0, 3.0, 3.0, 9.0, 7.0]), file).tolist() == [0, 1, 1, 2, 0]
     for bad in (np.array([1.0, np.nan]), np.array(["a", None], dtype=object)):
         with pytest.raises(km.errors.DataError, match="has rows whose episode is null"):
-            _numbered(bad, file)
+            _number_episodes(bad, file)
 
 
 def test_more_rows_than_memory_holds_are_refused_before_they_are_made(tmp_path, monkeypatch):

@@ -102,14 +102,14 @@ def test_on_random_linear_plants_the_noise_is_found_and_most_of_it_taken_out(see
     data = noisy(clean, share, seed)
     smoother = km.data.Smoother.of(data)
     np.testing.assert_allclose(smoother.noise / spread(clean), share, rtol=0.15)
-    assert smoother.found.all()
+    assert smoother.is_noisy.all()
     assert (error(smoother(data), clean) < 0.6 * share).all()
 
 
 def test_disturbances_of_the_plant_are_kept() -> None:
     """White process noise is no measurement noise: smoothing must not take it out."""
     clean = linear_data(np.random.default_rng(1), 2, process=0.2)
-    assert not km.data.Smoother.of(clean).found.any()
+    assert not km.data.Smoother.of(clean).is_noisy.any()
     data = noisy(clean, 0.1)
     assert (error(km.data.Smoother.of(data)(data), clean) < error(data, clean)).all()
 
@@ -179,7 +179,7 @@ def test_measured_disturbances_explain_what_they_do() -> None:
 @pytest.mark.parametrize("clean", [pendulum_data(), linear_data(np.random.default_rng(0), 3)])
 def test_exact_data_stay_as_they_are(clean: km.Episodes) -> None:
     """To the bit: select gives the model that it gives when it is told not to smooth."""
-    assert not km.data.Smoother.of(clean).found.any()
+    assert not km.data.Smoother.of(clean).is_noisy.any()
     options: Any = {"candidates": [km.State() + km.Constant() + km.Monomials(2)], "delays": [0], "horizon": 5}
     assert km.select(clean, **options).predictor == km.select(clean, smooth=False, **options).predictor
 

@@ -116,7 +116,7 @@ def test_the_path_must_be_there_and_hold_episodes(tmp_path: Path) -> None:
     (tmp_path / "a.txt").touch()
     with pytest.raises(km.errors.LogError, match=r"it holds a\.txt"):
         km.data.Files(tmp_path)
-    with pytest.raises(km.errors.LogError, match=r"b\.npz is no file; pass files, or one folder"):
+    with pytest.raises(km.errors.LogError, match=r"b\.npz is not a file; pass files, or one folder"):
         km.data.Files([tmp_path / "b.npz"])
     with pytest.raises(km.errors.DataError, match="there is no path"):
         km.data.Files([])

@@ -247,5 +247,7 @@ def test_a_table_from_before_there_were_checksums_is_refused_by_its_edition(tmp_
     kept = {key: value for key, value in table.schema.metadata.items() if key != b"koopmpc.check"}
     assert len(kept) == len(table.schema.metadata) - 1
     pq.write_table(table.replace_schema_metadata(kept), path)
-    with pytest.raises(km.errors.LogError, match=r"of an edition before 0\.1\.0, without checksums; save it anew"):
+    with pytest.raises(
+        km.errors.LogError, match=r"of an edition before 0\.1\.0, without checksums; save it by that edition"
+    ):
         km.load_episodes(path)

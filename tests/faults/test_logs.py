@@ -20,7 +20,7 @@ def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
     folder.mkdir()
     for path in (text, empty):
         with pytest.raises(
-            km.errors.LogError, match=rf"{path.name} is no log of koopmpc: it does not start as an \.rrd file does"
+            km.errors.LogError, match=rf"{path.name} is not a log of koopmpc: it does not start as an \.rrd file does"
         ):
             km.load_run(path)
     with pytest.raises(km.errors.LogError, match=r"folder\.rrd is a folder; pass the \.rrd of a run"):

@@ -32,7 +32,9 @@ def test_lqr_says_what_is_wrong_with_its_reference_and_its_disturbance(model, ba
 
 
 def test_a_number_is_no_path_of_a_controller():
-    with pytest.raises(km.errors.KoopmpcError, match=r"3 is no path; pass the \.npz of a saved Controller or Design"):
+    with pytest.raises(
+        km.errors.KoopmpcError, match=r"3 is not a path; pass the \.npz of a saved Controller or Design"
+    ):
         km.load_controller(3)
 
 
@@ -306,7 +308,7 @@ def test_resampling_beyond_memory_is_refused_with_the_number(tmp_path: Path):
 
 
 def test_a_table_is_no_problem(tmp_path: Path):
-    with pytest.raises(km.errors.ProblemError, match="is no problem: a problem is a Python file; `koopmpc fit"):
+    with pytest.raises(km.errors.ProblemError, match="is not a problem: a problem is a Python file; `koopmpc fit"):
         km.load_problem(str(table(tmp_path / "log.csv")))
 
 
@@ -324,7 +326,7 @@ def test_what_is_no_path_is_said_by_everything_that_reads_or_writes(model, bad, 
     readers = (km.load_model, km.load_run, km.load_episodes, km.load_controller)
     writers = (model.save, data.save, lambda path: km.record(run, path))
     for call in (*readers, *writers):
-        with pytest.raises(km.errors.DataError, match=" is no path; pass "):
+        with pytest.raises(km.errors.DataError, match=" is not a path; pass "):
             call(bad)
 
 

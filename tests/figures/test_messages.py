@@ -18,7 +18,7 @@ CUBE = three_states()
 
 
 def planes(which: Any, axes: Any, over: Any, at: Any = None) -> Any:
-    return km.plot.eigenfunctions(CUBE, which, axes, over, at=at, points=5)
+    return km.plot.eigenfunction_maps(CUBE, which, axes, over, at=at, points=5)
 
 
 MISTAKES = [
@@ -76,12 +76,12 @@ MISTAKES = [
     (
         DATA,
         "there is no eigenfunction 2; the predictor has 0 … 1",
-        lambda: km.plot.eigenfunctions(turning(), 2, (0, 1), SQUARE),
+        lambda: km.plot.eigenfunction_maps(turning(), 2, (0, 1), SQUARE),
     ),
     (
         DATA,
         r"asked for state 'x'; the states are angle \[rad\]",
-        lambda: km.plot.eigenfunctions(turning(), 0, ("x", 1), SQUARE),
+        lambda: km.plot.eigenfunction_maps(turning(), 0, ("x", 1), SQUARE),
     ),
     (SHAPE, r"residuals has shape \(3,\), expected \(2,\)", lambda: km.plot.spectrum(turning(), [0, 0, 0])),
     (DATA, "residuals holds -1; residuals are norms, 0 or above", lambda: km.plot.spectrum(turning(), [0, -1])),

@@ -113,7 +113,7 @@ def test_a_model_with_a_memory_forecasts_from_the_first_known_past() -> None:
         made = km.plot.rollout(model, data[0], 20, start=3, relift=relift)
         assert curve(made.axes[0], "truth")[1] == pytest.approx(data[0].X[4:25, 0])
         assert curve(made.axes[0], "prediction")[1] == pytest.approx(data[0].X[4:25, 0], abs=1e-6)
-    axes = km.plot.eigenfunctions(model, 0, ("angle", 2), data, points=5).axes[0]
+    axes = km.plot.eigenfunction_maps(model, 0, ("angle", 2), data, points=5).axes[0]
     assert axes.get_ylabel() == "angle[k-1] [rad]"
 
 

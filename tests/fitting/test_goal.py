@@ -319,7 +319,7 @@ def test_states_without_weight_are_not_tracked_and_a_list_is_a_reference_for_eac
         ("[-0.8, 0.8]", "[0.8]", r"write \[low, high\]"),
         ("horizon = 15", "horizon = 0", "a horizon of 0; write a whole number"),
         ("horizon = 15", "horizont = 15", "has 'horizont'"),
-        ("horizon = 15", "horizon = ", "is no TOML"),
+        ("horizon = 15", "horizon = ", "is not valid TOML"),
         ("reference = 0.0", "reference = [0.0, 1.0]\nangle = 3", "angle is 3; write true or false"),
     ],
 )

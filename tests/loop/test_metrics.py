@@ -235,5 +235,5 @@ def test_a_step_that_takes_exactly_the_sampling_time_is_not_late():
 
 def test_references_bear_the_names_of_what_is_tracked_where_these_are_known():
     run = random_run(np.random.default_rng(0), cost=km.Cost(1, 1))
-    assert run.tracked(len(run.states)) == run.states
-    assert run.tracked(1) == ("reference 0",)
+    assert run.name_references(len(run.states)) == run.states
+    assert run.name_references(1) == ("reference 0",)

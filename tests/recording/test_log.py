@@ -91,7 +91,7 @@ def test_blocks_joined_are_the_run_again(T: int, least: int, most: int, k: int) 
     assert len(parts) <= most
     assert all(len(part.U) >= min(least, T) for part in parts)
     assert [part.k for part in parts] == [k + sum(len(p.U) for p in parts[:i]) for i in range(len(parts))]
-    assert km.Run(**StepRows.joined(parts).columns(), **run.about()) == replace(run, plans=None)
+    assert km.Run(**StepRows.join(parts).columns(), **run.about()) == replace(run, plans=None)
     assert all(np.array_equal(p.planned, p.k + np.arange(len(p.U))) for p in parts)
     assert np.array_equal(np.concatenate([p.plan_X for p in parts]), run.plans.X)
     assert np.array_equal(np.concatenate([p.plan_U for p in parts]), run.plans.U)

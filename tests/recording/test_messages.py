@@ -49,10 +49,10 @@ MISTAKES = [
         lambda f: km.Recorder(f / "run.rrd", **about(RUN))(steps_of(RUN)[0]),
     ),
     (LOG, r"nowhere\.rrd does not exist; pass the \.rrd of a run", lambda f: km.recording.view([f / "nowhere.rrd"])),
-    (LOG, r"notes\.rrd is no log of koopmpc: it does not start as", lambda f: km.recording.view(notes(f))),
+    (LOG, r"notes\.rrd is not a log of koopmpc: it does not start as", lambda f: km.recording.view(notes(f))),
     (LOG, r"no log to open; pass the \.rrd of a run", lambda f: km.recording.view([])),
     (LOG, r"is a folder; pass the \.rrd of a run", lambda f: km.recording.view(f)),
-    (LOG, r"notes\.rrd is no log of koopmpc", lambda f: km.load_episodes(notes(f))),
+    (LOG, r"notes\.rrd is not a log of koopmpc", lambda f: km.load_episodes(notes(f))),
     (DATA_ERROR, r"episode 0 has 30 steps, the horizon is 31", lambda f: model(turning(), f / "a.rrd", horizon=31)),
     (
         DATA_ERROR,

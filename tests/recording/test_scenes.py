@@ -21,7 +21,7 @@ coordinate = st.floats(-10, 10)
 def named(*shapes: km.scene.Shape) -> Names:
     """Return the names of a scene of these shapes."""
     names = Names()
-    names.checked(shapes, 0)
+    names.check(shapes, 0)
     return names
 
 
@@ -124,17 +124,17 @@ def test_a_prediction_that_diverges_does_not_push_the_scene_out_of_sight() -> No
 def test_a_shape_that_comes_or_goes_is_named() -> None:
     rail, cart = km.scene.Line("rail", [(0.0, 0.0)]), km.scene.Disk("cart", (0.0, 0.0), 0.1)
     names = Names()
-    assert names.checked((rail, cart, rail), 0) == [rail, cart, rail]
-    assert names.checked([cart, rail], 1) == [cart, rail]
+    assert names.check((rail, cart, rail), 0) == [rail, cart, rail]
+    assert names.check([cart, rail], 1) == [cart, rail]
     assert list(names) == ["rail", "cart"]
     with pytest.raises(
         km.errors.DataError, match="the scene of step 2 lacks the shape 'cart'; a scene returns the same"
     ):
-        names.checked([rail], 2)
+        names.check([rail], 2)
     with pytest.raises(
         km.errors.DataError, match="the scene of step 3 has a new shape 'wall'; a scene returns the same"
     ):
-        names.checked([rail, cart, km.scene.Line("wall", [])], 3)
+        names.check([rail, cart, km.scene.Line("wall", [])], 3)
 
 
 class Satellite(km.Dynamics):

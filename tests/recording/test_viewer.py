@@ -101,7 +101,7 @@ def test_a_viewer_is_found_once_it_is_up(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_what_a_loop_streams_is_served_to_a_browser_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     data, web, run = free_port(), free_port(), make_run(T=40)
     monkeypatch.setattr(viewer, "PORT", data)
-    with viewer.served((), web, live=True) as (address, port), urlopen(f"http://127.0.0.1:{web}") as page:
+    with viewer.serve((), web, live=True) as (address, port), urlopen(f"http://127.0.0.1:{web}") as page:
         assert port == data
         assert address == f"http://127.0.0.1:{web}?url=rerun%2Bhttp://127.0.0.1:{data}/proxy"
         assert b"<html" in page.read()

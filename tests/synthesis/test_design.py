@@ -262,7 +262,7 @@ def test_limits_inside_which_nothing_rests_are_told():
 
 
 def test_a_moving_state_is_no_equilibrium_to_rest_at():
-    with pytest.warns(km.FitWarning, match="this is no equilibrium of the plant"):
+    with pytest.warns(km.FitWarning, match="this is not an equilibrium of the plant"):
         km.design(data(), COST, LIMITS, horizon=8, reference=[0.0, 0.4], candidates=[PLAIN], delays=[0], bilinear=False)
 
 

@@ -349,7 +349,7 @@ class KoopmanMPC(MPCBase):
             np.greater_equal(t, plan.low, out=plan.met_low)
             np.less_equal(t, plan.high, out=plan.met_high)
             # no 0 byte: every limit is met, and nothing is NaN (NaN meets no limit)
-            move = self._limited(t, applied, start) if 0 in plan.met else self._unconstrained(t, start)
+            move = self._solve_limited(t, applied, start) if 0 in plan.met else self._return_free_plan(t, start)
             if origin.refused:
                 move.refused = True
             watch = self._watch
@@ -394,13 +394,13 @@ class KoopmanMPC(MPCBase):
                 column[plan.planned :] = np.concatenate([values.min(axis=0), values.max(axis=0)])
         column[: plan.planned] = v
 
-    def _unconstrained(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
+    def _return_free_plan(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
         self._qps.rest()
         self._plan, self._spare = t, self._plan
         self._keep(t)
         return self._move(self._given.copy(), Status.UNCONSTRAINED, 0, start)
 
-    def _limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
+    def _solve_limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Handle a step in which the plan or its target breaks a limit, or something is not finite."""
         plan, origin, u_prev = self._map, self._initial, self._initial.u_prev
         if not t.dot(t) < HUGE * HUGE:
@@ -413,7 +413,7 @@ class KoopmanMPC(MPCBase):
             moved = plan.targets.coordinates(self._reference, e) - plan.targets.nearest(self._reference, e)
             v += plan.maps.from_target @ moved.ravel()
             if (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
-                return self._unconstrained(t, start)
+                return self._return_free_plan(t, start)
         inputs, room = plan.track.inputs, None
         if self._hard_rates is not None:
             room = Interval(inputs.low - u_prev, inputs.high - u_prev)

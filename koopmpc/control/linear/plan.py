@@ -38,7 +38,7 @@ class PlanMap(Viewing):
     """t = M [z; u_{−1}; g; 1]: the unconstrained plan, which is the optimum where low ≤ t ≤ high.
 
     t = [v; lowest and highest target], v the plan as in `Condensed`. u_{−1} is there where the change of inputs is
-    weighed or limited, g = [w_0 … w_{N−1}; d] where disturbances are known. The last column of M is written anew for
+    weighed or limited, g = [w_0 … w_{N−1}; d] where disturbances are known. The last column of M is rewritten for
     each reference. Where there is a g, it is that of targets that no limit moves, for g moves them, too: the last rows
     of t are the lowest and highest values of the limits `checked`, and show whether a target has to be moved inside.
 

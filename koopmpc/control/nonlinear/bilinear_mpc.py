@@ -218,7 +218,7 @@ class BilinearMPC(StagedMPC):
         return build, (self.model, self.cost, self.limits, self._N), held
 
     def __setstate__(self, held: dict[str, Any]) -> None:
-        """Go on where the original was; the next step finds its targets anew."""
+        """Go on where the original was; the next step searches its targets again."""
         iteration = self._iteration
         iteration.X[:], iteration.U[:], iteration.e[:] = held.pop("plan")
         self.__dict__.update(held)

@@ -274,7 +274,7 @@ class Equilibria:
         if self.of_state:
             weighed, center = self._outputs.Q.any(axis=0), model.center  # of other states a reference may say nothing
             x = row if center is None else np.where(weighed, row, center)
-            x = x if model.embedding is None else model.embedding.held(x, u)
+            x = x if model.embedding is None else model.embedding.repeat(x, u)
         return Equilibrium(x, u, np.zeros(len(self._low), dtype=np.intp))
 
     def find(
@@ -315,7 +315,7 @@ class Equilibria:
             for i, value, counts in zip(chosen, row, weighed, strict=True):
                 y[i] = value if counts else y[i]
         amid[both] = (low[both] + high[both]) / 2
-        held = [y if model.embedding is None else model.embedding.held(y, each) for each in (u, amid)]
+        held = [y if model.embedding is None else model.embedding.repeat(y, each) for each in (u, amid)]
         return [np.concatenate(pair) for pair in zip(held, (u, amid), strict=True)]
 
     def _outside(self, x: Float[np.ndarray, " nx"]) -> float:
@@ -433,7 +433,7 @@ class TerminalTargets:
         self._missed.clear()
 
     def update(self, model: LearnedMap) -> None:
-        """Go on with another θ: the last target is found anew, from where it was."""
+        """Go on with another θ: the last target is searched again, from where it was."""
         self.equilibria.update(model)
         self.forget_missed()
         self._last = None
@@ -477,7 +477,7 @@ class TerminalTargets:
         begin = self.equilibria.guess(row)
         return TerminalTarget(begin, begin.u * self._hold, M, L, V, M @ row, np.zeros((nu, nx)))
 
-    def disturbed(
+    def find_disturbed(
         self, row: Float[np.ndarray, " nr"], e: Float[np.ndarray, " nx"], last: TerminalTarget | None
     ) -> TerminalTarget:
         """Return the target of a row where x⁺ = F(x, u) + e, mostly by one step from that of the last control step.

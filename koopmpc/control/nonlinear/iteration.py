@@ -1,9 +1,9 @@
 """Real-time iteration: linearise along the plan, solve the quadratic program of its stages, add the step.
 
-Interior-point steps over the stages solve the program. Where they end early an active-set method finishes it, on the
-program in condensed form: with δx = δx_free + x̃ and δu_k = δu_free,k − K_k x̃_k + L_k⁻ᵀ w_k,
-S_k = R + BᵀP_{k+1}B = L_k L_kᵀ, the cost is that of the program without limits and ½ ‖w‖², so that the Hessian is the
-identity also where the plant is unstable.
+Interior-point steps over the stages solve the program. If they end early, an active-set method finishes the program in
+condensed form. Its variables w are defined by δx = δx_free + x̃ and δu_k = δu_free,k − K_k x̃_k + L_k⁻ᵀ w_k, where
+S_k = R + BᵀP_{k+1}B = L_k L_kᵀ. The cost is that of the program without limits plus ½ ‖w‖²: the Hessian is the
+identity, also of an unstable plant.
 
 Diehl, Bock & Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control", SIAM
 J. Control Optim. 43, 2005.
@@ -25,7 +25,7 @@ from koopmpc.control.nonlinear.stagewise import (
     list_sides,
     plan_cost,
     simulation,
-    unconstrained,
+    solve_unconstrained,
     weights,
 )
 from koopmpc.control.riccati import Stage, step
@@ -80,7 +80,7 @@ class RealTimeIteration:
         self._softness = Softness(*(np.concatenate(pair) for pair in prices))
         self._sizes, self._input_sizes = problem.sizes, problem.input_sizes
         sweeps, simulate, linearise = RiccatiSweeps(nx, nu, N), simulation(problem), linearisation(problem)
-        free = unconstrained(sweeps, R)
+        free = solve_unconstrained(sweeps, R)
         interior = interior_step(sweeps, R, self._sides, ng) if len(self._sides.row) else None
         self._limits = Interval(*(np.concatenate([problem.inputs[i], problem.box[i]]) for i in (0, 1)))
         self.low, self.high = (np.tile(end, (N, 1)) for end in self._limits)

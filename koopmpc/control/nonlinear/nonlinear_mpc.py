@@ -355,7 +355,7 @@ class NonlinearMPC(StagedMPC):
         return pickle.loads(pickle.dumps(self))
 
     def update(self, model: ModelOrMap) -> None:
-        """Go on with another predictor of the same lifting, as `BilinearMPC.update`; the solver is built anew."""
+        """Go on with another predictor of the same lifting, as `BilinearMPC.update`; the solver is built again."""
         super().update(model)
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
 

@@ -270,4 +270,4 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
 def point_sizes(model: LearnedMap, outputs: StateTracking) -> Float[np.ndarray, " nx"]:
     """Return the sizes of the entries of x, under an embedding those of the state and of its past."""
     sizes = outputs.sizes
-    return sizes.states if model.embedding is None else model.embedding.held(sizes.states, sizes.inputs)
+    return sizes.states if model.embedding is None else model.embedding.repeat(sizes.states, sizes.inputs)

@@ -130,7 +130,7 @@ class StagedMPC(MPCBase):
         self._forget_targets()
 
     def _forget_targets(self) -> None:
-        """Have the next step find its targets anew."""
+        """Have the next step search its targets again."""
         self._reference: bytes | None = None
         self._target: TerminalTarget | None = None
 
@@ -222,7 +222,7 @@ class StagedMPC(MPCBase):
         R, U, slopes, held, end = self._preview
         if self._disturbed:  # the last disturbance of the preview stays
             e = self._e[-1]
-            end = self._target = self._terminal.disturbed(R[-1], e, self._target)
+            end = self._target = self._terminal.find_disturbed(R[-1], e, self._target)
             U = np.clip(U + slopes @ e, *self._outputs.inputs)
             U[held] = end.u
         self._moved = False
@@ -300,7 +300,7 @@ class StagedMPC(MPCBase):
         start: float,
         free: Float[np.ndarray, " nu"] | None = None,
     ) -> Move:
-        """Return the move that replaces a failed step; the next step begins anew, unless this one ran out of time."""
+        """Return the move that replaces a failed step; the next step starts cold, unless this one ran out of time."""
         self._warm = status is Status.TIME_LIMIT
         known = free is not None and bool((np.abs(free) < HUGE).all())
         return self._fail(free if known else None, applied, status, iterations, start)

@@ -1,9 +1,10 @@
 """A quadratic program of N stages with their own dynamics, as CasADi functions: Riccati sweeps, interior points.
 
-    min Σ ½ δx_{k+1}ᵀQ_{k+1}δx_{k+1} + q_{k+1}ᵀδx_{k+1} + ½ δu_kᵀRδu_k + r_kᵀδu_k,  δx_{k+1} = A_k δx_k + B_k δu_k + c_k
+    min Σ ½ δx_{k+1}ᵀQ_{k+1}δx_{k+1} + q_{k+1}ᵀδx_{k+1} + ½ δu_kᵀRδu_k + r_kᵀδu_k,
+    δx_{k+1} = A_k δx_k + B_k δu_k + c_k.
 
-A barrier term adds a diagonal to R and GᵀwG to Q, so that every Newton step is one backward and one forward sweep:
-its work grows with N, not with N³, and an unstable plant spoils no digits.
+A barrier term adds a diagonal to R and GᵀwG to Q. Every Newton step is then one backward and one forward sweep: its
+work grows with N, not with N³, and an unstable plant costs no digits.
 
 Rao, Wright & Rawlings, "Application of interior-point methods to model predictive control", J. Optim. Theory
 Appl. 99, 1998; Mehrotra, "On the implementation of a primal-dual interior point method", SIAM J. Optim. 2, 1992.
@@ -202,7 +203,7 @@ class RiccatiSweeps:
         return X, U
 
 
-def unconstrained(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"]) -> ca.Function:
+def solve_unconstrained(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"]) -> ca.Function:
     """Return (A, B, c, Q, q, r, δx_0) → (δX, δU, diag S): the solution without limits, and the inputs' curvatures."""
     nx, nu, N = sweeps.nx, sweeps.nu, sweeps.N
     A, B, c, Q, q, r, x0 = _problem(nx, nu, N)

@@ -118,7 +118,7 @@ class QPSolver(ABC):
                 f"the QP has A {qp.A.shape}, P {qp.P.shape}, q {qp.q.shape}, low {qp.low.shape} and"
                 f" high {qp.high.shape}; pass A (m, n), P (n, n), q (n,), low and high (m,)"
             )
-        checks.crossed(qp.low, qp.high, "the QP's")
+        checks.refuse_crossed(qp.low, qp.high, "the QP's")
         self._qp = qp
         self._own = np.stack([np.maximum(qp.low, -INFINITY), np.minimum(qp.high, INFINITY)])
         self._now, self._spare = self._own.copy(), np.empty((2, m))

@@ -2,8 +2,8 @@
 """DAQP behind our interface: the one file that imports it, checks what it accepts, and maps every exit flag.
 
 DAQP is a dual active-set method: exact to rounding, and fast where few rows are active; but what it holds before
-its end is infeasible. DAQP 0.11 ignores short vectors and unknown settings without a word, takes NaN, ignores a
-row whose norm is below 3e-6, measures its tolerances in the units of the cost, and may call equalities that differ
+its end is infeasible. DAQP 0.11 ignores short vectors and unknown settings without a word, and takes NaN. It ignores a
+row whose norm is below 3e-6, measures its tolerances in the units of the cost. It may call equalities that differ
 by rounding contradictory, or a problem with a singular P unbounded when it starts warm. Nothing of that passes
 here: rows, variables and cost are scaled; answers are measured where P is not diagonal; and a problem that is called
 infeasible or unbounded is solved again, cold, with limits a tolerance wider, before that is believed. Scaling is

@@ -1,8 +1,8 @@
 # pyright: basic, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
 """OSQP behind our interface: the one file that imports it, checks what it accepts, and maps every status.
 
-OSQP 1.1 takes short, strided and NaN vectors and crossed limits without raising, returns finite nonsense for an
-infeasible problem, and says "solved" after a solve that ran out of iterations if the solve before it was solved
+OSQP 1.1 takes short, strided and NaN vectors and crossed limits without raising, and returns finite nonsense for an
+infeasible problem. It says "solved" after a solve that ran out of iterations if the solve before it was solved
 and no limit moved in between. Nothing of that passes here. Updates and solves go to its extension object, which
 spares the 15 µs that its Python wrapper spends on copies of the problem.
 
@@ -138,7 +138,7 @@ class OSQP(QPSolver):
         self._solver.update_rho(rho)
 
     def update(self, qp: QP) -> None:
-        """Go on with another QP of the same size; where its zeros stand elsewhere it is set up anew.
+        """Go on with another QP of the same size; if its zeros are in other places, the solver is set up again.
 
         Raises
         ------

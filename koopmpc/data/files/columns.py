@@ -71,13 +71,13 @@ class TableSettings:
 
         given = {
             what: tuple(map(match_name, map(str, some)))
-            for what, some in self.given.items()
+            for what, some in self.roles.items()
             if not isinstance(some, str)
         }
         return replace(self, **given)
 
     @property
-    def given(self) -> dict[str, Sequence[str]]:
+    def roles(self) -> dict[str, Sequence[str]]:
         """The names that the caller gives, by their role."""
         every = {"states": self.states, "inputs": self.inputs, "disturbances": self.disturbances}
         return {what: some for what, some in every.items() if some is not None}
@@ -85,7 +85,7 @@ class TableSettings:
     @property
     def named(self) -> set[str]:
         """The columns that the caller names."""
-        return {name for some in self.given.values() for name in some}
+        return {name for some in self.roles.values() for name in some}
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def find_roles(
         A given column is missing or stands twice, or no column is left for a state.
     """
     states, inputs, disturbances = told.states, told.inputs, told.disturbances
-    for what, given in told.given.items():
+    for what, given in told.roles.items():
         if isinstance(given, str):
             raise DataError(f"{what} is {given!r}; pass a tuple of names")
         for name in given:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from koopmpc import disk
-from koopmpc.data.episodes import Episodes, PlantSignature, joined
+from koopmpc.data.episodes import Episodes, PlantSignature, join_sets
 from koopmpc.data.files.formats import find_format, list_suffixes
 from koopmpc.data.files.load import load_episodes
 from koopmpc.data.source import Part, Source
@@ -53,7 +53,7 @@ class Files(Source):
     ) -> None:
         if reader is not None and reading:
             raise DataError(f"a reader of your own is given no {', '.join(reading)}; bind them with partial")
-        self.files = _found(paths)
+        self.files = _list_files(paths)
         self._reader = partial(load_episodes, **reading) if reader is None else reader
         self._plain = reader is None and not reading
         cut = self._cut(self.files[0], 0, None)
@@ -100,7 +100,7 @@ def _read_together(files: tuple[Path, ...], reader: EpisodesReader, plant: Plant
     for file in files:
         sets.append(_read_folder(file, reader))
         plant.check(sets[-1], str(file))
-    return joined(sets)
+    return join_sets(sets)
 
 
 def _read_folder(file: Path, reader: EpisodesReader) -> Episodes:
@@ -113,7 +113,7 @@ def _read_folder(file: Path, reader: EpisodesReader) -> Episodes:
         raise type(error)(f"{file}: {error}") from error
 
 
-def _found(paths: str | PathLike[str] | Iterable[str | PathLike[str]]) -> tuple[Path, ...]:
+def _list_files(paths: str | PathLike[str] | Iterable[str | PathLike[str]]) -> tuple[Path, ...]:
     """Return the files, those of a folder by name."""
     if not isinstance(paths, str | PathLike):
         each = paths if hasattr(paths, "__iter__") else [paths]
@@ -122,7 +122,7 @@ def _found(paths: str | PathLike[str] | Iterable[str | PathLike[str]]) -> tuple[
             raise DataError("there is no path; pass a folder, or at least one file")
         for file in files:
             if not file.is_file():
-                raise LogError(f"{file} is no file; pass files, or one folder")
+                raise LogError(f"{file} is not a file; pass files, or one folder")
         return _distinct(files)
     folder = Path(paths)
     if folder.is_file():
@@ -151,6 +151,6 @@ def _distinct(files: tuple[Path, ...]) -> tuple[Path, ...]:
         for i, file in enumerate(group):
             twin = next((other for other in group[:i] if cmp(file, other, shallow=False)), None)
             if twin is not None:
-                warnings.warn(f"{file} holds the same bytes as {twin}, and counts beside it", FitWarning, stacklevel=2)
+                warnings.warn(f"{file} holds the same bytes as {twin}; its rows count twice", FitWarning, stacklevel=2)
                 break
     return files

@@ -5,7 +5,7 @@ from os import PathLike
 from pathlib import Path
 
 from koopmpc import disk
-from koopmpc.data.episodes import Episodes, PlantSignature, joined
+from koopmpc.data.episodes import Episodes, PlantSignature, join_sets
 from koopmpc.data.files.columns import TableSettings
 from koopmpc.data.files.formats import find_format, read_log
 from koopmpc.data.files.tables import read_table
@@ -74,7 +74,7 @@ def load_episodes(
     plant = PlantSignature.of(sets[0], str(files[0]))
     for file, episodes in zip(files, sets, strict=True):
         plant.check(episodes, str(file), tolerance=0.0)
-    return joined(sets)
+    return join_sets(sets)
 
 
 def _load_file(file: Path, settings: TableSettings) -> Episodes:

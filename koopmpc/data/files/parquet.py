@@ -78,12 +78,12 @@ def _verify(table: Any, named: dict[str, Any], first: int = 0, rows: int | None 
     """Raise where rows of a file, the first of them number `first` of `rows`, are not those that were written."""
     metadata = table.schema.metadata
     if _CHECK not in metadata:
-        raise ValueError("it is of an edition before 0.1.0, without checksums; save it anew by that edition as .npz")
+        raise ValueError("it is of an edition before 0.1.0, without checksums; save it by that edition as .npz")
     check = json.loads(metadata[_CHECK])
     size, rows = int(check["rows"]), len(table) if rows is None else rows
     places = np.stack([table[name].to_numpy() for name in ("episode", "step")], axis=1)
-    U = _stacked(table, _driving(named))
-    found = _checksums(metadata[_KEY].decode(), size, first, places, _stacked(table, named["states"]), np.nan_to_num(U))
+    U = _stack(table, _driving(named))
+    found = _checksums(metadata[_KEY].decode(), size, first, places, _stack(table, named["states"]), np.nan_to_num(U))
     if (first + len(table)) % size and first + len(table) < rows:  # the last block is not whole
         found.pop()
     begin = -(-first // size)
@@ -108,7 +108,7 @@ def read_parquet(file: Path) -> Episodes | LogTable:
     try:
         about = table.schema.metadata[_KEY].decode()
         named = json.loads(about)
-        X, U, steps = _unpacked(table, named)
+        X, U, steps = _unpack(table, named)
         _verify(table, named)
         return split_rows(X, U, steps, about)
     except (KeyError, TypeError, ValueError) as error:
@@ -160,7 +160,7 @@ def _read_rows(file: Path, stretches: list[tuple[int, int]], plant: PlantSignatu
             table = held.read_row_groups(groups.tolist())
         named = json.loads(table.schema.metadata[_KEY])
         disturbances = named["disturbances"]
-        X, U, W = (_stacked(table, some) for some in (named["states"], named["inputs"], disturbances))
+        X, U, W = (_stack(table, some) for some in (named["states"], named["inputs"], disturbances))
         episode, step = (table[name].to_numpy() for name in ("episode", "step"))
         before = int(ends[groups[0] - 1]) if groups[0] else 0
         found: list[Episode] = []
@@ -218,7 +218,7 @@ def split_groups(file: Path, history: int, plant: PlantSignature | None) -> list
     return parts
 
 
-def _unpacked(columns: Any, named: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _unpack(columns: Any, named: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return X, U and the steps of each episode, of a table of all rows; ValueError where some are out of order."""
     episode, step = (np.asarray(columns[name], dtype=np.intp) for name in ("episode", "step"))
     steps = np.bincount(episode) - 1
@@ -226,7 +226,7 @@ def _unpacked(columns: Any, named: dict[str, Any]) -> tuple[np.ndarray, np.ndarr
     if not (np.array_equal(episode, expected[0]) and np.array_equal(step, expected[1])):
         raise ValueError("rows are missing or out of order")
     last = step == steps[episode]
-    return _stacked(columns, named["states"]), _stacked(columns, _driving(named))[~last], steps
+    return _stack(columns, named["states"]), _stack(columns, _driving(named))[~last], steps
 
 
 def _driving(named: dict[str, Any]) -> list[str]:
@@ -234,7 +234,7 @@ def _driving(named: dict[str, Any]) -> list[str]:
     return named["inputs"] + named["disturbances"]
 
 
-def _stacked(columns: Any, names: list[str]) -> np.ndarray:
+def _stack(columns: Any, names: list[str]) -> np.ndarray:
     """Return the columns of these names side by side, (rows, columns), as numbers; null is NaN."""
     found = [np.asarray(columns[name], dtype=np.float64) for name in names]
     return np.stack(found, axis=1) if found else np.empty((len(columns["episode"]), 0))

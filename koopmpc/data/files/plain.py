@@ -83,7 +83,7 @@ def read_plain(file: Path) -> LogTable:
     if raw.startswith(_WITH_CHECKSUM):
         raise LogError(
             f"{file} holds no episodes that can be read: it is of an edition before 0.1.0, with a checksum in its "
-            "first line; remove this line and pass dt=, states= and inputs=, or save the episodes anew"
+            "first line; remove this line and pass dt=, states= and inputs=, or save the episodes again"
         )
     return _parse(raw, file)
 

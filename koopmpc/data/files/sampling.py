@@ -59,7 +59,7 @@ def sample_time(times: list[np.ndarray], where: str) -> float:
 
 
 def restarts(signals: Signals, where: str) -> list[Signals]:
-    """Return the parts between steps back in time, where a recorder was started anew.
+    """Return the parts between steps back in time, where a recorder was restarted.
 
     A warning tells where the clock went back to another time than that of the first row: it was set, not started.
     """
@@ -79,7 +79,7 @@ def restarts(signals: Signals, where: str) -> list[Signals]:
     return [signals.at(slice(a, b)) for a, b in pairwise(at)]
 
 
-def resampled(parts: list[Signals], dt: float, where: str) -> list[Signals]:
+def resample(parts: list[Signals], dt: float, where: str) -> list[Signals]:
     """Return the parts on the grid t₀, t₀ + dt, …: states are interpolated, inputs and disturbances held.
 
     Rows with a missing value are left out first. A step of more than 1.5 times both dt and the median step is a gap,

@@ -15,7 +15,7 @@ from koopmpc import checks, disk
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.columns import ColumnRoles, TableSettings, drop_unit, find_roles, is_label
 from koopmpc.data.files.formats import LogTable
-from koopmpc.data.files.sampling import Signals, episodes_from, resampled, restarts, sample_time
+from koopmpc.data.files.sampling import Signals, episodes_from, resample, restarts, sample_time
 from koopmpc.errors import ColumnWarning, DataError, FitWarning, KoopmpcError, LogError, NoInputWarning
 
 SAVED = ("episode", "step", "time [s]")
@@ -113,11 +113,11 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
         raise DataError(f"{where} has no column of time to resample by; its columns are {', '.join(names)}")
     episode = np.zeros(rows, dtype=np.intp)
     if found.episode is not None:
-        episode = _numbered(columns[found.episode], file)
+        episode = _number_episodes(columns[found.episode], file)
     step = None
     if found.step is not None and time is None:
         step = checks.array(columns[found.step], f"{where}: step", (None,))
-    X, U, W = (_stacked([values[n] for n in some], rows) for some in (found.states, found.inputs, found.disturbances))
+    X, U, W = (_stack([values[n] for n in some], rows) for some in (found.states, found.inputs, found.disturbances))
     parts: list[Signals] = []
     for e in range(int(episode.max(initial=-1)) + 1):
         here = np.flatnonzero(episode == e)
@@ -143,7 +143,7 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
     dt = checks.positive(dt, "dt", "s")
     if told.resample is not None:
         _affordable(parts, dt, len(found.values), where)
-        parts = resampled(parts, dt, where)
+        parts = resample(parts, dt, where)
     if found.guessed:
         _doubt(found, values, where, alone=told.inputs is None and not found.inputs)
     try:
@@ -167,7 +167,7 @@ def _rename_columns(table: LogTable, told: TableSettings, where: str) -> LogTabl
     """
     count = len(table.names)
     if told.columns is None:
-        if not table.named and not told.given:
+        if not table.named and not told.roles:
             first = ", ".join(f"{table.columns[name][0]:g}" for name in table.names[:4])
             raise LogError(
                 f"{where} has no line of names: its first row is {first}; write one above it, or pass columns= with "
@@ -222,8 +222,8 @@ def _numbers(column: np.ndarray, name: str, where: str) -> np.ndarray:
         return column
     row, cell = next((i, cell) for i, cell in enumerate(column) if cell is not None and not is_a_number(cell))
     raise DataError(
-        f"{where}: {name!r} holds {str(cell)!r} in row {row + 1}, which is no real number; repair the cell, leave it "
-        "empty where the value is missing, or name the columns to use: pass states= and inputs="
+        f"{where}: {name!r} holds {str(cell)!r} in row {row + 1}, which is not a real number; repair the cell, leave "
+        "it empty where the value is missing, or name the columns to use: pass states= and inputs="
     )
 
 
@@ -235,8 +235,9 @@ def _like_a_number(cell: object) -> bool:
     return True
 
 
-_USUAL, _ABSURD = 0.99, 1e6  # share of usual cells, and how many times larger none can be
-_MANY = 100  # cells that say what is usual
+_USUAL = 0.99  # quantile of |cells| that counts as usual in a column
+_ABSURD = 1e6  # a cell this many times larger than the usual one is an error
+_MANY = 100  # a column with fewer cells is not checked
 
 
 def _plausible(column: Float[np.ndarray, " M"], name: str, where: str) -> None:
@@ -279,7 +280,7 @@ def _affordable(parts: list[Signals], dt: float, columns: int, where: str) -> No
 def _doubt(found: ColumnRoles, table: dict[str, np.ndarray], where: str, *, alone: bool) -> None:
     """Warn of roles that may be guessed wrongly, and of columns that are constant or repeat another."""
     if alone:
-        stepped = [name for name in found.states if _stepped(table[name])]
+        stepped = [name for name in found.states if _is_stepped(table[name])]
         advice = "pass inputs= if some of them are inputs"
         if 0 < len(stepped) < len(found.states):
             hold = "holds its" if len(stepped) == 1 else "hold their"
@@ -333,13 +334,13 @@ def _even(column: Float[np.ndarray, " M"]) -> bool:
     return len(changes) >= 9 and bool((changes > 0).all() and np.ptp(changes) <= 1e-3 * changes.max())
 
 
-def _stepped(column: Float[np.ndarray, " M"]) -> bool:
+def _is_stepped(column: Float[np.ndarray, " M"]) -> bool:
     """Return True for a column that changes, and repeats its last value in more than half of the rows."""
     changes = np.diff(column[np.isfinite(column)])
     return 0 < int(np.count_nonzero(changes)) < len(changes) / 2
 
 
-def _numbered(labels: np.ndarray, file: Path) -> np.ndarray:
+def _number_episodes(labels: np.ndarray, file: Path) -> np.ndarray:
     """Return 0, 1, … for the labels in the order in which they first come."""
     if any(label is None or label != label for label in labels):
         raise DataError(f"{file} has rows whose episode is null; give each row the name of its episode")
@@ -349,5 +350,5 @@ def _numbered(labels: np.ndarray, file: Path) -> np.ndarray:
     return rank[number]
 
 
-def _stacked(columns: list[np.ndarray], rows: int) -> Float[np.ndarray, "rows n"]:
+def _stack(columns: list[np.ndarray], rows: int) -> Float[np.ndarray, "rows n"]:
     return np.stack(columns, axis=1) if columns else np.empty((rows, 0))

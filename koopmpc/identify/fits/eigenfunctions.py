@@ -290,7 +290,7 @@ class EigenfunctionRows:
     ) -> Eigenfunction | None:
         """Return φ on the fewest observables, those that contribute most to ξ; a `free` λ is fitted to each choice.
 
-        The result is None if φ vanishes on all data and λ is not fixed at 0.
+        Return None if φ vanishes on all data and λ is not fixed at 0.
         """
         weight = np.abs(xi) * np.hypot(np.linalg.norm(self.G, axis=0), np.linalg.norm(self._now, axis=0))
         order = np.argsort(-weight, kind="stable")

@@ -42,7 +42,7 @@ class Combination(Value):
         if A is None and B is None:
             raise DataError("a Combination has no weights; pass A, B or both")
         ends = checks.array([low, high], "low, high", (2,), infinite=True)
-        checks.crossed(ends[:1], ends[1:], "Combination")
+        checks.refuse_crossed(ends[:1], ends[1:], "Combination")
         freeze(
             self,
             low=float(ends[0]),

@@ -64,7 +64,7 @@ class MultiStepError:
                 total += float(np.sum(((x - truth) / self.size) ** 2))
                 if not np.isfinite(total):
                     return np.inf
-                point = x if self.embedding is None else self.embedding.shifted(point, u, x)
+                point = x if self.embedding is None else self.embedding.shift(point, u, x)
         return total / data.states.size
 
     @raise_swallowed()
@@ -94,8 +94,8 @@ class MultiStepError:
             if self.embedding is None:
                 point, moved = x, D
             else:
-                point = self.embedding.shifted(point, u, x)
-                moved = self.embedding.shifted(moved, np.zeros((*D.shape[:2], u.shape[1])), D)
+                point = self.embedding.shift(point, u, x)
+                moved = self.embedding.shift(moved, np.zeros((*D.shape[:2], u.shape[1])), D)
         return gradient / data.states.size, matrix / data.states.size
 
 

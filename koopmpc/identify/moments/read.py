@@ -94,7 +94,7 @@ def second_moments(
     source = source_of(episodes)
     if embedding is not None:
         checks.kind(embedding, "embedding", Delay, "pass km.Delay(2), or leave it out")
-        embedding = embedding.fitted(source.states, source.inputs)
+        embedding = embedding.match(source.states, source.inputs)
         source = embedding.source(source)
     bound = check_lifting(lifting).bind(source.states)
     reading = _ReadTask(None, bound, source.inputs, bilinear, _align_weights(weights, source))
