@@ -55,7 +55,12 @@ def test_arrays():
             r"x0 is not an array of numbers: got list, .*; pass numbers of one shape",
         ),
         ("12", {}, km.errors.DataError, r"x0 is not an array of numbers: got str, numbers cannot be None or text"),
-        ([1, None], {}, km.errors.DataError, r"x0 is not an array of numbers: got list, numbers cannot be None or text"),
+        (
+            [1, None],
+            {},
+            km.errors.DataError,
+            r"x0 is not an array of numbers: got list, numbers cannot be None or text",
+        ),
     ):
         with pytest.raises(error, match=text):
             checks.array(value, "x0", **kwargs)
