@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 PINNED := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 # Bytecode is kept: tests start hundreds of processes that import koopmpc.
 PYTEST := $(PINNED) PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --benchmark-disable
-TYPED := KOOPMPC_TESTS=typed $(PYTEST) --cov --cov-report=term
+TYPED := KOOPMPC_TESTS=typed $(PYTEST)
 
 .PHONY: bench test typed full mutants loops real soak speed docs check format clean embedded
 
@@ -18,12 +18,13 @@ bench: $(VENV)/installed
 test: $(VENV)/installed-dev
 	$(PYTEST)
 
-# The same tests with shapes checked by the type hook, and coverage.
+# The same tests with shapes checked by the type hook.
 typed: $(VENV)/installed-dev
 	$(TYPED)
 
+# All counts that the issues name, and coverage, which doubles the time.
 full: $(VENV)/installed-dev
-	$(TYPED) -m "(slow or not slow) and not speed and not loops and not real"
+	$(TYPED) --cov --cov-report=term -m "(slow or not slow) and not speed and not loops and not real"
 
 # 200 small changes of the library, of which the tests must notice 92 %: about half an hour on two cores.
 mutants: $(VENV)/installed-dev

@@ -126,7 +126,16 @@ else:
             "loop.simulate",
         ),
         joints={
-            "log formats": ("data.files.npz", "data.files.parquet", "data.files.plain", "recording.reader"),
+            "log formats": (
+                "data.files.npz",
+                "data.files.parquet",
+                "data.files.plain",
+                "data.files.foreign.matlab",
+                "data.files.foreign.hdf5",
+                "data.files.foreign.mdf",
+                "data.files.foreign.ros",
+                "recording.reader",
+            ),
             "controllers": (
                 "control.lqr",
                 "control.linear.koopman_mpc",

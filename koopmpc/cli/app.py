@@ -21,6 +21,7 @@ from koopmpc.cli.console import (
     say,
     say_page,
     split,
+    split_columns,
 )
 from koopmpc.cli.sweeps import Logs
 from koopmpc.errors import DataError, KoopmpcError, ProblemError
@@ -78,7 +79,10 @@ def new(name: Annotated[str, typer.Argument(help="Name of the problem; the file 
 
 @app.command()
 def fit(
-    data: Annotated[list[Path], typer.Argument(help="A folder of .npz, .parquet, .csv and .rrd files, or files.")],
+    data: Annotated[
+        list[Path],
+        typer.Argument(help="A folder of logs, or files: .csv, .parquet, .npz, .rrd, .mat, .h5, .mf4, .mcap, .db3."),
+    ],
     states: Annotated[
         str | None, typer.Option("--states", help="Columns of a table that are states or outputs: a,b,… or 3,4.")
     ] = None,
@@ -86,7 +90,7 @@ def fit(
         str | None, typer.Option("--inputs", help='Columns that are inputs: u,v,… or 2; "" where there are none.')
     ] = None,
     columns: Annotated[
-        str | None, typer.Option("--columns", help="Names of all columns, for a table without a line of names.")
+        str | None, typer.Option("--columns", help="Names to use: old=new,old=new,…; or of all columns: a,b,…")
     ] = None,
     dt: Annotated[float | None, typer.Option("--dt", help="Sample time in s, where no column tells it.")] = None,
     resample: Annotated[
@@ -119,7 +123,7 @@ def fit(
         "states": None if states is None else split(states),
         "inputs": None if inputs is None else split(inputs),
         "resample": resample,
-        "columns": None if columns is None else split(columns),
+        "columns": None if columns is None else split_columns(columns),
     }
     if goal_template:
         with friendly():

@@ -16,13 +16,30 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from koopmpc.errors import FitWarning, FullDiskError, KoopmpcError, LogError
+from koopmpc.errors import DataError, FitWarning, FullDiskError, KoopmpcError, LogError
 from koopmpc.interrupts import ENDING
 
 
 def split(names: str) -> list[str]:
     """Return the names in ``"a, b"``; an empty text has none."""
     return [name.strip() for name in names.split(",") if name.strip()]
+
+
+def split_columns(text: str) -> dict[str, str] | list[str]:
+    """Return old → new of the names in ``"old=new, old=new"``, or the names in ``"a, b"``.
+
+    Raises
+    ------
+    DataError
+        A part is no such pair.
+    """
+    if "=" not in text:
+        return split(text)
+    pairs = [part.rpartition("=") for part in split(text)]
+    wrong = next((new for old, _, new in pairs if not old.strip() or not new.strip()), None)
+    if wrong is not None:
+        raise DataError(f"--columns {text!r} is no list of old=new; write for example --columns 'y1=theta,y2=omega'")
+    return {old.strip(): new.strip() for old, _, new in pairs}
 
 
 def find_program() -> list[str]:

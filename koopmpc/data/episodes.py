@@ -8,7 +8,7 @@ from itertools import islice
 from math import isclose
 from os import PathLike
 from pathlib import Path
-from typing import cast, overload
+from typing import Any, cast, overload
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -322,6 +322,60 @@ class Episodes(Named, Value):
         from koopmpc.data.files.load import save_episodes  # readers build Episodes, so it imports this file
 
         save_episodes(self, path)
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: Any,
+        *,
+        by: str | None = None,
+        time: str | None = None,
+        states: Sequence[str] | None = None,
+        inputs: Sequence[str] | None = None,
+        disturbances: Sequence[str] | None = None,
+        dt: float | None = None,
+        resample: float | None = None,
+    ) -> "Episodes":
+        """Return the episodes of a pandas.DataFrame: a row a time step, a column a signal, as in a .csv file.
+
+        Parameters
+        ----------
+        frame
+            The table. A column or an index of times may hold seconds, datetimes or timedeltas.
+        by
+            The column that tells episodes apart; by default ``episode``, ``run`` or ``trial`` where there is one.
+        time
+            The column of time; by default ``t``, ``time [s]``, ``time [ms]`` or ``timestamp``, or an index of
+            datetimes.
+        states, inputs, disturbances, dt, resample
+            As in `load_episodes`.
+
+        Raises
+        ------
+        DataError
+            It is no DataFrame, a column is missing, or as `load_episodes` says of tables.
+
+        Examples
+        --------
+        >>> import koopmpc as km
+        >>> import pandas as pd
+        >>> frame = pd.DataFrame({"t": [0.0, 0.1, 0.2], "theta": [0.0, 0.1, 0.3], "u": [1.0, 1.0, 0.0]})
+        >>> km.Episodes.from_frame(frame).dt
+        0.1
+        """
+        from koopmpc.data.files.columns import TableSettings
+        from koopmpc.data.files.frames import read_frame  # readers build Episodes, so they import this file
+
+        return read_frame(frame, TableSettings(dt, states, inputs, disturbances, resample), by, time)
+
+    def to_frame(self) -> Any:
+        """Return a pandas.DataFrame with episode, step, time [s] and all signals, which `from_frame` reads back.
+
+        The inputs of an episode's last row are NaN: none was applied there.
+        """
+        from koopmpc.data.files.frames import build_frame, list_columns
+
+        return build_frame(list_columns(self))
 
     def with_episodes(self, episodes: Sequence[Episode]) -> "Episodes":
         """Return a set of other episodes with the sample time and the names of this set."""

@@ -417,11 +417,15 @@ def _escape_text(name: str) -> str:
 
 
 def _format_toml(value: Any) -> str:
-    """Return a number, a text or a sequence of these as TOML."""
+    """Return a number, a text, a sequence or a mapping of these as TOML."""
     if isinstance(value, bool | int | float):
         return repr(value).lower()
     if isinstance(value, str):
         return f'"{_escape_text(value)}"'
+    if isinstance(value, Mapping):
+        table = cast("Mapping[str, Any]", value)
+        pairs = (f'"{_escape_text(key)}" = {_format_toml(item)}' for key, item in table.items())
+        return f"{{ {', '.join(pairs)} }}"
     return f"[{', '.join(map(_format_toml, value))}]"
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Plan, Status
+from koopmpc.data.files.frames import build_frame
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
 from koopmpc.predict.base import Predictor
@@ -318,6 +319,29 @@ class Run(About, StepRows):
             return self
         rows = {name: values[: steps + (name in _OF_STATES)] for name, values in self.columns().items()}
         return replace(self, **rows, plans=None)
+
+    def to_frame(self) -> Any:
+        """Return a pandas.DataFrame of step, time [s], states, measurements, references, inputs and status.
+
+        Columns of measurements begin with ``measured``, those of references with ``reference``. The last row has no
+        input, status or solve time.
+
+        Raises
+        ------
+        KoopmpcError
+            pandas is not installed.
+        """
+        last = [None] * (len(self.X) - self.steps)
+        columns: dict[str, Any] = {"step": np.arange(len(self.X)), "time [s]": self.time}
+        columns |= dict(zip(self.states, self.X.T, strict=True))
+        columns |= {f"measured {name}": column for name, column in zip(self.outputs, self.Y.T, strict=True)}
+        tracked = self.tracked(self.reference.shape[1])
+        columns |= {f"reference {name}": column for name, column in zip(tracked, self.reference.T, strict=True)}
+        inputs = np.vstack([self.U, np.full((len(last), self.U.shape[1]), np.nan)])
+        columns |= dict(zip(self.inputs, inputs.T, strict=True))
+        columns["status"] = [*(Status(code).name for code in self.status), *last]
+        columns["solve time [s]"] = np.append(self.solve_time, [np.nan] * len(last))
+        return build_frame(columns)
 
     @property
     def steps(self) -> int:

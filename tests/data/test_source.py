@@ -111,7 +111,7 @@ def test_measured_disturbances_come_behind_the_inputs() -> None:
 def test_the_path_must_be_there_and_hold_episodes(tmp_path: Path) -> None:
     with pytest.raises(km.errors.LogError, match="nowhere does not exist; pass a folder"):
         km.data.Files(tmp_path / "nowhere")
-    with pytest.raises(km.errors.LogError, match=r"holds no .npz, .parquet, .csv or .rrd file: it holds nothing"):
+    with pytest.raises(km.errors.LogError, match=r"holds no .npz, .parquet, .csv, .* or .rrd file: it holds nothing"):
         km.data.Files(tmp_path)
     (tmp_path / "a.txt").touch()
     with pytest.raises(km.errors.LogError, match=r"it holds a\.txt"):
@@ -225,7 +225,7 @@ def test_row_groups_hold_each_pair_once_in_order(
         patch.setattr("koopmpc.data.files.parquet._GROUP", 8 * rows * (5 + disturbed))
         data.save(tmp_path / "a.parquet")
         patch.setattr("koopmpc.data.files.parquet._LARGE", 0)
-        parts = split_groups(tmp_path / "a.parquet", history, None)
+        parts = split_groups(tmp_path / "a.parquet", history, None, {})
     assert parts is not None
     for part in parts:
         assert sum(map(len, part.load())) <= rows + history + 1
@@ -273,7 +273,7 @@ def test_files_that_cannot_be_cut_are_read_whole_and_damage_is_named(
     data.save(a)
     monkeypatch.setattr("koopmpc.data.files.parquet._LARGE", 0)
     pq.write_table(pa.table({"time": [0.0, 0.1, 0.2], "x": [1.0, 2.0, 3.0], "u": [0.0, 1.0, 0.0]}), b)
-    assert split_groups(b, 0, None) is None
+    assert split_groups(b, 0, None, {}) is None
     assert [len(one) for part in km.data.Files(b).parts() for one in part.load()] == [2]
     c.write_bytes(b"no table")
     with pytest.raises(km.errors.LogError, match=r"c\.parquet"):
@@ -338,6 +338,6 @@ def test_a_row_group_that_was_changed_is_told_wherever_the_change_is(
             pq.write_table(changed, tmp_path / "changed.parquet", row_group_size=16)
             with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
                 km.load_episodes(tmp_path / "changed.parquet")
-            parts = split_groups(tmp_path / "changed.parquet", 0, None)
+            parts = split_groups(tmp_path / "changed.parquet", 0, None, {})
             with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
                 parts[row // 16].load()

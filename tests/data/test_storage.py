@@ -137,10 +137,10 @@ def test_a_file_with_nan_says_so(tmp_path: Path) -> None:
 
 def test_other_suffixes_and_taken_names_are_refused(tmp_path: Path) -> None:
     data = random_episodes([2], 1, 1, 0)
-    with pytest.raises(km.errors.DataError, match=r"in .npz, .parquet, .csv files, not in 'data.txt'; rename it"):
-        data.save(tmp_path / "data.txt")
-    with pytest.raises(km.errors.DataError, match=r"in .npz, .parquet, .csv,.* files, not in 'data.log'; rename it"):
-        km.load_episodes(tmp_path / "data.log")
+    with pytest.raises(km.errors.DataError, match=r"in .npz, .parquet, .csv files, not in 'data.xyz'; rename it"):
+        data.save(tmp_path / "data.xyz")
+    with pytest.raises(km.errors.DataError, match=r"in .npz, .parquet, .csv, .* files, not in 'data.xyz'; rename it"):
+        km.load_episodes(tmp_path / "data.xyz")
     taken = km.Episodes(data.episodes, data.dt, states=["step"])
     with pytest.raises(km.errors.DataError, match=r"has a column 'step' of its own; rename the state, or save as .npz"):
         taken.save(tmp_path / "data.parquet")

@@ -27,6 +27,15 @@ ELSEWHERE = {  # pages whose claims are tested beyond what they print, and where
     "start.md": "tests/docs/test_pages.py",  # as the notebook
     "sweeps.md": "tests/bench/test_docs.py",
 }
+PACKAGES = {
+    "gym": "gymnasium",
+    "sklearn": "sklearn",
+    "pandas": "pandas",
+    "hdf5": "h5py",
+    "mdf": "asammdf",
+    "ros": "mcap",
+}
+
 HERE = [page for page in PAGES if blocks(page) and page not in ELSEWHERE]
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
 
@@ -47,7 +56,7 @@ def anchors(page):
 def test_every_block_of_a_page_runs_and_prints_what_the_page_shows(page, tmp_path):
     for block in blocks(page):
         if block.extra:
-            pytest.importorskip({"gym": "gymnasium", "sklearn": "sklearn"}[block.extra])
+            pytest.importorskip(PACKAGES[block.extra])
     for shown, printed in run(page, tmp_path)[1]:
         assert alike(shown, printed), printed
 

@@ -1,7 +1,7 @@
 """Roles of a table's columns: time, episode, states, inputs and disturbances, as given or as their names say."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from koopmpc import checks
@@ -32,7 +32,7 @@ _TARGETS = {"setpoint", "reference", "ref", "target", "desired", "sp"}  # what a
 class TableSettings:
     """The caller's knowledge of a table; None is inferred from the table.
 
-    `columns` renames all columns, for a table without a line of names.
+    `columns` names all columns, for a table without a line of names, or maps names in the log to the names to use.
     """
 
     dt: float | None = None
@@ -40,7 +40,7 @@ class TableSettings:
     inputs: Sequence[str] | None = None
     disturbances: Sequence[str] | None = None
     resample: float | None = None
-    columns: Sequence[str] | None = None
+    columns: Sequence[str] | Mapping[str, str] | None = None
 
     def __post_init__(self) -> None:
         for name in ("dt", "resample"):
@@ -53,6 +53,33 @@ class TableSettings:
     def nothing(self) -> bool:
         """True where the caller gives nothing."""
         return all(value is None for value in vars(self).values())
+
+    def rename(self, names: Sequence[str], where: str) -> list[str]:
+        """Return the names of all columns after `columns`; a mapped name without a unit keeps the unit of the old one.
+
+        Raises
+        ------
+        DataError
+            There are more or fewer names than columns, or a column to rename is not there.
+        """
+        if self.columns is None:
+            return list(names)
+        if not isinstance(self.columns, Mapping):
+            if len(self.columns) != len(names):
+                raise DataError(
+                    f"{where} has {len(names)} columns, columns= gives {len(self.columns)} names; pass one for each"
+                )
+            return list(map(str, self.columns))
+        stems, renamed = [drop_unit(name) for name in names], list(names)
+        for old, new in self.columns.items():
+            at = [i for i, name in enumerate(names) if name == old]
+            at = at or [i for i, stem in enumerate(stems) if stem == drop_unit(old)]
+            if len(at) != 1:
+                has = "has two columns" if at else "has no column"
+                raise DataError(f"{where} {has} {old!r} to rename; its columns are {', '.join(names)}")
+            unit = re.search(r"\s*[\[(][^\])]*[\])]$", names[at[0]])
+            renamed[at[0]] = new if unit is None or "[" in new else f"{new}{unit.group(0)}"
+        return renamed
 
     def match_names(self, names: Sequence[str]) -> "TableSettings":
         """Return the copy with names as the table writes them.

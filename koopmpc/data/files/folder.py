@@ -55,7 +55,7 @@ class Files(Source):
             raise DataError(f"a reader of your own is given no {', '.join(reading)}; bind them with partial")
         self.files = _list_files(paths)
         self._reader = partial(load_episodes, **reading) if reader is None else reader
-        self._plain = reader is None and not reading
+        self._reading = None if reader is not None else reading
         cut = self._cut(self.files[0], 0, None)
         first = cut[0].load() if cut else _read_folder(self.files[0], self._reader)
         self._signature = PlantSignature.of(first, str(self.files[0]))
@@ -83,8 +83,10 @@ class Files(Source):
 
     def _cut(self, file: Path, history: int, plant: PlantSignature | None) -> list[Part] | None:
         """Return the parts of a large file that can be read in groups of rows."""
-        split = find_format(file).parts if self._plain else None
-        return None if split is None else split(file, history, plant)
+        if self._reading is None:
+            return None
+        split = find_format(file).parts
+        return None if split is None else split(file, history, plant, self._reading)
 
 
 def _together(files: tuple[Path, ...], reader: EpisodesReader, plant: PlantSignature) -> Part:

@@ -4,12 +4,14 @@ A new format is a file with a reader that calls `register_format`, and its line 
 ``koopmpc/__init__.py``.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
+from jaxtyping import Float
 
 from koopmpc import disk
 from koopmpc.data.episodes import Episodes, PlantSignature
@@ -50,6 +52,12 @@ class LogTable:
         columns = {known.get(name, name): column for name, column in self.columns.items()}
         return LogTable(tuple(known.get(name, name) for name in self.names), columns, {}, self.dt, self.named)
 
+    def renamed(self, names: Sequence[str]) -> "LogTable":
+        """Return the table with other names of its columns, in the same order."""
+        new = dict(zip(self.names, names, strict=True))
+        columns = {new[name]: column for name, column in self.columns.items()}
+        return replace(self, names=tuple(names), columns=columns, named=True)
+
 
 @dataclass(frozen=True, eq=False)
 class LogFormat:
@@ -60,12 +68,13 @@ class LogFormat:
     suffixes
         Ends of file names, with the dot.
     read
-        Path → Episodes, if the file states sample time and roles; else → LogTable.
+        Path → Episodes, if the file states sample time and roles; → LogTable, if all columns share their rows; else →
+        Recording.
     write
         Write Episodes to a file that is open; None for a format that is only read.
     parts
-        (path, history, signature) → the parts of a large file, as `Source.parts` has them, or None if this file cannot
-        be read in parts. None for a format whose files are always read whole.
+        (path, history, signature, keywords of `load_episodes`) → the parts of a large file, as `Source.parts` has them,
+        or None if this file cannot be read in parts. None for a format whose files are always read whole.
     extra
         The extra of koopmpc that installs what `read` imports.
     folders
@@ -73,11 +82,56 @@ class LogFormat:
     """
 
     suffixes: tuple[str, ...]
-    read: Callable[[Path], Episodes | LogTable]
+    read: Callable[[Path], "Episodes | LogTable | Recording"]
     write: Callable[[BinaryIO, Episodes], None] | None = None
-    parts: Callable[[Path, int, PlantSignature | None], list[Part] | None] | None = None
+    parts: Callable[[Path, int, PlantSignature | None, Mapping[str, Any]], list[Part] | None] | None = None
     extra: str | None = None
     folders: bool = True
+
+
+Samples = tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One signal of a recording.
+
+    Attributes
+    ----------
+    name
+        Its name in the file, without the unit.
+    unit
+        Its unit, where the file states one.
+    count
+        Number of its samples.
+    """
+
+    name: str
+    unit: str
+    count: int
+
+    @property
+    def title(self) -> str:
+        """Name and unit, as ``"theta [rad]"``."""
+        return f"{self.name} [{self.unit}]" if self.unit and "[" not in self.name else self.name
+
+
+class Recording(ABC):
+    """A log that is open for reading. Times are in seconds since the recording's own zero."""
+
+    @abstractmethod
+    def channels(self) -> tuple[Channel, ...]:
+        """Return the channels of numbers, in the order of the file."""
+
+    @abstractmethod
+    def span(self) -> tuple[float, float]:
+        """Return the first and the last time of any channel [s]."""
+
+    @abstractmethod
+    def read(
+        self, names: Sequence[str], begin: float = -np.inf, end: float = np.inf, count: int | None = None
+    ) -> list[Samples]:
+        """Return times [s] and values of channels from `begin` to `end`; of each the first `count` at most."""
 
 
 _JOINT = "log formats"
@@ -117,7 +171,7 @@ def find_format(file: Path, *, writable: bool = False) -> LogFormat:
     return log_format
 
 
-def read_log(file: Path) -> Episodes | LogTable:
+def read_log(file: Path) -> Episodes | LogTable | Recording:
     """Return what the reader of the file's format makes of it.
 
     Raises

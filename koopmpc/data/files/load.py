@@ -1,13 +1,15 @@
 """load_episodes: the episodes of one file or of several, in any format that is registered."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
-from pathlib import Path
+from typing import Any
 
 from koopmpc import disk
 from koopmpc.data.episodes import Episodes, PlantSignature, join_sets
 from koopmpc.data.files.columns import TableSettings
-from koopmpc.data.files.formats import find_format, read_log
+from koopmpc.data.files.formats import LogTable, find_format, read_log
+from koopmpc.data.files.frames import is_frame, read_frame
+from koopmpc.data.files.recording import read_recording
 from koopmpc.data.files.tables import read_table
 from koopmpc.errors import DataError
 
@@ -22,14 +24,14 @@ def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:
 
 
 def load_episodes(
-    path: str | PathLike[str],
-    *more: str | PathLike[str],
+    path: Any,
+    *more: Any,
     dt: float | None = None,
     states: Sequence[str] | None = None,
     inputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
     resample: float | None = None,
-    columns: Sequence[str] | None = None,
+    columns: Sequence[str] | Mapping[str, str] | None = None,
 ) -> Episodes:
     """Read the episodes of one file, or of several as one set.
 
@@ -42,10 +44,14 @@ def load_episodes(
     set point is left out. All other columns of numbers are states; arguments count before such guesses. The inputs of
     an episode's last row are not read. Missing values and gaps in time cut episodes, and a warning counts them.
 
+    A .mf4, .mcap or .db3 holds channels with clocks of their own. Those of one clock are the rows of a table; others
+    are brought to the steps of the slowest state, or of `resample`, and a warning says so.
+
     Parameters
     ----------
     path, more
-        .npz, .parquet, .csv, .dat, .txt or .rrd.
+        Files of a format below, or a pandas.DataFrame. .npz, .parquet, .csv, .dat, .txt and .rrd are always read; .mat
+        and .h5 with the extra ``hdf5``, .mf4 with ``mdf``, .mcap and the .db3 of ROS 2 bags with ``ros``.
     dt
         Sample time of a table without a column of time [s].
     states, inputs, disturbances
@@ -53,7 +59,8 @@ def load_episodes(
     resample
         Sample time [s] to interpolate to, for a table whose steps are unequal: states linearly, inputs held.
     columns
-        Names of all columns of a table, which replace its own: for a file without a line of names.
+        Names of all columns of a table, for a file without a line of names; or {name in the log: name to use}, where a
+        new name without a unit keeps the unit of the old one.
 
     Raises
     ------
@@ -69,18 +76,23 @@ def load_episodes(
         There are gaps, columns that are constant or repeat another, or no column with the name of an input.
     """
     settings = TableSettings(dt, states, inputs, disturbances, resample, columns)
-    files = [disk.path_of(file) for file in (path, *more)]
+    files = [log if is_frame(log) else disk.path_of(log) for log in (path, *more)]
     sets = [_load_file(file, settings) for file in files]
-    plant = PlantSignature.of(sets[0], str(files[0]))
-    for file, episodes in zip(files, sets, strict=True):
-        plant.check(episodes, str(file), tolerance=0.0)
+    places = ["a DataFrame" if is_frame(log) else str(log) for log in files]
+    plant = PlantSignature.of(sets[0], places[0])
+    for place, episodes in zip(places, sets, strict=True):
+        plant.check(episodes, place, tolerance=0.0)
     return join_sets(sets)
 
 
-def _load_file(file: Path, settings: TableSettings) -> Episodes:
+def _load_file(file: Any, settings: TableSettings) -> Episodes:
+    if is_frame(file):
+        return read_frame(file, settings)
     content = read_log(file)
-    if not isinstance(content, Episodes):
+    if isinstance(content, LogTable):
         return read_table(file, content, settings)
+    if not isinstance(content, Episodes):
+        return read_recording(file, content, settings)
     if not settings.nothing:
         raise DataError(f"{file} holds its own names and dt; leave out dt, states and inputs")
     return content

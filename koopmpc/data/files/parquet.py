@@ -6,6 +6,7 @@ A group of rows of a .parquet file is read without the rest of the file, so that
 
 import json
 import zlib
+from collections.abc import Mapping
 from functools import partial
 from os import SEEK_END
 from pathlib import Path
@@ -178,7 +179,9 @@ def _read_rows(file: Path, stretches: list[tuple[int, int]], plant: PlantSignatu
     return episodes
 
 
-def split_groups(file: Path, history: int, plant: PlantSignature | None) -> list[Part] | None:
+def split_groups(
+    file: Path, history: int, plant: PlantSignature | None, keywords: Mapping[str, Any]
+) -> list[Part] | None:
     """Return a part for each group of rows of a large file, in order; None if it is small, a plain table or damaged.
 
     No pair is lost or comes twice: x_k → x_{k+1} belongs to the group that holds x_{k+1}. A stretch that begins inside
@@ -187,7 +190,7 @@ def split_groups(file: Path, history: int, plant: PlantSignature | None) -> list
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    if file.stat().st_size < _LARGE:
+    if file.stat().st_size < _LARGE or keywords:
         return None
     counts, lengths = np.zeros(0, dtype=np.intp), list[int]()
     try:

@@ -71,7 +71,7 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
         number, or the rows are no whole episodes.
     """
     where = str(file)
-    table = _rename_columns(table, told, where).with_units()
+    table = _rename_columns(table.with_units(), told, where)
     names, columns = list(table.names), table.columns
     told = told.match_names(names)
     rows = len(next(iter(columns.values()))) if columns else 0
@@ -161,7 +161,7 @@ def _rename_columns(table: LogTable, told: TableSettings, where: str) -> LogTabl
     Raises
     ------
     DataError
-        There are more or fewer names than columns.
+        There are more or fewer names than columns, or a column to rename is not there.
     LogError
         The table has no line of names, and the caller gives neither names nor numbers of columns.
     """
@@ -174,11 +174,7 @@ def _rename_columns(table: LogTable, told: TableSettings, where: str) -> LogTabl
                 f"{count} names, or inputs= with the numbers of the columns that are inputs, 1 to {count}"
             )
         return table
-    if len(told.columns) != count:
-        raise DataError(f"{where} has {count} columns, columns= gives {len(told.columns)} names; pass one for each")
-    names = tuple(map(str, told.columns))
-    columns = {new: table.columns[old] for new, old in zip(names, table.names, strict=True) if old in table.columns}
-    return LogTable(names, columns, dt=table.dt)
+    return table.renamed(told.rename(table.names, where))
 
 
 def _find_clock(names: list[str], columns: Mapping[str, np.ndarray], told: TableSettings, where: str) -> str | None:
