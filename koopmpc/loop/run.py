@@ -335,7 +335,7 @@ class Run(About, StepRows):
         columns: dict[str, Any] = {"step": np.arange(len(self.X)), "time [s]": self.time}
         columns |= dict(zip(self.states, self.X.T, strict=True))
         columns |= {f"measured {name}": column for name, column in zip(self.outputs, self.Y.T, strict=True)}
-        tracked = self.tracked(self.reference.shape[1])
+        tracked = self.name_references(self.reference.shape[1])
         columns |= {f"reference {name}": column for name, column in zip(tracked, self.reference.T, strict=True)}
         inputs = np.vstack([self.U, np.full((len(last), self.U.shape[1]), np.nan)])
         columns |= dict(zip(self.inputs, inputs.T, strict=True))

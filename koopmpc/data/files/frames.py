@@ -15,7 +15,8 @@ from koopmpc.data.files.tables import read_table
 from koopmpc.errors import DataError, KoopmpcError, install
 
 _FRAME = Path("the DataFrame")  # its place in messages
-_TIME, _EPISODE = "time [s]", "episode"
+_TIME = "time [s]"  # name of the clock
+_EPISODE = "episode"  # name of the column that tells episodes apart
 
 
 def is_frame(given: object) -> bool:

@@ -16,7 +16,7 @@ _RATES = ("fs", "sample_rate", "samplerate", "sampling_rate", "sampling_frequenc
 _SHOWN = 5  # arrays that a message names
 
 
-def build_table(file: Path, arrays: Mapping[str, np.ndarray], units: Mapping[str, str]) -> LogTable:
+def tabulate_arrays(file: Path, arrays: Mapping[str, np.ndarray], units: Mapping[str, str]) -> LogTable:
     """Return the arrays that have one row a sample as columns: vectors as they are, matrices as name1, name2, ….
 
     A name is the last part of its path where no other column has the same. The number of samples is the length that

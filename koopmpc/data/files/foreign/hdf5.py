@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from koopmpc.data.files.foreign.arrays import build_table
+from koopmpc.data.files.foreign.arrays import tabulate_arrays
 from koopmpc.data.files.formats import LogFormat, LogTable, register_format
 from koopmpc.disk import affordable
 from koopmpc.errors import KoopmpcError, LogError
@@ -26,7 +26,7 @@ def read_hdf5(file: Path) -> LogTable:
         It is no HDF5 file, or it is damaged.
     """
     arrays, units = load_datasets(file)
-    return build_table(file, arrays, units)
+    return tabulate_arrays(file, arrays, units)
 
 
 def load_datasets(file: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:

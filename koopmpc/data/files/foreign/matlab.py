@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from koopmpc.data.files.foreign.arrays import build_table
+from koopmpc.data.files.foreign.arrays import tabulate_arrays
 from koopmpc.data.files.foreign.hdf5 import EXTRA, load_datasets
 from koopmpc.data.files.formats import LogFormat, LogTable, register_format
 from koopmpc.errors import DataError, LogError
@@ -32,7 +32,7 @@ def read_matlab(file: Path) -> LogTable:
     if head[512:520] == _HDF5 or head[:8] == _HDF5:
         arrays, units = load_datasets(file)
         arrays = {name: array.T for name, array in arrays.items()}  # MATLAB stores by columns
-        return build_table(file, arrays, units)
+        return tabulate_arrays(file, arrays, units)
     try:
         content = loadmat(file, struct_as_record=False, squeeze_me=True)
     except (
@@ -48,7 +48,7 @@ def read_matlab(file: Path) -> LogTable:
             f"{file} holds objects of MATLAB classes (iddata, timetable, timeseries), which only MATLAB can read; save "
             "their columns as plain arrays: save('log.mat', 't', 'u', 'y')"
         )
-    return build_table(file, arrays, {})
+    return tabulate_arrays(file, arrays, {})
 
 
 def _collect(name: str, value: Any, arrays: dict[str, np.ndarray]) -> None:
