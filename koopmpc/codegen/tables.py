@@ -229,7 +229,7 @@ def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram) ->
         }
     elif isinstance(estimator, DisturbanceProgram):
         sizes["ESTIMATOR"] = 1
-        tables.reals["GAIN"] = estimator.gain
+        tables.reals |= {"GAIN": estimator.gain, "REACH": estimator.reach}
     _add_gate(tables, estimator.gate, sizes["NY"])
     if isinstance(program, StagedProgram):
         plan |= {"C": stack(np.eye(program.ny, program.nx)), "E": stack(program.E)}

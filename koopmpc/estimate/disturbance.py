@@ -19,6 +19,9 @@ from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value, Viewing
 
 GAIN = 0.1  # the least gain that a horizon gives: d forgets within twenty steps, however long the plan
+REACH = (
+    0.15  # share of the horizon over which a misfit must hardly change to be taken as it is, see docs/offset_free.md
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,11 @@ class LiftedDisturbance(Value):
     state has shown so far. Where the misfits vary by more than their mean nothing is learned; at rest v = 0 and
     d = m = e.
 
+    Exact measurements need no mean. If the gain is not given, and c' = 1 − L² D / max(Σ (C e)ᵢ²/sᵢ², Σ (C d)ᵢ²/sᵢ²) is
+    above c, the last misfit takes the place of the mean: d ← d + c' (e − d). D is the running mean of
+    Σ (C e − C e⁻)ᵢ²/sᵢ², the squared change of a misfit in a step, and L is 0.15 N. Noise and transients that turn
+    within L steps leave c' at zero.
+
     A reading far from its prediction is refused: A z + B u + E w + d stands in for at most five steps, and nothing is
     learned. Once readings are used again, all means start again.
 
@@ -44,7 +52,8 @@ class LiftedDisturbance(Value):
     ----------
     gain
         Weight of the newest misfit in all these means, m ← m + gain (e − m), in (0, 1]: 1 makes d the last misfit.
-        By default 1 − exp(−4/N), so that misfits are remembered over a quarter of the horizon, and at least 0.1.
+        By default 1 − exp(−4/N), so that misfits are remembered over a quarter of the horizon, and at least 0.1; and
+        1 where misfits hardly change.
 
     Raises
     ------
@@ -79,7 +88,9 @@ class LiftedDisturbance(Value):
 
     def start(self, model: LinearPredictor | StateModel, horizon: int) -> "DisturbanceObserver":
         """Return the observer of one controller with plans of this many steps."""
-        return DisturbanceObserver(model, max(1 - exp(-4 / horizon), GAIN) if self.gain is None else self.gain)
+        if self.gain is not None:
+            return DisturbanceObserver(model, self.gain, 0.0)
+        return DisturbanceObserver(model, max(1 - exp(-4 / horizon), GAIN), max(REACH * horizon, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +101,8 @@ class DisturbanceProgram(EstimatorProgram):
     ----------
     gain
         Weight of the newest misfit.
+    reach
+        Steps over which a misfit must hardly change to be taken as it is; 0 where a mean is always taken.
     known
         (nz,) the entries of z that have no disturbance.
     C
@@ -97,6 +110,7 @@ class DisturbanceProgram(EstimatorProgram):
     """
 
     gain: float
+    reach: float
     known: Bool[np.ndarray, " _"]
     C: Float[np.ndarray, "_ _"]
 
@@ -113,14 +127,16 @@ class DisturbanceObserver(Viewing, Measured):
         The predictor, or a model whose z is the state.
     gain
         Weight of the newest misfit, in (0, 1].
+    reach
+        Steps over which a misfit must hardly change to be taken as it is; 0: a mean is always taken.
     """
 
     _remembers = True
     _VIEWS = ("z", "d", "_seen", "_x", "_driven", "_u", "_w", "_after", "_flags", "_evaluate", "_buffer")
 
-    def __init__(self, model: LinearPredictor | StateModel, gain: float) -> None:
+    def __init__(self, model: LinearPredictor | StateModel, gain: float, reach: float) -> None:
         super().__init__(model)
-        self.gain = gain
+        self.gain, self.reach = gain, reach
         own = self._model
         known = slice(self.ny, None)
         if isinstance(model, LinearPredictor):
@@ -128,7 +144,8 @@ class DisturbanceObserver(Viewing, Measured):
             known = slice(0, 0) if constant is None else slice(constant, constant + 1)
         self._sizes = own.nz, own.nu, own.nw
         self._known = np.isin(np.arange(own.nz), np.arange(own.nz)[known])
-        self._rule = _rule(self._sizes, self.ny, known, gain, None if self.lift is None else self.lift.function)
+        lift = None if self.lift is None else self.lift.function
+        self._rule = _rule(self._sizes, self.ny, known, (gain, reach), lift)
         self._memory, self._C = np.zeros(self._rule.numel_in(2)), np.zeros(self.ny * own.nz)
         self._predicted, self._still = np.zeros(own.nz), np.zeros(own.nz)
         self._stood_in = False  # whether a prediction stood in for a part of the last reading
@@ -161,7 +178,7 @@ class DisturbanceObserver(Viewing, Measured):
 
     def program(self) -> DisturbanceProgram:
         """Return the data with which z and d are found."""
-        return DisturbanceProgram(self.gain, self._known, self._to_y.copy(), gate=gate_graph(self.ny))
+        return DisturbanceProgram(self.gain, self.reach, self._known, self._to_y.copy(), gate=gate_graph(self.ny))
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""
@@ -193,19 +210,21 @@ class DisturbanceObserver(Viewing, Measured):
 
 
 @raise_swallowed()
-def _rule(sizes: tuple[int, int, int], nx: int, known: slice, gain: float, lift: ca.Function | None) -> ca.Function:
+def _rule(
+    sizes: tuple[int, int, int], nx: int, known: slice, speed: tuple[float, float], lift: ca.Function | None
+) -> ca.Function:
     """Return (x, A z + B u + E w, memory, C, flags) → memory after x has come; z = ψ(x), or x itself without a `lift`.
 
-    The memory is [z; u; w; m; d; C e; the mean of (C e)² less half the square of its change; s²; whether there has been
-    a misfit; the weight of the next misfit, if it is above the gain; whether z is known]. The flags say whether this
-    misfit is learned, and whether all means start again with the next one.
+    The memory is [z; u; w; m; d; C e; the mean of (C e)² less half the square of its change; s²; D; the number of
+    misfits so far, up to 2; the weight of the next misfit, if it is above the gain; whether z is known]. The flags say
+    whether this misfit is learned, and whether all means start again with the next one. `speed` is the gain and L.
     """
     nz, nu, nw = sizes
     x, C = ca.SX.sym("x", nz if lift is None else lift.numel_in(0)), ca.SX.sym("C", nx, nz)
-    predicted, memory = ca.SX.sym("predicted", nz), ca.SX.sym("memory", 3 * nz + nu + nw + 3 * nx + 3)
+    predicted, memory = ca.SX.sym("predicted", nz), ca.SX.sym("memory", 3 * nz + nu + nw + 3 * nx + 4)
     flags = ca.SX.sym("flags", 2)
-    ends = np.cumsum([0, nz, nu + nw, nz, nz, nx, nx, nx, 1, 1, 1]).tolist()
-    last, driven, m, d, f, rough, squares, learned, newest, seen = ca.vertsplit(memory, ends)
+    ends, (gain, reach) = np.cumsum([0, nz, nu + nw, nz, nz, nx, nx, nx, 1, 1, 1, 1]).tolist(), speed
+    last, driven, m, d, f, rough, squares, change, learned, newest, seen = ca.vertsplit(memory, ends)
     z = x if lift is None else ca.SX(lift(x))
     good = ca.dot(z, z) < HUGE**2  # False for NaN
     unknown = np.ones(nz)
@@ -217,13 +236,20 @@ def _rule(sizes: tuple[int, int, int], nx: int, known: slice, gain: float, lift:
     squares_new = ca.fmax(squares, ca.fmax(moved**2, f_new**2))
     weights = ca.if_else(squares_new > 0, 1 / squares_new, 0)
     m_new = m + weight * (e - m)
-    rough_new = rough + weight * (f_new**2 - 0.5 * learned * (f_new - f) ** 2 - rough)
+    rough_new = rough + weight * (f_new**2 - 0.5 * (learned > 0) * (f_new - f) ** 2 - rough)
     mean = (C @ m_new) ** 2
     varied = ca.dot(ca.fmax(rough_new - mean, 0), weights)
     most = ca.dot(ca.fmax(mean, (C @ d) ** 2), weights)
-    d_new = d + ca.if_else(varied < most, 1 - varied / most, 0) * (m_new - d)
+    share = ca.if_else(varied < most, 1 - varied / most, 0)
+    changed = ca.dot((f_new - f) ** 2, weights)
+    change_new = ca.if_else(learned > 1, change + weight * (changed - change), ca.if_else(learned > 0, changed, change))
+    turned = reach**2 * change_new
+    largest = ca.dot(ca.fmax(f_new**2, (C @ d) ** 2), weights)
+    exact = ca.if_else(ca.logic_and(learned > 0, turned < largest), 1 - turned / largest, 0) if reach else 0
+    d_new = d + ca.if_else(share < exact, exact * (e - d), share * (m_new - d))
     starts = ca.logic_and(flags[1], good)
-    before = ca.vertcat(m, d, f, rough, squares, ca.if_else(starts, 0, learned), ca.if_else(starts, 1, newest))
-    after = ca.vertcat(m_new, d_new, f_new, rough_new, squares_new, 1, newest / (1 + newest))
+    before = ca.vertcat(m, d, f, rough, squares, change, ca.if_else(starts, 0, learned), ca.if_else(starts, 1, newest))
+    count = ca.fmin(learned + 1, 2)
+    after = ca.vertcat(m_new, d_new, f_new, rough_new, squares_new, change_new, count, newest / (1 + newest))
     result = ca.vertcat(z, driven, ca.if_else(learns, after, before), good)
     return ca.Function("rule", [x, predicted, memory, C, flags], [ca.densify(result)], {"cse": True})

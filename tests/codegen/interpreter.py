@@ -101,7 +101,7 @@ class Estimate:
         self.zeta, self.ny = None, len(program.model.states)
         self.z, self.d = np.zeros(program.lifting.m), np.zeros(program.lifting.m)
         self.kind = type(self.rule).__name__
-        self.last, self.newest, self.mean, self.sizes, self.learned = None, None, 0.0, np.zeros(self.ny), False
+        self.last, self.newest, self.mean, self.sizes, self.learned = None, None, 0.0, np.zeros(self.ny), 0
         self.missed, self.queue = 0, None
         self.gate = program.gate if self.rule is None else self.rule.gate
         self.memory = None if self.gate is None else np.zeros(self.gate.m - 2)
@@ -147,7 +147,7 @@ class Estimate:
         z = evaluate(self.program.lifting, zeta) if np.isfinite(zeta).all() else np.full(self.program.lifting.m, np.nan)
         if self.kind == "DisturbanceProgram" and np.isfinite(z).all():
             if self.opened:
-                self.learned, self.fresh = False, 1.0
+                self.learned, self.fresh = 0, 1.0
             elif self.last is not None and not (self.refused or stood_in):
                 self.learn(np.where(self.rule.known, 0.0, z - self.advance(self.last, u, w, 0.0)), z - self.last)
             self.last = z
@@ -164,13 +164,20 @@ class Estimate:
         rough = f**2 - (0.5 * (f - self.newest) ** 2 if self.learned else 0.0)
         new = np.concatenate([misfit, rough])
         self.mean = self.mean + gain * (new - self.mean)
-        self.newest, self.learned = f, True
+        if self.learned:
+            changed = (f - self.newest) ** 2
+        count, self.newest, self.learned = int(self.learned), f, self.learned + 1
         m, mean_rough = self.mean[: len(misfit)], self.mean[len(misfit) :]
         weights = np.divide(1.0, self.sizes, out=np.zeros_like(self.sizes), where=self.sizes > 0)
         varied = (np.maximum(mean_rough - (C @ m) ** 2, 0) * weights).sum()
         most = (np.maximum((C @ m) ** 2, (C @ self.d) ** 2) * weights).sum()
-        if varied < most:
-            self.d = self.d + (1 - varied / most) * (m - self.d)
+        share, exact = max(1 - varied / most, 0) if most else 0.0, 0.0
+        if count and self.rule.reach:
+            change = (changed * weights).sum()
+            self.change = change if count == 1 else self.change + gain * (change - self.change)
+            largest = (np.maximum(f**2, (C @ self.d) ** 2) * weights).sum()
+            exact = max(1 - self.rule.reach**2 * self.change / largest, 0) if largest else 0.0
+        self.d = self.d + (exact * (misfit - self.d) if share < exact else share * (m - self.d))
 
     def filtered(self, y, u, w):
         rule = self.rule

@@ -79,9 +79,42 @@ def test_noise_is_averaged_and_does_not_stop_it():
 
 
 def test_the_gain_follows_the_horizon_and_is_never_below_a_tenth():
-    misfits = np.ones(60)
-    np.testing.assert_array_equal(after(misfits, None, 10), after(misfits, 1 - np.exp(-0.4), 10))
-    np.testing.assert_array_equal(after(misfits, None, 400), after(misfits, 0.1, 400))
+    misfits = np.full(200, 0.1)
+    np.testing.assert_array_equal(after(misfits, None, 10, 1.0), after(misfits, 1 - np.exp(-0.4), 10, 1.0))
+    np.testing.assert_array_equal(after(misfits, None, 400, 1.0), after(misfits, 0.1, 400, 1.0))
+
+
+def test_exact_measurements_need_no_mean():
+    """A load is known with its second misfit, and followed where it drifts; a mean of gain 0.1 lags nine steps behind."""
+    assert (after(np.ones(30))[2:] == 1).all()
+    drifting = 1 + 0.01 * np.arange(200)
+    assert np.abs(after(drifting)[3:] - drifting[2:-1]).max() < 0.002
+    assert np.abs(after(drifting, 0.1)[100:] - drifting[99:-1]).min() > 0.08
+
+
+def test_constant_leaks_cost_at_most_three_percent():
+    """Two tanks in line, outflows 20 % off, leaks, exact measurements: against the same controller that knows the leaks."""
+
+    def tanks(leak, wide):
+        x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
+        out = ca.sqrt(x + 0.01)
+        F = x + 0.1 * ca.vertcat(u - 1.2**wide * out[0] - leak, 1.2**wide * out[0] - 0.8**wide * out[1] - leak)
+        return km.StepMap(ca.Function("F", [x, u], [F]), 0.1, states=("a [m]", "b [m]"), inputs=("u [m/s]",))
+
+    cost, limits = km.Cost(Q=[0.1, 1.0], R=0.05), km.Limits(u_min=0, u_max=3)
+    truth, start, aim = tanks(0.15, 1), [1.0, 1.0], [1.3, 1.5]
+    data = km.collect(tanks(0, 0), km.Uniform([0.3, 0.3], [2, 2]), km.Noise(0, 3, 4), episodes=40, steps=40)
+    model = km.bilinear_edmd(data, km.State() + km.Monomials(2) + km.Constant())
+    costs = [
+        km.metrics(km.simulate(truth, c, x0=start, reference=aim, steps=80, cost=cost, limits=limits)).cost
+        for c in (
+            km.NonlinearMPC(truth, cost, limits, 30),
+            km.BilinearMPC(model, cost, limits, 30, estimator=km.LiftedDisturbance()),
+            km.BilinearMPC(model, cost, limits, 30, estimator=km.LiftedDisturbance(gain=0.15)),
+        )
+    ]
+    assert costs[1] < 1.03 * costs[0]
+    assert costs[2] > costs[1]
 
 
 @given(st.integers(0, 10**6), st.lists(st.floats(-6, 6), min_size=3, max_size=3))

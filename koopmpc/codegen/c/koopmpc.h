@@ -90,7 +90,7 @@ typedef struct {
 #if KOOPMPC_ESTIMATOR == 1
   koopmpc_real last_z[KOOPMPC_NZ];
   koopmpc_real newest[KOOPMPC_NZ + 2 * KOOPMPC_NX], means[KOOPMPC_NZ + 2 * KOOPMPC_NX];
-  koopmpc_real sizes[KOOPMPC_NX], weights[KOOPMPC_NX], fresh;
+  koopmpc_real sizes[KOOPMPC_NX], weights[KOOPMPC_NX], fresh, change;
   int learned, has_last, stood_in;
 #elif KOOPMPC_ESTIMATOR == 2
   koopmpc_real s[KOOPMPC_NS];

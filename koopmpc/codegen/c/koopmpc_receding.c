@@ -30,6 +30,7 @@ static void learn(koopmpc_state *s, koopmpc_real *misfit) {
   enum { NZ = KOOPMPC_NZ, NX = KOOPMPC_NX };
   const koopmpc_real weight = s->fresh > KOOPMPC_GAIN ? s->fresh : KOOPMPC_GAIN;
   koopmpc_real states[KOOPMPC_NX], step[KOOPMPC_NX], believed[KOOPMPC_NX], varied = 0, most = 0;
+  koopmpc_real changed = 0, largest = 0, share, exact;
   for (int i = 0; i < NZ; i++)
     if (i == KOOPMPC_CONSTANT || i >= KOOPMPC_LEARNED) misfit[i] = 0;
   if (!koopmpc_usable(misfit, NZ)) return;
@@ -48,8 +49,13 @@ static void learn(koopmpc_state *s, koopmpc_real *misfit) {
     }
     s->newest[NZ + NX + i] = s->learned ? square - (koopmpc_real)0.5 * change * change : square;
     s->newest[NZ + i] = states[i];
+    changed += change * change * s->weights[i];
+    largest += (square > believed[i] * believed[i] ? square : believed[i] * believed[i]) * s->weights[i];
   }
-  s->learned = 1;
+  if (s->learned) s->change = s->learned > 1 ? s->change + weight * (changed - s->change) : changed;
+  changed = KOOPMPC_REACH * KOOPMPC_REACH * s->change;
+  exact = KOOPMPC_REACH > 0 && s->learned && changed < largest ? 1 - changed / largest : 0;
+  if (s->learned < 2) s->learned++;
   koopmpc_copy(s->newest, misfit, NZ);
   for (int i = 0; i < NZ + 2 * NX; i++) s->means[i] += weight * (s->newest[i] - s->means[i]);
   s->fresh /= 1 + s->fresh;
@@ -59,8 +65,8 @@ static void learn(koopmpc_state *s, koopmpc_real *misfit) {
     varied += (spread > 0 ? spread : 0) * s->weights[i];
     most += (mean > square ? mean : square) * s->weights[i];
   }
-  if (varied < most)
-    for (int i = 0; i < NZ; i++) s->d[i] += (1 - varied / most) * (s->means[i] - s->d[i]);
+  share = varied < most ? 1 - varied / most : 0;
+  for (int i = 0; i < NZ; i++) s->d[i] += share < exact ? exact * (misfit[i] - s->d[i]) : share * (s->means[i] - s->d[i]);
 }
 
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
