@@ -197,6 +197,13 @@ def run_export(
     problem: Annotated[
         str | None, typer.Option("--problem", help="The example controls the plant of this problem: name or name:case.")
     ] = None,
+    reference: Annotated[
+        str | None,
+        typer.Option("--reference", help='Reference rows of the C code: "0.5,0", or several as "0,0; 0.5,0".'),
+    ] = None,
+    fmu: Annotated[
+        int | None, typer.Option("--fmu", help="2 or 3: also write the controller as an FMI co-simulation unit.")
+    ] = None,
 ) -> None:
     """Write a controller as C99: sources, Makefile, CMakeLists.txt, an example, and a README with its sizes."""
     import numpy as np
@@ -215,11 +222,26 @@ def run_export(
             example = {"x0": asked.starts[0], "reference": asked.reference if asked.moves else asked.reference[:1]}
         if problem is not None:
             given = load_problem(problem)
-            name, case = next(iter(given.cases.items()))
+            case_name, case = next(iter(given.cases.items()))
             row = np.atleast_2d(np.asarray(case.reference))
-            example = {"plant": Prepared(given).truth_of(name), "x0": case.x0, "reference": row, "steps": case.steps}
-        folder = write(loaded, out, name=name, precision=cast("Any", precision), **example)
+            truth = Prepared(given).truth_of(case_name)
+            example = {"plant": truth, "x0": case.x0, "reference": row, "steps": case.steps}
+        if reference is not None:
+            example["reference"] = _read_rows(reference)
+        folder = write(loaded, out, name=name, precision=cast("Any", precision), fmu=fmu, **example)
     say(f"{folder}: make run builds it and prints its closed loop")
+    if fmu is not None:
+        say(f"{folder / name}.fmu: the controller as a co-simulation unit, FMI {fmu}")
+
+
+def _read_rows(text: str) -> list[list[float]]:
+    """Return the numbers of rows such as "0,0; 0.5,0"."""
+    from koopmpc.errors import DataError
+
+    try:
+        return [[float(word) for word in row.split(",")] for row in text.split(";") if row.strip()]
+    except ValueError as error:
+        raise DataError(f'--reference is "{text}"; write numbers, a row as "0.5,0", rows as "0,0; 0.5,0"') from error
 
 
 @app.command("view")

@@ -22,6 +22,7 @@ from koopmpc.codegen.sources import (
     write_sources,
 )
 from koopmpc.codegen.tables import Precision, Tables, make_tables, read_program
+from koopmpc.codegen.unit import write_unit
 from koopmpc.control.linear.koopman_mpc import CondensedProgram
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.iteration import MOST
@@ -54,6 +55,7 @@ def export(
     x0: ArrayLike | None = None,
     reference: ArrayLike | None = None,
     steps: int = 200,
+    fmu: int | None = None,
 ) -> Path:
     """Write the controller as C99 into a folder: sources, Makefile, CMakeLists.txt, an example and a README.
 
@@ -79,6 +81,10 @@ def export(
         with delays starts as if x0 and the smallest allowed input had been held before.
     steps
         Steps of the example.
+    fmu
+        2 or 3: also write ``name.fmu``, the controller as a co-simulation unit of this version of the FMI standard,
+        with its source and machine code for this platform. Inputs y, reference (one row, held over the horizon) and w;
+        outputs u, status, fallback and iterations; a step is one sample.
 
     Raises
     ------
@@ -93,6 +99,8 @@ def export(
     if precision not in ("double", "float"):
         raise DataError(f'precision is {precision!r}; pass "double" or "float"')
     single = precision == "float"
+    if fmu not in (None, 2, 3):
+        raise DataError(f"fmu is {fmu!r}; pass 2 or 3, the version of the FMI standard")
     program = read_program(controller, reference)
     tables = make_tables(program, single=single)
     coarse = float(np.finfo(np.float32).eps) * tables.conditioning
@@ -103,16 +111,19 @@ def export(
             PrecisionWarning,
             stacklevel=2,
         )
-    texts = write_sources(tables, single=single)
+    own = write_sources(tables, single=single)
+    texts = dict(own)
     texts |= {name: read_shipped("c", name) for name in ("Makefile", "CMakeLists.txt", "example.c")}
     texts |= _write_plant(tables, plant, x0, checks.count(steps, "steps"), Language(single))
     texts = rename_symbols(texts, name)
     root = path_of(folder)
-    _refuse_others(root, {*texts, "README.md"}, name)
+    _refuse_others(root, {*texts, "README.md", f"{name}.fmu"}, name)
     for path, text in texts.items():
         _write(root / path, text)
     readme = {"README.md": _write_readme(tables, _measure_objects(root, name), precision)}
     _write(root / "README.md", rename_symbols(readme, name)["README.md"])
+    if fmu is not None:
+        write_unit(tables, own, root / f"{name}.fmu", name, 2 if fmu == 2 else 3)
     return root
 
 

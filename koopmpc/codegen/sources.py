@@ -175,11 +175,13 @@ def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
 
 
 def write_one_source(tables: Tables, *, single: bool) -> str:
-    """Return all C of a controller as one file, with the functions by which Python calls it.
+    """Return all C of a controller as one file, with the functions by which Python calls it."""
+    return "\n".join([_CLOCK + join_sources(write_sources(tables, single=single)), read_shipped("c", "door.c")])
 
-    Each local header stands where it is first included.
-    """
-    texts, seen = write_sources(tables, single=single), set[str]()
+
+def join_sources(texts: Mapping[str, str]) -> str:
+    """Return the C files of a controller as one; each local header stands where it is first included."""
+    seen = set[str]()
 
     def inline(text: str, folder: str) -> str:
         def include(match: re.Match[str]) -> str:
@@ -194,8 +196,7 @@ def write_one_source(tables: Tables, *, single: bool) -> str:
 
         return re.sub(r'^#include "([^"]+)"$', include, text, flags=re.MULTILINE)
 
-    own = [inline(text, "") for name, text in texts.items() if name.endswith(".c") and "/" not in name]
-    return "\n".join([_CLOCK + own[0], *own[1:], read_shipped("c", "door.c")])
+    return "\n".join(inline(text, "") for name, text in texts.items() if name.endswith(".c") and "/" not in name)
 
 
 def write_plant_functions(F: ca.Function, h: ca.Function, language: Language) -> str:

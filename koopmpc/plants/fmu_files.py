@@ -199,7 +199,8 @@ def _require_binary(fmpy: ModuleType, names: list[str], identifier: str, version
     held = sorted({PurePosixPath(name).parts[1] for name in names if name.startswith("binaries/") and name[-1] != "/"})
     sources = any(name.startswith("sources/") and name.endswith(".c") for name in names)
     advice = "compile its C sources by `fmpy compile FILE`" if sources else f"export the model for {folder}"
-    raise DataError(f"{file} holds no binary for {folder}, only for {', '.join(held) or 'no platform'}; {advice}")
+    others = f", only for {', '.join(held)}" if held else ""
+    raise DataError(f"{file} holds no binary for {folder}{others}; {advice}")
 
 
 def _read_variable(each: Any) -> UnitVariable:

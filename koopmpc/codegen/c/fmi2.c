@@ -1,0 +1,98 @@
+/** @file fmi2.c @brief The functions of FMI 2.0 for co-simulation; follows unit.c. Types as the standard defines them. */
+typedef koopmpc_fmu *Unit;
+typedef void (*Logger)(void *, const char *, int, const char *, const char *, ...);
+typedef struct {
+  Logger logger;
+  void *allocate, *release, *finished;
+  void *environment;
+} Callbacks;
+typedef const unsigned *Refs;
+typedef const char *const *Texts;
+enum { OK = 0, DISCARD = 2, ERROR = 3 };
+
+UNIT const char *fmi2GetTypesPlatform(void) { return "default"; }
+UNIT const char *fmi2GetVersion(void) { return "2.0"; }
+
+UNIT void *fmi2Instantiate(const char *name, int type, const char *guid, const char *resources,
+                           const Callbacks *callbacks, int visible, int logging) {
+  Unit unit = 0;
+  (void)name, (void)resources, (void)visible, (void)logging;
+  if (type == 1) unit = koopmpc_fmu_make(guid, callbacks ? callbacks->environment : 0, 0);
+  if (unit && callbacks) memcpy(&unit->log, &callbacks->logger, sizeof unit->log);
+  return unit;
+}
+UNIT void fmi2FreeInstance(Unit unit) { free(unit); }
+UNIT int fmi2Reset(Unit unit) {
+  koopmpc_fmu_reset(unit);
+  return OK;
+}
+UNIT int fmi2SetupExperiment(Unit unit, int defined, double tolerance, double start, int ends, double stop) {
+  (void)defined, (void)tolerance, (void)ends, (void)stop;
+  unit->time = start;
+  return OK;
+}
+UNIT int fmi2EnterInitializationMode(Unit unit) { return unit ? OK : ERROR; }
+UNIT int fmi2ExitInitializationMode(Unit unit) {
+  koopmpc_fmu_start(unit);
+  return OK;
+}
+UNIT int fmi2Terminate(Unit unit) { return unit ? OK : ERROR; }
+
+UNIT int fmi2GetReal(Unit unit, Refs refs, size_t count, double values[]) {
+  return koopmpc_fmu_get(unit, refs, count, values) ? OK : ERROR;
+}
+UNIT int fmi2SetReal(Unit unit, Refs refs, size_t count, const double values[]) {
+  return koopmpc_fmu_set(unit, refs, count, values) ? OK : ERROR;
+}
+UNIT int fmi2GetInteger(Unit unit, Refs refs, size_t count, int values[]) {
+  return koopmpc_fmu_get_whole(unit, refs, count, values) ? OK : ERROR;
+}
+
+UNIT int fmi2DoStep(Unit unit, double time, double step, int keeps) {
+  (void)keeps;
+  if (koopmpc_fmu_step(unit, time, step)) return OK;
+  if (unit->log) {
+    Logger logger;
+    char text[120];
+    memcpy(&logger, &unit->log, sizeof logger);
+    koopmpc_fmu_complain(text, sizeof text, step);
+    logger(unit->owner, "koopmpc", DISCARD, "logStatusDiscard", "%s", text);
+  }
+  return DISCARD;
+}
+UNIT int fmi2CancelStep(Unit unit) { return unit ? ERROR : ERROR; }
+UNIT int fmi2SetDebugLogging(Unit unit, int on, size_t count, Texts categories) {
+  (void)on, (void)count, (void)categories;
+  return unit ? OK : ERROR;
+}
+
+#ifdef __GNUC__
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#endif
+/* What this unit does not offer: calls with arguments succeed only if they ask for nothing. */
+#define NOTHING(name, kind) \
+  UNIT int name(Unit unit, Refs refs, size_t count, kind values) { \
+    (void)unit, (void)refs, (void)values; \
+    return count ? ERROR : OK; \
+  }
+NOTHING(fmi2GetBoolean, int *)
+NOTHING(fmi2GetString, const char **)
+NOTHING(fmi2SetInteger, const int *)
+NOTHING(fmi2SetBoolean, const int *)
+NOTHING(fmi2SetString, Texts)
+#define ABSENT(name, ...) \
+  UNIT int name(Unit unit, __VA_ARGS__) { return unit ? ERROR : ERROR; }
+ABSENT(fmi2GetFMUstate, void **state)
+ABSENT(fmi2SetFMUstate, void *state)
+ABSENT(fmi2FreeFMUstate, void **state)
+ABSENT(fmi2SerializedFMUstateSize, void *state, size_t *size)
+ABSENT(fmi2SerializeFMUstate, void *state, char bytes[], size_t size)
+ABSENT(fmi2DeSerializeFMUstate, const char bytes[], size_t size, void **state)
+ABSENT(fmi2GetDirectionalDerivative, Refs z, size_t nz, Refs v, size_t nv, const double dv[], double dz[])
+ABSENT(fmi2SetRealInputDerivatives, Refs refs, size_t count, const int order[], const double values[])
+ABSENT(fmi2GetRealOutputDerivatives, Refs refs, size_t count, const int order[], double values[])
+ABSENT(fmi2GetStatus, int kind, int *value)
+ABSENT(fmi2GetRealStatus, int kind, double *value)
+ABSENT(fmi2GetIntegerStatus, int kind, int *value)
+ABSENT(fmi2GetBooleanStatus, int kind, int *value)
+ABSENT(fmi2GetStringStatus, int kind, const char **value)
