@@ -377,6 +377,25 @@ class Episodes(Named, Value):
 
         return build_frame(list_columns(self))
 
+    def with_inputs_advanced(self, rows: int = 1) -> "Episodes":
+        """Return the episodes with u_{k+rows} beside x_k, for logs whose input column is written `rows` rows late.
+
+        In such a log u_k stands beside the x_k that it has already moved. Each episode loses its last `rows` steps;
+        measured disturbances stay where they are.
+
+        Raises
+        ------
+        DataError
+            No episode has more than `rows` steps.
+        """
+        rows = checks.count(rows, "rows", 0)
+        if rows == 0:
+            return self
+        long = [episode for episode in self if len(episode) > rows]
+        if not long:
+            raise DataError(f"no episode has more than {rows} steps; pass longer ones, or a smaller number of rows")
+        return self.with_episodes([Episode(X=e.X[:-rows], U=e.U[rows:], W=e.W[:-rows]) for e in long])
+
     def with_episodes(self, episodes: Sequence[Episode]) -> "Episodes":
         """Return a set of other episodes with the sample time and the names of this set."""
         return Episodes(episodes, self.dt, self.states, self.inputs, self.disturbances)

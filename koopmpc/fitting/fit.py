@@ -23,7 +23,8 @@ from koopmpc.page import Page
 from koopmpc.parallel import StageProgress
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.recording.model import record_model
-from koopmpc.synthesis.select import Selection, select
+from koopmpc.synthesis.leaderboard import Selection
+from koopmpc.synthesis.select import select
 from koopmpc.terminal import label_lines, render_text
 from koopmpc.validate.report import TrustReport, trust
 from koopmpc.validate.scoring import Score, score

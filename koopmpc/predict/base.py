@@ -1,6 +1,7 @@
 """The base class of lifted predictors: x ≈ C z, z₀ = ψ(x₀), the eigenvalues of A, the fit report, the file format."""
 
 import json
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +16,7 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, LogError, ShapeError
 from koopmpc.lifting.base import Lifting
-from koopmpc.values import Arrays, Value, from_data, to_data
+from koopmpc.values import Arrays, Value, freeze, from_data, to_data
 
 V = TypeVar("V", bound=Value)
 _FORMAT = "koopmpc-1"
@@ -106,6 +107,9 @@ class FitReport(Value):
         Sentences, one for each doubt.
     changes
         Sentences, one for each change that a prior, a limit on the spectral radius or a penalty made.
+    input_lead
+        Rows by which the inputs of the log were moved up before the fit: the model's u_k is row k + input_lead of the
+        log. 0 where a log's row holds the input that acts next.
     """
 
     method: str
@@ -119,6 +123,7 @@ class FitReport(Value):
     state_residual: Float[np.ndarray, " nx"]
     warnings: tuple[str, ...] = ()
     changes: tuple[str, ...] = ()
+    input_lead: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,6 +200,15 @@ class Predictor(Value):
         """Return the episodes of points ζ, the states first in each row; without an embedding, the same episodes."""
         return episodes if self.embedding is None else self.embedding(episodes)
 
+    @property
+    def input_lead(self) -> int:
+        """Rows by which inputs of logs like those of the fit are moved up, see `align`; 0 for most logs."""
+        return 0 if self.report is None else self.report.input_lead
+
+    def align(self, episodes: Episodes) -> Episodes:
+        """Return episodes of a log with the model's timing: their inputs are moved up by `input_lead` rows."""
+        return episodes.with_inputs_advanced(self.input_lead)
+
     def save(self, path: str | Path) -> None:
         """Write the predictor as data (.npz: arrays and one JSON text); `load_model` reads it."""
         save_value(self, path)
@@ -260,6 +274,16 @@ class Predictor(Value):
                 "or predictor.rest_point(x) for a plant at rest there"
             )
         return x
+
+
+P = TypeVar("P", bound=Predictor)
+
+
+def replace_report(model: P, report: FitReport) -> P:
+    """Return the same model with another report."""
+    other = copy(model)
+    freeze(other, report=report)
+    return other
 
 
 def sorted_eigen(A: Float[np.ndarray, "nz nz"]) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:

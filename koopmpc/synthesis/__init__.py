@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from koopmpc.synthesis.designed import Evidence as Evidence
     from koopmpc.synthesis.designed import Expected as Expected
     from koopmpc.synthesis.designed import SavedDesign as SavedDesign
-    from koopmpc.synthesis.select import LeaderboardRow as LeaderboardRow
-    from koopmpc.synthesis.select import Selection as Selection
+    from koopmpc.synthesis.leaderboard import LeaderboardRow as LeaderboardRow
+    from koopmpc.synthesis.leaderboard import Selection as Selection
     from koopmpc.synthesis.stabilise import Stabilised as Stabilised
     from koopmpc.synthesis.surrogates import Surrogate as Surrogate
 else:

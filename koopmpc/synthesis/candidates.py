@@ -24,11 +24,13 @@ from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import Towards, edmd
 from koopmpc.identify.moments.read import ReadOptions
+from koopmpc.identify.records.structure import Structure, fit_structure
 from koopmpc.lifting.base import Lifting, check_lifting, strip_unit
 from koopmpc.lifting.composed import Standardized, Sum
 from koopmpc.lifting.fourier import Fourier, RandomFourier
 from koopmpc.lifting.radial import Gaussian, ThinPlate
 from koopmpc.lifting.state import Constant, Monomials, State
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Arrays, Value, from_data, to_data
 
@@ -55,12 +57,18 @@ class Candidate(Value):
         The delays, where ψ acts on the state and its past.
     bilinear
         z⁺ = A z + B u + Σ uᵢ Nᵢ z instead of z⁺ = A z + B u.
+    structure
+        The terms of a sparse polynomial model, whose lifting and embedding these are; None for other candidates.
+    relifted
+        The fit is linear, and the model is lifted at each step all the same: a bilinear one with N = 0.
     """
 
     name: str
     lifting: Lifting
     embedding: Delay | None = None
     bilinear: bool = False
+    structure: Structure | None = None
+    relifted: bool = False
 
     def __reduce__(self) -> tuple[Any, ...]:  # as data, so that a lifting of the user's own crosses processes too
         arrays: Arrays = {}
@@ -93,15 +101,29 @@ class Candidate(Value):
         """Return the sized copy for a plant with these names."""
         sized = None if self.embedding is None else self.embedding.match(states, inputs)
         bound = self.lifting.bind(states if sized is None else sized.names)
-        return Candidate(self.name, bound, sized, self.bilinear)
+        return replace(self, lifting=bound, embedding=sized)
 
 
 def fit_candidate(candidate: Candidate, data: Episodes | Source, ridge: float, read: ReadOptions) -> AnyPredictor:
     """Return the model of these data; the ridge of a bilinear one pulls it towards z⁺ = z."""
     psi, embedding = candidate.lifting, candidate.embedding
+    if candidate.structure is not None:
+        return fit_structure(candidate.structure, data, **read)
     if candidate.bilinear:
         return bilinear_edmd(data, psi, embedding=embedding, ridge=ridge, difference=True, **read)
-    return edmd(data, psi, embedding=embedding, ridge=ridge, towards=candidate.towards, **read)
+    model = edmd(data, psi, embedding=embedding, ridge=ridge, towards=candidate.towards, **read)
+    return relift_model(model) if candidate.relifted else model
+
+
+def relift_model(model: LinearPredictor) -> BilinearPredictor:
+    """Return z⁺ = A z + B u as a bilinear model with N = 0, which controllers and forecasts lift at each step."""
+    report = model.report
+    if report is not None:
+        sentence = "N = 0: it forecasts better if it is lifted at each step, as bilinear models are used"
+        report = replace(report, changes=(*report.changes, sentence))
+    N = np.zeros((model.nu, model.nz, model.nz))
+    about = (model.C, model.lifting, model.dt, model.states, model.inputs, report, model.embedding, model.scale)
+    return BilinearPredictor(model.A, model.B, N, *about)
 
 
 def check_delays(delays: Sequence[int]) -> list[int]:

@@ -20,6 +20,7 @@ from koopmpc.data.source import Changed, EpisodesMap, Held, Source
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments, space_evenly
+from koopmpc.identify.records.structure import solve_structure
 from koopmpc.identify.regression import Regression, build_regression
 from koopmpc.identify.solve import centre_products, solve_path
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -280,6 +281,11 @@ class Trial:
     ridges: tuple[float, ...]
     relift: bool = False
 
+    @property
+    def lifts_at_each_step(self) -> bool:
+        """Whether forecasts are lifted at every step."""
+        return self.candidate.bilinear and (self.relift or self.candidate.structure is not None)
+
     def __str__(self) -> str:
         return f"{self.candidate.kind} {self.candidate.name}"
 
@@ -367,6 +373,8 @@ def cross_validate(trial: Trial) -> Tried:
 
 def fit_ridges(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[float, ...]) -> list[AnyPredictor]:
     """Return the predictor of each ridge on these moments, without the checks that a report would need."""
+    if candidate.structure is not None:  # fitted without a ridge
+        return [solve_structure(candidate.structure, total)] * len(ridges)
     task, nz, nu, which = build_regression(total, "select"), total.nz, like.nu, total.products
     C = task.C
     assert C is not None, "an extended regression has its C"
@@ -387,6 +395,8 @@ def fit_ridges(candidate: Candidate, total: Moments, like: Episodes, ridges: tup
 
 
 def _misfit(candidate: Candidate, total: Moments) -> float:
+    if candidate.structure is not None:
+        return np.inf  # it is fitted without a ridge, and takes no part in the choice of the least one
     task = build_regression(total, "select")
     rows, where = task.rows, task.x_next
     (K,) = _solutions(candidate, task, (LEAST,), total.products)
@@ -410,12 +420,13 @@ def _solutions(
 
 def _moments(candidate: Candidate, episodes: Episodes) -> Moments:
     """Return moments as triangular factors, whatever their condition, so that all folds are solved in the same way."""
+    products = candidate.bilinear if candidate.structure is None else candidate.structure.has_products
     return second_moments(
         episodes if candidate.bilinear else episodes.driven(),
         candidate.lifting,
         embedding=candidate.embedding,
         route="qr",
-        bilinear=candidate.bilinear,
+        bilinear=products,
     )
 
 
@@ -437,9 +448,7 @@ def _errors(
     result = np.empty((len(models), trial.horizon))
     for row, model in zip(result, models, strict=True):
         total, count = np.zeros(trial.horizon), 0
-        for gap, _ in forecast_errors(
-            model, points, starts, trial.horizon, relift=trial.relift and trial.candidate.bilinear
-        ):
+        for gap, _ in forecast_errors(model, points, starts, trial.horizon, relift=trial.lifts_at_each_step):
             with np.errstate(over="ignore"):
                 total += ((gap / sizes) ** 2).mean(axis=2).sum(axis=1)
             count += gap.shape[1]

@@ -63,15 +63,16 @@ def records_of(name: str) -> list[Record]:
 def free_run(model: km.LinearPredictor | km.BilinearPredictor, test: Record, relift: bool) -> np.ndarray:
     """Return the outputs of a model over the test part, which begins at the rows that are known.
 
-    Row k of the inputs acts on row k + 1. A model whose past is longer than the known rows gets the first row repeated.
+    Row k of the inputs acts on row k + 1, or on row k where the model's inputs are one row up. A model whose past is longer than the known rows gets the first row repeated.
     """
-    past = 0 if model.embedding is None else model.embedding.steps
+    past, early = (0 if model.embedding is None else model.embedding.steps), model.input_lead
+    told = test.U_test[early:]  # row k of the model's inputs is row k + early of the log
     lead = max(past - (test.known - 1), 0)
     Y = np.vstack([np.repeat(test.Y_test[:1], lead, axis=0), test.Y_test[: test.known]])
-    U = np.vstack([np.repeat(test.U_test[:1], lead, axis=0), test.U_test])
+    U = np.vstack([np.repeat(told[:1], lead, axis=0), told])
     begin = len(Y) - 1
     history = km.Episode(X=Y, U=U[:begin]) if past else None
-    start, ahead = (model.start(Y[-1], history) if past else Y[-1]), U[begin:-1]
+    start, ahead = (model.start(Y[-1], history) if past else Y[-1]), U[begin : lead + len(test.Y_test) - 1]
     with np.errstate(all="ignore"):
         if relift:
             X = model.step_map().rollout(start, ahead)[:, : model.nx]
@@ -80,13 +81,16 @@ def free_run(model: km.LinearPredictor | km.BilinearPredictor, test: Record, rel
     return np.vstack([test.Y_test[: test.known - 1], X])
 
 
-def _entry(model: km.LinearPredictor | km.BilinearPredictor, test: Record, relift: bool, seconds: float) -> Entry:
+def _entry(model: km.LinearPredictor | km.BilinearPredictor, test: Record, seconds: float) -> Entry:
+    """Judge a model as its controller uses it: KoopmanMPC lifts once, BilinearMPC at each step."""
+    relift = isinstance(model, km.BilinearPredictor)
     Y = free_run(model, test, relift)
     free = test.error(Y)
     gap = np.abs(Y - test.Y_test).max() if len(test.outputs) == 1 else free
     episode = km.Episodes(
         [km.Episode(X=test.Y_test, U=test.U_test[:-1])], test.dt, model.states, model.inputs
     )  # fmt: skip
+    episode = model.align(episode)
     ahead = km.score(model, episode, HORIZON, stride=10, relift=relift).rmse
     scale = test.Y_test.std(axis=0) if len(test.outputs) > 1 else 1.0
     return Entry(
@@ -104,11 +108,7 @@ def _select(record: Record) -> dict[str, Entry]:
         found = km.select(data)
     seconds = time.perf_counter() - begun
     models = {"select": found.predictor, "select linear": found.linear, "select bilinear": found.bilinear}
-    return {
-        which: _entry(model, record, isinstance(model, km.BilinearPredictor), seconds)
-        for which, model in models.items()
-        if model is not None
-    }
+    return {which: _entry(model, record, seconds) for which, model in models.items() if model is not None}
 
 
 def _fit(record: Record) -> Entry:
@@ -129,7 +129,7 @@ def _fit(record: Record) -> Entry:
         written = sorted(Path(folder).rglob("model.npz"))
         if not written:
             return Entry(float("inf"), seconds=seconds, diverged=True, failure=ended.stderr.strip()[-200:])
-        return _entry(km.load_model(written[0]), record, False, seconds)
+        return _entry(km.load_model(written[0]), record, seconds)
 
 
 def _yardstick(which: str, record: Record) -> Entry | None:

@@ -8,7 +8,7 @@ import pytest
 import koopmpc as km
 from koopmpc.data.angles import find_angles
 from koopmpc.synthesis.cross_validation import Trial, cross_validate, make_folds, take_sample, usual_horizon
-from koopmpc.synthesis.select import choose_model
+from koopmpc.synthesis.leaderboard import choose_model
 from tests.roundtrip import returned
 
 A, B = np.array([[0.9, 0.2], [-0.1, 0.95]]), np.array([[0.0], [0.3]])

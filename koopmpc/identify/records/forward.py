@@ -13,7 +13,7 @@ _DEAD = 1e-9  # a column with less than this standard deviation is constant
 _DEPENDENT = 1e-10  # skip a column if less than this share of its energy is independent of the chosen ones
 _EXPLAINED = 1e-14  # stop where the next term explains less than this share of the target's energy
 
-Terms = Int[np.ndarray, "n degree"]
+Terms = Int[np.ndarray, "_ _"]
 
 
 def count_terms(variables: int, inputs: int, degree: int) -> int:

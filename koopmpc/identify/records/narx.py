@@ -31,6 +31,8 @@ MOST = 2600  # terms to choose from: a structure with more is not tried
 NUMBERS = 8_000_000  # entries of the table that terms are chosen on: of more rows evenly spread ones are taken
 EACH = 4  # rows of data for each chosen term, at least
 
+_MEDIAN = 0.1  # log of the ratio by which the errors of half of the blocks may be larger
+
 Ask = Callable[[str, int, int], object]  # name of a structure, done, of how many
 
 
@@ -123,9 +125,12 @@ def choose_structure(found: Sequence[Structure]) -> Structure:
 
 
 def is_worse(errors: Float[np.ndarray, " blocks"], than: Float[np.ndarray, " blocks"]) -> bool:
-    """Return whether log errors are larger by more than one standard error of their mean difference over the blocks."""
+    """Return whether the errors are larger by more than one standard error of their mean log ratio over the blocks.
+
+    They are larger too if their median ratio is above 1.1: one block that is lost makes the standard error large.
+    """
     gap = np.log(np.maximum(errors, EXACT)) - np.log(np.maximum(than, EXACT))
-    return bool(gap.mean() > gap.std(ddof=1) / np.sqrt(len(gap)))
+    return bool(gap.mean() > gap.std(ddof=1) / np.sqrt(len(gap)) or np.median(gap) > _MEDIAN)
 
 
 def search_structures(
@@ -164,19 +169,16 @@ def search_structures(
     plans = [(d, g) for d in room for g in degrees if count_terms(nx + d * (nx + nu), nu, g) <= MOST]
     if not plans:
         raise DataError(f"every structure has more than {MOST} terms; pass fewer delays, or a lower degree")
-    found: list[tuple[Structure, bool]] = []
+    found: list[Structure] = []
     for i, (d, g) in enumerate(plans):
         if ask is not None:
             ask(f"polynomials of degree {g} with {d} past rows", i, len(plans))
         found += list(_try_plan(pieces, d, g, first, terms, horizon))
-    calm = [structure for structure, keeps in found if keeps]
-    return calm or [structure for structure, _ in found]
+    return [structure for structure in found if structure.calm] or found
 
 
-def _try_plan(
-    pieces: Pieces, delays: int, degree: int, first: int, terms: int, horizon: int
-) -> Iterator[tuple[Structure, bool]]:
-    """Yield the structures of all sizes for these delays and this degree, and whether their free run stays in range."""
+def _try_plan(pieces: Pieces, delays: int, degree: int, first: int, terms: int, horizon: int) -> Iterator[Structure]:
+    """Yield the structures of all sizes for these delays and this degree."""
     nx, nu = pieces.nx, pieces.nu
     candidates = list_terms(nx + delays * (nx + nu), nu, degree)
     spans = [[round(len(u) * i / FOLDS) for i in range(FOLDS + 1)] for u in pieces.U]
@@ -191,7 +193,7 @@ def _try_plan(
     calm = is_calm(models, pieces, first)
     for i, size in enumerate(sizes):
         chosen = tuple(own[:size] for own in models.terms)
-        yield Structure(delays, degree, chosen, pieces.mean, pieces.scale, table[:, i]), bool(calm[i])
+        yield Structure(delays, degree, chosen, pieces.mean, pieces.scale, table[:, i], bool(calm[i]))
         if all(len(own) <= size for own in models.terms):
             return
 

@@ -1,6 +1,7 @@
 """The structure of a polynomial model, its terms in standard units, and the predictor with these terms."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Unpack
 
 import numpy as np
@@ -9,6 +10,7 @@ from jaxtyping import Float, Int
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
+from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.records.forward import Terms, list_terms
 from koopmpc.identify.regression import (
@@ -24,6 +26,7 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Picked, Standardized
 from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.values import Value
 
 HORIZON = 20  # steps of the short forecasts that count beside the free run
 EXACT = 1e-6  # smaller errors, in spreads, are alike: they are due to rounding
@@ -31,7 +34,7 @@ _SOFT = 1e-9  # ridge of the observables' own rows, which are almost dependent
 
 
 @dataclass(frozen=True, eq=False)
-class Structure:
+class Structure(Value):
     """Terms of a polynomial model in standard units, for each state, and its errors on unseen rows.
 
     Attributes
@@ -43,7 +46,10 @@ class Structure:
     mean, scale
         (nx + nu,) of [x u]: a variable v stands for (v − mean) / scale.
     errors
-        (blocks,) errors in spreads, of free runs and forecasts alike, on blocks of rows that no coefficient saw.
+        (blocks,) errors in spreads, of free runs and forecasts alike, on blocks of rows that neither the choice of the
+        terms nor their coefficients saw.
+    calm
+        Fitted to all rows it stays within three times the range of the data, in free run over each record twice.
     """
 
     delays: int
@@ -52,6 +58,7 @@ class Structure:
     mean: Float[np.ndarray, " nv"]
     scale: Float[np.ndarray, " nv"]
     errors: Float[np.ndarray, " blocks"]
+    calm: bool
 
     @property
     def size(self) -> int:
@@ -69,6 +76,11 @@ class Structure:
         return len(self.terms) + self.delays * len(self.mean)
 
     @property
+    def delay(self) -> Delay | None:
+        """The embedding; None without past rows."""
+        return Delay(self.delays) if self.delays else None
+
+    @property
     def signals(self) -> Int[np.ndarray, " n"]:
         """For each entry of ζ the place of its signal in [x u]."""
         nx, every = len(self.terms), np.arange(len(self.mean))
@@ -78,6 +90,40 @@ class Structure:
     def is_nonlinear(self) -> bool:
         """Whether a term is a product."""
         return any((np.count_nonzero(own, axis=1) > 1).any() for own in self.terms)
+
+    @property
+    def has_products(self) -> bool:
+        """Whether a term is an input times entries of ζ."""
+        n = self.point_size
+        return any((np.count_nonzero(own, axis=1) > 1)[own.max(axis=1) > n].any() for own in self.terms if len(own))
+
+    @property
+    def lifting(self) -> Lifting:
+        """ψ = [ζ, 1, the monomials of the terms in standard units]."""
+        return self._build[0]
+
+    @property
+    def places(self) -> dict[tuple[int, ...], int]:
+        """The place of each product of entries of ζ among the observables; of no factors that of the Constant."""
+        return self._build[1]
+
+    @cached_property
+    def _build(self) -> tuple[Lifting, dict[tuple[int, ...], int]]:
+        n = self.point_size
+        where: dict[tuple[int, ...], int] = {(): n}
+        where.update({(v,): v - 1 for v in range(1, n + 1)})
+        used = {tuple(int(v) for v in term if 0 < v <= n) for own in self.terms for term in own}
+        needed = {factors for factors in used if len(factors) > 1}
+        lifting: Lifting = State() + Constant()
+        if not needed:
+            return lifting, where
+        degree = max(map(len, needed))
+        every = list(list_terms(n, 0, degree)[n:])  # in the order of Monomials
+        which = [i for i, term in enumerate(every) if tuple(int(v) for v in term if v) in needed]
+        for place, i in enumerate(which, n + 1):
+            where[tuple(int(v) for v in every[i] if v)] = place
+        monomials = Picked(Monomials(degree), tuple(which))
+        return lifting + Standardized(monomials, self.mean[self.signals], self.scale[self.signals]), where
 
     def describe(self) -> str:
         """Return a sentence on terms, delays and the error in free run."""
@@ -98,12 +144,15 @@ def fit_structure(
 ) -> LinearPredictor | BilinearPredictor:
     """Return the predictor of a structure, its coefficients by least squares over all rows of the data."""
     source = source_of(episodes)
-    nx, nu, n = source.nx, source.nu, structure.point_size
-    mixes = any((np.count_nonzero(own, axis=1) > 1)[own.max(axis=1) > n].any() for own in structure.terms if len(own))
-    embedding = Delay(structure.delays).fitted(source.states, source.inputs) if structure.delays else None
-    lifting, where = _build_lifting(structure)
-    total = second_moments(source, lifting, bilinear=mixes, embedding=embedding, **options)
+    mixes, delay = structure.has_products, structure.delay
+    total = second_moments(source, structure.lifting, bilinear=mixes, embedding=delay, **options)
+    return solve_structure(structure, total)
+
+
+def solve_structure(structure: Structure, total: Moments) -> LinearPredictor | BilinearPredictor:
+    """Return the predictor of a structure on the moments of its lifting."""
     regression = build_regression(total, "narx")
+    n, nx, nu = structure.point_size, len(structure.terms), structure.nu
     nz, rows = total.nz, regression.rows
     K = np.zeros((rows.P.shape[1], nz))
     K[n, n] = 1.0
@@ -119,7 +168,7 @@ def fit_structure(
         span = np.zeros((len(K), len(own) + 1))
         span[n, 0] = 1.0
         for column, term in zip(span.T[1:], own, strict=True):
-            _write_term(column, tuple(int(v) for v in term if v), structure, where, total.products, nz)
+            _write_term(column, tuple(int(v) for v in term if v), structure, total.products, nz)
         regressors = rows.P @ span
         size = column_norms(regressors)
         size = np.where(size > 0, size, 1.0)
@@ -129,38 +178,17 @@ def fit_structure(
     return _build_model(regression, K, structure, total.products, (rank, condition))
 
 
-def _build_lifting(structure: Structure) -> tuple[Lifting, dict[tuple[int, ...], int]]:
-    """Return ψ = [ζ, 1, monomials], and the place of each product of entries of ζ among the observables."""
-    n = structure.point_size
-    where: dict[tuple[int, ...], int] = {(): n}
-    where.update({(v,): v - 1 for v in range(1, n + 1)})
-    used = {tuple(int(v) for v in term if 0 < v <= n) for own in structure.terms for term in own}
-    needed = {factors for factors in used if len(factors) > 1}
-    lifting: Lifting = State() + Constant()
-    if not needed:
-        return lifting, where
-    degree = max(map(len, needed))
-    every = list(list_terms(n, 0, degree)[n:])  # in the order of Monomials
-    which = [i for i, term in enumerate(every) if tuple(int(v) for v in term if v) in needed]
-    for place, i in enumerate(which, n + 1):
-        where[tuple(int(v) for v in every[i] if v)] = place
-    signals = structure.signals
-    monomials = Picked(Monomials(degree), tuple(which))
-    return lifting + Standardized(monomials, structure.mean[signals], structure.scale[signals]), where
-
-
 def _write_term(
     column: Float[np.ndarray, " n"],
     factors: tuple[int, ...],
     structure: Structure,
-    where: dict[tuple[int, ...], int],
     products: Int[np.ndarray, " np"],
     nz: int,
 ) -> None:
     """Write a term in standard units as a combination of [ψ(ζ), u, u ⊗ ψ(ζ)], which hold ζ and u in their own units."""
     n, nu, nx = structure.point_size, structure.nu, len(structure.terms)
     own = tuple(v for v in factors if v <= n)
-    parts = {where[own]: 1.0}
+    parts = {structure.places[own]: 1.0}
     if len(own) == 1:
         signal = structure.signals[own[0] - 1]
         parts = {own[0] - 1: 1 / structure.scale[signal], n: -structure.mean[signal] / structure.scale[signal]}

@@ -1,0 +1,317 @@
+"""Long measured records: late input columns, sparse polynomial candidates, and the judgement of models by free runs."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from operator import methodcaller
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.source import Changed, Held, Source
+from koopmpc.errors import KoopmpcError, unwarned
+from koopmpc.identify.moments.read import ReadOptions
+from koopmpc.identify.records.free_run import HELD, PIECE, ROWS
+from koopmpc.identify.records.narx import DELAYS, FOLDS, choose_structure, is_worse, search_structures
+from koopmpc.identify.records.structure import EXACT, Structure
+from koopmpc.parallel import Progress
+from koopmpc.synthesis.candidates import Candidate, fit_candidate
+from koopmpc.synthesis.leaderboard import LeaderboardRow, choose_model
+from koopmpc.validate.scoring import AnyPredictor, forecast_errors
+from koopmpc.values import Value
+
+FEW = 10  # records are fewer episodes than this, which select would cut into blocks
+LONG = 150  # steps: half of the data are in episodes at least as long, so that a free run says something
+OUTPUTS = 4  # states of a record at most: with more the search for terms takes too long
+MARGIN = 0.8  # the input column is moved up if that lowers the error on unseen rows to this share
+FEEDBACK = 0.95  # inputs are fed back if outputs lower the error of their prediction below this share
+_STATIC = 0.1  # inputs are fed back if outputs of the same row explain their moves but for this share
+_PAST = 6  # rows of the past in the test for feedback
+_LAGS = range(1, _PAST + 1)
+_PASSES = 6  # weighted least squares fits for least absolute deviations
+_PROBE = (2, 4)  # past rows of the models that compare both timings of the inputs
+_PROBED = 3000  # rows of each record that these models learn from, at most
+_LOST = 1e3  # a free run counts as this many spreads at most
+
+
+def is_record(episodes: Episodes) -> bool:
+    """Return whether these are a few long records of few signals, on which models run freely."""
+    lengths = np.sort([len(episode) for episode in episodes])[::-1]
+    half = int(lengths[np.argmax(np.cumsum(lengths) >= lengths.sum() / 2)])
+    return len(lengths) < FEW and half >= LONG and episodes.nx <= OUTPUTS and episodes.nw == 0
+
+
+def is_fed_back(episodes: Episodes) -> bool:
+    """Return whether an input may be a feedback of the outputs, so that nothing tells when it acts.
+
+    Either past outputs predict u_{k+1} better than its own past does, on unseen rows; or most of its moves are a
+    function of the outputs in the same rows. Both use least absolute deviations, so that a few moves of a set point do
+    not hide it. Under feedback u_{k+1} holds y_{k+1}, and a model with the inputs moved up would seem to know y_{k+1}.
+    """
+    long = [e for e in episodes if len(e) > 4 * _PAST]
+    if not long:
+        return True  # too short to tell
+    past = np.concatenate([np.hstack([e.U[_PAST - i : len(e) - i] for i in _LAGS]) for e in long])
+    outputs = np.concatenate([np.hstack([e.X[_PAST - i : len(e) - i] for i in _LAGS]) for e in long])
+    now = np.concatenate([e.U[_PAST:] for e in long])
+    move = np.concatenate([np.diff(e.U, axis=0) for e in long])
+    same = np.concatenate([np.hstack([np.diff(e.X[:-1], axis=0), e.X[1:-1]]) for e in long])
+    for target, step in zip(now.T, move.T, strict=True):
+        own, both = _miss(past, target), _miss(np.hstack([past, outputs]), target)
+        cap = 5 * float(np.median(own))
+        if np.minimum(both, cap).mean() < FEEDBACK * np.minimum(own, cap).mean():
+            return True
+        moving = step != 0
+        if moving.any() and np.median(_miss(same[moving], step[moving])) < _STATIC * np.median(np.abs(step[moving])):
+            return True
+    return False
+
+
+def _miss(P: Float[np.ndarray, "M n"], target: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
+    """Return |t − [1, P] k| on each quarter of the rows, k by least absolute deviations over the others."""
+    A = np.hstack([np.ones((len(P), 1)), P])
+    fold, missed = np.arange(len(A)) * FOLDS // len(A), np.empty(len(A))
+    for out in range(FOLDS):
+        rows = fold != out
+        weight = np.ones(int(rows.sum()))
+        k = np.zeros(A.shape[1])
+        for _ in range(_PASSES):  # least squares with weights 1 / |residual|
+            k = np.linalg.lstsq(A[rows] * weight[:, None], target[rows] * weight, rcond=None)[0]
+            gap = np.abs(target[rows] - A[rows] @ k)
+            weight = 1 / np.sqrt(np.maximum(gap, max(float(np.median(gap)), 1e-12)))
+        missed[~rows] = np.abs(target[~rows] - A[~rows] @ k)
+    return missed
+
+
+def is_late(episodes: Episodes) -> bool:
+    """Return whether the log's inputs stand a row too low: models with the inputs moved up do much better.
+
+    Polynomials of degrees 2 and 3 in a few past rows are tried with both timings. The inputs are moved up only if the
+    error on unseen rows falls to 80 %, in all but one of the blocks, and no feedback from the outputs can have made it
+    fall.
+    """
+    if not episodes.nu or is_fed_back(episodes):
+        return False
+    part = episodes.with_episodes([e.cut(0, min(len(e), _PROBED)) for e in episodes])
+    try:
+        plain, moved = (
+            min(search_structures(data, _PROBE, [2, 3], 30), key=lambda one: one.error)
+            for data in (part, part.with_inputs_advanced(1))
+        )
+    except KoopmpcError:  # too short
+        return False
+    better = int(np.sum(moved.errors < plain.errors))
+    return moved.error < MARGIN * plain.error and better >= len(plain.errors) - 1
+
+
+def advance_inputs(source: Source, held: Episodes) -> tuple[Source, Episodes]:
+    """Return the source and the episodes `held` of it with the inputs one row up."""
+    moved = held.with_inputs_advanced(1)
+    if isinstance(source, Held) and source.episodes is held:
+        return Held(moved), moved
+    change = methodcaller("with_inputs_advanced", 1)
+    return Changed(source, change, held.states, held.inputs, held.disturbances), moved
+
+
+def propose_structures(
+    episodes: Episodes, delays: Sequence[int] | None, bilinear: bool, progress: Progress | None = None
+) -> list[Candidate]:
+    """Return the best sparse polynomial of these records and the best linear one; none where they are too short."""
+
+    def ask(_: str, done: int, total: int) -> None:
+        if progress is not None:
+            progress(done, total)
+
+    try:
+        found = search_structures(episodes, DELAYS if delays is None else delays, ask=ask)
+    except KoopmpcError:  # too short for any delay
+        return []
+    kinds = (False, True) if bilinear else (False,)
+    same = ([one for one in found if one.is_nonlinear is kind] for kind in kinds)
+    chosen = [choose_structure(those) for those in same if those]
+    return [_make_candidate(one).bind(episodes.states, episodes.inputs) for one in chosen]
+
+
+def _make_candidate(structure: Structure) -> Candidate:
+    name = f"{structure.size} terms" + (f", degree {structure.degree}" if structure.is_nonlinear else "")
+    return Candidate(name, structure.lifting, structure.delay, structure.is_nonlinear, structure)
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRun(Value):
+    """How a model does on stretches of records that its fit did not see, in free run and in short forecasts.
+
+    Attributes
+    ----------
+    errors
+        (blocks,) geometric means of both errors, relative to the spread of each state.
+    calm
+        The model that is fitted to all rows stays within three times the range of the data, over each record twice.
+    """
+
+    errors: Float[np.ndarray, " blocks"]
+    calm: bool
+
+    @property
+    def error(self) -> float:
+        """Geometric mean of the errors of the blocks."""
+        return float(np.exp(np.log(np.maximum(self.errors, EXACT)).mean()))
+
+
+def judge_free_run(
+    fit: Callable[[Episodes], AnyPredictor],
+    learned: Episodes,
+    measured: Episodes,
+    first: int,
+    horizon: int,
+    *,
+    relift: bool,
+) -> FreeRun:
+    """Return how a fit does on each quarter of the records when it learns from the others.
+
+    Parameters
+    ----------
+    fit
+        Returns the model of some episodes.
+    learned, measured
+        The same records, as they are fitted, smoothed for example, and as they were measured.
+    first
+        Row of a record at which its free run begins; the model's past lies before it.
+    horizon
+        Steps of the short forecasts.
+    relift
+        Lift the forecasts at every step.
+    """
+    seen, truth = cut_pieces(learned), cut_pieces(measured)
+    scale = np.concatenate([episode.X for episode in truth]).std(axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    errors: list[float] = []
+    for fold in range(FOLDS):
+        spans = [(len(e) * fold // FOLDS, len(e) * (fold + 1) // FOLDS) for e in truth]
+        kept = [e.cut(a, b) for e, (low, high) in zip(seen, spans, strict=True) for a, b in ((0, low), (high, len(e)))]
+        model = fit(truth.with_episodes([e for e in kept if len(e) > first]))
+        free: list[np.ndarray] = []
+        short: list[np.ndarray] = []
+        for e, (low, high) in zip(truth, spans, strict=True):
+            low = max(low, first)
+            if high - low < 2:
+                continue
+            run = _forecast(model, truth.with_episodes([e.cut(0, high)]), [first], high - first, relift)[:, 0]
+            free.append(run[low - first :])
+            starts = [*range(low, high - horizon + 1, horizon)]
+            if starts:
+                forecasts = _forecast(model, truth.with_episodes([e]), starts, horizon, relift)
+                short.append(forecasts.transpose(1, 0, 2))
+        parts = [np.array_split(np.concatenate(gaps), 2) for gaps in (free, short) if gaps]
+        for halves in zip(*parts, strict=True):
+            sizes = [_root_mean_square(half / scale) for half in halves if len(half)]
+            errors.append(float(np.exp(np.mean(np.log(sizes)))))
+    return FreeRun(np.array(errors), _is_calm(fit(seen), truth, first, relift))
+
+
+def _root_mean_square(gaps: Float[np.ndarray, "*rows nx"]) -> float:
+    """Return the root of the mean square, not below rounding error; a lost forecast counts as 1000 spreads."""
+    return max(float(np.sqrt(np.mean(np.minimum(gaps**2, _LOST**2)))), EXACT)
+
+
+def cut_pieces(episodes: Episodes) -> Episodes:
+    """Return the records in pieces of at most 1500 rows, of very long data evenly spread ones."""
+    pieces: list[Episode] = []
+    for e in episodes:
+        count = -(-len(e) // PIECE)
+        pieces += [e.cut(len(e) * i // count, len(e) * (i + 1) // count) for i in range(count)]
+    return episodes.with_episodes(pieces[:: -(-sum(map(len, pieces)) // ROWS)])
+
+
+def _forecast(
+    model: AnyPredictor, episode: Episodes, starts: Sequence[int], horizon: int, relift: bool
+) -> Float[np.ndarray, "horizon starts nx"]:
+    """Return the errors of forecasts that begin at these rows of one episode."""
+    past = 0 if model.embedding is None else model.embedding.steps
+    rows = [np.array(starts) - past]
+    return np.concatenate(
+        [gap for gap, _ in forecast_errors(model, model.embed(episode), rows, horizon, relift=relift)], axis=1
+    )
+
+
+def _is_calm(model: AnyPredictor, pieces: Episodes, first: int, relift: bool) -> bool:
+    centre = np.concatenate([e.X for e in pieces]).mean(axis=0)
+    reach = HELD * np.max([np.abs(e.X - centre).max(axis=0) for e in pieces], axis=0)
+    for e in pieces:
+        if len(e) <= first:
+            continue
+        twice = Episode(X=np.vstack([e.X, e.X[1:]]), U=np.vstack([e.U, e.U]))
+        gap = _forecast(model, pieces.with_episodes([twice]), [first], len(twice) - first, relift)[:, 0]
+        if not bool((np.abs(twice.X[first + 1 :] - gap - centre) < reach).all()):
+            return False
+    return True
+
+
+def judge_finalists(
+    rows: tuple[LeaderboardRow, ...],
+    learned: Episodes,
+    measured: Episodes,
+    first: int,
+    horizon: int,
+    progress: Progress | None = None,
+) -> tuple[tuple[LeaderboardRow, ...], int, dict[str, int]]:
+    """Return the rows with the errors of those that ran freely, and the places of the best one and of each kind's best.
+
+    The best row of each kind runs, with delays and without, sparse or not. Linear models with other observables than
+    the states run lifted once and lifted at each step; where that is better, the row becomes one of a bilinear model
+    with N = 0, for those are used so.
+
+    Parameters
+    ----------
+    rows
+        The leaderboard.
+    learned, measured, first, horizon
+        As in `judge_free_run`.
+    progress
+        Called after each model.
+    """
+    groups: dict[tuple[str, bool, bool], list[int]] = {}
+    for i, row in enumerate(rows):
+        groups.setdefault((row.kind, row.structure is None, row.delays > 0), []).append(i)
+    places = [choose_model(rows, among=group) for group in groups.values()]
+    every, runs = list(rows), dict[int, FreeRun]()
+    for done, place in enumerate(places):
+        if progress is not None:
+            progress(done, len(places))
+        row = rows[place]
+        if row.structure is not None:  # the search for its terms ran it freely
+            runs[place] = FreeRun(row.structure.errors, row.structure.calm)
+            continue
+        fit = partial(_fit_quietly, row.candidate, row.ridge)
+        run = judge_free_run(fit, learned, measured, first, horizon, relift=row.bilinear)
+        lifted = row.nz > len(row.lifting.bound_states) + 1
+        if row.kind == "linear" and lifted:
+            again = judge_free_run(fit, learned, measured, first, horizon, relift=True)
+            if again.calm >= run.calm and is_worse(run.errors, again.errors):
+                every[place], run = replace(row, bilinear=True, relifted=True), again
+        runs[place] = run
+    some = any(run.calm for run in runs.values())
+    for place, run in runs.items():
+        every[place] = replace(every[place], free=run.error if run.calm or not some else np.inf)
+    found = tuple(every)
+
+    def choose(kind: str | None) -> int:
+        those = [i for i in places if kind is None or found[i].kind == kind]
+        return those[choose_by_free_run([runs[i] for i in those], [found[i].size for i in those])]
+
+    kinds = {found[i].kind for i in places}
+    return found, choose(None), {kind: choose(kind) for kind in kinds}
+
+
+def _fit_quietly(candidate: Candidate, ridge: float, data: Episodes) -> AnyPredictor:
+    with unwarned():
+        return fit_candidate(candidate, data, ridge, ReadOptions())
+
+
+def choose_by_free_run(runs: Sequence[FreeRun], sizes: Sequence[float]) -> int:
+    """Return the smallest model within one standard error of the best; a calm one where there is any."""
+    places = [i for i, run in enumerate(runs) if run.calm] or list(range(len(runs)))
+    best = min(places, key=lambda i: runs[i].error)
+    near = [i for i in places if not is_worse(runs[i].errors, runs[best].errors)]
+    return min(near, key=lambda i: (sizes[i], runs[i].error))

@@ -1,0 +1,120 @@
+"""select on long records: sparse polynomials of the past, late input columns, free runs that decide."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.errors import DataError
+from koopmpc.synthesis.candidates import relift_model
+from koopmpc.synthesis.records import FreeRun, choose_by_free_run, is_fed_back, is_late, is_record
+
+
+def oscillator(rows=420, noise=0.01, late=False, gain=None, seed=0):
+    """Return one record of a hardening spring, of which the position alone is measured; P feedback with a gain."""
+    rng = np.random.default_rng(seed)
+    y, u, setpoint = np.zeros(rows + 2), np.zeros(rows + 2), np.repeat(rng.uniform(-1, 1, rows // 10 + 2), 10)
+    measured = np.zeros(rows + 2)
+    for k in range(1, rows + 1):
+        measured[k] = y[k] + noise * rng.standard_normal()
+        u[k] = rng.uniform(-1, 1) if gain is None else gain * (setpoint[k] - measured[k])
+        y[k + 1] = 1.5 * y[k] - 0.8 * y[k - 1] - 0.1 * y[k] ** 3 + 0.4 * u[k]
+    X, U = measured[1 : rows + 1, None], u[1:rows, None]
+    if late:
+        U = np.vstack([U[:1], U[:-1]])  # the row of u_k holds y_{k+1}
+    return km.Episodes([km.Episode(X=X, U=U)], 0.1, ["y [mm]"], ["u"])
+
+
+@cache
+def selection(late):
+    return km.select(oscillator(late=late), ridges=[1e-6], horizon=10, delays=[0, 2], folds=2)
+
+
+def free_error(model, data):
+    """Return the error of a free run from the first rows of a record, as the model's controllers use it."""
+    points = model.embed(model.align(data))[0]
+    if isinstance(model, km.BilinearPredictor):
+        X = model.step_map().rollout(points.X[0], points.U)[:, :1]
+    else:
+        X = model.rollout(points.X[0], points.U)
+    return float(np.sqrt(np.mean((X - points.X[:, :1]) ** 2)))
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_the_free_run_of_the_chosen_model_is_that_of_the_plant(late):
+    found, fresh = selection(late), oscillator(late=late, seed=9, noise=0.0)
+    assert found.predictor.embedding is not None
+    assert free_error(found.predictor, fresh) < 0.05 * fresh[0].X.std()
+    assert found.best.free == min(row.free for row in found.leaderboard if np.isfinite(row.free))
+
+
+def test_the_best_of_each_kind_is_near_the_best_that_ran():
+    found = selection(False)
+    for kind, row in (("linear", found.best_linear), (found.best.kind, found.best)):
+        ran = [r.free for r in found.leaderboard if r.kind == kind and np.isfinite(r.free)]
+        assert row.free < 1.3 * min(ran)
+    assert isinstance(found.linear, km.LinearPredictor)
+    assert isinstance(found.bilinear, km.BilinearPredictor)
+
+
+def test_a_late_input_column_is_moved_up_and_the_model_says_so(tmp_path):
+    found = selection(True)
+    assert found.predictor.input_lead == found.linear.input_lead == 1
+    assert any("moved up by one row" in note for note in found.notes)
+    assert selection(False).predictor.input_lead == 0
+    found.predictor.save(tmp_path / "m.npz")
+    loaded = km.load_model(tmp_path / "m.npz")
+    assert loaded.input_lead == 1
+    data = oscillator(late=True)
+    assert np.array_equal(loaded.align(data)[0].U, data[0].U[1:])
+    assert np.array_equal(loaded.align(data)[0].X, data[0].X[:-1])
+
+
+def test_a_table_of_a_record_shows_the_free_run():
+    assert "free" in str(selection(False))
+
+
+def test_inputs_move_up_only_where_the_log_is_late_and_open():
+    assert is_late(oscillator(late=True))
+    assert not is_late(oscillator())
+    fed_back = oscillator(gain=0.6)
+    assert is_fed_back(fed_back)
+    assert not is_late(fed_back)
+    assert not is_fed_back(oscillator(late=True))
+
+
+def test_inputs_that_are_advanced_twice_are_those_advanced_by_two():
+    data = oscillator(rows=40)
+    twice, two = data.with_inputs_advanced().with_inputs_advanced(), data.with_inputs_advanced(2)
+    assert twice == two
+    assert data.with_inputs_advanced(0) is data
+    with pytest.raises(DataError, match="smaller number of rows"):
+        data.with_inputs_advanced(39)
+
+
+def test_a_record_is_one_long_series_of_few_signals():
+    data = oscillator()
+    assert is_record(data)
+    blocks = data.with_episodes([data[0].cut(10 * i, 10 * i + 10) for i in range(20)])
+    assert not is_record(blocks)
+    wide = km.Episodes([km.Episode(X=np.ones((400, 6)))], 0.1)
+    assert not is_record(wide)
+
+
+def test_a_linear_model_lifted_at_each_step_is_a_bilinear_one_without_products():
+    data = oscillator()
+    model = km.edmd(data, km.State() + km.Monomials(3), embedding=km.Delay(1), ridge=1e-6)
+    lifted = relift_model(model)
+    assert not lifted.N.any()
+    point = model.embed(data)[0].X[5]
+    assert np.allclose(model.step_map()(point, [0.3]), lifted.step_map()(point, [0.3]), rtol=0, atol=1e-14)
+    assert "lifted at each step" in lifted.report.changes[-1]
+
+
+def test_a_model_that_leaves_the_range_is_taken_only_where_all_do():
+    wild, calm = FreeRun(np.array([0.1, 0.1]), False), FreeRun(np.array([0.5, 0.6]), True)
+    assert choose_by_free_run([wild, calm], [1, 9]) == 1
+    assert choose_by_free_run([wild, wild], [3, 2]) == 1
+    near = FreeRun(np.array([0.52, 0.57]), True)
+    assert choose_by_free_run([calm, near], [9, 1]) == 1
