@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Changed, Held, Source
-from koopmpc.errors import KoopmpcError, unwarned
+from koopmpc.errors import KoopmpcError, hide_fit_warnings
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.records.free_run import HELD, PIECE, ROWS
 from koopmpc.identify.records.narx import DELAYS, FOLDS, choose_structure, is_worse, search_structures
@@ -26,7 +26,7 @@ LONG = 150  # steps: half of the data are in episodes at least as long, so that 
 OUTPUTS = 4  # states of a record at most: with more the search for terms takes too long
 MARGIN = 0.8  # the input column is moved up if that lowers the error on unseen rows to this share
 FEEDBACK = 0.95  # inputs are fed back if outputs lower the error of their prediction below this share
-_STATIC = 0.1  # inputs are fed back if outputs of the same row explain their moves but for this share
+_STATIC = 0.1  # inputs are fed back if outputs of the same row leave less than this share of their moves open
 _PAST = 6  # rows of the past in the test for feedback
 _LAGS = range(1, _PAST + 1)
 _PASSES = 6  # weighted least squares fits for least absolute deviations
@@ -305,7 +305,7 @@ def judge_finalists(
 
 
 def _fit_quietly(candidate: Candidate, ridge: float, data: Episodes) -> AnyPredictor:
-    with unwarned():
+    with hide_fit_warnings():
         return fit_candidate(candidate, data, ridge, ReadOptions())
 
 

@@ -28,7 +28,7 @@ from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.values import Value
 
-HORIZON = 20  # steps of the short forecasts that count beside the free run
+HORIZON = 20  # steps of the short forecasts, which count as much as the free run
 EXACT = 1e-6  # smaller errors, in spreads, are alike: they are due to rounding
 _SOFT = 1e-9  # ridge of the observables' own rows, which are almost dependent
 
