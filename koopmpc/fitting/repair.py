@@ -116,6 +116,7 @@ def audit_episodes(episodes: Episodes, *, cut: bool = True) -> tuple[Episodes, t
         else:
             done = fault.do
         notes.append(f"{fault.name}: {_locate_fault(fault, episodes)}; {done}")
+    notes += [f"input timing: {doubt}" for doubt in report.doubts]
     return rest, tuple(notes), report.delay
 
 

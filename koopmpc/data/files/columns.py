@@ -119,7 +119,7 @@ class TableSettings:
 class ColumnRoles:
     """The role of each column of a table.
 
-    `scale` is the unit of the time column in seconds; `targets` are set points, which are no part of the plant.
+    `scale` is the unit of the time column in seconds; `targets` are set points, which do not belong to the plant.
     `guessed` says that names alone tell states or inputs.
     """
 
@@ -151,7 +151,7 @@ def find_roles(
 
     Roles that the caller does not give are read from the words of the names. ``t``, ``time [s]``, ``sampling_time`` and
     ``timestamp`` are time; ``episode``, ``run``, ``trial`` and ``trajectory`` number the episodes; `is_input` says
-    which are inputs; ``w``, ``w0`` and ``disturbance`` are measured disturbances; a set point is no part of the plant;
+    which are inputs; ``w``, ``w0`` and ``disturbance`` are measured disturbances; a set point is left out;
     every other column of numbers is a state.
 
     Parameters
@@ -226,7 +226,7 @@ def is_input(name: str) -> bool:
 
     A word for a command always says so (``speed command``). A word for a driving quantity or for an actuator says so
     (``pump voltage``, ``valve [%]``, ``u_left``) unless another word names a measurement (``motor speed``, ``output
-    voltage``). A set point is no input.
+    voltage``). A set point does not count as an input.
     """
     words = _list_words(name)
     if words & _COMMANDS:

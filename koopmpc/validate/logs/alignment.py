@@ -138,6 +138,8 @@ def _find_best_shift(
         return None
     errors = {shift: align_rows(log, (*accepted, *shift)).residuals(log) for shift in _list_shifts(log, accepted)}
     scores = {shift: _score_shift(log, shift[0], E, other) for shift, other in errors.items()}
+    if not scores:  # the only signal that can be late has its shift
+        return None
     best = max(scores, key=lambda shift: scores[shift] * (_PREFERENCE if shift[0].column >= nx else 1.0))
     rivals = {shift: score for shift, score in scores.items() if shift[0].column != best[0].column}
     if best[0].column >= nx and not _replaces_present_input(log, accepted, best, errors[best]):

@@ -22,6 +22,7 @@ from koopmpc.validate.logs.alignment import (
 )
 from koopmpc.validate.logs.changes import find_changes
 from koopmpc.validate.logs.log import Log, LogFault, Place, find_stretches, list_places
+from koopmpc.validate.logs.timing import InputTiming, Timing, find_same_row_inputs, measure_timing
 from koopmpc.values import Value
 
 Check = Callable[[Log], Iterator[LogFault]]
@@ -55,11 +56,14 @@ class AuditReport(Value):
         The faults.
     episodes, steps
         Number of episodes and steps that were checked.
+    timing
+        For each input, whether it acts on the row after its own or within its own row.
     """
 
     faults: tuple[LogFault, ...]
     episodes: int
     steps: int
+    timing: tuple[InputTiming, ...] = ()
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -70,6 +74,17 @@ class AuditReport(Value):
     def delay(self) -> int:
         """Number of past steps that a model needs because signals are late; 0 if every signal is in time."""
         return max((fault.steps for fault in self.faults), default=0)
+
+    @property
+    def same_row(self) -> tuple[str, ...]:
+        """Names of the inputs that act within their own row."""
+        return tuple(one.input for one in self.timing if one.timing is Timing.SAME_ROW)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """A sentence for each input of which feedback hides whether it acts within its own row."""
+        advice = "record it once without the controller, or with a test signal of your own added to it"
+        return tuple(f"{one}; {advice}" for one in self.timing if one.feedback)
 
     def without_faults(self, data: Episodes) -> Episodes:
         """Return the data without the faulty rows: episodes are cut there, and pieces of one row are dropped.
@@ -87,11 +102,13 @@ class AuditReport(Value):
     def __str__(self) -> str:
         """Return the report: a summary, then each fault with its remedy."""
         checked = f"{self.episodes} episode{'s' * (self.episodes > 1)}, {self.steps} steps"
-        if not self.faults:
+        doubts = [("input timing", f"{doubt}.") for doubt in self.doubts]
+        if not self.faults and not doubts:
             return f"no fault found in {checked}"
         count = len(self.faults)
         pairs = [(fault.name, f"{fault.says}. {fault.do[0].upper()}{fault.do[1:]}.") for fault in self.faults]
-        return render_text(f"{count} fault{'s' * (count > 1)} found in {checked}", label_lines(pairs))
+        summary = f"{count} fault{'s' * (count > 1)}" if count else "no fault"
+        return render_text(f"{summary} found in {checked}", label_lines([*pairs, *doubts]))
 
 
 def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditReport:
@@ -102,6 +119,8 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditR
     - Inputs: some do not move, move together, have no effect, excite too little, or follow from the state.
     - Alignment: a one-step regression on the present row predicts better after a late signal is shifted to its true
       row, or after an input is clipped at the limit of its actuator.
+    - Timing: an input acts within its own row: a feedthrough, or a log whose input column is one row late. Under
+      feedback one log cannot tell, and the report says so.
     - Changes: an episode follows the law of the others after a sign, unit, offset, order of columns or sample time is
       corrected.
 
@@ -138,7 +157,9 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditR
     if rest is not None and not rough and "inputs together" not in kinds:
         late_signals = list(find_late_signals(Log(rest.data)))
         faults += late_signals or list(find_saturated_actuators(Log(rest.data)))
-    return AuditReport(tuple(faults), len(data), sum(map(len, data)))
+    timing = measure_timing(Log(rest.data)) if rest is not None and "inputs together" not in kinds else ()
+    faults += find_same_row_inputs(timing)
+    return AuditReport(tuple(faults), len(data), sum(map(len, data)), timing)
 
 
 def _take_first(data: Episodes) -> Episodes:

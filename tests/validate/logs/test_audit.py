@@ -17,9 +17,13 @@ CLEAN = [0, 7, 19, 40, 51, 87, 91058, 3021, 12061, 20187]
 )
 def test_it_is_silent_on_logs_of_a_sound_plant(seed):
     """Whatever the plant, the excitation, the noise of the sensors, and the length and number of the episodes."""
-    _, data = clean(seed)
+    drawn, data = clean(seed)
     report = km.validate.audit(data)
     assert report.faults == (), str(report)
+    if drawn.drive == "loop":  # under feedback the report may say that it cannot tell the timing
+        assert str(report).startswith("no fault found in")
+        assert all(one in " ".join(str(report).split()) for one in report.doubts)
+        return
     assert str(report) == f"no fault found in {len(data)} episode{'s' * (len(data) > 1)}, {report.steps} steps"
 
 

@@ -1,0 +1,274 @@
+"""Input timing: whether an input acts on the row after its own, or within its own row.
+
+The next row y_{k+1} is regressed on the past p_k = (y_k, y_{k−1}, …, u_k, u_{k−1}, …) and on u_{k+1}. If an input that
+nobody computes from y acts on later rows only, the part of u_{k+1} that p_k does not predict is independent of all that
+y_{k+1} holds, noise included: its coefficient is zero whatever the plant, its order and its noise. A coefficient that
+differs from zero by more than chance says that u_{k+1} acts within its own row: a feedthrough, or a log whose input
+column is one row late.
+
+Under feedback u_{k+1} = −K y_{k+1} + … the coefficient differs from zero too, so that one log cannot tell the two
+apart. Three tests look for feedback:
+
+1. Past outputs predict an input better than its own past does (Granger), or a few of them do as well.
+2. The past p_k predicts an input only by K times its prediction of y_{k+1} (Sargan's test of p_k as instruments).
+3. A later input u_{k+2} seems to act on y_{k+1}.
+
+References
+----------
+Granger, "Investigating causal relations by econometric models", Econometrica 37, 1969. Sargan, "The estimation of
+economic relationships using instrumental variables", Econometrica 26, 1958. White, "A heteroskedasticity-consistent
+covariance matrix estimator", Econometrica 48, 1980.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from koopmpc.lifting.base import strip_unit
+from koopmpc.validate.logs.log import Log, LogFault
+from koopmpc.values import Value
+
+_LAGS = 8  # rows of states that the past holds at most
+_INPUT_LAGS = 24  # rows of inputs that the past holds at most
+_EACH = 12  # rows of the log for each column of the past
+_MOST_ROWS = 10_000  # read at most about this many rows
+_SURE = 5.5  # standard errors by which the coefficient of u_{k+1} must differ from zero
+_LATER = 0.5  # reject if u_{k+2} has more than this share of the t value of u_{k+1}
+_FRESH = 1e-3  # share of an input's variance that its past must leave open
+_BLOCKS = 8  # in all but one of this many parts of the log the coefficient must have the same sign
+_SHORT = 3  # rows of the input beside which a few outputs must not predict it better
+_STATE_ROWS = 4  # rows of these outputs
+_REPEATED = 0.3  # an input that keeps its exact value in this share of the rows does not follow a noisy output
+_WEAK = 2.5  # below this t value the coefficient is taken for zero
+_INSTRUMENTS = 1e-4  # significance at which a proportional feedback is rejected
+_STRONG = 0.1  # squared partial correlation of u_{k+1} and y_{k+1} above which a feedback must be strong, thus seen
+
+
+class _Strictness(NamedTuple):
+    """Limits beyond which an input counts as a feedback."""
+
+    significance: float  # of past outputs that predict an input beside its own past
+    share: float  # of what all rows of the input predict, which a few outputs may predict as well
+    gain: float  # standard errors by which the gain of a proportional feedback must differ from zero
+
+
+_USUAL = _Strictness(significance=0.003, share=0.65, gain=5.0)
+_STRICT = _Strictness(significance=0.05, share=0.4, gain=3.0)  # for weak effects, which a weak feedback could make
+
+
+class Timing(Enum):
+    """When an input acts, by its rows in the log."""
+
+    NEXT_ROW = "acts on the next row"
+    SAME_ROW = "acts within its own row"
+    UNKNOWN = "cannot say"
+
+
+@dataclass(frozen=True, eq=False)
+class InputTiming(Value):
+    """The timing of one input.
+
+    Attributes
+    ----------
+    input
+        Name of the input.
+    timing
+        `UNKNOWN` under feedback, and for an input that is too smooth.
+    t
+        t value of the coefficient of u_{k+1}, the largest of all states.
+    why
+        The reason, in words.
+    feedback
+        Whether the reason is a feedback, which one log cannot tell from an effect within the row.
+    """
+
+    input: str
+    timing: Timing
+    t: float
+    why: str
+    feedback: bool = False
+
+    def __str__(self) -> str:
+        """Return a sentence."""
+        name = strip_unit(self.input)
+        if self.timing is Timing.UNKNOWN:
+            return f"cannot say whether {name} acts within its own row: {self.why}"
+        return f"{name} {self.timing.value}: {self.why}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows k of all episodes: the past p_k in two parts, and what follows, all centred and of unit size."""
+
+    states: Float[np.ndarray, "M p"]
+    inputs: Float[np.ndarray, "M q"]
+    products: Float[np.ndarray, "M r"]
+    change: Float[np.ndarray, "M nx"]
+    after: Float[np.ndarray, "M nx"]
+    same: Float[np.ndarray, "M nu"]
+    later: Float[np.ndarray, "M nu"]
+    repeated: Float[np.ndarray, " nu"]
+
+
+def measure_timing(log: Log) -> tuple[InputTiming, ...]:
+    """Return the timing of each input; `UNKNOWN` where the log is too short to tell."""
+    nu, names = log.data.nu, log.data.inputs
+    rows = _stack_rows(log) if nu else None
+    if rows is None:
+        return tuple(InputTiming(name, Timing.UNKNOWN, 0.0, "the log is too short") for name in names)
+    past = _find_basis(np.hstack([rows.states, rows.inputs, rows.products]))
+    fresh, left = _leave_out(past, rows.same), _leave_out(past, rows.change)
+    share = (fresh**2).mean(axis=0) / np.maximum((rows.same**2).mean(axis=0), 1e-300)
+    moving = share > _FRESH
+    t = np.zeros((nu, log.data.nx))
+    later = np.zeros_like(t)
+    if moving.any():
+        t[moving], signs = _test_coefficients(fresh[:, moving], left)
+        more = _find_basis(np.hstack([rows.states, rows.inputs, rows.products, rows.same]))
+        beyond = _leave_out(more, rows.later)
+        known = moving & ((beyond**2).mean(axis=0) > _FRESH * (rows.same**2).mean(axis=0))
+        if known.any():
+            later[known], _ = _test_coefficients(beyond[:, known], _leave_out(more, rows.change))
+    else:
+        signs = np.zeros((0, log.data.nx))
+    found: list[InputTiming] = []
+    for j, name in enumerate(names):
+        i = int(np.argmax(np.abs(t[j])))
+        value = float(t[j, i])
+        if not moving[j]:
+            found.append(InputTiming(name, Timing.UNKNOWN, value, "its past predicts it, so no row shows its effect"))
+            continue
+        agree = signs[np.flatnonzero(moving).tolist().index(j), i] >= _BLOCKS - 1
+        limits = _USUAL if value**2 > _STRONG * (len(rows.same) + value**2) else _STRICT
+        if why := _explain_feedback(rows, j, limits if abs(value) > _WEAK else _USUAL):
+            found.append(InputTiming(name, Timing.UNKNOWN, value, why, feedback=True))
+        elif abs(value) < _WEAK:
+            found.append(InputTiming(name, Timing.NEXT_ROW, value, "its own row does not hold its effect"))
+        elif abs(value) < _SURE:
+            found.append(InputTiming(name, Timing.UNKNOWN, value, f"its own row may hold its effect (t = {value:.3g})"))
+        elif not agree or np.abs(later[j]).max() > max(_LATER * abs(value), _WEAK):
+            why = "rows before it seem to hold its effect too" if agree else "parts of the log disagree"
+            found.append(InputTiming(name, Timing.UNKNOWN, value, why))
+        else:
+            found.append(InputTiming(name, Timing.SAME_ROW, value, f"its own row holds its effect (t = {value:.3g})"))
+    return tuple(found)
+
+
+def find_same_row_inputs(timings: tuple[InputTiming, ...]) -> Iterator[LogFault]:
+    """Find inputs that act within their own row."""
+    for one in timings:
+        if one.timing is Timing.SAME_ROW:
+            name = strip_unit(one.input)
+            yield LogFault(
+                "input in its own row",
+                f"a row of {name} explains the states of the same row beyond all earlier rows (t = {one.t:.3g}): "
+                f"{name} acts within its row, or its column is one row late",
+                "move its column one row up before a fit, or fit a model with feedthrough",
+                (one.input,),
+            )
+
+
+def _stack_rows(log: Log) -> _Rows | None:
+    """Return the rows of the test, or None if the log is too short."""
+    nx, nu = log.data.nx, log.data.nu
+    usual = sorted(len(e) for e in log.data)[len(log.data) // 2]
+    total = min(log.steps, _MOST_ROWS)
+    lags = int(np.clip(min((usual - 4) // 3, total // (_EACH * 3 * nx)), 1, _LAGS))
+    input_lags = int(np.clip(min((usual - 4) // 2, total // (_EACH * 2 * nu)), 1, _INPUT_LAGS))
+    margin = max(lags, input_lags)
+    parts: list[tuple[np.ndarray, ...]] = []
+    count = 0
+    for episode in log.data:
+        T = len(episode)
+        k = np.arange(margin, T - 2)
+        if not len(k):
+            continue
+        Z, V = log.scale(episode.X[:-1], episode.U)
+        parts.append(
+            (
+                np.hstack([Z[k - i] for i in range(lags + 1)]),
+                np.hstack([V[k - i] for i in range(input_lags + 1)]),
+                log.stack_regressors(episode.X[k], episode.U[k])[:, 1:],
+                Z[k + 1] - Z[k],
+                Z[k + 1],
+                V[k + 1],
+                V[k + 2],
+            )
+        )
+        count += len(k)
+        if count > _MOST_ROWS:
+            break
+    if not parts:
+        return None
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    if len(columns[0]) < max(200, 4 * sum(column.shape[1] for column in columns[:3])):
+        return None
+    repeated = np.mean(columns[5] == columns[1][:, :nu], axis=0)
+    return _Rows(*(column - column.mean(axis=0) for column in columns), repeated=repeated)
+
+
+def _find_basis(P: Float[np.ndarray, "M p"]) -> Float[np.ndarray, "M rank"]:
+    """Return orthonormal columns that span those of P; directions below 1e-9 of the largest are left out."""
+    norms = np.linalg.norm(P, axis=0)
+    Q, sizes, _ = np.linalg.svd(P[:, norms > 0] / norms[norms > 0], full_matrices=False)
+    return Q[:, sizes > 1e-9 * sizes.max(initial=0.0)]
+
+
+def _leave_out(Q: Float[np.ndarray, "M rank"], Y: Float[np.ndarray, "M n"]) -> Float[np.ndarray, "M n"]:
+    """Return what orthonormal columns leave of Y."""
+    return Y - Q @ (Q.T @ Y)
+
+
+def _test_coefficients(
+    W: Float[np.ndarray, "M nu"], E: Float[np.ndarray, "M nx"]
+) -> tuple[Float[np.ndarray, "nu nx"], Float[np.ndarray, "nu nx"]]:
+    """Return White's t values of E = W b + e, and in how many parts of the log the coefficients have b's sign."""
+    inverse = np.linalg.pinv(W.T @ W)
+    b = inverse @ W.T @ E
+    e = E - W @ b
+    weights = W @ inverse
+    errors = np.sqrt(np.einsum("mj,mi->ji", weights**2, e**2))
+    agree = np.zeros_like(b)
+    for part, other in zip(np.array_split(W, _BLOCKS), np.array_split(E, _BLOCKS), strict=True):
+        agree += np.sign(np.linalg.pinv(part) @ other) == np.sign(b)
+    floor = 1e-12 * np.abs(b)
+    return b / np.maximum(errors, np.maximum(floor, 1e-300)), agree
+
+
+def _explain_feedback(rows: _Rows, j: int, limits: _Strictness) -> str:
+    """Return why input j may be a feedback of the states, or an empty text."""
+    u, ones = rows.same[:, [j]], len(rows.same)
+    own = _find_basis(rows.inputs)
+    both = _find_basis(np.hstack([rows.inputs, rows.states]))
+    alone, joint = (float((_leave_out(Q, u) ** 2).sum()) for Q in (own, both))
+    more, free = both.shape[1] - own.shape[1], ones - both.shape[1] - 1
+    if joint < 1e-9 * float((u**2).sum()):
+        return "the rows before determine it"
+    if more > 0 and stats.f.sf((alone - joint) / more / (joint / free), more, free) < limits.significance:
+        return "past outputs predict it, so it is a feedback"
+    nx, nu = rows.after.shape[1], rows.same.shape[1]
+    if rows.repeated[j] < _REPEATED:
+        short = _find_basis(rows.inputs[:, : nu * _SHORT])
+        few = _find_basis(np.hstack([rows.inputs[:, : nu * _SHORT], rows.states[:, : nx * _STATE_ROWS]]))
+        base, proxy = (float((_leave_out(Q, u) ** 2).sum()) for Q in (short, few))
+        more, free = few.shape[1] - short.shape[1], ones - few.shape[1] - 1
+        better = more > 0 and float(stats.f.sf((base - proxy) / more / (proxy / free), more, free)) < _INSTRUMENTS
+        if better and base - proxy > limits.share * (base - alone):
+            return "outputs predict it as well as its own past does, so it may be a feedback"
+    # two-stage least squares of u = −K y + r with the past as instruments: r must not follow from the past
+    predicted = both @ (both.T @ rows.after)
+    K, *_ = np.linalg.lstsq(predicted, u, rcond=1e-9)
+    r = u - rows.after @ K
+    rest = float((r**2).sum())
+    errors = np.sqrt(np.diag(np.linalg.pinv(predicted.T @ predicted)) * rest / ones)
+    if not (np.abs(K[:, 0]) > limits.gain * errors).any():
+        return ""
+    explained = float(((both.T @ r) ** 2).sum()) / max(rest / ones, 1e-300)
+    if stats.chi2.sf(explained, both.shape[1] - nx) > _INSTRUMENTS:
+        return "its past follows from the outputs as under a proportional feedback"
+    return ""
