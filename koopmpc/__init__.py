@@ -68,6 +68,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.lifting.composed import Standardized as Standardized
     from koopmpc.lifting.fourier import Fourier as Fourier
     from koopmpc.lifting.fourier import RandomFourier as RandomFourier
+    from koopmpc.lifting.network import ONNX as ONNX
     from koopmpc.lifting.radial import Gaussian as Gaussian
     from koopmpc.lifting.radial import ThinPlate as ThinPlate
     from koopmpc.lifting.state import Constant as Constant

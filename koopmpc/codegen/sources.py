@@ -50,12 +50,13 @@ _BINARY = {
     "constpow": "KOOPMPC_FN(pow)({0}, {1})",
 }
 _HYPERBOLIC = ("sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
-_MATH = ("sqrt", "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "fabs", "floor", "ceil")
+_MATH = ("sqrt", "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "erf")
+_WHOLE = ("fabs", "floor", "ceil")
 _MATH_OF_TWO = ("hypot", "atan2", "fmin", "fmax", "fmod", "copysign")
 EXPRESSIONS = (
     _UNARY
     | _BINARY
-    | {name: f"KOOPMPC_FN({name})({{0}})" for name in (*_MATH, *_HYPERBOLIC)}
+    | {name: f"KOOPMPC_FN({name})({{0}})" for name in (*_MATH, *_WHOLE, *_HYPERBOLIC)}
     | {name: f"KOOPMPC_FN({name})({{0}}, {{1}})" for name in _MATH_OF_TWO}
 )
 _FLOPS = {"assign": 0, "neg": 0}  # of one operation where it is not 1; a function of math.h counts 20

@@ -32,6 +32,12 @@ def _where(condition: Columns, value: Columns, out: np.ndarray) -> None:
     out[...] = np.where(condition, value, 0.0)
 
 
+def _erf(value: Columns, out: np.ndarray) -> None:
+    from scipy.special import erf  # here, because few graphs need it and its import takes a while
+
+    erf(value, out)
+
+
 def _symbolic_square(a: ca.SX) -> ca.SX:
     return a * a
 
@@ -72,6 +78,7 @@ OPERATIONS = {
     "asinh": Operation(1, np.arcsinh, ca.asinh),
     "acosh": Operation(1, np.arccosh, ca.acosh),
     "atanh": Operation(1, np.arctanh, ca.atanh),
+    "erf": Operation(1, _erf, ca.erf),
     "fabs": Operation(1, np.fabs, ca.fabs),
     "sign": Operation(1, np.sign, ca.sign),
     "floor": Operation(1, np.floor, ca.floor),

@@ -17,6 +17,7 @@ ELSEWHERE = {  # pages whose claims are tested beyond what they print, and where
     "faults.md": "tests/bench/test_docs.py",
     "how/fmu.md": "tests/test_docs_plants.py",
     "how/gymnasium.md": "tests/test_docs_plants.py",
+    "how/onnx.md": "tests/lifting/test_onnx.py",
     "how/own_step_function.md": "tests/test_docs_plants.py",
     "how/peers.md": "tests/predict/test_peers.py",
     "identification.md": "tests/test_docs_identification.py",

@@ -35,7 +35,7 @@ class Error(km.Lifting):
         return ("erf",)
 
     def formula(self, x: ca.SX) -> ca.SX:
-        return ca.erf(x[0])
+        return ca.erfinv(x[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +111,9 @@ MISTAKES = [
         lambda: km.Expressions(lambda x: [x[0]], ["a", "b"]).bind(NAMES),
     ),
     (DATA, "two observables are named", lambda: km.Expressions(lambda x: [x[0], x[1]], ["a", "a"]).bind(NAMES)),
-    (DATA, "uses the operation 'erf'", lambda: km.Expressions(lambda x: [ca.erf(x[0])], ["a"]).bind(NAMES)),
+    (DATA, "uses the operation 'erfinv'", lambda: km.Expressions(lambda x: [ca.erfinv(x[0])], ["a"]).bind(NAMES)),
     (DATA, r"call .bind\(states\), which traces", lambda: to_data(km.Expressions(lambda x: [x[0]], ["a"]))),
-    (DATA, "uses the operation 'erf'", lambda: to_data(Error().bind(NAMES))),
+    (DATA, "uses the operation 'erfinv'", lambda: to_data(Error().bind(NAMES))),
     (DATA, "Drag does not know its states yet", lambda: to_data(Drag())),
     (
         SHAPE,
