@@ -10,6 +10,7 @@ from rich.table import Column, Table
 
 WIDTH = 100  # columns of a report
 _WIDEST = 200  # columns of its tables, at most
+_SHOWN = 15  # a leaderboard prints this many of its first rows
 _HEADED = box.Box("    \n    \n -- \n    \n    \n    \n    \n    \n", ascii=True)  # Rerun's font has this line too
 
 
@@ -42,6 +43,18 @@ def build_table(headings: Sequence[str], rows: Iterable[Sequence[str]], left: in
     for row in rows:
         made.add_row(*row)
     return made
+
+
+def build_leaderboard(
+    headings: Sequence[str], rows: Sequence[Sequence[str]], chosen: int, linear: int | None, extra: Iterable[int] = ()
+) -> tuple[Table, int]:
+    """Return the table of the first 15 rows, those chosen and `extra`, and how many rows it leaves out.
+
+    → marks the chosen row, and l the best linear one where it is another.
+    """
+    marks = {**({} if linear is None else {linear: "l"}), chosen: "→"}
+    shown = sorted({*range(min(_SHOWN, len(rows))), *marks, *extra})
+    return build_table(["", *headings], [[marks.get(i, ""), *rows[i]] for i in shown], left=2), len(rows) - len(shown)
 
 
 def build_plain_table(title: str, words: Sequence[str], numbers: Sequence[str] = (), **settings: Any) -> Table:

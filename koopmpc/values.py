@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from functools import cache
+from hashlib import sha256
 from math import copysign
 from types import UnionType
 from typing import (
@@ -25,6 +26,7 @@ from typing import (
     no_type_check,
     runtime_checkable,
 )
+from zlib import crc32
 
 import numpy as np
 from jaxtyping import jaxtyped  # pyright: ignore[reportUnknownVariableType]
@@ -308,3 +310,15 @@ def _parts(dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 def _fields(value: Value) -> list[str]:
     return [f.name for f in dataclasses.fields(cast(Any, value)) if f.init and f.compare]
+
+
+def checksum(*parts: Any, start: int = 0) -> int:
+    """Return the CRC-32 of parts of bytes, one behind the other; `start` is that of the parts before, to go on from."""
+    for part in parts:
+        start = crc32(part, start)
+    return start
+
+
+def fingerprint(content: bytes) -> str:
+    """Return the SHA-256 of the content in hexadecimal digits: other contents have other fingerprints."""
+    return sha256(content).hexdigest()

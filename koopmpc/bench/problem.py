@@ -1,7 +1,6 @@
 """Problem: a plant, how to learn it, how to control it, and the cases to compare in; and the files that hold one."""
 
 import ast
-import hashlib
 import importlib.util
 import sys
 import traceback
@@ -28,6 +27,7 @@ from koopmpc.plants.dynamics import RK4, Dynamics, Euler, Integrator
 from koopmpc.plants.plant import Plant
 from koopmpc.plants.step_map import StepMap, discretize
 from koopmpc.scene import Scene
+from koopmpc.values import fingerprint
 
 DEFAULT = ("bilinear_motor:step", "cart_pole", "cart_pole_swing", "pendulum", "van_der_pol:track")  # a minute's bench
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -355,7 +355,7 @@ def _unknown(text: str) -> str:
 def _load(path: Path) -> Problem:
     """Run the file and return its `problem` with name and title."""
     path = path.resolve()
-    module_name = f"koopmpc_problem_{path.stem}_{hashlib.sha1(str(path).encode()).hexdigest()[:8]}"
+    module_name = f"koopmpc_problem_{path.stem}_{fingerprint(str(path).encode())[:8]}"
     spec = importlib.util.spec_from_loader(module_name, loader=None, origin=str(path))
     assert spec is not None
     module = importlib.util.module_from_spec(spec)

@@ -8,7 +8,6 @@ from dataclasses import astuple, dataclass, fields
 from itertools import groupby
 from pathlib import Path
 from typing import Any
-from zlib import crc32
 
 import numpy as np
 from jaxtyping import Float
@@ -28,6 +27,7 @@ from koopmpc.recording.description import STATUS_WORDS
 from koopmpc.recording.reader import load_run
 from koopmpc.terminal import build_plain_table
 from koopmpc.text import format_duration, format_markdown_table
+from koopmpc.values import checksum
 
 _SURE = (0.025, 0.975)  # the ends of an interval
 _STARTS = 10  # from which a map of starts is drawn
@@ -454,7 +454,7 @@ def _html(rows: Sequence[RunRow], about: dict[str, Any], sections: Sequence[_Sec
 
 def _own_ids(picture: str) -> str:
     """Return an SVG whose ids no other of the page has: references to them would end in the first."""
-    mark = f"p{crc32(picture.encode()):x}-"
+    mark = f"p{checksum(picture.encode()):x}-"
     for before in ('id="', 'href="#', "url(#"):
         picture = picture.replace(before, before + mark)
     return picture

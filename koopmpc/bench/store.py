@@ -18,8 +18,7 @@ from dataclasses import dataclass, fields
 from importlib.metadata import version
 from io import FileIO
 from pathlib import Path
-from typing import Any, cast
-from zlib import crc32
+from typing import Any, cast, get_type_hints
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from koopmpc.errors import LogError, ProblemError
 from koopmpc.loop.metrics import Metrics, tracking_error
 from koopmpc.loop.run import Run
 from koopmpc.parallel import is_orphan
+from koopmpc.values import checksum
 
 MANIFEST = "sweep.json"
 ROWS = "rows"  # folder of the lines of finished runs
@@ -139,11 +139,13 @@ def row_to_view(rows: Sequence[RunRow]) -> RunRow | None:
     return max(koopman, key=ratio) if koopman else next(iter(logged), None)
 
 
+_COUNTS = ("status", "fallback", "solver")  # the figures that count steps by name
+_HINTS: dict[str, Any] = get_type_hints(Metrics)
 _FIGURES: dict[str, type] = {
-    "cost": float, "tracking_rmse": np.ndarray, "final_error": np.ndarray, "violation": float, "violation_share": float,
-    "input_violation": float, "effort": float, "settling_time": float, "solve_time_p50": float, "solve_time_p99": float,
-    "solve_time_max": float, "late": int, "unknown": int,
-}  # fmt: skip
+    each.name: {float: float, int: int, int | None: int}.get(_HINTS[each.name], np.ndarray)
+    for each in fields(Metrics)
+    if each.name not in _COUNTS
+}
 _KINDS: dict[str, type] = {
     "problem": str, "case": str, "controller": str, "fault": str, "noise": float, "wrong": float, "seed": int,
     "start": int, "x0": np.ndarray, **_FIGURES, "status": Status, "fallback": Fallback, "reached": bool,
@@ -177,10 +179,9 @@ def record_of(row: RunRow) -> dict[str, Any]:
     record: dict[str, Any] = {name: getattr(row, name, None) for name in _KINDS}
     record |= {"log": row.log and row.log.name, "x0": list(row.x0)}
     if row.metrics is not None:
-        record |= {name: getattr(row.metrics, name) for name in (*_FIGURES, "status", "fallback")}
+        record |= {name: getattr(row.metrics, name) for name in _FIGURES}
         record |= {name: record[name].tolist() for name, kind in _FIGURES.items() if kind is np.ndarray}
-        record |= {name: dict(record[name]) for name in ("status", "fallback")}
-        record["solver"] = dict(row.metrics.solver)
+        record |= {name: dict(getattr(row.metrics, name)) for name in _COUNTS}
     return record
 
 
@@ -188,7 +189,7 @@ def parse_row(record: Mapping[str, Any], folder: Path) -> RunRow:
     """Return the row that `record_of` made this record of; its log lies in `folder`."""
     figures = None
     if record["status"] is not None:
-        values: dict[str, Any] = {name: record[name] for name in (*_FIGURES, "status", "fallback", "solver")}
+        values: dict[str, Any] = {name: record[name] for name in (*_FIGURES, *_COUNTS)}
         values |= {name: np.array(values[name]) for name, kind in _FIGURES.items() if kind is np.ndarray}
         figures = Metrics(**values)
     own = {name: value for name, value in record.items() if name in _OWN}
@@ -249,22 +250,24 @@ def _whole(file: FileIO, data: bytes) -> None:
 
 def _seal(content: dict[str, Any]) -> dict[str, Any]:
     """Return the content with the checksum of its text."""
-    return {**content, _SEAL: crc32(_LINE.encode(content).encode())}
+    return {**content, _SEAL: checksum(_LINE.encode(content).encode())}
 
 
 def _unseal(text: bytes) -> dict[str, Any]:
-    """Return the content of a text that holds its checksum; older ones hold none.
+    """Return the content of a text that holds its checksum.
 
     Raises
     ------
     ValueError
-        The text is cut, or no longer what was written.
+        The text is cut, no longer what was written, or of an edition that wrote no checksums.
     """
     content: object = json.loads(text)
     if not isinstance(content, dict):
         raise ValueError("it is not a JSON object")
     content = cast("dict[str, Any]", content)
-    if content.pop(_SEAL, None) not in (None, crc32(_LINE.encode(content).encode())):
+    if _SEAL not in content:
+        raise ValueError("it has no checksum: it is of an edition before 0.1.0; run the sweep again")
+    if content.pop(_SEAL) != checksum(_LINE.encode(content).encode()):
         raise ValueError("it no longer holds what was written")
     return content
 

@@ -1,6 +1,5 @@
 """sweep: problems × controllers × starts × seeds × noise × wrong parameters × faults, into a store that survives."""
 
-import hashlib
 import pickle
 import time
 import warnings
@@ -24,6 +23,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.errors import ProblemError
 from koopmpc.parallel import map_tasks
 from koopmpc.recording.viewer import find_viewer, why_none
+from koopmpc.values import fingerprint
 
 MODELS = "models"  # beside the logs: what was learned
 _BATCHES = 40  # give each worker about this many batches
@@ -225,7 +225,7 @@ def _print_of(problem: Problem) -> dict[str, Any]:
     file = Path(problem.file) if problem.file else None
     text = repr((problem.dynamics, problem.dt, problem.horizon, problem.cost, problem.limits)).encode()
     content = file.read_bytes() if file is not None and file.is_file() else text
-    return {"file": problem.file, "cases": list(problem.cases), "sha256": hashlib.sha256(content).hexdigest()}
+    return {"file": problem.file, "cases": list(problem.cases), "sha256": fingerprint(content)}
 
 
 def _sendable(problem: Problem) -> bytes | str:

@@ -87,7 +87,7 @@ class FeedbackLaw(Published):
         """Return the input inside its limits; None, where nothing is known, is answered by the last one."""
         if free is None:
             self._last = clip_input(self._last, self.inputs, self.rates, self._last)
-            return Move(self._last.copy(), Status.BAD_MEASUREMENT, Fallback.HOLD, perf_counter() - start, 0)
+            return Move.hold(self._last.copy(), Status.BAD_MEASUREMENT, perf_counter() - start)
         u = clip_input(free, self.inputs, self.rates, self._last)
         status = Status.UNCONSTRAINED if (u == free).all() else Status.SATURATED
         self._last = u

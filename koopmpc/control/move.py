@@ -84,6 +84,11 @@ class Move:
     known: bool | None = None
     refused: bool = False
 
+    @classmethod
+    def hold(cls, u: Float[np.ndarray, " nu"], status: Status, solve_time: float = 0.0) -> "Move":
+        """Return the move of a step without an answer, which holds the last input u."""
+        return cls(u, status, Fallback.HOLD, solve_time, 0)
+
 
 @dataclass(frozen=True, eq=False)
 class Plan(Value):

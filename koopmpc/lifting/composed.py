@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
-from zlib import crc32
 
 import casadi as ca
 import numpy as np
@@ -18,7 +17,7 @@ from koopmpc.errors import DataError, ShapeError
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import CONSTANT, Indices, Lifting, check_lifting, strip_unit
 from koopmpc.plants.graph import Graph
-from koopmpc.values import freeze
+from koopmpc.values import checksum, freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,7 +313,7 @@ class Standardized(Lifting):
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the inner names, each with ``~`` and a checksum of mean and scale: a name fixes the function."""
-        tag = f"~{crc32(self.mean.tobytes() + self.scale.tobytes()):08x}"
+        tag = f"~{checksum(self.mean.tobytes(), self.scale.tobytes()):08x}"
         return tuple(name if name == CONSTANT else name + tag for name in self.lifting.bind(states).names)
 
     def formula(self, x: ca.SX) -> ca.SX:

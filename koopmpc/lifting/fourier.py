@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
-from zlib import crc32
 
 import casadi as ca
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting, StateChoice, find_states, freeze_choice, strip_unit
-from koopmpc.values import freeze
+from koopmpc.values import checksum, freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +157,7 @@ class RandomFourier(Lifting):
         if self.frequencies is not None and self.phases is not None:
             omegas, shifts = self._draw_features(self.frequencies.shape[1])
             if not (np.array_equal(omegas, self.frequencies) and np.array_equal(shifts, self.phases)):
-                tag = f"; {crc32(self.frequencies.tobytes() + self.phases.tobytes()):08x}"
+                tag = f"; {checksum(self.frequencies.tobytes(), self.phases.tobytes()):08x}"
         every = range(self.count)
         return tuple(f"randomfourier({j} of {self.count}; {self.width!r}; seed {self.rng}{tag})" for j in every)
 

@@ -145,17 +145,11 @@ def metrics(run: Run) -> Metrics:
     """
     checks.kind(run, "run", Run, "simulate returns one")
     error = tracking_error(run)
-    nr, nu = error.shape[1], run.U.shape[1]
-    Q, R = (np.eye(nr), np.zeros((nu, nu))) if run.cost is None else run.cost.matrices(nr, nu)
-    stage = np.einsum("ki,ij,kj->k", error, Q, error)
-    moved, changed = run.U - run.u_reference, np.diff(run.U, axis=0)
-    R_delta = None if run.cost is None else run.cost.rate(nu)
-    rates = 0.0 if R_delta is None else float(np.einsum("ki,ij,kj->", changed, R_delta, changed))
+    nu = run.U.shape[1]
+    stage, moved, changed = cost_terms(run, error)
     p50, p99 = np.quantile(run.solve_time, [0.5, 0.99])
     return Metrics(
-        cost=float("nan")
-        if run.cost is None
-        else float(stage[1:].sum() + np.einsum("ki,ij,kj->", moved, R, moved)) + rates,
+        cost=float("nan") if run.cost is None else float(stage[1:].sum() + moved.sum() + changed.sum()),
         tracking_rmse=np.sqrt(np.mean(error[1:] ** 2, axis=0)),
         final_error=error[-1].copy(),
         violation=float(beyond(run).max()),
@@ -179,13 +173,24 @@ def running_cost(run: Run) -> Float[np.ndarray, " T1"]:
     """Return the cost so far at every state, from 0 to the cost that `metrics` gives; NaN where there is no Cost."""
     if run.cost is None:
         return np.full(len(run.X), np.nan)
-    error, moved, changed = tracking_error(run), run.U - run.u_reference, np.diff(run.U, axis=0)
-    Q, R = run.cost.matrices(error.shape[1], run.U.shape[1])
-    R_delta = run.cost.rate(run.U.shape[1])
-    steps = np.einsum("ki,ij,kj->k", error[1:], Q, error[1:]) + np.einsum("ki,ij,kj->k", moved, R, moved)
-    if R_delta is not None:
-        steps[1:] += np.einsum("ki,ij,kj->k", changed, R_delta, changed)
+    stage, moved, changed = cost_terms(run, tracking_error(run))
+    steps = stage[1:] + moved
+    steps[1:] += changed
     return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def cost_terms(
+    run: Run, error: Float[np.ndarray, "T1 nr"]
+) -> tuple[Float[np.ndarray, " T1"], Float[np.ndarray, " T"], Float[np.ndarray, " T0"]]:
+    """Return ‖error_k‖²_Q, ‖u_k − u_reference_k‖²_R and ‖u_k − u_{k−1}‖²_{R_delta}; without a cost Q = I, R = 0."""
+    nr, nu = error.shape[1], run.U.shape[1]
+    Q, R = (np.eye(nr), np.zeros((nu, nu))) if run.cost is None else run.cost.matrices(nr, nu)
+    R_delta = None if run.cost is None else run.cost.rate(nu)
+    weighed = ((error, Q), (run.U - run.u_reference, R), (np.diff(run.U, axis=0), R_delta))
+    stage, moved, changed = (
+        np.zeros(len(rows)) if W is None else np.einsum("ki,ij,kj->k", rows, W, rows) for rows, W in weighed
+    )
+    return stage, moved, changed
 
 
 def tracking_error(run: Run) -> Float[np.ndarray, "T1 nr"]:

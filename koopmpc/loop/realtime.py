@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.move import Controller, Fallback, Move, Status
+from koopmpc.control.move import Controller, Move, Status
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.loop.run import Step
 from koopmpc.loop.simulate import CONTROLLER, HOW, checked_input, predictor_of, rows_ahead
@@ -300,7 +300,7 @@ class _Loop:
         """Count and record a step whose time has passed: nothing was measured, and the plant kept its input."""
         self.paced.skipped += 1
         if self.recorder is not None:
-            move = Move(self.kept, Status.TIME_LIMIT, Fallback.HOLD, 0.0, 0)
+            move = Move.hold(self.kept, Status.TIME_LIMIT)
             self.recorder(
                 Step(k, np.full(len(self.y), np.nan), self.kept, self.rows[min(k, self.last)], move, own=True)
             )

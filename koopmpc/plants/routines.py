@@ -1,7 +1,6 @@
 """CasADi functions on numpy arrays, run by the interpreter or as machine code from the C that CasADi generates."""
 
 import ctypes
-import hashlib
 import os
 import platform
 import shlex
@@ -21,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.interrupts import raise_swallowed
+from koopmpc.values import fingerprint
 
 Kernel = Callable[[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]], None]
 
@@ -163,7 +163,7 @@ def load_library(text: str, command: list[str], cache: Path | None) -> ctypes.CD
         with tempfile.TemporaryDirectory() as folder:  # loaded code stays valid when its file is gone
             return ctypes.CDLL(str(_compile(text, command, Path(folder) / "step.so")))
     key = "\0".join([text, *command, platform.machine(), platform.system()])
-    path = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.so"
+    path = cache / f"{fingerprint(key.encode())}.so"
     if path.is_file():
         try:
             return ctypes.CDLL(str(path))

@@ -6,8 +6,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-from zlib import crc32
+from typing import Any, cast
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from koopmpc.errors import DataError, LogError
 from koopmpc.loop.run import MOVE_COLUMNS, About, MoveColumn, Plans, Run
 from koopmpc.recording.description import DRAWN, NO_WORD, Entity, from_json
 from koopmpc.recording.rrd import Column, check_log, read
+from koopmpc.values import checksum
 
 
 class LogColumns:
@@ -89,13 +89,14 @@ class LogColumns:
 
     def find_changed(self) -> list[str]:
         """Return the columns that differ from the checksums at the end of the log."""
-        sums: dict[str, int] = json.loads(self.static(Entity.METRICS, "sums"))
-        places: dict[str, int] = json.loads(self.static(Entity.METRICS, "places") or "{}")  # older logs have none
+        sums, places = (
+            cast("dict[str, int]", json.loads(self.static(Entity.METRICS, name))) for name in ("sums", "places")
+        )
         names = {key: key.split(":") for key in sums | places}
         read = {key: self.rows(entity, name) for key, (entity, name) in names.items() if entity in self._entities}
-        bad = [key for key in sums if key in read and crc32(_bytes(read[key][2])) != sums[key]]
+        bad = [key for key in sums if key in read and checksum(_bytes(read[key][2])) != sums[key]]
         good = [key for key in places if key in read and key not in bad]
-        return bad + [key for key in good if crc32(_bytes(read[key][0])) != places[key]]
+        return bad + [key for key in good if checksum(_bytes(read[key][0])) != places[key]]
 
 
 def _bytes(values: Any) -> Any:
@@ -193,6 +194,8 @@ def _run(log: LogColumns, path: Path) -> Run:
         )
     elif end is None or log.torn:
         warnings.warn(f"{path}: its end is cut, all {steps} steps are there", UserWarning, stacklevel=3)
+    if end is not None and log.static(Entity.METRICS, "places") is None:
+        raise LogError(f"{path} is of an edition before 0.1.0, without checksums of its rows; read it by that edition")
     if end == steps and (changed := log.find_changed()):
         raise LogError(f"{path} is damaged: {', '.join(changed)} no longer hold what was written; take another copy")
     status, fallback = _statuses(log, steps, path)

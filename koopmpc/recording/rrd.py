@@ -15,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 import uuid
-import zlib
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -27,6 +26,7 @@ import numpy as np
 from koopmpc import disk
 from koopmpc.errors import LogError
 from koopmpc.interrupts import defer_interrupts
+from koopmpc.values import checksum
 
 _MARK = b"koopmpc-crc32:"  # stands before the checksum of a file
 _BLANK = b"x7k2q9zp"  # holds the place of the checksum until the file is closed
@@ -166,7 +166,7 @@ class LogFile:
         if found >= 0:
             self._place = self._length - len(self._tail) + found + len(_MARK)
         self._length += len(piece)
-        self._sum = zlib.crc32(piece, self._sum)
+        self._sum = checksum(piece, start=self._sum)
         self._tail = known[-len(_MARK + _BLANK) + 1 :]
 
 
@@ -290,8 +290,8 @@ def _intact(path: Path) -> bool:
         total, place = 0, start + len(_MARK)
         for begin, stop in ((0, place), (place + len(_BLANK), len(data))):
             for first in range(begin, stop, _PIECE):
-                total = zlib.crc32(data[first : min(first + _PIECE, stop)], total)
-            total = zlib.crc32(_BLANK, total) if begin == 0 else total
+                total = checksum(data[first : min(first + _PIECE, stop)], start=total)
+            total = checksum(_BLANK, start=total) if begin == 0 else total
         return total == int(found.group(1), 16)
 
 

@@ -2,7 +2,6 @@
 """record and Writer: the rows of a run as a Rerun recording, the same for a finished run and for a running loop."""
 
 import json
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +45,7 @@ from koopmpc.recording.description import (
 from koopmpc.recording.rrd import CHECK, LogFile, new_recording, send_blueprint, times
 from koopmpc.recording.scenes import Drawing, Scenes
 from koopmpc.scene import Scene
+from koopmpc.values import checksum
 
 _FLUSH = 3.0  # longest wait for a sink of a running loop [s]
 _NO_PLANS = Plans(np.empty((0, 0, 0)), np.empty((0, 0, 0)))
@@ -400,10 +400,10 @@ class Writer:
 
     def _sum(self, column: str, data: Any, k: np.ndarray | None = None) -> None:
         """Take data of a column, and the steps k of its rows, into their checksums."""
-        self._sums[column] = zlib.crc32(data, self._sums.get(column, 0))
+        self._sums[column] = checksum(data, start=self._sums.get(column, 0))
         if k is not None:
             steps = np.ascontiguousarray(k, dtype=np.int64)
-            self._places[column] = zlib.crc32(steps.data, self._places.get(column, 0))
+            self._places[column] = checksum(steps.data, start=self._places.get(column, 0))
 
     def _style(self, entity: str, style: Any) -> None:
         """Log a static archetype of the entity, once."""

@@ -19,12 +19,11 @@ from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.asked import Asked
 from koopmpc.synthesis.candidates import Designed, Recipe
 from koopmpc.synthesis.surrogates import Surrogate
-from koopmpc.terminal import build_table, label_lines, render_text
+from koopmpc.terminal import build_leaderboard, label_lines, render_text
 from koopmpc.text import to_percent
 from koopmpc.values import Value
 
 AnyMPC = KoopmanMPC | BilinearMPC | NonlinearMPC
-_SHOWN = 15  # print at most this many rows of the leaderboard
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,15 +207,12 @@ class Design:
         if place is not None and place != self.chosen:
             parts.append(f"best linear: {self.leaderboard[place].title}")
         parts += ["", "expected", str(self.expected), ""]
-        marked = {self.chosen, *(() if place is None else (place,))}
-        shown = sorted({*range(min(_SHOWN, len(self.leaderboard))), *marked})
         rows: list[list[str]] = []
-        for i in shown:
-            row = self.leaderboard[i]
-            mark = "→" if i == self.chosen else ("l" if i == place else "")
+        for row in self.leaderboard:
             figures = [f"{row.score:.3f}", f"{row.worst:.3f}", to_percent(row.violation), f"{row.lost} of {row.runs}"]
-            rows.append([mark, row.title, *figures])
-        parts.append(build_table(["", "controller", "score", "worst\nrun", "viol-\nation", "lost\nruns"], rows, left=2))
+            rows.append([row.title, *figures])
+        headings = ["controller", "score", "worst\nrun", "viol-\nation", "lost\nruns"]
+        parts.append(build_leaderboard(headings, rows, self.chosen, place)[0])
         parts += [
             "",
             "A score is the mean over closed loops on surrogates of the cost, with a price on violations, relative to "

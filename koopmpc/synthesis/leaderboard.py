@@ -13,13 +13,12 @@ from koopmpc.predict.base import sorted_eigen
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.synthesis.cross_validation import EXACT, HALF, Tried
-from koopmpc.terminal import build_table, render_text
+from koopmpc.terminal import build_leaderboard, render_text
 from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Value
 
 PLAIN = "linear: x, 1"  # z = [x, 1], the model that the others have to beat
 _FASTER = 3.0  # growth over the horizon, as a multiple of the smallest model's, above which a linear model is doubted
-_SHOWN = 15  # rows of the leaderboard that are printed
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,18 +150,15 @@ class Selection(Value):
             parts.append(_sentence("best linear", linear))
         plain = [i for i, row in enumerate(self.leaderboard) if row.title == PLAIN]
         ran = [i for i, row in enumerate(self.leaderboard) if not np.isnan(row.free)]
-        shown = sorted({*range(min(_SHOWN, len(self.leaderboard))), self.chosen, self.chosen_linear, *plain, *ran})
         steps = [f"{n} step{'s' * (n > 1)}" for n in (1, max(horizon // 2, 1), horizon)]
-        headings = ["", "model", "observ-\nables", *(f"error\n{n}" for n in steps), "worst\nfold"]
+        headings = ["model", "observ-\nables", *(f"error\n{n}" for n in steps), "worst\nfold"]
         headings += [*["free\nrun"] * bool(ran), "spectral\nradius", "ridge", "time\n[s]"]
         rows: list[list[str]] = []
-        for i in shown:
-            row = self.leaderboard[i]
-            mark = "→" if i == self.chosen else ("l" if i == self.chosen_linear else "")
+        for row in self.leaderboard:
             errors = [f"{error:.2g}" for error in (row.first, row.middle, row.last, row.worst)]
             errors += [("" if np.isnan(row.free) else f"{row.free:.2g}")] * bool(ran)
             ridge = f"{row.ridge:.0e}" if row.ridge else "0"
-            rows.append([mark, row.title, str(row.nz), *errors, f"{row.radius:.4g}", ridge, f"{row.seconds:.1f}"])
+            rows.append([row.title, str(row.nz), *errors, f"{row.radius:.4g}", ridge, f"{row.seconds:.1f}"])
         legend = (
             f"Errors are root-mean-squares over the states, each relative to its standard deviation, {horizon} steps = "
             f"{horizon * self.predictor.dt:.3g} s: the median over {self.folds} folds at each number of steps ahead, "
@@ -175,10 +171,10 @@ class Selection(Value):
                 "and the inputs alone, and count as much as short forecasts; inf leaves three times the data's range"
             )
         legend += "." if self.chosen == self.chosen_linear else "; l marks the best linear model."
-        hidden = len(self.leaderboard) - len(shown)
+        table, hidden = build_leaderboard(headings, rows, self.chosen, self.chosen_linear, [*plain, *ran])
         if hidden:
             legend += f" The leaderboard has {hidden} more models."
-        parts += ["", build_table(headings, rows, left=2), "", legend]
+        parts += ["", table, "", legend]
         return "\n".join([render_text(*parts), *([""] if self.notes else []), *self.notes])
 
 

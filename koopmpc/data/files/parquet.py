@@ -5,7 +5,6 @@ A group of rows of a .parquet file is read without the rest of the file, so that
 """
 
 import json
-import zlib
 from collections.abc import Mapping
 from functools import partial
 from os import SEEK_END
@@ -20,6 +19,7 @@ from koopmpc.data.files.npz import describe_episodes, split_rows, stack_episodes
 from koopmpc.data.source import Part
 from koopmpc.disk import affordable
 from koopmpc.errors import DataError, LogError
+from koopmpc.values import checksum
 
 _KEY = b"koopmpc.episodes"  # metadata of the file: sample time and names
 _CHECK = b"koopmpc.check"  # metadata of the file: checksums of its groups of rows
@@ -65,14 +65,9 @@ def _checksums(about: str, size: int, first: int, *columns: np.ndarray) -> list[
 
     Pages have checksums of their own, but names, sizes and the places of pages have none.
     """
-    seed, count = zlib.crc32(about.encode()), len(columns[0])
-    sums: list[int] = []
-    for start in range(-first % size, count, size):
-        total = seed
-        for some in columns:
-            total = zlib.crc32(np.ascontiguousarray(some[start : start + size]).data, total)
-        sums.append(total)
-    return sums
+    seed, blocks = checksum(about.encode()), range(-first % size, len(columns[0]), size)
+    whole = [np.ascontiguousarray(some) for some in columns]
+    return [checksum(*(some[at : at + size].data for some in whole), start=seed) for at in blocks]
 
 
 def _verify(table: Any, named: dict[str, Any], first: int = 0, rows: int | None = None) -> None:
