@@ -18,6 +18,7 @@ from koopmpc.figures.series import error, rollout
 from koopmpc.figures.style import save
 from koopmpc.fitting.repair import IN_MEMORY, PAST, Data, DividedData, collect_notes, read_logs
 from koopmpc.identify.fits.edmd import edmd
+from koopmpc.identify.records.narx import DELAYS
 from koopmpc.lifting.state import Constant, State
 from koopmpc.page import Page
 from koopmpc.parallel import StageProgress
@@ -129,9 +130,8 @@ def fit_data(
         selection = select(
             split.fitted,
             horizon=split.horizon,
-            delays=sorted({*range(PAST + 1), split.delay}),
+            delays=None if split.delay <= PAST else sorted({*range(PAST + 1), *DELAYS, split.delay}),
             bilinear=bilinear,
-            relift=False,  # the report is one of forecasts in z
             workers=workers,
             scheduler=scheduler,
             progress=progress,
@@ -144,15 +144,16 @@ def fit_data(
     chosen = "\n".join([str(selection), *(f"! {doubt}" for doubt in doubts)])
     tell(chosen)
     with collect_notes([]):  # the fits repeat the doubts that stand above
-        report = trust(selection.predictor, split.held_out, split.horizon, train=split.seen, rng=draw)
-        plain = score(edmd(split.seen, State() + Constant()), split.held_out, split.horizon)
+        seen, held_out = (selection.predictor.align(data) for data in (split.seen, split.held_out))
+        report = trust(selection.predictor, held_out, split.horizon, train=seen, rng=draw)
+        plain = score(edmd(seen, State() + Constant()), held_out, split.horizon)
     judged = f"{report}\n\n{_compare_with_plain(report.score, plain)}"
     tell(judged)
     failures: list[str] = []
-    pictures = list_pictures(selection, report, plain, split.held_out)
+    pictures = list_pictures(selection, report, plain, held_out)
     recording = place / "model.rrd"
     try:
-        record_model(selection.predictor, split.held_out, recording, report=report)
+        record_model(selection.predictor, held_out, recording, report=report)
     except FullDiskError:
         raise
     except Exception as failure:  # a log that cannot be written must not cost the model
@@ -181,7 +182,7 @@ def fit_data(
         selection=selection,
         report=report,
         plain=plain,
-        held_out=split.held_out,
+        held_out=held_out,
         model=model,
         recording=recording if recording.exists() else None,
         page=page.write(),
@@ -198,6 +199,8 @@ def _format_usage(selection: Selection, path: Path) -> str:
             lines.append(f'linear = km.load_model("{(path.parent / LINEAR).as_posix()}")  # for KoopmanMPC')
     else:
         lines.append(f'model = km.load_model("{path.as_posix()}")  # for KoopmanMPC')
+    if selection.predictor.input_lead:
+        lines.append("logs = model.align(logs)  # of logs like these the inputs move one row up")
     return "\n".join(lines)
 
 
@@ -232,7 +235,7 @@ def list_pictures(
     yield "error", "Errors on held-out episodes against the steps ahead, beside those of x⁺ = A x + B u + c.", errors
     for i, episode in enumerate(list(held_out)[:_ROLLOUTS]):
         caption = f"Forecast of held-out episode {i} from its start, and the {around}."
-        yield f"rollout-{i}", caption, partial(rollout, predictor, episode, horizon, bands)
+        yield f"rollout-{i}", caption, partial(rollout, predictor, episode, horizon, bands, relift=report.band.relift)
     caption = "Eigenvalues of A and the unit circle; crosses are spurious on the held-out episodes."
     yield "spectrum", caption, partial(spectrum, predictor, report.residuals)
 

@@ -19,7 +19,9 @@ from koopmpc.data.files.sampling import UnevenSamplingError
 from koopmpc.data.files.tables import SAVED
 from koopmpc.data.source import Changed, Held, Source, Subset
 from koopmpc.errors import ColumnWarning, DataError, FitWarning, NoInputWarning
+from koopmpc.identify.records.narx import DELAYS
 from koopmpc.synthesis.cross_validation import cut_blocks, replace_glitches, take_sample, usual_horizon
+from koopmpc.synthesis.records import is_record
 from koopmpc.text import with_unit
 from koopmpc.validate.logs.audit import audit
 from koopmpc.validate.logs.log import LogFault, Place, list_places
@@ -397,6 +399,8 @@ def _divide_episodes(
     shortest = ahead + past
     whole = list(episodes)
     notes: tuple[str, ...] = ()
+    if is_record(episodes):
+        return _divide_records(episodes, ahead, size, repaired, delay)
     if len(_keep_long(whole, shortest)) < _ENOUGH:
         block = max(2 * shortest, min(sum(lengths) // (4 * _ENOUGH), _JUDGED // _ENOUGH))
         whole = [piece for episode in episodes for piece in cut_blocks(episode, block)]
@@ -425,6 +429,28 @@ def _divide_episodes(
         (*repaired, *notes),
         delay,
     )
+
+
+def _divide_records(records: Episodes, ahead: int, size: str, repaired: tuple[str, ...], delay: int) -> DividedData:
+    """Hold out the last fifth of each record, in blocks; the rest stays in one piece, on which models run freely."""
+    shortest = ahead + max(delay, *DELAYS)
+    learned: list[Episode] = []
+    held_out: list[Episode] = []
+    for record in records:
+        last = len(record)
+        first = max(round((1 - _SHARE) * last), last - _JUDGED)
+        learned.append(record.cut(0, round((1 - _SHARE) * last)))
+        block = max(shortest, (last - first) // _ENOUGH)
+        held_out += _keep_long(cut_blocks(record.cut(first, last), block), shortest)
+    if len(held_out) < 2:
+        raise DataError(_say_too_short(len(records), ahead, _SHORTER))
+    note = (
+        f"the last fifth of {'each' if len(records) > 1 else 'the'} record is held out, in {len(held_out)} blocks; "
+        "models run freely over the rest"
+    )
+    train = records.with_episodes(learned)
+    seen, _ = take_sample(Held(train), _JUDGED)
+    return DividedData(train, seen, records.with_episodes(held_out), ahead, size, (*repaired, note), delay)
 
 
 def drop_origins(episodes: Episodes) -> Episodes:

@@ -17,7 +17,7 @@ from koopmpc.errors import DataError, LogError
 from koopmpc.figures.eigenvalues import Axes, Plane, evaluate_eigenfunctions, make_plane
 from koopmpc.figures.style import CYCLIC, SEQUENTIAL, map_colors
 from koopmpc.interrupts import raise_swallowed
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.recording.blueprint import (
     color,
     draw_eigenvalues,
@@ -99,10 +99,11 @@ def record_model(
 
     if horizon is None:
         horizon = min(len(episode) for episode in predictor.embed(episodes)) if report is None else report.score.horizon
-    errors = score(predictor, episodes, horizon) if report is None else report.score
+    relift = isinstance(predictor, BilinearPredictor) if report is None else report.band.relift
+    errors = score(predictor, episodes, horizon, relift=relift) if report is None else report.score
     bands = errors if report is None else report.band
     count = checks.count(rollouts, "rollouts")
-    ahead = [forecast(predictor, episode, horizon, bands=bands) for episode in list(episodes)[:count]]
+    ahead = [forecast(predictor, episode, horizon, bands=bands, relift=relift) for episode in list(episodes)[:count]]
     residuals = None if report is None else report.residuals
     pictures, surface, note = _pictures(predictor, episodes, report, which, plane, at)
     layout = _blueprint(predictor, ahead, pictures, surface, told=residuals is not None)

@@ -212,7 +212,7 @@ def judge_free_run(
 
 def _root_mean_square(gaps: Float[np.ndarray, "*rows nx"]) -> float:
     """Return the root of the mean square, not below rounding error; a lost forecast counts as 1000 spreads."""
-    return max(float(np.sqrt(np.mean(np.minimum(gaps**2, _LOST**2)))), EXACT)
+    return max(float(np.sqrt(np.mean(np.minimum(np.abs(gaps), _LOST) ** 2))), EXACT)
 
 
 def cut_pieces(episodes: Episodes) -> Episodes:

@@ -177,6 +177,9 @@ def trust(
 ) -> TrustReport:
     """Check a predictor on episodes that it was not fitted to: errors, spectrum, dictionary, coverage, bands.
 
+    The forecasts are those that a controller makes: a `KoopmanMPC` lifts a linear predictor once, a `BilinearMPC` lifts
+    a bilinear one at each step.
+
     One rule gives the verdict. A step ahead is trusted if, for every state, the 5 … 95 % band of the errors stays
     within 20 % of the state's range in the held-out episodes. If the band exceeds 5 %, the root-mean-square error must
     also be below that of the guess x̂ = x_k. The report asks for care if
@@ -234,10 +237,11 @@ def trust(
     True
     """
     horizon, source = checks.count(horizon, "horizon"), checks.generator(rng)
-    errors = score(predictor, episodes_of(held_out), horizon)
+    relift = isinstance(predictor, BilinearPredictor)
+    errors = score(predictor, episodes_of(held_out), horizon, relift=relift)
     if len(held_out) < 2:
         raise DataError("there is 1 held-out episode; the conformal band needs 2 or more")
-    band = conformal(predictor, held_out, horizon, level=level, rng=source)
+    band = conformal(predictor, held_out, horizon, level=level, relift=relift, rng=source)
     total = compute_moments(held_out, predictor)
     judged = held_out if train is None else episodes_of(train)
     low, high = _find_range(held_out)
@@ -255,7 +259,7 @@ def trust(
         persistency=persistency(driven, order) if driven.nu else None,
         feedback=explain_inputs(judged_total) if driven.nu else None,
         band=band,
-        train_score=None if train is None else score(predictor, train, horizon),
+        train_score=None if train is None else score(predictor, train, horizon, relift=relift),
         unseen=None if train is None else _unseen_share(covered, held_out),
         closed_loop=None if closed_loop is None else band.measure_coverage(predictor, closed_loop, rng=source),
         recalibrated=None if closed_loop is None else band.recalibrate(predictor, closed_loop, rng=source),

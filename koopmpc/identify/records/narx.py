@@ -27,7 +27,7 @@ DELAYS = (0, 1, 2, 3, 4, 6, 8, 12)  # numbers of past rows that are tried
 DEGREES = (1, 2, 3)  # total degrees of the polynomials that are tried
 SIZES = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 22, 28, 36, 46, 60)  # numbers of terms for each state
 FOLDS = 4  # stretches of the record that are left out in turn
-MOST = 2600  # terms to choose from: a structure with more is not tried
+MOST = 2600  # terms to choose from, of all states together: a structure with more is not tried
 NUMBERS = 8_000_000  # entries of the table that terms are chosen on: of more rows evenly spread ones are taken
 EACH = 4  # rows of data for each chosen term, at least
 
@@ -166,9 +166,11 @@ def search_structures(
     first = max(room)
     usable = [i for i, u in enumerate(pieces.U) if len(u) > first + FOLDS]
     pieces = Pieces(tuple(pieces.Y[i] for i in usable), tuple(pieces.U[i] for i in usable), pieces.mean, pieces.scale)
-    plans = [(d, g) for d in room for g in degrees if count_terms(nx + d * (nx + nu), nu, g) <= MOST]
+    plans = [(d, g) for d in room for g in degrees if nx * count_terms(nx + d * (nx + nu), nu, g) <= MOST]
     if not plans:
-        raise DataError(f"every structure has more than {MOST} terms; pass fewer delays, or a lower degree")
+        raise DataError(
+            f"every structure has more than {MOST} terms of all states together; pass fewer delays, or a lower degree"
+        )
     found: list[Structure] = []
     for i, (d, g) in enumerate(plans):
         if ask is not None:
