@@ -108,9 +108,9 @@ class FeedbackProgram(LinearProgram):
         Which readings are refused; None where no past of them is kept.
     """
 
-    K: Float[np.ndarray, "nu _"]
-    K_rate: Float[np.ndarray, "nu _"]
-    feedforward: Float[np.ndarray, "nu _"]
+    K: Float[np.ndarray, "nu nz"]
+    K_rate: Float[np.ndarray, "nu rates"]
+    feedforward: Float[np.ndarray, "nu driving"]
     gate: Graph | None = None
 
 

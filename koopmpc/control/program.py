@@ -106,10 +106,10 @@ class StepProgram(Program):
     lifting: Graph
     inputs: Interval
     rates: Interval | None
-    given: Float[np.ndarray, "_ nu"] | None
-    reference: Float[np.ndarray, "_ nr"]
-    sizes: Float[np.ndarray, " _"]
-    gain: Float[np.ndarray, "_ _"]
+    given: Float[np.ndarray, "given_rows nu"] | None
+    reference: Float[np.ndarray, "rows nr"]
+    sizes: Float[np.ndarray, " nz"]
+    gain: Float[np.ndarray, "moves nz"]
     settings: Mapping[str, Any]
     notes: tuple[str, ...] = ()
 

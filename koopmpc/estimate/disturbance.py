@@ -111,8 +111,8 @@ class DisturbanceProgram(EstimatorProgram):
 
     gain: float
     reach: float
-    known: Bool[np.ndarray, " _"]
-    C: Float[np.ndarray, "_ _"]
+    known: Bool[np.ndarray, " nz"]
+    C: Float[np.ndarray, "ny nz"]
 
 
 class DisturbanceObserver(Viewing, Measured):

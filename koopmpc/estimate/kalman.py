@@ -88,17 +88,17 @@ class FilterProgram(EstimatorProgram):
         Steps that y is old; samples in sequence without any measurement that are bridged.
     """
 
-    F: Float[np.ndarray, "_ _"]
-    G: Float[np.ndarray, "_ _"]
-    f: Float[np.ndarray, " _"]
-    M: Float[np.ndarray, "_ _"]
-    h: Float[np.ndarray, " _"]
-    to_z: Float[np.ndarray, "_ _"]
-    one: Float[np.ndarray, " _"]
-    to_d: Float[np.ndarray, "_ _"]
-    P: Float[np.ndarray, "_ _"]
-    R: Float[np.ndarray, "_ _"]
-    kept: Int[np.ndarray, " _"]
+    F: Float[np.ndarray, "ns ns"]
+    G: Float[np.ndarray, "ns nuw"]
+    f: Float[np.ndarray, " ns"]
+    M: Float[np.ndarray, "ny ns"]
+    h: Float[np.ndarray, " ny"]
+    to_z: Float[np.ndarray, "nz ns"]
+    one: Float[np.ndarray, " nz"]
+    to_d: Float[np.ndarray, "nz ns"]
+    P: Float[np.ndarray, "ns ns"]
+    R: Float[np.ndarray, "ny ny"]
+    kept: Int[np.ndarray, " kept"]
     delay: int
     patience: int
 

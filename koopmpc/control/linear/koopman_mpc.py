@@ -72,21 +72,21 @@ class CondensedProgram(LinearProgram):
 
     N: int
     latency: int
-    move_of: Int[np.ndarray, " _"]
+    move_of: Int[np.ndarray, " N"]
     with_rates: bool
     hard_rates: Interval | None
-    M: Float[np.ndarray, "_ _"]
-    low: Float[np.ndarray, " _"]
-    high: Float[np.ndarray, " _"]
-    offset: Float[np.ndarray, " _"]
-    from_reference: Float[np.ndarray, "_ _"]
-    from_target: Float[np.ndarray, "_ _"]
-    from_given: Float[np.ndarray, "_ _"]
+    M: Float[np.ndarray, "nt known"]
+    low: Float[np.ndarray, " nt"]
+    high: Float[np.ndarray, " nt"]
+    offset: Float[np.ndarray, " planned"]
+    from_reference: Float[np.ndarray, "planned preview"]
+    from_target: Float[np.ndarray, "planned target"]
+    from_given: Float[np.ndarray, "planned inputs"]
     aimed: bool
-    checked: Bool[np.ndarray, " _"]
-    disturbance: Float[np.ndarray, "_ _"]
+    checked: Bool[np.ndarray, " checked"]
+    disturbance: Float[np.ndarray, "nz ng"]
     qp: StepQP
-    deviation: Float[np.ndarray, "_ _"]
+    deviation: Float[np.ndarray, "moves nw"]
     solver: DAQPSetup
     estimator: EstimatorProgram
 

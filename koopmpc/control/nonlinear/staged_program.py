@@ -77,28 +77,28 @@ class StagedProgram(StepProgram):
     nx: int
     ny: int
     ns: int
-    E: Float[np.ndarray, "_ _"]
+    E: Float[np.ndarray, "nx nw"]
     with_rates: bool
     weighs_changes: bool
-    soft_rates: Int[np.ndarray, " _"]
-    free: Bool[np.ndarray, " _"]
-    held_from: Int[np.ndarray, " _"]
+    soft_rates: Int[np.ndarray, " soft"]
+    free: Bool[np.ndarray, " N"]
+    held_from: Int[np.ndarray, " N"]
     hard_rates: Interval | None
-    Q: Float[np.ndarray, "_ _"]
+    Q: Float[np.ndarray, "nq nq"]
     R: Float[np.ndarray, "nu nu"]
     R_held: Float[np.ndarray, "nu nu"]
-    Q_root: Float[np.ndarray, "_ _"]
+    Q_root: Float[np.ndarray, "root nr"]
     R_root: Float[np.ndarray, "nu nu"]
     v_limits: Interval
     box: Interval
-    margin: Float[np.ndarray, "_ _"]
+    margin: Float[np.ndarray, "N margin"]
     softness: Softness
     sides: Sides
-    stage_sizes: Float[np.ndarray, " _"]
+    stage_sizes: Float[np.ndarray, " ns"]
     input_sizes: Float[np.ndarray, " nu"]
     holds: bool
     end: str
-    table: Float[np.ndarray, "_ _"]
+    table: Float[np.ndarray, "found size"]
     rest: RestProgram | None
     estimator: EstimatorProgram
 
