@@ -352,3 +352,42 @@ class Run(About, StepRows):
     def time(self) -> Float[np.ndarray, " T1"]:
         """Time of every state [s]."""
         return np.arange(len(self.X)) * self.dt
+
+
+class LoopRows:
+    """What happens in a loop, row by row; one array holds states and measurements where they are the same."""
+
+    def __init__(
+        self,
+        y0: Float[np.ndarray, " ny"],
+        x0: Float[np.ndarray, " nx"],
+        reference: Float[np.ndarray, "rows nr"],
+        u_reference: Float[np.ndarray, "T nu"],
+        *,
+        sees_state: bool,
+        plans: bool,
+    ) -> None:
+        self.reference, self.u_reference, self.steps = reference, u_reference, len(u_reference)
+        self.Y, self.U = np.empty((self.steps + 1, len(y0))), np.empty(u_reference.shape)
+        self.X = self.Y if sees_state else np.full((self.steps + 1, len(x0)), np.nan)
+        self.X[0], self.Y[0] = x0, y0
+        self.at_once: dict[str, Any] | None = None  # the columns of all moves, where they were made at once
+        self._moves: list[Any] = []  # no Move itself: thousands of objects keep the garbage collector busy
+        self._plans: list[Plan | None] | None = [] if plans else None
+
+    def keep(self, move: Move, look_ahead: Callable[[], Plan | None] | None) -> Callable[[], Plan | None] | None:
+        """Keep the move of a step, and its plan where plans are kept; return what an observer asks for the plan."""
+        self._moves.extend(read_move(move))
+        if self._plans is None or look_ahead is None:
+            return look_ahead
+        plan = look_ahead()
+        self._plans.append(None if plan is None else Plan(plan.X.copy(), plan.U.copy()))
+        return lambda: plan
+
+    def columns(self) -> dict[str, Any]:
+        """Return the rows, and the plans of all steps where they were kept, as keywords of a Run."""
+        T = self.steps
+        X = self.Y.copy() if self.X is self.Y else self.X[: T + 1]
+        moves = collect_columns(self._moves) if self.at_once is None else self.at_once
+        own = {"U": self.U[:T], "reference": self.reference[: T + 1], "u_reference": self.u_reference[:T]}
+        return {"X": X, "Y": self.Y[: T + 1], **own, **moves, "plans": Plans.of(self._plans or [])}

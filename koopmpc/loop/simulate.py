@@ -1,6 +1,6 @@
 """simulate: one controller on one plant, step by step; every step has a status, every input is finite.
 
-`_Wiring` is the loop that is asked for, checked. `_step_through` makes the steps. `_KeptRows` keeps what happened.
+`_Wiring` is the loop that is asked for, checked. `_step_through` makes the steps. `LoopRows` keeps them.
 """
 
 import warnings
@@ -19,7 +19,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Fallible, Move, Plan
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.faults import Fault, Injections, Wiring
-from koopmpc.loop.run import Plans, Run, Step, bind_outputs, collect_columns, read_move
+from koopmpc.loop.run import LoopRows, Run, Step, bind_outputs
 from koopmpc.plants.plant import Plant, SimulatedPlant, read_measurement, require_plant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import Predictor
@@ -124,7 +124,7 @@ def simulate(
     steps, rng = checks.count(steps, "steps"), checks.generator(rng)
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
     _require_match(plant, controller, angles)
-    nx, nu, N = len(plant.states), controller.nu, controller.horizon
+    nx, nu, N, model = len(plant.states), controller.nu, controller.horizon, predictor_of(controller)
     wiring = _Wiring(
         plant=plant,
         controller=controller,
@@ -140,8 +140,14 @@ def simulate(
     wiring.noise = None if noise is None else _noise(noise, steps, len(y0))
     if faults:
         wiring.faults = Injections(faults, Wiring(len(y0), (limits or Limits()).inputs(nu)), rng)
-    rows = _KeptRows(wiring, wiring.sense(0, y0), state, plans=plans)
-    model = predictor_of(controller)
+    rows = LoopRows(
+        wiring.sense(0, y0),
+        np.full(nx, np.nan) if state is None else state,
+        wiring.reference,
+        wiring.u_reference,
+        sees_state=wiring.sees_state,
+        plans=plans,
+    )
     known = getattr(model or getattr(controller, "step_map", None), "states", None)
     controller.reset(x0 if known is None or len(known) == nx else None)  # a model of other states knows no such x0
     metadata = {"controller": type(controller).__name__, **(metadata or {})}
@@ -164,7 +170,6 @@ def simulate(
         states=tuple(plant.states),
         inputs=tuple(plant.inputs),
         outputs=tuple(plant.outputs),
-        plans=rows.kept_plans(),
         angles=tuple(angles),
         metadata=metadata,
         scene=getattr(plant, "scene", None),
@@ -246,7 +251,7 @@ class _Wiring:
             if failing is not None:
                 failing.solver_fails = False
 
-    def advance(self, k: int, u: Float[np.ndarray, " nu"], rows: "_KeptRows") -> Float[np.ndarray, " ny"]:
+    def advance(self, k: int, u: Float[np.ndarray, " nu"], rows: LoopRows) -> Float[np.ndarray, " ny"]:
         """Drive the plant with u_k, write x_{k+1} and y_{k+1} into the rows, and return a copy of y_{k+1}."""
         plant = self.plant
         push = None if self.disturbance is None else self.disturbance(k, self.rng)
@@ -267,50 +272,7 @@ class _Wiring:
         return y
 
 
-class _KeptRows:
-    """What happens in a loop, row by row; one array holds states and measurements where they are the same."""
-
-    def __init__(
-        self,
-        wiring: _Wiring,
-        y0: Float[np.ndarray, " ny"],
-        state: Float[np.ndarray, " nx"] | None,
-        *,
-        plans: bool,
-    ) -> None:
-        self.steps, self.reference, self.u_reference = wiring.steps, wiring.reference, wiring.u_reference
-        self.Y, self.U = np.empty((self.steps + 1, len(y0))), np.empty((self.steps, wiring.controller.nu))
-        self.X = self.Y if wiring.sees_state else np.full((self.steps + 1, len(wiring.plant.states)), np.nan)
-        if state is not None:
-            self.X[0] = state
-        self.Y[0] = y0
-        self.at_once: dict[str, Any] | None = None  # the columns of all moves, where they were made at once
-        self._moves: list[Any] = []  # no Move itself: thousands of objects keep the garbage collector busy
-        self._plans: list[Plan | None] | None = [] if plans else None
-
-    def keep(self, move: Move, look_ahead: Callable[[], Plan | None] | None) -> Callable[[], Plan | None] | None:
-        """Keep the move of a step, and its plan where plans are kept; return what an observer asks for the plan."""
-        self._moves.extend(read_move(move))
-        if self._plans is None or look_ahead is None:
-            return look_ahead
-        plan = look_ahead()
-        self._plans.append(None if plan is None else Plan(plan.X.copy(), plan.U.copy()))
-        return lambda: plan
-
-    def columns(self) -> dict[str, Any]:
-        """Return the rows as keywords of a Run."""
-        T = self.steps
-        X = self.Y.copy() if self.X is self.Y else self.X[: T + 1]
-        moves = collect_columns(self._moves) if self.at_once is None else self.at_once
-        own = {"U": self.U[:T], "reference": self.reference[: T + 1], "u_reference": self.u_reference[:T]}
-        return {"X": X, "Y": self.Y[: T + 1], **own, **moves}
-
-    def kept_plans(self) -> Plans | None:
-        """Return the plans of all steps; None where none was kept."""
-        return Plans.of(self._plans or [])
-
-
-def _step_through(wiring: _Wiring, rows: _KeptRows, observers: Sequence[StepObserver]) -> str:
+def _step_through(wiring: _Wiring, rows: LoopRows, observers: Sequence[StepObserver]) -> str:
     """Run the loop step by step; return why the plant ended it early, or an empty text."""
     nu, reference, faults = wiring.controller.nu, wiring.reference, wiring.faults
     look_ahead: Callable[[], Plan | None] | None = getattr(wiring.controller, "plan", None)
@@ -323,8 +285,8 @@ def _step_through(wiring: _Wiring, rows: _KeptRows, observers: Sequence[StepObse
         if faults is not None:
             u = np.array(faults.applied(k, u), dtype=np.float64)
         U[k] = u
-        ask = rows.keep(move, look_ahead)
         y = wiring.advance(k, u, rows)
+        ask = rows.keep(move, look_ahead)
         for observer in observers:
             step = Step(k, Y[k], U[k], reference[k], move, X[k], X[k + 1], Y[k + 1], reference[k + 1], held[k], ask)
             observer(step)
@@ -340,7 +302,7 @@ def _step_through(wiring: _Wiring, rows: _KeptRows, observers: Sequence[StepObse
     return ""
 
 
-def _run_at_once(wiring: _Wiring, rows: _KeptRows) -> bool:
+def _run_at_once(wiring: _Wiring, rows: LoopRows) -> bool:
     """Let a compiled controller make the whole run; return False where it cannot, or the loop needs Python."""
     make_run = getattr(wiring.controller, "whole_run", None)
     plant, plain = wiring.plant, wiring.noise is None and wiring.faults is None and wiring.disturbance is None
