@@ -58,7 +58,7 @@ class CheckedDAQP(DAQP):
         qp = self._qp
         hard = qp.softness is None or np.isinf(qp.softness.linear).all()
         if hard and solution.status is km.Status.OPTIMAL:
-            share = 2e-6 if self._is_steep else 1e-6  # proximal points end at 1e-6, and so does the QP of each of them
+            share = 2e-6 if self._is_steep else 1e-6  # the last proximal step may miss 1e-6, and the QP in it 1e-6 more
             meets_kkt(QP(qp.P, qp.q, qp.A, self.low, self.high), solution, 1e-7, share)
             CheckedDAQP.checked += 1
         return solution
