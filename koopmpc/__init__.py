@@ -147,6 +147,13 @@ else:
             ),
             "monitor": ("supervise.monitor",),
         },
+        hints={
+            "load": "km.load_episodes, load_model, load_controller, load_run and load_problem read files",
+            "EDMD": "km.edmd(episodes, lifting) fits a model",
+            "EDMDc": "km.edmd(episodes, lifting) fits a model; with inputs where the episodes have them",
+            "MPC": "km.KoopmanMPC, LinearMPC, BilinearMPC and NonlinearMPC are the controllers",
+            "fit": "km.edmd fits one model, km.select chooses one, and koopmpc fit LOGS does it from the shell",
+        },
         moved={
             "Adaptive": "supervise",
             "Files": "data",

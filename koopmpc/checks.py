@@ -1,10 +1,10 @@
 """Checks of arguments, with the messages about shapes, dtypes, NaN and definiteness."""
 
 import inspect
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -15,9 +15,12 @@ from koopmpc.errors import DataError, DefinitenessError, ShapeError
 HUGE = 1e30  # a state or a reference beyond it is a bad one: its square overflows
 LARGEST = 1e100  # refuse a matrix of a model or a weight with a larger entry: products of three of them overflow
 
+ByName = Mapping[str, float]
+"""Name of a signal, with or without its unit → number."""
+
 
 def array(
-    value: ArrayLike,
+    value: ArrayLike | ByName,
     name: str,
     shape: Sequence[int | None] | None = None,
     *,
@@ -73,7 +76,9 @@ def array(
     return result
 
 
-def bounded(value: ArrayLike, name: str, shape: Sequence[int | None] | None = None) -> Float[np.ndarray, "..."]:
+def bounded(
+    value: ArrayLike | ByName, name: str, shape: Sequence[int | None] | None = None
+) -> Float[np.ndarray, "..."]:
     """Return `value` as `array` does, if none of its entries is beyond 1e100.
 
     Raises
@@ -108,7 +113,7 @@ def start(x0: ArrayLike | None, nx: int) -> Float[np.ndarray, " nx"] | None:
     return None if x0 is None else array(x0, "x0", (nx,))
 
 
-def vector(value: ArrayLike, name: str, length: int, *, infinite: bool = False) -> Float[np.ndarray, " n"]:
+def vector(value: ArrayLike | ByName, name: str, length: int, *, infinite: bool = False) -> Float[np.ndarray, " n"]:
     """Return `value` as a vector of `length`; a scalar is repeated."""
     result = array(value, name, infinite=infinite)
     if result.ndim == 0:
@@ -118,7 +123,9 @@ def vector(value: ArrayLike, name: str, length: int, *, infinite: bool = False) 
     return result
 
 
-def weight(value: ArrayLike, name: str, size: int | None = None, *, definite: bool = False) -> Float[np.ndarray, "n n"]:
+def weight(
+    value: ArrayLike | ByName, name: str, size: int | None = None, *, definite: bool = False
+) -> Float[np.ndarray, "n n"]:
     """Return a symmetric positive (semi)definite matrix; a scalar or a 1-D `value` is a diagonal."""
     result = bounded(value, name)
     got = result.shape
@@ -296,3 +303,60 @@ def numbers(value: ArrayLike | None, name: str) -> Float[np.ndarray, "..."]:
     except (TypeError, ValueError):
         pass
     return array(value, name, finite=False)  # pyright: ignore[reportArgumentType]
+
+
+def check_named(given: Any, what: str, *, infinite: bool = False) -> dict[str, float]:
+    """Return the numbers by name.
+
+    Raises
+    ------
+    DataError
+        A name is no text, or a value no number.
+    """
+    wrong = next((name for name in given if not isinstance(name, str)), None)
+    if wrong is not None or not given:
+        raise DataError(f"{what} is {given!r}; pass names of signals with their numbers, as {{'theta': 10}}")
+    return {name: float(array(value, f"{what}[{name!r}]", (), infinite=infinite)) for name, value in given.items()}
+
+
+def list_values(given: Any) -> Any:
+    """Return the numbers alone."""
+    return list(cast("Mapping[str, float]", given).values()) if isinstance(given, Mapping) else given
+
+
+def order_by_name(given: Any, what: str, names: Sequence[str], omitted: float | None) -> Float[np.ndarray, " n"]:
+    """Return the numbers in the order of the names of a plant.
+
+    Parameters
+    ----------
+    given
+        Name → number.
+    what
+        The field, for messages.
+    names
+        Names with units.
+    omitted
+        The number of a name that is not given; None where each must be.
+
+    Raises
+    ------
+    DataError
+        A name is unknown, fits two, is given twice, or is missing.
+    """
+    values: dict[int, float] = {}
+    for name, value in cast("Mapping[str, float]", given).items():
+        at = [i for i, known in enumerate(names) if known == name]
+        at = at or [i for i, known in enumerate(names) if _stem(known) == name.strip()]
+        if len(at) != 1 or at[0] in values:
+            wrong = "is given twice" if len(at) == 1 else "fits two" if at else "is not there"
+            raise DataError(f"{what} names {name!r}, which {wrong}; the names are {', '.join(names)}")
+        values[at[0]] = value
+    if omitted is None and len(values) < len(names):
+        missing = ", ".join(name for i, name in enumerate(names) if i not in values)
+        raise DataError(f"{what} has no value for {missing}; name each of {', '.join(names)}")
+    return np.array([values.get(i, omitted) for i in range(len(names))], dtype=np.float64)
+
+
+def _stem(name: str) -> str:
+    """Return a name without its unit."""
+    return name.partition("[")[0].strip()

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NoReturn
 
 
 def install(extra: str) -> str:
@@ -66,6 +67,23 @@ class NoInputWarning(FitWarning):
     def __init__(self, message: str, question: str) -> None:
         super().__init__(message)
         self.question = question
+
+
+class Hint:
+    """A name that users of other libraries try first; asking for it raises an AttributeError that says what to write.
+
+    `hasattr` is False, and a type checker knows that it never returns.
+    """
+
+    def __init__(self, advice: str) -> None:
+        self.advice = advice
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, owner: object, kind: type | None = None) -> NoReturn:
+        what = getattr(kind, "__name__", "object")
+        raise AttributeError(f"{what!r} object has no attribute {self.name!r}; {self.advice}")
 
 
 @contextmanager

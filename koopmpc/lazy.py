@@ -3,8 +3,9 @@
 import ast
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from inspect import formatannotation
 from sys import modules as loaded
-from typing import Any
+from typing import Any, cast, get_args, get_origin
 
 _ROOMS: list[str] = []
 """Modules that the front door serves as rooms: `find_public` looks into them in this order."""
@@ -20,6 +21,7 @@ def attach(
     core: Sequence[str] = (),
     moved: Mapping[str, str] | None = None,
     joints: Mapping[str, Sequence[str]] | None = None,
+    hints: Mapping[str, str] | None = None,
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` of a package that serves the names which type checkers see.
 
@@ -39,6 +41,8 @@ def attach(
     joints
         Joint → files below the package that register themselves there; `load_joint` imports them. Only the front door,
         which stands above all rooms, has joints.
+    hints
+        Name that users of other libraries try → what to write here.
     """
     imported = read_imports(package)
     rooms = {name: f"koopmpc.{file}" for name, file in (modules or {}).items()}
@@ -55,8 +59,14 @@ def attach(
             while waiting:
                 import_module(waiting.pop())
             ready = {known: getattr(loaded[file], known) for known, file in home.items() if file in loaded}
+            for known in ready.keys() - loaded[package].__dict__.keys():
+                shorten_annotations(ready[known])
             loaded[package].__dict__.update(ready)
-        if name in rooms:
+        if name == "__version__" and package == "koopmpc":
+            from importlib.metadata import version  # 10 ms, paid by who asks
+
+            value = version(package)
+        elif name in rooms:
             value = import_module(rooms[name])
         elif name in home:
             value = getattr(import_module(home[name]), name)
@@ -64,11 +74,48 @@ def attach(
             old = f"{package}.{name}".replace("koopmpc", "km", 1)
             raise AttributeError(f"{old} has moved: it is km.{moved[name]}.{name} now")
         else:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            near = [known for known in (*public, *rooms) if known.lower() == name.lower()]
+            hint = (hints or {}).get(name) or (f"it is {package.replace('koopmpc', 'km', 1)}.{near[0]}" if near else "")
+            raise AttributeError(f"module {package!r} has no attribute {name!r}" + (f"; {hint}" if hint else ""))
+        shorten_annotations(value)
         setattr(loaded[package], name, value)
         return value
 
     return serve, lambda: sorted([*public, *rooms]), public
+
+
+def shorten_annotations(value: Any) -> None:
+    """Write ``ArrayLike`` in place of its parts in the annotations of a function or a constructor, which `help` shows.
+
+    The name resolves in the module of the function, which imports it from numpy.typing.
+    """
+    function = value.__dict__.get("__init__") if isinstance(value, type) else value
+    notes = getattr(function, "__annotations__", None)
+    typing = loaded.get("numpy.typing")
+    if not notes or typing is None or not str(getattr(value, "__module__", "")).startswith("koopmpc"):
+        return
+    for name, note in notes.items():
+        text = _name_array_like(note, get_args(typing.ArrayLike))
+        if text is not None:
+            notes[name] = text
+
+
+def _name_array_like(note: Any, parts: tuple[Any, ...]) -> str | None:
+    """Return an annotation as text with ``ArrayLike`` in place of its parts; None where it has none of them."""
+    own = get_args(note)
+    if len(own) >= len(parts) and all(part in own for part in parts):
+        rest = [part for part in own if part not in parts]
+        texts = [_name_array_like(part, parts) or formatannotation(part) for part in rest]
+        return " | ".join(["ArrayLike", *("None" if text == "NoneType" else text for text in texts)])
+    flat: list[Any] = []
+    for inner in own:
+        flat += cast("list[Any]", inner) if isinstance(inner, list) else [inner]
+    if not any(_name_array_like(part, parts) for part in flat):
+        return None
+    texts = [_name_array_like(part, parts) or formatannotation(part) for part in flat]
+    texts = ["None" if text == "NoneType" else text for text in texts]
+    kind = getattr(get_origin(note), "__name__", "Union")
+    return " | ".join(texts) if kind in ("Union", "UnionType") else f"{kind}[{', '.join(texts)}]"
 
 
 def find_public(name: str) -> Any:

@@ -200,7 +200,7 @@ class Prepared:
             return given[np.minimum(np.arange(steps), len(given) - 1)]
         if problem.cost.u_target == "zero":
             return np.zeros((steps, plant.nu))
-        seen = state_tracking(plant.states, plant.nu, problem.cost, problem.limits_of(case))
+        seen = state_tracking(plant.states, plant.inputs, problem.cost, problem.limits_of(case))
         equilibria = Equilibria(learned_map(plant), problem.cost, seen)
         rows = np.broadcast_to(np.asarray(problem.cases[case].reference), (steps + 1, len(seen.Q)))
         distinct, of = np.unique(rows[:steps], axis=0, return_inverse=True)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks, disk
 from koopmpc.checks import nearest
-from koopmpc.control.cost import Cost
+from koopmpc.control.cost import Cost, check_cost_and_limits
 from koopmpc.control.limits import Limits
 from koopmpc.data.collect import InputFunction, Uniform
 from koopmpc.data.excitation import Excitation
@@ -186,8 +186,12 @@ class Problem:
             raise DataError(f"ridge is {self.ridge:g}; it must be zero or above")
         if not self.cases:
             raise DataError('a problem needs at least one case: cases={"name": km.Case(x0, reference, steps)}')
-        nr = self.cost.of.bind(self.dynamics.states).nz
-        self.cost.matrices(nr, nu)
+        names = self.dynamics.states, self.dynamics.inputs
+        cost, limits = check_cost_and_limits(self.cost, self.limits, *names)
+        object.__setattr__(self, "cost", cost)
+        object.__setattr__(self, "limits", limits)
+        nr = cost.of.bind(self.dynamics.states).nz
+        cost.matrices(nr, nu)
         _fits(self.limits, self.dynamics, "limits")
         for name, case in self.cases.items():
             if not name or any(sign.isspace() or sign in "/\\:" for sign in name):
@@ -245,12 +249,13 @@ class Problem:
     def limits_of(self, case: str) -> Limits:
         """Return the limits that hold in this case."""
         own = self.cases[case].limits
-        return self.limits if own is None else own
+        return self.limits if own is None else own.resolve(self.dynamics.states, self.dynamics.inputs)
 
 
 def _fits(limits: Limits, dynamics: Dynamics, what: str) -> None:
     """Raise a ShapeError where limits have other sizes than the inputs, states and observables that they limit."""
     try:
+        limits = limits.resolve(dynamics.states, dynamics.inputs)
         limits.inputs(dynamics.nu)
         limits.rates(dynamics.nu)
         limits.rows(dynamics.nx, 0 if limits.of is None else limits.of.bind(dynamics.states).nz)

@@ -216,7 +216,9 @@ def _rows(
 
 def possible_faults(limits: Limits) -> tuple[str, ...]:
     """Return the names of the faults that can occur: without input limits an actuator has no range to lose."""
-    limited = any(end is not None and np.isfinite(end).any() for end in (limits.u_min, limits.u_max))
+    limited = any(
+        end is not None and np.isfinite(checks.list_values(end)).any() for end in (limits.u_min, limits.u_max)
+    )
     return tuple(name for name in FAULTS if limited or name != "actuator-loss")
 
 

@@ -38,7 +38,7 @@ def split_columns(text: str) -> dict[str, str] | list[str]:
     pairs = [part.rpartition("=") for part in split(text)]
     wrong = next((new for old, _, new in pairs if not old.strip() or not new.strip()), None)
     if wrong is not None:
-        raise DataError(f"--columns {text!r} is no list of old=new; write for example --columns 'y1=theta,y2=omega'")
+        raise DataError(f"--columns {text!r} must be a list of old=new; for example --columns 'y1=theta,y2=omega'")
     return {old.strip(): new.strip() for old, _, new in pairs}
 
 

@@ -1,8 +1,8 @@
 """The quadratic Cost that every controller and every metric shares, and what of a model it and the Limits read."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Generic, Literal, NamedTuple, TypeAlias, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -34,9 +34,11 @@ class Cost(Value):
     Parameters
     ----------
     Q
-        Weight of the tracked outputs, ⪰ 0; a scalar or a vector is a diagonal.
+        Weight of the tracked outputs, ⪰ 0; a scalar or a vector is a diagonal. Or by name, ``{"theta": 10}``, with or
+        without the unit; an omitted name has weight 0. The names are looked up when a controller is built.
     R
-        Weight of the inputs, ⪰ 0; a scalar or a vector is a diagonal. R + BᵀPB must be positive definite.
+        Weight of the inputs, ⪰ 0; a scalar or a vector is a diagonal; by name it names every input. R + BᵀPB must be
+        positive definite.
     Q_N
         Terminal weight in place of the tail, of x_N − r_N if (nx, nx), of z_N − z_r if (nz, nz), where z_r is the
         equilibrium that comes nearest to r_N.
@@ -71,12 +73,12 @@ class Cost(Value):
     >>> upright = km.Cost(Q=[10, 10, 1], R=0.1, of=km.Fourier(1, states="theta") + km.State("omega"))  # sin θ, cos θ, ω
     """
 
-    Q: ArrayLike
-    R: ArrayLike
+    Q: ArrayLike | checks.ByName
+    R: ArrayLike | checks.ByName
     Q_N: ArrayLike | None = None
     of: Lifting = field(default_factory=State)
     u_target: Literal["equilibrium", "zero"] | ArrayLike = "equilibrium"
-    R_delta: ArrayLike | None = None
+    R_delta: ArrayLike | checks.ByName | None = None
     tail: int | None = None
 
     def __post_init__(self) -> None:
@@ -85,7 +87,14 @@ class Cost(Value):
             value = getattr(self, name)
             if value is None and name in ("Q", "R"):
                 raise DataError(f"{name} must be a weight, got None; pass 0 to leave it out")
-            if value is not None:
+            if isinstance(value, Mapping):
+                if name == "Q_N":
+                    raise DataError("Q_N is a table of names; pass a matrix (nx, nx) or (nz, nz)")
+                stored = checks.check_named(value, name)
+                for key, weight in stored.items():
+                    checks.weight(np.array(weight), f"{name}[{key!r}]")
+                object.__setattr__(self, name, stored)
+            elif value is not None:
                 stored = checks.array(value, name)
                 checks.weight(stored, name)
                 object.__setattr__(self, name, stored)
@@ -102,6 +111,29 @@ class Cost(Value):
             object.__setattr__(self, "tail", int(checks.count(self.tail, "tail", 0)))
             if self.Q_N is not None:
                 raise DataError(f"Q_N and tail = {self.tail} are given; Q_N takes the tail's place: pass one of them")
+
+    def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Cost":
+        """Return the cost with arrays in place of weights by name.
+
+        Raises
+        ------
+        DataError
+            A name is unknown or fits two, or R does not name every input.
+        """
+        fields: dict[str, Any] = {
+            name: value for name in ("Q", "R", "R_delta") if isinstance(value := getattr(self, name), Mapping)
+        }
+        if not fields:
+            return self
+        known = {"Q": self.of.bind(tuple(states)).names if "Q" in fields else ()}
+        omitted = {"Q": 0.0, "R": None, "R_delta": 0.0}
+        return replace(
+            self,
+            **{
+                name: checks.order_by_name(value, name, known.get(name, inputs), omitted[name])
+                for name, value in fields.items()
+            },
+        )
 
     def matrices(self, nr: int, nu: int) -> tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]]:
         """Return Q (nr, nr) and R (nu, nu) for `nr` tracked outputs and `nu` inputs."""
@@ -243,7 +275,7 @@ def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits | Non
     ShapeError
         A weight or a limit has another size than what it weighs or limits.
     """
-    cost, limits = check_cost_and_limits(cost, limits)
+    cost, limits = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
     C, G = select_rows(predictor, cost.of), predictor.C
     if limits.of is not None:
         G = np.vstack([G, select_rows(predictor, limits.of)])
@@ -254,7 +286,7 @@ def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits | Non
 @raise_swallowed()
 def state_tracking(
     states: tuple[str, ...],
-    nu: int,
+    inputs: tuple[str, ...],
     cost: Cost,
     limits: Limits | None,
     size: int | None = None,
@@ -264,8 +296,8 @@ def state_tracking(
 
     The functions take `size` values, the states first; by default the states alone. `ranges` as for `Sizes`.
     """
-    cost, limits = check_cost_and_limits(cost, limits)
-    nx = len(states)
+    cost, limits = check_cost_and_limits(cost, limits, states, inputs)
+    nx, nu = len(states), len(inputs)
     point = ca.SX.sym("x", nx if size is None else size)
     x, of = point[:nx], cost.of.bind(states)
     bound = None if limits.of is None else limits.of.bind(states)
@@ -348,18 +380,22 @@ def select_rows(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "n
     return np.eye(predictor.nz)[find_observables(predictor.lifting, wanted)]
 
 
-def check_cost_and_limits(cost: object, limits: object) -> tuple[Cost, Limits]:
-    """Return the cost and the limits, no limits for None.
+def check_cost_and_limits(
+    cost: object, limits: object, states: Sequence[str], inputs: Sequence[str]
+) -> tuple[Cost, Limits]:
+    """Return the cost and the limits of a plant with these names, no limits for None.
 
     Raises
     ------
     DataError
-        One is something else, perhaps the other.
+        One is something else, perhaps the other; or names a signal that the plant does not have.
     """
     if not isinstance(cost, Cost):
         raise DataError(f"cost is a {type(cost).__name__}; pass a Cost, and the Limits after it")
     if limits is None:
-        return cost, Limits()
-    if not isinstance(limits, Limits):
+        limits = Limits()
+    elif not isinstance(limits, Limits):
         raise DataError(f"limits is a {type(limits).__name__}; pass Limits, or None for none")
+    if any(isinstance(value, Mapping) for value in (*vars(cost).values(), *vars(limits).values())):
+        return cost.resolve(states, inputs), limits.resolve(states, inputs)
     return cost, limits

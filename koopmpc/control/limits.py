@@ -1,6 +1,6 @@
 """Limits: the inequalities that every controller and every metric shares."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, cast
 
@@ -19,6 +19,16 @@ QUADRATIC = 1e2  # the quadratic weight, in the same unit
 TIGHTEST = 0.2  # share of the range by which a limit is tightened at most
 _AHEAD = 5  # steps of an error band that tighten limits
 Slack = tuple[ArrayLike, ArrayLike]
+Bound = ArrayLike | checks.ByName | None  # of a limit, as a user writes it
+
+
+_ENDS = (
+    ("u_min", "u_max", "input"),
+    ("du_min", "du_max", "rate"),
+    ("x_min", "x_max", "state"),
+    ("y_min", "y_max", "output"),
+)  # fields of the lower and the upper limit, and what they limit
+_OPEN = {"min": -np.inf, "max": np.inf}  # end of a name of a field → the value that limits nothing
 
 
 class Interval(NamedTuple):
@@ -72,7 +82,8 @@ class Limits(Value):
     Parameters
     ----------
     u_min, u_max, x_min, x_max, y_min, y_max
-        Scalars or vectors; None or ±inf where there is no limit.
+        Scalars or vectors; None or ±inf where there is no limit. Or by name, ``{"torque": 25}``, with or without the
+        unit; an omitted name has no limit. The names are looked up when a controller is built.
     of
         Observables of the state that y_min and y_max limit. A controller on a lifted predictor finds them in its
         own lifting by name.
@@ -105,39 +116,37 @@ class Limits(Value):
     >>> hard = km.Limits(u_min=-25, u_max=25, du_max=8, x_max=[1.2, 4], slack=None)
     """
 
-    u_min: ArrayLike | None = None
-    u_max: ArrayLike | None = None
-    x_min: ArrayLike | None = None
-    x_max: ArrayLike | None = None
+    u_min: ArrayLike | checks.ByName | None = None
+    u_max: ArrayLike | checks.ByName | None = None
+    x_min: ArrayLike | checks.ByName | None = None
+    x_max: ArrayLike | checks.ByName | None = None
     of: Lifting | None = None
-    y_min: ArrayLike | None = None
-    y_max: ArrayLike | None = None
+    y_min: ArrayLike | checks.ByName | None = None
+    y_max: ArrayLike | checks.ByName | None = None
     slack: Slack | Literal["auto"] | None = "auto"
-    du_min: ArrayLike | None = None
-    du_max: ArrayLike | None = None
+    du_min: ArrayLike | checks.ByName | None = None
+    du_max: ArrayLike | checks.ByName | None = None
     du_slack: Slack | None = None
     margin: ArrayLike | None = None
     capped: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for low, high, name in (
-            ("u_min", "u_max", "input"),
-            ("du_min", "du_max", "rate"),
-            ("x_min", "x_max", "state"),
-            ("y_min", "y_max", "output"),
-        ):
+        for low, high, name in _ENDS:
             for end in (low, high):
                 value = getattr(self, end)
-                if value is not None:
+                if isinstance(value, Mapping):
+                    object.__setattr__(self, end, checks.check_named(value, end, infinite=True))
+                elif value is not None:
                     object.__setattr__(self, end, checks.array(value, end, infinite=True))
-            _require_room(getattr(self, low), getattr(self, high), low, high, name)
+            if not any(isinstance(getattr(self, end), Mapping) for end in (low, high)):
+                _require_room(getattr(self, low), getattr(self, high), low, high, name)
         if (self.y_min is not None or self.y_max is not None) and self.of is None:
             raise DataError("y_min and y_max limit observables; say which with of=, for example of=km.Fourier(1)")
         if self.of is not None:
             checks.kind(self.of, "of", Lifting, 'for example km.Fourier(1, states="theta")')
         for end, sign in (("du_min", 1.0), ("du_max", -1.0)):
             value = getattr(self, end)
-            if value is not None and (sign * value > 0).any():
+            if value is not None and (sign * np.array(checks.list_values(value)) > 0).any():
                 raise DataError(f"{end} is {value}; an input must be free to stay, so keep 0 inside its rates")
         for name in ("slack", "du_slack"):
             value = getattr(self, name)
@@ -145,6 +154,29 @@ class Limits(Value):
                 object.__setattr__(self, name, _weights(cast("Slack", value), name))
         if self.margin is not None:
             object.__setattr__(self, "margin", self._margin(checks.array(self.margin, "margin", (None, None))))
+
+    def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Limits":
+        """Return the limits with arrays in place of limits by name; an omitted name has no limit.
+
+        Raises
+        ------
+        DataError
+            A name is unknown or fits two, or limits cross.
+        """
+        named = [end for pair in _ENDS for end in pair[:2] if isinstance(getattr(self, end), Mapping)]
+        if not named:
+            return self
+        outputs = () if self.of is None else self.of.bind(tuple(states)).names
+        known = {"u": inputs, "d": inputs, "x": states, "y": outputs}
+        return replace(
+            self,
+            **{
+                end: checks.order_by_name(
+                    getattr(self, end), end, known[end[0]], np.inf if end.endswith("max") else -np.inf
+                )
+                for end in named
+            },
+        )
 
     def _margin(self, margin: Float[np.ndarray, "K nx"]) -> Float[np.ndarray, "K nx"]:
         if (margin < 0).any() or not len(margin):
@@ -217,7 +249,11 @@ class Limits(Value):
         return box if (np.isfinite(box.low) | np.isfinite(box.high)).any() else None
 
     def _rates(self, nu: int) -> Interval:
-        low = -np.asarray(self.du_max) if self.du_min is None and self.du_max is not None else self.du_min
+        low = (
+            -checks.array(self.du_max, "du_max", infinite=True)
+            if self.du_min is None and self.du_max is not None
+            else self.du_min
+        )
         return _box(low, self.du_max, "du_min", "du_max", nu)
 
     def rate_softness(self, nu: int) -> Softness:
@@ -305,7 +341,7 @@ def clip_input(
     return np.clip(u, *inputs)
 
 
-def _is_set(low: ArrayLike | None, high: ArrayLike | None) -> bool:
+def _is_set(low: Bound, high: Bound) -> bool:
     return low is not None or high is not None
 
 
@@ -364,7 +400,7 @@ def _require_room(
         raise DataError(f"{low_name} is +inf or {high_name} is −inf somewhere; use −inf, +inf where there is no limit")
 
 
-def _box(low: ArrayLike | None, high: ArrayLike | None, low_name: str, high_name: str, n: int) -> Interval:
+def _box(low: Bound, high: Bound, low_name: str, high_name: str, n: int) -> Interval:
     return Interval(
         checks.vector(-np.inf if low is None else low, low_name, n, infinite=True),
         checks.vector(np.inf if high is None else high, high_name, n, infinite=True),

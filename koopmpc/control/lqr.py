@@ -186,10 +186,10 @@ class LQR(FeedbackLaw):
 
     @checks.explain_overflow()
     def __init__(self, predictor: LinearPredictor, cost: Cost, limits: Limits | None = None) -> None:
-        advice = "fit one with edmd, or linearise with LinearPredictor.local"
+        advice = "fit one with edmd, or linearise with LinearPredictor.local; from_state_space takes matrices"
         checks.kind(predictor, "predictor", LinearPredictor, advice)
-        self.predictor, self.cost, self.limits = predictor, cost, limits
-        track = lifted_tracking(predictor, cost, Limits() if limits is None else limits)
+        track = lifted_tracking(predictor, cost, limits)
+        self.predictor, self.cost, self.limits = predictor, track.cost, None if limits is None else track.limits
         units, C = Units.of(predictor, track), track.tracked
         h = horizon_of(predictor, track, (1,), disturbed=False).in_units(units)
         rest = tail_of(tail_stage(h.A, h.B, h.E, h.C, h.Q, h.R, h.R_delta), None)

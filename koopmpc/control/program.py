@@ -1,9 +1,9 @@
 """What a controller publishes of itself: the data that it is made of, for files, and the data of a step, for code."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import casadi as ca
 import numpy as np
@@ -17,9 +17,10 @@ from koopmpc.control.solvers.daqp import DAQPSetup
 from koopmpc.control.target import Targets
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.delay import Delay
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, Hint
 from koopmpc.estimate.observer import Estimator, EstimatorProgram, StateObserver, estimator_program
 from koopmpc.interrupts import raise_swallowed
+from koopmpc.lifting.base import strip_unit
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import save_value
@@ -141,6 +142,52 @@ class LinearProgram(StepProgram):
     target_solvers: tuple[DAQPSetup, ...]
 
 
+def describe_controller(controller: Any) -> str:
+    """Return the class of a controller, its model, horizon, cost and limits in words."""
+    known = cast("dict[str, Any]", vars(controller))
+    model: Any = next((known[name] for name in ("predictor", "model", "eigenfunction") if name in known), None)
+    parts = [] if model is None else [_describe_model(model)]
+    if known.get("dt") is not None:
+        steps = known.get("horizon")
+        ahead = "" if steps is None else f", horizon {steps} = {steps * known['dt']:.4g} s"
+        parts.append(f"dt {known['dt']:.4g} s{ahead}")
+    names = getattr(model, "states", ()), getattr(model, "inputs", ())
+    parts += [text for text in (_describe_limits(known.get("limits"), *names),) if text]
+    solver = getattr(controller, "solver", None)
+    parts += [f"solver {solver}"] if isinstance(solver, str) else []
+    return f"{type(controller).__name__}({'; '.join(parts)})"
+
+
+def _describe_model(model: Any) -> str:
+    count = getattr(model, "nz", None)
+    states = ", ".join(map(strip_unit, getattr(model, "states", ())))
+    size = f"{count} observables" if count is not None else type(model).__name__
+    return f"{size} of {states}" if states else size
+
+
+def _describe_limits(limits: Any, states: Sequence[str], inputs: Sequence[str]) -> str:
+    if limits is None:
+        return ""
+    parts: list[str] = []
+    for low, high, names in (("u_min", "u_max", inputs), ("x_min", "x_max", states)):
+        ends = [getattr(limits, end) for end in (low, high)]
+        if all(end is None for end in ends):
+            continue
+        count = len(names) or max(np.size(end) for end in ends if end is not None)
+        lows, highs = (
+            np.broadcast_to(default if end is None else end, count)
+            for end, default in zip(ends, (-np.inf, np.inf), strict=True)
+        )
+        for i in range(count):
+            if np.isfinite(lows[i]) or np.isfinite(highs[i]):
+                name = strip_unit(names[i]) if names else f"{low[0]}{i}"
+                parts.append(f"{lows[i]:.4g} ≤ {name} ≤ {highs[i]:.4g}")
+    rates = limits.du_max is not None or limits.du_min is not None
+    return ", ".join(
+        [*parts, *(["limited rates"] if rates else []), *([] if limits.of is None else ["limited outputs"])]
+    )
+
+
 class Published:
     """A controller that is saved as data, and whose step may be published as a `Program`.
 
@@ -161,6 +208,16 @@ class Published:
     def from_data(cls: type[_Restored], saved: SavedController) -> _Restored:
         """Return the controller that is made of these data."""
         raise NotImplementedError
+
+    def __repr__(self) -> str:
+        """Return the class, its model, horizon, cost and limits in words."""
+        return describe_controller(self)
+
+    solve = Hint("call the controller: move = mpc(y, reference), and move.u is the input")
+    step = Hint("call the controller: move = mpc(y, reference), and move.u is the input")
+    predict = Hint("mpc.plan() is the forecast of the last call; model.rollout(x0, U) is that of a model")
+    run = Hint("run = km.simulate(plant, mpc, x0=…, reference=…, steps=…)")
+    simulate = Hint("run = km.simulate(plant, mpc, x0=…, reference=…, steps=…)")
 
     def save(self, path: str | Path) -> None:
         """Write the controller as data (.npz: arrays and one JSON text); `km.load_controller` reads it.

@@ -97,11 +97,14 @@ class Monomials(Lifting):
     ----------
     degree
         The highest total degree, 2 or more.
+    states
+        Name or index of a state, or several, that are multiplied; all by default. Names count with or without their
+        unit.
 
     Raises
     ------
     DataError
-        degree is below 2.
+        degree is below 2; a state is unknown.
 
     Examples
     --------
@@ -109,17 +112,21 @@ class Monomials(Lifting):
     >>> lifting = km.State() + km.Monomials(2)
     >>> lifting.bind(("x", "v")).names
     ('x', 'v', 'x^2', 'x*v', 'v^2')
+    >>> km.Monomials(3, states="x").bind(("x", "v")).names
+    ('x^2', 'x^3')
     """
 
     degree: int
+    states: StateChoice | None = None
 
     def __post_init__(self) -> None:
-        freeze(self, degree=checks.count(self.degree, "degree", 2))
+        freeze(self, degree=checks.count(self.degree, "degree", 2), states=freeze_choice(self.states))
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"theta^2*omega"``."""
         names = [strip_unit(state) for state in states]
-        monomials = (Counter(factors) for factors in _list_monomials(len(states), self.degree))
+        chosen = find_states(self.states, states, "Monomials")
+        monomials = (Counter(factors) for factors in _list_monomials(chosen, self.degree))
         return tuple("*".join(names[i] + (f"^{p}" if p > 1 else "") for i, p in powers.items()) for powers in monomials)
 
     def formula(self, x: ca.SX) -> ca.SX:
@@ -139,12 +146,12 @@ class Monomials(Lifting):
 
     @cached_property
     def _all(self) -> list[tuple[int, ...]]:
-        return _list_monomials(len(self.bound_states), self.degree)
+        return _list_monomials(find_states(self.states, self.bound_states, "Monomials"), self.degree)
 
 
-def _list_monomials(nx: int, degree: int) -> list[tuple[int, ...]]:
+def _list_monomials(states: Sequence[int], degree: int) -> list[tuple[int, ...]]:
     """Return the monomials of degree 2 … `degree` as ascending lists of state indices."""
-    return [c for d in range(2, degree + 1) for c in combinations_with_replacement(range(nx), d)]
+    return [c for d in range(2, degree + 1) for c in combinations_with_replacement(states, d)]
 
 
 @dataclass(frozen=True, eq=False, init=False)

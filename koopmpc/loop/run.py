@@ -16,6 +16,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Plan, Status
 from koopmpc.data.files.frames import build_frame
+from koopmpc.errors import Hint
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
 from koopmpc.predict.base import Predictor
@@ -249,6 +250,16 @@ class About(Value):
     angles: tuple[int, ...] = ()
     metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
+    def __post_init__(self) -> None:
+        names = self.states, self.inputs
+        for part in ("cost", "limits"):
+            given: Cost | Limits | None = getattr(self, part)
+            if given is not None and any(isinstance(value, Mapping) for value in vars(given).values()):
+                object.__setattr__(self, part, given.resolve(*names))
+        check_rows = getattr(super(), "__post_init__", None)
+        if check_rows is not None:
+            check_rows()
+
     def about(self) -> dict[str, Any]:
         """Return these fields as keywords of a Run, or of an About."""
         return {f.name: getattr(self, f.name) for f in fields(About)}
@@ -319,6 +330,10 @@ class Run(About, StepRows):
             return self
         rows = {name: values[: steps + (name in _OF_STATES)] for name, values in self.columns().items()}
         return replace(self, **rows, plans=None)
+
+    plot = Hint("km.plot.run(run) draws it, km.record(run, path) and koopmpc view show it")
+    metrics = Hint("km.metrics(run) judges it")
+    save = Hint("km.record(run, 'run.rrd') writes it, km.load_run reads it")
 
     def to_frame(self) -> Any:
         """Return a pandas.DataFrame of step, time [s], states, measurements, references, inputs and status.

@@ -139,7 +139,8 @@ def simulate(
     y0, state = wiring.start_plant(x0)
     wiring.noise = None if noise is None else _noise(noise, steps, len(y0))
     if faults:
-        wiring.faults = Injections(faults, Wiring(len(y0), (limits or Limits()).inputs(nu)), rng)
+        box = (limits or Limits()).resolve(plant.states, plant.inputs).inputs(nu)
+        wiring.faults = Injections(faults, Wiring(len(y0), box), rng)
     rows = LoopRows(
         wiring.sense(0, y0),
         np.full(nx, np.nan) if state is None else state,

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks, disk
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, LogError, ShapeError
+from koopmpc.errors import DataError, Hint, LogError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.values import Arrays, Value, freeze, from_data, to_data
 
@@ -168,6 +168,11 @@ class Predictor(Value):
     nx: int = field(init=False)
     nu: int = field(init=False)
     nz: int = field(init=False)
+
+    predict = Hint("model.rollout(x0, U) forecasts from x0 under the rows of U")
+    simulate = Hint("model.rollout(x0, U) forecasts from x0 under the rows of U")
+    fit = Hint("a model is a result: km.edmd(episodes, lifting) returns one")
+    score = Hint("km.score(model, episodes, horizon) measures its forecasts")
 
     @property
     def point_names(self) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -25,6 +26,7 @@ from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant, State
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import FitReport, Predictor, load_value
+from koopmpc.predict.state_space import build_system, read_state_space
 from koopmpc.values import freeze
 
 _LARGEST = 1e300  # refuse an A with a larger entry: sums of its entries would overflow
@@ -142,6 +144,51 @@ class LinearPredictor(Predictor):
         if set(self.states) <= set(place):
             return self.exact_modes[[place[name] for name in self.states]]
         return self.C @ (self.lifting.basis.T @ self.exact_modes)
+
+    @classmethod
+    def from_state_space(
+        cls,
+        system: Any,
+        *,
+        dt: float | None = None,
+        states: Sequence[str] | None = None,
+        inputs: Sequence[str] | None = None,
+    ) -> "LinearPredictor":
+        """Return x⁺ = A x + B u of a system of scipy.signal or python-control as a predictor.
+
+        The state is x itself, measured as a whole: C of the system chooses nothing here. Track its outputs y = C x by a
+        `Cost` with Q = CᵀQ_y C. Names are those of python-control, or ``x0, …`` and ``u0, …``.
+
+        Parameters
+        ----------
+        system
+            Discrete, or continuous with `dt`: then it is sampled with a zero-order hold.
+        dt
+            Sample time [s] of a continuous system.
+        states, inputs
+            Names with units.
+
+        Raises
+        ------
+        DataError
+            It is no state-space system, has feedthrough, or its sample time is unknown.
+
+        Examples
+        --------
+        >>> import koopmpc as km
+        >>> import scipy.signal
+        >>> mass = scipy.signal.StateSpace([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], 0)
+        >>> model = km.LinearPredictor.from_state_space(mass, dt=0.1)
+        >>> model.A.tolist()
+        [[1.0, 0.1], [0.0, 1.0]]
+        """
+        found = read_state_space(system, dt, states, inputs)
+        nx = len(found.A)
+        return cls(found.A, found.B, np.eye(nx), State(), found.dt, found.states, found.inputs)
+
+    def to_state_space(self) -> Any:
+        """Return z⁺ = A z + B u, x = C z as a scipy.signal.dlti; ``control.ss(system)`` takes its matrices."""
+        return build_system(self.A, self.B, self.C, self.dt)
 
     @classmethod
     def local(cls, step_map: StepMap, x: ArrayLike, u: ArrayLike) -> "LinearPredictor":

@@ -106,7 +106,7 @@ def check_task(
     DataError, ShapeError
         A size does not fit, NaN, an angle that is no state.
     """
-    cost, limits = check_cost_and_limits(cost, limits)
+    cost, limits = check_cost_and_limits(cost, limits, data.states, data.inputs)
     nx, states = data.nx, data.states
     of = cost.of.bind(states)
     cost.matrices(of.nz, data.nu)

@@ -66,7 +66,7 @@ class Surrogate(Value):
     def holding(self, cost: Cost, limits: Limits, gain: float = 1.0) -> "Holding":
         """Return the search for equilibria of this plant."""
         given = self._map(gain)
-        outputs = state_tracking(self.model.states, self.model.nu, cost, limits, given.nx)
+        outputs = state_tracking(self.model.states, self.model.inputs, cost, limits, given.nx)
         return Holding(Equilibria(given, cost, outputs), given.E @ self.w)
 
     def find_reference_inputs(

@@ -134,13 +134,13 @@ show(lambda: km.metrics([1, 2]))
         "DataError step_map is a LinearPredictor, expected a StepMap; discretize the dynamics, or use KoopmanMPC "
         "for a predictor",
         "DataError predictor is a NoneType, expected a LinearPredictor; fit one with edmd, or linearise with "
-        "LinearPredictor.local",
+        "LinearPredictor.local; from_state_space takes matrices",
         "DataError run is a list, expected a Run; simulate returns one",
     ]
 
 
 def sizes_of(cost, limits, ranges=None):
-    return state_tracking(("a", "b", "c"), 2, cost, limits, None, ranges).sizes
+    return state_tracking(("a", "b", "c"), ("u", "v"), cost, limits, None, ranges).sizes
 
 
 def test_sizes_are_those_of_two_limits_then_of_the_data_then_of_the_cost_then_of_one_limit():

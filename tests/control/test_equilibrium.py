@@ -30,7 +30,7 @@ def two_tanks() -> km.StepMap:
 
 
 def equilibria(model, limits: km.Limits, cost: km.Cost = COST) -> Equilibria:
-    seen = state_tracking(model.states, model.nu, cost, limits)
+    seen = state_tracking(model.states, model.inputs, cost, limits)
     return Equilibria(learned_map(model), cost, seen)
 
 
@@ -111,7 +111,7 @@ def test_a_target_under_a_load_is_found_without_ipopt_and_no_offset_is_left(
 
 def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_target() -> None:
     plant, cost = hinge(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
-    read = state_tracking(plant.states, plant.nu, cost, km.Limits(-2, 2))
+    read = state_tracking(plant.states, plant.inputs, cost, km.Limits(-2, 2))
     target = TerminalTargets(learned_map(plant), cost, read, 300)(np.array([0.0, 1.0, 0.0]))
 
     def end(x: np.ndarray) -> float:
@@ -134,7 +134,7 @@ def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_target() 
 def test_the_terminal_target_of_a_periodic_reference_is_not_the_stationary_point_at_zero() -> None:
     """From the guess x = 0 the gradient of the distance to cos θ = −1 is zero."""
     plant, cost = hinge(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
-    read = state_tracking(plant.states, plant.nu, cost, km.Limits(-2, 2))
+    read = state_tracking(plant.states, plant.inputs, cost, km.Limits(-2, 2))
     target = TerminalTargets(learned_map(plant), cost, read, 300)(np.array([0.0, -1.0, 0.0]))
     assert np.cos(target.equilibrium.x[0]) < -0.99
 
@@ -146,7 +146,7 @@ def test_what_a_reference_says_of_states_without_weight_does_not_move_its_equili
     lifting = km.State() + km.Constant() + km.Standardized.of(data, km.Monomials(2))
     model = km.bilinear_edmd(data, lifting, ridge=1e-8, difference=True)
     cost = km.Cost(Q=task.Q, R=task.R)
-    tracking = state_tracking(model.states, 1, cost, task.limits)
+    tracking = state_tracking(model.states, model.inputs, cost, task.limits)
     silent, told = (
         Equilibria(learned_map(model), cost, tracking).find(np.array([0.676, 340.0, wall])) for wall in (0.0, 302.8)
     )
@@ -156,7 +156,7 @@ def test_what_a_reference_says_of_states_without_weight_does_not_move_its_equili
 
 def test_the_rows_of_a_reference_that_moves_are_followed_and_ipopt_is_asked_once(monkeypatch):
     plant = two_tanks()
-    seen = state_tracking(plant.states, plant.nu, COST, km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
+    seen = state_tracking(plant.states, plant.inputs, COST, km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
     targets = TerminalTargets(learned_map(plant), COST, seen, 300)
     asked, own = [], targets.equilibria.find
     monkeypatch.setattr(targets.equilibria, "find", lambda row: asked.append(row) or own(row))
@@ -187,7 +187,7 @@ def test_with_another_model_the_last_target_goes_on_from_where_it_was_without_ip
     before, row = pendulum(), np.array([0.2, 0.0])
     after = replace(before, A=before.A * np.where(before.A == 0.05, 1.02, 1.0))  # gravity
 
-    seen = state_tracking(before.states, before.nu, COST, km.Limits(-4, 4))
+    seen = state_tracking(before.states, before.inputs, COST, km.Limits(-4, 4))
     targets = TerminalTargets(learned_map(before), COST, seen, 300)
     targets(np.array([0.7, 0.0]))
     old = targets(row)
@@ -211,7 +211,7 @@ def test_the_slope_of_an_equilibrium_is_how_its_input_moves_with_a_disturbance(e
 
 def ends(plant: km.StepMap, cost: km.Cost, row: np.ndarray, limits: km.Limits):
     """Return the target of a row, and what a plan that ends in x after the input u pays for its end."""
-    read = state_tracking(plant.states, plant.nu, cost, limits)
+    read = state_tracking(plant.states, plant.inputs, cost, limits)
     target = TerminalTargets(learned_map(plant), cost, read, 1000)(row)
 
     def price(x: np.ndarray, u: np.ndarray) -> float:
@@ -266,7 +266,7 @@ def test_what_no_small_motion_changes_of_the_tracked_outputs_keeps_its_weight_at
 def test_a_disturbance_moves_the_target_to_the_equilibrium_that_it_allows(Q_N) -> None:
     plant, e, row = two_tanks(), np.array([0.01, -0.008]), np.array([0.6, 0.5])
     cost = km.Cost(Q=[1, 2], R=0.3, Q_N=Q_N, R_delta=None if Q_N else 0.1)
-    read = state_tracking(plant.states, plant.nu, cost, km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
+    read = state_tracking(plant.states, plant.inputs, cost, km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
     targets, last = TerminalTargets(learned_map(plant), cost, read, 1000), None
     for _ in range(4):
         last = targets.find_disturbed(row, e, last)
@@ -281,7 +281,7 @@ def test_a_disturbance_moves_the_target_to_the_equilibrium_that_it_allows(Q_N) -
 def test_a_row_whose_equilibrium_is_not_found_is_aimed_at_itself_until_it_is_looked_for_again(monkeypatch) -> None:
     plant, row = two_tanks(), np.array([0.6, 0.5])
     for cost, weight in ((km.Cost(Q=[1, 2], R=0.3, R_delta=0.1), [1, 2]), (km.Cost(1, 0.3, Q_N=[4, 9]), [4, 9])):
-        read = state_tracking(plant.states, plant.nu, cost, km.Limits([0.1, -1], 1))
+        read = state_tracking(plant.states, plant.inputs, cost, km.Limits([0.1, -1], 1))
         targets = TerminalTargets(learned_map(plant), cost, read, 1000)
         with monkeypatch.context() as patch:
             patch.setattr(targets.equilibria, "find", lambda *rest: None)

@@ -49,7 +49,7 @@ def problem_of(kind: str) -> StagedProblem:
     limits = {"rated": LIMITS, "plain": BOXED, "free": km.Limits()}[kind]
     given = learned_map(plant)
     return staged_problem(
-        given, state_tracking(plant.states, 2, cost, limits), (1, 2, 1) if kind == "rated" else (1,) * 4
+        given, state_tracking(plant.states, plant.inputs, cost, limits), (1, 2, 1) if kind == "rated" else (1,) * 4
     )
 
 

@@ -182,7 +182,12 @@ class KoopmanMPC(MPCBase):
     ) -> None:
         if settings is not None:
             checks.kind(settings, "settings", Mapping, 'pass the solver\'s own by name, for example {"max_iter": 100}')
-        checks.kind(predictor, "predictor", LinearPredictor, "fit one with edmd, or use LinearMPC for a StepMap")
+        checks.kind(
+            predictor,
+            "predictor",
+            LinearPredictor,
+            "fit one with edmd, or use LinearMPC for a StepMap, LinearPredictor.from_state_space for matrices",
+        )
         settings = dict(settings or {})
         turns = order_solvers(solver, settings)
         self._solver = turns[0].solver.name

@@ -76,7 +76,7 @@ class StagedMPC(MPCBase):
         self._forget_targets()
         self._map = given = learned_map(model)
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
-        self._outputs = o = state_tracking(model.states, given.nu, cost, limits, given.nx, ranges)
+        self._outputs = o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges)
         super().__init__(
             model.dt,
             given,
