@@ -69,7 +69,7 @@ class CFunction(NamedTuple):
 class Tables:
     """The numbers of a controller's C code: `sizes` are integers, `settings` those of the QP solver, the others arrays.
 
-    `conditioning` is how many times a rounding of the lifted state moves the plan, as a share of an input's span.
+    `conditioning` is the change of the plan, as a share of an input's span, per relative rounding of the lifted state.
     """
 
     program: StepProgram

@@ -214,7 +214,7 @@ class MPCBase(Published):
     tracking
         The tracked and limited outputs, with their weights and limits.
     moves, horizon
-        N steps, and which of them hold their inputs, see `blocked`.
+        N steps, and which of them hold their inputs, see `find_blocks`.
     observer, estimator
         The observer of this controller, and the rule that started it, None where y is the state.
     latency
@@ -222,9 +222,9 @@ class MPCBase(Published):
     time_limit
         Wall-clock time of a step [s].
     stagewise
-        Whether a plan has an input of each step, held ones being changes of 0, or one of each block.
+        True: a plan has an input for each step, with a change of 0 in held ones. False: one for each block.
     monitor
-        What tells of each step whether the model knows it; None where that is not asked.
+        Says of each step whether the model knows it; None without a monitor.
     """
 
     solver_fails = False  # fault injection sets it, see control.move.Fallible

@@ -18,9 +18,9 @@ from koopmpc.predict.predictors import LinearPredictor
 
 TOLERANCE = 1e-8  # singular values of [A − I, B] below this share of the largest span the equilibria
 ROUNDING = 1e-9  # by how much of its value and its limit a target may stand outside before it is moved
-KEPT = 10_000  # coordinates kept in memory; it is cleared beyond
-_SHARES = (1.0, 0.7, 0.45)  # of the states' sizes at which observables are read for theirs
-_LEAST = 1e-150  # what an observable that vanishes there is smaller than
+KEPT = 10_000  # the memory of coordinates is cleared when it holds this many
+_SHARES = (1.0, 0.7, 0.45)  # observables are evaluated at these shares of the states' sizes to find their own sizes
+_LEAST = 1e-150  # an observable below this at all these points has size 1
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Targets:
     def solver(self, count: int) -> DAQP:
         """Return the solver of ‖weighted β‖² → min within limits on the first `count` rows of β."""
         if count not in self._solvers:
-            # H of trace 1: the tolerance is relative to the weight, and cost in other units has the same target
+            # H of trace 1: the tolerance is relative to the weight, so the unit of the cost does not move the target
             H = self.weighted.T @ self.weighted
             H = H / max(float(np.trace(H)), 1e-300) + 1e-9 * np.eye(len(H))
             free = np.full(count, np.inf)
@@ -123,7 +123,7 @@ class Units(NamedTuple):
     """The units of a linear problem: L, its inverse, and the diagonals of D_u, D_r and D_g.
 
     Recursions and rank decisions lose digits where entries differ by many powers of ten, and where observables are
-    almost dependent. So a problem is solved in units in which those of a model and of its user mean nothing: z = L q,
+    almost dependent. A problem is therefore solved in units that do not depend on those of the model: z = L q,
     u = D_u ũ, r = D_r r̃, limited outputs D_g g̃, and a cost of `scale` times its own unit.
     """
 
@@ -173,11 +173,11 @@ class Units(NamedTuple):
         return replace(cost, Q_N=Q_N * np.outer(self.tracked, self.tracked) / self.scale)
 
     def gain(self, K: Float[np.ndarray, "nu nx"]) -> Float[np.ndarray, "nu nx"]:
-        """Return the gain of [z; u_{k−1}], or of z, of one in these units."""
+        """Return the gain on [z; u_{k−1}], or on z, for a gain in these units."""
         return self.inputs[:, None] * K @ self._back(K.shape[1])
 
     def value(self, P: Float[np.ndarray, "nx nx"]) -> Float[np.ndarray, "nx nx"]:
-        """Return the P of a value of [z; u_{k−1}], or of z, of one in these units."""
+        """Return the P of a quadratic cost of [z; u_{k−1}], or of z, for a P in these units."""
         back = self._back(len(P))
         return self.scale * back.T @ P @ back
 
@@ -247,7 +247,7 @@ def targets(
     measure = checks.array(1.0 if sizes is None else sizes, "sizes") * np.ones(nz + nu)
     size = measure[:nz]
     E, push = np.hstack([A - np.eye(nz), B]) * measure / size[:, None], np.diag(1 / size)
-    if constant is not None:  # 1 = 1, whatever a fit has made of it
+    if constant is not None:  # the Constant stays 1, whatever its row is in a fit
         E, push = np.delete(E, constant, axis=0), np.delete(push, constant, axis=0)
     free = np.array([i for i in range(nz + nu) if i != constant])
     pinned = np.zeros(nz) if constant is None else -E[:, constant] / size[constant]

@@ -62,7 +62,7 @@ class Delay(Value):
         return replace(self, bound=(tuple(states), tuple(inputs)))
 
     def match(self, states: Sequence[str], inputs: Sequence[str]) -> "Delay":
-        """Return the copy for data with these names; a bound one keeps the past of no inputs but its own.
+        """Return the copy for data with these names; a bound one keeps only the past of its own inputs.
 
         Raises
         ------

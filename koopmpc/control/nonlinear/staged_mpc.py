@@ -72,7 +72,7 @@ class StagedMPC(MPCBase):
         time_limit: float | None,
         monitor: StepMonitor | Episodes | None,
     ) -> None:
-        self._warm, self._moved, self._row = False, False, 0  # the row is that of a u_target given in rows
+        self._warm, self._moved, self._row = False, False, 0  # present row of a u_target that is given in rows
         self._forget_targets()
         self._map = given = learned_map(model)
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
@@ -233,7 +233,7 @@ class StagedMPC(MPCBase):
             U, end = given[:-1], end._replace(u=given[-1], m=end.m + end.V @ given[-1])
             self._moved = self._row + 1 < len(rows)
             self._row += self._moved
-        trajectory = rows is not None and not held[-1]  # no equilibrium is where it goes on
+        trajectory = rows is not None and not held[-1]  # the reference goes on, so it ends at no equilibrium
         if self.cost.Q_N is None and (trajectory or self.cost.tail == 0):
             M, nr = np.zeros_like(end.M), len(R[-1])
             M[:nr] = self._outputs.Q_root

@@ -14,7 +14,7 @@ from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.move import Status
 from koopmpc.errors import DataError, ShapeError
 
-INFINITY = 1e30  # what OSQP and DAQP take for no limit
+INFINITY = 1e30  # OSQP and DAQP read a limit of this size as none
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class QPSolution:
     solver: str
 
 
-_BELOW_ROUNDING = 1e26  # ‖by‖² up to which 1e30 less an entry of it is 1e30
+_BELOW_ROUNDING = 1e26  # up to this ‖by‖², 1e30 less an entry of `by` still rounds to 1e30
 _AFTER = 5e-5  # what a step still has to do after its solve [s]
 
 
@@ -208,7 +208,7 @@ class SolverTurn(NamedTuple):
 
 
 class StepSolver:
-    """The QP of a step, by the first of some solvers that has an answer, started from the last one moved on by a step.
+    """The QP of a step: solvers are asked in turn, from the last answer shifted by a step, until one has an answer.
 
     A solver that had the answer where the first one had none is asked first in the next steps, until a plan meets all
     limits: a first-order method that has reached its bound of iterations will reach it in the next step, too, and an
