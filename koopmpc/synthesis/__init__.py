@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
-    from koopmpc.synthesis.asked import Asked as Asked
+    from koopmpc.synthesis.asked import DesignTask as DesignTask
     from koopmpc.synthesis.candidates import Candidate as Candidate
     from koopmpc.synthesis.candidates import Recipe as Recipe
     from koopmpc.synthesis.designed import Design as Design
     from koopmpc.synthesis.designed import DesignRow as DesignRow
     from koopmpc.synthesis.designed import Evidence as Evidence
-    from koopmpc.synthesis.designed import Expected as Expected
+    from koopmpc.synthesis.designed import ExpectedLoop as ExpectedLoop
     from koopmpc.synthesis.designed import SavedDesign as SavedDesign
     from koopmpc.synthesis.leaderboard import LeaderboardRow as LeaderboardRow
     from koopmpc.synthesis.leaderboard import Selection as Selection

@@ -27,7 +27,7 @@ MOST = 0.9  # share of the episodes inside this box
 
 
 @dataclass(frozen=True, eq=False)
-class Asked(Value):
+class DesignTask(Value):
     """A control task on the plant of some data.
 
     Attributes
@@ -98,7 +98,7 @@ def check_task(
     reference: ArrayLike,
     starts: ArrayLike | None,
     angles: Sequence[int],
-) -> Asked:
+) -> DesignTask:
     """Return the task, checked.
 
     Raises
@@ -141,7 +141,7 @@ def check_task(
     values, box = stack_limited(limits, X, states)
     sizes = box.high - box.low
     sizes = np.where(np.isfinite(sizes) & (sizes > 0), sizes, np.maximum(np.ptp(values, axis=0), 1e-300))
-    return Asked(
+    return DesignTask(
         cost=cost,
         limits=limits,
         horizon=horizon,
@@ -156,7 +156,7 @@ def check_task(
     )
 
 
-def limit_margins(asked: Asked, data: Episodes) -> Float[np.ndarray, " nx"]:
+def limit_margins(asked: DesignTask, data: Episodes) -> Float[np.ndarray, " nx"]:
     """Return the largest margin of each state (nx,): half of the way from the reference to the nearest limit.
 
     Without this bound, errors of a poor model could lead to margins that exclude the reference itself. A reference on
@@ -171,7 +171,7 @@ def limit_margins(asked: Asked, data: Episodes) -> Float[np.ndarray, " nx"]:
     return room
 
 
-def find_stray_episodes(data: Episodes, asked: Asked) -> dict[int, str]:
+def find_stray_episodes(data: Episodes, asked: DesignTask) -> dict[int, str]:
     """Return the episodes that went far away with ordinary inputs, each with a sentence that says how far.
 
     A sensor may have jumped, or the plant fallen over; the squares of such an episode outweigh all others in fits and
@@ -213,7 +213,7 @@ def _measure_departures(
     return np.maximum(low - least, most - high) / width, low, high
 
 
-def find_outside_data(asked: Asked, data: Episodes, tracked: Sequence[int], free: Sequence[int]) -> list[str]:
+def find_outside_data(asked: DesignTask, data: Episodes, tracked: Sequence[int], free: Sequence[int]) -> list[str]:
     """Return a sentence for each state whose start or reference lies outside the data, where no model was fitted."""
     said: list[str] = []
     room = 0.01 * (asked.high - asked.low)
@@ -231,7 +231,7 @@ def find_outside_data(asked: Asked, data: Episodes, tracked: Sequence[int], free
     return said
 
 
-def find_outside_limits(asked: Asked, data: Episodes) -> list[str]:
+def find_outside_limits(asked: DesignTask, data: Episodes) -> list[str]:
     """Return a sentence for each limit that a start or a moving reference lies beyond.
 
     A constant reference is not checked here; `explain_unreachable` says what can be held instead.
@@ -255,7 +255,7 @@ def find_outside_limits(asked: Asked, data: Episodes) -> list[str]:
     return said
 
 
-def find_unweighted_limits(asked: Asked, data: Episodes) -> list[str]:
+def find_unweighted_limits(asked: DesignTask, data: Episodes) -> list[str]:
     """Return a sentence for each limited state that the cost does not weigh."""
     of = asked.cost.of.bind(data.states)
     if not isinstance(of, State):
@@ -272,7 +272,7 @@ def find_unweighted_limits(asked: Asked, data: Episodes) -> list[str]:
     ]
 
 
-def _weighted_references(asked: Asked, data: Episodes) -> dict[int, Float[np.ndarray, " T1"]]:
+def _weighted_references(asked: DesignTask, data: Episodes) -> dict[int, Float[np.ndarray, " T1"]]:
     """Return the reference rows of each state that the cost weighs; none for a cost on other observables."""
     of = asked.cost.of.bind(data.states)
     if not isinstance(of, State):

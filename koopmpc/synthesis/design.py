@@ -24,7 +24,7 @@ from koopmpc.lifting.composed import Present
 from koopmpc.lifting.state import State
 from koopmpc.parallel import StageProgress, Workers
 from koopmpc.synthesis.asked import (
-    Asked,
+    DesignTask,
     check_task,
     find_outside_data,
     find_outside_limits,
@@ -54,7 +54,7 @@ from koopmpc.synthesis.cross_validation import (
     smooth_data,
     take_sample,
 )
-from koopmpc.synthesis.designed import Design, DesignRow, Evidence, Expected, choose_row
+from koopmpc.synthesis.designed import Design, DesignRow, Evidence, ExpectedLoop, choose_row
 from koopmpc.synthesis.judging import (
     Condition,
     Job,
@@ -292,7 +292,7 @@ def _confirm_first(
 
 def _list_models(
     held: Episodes,
-    asked: Asked,
+    asked: DesignTask,
     given: Sequence[Candidate | Lifting] | None,
     past: Sequence[int],
     both: bool,
@@ -315,7 +315,7 @@ def _list_models(
 
 def _prepare_test(
     folds: Folds,
-    asked: Asked,
+    asked: DesignTask,
     pair: Sequence[Recipe],
     tighten: bool,
     noise: Float[np.ndarray, " nx"],
@@ -373,7 +373,7 @@ class _StandIn(NamedTuple):
 
 
 def _fit_task(
-    folds: Folds, asked: Asked, noise: Float[np.ndarray, " nx"], task: _StandIn
+    folds: Folds, asked: DesignTask, noise: Float[np.ndarray, " nx"], task: _StandIn
 ) -> tuple[Surrogate, list[Float[np.ndarray, "T nu"]]]:
     """Return the surrogate and the `Condition.u_reference` of each run on it."""
     data, fold = folds.episodes, folds.fold
@@ -478,12 +478,12 @@ def _build_leaderboard(test: LoopTest, screened: Judged, last: Judged) -> tuple[
     return tuple(row for row, _ in both), [outcome for _, outcome in both]
 
 
-def _summarise_expected(test: LoopTest, outcome: Outcome) -> Expected:
+def _summarise_expected(test: LoopTest, outcome: Outcome) -> ExpectedLoop:
     nominal = test.nominal
     off = [j for j in range(len(test.conditions)) if j not in nominal]
     near = [test.conditions[j] for j in nominal]
     known = outcome.broken[np.isfinite(outcome.cost)]
-    return Expected(
+    return ExpectedLoop(
         cost=outcome.cost[nominal],
         cost_off=outcome.cost[off],
         violation=outcome.violation[nominal],
@@ -495,7 +495,7 @@ def _summarise_expected(test: LoopTest, outcome: Outcome) -> Expected:
     )
 
 
-def _give_advice(rows: Sequence[DesignRow], best: int, linear: int | None, expected: Expected) -> list[str]:
+def _give_advice(rows: Sequence[DesignRow], best: int, linear: int | None, expected: ExpectedLoop) -> list[str]:
     """Return sentences on what limits the closed loop, and which data would help."""
     said: list[str] = []
     row, runs = rows[best], len(expected.cost) + len(expected.cost_off)

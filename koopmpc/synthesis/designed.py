@@ -16,7 +16,7 @@ from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.program import SavedController
 from koopmpc.errors import KoopmpcError, LogError
 from koopmpc.predict.base import load_value, save_value
-from koopmpc.synthesis.asked import Asked
+from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Recipe
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.terminal import build_leaderboard, label_lines, render_text
@@ -63,7 +63,7 @@ class DesignRow(Value):
 
 
 @dataclass(frozen=True, eq=False)
-class Expected(Value):
+class ExpectedLoop(Value):
     """Expected closed loop of a design, from runs on surrogates that were fitted to data unknown to its model.
 
     It is an estimate from data alone and no guarantee: no surrogate shows an error that all models share.
@@ -133,11 +133,11 @@ class Evidence(Value):
         True if the reference is constant and an input inside the limits holds it.
     """
 
-    asked: Asked
+    asked: DesignTask
     surrogates: tuple[Surrogate, ...]
     low: Float[np.ndarray, " nx"]
     high: Float[np.ndarray, " nx"]
-    expected: Expected
+    expected: ExpectedLoop
     goal_can_be_held: bool
 
 
@@ -186,7 +186,7 @@ class Design:
         return self.leaderboard[self.chosen]
 
     @property
-    def expected(self) -> Expected:
+    def expected(self) -> ExpectedLoop:
         """What to expect of `controller`: an estimate, and no promise."""
         return self.evidence.expected
 

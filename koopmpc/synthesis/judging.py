@@ -22,7 +22,7 @@ from koopmpc.loop.simulate import StepObserver, simulate
 from koopmpc.plants.plant import SimulatedPlant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor
-from koopmpc.synthesis.asked import Asked
+from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Nearness, Recipe
 from koopmpc.synthesis.cross_validation import drop_fold, select_fold
 from koopmpc.synthesis.surrogates import Surrogate
@@ -78,7 +78,7 @@ class LoopTest:
     data.
     """
 
-    asked: Asked
+    asked: DesignTask
     episodes: Episodes
     fold: tuple[int, ...]
     surrogates: tuple[Surrogate, ...]
@@ -311,7 +311,7 @@ def _run_condition(test: LoopTest, one: Condition, controller: Designed, seed: i
 
 
 def run_on_surrogate(
-    asked: Asked,
+    asked: DesignTask,
     surrogate: Surrogate,
     plant: StepMap,
     controller: Controller,

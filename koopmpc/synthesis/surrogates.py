@@ -14,7 +14,7 @@ from koopmpc.control.nonlinear.problem import LearnedMap, learned_map
 from koopmpc.data.episodes import Episodes
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.step_map import StepMap
-from koopmpc.synthesis.asked import Asked
+from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Recipe
 from koopmpc.synthesis.cross_validation import HALF, Tried
 from koopmpc.text import with_unit
@@ -186,7 +186,7 @@ def _find_family(tried: Tried) -> str:
     return next((family for family in reversed(_FAMILIES) if name.startswith(family)), name)
 
 
-def explain_unreachable(one: Surrogate, asked: Asked) -> list[str]:
+def explain_unreachable(one: Surrogate, asked: DesignTask) -> list[str]:
     """Return a sentence if no input holds a constant reference; it names the limit and the nearest equilibrium.
 
     Outputs without a weight in the cost are ignored, and so are deviations up to 2 % of the data's range, which may be

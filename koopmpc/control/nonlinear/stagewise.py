@@ -216,9 +216,9 @@ def solve_unconstrained(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"]) -> 
 def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"], sides: Sides, ng: int) -> ca.Function:
     """Return one predictor–corrector step of the interior-point method.
 
-    (A, B, c, Q, q, r, δx_0, G, d, σ; X, U, t, λ, ε, ν) → (X, U, t, λ, ε, ν, [μ, α]): d the plan's distances
-    (ns, N), t ≥ 0 their slack variables, λ the multipliers, ε ≥ 0 and ν those of the soft sides, μ the mean
-    complementarity before the step, α the step's length. σ is zero in a predictor–corrector step. A step with σ > 0 aims at the
+    (A, B, c, Q, q, r, δx_0, G, d, σ; X, U, t, λ, ε, ν) → (X, U, t, λ, ε, ν, [μ, α]): d the plan's distances (ns, N), t
+    ≥ 0 their slack variables, λ the multipliers, ε ≥ 0 and ν those of the soft sides, μ the mean complementarity before
+    the step, α the step's length. σ is zero in a predictor–corrector step. A step with σ > 0 aims at the
     complementarity σ μ everywhere and leaves the corrector out: it returns to the central path.
     """
     nx, nu, N = sweeps.nx, sweeps.nu, sweeps.N
