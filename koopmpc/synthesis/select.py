@@ -42,7 +42,14 @@ from koopmpc.synthesis.cross_validation import (
     usual_horizon,
 )
 from koopmpc.synthesis.leaderboard import LeaderboardRow, Selection, choose_model, make_row
-from koopmpc.synthesis.records import advance_inputs, is_late, is_record, judge_finalists, propose_structures
+from koopmpc.synthesis.records import (
+    advance_inputs,
+    is_late,
+    is_record,
+    judge_finalists,
+    propose_structures,
+    refine_structure,
+)
 from koopmpc.validate.scoring import AnyPredictor
 
 ENOUGH = 1e-2  # error of a forecast, as a share of the states' spread, below which a controller gains nothing
@@ -229,6 +236,8 @@ def select(
     def refit(row: LeaderboardRow) -> AnyPredictor:
         read = ReadOptions(workers=workers, scheduler=scheduler, progress=report_stage(progress, f"fit of {row.title}"))
         model = fit_candidate(row.candidate, source if row.structure is None else measured[0], row.ridge, read)
+        if record and row.structure is not None:
+            model = refine_structure(row.structure, model, measured[1], first, ahead)
         if lead and model.report is not None:
             report = replace(model.report, input_lead=lead, changes=(*model.report.changes, LATE))
             model = replace_report(model, report)

@@ -161,3 +161,16 @@ def test_what_cannot_be_refined_is_refused_in_a_sentence():
         km.identify.refine(km.edmd(watched, km.State()), watched, horizon=5)
     with pytest.raises(KoopmpcError, match="horizon"):
         km.identify.refine(model, data, horizon=0)
+
+
+def test_coefficients_that_are_zero_stay_zero():
+    rng = np.random.default_rng(5)
+    truth = bilinear_plant(rng)
+    data = episodes_of(truth, rng, noise=0.02)
+    start = disturbed(truth, rng)
+    A, N = start.A.copy(), start.N.copy()
+    A[0, 1] = N[0, 1, 0] = 0.0
+    about = start.C, start.lifting, start.dt, start.states, start.inputs
+    refined = km.identify.refine(km.BilinearPredictor(A, start.B, N, *about), data, horizon=8, iterations=5)
+    assert refined.A[0, 1] == refined.N[0, 1, 0] == 0.0
+    assert (refined.A[0, [0, 2]] != A[0, [0, 2]]).all()

@@ -112,7 +112,7 @@ def refine(
     The forecast x̂_{k+1} = C (A ψ(ζ̂_k) + B u_k + Σ uᵢ Nᵢ ψ(ζ̂_k)) starts at measured ζ_s and is lifted afresh at each
     step, as `step_map()` simulates and BilinearMPC plans; a model that is linear in the state and its past forecasts
     the same lifted once. One-step least squares learns the noise where samples are fast; the error over many steps
-    does not. Segments of `horizon` steps begin at measured points, as in multiple shooting for an unstable plant. The
+    does not. Coefficients that are exactly zero stay zero. Segments of `horizon` steps begin at measured points, as in multiple shooting for an unstable plant. The
     minimisation is Levenberg-Marquardt with exact derivatives, in units of the states' standard deviations σ. It stops
     on held-out rows, and the model returned has the least error there: `model` itself where no step lowers that.
 
@@ -181,17 +181,20 @@ def _minimise(
 ) -> tuple[Float[np.ndarray, "nx nphi"], int]:
     """Return the Θ on the way down the error of `fitted` that has the least error on `judged`, and its iteration."""
     theta = best = start
+    free = np.flatnonzero(theta.ravel())
     value, least = error.evaluate(theta, fitted), error.evaluate(theta, judged)
     damping, at, waited = DAMPING, 0, 0
     for step in range(1, iterations + 1):
         if not np.isfinite(value):
             break  # the start overflows: there is no derivative to follow
         gradient, matrix = error.derivatives(theta, fitted)
+        gradient, matrix = gradient[free], matrix[np.ix_(free, free)]
         scale = np.sqrt(np.where(matrix.diagonal() > 0, matrix.diagonal(), 1.0))
         scaled, slope = matrix / np.outer(scale, scale), gradient / scale
         lower = np.inf
         for _ in range(TRIALS):
-            move = np.linalg.lstsq(scaled + damping * np.eye(len(slope)), -slope, rcond=None)[0] / scale
+            move = np.zeros(theta.size)
+            move[free] = np.linalg.lstsq(scaled + damping * np.eye(len(slope)), -slope, rcond=None)[0] / scale
             trial = theta + move.reshape(theta.shape)
             lower = error.evaluate(trial, fitted)
             if lower < value:
