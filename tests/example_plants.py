@@ -28,6 +28,16 @@ def energy(X: np.ndarray) -> np.ndarray:
     return 0.5 * X[..., 1] ** 2 + GRAVITY * (1 - np.cos(X[..., 0]))
 
 
+class Swing(km.Dynamics):
+    """θ̈ = sin θ + u, upright at θ = 0."""
+
+    states = ("theta [rad]", "omega [rad/s]")
+    inputs = ("torque [N m]",)
+
+    def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
+        return ca.vertcat(x[1], ca.sin(x[0]) + u[0])
+
+
 @dataclass(frozen=True)
 class CartPole(km.Dynamics):
     cart: float = 1.0  # [kg]

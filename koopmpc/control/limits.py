@@ -28,7 +28,6 @@ _ENDS = (
     ("x_min", "x_max", "state"),
     ("y_min", "y_max", "output"),
 )  # fields of the lower and the upper limit, and what they limit
-_OPEN = {"min": -np.inf, "max": np.inf}  # end of a name of a field → the value that limits nothing
 
 
 class Interval(NamedTuple):

@@ -3,29 +3,19 @@
 from collections import Counter
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
+from tests.example_plants import Swing
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
 BOX = km.Limits(u_min=-3.0, u_max=5.0)
 RATED = km.Limits(u_min=-3.0, u_max=5.0, du_max=1.5, x_min=[-2.0, -2.5], x_max=[2.0, 2.5])
 GOOD = {km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED, km.Status.SATURATED}
 ORIGIN = ([0.0, 0.0], [0.0])
-
-
-class Swing(km.Dynamics):
-    """θ̈ = sin θ + u, upright at θ = 0."""
-
-    states = ("theta [rad]", "omega [rad/s]")
-    inputs = ("torque [N m]",)
-
-    def rhs(self, x, u):
-        return ca.vertcat(x[1], ca.sin(x[0]) + u[0])
 
 
 PLANT = km.discretize(Swing(), 0.1)

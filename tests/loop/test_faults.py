@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,20 +9,11 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from tests.bare import shown
+from tests.example_plants import Swing
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
 LIMITS = km.Limits(u_min=-3.0, u_max=5.0)
 GOOD = {km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED, km.Status.SATURATED}
-
-
-class Swing(km.Dynamics):
-    """θ̈ = sin θ + u, upright at θ = 0."""
-
-    states = ("theta [rad]", "omega [rad/s]")
-    inputs = ("torque [N m]",)
-
-    def rhs(self, x, u):
-        return ca.vertcat(x[1], ca.sin(x[0]) + u[0])
 
 
 PLANT = km.discretize(Swing(), 0.1)
