@@ -15,7 +15,7 @@ from koopmpc.data.files.recording import split_recording
 from koopmpc.errors import KoopmpcError, LogError
 
 EXTRA = "mdf"
-_STEP = 500_000  # records that are read at once
+_STEP = 100_000  # records that are read at once
 
 
 class MDFRecording(Recording):
@@ -104,7 +104,7 @@ class MDFRecording(Recording):
         from asammdf import MDF
 
         try:
-            with MDF(self.file) as mdf:
+            with self.file.open("rb") as stream, MDF(stream) as mdf:  # of a path asammdf reads whole channels
                 yield mdf
         except (KoopmpcError, ModuleNotFoundError):
             raise
