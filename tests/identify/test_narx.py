@@ -163,3 +163,14 @@ def test_records_without_inputs_are_fitted():
     model = km.identify.narx(data, delays=[1, 2], degrees=2)
     assert np.abs(km.score(model, data, 5, relift=True).rmse).max() < 1e-6
     assert model.report.method == "narx"
+
+
+def test_a_driven_plant_never_gets_a_model_without_its_input():
+    rng = np.random.default_rng(0)
+    y = np.cumsum(rng.standard_normal(300)) * 0.1  # the input does nothing that a free run would show
+    data = km.Episodes([km.Episode(X=y[:, None], U=rng.standard_normal((299, 1)))], 0.1, ["y"], ["u"])
+    found = search_structures(data, [0, 1], [1, 2], 6)
+    assert found
+    assert all(one.is_driven for one in found)
+    model = fit_structure(found[0], data)
+    assert np.abs(model.B[0]).max() > 0 or np.abs(model.A[0, 1]) > 0

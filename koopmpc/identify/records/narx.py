@@ -51,8 +51,8 @@ def narx(
     record is cut into four stretches. Without each of them the terms are chosen and fitted; on it the model is judged
     by forecasts of 20 steps and by its free run, from the record's first rows and the inputs alone. The least error
     decides on delays, degree and number of terms, and of all within one standard error the fewest terms are taken. A
-    model whose free run leaves three times the range of the data is taken only where every model's does. All rows then
-    fit the coefficients.
+    model whose free run leaves three times the range of the data is taken only where every model's does, and one
+    without an input only where the data have none. All rows then fit the coefficients.
 
     The result predicts with ψ(ζ) = [ζ, 1, the monomials in these terms], lifted afresh at each step: it is a
     `BilinearPredictor`, which `step_map`, `score(relift=True)` and `BilinearMPC` use so. Terms of degree 1 alone make
@@ -176,7 +176,8 @@ def search_structures(
         if ask is not None:
             ask(f"polynomials of degree {g} with {d} past rows", i, len(plans))
         found += list(_try_plan(pieces, d, g, first, terms, horizon))
-    return [structure for structure in found if structure.calm] or found
+    driven = [structure for structure in found if structure.is_driven] or found  # a controller needs the input
+    return [structure for structure in driven if structure.calm] or driven
 
 
 def _try_plan(pieces: Pieces, delays: int, degree: int, first: int, terms: int, horizon: int) -> Iterator[Structure]:

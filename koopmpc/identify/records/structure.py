@@ -125,6 +125,13 @@ class Structure(Value):
         monomials = Picked(Monomials(degree), tuple(which))
         return lifting + Standardized(monomials, self.mean[self.signals], self.scale[self.signals]), where
 
+    @property
+    def is_driven(self) -> bool:
+        """Whether a term holds an input, of the present row or a past one."""
+        n, past = self.point_size, np.flatnonzero(self.signals >= len(self.terms)) + 1
+        inputs = {*past.tolist(), *range(n + 1, n + self.nu + 1)}
+        return any(int(v) in inputs for own in self.terms for v in own.ravel())
+
     def describe(self) -> str:
         """Return a sentence on terms, delays and the error in free run."""
         past = f"{self.delays} past row{'s' * (self.delays != 1)}"
