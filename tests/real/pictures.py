@@ -1,6 +1,7 @@
 """Draw the measured test part of a record and the free run of the model that `select` chooses, for docs/real.md."""
 
 import argparse
+import sys
 import warnings
 from pathlib import Path
 
@@ -39,7 +40,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path(__file__).parents[2] / "docs" / "pictures")
     asked = parser.parse_args()
     for name in asked.records:
-        print(draw(name, asked.folder))
+        sys.stdout.write(f"{draw(name, asked.folder)}\n")
 
 
 if __name__ == "__main__":
