@@ -268,7 +268,7 @@ def test_a_picture_or_a_log_that_fails_costs_neither_model_nor_report(tmp_path, 
     ("arguments", "words"),
     [
         (["nowhere"], "nowhere does not exist"),
-        (["empty"], "holds no .npz, .parquet, .csv or .rrd file"),
+        (["empty"], "or .rrd file: it holds"),
         (["csv", "--states", "x,speed"], "has no column 'speed'"),
         (["csv", "--horizon", "500"], "pass a shorter --horizon"),
         (["csv", "--horizon", "0"], "--horizon is 0"),
