@@ -84,7 +84,7 @@ KEPT = {  # what is no garbage in some places: a function for an excitation, Non
     "trust train": [None],
     "simulate cost": [None],
     "candidates": [None],
-    "delays": [GARBAGE[4]],
+    "delays": [GARBAGE[4], None],
     "embedding": [None],
 }
 EPISODES = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-8, 8), episodes=4, steps=8)

@@ -262,7 +262,7 @@ def test_the_parts_of_the_report_hold_their_tables_and_pictures(settings, fits, 
     claims = judge_figures(fits)
     report.add_opening(page, claims, 0.01, 10)
     add_verdicts(page, claims)
-    report.numbers(page, settings, fits, claims)
+    report.tabulate_figures(page, settings, fits, claims)
     report.add_feedbacks(page)
     theory.add_frequencies(page, fits)
     theory.add_equations(page, settings["pendulum"], fits)

@@ -191,7 +191,7 @@ def test_the_best_of_the_earlier_models_comes_back(monkeypatch):
 
 def test_a_model_of_which_no_controller_can_be_made_is_not_used(monkeypatch):
     trial = Trial(monkeypatch, {"first": 1.0, "new": 0.1})
-    trial.new = replace(model(), B=np.full((2, 1), 1e200))
+    trial.new = replace(model(), B=np.full((2, 1), 1e99))
     own = trial.one.controller.update
     monkeypatch.setattr(
         trial.one.controller,
