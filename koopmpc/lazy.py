@@ -3,9 +3,9 @@
 import ast
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from inspect import formatannotation
 from sys import modules as loaded
-from typing import Any, cast, get_args, get_origin
+from types import UnionType
+from typing import Any, ForwardRef, Union, cast, get_args, get_origin
 
 _ROOMS: list[str] = []
 """Modules that the front door serves as rooms: `find_public` looks into them in this order."""
@@ -87,35 +87,36 @@ def attach(
 def shorten_annotations(value: Any) -> None:
     """Write ``ArrayLike`` in place of its parts in the annotations of a function or a constructor, which `help` shows.
 
-    The name resolves in the module of the function, which imports it from numpy.typing.
+    The name is a forward reference: it resolves in the module of the function, which imports it from numpy.typing.
+    Where beartype is loaded the annotations stay, for it reads them while the program runs.
     """
     function = value.__dict__.get("__init__") if isinstance(value, type) else value
     notes = getattr(function, "__annotations__", None)
     typing = loaded.get("numpy.typing")
-    if not notes or typing is None or not str(getattr(value, "__module__", "")).startswith("koopmpc"):
+    ours = str(getattr(value, "__module__", "")).startswith("koopmpc")
+    if not notes or typing is None or not ours or "beartype" in loaded:
         return
+    parts = get_args(typing.ArrayLike)
     for name, note in notes.items():
-        text = _name_array_like(note, get_args(typing.ArrayLike))
-        if text is not None:
-            notes[name] = text
+        notes[name] = _name_array_like(note, parts)
 
 
-def _name_array_like(note: Any, parts: tuple[Any, ...]) -> str | None:
-    """Return an annotation as text with ``ArrayLike`` in place of its parts; None where it has none of them."""
+def _name_array_like(note: Any, parts: tuple[Any, ...]) -> Any:
+    """Return an annotation with a reference to ``ArrayLike`` in place of the parts of it; itself where it has none."""
     own = get_args(note)
     if len(own) >= len(parts) and all(part in own for part in parts):
-        rest = [part for part in own if part not in parts]
-        texts = [_name_array_like(part, parts) or formatannotation(part) for part in rest]
-        return " | ".join(["ArrayLike", *("None" if text == "NoneType" else text for text in texts)])
-    flat: list[Any] = []
-    for inner in own:
-        flat += cast("list[Any]", inner) if isinstance(inner, list) else [inner]
-    if not any(_name_array_like(part, parts) for part in flat):
-        return None
-    texts = [_name_array_like(part, parts) or formatannotation(part) for part in flat]
-    texts = ["None" if text == "NoneType" else text for text in texts]
-    kind = getattr(get_origin(note), "__name__", "Union")
-    return " | ".join(texts) if kind in ("Union", "UnionType") else f"{kind}[{', '.join(texts)}]"
+        rest = [_name_array_like(part, parts) for part in own if part not in parts]
+        return Union[ForwardRef("ArrayLike"), *rest]
+    inner = [
+        [_name_array_like(part, parts) for part in cast("list[Any]", one)]
+        if isinstance(one, list)
+        else _name_array_like(one, parts)
+        for one in own
+    ]
+    if inner == list(own):
+        return note
+    origin: Any = get_origin(note)
+    return Union[tuple(inner)] if origin in (Union, UnionType) else origin[tuple(inner)]  # noqa: UP007
 
 
 def find_public(name: str) -> Any:

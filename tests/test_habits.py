@@ -1,6 +1,5 @@
 """What users of Python and of other libraries try first: names, versions, printing, hints, DataFrames, state space."""
 
-import inspect
 from importlib.metadata import version
 
 import numpy as np
@@ -20,18 +19,26 @@ def test_the_version_is_that_of_the_package():
     assert km.__version__ == version("koopmpc")
 
 
-@pytest.mark.parametrize("name", ["Limits", "Cost", "simulate", "LinearPredictor", "collect", "LiftedKalman", "lqr"])
-def test_a_signature_fits_on_a_screen(name):
-    text = str(inspect.signature(getattr(km, name)))
-    assert "_SupportsArray" not in text
-    assert "ArrayLike" in text
-    assert len(text) < 1200
+NAMES = ["Limits", "Cost", "simulate", "LinearPredictor", "collect", "LiftedKalman", "lqr"]
 
 
-def test_annotations_still_name_types():
-    from typing import get_type_hints
-
-    assert get_type_hints(km.lqr)["A"] == np.typing.ArrayLike
+def test_signatures_fit_on_a_screen_and_their_annotations_still_name_types():
+    lines = shown(  # in a process without beartype, which reads annotations as they are
+        "import inspect, typing\n"
+        "from numpy.typing import ArrayLike\n"
+        f"for name in {NAMES}:\n"
+        "    print(name, str(inspect.signature(getattr(km, name))))\n"
+        "print(typing.get_type_hints(km.lqr)['A'] == ArrayLike)\n"
+        "print(typing.get_type_hints(km.simulate)['x0'] == ArrayLike | None)\n"
+        "print('slack' in typing.get_type_hints(km.Limits.__init__))\n",
+        fresh=True,
+    )
+    assert lines[-3:] == ["True"] * 3
+    assert [line.split()[0] for line in lines[:-3]] == NAMES
+    for line in lines[:-3]:
+        assert "_SupportsArray" not in line
+        assert "ArrayLike" in line
+        assert len(line) < 1200
 
 
 @pytest.mark.parametrize(("owner", "name", "hint"), [
