@@ -257,8 +257,8 @@ def _explain_feedback(rows: _Rows, j: int, limits: _Strictness) -> str:
         few = _find_basis(np.hstack([rows.inputs[:, : nu * _SHORT], rows.states[:, : nx * _STATE_ROWS]]))
         base, proxy = (float((_leave_out(Q, u) ** 2).sum()) for Q in (short, few))
         more, free = few.shape[1] - short.shape[1], ones - few.shape[1] - 1
-        better = more > 0 and stats.f.sf((base - proxy) / more / (proxy / free), more, free) < _INSTRUMENTS
-        if better and base - proxy > limits.share * (base - alone):
+        explained = base - proxy > limits.share * (base - alone)
+        if more > 0 and explained and stats.f.sf((base - proxy) / more / (proxy / free), more, free) < _INSTRUMENTS:
             return "outputs predict it as well as its own past does, so it may be a feedback"
     # two-stage least squares of u = −K y + r with the past as instruments: r must not follow from the past
     predicted = both @ (both.T @ rows.after)
