@@ -9,6 +9,8 @@ if TYPE_CHECKING:
     from koopmpc.validate.bands import Forecast as Forecast
     from koopmpc.validate.bands import conformal as conformal
     from koopmpc.validate.bands import forecast as forecast
+    from koopmpc.validate.binomial import bound_failure_rate as bound_failure_rate
+    from koopmpc.validate.binomial import count_runs_needed as count_runs_needed
     from koopmpc.validate.logs.audit import AuditReport as AuditReport
     from koopmpc.validate.logs.audit import audit as audit
     from koopmpc.validate.report import TrustReport as TrustReport
