@@ -327,8 +327,9 @@ class Interpreter:
         driven = p.disturbance.shape[1] > 0
         good = usable(R, z)
         if p.aimed and good:
-            alphas = np.array([self.alpha(r, inside=not driven) for r in R])
-            m[:nv] += p.from_target @ alphas.ravel()
+            alphas = np.array([self.alpha(r, inside=False) for r in R])
+            if not driven:
+                m[:nv] += p.from_target @ np.ravel([self.alpha(r) for r in R] - alphas)
             if p.checked.any():
                 values = alphas @ p.targets.rows[p.checked].T
                 m[nv:] = np.concatenate([values.min(axis=0), values.max(axis=0)])

@@ -63,6 +63,21 @@ def test_step_with_nothing_active(benchmark, model):
     report(benchmark, **{"median µs": half, "p99 µs": high})
 
 
+@pytest.mark.parametrize("N", [20, 40, 100])
+def test_step_with_a_moving_reference(benchmark, model, N):
+    """Resting and moving steps by turns: the ratio is what a reference that moves costs."""
+    cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(-25, 25)
+    rest, rows, row = (km.KoopmanMPC(model, cost, limits, N) for _ in range(3))
+    signal = 0.01 * np.sin(0.1 * np.arange(4001 + N))[:, None] * np.ones(2)
+    x, times = np.array([0.02, 0.0]), []
+    for k in range(4000):
+        ahead, now = signal[k : k + N + 1], signal[k]
+        times.append([timed(rest, x, np.zeros(2))[0], timed(rows, x, ahead)[0], timed(row, x, now)[0]])
+    benchmark(rest, x, np.zeros(2))
+    resting, moving, single = np.median(times, axis=0) * 1e6
+    report(benchmark, **{"resting µs": resting, "rows": moving / resting, "one row": single / resting})
+
+
 def test_step_with_a_monitor(benchmark):
     """Plain and watched steps by turns, so that both meet the same machine: the ratio is what a monitor costs."""
     data = km.collect(pendulum(), km.Uniform([-3.2, -4], [3.2, 4]), km.Noise(-10, 10), episodes=200, steps=40)

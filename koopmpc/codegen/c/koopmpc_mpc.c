@@ -51,21 +51,27 @@ static void aim(koopmpc_state *s, const koopmpc_rows *reference) {
         koopmpc_add(s->column, koopmpc_from_given + k * KOOPMPC_NU * PLANNED, PLANNED, given_row(s, k), KOOPMPC_NU);
 #endif
 #if KOOPMPC_AIMED
+      koopmpc_real nearest[KOOPMPC_NA];
+#if !KOOPMPC_CHECKED_LIMITS
       koopmpc_real alpha[KOOPMPC_NA];
+      int moved = 0; /* whether a limit moves the target of this row, which the column holds as if there were none */
+#endif
       for (int k = 0; k <= KOOPMPC_N; k++) {
         const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
         int repeated = k > 0;
         for (int i = 0; i < KOOPMPC_NR && repeated; i++) repeated = row[i] == row[i - KOOPMPC_NR];
-        if (!repeated) {
-          if (KOOPMPC_CHECKED_LIMITS)
-            koopmpc_nearest(row, 0, alpha); /* limits are checked when the disturbance is known */
-          else
-            koopmpc_target(s, row, 0, alpha);
+#if KOOPMPC_CHECKED_LIMITS /* checked when the disturbance is known */
+        if (!repeated) koopmpc_nearest(row, 0, nearest);
+#else
+        if (!repeated && (moved = koopmpc_target(s, row, 0, alpha))) {
+          koopmpc_nearest(row, 0, nearest);
+          for (int i = 0; i < KOOPMPC_NA; i++) alpha[i] -= nearest[i];
         }
-        koopmpc_add(s->column, koopmpc_from_target + k * KOOPMPC_NA * PLANNED, PLANNED, alpha, KOOPMPC_NA);
+        if (moved) koopmpc_add(s->column, koopmpc_from_target + k * KOOPMPC_NA * PLANNED, PLANNED, alpha, KOOPMPC_NA);
+#endif
         for (int i = 0; i < KOOPMPC_CHECKED; i++) {
           koopmpc_real value = 0, *lowest = s->column + PLANNED + i, *highest = lowest + KOOPMPC_CHECKED;
-          for (int j = 0; j < KOOPMPC_NA; j++) value += koopmpc_checked[i * KOOPMPC_NA + j] * alpha[j];
+          for (int j = 0; j < KOOPMPC_NA; j++) value += koopmpc_checked[i * KOOPMPC_NA + j] * nearest[j];
           *lowest = k > 0 && *lowest < value ? *lowest : value;
           *highest = k > 0 && *highest > value ? *highest : value;
         }

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
+from scipy.linalg.blas import dasum
 
 from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
@@ -40,9 +41,10 @@ class CondensedProgram(LinearProgram):
     """t = M [z; u_{−1}; g] + m(r), g = [w_0 … w_{N−1}; d]: the plan, and the QP of the deviation w where a limit acts.
 
     The first entries of t are the moves; they become t + deviation w. m(r) = offset + from_reference [r_0; …; r_N]
-    + from_given [u_r; …] + from_target [α_0; …; α_N]. The last entries of t are the lowest and highest values of the
-    limits `checked` of the targets. Where one is outside [low, high], g has moved a target outside its limits, and
-    from_target moves the plan to the nearest one inside.
+    + from_given [u_r; …] + from_target [α_0 − ᾱ_0; …; α_N − ᾱ_N], ᾱ the coordinates of a target as if there were no
+    limits. The last entries of t are the lowest and highest values of the limits `checked` of the targets. Where one
+    is outside [low, high], g has moved a target outside its limits, and from_target moves the plan to the nearest one
+    inside.
 
     Attributes
     ----------
@@ -214,6 +216,9 @@ class KoopmanMPC(MPCBase):
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference_key: bytes | None = None
         self._given_row, self._rows_left = 0, False  # u_target in rows: which is this step's, and whether others follow
+        self._aimed = False  # whether the plan's last column is that of the reference
+        self._going = False  # whether a step was made since reset: the first one repeats to the bit in every run
+        self._rows = np.zeros((self._N + 1, len(track.tracked)))
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # the states of a plan, once somebody asks for one
 
     def _made_of(self) -> tuple[str, LinearPredictor, dict[str, Any]]:
@@ -284,6 +289,7 @@ class KoopmanMPC(MPCBase):
         """Forget all earlier steps; see `MPCBase`."""
         super().reset(x0, u_prev)
         self._qps.reset()
+        self._going = False
         if self._given_row:
             self._given_row, self._rows_left, self._reference_key = 0, False, None
 
@@ -341,20 +347,32 @@ class KoopmanMPC(MPCBase):
         try:
             start = perf_counter()
             target = numbers(reference, "reference")
-            key = target.tobytes()
+            key, moving = target.tobytes(), None
             if key != self._reference_key:
-                self._aim(target)
-                self._reference_key = key
+                finite = self._take_reference(target)
+                moving = self._map.moving if finite and self._going else None
+                self._reference_key, self._aimed = key, False
+            if moving is None and not self._aimed:
+                self._aim()
+            self._going = True
             origin = self._initial
             origin.take(y, self._given, applied, w)
             if self._rows_left:  # the next call has its own row of a given u_target
                 self._given_row, self._reference_key = self._given_row + 1, None
             plan, t = self._map, self._spare
-            plan.matrix.dot(origin.known, t)
-            np.greater_equal(t, plan.low, out=plan.met_low)
-            np.less_equal(t, plan.high, out=plan.met_high)
-            # no 0 byte: every limit is met, and nothing is NaN (NaN meets no limit)
-            move = self._solve_limited(t, applied, start) if 0 in plan.met else self._return_free_plan(t, start)
+            if moving is None:
+                plan.matrix.dot(origin.known, t)
+                np.greater_equal(t, plan.low, out=plan.met_low)
+                np.less_equal(t, plan.high, out=plan.met_high)
+                # no 0 byte: every limit is met, and nothing is NaN (NaN meets no limit)
+                move = self._solve_limited(t, applied, start) if 0 in plan.met else self._return_free_plan(t, start)
+            else:
+                moving.start[:] = origin.known
+                moving.matrix.dot(moving.known, moving.t)
+                np.greater_equal(moving.t, moving.low, out=moving.met_low)
+                np.less_equal(moving.t, moving.high, out=moving.met_high)
+                t[: plan.planned] = moving.t[: plan.planned]
+                move = self._solve_moving(t, applied, start) if 0 in moving.met else self._return_free_plan(t, start)
             if origin.refused:
                 move.refused = True
             watch = self._watch
@@ -373,30 +391,52 @@ class KoopmanMPC(MPCBase):
         X = self._states.dot(np.concatenate((moves, self._initial.known)))
         return Plan(X.reshape(self._N + 1, -1), moves.reshape(-1, self.nu)[self._move_of])
 
-    def _aim(self, reference: Float[np.ndarray, "..."]) -> None:
+    @property
+    def _reference(self) -> Float[np.ndarray, "N1 nr"]:
+        """The rows r_k … r_{k+N} of the last call."""
+        return self._rows if self._map.moving is None else self._map.moving.rows
+
+    def _take_reference(self, reference: Float[np.ndarray, "..."]) -> bool:
+        """Keep the rows of the reference that the plan reads; return whether all are finite."""
+        moving, shape, latency, R = self._map.moving, reference.shape, self._latency, self._reference
+        if shape == R.shape[1:] or (shape == R.shape and not latency):
+            R[:] = reference
+        else:
+            R[:] = checks.reference_rows(reference, self._N, R.shape[1], latency)
+        given = self._map.track.given
+        if given is not None:
+            self._rows_left = self._given_row + 1 < len(given)
+            if moving is not None:
+                moving.given[:] = self._given_ahead()
+        return dasum(R.reshape(-1) if moving is None else moving.flat) < HUGE
+
+    def _given_ahead(self) -> Float[np.ndarray, "N1 nu"]:
+        """Return the rows of a given u_target that belong to the reference's."""
+        given, first = self._map.given_ahead, self._given_row + self._latency
+        return given[first : first + self._N + 1] if first < len(given) - self._N else given[-self._N - 1 :]
+
+    def _aim(self) -> None:
         """Write the part of the plan that depends on the reference into the last column of the plan's matrix.
 
         Where a row of the reference is not finite, the column is NaN: no limit is met then, and the step ends in
         BAD_MEASUREMENT.
         """
-        plan, maps, found = self._map, self._map.maps, self._map.targets
-        R = self._reference = checks.reference_rows(reference, self._N, len(plan.track.tracked), self._latency)
-        given, column = plan.track.given, plan.matrix[:, -1]
-        self._rows_left = given is not None and self._given_row + 1 < len(given)
-        if not np.isfinite(R).all():
+        plan, maps, targets, R = self._map, self._map.maps, self._map.targets, self._reference
+        column, self._aimed = plan.matrix[:, -1], not self._rows_left
+        if not (np.abs(R) < HUGE).all():
             column[:] = np.nan
             return
-        v = maps.from_reference @ R.ravel() + maps.offset
-        if given is not None:
-            ahead = np.arange(len(R)) + self._given_row + self._latency
-            v += maps.from_given @ given[np.minimum(ahead, len(given) - 1)].ravel()
+        v = maps.from_reference.dot(R.reshape(-1))
+        v += maps.offset
+        if plan.track.given is not None:
+            v += maps.from_given @ self._given_ahead().reshape(-1)
         if plan.aimed:
-            driven = plan.disturbance.shape[1] > 0
-            alpha = found.nearest(R) if driven else found.coordinates(R)
-            v += maps.from_target @ alpha.ravel()
-            if driven:
-                values = (alpha @ found.rows.T)[:, plan.checked]
+            alpha = targets.nearest(R)
+            if plan.disturbance.shape[1]:
+                values = (alpha @ targets.rows.T)[:, plan.checked]
                 column[plan.planned :] = np.concatenate([values.min(axis=0), values.max(axis=0)])
+            else:
+                v += maps.from_target @ (targets.coordinates(R) - alpha).ravel()
         column[: plan.planned] = v
 
     def _return_free_plan(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
@@ -404,6 +444,18 @@ class KoopmanMPC(MPCBase):
         self._plan, self._spare = t, self._plan
         self._keep(t)
         return self._move(self._given.copy(), Status.UNCONSTRAINED, 0, start)
+
+    def _solve_moving(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
+        """Handle a step like `_solve_limited`, of a plan t from one product with the reference."""
+        plan, moving, n = self._map, self._map.moving, self._map.planned
+        if moving is not None and moving.met_low[n:].all() and moving.met_high[n:].all():
+            t[n:] = plan.inside  # no limit moves a target
+        else:
+            self._aim()
+            plan.matrix.dot(self._initial.known, t)
+            if (t >= plan.low).all() and (t <= plan.high).all():
+                return self._return_free_plan(t, start)
+        return self._solve_limited(t, applied, start)
 
     def _solve_limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Handle a step in which the plan or its target breaks a limit, or something is not finite."""

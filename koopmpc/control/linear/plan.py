@@ -18,6 +18,8 @@ from koopmpc.control.terminal_cost import terminal_of
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Viewing
 
+_LARGEST = 2**16  # entries of a MovingMap: a larger one takes longer than the sparse products that it replaces
+
 
 class PlanLimits(NamedTuple):
     """The limits of every entry of a plan [moves; their changes, where they have limits; outputs], stage by stage.
@@ -55,8 +57,8 @@ class PlanMap(Viewing):
         Lengths of the blocks of steps in which an input is held.
     moves, planned
         Entries of the inputs, which come first, and of v.
-    box
-        Limits of the inputs.
+    box, inside
+        Limits of the inputs, and values of the last rows of t that meet their limits.
     deviation
         How a solution w of the QP moves the inputs.
     disturbance
@@ -65,6 +67,10 @@ class PlanMap(Viewing):
         Whether a target enters the plan.
     qp
         The QP of w.
+    given_ahead
+        The rows of a given u_target, the last one repeated for a preview.
+    moving
+        The map of a reference that moves, where one product is fast.
     met
         A byte for each limit, met or not; `met_low` and `met_high` are views of the lower and of the upper ones.
     """
@@ -72,7 +78,7 @@ class PlanMap(Viewing):
     _VIEWS = ("met", "met_low", "met_high")
 
     def __init__(self, track: LiftedTracking, targets: Targets, horizon: Horizon, maps: Condensed) -> None:
-        self.track, self.targets, self.maps = track, targets, maps
+        self.track, self.targets = track, targets
         self.moves, self.blocks = len(maps.hessian), horizon.blocks
         self.deviation = maps.deviation[: self.moves]
         limits = _plan_limits(track, horizon, maps.deviation)
@@ -83,6 +89,7 @@ class PlanMap(Viewing):
         driven = self.disturbance.shape[1] > 0
         self.checked = np.zeros(len(targets.low), dtype=np.bool_)
         self.aimed = bool(maps.from_target.any())
+        self.maps = _fold_targets(maps, targets) if self.aimed else maps
         if driven:
             first = maps.from_drive
         if driven and self.aimed:
@@ -99,9 +106,13 @@ class PlanMap(Viewing):
         self.planned = nv
         self.low, self.high = np.maximum(low, -HUGE), np.minimum(high, HUGE)  # inf meets no limit
         self.box = Interval(self.low[: self.moves], self.high[: self.moves])
+        self.inside = np.clip(0.0, self.low[nv:], self.high[nv:])
         from_state = np.zeros((len(low), horizon.size))
         from_state[:nv] = maps.from_state
         self.matrix = np.ascontiguousarray(np.column_stack([from_state, first, np.zeros(len(low))]))
+        given = np.zeros((1, len(track.inputs.low))) if track.given is None else track.given
+        self.given_ahead = np.vstack([given, np.tile(given[-1], (horizon.N, 1))])
+        self.moving = MovingMap.of(self, len(track.tracked), len(track.inputs.low))
         self._see()
 
     def _see(self) -> None:
@@ -110,6 +121,68 @@ class PlanMap(Viewing):
         self.met = bytearray(2 * rows)
         met = np.frombuffer(self.met, dtype=np.bool_)
         self.met_low, self.met_high = met[:rows], met[rows:]
+
+
+class MovingMap(Viewing):
+    """t = M [z; u_{−1}; g; 1; r_0; …; r_N; u_r …]: the plan, and the limited values of each row's target.
+
+    One product serves a reference that moves. Where low ≤ t ≤ high, the plan is the optimum, and no limit moves a
+    target. The input targets u_r are there where they are given.
+
+    Attributes
+    ----------
+    known
+        What M is multiplied by, with the views `start`, `rows`, `given`, and `flat`, the rows one after the other.
+    met
+        A byte for each limit, as in `PlanMap`.
+    """
+
+    _VIEWS = ("met", "met_low", "met_high", "start", "flat", "rows", "given")
+
+    def __init__(self, plan: "PlanMap", nr: int, nu: int) -> None:
+        maps, targets, fixed = plan.maps, plan.targets, plan.matrix[: plan.planned, :-1]
+        steps, given = maps.from_reference.shape[1] // nr, plan.track.given
+        parts = [fixed, maps.offset[:, None], maps.from_reference]
+        low, high = [plan.low[: plan.planned]], [plan.high[: plan.planned]]
+        tests = np.zeros((0, fixed.shape[1] + 1 + maps.from_reference.shape[1]))
+        if plan.aimed:
+            limited = np.isfinite(targets.low) | np.isfinite(targets.high)
+            K = targets.rows[limited] @ targets.from_reference
+            drive = np.zeros((len(K), fixed.shape[1]))
+            if plan.checked.any():
+                drive = plan.matrix[plan.planned : plan.planned + len(K), :-1]
+            once = np.column_stack([drive, targets.rows[limited] @ targets.offset])
+            tests = np.column_stack([np.tile(once, (steps, 1)), np.kron(np.eye(steps), K)])
+            reach = ROUNDING * targets.size[limited]
+            low.append(np.tile(targets.low[limited] - reach, steps))
+            high.append(np.tile(targets.high[limited] + reach, steps))
+        if given is not None:
+            parts.append(maps.from_given)
+            tests = np.column_stack([tests, np.zeros((len(tests), maps.from_given.shape[1]))])
+        self.matrix = np.ascontiguousarray(np.vstack([np.column_stack(parts), tests]))
+        self.low, self.high = np.maximum(np.concatenate(low), -HUGE), np.minimum(np.concatenate(high), HUGE)
+        self.t, self.known = np.zeros(len(self.matrix)), np.zeros(self.matrix.shape[1])
+        self._sizes = fixed.shape[1] + 1, steps, nr, nu
+        self._see()
+
+    def _see(self) -> None:
+        """Make the views; see `Viewing`."""
+        first, steps, nr, nu = self._sizes
+        count, last = len(self.t), first + steps * nr
+        self.met = bytearray(2 * count)
+        met = np.frombuffer(self.met, dtype=np.bool_)
+        self.met_low, self.met_high = met[:count], met[count:]
+        self.start = self.known[:first]
+        self.flat = self.known[first:last]
+        self.rows = self.flat.reshape(steps, nr)
+        self.given = self.known[last:].reshape(-1, nu)
+
+    @staticmethod
+    def of(plan: "PlanMap", nr: int, nu: int) -> "MovingMap | None":
+        """Return the map of a plan; None where one product would be slower than its parts."""
+        rows, columns = plan.planned, plan.matrix.shape[1] + plan.maps.from_reference.shape[1]
+        steps = plan.maps.from_reference.shape[1] // nr
+        return MovingMap(plan, nr, nu) if (rows + steps * len(plan.targets.low)) * columns <= _LARGEST else None
 
 
 @checks.explain_overflow()
@@ -131,6 +204,17 @@ def plan_map(
     law = recursion(parts, end.P, end.p)
     maps = condense(own, law, end, aims, units, coordinates)
     return PlanMap(track, targets, horizon, _scale_deviation(maps, track.inputs, len(blocks)))
+
+
+def _fold_targets(maps: Condensed, targets: Targets) -> Condensed:
+    """Return the maps of F_α (α − ᾱ) in place of F_α α, ᾱ(r) the coordinates as if there were no limits.
+
+    Where no limit moves a target, the last term is zero, and F_r r + f is the whole share of the reference.
+    """
+    rows, steps = len(maps.from_target), maps.from_reference.shape[1] // targets.from_reference.shape[1]
+    each = maps.from_target.reshape(rows, steps, len(targets.offset))
+    from_reference = maps.from_reference + (each @ targets.from_reference).reshape(rows, -1)
+    return replace(maps, from_reference=from_reference, offset=maps.offset + each.sum(axis=1) @ targets.offset)
 
 
 def _scale_deviation(maps: Condensed, inputs: Interval, stages: int) -> Condensed:
