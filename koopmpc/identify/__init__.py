@@ -18,5 +18,6 @@ if TYPE_CHECKING:
     from koopmpc.identify.fits.sparse import sparse_edmd as sparse_edmd
     from koopmpc.identify.fits.stable import stable_edmd as stable_edmd
     from koopmpc.identify.records.narx import narx as narx
+    from koopmpc.identify.records.subspace import subspace as subspace
 else:
     __getattr__, __dir__, __all__ = attach(__name__)
