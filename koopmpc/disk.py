@@ -7,9 +7,13 @@ import errno
 import io
 import os
 import secrets
+import shutil
 import stat
+import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
+from functools import cache
+from multiprocessing.util import Finalize
 from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -22,6 +26,7 @@ from koopmpc.errors import DataError, FullDiskError, LogError
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _DEFLATED = 1100  # deflate makes a member at most 1032 times smaller
 _PIECE = 1 << 22  # bytes that are read at once
+_SHELF, _LOCK = "koopmpc-", ".lock"  # names of a process's folder of temporary files, and of its lock
 
 
 def path_of(path: object, advice: str = "pass text or a pathlib.Path") -> Path:
@@ -231,3 +236,46 @@ def memory() -> int | None:
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
     return None
+
+
+def make_temporary_folder() -> Path:
+    """Return a new folder for what this process needs until it ends; it is removed then.
+
+    What a process left that was killed goes when another one that uses such folders ends.
+    """
+    return Path(tempfile.mkdtemp(dir=_open_shelf(os.getpid())))
+
+
+@cache
+def _open_shelf(process: int) -> Path:
+    """Return the folder of this process, whose folders of temporary files lie in it; `process` is its id.
+
+    A lock on the file beside it tells other processes that this one lives.
+    """
+    lock, name = tempfile.mkstemp(_LOCK, _SHELF)  # open, and locked, until the process ends
+    _lock(lock)
+    shelf = Path(name.removesuffix(_LOCK))
+    shelf.mkdir(mode=0o700)
+    Finalize(None, _remove_shelves, (shelf,), exitpriority=0)  # worker processes do not run atexit
+    return shelf
+
+
+def _lock(file: int) -> bool:
+    """Lock an open file for this process; return whether it was free. Windows has no such lock: none is free."""
+    with suppress(ImportError, OSError):
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return True
+    return False
+
+
+def _remove_shelves(own: Path) -> None:
+    """Remove the folder of this process, and those of processes that were killed."""
+    shutil.rmtree(own, ignore_errors=True)
+    Path(f"{own}{_LOCK}").unlink(missing_ok=True)
+    for mark in own.parent.glob(f"{_SHELF}*{_LOCK}"):
+        with suppress(OSError), mark.open() as stream:
+            if _lock(stream.fileno()):
+                shutil.rmtree(mark.with_suffix(""), ignore_errors=True)
+                mark.unlink()

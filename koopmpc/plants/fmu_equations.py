@@ -1,14 +1,20 @@
 # pyright: basic
 """A model-exchange unit as a step map: its equations through CasADi, with their derivatives."""
 
+import hashlib
+import os
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.disk import make_temporary_folder
 from koopmpc.errors import DataError
 from koopmpc.plants.dynamics import Integrator
 from koopmpc.plants.fmu_files import StartValue, UnitDescription, UnitVariable, collect_limits, read_description
@@ -85,8 +91,10 @@ def read_equations(
             f"{unit.file} has {unit.events} event indicators: by model exchange koopmpc steps over events; pass "
             'interface="co-simulation" where the unit offers it, or export the model without events'
         )
+    with unit.path.open("rb") as stream:
+        folder = _unpack(unit.path, hashlib.file_digest(stream, "sha256").hexdigest(), os.getpid())
     try:
-        builder = ca.DaeBuilder(unit.source.modelName, str(unit.path), {"enable_ls_serialization": False})
+        builder = ca.DaeBuilder(unit.source.modelName, str(folder), {"enable_ls_serialization": False})
         for name, value in values.items():
             builder.set(name, value)
         names, all_inputs = builder.x(), builder.u()
@@ -123,6 +131,18 @@ def read_equations(
     f = ca.Function("f", [x, u], [slope], ["x", "u"], ["dx"])
     h = None if measured == states else ca.Function("h", [x], [y], ["x"], ["y"])
     return UnitEquations(f, h, start, states, moved, measured, values)
+
+
+@cache
+def _unpack(path: Path, content: str, process: int) -> Path:
+    """Return the folder of a unit that this process unpacked; `content` is the hash of its file.
+
+    CasADi 3.8 itself would unpack into the present folder, and leave there what lives until the process ends.
+    """
+    folder = make_temporary_folder()
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(folder)
+    return folder
 
 
 def _require_autonomous(f: ca.Function, x: np.ndarray, u: np.ndarray, file: str) -> None:

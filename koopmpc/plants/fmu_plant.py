@@ -2,7 +2,6 @@
 """km.plants.fmu: a Functional Mock-up Unit as a plant, by model exchange as a step map or by co-simulation."""
 
 import shutil
-import tempfile
 import weakref
 from collections.abc import Mapping, Sequence
 from ctypes import c_double, c_uint
@@ -14,6 +13,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.disk import make_temporary_folder
 from koopmpc.errors import DataError, LogError
 from koopmpc.plants.dynamics import RK4, Integrator
 from koopmpc.plants.fmu_equations import FMUStepMap, read_equations
@@ -292,7 +292,7 @@ def _reload(path: str, *parts: Any) -> FMUPlant:
 def _load(unit: UnitDescription, messages: list[str]) -> Any:
     """Return an instance of a co-simulation unit in FMPy; its machine code is unpacked into a temporary folder."""
     fmpy = import_fmpy()
-    folder = tempfile.mkdtemp(prefix="koopmpc-fmu-")
+    folder = str(make_temporary_folder())
 
     def log(*parts: Any) -> None:
         text = parts[-1].decode(errors="replace") if isinstance(parts[-1], bytes) else ""

@@ -1,10 +1,12 @@
 """Functional Mock-up Units as plants: km.plants.fmu."""
 
 import copy
+import os
 import pickle
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -235,6 +237,36 @@ def test_units_that_cannot_be_a_plant_say_why(folder, pendulum, pendulum3, tanks
             for inside, text in held.items():
                 archive.writestr(inside, text)
         refuse(folder / f"{name}.fmu", message)
+
+
+HELD = """
+import os, sys, tempfile
+import koopmpc as km
+from koopmpc.parallel import map_tasks
+
+def run(unit):
+    noise = km.Noise(-1, 1)
+    return len(km.collect(unit, km.Uniform([0, 0], [1, 1]), noise, episodes=2, steps=2)), os.listdir(".")
+
+kinds = ["model exchange", "co-simulation"]
+units = [km.plants.fmu(sys.argv[1], dt=0.05, interface=kind, outputs=["theta", "omega"]) for kind in kinds]
+mpc = km.NonlinearMPC(units[0], km.Cost(Q=[1, 1], R=0.1), horizon=3)
+assert list(map_tasks(run, units, workers=2)) == [(2, [])] * 2
+assert [run(unit) for unit in units] == [(2, [])] * 2
+assert any(name.startswith("koopmpc-") for name in os.listdir(tempfile.gettempdir()))
+"""
+
+
+def test_processes_with_units_leave_no_files_behind(pendulum, tmp_path):
+    places = [tmp_path / "here", tmp_path / "temporary"]
+    for place in places:
+        place.mkdir()
+    words = [sys.executable, "-c", HELD, str(pendulum)]
+    path = os.pathsep.join([str(Path(km.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    env = os.environ | {"TMPDIR": str(places[1]), "PYTHONPATH": path}
+    done = subprocess.run(words, cwd=places[0], env=env, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [list(place.iterdir()) for place in places] == [[], []]
 
 
 def test_an_episode_cannot_begin_where_the_unit_does_not_let_it(pendulum):
