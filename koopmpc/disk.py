@@ -26,7 +26,8 @@ from koopmpc.errors import DataError, FullDiskError, LogError
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _DEFLATED = 1100  # deflate makes a member at most 1032 times smaller
 _PIECE = 1 << 22  # bytes that are read at once
-_SHELF, _LOCK = "koopmpc-", ".lock"  # names of a process's folder of temporary files, and of its lock
+_SHELF = "koopmpc-"  # begins the name of a process's folder of temporary files
+_LOCK = ".lock"  # ends the name of the file beside it
 
 
 def path_of(path: object, advice: str = "pass text or a pathlib.Path") -> Path:
