@@ -65,8 +65,13 @@ def _store(shape: Any, *names: str) -> None:
 
 
 def _plain(value: Any) -> Any:
-    plain = value.tolist() if isinstance(value, np.ndarray) else value
-    return tuple(map(_plain, cast("list[Any]", plain))) if isinstance(plain, list | tuple) else plain
+    plain: Any = value.tolist() if isinstance(value, np.ndarray) else value
+    if not isinstance(plain, list | tuple):
+        return plain
+    parts = cast("Sequence[Any]", plain)
+    if parts and isinstance(parts[0], float | int):  # one point, as a scene draws thousands of
+        return tuple(parts)
+    return tuple(map(_plain, parts))
 
 
 Shape = Line | Box | Disk

@@ -40,21 +40,28 @@ UNDER_FAULTS = "under faults: cost over that without the fault (steps that fell 
 
 def results_table(rows: Sequence[RunRow]) -> RenderableType:
     """Return one table for each case, each failure in full and once, and what the columns mean, within 100 columns."""
-    parts: list[RenderableType] = []
-    for (problem, case), group in groupby(rows, key=lambda row: (row.problem, row.case)):
-        ran = list(group)
-        parts.append(_case(f"{problem}:{case}", [row for row in ran if row.fault is None]))
-        if any(row.fault is not None for row in ran):
-            parts.append(_under_faults(f"{problem}:{case} under faults", ran))
+    cases = groupby(rows, key=lambda row: (row.problem, row.case))
+    return Group(*(case_table(list(group)) for _, group in cases), explain_results(rows))
+
+
+def case_table(rows: Sequence[RunRow]) -> RenderableType:
+    """Return the table of the runs of one case, and the one under faults where there are such runs."""
+    title = f"{rows[0].problem}:{rows[0].case}"
+    table = _case(title, [row for row in rows if row.fault is None])
+    broken = any(row.fault is not None for row in rows)
+    return Group(table, _under_faults(f"{title} under faults", rows)) if broken else table
+
+
+def explain_results(rows: Sequence[RunRow]) -> RenderableType:
+    """Return each failure in full and once, and what the columns mean."""
     failed: dict[str, list[str]] = {}
     for row in rows:
         if row.failure is not None:
             what = " ".join(filter(None, (f"{row.problem}:{row.case}", row.controller, row.fault)))
             failed.setdefault(row.failure, []).append(what)
-    parts += [Text(f"{', '.join(which)}: {failure}", style="red") for failure, which in failed.items()]
+    parts = [Text(f"{', '.join(which)}: {failure}", style="red") for failure, which in failed.items()]
     broken = any(row.fault is not None for row in rows)
-    parts.append(Text(f"{LEGEND}\n{UNDER_FAULTS if broken else TIMES}", style="dim"))
-    return Group(*parts)
+    return Group(*parts, Text(f"{LEGEND}\n{UNDER_FAULTS if broken else TIMES}", style="dim"))
 
 
 def _case(title: str, rows: list[RunRow]) -> Table:

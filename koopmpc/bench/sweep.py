@@ -3,11 +3,12 @@
 import pickle
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache, partial
-from itertools import islice, product
+from itertools import groupby, islice, product
 from pathlib import Path
 from typing import Any, NamedTuple
 from uuid import uuid4
@@ -65,6 +66,7 @@ def sweep(
     live: bool = False,
     paced: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
+    on_case: Callable[[list[RunRow]], None] | None = None,
 ) -> list[RunRow]:
     """Run each controller on each case of each problem, and judge all by the same cost and limits.
 
@@ -108,6 +110,8 @@ def sweep(
         Whether each run takes as long as its plant would, to be watched.
     progress
         Called with (name of the run, runs done, runs in all).
+    on_case
+        Called with all runs of a case when the last one is finished; cases come in their order.
 
     Returns
     -------
@@ -151,9 +155,13 @@ def sweep(
         grid = _Grid(uuid4().hex, dict(sent), folder.resolve(), log_starts, live, paced, monitor, compiled)
         where: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
 
+        cases = deque(list(group) for _, group in groupby(rows, key=lambda row: (row.problem, row.case)))
+
         def say(what: str) -> None:
             if progress is not None:
                 progress(what.replace("-", ":", 1), len(done), len(rows))
+            while on_case is not None and cases and all(row.key in done for row in cases[0]):
+                on_case(_in_order(cases.popleft(), done))
 
         say(left[0].name if left else "done")
         due = time.monotonic() + _FIRST

@@ -6,7 +6,7 @@ import shlex
 import shutil
 import sys
 import warnings
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -64,9 +64,26 @@ def near(path: str) -> str:
         return path
 
 
+class Bar:
+    """A progress bar on stderr; calling it with (what, done, total) moves it."""
+
+    def __init__(self, shown: Any, first: str) -> None:
+        self._shown, self._task = shown, shown.add_task(first, total=None)
+
+    def __call__(self, what: str, done: int, total: int | None) -> None:
+        """Show what is under way, and how many of all are done."""
+        self._shown.update(self._task, description=what[:40], completed=done, total=total)
+
+    def print(self, text: Any) -> None:
+        """Print to stdout above the bar."""
+        self._shown.stop()
+        console().print(text)
+        self._shown.start()
+
+
 @contextmanager
-def bar(first: str, *, rate: bool = False) -> Generator[Callable[[str, int, int | None], None]]:
-    """Show a progress bar on stderr and yield the function that moves it: (what, done, total).
+def bar(first: str, *, rate: bool = False) -> Generator[Bar]:
+    """Show a progress bar on stderr and yield it.
 
     With `rate` it shows how many are done in a second, and how long the rest takes at that rate.
     """
@@ -79,8 +96,7 @@ def bar(first: str, *, rate: bool = False) -> Generator[Callable[[str, int, int 
     columns = [progress.TextColumn("{task.description:40}"), progress.BarColumn(), progress.MofNCompleteColumn()]
     columns += [progress.TimeElapsedColumn(), *((Rate(), progress.TimeRemainingColumn()) if rate else ())]
     with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        task = shown.add_task(first, total=None)
-        yield lambda what, done, total: shown.update(task, description=what[:40], completed=done, total=total)
+        yield Bar(shown, first)
 
 
 def console() -> Console:

@@ -16,6 +16,7 @@ from koopmpc.interrupts import ENDING
 
 if TYPE_CHECKING:
     from koopmpc.bench.problem import Problem
+    from koopmpc.bench.store import RunRow
 
 _PROBLEM = "A name that `koopmpc list` shows, or the path of a problem file; `:case` after it keeps one case."
 Live = Annotated[
@@ -182,25 +183,31 @@ def _sweep(
     what: str,
     **asked: Any,
 ) -> None:
-    """Sweep with a progress bar, print the table, and exit with 1 where a run did not end as it should."""
+    """Sweep with a progress bar, print the tables, and exit with 1 where a run did not end as it should."""
     from koopmpc.bench.controllers import controller_names
-    from koopmpc.bench.report import build_summary_table, results_table, write_report
+    from koopmpc.bench.report import build_summary_table, case_table, explain_results, write_report
     from koopmpc.bench.store import row_to_view
     from koopmpc.bench.sweep import sweep
 
     controller_names(controllers)
     folder = new_folder(logs, what) if folder is None else folder
     ENDING.folder = folder
+    single = asked.get("starts", 1) == asked.get("seeds", 1) == 1
+    single &= all(share == 0 for name in ("noise", "wrong") for share in asked.get(name, ()))
     with bar("", rate=True) as progress:
-        rows = sweep(problems, controllers, folder=folder, progress=progress, **asked)
-    single = all(row.start == row.seed == row.noise == row.wrong == 0 for row in rows)
-    console().print(results_table(rows) if single else build_summary_table(rows))
+
+        def show_case(runs: "list[RunRow]") -> None:
+            if single:
+                progress.print(case_table(runs))
+
+        rows = sweep(problems, controllers, folder=folder, progress=progress, on_case=show_case, **asked)
+    console().print(explain_results(rows) if single else build_summary_table(rows))
     if not single:
         say(f"\nreport: {write_report(folder)}")
     say(f"\nlogs and results.parquet: {folder}")
-    shown = row_to_view(rows)
-    if shown is not None:
-        say(f"look at a run: {format_command('view', shown.log)}")
+    best = row_to_view(rows)
+    if best is not None:
+        say(f"look at a run: {format_command('view', best.log)}")
     if any(row.failure is not None for row in rows):
         raise typer.Exit(1)
 

@@ -2,7 +2,8 @@
 """Scenes: the shapes that scene(x, u) returns over time, as Rerun draws them."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import dataclass, field, fields
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -192,16 +193,14 @@ class Names:
         """
         own = {shape.name: type(shape) for shape in scene}
         for shape in scene:
-            self._coordinates |= {np.size(point) for point in _places(shape)}
+            self._coordinates.update(len(at) if isinstance(at, tuple) else np.size(at) for at in _places(shape))
             if len(self._coordinates) > 1 or not self._coordinates <= {2, 3}:
                 many = " and ".join(str(n) for n in sorted(self._coordinates))
                 raise DataError(
                     f"the scene of step {step} draws points with {many} coordinates, the last one of {shape.name!r}; "
                     "all points and sizes of a scene have two, (x, y), or all have three, (x, y, z)"
                 )
-            if not all(
-                np.isfinite(np.asarray(getattr(shape, f.name), dtype=np.float64)).all() for f in _numbers(shape)
-            ):
+            if not _is_finite(shape):
                 raise DataError(
                     f"the scene of step {step} draws {shape.name!r} at NaN or inf; every x and u needs a place"
                 )
@@ -220,20 +219,27 @@ class Names:
         return list(scene)
 
 
-def _places(shape: Shape) -> Iterable[Any]:
+def _places(shape: Shape) -> Any:
     """Return what of a shape has a number for each coordinate."""
-    match shape:
-        case Line():
-            return shape.points
-        case Disk():
-            return [shape.center]
-        case Box():
-            return [shape.center, shape.size, *([shape.angle] if np.ndim(shape.angle) else [])]
+    if isinstance(shape, Line):
+        return shape.points
+    if isinstance(shape, Disk):
+        return (shape.center,)
+    return (shape.center, shape.size, *([shape.angle] if np.ndim(shape.angle) else []))
 
 
-def _numbers(shape: Shape) -> list[Field[Any]]:
-    """Return the fields of a shape that are places and sizes."""
-    return [field for field in fields(shape) if field.name not in ("name", "color")]
+def _is_finite(shape: Shape) -> bool:
+    """Return whether all places and sizes of a shape are finite; a finite sum has finite terms."""
+    if isinstance(shape, Line):
+        total = shape.width + sum(map(sum, shape.points))
+    elif isinstance(shape, Disk):
+        total = shape.radius + sum(shape.center)
+    else:
+        total = float(np.sum(shape.angle)) + sum(shape.center) + sum(shape.size)
+    if isfinite(total):
+        return True
+    numbers = (getattr(shape, part.name) for part in fields(shape) if part.name not in ("name", "color"))
+    return all(np.isfinite(np.asarray(value, dtype=np.float64)).all() for value in numbers)
 
 
 def draw(names: Names, scenes: Sequence[Sequence[Shape]], extent: Extent) -> dict[str, Drawing]:

@@ -108,6 +108,26 @@ def test_data_and_model_are_made_once(swept):
     assert parts.training_time > 0
 
 
+def test_the_runs_of_a_case_are_shown_when_its_last_one_is_finished(tmp_path):
+    problem, shown, done = km.load_problem(write(tmp_path)), [], []
+
+    def sweep(controllers):
+        return km.sweep(
+            [problem],
+            controllers,
+            folder=tmp_path / "logs",
+            progress=lambda what, count, total: done.append(count),
+            on_case=lambda runs: shown.append((done[-1], [(row.case, row.controller) for row in runs])),
+        )
+
+    names = ["lqr", "koopman-mpc"]
+    sweep(names)
+    cases = [[(case, name) for name in names] for case in ("near", "far")]
+    assert shown == [(2, cases[0]), (4, cases[1])]
+    sweep(names)  # all are finished already
+    assert shown[2:] == [(4, cases[0]), (4, cases[1])]
+
+
 def test_the_truth_may_be_another_plant(swept):
     problem, *_ = swept
     heavier = type(problem.dynamics)
