@@ -17,7 +17,8 @@ from koopmpc.plants.graph import Graph
 _OWN = ("koopmpc.h", "koopmpc_common.h", "koopmpc_common.c")
 _RECEDING = ("koopmpc_receding.h", "koopmpc_receding.c")
 _QP = ("koopmpc_qp.h", "koopmpc_qp.c", "koopmpc_daqp.c")
-_STAGED = ("koopmpc_stages.h", "koopmpc_stages.c", "koopmpc_staged.c", "koopmpc_rest.c", "koopmpc_finish.c")
+_STAGES = ("koopmpc_stages.h", "koopmpc_stages.c", "koopmpc_staged.c")
+_STAGED = (*_STAGES, "koopmpc_rest.c", "koopmpc_rows.c", "koopmpc_finish.c")
 _SOLVER = ("daqp.c", "auxiliary.c", "factorization.c", "constants.h", "types.h", "auxiliary.h", "daqp.h")
 _SOLVER_FILES = (*_SOLVER, "factorization.h", "LICENSE")
 _CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"  # for the step times of a whole run

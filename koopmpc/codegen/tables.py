@@ -11,11 +11,12 @@ from koopmpc.control.limits import Interval
 from koopmpc.control.linear.koopman_mpc import CondensedProgram
 from koopmpc.control.lqr import FeedbackProgram
 from koopmpc.control.nonlinear.bilinear_mpc import SETTLED
-from koopmpc.control.nonlinear.equilibrium import RANK
+from koopmpc.control.nonlinear.equilibrium import PSEUDO, RANK
 from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
 from koopmpc.control.nonlinear.iteration import DIGITS, ENOUGH, MOST, PRECISE, STUCK
 from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.program import LinearProgram, Published, StepProgram, no_export
+from koopmpc.control.riccati import SETTLED as RESTED
 from koopmpc.control.solvers.daqp import FEW
 from koopmpc.control.target import ROUNDING
 from koopmpc.errors import DataError
@@ -49,11 +50,14 @@ _TOLERANCES = {
     "HELD": (HELD, 1e-4),
     "TURN": (1e-15, 1e-7),
     "SMALL": (1e-7, 1e-4),
+    "RESTED": (RESTED, 1e-5),
+    "PSEUDO": (PSEUDO, 1e-5),
 }
 _TABLE_NOTE = (
-    "The equilibrium of a reference, and what the end of the horizon costs there, are found when the C is written: "
-    "`koopmpc_table.h` holds them for the reference rows that `export` was given. A step whose reference holds "
-    "another row is KOOPMPC_BAD_MEASUREMENT; export with all rows, or pass a table by `koopmpc_use_targets`."
+    "`koopmpc_table.h` holds the equilibria of the reference rows that `export` was given, and what the end of the "
+    "horizon costs there. Any other row may come at run time: the step that meets it finds its equilibrium from that of "
+    "the nearest row, by up to 40 times 20 Gauss-Newton steps, and keeps it. To bound the time of a step, pass all rows "
+    "to `export`."
 )
 
 
@@ -405,7 +409,8 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
     p, side, softness = program, program.sides, program.softness
     N, nx, nu, nr, ng = p.N, p.nx, p.model.nu, p.nr, len(p.box.low)
     goal = nx + nr + nu * (p.weighs_changes and p.end != "given")
-    box = len(p.rest.low) - nu if p.rest is not None else ng - (nu + len(p.soft_rates)) * p.with_rates
+    box = len(p.rest.low) - nu
+    target = nr + nx + nu + (nu + box) + nu + nu * nx
     tables.sizes |= {
         "IS_STAGED": 1,
         "NX": p.ny,
@@ -432,8 +437,8 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         "EASED": max(1, N * side.soft),
         "SOFT_RATES": len(p.soft_rates),
         "INTERIOR": MOST,
-        "DISTURBED": int(p.rest is not None),
-        "PUSHES": N * nx if p.rest is not None else 1,
+        "DISTURBED": int(p.disturbed),
+        "PUSHES": N * nx if p.disturbed else 1,
         "GIVEN_MAP": int(isinstance(p.model, StepMap)),
         "ITERATIONS": p.iterations,
         "HOLDS": int(p.holds),
@@ -442,7 +447,10 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         "GOAL": goal,
         "END": goal + nu * p.with_rates,
         "TARGETS": len(p.table),
-        "TARGET": nr + nx + nu + (nu + box) + nu + nu * nx + goal * (nr + nx + nu + 1) + 1,
+        "TARGET": target + goal * (nr + nx + nu + 1) + 1,
+        "MADE": N + 1 if p.holds else 1,
+        "MADE_SIZE": target + 1,
+        "TAIL": p.tail.steps,
     }
     arguments = {
         "map": {"x": nx, "u": nu},
@@ -487,14 +495,19 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         "sizes": p.stage_sizes,
         "input_sizes": p.input_sizes,
     }
-    if p.rest is not None:
-        tables.plan |= {
-            "rest_weight": p.rest.weight,
-            "rest_size": p.rest.size,
-            "rest_limit": p.rest.limit_size,
-            "rest_low": p.rest.low,
-            "rest_high": p.rest.high,
-        }
+    tables.plan |= {
+        "rest_weight": p.rest.weight,
+        "rest_size": p.rest.size,
+        "rest_limit": p.rest.limit_size,
+        "rest_low": p.rest.low,
+        "rest_high": p.rest.high,
+        "tail_rows": p.tail.row_size,
+        "tail_Q": p.tail.Q,
+        "tail_R": p.tail.R,
+        "tail_D": p.tail.R_delta,
+        "tail_end": p.tail.end,
+    }
+    tables.reals["TAIL_SCALE"] = p.tail.scale
     tables.reals |= {name: values[single] for name, values in _TOLERANCES.items()}
     _add_finish(tables, p, low, high)
     _add_estimator(tables, p)

@@ -378,7 +378,7 @@ class Interpreter:
     def staged(self, y, reference, applied=None, w=None):
         p, N, nx, nu, nr = self.p, self.p.N, self.p.nx, self.nu, self.p.nr
         x, u_prev, W, d = self.start(y, applied, w)
-        e = np.zeros((N, nx)) if p.rest is None else W @ p.E.T + d
+        e = np.zeros((N, nx)) if not p.disturbed else W @ p.E.T + d
         R = self.ahead(reference, N, p.latency)
         if not usable(x, R, e):
             self.warm = False
@@ -394,7 +394,7 @@ class Interpreter:
         slopes = np.array([targets[r.tobytes()][4] for r in R[:-1]])
         rest_x, rest_u, active, u_r, _, M, L, V, m = targets[R[-1].tobytes()]
         held = (R[:-1] == R[-1]).all(axis=1)
-        if p.rest is not None:
+        if p.disturbed:
             begin = self.last_target or (rest_x, rest_u)
             assert not active.any(), "a loop whose equilibria are inside their limits"
             rest_x, rest_u = self.last_target = self.follow(begin, R[-1], e[-1])

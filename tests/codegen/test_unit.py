@@ -84,17 +84,21 @@ def test_a_closed_loop_with_the_unit_is_that_with_the_controller(version, pendul
     assert {km.Status.UNCONSTRAINED, km.Status.OPTIMAL} <= seen
 
 
-def test_a_bilinear_controller_takes_the_reference_rows_of_its_export(pendulum, tmp_path):
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_bilinear_unit_takes_any_reference(version, pendulum, tmp_path):
     plant = pendulum[0]
     data = km.collect(plant, km.Uniform([-1, -2], [1, 2]), km.Noise(-6, 6), episodes=30, steps=20)
     model = km.bilinear_edmd(data, km.State() + km.Fourier(1, states=[0]), difference=True)
     mpc = km.BilinearMPC(model, COST, LIMITS, horizon=8)
-    km.export(mpc, tmp_path, name="arm", fmu=3, reference=[[0.0, 0.0], [0.2, 0.0]])
-    unit = Unit(tmp_path / "arm.fmu")
-    for k, row in enumerate([[0.0, 0.0], [0.2, 0.0]]):
-        move = mpc([0.5, 0.0], row)
-        assert unit.step(k, mpc.dt, [0.5, 0.0], row)[0] == pytest.approx(move.u, abs=1e-9)
-    assert unit.step(2, mpc.dt, [0.5, 0.0], [0.1, 0.0])[1][0] == list(km.Status).index(km.Status.BAD_MEASUREMENT)
+    km.export(mpc, tmp_path, name="arm", fmu=version)
+    unit, x, rng = Unit(tmp_path / "arm.fmu"), np.array([0.5, 0.0]), np.random.default_rng(2)
+    for k in range(20):
+        row = np.array([rng.uniform(-0.6, 0.6), 0.0]) if k % 4 == 0 else row
+        move = mpc(x, row)
+        u, (status, fallback, _) = unit.step(k, mpc.dt, x, row)
+        assert u == pytest.approx(move.u, abs=1e-9)
+        assert (list(km.Status)[status], fallback) == (move.status, 0)
+        x = plant(x, u)
 
 
 @pytest.fixture(scope="module")

@@ -141,6 +141,9 @@ typedef struct {
   koopmpc_real chord_G[(KOOPMPC_BOX + 1) * KOOPMPC_NZ];
   int has_rest, has_chord;
 #endif
+  koopmpc_real made[KOOPMPC_MADE * KOOPMPC_MADE_SIZE]; /**< equilibria of rows that the table lacks */
+  koopmpc_real made_end[KOOPMPC_TARGET];               /**< the target of the last row, if the table lacks it */
+  int made_count, made_next, has_made_end;
   const koopmpc_real *targets; /**< the table of targets, see koopmpc_use_targets */
   int finishing;               /**< whether the active-set method finished the last program of this step */
   int target_count, found;     /**< number of its rows, and the row that was found last */
@@ -212,11 +215,11 @@ void koopmpc_lift(const koopmpc_real *zeta, koopmpc_real *z);
 int koopmpc_plan_states(const koopmpc_state *s, koopmpc_real *X);
 
 /**
- * Take the targets of reference rows from another table than that of koopmpc_table.h. A step whose reference holds a
- * row that the table lacks is KOOPMPC_BAD_MEASUREMENT.
+ * Take the targets of reference rows from another table than that of koopmpc_table.h. The target of a row that the
+ * table lacks is found by the step that meets it, from the nearest one of the table.
  * @param s       the state
  * @param targets `count` rows of KOOPMPC_TARGET numbers; the memory must stay valid
- * @param count   number of rows
+ * @param count   number of rows, at least 1
  */
 void koopmpc_use_targets(koopmpc_state *s, const koopmpc_real *targets, int count);
 

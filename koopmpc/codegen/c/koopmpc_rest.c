@@ -12,8 +12,6 @@
 #include "koopmpc_solver.h"
 #include "koopmpc_stages.h"
 
-#if KOOPMPC_DISTURBED
-
 enum {
   BOX = KOOPMPC_BOX,
   ROWS_R = KOOPMPC_NR,
@@ -26,10 +24,6 @@ enum {
 #define RANK ((koopmpc_real)KOOPMPC_RANK)
 #define CLOSE ((koopmpc_real)1e-2)
 
-/** Parts of koopmpc_local at (x, u): F, its derivatives A and B, of and J, the limited g and G. */
-enum { AT_A = NX, AT_B = AT_A + NX * NX, AT_OF = AT_B + NX * NV, AT_J = AT_OF + ROWS_R, AT_G = AT_J + ROWS_R * NX };
-enum { AT_DG = AT_G + BOX, AT = AT_DG + BOX * NX };
-
 static koopmpc_real largest_of(const koopmpc_real *a, int n) {
   koopmpc_real most = 0;
   for (int i = 0; i < n; i++)
@@ -37,11 +31,7 @@ static koopmpc_real largest_of(const koopmpc_real *a, int n) {
   return most;
 }
 
-/**
- * The pseudo-inverse (n, m) of E (m, n), and a basis of its null space in the columns of `null` (n, n), by one-sided
- * Jacobi rotations of E's columns: E V = B has orthogonal columns. E is overwritten; returns the null space's size.
- */
-static int inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_real *result, koopmpc_real *null) {
+int koopmpc_inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_real *result, koopmpc_real *null) {
   koopmpc_real V[SIZE * SIZE], size[SIZE], largest = 0;
   int count = 0;
   for (int i = 0; i < n * n; i++) V[i] = i % (n + 1) == 0 ? 1 : 0;
@@ -97,7 +87,7 @@ static void residuals(const koopmpc_real *at, koopmpc_real *W) {
   for (int i = 0; i < ROWS_R; i++)
     for (int m = 0; m < ROWS_R; m++)
       for (int j = 0; j < NX; j++)
-        W[i * SIZE + j] += koopmpc_rest_weight[i * ROWS_R + m] * at[AT_J + m * NX + j] * koopmpc_rest_size[j];
+        W[i * SIZE + j] += koopmpc_rest_weight[i * ROWS_R + m] * at[LOCAL_J + m * NX + j] * koopmpc_rest_size[j];
   for (int i = 0; i < SIZE; i++) W[(ROWS_R + i) * SIZE + i] = KOOPMPC_SMALL;
 }
 
@@ -105,7 +95,7 @@ static void residuals(const koopmpc_real *at, koopmpc_real *W) {
 static void holding(const koopmpc_real *at, koopmpc_real *E) {
   for (int i = 0; i < NX; i++)
     for (int j = 0; j < SIZE; j++) {
-      const koopmpc_real value = j < NX ? at[AT_A + i * NX + j] - (i == j) : at[AT_B + i * NV + j - NX];
+      const koopmpc_real value = j < NX ? at[LOCAL_A + i * NX + j] - (i == j) : at[LOCAL_B + i * NV + j - NX];
       E[i * SIZE + j] = value * koopmpc_rest_size[j] / koopmpc_rest_size[i];
     }
 }
@@ -131,7 +121,7 @@ static void least(const koopmpc_real *W, const koopmpc_real *null, int count, ko
     }
   koopmpc_fill(back, 0, SIZE * LEFT);
   if (!count) return;
-  (void)inverse(turned, LEFT, count, KOOPMPC_TURN, inverted, 0);
+  (void)koopmpc_inverse(turned, LEFT, count, KOOPMPC_TURN, inverted, 0);
   for (int i = 0; i < SIZE; i++)
     for (int j = 0; j < count; j++)
       for (int m = 0; m < LEFT; m++) back[i * LEFT + m] += null[i * SIZE + j] * inverted[j * LEFT + m];
@@ -142,35 +132,40 @@ static void scaled(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *s
   for (int i = 0; i < SIZE; i++) s[i] = (i < NX ? x[i] : u[i - NX]) / koopmpc_rest_size[i];
 }
 
+void koopmpc_factors(const koopmpc_real *at, koopmpc_real *H, koopmpc_real *T) {
+  koopmpc_real E[MOST_ROWS * SIZE], gain[SIZE * MOST_ROWS], null[SIZE * SIZE], W[LEFT * SIZE];
+  int count;
+  holding(at, E);
+  count = koopmpc_inverse(E, NX, SIZE, RANK, gain, null);
+  residuals(at, W);
+  least(W, null, count, T);
+  for (int j = 0; j < NX; j++)
+    for (int i = 0; i < SIZE; i++) {
+      koopmpc_real sum = -gain[i * NX + j];
+      for (int m = 0; m < LEFT; m++) {
+        koopmpc_real through = 0;
+        for (int n = 0; n < SIZE; n++) through += W[m * SIZE + n] * gain[n * NX + j];
+        sum += T[i * LEFT + m] * through;
+      }
+      H[i * NX + j] = sum;
+    }
+}
+
+#if KOOPMPC_DISTURBED
 /** One step with the factors of an earlier equilibrium close by; 0 if the step leads far. */
 static int chord(koopmpc_state *k, koopmpc_real *x, koopmpc_real *u, const koopmpc_real *row, const koopmpc_real *e) {
-  koopmpc_real s[SIZE], at[AT], left[LEFT], step[SIZE], missed[NX], close, far = 0;
+  koopmpc_real s[SIZE], at[KOOPMPC_LOCAL], left[LEFT], step[SIZE], missed[NX], close, far = 0;
   scaled(x, u, s);
   close = CLOSE * (1 + largest_of(s, SIZE));
   koopmpc_local(x, u, at);
   for (int i = 0; i < SIZE; i++) far = koopmpc_abs(s[i] - k->chord_s[i]) > far ? koopmpc_abs(s[i] - k->chord_s[i]) : far;
   if (!k->has_chord || far > close) {
-    koopmpc_real E[MOST_ROWS * SIZE], gain[SIZE * MOST_ROWS], null[SIZE * SIZE], W[LEFT * SIZE];
-    int count;
-    holding(at, E);
-    count = inverse(E, NX, SIZE, RANK, gain, null);
-    residuals(at, W);
-    least(W, null, count, k->chord_T);
-    for (int j = 0; j < NX; j++)
-      for (int i = 0; i < SIZE; i++) {
-        koopmpc_real sum = -gain[i * NX + j];
-        for (int m = 0; m < LEFT; m++) {
-          koopmpc_real through = 0;
-          for (int n = 0; n < SIZE; n++) through += W[m * SIZE + n] * gain[n * NX + j];
-          sum += k->chord_T[i * LEFT + m] * through;
-        }
-        k->chord_H[i * NX + j] = sum;
-      }
-    koopmpc_copy(k->chord_G, at + AT_DG, BOX * NX);
+    koopmpc_factors(at, k->chord_H, k->chord_T);
+    koopmpc_copy(k->chord_G, at + LOCAL_DG, BOX * NX);
     koopmpc_copy(k->chord_s, s, SIZE);
     k->has_chord = 1;
   }
-  residual(row, at + AT_OF, s, left);
+  residual(row, at + LOCAL_OF, s, left);
   for (int i = 0; i < NX; i++) missed[i] = (at[i] + e[i] - x[i]) / koopmpc_rest_size[i];
   for (int i = 0; i < SIZE; i++)
     step[i] = koopmpc_dot(k->chord_H + i * NX, missed, NX) + koopmpc_dot(k->chord_T + i * LEFT, left, LEFT);
@@ -180,7 +175,7 @@ static int chord(koopmpc_state *k, koopmpc_real *x, koopmpc_real *u, const koopm
     if (i < NV) {
       reached = u[i] + step[NX + i] * koopmpc_rest_size[NX + i];
     } else {
-      reached = at[AT_G + i - NV];
+      reached = at[LOCAL_G + i - NV];
       for (int j = 0; j < NX; j++) reached += k->chord_G[(i - NV) * NX + j] * step[j] * koopmpc_rest_size[j];
     }
     if (reached > koopmpc_rest_high[i] || reached < koopmpc_rest_low[i]) return 0;
@@ -190,13 +185,15 @@ static int chord(koopmpc_state *k, koopmpc_real *x, koopmpc_real *u, const koopm
   return 1;
 }
 
-/** Gauss-Newton steps with active limits: a violated one is added, one with a wrong sign released; 0 if they fail. */
-static int near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *e) {
+#endif
+
+int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *e,
+                 koopmpc_real enough) {
   koopmpc_real s[SIZE], held_now[LIMITS];
   scaled(x, u, s);
   koopmpc_copy(held_now, active, LIMITS);
   for (int pass = 0; pass < NEWTON; pass++) {
-    koopmpc_real at[AT], E[MOST_ROWS * SIZE], kept[MOST_ROWS * SIZE], gain[SIZE * MOST_ROWS], null[SIZE * SIZE];
+    koopmpc_real at[KOOPMPC_LOCAL], E[MOST_ROWS * SIZE], kept[MOST_ROWS * SIZE], gain[SIZE * MOST_ROWS], null[SIZE * SIZE];
     koopmpc_real W[LEFT * SIZE], back[SIZE * LEFT], left[LEFT], missed[MOST_ROWS], step[SIZE], rows[LIMITS * SIZE];
     koopmpc_real value[LIMITS], here[NX], input[NV], reach, pull[LEFT], turned[SIZE], worst = 0, least_pull = 0;
     koopmpc_real most_pull = 0, off = 0;
@@ -210,9 +207,9 @@ static int near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const ko
         rows[i * SIZE + NX + i] = 1;
         value[i] = input[i] / koopmpc_rest_limit[i];
       } else {
-        value[i] = at[AT_G + i - NV] / koopmpc_rest_limit[i];
+        value[i] = at[LOCAL_G + i - NV] / koopmpc_rest_limit[i];
         for (int j = 0; j < NX; j++)
-          rows[i * SIZE + j] = at[AT_DG + (i - NV) * NX + j] * koopmpc_rest_size[j] / koopmpc_rest_limit[i];
+          rows[i * SIZE + j] = at[LOCAL_DG + (i - NV) * NX + j] * koopmpc_rest_size[j] / koopmpc_rest_limit[i];
       }
       if (held_now[i] > 0 || held_now[i] < 0) held[n++] = i;
     }
@@ -224,9 +221,9 @@ static int near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const ko
       missed[NX + i] = value[held[i]] - end / koopmpc_rest_limit[held[i]];
     }
     koopmpc_copy(kept, E, (NX + n) * SIZE);
-    count = inverse(E, NX + n, SIZE, RANK, gain, null);
+    count = koopmpc_inverse(E, NX + n, SIZE, RANK, gain, null);
     residuals(at, W);
-    residual(row, at + AT_OF, s, left);
+    residual(row, at + LOCAL_OF, s, left);
     for (int i = 0; i < SIZE; i++) step[i] = -koopmpc_dot(gain + i * (NX + n), missed, NX + n);
     least(W, null, count, back);
     for (int i = 0; i < LEFT; i++) pull[i] = left[i] - koopmpc_dot(W + i * SIZE, step, SIZE);
@@ -263,7 +260,7 @@ static int near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const ko
       held_now[release] = 0;
     } else if (worst > 0) {
       held_now[broken >= 0 ? broken : -2 - broken] = broken >= 0 ? 1 : -1;
-    } else if (largest_of(step, SIZE) <= CLOSE * reach) {
+    } else if (largest_of(step, SIZE) <= enough * reach) {
       for (int i = 0; i < NX + n; i++) {
         const koopmpc_real still = koopmpc_abs(koopmpc_dot(kept + i * SIZE, step, SIZE) + missed[i]);
         if (still > off) off = still;
@@ -279,14 +276,15 @@ static int near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const ko
   return 0;
 }
 
+#if KOOPMPC_DISTURBED
 void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_real *e) {
-  koopmpc_real x[NX], u[NV], active[LIMITS], at[AT];
+  koopmpc_real x[NX], u[NV], active[LIMITS], at[KOOPMPC_LOCAL];
   int found, limited = 0;
   koopmpc_copy(x, s->has_rest ? s->rest : target + TARGET_X, NX);
   koopmpc_copy(u, s->has_rest ? s->rest_u : target + TARGET_U, NV);
   koopmpc_copy(active, s->has_rest ? s->rest_active : target + TARGET_ACTIVE, LIMITS);
   for (int i = 0; i < LIMITS; i++) limited |= active[i] > 0 || active[i] < 0;
-  found = (!limited && chord(s, x, u, target, e)) || near(x, u, active, target, e);
+  found = (!limited && chord(s, x, u, target, e)) || koopmpc_near(x, u, active, target, e, CLOSE);
   if (!(target[TARGET_FOUND] > 0)) found = 0;
   if (!found) {
     koopmpc_copy(x, target + TARGET_X, NX);
@@ -304,11 +302,9 @@ void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_re
   if (!KOOPMPC_GIVEN_END) {
     koopmpc_local(x, u, at);
     for (int i = 0; i < KOOPMPC_GOAL; i++)
-      s->rest_goal[i] = koopmpc_dot(target + TARGET_M + i * KOOPMPC_NR, at + AT_OF, KOOPMPC_NR) +
+      s->rest_goal[i] = koopmpc_dot(target + TARGET_M + i * KOOPMPC_NR, at + LOCAL_OF, KOOPMPC_NR) +
                         koopmpc_dot(target + TARGET_L + i * NX, x, NX) +
                         koopmpc_dot(target + TARGET_V + i * NV, s->rest_input, NV);
   }
 }
-#else
-typedef int koopmpc_no_disturbance; /* C forbids an empty file */
 #endif

@@ -288,8 +288,8 @@ static int disturb(koopmpc_state *s) {
   return 1;
 }
 
-/** The target of a reference row; the search starts at the last one found. NULL if the table lacks the row. */
-static const koopmpc_real *target_of(koopmpc_state *s, const koopmpc_real *row) {
+/** The target of a reference row, without its cost unless `whole`; the search starts at the last one found. */
+static const koopmpc_real *target_of(koopmpc_state *s, const koopmpc_real *row, int whole) {
   for (int tried = 0; tried < s->target_count; tried++) {
     const koopmpc_real *target = s->targets + s->found * KOOPMPC_TARGET;
     int same = 1;
@@ -297,7 +297,7 @@ static const koopmpc_real *target_of(koopmpc_state *s, const koopmpc_real *row) 
     if (same) return target;
     s->found = s->found + 1 < s->target_count ? s->found + 1 : 0;
   }
-  return 0;
+  return koopmpc_find_row(s, row, whole);
 }
 
 /** Find the targets of the stages where the reference or the disturbance moved; 0 where a row has none. */
@@ -319,7 +319,11 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference) {
     const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
     int repeated = k > 0;
     for (int i = 0; i < KOOPMPC_NR && repeated; i++) repeated = row[i] == row[i - KOOPMPC_NR];
-    if (!repeated) end = target_of(s, row);
+    if (k < STEPS && !KOOPMPC_HOLDS) { /* only the last row counts */
+      koopmpc_fill(s->u_r + k * NV, 0, NV);
+      continue;
+    }
+    if (!repeated || k == STEPS) end = target_of(s, row, k == STEPS);
     if (!end) return 0;
     if (k < STEPS) {
       koopmpc_copy(s->u_r + k * NV, end + TARGET_INPUT, NV);
@@ -438,7 +442,7 @@ void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *
 void koopmpc_use_targets(koopmpc_state *s, const koopmpc_real *targets, int count) {
   s->targets = targets;
   s->target_count = count;
-  s->found = 0;
+  s->found = s->made_count = s->made_next = s->has_made_end = 0;
 }
 
 void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *reference, const koopmpc_real *applied,

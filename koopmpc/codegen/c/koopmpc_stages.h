@@ -32,6 +32,17 @@ enum {
   TARGET_FOUND = TARGET_GOAL + KOOPMPC_GOAL
 };
 
+/** Parts of koopmpc_local at (x, u): F, its derivatives A and B, of and J, the limited g and G. */
+enum {
+  LOCAL_A = KOOPMPC_NZ,
+  LOCAL_B = LOCAL_A + KOOPMPC_NZ * KOOPMPC_NZ,
+  LOCAL_OF = LOCAL_B + KOOPMPC_NZ * KOOPMPC_NU,
+  LOCAL_J = LOCAL_OF + KOOPMPC_NR,
+  LOCAL_G = LOCAL_J + KOOPMPC_NR * KOOPMPC_NZ,
+  LOCAL_DG = LOCAL_G + KOOPMPC_BOX,
+  KOOPMPC_LOCAL = LOCAL_DG + KOOPMPC_BOX * KOOPMPC_NZ
+};
+
 /** Slopes: A and B of a stage, row after row, and its next state. Stage map: the next state alone. */
 void koopmpc_slopes(const koopmpc_real *s, const koopmpc_real *v, koopmpc_real *out);
 void koopmpc_stage_map(const koopmpc_real *s, const koopmpc_real *v, koopmpc_real *next);
@@ -61,6 +72,28 @@ koopmpc_status koopmpc_finish(koopmpc_state *s, int *iterations);
 
 /** The cost of the plan, with the price of violated soft limits. */
 koopmpc_real koopmpc_cost(const koopmpc_state *s);
+
+/**
+ * The pseudo-inverse (n, m) of E (m, n), and a basis of its null space in the columns of `null` (n, n), by one-sided
+ * Jacobi rotations of E's columns: E V = B has orthogonal columns. E is overwritten; returns the null space's size.
+ */
+int koopmpc_inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_real *result, koopmpc_real *null);
+
+/**
+ * Gauss-Newton steps to the equilibrium of a row and of a disturbance e: a violated limit is added, one with a wrong
+ * sign released. The last step is at most a share `enough` of (x, u); 0, and nothing written, if they fail.
+ */
+int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *e,
+                 koopmpc_real enough);
+
+/** The factors of a Gauss-Newton step at `koopmpc_local` without active limits: H of F + e - x, T of the residuals. */
+void koopmpc_factors(const koopmpc_real *at, koopmpc_real *H, koopmpc_real *T);
+
+/**
+ * The target of a row that the table lacks: all of it, or with whole = 0 the parts before TARGET_M, after which stands
+ * whether an equilibrium was found. NULL if the table is empty.
+ */
+const koopmpc_real *koopmpc_find_row(koopmpc_state *s, const koopmpc_real *row, int whole);
 
 /** Move the equilibrium of a target, and its cost, to where x = F(x, u) + e. */
 void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_real *e);

@@ -169,7 +169,7 @@ class BilinearMPC(StagedMPC):
             sizes=terminal.equilibria.size[: model.nx],
             gain=first_gain(terminal, outputs, self._N, rows[0]) if len(rows) else np.zeros((self.nu, model.nx)),
             settings=daqp_settings(),
-            functions=trace_functions(problem, outputs, model, disturbed=self._disturbed),
+            functions=trace_functions(problem, outputs, model),
             N=self._N,
             latency=self._latency,
             iterations=self._sqp_iterations,
@@ -198,7 +198,9 @@ class BilinearMPC(StagedMPC):
             holds=isinstance(cost.u_target, str) and cost.u_target == "equilibrium",
             end="given" if cost.Q_N is not None else "stage" if cost.tail == 0 else "tail",
             table=self.find_targets(rows) if len(rows) else np.zeros((0, 1)),
-            rest=terminal.equilibria.program() if self._disturbed else None,
+            disturbed=self._disturbed,
+            rest=terminal.equilibria.program(),
+            tail=terminal.program(),
             estimator=estimator,
         )
 

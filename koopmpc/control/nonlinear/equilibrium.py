@@ -25,6 +25,7 @@ from koopmpc.values import Value
 
 SETTLED = 1e-10  # the last Gauss–Newton step is at most this share of the size of (x, u)
 RANK = 1e-12  # singular values below this share of the largest are rounding; ipopt meets all others too
+PSEUDO = 1e-9  # singular values of the tracked outputs' slopes below this share of the largest count as zero
 CLOSE = 1e-2  # the same where the next control step goes on: the error left is of the square of this share
 _QUIET = {
     "print_time": False,
@@ -110,6 +111,31 @@ class RestProgram(Value):
     limit_size: Float[np.ndarray, " nl"]
     low: Float[np.ndarray, " nl"]
     high: Float[np.ndarray, " nl"]
+
+
+@dataclass(frozen=True, eq=False)
+class TailProgram(Value):
+    """What the terminal cost of a row is made of, in the sizes of x, u and the rows; see `TerminalTargets`.
+
+    Attributes
+    ----------
+    steps
+        Steps of the tail; 0 for as many as its gain takes to rest.
+    row_size, scale
+        Sizes of the tracked outputs, and of the cost.
+    Q, R, R_delta
+        Weights in these sizes; zeros where changes have no weight.
+    end
+        (nr, nr) S with SᵀS = Q_N where the cost has one, else zeros.
+    """
+
+    steps: int
+    row_size: Float[np.ndarray, " nr"]
+    scale: float
+    Q: Float[np.ndarray, "nr nr"]
+    R: Float[np.ndarray, "nu nu"]
+    R_delta: Float[np.ndarray, "nu nu"]
+    end: Float[np.ndarray, "nr nr"]
 
 
 class Equilibria:
@@ -422,6 +448,18 @@ class TerminalTargets:
         self._missed: set[bytes] = set()  # reference rows whose equilibrium was not found
         self._last: tuple[Float[np.ndarray, " nr"], Equilibrium] | None = None  # the row found last, and where
 
+    def program(self) -> TailProgram:
+        """Return the data of the terminal cost."""
+        o, nr, su = self._outputs, len(self._outputs.Q), self._outputs.sizes.inputs
+        scale, weights, Q_N = o.sizes.scale, o.Q.diagonal(), self._cost.Q_N
+        size = np.sqrt(scale / np.where(weights > 0, weights, scale))
+        if self.equilibria.of_state:
+            size = self.equilibria.size[:nr]
+        changes = np.zeros_like(o.R) if o.R_delta is None else o.R_delta
+        end = np.zeros((nr, nr)) if Q_N is None else checks.root(checks.weight(Q_N, "Q_N", nr))
+        R, R_delta = (weight * np.outer(su, su) / scale for weight in (o.R, changes))
+        return TailProgram(self._cost.tail or 0, size, scale, o.Q * np.outer(size, size) / scale, R, R_delta, end)
+
     def is_missed(self, row: Float[np.ndarray, " nr"]) -> bool:
         """Return whether no equilibrium was found for a row that was asked for."""
         return row.tobytes() in self._missed
@@ -451,7 +489,7 @@ class TerminalTargets:
             if len(self._known) > _MOST:
                 self._known.clear()
                 self._missed.clear()
-            found = self._beside(row) or self.equilibria.find(row)
+            found = self._beside(row) or self._polish(self.equilibria.find(row), row)
             self._last = None if found is None else (row.copy(), found)
             if found is None:
                 self._missed.add(key)
@@ -467,6 +505,14 @@ class TerminalTargets:
         if sizes[0] > _BESIDE * max(sizes[1:]):
             return None
         return self.equilibria.near(begin, row, np.zeros(self.equilibria.model.nx))
+
+    def _polish(self, found: Equilibrium | None, row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
+        """Return an equilibrium of ipopt to rounding, by Gauss–Newton steps, as C finds it."""
+        exact = None if found is None else self.equilibria.near(found, row, np.zeros(self.equilibria.model.nx))
+        if found is None or exact is None:
+            return found
+        away = np.concatenate([exact.x - found.x, exact.u - found.u]) / self.equilibria.size
+        return exact if np.abs(away).max() <= CLOSE else found
 
     def _target_without_equilibrium(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
         """Return the target of a row whose equilibrium was not found: ‖of(x_N) − r‖²_Q, and inputs at zero."""
@@ -503,16 +549,12 @@ class TerminalTargets:
             M, L, V = (np.zeros((nx + nr, columns)) for columns in (nr, nx, len(u)))
             M[:nr] = checks.root(checks.weight(self._cost.Q_N, "Q_N", nr))
             return TerminalTarget(found, u, M, L, V, M @ row, slope)
-        (sx, su), scale, weights = np.split(self.equilibria.size, [nx]), o.sizes.scale, Q.diagonal()
-        sr = np.where(weights > 0, np.sqrt(scale / np.where(weights > 0, weights, 1.0)), 1.0)
-        if self.equilibria.of_state:
-            sr = sx[:nr]
+        (sx, su), tail = np.split(self.equilibria.size, [nx]), self.program()
+        sr, scale, Q_s, R = tail.row_size, tail.scale, tail.Q, tail.R
+        R_delta = None if o.R_delta is None else tail.R_delta
         A, B, J = at.A * sx / sx[:, None], at.B * su / sx[:, None], at.J * sx / sr[:, None]
-        Q_s, R, R_delta = Q * np.outer(sr, sr) / scale, o.R * np.outer(su, su) / scale, o.R_delta
-        if R_delta is not None:
-            R_delta = R_delta * np.outer(su, su) / scale
         seen = J.T @ Q_s @ J
-        back, inverse = (np.linalg.pinv(each, rcond=1e-9) for each in (J, seen))
+        back, inverse = (np.linalg.pinv(each, rcond=PSEUDO) for each in (J, seen))
         P = stationary(one_step(A, B, seen, R, R_delta), self._most).P
         if self._cost.tail:
             P = tail_of(tail_stage(A, B, np.eye(nx), J, Q_s, R, R_delta), self._cost.tail).P

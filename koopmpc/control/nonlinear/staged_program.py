@@ -10,7 +10,7 @@ from scipy.linalg import solve
 
 from koopmpc.control.cost import StateTracking
 from koopmpc.control.limits import Interval, Softness
-from koopmpc.control.nonlinear.equilibrium import RestProgram, TerminalTargets
+from koopmpc.control.nonlinear.equilibrium import RestProgram, TailProgram, TerminalTargets
 from koopmpc.control.nonlinear.problem import LearnedMap, ModelOrMap, StagedProblem
 from koopmpc.control.nonlinear.stagewise import Sides
 from koopmpc.control.program import StepProgram, trace_graph
@@ -31,8 +31,8 @@ class StagedProgram(StepProgram):
     ----------
     functions
         Name → graph: "map" (x, u) → F; "stage_map" (s, v) → s⁺; "slopes" (s, v) → ∂s⁺/∂s, ∂s⁺/∂v by rows, s⁺;
-        "tracked" and "limited" s → value, Jacobian by rows; "stage" (s, r) → JᵀQJ, JᵀQ(of − r); where disturbances
-        move the target "local" (x, u) → F, ∂F/∂x, ∂F/∂u, of, ∂of/∂x, g, ∂g/∂x.
+        "tracked" and "limited" s → value, Jacobian by rows; "stage" (s, r) → JᵀQJ, JᵀQ(of − r); "local"
+        (x, u) → F, ∂F/∂x, ∂F/∂u, of, ∂of/∂x, g, ∂g/∂x.
     N, latency, iterations
         Steps of the plan, steps until its first input acts, linearisations a step.
     nx, ny, ns
@@ -63,8 +63,10 @@ class StagedProgram(StepProgram):
     table
         (rows, size) the target of each reference row: [r, x_r, u_r, active limits of (u_r, g), reference input,
         ∂u/∂e, M, L, V, m, whether an equilibrium was found].
-    rest
-        How a disturbance moves the target; None where there is no disturbance.
+    disturbed
+        Whether disturbances, measured or estimated, move the target.
+    rest, tail
+        How the target of another row or of a disturbance is found, and what the end of the horizon costs there.
     estimator
         How x and d follow from y.
     """
@@ -99,7 +101,9 @@ class StagedProgram(StepProgram):
     holds: bool
     end: str
     table: Float[np.ndarray, "found size"]
-    rest: RestProgram | None
+    disturbed: bool
+    rest: RestProgram
+    tail: TailProgram
     estimator: EstimatorProgram
 
 
@@ -121,7 +125,7 @@ def find_targets(
 
 @raise_swallowed()
 def trace_functions(
-    problem: StagedProblem, outputs: StateTracking, model: LearnedMap, *, disturbed: bool
+    problem: StagedProblem, outputs: StateTracking, model: LearnedMap
 ) -> dict[str, Graph]:
     """Return the functions of a StagedProgram.
 
@@ -147,6 +151,7 @@ def trace_functions(
     limited = ca.SX(problem.limited(s)) if len(problem.box.low) else ca.SX(1, 1)
     J = ca.jacobian(tracked, s)
     weighed = J.T @ ca.sparsify(ca.DM(problem.Q))
+    of, g = ca.SX(outputs.tracked(x)), ca.SX(outputs.limited(x))
     functions = {
         "map": ([x, u], [F]),
         "stage_map": ([s, v], [F_s]),
@@ -154,10 +159,8 @@ def trace_functions(
         "tracked": ([s], [tracked, slope(tracked, s)]),
         "limited": ([s], [limited, slope(limited, s)]),
         "stage": ([s, r], [ca.vec(ca.densify(weighed @ J)), ca.densify(weighed @ (tracked - r))]),
+        "local": ([x, u], [F, slope(F, x), slope(F, u), of, slope(of, x), g, slope(g, x)]),
     }
-    if disturbed:
-        of, g = ca.SX(outputs.tracked(x)), ca.SX(outputs.limited(x))
-        functions["local"] = [x, u], [F, slope(F, x), slope(F, u), of, slope(of, x), g, slope(g, x)]
     found: dict[str, Graph] = {}
     for name, (arguments, results) in functions.items():
         function = ca.Function(f"koopmpc_{name}", arguments, [ca.densify(ca.vertcat(*results))], {"cse": True})

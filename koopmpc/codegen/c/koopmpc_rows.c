@@ -1,0 +1,328 @@
+/**
+ * @file koopmpc_rows.c
+ * @brief The target of a reference row that the table lacks: its equilibrium, and what the end of the horizon costs there.
+ *
+ * The equilibrium is sought from that of the nearest known row, on the straight line between both rows where one go
+ * does not lead to it. Around it a Riccati recursion gives the cost of a tail. Found rows are kept for later steps.
+ */
+#include <math.h>
+
+#include "koopmpc_limits.h"
+#include "koopmpc_plan.h"
+#include "koopmpc_solver.h"
+#include "koopmpc_stages.h"
+#include "koopmpc_table.h"
+
+enum {
+  ROW = KOOPMPC_NR,
+  TAILED = KOOPMPC_GOAL - KOOPMPC_NR, /* entries of the tail's state: x, and the last input where its changes are weighed */
+  HALVINGS = 40,                      /* pieces of the line between two rows, at most */
+  RESTING = TAILED < 50 ? TAILED : 50 /* steps for which a gain that has settled must rest */
+};
+
+/** The squared distance of two rows by the weights of the cost. */
+static koopmpc_real apart(const koopmpc_real *a, const koopmpc_real *b) {
+  koopmpc_real sum = 0;
+  for (int i = 0; i < ROW; i++) {
+    koopmpc_real part = 0;
+    for (int j = 0; j < ROW; j++) part += koopmpc_rest_weight[i * ROW + j] * (a[j] - b[j]);
+    sum += part * part;
+  }
+  return sum;
+}
+
+/** The known target whose row is nearest; one without an equilibrium only if all are. NULL without any. */
+static const koopmpc_real *nearest(const koopmpc_state *s, const koopmpc_real *row) {
+  const koopmpc_real *found = 0;
+  koopmpc_real least = 0;
+  for (int good = 1; good >= 0 && !found; good--)
+    for (int i = 0; i < s->target_count + s->made_count; i++) {
+      const int made = i - s->target_count;
+      const koopmpc_real *each = made < 0 ? s->targets + i * KOOPMPC_TARGET : s->made + made * KOOPMPC_MADE_SIZE;
+      const int known = each[made < 0 ? TARGET_FOUND : TARGET_M] > 0;
+      const koopmpc_real far = apart(row, each);
+      if (known != good || (found && !(far < least))) continue;
+      least = far;
+      found = each;
+    }
+  return found;
+}
+
+/** Walk from an equilibrium to that of another row, in one go or in pieces; 0 if the way ends before. */
+static int walk(const koopmpc_real *from, const koopmpc_real *row, koopmpc_real *x, koopmpc_real *u,
+                koopmpc_real *active) {
+  koopmpc_real none[NX], there[ROW], done = 0, stride = 1;
+  koopmpc_fill(none, 0, NX);
+  for (int tries = 0; tries < HALVINGS; tries++) {
+    const koopmpc_real share = done + stride < 1 ? done + stride : 1;
+    for (int i = 0; i < ROW; i++) there[i] = share < 1 ? from[i] + share * (row[i] - from[i]) : row[i];
+    if (koopmpc_near(x, u, active, there, none, KOOPMPC_HELD)) {
+      done = share;
+      if (!(done < 1)) return 1;
+      stride *= 2;
+    } else {
+      stride /= 2;
+    }
+  }
+  return 0;
+}
+
+/** du/de of an equilibrium without active limits. */
+static void slope_of(const koopmpc_real *at, koopmpc_real *slope) {
+  koopmpc_real H[(NX + NV) * NX], T[(NX + NV) * (ROW + NX + NV)];
+  koopmpc_factors(at, H, T);
+  for (int i = 0; i < NV; i++)
+    for (int j = 0; j < NX; j++)
+      slope[i * NX + j] =
+          KOOPMPC_HOLDS ? H[(NX + i) * NX + j] * koopmpc_rest_size[NX + i] / koopmpc_rest_size[j] : 0;
+}
+
+/** Find the equilibrium of a row and keep it; NULL if there is no table to start from. */
+static const koopmpc_real *make(koopmpc_state *s, const koopmpc_real *row) {
+  const koopmpc_real *from = nearest(s, row);
+  koopmpc_real at[KOOPMPC_LOCAL], own[KOOPMPC_MADE_SIZE];
+  if (!from) return 0;
+  koopmpc_copy(own, from, TARGET_M);
+  own[TARGET_M] = (koopmpc_real)walk(from, row, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
+  koopmpc_copy(own, row, ROW);
+  for (int i = 0; i < NV; i++) {
+    if (!(own[TARGET_M] > 0)) own[TARGET_U + i] = koopmpc_clip(0, koopmpc_input_low[i], koopmpc_input_high[i]);
+    own[TARGET_INPUT + i] = KOOPMPC_HOLDS ? own[TARGET_U + i] : 0;
+  }
+  koopmpc_fill(own + TARGET_SLOPE, 0, NV * NX);
+  if (own[TARGET_M] > 0 && KOOPMPC_DISTURBED) {
+    koopmpc_local(own + TARGET_X, own + TARGET_U, at);
+    slope_of(at, own + TARGET_SLOPE);
+  }
+  koopmpc_copy(s->made + s->made_next * KOOPMPC_MADE_SIZE, own, KOOPMPC_MADE_SIZE);
+  from = s->made + s->made_next * KOOPMPC_MADE_SIZE;
+  if (s->made_count <= s->made_next) s->made_count = s->made_next + 1;
+  s->made_next = s->made_next + 1 < KOOPMPC_MADE ? s->made_next + 1 : 0;
+  return from;
+}
+
+/** Weigh the end of the horizon by a matrix alone: |root (of(x_N) - r)|^2. */
+static void weigh(koopmpc_real *target, const koopmpc_real *root) {
+  koopmpc_fill(target + TARGET_M, 0, TARGET_FOUND - TARGET_M);
+  for (int i = 0; i < ROW; i++) {
+    koopmpc_copy(target + TARGET_M + i * ROW, root + i * ROW, ROW);
+    target[TARGET_GOAL + i] = koopmpc_dot(root + i * ROW, target, ROW);
+  }
+}
+
+#if KOOPMPC_STAGE_END == 1
+
+/** One step of the tail, x+ = A x + B u at the cost of Q and R; row after row, in the sizes of x and u. */
+typedef struct {
+  koopmpc_real A[TAILED * TAILED], B[TAILED * NV], Q[TAILED * TAILED], R[NV * NV];
+} tail_step;
+
+/** P of the step before, and its gain K; 0 if R + B'PB is not positive definite. */
+static int before(const tail_step *t, koopmpc_real *P, koopmpc_real *K) {
+  koopmpc_real BP[NV * TAILED], S[NV * NV], closed[TAILED * TAILED], PC[TAILED * TAILED];
+  for (int i = 0; i < NV; i++)
+    for (int j = 0; j < TAILED; j++) {
+      BP[i * TAILED + j] = 0;
+      for (int m = 0; m < TAILED; m++) BP[i * TAILED + j] += t->B[m * NV + i] * P[m * TAILED + j];
+    }
+  for (int i = 0; i < NV; i++)
+    for (int j = 0; j < NV; j++) {
+      S[i * NV + j] = t->R[i * NV + j];
+      for (int m = 0; m < TAILED; m++) S[i * NV + j] += BP[i * TAILED + m] * t->B[m * NV + j];
+    }
+  for (int i = 0; i < NV; i++)
+    for (int j = 0; j < TAILED; j++) {
+      K[i * TAILED + j] = j >= NX ? -koopmpc_tail_D[i * NV + j - NX] : 0;
+      for (int m = 0; m < TAILED; m++) K[i * TAILED + j] += BP[i * TAILED + m] * t->A[m * TAILED + j];
+    }
+  for (int j = 0; j < NV; j++) { /* S = L L' */
+    for (int m = 0; m < j; m++) S[j * NV + j] -= S[j * NV + m] * S[j * NV + m];
+    if (!(S[j * NV + j] > 0)) return 0;
+    S[j * NV + j] = KOOPMPC_SQRT(S[j * NV + j]);
+    for (int i = j + 1; i < NV; i++) {
+      for (int m = 0; m < j; m++) S[i * NV + j] -= S[i * NV + m] * S[j * NV + m];
+      S[i * NV + j] /= S[j * NV + j];
+    }
+  }
+  for (int j = 0; j < TAILED; j++) {
+    for (int i = 0; i < NV; i++) {
+      for (int m = 0; m < i; m++) K[i * TAILED + j] -= S[i * NV + m] * K[m * TAILED + j];
+      K[i * TAILED + j] /= S[i * NV + i];
+    }
+    for (int i = NV - 1; i >= 0; i--) {
+      for (int m = i + 1; m < NV; m++) K[i * TAILED + j] -= S[m * NV + i] * K[m * TAILED + j];
+      K[i * TAILED + j] /= S[i * NV + i];
+    }
+  }
+  for (int i = 0; i < TAILED; i++)
+    for (int j = 0; j < TAILED; j++) {
+      closed[i * TAILED + j] = t->A[i * TAILED + j];
+      for (int m = 0; m < NV; m++) closed[i * TAILED + j] -= t->B[i * NV + m] * K[m * TAILED + j];
+    }
+  for (int i = 0; i < TAILED; i++)
+    for (int j = 0; j < TAILED; j++) {
+      PC[i * TAILED + j] = 0;
+      for (int m = 0; m < TAILED; m++) PC[i * TAILED + j] += P[i * TAILED + m] * closed[m * TAILED + j];
+    }
+  for (int i = 0; i < TAILED; i++)
+    for (int j = 0; j < TAILED; j++) {
+      koopmpc_real sum = t->Q[i * TAILED + j];
+      for (int m = 0; m < TAILED; m++) sum += t->A[m * TAILED + i] * PC[m * TAILED + j];
+      for (int m = 0; m < NV && i >= NX; m++) sum += koopmpc_tail_D[(i - NX) * NV + m] * K[m * TAILED + j];
+      P[i * TAILED + j] = sum;
+    }
+  for (int i = 0; i < TAILED; i++)
+    for (int j = 0; j < i; j++)
+      P[i * TAILED + j] = P[j * TAILED + i] = (P[i * TAILED + j] + P[j * TAILED + i]) / 2;
+  return koopmpc_usable(P, TAILED * TAILED);
+}
+
+/** P of the whole tail: of KOOPMPC_TAIL steps, or until its gain rests. */
+static int sum_tail(const tail_step *t, koopmpc_real *P) {
+  koopmpc_real K[NV * TAILED], last[NV * TAILED];
+  int rested = 0;
+  koopmpc_copy(P, t->Q, TAILED * TAILED);
+  koopmpc_fill(last, 0, NV * TAILED);
+  for (int i = NX; i < TAILED && KOOPMPC_TAIL; i++) koopmpc_fill(P + i * TAILED + NX, 0, TAILED - NX);
+  for (int k = 0; k < (KOOPMPC_TAIL ? KOOPMPC_TAIL : 10 * STEPS); k++) {
+    koopmpc_real moved = 0, most = 0;
+    if (!before(t, P, K)) return 0;
+    for (int i = 0; i < NV * TAILED; i++) {
+      if (koopmpc_abs(K[i] - last[i]) > moved) moved = koopmpc_abs(K[i] - last[i]);
+      if (koopmpc_abs(K[i]) > most) most = koopmpc_abs(K[i]);
+    }
+    koopmpc_copy(last, K, NV * TAILED);
+    rested = moved <= KOOPMPC_RESTED * most ? rested + 1 : 0;
+    if (!KOOPMPC_TAIL && rested >= RESTING) break;
+  }
+  return 1;
+}
+
+/** S with S'S = P, by Cholesky's factor; rows of pivots that are rounding are zero. */
+static void root_of(const koopmpc_real *P, koopmpc_real *S) {
+  koopmpc_fill(S, 0, TAILED * TAILED);
+  for (int i = 0; i < TAILED; i++) {
+    koopmpc_real pivot = P[i * TAILED + i];
+    for (int m = 0; m < i; m++) pivot -= S[m * TAILED + i] * S[m * TAILED + i];
+    if (!(pivot > KOOPMPC_RANK * P[i * TAILED + i])) continue;
+    for (int j = i; j < TAILED; j++) {
+      koopmpc_real sum = P[i * TAILED + j];
+      for (int m = 0; m < i; m++) sum -= S[m * TAILED + i] * S[m * TAILED + j];
+      S[i * TAILED + j] = sum / KOOPMPC_SQRT(pivot);
+    }
+  }
+}
+
+/** Write M, L, V and the goal of a target whose equilibrium is known; 0 if the recursion fails. */
+static int add_tail(koopmpc_real *target) {
+  koopmpc_real at[KOOPMPC_LOCAL], J[ROW * NX], QJ[ROW * NX], work[ROW * NX], back[NX * ROW], seen[NX * NX];
+  koopmpc_real inverse[NX * NX], copied[NX * NX], P[TAILED * TAILED], S[TAILED * TAILED], mean = 0;
+  koopmpc_real *M = target + TARGET_M, *L = target + TARGET_L, *V = target + TARGET_V;
+  const koopmpc_real *size = koopmpc_rest_size, scale = KOOPMPC_SQRT((koopmpc_real)KOOPMPC_TAIL_SCALE);
+  tail_step t;
+  int blind;
+  koopmpc_local(target + TARGET_X, target + TARGET_U, at);
+  for (int i = 0; i < ROW; i++)
+    for (int j = 0; j < NX; j++) J[i * NX + j] = at[LOCAL_J + i * NX + j] * size[j] / koopmpc_tail_rows[i];
+  for (int i = 0; i < ROW; i++)
+    for (int j = 0; j < NX; j++) {
+      QJ[i * NX + j] = 0;
+      for (int m = 0; m < ROW; m++) QJ[i * NX + j] += koopmpc_tail_Q[i * ROW + m] * J[m * NX + j];
+    }
+  for (int i = 0; i < NX; i++)
+    for (int j = 0; j < NX; j++) {
+      seen[i * NX + j] = 0;
+      for (int m = 0; m < ROW; m++) seen[i * NX + j] += J[m * NX + i] * QJ[m * NX + j];
+    }
+  koopmpc_fill(t.A, 0, TAILED * TAILED);
+  koopmpc_fill(t.B, 0, TAILED * NV);
+  koopmpc_fill(t.Q, 0, TAILED * TAILED);
+  for (int i = 0; i < NX; i++) {
+    for (int j = 0; j < NX; j++) {
+      t.A[i * TAILED + j] = at[LOCAL_A + i * NX + j] * size[j] / size[i];
+      t.Q[i * TAILED + j] = seen[i * NX + j];
+    }
+    for (int j = 0; j < NV; j++) t.B[i * NV + j] = at[LOCAL_B + i * NV + j] * size[NX + j] / size[i];
+  }
+  koopmpc_copy(t.R, koopmpc_tail_R, NV * NV);
+  for (int i = NX; i < TAILED; i++) {
+    t.B[i * NV + i - NX] = 1;
+    for (int j = 0; j < NV; j++) {
+      t.Q[i * TAILED + NX + j] = koopmpc_tail_D[(i - NX) * NV + j];
+      t.R[(i - NX) * NV + j] += koopmpc_tail_D[(i - NX) * NV + j];
+    }
+  }
+  if (!sum_tail(&t, P)) return 0;
+  root_of(P, S);
+  koopmpc_copy(work, J, ROW * NX);
+  (void)koopmpc_inverse(work, ROW, NX, KOOPMPC_PSEUDO, back, 0);
+  koopmpc_copy(copied, seen, NX * NX);
+  (void)koopmpc_inverse(copied, NX, NX, KOOPMPC_PSEUDO, inverse, 0);
+  koopmpc_copy(copied, seen, NX * NX);
+  blind = koopmpc_inverse(copied, NX, NX, KOOPMPC_TURN * NX, copied, 0);
+  for (int i = 0; i < NX; i++)
+    for (int j = 0; j < NX; j++) mean += P[i * TAILED + j] * inverse[i * NX + j];
+  mean /= (koopmpc_real)(blind < NX ? NX - blind : 1);
+  mean = KOOPMPC_SQRT(mean > 1 ? mean : 1);
+  koopmpc_fill(M, 0, TARGET_FOUND - TARGET_M);
+  for (int i = 0; i < TAILED; i++) {
+    koopmpc_real through[ROW];
+    for (int r = 0; r < ROW; r++) {
+      through[r] = 0;
+      for (int j = 0; j < NX; j++) through[r] += S[i * TAILED + j] * back[j * ROW + r];
+      M[i * ROW + r] = scale * through[r] / koopmpc_tail_rows[r];
+    }
+    for (int j = 0; j < NX; j++) {
+      koopmpc_real left = S[i * TAILED + j];
+      for (int r = 0; r < ROW; r++) left -= through[r] * J[r * NX + j];
+      L[i * NX + j] = scale * left / size[j];
+    }
+    for (int j = NX; j < TAILED; j++) V[i * NV + j - NX] = scale * S[i * TAILED + j] / size[j];
+  }
+  for (int i = 0; i < ROW; i++)
+    for (int r = 0; r < ROW; r++) {
+      koopmpc_real sum = koopmpc_Q_root[i * ROW + r];
+      for (int b = 0; b < ROW; b++) {
+        koopmpc_real through = 0;
+        for (int j = 0; j < NX; j++) through += J[b * NX + j] * back[j * ROW + r];
+        sum -= koopmpc_Q_root[i * ROW + b] * koopmpc_tail_rows[b] * through / koopmpc_tail_rows[r];
+      }
+      M[(TAILED + i) * ROW + r] = mean * sum;
+    }
+  for (int i = 0; i < KOOPMPC_GOAL; i++)
+    target[TARGET_GOAL + i] = koopmpc_dot(M + i * ROW, at + LOCAL_OF, ROW) +
+                              koopmpc_dot(L + i * NX, target + TARGET_X, NX) +
+                              koopmpc_dot(V + i * NV, target + TARGET_INPUT, NV);
+  return 1;
+}
+#endif
+
+const koopmpc_real *koopmpc_find_row(koopmpc_state *s, const koopmpc_real *row, int whole) {
+  const koopmpc_real *found = 0;
+  koopmpc_real *target = s->made_end;
+  for (int k = 0; k < s->made_count && !found; k++) {
+    const koopmpc_real *each = s->made + k * KOOPMPC_MADE_SIZE;
+    int same = 1;
+    for (int i = 0; i < ROW && same; i++) same = !(each[i] < row[i] || each[i] > row[i]);
+    if (same) found = each;
+  }
+  if (whole && s->has_made_end) { /* the end may outlive its row's place */
+    int same = 1;
+    for (int i = 0; i < ROW && same; i++) same = !(target[i] < row[i] || target[i] > row[i]);
+    if (same) return target;
+  }
+  if (!found) found = make(s, row);
+  if (!found || !whole) return found;
+  koopmpc_copy(target, found, TARGET_M);
+  target[TARGET_FOUND] = found[TARGET_M];
+  s->has_made_end = 1;
+#if KOOPMPC_STAGE_END == 1
+  if (found[TARGET_M] > 0 && add_tail(target)) {
+    target[TARGET_FOUND] = found[TARGET_M];
+    return target;
+  }
+#endif
+  weigh(target, KOOPMPC_GIVEN_END ? koopmpc_tail_end : koopmpc_Q_root);
+  target[TARGET_FOUND] = found[TARGET_M];
+  return target;
+}
