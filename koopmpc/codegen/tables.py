@@ -55,9 +55,9 @@ _TOLERANCES = {
 }
 _TABLE_NOTE = (
     "`koopmpc_table.h` holds the equilibria of the reference rows that `export` was given, and what the end of the "
-    "horizon costs there. Any other row may come at run time: the step that meets it finds its equilibrium from that of "
-    "the nearest row, by up to 40 times 20 Gauss-Newton steps, and keeps it. To bound the time of a step, pass all rows "
-    "to `export`."
+    "horizon costs there. Any other row may come at run time: the step that meets it finds its equilibrium from that "
+    "of the nearest row, by up to 40 times 20 Gauss-Newton steps, and keeps it. To bound the time of a step, pass all "
+    "rows to `export`."
 )
 
 

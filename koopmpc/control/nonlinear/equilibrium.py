@@ -542,7 +542,7 @@ class TerminalTargets:
         return target._replace(equilibrium=found, u=u, m=m)
 
     def _target(self, row: Float[np.ndarray, " nr"], found: Equilibrium) -> TerminalTarget:
-        o, nx, nr, Q = self._outputs, len(found.x), len(row), self._outputs.Q
+        o, nx, nr = self._outputs, len(found.x), len(row)
         at, u = self.equilibria.linearise(found.x, found.u), found.u * self._hold
         slope = self.equilibria.slope(at) * self._hold
         if self._cost.Q_N is not None:

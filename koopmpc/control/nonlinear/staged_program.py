@@ -124,9 +124,7 @@ def find_targets(
 
 
 @raise_swallowed()
-def trace_functions(
-    problem: StagedProblem, outputs: StateTracking, model: LearnedMap
-) -> dict[str, Graph]:
+def trace_functions(problem: StagedProblem, outputs: StateTracking, model: LearnedMap) -> dict[str, Graph]:
     """Return the functions of a StagedProgram.
 
     Raises
