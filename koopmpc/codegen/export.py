@@ -78,7 +78,8 @@ def export(
         The plant of `example.c`; by default the controller's own model, lifted afresh each step.
     x0, reference
         Initial state and reference rows of the example; by default the root mean square of the data, and zero. A model
-        with delays starts as if x0 and the smallest allowed input had been held before.
+        with delays starts as if x0 and the smallest allowed input had been held before. The C of a BilinearMPC holds
+        the equilibria of these rows, and searches those of other rows when they come.
     steps
         Steps of the example.
     fmu
