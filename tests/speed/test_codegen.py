@@ -5,9 +5,11 @@ All figures are CPU time of this process, in turns of what is compared, so that 
 
 import time
 
+import casadi as ca
 import daqp
 import numpy as np
 import pytest
+from scipy.signal import cont2discrete
 
 import koopmpc as km
 from tests.speed.test_control import CHAIN, model, pendulum, report, timed
@@ -94,6 +96,69 @@ def test_c_step_with_limits_active_against_daqp(benchmark):
             "DAQP's own time µs": solved,
             "to DAQP called": ours / called,
             "to DAQP's own time": ours / solved,
+        },
+    )
+
+
+def cart_pole():
+    """Return the linear cart-pole of LinearMPC.jl's benchmark of generated C (docs/src/manual/benchmark.md)."""
+    A = np.array([[0, 1, 0, 0], [0, -10, 9.81, 0], [0, 0, 0, 1], [0, -20, 39.24, 0]])
+    A, B, *_ = cont2discrete((A, 100 * np.array([[0], [1], [0], [2.0]]), np.eye(4), np.zeros((4, 1))), 0.01)
+    x, u = ca.SX.sym("x", 4), ca.SX.sym("u", 1)
+    names = ("p", "v", "theta", "omega")
+    plant = km.StepMap(ca.Function("F", [x, u], [ca.DM(A) @ x + ca.DM(B) @ u]), 0.01, states=names, inputs=("u",))
+    return km.LinearPredictor(A, B, np.eye(4), km.State(), 0.01, names, ("u",)), plant
+
+
+class TimedSolver:
+    """DAQP's model, which sums the seconds that DAQP says its solves take."""
+
+    def __init__(self, model):
+        self.model, self.seconds, self.iterations = model, 0.0, 0
+
+    def __getattr__(self, name):
+        return getattr(self.model, name)
+
+    def solve(self, *arguments, **options):
+        answer = self.model.solve(*arguments, **options)
+        self.seconds += answer[3]["solve_time"]
+        self.iterations += answer[3]["iterations"]
+        return answer
+
+
+@pytest.mark.parametrize("N", [50, 75, 100, 125])
+def test_c_steps_of_the_cart_pole_of_other_generators(benchmark, N):
+    """Weights, limits and references of the published table; beside it the time of DAQP alone on the same QPs."""
+    model, plant = cart_pole()
+    cost, end = km.Cost(Q=[1.44, 0, 1, 0], R=0.0, R_delta=0.01, tail=0), np.array([np.inf, np.inf, 0.3, np.inf])
+    slow = km.KoopmanMPC(model, cost, km.Limits(-2, 2, x_min=-end, x_max=end, slack=(0.0, 1e3)), N)
+    fast, steps = km.compiled(slow), 500
+    rows = np.zeros((steps + 1 + N, 4))
+    rows[:, 0] = np.where(np.arange(len(rows)) < 250, 1.0, -0.5)
+    X, U, ours, alone = np.zeros((steps + 1, 4)), np.zeros((steps, 1)), [], []
+    X[0, 2] = 0.2
+    solver = slow._qps.first
+    solver._model = TimedSolver(solver._model)
+    for _ in range(5):
+        fast.reset()
+        slow.reset()
+        ours.append(np.array(fast.whole_run(plant, rows, None, X, X, U, preview=False)["solve_time"]))
+        spent = [0.0]
+        for x, row in zip(X, rows[:steps], strict=False):
+            slow(x, row)
+            spent.append(solver._model.seconds)
+        solver._model.seconds = 0.0
+        alone.append(np.diff(spent))
+    ours, alone = np.min(ours, axis=0), np.min(alone, axis=0)
+    limited, slowest = alone > 0, steps // 5
+    benchmark(fast, X[0], rows[0])
+    report(
+        benchmark,
+        **{
+            "median µs": float(np.median(ours)) * 1e6,
+            "mean of the slowest fifth µs": float(np.sort(ours)[-slowest:].mean()) * 1e6,
+            "steps with a QP": int(limited.sum()),
+            "these to DAQP's own time": float(ours[limited].sum() / alone[limited].sum()),
         },
     )
 

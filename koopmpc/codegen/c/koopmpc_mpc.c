@@ -278,7 +278,7 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   report->slack = conflict;
   for (int i = 0; i < ROWS; i++) {
     const koopmpc_real dual = qp->dual[i];
-    if (koopmpc_sense[i] && koopmpc_abs(dual) >= (1 - (koopmpc_real)1e-9) * koopmpc_linear[i]) {
+    if (koopmpc_sense[i] && (dual < 0 || dual > 0) && koopmpc_abs(dual) >= (1 - (koopmpc_real)1e-9) * koopmpc_linear[i]) {
       const koopmpc_real unit = koopmpc_unit[i] * koopmpc_scale[i];
       const koopmpc_real value = koopmpc_dot(koopmpc_M + i * MOVES, qp->primal, MOVES) / koopmpc_scaling[i] / unit +
                                  s->t[koopmpc_source[i]];

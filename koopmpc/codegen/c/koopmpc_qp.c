@@ -139,7 +139,10 @@ koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, co
   end.iterations = work.iterations;
   if (end.flag <= 0) return end;
   if (work.n_active > 0 && work.sing_ind == DAQP_EMPTY_IND && rounded(&work, qp->rinv != 0))
+  {
     for (int pass = 0; pass < REFINEMENTS; pass++) daqp_refine_active(&work);
+    daqp_compute_Mu(&work);
+  }
   for (int i = 0; i < work.n_active; i++)
     mem->dual[work.WS[i]] = work.lam_star[i] * qp->scaling[work.WS[i]];
   if (qp->rinv) {
@@ -156,13 +159,18 @@ koopmpc_qp_end koopmpc_qp_solve(const koopmpc_qp *qp, koopmpc_qp_memory *mem, co
 static int accurate(const koopmpc_qp *problem, const koopmpc_qp_memory *qp) {
   const int n = problem->n, m = problem->m;
   koopmpc_real stationarity = 0, size = 1, near = 1;
+  koopmpc_real *pull = qp->u; /* the solution is in primal, too */
+  koopmpc_fill(pull, 0, n);
+  for (int i = 0; i < m; i++) {
+    if (qp->dual[i] < 0 || qp->dual[i] > 0) {
+      const koopmpc_real push = qp->dual[i] / problem->scaling[i], *row = problem->M + i * n;
+      for (int j = 0; j < n; j++) pull[j] += push * row[j];
+    }
+  }
   for (int j = 0; j < n; j++) {
-    koopmpc_real pull = 0;
-    for (int i = 0; i < m; i++)
-      if (qp->dual[i] < 0 || qp->dual[i] > 0) pull += qp->dual[i] * problem->M[i * n + j] / problem->scaling[i];
-    if (koopmpc_abs(pull) > size) size = koopmpc_abs(pull);
+    if (koopmpc_abs(pull[j]) > size) size = koopmpc_abs(pull[j]);
     if (koopmpc_abs(qp->primal[j]) > size) size = koopmpc_abs(qp->primal[j]);
-    if (!(koopmpc_abs(pull + qp->primal[j]) <= stationarity)) stationarity = koopmpc_abs(pull + qp->primal[j]);
+    if (!(koopmpc_abs(pull[j] + qp->primal[j]) <= stationarity)) stationarity = koopmpc_abs(pull[j] + qp->primal[j]);
   }
 #ifdef KOOPMPC_FLOAT
   for (int i = 0; i < m; i++) /* the sum above is rounded by a share of its largest term */
@@ -196,8 +204,7 @@ koopmpc_qp_end koopmpc_qp_attempt(const koopmpc_qp *problem, koopmpc_qp_memory *
   const koopmpc_qp_end end = koopmpc_qp_solve(problem, qp, push, wider, resume);
   *good = end.flag == 1;
   if (end.flag > 1) {
-    for (int i = 0; i < problem->m; i++)
-      qp->product[i] = koopmpc_dot(problem->M + i * problem->n, qp->primal, problem->n) / problem->scaling[i];
+    for (int i = 0; i < problem->m; i++) qp->product[i] /= problem->scaling[i]; /* DAQP's last product M u */
     *good = accurate(problem, qp);
   }
   return end;
