@@ -18,8 +18,10 @@ ELSEWHERE = {  # pages whose claims are tested beyond what they print, and where
     "how/fmu.md": "tests/test_docs_plants.py",
     "how/gymnasium.md": "tests/test_docs_plants.py",
     "how/onnx.md": "tests/lifting/test_onnx.py",
+    "how/opcua.md": "tests/loop/test_live.py",
     "how/own_step_function.md": "tests/test_docs_plants.py",
     "how/peers.md": "tests/predict/test_peers.py",
+    "how/ros2.md": "tests/loop/test_live.py",
     "identification.md": "tests/test_docs_identification.py",
     "offset_free.md": "tests/estimate/test_docs.py",
     "on_the_machine.md": "tests/test_docs_on_the_machine.py",
@@ -35,6 +37,7 @@ PACKAGES = {
     "hdf5": "h5py",
     "mdf": "asammdf",
     "ros": "mcap",
+    "opcua": "asyncua",
 }
 
 HERE = [page for page in PAGES if blocks(page) and page not in ELSEWHERE]
