@@ -24,6 +24,7 @@ from koopmpc.lifting.base import strip_unit
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import save_value
+from koopmpc.predict.hidden_state import HiddenState
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.values import Value
 
@@ -325,8 +326,16 @@ def trace_lifting(lift: Callable[[ca.SX], ca.SX], nzeta: int, embedding: Delay |
     Raises
     ------
     DataError
-        It holds an operation that cannot be written in C, or the past holds other inputs than the model has.
+        It holds an operation that cannot be written in C; the past holds other inputs than the model has; the model has
+        a hidden state, or sensors that saturate.
     """
+    if isinstance(embedding, HiddenState):
+        raise DataError(
+            "the model has a hidden state with nonlinear dynamics, and C code keeps past rows only; export a model of "
+            "km.identify.subspace(data) or km.identify.narx(data)"
+        )
+    if embedding is not None and embedding.rails is not None:
+        raise DataError("the model has sensors that saturate, which C code does not know; fit it without rails")
     if embedding is not None and embedding.inputs and embedding.bound and len(embedding.bound[1]) != nu:
         raise DataError("the embedding holds other inputs than the predictor; fit both on the same data to export it")
     zeta = ca.SX.sym("zeta", nzeta)

@@ -112,7 +112,7 @@ def observable_sizes(predictor: LinearPredictor, sizes: Sizes) -> Float[np.ndarr
         return np.linalg.norm(predictor.scale, axis=0)
     point = sizes.states
     if predictor.embedding is not None:
-        point = predictor.embedding.repeat(sizes.states, sizes.inputs)
+        point = predictor.embedding.spread(sizes.states, sizes.inputs)
     seen = np.abs(predictor.lifting(np.outer(_SHARES, point))).max(axis=0)
     if seen.shape != (predictor.nz,):  # a reduced model
         return np.ones(predictor.nz)

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.lib.stride_tricks import sliding_window_view
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Changed, Source
 from koopmpc.errors import DataError, FitWarning, ShapeError
-from koopmpc.values import Value
+from koopmpc.values import Value, freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +29,15 @@ class Delay(Value):
         d ≥ 1.
     inputs
         Keep the past inputs too; without them ζ_k = [x_k, x_{k−1}, …, x_{k−d}].
+    rails
+        (2, nx) the least and the largest reading of each sensor, ±inf where it has no limit. A model with these rails
+        forecasts y = min(max(h, low), high), and ζ holds such readings. Plans of a controller ignore them: a limit of
+        its own must not hide behind the sensor's. None: no sensor saturates.
 
     Raises
     ------
     DataError
-        steps is below 1.
+        steps is below 1; rails are not in order.
 
     References
     ----------
@@ -52,10 +56,16 @@ class Delay(Value):
 
     steps: int
     inputs: bool = True
+    rails: Float[np.ndarray, "2 nx"] | None = field(default=None, kw_only=True)
     bound: tuple[tuple[str, ...], tuple[str, ...]] | None = field(default=None, kw_only=True)  # x, u
 
     def __post_init__(self) -> None:
         checks.count(self.steps, "steps")
+        if self.rails is not None:
+            rails = checks.array(self.rails, "rails", (2, None), finite=False)
+            if not (rails[0] < rails[1]).all():
+                raise DataError("rails must hold the least and the largest reading of each output, low below high")
+            freeze(self, rails=rails)
 
     def bind(self, states: Sequence[str], inputs: Sequence[str]) -> "Delay":
         """Return the sized copy, for a plant with these names."""
@@ -167,13 +177,49 @@ class Delay(Value):
         x_next: Float[np.ndarray, "*batch nx"],
     ) -> Float[np.ndarray, "*batch nzeta"]:
         """Return ζ⁺ = [x⁺, u, ζ without its oldest step], of one ζ or of rows."""
-        kept = zeta[..., : zeta.shape[-1] - self._block]
+        kept, x_next = zeta[..., : zeta.shape[-1] - self._block], self.clip(x_next)
         return np.concatenate([x_next, u, kept] if self.inputs else [x_next, kept], axis=-1)
+
+    def bridge(self, zeta: Float[np.ndarray, " nzeta"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nzeta"]:
+        """Return ζ⁺ where no reading has come: the last state takes its place."""
+        return self.shift(zeta, u, zeta[: len(self.states)])
+
+    def clip(self, x: Float[np.ndarray, "*batch nx"]) -> Float[np.ndarray, "*batch nx"]:
+        """Return what the sensors show of x: no more than their rails."""
+        return x if self.rails is None else np.clip(x, *self.rails)
+
+    def is_beyond(self, y: Float[np.ndarray, " nx"], predicted: Float[np.ndarray, " nx"]) -> Bool[np.ndarray, " nx"]:
+        """Return which readings are at a rail with a prediction at it or beyond: they tell nothing more."""
+        if self.rails is None:
+            return np.zeros(len(y), dtype=np.bool_)
+        low, high = self.rails
+        return ((y <= low) & (predicted <= low)) | ((y >= high) & (predicted >= high))
+
+    def spread(self, states: Float[np.ndarray, " nx"], inputs: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nzeta"]:
+        """Return the sizes of the entries of ζ for these sizes of states and inputs."""
+        return self.repeat(states, inputs)
+
+    def without_rails(self) -> "Delay":
+        """Return the embedding for sensors without limits, as plans need it."""
+        return self if self.rails is None else replace(self, rails=None)
 
     def symbolic(self, zeta: ca.SX, u: ca.SX, x_next: ca.SX) -> ca.SX:
         """Return ζ⁺ for symbolic columns ζ, u and x⁺."""
-        kept = zeta[: zeta.shape[0] - self._block]
+        kept, x_next = zeta[: zeta.shape[0] - self._block], self.clip_symbolic(x_next)
         return ca.vertcat(x_next, u, kept) if self.inputs else ca.vertcat(x_next, kept)
+
+    def clip_symbolic(self, x: ca.SX) -> ca.SX:
+        """Return `clip` of a symbolic column."""
+        if self.rails is None:
+            return x
+        low, high = self.rails
+        entries = [
+            ca.fmax(ca.fmin(x[i], high[i]) if np.isfinite(high[i]) else x[i], low[i])
+            if np.isfinite(low[i])
+            else (ca.fmin(x[i], high[i]) if np.isfinite(high[i]) else x[i])
+            for i in range(x.numel())
+        ]
+        return ca.vertcat(*entries)
 
     def _points(
         self, X: Float[np.ndarray, "rows nx"], U: Float[np.ndarray, "steps nu"]

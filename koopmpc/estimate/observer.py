@@ -170,7 +170,7 @@ class History:
     """
 
     def __init__(self, embedding: Delay) -> None:
-        self._embedding, self._nx = embedding, len(embedding.states)
+        self._embedding = embedding
         self.reset()
 
     def reset(self) -> None:
@@ -185,7 +185,7 @@ class History:
             self._zeta = zeta if known else None
             return zeta
         zeta = embedding.shift(self._zeta, u, x)
-        self._zeta = zeta if known else embedding.shift(self._zeta, u, self._zeta[: self._nx])
+        self._zeta = zeta if known else embedding.bridge(self._zeta, u)
         return zeta
 
 

@@ -264,6 +264,9 @@ class Predictor(Value):
     def _eigen(self) -> tuple[Complex[np.ndarray, " nz"], Complex[np.ndarray, "nz nz"]]:
         return sorted_eigen(self.A)
 
+    def _clip(self, X: Float[np.ndarray, "rows nx"]) -> Float[np.ndarray, "rows nx"]:
+        return X if self.embedding is None else self.embedding.clip(X)
+
     def _point(self, x: Float[np.ndarray, "..."], history: Episode | None) -> Float[np.ndarray, "..."]:
         if self.embedding is None:
             if history is not None:

@@ -25,6 +25,7 @@ from koopmpc.lifting.base import Lifting, check_lifting
 from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant, State
 from koopmpc.plants.step_map import StepMap
+from koopmpc.predict import hidden_state as hidden_state  # a file names its class, which must be known by then
 from koopmpc.predict.base import FitReport, Predictor, load_value
 from koopmpc.predict.state_space import build_system, read_state_space
 from koopmpc.values import freeze
@@ -123,7 +124,7 @@ class LinearPredictor(Predictor):
         transposed, rows = self.A.T, list(Z)
         for z, z_next in pairwise(rows):  # z_next += A z in place, the fastest BLAS call for one vector
             dgemv(1.0, transposed, z, 1.0, z_next, 0, 1, 0, 1, 1, 1)
-        X = Z @ self.C.T
+        X = self._clip(Z @ self.C.T)
         X[0] = start[: self.nx]
         return X
 
@@ -267,7 +268,7 @@ class BilinearPredictor(Predictor):
         Z[0] = self.lifting(start)
         for k, u in enumerate(inputs):
             Z[k + 1] = self.A @ Z[k] + self.B @ u + u @ (self.N @ Z[k])
-        X = Z @ self.C.T
+        X = self._clip(Z @ self.C.T)
         X[0] = start[: self.nx]
         return X
 

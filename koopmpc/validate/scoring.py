@@ -169,6 +169,8 @@ def forecast_errors(
                         z_next += v[:, i : i + 1] * (z @ N.T)
                 truth[h] = X[rows + h + 1, : predictor.nx]
                 x = z_next @ C
+                if predictor.embedding is not None:
+                    x = predictor.embedding.clip(x)
                 np.subtract(truth[h], x, out=gap[h])
                 if relift:
                     past = predictor.embedding

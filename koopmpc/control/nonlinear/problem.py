@@ -136,7 +136,7 @@ def learned_map(model: ModelOrMap) -> LearnedMap:
         A = A + u[i] * theta[-1]
     x_next = A @ z + B @ u
     if model.embedding is not None:
-        x_next = model.embedding.symbolic(x, u, x_next)
+        x_next = model.embedding.without_rails().symbolic(x, u, x_next)
     F = ca.Function("F", [x, u, ca.vertcat(*map(ca.vec, theta))], [ca.densify(x_next)], {"cse": True})
     E = _gain(model, nx)
     return LearnedMap(model, F, _theta(model), E, nx, ny, nu, E.shape[1], model.embedding)
@@ -270,4 +270,4 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
 def point_sizes(model: LearnedMap, outputs: StateTracking) -> Float[np.ndarray, " nx"]:
     """Return the sizes of the entries of x, under an embedding those of the state and of its past."""
     sizes = outputs.sizes
-    return sizes.states if model.embedding is None else model.embedding.repeat(sizes.states, sizes.inputs)
+    return sizes.states if model.embedding is None else model.embedding.spread(sizes.states, sizes.inputs)

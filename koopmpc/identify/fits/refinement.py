@@ -11,24 +11,21 @@ from jaxtyping import Float, Int
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
 from koopmpc.errors import DataError
+from koopmpc.identify.levenberg_marquardt import minimise
+from koopmpc.identify.records.conversion import SignalUnits, cut_segments, from_standard, is_hidden, to_standard
+from koopmpc.identify.records.hidden import SimulationError, join_segments
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.predict.base import FitReport
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.predict.spectrum import check_same_names
 
 HELD_OUT = 0.25  # share of each episode, its end, that decides when to stop, where no episodes are given for it
 ROWS = 20_000  # steps of all segments together, at most: beyond it segments begin less often
-DAMPING = 1e-3  # first weight of the diagonal in a Levenberg-Marquardt step
-GROWTH = 4.0  # factor on the damping after a step that does not lower the error
-DECAY = 0.2  # factor on the damping after a step that does
-LEAST_DAMPING = 1e-14  # damping does not fall below this
-TRIALS = 10  # dampings tried for one step
-CONVERGED = 1e-12  # stop where a step lowers the squared error by less than this share
-PATIENCE = 3  # stop after this many steps in a row that do not lower the error on the held-out rows
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Stretches of `horizon` steps: the points ζ they start from, their inputs, and the states that followed."""
+    """RecordSegments of `horizon` steps: the points ζ they start from, their inputs, and the states that followed."""
 
     points: Float[np.ndarray, "m npoint"]
     inputs: Float[np.ndarray, "horizon m nu"]
@@ -121,6 +118,8 @@ def refine(
     ----------
     model
         Its lifting holds the states (C picks them), as `State() + …` does. Of ψ(ζ⁺) only the rows of the states change.
+        Or a model with a hidden state, of `subspace` or `polynomial_state_space`: then the dynamics of z, C and the
+        encoder T of z_0 = T ζ change, and a segment runs in z, without lifting afresh.
     episodes
         What it learns from.
     horizon
@@ -156,6 +155,8 @@ def refine(
     """
     checks.kind(model, "model", (LinearPredictor, BilinearPredictor), "pass what a fit returns")
     horizon, iterations = checks.count(horizon, "horizon"), checks.count(iterations, "iterations")
+    if is_hidden(model):
+        return _refine_hidden(model, episodes_of(episodes), horizon, held_out, iterations)
     places = _state_rows(model)
     if isinstance(model, LinearPredictor) and model.nw:
         raise DataError("the model has measured disturbances, which refine does not know; refine a model without them")
@@ -166,54 +167,54 @@ def refine(
     fitted = _segments(model, whole.with_episodes(learn), horizon, "to learn from")
     judged = _segments(model, whole.with_episodes(unseen), horizon, "held out")
     error, start = MultiStepError(model, size), _theta(model, places)
-    theta, steps = _minimise(error, start, fitted, judged, iterations)
+    free = np.flatnonzero(start.ravel())
+    theta, steps = minimise(error, start, fitted, judged, iterations, free=free)
     before, after = error.evaluate(start, judged), error.evaluate(theta, judged)
     if not after < before:
         return model
-    sentence = (
+    return _with_rows(model, places, theta, _describe(horizon, steps, before, after))
+
+
+def _describe(horizon: int, steps: int, before: float, after: float) -> str:
+    return (
         f"refined on forecasts of {horizon} steps, {steps} iterations: their error on held-out rows is "
         f"{np.sqrt(after):.3g} spreads, {np.sqrt(before):.3g} before"
     )
-    return _with_rows(model, places, theta, sentence)
 
 
-def _minimise(
-    error: MultiStepError, start: Float[np.ndarray, "nx nphi"], fitted: Segments, judged: Segments, iterations: int
-) -> tuple[Float[np.ndarray, "nx nphi"], int]:
-    """Return the Θ on the way down the error of `fitted` that has the least error on `judged`, and its iteration."""
-    theta = best = start
-    free = np.flatnonzero(theta.ravel())
-    value, least = error.evaluate(theta, fitted), error.evaluate(theta, judged)
-    damping, at, waited = DAMPING, 0, 0
-    for step in range(1, iterations + 1):
-        if not np.isfinite(value):
-            break  # the start overflows: there is no derivative to follow
-        gradient, matrix = error.derivatives(theta, fitted)
-        gradient, matrix = gradient[free], matrix[np.ix_(free, free)]
-        scale = np.sqrt(np.where(matrix.diagonal() > 0, matrix.diagonal(), 1.0))
-        scaled, slope = matrix / np.outer(scale, scale), gradient / scale
-        lower = np.inf
-        for _ in range(TRIALS):
-            move = np.zeros(theta.size)
-            move[free] = np.linalg.lstsq(scaled + damping * np.eye(len(slope)), -slope, rcond=None)[0] / scale
-            trial = theta + move.reshape(theta.shape)
-            lower = error.evaluate(trial, fitted)
-            if lower < value:
-                theta = trial
-                damping = max(DECAY * damping, LEAST_DAMPING)
-                break
-            damping *= GROWTH
-        if not lower < value:
-            break
-        gained, value = 1 - lower / value, lower
-        now = error.evaluate(theta, judged)
-        if now < least:
-            best, least, at, waited = theta, now, step, 0
-        else:
-            waited += 1
-        if gained < CONVERGED or waited == PATIENCE:
-            break
-    return best, at
+def _refine_hidden(
+    model: LinearPredictor | BilinearPredictor,
+    episodes: Episodes,
+    horizon: int,
+    held_out: Episodes | None,
+    iterations: int,
+) -> LinearPredictor | BilinearPredictor:
+    """Refine the dynamics, the output and the encoder of a hidden state on forecasts of `horizon` steps."""
+    check_same_names(model, episodes)
+    assert model.embedding is not None, "a hidden state begins with past rows"
+    parts = _parts(episodes) if held_out is None else (list(episodes), list(episodes_of(held_out)))
+    learn, unseen = (episodes.with_episodes(part) for part in parts)
+    delays = model.embedding.steps
+    units = SignalUnits.of(learn, model.embedding.rails)
+    start = to_standard(model, units)
+    fitted, judged = (
+        [join_segments(cut_segments(part, units, delays, horizon, _apart(part, horizon)))] for part in (learn, unseen)
+    )
+    error = SimulationError(start)
+    theta, steps = minimise(error, start.parameters, fitted, judged, iterations)
+    before, after = error.evaluate(start.parameters, judged), error.evaluate(theta, judged)
+    if not after < before:
+        return model
+    report = model.report
+    if report is not None:
+        report = replace(report, changes=(*report.changes, _describe(horizon, steps, before, after)))
+    return from_standard(start.with_parameters(theta), units, learn, delays, report)
+
+
+def _apart(episodes: Episodes, horizon: int) -> int:
+    """Return the rows between the starts of segments."""
+    steps = sum(map(len, episodes))
+    return max(-(-horizon // 2), -(-steps * horizon // ROWS))
 
 
 def _state_rows(model: LinearPredictor | BilinearPredictor) -> Int[np.ndarray, " nx"]:
@@ -270,8 +271,7 @@ def _segments(model: LinearPredictor | BilinearPredictor, episodes: Episodes, ho
             "longer episodes"
         )
     points = model.embed(episodes.with_episodes(long))
-    steps = sum(len(episode) for episode in points)
-    apart = max(-(-horizon // 2), -(-steps * horizon // ROWS))
+    apart = _apart(points, horizon)
     starts: list[Float[np.ndarray, "_ npoint"]] = []
     inputs: list[Float[np.ndarray, "horizon _ nu"]] = []
     states: list[Float[np.ndarray, "horizon _ nx"]] = []

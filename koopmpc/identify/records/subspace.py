@@ -151,7 +151,7 @@ def _find_state(
         ahead = ahead @ Phi
         forecasts.append(ahead / size[:, None])
     M = np.vstack(forecasts)
-    R = np.linalg.qr(zeta / np.sqrt(regression.rows.samples), mode="r")
+    R = np.asarray(np.linalg.qr(zeta / np.sqrt(regression.rows.samples), mode="r"), dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         weighted = M @ R.T
     if not np.isfinite(weighted).all():

@@ -1,0 +1,96 @@
+"""Levenberg-Marquardt descent that stops on rows which it does not fit."""
+
+from typing import Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int
+
+DAMPING = 1e-3  # first weight of the diagonal in a Levenberg-Marquardt step
+GROWTH = 4.0  # factor on the damping after a step that does not lower the error
+DECAY = 0.2  # factor on the damping after a step that does
+LEAST_DAMPING = 1e-14  # damping does not fall below this
+TRIALS = 10  # dampings tried for one step
+CONVERGED = 1e-12  # stop where a step lowers the squared error by less than this share
+PATIENCE = 3  # stop after this many steps in a row that do not lower the error on the held-out rows
+
+D = TypeVar("D", contravariant=True)
+
+
+@runtime_checkable
+class SquaredError(Protocol[D]):
+    """A mean squared error with parameters Θ, on some data."""
+
+    def evaluate(self, theta: Float[np.ndarray, "..."], data: D, /) -> float:
+        """Return the error; inf where it cannot be computed."""
+        ...
+
+    def derivatives(
+        self, theta: Float[np.ndarray, "..."], data: D, /
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
+        """Return half the gradient, row after row of Θ, and the Gauss-Newton matrix."""
+        ...
+
+
+def minimise(
+    error: SquaredError[D],
+    start: Float[np.ndarray, "..."],
+    fitted: D,
+    judged: D,
+    iterations: int,
+    *,
+    free: Int[np.ndarray, " f"] | None = None,
+    patience: int = PATIENCE,
+    converged: float = CONVERGED,
+) -> tuple[Float[np.ndarray, "..."], int]:
+    """Return the Θ on the way down the error of `fitted` that has the least error on `judged`, and its iteration.
+
+    Parameters
+    ----------
+    error
+        What is minimised.
+    start
+        Θ to start from.
+    fitted, judged
+        Data that are fitted, and data that decide when to stop.
+    iterations
+        Steps, at most.
+    free
+        Places of the entries of Θ that may change; all by default.
+    patience
+        Stop after this many steps in a row that do not lower the error of `judged`.
+    converged
+        Stop where a step lowers the error of `fitted` by less than this share.
+    """
+    theta = best = start
+    places = np.arange(theta.size) if free is None else free
+    value, least = error.evaluate(theta, fitted), error.evaluate(theta, judged)
+    damping, at, waited = DAMPING, 0, 0
+    for step in range(1, iterations + 1):
+        if not np.isfinite(value):
+            break  # the start overflows: there is no derivative to follow
+        gradient, matrix = error.derivatives(theta, fitted)
+        gradient, matrix = gradient[places], matrix[np.ix_(places, places)]
+        scale = np.sqrt(np.where(matrix.diagonal() > 0, matrix.diagonal(), 1.0))
+        scaled, slope = matrix / np.outer(scale, scale), gradient / scale
+        lower = np.inf
+        for _ in range(TRIALS):
+            move = np.zeros(theta.size)
+            move[places] = np.linalg.lstsq(scaled + damping * np.eye(len(slope)), -slope, rcond=None)[0] / scale
+            trial = theta + move.reshape(theta.shape)
+            lower = error.evaluate(trial, fitted)
+            if lower < value:
+                theta = trial
+                damping = max(DECAY * damping, LEAST_DAMPING)
+                break
+            damping *= GROWTH
+        if not lower < value:
+            break
+        gained, value = 1 - lower / value, lower
+        now = error.evaluate(theta, judged)
+        if now < least:
+            best, least, at, waited = theta, now, step, 0
+        else:
+            waited += 1
+        if gained < converged or waited == patience:
+            break
+    return best, at

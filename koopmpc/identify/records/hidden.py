@@ -1,0 +1,248 @@
+"""Models with a hidden state in standard units, their simulation error over segments, and its derivatives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from koopmpc.identify.records.forward import Terms, evaluate_terms, list_terms
+
+_STEPS = 32  # the rows of so many steps are multiplied at once
+_FAR = 1e3  # a state beyond this many spreads has left the model
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenModel:
+    """z⁺ = E φ(z, u), y = H [z; 1] and z = T [ζ; 1], φ = [1; products of z; inputs times such products].
+
+    All signals are deviations from their means, in standard deviations.
+
+    Attributes
+    ----------
+    terms
+        The factors of each product as indices of [1, z, u], from 1, padded with 0.
+    E, H, T
+        (n, 1 + terms), (ny, n + 1) and (n, nζ + 1).
+    bound
+        (n,) in terms with two factors of z or more, |z| counts as this at most: outside of the data they are constant.
+    """
+
+    terms: Terms
+    E: Float[np.ndarray, "n nphi"]
+    H: Float[np.ndarray, "ny n1"]
+    T: Float[np.ndarray, "n nzeta1"]
+    bound: Float[np.ndarray, " n"]
+
+    @property
+    def order(self) -> int:
+        """Order n of the hidden state."""
+        return len(self.E)
+
+    @property
+    def parameters(self) -> Float[np.ndarray, " p"]:
+        """All entries of E, H and T in one row."""
+        return np.concatenate([self.E.ravel(), self.H.ravel(), self.T.ravel()])
+
+    def with_parameters(self, p: Float[np.ndarray, " p"]) -> "HiddenModel":
+        """Return the model with other entries of E, H and T."""
+        a, b = self.E.size, self.E.size + self.H.size
+        E, H, T = p[:a].reshape(self.E.shape), p[a:b].reshape(self.H.shape), p[b:].reshape(self.T.shape)
+        return replace(self, E=E, H=H, T=T)
+
+    def raise_degree(self, degree: int) -> "HiddenModel":
+        """Return the same model with all products up to a degree, the new ones with coefficients of zero."""
+        nu = int(self.terms.max(initial=self.order)) - self.order
+        terms = list_terms(self.order, nu, degree)
+        place = {tuple(int(v) for v in term if v): i for i, term in enumerate(terms, 1)}
+        E = np.zeros((self.order, len(terms) + 1))
+        E[:, 0] = self.E[:, 0]
+        for j, term in enumerate(self.terms, 1):
+            E[:, place[tuple(int(v) for v in term if v)]] = self.E[:, j]
+        return replace(self, terms=terms, E=E)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordSegments:
+    """Segments of records: the points ζ they start from, (m, nζ), and inputs and outputs, (steps, m, n).
+
+    A reading at a rail of its sensor tells only that the output lies there or beyond: `low` and `high` say which.
+    """
+
+    points: Float[np.ndarray, "m nzeta"]
+    inputs: Float[np.ndarray, "steps m nu"]
+    outputs: Float[np.ndarray, "steps m ny"]
+    low: np.ndarray
+    high: np.ndarray
+
+
+Sets = Sequence[RecordSegments]
+"""Segments of several lengths; each length has the same weight."""
+
+
+class SimulationError:
+    """The mean squared error of ŷ_1, ŷ_2, … over sets of segments, z_0 = T ζ, and its derivatives by E, H and T.
+
+    With D_k = ∂z_k/∂θ and J = ∂(E φ)/∂z the derivative follows D_{k+1} = D_k Jᵀ + I ⊗ φ. Where a reading is at a rail
+    and ŷ lies beyond it, the error is zero.
+
+    Parameters
+    ----------
+    model
+        Its terms and sizes; E, H and T come with each call.
+    """
+
+    def __init__(self, model: HiddenModel) -> None:
+        self.model = model
+        n = model.order
+        self._slots = [np.where(slot <= n, slot, 0) for slot in model.terms.T]  # of z, the place of each factor
+        self._nonlinear = is_nonlinear(model.terms, n)
+
+    def evaluate(self, theta: Float[np.ndarray, " p"], data: Sets) -> float:
+        """Return the mean squared error; inf where a state leaves the model."""
+        return sum(self._evaluate(theta, part) for part in data) / len(data)
+
+    def derivatives(
+        self, theta: Float[np.ndarray, " p"], data: Sets
+    ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
+        """Return half the gradient of `evaluate`, and the Gauss-Newton matrix."""
+        gradient, matrix = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
+        for part in data:
+            own = self._derivatives(theta, part)
+            gradient, matrix = gradient + own[0], matrix + own[1]
+        return gradient / len(data), matrix / len(data)
+
+    def _evaluate(self, theta: Float[np.ndarray, " p"], data: RecordSegments) -> float:
+        model, total = self.model.with_parameters(theta), 0.0
+        z = start_states(model, data.points)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k, u in enumerate(data.inputs):
+                z = self._features(z, u)[0] @ model.E.T
+                if not (np.abs(z) < _FAR).all():
+                    return np.inf
+                gap = _gap(z @ model.H[:, :-1].T + model.H[:, -1], data, k)
+                total += float(np.sum(gap**2))
+        return total / data.outputs.size
+
+    def _derivatives(
+        self, theta: Float[np.ndarray, " p"], data: RecordSegments
+    ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
+        model, p = self.model.with_parameters(theta), len(theta)
+        (m, ny), n, nphi = data.outputs.shape[1:], model.order, model.E.shape[1]
+        first, last = model.E.size, model.E.size + model.H.size
+        C = model.H[:, :-1]
+        ones = np.ones((m, 1))
+        D = np.zeros((m, p, n))
+        E_part = D[:, :first].reshape(m, n, nphi, n)  # a view: the rows of E in D
+        own = np.arange(n)
+        outputs = np.arange(len(model.H))
+        D[:, last:].reshape(m, n, -1, n)[:, own, :, own] = np.hstack([data.points, ones])
+        z = start_states(model, data.points)
+        gradient, matrix = np.zeros(p), np.zeros((p, p))
+        rows, gaps = list[np.ndarray](), list[np.ndarray]()
+        for k, u in enumerate(data.inputs):
+            phi, slope = self._features(z, u, model.E)
+            assert slope is not None, "it was asked for"
+            D = np.matmul(D, slope.transpose(0, 2, 1))
+            E_part = D[:, :first].reshape(m, n, nphi, n)
+            E_part[:, own, :, own] += phi
+            z = phi @ model.E.T
+            gap = _gap(z @ C.T + model.H[:, -1], data, k)
+            J = D @ C.T  # (m, p, ny)
+            J[:, first:last].reshape(m, ny, n + 1, ny)[:, outputs, :, outputs] += np.hstack([z, ones])
+            J = J.transpose(0, 2, 1)
+            seen = ~_is_silent(z @ C.T + model.H[:, -1], data, k)
+            rows.append((J * seen[:, :, None]).reshape(m * ny, p))
+            gaps.append(gap.ravel())
+            if len(rows) == _STEPS or k + 1 == len(data.inputs):
+                block = np.concatenate(rows)
+                gradient += block.T @ np.concatenate(gaps)
+                matrix += block.T @ block
+                rows, gaps = [], []
+        return gradient / data.outputs.size, matrix / data.outputs.size
+
+    def _features(
+        self, z: Float[np.ndarray, "m n"], u: Float[np.ndarray, "m nu"], E: Float[np.ndarray, "n nphi"] | None = None
+    ) -> tuple[Float[np.ndarray, "m nphi"], Float[np.ndarray, "m n n"] | None]:
+        """Return φ, and with E also ∂(E φ)/∂z."""
+        terms, n = self.model.terms, z.shape[1]
+        phi = read_features(self.model, z, u)
+        if E is None:
+            return phi, None
+        bound = self.model.bound
+        V = np.hstack([np.ones((len(z), 1)), np.clip(z, -bound, bound), u])
+        inside = (np.abs(z) < bound).astype(float)
+        slope = np.zeros((len(z), n, n))
+        for s, place in enumerate(self._slots):
+            rest = np.ones((len(z), len(terms)))
+            for other, column in enumerate(terms.T):
+                if other != s:
+                    rest *= V[:, column]
+            for j in range(1, n + 1):
+                plain, curved = (np.flatnonzero((place == j) & (self._nonlinear == kind)) for kind in (False, True))
+                slope[:, :, j - 1] += rest[:, plain] @ E[:, plain + 1].T
+                slope[:, :, j - 1] += (rest[:, curved] * inside[:, j - 1 : j]) @ E[:, curved + 1].T
+        return phi, slope
+
+
+def simulate_hidden(
+    model: HiddenModel, points: Float[np.ndarray, "m nzeta"], inputs: Float[np.ndarray, "steps m nu"]
+) -> Float[np.ndarray, "steps m ny"]:
+    """Return ŷ_1, ŷ_2, … from several points ζ."""
+    z, out = start_states(model, points), list[np.ndarray]()
+    with np.errstate(over="ignore", invalid="ignore"):
+        for u in inputs:
+            z = np.clip(read_features(model, z, u) @ model.E.T, -_FAR, _FAR)
+            out.append(z @ model.H[:, :-1].T + model.H[:, -1])
+    return np.stack(out)
+
+
+def bound_states(model: HiddenModel, data: RecordSegments, reach: float) -> HiddenModel:
+    """Return the model with bounds at `reach` times the largest |z| that occurs on these stretches."""
+    model = replace(model, bound=np.full(model.order, np.inf))
+    z = start_states(model, data.points)
+    largest = np.abs(z).max(axis=0)
+    for u in data.inputs:
+        z = np.clip(read_features(model, z, u) @ model.E.T, -_FAR, _FAR)
+        largest = np.maximum(largest, np.abs(z).max(axis=0))
+    return replace(model, bound=reach * largest)
+
+
+def join_segments(parts: Sequence[RecordSegments]) -> RecordSegments:
+    """Return the segments of several records as one set."""
+    points = np.concatenate([part.points for part in parts])
+    inputs, outputs, low, high = (
+        np.concatenate([getattr(part, name) for part in parts], axis=1) for name in ("inputs", "outputs", "low", "high")
+    )
+    return RecordSegments(points, inputs, outputs, low, high)
+
+
+def start_states(model: HiddenModel, points: Float[np.ndarray, "m nzeta"]) -> Float[np.ndarray, "m n"]:
+    """Return z_0 = T [ζ_0; 1], inside of the bound."""
+    return np.clip(points @ model.T[:, :-1].T + model.T[:, -1], -model.bound, model.bound)
+
+
+def read_features(
+    model: HiddenModel, z: Float[np.ndarray, "m n"], u: Float[np.ndarray, "m nu"]
+) -> Float[np.ndarray, "m nphi"]:
+    """Return φ(z, u)."""
+    one, curved = np.ones((len(z), 1)), is_nonlinear(model.terms, model.order)
+    phi = np.hstack([one, evaluate_terms(model.terms, np.hstack([one, z, u]))])
+    if (np.abs(z) > model.bound).any():
+        near = np.hstack([one, np.clip(z, -model.bound, model.bound), u])
+        phi[:, 1:][:, curved] = evaluate_terms(model.terms[curved], near)
+    return phi
+
+
+def is_nonlinear(terms: Terms, order: int) -> Bool[np.ndarray, " nt"]:
+    """Return which terms have two factors of z or more."""
+    return np.sum((terms > 0) & (terms <= order), axis=1) > 1
+
+
+def _is_silent(y: Float[np.ndarray, "m ny"], data: RecordSegments, k: int) -> np.ndarray:
+    """Return which readings say nothing: they are at a rail and y lies beyond it."""
+    return (data.low[k] & (y < data.outputs[k])) | (data.high[k] & (y > data.outputs[k]))
+
+
+def _gap(y: Float[np.ndarray, "m ny"], data: RecordSegments, k: int) -> Float[np.ndarray, "m ny"]:
+    return np.where(_is_silent(y, data, k), 0.0, y - data.outputs[k])

@@ -1,0 +1,239 @@
+"""Models with a hidden state: exact derivatives, exact conversion, exact data, rails of sensors, refinement."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.errors import DataError
+from koopmpc.identify.records.conversion import SignalUnits, cut_segments, from_standard, to_standard
+from koopmpc.identify.records.forward import list_terms
+from koopmpc.identify.records.hidden import HiddenModel, RecordSegments, SimulationError, simulate_hidden
+from tests.identify.test_subspace import linear_plant, markov, model_markov, record_of
+
+
+def random_model(rng, order=2, degree=2, ny=1, nu=1, nzeta=5, bound=np.inf):
+    terms = list_terms(order, nu, degree)
+    E = 0.06 * rng.standard_normal((order, len(terms) + 1))
+    E[:, 1 : 1 + order] += 0.6 * np.eye(order)
+    H, T = rng.standard_normal((ny, order + 1)), 0.3 * rng.standard_normal((order, nzeta + 1))
+    return HiddenModel(terms, E, H, T, np.full(order, bound))
+
+
+def random_segments(model, rng, count=4, steps=5, nu=1):
+    points, inputs = rng.standard_normal((count, model.T.shape[1] - 1)), rng.standard_normal((steps, count, nu))
+    outputs = simulate_hidden(model, points, inputs) + 0.3 * rng.standard_normal((steps, count, len(model.H)))
+    rail = rng.random(outputs.shape)
+    return RecordSegments(points, inputs, outputs, rail < 0.2, rail > 0.8)
+
+
+@pytest.mark.parametrize("bound", [np.inf, 0.8])
+@pytest.mark.parametrize(("order", "degree", "ny", "nu"), [(2, 1, 1, 1), (2, 2, 2, 1), (3, 3, 1, 2)])
+def test_the_derivatives_are_those_of_casadi_and_of_finite_differences(order, degree, ny, nu, bound):
+    rng = np.random.default_rng(order + degree)
+    model = random_model(rng, order, degree, ny, nu, bound=bound)
+    data = random_segments(model, rng, nu=nu)
+    error, theta = SimulationError(model), model.parameters
+    gradient, matrix = error.derivatives(theta, [data])
+    if np.isinf(bound):  # a kink between the two points would spoil a difference
+        for j in rng.choice(theta.size, 12, replace=False):
+            up, down = theta.copy(), theta.copy()
+            up[j] += 1e-6
+            down[j] -= 1e-6
+            slope = (error.evaluate(up, [data]) - error.evaluate(down, [data])) / 4e-6
+            assert gradient[j] == pytest.approx(slope, rel=1e-5, abs=1e-7)
+    # CasADi differentiates the whole simulation; J of all residuals gives the Gauss-Newton matrix
+    a, b = model.E.size, model.E.size + model.H.size
+    symbol = ca.SX.sym("theta", theta.size)
+    E, H, T = (ca.reshape(v, shape[1], shape[0]).T for v, shape in
+               ((symbol[:a], model.E.shape), (symbol[a:b], model.H.shape), (symbol[b:], model.T.shape)))  # fmt: skip
+    residuals = []
+    for i, point in enumerate(data.points):
+        z = T @ ca.DM(np.append(point, 1.0))
+        z = ca.fmin(ca.fmax(z, -bound), bound) if np.isfinite(bound) else z
+        for k, u in enumerate(data.inputs[:, i]):
+            near = ca.fmin(ca.fmax(z, -bound), bound) if np.isfinite(bound) else z
+            phi = [ca.SX(1)]
+            for term in model.terms:
+                curved = sum(0 < v <= order for v in term) > 1
+                v = ca.vertcat(1, near if curved else z, u)
+                product = ca.SX(1)
+                for factor in term:
+                    product *= v[int(factor)]
+                phi.append(product)
+            z = E @ ca.vertcat(*phi)
+            y = H @ ca.vertcat(z, 1)
+            for o in range(ny):
+                truth = data.outputs[k, i, o]
+                silent = ca.logic_or(
+                    ca.logic_and(bool(data.low[k, i, o]), y[o] < truth),
+                    ca.logic_and(bool(data.high[k, i, o]), y[o] > truth),
+                )
+                residuals.append(ca.if_else(silent, 0, y[o] - truth))
+    r = ca.vertcat(*residuals)
+    both = ca.Function("J", [symbol], [r, ca.jacobian(r, symbol)])(theta)
+    value, J = (np.asarray(one) for one in both)
+    assert error.evaluate(theta, [data]) == pytest.approx(np.mean(value**2), rel=1e-9)
+    if np.isinf(bound) or (np.abs(data.points @ model.T[:, :-1].T + model.T[:, -1]) < bound).all():
+        assert np.allclose(gradient, J.T @ value.ravel() / len(value), rtol=1e-8, atol=1e-12)
+        assert np.allclose(matrix, J.T @ J / len(value), rtol=1e-8, atol=1e-12)
+
+
+def saturating_record(rng, steps=800, noise=0.0):
+    """Return a record of two tanks in a row; the sensor of the second one ends at 1.2."""
+    x, Y, U = np.array([0.5, 0.5]), [], []
+    u = 0.5
+    for k in range(steps + 1):
+        if k % 12 == 0:
+            u = rng.uniform(0.1, 1.1)
+        Y.append(min(x[1] + noise * rng.standard_normal(), 1.2))
+        U.append(u)
+        x = x + np.array([0.3 * u - 0.2 * x[0] - 0.1 * x[0] ** 2, 0.25 * x[0] - 0.2 * x[1]])
+    return km.Episodes([km.Episode(X=np.array(Y)[:, None], U=np.array(U[:-1])[:, None])], 1.0, ["h [m]"], ["q"])
+
+
+@pytest.fixture(scope="module")
+def tanks():
+    data = saturating_record(np.random.default_rng(0), noise=0.005)
+    rails = (-np.inf, 1.2)
+    return data, km.identify.polynomial_state_space(data, [2], [2], horizon=50, rails=rails)
+
+
+def test_a_saturated_sensor_is_no_obstacle(tanks):
+    data, model = tanks
+    fresh = saturating_record(np.random.default_rng(1))
+    assert (fresh[0].X == 1.2).mean() > 0.05
+    past = model.embedding.steps
+    start = model.embed(fresh)[0].X[0]
+    free = model.step_map().rollout(start, fresh[0].U[past:])[:, 0]
+    assert free.max() <= 1.2
+    error = np.sqrt(np.mean((free - fresh[0].X[past:, 0]) ** 2))
+    blind = km.identify.polynomial_state_space(data, [2], [2], horizon=50)
+    other = blind.step_map().rollout(blind.embed(fresh)[0].X[0], fresh[0].U[past:])[:, 0]
+    assert error < 0.03 * fresh[0].X.std()
+    assert error < 0.5 * np.sqrt(np.mean((other - fresh[0].X[past:, 0]) ** 2))
+
+
+def test_scores_steps_and_files_show_the_same_forecast(tanks, tmp_path):
+    data, model = tanks
+    model.save(tmp_path / "model.npz")
+    again = km.load_model(tmp_path / "model.npz")
+    assert again == model
+    points, U = model.embed(data)[0].X, data[0].U[model.embedding.steps :]
+    X = again.step_map().rollout(points[0], U[:30])
+    point = points[0]
+    for k in range(30):  # by hand, with the numbers of the predictor
+        z = model.lifting(point)
+        x_next = model.C @ (model.A @ z + model.B @ U[k] + U[k] @ (model.N @ z))
+        point = model.embedding.shift(point, U[k], x_next)
+        assert np.allclose(point, X[k + 1], rtol=1e-9, atol=1e-12)
+    gap = km.score(model, data, 30, stride=10_000, relift=True)
+    assert np.allclose(np.abs(X[1:, :1] - data[0].X[model.embedding.steps + 1 :][:30]), gap.rmse, atol=1e-9)
+
+
+def test_conversion_to_standard_units_and_back_changes_nothing(tanks):
+    data, model = tanks
+    units = SignalUnits.of(data, model.embedding.rails)
+    found = to_standard(model, units)
+    again = from_standard(found, units, data, model.embedding.steps, model.report)
+    for name in ("A", "B", "N", "C"):
+        assert np.allclose(getattr(model, name), getattr(again, name), rtol=1e-9, atol=1e-9)
+    (part,) = cut_segments(data, units, model.embedding.steps, 20, 100)
+    free = simulate_hidden(found, part.points, part.inputs)[:, :, 0] * units.scale[0] + units.mean[0]
+    starts = model.embed(data)[0].X[np.arange(0, len(part.points)) * 100]
+    U = data[0].U[model.embedding.steps :]
+    for i, start in enumerate(starts):
+        X = model.step_map().rollout(start, U[100 * i : 100 * i + 20])[1:, 0]
+        assert np.allclose(X, np.minimum(free[:, i], 1.2), atol=1e-9)
+
+
+def test_readings_correct_the_state_and_missing_ones_are_bridged(tanks):
+    data, model = tanks
+    embedding, X, U = model.embedding, data[0].X, data[0].U
+    past = embedding.steps
+    truth = model.embed(data)[0].X
+    wrong = truth[0].copy()
+    wrong[1:] += 0.5
+    free = wrong.copy()
+    for k in range(past, past + 60):
+        wrong = embedding.shift(wrong, U[k], X[k + 1])
+        free = embedding.bridge(free, U[k])
+    assert wrong[0] == X[past + 60, 0]
+    assert np.isfinite(free).all()
+    assert np.abs(wrong[1:] - truth[60, 1:]).max() < 0.3
+    z, low = wrong[1:], embedding.rails
+    hidden = embedding.shift(np.array([1.2, *z]), U[past], np.array([np.nan]))[1:]
+    assert np.isfinite(hidden).all()
+    assert low[1, 0] == 1.2
+
+
+def test_exact_data_are_met_from_coefficients_ten_percent_off():
+    """Free run and the first 50 Markov parameters; hidden states are unique only up to their basis."""
+    elsewhere = 0
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        plant = linear_plant(rng, 2)
+        data = record_of(plant, rng, steps=300)
+        true = km.identify.subspace(data, 2, delays=4)
+        units = SignalUnits.of(data, None)
+        found = to_standard(true, units)
+        theta = found.parameters * rng.uniform(0.9, 1.1, found.parameters.size)
+        start = from_standard(found.with_parameters(theta), units, data, 4, true.report)
+        refined = km.identify.refine(start, data, horizon=20, iterations=100)
+        elsewhere += not np.abs(model_markov(refined) - markov(*plant)).max() < 1e-6
+    assert elsewhere == 0
+
+
+def test_hidden_bilinear_dynamics_are_learned_from_the_output_alone():
+    rng = np.random.default_rng(3)
+
+    def run(u):
+        z, y = np.zeros(2), [0.0]
+        for v in u:
+            z = np.array([0.7 * z[0] + 0.2 * z[1] + 0.3 * v + 0.15 * v * z[0], 0.8 * z[1] + 0.4 * v - 0.1 * v * z[1]])
+            y.append(z[0] + 0.5 * z[1])
+        return np.array(y)
+
+    u, fresh = rng.uniform(-1, 1, 800), rng.uniform(-1, 1, 300)
+    data = km.Episodes([km.Episode(X=run(u)[:, None], U=u[:, None])], 0.1, ["y"], ["u"])
+    models = [km.identify.subspace(data, 2), km.identify.polynomial_state_space(data, [2], [2], horizon=40)]
+    truth, errors = run(fresh), list[float]()
+    for model in models:
+        past = model.embedding.steps
+        history = km.Episode(X=truth[: past + 1, None], U=fresh[:past, None])
+        X = model.step_map().rollout(model.start(truth[past : past + 1], history), fresh[past:, None])[:, 0]
+        errors.append(np.sqrt(np.mean((X - truth[past:]) ** 2)))
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_refinement_of_a_hidden_state_is_never_worse_on_held_out_rows():
+    rng = np.random.default_rng(7)
+    plant = linear_plant(rng, 2)
+    data, unseen = (record_of(plant, rng, steps=400, noise=0.2) for _ in range(2))
+    start = km.identify.subspace(data, 2, delays=6)
+    found = km.identify.refine(start, data, horizon=30, held_out=unseen)
+    units = SignalUnits.of(data, None)
+    judged = cut_segments(unseen, units, 6, 30, 15)
+    before, after = (
+        SimulationError(one).evaluate(one.parameters, judged) for one in (to_standard(m, units) for m in (start, found))
+    )
+    assert after <= before
+
+
+def test_bilinear_mpc_controls_a_hidden_state(tanks):
+    _, model = tanks
+    mpc = km.BilinearMPC(model, km.Cost(Q=1.0, R=1e-3), km.Limits(u_min=0.0, u_max=1.2), 20)
+    x, u = np.array([0.5, 0.5]), np.array([0.5])
+    for _ in range(80):
+        u = mpc([min(x[1], 1.2)], [0.9]).u
+        x = x + np.array([0.3 * u[0] - 0.2 * x[0] - 0.1 * x[0] ** 2, 0.25 * x[0] - 0.2 * x[1]])
+    assert abs(x[1] - 0.9) < 0.02
+    assert "hidden state" in mpc.program([0.9]).obstacle
+
+
+def test_wrong_rails_and_short_records_are_refused_in_a_sentence():
+    data = saturating_record(np.random.default_rng(0), steps=20)
+    with pytest.raises(DataError, match="low below high"):
+        km.Delay(2, rails=np.array([[1.0], [0.0]]))
+    with pytest.raises(DataError, match=r"segment|past rows|overflows|longer"):
+        km.identify.polynomial_state_space(data, [2], [1], delays=30)
