@@ -88,7 +88,7 @@ def fmu(
         The file is no FMU, or a path in it leaves its folder.
     DataError
         FMI 1, no binary for this platform, an unknown variable, model exchange with events, time-dependent equations,
-        an output that depends on the inputs directly, or a step that the unit refuses.
+        an output that depends on the inputs directly.
 
     References
     ----------
@@ -114,6 +114,13 @@ def fmu(
     if states is not None:
         raise DataError("model exchange knows its states: leave states out; outputs= chooses what is measured")
     return FMUStepMap(unit, dt, read_equations(unit, values, moved, chosen), integrator, scene)
+
+
+class _EventError(Exception):
+    """A unit stopped at an event inside a step, at this time [s]."""
+
+    def __init__(self, time: float) -> None:
+        self.time = time
 
 
 def _read_start_values(unit: UnitDescription, given: Mapping[str, StartValue]) -> dict[str, StartValue]:
@@ -221,7 +228,7 @@ class FMUPlant:
         Raises
         ------
         DataError
-            The unit was never reset, has ended, or refuses the step.
+            The unit was never reset, has ended, refuses the step, or stops at an event inside it.
         """
         if self.ended:
             raise DataError(f"{self._unit.file} does not run ({self.ended}); call reset(x0, rng) before step")
@@ -233,9 +240,19 @@ class FMUPlant:
                 slave.fmi2DoStep(slave.component, start, self.dt, 1)
             else:
                 slave.fmi3SetFloat64(slave.component, self._u_refs, n, self._u, n)
-                if slave.doStep(start, self.dt)[1]:
+                event, ended, early, reached = slave.doStep(start, self.dt)
+                if event or early:
+                    raise _EventError(reached)
+                if ended:
                     self.ended = "the unit ended the simulation"
             self._look()
+        except _EventError as error:
+            self.ended = "it met an event"
+            raise DataError(
+                f"{self._unit.file} met an event inside the step from t = {start:g} s by {self.dt:g} s and stopped at "
+                f"t = {error.time:g} s; koopmpc handles no events: export the unit so that it handles them inside "
+                "doStep, or pass a dt that its events fall on"
+            ) from None
         except Exception as error:  # FMPy raises bare Exceptions
             raise self._refused(
                 f"the step from t = {start:g} s by {self.dt:g} s with u = {self._values_sent}", error

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.plants.routines import find_compiler
 from tests.plants import units
 
 pytest.importorskip("fmpy", reason="the extra fmu is not installed")
@@ -185,6 +186,41 @@ def test_a_step_that_the_unit_refuses_names_its_reason_and_a_reset_mends_it(pend
     with pytest.raises(km.KoopmpcError, match="call reset"):
         unit.step([0.0])
     assert unit.reset(None) == [0.3]
+
+
+def build_eventful(path):
+    """Write an FMI 3 co-simulation unit, y ↦ u, that stops at an event in the step from t = 0.1 s."""
+    plant = km.discretize(Pendulum(), 0.05)
+    law = km.LQR(km.LinearPredictor.local(plant, [0, 0], [0]), km.Cost(Q=[1, 1], R=1))
+    with zipfile.ZipFile(km.export(law, path / "c", name="arm", fmu=3) / "arm.fmu") as whole:
+        held = {name: whole.read(name) for name in whole.namelist()}
+    text = held["sources/arm.c"].decode()
+    flags = "*event = *ends = *early = false;"
+    assert flags in text
+    (path / "arm.c").write_text(text.replace(flags, "*ends = false, *event = *early = time > 0.09; if (*early) { *last = time + 0.02; return OK; }"))  # fmt: skip
+    command = [*find_compiler(), "-std=c99", "-O1", "-fPIC", "-shared", str(path / "arm.c"), "-o", str(path / "arm.so")]
+    subprocess.run([*command, "-lm"], check=True)
+    (binary,) = (name for name in held if name.startswith("binaries/"))
+    held[binary] = (path / "arm.so").read_bytes()
+    with zipfile.ZipFile(path / "eventful.fmu", "w") as archive:
+        for name, content in held.items():
+            archive.writestr(name, content)
+    return path / "eventful.fmu"
+
+
+def test_an_event_inside_a_step_is_an_error_that_names_its_time(tmp_path):
+    unit = km.plants.fmu(build_eventful(tmp_path), inputs=["y.theta", "y.omega"], outputs=["u.tau"])
+    unit.reset(None)
+    for _ in range(2):
+        assert abs(unit.step([0.1, 0.0])[0]) > 1e-3
+    with pytest.raises(
+        km.KoopmpcError, match=r"an event inside the step from t = 0\.1 s by 0\.05 s and stopped at t = 0\.12 s"
+    ):
+        unit.step([0.1, 0.0])
+    with pytest.raises(km.KoopmpcError, match=r"it met an event.*call reset"):
+        unit.step([0.1, 0.0])
+    unit.reset(None)
+    assert abs(unit.step([0.1, 0.0])[0]) > 1e-3
 
 
 BAD = {
