@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import os
 import pkgutil
 import subprocess
 import sys
@@ -55,15 +56,20 @@ def test_type_checkers_see_the_same_names(room: str) -> None:
         assert value is (importlib.import_module(path) if held is None else held), name
 
 
-def test_nothing_is_imported_before_the_first_name_and_no_drawing_library_by_it() -> None:
+def test_nothing_is_imported_before_the_first_name_and_no_extra_by_a_fit(tmp_path: Path) -> None:
     code = (
         "import sys, koopmpc as km\n"
         "assert not [m for m in sys.modules if m.startswith('koopmpc.') and m != 'koopmpc.lazy'], sys.modules\n"
         "km.Cost\n"
         "heavy = {'matplotlib', 'rerun', 'cvxpy', 'sklearn', 'pandas', 'distributed', 'osqp'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
+        "data = km.Episodes([km.Episode(X=[[1], [2], [4], [3]], U=[[2], [3], [1]])], 1.0)\n"
+        "data.save('a.npz'); km.edmd(km.load_episodes('a.npz'), km.State())\n"
+        "foreign = {'h5py', 'asammdf', 'rosbags', 'mcap', 'fmpy', 'onnx', 'asyncua', 'pandas', 'imageio_ffmpeg'}\n"
+        "assert not foreign & set(sys.modules), foreign & set(sys.modules)\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    path = os.pathsep.join([str(Path(km.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, env=os.environ | {"PYTHONPATH": path})
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

@@ -81,9 +81,10 @@ class MessageRecording(Recording):
                     time = ((recorded if stamp is None else stamp) - self._zero) * _NS
                     if not begin <= time <= end:
                         continue
+                    numbers = flatten(content)
                     for name, path in wanted[where]:
                         samples[name][0].append(time)
-                        samples[name][1].append(_follow(content, path))
+                        samples[name][1].append(numbers.get(path, np.nan))
         except (KoopmpcError, ModuleNotFoundError):
             raise
         except Exception as error:
@@ -244,11 +245,6 @@ def _list_fields(content: Any) -> list[tuple[str, Any]]:
     if isinstance(content, dict):
         return [(str(name), value) for name, value in content.items()]
     return [(name, value) for name, value in vars(content).items() if not name.startswith("__")]
-
-
-def _follow(content: Any, path: str) -> float:
-    """Return the number at a path of a message; NaN where this message has none."""
-    return flatten(content).get(path, np.nan)
 
 
 def _read_stamp(content: Any) -> int | None:
