@@ -1,17 +1,32 @@
 """The errors of koopmpc: one root, and each class is also the builtin that it refines."""
 
+import json
 import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
+from importlib import metadata
 from pathlib import Path
 from typing import NoReturn
 
 
 def install(extra: str) -> str:
-    """Return the command that installs an extra: from the folder of a clone, which no index knows, else by name."""
+    """Return the command that installs an extra: from the clone or the address that koopmpc came from, else by name."""
     root = Path(__file__).resolve().parent.parent
-    what = f"{root}[{extra}]" if (root / "pyproject.toml").is_file() else f"koopmpc[{extra}]"
-    return f"pip install '{what}'"
+    if (root / "pyproject.toml").is_file():
+        return f"pip install '{root}[{extra}]'"
+    source = _find_source()
+    return f"pip install 'koopmpc[{extra}] @ {source}'" if source else f"pip install 'koopmpc[{extra}]'"
+
+
+def _find_source() -> str:
+    """Return the address that pip installed koopmpc from, as ``git+https://…``; empty if it came from an index."""
+    try:
+        text = metadata.distribution("koopmpc").read_text("direct_url.json")
+        found = json.loads(text or "{}")
+        kind = found.get("vcs_info", {}).get("vcs", "")
+        return f"{kind}+{found['url']}" if kind else str(found.get("url", ""))
+    except (metadata.PackageNotFoundError, OSError, ValueError, KeyError, AttributeError):
+        return ""
 
 
 class KoopmpcError(Exception):

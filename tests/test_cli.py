@@ -96,6 +96,14 @@ def test_bench_takes_several_problems(call, tmp_path):
     assert {path.stem for path in folder.glob("*.rrd")} == {"one-far-lqr", "two-far-lqr"}
 
 
+def test_bench_takes_the_name_of_its_folder(call, tmp_path):
+    path = write(tmp_path)
+    assert call("bench", f"{path}:far", "-c", "lqr", "--name", "monday").exit_code == 0
+    (folder,) = folders(tmp_path)
+    assert folder.name.endswith("-monday")
+    assert "--name is 'a/b'" in call("bench", f"{path}:far", "-c", "lqr", "--name", "a/b").stderr
+
+
 def test_faults_add_a_table_and_a_log_each_and_exit_with_zero(call, tmp_path):
     for command in ("run", "bench"):
         result = call(command, f"{write(tmp_path)}:far", "-c", "lqr", "--faults")
@@ -173,6 +181,13 @@ def test_inspect_recomputes_the_metrics_from_the_log_alone(call, tmp_path):
     assert both.stdout.endswith(2 * result.stdout)
 
 
+def test_inspect_says_that_no_log_has_what_is_asked_for(call, tmp_path):
+    assert call("run", f"{write(tmp_path)}:near", "-c", "lqr").exit_code == 0
+    (folder,) = folders(tmp_path)
+    result = call("inspect", folder, "--where", "violation > 3")
+    assert (result.exit_code, result.stdout.strip()) == (0, "no log has violation > 3")
+
+
 def test_inspect_refuses_what_is_no_log(call, tmp_path):
     (tmp_path / "note.rrd").write_text("not a log")
     result = call("inspect", "note.rrd")
@@ -239,6 +254,15 @@ def test_a_word_of_the_tables_is_explained_and_a_wrong_one_finds_its_neighbour(c
     assert missed.exit_code == 2
     assert "did you mean 'ratio'" in missed.stderr
     assert "offset-free: " in call("explain").stdout
+
+
+def test_a_case_is_explained_with_what_controllers_are_not_told(call, tmp_path):
+    said = " ".join(call("explain", "pendulum:hold").stdout.split())
+    assert "pendulum:hold is a case of pendulum: from the state (0.7854, 0) to the reference (0.8, 0), 10 s." in said
+    assert "(m is 1.2, not 1.0)" in said
+    assert "a ratio may be below 1" in said
+    write(tmp_path / "problems")
+    assert "tiny:near is a case of tiny" in call("explain", "near").stdout  # of all problems
 
 
 def test_logs_are_served_to_this_machine_alone_until_the_server_is_stopped(call, tmp_path):

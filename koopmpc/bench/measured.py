@@ -1,14 +1,18 @@
-"""Standings of the controllers on the shipped problems: measured.json, from which `koopmpc list` says the best."""
+"""What `koopmpc list` and `explain` say of problems: their cases, and standings of the controllers (measured.json)."""
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from koopmpc.bench.controllers import is_learned
+from koopmpc.bench.problem import Problem, list_problems, load_problem
 from koopmpc.bench.store import ORACLE
+from koopmpc.errors import KoopmpcError
 
 PATH = Path(__file__).with_name("measured.json")
 BASELINE = "linear-mpc"  # compare with it if a problem has no nonlinear MPC
@@ -64,3 +68,49 @@ def describe_best(problem: str) -> str:
     own = found[best]
     time = f"1/{1 / own.time:.0f} of its time" if own.time < 0.7 else f"{own.time:.1f} × its time"
     return f"{best}: {own.ratio:.3f} × the cost of {find_baseline(found)}, in {time}"
+
+
+def describe_cases(asked: str) -> list[str]:
+    """Return a sentence on each case that is called ``"case"`` or ``"problem:case"``."""
+    name, _, case = asked.rpartition(":")
+    found: list[str] = []
+    for entry in list_problems():
+        if name not in ("", entry.name):
+            continue
+        try:
+            problem = load_problem(entry.path)
+        except KoopmpcError:  # a file of the user's that does not load; `koopmpc list` names it
+            continue
+        found += [_describe_case(problem, each) for each in problem.cases if each == case]
+    return found
+
+
+def _describe_case(problem: Problem, name: str) -> str:
+    """Return where a case begins, where it leads, and what controllers are not told."""
+    case, row = problem.cases[name], np.atleast_2d(problem.cases[name].reference)
+    start, end = (", ".join(f"{value:.4g}" for value in np.ravel(each)) for each in (case.x0, row[0]))
+    moves = " and moves on" if len(row) > 1 else ""
+    parts = [
+        f"{problem.name}:{name} is a case of {problem.name}: from the state ({start}) to the reference ({end}){moves}, "
+        f"{case.steps * problem.dt:.4g} s"
+    ]
+    if case.limits is not None:
+        parts.append("with limits of its own")
+    if case.noise is not None:
+        parts.append("with noise in the measurement")
+    if case.faults:
+        parts.append("with " + ", ".join(type(fault).__name__ for fault in case.faults))
+    text = "; ".join(parts) + "."
+    if case.plant is not None:
+        text += f" The plant is another one than the controllers know{_name_changes(problem.dynamics, case.plant)}. "
+        text += "So nonlinear-mpc is no optimum here, and a ratio may be below 1."
+    return text
+
+
+def _name_changes(known: object, real: object) -> str:
+    """Return ``" (m is 1.2, not 1)"`` for the fields in which two plants differ; empty for plants of two kinds."""
+    if type(known) is not type(real) or not is_dataclass(known):
+        return ""
+    pairs = [(field.name, getattr(known, field.name), getattr(real, field.name)) for field in fields(known)]
+    changes = [f"{name} is {there}, not {here}" for name, here, there in pairs if np.any(here != there)]
+    return f" ({', '.join(changes)})" if changes else ""

@@ -31,10 +31,12 @@ from koopmpc.values import checksum
 
 _SURE = (0.025, 0.975)  # the ends of an interval
 _STARTS = 10  # from which a map of starts is drawn
+_BETTER = 0.9  # a cost below this share of nonlinear-mpc's is explained
 _LOGS = 12  # runs over one another, at most
 
 LEGEND = "cost: of the run; ratio: to nonlinear-mpc's, which knows the equations; off: error at the end."
 TIMES = "p50, p99: time of a step, in Python. `koopmpc explain WORD` explains every word, for example free."
+BELOW = "A ratio below 1: nonlinear-mpc is no optimum there. See `koopmpc explain {case}`."
 UNDER_FAULTS = "under faults: cost over that without the fault (steps that fell back). See `koopmpc explain WORD`."
 
 
@@ -61,7 +63,21 @@ def explain_results(rows: Sequence[RunRow]) -> RenderableType:
             failed.setdefault(row.failure, []).append(what)
     parts = [Text(f"{', '.join(which)}: {failure}", style="red") for failure, which in failed.items()]
     broken = any(row.fault is not None for row in rows)
+    better = _find_better(rows)
+    if better is not None:
+        parts.append(Text(BELOW.format(case=better)))
     return Group(*parts, Text(f"{LEGEND}\n{UNDER_FAULTS if broken else TIMES}", style="dim"))
+
+
+def _find_better(rows: Sequence[RunRow]) -> str | None:
+    """Return the first case, as ``"problem:case"``, in which a controller is clearly better than nonlinear-mpc."""
+    plain = [row for row in rows if row.fault is None and row.metrics is not None]
+    oracles = {(row.problem, row.case): row.metrics.cost for row in plain if row.controller == ORACLE and row.metrics}
+    for row in plain:
+        least = oracles.get((row.problem, row.case), -np.inf)
+        if row.metrics is not None and row.metrics.cost < _BETTER * least:
+            return f"{row.problem}:{row.case}"
+    return None
 
 
 def _case(title: str, rows: list[RunRow]) -> Table:

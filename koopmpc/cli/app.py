@@ -369,11 +369,12 @@ TERMS: dict[str, str] = {
 @app.command()
 def explain(
     term: Annotated[
-        list[str] | None, typer.Argument(help="A word of a table, a report or a picture; all if left out.")
+        list[str] | None, typer.Argument(help="A word of a table, a report or a picture, or a case; all words if left out.")
     ] = None,
 ) -> None:
     """Explain a word that stands in a table, a report or a picture."""
     from koopmpc.bench.controllers import CONTROLLERS
+    from koopmpc.bench.measured import describe_cases
     from koopmpc.checks import nearest
 
     out, terms = console(), TERMS | {name: entry.explanation for name, entry in CONTROLLERS.items()}
@@ -384,6 +385,10 @@ def explain(
     known, asked = {name.lower(): text for name, text in terms.items()}, " ".join(term)
     key = " ".join(asked.lower().split())
     with friendly():
+        if key not in known and (cases := describe_cases(asked)):
+            for text in cases:
+                out.print(Text(text))
+            return
         if key not in known:
             raise ProblemError(f"there is no term {asked!r}{nearest(key, known)}; there are {', '.join(terms)}")
     out.print(Text(known[key]))

@@ -71,6 +71,7 @@ def bench(
     live: Live = False,
     paced: InRealTime = False,
     logs: Logs = Path("logs"),
+    name: Annotated[str, typer.Option("--name", help="Ends the name of the folder.")] = "bench",
     resume: Annotated[Path | None, typer.Option("--resume", help="Go on with the sweep in this folder.")] = None,
 ) -> None:
     """Compare the controllers that each problem names, else the eight that suit any, from one start or many."""
@@ -85,12 +86,12 @@ def bench(
                 load_problem(each["file"] if len(each["cases"]) > 1 else f"{each['file']}:{each['cases'][0]}")
                 for each in asked.pop("problems")
             ]
-            _sweep(loaded, asked.pop("controllers"), resume, logs, "bench", **asked, **where)
+            _sweep(loaded, asked.pop("controllers"), resume, logs, name, **asked, **where)
             return
         loaded = [load_problem(problem) for problem in (shipped() if every else problems or DEFAULT)]
         where |= {"noise": _shares(noise, "--noise"), "wrong": _shares(wrong, "--wrong"), "starts": starts}
         where |= {"seeds": seeds, "faults": faults, "monitor": monitor, "compiled": compiled}
-        _sweep(loaded, controller, None, logs, "bench", **where)
+        _sweep(loaded, controller, None, logs, name, **where)
 
 
 def report(folder: Annotated[Path, typer.Argument(help="The folder of a sweep.")]) -> None:
@@ -140,6 +141,8 @@ def inspect(
             say(f"{each.path}: {each.refused}", "red")
         elif each.repaired is not None:
             say(f"repaired: {each.repaired}")
+    if not found:
+        say(f"no log has {where}")
     if not shown and len(found) and where is None:
         raise typer.Exit(2)
 

@@ -129,7 +129,7 @@ def simulate(
         plant=plant,
         controller=controller,
         steps=steps,
-        reference=_tracked_rows(reference, cost, plant.states, steps, N),
+        reference=_tracked_rows(reference, cost, plant, steps, N),
         u_reference=_reference_inputs(u_reference, cost, steps, nu),
         measured=None if measured is None else rows_ahead(measured, "measured", "nw", steps, N, "steps"),
         preview=preview,
@@ -347,16 +347,24 @@ def _require_match(plant: StepMap | Plant, controller: Controller, angles: Seque
 
 
 def _tracked_rows(
-    reference: ArrayLike, cost: Cost | None, states: Sequence[str], steps: int, horizon: int
+    reference: ArrayLike, cost: Cost | None, plant: StepMap | Plant, steps: int, horizon: int
 ) -> Float[np.ndarray, "rows nr"]:
     """Return the rows of the reference, one column for each output that the cost tracks."""
     rows = rows_ahead(reference, "reference", "nr", steps + 1, horizon, "steps+1")
     if cost is not None:
         checks.kind(cost, "cost", Cost, "pass km.Cost(Q=…, R=…)")
+        states, outputs = list(plant.states), list(plant.outputs)
         tracked = bind_outputs(cost.of, states)
-        nr = len(states) if tracked is None else tracked.nz
-        if rows.shape[1] != nr:
-            raise ShapeError(f"reference has {rows.shape[1]} columns, the cost tracks {nr} outputs; pass one a column")
+        names, given = states if tracked is None else list(tracked.names), rows.shape[1]
+        if given != len(names):
+            likely = outputs if len(outputs) == given and set(outputs) <= set(states) else states[:given]
+            chosen = ", ".join(repr(name.split(" [")[0]) for name in likely)
+            chosen = chosen if len(likely) == 1 else f"[{chosen}]"
+            fewer = f", or track fewer by Cost(of=km.State({chosen}), …)" if given < len(names) else ""
+            raise ShapeError(
+                f"reference has {given} column{'s' * (given != 1)}, and the cost tracks {len(names)}: "
+                f"{', '.join(names)}; pass a column for each{fewer}"
+            )
     return rows
 
 

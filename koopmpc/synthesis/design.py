@@ -473,7 +473,8 @@ def _build_leaderboard(test: LoopTest, screened: Judged, last: Judged) -> tuple[
                 runs=len(ratio),
                 off=off,
             )
-            part.append((row, outcome))
+            if off or recipe not in last[0]:  # else it stands above, judged in all conditions
+                part.append((row, outcome))
         both += sorted(part, key=lambda pair: pair[0].score)
     return tuple(row for row, _ in both), [outcome for _, outcome in both]
 

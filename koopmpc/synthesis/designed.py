@@ -1,5 +1,6 @@
 """Design: the controller chosen by closed loop, what to expect of it, the leaderboard, and the file that keeps it."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -208,9 +209,11 @@ class Design:
             parts.append(f"best linear: {self.leaderboard[place].title}")
         parts += ["", "expected", str(self.expected), ""]
         rows: list[list[str]] = []
+        titles = Counter(row.title for row in self.leaderboard)
         for row in self.leaderboard:
+            title = row.title if titles[row.title] == 1 else f"{row.title} (ridge {row.recipe.ridge:.0e})".replace("0e+00", "0")
             figures = [f"{row.score:.3f}", f"{row.worst:.3f}", to_percent(row.violation), f"{row.lost} of {row.runs}"]
-            rows.append([row.title, *figures])
+            rows.append([title, *figures])
         headings = ["controller", "score", "worst\nrun", "viol-\nation", "lost\nruns"]
         parts.append(build_leaderboard(headings, rows, self.chosen, place)[0])
         parts += [

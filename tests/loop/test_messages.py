@@ -34,6 +34,13 @@ def slow():
     return km.StepMap(ca.Function("F", [x, ca.SX.sym("u", 1)], [x]), 0.2)
 
 
+def speed_alone():
+    """Return a plant of two states that measures the second."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
+    h = ca.Function("h", [x], [x[1]])
+    return km.StepMap(ca.Function("F", [x, u], [x]), 0.1, h, ["p", "v [m/s]"], ["u"], ["v [m/s]"])
+
+
 class Longer(Outside):
     """A plant whose state has an entry more than its states have names."""
 
@@ -54,8 +61,14 @@ MISTAKES = [
     (DATA, "reference holds 1 NaN or inf", lambda: run(reference=[0, np.nan])),
     (
         SHAPE,
-        "reference has 2 columns, the cost tracks 3 outputs; pass one a column",
+        "reference has 2 columns, and the cost tracks 3: x0, x1, 1; pass a column for each",
         lambda: run(cost=km.Cost(1, 1, of=km.State() + km.Constant())),
+    ),
+    (
+        SHAPE,
+        "reference has 1 column, and the cost tracks 2: p, v [m/s]; pass a column for each, or track fewer by "
+        "Cost(of=km.State('v'), …)",
+        lambda: run(speed_alone(), reference=[0.0], cost=km.Cost([1, 1], 1)),
     ),
     (DATA, "angles holds 2; pass indices of states, 0 to 1", lambda: run(angles=[2])),
     (SHAPE, "disturbance has shape (3,), expected (2,) or a scalar", lambda: run(disturbance=[1, 1, 1])),

@@ -239,6 +239,10 @@ def test_what_is_printed_names_the_choice_and_says_that_figures_are_estimates():
     text = str(usual())
     assert text.startswith(f"chosen: {usual().best.title}")
     assert "no promise" in text
+    recipes = [row.recipe for row in usual().leaderboard]
+    assert all(one != other for k, one in enumerate(recipes) for other in recipes[:k])  # judged twice, listed once
+    names = [line.split("  ")[1].strip() for line in text.splitlines() if line.startswith(("   ", "→  ", "l  "))]
+    assert len(set(names)) == len(names) > 5
     assert "lost runs             0 of 12" in text
     assert max(map(len, text.splitlines())) <= 200
 
