@@ -1,10 +1,8 @@
 """The errors of koopmpc: one root, and each class is also the builtin that it refines."""
 
-import json
 import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
-from importlib import metadata
 from pathlib import Path
 from typing import NoReturn
 
@@ -20,6 +18,9 @@ def install(extra: str) -> str:
 
 def _find_source() -> str:
     """Return the address that pip installed koopmpc from, as ``git+https://…``; empty if it came from an index."""
+    import json
+    from importlib import metadata
+
     try:
         text = metadata.distribution("koopmpc").read_text("direct_url.json")
         found = json.loads(text or "{}")

@@ -45,7 +45,9 @@ def test_the_package_is_installed_from_git_with_pip_and_its_problems_come_with_i
         (None, "'koopmpc[fmu]'"),
     ],
 )
-def test_a_hint_installs_an_extra_from_where_koopmpc_came(source: dict[str, object] | None, told: str, tmp_path: Path) -> None:
+def test_a_hint_installs_an_extra_from_where_koopmpc_came(
+    source: dict[str, object] | None, told: str, tmp_path: Path
+) -> None:
     skipped = shutil.ignore_patterns("__pycache__", "measured.json", "*.c")
     shutil.copytree(ROOT / "koopmpc", tmp_path / "koopmpc", ignore=skipped)
     about = tmp_path / "koopmpc-0.1.0.dist-info"

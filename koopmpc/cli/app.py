@@ -369,7 +369,8 @@ TERMS: dict[str, str] = {
 @app.command()
 def explain(
     term: Annotated[
-        list[str] | None, typer.Argument(help="A word of a table, a report or a picture, or a case; all words if left out.")
+        list[str] | None,
+        typer.Argument(help="A word of a table, a report or a picture, or a case; all words if left out."),
     ] = None,
 ) -> None:
     """Explain a word that stands in a table, a report or a picture."""

@@ -211,7 +211,11 @@ class Design:
         rows: list[list[str]] = []
         titles = Counter(row.title for row in self.leaderboard)
         for row in self.leaderboard:
-            title = row.title if titles[row.title] == 1 else f"{row.title} (ridge {row.recipe.ridge:.0e})".replace("0e+00", "0")
+            title = (
+                row.title
+                if titles[row.title] == 1
+                else f"{row.title} (ridge {row.recipe.ridge:.0e})".replace("0e+00", "0")
+            )
             figures = [f"{row.score:.3f}", f"{row.worst:.3f}", to_percent(row.violation), f"{row.lost} of {row.runs}"]
             rows.append([title, *figures])
         headings = ["controller", "score", "worst\nrun", "viol-\nation", "lost\nruns"]
