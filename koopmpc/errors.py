@@ -85,6 +85,10 @@ class NoInputWarning(FitWarning):
         self.question = question
 
 
+class SourcesOnlyWarning(UserWarning):
+    """A Functional Mock-up Unit that was written holds no machine code, for want of a C compiler."""
+
+
 class Hint:
     """A name that users of other libraries try first; asking for it raises an AttributeError that says what to write.
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float, TypeCheckError
 
-import koopmpc.control.riccati
+import koopmpc as km
 from tests import typecheck
 
 
@@ -110,4 +110,4 @@ def test_an_inner_function_checks_each_time_that_it_is_made_and_sees_its_own_mak
 @pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") != "typed", reason="without the hook nothing is checked")
 def test_the_hook_stands_above_the_library():
     with pytest.raises(TypeCheckError):
-        koopmpc.control.riccati.one_step(np.eye(2), np.ones((3, 1)), np.eye(2), np.eye(1))
+        km.loop.Plans(np.zeros((3, 2)), np.zeros((1, 1, 1)))

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.loop.run import Plans
 from koopmpc.values import Value, from_data, same, to_data
 
 STATES = ("theta [rad]", "omega [rad/s]")
@@ -61,12 +60,12 @@ def test_trees_survive_json_to_the_bit(value):
 
 def test_equality_is_to_the_bit():
     plus, minus = (
-        Plans(np.zeros((1, 2, 1)), np.zeros((1, 1, 1))),
-        Plans(np.zeros((1, 2, 1)), -np.zeros((1, 1, 1))),
+        km.loop.Plans(np.zeros((1, 2, 1)), np.zeros((1, 1, 1))),
+        km.loop.Plans(np.zeros((1, 2, 1)), -np.zeros((1, 1, 1))),
     )
     assert plus != minus
     assert plus == replace(plus)
-    nan = Plans(np.full((1, 2, 1), np.nan), np.zeros((1, 1, 1)))
+    nan = km.loop.Plans(np.full((1, 2, 1), np.nan), np.zeros((1, 1, 1)))
     assert nan == replace(nan, X=nan.X.copy())
     assert plus != km.Cost(1, 1)
     assert plus != 3
@@ -101,7 +100,7 @@ VALUES = {
     "gaussian": km.Gaussian(np.array([[0.1, 1 / 3]]), 0.7).bind(STATES),
     "expressions": km.Expressions(lambda x: [x[0] * x[1], x[1] ** 2], ["a", "b"]).bind(STATES),
     "plan": km.control.Plan(np.array([[0.1, np.nan], [-0.0, 1e-300]]), np.array([[np.inf]])),
-    "plans": Plans(np.full((2, 3, 2), np.nan), np.ones((2, 2, 1))),
+    "plans": km.loop.Plans(np.full((2, 3, 2), np.nan), np.ones((2, 2, 1))),
 }
 
 
@@ -227,7 +226,7 @@ WRONG_TYPES = [
     hostile(km.control.Plan(np.zeros((2, 1)), np.zeros((1, 1))), U=[[1]]),
     hostile(km.control.Plan(np.zeros((2, 1)), np.zeros((1, 1))), X=to_data(np.zeros(3))),
     hostile(km.control.Plan(np.zeros((2, 1)), np.zeros((1, 1))), X=to_data(np.zeros((2, 1), int))),
-    hostile(Plans(np.zeros((2, 3, 1)), np.zeros((2, 2, 1))), U=to_data(np.zeros((3, 2, 1)))),
+    hostile(km.loop.Plans(np.zeros((2, 3, 1)), np.zeros((2, 2, 1))), U=to_data(np.zeros((3, 2, 1)))),
 ]
 
 

@@ -1,6 +1,5 @@
 """A controller as a Functional Mock-up Unit: its C in one file, its description, and machine code for this platform."""
 
-import hashlib
 import os
 import platform
 import re
@@ -17,7 +16,9 @@ from xml.sax.saxutils import quoteattr
 from koopmpc.codegen.sources import join_sources, read_shipped, rename_symbols
 from koopmpc.codegen.tables import Tables
 from koopmpc.disk import writing
+from koopmpc.errors import SourcesOnlyWarning
 from koopmpc.plants.routines import find_compiler
+from koopmpc.values import fingerprint
 
 FMIVersion = Literal[2, 3]
 
@@ -32,10 +33,6 @@ _STATUS = (
     "0 unconstrained, 1 optimal, 2 softened, 3 saturated, 4 iteration limit, 6 infeasible, 7 bad measurement, 8 failed"
 )
 _FALLBACK = "0 none, 1 shifted plan, 2 clipped LQR, 3 hold"
-
-
-class SourcesOnlyWarning(UserWarning):
-    """The unit holds no machine code."""
 
 
 class _Real(NamedTuple):
@@ -72,7 +69,7 @@ def write_unit(tables: Tables, texts: dict[str, str], path: Path, name: str, ver
     """
     code = join_sources(texts)
     parts = [code, read_shipped("c", "unit.c"), read_shipped("c", f"fmi{version}.c")]
-    token = hashlib.sha256("".join(parts).encode()).hexdigest()[:32]
+    token = fingerprint("".join(parts).encode())[:32]
     parts.insert(1, f'#define KOOPMPC_TOKEN "{token}"\n')
     source = rename_symbols({"all": "\n".join(parts)}, name)["all"]
     files = {"modelDescription.xml": _describe(tables, name, token, version).encode()}

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from koopmpc.identify.fits.prior import Dissipation as Dissipation
     from koopmpc.identify.fits.prior import Prior as Prior
     from koopmpc.identify.fits.refinement import refine as refine
-    from koopmpc.identify.fits.regressor import KoopmanRegressor as KoopmanRegressor
     from koopmpc.identify.fits.sparse import sparse_edmd as sparse_edmd
     from koopmpc.identify.fits.stable import stable_edmd as stable_edmd
     from koopmpc.identify.records.narx import narx as narx
     from koopmpc.identify.records.state_space import polynomial_state_space as polynomial_state_space
     from koopmpc.identify.records.subspace import subspace as subspace
+    from koopmpc.identify.regressor import KoopmanRegressor as KoopmanRegressor
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -1,7 +1,6 @@
 # pyright: basic
 """A model-exchange unit as a step map: its equations through CasADi, with their derivatives."""
 
-import hashlib
 import os
 import zipfile
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from koopmpc.plants.dynamics import Integrator
 from koopmpc.plants.fmu_files import StartValue, UnitDescription, UnitVariable, collect_limits, read_description
 from koopmpc.plants.step_map import StepMap
 from koopmpc.scene import Scene
-from koopmpc.values import freeze
+from koopmpc.values import fingerprint, freeze
 
 _LATER = 1234.5  # time [s] at which ẋ is compared with that at 0, to see whether it depends on time
 
@@ -91,8 +90,7 @@ def read_equations(
             f"{unit.file} has {unit.events} event indicators: by model exchange koopmpc steps over events; pass "
             'interface="co-simulation" where the unit offers it, or export the model without events'
         )
-    with unit.path.open("rb") as stream:
-        folder = _unpack(unit.path, hashlib.file_digest(stream, "sha256").hexdigest(), os.getpid())
+    folder = _unpack(unit.path, fingerprint(unit.path.read_bytes()), os.getpid())
     try:
         builder = ca.DaeBuilder(unit.source.modelName, str(folder), {"enable_ls_serialization": False})
         for name, value in values.items():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.plants.routines import find_compiler
+from tests.compiler import find_compiler
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
 BOX = {"u_min": -8.0, "u_max": 8.0}

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.codegen.unit import SourcesOnlyWarning
-from koopmpc.plants.routines import find_compiler
 from tests.commands import koopmpc
+from tests.compiler import find_compiler
 
 fmpy = pytest.importorskip("fmpy", reason="the extra fmu is not installed")
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -142,7 +141,7 @@ def test_a_step_of_another_length_is_discarded_and_a_reset_starts_again(exported
 
 def test_without_a_compiler_the_unit_holds_sources_and_says_so(tmp_path, pendulum, monkeypatch):
     monkeypatch.setattr("koopmpc.codegen.unit.find_compiler", lambda: None)
-    with pytest.warns(SourcesOnlyWarning, match="sources only"):
+    with pytest.warns(km.errors.SourcesOnlyWarning, match="sources only"):
         km.export(km.LQR(pendulum[1], COST), tmp_path, fmu=3)
     with pytest.raises(km.KoopmpcError, match=r"no binary for x86_64-linux; compile its C sources"):
         km.plants.fmu(tmp_path / "koopmpc.fmu")

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.synthesis.surrogates import Surrogate
 from tests.example_plants import Pendulum
 
 ROOT = Path(km.__file__).parent
@@ -81,7 +80,7 @@ BUILDS = {
     "KoopmanMPC": lambda _: take_steps(km.KoopmanMPC(linear(), COST, BOX, 8)),
     "offset-free": lambda _: take_steps(km.KoopmanMPC(linear(), COST, BOX, 8, estimator=km.LiftedDisturbance())),
     "delays": lambda _: delayed().step_map(),
-    "surrogate": lambda _: Surrogate(linear(), np.zeros(1), np.zeros(0), np.zeros(2)).plant(1.2),
+    "surrogate": lambda _: km.synthesis.Surrogate(linear(), np.zeros(1), np.zeros(0), np.zeros(2)).plant(1.2),
     "LinearMPC": lambda _: take_steps(km.LinearMPC(plant(), *STEADY, COST, BOX, 8)),
     "BilinearMPC": lambda _: take_steps(km.BilinearMPC(bilinear(), COST, BOX, 3, estimator=km.LiftedDisturbance())),
     "NonlinearMPC": lambda _: take_steps(km.NonlinearMPC(plant(), COST, BOX, 4)),

@@ -3,14 +3,13 @@
 import re
 import shutil
 import warnings
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.loop.run import MOVE_COLUMNS
 from tests.recording.runs import about, make_run, steps_of
 
 
@@ -98,7 +97,7 @@ def test_a_log_cut_behind_its_first_batch_is_read_up_to_the_cut(written: Path, t
 def head(run: km.Run, steps: int) -> km.Run:
     """Return the first steps of a run."""
     ends = ("X", "Y", "reference")
-    moves = ("U", "u_reference", *(column.name for column in MOVE_COLUMNS))
+    moves = ("U", "u_reference", *(field.name for field in fields(km.Run) if "move" in field.metadata))
     return replace(
         run,
         **{name: getattr(run, name)[: steps + 1] for name in ends},

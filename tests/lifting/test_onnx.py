@@ -5,7 +5,7 @@ import pytest
 import scipy.special
 
 import koopmpc as km
-from koopmpc.plants.routines import find_compiler
+from tests.compiler import find_compiler
 from tests.docs.page import alike, run
 
 onnx = pytest.importorskip("onnx", reason="the extra dev is not installed")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import casadi as ca
 
-from koopmpc.plants.routines import find_compiler
+from tests.compiler import find_compiler
 
 HERE = Path(__file__).parent
 DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
