@@ -7,6 +7,7 @@ from koopmpc.lazy import attach
 if TYPE_CHECKING:
     from koopmpc.control.kinds import BenchEntry as BenchEntry
     from koopmpc.control.kinds import ControllerKind as ControllerKind
+    from koopmpc.control.kinds import list_kinds as list_kinds
     from koopmpc.control.kinds import register_controller as register_controller
     from koopmpc.control.linear.koopman_mpc import CondensedProgram as CondensedProgram
     from koopmpc.control.lqr import EigenfunctionLQR as EigenfunctionLQR

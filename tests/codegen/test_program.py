@@ -1,5 +1,7 @@
 """A `Program` says all of a controller: interpreted by a plain loop it gives the same inputs, as the C made of it does."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -36,11 +38,28 @@ def staged(cost=CIRCLE, limits=None, of_plant=False, **options):
 
 KALMAN = km.LiftedKalman(["theta", "omega"], disturbance="output", delay=1)
 ROWS = np.linspace(0, 5, 30)[:, None]
+
+
+@cache
+def past_model():
+    """Return a model of the present row and the two before."""
+    problem = km.load_problem("pendulum")
+    plant, training = km.discretize(problem.dynamics, dt=0.05), problem.training
+    data = km.collect(plant, training.x0, training.excitation, episodes=30, steps=40, rng=2)
+    return km.edmd(data, km.State() + km.Constant(), embedding=km.Delay(2), ridge=1e-6)
+
+
+def of_past(build):
+    return lambda plant, model, bilinear: build(plant, past_model(), bilinear)
+
+
 KINDS = {
     "LQR": lqr(),
     "LQR, rates and their weight": lqr(km.Cost(Q=[10.0, 1.0], R=0.1, R_delta=0.3), du_max=8.0),
     "LQR, given inputs": lqr(km.Cost(Q=[10.0, 1.0], R=0.1, u_target=ROWS)),
+    "LQR, past rows": of_past(lqr()),
     "KoopmanMPC": mpc(),
+    "KoopmanMPC, past rows": of_past(mpc(limits=BOX | {"x_max": [0.5, 9.0]})),
     "KoopmanMPC, soft states": mpc(limits=BOX | {"x_min": [-0.5, -1.0], "x_max": [0.5, 1.0]}),
     "KoopmanMPC, rates and blocks": mpc(
         km.Cost(Q=[10.0, 1.0], R=0.1, R_delta=0.3), limits=BOX | {"du_max": 6.0}, moves=(1, 1, 2, 3, 5), latency=1
@@ -107,6 +126,22 @@ def test_a_program_in_a_plain_loop_gives_the_inputs_of_the_controller_and_of_its
         if not turned:
             x = x + 0.01 * rng.standard_normal(2) if k % 20 else rng.uniform([-0.6, -1.5], [0.6, 1.5])
     assert seen & {"OPTIMAL", "SOFTENED", "SATURATED"}  # limits acted
+
+
+def test_each_registered_kind_is_interpreted_or_says_why_not(models):
+    shipped = {
+        kind.controller
+        for kind in km.control.list_kinds().values()
+        if kind.controller.__module__.startswith("koopmpc.")
+    }
+    exported = {type(build(*models)) for build in KINDS.values()}
+    others = {
+        km.NonlinearMPC,
+        km.supervise.Adaptive,
+        km.supervise.Guarded,
+        km.control.EigenfunctionLQR,
+    }  # the next test
+    assert exported | others == shipped | {km.LinearMPC}  # which is saved as the KoopmanMPC that it is
 
 
 def test_each_kind_without_c_code_says_why_and_export_raises_that_sentence(models, tmp_path):
