@@ -8,26 +8,13 @@ from typing import NoReturn
 
 
 def install(extra: str) -> str:
-    """Return the command that installs an extra: from the clone or the address that koopmpc came from, else by name."""
+    """Return the command that installs an extra: from the folder of a clone, else by name.
+
+    By name pip takes the koopmpc that is installed, whether it came from git or an index, and adds what is missing.
+    """
     root = Path(__file__).resolve().parent.parent
-    if (root / "pyproject.toml").is_file():
-        return f"pip install '{root}[{extra}]'"
-    source = _find_source()
-    return f"pip install 'koopmpc[{extra}] @ {source}'" if source else f"pip install 'koopmpc[{extra}]'"
-
-
-def _find_source() -> str:
-    """Return the address that pip installed koopmpc from, as ``git+https://…``; empty if it came from an index."""
-    import json
-    from importlib import metadata
-
-    try:
-        text = metadata.distribution("koopmpc").read_text("direct_url.json")
-        found = json.loads(text or "{}")
-        kind = found.get("vcs_info", {}).get("vcs", "")
-        return f"{kind}+{found['url']}" if kind else str(found.get("url", ""))
-    except (metadata.PackageNotFoundError, OSError, ValueError, KeyError, AttributeError):
-        return ""
+    what = f"{root}[{extra}]" if (root / "pyproject.toml").is_file() else f"koopmpc[{extra}]"
+    return f"pip install '{what}'"
 
 
 class KoopmpcError(Exception):

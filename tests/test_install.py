@@ -1,8 +1,6 @@
 """README's first command: pip installs koopmpc from git into a fresh environment, and the second one runs there."""
 
-import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -33,30 +31,7 @@ def test_the_package_is_installed_from_git_with_pip_and_its_problems_come_with_i
     table = _run(tools / "koopmpc", "run", "pendulum:upright", *chosen, within=tmp_path)
     assert all(name in table for name in CONTROLLERS)
     assert len(list((tmp_path / "logs").glob("*/*.rrd"))) == len(CONTROLLERS)
-
-
-@pytest.mark.parametrize(
-    ("source", "told"),
-    [
-        (
-            {"url": "https://example.org/k.git", "vcs_info": {"vcs": "git", "commit_id": "0"}},
-            "'koopmpc[fmu] @ git+https://example.org/k.git'",
-        ),
-        (None, "'koopmpc[fmu]'"),
-    ],
-)
-def test_a_hint_installs_an_extra_from_where_koopmpc_came(
-    source: dict[str, object] | None, told: str, tmp_path: Path
-) -> None:
-    skipped = shutil.ignore_patterns("__pycache__", "measured.json", "*.c")
-    shutil.copytree(ROOT / "koopmpc", tmp_path / "koopmpc", ignore=skipped)
-    about = tmp_path / "koopmpc-0.1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: koopmpc\nVersion: 0.1.0\n")
-    if source is not None:
-        (about / "direct_url.json").write_text(json.dumps(source))
-    code = (
-        "import sys; sys.path.insert(0, '.'); sys.modules['fmpy'] = None\nimport koopmpc as km\n"
-        "try:\n    km.plants.fmu('a.fmu')\nexcept ImportError as error:\n    print(error)"
-    )
-    assert f"which is not installed: pip install {told}\n" in _run(sys.executable, "-c", code, within=tmp_path)
+    said = _run(tools / "python", "-c", "from koopmpc.errors import install; print(install('video'))", within=tmp_path)
+    assert said == "pip install 'koopmpc[video]'\n"
+    found = _run(tools / "python", "-m", "pip", "install", "--dry-run", "koopmpc[video]", within=tmp_path)
+    assert "Would install imageio-ffmpeg" in found  # pip adds to the koopmpc that came from git

@@ -93,7 +93,11 @@ def bar(first: str, *, rate: bool = False) -> Generator[Bar]:
         def render(self, task: progress.Task) -> Text:
             return Text("" if task.speed is None else f"{task.speed:.3g}/s")
 
-    columns = [progress.TextColumn("{task.description:40}"), progress.BarColumn(), progress.MofNCompleteColumn()]
+    class Count(progress.MofNCompleteColumn):
+        def render(self, task: progress.Task) -> Text:
+            return Text("") if task.total is None else super().render(task)  # else it shows "0/?"
+
+    columns = [progress.TextColumn("{task.description:40}"), progress.BarColumn(), Count()]
     columns += [progress.TimeElapsedColumn(), *((Rate(), progress.TimeRemainingColumn()) if rate else ())]
     with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         yield Bar(shown, first)

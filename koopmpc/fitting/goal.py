@@ -202,7 +202,12 @@ def format_template(data: Episodes, *, horizon: int | None = None, reading: Mapp
         "# koopmpc fit LOGS --goal this-file designs it, koopmpc check CONTROLLER says whether it keeps the goal.",
         "# References are medians of the last rows of the logs: change them to where the plant must rest or go.",
         "",
-        f"horizon = {horizon}  # steps of {data.dt:g} s that the controller looks ahead: {horizon * data.dt:.3g} s",
+        "# A weight says what an error costs, per unit²: as written, half a range in any state costs 1. Twice the weight",
+        "# of a state follows it more closely; twice the weight of an input, or a change_weight, makes the loop calmer.",
+        "# The horizon is about the time in which the plant settles after a step of an input. A longer one takes longer",
+        "# to compute; a shorter one sees limits and overshoot too late.",
+        "",
+        f"horizon = {horizon}  # steps of {data.dt:g} s that the controller looks ahead",
     ]
     if reading:
         lines += ["", "[logs]  # how koopmpc fit reads them; an option such as --resample replaces the value here"]

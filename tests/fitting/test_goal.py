@@ -292,6 +292,10 @@ def test_the_template_is_a_goal_file_with_the_ranges_of_the_logs(tmp_path):
     np.testing.assert_allclose(np.diag(goal.cost.matrices(2, 1)[0]), 4 / np.ptp(X, axis=0) ** 2, rtol=1e-2)
     assert f"in the data from {X[:, 0].min():.4g} to {X[:, 0].max():.4g}" in text
     assert "steps of 0.1 s" in text
+    (line,) = (line for line in text.splitlines() if line.startswith("horizon = "))
+    assert line.count(" s ") == 1  # the sample time alone: a product would stay behind when the number is changed
+    assert "The horizon is about the time in which the plant settles" in text
+    assert "A weight says what an error costs" in text
 
 
 def test_states_without_weight_are_not_tracked_and_a_list_is_a_reference_for_each_step(tmp_path):
