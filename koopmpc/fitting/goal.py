@@ -203,7 +203,7 @@ def format_template(data: Episodes, *, horizon: int | None = None, reading: Mapp
         "# References are medians of the last rows of the logs: change them to where the plant must rest or go.",
         "",
         "# A weight says what an error costs, per unit²: as written, half a range in any state costs 1. Twice the",
-        "# weight of a state follows it more closely; twice that of an input, or a change_weight, makes the loop calmer.",
+        "# weight of a state follows it more closely; twice that of an input, or a change_weight, calms the loop.",
         "# The horizon is about the time in which the plant settles after a step of an input. A longer one takes more",
         "# time to compute; a shorter one sees limits and overshoot too late.",
         "",
