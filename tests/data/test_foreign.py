@@ -390,7 +390,9 @@ def test_a_heap_on_which_the_hdf5_library_walks_for_ever_is_refused(tmp_path):
     assert number == 0
     content[place + 8 : place + 16] = bytes(8)  # free space of no length
     (tmp_path / "log.h5").write_bytes(content)
-    code = "import sys, koopmpc as km\ntry:\n    km.load_episodes(sys.argv[1])\nexcept km.KoopmpcError as e:\n    print(e)"
+    code = (
+        "import sys, koopmpc as km\ntry:\n    km.load_episodes(sys.argv[1])\nexcept km.KoopmpcError as e:\n    print(e)"
+    )
     done = subprocess.run(  # in a process of its own, which can be ended
         [sys.executable, "-c", code, str(tmp_path / "log.h5")], capture_output=True, text=True, timeout=60, check=True
     )

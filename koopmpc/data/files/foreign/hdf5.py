@@ -80,7 +80,9 @@ def _require_sound_heaps(file: Path) -> None:
             start = whole.find(_HEAP)
             while start >= 0:
                 place = start + 16
-                end = min(start + struct.unpack_from("<Q", whole, start + 8)[0], len(whole)) if place <= len(whole) else 0
+                end = (
+                    min(start + struct.unpack_from("<Q", whole, start + 8)[0], len(whole)) if place <= len(whole) else 0
+                )
                 while place + 16 <= end:
                     number, _, _, size = struct.unpack_from("<HHIQ", whole, place)
                     if number == 0 and size == 0:
