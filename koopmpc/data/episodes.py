@@ -411,9 +411,16 @@ def episodes_of(given: object) -> Episodes:
     """
     if isinstance(given, Episodes):
         return given
-    raise DataError(
-        f"episodes is a {type(given).__name__}; pass Episodes([Episode(X=…, U=…), …], dt), or what collect returns"
-    )
+    raise describe_misfit(given, "or what collect returns")
+
+
+def describe_misfit(given: object, others: str) -> DataError:
+    """Return the error for what is no data: of a path or a DataFrame it names the function that reads it."""
+    kind = type(given).__name__
+    if isinstance(given, str | PathLike) or kind == "DataFrame":
+        name = "frame" if kind == "DataFrame" else repr(str(given))
+        return DataError(f"episodes is a {kind}; pass km.load_episodes({name}), which reads it")
+    return DataError(f"episodes is a {kind}; pass Episodes([Episode(X=…, U=…), …], dt), {others}")
 
 
 _CLOSE = 1e-6  # relative; the clocks that wrote the files round

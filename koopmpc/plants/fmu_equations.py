@@ -3,6 +3,7 @@
 
 import os
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.disk import make_temporary_folder
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, LogError
 from koopmpc.plants.dynamics import Integrator
 from koopmpc.plants.fmu_files import StartValue, UnitDescription, UnitVariable, collect_limits, read_description
 from koopmpc.plants.step_map import StepMap
@@ -138,8 +139,11 @@ def _unpack(path: Path, content: str, process: int) -> Path:
     CasADi 3.8 itself would unpack into the present folder, and leave there what lives until the process ends.
     """
     folder = make_temporary_folder()
-    with zipfile.ZipFile(path) as archive:
-        archive.extractall(folder)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            archive.extractall(folder)
+    except (OSError, RuntimeError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise LogError(f"{path.name} cannot be unpacked: {error}; take another copy") from error
     return folder
 
 

@@ -2,6 +2,7 @@
 """Files of Functional Mock-up Units: what a unit says about its variables, and FMPy, which reads and loads it."""
 
 import re
+import struct
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.errors import DataError, LogError, install
+from koopmpc.errors import DataError, KoopmpcError, LogError, install
 
 Interface = Literal["model exchange", "co-simulation"]
 INTERFACES: Mapping[Interface, str] = {"model exchange": "modelExchange", "co-simulation": "coSimulation"}
@@ -135,15 +136,24 @@ def read_description(path: str | Path, interface: str | None) -> UnitDescription
         raise DataError(f'interface is {interface!r}; pass "model exchange" or "co-simulation"')
     fmpy, place = import_fmpy(), Path(path)
     names = _check_archive(place)
-    with zipfile.ZipFile(place) as archive:
-        opening = archive.read("modelDescription.xml")[:_OPENING]
-    if re.search(rb"""fmiVersion\s*=\s*["']1""", opening):
-        raise DataError(f"{place.name} is FMI 1.0; koopmpc loads FMI 2 and 3: export the model in one of these")
     try:
+        with zipfile.ZipFile(place) as archive:
+            opening = archive.read("modelDescription.xml")[:_OPENING]
+        if re.search(rb"""fmiVersion\s*=\s*["']1""", opening):
+            raise DataError(f"{place.name} is FMI 1.0; koopmpc loads FMI 2 and 3: export the model in one of these")
         source = fmpy.read_model_description(str(place), validate=False)  # CasADi, for one, leaves units undefined
-    except Exception as error:  # FMPy raises bare Exceptions, lxml its own
-        reason = " ".join(str(error).split())[:300]
+        return _read_source(fmpy, source, place, names, interface)
+    except KoopmpcError:
+        raise
+    except Exception as error:  # FMPy raises bare Exceptions, lxml and zipfile their own, a damaged text any
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
         raise LogError(f"the modelDescription.xml of {place.name} cannot be read: {reason}") from error
+
+
+def _read_source(
+    fmpy: ModuleType, source: Any, place: Path, names: list[str], interface: str | None
+) -> UnitDescription:
+    """Return what FMPy read of a unit, in our words."""
     version = int(source.fmiVersion[0])
     chosen = _choose_interface(source, place.name, interface)
     _require_binary(fmpy, names, getattr(source, INTERFACES[chosen]).modelIdentifier, version, place.name)
@@ -168,7 +178,7 @@ def _check_archive(path: Path) -> list[str]:
             names = archive.namelist()
     except FileNotFoundError as error:
         raise LogError(f"there is no file {path}; pass the path of an .fmu file") from error
-    except (OSError, zipfile.BadZipFile) as error:
+    except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError, struct.error) as error:
         raise LogError(f"{path} is no .fmu file: it cannot be read as a zip archive ({error})") from error
     for name in names:
         parts = PurePosixPath(name)

@@ -305,6 +305,32 @@ def test_processes_with_units_leave_no_files_behind(pendulum, tmp_path):
     assert [list(place.iterdir()) for place in places] == [[], []]
 
 
+@pytest.mark.parametrize("count", [40, pytest.param(300, marks=pytest.mark.slow)])
+def test_a_damaged_unit_is_refused_in_a_sentence_before_its_code_is_loaded(count, folder, tmp_path):
+    path = units.build_pendulum(tmp_path / "win.fmu", folder="win64")  # complete, its code is for another platform
+    with zipfile.ZipFile(path) as whole:
+        text = whole.read("modelDescription.xml")
+    content, rng, loaded = path.read_bytes(), np.random.default_rng(3), 0
+    for k in range(count):
+        damaged, place = bytearray(content if k % 2 else text), int(rng.integers(len(content if k % 2 else text)))
+        if k % 3 == 0:
+            damaged[place : place + 8] = rng.bytes(int(rng.integers(1, 8)))
+        elif k % 3 == 1:
+            damaged[place : place + int(rng.integers(1, 200))] = b""
+        else:
+            damaged[place:place] = damaged[place : place + int(rng.integers(1, 200))]
+        if k % 2:
+            path.write_bytes(damaged)
+        else:
+            with zipfile.ZipFile(path, "w") as archive:
+                archive.writestr("modelDescription.xml", bytes(damaged))
+                archive.writestr("binaries/win64/pendulum.dll", b"")
+        with pytest.raises(km.KoopmpcError) as caught:
+            km.plants.fmu(path)
+        loaded += "no binary for" in str(caught.value)
+    assert 0 < loaded < count
+
+
 def test_an_episode_cannot_begin_where_the_unit_does_not_let_it(pendulum):
     unit = km.plants.fmu(pendulum, interface="co-simulation", states=["theta", "reach"], outputs=["theta"])
     with pytest.raises(km.KoopmpcError, match=r"calculates reach itself; pass x0=None"):

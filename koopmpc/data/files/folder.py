@@ -11,6 +11,7 @@ from typing import Any
 from koopmpc import disk
 from koopmpc.data.episodes import Episodes, PlantSignature, join_sets
 from koopmpc.data.files.formats import find_format, list_suffixes
+from koopmpc.data.files.frames import is_frame
 from koopmpc.data.files.load import load_episodes
 from koopmpc.data.source import Part, Source
 from koopmpc.errors import DataError, FitWarning, KoopmpcError, LogError
@@ -117,6 +118,8 @@ def _read_folder(file: Path, reader: EpisodesReader) -> Episodes:
 
 def _list_files(paths: str | PathLike[str] | Iterable[str | PathLike[str]]) -> tuple[Path, ...]:
     """Return the files, those of a folder by name."""
+    if is_frame(paths):
+        raise DataError("a DataFrame is in memory, and no file; pass km.load_episodes(frame) to the fit")
     if not isinstance(paths, str | PathLike):
         each = paths if hasattr(paths, "__iter__") else [paths]
         files = tuple(map(disk.path_of, each))
