@@ -347,11 +347,15 @@ def test_a_frame_without_the_column_asked_for_is_refused():
         km.Episodes.from_frame([1, 2])
 
 
+def fit_states(data):
+    return km.edmd(data, km.State())
+
+
 def test_a_path_or_a_frame_in_the_place_of_data_names_what_reads_it():
     frame = pd.DataFrame({"x": [1.0, 2.0, 4.0], "u": [1.0, 2.0, 1.0]})
-    for given, told in ((frame, "frame"), ("logs.csv", "'logs.csv'")):
-        for use in (lambda data: km.edmd(data, km.State()), km.select, km.validate.audit):
-            with pytest.raises(km.KoopmpcError, match=rf"pass km\.load_episodes\({told}\), which reads it"):
+    for given, said in ((frame, "frame"), ("logs.csv", "'logs.csv'")):
+        for use in (fit_states, km.select, km.validate.audit):
+            with pytest.raises(km.KoopmpcError, match=rf"pass km\.load_episodes\({said}\), which reads it"):
                 use(given)
     with pytest.raises(km.KoopmpcError, match=r"no file; pass km\.load_episodes\(frame\)"):
         km.data.Files(frame)
