@@ -353,10 +353,10 @@ def fit_states(data):
 
 def test_a_path_or_a_frame_in_the_place_of_data_names_what_reads_it():
     frame = pd.DataFrame({"x": [1.0, 2.0, 4.0], "u": [1.0, 2.0, 1.0]})
-    for given, said in ((frame, "frame"), ("logs.csv", "'logs.csv'")):
+    for wrong, said in ((frame, "frame"), ("logs.csv", "'logs.csv'")):
         for use in (fit_states, km.select, km.validate.audit):
             with pytest.raises(km.KoopmpcError, match=rf"pass km\.load_episodes\({said}\), which reads it"):
-                use(given)
+                use(wrong)
     with pytest.raises(km.KoopmpcError, match=r"no file; pass km\.load_episodes\(frame\)"):
         km.data.Files(frame)
 
