@@ -1,5 +1,6 @@
 """ONNX: a trained network, saved by PyTorch or another tool, as a lifting."""
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from koopmpc import checks
 from koopmpc.errors import DataError, LogError, ShapeError
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import Lifting, StateChoice, Traced, find_states, freeze_choice
+from koopmpc.lifting.onnx_layers import replace_layers
 from koopmpc.plants.graph import Graph
 from koopmpc.values import Value, freeze
 
@@ -89,13 +91,25 @@ class ONNX(Lifting):
         return self.graph.symbolic(x)
 
 
+def _open_network(path: Path) -> Any:
+    """Return CasADi's reader of a network, with layers that it lacks written in others."""
+    content = path.read_bytes()
+    known = replace_layers(content)
+    if known == content:
+        return cast("Any", ca.GraphBuilder(str(path.resolve()), {}))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / path.name
+        file.write_bytes(known)
+        return cast("Any", ca.GraphBuilder(str(file), {}))
+
+
 @raise_swallowed()
 def _read_network(path: Path) -> Graph:
     """Return the operations of a network, for one sample."""
     if not path.is_file():
         raise LogError(f"there is no file {path}; pass the path of an .onnx file")
     try:
-        builder = cast("Any", ca.GraphBuilder(str(path.resolve()), {}))
+        builder = _open_network(path)
         for name in builder.dynamic_params():
             builder.bind_dim(name, 1)
         network = cast("ca.Function", builder.create("network", {"symbolic": True})).expand()

@@ -68,6 +68,39 @@ def test_a_network_computes_what_it_says_for_arrays_symbols_and_onnxruntime(laye
     assert lifting(X) == pytest.approx(session.run(None, {"x": X.astype(np.float32)})[0], abs=3e-6, rel=1e-6)
 
 
+S, B = np.linspace(0.5, 2, 6), np.linspace(-1, 1, 6)
+V = np.linspace(0.1, 3, 6)
+REWRITTEN = {
+    "Dropout": (["a"], {}, lambda x: x),
+    "Flatten": (["a"], {"axis": 1}, lambda x: x),
+    "Softmax": (["a"], {"axis": -1}, lambda x: scipy.special.softmax(x, axis=-1)),
+    "BatchNormalization": (["a", "S", "B", "B", "V"], {"epsilon": 1e-3}, lambda x: (x - B) / np.sqrt(V + 1e-3) * S + B),
+    "LayerNormalization": (
+        ["a", "S", "B"],
+        {"axis": -1},
+        lambda x: (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5) * S + B,
+    ),
+}
+
+
+@pytest.mark.parametrize("layer", REWRITTEN)
+def test_layers_that_casadi_lacks_are_written_in_others(layer, tmp_path):
+    inputs, told, formula = REWRITTEN[layer]
+    w, node = weights(2, 3), helper.make_node
+    held = w | {name: array.astype(np.float32) for name, array in (("S", S), ("B", B), ("V", V))}
+    nodes = [node("Gemm", ["x", "W1", "b1"], ["a"]), node(layer, inputs, ["n"], **told), node("Tanh", ["n"], ["h"])]
+    path = write(tmp_path / "net.onnx", [*nodes, node("Gemm", ["h", "W2", "b2"], ["z"])], rows=1, tensors=held)
+    X = np.random.default_rng(1).normal(size=(20, 2))
+    wide = {name: array.astype(np.float64) for name, array in w.items()}
+    exact = np.tanh(formula(X @ wide["W1"] + wide["b1"])) @ wide["W2"] + wide["b2"]
+    found = km.ONNX(path).bind(STATES[:2])(X)
+    assert found == pytest.approx(exact, abs=3e-6)  # of parameters in single precision
+    runtime = pytest.importorskip("onnxruntime", reason="the extra peers is not installed")
+    session = runtime.InferenceSession(str(path))
+    for x, z in zip(X, found, strict=True):
+        assert z == pytest.approx(session.run(None, {"x": x[None].astype(np.float32)})[0][0], abs=3e-6, rel=1e-6)
+
+
 def test_states_and_names_are_chosen_and_the_file_is_needed_no_more(tmp_path):
     path, forward = perceptron(tmp_path / "net.onnx", rows=1)
     lifting = km.State() + km.ONNX(path, states=["current", "theta"], names=["a", "b", "c"])
@@ -96,11 +129,11 @@ def test_a_model_on_a_network_is_saved_controlled_and_written_to_c(tmp_path):
 
 def test_what_cannot_be_read_is_named(tmp_path):
     node, w = helper.make_node, weights(2, 3)
-    nodes = [node("Gemm", ["x", "W1", "b1"], ["a"]), node("LayerNormalization", ["a", "s"], ["z"])]
+    nodes = [node("Gemm", ["x", "W1", "b1"], ["a"]), node("InstanceNormalization", ["a", "s", "s"], ["z"])]
     held = {"W1": w["W1"], "b1": w["b1"], "s": np.ones(6, np.float32)}
     path = write(tmp_path / "norm.onnx", nodes, nz=6, tensors=held)
     with pytest.raises(
-        km.KoopmpcError, match=r"norm.onnx cannot be read as a network: .*LayerNormalization.*for inference"
+        km.KoopmpcError, match=r"norm.onnx cannot be read as a network: .*InstanceNormalization.*for inference"
     ):
         km.ONNX(path)
     path = write(tmp_path / "foreign.onnx", [node("Foreign", ["x"], ["z"], domain="elsewhere")], nz=2)
@@ -120,8 +153,13 @@ def test_what_cannot_be_read_is_named(tmp_path):
         km.ONNX(path).as_saved()
 
 
-def test_damaged_files_are_read_right_or_refused(tmp_path):
+@pytest.mark.parametrize("layer", ["Tanh", "LayerNormalization"])
+def test_damaged_files_are_read_right_or_refused(layer, tmp_path):
     path, _ = perceptron(tmp_path / "net.onnx")
+    if layer not in LAYERS:
+        w, node = weights(2, 3), helper.make_node
+        nodes = [node("Gemm", ["x", "W1", "b1"], ["a"]), node(layer, ["a", "b1"], ["h"])]
+        write(path, [*nodes, node("Gemm", ["h", "W2", "b2"], ["z"])], rows=1, tensors=w)
     whole, rng, refused = path.read_bytes(), np.random.default_rng(5), 0
     for k in range(300):
         damaged = bytearray(whole)

@@ -1,0 +1,206 @@
+"""Layers of ONNX that CasADi's import lacks, written in those that it knows; files are read as Protocol Buffers.
+
+Dropout, Flatten, Softmax, BatchNormalization and LayerNormalization of a row x of n numbers, for inference.
+"""
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from math import prod
+
+Field = tuple[int, int, bytes | int]  # number, wire type, content
+
+# Numbers of fields in onnx.proto.
+_GRAPH = 7  # of a model
+_NODE = 1  # of a graph
+_INITIALIZER = 5  # of a graph
+_DIMS = 1  # of a tensor
+_TENSOR_NAME = 8
+_INPUT = 1  # of a node
+_OUTPUT = 2
+_OPERATION = 4
+_ATTRIBUTE = 5
+_ATTRIBUTE_NAME = 1  # of an attribute
+_FLOAT = 2
+_INTEGER = 3
+_TYPE = 20
+_SIZES = {1: 8, 5: 4}  # bytes of a wire type of fixed size
+_EPSILON = 1e-5  # of both normalisations, if they do not tell another
+
+
+@dataclass
+class Node:
+    """An operation: its name, and those of its inputs and outputs; `attributes` are floats and whole numbers."""
+
+    operation: str
+    inputs: list[str]
+    outputs: list[str]
+    attributes: dict[str, float] = field(default_factory=dict[str, float])
+
+    def encode(self) -> bytes:
+        """Return the node as bytes; attributes are single floats."""
+        parts: list[Field] = [(_INPUT, 2, name.encode()) for name in self.inputs]
+        parts += [(_OUTPUT, 2, name.encode()) for name in self.outputs]
+        parts.append((_OPERATION, 2, self.operation.encode()))
+        for name, value in self.attributes.items():
+            said: list[Field] = [
+                (_ATTRIBUTE_NAME, 2, name.encode()),
+                (_FLOAT, 5, struct.pack("<f", value)),
+                (_TYPE, 0, 1),
+            ]
+            parts.append((_ATTRIBUTE, 2, join_fields(said)))
+        return join_fields(parts)
+
+
+def replace_layers(model: bytes) -> bytes:
+    """Return an ONNX model in which known layers stand for those that CasADi lacks; what is damaged stays as it is."""
+    try:
+        return join_fields(
+            [(k, w, _replace(v) if k == _GRAPH and isinstance(v, bytes) else v) for k, w, v in split_fields(model)]
+        )
+    except (ValueError, IndexError, struct.error):  # CasADi says what is wrong with it
+        return model
+
+
+def _replace(graph: bytes) -> bytes:
+    parts = list(split_fields(graph))
+    sizes = dict(_read_size(v) for k, _, v in parts if k == _INITIALIZER and isinstance(v, bytes))
+    result: list[Field] = []
+    for number, wire, content in parts:
+        others = _rewrite(_read_node(content), sizes) if number == _NODE and isinstance(content, bytes) else None
+        result += [(number, wire, content)] if others is None else [(_NODE, 2, each.encode()) for each in others]
+    return join_fields(result)
+
+
+def _rewrite(node: Node, sizes: dict[str, int]) -> list[Node] | None:
+    """Return nodes that compute the same of one row; None where the node stays."""
+    operation, told = node.operation, node.attributes
+    if operation not in ("Dropout", "Flatten", "Softmax", "BatchNormalization", "LayerNormalization"):
+        return None
+    x, result, names = node.inputs[0], node.outputs[0], (f"{node.outputs[0]}/{k}" for k in count())
+    nodes: list[Node] = []
+
+    def add(operation: str, *inputs: str, **attributes: float) -> str:
+        nodes.append(Node(operation, list(inputs), [next(names)], attributes))
+        return nodes[-1].outputs[0]
+
+    if operation in ("Dropout", "Flatten"):
+        add("Identity", x)
+    elif operation == "Softmax":
+        if told.get("axis", -1) not in (-1, 1):
+            return None
+        powers = add("Exp", add("Sub", x, add("ReduceMax", x)))  # of no axes: of all, and there is one row
+        add("Div", powers, add("ReduceSum", powers))
+    else:
+        epsilon = add("Constant", value_float=told.get("epsilon", _EPSILON))
+        scale, *rest = node.inputs[1:]
+        if operation == "BatchNormalization":
+            if told.get("training_mode", 0):
+                return None
+            offset, mean, variance = rest
+            off = add("Sub", x, mean)
+        else:
+            if told.get("axis", -1) not in (-1, 1) or scale not in sizes:
+                return None
+            offset, n = next(iter(rest), ""), add("Constant", value_float=float(sizes[scale]))
+            off = add("Sub", x, add("Div", add("ReduceSum", x), n))
+            variance = add("Div", add("ReduceSum", add("Mul", off, off)), n)
+        scaled = add("Mul", add("Div", off, add("Sqrt", add("Add", variance, epsilon))), scale)
+        if offset:
+            add("Add", scaled, offset)
+    nodes[-1].outputs = [result]
+    return nodes
+
+
+def _read_node(content: bytes) -> Node:
+    node = Node("", [], [])
+    for number, _, value in split_fields(content):
+        if not isinstance(value, bytes):
+            continue
+        if number == _ATTRIBUTE:
+            said = {k: v for k, _, v in split_fields(value)}
+            name, real, whole = said.get(_ATTRIBUTE_NAME), said.get(_FLOAT), said.get(_INTEGER)
+            if isinstance(name, bytes) and isinstance(real, bytes):
+                node.attributes[name.decode()] = float(struct.unpack("<f", real)[0])
+            elif isinstance(name, bytes) and isinstance(whole, int):
+                node.attributes[name.decode()] = whole - (1 << 64) * (whole >> 63)
+        elif number in (_INPUT, _OUTPUT):
+            (node.inputs if number == _INPUT else node.outputs).append(value.decode())
+        elif number == _OPERATION:
+            node.operation = value.decode()
+    return node
+
+
+def _read_size(tensor: bytes) -> tuple[str, int]:
+    """Return the name of a tensor, and how many numbers it holds."""
+    name, sizes = "", list[int]()
+    for number, _, value in split_fields(tensor):
+        if number == _TENSOR_NAME and isinstance(value, bytes):
+            name = value.decode()
+        elif number == _DIMS:
+            sizes += [value] if isinstance(value, int) else list(_read_packed(value))
+    return name, prod(sizes)
+
+
+def _read_packed(content: bytes) -> Iterator[int]:
+    place = 0
+    while place < len(content):
+        value, place = _read_varint(content, place)
+        yield value
+
+
+def split_fields(message: bytes) -> Iterator[Field]:
+    """Yield the fields of a message in their order.
+
+    Raises
+    ------
+    ValueError, IndexError
+        It is no message.
+    """
+    place = 0
+    while place < len(message):
+        key, place = _read_varint(message, place)
+        number, wire = key >> 3, key & 7
+        if wire == 0:
+            value, place = _read_varint(message, place)
+            yield number, wire, value
+            continue
+        size, place = (_SIZES[wire], place) if wire in _SIZES else _read_varint(message, place)
+        if wire not in (1, 2, 5) or place + size > len(message):
+            raise ValueError("no message")
+        yield number, wire, message[place : place + size]
+        place += size
+
+
+def join_fields(parts: Sequence[Field]) -> bytes:
+    """Return the message of these fields."""
+    result = bytearray()
+    for number, wire, value in parts:
+        result += _write_varint(number << 3 | wire)
+        if isinstance(value, int):
+            result += _write_varint(value)
+        else:
+            result += (_write_varint(len(value)) if wire == 2 else b"") + value
+    return bytes(result)
+
+
+def _read_varint(message: bytes, place: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = message[place]
+        value |= (byte & 127) << shift
+        place, shift = place + 1, shift + 7
+        if byte < 128:
+            return value, place
+        if shift > 63:
+            raise ValueError("no number")
+
+
+def _write_varint(value: int) -> bytes:
+    result = bytearray()
+    while value > 127:
+        result.append(value & 127 | 128)
+        value >>= 7
+    result.append(value)
+    return bytes(result)
