@@ -57,6 +57,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.errors import FitWarning as FitWarning
     from koopmpc.errors import KoopmpcError as KoopmpcError
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
+    from koopmpc.estimate.extended import ExtendedKalman as ExtendedKalman
     from koopmpc.estimate.kalman import LiftedKalman as LiftedKalman
     from koopmpc.identify import moments as moments
     from koopmpc.identify.fits.bilinear import bilinear_edmd as bilinear_edmd

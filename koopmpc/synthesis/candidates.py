@@ -18,12 +18,14 @@ from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.angles import find_angles
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.source import Source
+from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ShapeError, hide_fit_warnings
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import Towards, edmd
 from koopmpc.identify.moments.read import ReadOptions
+from koopmpc.identify.records.narx import source_episodes
+from koopmpc.identify.records.state_space import HiddenStructure, fit_hidden
 from koopmpc.identify.records.structure import Structure, fit_structure
 from koopmpc.lifting.base import Lifting, check_lifting, strip_unit
 from koopmpc.lifting.composed import Standardized, Sum
@@ -58,7 +60,8 @@ class Candidate(Value):
     bilinear
         z⁺ = A z + B u + Σ uᵢ Nᵢ z instead of z⁺ = A z + B u.
     structure
-        The terms of a sparse polynomial model, whose lifting and embedding these are; None for other candidates.
+        The terms of a sparse polynomial model, whose lifting and embedding these are, or the sizes of one with a hidden
+        state; None for other candidates.
     relifted
         The fit is linear, and the model is lifted at each step all the same: a bilinear one with N = 0.
     """
@@ -67,7 +70,7 @@ class Candidate(Value):
     lifting: Lifting
     embedding: Delay | None = None
     bilinear: bool = False
-    structure: Structure | None = None
+    structure: Structure | HiddenStructure | None = None
     relifted: bool = False
 
     def __reduce__(self) -> tuple[Any, ...]:  # as data, so that a lifting of the user's own crosses processes too
@@ -108,6 +111,8 @@ def fit_candidate(candidate: Candidate, data: Episodes | Source, ridge: float, r
     """Return the model of these data; the ridge of a bilinear one pulls it towards z⁺ = z."""
     psi, embedding = candidate.lifting, candidate.embedding
     if candidate.structure is not None:
+        if isinstance(candidate.structure, HiddenStructure):
+            return fit_hidden(candidate.structure, source_episodes(source_of(data)))
         return fit_structure(candidate.structure, data, **read)
     if candidate.bilinear:
         return bilinear_edmd(data, psi, embedding=embedding, ridge=ridge, difference=True, **read)

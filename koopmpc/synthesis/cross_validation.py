@@ -20,7 +20,7 @@ from koopmpc.data.source import Changed, EpisodesMap, Held, Source
 from koopmpc.errors import DataError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments, space_evenly
-from koopmpc.identify.records.structure import solve_structure
+from koopmpc.identify.records.structure import Structure, solve_structure
 from koopmpc.identify.regression import Regression, build_regression
 from koopmpc.identify.solve import centre_products, solve_path
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -373,7 +373,7 @@ def cross_validate(trial: Trial) -> Tried:
 
 def fit_ridges(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[float, ...]) -> list[AnyPredictor]:
     """Return the predictor of each ridge on these moments, without the checks that a report would need."""
-    if candidate.structure is not None:  # fitted without a ridge
+    if isinstance(candidate.structure, Structure):  # fitted without a ridge
         return [solve_structure(candidate.structure, total)] * len(ridges)
     task, nz, nu, which = build_regression(total, "select"), total.nz, like.nu, total.products
     C = task.C
@@ -395,7 +395,7 @@ def fit_ridges(candidate: Candidate, total: Moments, like: Episodes, ridges: tup
 
 
 def _misfit(candidate: Candidate, total: Moments) -> float:
-    if candidate.structure is not None:
+    if isinstance(candidate.structure, Structure):
         return np.inf  # it is fitted without a ridge, and takes no part in the choice of the least one
     task = build_regression(total, "select")
     rows, where = task.rows, task.x_next
@@ -420,7 +420,7 @@ def _solutions(
 
 def _moments(candidate: Candidate, episodes: Episodes) -> Moments:
     """Return moments as triangular factors, whatever their condition, so that all folds are solved in the same way."""
-    products = candidate.bilinear if candidate.structure is None else candidate.structure.has_products
+    products = candidate.structure.has_products if isinstance(candidate.structure, Structure) else candidate.bilinear
     return second_moments(
         episodes if candidate.bilinear else episodes.driven(),
         candidate.lifting,

@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import RenderableType
 
 from koopmpc.data.delay import Delay
+from koopmpc.identify.records.state_space import HiddenStructure
 from koopmpc.identify.records.structure import Structure
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.base import sorted_eigen
@@ -77,7 +78,7 @@ class LeaderboardRow(Value):
     seconds: float
     lifting: Lifting
     embedding: Delay | None
-    structure: Structure | None = None
+    structure: Structure | HiddenStructure | None = None
     relifted: bool = False
     free: float = np.nan
 

@@ -15,6 +15,7 @@ from koopmpc.identify.fits.refinement import refine
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.records.free_run import HELD, PIECE, ROWS
 from koopmpc.identify.records.narx import DELAYS, FOLDS, choose_structure, is_worse, search_structures
+from koopmpc.identify.records.state_space import HiddenStructure
 from koopmpc.identify.records.structure import EXACT, Structure, fit_structure
 from koopmpc.parallel import Progress
 from koopmpc.predict.predictors import BilinearPredictor
@@ -36,6 +37,7 @@ _PROBE = (2, 4)  # past rows of the models that compare both timings of the inpu
 _PROBED = 3000  # rows of each record that these models learn from, at most
 _ITERATIONS = 12  # Levenberg-Marquardt steps of a refinement
 _GAIN = 0.98  # keep a refinement if it lowers the error on unseen rows to less than this share
+_PAYS = 0.9  # take a hidden state if it lowers the error on unseen rows to less than this share
 _LOST = 1e3  # a free run counts as this many spreads at most
 
 
@@ -216,11 +218,11 @@ def _stretch_errors(
         low = max(start, first)
         if high - low < 2:
             continue
-        run = _forecast(model, truth.with_episodes([e.cut(0, high)]), [first], high - first, relift)[:, 0]
+        run = forecast_rows(model, truth.with_episodes([e.cut(0, high)]), [first], high - first, relift)[:, 0]
         free.append(run[low - first :])
         starts = [*range(low, high - horizon + 1, horizon)]
         if starts:
-            short.append(_forecast(model, truth.with_episodes([e]), starts, horizon, relift).transpose(1, 0, 2))
+            short.append(forecast_rows(model, truth.with_episodes([e]), starts, horizon, relift).transpose(1, 0, 2))
     parts = [np.array_split(np.concatenate(gaps), 2) for gaps in (free, short) if gaps]
     errors: list[float] = []
     for halves in zip(*parts, strict=True):
@@ -286,7 +288,7 @@ def cut_pieces(episodes: Episodes) -> Episodes:
     return episodes.with_episodes(pieces[:: -(-sum(map(len, pieces)) // ROWS)])
 
 
-def _forecast(
+def forecast_rows(
     model: AnyPredictor, episode: Episodes, starts: Sequence[int], horizon: int, relift: bool
 ) -> Float[np.ndarray, "horizon starts nx"]:
     """Return the errors of forecasts that begin at these rows of one episode."""
@@ -304,7 +306,7 @@ def _is_calm(model: AnyPredictor, pieces: Episodes, first: int, relift: bool) ->
         if len(e) <= first:
             continue
         twice = Episode(X=np.vstack([e.X, e.X[1:]]), U=np.vstack([e.U, e.U]))
-        gap = _forecast(model, pieces.with_episodes([twice]), [first], len(twice) - first, relift)[:, 0]
+        gap = forecast_rows(model, pieces.with_episodes([twice]), [first], len(twice) - first, relift)[:, 0]
         if not bool((np.abs(twice.X[first + 1 :] - gap - centre) < reach).all()):
             return False
     return True
@@ -317,6 +319,7 @@ def judge_finalists(
     first: int,
     horizon: int,
     progress: Progress | None = None,
+    ran: Sequence[tuple[LeaderboardRow, FreeRun]] = (),
 ) -> tuple[tuple[LeaderboardRow, ...], int, dict[str, int]]:
     """Return the rows with the errors of those that ran freely, and the places of the best one and of each kind's best.
 
@@ -332,6 +335,8 @@ def judge_finalists(
         As in `judge_free_run`.
     progress
         Called after each model.
+    ran
+        Further rows, of models that ran freely already.
     """
     groups: dict[tuple[str, bool, bool], list[int]] = {}
     for i, row in enumerate(rows):
@@ -342,7 +347,7 @@ def judge_finalists(
         if progress is not None:
             progress(done, len(places))
         row = rows[place]
-        if row.structure is not None:  # the search for its terms ran it freely
+        if isinstance(row.structure, Structure):  # the search for its terms ran it freely
             runs[place] = FreeRun(row.structure.errors, row.structure.calm)
             continue
         fit = partial(_fit_quietly, row.candidate, row.ridge)
@@ -353,14 +358,22 @@ def judge_finalists(
             if again.calm >= run.calm and is_worse(run.errors, again.errors):
                 every[place], run = replace(row, bilinear=True, relifted=True), again
         runs[place] = run
+    for row, run in ran:
+        runs[len(every)] = run
+        places.append(len(every))
+        every.append(row)
     some = any(run.calm for run in runs.values())
     for place, run in runs.items():
         every[place] = replace(every[place], free=run.error if run.calm or not some else np.inf)
     found = tuple(every)
 
     def choose(kind: str | None) -> int:
-        those = [i for i in places if kind is None or found[i].kind == kind]
-        return those[choose_by_free_run([runs[i] for i in those], [found[i].size for i in those])]
+        asked = [i for i in places if kind is None or found[i].kind == kind]
+        plain = [i for i in asked if not isinstance(found[i].structure, HiddenStructure)]
+        calm = [found[i].free for i in plain]
+        those = [i for i in asked if i in plain or found[i].free < _PAYS * min(calm, default=np.inf)]
+        sizes = [found[i].size if i in plain else np.inf for i in those]  # of models alike one without a hidden state
+        return those[choose_by_free_run([runs[i] for i in those], sizes)]
 
     kinds = {found[i].kind for i in places}
     return found, choose(None), {kind: choose(kind) for kind in kinds}

@@ -17,6 +17,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import FitWarning
 from koopmpc.identify.moments.read import ReadOptions
+from koopmpc.identify.records.structure import Structure
 from koopmpc.lifting.base import Lifting
 from koopmpc.parallel import Progress, StageProgress, map_tasks
 from koopmpc.predict.base import replace_report
@@ -41,6 +42,7 @@ from koopmpc.synthesis.cross_validation import (
     take_sample,
     usual_horizon,
 )
+from koopmpc.synthesis.hidden_states import judge_hidden_states
 from koopmpc.synthesis.leaderboard import LeaderboardRow, Selection, choose_model, make_row
 from koopmpc.synthesis.records import (
     advance_inputs,
@@ -90,7 +92,8 @@ def select(
     halves the error at the horizon's end.
 
     Fewer than ten long episodes of at most four states are records. On records sparse polynomials of up to 12 past rows
-    are tried too, as `km.identify.narx` finds them, and the best models of each kind run freely over stretches that no
+    are tried too, as `km.identify.narx` finds them, and hidden states, as `km.identify.subspace` and
+    `km.identify.polynomial_state_space` find them; the best models of each kind run freely over stretches that no
     fit saw. The geometric mean of their errors in free run and in forecasts of the horizon then decides, over all kinds
     together and without a rule on delays. A model whose free run leaves three times the range of the data is taken only
     where all do. If models with the inputs one row up err by 20 % less, and nothing speaks of feedback, the log's input
@@ -215,8 +218,11 @@ def select(
     rows = tuple(sorted((make_row(result, floor) for result in results), key=lambda row: (row.worst, row.size)))
     alike = ENOUGH if relift else EXACT
     if record:
+        told = report_stage(progress, "hidden states")
+        rival = min((one.structure.error for one in given if one.structure is not None), default=np.inf)
+        ran = judge_hidden_states(measured[1], first, ahead, both, rival, told)
         told = report_stage(progress, "free runs")
-        rows, chosen, found = judge_finalists(rows, held, measured[1], first, ahead, told)
+        rows, chosen, found = judge_finalists(rows, held, measured[1], first, ahead, told, ran)
     else:
         kinds = {row.kind for row in rows}
         found = {kind: choose_model(rows, kind, alike) for kind in ("linear", "bilinear") if kind in kinds}
@@ -236,7 +242,7 @@ def select(
     def refit(row: LeaderboardRow) -> AnyPredictor:
         read = ReadOptions(workers=workers, scheduler=scheduler, progress=report_stage(progress, f"fit of {row.title}"))
         model = fit_candidate(row.candidate, source if row.structure is None else measured[0], row.ridge, read)
-        if record and row.structure is not None:
+        if isinstance(row.structure, Structure):
             model = refine_structure(row.structure, model, measured[1], first, ahead)
         if lead and model.report is not None:
             report = replace(model.report, input_lead=lead, changes=(*model.report.changes, LATE))

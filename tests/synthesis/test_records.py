@@ -9,6 +9,7 @@ import koopmpc as km
 from koopmpc.errors import DataError
 from koopmpc.synthesis.candidates import relift_model
 from koopmpc.synthesis.records import FreeRun, choose_by_free_run, is_fed_back, is_late, is_record
+from tests.identify.test_hidden_state import saturating_record
 
 
 def oscillator(rows=420, noise=0.01, late=False, gain=None, seed=0):
@@ -118,3 +119,23 @@ def test_a_model_that_leaves_the_range_is_taken_only_where_all_do():
     assert choose_by_free_run([wild, wild], [3, 2]) == 1
     near = FreeRun(np.array([0.52, 0.57]), True)
     assert choose_by_free_run([calm, near], [9, 1]) == 1
+
+
+@pytest.mark.slow
+def test_a_hidden_state_is_taken_where_it_pays_on_unseen_rows():
+    """Two tanks of which the second one's sensor saturates; polynomials of past rows cannot hold that."""
+    data = saturating_record(np.random.default_rng(0), noise=0.005)
+    found, fresh = km.select(data, horizon=10, delays=[0, 2, 4], folds=2), saturating_record(np.random.default_rng(1))
+    hidden = [row for row in found.leaderboard if "hidden state" in row.title]
+    others = [row.free for row in found.leaderboard if row not in hidden and np.isfinite(row.free)]
+    assert "saturating sensor" in found.best.title
+    assert found.best.free < 0.9 * min(others)
+    assert free_error(found.predictor, fresh) < 0.05 * fresh[0].X.std()
+
+
+def test_of_models_alike_one_without_a_hidden_state_is_taken():
+    found = selection(False)
+    hidden = [row for row in found.leaderboard if "hidden state" in row.title]
+    assert hidden
+    assert all(np.isfinite(row.free) and row.worst < 1 for row in hidden)
+    assert "hidden" not in found.best.title

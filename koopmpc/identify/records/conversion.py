@@ -242,7 +242,7 @@ def cut_segments(
         starts = np.arange(0, len(zeta) - horizon + 1, apart)
         rows = np.arange(horizon)[:, None] + starts
         outputs = Y[rows]
-        low = high = np.zeros(outputs.shape, dtype=np.bool_)
+        low = high = None
         if units.rails is not None:
             low, high = outputs <= units.rails[0] + 1e-9, outputs >= units.rails[1] - 1e-9
         found.append(RecordSegments(zeta[starts], U[rows], outputs, low, high))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -72,8 +73,8 @@ class RecordSegments:
     points: Float[np.ndarray, "m nzeta"]
     inputs: Float[np.ndarray, "steps m nu"]
     outputs: Float[np.ndarray, "steps m ny"]
-    low: np.ndarray
-    high: np.ndarray
+    low: np.ndarray | None = None
+    high: np.ndarray | None = None
 
 
 Sets = Sequence[RecordSegments]
@@ -90,17 +91,28 @@ class SimulationError:
     ----------
     model
         Its terms and sizes; E, H and T come with each call.
+    noise
+        Standard deviation of noise in ζ, against which T is made robust: noise² ‖T‖² / steps is added, without offsets.
     """
 
-    def __init__(self, model: HiddenModel) -> None:
-        self.model = model
-        n = model.order
-        self._slots = [np.where(slot <= n, slot, 0) for slot in model.terms.T]  # of z, the place of each factor
-        self._nonlinear = is_nonlinear(model.terms, n)
+    def __init__(self, model: HiddenModel, noise: float = 0.0) -> None:
+        self.model, self._noise = model, noise
+        self._encoder = np.arange(model.T.size).reshape(model.T.shape)[:, :-1].ravel() + model.E.size + model.H.size
+        n, curved = model.order, is_nonlinear(model.terms, model.order)
+        kinds = (~curved, curved) if np.isfinite(model.bound).all() else (np.ones(len(curved), dtype=np.bool_),)
+        self._places = [  # slot, entry of z, terms that have it in this slot, whether they are bounded
+            (s, j, places, bounded)
+            for s, slot in enumerate(model.terms.T)
+            for j in range(1, n + 1)
+            for bounded, kind in enumerate(kinds)
+            for places in [np.flatnonzero((slot == j) & kind)]
+            if len(places)
+        ]
 
     def evaluate(self, theta: Float[np.ndarray, " p"], data: Sets) -> float:
         """Return the mean squared error; inf where a state leaves the model."""
-        return sum(self._evaluate(theta, part) for part in data) / len(data)
+        plain = sum(self._evaluate(theta, part) for part in data) / len(data)
+        return plain + self._weight(data) * float(np.sum(theta[self._encoder] ** 2))
 
     def derivatives(
         self, theta: Float[np.ndarray, " p"], data: Sets
@@ -110,7 +122,13 @@ class SimulationError:
         for part in data:
             own = self._derivatives(theta, part)
             gradient, matrix = gradient + own[0], matrix + own[1]
-        return gradient / len(data), matrix / len(data)
+        gradient, matrix, weight = gradient / len(data), matrix / len(data), self._weight(data)
+        gradient[self._encoder] += weight * theta[self._encoder]
+        matrix[self._encoder, self._encoder] += weight
+        return gradient, matrix
+
+    def _weight(self, data: Sets) -> float:
+        return self._noise**2 / min(len(part.inputs) for part in data)
 
     def _evaluate(self, theta: Float[np.ndarray, " p"], data: RecordSegments) -> float:
         model, total = self.model.with_parameters(theta), 0.0
@@ -151,8 +169,9 @@ class SimulationError:
             J = D @ C.T  # (m, p, ny)
             J[:, first:last].reshape(m, ny, n + 1, ny)[:, outputs, :, outputs] += np.hstack([z, ones])
             J = J.transpose(0, 2, 1)
-            seen = ~_is_silent(z @ C.T + model.H[:, -1], data, k)
-            rows.append((J * seen[:, :, None]).reshape(m * ny, p))
+            if data.low is not None:
+                J = J * ~_is_silent(z @ C.T + model.H[:, -1], data, k)[:, :, None]
+            rows.append(J.reshape(m * ny, p))
             gaps.append(gap.ravel())
             if len(rows) == _STEPS or k + 1 == len(data.inputs):
                 block = np.concatenate(rows)
@@ -173,15 +192,13 @@ class SimulationError:
         V = np.hstack([np.ones((len(z), 1)), np.clip(z, -bound, bound), u])
         inside = (np.abs(z) < bound).astype(float)
         slope = np.zeros((len(z), n, n))
-        for s, place in enumerate(self._slots):
-            rest = np.ones((len(z), len(terms)))
-            for other, column in enumerate(terms.T):
-                if other != s:
-                    rest *= V[:, column]
-            for j in range(1, n + 1):
-                plain, curved = (np.flatnonzero((place == j) & (self._nonlinear == kind)) for kind in (False, True))
-                slope[:, :, j - 1] += rest[:, plain] @ E[:, plain + 1].T
-                slope[:, :, j - 1] += (rest[:, curved] * inside[:, j - 1 : j]) @ E[:, curved + 1].T
+        rest: dict[int, np.ndarray] = {}
+        for s, j, places, bounded in self._places:
+            if s not in rest:
+                others = [V[:, column] for other, column in enumerate(terms.T) if other != s]
+                rest[s] = reduce(np.multiply, others, np.ones((len(z), len(terms))))
+            part = rest[s][:, places]
+            slope[:, :, j - 1] += (part * inside[:, j - 1 : j] if bounded else part) @ E[:, places + 1].T
         return phi, slope
 
 
@@ -211,10 +228,8 @@ def bound_states(model: HiddenModel, data: RecordSegments, reach: float) -> Hidd
 def join_segments(parts: Sequence[RecordSegments]) -> RecordSegments:
     """Return the segments of several records as one set."""
     points = np.concatenate([part.points for part in parts])
-    inputs, outputs, low, high = (
-        np.concatenate([getattr(part, name) for part in parts], axis=1) for name in ("inputs", "outputs", "low", "high")
-    )
-    return RecordSegments(points, inputs, outputs, low, high)
+    names = ("inputs", "outputs") if parts[0].low is None else ("inputs", "outputs", "low", "high")
+    return RecordSegments(points, *(np.concatenate([getattr(part, name) for part in parts], axis=1) for name in names))
 
 
 def start_states(model: HiddenModel, points: Float[np.ndarray, "m nzeta"]) -> Float[np.ndarray, "m n"]:
@@ -226,9 +241,10 @@ def read_features(
     model: HiddenModel, z: Float[np.ndarray, "m n"], u: Float[np.ndarray, "m nu"]
 ) -> Float[np.ndarray, "m nphi"]:
     """Return φ(z, u)."""
-    one, curved = np.ones((len(z), 1)), is_nonlinear(model.terms, model.order)
+    one = np.ones((len(z), 1))
     phi = np.hstack([one, evaluate_terms(model.terms, np.hstack([one, z, u]))])
     if (np.abs(z) > model.bound).any():
+        curved = is_nonlinear(model.terms, model.order)
         near = np.hstack([one, np.clip(z, -model.bound, model.bound), u])
         phi[:, 1:][:, curved] = evaluate_terms(model.terms[curved], near)
     return phi
@@ -241,8 +257,11 @@ def is_nonlinear(terms: Terms, order: int) -> Bool[np.ndarray, " nt"]:
 
 def _is_silent(y: Float[np.ndarray, "m ny"], data: RecordSegments, k: int) -> np.ndarray:
     """Return which readings say nothing: they are at a rail and y lies beyond it."""
+    assert data.low is not None
+    assert data.high is not None
     return (data.low[k] & (y < data.outputs[k])) | (data.high[k] & (y > data.outputs[k]))
 
 
 def _gap(y: Float[np.ndarray, "m ny"], data: RecordSegments, k: int) -> Float[np.ndarray, "m ny"]:
-    return np.where(_is_silent(y, data, k), 0.0, y - data.outputs[k])
+    gap = y - data.outputs[k]
+    return gap if data.low is None else np.where(_is_silent(y, data, k), 0.0, gap)

@@ -39,15 +39,19 @@ HORIZONS = (50, 200)  # steps of the segments whose errors are minimised
 ROWS = 4000  # rows that a search learns from, at most: of longer records evenly spread pieces are taken
 PIECE = 1000  # rows of such a piece
 REACH = 1.2  # products of z are constant beyond this many times the largest |z| that occurs in the fit
-STEPS = 12_000  # steps of all segments of one length, about
+STEPS = 8_000  # steps of all segments of one length, about
 OVERLAP = 3  # a long segment begins behind this share of the one before
 SHORT_OVERLAP = 7  # a short one behind this share
+RESTS = 10  # rows at the least or the largest reading, at least, that make it a rail
+ROBUST = 1.0  # share of the error of one step that counts as noise in the rows where the state begins
+GAINED = 0.95  # try a larger order only if the last one lowered the error to less than this share
+SEGMENTS = 5  # segments that fit into the records one behind the other, at least, of the longer kinds
 FINALISTS = 2  # orders that are fitted to longer segments too
 MOST = 300  # parameters of a model, at most
 EACH = 3  # rows for each parameter, at least
-_ITERATIONS = 40  # Levenberg-Marquardt steps for each degree
+_ITERATIONS = 25  # Levenberg-Marquardt steps for each degree
 _PATIENCE = 5  # steps in a row that do not lower the error on unseen rows
-_CONVERGED = 1e-4  # a step that lowers the squared error by a smaller share is the last
+_CONVERGED = 1e-3  # a step that lowers the squared error by a smaller share is the last
 _POLISH = 8  # steps on all rows, at the end
 _LOST = 1e3  # an error counts as this many spreads at most
 
@@ -61,7 +65,8 @@ class HiddenStructure(Value):
     order, degree
         Order of the hidden state, and total degree of the polynomials.
     delays, horizon
-        Past rows from which the state begins, and steps of the segments that the fit forecasts.
+        Past rows from which the state begins, and steps of the segments that the fit forecasts; 0 where `subspace` is
+        taken as it is.
     rails
         (2, ny) the least and the largest reading of each sensor; None where none saturates.
     errors
@@ -93,10 +98,11 @@ class HiddenStructure(Value):
 
     def describe(self) -> str:
         """Return a sentence on the model and its error."""
+        kind = f"polynomials of degree {self.degree}" if self.is_nonlinear else "linear dynamics"
+        how = f"fitted to forecasts of {self.horizon} steps" if self.horizon else "by a subspace method"
         return (
-            f"a hidden state of order {self.order} with polynomials of degree {self.degree}, which begins with "
-            f"{self.delays} past rows, fitted to forecasts of {self.horizon} steps; on unseen rows, in free run and "
-            f"{HORIZON} steps ahead, it errs by {self.error:.3g} spreads"
+            f"a hidden state of order {self.order} with {kind}, which begins with {self.delays} past rows, {how}; on "
+            f"unseen rows, in free run and {HORIZON} steps ahead, it errs by {self.error:.3g} spreads"
         )
 
 
@@ -200,40 +206,53 @@ def search_hidden(
         The records are too short for all of them.
     """
     data = thin_records(episodes)
-    plans = [(n, d, min(horizons)) for n in orders for d in delays]
-    count = len(plans) + FINALISTS * (len(horizons) - 1)
+    plans = [(n, d, min(horizons)) for n in sorted(orders) for d in delays]
+    count, done, least = len(plans) + FINALISTS * (len(horizons) - 1), 0, np.inf
     found: list[HiddenStructure] = []
-    reason: KoopmpcError | None = None
-    for i in range(count):
-        if i == len(plans):  # longer segments for the best of those so far
-            best = sorted(found, key=lambda one: one.error)[:FINALISTS]
-            sizes = dict.fromkeys((one.order, one.delays) for one in best)
-            plans += [(n, d, h) for n, d in sizes for h in horizons if h > min(horizons)]
-        if i >= len(plans):
-            break
-        n, d, h = plans[i]
+    reasons: list[KoopmpcError] = []
+
+    def try_plan(order: int, past: int, horizon: int) -> None:
+        nonlocal done
         if ask is not None:
-            ask(f"hidden states of order {n}", i, count)
+            ask(f"hidden states of order {order}", done, count)
+        done += 1
         try:
-            chain = _fit_chain(data, n, max(degrees), d, h, rails)
+            chain = _fit_chain(data, order, max(degrees), past, horizon, rails)
         except KoopmpcError as error:
-            reason = error
-            continue
+            reasons.append(error)
+            return
         for model, units in chain:
             degree = model.terms.shape[1]
             if degree in degrees:
-                errors = _measure(model, data, units, d)
-                calm = is_calm_hidden(model, data, units, d)
-                found.append(HiddenStructure(model.order, degree, d, h, rails, errors, calm, model.E.size))
+                errors = _measure(model, data, units, past)
+                calm = is_calm_hidden(model, data, units, past)
+                found.append(HiddenStructure(model.order, degree, past, horizon, rails, errors, calm, model.E.size))
+
+    for n in sorted(orders):
+        for order, past, horizon in plans:
+            if order == n:
+                try_plan(order, past, horizon)
+        best = min((one.error for one in found), default=np.inf)
+        if n > 1 and not best < GAINED * least:
+            break  # a larger state gains nothing
+        least = best
+    sizes = dict.fromkeys((one.order, one.delays) for one in sorted(found, key=lambda one: one.error)[:FINALISTS])
+    for order, past in sizes:
+        for horizon in sorted(horizons)[1:]:
+            if horizon * SEGMENTS > sum(map(len, data)):
+                break  # too few segments of this length
+            try_plan(order, past, horizon)
     if not found:
-        raise reason or DataError("no structure was asked for; pass orders and degrees")
+        raise reasons[0] if reasons else DataError("no structure was asked for; pass orders and degrees")
     return found
 
 
 def fit_hidden(structure: HiddenStructure, episodes: Episodes) -> LinearPredictor | BilinearPredictor:
     """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows."""
-    data = thin_records(episodes)
     s = structure
+    if not s.horizon:
+        return build_realisation(compute_block_moments(episodes, s.delays), s.order)
+    data = thin_records(episodes)
     found, units = _fit_chain(data, s.order, s.degree, s.delays, s.horizon, s.rails)[-1]
     whole = _cut_sets(data, units, s.delays, s.horizon, [(0, len(e)) for e in data])
     theta, _ = minimise(
@@ -245,6 +264,21 @@ def fit_hidden(structure: HiddenStructure, episodes: Episodes) -> LinearPredicto
     if is_calm_hidden(polished, data, units, s.delays) or not is_calm_hidden(found, data, units, s.delays):
         found = polished
     return from_standard(found, units, episodes, s.delays, _report(structure, found, units, data))
+
+
+def find_rails(episodes: Episodes) -> Float[np.ndarray, "2 ny"] | None:
+    """Return the rails of sensors that rest at their least or largest reading; None where none does.
+
+    A rail shows in at least ten rows, and at least a quarter of them follow each other.
+    """
+    rails = np.vstack([np.full(episodes.nx, -np.inf), np.full(episodes.nx, np.inf)])
+    Y = np.concatenate([e.X for e in episodes])
+    for i, column in enumerate(Y.T):
+        for side, value in enumerate((column.min(), column.max())):
+            at = column == value
+            if at.sum() >= RESTS and (at[1:] & at[:-1]).sum() >= at.sum() / 4 and not at.all():
+                rails[side, i] = value
+    return rails if np.isfinite(rails).any() else None
 
 
 def thin_records(episodes: Episodes) -> Episodes:
@@ -282,9 +316,9 @@ def _fit_chain(
     fitted = _cut_sets(data, units, delays, horizon, [(0, a) for a in ends])
     judged = _cut_sets(data, units, delays, horizon, [(a, len(e)) for e, a in zip(data, ends, strict=True)])
     learned = data.with_episodes([e.cut(0, a) for e, a in zip(data, ends, strict=True) if a > 0])
-    model = normalise(
-        to_standard(build_realisation(compute_block_moments(learned, delays), order), units), fitted[-1].points
-    )
+    start = build_realisation(compute_block_moments(learned, delays), order)
+    model = normalise(to_standard(start, units), fitted[-1].points)
+    noise = _noise_of(start, units)
     found: list[tuple[HiddenModel, SignalUnits]] = []
     rows = sum(map(len, data)) * units.ny
     for g in range(1, degree + 1):
@@ -292,12 +326,18 @@ def _fit_chain(
         if g > 1 and len(model.parameters) > min(MOST, rows // EACH):
             break
         theta, _ = minimise(
-            SimulationError(model), model.parameters, fitted, judged, _ITERATIONS,
+            SimulationError(model, noise), model.parameters, fitted, judged, _ITERATIONS,
             patience=_PATIENCE, converged=_CONVERGED,
         )  # fmt: skip
         model = model.with_parameters(theta)
         found.append((bound_states(model, fitted[0], REACH) if g > 1 else model, units))
     return found
+
+
+def _noise_of(start: LinearPredictor, units: SignalUnits) -> float:
+    """Return the noise in ζ: the error of one step of the linear model, in spreads."""
+    assert start.report is not None, "it was fitted"
+    return ROBUST * float(np.max(start.report.residual / units.scale[: units.ny]))
 
 
 def normalise(model: HiddenModel, points: Float[np.ndarray, "m nzeta"]) -> HiddenModel:

@@ -93,7 +93,7 @@ def subspace(
         raise DataError("the data have measured disturbances, which subspace does not know; pass them as inputs")
     orders, pasts = check_list(order, 1), check_list(delays, 1)
     if len(orders) * len(pasts) > 1:
-        orders, pasts = _choose_sizes(source_episodes(source), orders, pasts)
+        orders, pasts = choose_sizes(source_episodes(source), orders, pasts)[:2]
     return build_realisation(compute_block_moments(source, pasts[0], **options), orders[0])
 
 
@@ -209,8 +209,16 @@ def _build_model(regression: Regression, found: Realisation) -> LinearPredictor:
     )
 
 
-def _choose_sizes(episodes: Episodes, orders: list[int], pasts: list[int]) -> tuple[list[int], list[int]]:
-    """Return the smallest order, and its past rows, whose error on the last quarter is like the least one."""
+def choose_sizes(
+    episodes: Episodes, orders: Sequence[int] = ORDERS, pasts: Sequence[int] = DELAYS
+) -> tuple[list[int], list[int], Float[np.ndarray, " blocks"]]:
+    """Return the smallest order, and its past rows, whose error on the last quarter is like the least one; its errors.
+
+    Raises
+    ------
+    DataError
+        The records are too short.
+    """
     learned, spans = cut_quarter(episodes)
     tried: list[tuple[int, int, Float[np.ndarray, " blocks"]]] = []
     for delays in pasts:
@@ -223,7 +231,6 @@ def _choose_sizes(episodes: Episodes, orders: list[int], pasts: list[int]) -> tu
     if not tried:
         raise DataError(f"the records are too short for {pasts[0]} past rows; pass fewer delays, or longer records")
     least = min(tried, key=lambda one: float(np.log(one[2]).mean()))[2]
-    order, delays, _ = min(
-        one for one in ((m, d, tuple(e)) for m, d, e in tried) if not is_worse(np.array(one[2]), least)
-    )
-    return [order], [delays]
+    near = [one for one in tried if not is_worse(one[2], least)]
+    order, delays, errors = min(near, key=lambda one: one[:2])
+    return [order], [delays], errors

@@ -1,0 +1,258 @@
+"""ExtendedKalman: a Kalman filter on a nonlinear model, with delays or a hidden state, from measured outputs."""
+
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.checks import HUGE
+from koopmpc.errors import DataError
+from koopmpc.estimate.disturbance import GAIN
+from koopmpc.estimate.gate import ReadingGate
+from koopmpc.estimate.observer import StateModel
+from koopmpc.plants.step_map import StepMap
+from koopmpc.predict.hidden_state import HiddenState
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.values import Value
+
+PROCESS = 1e-4  # default variance of the process noise, as a share of that of the outputs
+LEAST = 1e-8  # variance of the noise of y, as a share of that of the outputs, where a fit leaves no residual
+PATIENCE = 10  # samples in sequence without any reading that are bridged by prediction
+
+
+@dataclass(frozen=True, eq=False)
+class ExtendedKalman(Value):
+    """Extended Kalman filter on s = [x; d]: x⁺ = F(x, u) + E w + Γ (d + noise), d⁺ = d + noise, y = h(x) + noise.
+
+    It serves the controllers that plan in the state's own coordinates: BilinearMPC and NonlinearMPC. Of a predictor F
+    is the re-lifted map. With delays x is ζ, so readings of the past are filtered too; with a hidden state x is
+    [y; z], and z is corrected by what y shows. Each step linearises F and h at the estimate, exactly. d is an additive
+    disturbance of the outputs, one for each, so that a controller leaves no offset.
+
+    Entries of y that are NaN are left out. A reading at a rail of its sensor with a prediction at it or beyond is left
+    out too: it tells nothing more. A reading far from its prediction is refused, for at most five steps in sequence.
+
+    Of a StepMap y is its own output h(x), which may be less than the state; then d is zero, and an offset may remain.
+
+    There is no C code for it.
+
+    Parameters
+    ----------
+    process, drift, noise
+        Variances of what enters an output in a step, of a step of d, and of y; a scalar, or one for each output. By
+        default `noise` is that of the fit's residuals, and `process` a standard deviation of 1 % of the outputs' size;
+        a model that was given has sizes of one. With the default `drift` an error of d dies out within the horizon, and
+        within the 38 steps of a mean with gain 0.1.
+
+    Raises
+    ------
+    DataError
+        A variance is below zero; when a controller is built, its model is linear and lifted once, as in KoopmanMPC.
+
+    References
+    ----------
+    Anderson & Moore, "Optimal Filtering", 1979, section 8.2.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    >>> data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-5, 5), episodes=60, steps=30)
+    >>> model = km.bilinear_edmd(data, km.State() + km.Fourier(2, states="theta"), difference=True)
+    >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
+    >>> mpc = km.BilinearMPC(model, cost, limits, horizon=20, estimator=km.ExtendedKalman())
+    >>> mpc([0.1, 0.0], [0, 0]).status.name
+    'OPTIMAL'
+    """
+
+    process: ArrayLike | None = None
+    drift: ArrayLike | None = None
+    noise: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("process", "drift", "noise"):
+            if getattr(self, name) is not None:
+                variance = checks.array(getattr(self, name), name)
+                if variance.ndim > 1 or (variance < 0).any():
+                    raise DataError(f"{name} must be a variance, or one for each output, of zero or above")
+                object.__setattr__(self, name, variance)
+
+    def start(self, model: LinearPredictor | StateModel, horizon: int) -> "ExtendedObserver":
+        """Return the observer of one controller with plans of this many steps.
+
+        Raises
+        ------
+        DataError
+            The model is linear and lifted once; or it is of a kind that cannot be linearised.
+        """
+        if isinstance(model, LinearPredictor):
+            raise DataError(
+                "this controller's model is linear in z, for which LiftedKalman(outputs=model.C) is the Kalman filter; "
+                "pass that, or use a BilinearMPC"
+            )
+        return ExtendedObserver(self, model, max(GAIN, min(4.0 / horizon, 1.0)))
+
+
+class ExtendedObserver:
+    """The observer of an `ExtendedKalman`.
+
+    Parameters
+    ----------
+    rule
+        Its settings.
+    model
+        The model of the controller.
+    gain
+        Share of an innovation that d takes over in a step, about.
+    """
+
+    def __init__(self, rule: ExtendedKalman, model: StateModel, gain: float) -> None:
+        self._rule, self._settle = rule, gain
+        self._take(model)
+        self._gate = ReadingGate(self.ny)
+        self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
+        self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
+        self.reset()
+
+    def _take(self, model: StateModel) -> None:
+        """Take over the map of a model, and what its noise is by default."""
+        given: object = getattr(model, "model", None)
+        self._model, n = model, model.nz
+        self._embedding = model.embedding
+        if isinstance(given, StepMap):
+            self._map, self.ny, self._disturbed = given, given.ny, given.measures_all
+            size, residual = np.ones(self.ny), np.zeros(self.ny)
+            self._enters = np.eye(n)
+        elif isinstance(given, LinearPredictor | BilinearPredictor):
+            self._map, self.ny, self._disturbed = _open_map(given), given.nx, True
+            size = np.ones(self.ny) if given.scale is None else np.linalg.norm(given.scale @ given.C.T, axis=0)
+            residual = np.zeros(self.ny) if given.report is None else given.report.residual
+            self._enters = np.eye(n, self.ny)
+            if isinstance(given.embedding, HiddenState):  # noise enters z, and shows in y
+                self._enters = np.vstack([given.embedding.C, np.eye(given.embedding.order)])
+        else:
+            raise DataError(
+                "ExtendedKalman needs the equations of the controller's model; pass a predictor or a StepMap to a "
+                "BilinearMPC or a NonlinearMPC"
+            )
+        size = np.where(size > 0, size, 1.0)
+        count = self._enters.shape[1]
+        noise = np.where(residual > 0, np.maximum(residual**2, LEAST * size**2), PROCESS * size**2)
+        self._R = np.diag(self._fill(self._rule.noise, noise))
+        usual = PROCESS * size**2 if count == self.ny else np.full(count, PROCESS)
+        process = usual if self._rule.process is None else np.resize(np.asarray(self._rule.process), count)
+        self._Q = self._enters @ np.diag(process) @ self._enters.T
+        drift = self._settle**2 * (np.diag(self._R) + self._Q.diagonal()[: self.ny])
+        self._drift = np.diag(self._fill(self._rule.drift, drift)) if self._disturbed else np.zeros((self.ny, self.ny))
+        self._size = size
+
+    def _fill(self, given: ArrayLike | None, usual: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+        if given is None:
+            return usual
+        return np.broadcast_to(checks.array(given, "a variance"), usual.shape).astype(np.float64)
+
+    @property
+    def refused(self) -> bool:
+        """Whether the last y was refused: the filter only predicted."""
+        return self._gate.refused
+
+    def reset(self, x0: ArrayLike | None = None) -> None:
+        """Forget everything; the run starts at x0, where it is known, or at the first reading."""
+        self._begun, self._missed, n = False, 0, self._model.nz
+        self._start = None if x0 is None else checks.array(x0, "x0")
+        self.z[:], self.d[:] = 0.0, 0.0
+        self._P = np.zeros((n + self.ny, n + self.ny))
+        self._gate.reset()
+
+    def update(self, model: StateModel) -> None:
+        """Go on with another model, from the same estimate."""
+        self._take(model)
+
+    def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
+        """Predict with the inputs that acted, and correct with the entries of y that have come and tell something.
+
+        False says that the estimate cannot be used: readings have been missing for too long, or it has run away.
+        """
+        if not self._begun:
+            return self._begin(y, u)
+        n, ny = self._model.nz, self.ny
+        F = np.eye(n + ny)
+        F[:n, :n] = self._map.linearize(self.z, u).A
+        F[:ny, n:] = np.eye(ny) if self._disturbed else 0.0
+        z = np.array(self._model.advance(self.z, u, w, self.d), dtype=np.float64)
+        Q = scipy.linalg.block_diag(self._Q, self._drift)
+        P = F @ self._P @ F.T + Q
+        H = np.hstack([self._output_slope(z), np.zeros((ny, ny))])
+        predicted = self._output(z)
+        came = np.abs(y) < HUGE  # False for NaN
+        useful = came if self._embedding is None else came & ~self._embedding.is_beyond(y, predicted)
+        shown = np.where(useful | ~came, y, predicted)
+        refused = self._gate.judge(shown, predicted)
+        s = np.concatenate([z, self.d[:ny]])
+        if useful.any() and not refused:
+            s, P = self._correct(s, P, H[useful], self._R[np.ix_(useful, useful)], (y - predicted)[useful])
+        self._P = 0.5 * (P + P.T)
+        self._missed = 0 if came.any() else self._missed + 1
+        self.z[:] = s[:n]
+        self.d[:ny] = s[n:] if self._disturbed else 0.0
+        return self._missed <= PATIENCE and bool(np.abs(s).max() < HUGE)
+
+    def _begin(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"]) -> bool:
+        n, ny, embedding = self._model.nz, self.ny, self._embedding
+        if not np.isfinite(y).all():
+            return False
+        if embedding is not None:
+            self.z[:] = embedding.repeat(y, u)
+            spread = embedding.spread(self._size, np.zeros(self._model.nu))
+        elif self._start is not None and len(self._start) == n:
+            self.z[:], spread = self._start, np.ones(n)
+        else:
+            self.z[:ny], spread = y, np.ones(n)
+        self._P = scipy.linalg.block_diag(np.diag(0.1 * spread**2), self._drift)
+        self._P[:ny, :ny] = self._R
+        self._begun = True
+        return True
+
+    def _correct(
+        self,
+        s: Float[np.ndarray, " ns"],
+        P: Float[np.ndarray, "ns ns"],
+        H: Float[np.ndarray, "m ns"],
+        R: Float[np.ndarray, "m m"],
+        gap: Float[np.ndarray, " m"],
+    ) -> tuple[Float[np.ndarray, " ns"], Float[np.ndarray, "ns ns"]]:
+        """Return s and P after a reading, in Joseph's form."""
+        S = H @ P @ H.T + R
+        size = np.sqrt(S.diagonal())
+        K = np.linalg.solve(S / np.outer(size, size), (H @ P) / size[:, None]).T / size
+        kept = np.eye(len(s)) - K @ H
+        return s + K @ gap, kept @ P @ kept.T + K @ R @ K.T
+
+    def _output(self, z: Float[np.ndarray, " nz"]) -> Float[np.ndarray, " ny"]:
+        return self._map.measure(z)[: self.ny] if self._embedding is None else z[: self.ny]
+
+    def _output_slope(self, z: Float[np.ndarray, " nz"]) -> Float[np.ndarray, "ny nz"]:
+        """Return ∂h/∂x, by differences where the output is no part of the state."""
+        n, ny = len(z), self.ny
+        if self._disturbed:
+            return np.eye(ny, n)
+        step = 1e-6 * np.maximum(np.abs(z), 1.0)
+        rows: list[Bool[np.ndarray, " ny"] | Float[np.ndarray, " ny"]] = []
+        for i in range(n):
+            up, down = z.copy(), z.copy()
+            up[i], down[i] = z[i] + step[i], z[i] - step[i]
+            rows.append((self._map.measure(up) - self._map.measure(down)) / (2 * step[i]))
+        return np.array(rows).T
+
+
+def _open_map(model: LinearPredictor | BilinearPredictor) -> StepMap:
+    """Return the re-lifted map of a model whose sensors have no limits."""
+    if model.embedding is None or model.embedding.rails is None:
+        return model.step_map()
+    other = copy(model)
+    object.__setattr__(other, "embedding", model.embedding.without_rails())
+    return other.step_map()

@@ -1,0 +1,155 @@
+"""Models of records with a hidden state: linear and polynomial ones, with the sensor's rails and without."""
+
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import KoopmpcError, hide_fit_warnings
+from koopmpc.identify.records.narx import FOLDS
+from koopmpc.identify.records.state_space import (
+    HiddenStructure,
+    choose_hidden,
+    find_rails,
+    fit_hidden,
+    search_hidden,
+    thin_records,
+)
+from koopmpc.identify.records.subspace import choose_sizes
+from koopmpc.parallel import Progress
+from koopmpc.predict.base import sorted_eigen
+from koopmpc.predict.predictors import BilinearPredictor
+from koopmpc.synthesis.leaderboard import LeaderboardRow
+from koopmpc.synthesis.records import FreeRun, cut_pieces, forecast_rows, judge_free_run
+from koopmpc.validate.scoring import AnyPredictor
+
+FAR = 1.5  # a kind that errs by this many times the least error is left out
+LOST = 1.0  # a model that errs by more spreads than this on one stretch is not taken where another one is calm
+_ORDERS = (1, 2, 3, 4)  # orders of hidden states that simulation error is tried on
+
+
+def judge_hidden_states(
+    measured: Episodes,
+    first: int,
+    horizon: int,
+    bilinear: bool,
+    rival: float = np.inf,
+    progress: Progress | None = None,
+) -> list[tuple[LeaderboardRow, FreeRun]]:
+    """Return the best models with a hidden state, one of each kind, and how they run over stretches that no fit saw.
+
+    The kinds are the subspace model, the linear and the polynomial one of least simulation error, and where a sensor
+    rests at its least or largest reading, the polynomial one with these rails. Where records are too short for a kind,
+    it is left out.
+
+    Parameters
+    ----------
+    measured
+        The records, their inputs in time.
+    first, horizon
+        As in `judge_free_run`.
+    rival
+        Least error of other models on unseen rows; what errs by far more is not judged.
+    bilinear
+        Try polynomial ones, which are bilinear predictors.
+    progress
+        Called with what is done and how many there are.
+    """
+    begun = perf_counter()
+    found: list[HiddenStructure] = []
+    try:
+        (order,), (delays,), errors = choose_sizes(measured)
+        found.append(HiddenStructure(order, 1, delays, 0, None, errors, True, order * (order + 1 + measured.nu)))
+    except KoopmpcError:
+        pass
+    rails = find_rails(measured)
+    for limits in (None,) if rails is None else (None, rails):
+
+        def ask(_: str, done: int, total: int) -> None:
+            if progress is not None:
+                progress(done, total)
+
+        try:
+            tried = search_hidden(measured, _ORDERS, rails=limits, ask=ask)
+        except KoopmpcError:
+            continue
+        for kind in (False, True) if bilinear else (False,):
+            same = [one for one in tried if one.is_nonlinear is kind]
+            if same and (kind or limits is None):
+                found.append(choose_hidden(same))
+    least = min((one.error for one in found), default=np.inf)
+    found = [one for one in found if one.error < FAR * min(least, rival)]
+    searched = (perf_counter() - begun) / max(len(found), 1)
+    results: list[tuple[LeaderboardRow, FreeRun]] = []
+    for structure in found:
+        try:
+            results.append(_judge(structure, measured, first, horizon, searched))
+        except KoopmpcError:
+            continue
+    return results
+
+
+def _judge(
+    structure: HiddenStructure, measured: Episodes, first: int, horizon: int, searched: float
+) -> tuple[LeaderboardRow, FreeRun]:
+    """Return the line of the leaderboard and the free runs of a structure."""
+    begun, models = perf_counter(), list[AnyPredictor]()
+    data = measured if len(measured) > 1 else thin_records(measured)
+
+    def fit(episodes: Episodes) -> AnyPredictor:
+        with hide_fit_warnings():
+            models.append(fit_hidden(structure, episodes))
+        return models[-1]
+
+    start = max(first, structure.delays)
+    run = judge_free_run(fit, data, data, start, horizon, relift=structure.is_nonlinear)
+    run = replace(run, calm=run.calm and bool(run.errors.max() < LOST))
+    errors, whole = _errors_ahead(models, data, start, horizon), models[-1]
+    radius = float(np.abs(sorted_eigen(whole.A)[0][0]))
+    rails = "" if structure.rails is None else ", saturating sensor"
+    how = "simulation error" if structure.horizon else "subspace"
+    name = f"hidden state of order {structure.order}"
+    name += f", degree {structure.degree}" if structure.is_nonlinear else f", {how}"
+    row = LeaderboardRow(
+        name=name + rails,
+        bilinear=isinstance(whole, BilinearPredictor),
+        nz=whole.nz,
+        size=structure.parameters,
+        delays=structure.delays,
+        ridge=0.0,
+        first=float(errors[0]),
+        middle=float(errors[max(horizon // 2, 1) - 1]),
+        last=float(errors[-1]),
+        median=float(np.median(run.errors)),
+        worst=float(run.errors.max()),
+        deviation=0.0,
+        radius=radius,
+        growth=1.0,
+        seconds=perf_counter() - begun + searched,
+        lifting=whole.lifting,
+        embedding=whole.embedding,
+        structure=replace(structure, errors=run.errors, calm=run.calm),
+    )
+    return row, run
+
+
+def _errors_ahead(
+    models: list[AnyPredictor], data: Episodes, first: int, horizon: int
+) -> Float[np.ndarray, " horizon"]:
+    """Return the error of each step ahead, in spreads, each model on the quarter that it did not learn from."""
+    pieces = cut_pieces(data)
+    scale = np.concatenate([e.X for e in pieces]).std(axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    squares, count = np.zeros(horizon), 0
+    for fold, model in enumerate(models[:FOLDS]):
+        for e in pieces:
+            low, high = max(len(e) * fold // FOLDS, first), len(e) * (fold + 1) // FOLDS
+            starts = [*range(low, high - horizon + 1, horizon)]
+            if starts:
+                relift = isinstance(model, BilinearPredictor)
+                gaps = forecast_rows(model, pieces.with_episodes([e]), starts, horizon, relift) / scale
+                squares += np.sum(np.minimum(np.abs(gaps), 1e3) ** 2, axis=(1, 2)) / gaps.shape[2]
+                count += gaps.shape[1]
+    return np.sqrt(squares / max(count, 1))
