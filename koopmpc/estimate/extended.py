@@ -66,7 +66,7 @@ class ExtendedKalman(Value):
     >>> cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-25, u_max=25)
     >>> mpc = km.BilinearMPC(model, cost, limits, horizon=20, estimator=km.ExtendedKalman())
     >>> mpc([0.1, 0.0], [0, 0]).status.name
-    'OPTIMAL'
+    'UNCONSTRAINED'
     """
 
     process: ArrayLike | None = None
@@ -236,7 +236,7 @@ class ExtendedObserver:
         return self._map.measure(z)[: self.ny] if self._embedding is None else z[: self.ny]
 
     def _output_slope(self, z: Float[np.ndarray, " nz"]) -> Float[np.ndarray, "ny nz"]:
-        """Return ∂h/∂x, by differences where the output is no part of the state."""
+        """Return ∂h/∂x, by differences where the state does not hold the output."""
         n, ny = len(z), self.ny
         if self._disturbed:
             return np.eye(ny, n)

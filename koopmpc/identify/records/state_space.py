@@ -123,7 +123,7 @@ def polynomial_state_space(
     T. It starts with the linear model of `subspace`; then each degree starts with the model of the lower one. It stops
     on the last quarter of each record. Then a few steps on all rows follow.
 
-    Segments begin at measured rows, as in multiple shooting; so an unstable plant is no obstacle.
+    Segments begin at measured rows, as in multiple shooting; so the plant may be unstable.
 
     Parameters
     ----------

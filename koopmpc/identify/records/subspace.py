@@ -43,8 +43,8 @@ def subspace(
     what of the past counts for the future. In it, the covariance of the state and the observability Gramian over p
     steps are both S. Least squares of s_{k+1} and y_{k+1} on [s_k, u_k] gives A, C and B; s = A z and C z ≈ y give z.
 
-    All sums come from one pass over the data: the moments of ζ_k, u_k and ζ_{k+1} hold all block Hankel sums. Future
-    inputs are no regressors, so the fit is consistent under feedback. There, N4SID is biased.
+    All sums come from one pass over the data: the moments of ζ_k, u_k and ζ_{k+1} hold all block Hankel sums. The
+    regression leaves future inputs out, so the fit is consistent under feedback. There, N4SID is biased.
 
     The result has the embedding Delay(p) and the lifting [T ζ, 1]: controllers, C code and files take it as any other
     linear model. `refine` improves it on forecasts of many steps.
