@@ -1,10 +1,13 @@
 """Tasks on a Dask cluster, and what local workers and a cluster share: jobs, and the pool that does them."""
 
+import logging
 import os
+import signal
 import socket
 import time
+from asyncio import CancelledError
 from collections.abc import Callable, Generator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 from urllib.parse import urlsplit
@@ -22,7 +25,9 @@ ONE_THREAD: dict[str, str] = dict.fromkeys(  # environment of a worker: numpy re
 _SHOWN = 200  # a message shows at most this many characters of a task
 _PATIENCE = 30.0  # raise an error if the cluster has had no worker for this time [s]
 _LOOK = 1.0  # while a result is awaited, look for workers this often [s]
-_ANSWER = 3.0  # raise an error if the scheduler does not answer within this time [s]
+_ANSWER = 3.0  # raise an error if nothing listens at the scheduler's address for this time [s]
+_GREETING = 30.0  # raise an error if what listens there has not greeted as a scheduler within this time [s]
+_LOG = logging.getLogger(__name__)
 _ANY_PORT = "127.0.0.1:0"
 
 
@@ -149,16 +154,34 @@ class DaskPool(Generic[Task, Result]):
 
 
 def _knock(scheduler: str) -> None:
-    """Raise OSError where nothing listens at the address, now or within the time that a scheduler has to answer."""
+    """Raise OSError where nothing listens at the address, or what listens does not greet as a scheduler in time."""
     place, last = urlsplit(scheduler), time.monotonic() + _ANSWER
     while True:
         try:
-            with socket.create_connection((place.hostname or "", place.port or 8786), timeout=_ANSWER):
-                return
-        except OSError:
+            line = socket.create_connection((place.hostname or "", place.port or 8786), timeout=_ANSWER)
+            break
+        except OSError as error:
             if time.monotonic() + 0.2 > last:
-                raise
+                raise ConnectionError(str(error)) from error  # a TimeoutError means that no greeting came
         time.sleep(0.2)
+    with line:
+        if place.scheme == "tcp":  # a scheduler speaks first, and a Client would wait for it without end
+            line.settimeout(_GREETING)
+            line.recv(1)
+
+
+def _close(cluster: Any) -> None:
+    """Take down a local cluster, by force where Dask fails to: it does if a worker that died is started just then."""
+    try:
+        cluster.close()
+    except (Exception, CancelledError):
+        _LOG.debug("Dask did not close its cluster", exc_info=True)
+        for nanny in list(cluster.workers.values()):
+            with suppress(AttributeError, TypeError, OSError):  # it has no process, or no longer
+                os.kill(nanny.pid, getattr(signal, "SIGKILL", signal.SIGTERM))
+        with suppress(Exception, CancelledError):
+            cluster.sync(cluster.scheduler.close)
+        cluster.status = type(cluster.status).closed  # else it warns, and tries again at the end of the program
 
 
 @contextmanager
@@ -182,7 +205,7 @@ def open_dask(
         if scheduler == "local":
             # Dask has its workers give freed memory back at once, which makes fresh arrays cost more than their sums
             with config.set({"distributed.nanny.pre-spawn-environ": ONE_THREAD}):
-                cluster: Any = LocalCluster(
+                address = LocalCluster(
                     n_workers=workers or os.cpu_count(),
                     threads_per_worker=1,
                     processes=True,
@@ -190,14 +213,15 @@ def open_dask(
                     dashboard_address=_ANY_PORT,
                     worker_dashboard_address=_ANY_PORT,
                 )
-            address = open_now.enter_context(cluster)
+            open_now.callback(_close, address)
         try:
             if scheduler.startswith(("tcp://", "tls://")):
                 _knock(scheduler)  # a Client without an answer needs 11 s to say so
-            client = open_now.enter_context(Client(address, set_as_default=False, timeout=_ANSWER))
+            client = open_now.enter_context(Client(address, set_as_default=False, timeout=_GREETING))
         except (OSError, ValueError, MemoryError) as error:  # MemoryError: another service's words were read as a size
+            waited = _GREETING if isinstance(error, TimeoutError) else _ANSWER
             raise KoopmpcError(
-                f"no Dask scheduler answers at {scheduler} within {_ANSWER:g} s; start one with `dask scheduler`, "
+                f"no Dask scheduler answers at {scheduler} within {waited:g} s; start one with `dask scheduler`, "
                 'or pass "local"'
             ) from error
         yield DaskPool(function, client, scheduler)

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -214,6 +215,30 @@ def test_workers_have_one_blas_thread_each(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_local_cluster_is_made_and_taken_down() -> None:
     assert list(map_tasks(tasks.threads, range(3), workers=2, scheduler="local")) == ["1", "1", "1"]
+
+
+def test_what_a_task_raised_is_told_where_dask_fails_to_close_its_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+    from distributed import Nanny
+
+    pids = []
+
+    async def fail(nanny: Nanny, *_: Any, **__: Any) -> None:
+        pids.append(nanny.pid)
+        raise AssertionError("can only join a started process")
+
+    monkeypatch.setattr(Nanny, "close", fail)
+    with pytest.raises(km.errors.DataError, match="the second task is wrong"):
+        list(map_tasks(tasks.fail, range(3), workers=2, scheduler="local"))
+    assert len(pids) == 2
+    wait_until(lambda: not any(map(_is_alive, pids)))
+
+
+def test_a_service_that_does_not_greet_as_a_scheduler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("koopmpc.cluster._GREETING", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(km.KoopmpcError, match=rf"no Dask scheduler answers at {address} within 0\.5 s; start one"):
+            list(map_tasks(tasks.square, [1], scheduler=address))
 
 
 def test_no_task_is_no_result() -> None:
