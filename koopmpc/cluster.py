@@ -181,7 +181,8 @@ def _close(cluster: Any) -> None:
                 os.kill(nanny.pid, getattr(signal, "SIGKILL", signal.SIGTERM))
         with suppress(Exception, CancelledError):
             cluster.sync(cluster.scheduler.close)
-        cluster.status = type(cluster.status).closed  # else it warns, and tries again at the end of the program
+        statuses: Any = type(cluster.status)
+        cluster.status = statuses.closed  # else it warns, and tries again at the end of the program
 
 
 @contextmanager
