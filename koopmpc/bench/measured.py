@@ -103,7 +103,7 @@ def _describe_case(problem: Problem, name: str) -> str:
     text = "; ".join(parts) + "."
     if case.plant is not None:
         text += f" The plant is another one than the controllers know{_name_changes(problem.dynamics, case.plant)}. "
-        text += "So nonlinear-mpc is no optimum here, and a ratio may be below 1."
+        text += "So nonlinear-mpc is not optimal here, and a ratio may be below 1."
     return text
 
 

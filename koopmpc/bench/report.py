@@ -36,7 +36,7 @@ _LOGS = 12  # runs over one another, at most
 
 LEGEND = "cost: of the run; ratio: to nonlinear-mpc's, which knows the equations; off: error at the end."
 TIMES = "p50, p99: time of a step, in Python. `koopmpc explain WORD` explains every word, for example free."
-BELOW = "A ratio below 1: nonlinear-mpc is no optimum there. See `koopmpc explain {case}`."
+BELOW = "A ratio below 1: nonlinear-mpc is not optimal there. See `koopmpc explain {case}`."
 UNDER_FAULTS = "under faults: cost over that without the fault (steps that fell back). See `koopmpc explain WORD`."
 
 

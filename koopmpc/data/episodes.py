@@ -411,11 +411,11 @@ def episodes_of(given: object) -> Episodes:
     """
     if isinstance(given, Episodes):
         return given
-    raise describe_misfit(given, "or what collect returns")
+    raise explain_wrong_data(given, "or what collect returns")
 
 
-def describe_misfit(given: object, others: str) -> DataError:
-    """Return the error for what is no data: of a path or a DataFrame it names the function that reads it."""
+def explain_wrong_data(given: object, others: str) -> DataError:
+    """Return the error for another object than data; for a path or a DataFrame it names the function that reads it."""
     kind = type(given).__name__
     if isinstance(given, str | PathLike) or kind == "DataFrame":
         name = "frame" if kind == "DataFrame" else repr(str(given))

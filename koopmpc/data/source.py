@@ -7,7 +7,7 @@ from functools import partial
 from itertools import chain
 from typing import cast
 
-from koopmpc.data.episodes import Episodes, PlantSignature, describe_misfit, join_sets
+from koopmpc.data.episodes import Episodes, PlantSignature, explain_wrong_data, join_sets
 from koopmpc.errors import DataError
 from koopmpc.values import Named
 
@@ -156,7 +156,7 @@ def source_of(given: object) -> Source:
         return Held(given)
     if isinstance(given, Source):
         return given
-    raise describe_misfit(given, "what collect returns, km.data.Files(folder) or km.data.Stream(episodes)")
+    raise explain_wrong_data(given, "what collect returns, km.data.Files(folder) or km.data.Stream(episodes)")
 
 
 _PART = 8_000_000  # bytes of small sets that are one part

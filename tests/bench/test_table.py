@@ -60,7 +60,7 @@ def test_a_ratio_below_one_is_explained_by_the_case_that_has_it():
     better = km.bench.RunRow("pendulum", "hold", "lqr", replace(GOOD, cost=0.1 * GOOD.cost), reached=True)
     oracle = km.bench.RunRow("pendulum", "hold", "nonlinear-mpc", GOOD, reached=True)
     text = " ".join(printed(km.bench.results_table([better, oracle])).split())
-    assert "A ratio below 1: nonlinear-mpc is no optimum there. See `koopmpc explain pendulum:hold`." in text
+    assert "A ratio below 1: nonlinear-mpc is not optimal there. See `koopmpc explain pendulum:hold`." in text
     assert "below 1" not in printed(km.bench.results_table(rows()))
 
 
