@@ -418,7 +418,7 @@ def explain_wrong_data(given: object, others: str) -> DataError:
     """Return the error for another object than data; for a path or a DataFrame it names the function that reads it."""
     kind = type(given).__name__
     if isinstance(given, str | PathLike) or kind == "DataFrame":
-        name = "frame" if kind == "DataFrame" else repr(str(given))
+        name = "frame" if kind == "DataFrame" else repr(str(cast("object", given)))
         return DataError(f"episodes is a {kind}; pass km.load_episodes({name}), which reads it")
     return DataError(f"episodes is a {kind}; pass Episodes([Episode(X=…, U=…), …], dt), {others}")
 
