@@ -19,6 +19,7 @@ from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Value
 
 PLAIN = "linear: x, 1"  # z = [x, 1], the model that the others have to beat
+_WORTH = 0.01  # share of a linear model's error that a bilinear one may reach to be taken in its place
 _FASTER = 3.0  # growth over the horizon, as a multiple of the smallest model's, above which a linear model is doubted
 
 
@@ -227,8 +228,9 @@ def choose_model(
     Errors below `alike` count as equal; by default these are errors of rounding and of the least ridge. Where every
     forecast ran away, it is the smallest model of all. Models with delays are taken only where they halve the error, as
     they do where some of the state is not measured: elsewhere the past tells a linear model which input the data
-    would have applied next, and a controller applies others. Linear models that grow too fast are left out. `among`
-    holds the places to choose from; by default all.
+    would have applied next, and a controller applies others. Linear models that grow too fast are left out. In place
+    of a linear model whose errors count as equal, a bilinear one is taken if its own are at most a hundredth of them.
+    `among` holds the places to choose from; by default all.
     """
     asked = [i for i in (range(len(rows)) if among is None else among) if kind is None or rows[i].kind == kind]
     places = [i for i in asked if not _runaway(rows[i], rows)] or asked
@@ -237,7 +239,13 @@ def choose_model(
         places = present
     best = min((rows[i] for i in places), key=lambda row: row.worst)
     near = [i for i in places if rows[i].worst <= max(best.worst + best.deviation, alike)]
-    return min(near, key=lambda i: (rows[i].size, rows[i].worst))
+    chosen = min(near, key=lambda i: (rows[i].size, rows[i].worst))
+    exact = [
+        i for i in places if rows[i].kind == "bilinear" and max(rows[i].worst, EXACT) <= _WORTH * rows[chosen].worst
+    ]
+    if rows[chosen].kind == "linear" and exact:
+        return choose_model(rows, "bilinear", EXACT, exact)
+    return chosen
 
 
 def _runaway(row: LeaderboardRow, rows: tuple[LeaderboardRow, ...]) -> bool:

@@ -1,5 +1,6 @@
 """Logs of other tools: each is written by its own library and read back as the rows that were written."""
 
+import gc
 import json
 import sqlite3
 import struct
@@ -423,3 +424,17 @@ def test_a_run_as_a_frame_holds_every_row():
     np.testing.assert_array_equal(frame[[f"measured {name}" for name in run.outputs]].to_numpy(), run.Y)
     statuses = [None if pd.isna(name) else name for name in frame["status"]]
     assert statuses == [status.name for status in map(km.Status, run.status)] + [None]
+
+
+@pytest.mark.parametrize("size", [70, 100, 200, 400])
+def test_a_file_cut_in_its_header_leaves_nothing_that_raises_later(size, tmp_path, monkeypatch, capfd):
+    write_mdf(tmp_path / "log.mf4")
+    whole = (tmp_path / "log.mf4").read_bytes()
+    (tmp_path / "cut.mf4").write_bytes(whole[:size])
+    raised = []
+    monkeypatch.setattr(sys, "unraisablehook", raised.append)
+    with pytest.raises(km.errors.LogError, match="cannot be read as MDF"):
+        km.load_episodes(tmp_path / "cut.mf4", **ROLES)
+    gc.collect()
+    assert not raised
+    assert capfd.readouterr() == ("", "")

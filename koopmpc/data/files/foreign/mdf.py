@@ -109,7 +109,23 @@ class MDFRecording(Recording):
         except (KoopmpcError, ModuleNotFoundError):
             raise
         except Exception as error:  # asammdf raises what it stumbles over: MdfException, struct.error, KeyError, …
+            _close_unfinished(error)
             raise LogError(f"{self.file} cannot be read as MDF: {error}; take another copy") from error
+
+
+def _close_unfinished(error: BaseException) -> None:
+    """Close the objects of asammdf whose constructor raised this error.
+
+    Their own finalizer raises or prints an error for each part that they do not have yet.
+    """
+    trace = error.__traceback__
+    while trace is not None:
+        made = trace.tb_frame.f_locals.get("self")
+        if type(made).__module__.startswith("asammdf."):
+            made._closed = True
+            if getattr(made, "_tempfile", None) is not None:
+                made._tempfile.close()
+        trace = trace.tb_next
 
 
 register_format(LogFormat((".mf4", ".mdf"), MDFRecording, parts=partial(split_recording, MDFRecording), extra=EXTRA))
