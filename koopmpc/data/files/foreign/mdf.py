@@ -120,8 +120,8 @@ def _close_unfinished(error: BaseException) -> None:
     """
     trace = error.__traceback__
     while trace is not None:
-        made = trace.tb_frame.f_locals.get("self")
-        if type(made).__module__.startswith("asammdf."):
+        made: Any = trace.tb_frame.f_locals.get("self")
+        if type(made).__name__ in ("MDF3", "MDF4"):
             made._closed = True
             if getattr(made, "_tempfile", None) is not None:
                 made._tempfile.close()
