@@ -109,22 +109,18 @@ class MDFRecording(Recording):
         except (KoopmpcError, ModuleNotFoundError):
             raise
         except Exception as error:  # asammdf raises what it stumbles over: MdfException, struct.error, KeyError, …
-            _close_unfinished(error)
+            _complete_unfinished(error)
             raise LogError(f"{self.file} cannot be read as MDF: {error}; take another copy") from error
 
 
-def _close_unfinished(error: BaseException) -> None:
-    """Close the objects of asammdf whose constructor raised this error.
-
-    Their own finalizer raises or prints an error for each part that they do not have yet.
-    """
+def _complete_unfinished(error: BaseException) -> None:
+    """Give the objects of asammdf whose constructor raised this error the parts that their finalizer deletes."""
     trace = error.__traceback__
     while trace is not None:
         made: Any = trace.tb_frame.f_locals.get("self")
         if type(made).__name__ in ("MDF3", "MDF4"):
-            made._closed = True
-            if getattr(made, "_tempfile", None) is not None:
-                made._tempfile.close()
+            for part in ("header", "identification"):
+                setattr(made, part, getattr(made, part, None))
         trace = trace.tb_next
 
 
