@@ -23,6 +23,7 @@ from koopmpc.figures.reports import draw_attraction, draw_profiles, draw_step_ti
 from koopmpc.figures.style import render_svg
 from koopmpc.loop.metrics import Metrics
 from koopmpc.loop.run import Run
+from koopmpc.page import Page
 from koopmpc.recording.description import STATUS_WORDS
 from koopmpc.recording.reader import load_run
 from koopmpc.terminal import build_plain_table
@@ -306,11 +307,15 @@ def write_report(folder: str | Path) -> Path:
     out.writerow([field.name for field in fields(Summary)])
     out.writerows(astuple(each) for each in found)
     sections = list(_sections(rows, found, folder))
-    for name, text in (
-        ("summary.csv", table.getvalue()),
-        ("report.md", _markdown(rows, about, sections)),
-        ("report.html", _html(rows, about, sections)),
-    ):
+    intro = Page(folder)
+    intro.text("# Sweep", *_intro(rows, about))
+    page = Page(folder, parts=[*intro.parts])
+    for each in sections:
+        page.text(f"## {each.title}")
+        page.table(each.headings, each.lines)
+        page.text(*[f"Logs: {_links(each)}"] * bool(each.logs))
+    page.write()
+    for name, text in (("summary.csv", table.getvalue()), ("report.html", _html(intro, sections))):
         with disk.writing(folder / name) as stream:
             stream.write(text.encode())
     return folder / "report.html"
@@ -435,14 +440,6 @@ def _intro(rows: Sequence[RunRow], about: dict[str, Any]) -> list[str]:
     return [*lines, f"{len(failed) - 20} more failed."] if len(failed) > 20 else lines
 
 
-def _markdown(rows: Sequence[RunRow], about: dict[str, Any], sections: Sequence[_Section]) -> str:
-    parts = ["# Sweep", *_intro(rows, about)]
-    for each in sections:
-        parts += [f"## {each.title}", format_markdown_table(each.headings, each.lines)]
-        parts += [f"Logs: {_links(each)}"] if each.logs else []
-    return "\n\n".join(parts) + "\n"
-
-
 def _links(section: _Section) -> str:
     return ", ".join(f"[{log}]({log})" for log in section.logs)
 
@@ -459,10 +456,10 @@ details{font-size:.85rem}a{color:#003a7d;overflow-wrap:anywhere}
 """
 
 
-def _html(rows: Sequence[RunRow], about: dict[str, Any], sections: Sequence[_Section]) -> str:
+def _html(intro: Page, sections: Sequence[_Section]) -> str:
     """Return the Markdown of the report as one HTML page, with pictures; what looks like HTML in a text is escaped."""
     render = MarkdownIt("commonmark", {"html": False}).enable("table").render
-    parts = [render("\n\n".join(["# Sweep", *_intro(rows, about)]))]
+    parts = [render(intro.markdown)]
     for each in sections:
         table = render(format_markdown_table(each.headings, each.lines))
         parts.append(f"{render(f'## {each.title}')}<div class=wide>{table}</div>")
