@@ -268,31 +268,26 @@ def no_export(
 
 
 def publish_estimator(
-    observer: StateObserver, estimator: Estimator | None, time_limit: float | None, watch: object, bound: str
+    observer: StateObserver, estimator: Estimator | None, time_limit: float | None, bound: str
 ) -> EstimatorProgram:
     """Return how the observer of a predictive controller finds z and d.
 
     Parameters
     ----------
-    observer, estimator, time_limit, watch
-        Those of the controller.
+    observer, estimator, time_limit
+        Those of the controller. Its monitor is left out: the C does not say whether a step is known.
     bound
         The arguments that bound the iterations of a step of this controller.
 
     Raises
     ------
     DataError
-        The controller has a time_limit, a monitor, or an estimator for which no C code can be generated.
+        The controller has a time_limit, or an estimator for which no C code can be generated.
     """
     if time_limit is not None:
         raise DataError(
             "the controller has a time_limit, and C has no clock; make it without one and bound the iterations: "
             + bound
-        )
-    if watch is not None:
-        raise DataError(
-            "the controller has a monitor, whose data are not written in C; export the controller without monitor=,"
-            " and have a Python loop or a log ask the monitor"
         )
     return estimator_program(observer, estimator)
 

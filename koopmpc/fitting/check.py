@@ -20,6 +20,7 @@ from koopmpc.page import Page
 from koopmpc.parallel import StageProgress
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign, read_controller, rebuild_controller
+from koopmpc.synthesis.fresh.loops import goal_box
 from koopmpc.synthesis.judging import run_on_surrogate
 from koopmpc.terminal import build_table, render_text
 from koopmpc.text import format_duration, to_percent
@@ -29,6 +30,7 @@ ALLOWED_OFF = 0.05  # the same where noise or inputs differ from the data
 ARRIVED = 0.05  # error over the last tenth of a run, as a share of the data's range
 LONGER = 3  # times the runs of the design that there is for arriving at a reference: a start may be far, a limit slow
 OFF = 0.2  # inputs are weaker or stronger by this share
+UNKNOWN = 0.1  # share of steps outside the data above which the verdict is "cannot say"
 LOUD = 3.0  # noise is this many times that of the data
 _GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
 
@@ -92,9 +94,11 @@ class Checked:
     Attributes
     ----------
     kept
-        Whether the goal is kept.
+        Whether the goal is kept, and known to be: the verdict is "kept".
     reasons
         Sentences that say why it is not kept.
+    doubts
+        Sentences that say where nobody can say whether it is kept, for there are no data.
     broken
         Sentences that say what happened in runs with faults; among the reasons too, where these were asked to count.
     figures
@@ -115,19 +119,30 @@ class Checked:
     hot: float
     dt: float
     page: Path
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """One of three values: "kept", "not kept", "cannot say"."""
+        return "not kept" if self.reasons else "cannot say" if self.doubts else "kept"
 
     def __str__(self) -> str:
         """Return the verdict and a line for each kind of run."""
-        verdict = "the goal is kept" if self.kept else "THE GOAL IS NOT KEPT"
+        verdict = _VERDICTS[self.verdict]
         rows = [_row(one) for one in self.figures]
         hot, cold, dt = map(format_duration, (self.hot, self.cold, self.dt))
         times = f"a step takes {hot} (99 %), the first one {cold}; dt is {dt}"
         aside = [f"- {one}" for one in self.broken if one not in self.reasons]
         aside = ["with faults, which do not count (--faults counts them):", *aside] if aside else []
-        reasons = [f"- {reason}" for reason in self.reasons]
+        reasons = [f"- {reason}" for reason in (*self.reasons, *self.doubts)]
         return render_text(verdict, *reasons, *aside, "", build_table(_HEADINGS, rows), "", times)
 
 
+_VERDICTS = {
+    "kept": "the goal is kept",
+    "not kept": "THE GOAL IS NOT KEPT",
+    "cannot say": "NOBODY CAN SAY WHETHER THE GOAL IS KEPT: the logs do not show it",
+}
 _NUMBERS = ("lost", "median\ncost", "worst\nviolation", "error\nat the end", "steps without\na good status")
 _HEADINGS = ("kind of run", *_NUMBERS)
 
@@ -158,6 +173,11 @@ def check_controller(
     - The first step, and 99 % of the others, take less than dt.
     - Where inputs and noise are as in the data, a constant reference that can be held is reached to 5 % of the data's
       range.
+
+    Then as many runs start anywhere in the range of the goal, which is what its limits and the ranges of the signals
+    allow, on the nearest rows of the logs. One that is lost or violates a limit by more than 5 % counts against the
+    goal if it started where there are data. If it started outside of them, or if more than 10 % of the steps of these
+    runs are outside, the verdict is "cannot say".
 
     A goal says nothing of broken sensors, actuators and solvers. Runs that are lost under them, and limits violated by
     more than 5 %, are listed separately; they count if `faults` is true. The surrogates are learned from the same logs
@@ -211,8 +231,11 @@ def check_controller(
     hot = float(np.quantile(bench.times, 0.99)) if bench.times else np.inf
     reasons, broken = _reasons(evidence, figures, cold, hot, controller.dt)
     reasons += broken if faults else []
+    lost_inside, doubts = bench.run_anywhere(runs, draw)
+    reasons += lost_inside
     page = Path(folder, "check.md")
-    result = Checked(not reasons, tuple(reasons), tuple(broken), tuple(figures), cold, hot, controller.dt, page)
+    kept = not (reasons or doubts)
+    result = Checked(kept, tuple(reasons), tuple(broken), tuple(figures), cold, hot, controller.dt, page, tuple(doubts))
     _page(result, Path(folder), path, saved)
     return result
 
@@ -289,6 +312,52 @@ class _TestBench:
             outside=watch.outside,
         )
 
+    def run_anywhere(self, runs: int, rng: np.random.Generator) -> tuple[list[str], list[str]]:
+        """Return reasons and doubts of runs that start anywhere in the range of the goal."""
+        neighbours, evidence = self._evidence.neighbours, self._evidence
+        if neighbours is None:
+            return [], []
+        asked, u_reference = evidence.asked, self._plants[0, 1.0][1] if (0, 1.0) in self._plants else None
+        if u_reference is None:
+            u_reference = evidence.surrogates[0].find_reference_inputs(asked.cost, asked.limits, self._reference[:-1])
+        low, high = goal_box(asked)
+        starts = low + (high - low) * rng.uniform(size=(runs, len(low)))
+        bad_inside, bad_outside, unknown = 0, 0, 0.0
+        for j, x0 in enumerate(starts):
+            run = run_on_surrogate(
+                asked,
+                neighbours,
+                neighbours.draw(rng),
+                self._controller,
+                x0,
+                box=(evidence.low, evidence.high),
+                reference=self._reference,
+                u_reference=u_reference,
+                rng=j,
+            )
+            known = not neighbours.find_outside(neighbours.start(x0)[None], neighbours.middle[None])[0]
+            bad = run is None or bool(violation_shares(run, asked.limit_sizes)[len(run.X) // 2 :].max() > ALLOWED_OFF)
+            bad_inside, bad_outside = bad_inside + (bad and known), bad_outside + (bad and not known)
+            if run is not None and neighbours.embedding is None:
+                unknown += float(neighbours.find_outside(run.X[:-1], run.U).mean()) / runs
+        reasons, doubts = list[str](), list[str]()
+        what = "are lost, or still violate a limit in their second half"
+        if bad_inside:
+            reasons.append(
+                f"from the goal's range: {bad_inside} of {runs} runs {what}, and started where there are data"
+            )
+        if bad_outside:
+            doubts.append(
+                f"from the goal's range: {bad_outside} of {runs} runs {what}, and started where no log has been: "
+                "record episodes that start there, or never start there"
+            )
+        if unknown > UNKNOWN:
+            doubts.append(
+                f"from the goal's range: {to_percent(unknown)} of the steps have no data around them: record episodes "
+                "there, or narrow the limits of the goal to where it will be used"
+            )
+        return reasons, doubts
+
 
 def _figures(kind: RunKind, outcomes: Sequence[_Outcome]) -> Figures:
     ended = [one for one in outcomes if np.isfinite(one.cost)]
@@ -339,8 +408,8 @@ def _reasons(
 def _page(result: Checked, folder: Path, path: str | Path, saved: SavedDesign) -> None:
     one = saved.controller
     page = Page(folder)
-    page.text("# Acceptance", "**The goal is kept.**" if result.kept else "**The goal is not kept.**")
-    page.items(result.reasons or ["Nothing speaks against it."])
+    page.text("# Acceptance", f"**{_VERDICTS[result.verdict].capitalize()}.**")
+    page.items([*result.reasons, *result.doubts] or ["Nothing speaks against it."])
     page.text(
         f"`{Path(path).name}`: a {one.name} with a horizon of {one.horizon} steps of {result.dt:g} s, driven on "
         f"{len(saved.evidence.surrogates)} models that were learned from its logs. An error that all of these models "

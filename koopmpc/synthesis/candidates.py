@@ -334,6 +334,8 @@ class Recipe(Value):
             parts.append(f"{one.delays} delay{'s' * (one.delays > 1)}")
         if self.tail == 0:
             parts.append("Q_N = Q")
+        elif self.tail is not None:
+            parts.append(f"a tail of {self.tail} steps")
         if estimator is not None:
             parts.append("offset-free" + ("" if estimator.gain is None else f" (gain {estimator.gain:g})"))
         if self.weighted:
@@ -354,9 +356,18 @@ class Recipe(Value):
             return fit_candidate(self.candidate, data, self.ridge, read)
 
     def controller(
-        self, model: AnyPredictor, cost: Cost, limits: Limits, horizon: int, *, brief: bool = False
+        self,
+        model: AnyPredictor,
+        cost: Cost,
+        limits: Limits,
+        horizon: int,
+        *,
+        brief: bool = False,
+        monitor: Episodes | None = None,
     ) -> Designed:
         """Return the controller of a model; one that is used briefly (`brief`) compiles no machine code of the model.
+
+        With `monitor`, its moves say whether they are `known` to these data.
 
         Raises
         ------
@@ -367,4 +378,4 @@ class Recipe(Value):
             cost = replace(cost, tail=self.tail)
         kind = kind_for(model)
         build: Any = (kind.brief if brief else None) or kind.controller
-        return build(model, cost, limits, horizon, estimator=self.estimator)
+        return build(model, cost, limits, horizon, estimator=self.estimator, monitor=monitor)

@@ -19,12 +19,13 @@ from koopmpc.loop.faults import Fault
 from koopmpc.loop.metrics import metrics, violation_shares
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import StepObserver, simulate
-from koopmpc.plants.plant import SimulatedPlant
+from koopmpc.plants.plant import SimulatedPlant, Transition
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Nearness, Recipe
 from koopmpc.synthesis.cross_validation import drop_fold, select_fold
+from koopmpc.synthesis.fresh.neighbours import NeighbourMap
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.validate.scoring import AnyPredictor, score
 
@@ -75,7 +76,7 @@ class LoopTest:
 
     A run that leaves the box from `low` to `high` is lost. The margins of controllers to the limits are at most `room`
     (nx,); None for no margins. `noise` is the (nx,) standard deviation of the noise that a smoother took out of the
-    data.
+    data. `ignored` are states that nothing depends on, `turning` angles that make whole turns.
     """
 
     asked: DesignTask
@@ -87,6 +88,8 @@ class LoopTest:
     high: Float[np.ndarray, " nx"]
     room: Float[np.ndarray, " nx"] | None
     noise: Float[np.ndarray, " nx"]
+    ignored: tuple[int, ...] = ()
+    turning: tuple[int, ...] = ()
 
     def limits(self, band: Float[np.ndarray, "h nx"]) -> Limits:
         """Return the limits of a controller whose model has these errors."""
@@ -182,7 +185,7 @@ class LostError(Exception):
 class Fenced(SimulatedPlant):
     """A plant that ends the run where its state leaves the box from low to high."""
 
-    def __init__(self, step_map: StepMap, low: Float[np.ndarray, " nx"], high: Float[np.ndarray, " nx"]) -> None:
+    def __init__(self, step_map: Transition, low: Float[np.ndarray, " nx"], high: Float[np.ndarray, " nx"]) -> None:
         super().__init__(step_map)
         self._low, self._high = low, high
 
@@ -312,8 +315,8 @@ def _run_condition(test: LoopTest, one: Condition, controller: Designed, seed: i
 
 def run_on_surrogate(
     asked: DesignTask,
-    surrogate: Surrogate,
-    plant: StepMap,
+    surrogate: Surrogate | NeighbourMap,
+    plant: Transition,
     controller: Controller,
     x0: Float[np.ndarray, " nx"],
     *,
@@ -330,7 +333,7 @@ def run_on_surrogate(
     The run is lost if a state leaves the box. It is judged by the cost and the limits of the task. `noise` is a factor
     on the noise of the surrogate.
     """
-    states = surrogate.model.states
+    states = surrogate.states
     try:
         run = simulate(
             Fenced(plant, *box),
@@ -378,3 +381,17 @@ def average_ratios(
     With six runs with inputs as in the data and six with inputs 20 % off, one lost run raises the mean by 40 % or 18 %.
     """
     return np.exp(np.average(np.log(ratio), axis=1, weights=weights))
+
+
+def measure_errors(
+    ratio: Float[np.ndarray, "jobs runs"],
+    score: Float[np.ndarray, " jobs"],
+    weights: Float[np.ndarray, " runs"],
+) -> Float[np.ndarray, " jobs"]:
+    """Return the standard error of each job's log score less that of the best job, over the runs that both share."""
+    if not len(score):
+        return score
+    apart = np.log(ratio) - np.log(ratio[int(np.argmin(score))])
+    share = weights / weights.sum()
+    spread = ((apart - (apart @ share)[:, None]) ** 2) @ share
+    return np.sqrt(spread * (share**2).sum())

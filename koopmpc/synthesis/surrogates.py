@@ -24,6 +24,7 @@ from koopmpc.values import Value
 SECOND = 3.0  # the error of the second surrogate may be this many times that of the best
 INVARIANT = 0.25  # the plant ignores a state that changes increments by less than this share; models err as much
 UNHELD = 0.02  # an equilibrium may miss the reference by this share of the data's range
+GROWN = 2.0  # a plant is unstable if a deviation grows by this factor within a horizon
 _SAMPLE = 500  # number of states on which ignored states are searched
 _FAMILIES = ("monomials", "fourier", "gaussian", "thin plate", "random fourier")
 
@@ -47,6 +48,11 @@ class Surrogate(Value):
     middle: Float[np.ndarray, " nu"]
     w: Float[np.ndarray, " nw"]
     noise: Float[np.ndarray, " nx"]
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states, without their past."""
+        return self.model.states
 
     @raise_swallowed()
     def plant(self, gain: float = 1.0) -> StepMap:
@@ -179,6 +185,23 @@ def find_ignored_states(one: Surrogate, X: Float[np.ndarray, "M nx"]) -> list[in
         if (np.sqrt(np.mean(change**2, axis=0)) < INVARIANT * size).all():
             found.append(i)
     return found
+
+
+def is_unstable(surrogates: Sequence[Surrogate], asked: DesignTask) -> bool:
+    """Return whether deviations from the equilibrium at the reference grow within a horizon, on half of the surrogates.
+
+    Of a moving reference this is asked at its first, middle and last row. A pair of integrators does not count.
+    """
+    places = (0, len(asked.reference) // 2, -1) if asked.moves else (0,)
+    found: list[bool] = []
+    for one in surrogates:
+        plant, find = one.plant(), one.holding(asked.cost, asked.limits)
+        for place in places:
+            at = find(asked.reference[place])
+            A = plant.linearize(at.x, at.u).A
+            modulus = np.abs(np.linalg.eigvals(A)).max() if np.isfinite(A).all() else np.inf
+            found.append(asked.horizon * np.log(max(modulus, 1e-300)) > np.log(GROWN))
+    return 2 * sum(found) > len(found)
 
 
 def _find_family(tried: Tried) -> str:

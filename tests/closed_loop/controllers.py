@@ -127,6 +127,11 @@ def _designed(p: Parts) -> Any:
     return p.design.controller
 
 
+def _guarded(p: Parts) -> Any:
+    """The same design, with the plain linear controller outside the data."""
+    return p.design.guarded()
+
+
 def _designed_linear(p: Parts) -> Any:
     """The best KoopmanMPC of the same design."""
     if p.design.linear is None:
@@ -147,7 +152,11 @@ CONTROLLERS: dict[str, Callable[[Parts], Any]] = {
     "bilinear-offset": _bilinear_offset,
 }
 # a design takes up to a minute of one core, so these are measured where they are named, and are not in the stored table
-DESIGNED: dict[str, Callable[[Parts], Any]] = {"designed": _designed, "designed-linear": _designed_linear}
+DESIGNED: dict[str, Callable[[Parts], Any]] = {
+    "designed": _designed,
+    "designed-linear": _designed_linear,
+    "guarded": _guarded,
+}
 YARDSTICKS = ("edmd", "dmdc")
 GIVEN = ("lqr", "linear-mpc", "nonlinear-mpc", "bilinear-exact")  # on equations: one seed is as good as three
 LEARNED = ("koopman-mpc", "koopman-offset", "bilinear-mpc", "bilinear-offset")  # from data alone

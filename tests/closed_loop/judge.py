@@ -12,8 +12,9 @@ import numpy as np
 
 import koopmpc as km
 from tests.closed_loop.controllers import CONTROLLERS, DESIGNED, GIVEN, NotApplicableError, Parts
+from tests.closed_loop.more_tasks import ALL
 from tests.closed_loop.optimum import boxes, held, optimum, weights
-from tests.closed_loop.tasks import TASKS, Task, UTarget
+from tests.closed_loop.tasks import Task, UTarget
 
 LOST = 1e3  # a run that costs more than this many times the optimum is lost, and is ended
 TAIL = 0.1  # share of a run, its end, over which the steady error is taken
@@ -38,6 +39,8 @@ class Row:
         The first exception, where there was one; its run counts as lost.
     median, p99
         Time of a step [s].
+    promise
+        Of a designed controller: what the design promised, beside what happened in as many steps; see `promised`.
     """
 
     ratio: float | None
@@ -47,6 +50,7 @@ class Row:
     failure: str = ""
     median: float = 0.0
     p99: float = 0.0
+    promise: dict[str, float] = field(default_factory=dict)
 
 
 Table = dict[str, dict[str, Row]]  # task → controller → row
@@ -63,6 +67,7 @@ class _Watch:
         self._Q, self._R, self._tracked = weights(task)
         self._most = LOST * best
         self.cost = 0.0
+        self.costs: list[float] = []
         self.X: list[np.ndarray] = []
         self.statuses: Counter[str] = Counter()
         self.times: list[float] = []
@@ -70,6 +75,7 @@ class _Watch:
     def __call__(self, step: km.loop.Step) -> None:
         error, moved = step.x_next[self._tracked] - step.reference_next, step.u - step.u_reference
         self.cost += float(error @ self._Q @ error + moved @ self._R @ moved)
+        self.costs.append(self.cost)
         self.X.append(step.x_next)
         self.statuses[step.move.status.name] += 1
         self.times.append(step.move.solve_time)
@@ -131,7 +137,38 @@ def judged(parts: Parts, name: str, start: int, u_target: UTarget | None = None)
         failure=failure,
         median=float(np.median(watch.times)) if watch.times else 0.0,
         p99=float(np.quantile(watch.times, 0.99)) if watch.times else 0.0,
+        promise=promised(parts.design.expected, watch.costs, float(beyond)) if name == "designed" else {},
     )
+
+
+def promised(expected: km.synthesis.ExpectedLoop, costs: Sequence[float], violation: float) -> dict[str, float]:
+    """Return what a design promised, and what happened in the first steps of a run, as many as it promised.
+
+    `low`, `high` and `cost` are costs, promised and spent; `most` and `violation` bound and measure the violation;
+    `lost` bounds the probability that a loop is lost.
+    """
+    spent = costs[min(expected.steps, len(costs)) - 1] if costs else math.inf
+    low, high = expected.cost_interval
+    return {
+        "low": low,
+        "high": high,
+        "cost": spent,
+        "most": expected.violation_bound,
+        "violation": violation,
+        "lost": expected.lost_bound,
+    }
+
+
+def kept_promises(rows: Iterable[Row]) -> dict[str, float]:
+    """Return which shares of the runs kept the promises: cost inside the interval, violation below its bound."""
+    kept = [row.promise for row in rows if row.promise]
+    if not kept:
+        return {}
+    return {
+        "cost": float(np.mean([one["low"] <= one["cost"] <= one["high"] for one in kept])),
+        "violation": float(np.mean([one["violation"] <= one["most"] for one in kept])),
+        "mean bound": float(np.mean([one["most"] for one in kept])),
+    }
 
 
 def _ends(X: np.ndarray, best: np.ndarray, last: int) -> tuple[np.ndarray, np.ndarray]:
@@ -152,12 +189,13 @@ def worst(rows: Iterable[Row]) -> Row:
         failure=next((row.failure for row in rows if row.failure), ""),
         median=max(row.median for row in rows),
         p99=max(row.p99 for row in rows),
+        promise=max(rows, key=lambda row: row.ratio).promise,
     )
 
 
 def one(task: str, seed: int, names: Sequence[str], u_target: UTarget | None = None) -> dict[str, Row]:
     """Return the rows of one task and training seed, each the worst of the task's starts."""
-    parts = Parts(TASKS[task], seed, u_target)
+    parts = Parts(ALL[task], seed, u_target)
     starts = range(len(parts.task.starts))
     return {name: worst(judged(parts, name, start, u_target) for start in starts) for name in names}
 

@@ -9,7 +9,8 @@ from functools import cache
 import casadi as ca
 import numpy as np
 
-from tests.closed_loop.tasks import TASKS, Task, UTarget
+from tests.closed_loop.more_tasks import ALL
+from tests.closed_loop.tasks import Task, UTarget
 
 QUIET = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "ipopt.max_iter": 1500}
 RANDOM = 3  # starts with random inputs
@@ -49,7 +50,7 @@ def held(name: str, u_target: UTarget | None = None) -> np.ndarray:
 
     They minimise ‖of(x) − r‖²_Q over the equilibria x = F(x, u) inside the limits.
     """
-    task = TASKS[name].but(u_target)
+    task = ALL[name].but(u_target)
     plant = task.plant
     if task.u_target == "zero":
         return np.zeros((task.steps, plant.nu))
@@ -90,7 +91,7 @@ def optimum(name: str, start: int, u_target: UTarget | None = None) -> Optimum:
 
     The sum is the one of `km.metrics`: Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k − u_r‖²_R.
     """
-    task = TASKS[name].but(u_target)
+    task = ALL[name].but(u_target)
     plant, T = task.plant, task.steps
     Q, R, tracked = weights(task)
     size, u_size = sizes(task)

@@ -159,7 +159,6 @@ def test_each_kind_without_c_code_says_why_and_export_raises_that_sentence(model
         ),
         "C has no clock.*iter_limit": km.KoopmanMPC(model, COST, limits, 5, time_limit=1.0),
         "C has no clock.*sqp_iterations": km.BilinearMPC(bilinear, CIRCLE, limits, 5, time_limit=1.0),
-        "the controller has a monitor": watched,
     }
     for sentence, controller in refused.items():
         obstacle = controller.program().obstacle

@@ -37,7 +37,14 @@ def data(count=9, steps=30):
 
 
 def designed(episodes, cost=COST, limits=LIMITS, **more):
-    asked = {"horizon": 8, "reference": [0.0, 0.0], "candidates": [PLAIN], "delays": [0], "bilinear": False} | more
+    asked = {
+        "horizon": 8,
+        "reference": [0.0, 0.0],
+        "candidates": [PLAIN],
+        "delays": [0],
+        "bilinear": False,
+        "loops": 0,
+    } | more
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", km.FitWarning)
         return km.design(episodes, cost, limits, **asked)

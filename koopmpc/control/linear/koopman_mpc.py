@@ -232,7 +232,6 @@ class KoopmanMPC(MPCBase):
             self._initial.observer,
             self._estimator,
             self._time_limit,
-            self._watch,
             'solver="daqp", settings={"iter_limit": 100}',
         )
         if self._solver != FINISHER.name:

@@ -153,9 +153,7 @@ class BilinearMPC(StagedMPC):
     def build_program(self, reference: ArrayLike | None) -> StagedProgram:
         """Return the data of a step."""
         problem, outputs, model = self._problem, self._outputs, self._map
-        estimator = publish_estimator(
-            self._initial.observer, self._estimator, self._time_limit, self._watch, "sqp_iterations=1"
-        )
+        estimator = publish_estimator(self._initial.observer, self._estimator, self._time_limit, "sqp_iterations=1")
         rows, terminal, cost = reference_table(reference, len(outputs.Q)), self._terminal, self.cost
         R, held = weights(problem), int((~problem.free).argmax()) * (not problem.free.all())
         return StagedProgram(

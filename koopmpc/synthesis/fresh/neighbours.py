@@ -1,0 +1,210 @@
+"""NeighbourMap: a stand-in of the plant by the nearest rows of the data, drawn anew for each loop."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episodes
+from koopmpc.scene import Scene
+from koopmpc.values import Value
+
+MOST = 6000  # rows that are kept
+NEAR = 3  # neighbours for each coefficient of the local slope
+LEAST = 12  # neighbours at least
+RIDGE = 1e-4  # of the local slope, as a share of its largest squared direction
+KNOWN = 0.99  # share of the data's own rows that is inside the data
+ROOM = 1.5  # a row is outside if its neighbours are this many times as far as those of KNOWN
+GRID = 1e-9  # spread below which a column counts as constant
+
+
+@dataclass(frozen=True, eq=False)
+class NeighbourMap(Value):
+    """ζ⁺ = ζ + affine(v) + local slope of the k nearest rows around v, v = [ζ; u; w] over its spread.
+
+    States that nothing depends on are left out of v, and of angles that make whole turns v holds sine and cosine. The
+    affine part is fitted to all rows; the local slope corrects what it misses, by least squares with tricube
+    weights (Cleveland & Devlin, "Locally weighted regression", J. Am. Stat. Assoc. 83, 1988). Where no rows are near,
+    the slope of the nearest ones goes on.
+
+    Attributes
+    ----------
+    rows
+        (M, n) v of each row.
+    steps
+        (M, nzeta) ζ⁺ − ζ.
+    episode
+        (M,) number of the episode of each row, which a bootstrap draws as a whole.
+    scale
+        (n,) spread of v.
+    ignored, turning
+        Places in ζ of the states that nothing depends on, and of angles that make whole turns.
+    middle, w
+        (nu,) and (nw,) means of the inputs and of the measured disturbances.
+    noise
+        (nx,) standard deviation of the measurements.
+    embedding
+        The delays of ζ, None where ζ is the state.
+    states, inputs
+        Names of the state without its past, and of the inputs.
+    dt
+        Sampling time [s].
+    """
+
+    rows: Float[np.ndarray, "M n"]
+    steps: Float[np.ndarray, "M nzeta"]
+    episode: Int[np.ndarray, " M"]
+    scale: Float[np.ndarray, " n"]
+    ignored: tuple[int, ...]
+    turning: tuple[int, ...]
+    middle: Float[np.ndarray, " nu"]
+    w: Float[np.ndarray, " nw"]
+    noise: Float[np.ndarray, " nx"]
+    embedding: Delay | None
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    dt: float
+
+    @classmethod
+    def of(
+        cls,
+        data: Episodes,
+        embedding: Delay | None,
+        noise: Float[np.ndarray, " nx"],
+        ignored: Sequence[int] = (),
+        turning: Sequence[int] = (),
+    ) -> "NeighbourMap":
+        """Return the map of these data; of more than 6,000 rows every second, third … is kept."""
+        points = data if embedding is None else embedding(data)
+        if embedding is not None:  # the past of these states would have to go as well
+            ignored, turning = (), ()
+        V = np.concatenate([_regress(e.X[:-1], e.U, e.W, ignored, turning) for e in points])
+        steps = np.concatenate([np.diff(e.X, axis=0) for e in points])
+        number = np.repeat(np.arange(len(points)), [len(e) for e in points])
+        spread = V.std(axis=0)
+        scale = np.where(spread > GRID * (np.abs(V).max(axis=0) + 1e-300), spread, 1.0)
+        apart = -(-len(V) // MOST)
+        mean = np.concatenate([np.hstack([e.U, e.W]) for e in points]).mean(axis=0)
+        return cls(
+            rows=np.ascontiguousarray((V / scale)[::apart]),
+            steps=np.ascontiguousarray(steps[::apart]),
+            episode=number[::apart],
+            scale=scale,
+            ignored=tuple(ignored),
+            turning=tuple(turning),
+            middle=mean[: data.nu],
+            w=mean[data.nu :],
+            noise=noise,
+            embedding=embedding,
+            states=data.states,
+            inputs=data.inputs,
+            dt=data.dt,
+        )
+
+    @cached_property
+    def tree(self) -> KDTree:
+        """The search tree of the rows."""
+        return KDTree(self.rows)
+
+    @property
+    def near(self) -> int:
+        """Number k of neighbours."""
+        return min(max(NEAR * (self.rows.shape[1] + 1), LEAST), len(self.rows))
+
+    @cached_property
+    def reach(self) -> float:
+        """Distance to the k-th neighbour beyond which a row is outside the data."""
+        apart = -(-len(self.rows) // 1000)
+        distance, _ = self.tree.query(self.rows[::apart], self.near)
+        return ROOM * float(np.quantile(np.reshape(distance, (-1, self.near))[:, -1], KNOWN))
+
+    def start(self, x0: Float[np.ndarray, " nx"]) -> Float[np.ndarray, " nzeta"]:
+        """Return ζ after a rest at x0."""
+        return x0 if self.embedding is None else self.embedding.repeat(x0, self.middle)
+
+    def scale_rows(self, Z: Float[np.ndarray, "T nzeta"], U: Float[np.ndarray, "T nu"]) -> Float[np.ndarray, "T n"]:
+        """Return v of each row over its spread."""
+        return _regress(Z, U, np.tile(self.w, (len(Z), 1)), self.ignored, self.turning) / self.scale
+
+    def find_outside(self, Z: Float[np.ndarray, "T nzeta"], U: Float[np.ndarray, "T nu"]) -> Bool[np.ndarray, " T"]:
+        """Return which rows [ζ; u] have no data around them."""
+        V = self.scale_rows(Z, U)
+        V = np.where(np.isfinite(V), V, 1e6)
+        distance, _ = self.tree.query(V, self.near)
+        return np.reshape(distance, (len(V), -1))[:, -1] > self.reach
+
+    def draw(self, rng: np.random.Generator, gain: float = 1.0) -> "NeighbourPlant":
+        """Return a plant of one bootstrap sample of the episodes, whose inputs act `gain` times as in the data."""
+        number = int(self.episode.max()) + 1
+        counts = np.bincount(rng.integers(number, size=number), minlength=number)[self.episode].astype(np.float64)
+        if np.count_nonzero(counts) < self.near:
+            counts = np.ones(len(self.rows))
+        return NeighbourPlant(self, counts, gain)
+
+
+def _regress(
+    Z: Float[np.ndarray, "T nzeta"],
+    U: Float[np.ndarray, "T nu"],
+    W: Float[np.ndarray, "T nw"],
+    ignored: Sequence[int],
+    turning: Sequence[int],
+) -> Float[np.ndarray, "T n"]:
+    """Return v of each row."""
+    kept = [i for i in range(Z.shape[1]) if i not in ignored and i not in turning]
+    angles = Z[:, list(turning)]
+    return np.hstack([Z[:, kept], np.sin(angles), np.cos(angles), U, W])
+
+
+class NeighbourPlant:
+    """x⁺ = F(x, u) of a NeighbourMap with a weight for each of its rows; see `NeighbourMap.draw`."""
+
+    scene: Scene | None = None
+
+    def __init__(self, map_: NeighbourMap, counts: Float[np.ndarray, " M"], gain: float) -> None:
+        self._map, self._gain, self._counts = map_, gain, counts
+        self.dt, self.inputs, self.outputs = map_.dt, map_.inputs, map_.states
+        self.states = map_.states if map_.embedding is None else map_.embedding.names
+        root = np.sqrt(counts)[:, None]
+        table = np.hstack([map_.rows, np.ones((len(map_.rows), 1))])
+        self._affine = np.linalg.lstsq(root * table, root * map_.steps, rcond=1e-10)[0]
+        self._missed = map_.steps - table @ self._affine
+
+    @property
+    def nx(self) -> int:
+        """Size of ζ."""
+        return self._map.steps.shape[1]
+
+    def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
+        """Return the state without its past."""
+        return np.array(x, dtype=np.float64)[: len(self.outputs)]
+
+    def __call__(self, x: ArrayLike, u: ArrayLike) -> Float[np.ndarray, " nzeta"]:
+        """x⁺ = F(x, u)."""
+        one = self._map
+        zeta, driven = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
+        driven = one.middle + self._gain * (driven - one.middle)
+        v = one.scale_rows(zeta[None], driven[None])[0]
+        if not np.isfinite(v).all():
+            return np.full_like(zeta, np.nan)
+        distance, found = one.tree.query(v, min(2 * one.near, len(one.rows)))
+        places, distance = np.atleast_1d(found), np.atleast_1d(distance)
+        weight = self._counts[places]
+        width = 1.0001 * max(float(distance[-1]), 1e-12)
+        weight = weight * (1 - (distance / width) ** 3) ** 3
+        total = weight.sum()
+        value: Float[np.ndarray, " nzeta"] = np.append(v, 1.0) @ self._affine
+        if total > 0:
+            near, missed = one.rows[places], self._missed[places]
+            share = weight / total
+            center, mean = share @ near, share @ missed
+            D = near - center
+            S = (D * share[:, None]).T @ D
+            S[np.diag_indices_from(S)] += RIDGE * S.diagonal().max() + 1e-300
+            slope = np.asarray(np.linalg.solve(S, (D * share[:, None]).T @ (missed - mean)), dtype=np.float64)
+            value = np.asarray(value + mean + (v - center) @ slope, dtype=np.float64)
+        return zeta + value

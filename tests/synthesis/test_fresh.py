@@ -1,0 +1,226 @@
+"""Fresh loops: exact bounds, a stand-in by nearest rows, and what a design says of places without data."""
+
+import warnings
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import koopmpc as km
+from koopmpc.synthesis.designed import ExpectedLoop, choose_row
+from koopmpc.synthesis.fresh.loops import draw_starts, goal_box
+from koopmpc.synthesis.fresh.neighbours import NeighbourMap
+from koopmpc.synthesis.fresh.verdict import bound_share, bound_value, cost_interval
+from koopmpc.synthesis.judging import measure_errors
+from tests.closed_loop.judge import judged, kept_promises, promised
+from tests.closed_loop.more_tasks import MORE
+from tests.synthesis.test_design import A, B, data, designed, usual
+from tests.synthesis.test_select import episodes_of
+
+
+def bent(x, u):
+    return np.array([0.9 * x[0] + 0.1 * np.sin(x[1]), 0.8 * x[1] + 0.3 * u[0] - 0.05 * x[0] ** 2])
+
+
+@cache
+def rows_of(plant, count=30):
+    return NeighbourMap.of(episodes_of(plant, count=count, steps=40), None, np.zeros(2))
+
+
+@cache
+def fresh():
+    return designed(data(count=15), loops=24)
+
+
+def test_no_failure_in_59_loops_is_below_five_percent_and_in_299_below_one():
+    assert bound_share(0, 59) < 0.05 < bound_share(0, 58)
+    assert bound_share(0, 299) < 0.01 < bound_share(0, 298)
+    assert bound_share(7, 7) == 1.0
+
+
+@given(loops=st.integers(1, 400), share=st.floats(0, 1))
+@settings(max_examples=60)
+def test_at_the_bound_so_few_failures_have_a_probability_of_five_percent(loops, share):
+    failures = int(share * (loops - 1))
+    bound = bound_share(failures, loops)
+    assert scipy.stats.binom.cdf(failures, loops, bound) == pytest.approx(0.05, rel=1e-6)
+
+
+def test_one_more_of_exchangeable_values_keeps_the_bound_and_the_interval_as_often_as_said():
+    rng = np.random.default_rng(0)
+    values = rng.lognormal(size=(4000, 60))
+    inside = over = 0
+    for row in values:
+        low, high = cost_interval(row[:-1])
+        inside += low <= row[-1] <= high
+        over += row[-1] > bound_value(row[:-1])
+    assert inside / len(values) == pytest.approx(0.9, abs=0.02)
+    assert over / len(values) == pytest.approx(0.05, abs=0.015)
+
+
+def test_lost_loops_are_in_the_interval_as_infinite_costs():
+    values = np.array([1.0] * 40 + [np.inf] * 10)
+    assert cost_interval(values) == (1.0, np.inf)
+
+
+def test_nearest_rows_of_an_affine_plant_are_that_plant_everywhere():
+    plant = rows_of(lambda x, u: A @ x + B @ u).draw(np.random.default_rng(0))
+    rng = np.random.default_rng(1)
+    for scale in (0.5, 50.0):
+        x, u = scale * rng.standard_normal(2), scale * rng.standard_normal(1)
+        np.testing.assert_allclose(plant(x, u), A @ x + B @ u, atol=1e-6 * scale)
+
+
+def test_nearest_rows_of_a_bent_plant_miss_less_the_more_rows_there_are():
+    rng = np.random.default_rng(2)
+    points = [(rng.uniform(-0.6, 0.6, 2), rng.uniform(-0.6, 0.6, 1)) for _ in range(60)]
+    missed = []
+    for count in (10, 80):
+        plant = rows_of(bent, count).draw(np.random.default_rng(0))
+        missed.append(np.sqrt(np.mean([(plant(x, u) - bent(x, u)) ** 2 for x, u in points])))
+    assert missed[1] < 0.7 * missed[0]
+    assert missed[1] < 2e-3
+
+
+def test_a_draw_is_kept_for_a_loop_and_two_draws_differ():
+    one, other = (rows_of(bent, 10).draw(np.random.default_rng(seed)) for seed in (0, 1))
+    x, u = np.array([0.9, -0.9]), np.array([0.5])
+    np.testing.assert_array_equal(one(x, u), one(x, u))
+    assert np.abs(one(x, u) - other(x, u)).max() > 1e-9
+
+
+def test_rows_of_the_data_are_inside_and_far_ones_and_nan_are_outside():
+    one = rows_of(bent)
+    Z, U = one.rows[:, :2] * one.scale[:2], one.rows[:, 2:] * one.scale[2:]
+    assert one.find_outside(Z, U).mean() < 0.02
+    assert one.find_outside(Z + 20 * one.scale[:2], U).all()
+    assert one.find_outside(np.full((1, 2), np.nan), np.zeros((1, 1))).all()
+
+
+def test_of_turning_angles_whole_turns_are_no_distance():
+    turned = NeighbourMap.of(episodes_of(bent, count=20, steps=40), None, np.zeros(2), turning=[1])
+    Z, U = np.array([[0.1, 0.2]]), np.zeros((1, 1))
+    np.testing.assert_allclose(turned.scale_rows(Z, U), turned.scale_rows(Z + np.array([0, 4 * np.pi]), U), atol=1e-12)
+
+
+def test_the_fresh_loops_of_a_design_are_counted_by_kind_and_give_its_bounds():
+    expected = fresh().expected
+    assert expected.loops == {
+        "choice": 6,
+        "choice, inputs 20 % off": 6,
+        "neighbours": 16,
+        "models": 8,
+        "corners": 4,
+    }
+    assert expected.lost_bound == bound_share(0, 24)
+    low, high = expected.cost_interval
+    assert low <= np.median(expected.fresh.cost) <= high
+    assert expected.violation_bound <= expected.fresh.violation.max()
+    assert "fresh loops" in str(expected)
+
+
+def test_fresh_loops_change_no_choice():
+    without = designed(data(count=15))
+    assert without.leaderboard == fresh().leaderboard
+    assert without.controller.predictor == fresh().controller.predictor
+    assert without.expected.fresh is None
+
+
+def test_fresh_starts_stay_in_the_range_of_the_goal_or_of_the_starts():
+    asked = fresh().evidence.asked
+    low, high = goal_box(asked)
+    pool = np.concatenate([asked.starts, asked.first_states])
+    X = draw_starts(asked, 200, np.random.default_rng(0))
+    assert (np.minimum(low, pool.min(axis=0)) - 1e-12 <= X).all()
+    assert (np.maximum(high, pool.max(axis=0)) + 1e-12 >= X).all()
+    assert len(np.unique(X, axis=0)) == 200
+
+
+def test_a_designed_controller_says_whether_a_step_is_known():
+    controller = fresh().controller
+    controller.reset()
+    assert controller([0.1, 0.0], [0.0, 0.0]).known
+    controller.reset()
+    assert not controller([500.0, 400.0], [0.0, 0.0]).known
+
+
+def test_the_standard_error_of_the_best_is_zero_and_equal_scores_have_none():
+    rng = np.random.default_rng(0)
+    ratio = np.exp(0.1 * rng.standard_normal((4, 12)))
+    ratio[3] = 1.1 * ratio[0]
+    score = np.exp(np.log(ratio).mean(axis=1))
+    errors = measure_errors(ratio, score, np.ones(12))
+    best = int(np.argmin(score))
+    assert errors[best] == 0.0
+    apart = np.log(ratio[1]) - np.log(ratio[best])
+    assert errors[1] == pytest.approx(apart.std() / np.sqrt(12))
+
+
+def test_rows_within_a_standard_error_are_alike_and_the_safer_one_is_taken():
+    best = usual().best
+    worse = replace(best, score=1.02, error=0.025)
+    risky = replace(best, score=1.0, error=0.0, lost=1)
+    assert choose_row([risky, worse]) == 1
+    assert choose_row([risky, replace(worse, error=0.015)]) == 0
+    assert choose_row([risky, replace(worse, score=1.05, error=0.2)]) == 0
+
+
+def test_on_an_unstable_plant_an_estimator_must_be_worth_five_percent():
+    plain = replace(usual().best, score=1.03, recipe=replace(usual().best.recipe, estimator=None))
+    free = replace(plain, score=1.0, recipe=replace(plain.recipe, estimator=km.LiftedDisturbance()))
+    assert choose_row([free, plain]) == 0
+    assert choose_row([free, plain], unstable=True) == 1
+    assert choose_row([free, replace(plain, score=1.06)], unstable=True) == 0
+
+
+def test_a_promise_is_kept_where_the_cost_is_in_its_interval():
+    costs = np.arange(1.0, 61.0)
+    zeros = np.zeros(3)
+    loop = ExpectedLoop(np.array([1.0, 2.0, 3.0]), zeros, zeros, zeros, 0.0, np.zeros((3, 2)), (0, 0, 0), 2)
+    one = promised(loop, list(costs), 0.5)
+    assert one["cost"] == 2.0  # of the first two steps
+    assert one["violation"] == 0.5
+    row = type("Row", (), {"promise": one})()
+    assert kept_promises([row]) == {"cost": 1.0, "violation": 0.0, "mean bound": one["most"]}
+
+
+@pytest.mark.slow
+def test_where_each_signal_is_inside_but_no_log_has_both_the_design_says_so_and_the_standby_holds():
+    """A lifted model promised 0 of 60 lost and cost 1.43 and 2.54 times the optimum from two such starts."""
+    task = MORE["off the diagonal"]
+
+    class Parts:
+        data = task.data(0)
+
+        @staticmethod
+        def cost():
+            return km.Cost(Q=task.Q, R=task.R)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", km.FitWarning)
+        found = km.design(Parts.data, Parts.cost(), task.limits, horizon=task.horizon, reference=task.reference)
+    assert any("of the goal's range" in sentence and "at the same time" in sentence for sentence in found.advice)
+    for start in range(len(task.starts)):
+        costs = []
+        for controller in (found.controller, found.guarded()):
+            run = km.simulate(
+                task.plant, controller, x0=task.starts[start], reference=task.rows, steps=task.steps, cost=Parts.cost()
+            )
+            costs.append(km.metrics(run).cost)
+        assert costs[1] < 0.8 * costs[0]
+
+
+@pytest.mark.slow
+def test_a_horizon_too_short_to_stop_before_a_limit_is_told_with_both_numbers():
+    from tests.closed_loop.controllers import Parts
+
+    parts = Parts(MORE["short horizon"], 0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", km.FitWarning)
+        sentences = parts.design.advice
+    assert any("a horizon of 12 steps in place of 6" in sentence for sentence in sentences)
+    assert judged(parts, "designed", 0).promise["violation"] > 0.01
