@@ -114,7 +114,7 @@ class ExpectedLoop(Value):
 
     @property
     def cost_interval(self) -> tuple[float, float]:
-        """The interval that shall hold 90 % of the costs of loops like the fresh ones, lost ones infinite."""
+        """The interval that holds 90 % of the costs of loops like the fresh ones, lost ones infinite."""
         return cost_interval(self._judged_runs(self.cost, self.cost_off, "cost"))
 
     @property

@@ -200,8 +200,8 @@ def is_unstable(surrogates: Sequence[Surrogate], asked: DesignTask) -> bool:
             at = find(asked.reference[place])
             A = plant.linearize(at.x, at.u).A
             modulus = np.abs(np.linalg.eigvals(A)).max() if np.isfinite(A).all() else np.inf
-            found.append(asked.horizon * np.log(max(modulus, 1e-300)) > np.log(GROWN))
-    return 2 * sum(found) > len(found)
+            found.append(bool(asked.horizon * np.log(max(modulus, 1e-300)) > np.log(GROWN)))
+    return bool(2 * sum(found) > len(found))
 
 
 def _find_family(tried: Tried) -> str:

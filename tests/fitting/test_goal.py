@@ -228,6 +228,18 @@ def test_a_design_that_keeps_its_goal_passes_the_check_and_its_page_says_so(made
     )  # a reference that rests has three times the three horizons of the design for arriving
 
 
+def test_where_starts_of_the_goals_range_have_no_data_around_them_nobody_can_say(made, tmp_path):
+    saved = load_value(made.controller, SavedDesign)
+    rows = saved.evidence.neighbours
+    corner = rows.rows[:, 0] < np.quantile(rows.rows[:, 0], 0.1)  # as if no log had been faster than its slowest tenth
+    few = replace(rows, rows=rows.rows[corner], steps=rows.steps[corner], episode=rows.episode[corner])
+    save_value(replace(saved, evidence=replace(saved.evidence, neighbours=few)), tmp_path / "design.npz")
+    done = check_controller(tmp_path / "design.npz", tmp_path, runs=3)
+    assert (done.verdict, done.kept, done.reasons) == ("cannot say", False, ())
+    assert any("of the steps have no data around them" in doubt for doubt in done.doubts)
+    assert str(done).startswith("NOBODY CAN SAY")
+
+
 def test_a_check_repeats_for_a_seed(made, tmp_path):
     first, second = (check_controller(made.controller, tmp_path, runs=2).figures for _ in range(2))
     assert first == second

@@ -208,7 +208,7 @@ def find_blind_reference(
 
 
 def watch_data(recipe: Recipe, model: AnyPredictor, controller: Designed, data: Episodes) -> Designed:
-    """Return the controller anew with a monitor of the data, or after a reset where these have too few rows for one."""
+    """Return a new controller with a monitor of the data; if these have too few rows, the old one after a reset."""
     try:
         return recipe.controller(model, controller.cost, controller.limits, controller.horizon, monitor=data)
     except DataError:

@@ -1,4 +1,4 @@
-"""NeighbourMap: a stand-in of the plant by the nearest rows of the data, drawn anew for each loop."""
+"""NeighbourMap: a stand-in of the plant by the nearest rows of the data, a bootstrap of them for each loop."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
