@@ -81,7 +81,7 @@ MOST = {  # files, returns
     "record_all": (13, 48),
     "export_all": (17, 30),
     "select_all": (26, 74),  # the leaderboard stands in a file of its own
-    "design_all": (69, 228),  # with fresh loops after the choice, and a monitor
+    "design_all": (69, 240),  # with fresh loops after the choice, and a monitor
 }
 
 
