@@ -7,7 +7,6 @@ import numpy as np
 from rich.console import Console
 
 import koopmpc as km
-from koopmpc.bench.report import build_summary_table
 
 GOOD = km.loop.Metrics(
     cost=120.5,
@@ -50,7 +49,7 @@ def test_nothing_is_cut_in_a_terminal_of_80_columns():
     assert max(map(len, text.splitlines())) <= 80
     assert " 2.4e+06 " in text
     starts = [replace(rows()[3], start=k, metrics=replace(GOOD, cost=100.1 + k), x0=(0.1, k)) for k in range(9)]
-    text = printed(build_summary_table([*starts, *(replace(row, noise=0.01) for row in starts)]), 80)
+    text = printed(km.bench.build_summary_table([*starts, *(replace(row, noise=0.01) for row in starts)]), 80)
     assert "…" not in text
     assert all(f" {word} " in text for word in ("nonlinear-mpc", "104.1", "13 µs", "4.2 ms", "100 %"))
     assert "over" not in text  # a column of zeros

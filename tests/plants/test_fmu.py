@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.plants.routines import find_compiler
+from tests.compiler import find_compiler
 from tests.plants import units
 
 pytest.importorskip("fmpy", reason="the extra fmu is not installed")
