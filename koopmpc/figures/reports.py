@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.figures.series import draw_limits
 from koopmpc.figures.style import REFERENCE, draw_legend, line_style, make_figure, styled
 from koopmpc.loop.run import Run
 
@@ -162,9 +163,17 @@ def draw_attraction(starts_by_name: Mapping[str, tuple[np.ndarray, np.ndarray]],
     return drawing
 
 
+def _add_near_limits(axes: Any, run: Run, kind: str, i: int) -> None:
+    """Draw the limits of a state or an input; those farther away than the curves reach do not widen the axis."""
+    low, high = axes.get_ylim()
+    near = [value for value in draw_limits(axes, run, kind, i) if 2 * low - high <= value <= 2 * high - low]
+    margin = 0.05 * (high - low)
+    axes.set_ylim(min([low, *(value - margin for value in near)]), max([high, *(value + margin for value in near)]))
+
+
 @styled
 def draw_trajectories(runs: Mapping[str, Run]) -> "Figure":
-    """Draw the first four states and the first input of runs of one case over time, a panel each."""
+    """Draw the first four states and the first input of runs of one case over time, a panel each, with their limits."""
     first = next(iter(runs.values()))
     states = list(range(min(len(first.states), 4)))
     rows = len(states) + 1
@@ -177,6 +186,8 @@ def draw_trajectories(runs: Mapping[str, Run]) -> "Figure":
         panel.set_ylabel(first.states[j])
         if first.cost is None or first.reference.shape[1] == len(first.states):
             panel.plot(first.time, first.reference[:, j], label="reference", **REFERENCE)
+        _add_near_limits(panel, first, "states", j)
+    _add_near_limits(axes[-1, 0], first, "inputs", 0)
     axes[-1, 0].set(ylabel=first.inputs[0], xlabel="time [s]")
     draw_legend(drawing, axes[:, 0], 4)
     return drawing

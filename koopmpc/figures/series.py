@@ -118,11 +118,11 @@ def run(run: Run, *, states: StateChoice | None = None, width: Width = "one colu
         if run.states[i] in tracked:
             panel.plot(t, run.reference[:, tracked.index(run.states[i])], **REFERENCE, label="reference")
         panel.plot(t, run.X[:, i], **TRUTH, label="state")
-        _draw_limits(panel, run, "states", i)
+        draw_limits(panel, run, "states", i)
         panel.set_ylabel(run.states[i])
     for j, panel in enumerate(axes[len(chosen) : -1]):
         panel.stairs(run.U[:, j], t, baseline=None, **TRUTH)
-        _draw_limits(panel, run, "inputs", j)
+        draw_limits(panel, run, "inputs", j)
         panel.set_ylabel(run.inputs[j])
     _draw_statuses(axes[-1], run)
     axes[-1].set(xlabel="time [s]", xlim=(0, t[-1]))
@@ -146,7 +146,7 @@ def _mask_infinite(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.nd
     return np.where(finite, low, np.nan), np.where(finite, high, np.nan)
 
 
-def _draw_limits(axes: Any, run: Run, kind: str, i: int) -> list[float]:
+def draw_limits(axes: Any, run: Run, kind: str, i: int) -> list[float]:
     """Draw the finite limits of the i-th of the "states" or "inputs", and return them."""
     if run.limits is None:
         return []
@@ -288,7 +288,7 @@ def _draw_task(panels: Any, runs: Mapping[str, Run], names: list[str]) -> None:
             panel.plot(first.time, first.reference[:, i], **REFERENCE, label="reference")
             required = first.reference[:, i].tolist()
         elif i >= nx:
-            required = _draw_limits(panel, first, "inputs", i - nx)
+            required = draw_limits(panel, first, "inputs", i - nx)
         lows, highs = [float(v.min()) for v in curves], [float(v.max()) for v in curves]
         low, high = min([float(np.median(lows)), *required]), max([float(np.median(highs)), *required])
         panel.set_ylim(*limit_axis(low, high, min(lows), max(highs), _BEYOND_MEDIAN))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.figures.reports import draw_trajectories
 from tests.figures.models import DT, INPUTS, STATES, curve, episodes, turning
 from tests.recording.runs import make_run
 
@@ -125,3 +126,16 @@ def test_a_bad_model_does_not_hide_the_good_one() -> None:
             km.plot.error({"good": good, "bad": km.score(bad, data, 10)}).axes, good.rmse.T, strict=True
         ):
             assert rmse.max() < axes.get_ylim()[1] < 100 * rmse.max()
+
+
+def test_runs_of_a_report_show_the_limits_that_are_near() -> None:
+    plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    limits = km.Limits(u_min=-5, u_max=5, x_max={"theta": 400, "omega": 0.3})
+    mpc = km.LinearMPC(plant, [0, 0], [0], km.Cost(Q=[10, 1], R=0.01), limits, horizon=10)
+    run = km.simulate(plant, mpc, x0=[0.3, 0], reference=[0, 0], steps=30, limits=limits)
+    theta, omega, torque = draw_trajectories({"mpc": run}).axes
+    lines = [[float(line.get_ydata()[0]) for line in panel.lines if line.get_label() == "limit"] for panel in (theta, omega, torque)]
+    assert lines == [[400], [0.3], [-5, 5]]
+    assert theta.get_ylim()[1] < 1  # a limit far away does not flatten the curve
+    assert omega.get_ylim()[1] > 0.3
+    assert torque.get_ylim()[0] < -5
