@@ -134,7 +134,10 @@ def test_runs_of_a_report_show_the_limits_that_are_near() -> None:
     mpc = km.LinearMPC(plant, [0, 0], [0], km.Cost(Q=[10, 1], R=0.01), limits, horizon=10)
     run = km.simulate(plant, mpc, x0=[0.3, 0], reference=[0, 0], steps=30, limits=limits)
     theta, omega, torque = draw_trajectories({"mpc": run}).axes
-    lines = [[float(line.get_ydata()[0]) for line in panel.lines if line.get_label() == "limit"] for panel in (theta, omega, torque)]
+    lines = [
+        [float(line.get_ydata()[0]) for line in panel.lines if line.get_label() == "limit"]
+        for panel in (theta, omega, torque)
+    ]
     assert lines == [[400], [0.3], [-5, 5]]
     assert theta.get_ylim()[1] < 1  # a limit far away does not flatten the curve
     assert omega.get_ylim()[1] > 0.3
