@@ -45,6 +45,7 @@ class LiftedDisturbance(Value):
     Σ (C e − C e⁻)ᵢ²/sᵢ², the squared change of a misfit in a step, and L is 0.15 N. Noise and transients that turn
     within L steps leave c' at zero.
 
+    A reading at a rail of its sensor with a prediction at it or beyond teaches nothing; the model's `Delay` has the rails.
     A reading far from its prediction is refused: A z + B u + E w + d stands in for at most five steps, and nothing is
     learned. Once readings are used again, all means start again.
 
@@ -138,6 +139,8 @@ class DisturbanceObserver(Viewing, Measured):
         super().__init__(model)
         self.gain, self.reach = gain, reach
         own = self._model
+        saturates = own.embedding is not None and own.embedding.rails is not None
+        self._rails = own.embedding if saturates else None
         known = slice(self.ny, None)
         if isinstance(model, LinearPredictor):
             constant = model.lifting.constant_index
@@ -187,7 +190,7 @@ class DisturbanceObserver(Viewing, Measured):
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y, and learn from the misfit of the step that led here, if y was neither refused now nor just before."""
-        gate, expected = self._gate, self._nothing
+        gate, expected, beyond = self._gate, self._nothing, False
         assert gate is not None, "it remembers readings"
         if self._seen[0]:
             if self._ABE is None:
@@ -198,11 +201,15 @@ class DisturbanceObserver(Viewing, Measured):
                     self._w[:] = w
                 self._ABE.dot(self._driven, self._predicted)
             expected = self._to_y.dot(self._predicted + self.d)
+            if self._rails is not None:
+                beyond = bool(self._rails.is_beyond(y, expected).any())
+                expected = self._rails.clip(expected)
         stands_in = gate.judge(y, expected)
         if stands_in:
             y = expected
         self._x[:] = y if self._history is None else self._history.take(y, u)
-        self._flags[0], self._flags[1] = not (stands_in or self._stood_in or gate.opened), gate.opened
+        learns = not (stands_in or self._stood_in or gate.opened or beyond)
+        self._flags[0], self._flags[1] = learns, gate.opened
         self._stood_in = stands_in
         self._evaluate()
         self._memory[:] = self._after

@@ -149,6 +149,7 @@ class KalmanFilter(Viewing):
     def _take(self, predictor: LinearPredictor) -> None:
         """Take over the matrices of a model."""
         self._system, self._P, self._R = self._model(predictor)
+        self._rails = _find_rails(predictor, self._system)
         self._gains: dict[bytes, Float[np.ndarray, "n m"]] = {}
         system = self._system
         K = self._gain(np.ones(len(system.M), dtype=np.bool_))
@@ -182,8 +183,11 @@ class KalmanFilter(Viewing):
                 self._uw[len(u) :] = w
             self._y[:] = y
             self._omega.dot(self._known, self._found)
-            refused = self._gate.judge(y, self._expected)
-            if not refused and self._found.dot(self._found) < HUGE**2:  # False for NaN: some of y is missing
+            refused = self._gate.judge(y, self._clip(self._expected))
+            silent = self._rails is not None and self._is_silent(y, self._expected).any()
+            if (
+                not refused and not silent and self._found.dot(self._found) < HUGE**2
+            ):  # False for NaN: some of y is missing
                 self._s[:] = self._s_new
                 self._missed = 0
                 return True
@@ -199,9 +203,10 @@ class KalmanFilter(Viewing):
         came = np.abs(y) < HUGE  # False for NaN
         first = len(self._inputs) < self._delay  # y is older than the start
         if not first and (self._delay or not self._started):
-            self._gate.judge(y, system.M @ self._s + system.h)
-        if not first and came.any() and not self._gate.refused:
-            self._s += self._gain(came) @ (y[came] - system.M[came] @ self._s - system.h[came])
+            self._gate.judge(y, self._clip(system.M @ self._s + system.h))
+        useful = came & ~self._is_silent(y, system.M @ self._s + system.h)
+        if not first and useful.any() and not self._gate.refused:
+            self._s += self._gain(useful) @ (y[useful] - system.M[useful] @ self._s - system.h[useful])
         self._missed = 0 if came.any() else self._missed + 1
         self._started = True
         s = self._s
@@ -210,6 +215,16 @@ class KalmanFilter(Viewing):
         np.add(system.to_z @ s, system.one, out=self.z)
         np.dot(system.to_d, s, out=self.d)
         return self._missed <= self._patience and bool(np.abs(s).max() < HUGE)
+
+    def _is_silent(self, y: Float[np.ndarray, " ny"], expected: Float[np.ndarray, " ny"]) -> Bool[np.ndarray, " ny"]:
+        """Return which readings are at a rail of their sensor with a prediction at it or beyond."""
+        if self._rails is None:
+            return np.zeros(len(y), dtype=np.bool_)
+        low, high = self._rails
+        return ((y <= low) & (expected <= low)) | ((y >= high) & (expected >= high))
+
+    def _clip(self, expected: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
+        return expected if self._rails is None else np.clip(expected, *self._rails)
 
     def _next(self, s: Float[np.ndarray, " n"], v: Float[np.ndarray, " nuw"]) -> Float[np.ndarray, " n"]:
         system = self._system
@@ -228,6 +243,19 @@ class KalmanFilter(Viewing):
             scaled = np.asarray(scipy.linalg.solve(S / size / size.T, PM.T / size, assume_a="pos"))
             self._gains[key] = (scaled / size).T
         return self._gains[key]
+
+
+def _find_rails(predictor: LinearPredictor, system: Augmented) -> Float[np.ndarray, "2 ny"] | None:
+    """Return the rails of the outputs that are states of the model; None where no sensor saturates."""
+    if predictor.embedding is None or predictor.embedding.rails is None:
+        return None
+    H = system.M[:, : len(system.kept)]
+    rails = np.vstack([np.full(len(H), -np.inf), np.full(len(H), np.inf)])
+    for i, row in enumerate(H):
+        found = np.flatnonzero((row == predictor.C[:, system.kept]).all(axis=1))
+        if len(found):
+            rails[:, i] = predictor.embedding.rails[:, found[0]]
+    return rails
 
 
 Hidden = tuple[complex, Complex[np.ndarray, " n"]]
@@ -260,7 +288,8 @@ class LiftedKalman(Value):
 
     z is never lifted afresh. There is one disturbance for each measurement, so that at rest the filter explains y
     exactly. The loop has no offset if all tracked outputs are measured, and if there are no more of them than inputs.
-    The Constant is known, and not estimated. A y that is far from its prediction is refused, for at most five steps in
+    The Constant is known, and not estimated. A state's reading at a rail of its sensor, which the model's `Delay` has,
+    corrects nothing where the prediction lies at it or beyond. A y that is far from its prediction is refused, for at most five steps in
     sequence: the filter only predicts.
 
     Parameters

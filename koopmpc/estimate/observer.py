@@ -258,6 +258,8 @@ class Measured:
         if self._known_z:
             z = self._model.advance(self.z, u, w, self.d)
             predicted = z[: self.ny] if self._to_y is None else self._to_y.dot(z)
+            if self._model.embedding is not None:
+                predicted = self._model.embedding.clip(predicted)
         self._known_z = True
         return predicted if gate.judge(y, predicted) else y
 

@@ -136,3 +136,24 @@ def test_linear_models_that_are_lifted_once_are_refused_in_a_sentence(narx):
         km.KoopmanMPC(linear, km.Cost(Q=1.0, R=1.0), None, 10, estimator=km.ExtendedKalman())
     with pytest.raises(DataError, match="variance"):
         km.ExtendedKalman(noise=-1.0)
+
+
+@pytest.mark.parametrize("kind", ["disturbance", "kalman"])
+def test_linear_observers_learn_nothing_at_a_rail_either(kind):
+    rails = np.array([[-np.inf], [1.0]])
+    delay = km.Delay(1, rails=rails).bind(("y",), ("u",))
+    A = np.array([[0.9, 0.1, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    B = np.array([[0.3], [1.0], [0.0]])
+    found = []
+    for embedding in (delay, delay.without_rails()):
+        model = km.LinearPredictor(A, B, np.eye(1, 3), km.State(), 0.1, ["y"], ["u"], embedding=embedding)
+        rule = km.LiftedDisturbance() if kind == "disturbance" else km.LiftedKalman(model.C)
+        observer = km.KoopmanMPC(model, km.Cost(Q=1.0, R=1.0), None, 10, estimator=rule).observer
+        y = 0.0
+        for k in range(60):  # the input drives the output far beyond the sensor's limit
+            observer.observe(np.array([min(y, 1.0)]), np.array([1.0 if k else 0.0]), np.zeros(0))
+            y = 0.9 * y + 0.3 + 0.1 * (k > 0)
+        assert y > 2.0
+        found.append(float(np.abs(observer.d).max()))
+    assert found[0] < 0.02
+    assert found[1] > 0.1
