@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.lib.stride_tricks import sliding_window_view
 
 from koopmpc import checks
@@ -187,6 +187,13 @@ class Delay(Value):
     def clip(self, x: Float[np.ndarray, "*batch nx"]) -> Float[np.ndarray, "*batch nx"]:
         """Return what the sensors show of x: no more than their rails."""
         return x if self.rails is None else np.clip(x, *self.rails)
+
+    def is_beyond(self, y: Float[np.ndarray, " nx"], predicted: Float[np.ndarray, " nx"]) -> Bool[np.ndarray, " nx"]:
+        """Return which readings are at a rail with a prediction at it or beyond: they tell nothing more."""
+        if self.rails is None:
+            return np.zeros(len(y), dtype=np.bool_)
+        low, high = self.rails
+        return ((y <= low) & (predicted <= low)) | ((y >= high) & (predicted >= high))
 
     def spread(self, states: Float[np.ndarray, " nx"], inputs: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nzeta"]:
         """Return the sizes of the entries of ζ for these sizes of states and inputs."""

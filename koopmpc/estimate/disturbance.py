@@ -45,7 +45,7 @@ class LiftedDisturbance(Value):
     Σ (C e − C e⁻)ᵢ²/sᵢ², the squared change of a misfit in a step, and L is 0.15 N. Noise and transients that turn
     within L steps leave c' at zero.
 
-    A reading at a rail of its sensor with a prediction at it or beyond teaches nothing; the model's `Delay` has the rails.
+    A reading at a rail of its sensor, as the model's `Delay` has them, teaches nothing if the prediction is beyond it.
     A reading far from its prediction is refused: A z + B u + E w + d stands in for at most five steps, and nothing is
     learned. Once readings are used again, all means start again.
 

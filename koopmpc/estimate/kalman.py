@@ -289,8 +289,8 @@ class LiftedKalman(Value):
     z is never lifted afresh. There is one disturbance for each measurement, so that at rest the filter explains y
     exactly. The loop has no offset if all tracked outputs are measured, and if there are no more of them than inputs.
     The Constant is known, and not estimated. A state's reading at a rail of its sensor, which the model's `Delay` has,
-    corrects nothing where the prediction lies at it or beyond. A y that is far from its prediction is refused, for at most five steps in
-    sequence: the filter only predicts.
+    corrects nothing where the prediction lies at it or beyond. A y that is far from its prediction is refused, for at
+    most five steps in sequence: the filter only predicts.
 
     Parameters
     ----------
