@@ -249,7 +249,7 @@ def select(
             model = replace_report(model, report)
         return model
 
-    models = {place: refit(rows[place]) for place in {chosen: None, **dict.fromkeys(found.values())}}
+    models = {place: refit(rows[place]) for place in dict.fromkeys([*found.values(), chosen])}
     best_linear, best_bilinear = models[linear], models[found.get("bilinear", chosen)]
     return Selection(
         predictor=models[chosen],
