@@ -45,6 +45,10 @@ class LogError(KoopmpcError, OSError):
     """A file is not a log, no model, or no data of koopmpc, or cannot be read to its end."""
 
 
+class CertificateError(KoopmpcError, RuntimeError):
+    """No certificate was found; the message says which assumption is in the way."""
+
+
 class ThreadError(KoopmpcError, RuntimeError):
     """Two threads entered one controller at once."""
 

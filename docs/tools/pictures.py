@@ -259,6 +259,24 @@ def what_trust_means() -> Any:
     return made
 
 
+def guarantees() -> Any:
+    """The certified region of two tanks, its data, and loops that start on its edge."""
+    plant, model, data, limits, x, u = _tanks()
+    certified = km.certify(model, data, limits, x=x, u=u)
+    edge = certified.sample(4000)
+    edge = edge[np.argsort(certified.value(edge))[-200:]][:: 200 // 8]
+    runs = [km.simulate(plant, certified.controller(), x0=x0, reference=x, steps=60) for x0 in edge]
+    return km.plot.certificate(certified, data, runs)
+
+
+def _tanks() -> tuple[Any, ...]:
+    """Return the page's tanks: plant, model, fresh pairs, limits and set point."""
+    names: dict[str, Any] = {"__name__": "page"}
+    source = re.findall(r"```python\n(.*?)```", (DOCS / "why/guarantees.md").read_text(), re.DOTALL)[0]
+    exec(compile(source.partition("certified =")[0], "guarantees.md", "exec"), names)
+    return tuple(names[name] for name in ("plant", "model", "data", "limits", "x", "u"))
+
+
 PICTURES: dict[str, Callable[[], Any]] = {
     made.__name__: styled(made)
     for made in (
@@ -270,6 +288,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         one_step_errors,
         choosing_by_closed_loop,
         what_trust_means,
+        guarantees,
     )
 }
 

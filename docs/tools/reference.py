@@ -36,6 +36,7 @@ ROOMS = {  # where a name is defined → title and first sentence of its page, i
         "What watches a controller",
         "Does the model know this step; learn on while it runs; hand over to a fallback.",
     ),
+    "guarantees": ("Guarantees", "What is proved, with its assumptions; what is promised, with its probability."),
     "synthesis": ("From data to a controller", "Choose a model, choose a controller, with evidence from closed loops."),
     "codegen": ("C code", "The same controller as C99 without a heap, in a folder or behind Python's protocol."),
     "figures": ("Figures", "`km.plot`: Matplotlib figures of models and runs."),

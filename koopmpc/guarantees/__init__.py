@@ -1,0 +1,13 @@
+"""What is proved, and what is promised with its probability: certificates, invariant sets, tubes, worst cases."""
+
+from typing import TYPE_CHECKING
+
+from koopmpc.lazy import attach
+
+if TYPE_CHECKING:
+    from koopmpc.guarantees.certificate import Certificate as Certificate
+    from koopmpc.guarantees.certificate import CertifiedFeedback as CertifiedFeedback
+    from koopmpc.guarantees.certificate import load_certificate as load_certificate
+    from koopmpc.guarantees.certify import certify as certify
+else:
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -1,0 +1,375 @@
+"""`certify`: a feedback with a proof of stability, from a bilinear or linear lifted model and pairs of data."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.control.limits import Limits
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import CertificateError, DataError
+from koopmpc.guarantees.certificate import Certificate
+from koopmpc.guarantees.deviation import DeviationModel, deviate, is_stabilisable, reduce_to_states
+from koopmpc.guarantees.error_bounds import (
+    ErrorBound,
+    ErrorPairs,
+    bound_by_lipschitz,
+    bound_by_scenario,
+    shape_of,
+    sizes_of,
+    split_pairs,
+)
+from koopmpc.guarantees.search import DECAY, Found, Room, find_largest, prove
+from koopmpc.lifting.base import find_observables
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+
+_SCALES = (1.0, 0.7, 0.5, 0.35, 0.25, 0.12, 0.06)  # shares of the box that are tried
+_WORSE = 2  # stop after this many smaller boxes in sequence gave smaller regions
+_MOST = 16  # with more observables than this only the states are tried
+_LEAST_PAIRS = 30  # a box with fewer pairs is not tried
+_PROBES = 4000  # states at which the slope of the lifting is measured for noise
+
+Corners = tuple[ArrayLike, ArrayLike]
+
+
+def certify(
+    model: BilinearPredictor | LinearPredictor,
+    data: Episodes,
+    limits: Limits | None = None,
+    *,
+    x: ArrayLike = 0.0,
+    u: ArrayLike = 0.0,
+    estimated: bool = False,
+    region: Corners | None = None,
+    error: tuple[float, float] | None = None,
+    lipschitz: float | None = None,
+    noise: ArrayLike | None = None,
+    decay: float | None = None,
+    confidence: float = 0.95,
+    rng: np.random.Generator | int = 0,
+) -> Certificate:
+    """Return a feedback u = κ(x) and a region {V ≤ 1} that it keeps, and in which V falls at every step.
+
+    V(x) = φᵀP⁻¹φ with φ = ψ(x) − ψ(x_s). The proof needs a bound of the model's error r on a box of states and inputs:
+
+        ‖S^−½ r‖ ≤ c_x ‖D⁻¹φ‖ + c_u ‖v/d‖ + c_0;    v = u − u_s.
+
+    D and d are sizes, and S is the shape of the error. One semidefinite program gives κ and P; a search over shares of
+    the box, and over the ellipsoid in which products v ⊗ φ are bounded, gives the largest region that is found. It is
+    inside the limits and inside the sampled box. The inputs stay inside their limits and inside the sampled ones.
+
+    Parameters
+    ----------
+    model
+        A lifted model whose lifting holds the states.
+    data
+        Episodes that the model was not fitted to, drawn independently. Episodes of one step are best.
+    limits
+        Limits of inputs, states and of observables of the lifting; limits of changes are refused.
+    x, u
+        The set point (x_s, u_s). It is an equilibrium of the plant unless `estimated`.
+    estimated
+        Whether the set point is not exactly an equilibrium. Then the error has a constant part c_0, u is found by
+        least squares on the model, and what is proved is a ball that is reached.
+    region
+        (low, high), a box in place of that of the sampled states.
+    error
+        (c_x, c_u) where they are known: then S, D and d are identities, and the proof rests on them.
+    lipschitz
+        L with ‖D⁻¹(r − r′)‖ ≤ L (‖D⁻¹(φ − φ′)‖ + ‖(v − v′)/d‖), where it is known: c_x = c_u = L.
+    noise
+        (nx,) or a number: largest error of each measured state. The certificate is then a ball.
+    decay
+        ρ: V falls by this factor at least in every step. By default it is 0.9999, and searched where c_0 > 0.
+    confidence
+        Of a scenario bound, which is used without `error` and `lipschitz`.
+    rng
+        Which episodes calibrate the bound, and which check it.
+
+    Returns
+    -------
+    Certificate
+        Its `page()` states the theorem and each assumption; `controller()` is the feedback.
+
+    Raises
+    ------
+    CertificateError
+        None was found: which assumption is in the way, and what to try.
+    DataError
+        The limits exclude the set point, the box does not hold it, or the model is of a kind that has no certificate.
+
+    References
+    ----------
+    Strässer, Schaller, Worthmann, Berberich, Allgöwer, "SafEDMD", arXiv 2402.03145; "Koopman-based control of nonlinear
+    systems with closed-loop guarantees", arXiv 2411.10359.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> plant = km.discretize(km.load_problem("slow_manifold").dynamics, dt=0.1)
+    >>> draw = dict(excitation=km.Noise(-1, 1), steps=1)
+    >>> box = km.Uniform([-1, -1], [1, 1])
+    >>> lifting = km.State() + km.Monomials(2, states=[0])
+    >>> model = km.bilinear_edmd(km.collect(plant, box, episodes=200, **draw), lifting)
+    >>> certificate = km.certify(model, km.collect(plant, box, episodes=300, rng=1, **draw))
+    >>> certificate.ball, bool(certificate.value([0.0, 0.0]) == 0.0)
+    (0.0, True)
+    """
+    source = checks.generator(rng)
+    given = _check_constants(error, lipschitz, estimated)
+    deviation = deviate(model, x, u)
+    if estimated:
+        deviation = deviate(model, x, _estimate_input(deviation))
+    seed = int(source.integers(2**32))
+    level = 1 - (1 - checks.positive(confidence, "confidence")) / (2 * len(_SCALES))  # one of so many bounds is chosen
+    if not 0 < level < 1:
+        raise DataError(f"confidence is {confidence}; it must be above 0 and below 1")
+    reach = np.zeros(model.nx) if noise is None else checks.vector(noise, "noise", model.nx)
+    asked = _Asked(data, limits, region, given, estimated, reach, decay, level, seed)
+    whole = _Search(deviation, asked)
+    best = whole.run() if len(deviation.kept) <= _MOST and is_stabilisable(deviation, decay or DECAY) else None
+    few = None
+    if not given and len(deviation.kept) > model.nx:
+        few = _Search(reduce_to_states(deviation), asked)
+        other = few.run()
+        if other is not None and (best is None or other.size > best.size):
+            best, deviation = other, few.model
+    if best is None:
+        raise CertificateError(_explain_failure(few or whole))
+    low, high, room, pairs = whole.low, whole.high, whole.room, whole.pairs
+    return Certificate(
+        deviation=deviation,
+        P=best.P,
+        K=best.K,
+        K_w=best.K_w,
+        decay=best.decay,
+        ball=best.ball,
+        error=best.bound,
+        low=deviation.x + best.scale * (low - deviation.x),
+        high=deviation.x + best.scale * (high - deviation.x),
+        v_max=room.inputs,
+        margin=best.margin,
+        estimated=estimated,
+        noise=reach,
+        dt=model.dt,
+        states=tuple(model.states),
+        inputs=tuple(model.inputs),
+        sampled=(pairs.X.min(axis=0), pairs.X.max(axis=0)),
+        limits=limits,
+    )
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """The arguments of `certify` that a search needs; `given` are two constants, one or none, `level` a confidence."""
+
+    data: Episodes
+    limits: Limits | None
+    region: Corners | None
+    given: tuple[float, ...]
+    estimated: bool
+    noise: Float[np.ndarray, " nx"]
+    decay: float | None
+    level: float
+    seed: int
+
+
+class _Search:
+    """The search over shares of the box, for one set of observables."""
+
+    def __init__(self, model: DeviationModel, asked: _Asked) -> None:
+        self.model, self.asked = model, asked
+        self.pairs = _read_pairs(model, asked.data)
+        sampled = len(asked.given) != 2
+        self.room, self.low, self.high = _find_room(model, self.pairs, asked.limits, asked.region, sampled=sampled)
+        inside = self.pairs.within(self.low, self.high)
+        if not asked.given and len(inside.phi) < _LEAST_PAIRS:
+            raise DataError(
+                f"{len(inside.phi)} pairs of the data lie in the box, {_LEAST_PAIRS} are needed; collect more there"
+            )
+        self.phi_size, self.v_size = sizes_of(inside.phi), sizes_of(inside.v)
+        self.slope = None
+        if asked.noise.any():
+            self.slope = _noise_in_lifting(model, self.low, self.high, asked.noise, np.random.default_rng(asked.seed))
+
+    def find_bound(self, scale: float) -> ErrorBound | None:
+        """Return the bound on this share of the box, None where there are too few pairs."""
+        model, asked, given = self.model, self.asked, self.asked.given
+        if len(given) == 2:
+            n, m = len(model.kept), len(model.u)
+            return ErrorBound("given", given[0], given[1], 0.0, np.eye(n), np.full(n, 1.0), np.full(m, 1.0))
+        near = self.pairs.within(model.x + scale * (self.low - model.x), model.x + scale * (self.high - model.x))
+        if len(near.phi) < _LEAST_PAIRS:
+            return None
+        if given:
+            return bound_by_lipschitz(given[0], near, self.phi_size, self.v_size)
+        calibration, held_out = split_pairs(near, np.random.default_rng(asked.seed))
+        return bound_by_scenario(
+            calibration,
+            shape_of(calibration, self.phi_size),
+            self.phi_size,
+            self.v_size,
+            constant=asked.estimated or self.slope is not None,
+            confidence=asked.level,
+            held_out=held_out,
+        )
+
+    def prove(self, bound: ErrorBound, scale: float) -> Found | None:
+        """Return the proof for a bound on this share of the box, None where there is none."""
+        eta = 0.0 if self.slope is None else float(np.linalg.norm(self.slope / bound.phi_size))
+        return prove(self.model, bound, self.room.scaled(scale), scale, decay=self.asked.decay, noise=eta)
+
+    def run(self) -> Found | None:
+        """Return the proof with the largest region over the shares of the box."""
+        best: Found | None = None
+        worse = 0
+        for scale in _SCALES:
+            bound = self.find_bound(scale) if worse < _WORSE else None
+            found = None if bound is None else self.prove(bound, scale)
+            if found is not None and (best is None or found.size > best.size):
+                best, worse = found, 0
+            elif best is not None:
+                worse += 1
+        return best
+
+
+def _check_constants(error: tuple[float, float] | None, lipschitz: float | None, estimated: bool) -> tuple[float, ...]:
+    """Return the constants that the user gives: two, one or none."""
+    if error is not None and lipschitz is not None:
+        raise DataError("error and lipschitz are both given; pass one of them")
+    if (error is not None or lipschitz is not None) and estimated:
+        raise DataError("estimated=True measures the error on data; leave error and lipschitz out")
+    if error is not None:
+        c = checks.array(error, "error", (2,))
+        if (c < 0).any():
+            raise DataError(f"error is {error}; its constants must be 0 or above")
+        return float(c[0]), float(c[1])
+    return () if lipschitz is None else (checks.positive(lipschitz, "lipschitz"),)
+
+
+def _estimate_input(model: DeviationModel) -> Float[np.ndarray, " m"]:
+    """Return u_s for which the model's own defect at x_s is least."""
+    return model.u - np.linalg.lstsq(model.B, model.defect, rcond=None)[0]
+
+
+def _read_pairs(model: DeviationModel, data: Episodes) -> ErrorPairs:
+    """Return all pairs of the data as deviations, with the model's errors."""
+    checks.kind(data, "data", Episodes, "collect some that the model was not fitted to")
+    nx, nu = len(model.x), len(model.u)
+    if data.episodes and (data.episodes[0].X.shape[1] != nx or data.episodes[0].U.shape[1] != nu):
+        raise DataError(
+            f"the data have {data.episodes[0].X.shape[1]} states and {data.episodes[0].U.shape[1]} inputs, the model"
+            f" {nx} and {nu}; pass data of the same plant"
+        )
+    X = np.vstack([episode.X[:-1] for episode in data.episodes])
+    X_next = np.vstack([episode.X[1:] for episode in data.episodes])
+    U = np.vstack([episode.U for episode in data.episodes])
+    names = np.repeat(np.arange(len(data.episodes)), [len(episode.U) for episode in data.episodes])
+    phi, v = model.lift(X), U - model.u
+    return ErrorPairs(phi, v, model.lift(X_next) - model.advance(phi, v), X, U, names)
+
+
+def _find_room(
+    model: DeviationModel, pairs: ErrorPairs, limits: Limits | None, region: Corners | None, *, sampled: bool
+) -> tuple[Room, Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
+    """Return where the region and the inputs may be, and the box of states that the bound of the error is on."""
+    nx, nu = len(model.x), len(model.u)
+    names = model.lifting.bound_states
+    allowed = Limits() if limits is None else limits
+    checks.kind(allowed, "limits", Limits, "or None for none")
+    if allowed.du_max is not None or allowed.du_min is not None:
+        raise DataError("limits of changes of the inputs are not part of a certificate; pass limits without du_max")
+    low, high = pairs.X.min(axis=0), pairs.X.max(axis=0)
+    if region is not None:
+        low, high = checks.vector(region[0], "region", nx), checks.vector(region[1], "region", nx)
+    x_low, x_high = allowed.states(nx)
+    where = "the sampled box" if region is None else "the region"
+    for box_low, box_high, what in ((low, high, where), (x_low, x_high, "the limits")):
+        outside = np.flatnonzero((model.x <= box_low) | (model.x >= box_high))
+        if outside.size:
+            i = int(outside[0])
+            raise DataError(
+                f"the set point has {names[i]} = {model.x[i]:g}, which is not inside {what},"
+                f" {box_low[i]:g} … {box_high[i]:g}; move the set point, or widen the box"
+            )
+    widths = np.minimum(np.minimum(model.x - low, high - model.x), np.minimum(model.x - x_low, x_high - model.x))
+    rows: list[Float[np.ndarray, " n"]] = []
+    if allowed.of is not None:
+        wanted = allowed.of.bind(names)
+        y_low, y_high = allowed.outputs(wanted.nz)
+        y = wanted(model.x)
+        half = np.minimum(y - y_low, y_high - y)
+        if (half <= 0).any():
+            raise DataError("the limits y_min … y_max exclude the set point; move it, or widen them")
+        place = {int(kept): i for i, kept in enumerate(model.kept)}
+        for index, h in zip(find_observables(model.lifting, wanted), half, strict=True):
+            if np.isfinite(h) and int(index) in place:
+                rows.append(np.eye(len(model.kept))[place[int(index)]] / h)
+    u_low, u_high = allowed.inputs(nu)
+    if sampled:  # a bound that is given holds for all inputs that the limits allow
+        u_low, u_high = np.maximum(u_low, pairs.U.min(axis=0)), np.minimum(u_high, pairs.U.max(axis=0))
+    if ((model.u <= u_low) | (model.u >= u_high)).any():
+        raise DataError(
+            f"the input of the set point is {model.u.tolist()}, which is not inside both the limits and the sampled"
+            f" inputs, {u_low.tolist()} … {u_high.tolist()}; sample inputs on both sides of it"
+        )
+    inputs = np.minimum(model.u - u_low, u_high - model.u)
+    table = np.array(rows).reshape(-1, len(model.kept))
+    return Room(widths, table, inputs), low, high
+
+
+def _noise_in_lifting(
+    model: DeviationModel,
+    low: Float[np.ndarray, " nx"],
+    high: Float[np.ndarray, " nx"],
+    noise: Float[np.ndarray, " nx"],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, " n"]:
+    """Return the largest |ψ(x + n) − ψ(x)| of each observable that was seen for |n| ≤ noise in the box."""
+    X = rng.uniform(low, high, (_PROBES, len(low)))
+    moved = X + noise * rng.choice([-1.0, 1.0], X.shape)
+    return 1.1 * np.abs(model.lift(moved) - model.lift(X)).max(axis=0)
+
+
+def _explain_failure(search: _Search) -> str:
+    """Return which assumption is in the way, found by bisection."""
+    model, room, decay = search.model, search.room, search.asked.decay
+    tried = {scale: search.find_bound(scale) for scale in _SCALES}
+    known: dict[float, ErrorBound] = {scale: bound for scale, bound in tried.items() if bound is not None}
+    if not known:
+        return (
+            "no certificate: the data have too few independent episodes for a bound of the error; collect 30 or more,"
+            " best of one step each"
+        )
+    if not is_stabilisable(model, decay or DECAY):
+        return (
+            "no certificate: the model itself cannot be stabilised around the set point, whatever its error. Its linear"
+            " part (A, B) has an unstable mode that no input moves; check the inputs of the model, or leave"
+            " observables out"
+        )
+    scale, bound = min(known.items(), key=lambda pair: pair[1].c_x + pair[1].c_u + pair[1].c_0)
+    constants = f"c_x = {bound.c_x:.3g}, c_u = {bound.c_u:.3g}" + (f", c_0 = {bound.c_0:.3g}" if bound.c_0 else "")
+    share = find_largest(lambda f: search.prove(bound.scaled(f), scale) is not None, 1e-3, 1.0)
+    if share > 0:
+        return (
+            f"no certificate: the error of the model is too large. It is bounded by {constants} on {scale:.3g} of the"
+            f" box, and a certificate exists for {share:.2g} of these constants. Try a lifting with a smaller error,"
+            " more data near the set point for the fit, or a smaller region"
+        )
+    exact = bound.scaled(0.0)
+    size = find_largest(lambda s: search.prove(exact, s) is not None, 1e-4 * scale, scale)
+    if size > 0:
+        return (
+            f"no certificate: the region is too large. Even a model without error has none on {scale:.3g} of the box,"
+            f" and one on {size:.2g} of it. Pass a smaller region=, wider limits of the inputs, or data with larger"
+            " inputs"
+        )
+    free = replace(room, inputs=np.full_like(room.inputs, np.inf))
+    if prove(model, exact, free.scaled(1e-4 * scale), scale, decay=decay) is not None:
+        return "no certificate: the limits of the inputs leave no room around the set point; widen them"
+    return (
+        "no certificate: even around the set point, without an error and without limits, the program finds none. The"
+        " lifting holds observables that are nearly functions of one another; leave some of them out"
+    )

@@ -1,0 +1,193 @@
+"""The search for the largest region that a certificate can be found for: over its scale, its ellipsoid, its decay."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.guarantees.deviation import DeviationModel
+from koopmpc.guarantees.error_bounds import ErrorBound
+from koopmpc.guarantees.semidefinite import FeedbackProof, FeedbackTask, solve_feedback
+
+ROUNDING = 1e-10  # products v ⊗ φ with smaller entries than this share of A are rounding: the model is linear
+_SHRINK = 0.03  # factor of the first ellipsoid from try to try
+_TRIES = 2  # ellipsoids tried before a program counts as infeasible
+_GROWTH = (2.0, 1.3, 1.1)  # factors by which the next ellipsoid may exceed the last region
+_ROUNDS = 5  # times that the ellipsoid follows the region
+_GAIN = 0.05  # stop where log det grows by less
+DECAY = 1 - 1e-4  # V falls by this factor a step at least, where the error vanishes at the set point
+_FASTER = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.25)  # 1 − ρ tried where it does not
+
+
+@dataclass(frozen=True)
+class Room:
+    """Where the region may lie: |C_i φ| ≤ half widths of a box of states, rows h of limits |h φ| ≤ 1, and |v| ≤ inputs.
+
+    `widths` is (nx,), `rows` (p, n), `inputs` (m,).
+    """
+
+    widths: Float[np.ndarray, " nx"]
+    rows: Float[np.ndarray, "p n"]
+    inputs: Float[np.ndarray, " m"]
+
+    def scaled(self, scale: float) -> "Room":
+        """Return the room with this share of the box of states; limits stay."""
+        return replace(self, widths=scale * self.widths)
+
+
+@dataclass(frozen=True)
+class Found:
+    """A proof in the model's own coordinates.
+
+    P, K, K_w as in `FeedbackProof`; `ball` is the level of V that is reached, 0 for the set point itself.
+    """
+
+    P: Float[np.ndarray, "n n"]
+    K: Float[np.ndarray, "m n"]
+    K_w: Float[np.ndarray, "m mn"]
+    decay: float
+    margin: float
+    size: float
+    ball: float
+    scale: float
+    bound: ErrorBound
+
+
+def make_task(model: DeviationModel, bound: ErrorBound, room: Room, decay: float) -> FeedbackTask:
+    """Return the task in the sizes D of φ and d of v, with the ball of the room as the first ellipsoid."""
+    D, d = bound.phi_size, bound.v_size
+    n, m = len(D), len(d)
+    bilinear = bool(np.abs(model.N).max(initial=0.0) > ROUNDING * np.abs(model.A).max())
+    C = model.C * D
+    rows = np.vstack([C / room.widths[:, None], room.rows * D])
+    rows = rows[np.isfinite(rows).all(axis=1) & (np.abs(rows).max(axis=1, initial=0.0) > 0)]
+    return FeedbackTask(
+        A=model.A * D / D[:, None],
+        B=model.B * d / D[:, None],
+        N=model.N * np.kron(d, D) / D[:, None] if bilinear else None,
+        S=bound.shape / np.outer(D, D),
+        c_x=bound.c_x,
+        c_u=bound.c_u,
+        E=np.eye(n) * n * 3.0,
+        inputs=room.inputs / d if m else room.inputs,
+        rows=rows,
+        volume=C / np.linalg.norm(C, axis=1, keepdims=True),
+        decay=decay,
+    )
+
+
+def grow(task: FeedbackTask, *, linear: bool = False) -> FeedbackProof | None:
+    """Return the proof with the largest region that is found by letting the ellipsoid E follow the region."""
+    best = solve_feedback(task, linear=linear)
+    if task.N is None:
+        return best
+    for _ in range(_TRIES):
+        if best is not None:
+            break
+        task = replace(task, E=_SHRINK * task.E)
+        best = solve_feedback(task, linear=linear)
+    if best is None:
+        return None
+    for _ in range(_ROUNDS):
+        before = best.size
+        for factor in _GROWTH:
+            tried = solve_feedback(replace(task, E=factor * best.P), linear=linear)
+            if tried is not None and tried.size > best.size:
+                best = tried
+                break
+        if best.size < before + _GAIN:
+            break
+    return best
+
+
+def prove(
+    model: DeviationModel,
+    bound: ErrorBound,
+    room: Room,
+    scale: float,
+    *,
+    decay: float | None = None,
+    noise: float = 0.0,
+    linear: bool = False,
+) -> Found | None:
+    """Return the best proof for one bound and one room, None where there is none.
+
+    Parameters
+    ----------
+    decay
+        ρ; by default 1 − 10⁻⁴, and searched where c_0 or noise adds a constant.
+    noise
+        Largest ‖D⁻¹(ψ(x + n) − ψ(x))‖ of the measurement.
+    """
+    constant = bound.c_0 > 0 or noise > 0
+    decays = [decay] if decay is not None else [1 - step for step in _FASTER] if constant else [DECAY]
+    best: Found | None = None
+    last: FeedbackProof | None = None
+    for rho in decays:
+        task = make_task(model, bound, room, rho)
+        if noise:
+            task = replace(task, inputs=0.9 * task.inputs)  # the rest is for what noise adds
+        if last is None:
+            proof = grow(task, linear=linear or noise > 0)
+        else:  # the ellipsoid of the slower decay is a good one
+            proof = solve_feedback(replace(task, E=1.3 * last.P), linear=linear or noise > 0)
+        if proof is None:
+            break  # a faster decay is harder
+        last = proof
+        found = _finish(task, proof, bound, room, rho, noise, scale)
+        if found is not None and (best is None or found.ball < best.ball or not constant):
+            best = found
+    return best
+
+
+def _finish(
+    task: FeedbackTask, proof: FeedbackProof, bound: ErrorBound, room: Room, rho: float, noise: float, scale: float
+) -> Found | None:
+    """Return the proof in the model's coordinates; None where the constant part pushes out of the region.
+
+    √V is a norm, so √V(φ⁺) ≤ √ρ √V(φ) + δ, with δ the norm of the constant part: of the error, and of what noise of
+    size η does to the input, B K η + N (K η ⊗ φ), and to the bound, c_u ‖K η‖. The ball is V ≤ (δ / (1 − √ρ))².
+    """
+    P, K, D, d = proof.P, proof.K, bound.phi_size, bound.v_size
+    factor = np.linalg.cholesky(P)
+    length = float(np.linalg.norm(np.linalg.solve(factor, np.linalg.cholesky(task.S)), 2))
+    delta = bound.c_0 * length
+    if noise:
+        gain = float(np.linalg.norm(K, 2))
+        delta += noise * (float(np.linalg.norm(np.linalg.solve(factor, task.B @ K), 2)) + bound.c_u * gain * length)
+        if task.N is not None:
+            n = len(P)
+            for i in range(len(K)):
+                Ni = task.N[:, i * n : (i + 1) * n]
+                delta += noise * gain * float(np.linalg.norm(np.linalg.solve(factor, Ni @ factor), 2))
+        reach = np.linalg.norm(K @ factor, axis=1) + noise * np.linalg.norm(K, axis=1)
+        if (reach > room.inputs / d * (1 + 1e-9)).any():
+            return None
+    radius = delta / (1 - np.sqrt(rho))
+    if radius > 1:
+        return None
+    return Found(
+        P * np.outer(D, D),
+        d[:, None] * K / D,
+        proof.K_w / np.kron(d, D) * d[:, None],
+        rho,
+        proof.margin,
+        proof.size,
+        float(radius**2),
+        scale,
+        bound,
+    )
+
+
+def find_largest(provable: Callable[[float], bool], low: float, high: float, steps: int = 5) -> float:
+    """Return the largest factor between low and high, on a logarithmic scale, that is provable; 0 where low is not."""
+    if not provable(low):
+        return 0.0
+    for _ in range(steps):
+        middle = float(np.sqrt(low * high))
+        if provable(middle):
+            low = middle
+        else:
+            high = middle
+    return low
