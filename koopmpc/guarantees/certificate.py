@@ -87,11 +87,11 @@ class Certificate(Value):
     def value(self, X: ArrayLike) -> Float[np.ndarray, "..."]:
         """Return V of a state (nx,) or of rows of states (M, nx)."""
         phi = self.deviation.lift(X)
-        return np.einsum("...i,...i->...", phi, phi @ np.linalg.inv(self.P))
+        return np.asarray(np.einsum("...i,...i->...", phi, phi @ np.linalg.inv(self.P)))
 
     def contains(self, X: ArrayLike) -> np.ndarray:
         """Return where V ≤ 1, for a state or rows of states."""
-        return self.value(X) <= 1.0
+        return np.asarray(self.value(X) <= 1.0)
 
     def feedback(self, X: ArrayLike) -> Float[np.ndarray, "... nu"]:
         """Return u = u_s + v of a state (nx,) or of rows of states (M, nx)."""

@@ -219,7 +219,7 @@ class _Search:
     def prove(self, bound: ErrorBound, scale: float) -> Found | None:
         """Return the proof for a bound on this share of the box, None where there is none."""
         eta = 0.0 if self.slope is None else float(np.linalg.norm(self.slope / bound.phi_size))
-        return prove(self.model, bound, self.room.scaled(scale), scale, decay=self.asked.decay, noise=eta)
+        return prove(self.model, bound, self.room.scale_by(scale), scale, decay=self.asked.decay, noise=eta)
 
     def run(self) -> Found | None:
         """Return the proof with the largest region over the shares of the box."""
@@ -266,7 +266,7 @@ def _read_pairs(model: DeviationModel, data: Episodes) -> ErrorPairs:
     X = np.vstack([episode.X[:-1] for episode in data.episodes])
     X_next = np.vstack([episode.X[1:] for episode in data.episodes])
     U = np.vstack([episode.U for episode in data.episodes])
-    names = np.repeat(np.arange(len(data.episodes)), [len(episode.U) for episode in data.episodes])
+    names = np.repeat(np.arange(len(data.episodes), dtype=np.float64), [len(episode.U) for episode in data.episodes])
     phi, v = model.lift(X), U - model.u
     return ErrorPairs(phi, v, model.lift(X_next) - model.advance(phi, v), X, U, names)
 
@@ -351,14 +351,14 @@ def _explain_failure(search: _Search) -> str:
         )
     scale, bound = min(known.items(), key=lambda pair: pair[1].c_x + pair[1].c_u + pair[1].c_0)
     constants = f"c_x = {bound.c_x:.3g}, c_u = {bound.c_u:.3g}" + (f", c_0 = {bound.c_0:.3g}" if bound.c_0 else "")
-    share = find_largest(lambda f: search.prove(bound.scaled(f), scale) is not None, 1e-3, 1.0)
+    share = find_largest(lambda f: search.prove(bound.scale_by(f), scale) is not None, 1e-3, 1.0)
     if share > 0:
         return (
             f"no certificate: the error of the model is too large. It is bounded by {constants} on {scale:.3g} of the"
             f" box, and a certificate exists for {share:.2g} of these constants. Try a lifting with a smaller error,"
             " more data near the set point for the fit, or a smaller region"
         )
-    exact = bound.scaled(0.0)
+    exact = bound.scale_by(0.0)
     size = find_largest(lambda s: search.prove(exact, s) is not None, 1e-4 * scale, scale)
     if size > 0:
         return (
@@ -367,7 +367,7 @@ def _explain_failure(search: _Search) -> str:
             " inputs"
         )
     free = replace(room, inputs=np.full_like(room.inputs, np.inf))
-    if prove(model, exact, free.scaled(1e-4 * scale), scale, decay=decay) is not None:
+    if prove(model, exact, free.scale_by(1e-4 * scale), scale, decay=decay) is not None:
         return "no certificate: the limits of the inputs leave no room around the set point; widen them"
     return (
         "no certificate: even around the set point, without an error and without limits, the program finds none. The"

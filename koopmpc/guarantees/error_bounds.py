@@ -92,7 +92,7 @@ class ErrorBound(Value):
             np.linalg.norm(pairs.v / self.v_size, axis=1),
         )
 
-    def scaled(self, factor: float) -> "ErrorBound":
+    def scale_by(self, factor: float) -> "ErrorBound":
         """Return the bound with all its constants multiplied."""
         return replace(self, c_x=factor * self.c_x, c_u=factor * self.c_u, c_0=factor * self.c_0)
 

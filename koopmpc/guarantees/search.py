@@ -31,7 +31,7 @@ class Room:
     rows: Float[np.ndarray, "p n"]
     inputs: Float[np.ndarray, " m"]
 
-    def scaled(self, scale: float) -> "Room":
+    def scale_by(self, scale: float) -> "Room":
         """Return the room with this share of the box of states; limits stay."""
         return replace(self, widths=scale * self.widths)
 
