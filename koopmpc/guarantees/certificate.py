@@ -80,7 +80,7 @@ class Certificate(Value):
     limits: Limits | None = None
 
     @property
-    def proved(self) -> bool:
+    def is_proof(self) -> bool:
         """Whether the bound of the error is an assumption that was given, and not an estimate from samples."""
         return self.error.method != "scenario"
 

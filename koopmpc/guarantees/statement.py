@@ -105,7 +105,7 @@ def _list_limits(c: Certificate) -> list[str]:
         lines.append(
             "That the data support it: part of the box was never sampled, and there the bound is your word alone."
         )
-    if not c.proved:
+    if not c.is_proof:
         lines.append("A proof for the plant: the bound of the error holds with a probability, see above.")
     if c.ball > 0:
         lines.append("That the set point is reached.")

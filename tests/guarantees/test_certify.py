@@ -248,7 +248,7 @@ def test_given_constants_are_a_proof_and_a_lipschitz_constant_may_be_refuted(tan
         km.certify(model, data, limits, x=x, u=u, lipschitz=1e-4)
     _, data = published_data(Invariant(), -1, 1, 100, 0.0)
     certificate = km.certify(km.bilinear_edmd(data, INVARIANT), data, u=0.5, x=[0, -0.5], lipschitz=0.004)
-    assert certificate.proved
+    assert certificate.is_proof
     assert certificate.error.c_x == certificate.error.c_u == 0.004
     assert "cannot prove it" in certificate.page()
 
