@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.synthesis.designed import ExpectedLoop, choose_row
+from koopmpc.synthesis.fresh.horizon import choose_horizon
 from koopmpc.synthesis.fresh.loops import draw_starts, goal_box
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap
 from koopmpc.synthesis.fresh.verdict import bound_share, bound_value, cost_interval
@@ -187,6 +188,24 @@ def test_a_promise_is_kept_where_the_cost_is_in_its_interval():
     assert one["violation"] == 0.5
     row = type("Row", (), {"promise": one})()
     assert kept_promises([row]) == {"cost": 1.0, "violation": 0.0, "mean bound": one["most"]}
+
+
+def test_a_horizon_of_none_is_longer_where_inputs_are_weaker_and_is_told():
+    cost, tight, wide = km.Cost(Q=[1.0, 0.1], R=0.1), km.Limits(u_min=-0.1, u_max=0.1), km.Limits(u_min=-5, u_max=5)
+    slow, _ = choose_horizon(data(count=9, steps=60), cost, tight, [0.0, 0.0])
+    fast, sentence = choose_horizon(data(count=9, steps=60), cost, wide, [0.0, 0.0])
+    assert 8 <= fast < slow <= 30  # half of the episodes
+    assert f"the horizon is {fast} steps" in sentence
+    found = designed(data(count=9), horizon=None)
+    assert any(f"the horizon is {found.controller.horizon} steps" in note for note in found.notes)
+
+
+def test_the_chosen_horizon_does_not_change_with_the_units():
+    cost, limits = km.Cost(Q=[1.0, 0.1], R=0.1), km.Limits(u_min=-1, u_max=1)
+    usual_data = data(count=9, steps=60)
+    scaled = km.Episodes([km.Episode(X=e.X * [1e3, 1e-3], U=10 * e.U) for e in usual_data], usual_data.dt)
+    other = km.Cost(Q=[1e-6, 0.1e6], R=0.1e-2), km.Limits(u_min=-10, u_max=10)
+    assert choose_horizon(scaled, *other, [0.0, 0.0])[0] == choose_horizon(usual_data, cost, limits, [0.0, 0.0])[0]
 
 
 @pytest.mark.slow
