@@ -262,7 +262,7 @@ def test_a_case_is_explained_with_what_controllers_are_not_told(call, tmp_path):
     assert "(m is 1.2, not 1.0)" in said
     assert "a ratio may be below 1" in said
     write(tmp_path / "problems")
-    assert "tiny:near is a case of tiny" in call("explain", "near").stdout  # of all problems
+    assert "tiny:near is a case of tiny" in call("explain", "tiny:near").stdout
 
 
 def test_logs_are_served_to_this_machine_alone_until_the_server_is_stopped(call, tmp_path):

@@ -75,7 +75,7 @@ def describe_cases(asked: str) -> list[str]:
     name, _, case = asked.rpartition(":")
     found: list[str] = []
     for entry in list_problems():
-        if name not in ("", entry.name):
+        if name not in ("", entry.name) or case not in entry.path.read_text(encoding="utf-8", errors="replace"):
             continue
         try:
             problem = load_problem(entry.path)

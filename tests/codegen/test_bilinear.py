@@ -249,7 +249,7 @@ SEARCHED = {
 
 
 @pytest.mark.parametrize(
-    "name", [n if n in ("swing", "rates", "disturbance") else pytest.param(n, marks=pytest.mark.slow) for n in SEARCHED]
+    "name", [n if n in ("swing", "rates") else pytest.param(n, marks=pytest.mark.slow) for n in SEARCHED]
 )
 def test_a_reference_row_that_was_not_exported_is_found_at_run_time(name, swung, tmp_path):
     plant, model = swung

@@ -85,6 +85,7 @@ def test_a_server_that_goes_ends_the_loop_and_is_named(tank):
     assert paced.steps < 10
 
 
+@pytest.mark.slow
 def test_a_controller_that_hangs_is_made_safe_by_the_watchdog(tank):
     class Hanging:
         dt, nu, horizon, calls = tank.mpc.dt, 1, tank.mpc.horizon, 0
