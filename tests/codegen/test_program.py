@@ -140,6 +140,7 @@ def test_each_registered_kind_is_interpreted_or_says_why_not(models):
         km.supervise.Adaptive,
         km.supervise.Guarded,
         km.control.EigenfunctionLQR,
+        km.guarantees.CertifiedFeedback,  # tests/guarantees exports it
     }  # the next test
     assert exported | others == shipped | {km.LinearMPC}  # which is saved as the KoopmanMPC that it is
 
