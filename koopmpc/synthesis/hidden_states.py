@@ -25,7 +25,7 @@ from koopmpc.synthesis.leaderboard import LeaderboardRow
 from koopmpc.synthesis.records import FreeRun, cut_pieces, forecast_rows, judge_free_run
 from koopmpc.validate.scoring import AnyPredictor
 
-FAR = 1.5  # a kind that errs by this many times the least error is left out
+FAR = 1.2  # a kind that errs by this many times the least error is left out
 LOST = 1.0  # a model that errs by more spreads than this on one stretch is not taken where another one is calm
 _ORDERS = (1, 2, 3, 4)  # orders of hidden states that simulation error is tried on
 
