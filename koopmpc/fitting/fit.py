@@ -25,10 +25,11 @@ from koopmpc.parallel import StageProgress
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.recording.model import record_model
 from koopmpc.synthesis.leaderboard import Selection
+from koopmpc.synthesis.records import fit_again
 from koopmpc.synthesis.select import select
 from koopmpc.terminal import label_lines, render_text
 from koopmpc.validate.report import TrustReport, trust
-from koopmpc.validate.scoring import Score, score
+from koopmpc.validate.scoring import AnyPredictor, Score, score
 
 Say = Callable[[str], None]
 _ROLLOUTS = 3  # draw forecasts of this many held-out episodes
@@ -44,7 +45,8 @@ class FittedData:
     selection
         The chosen model, and the leaderboard.
     report
-        The trust report, on episodes that the model was not fitted to.
+        The trust report, on episodes that the model was not fitted to. Of records the chosen model, fitted without the
+        last fifth, is judged there; the model of the file is fitted to all rows.
     plain
         Errors of x⁺ = A x + B u + c on the same episodes.
     held_out
@@ -126,11 +128,12 @@ def fit_data(
     about = describe_data(split)
     tell(about)
     doubts: list[str] = []
+    record = split.learned is not None  # select searches longer pasts of it by itself
     with collect_notes(doubts):
         selection = select(
             split.fitted,
             horizon=split.horizon,
-            delays=None if split.delay <= PAST else sorted({*range(PAST + 1), *DELAYS, split.delay}),
+            delays=None if split.delay <= (max(DELAYS) if record else PAST) else [*range(PAST + 1), split.delay],
             bilinear=bilinear,
             workers=workers,
             scheduler=scheduler,
@@ -144,28 +147,29 @@ def fit_data(
     chosen = "\n".join([str(selection), *(f"! {doubt}" for doubt in doubts)])
     tell(chosen)
     with collect_notes([]):  # the fits repeat the doubts that stand above
-        seen, held_out = (selection.predictor.align(data) for data in (split.seen, split.held_out))
-        report = trust(selection.predictor, held_out, split.horizon, train=seen, rng=draw)
+        judged = selection.predictor if split.learned is None else fit_again(selection, split.learned)
+        seen, held_out = (judged.align(data) for data in (split.seen, split.held_out))
+        report = trust(judged, held_out, split.horizon, train=seen, rng=draw)
         plain = score(edmd(seen, State() + Constant()), held_out, split.horizon)
-    judged = f"{report}\n\n{_compare_with_plain(report.score, plain)}"
-    tell(judged)
+    verdict = f"{report}\n\n{_compare_with_plain(report.score, plain)}"
+    tell(verdict)
     failures: list[str] = []
-    pictures = list_pictures(selection, report, plain, held_out)
+    pictures = list_pictures(selection, judged, report, plain, held_out)
     recording = place / "model.rrd"
     try:
-        record_model(selection.predictor, held_out, recording, report=report)
+        record_model(judged, held_out, recording, report=report)
     except FullDiskError:
         raise
     except Exception as failure:  # a log that cannot be written must not cost the model
         failures.append(f"{recording.name}: {type(failure).__name__}: {failure}")
     usage = _format_usage(selection, model)
     page = Page(place)
-    page.text("# Model report", judged.partition("\n")[0])
+    page.text("# Model report", verdict.partition("\n")[0])
     page.code(usage, "python")
     page.text("## Data")
     page.code(about)
     page.text("## Trust")
-    page.code(judged)
+    page.code(verdict)
     for name, caption, draw_picture in pictures:
         try:
             page.picture(name, caption, partial(save, draw_picture()))
@@ -205,7 +209,7 @@ def _format_usage(selection: Selection, path: Path) -> str:
 
 
 def list_pictures(
-    selection: Selection, report: TrustReport, plain: Score, held_out: Episodes
+    selection: Selection, judged: AnyPredictor, report: TrustReport, plain: Score, held_out: Episodes
 ) -> Iterator[tuple[str, str, Callable[[], Any]]]:
     """Yield the name of each picture, its caption, and the call that draws it.
 
@@ -213,6 +217,8 @@ def list_pictures(
     ----------
     selection
         The chosen model.
+    judged
+        The same model as it was judged: of records fitted without their held-out ends.
     report
         Its trust report: errors, bands and residuals.
     plain
@@ -220,14 +226,14 @@ def list_pictures(
     held_out
         Episodes that no fit saw; the first three are forecast.
     """
-    predictor, horizon = selection.predictor, selection.horizon
+    horizon = selection.horizon
     finite = bool(np.isfinite(report.band.width).all())
     bands = report.band if finite else report.score
     around = "band that holds whole forecasts nine times in ten" if finite else "5 to 95 % of the errors"
 
     def errors() -> Any:
         named = {selection.best.kind: report.score}
-        if selection.linear is not None and selection.linear is not predictor:
+        if selection.linear is not None and selection.linear is not selection.predictor:
             named["best linear"] = score(selection.linear, held_out, horizon)
         named["plain linear"] = plain
         return error(named, width="two columns")
@@ -235,9 +241,9 @@ def list_pictures(
     yield "error", "Errors on held-out episodes against the steps ahead, beside those of x⁺ = A x + B u + c.", errors
     for i, episode in enumerate(list(held_out)[:_ROLLOUTS]):
         caption = f"Forecast of held-out episode {i} from its start, and the {around}."
-        yield f"rollout-{i}", caption, partial(rollout, predictor, episode, horizon, bands, relift=report.band.relift)
+        yield f"rollout-{i}", caption, partial(rollout, judged, episode, horizon, bands, relift=report.band.relift)
     caption = "Eigenvalues of A and the unit circle; crosses are spurious on the held-out episodes."
-    yield "spectrum", caption, partial(spectrum, predictor, report.residuals)
+    yield "spectrum", caption, partial(spectrum, judged, report.residuals)
 
 
 def describe_data(split: DividedData) -> str:

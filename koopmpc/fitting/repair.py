@@ -19,6 +19,7 @@ from koopmpc.data.files.sampling import UnevenSamplingError
 from koopmpc.data.files.tables import SAVED
 from koopmpc.data.source import Changed, Held, Source, Subset
 from koopmpc.errors import ColumnWarning, DataError, FitWarning, NoInputWarning
+from koopmpc.fitting.suspected import bridge_spikes, decide_places
 from koopmpc.identify.records.narx import DELAYS
 from koopmpc.synthesis.cross_validation import cut_blocks, replace_glitches, take_sample, usual_horizon
 from koopmpc.synthesis.records import is_record
@@ -94,25 +95,32 @@ _LEAST = 0.5  # rows at fault are left out if at least this share of the steps r
 
 
 def audit_episodes(episodes: Episodes, *, cut: bool = True) -> tuple[Episodes, tuple[str, ...], int]:
-    """Return the episodes without the rows at fault, unless that would leave less than half of the steps.
+    """Return the episodes without the rows that `decide_places` leaves out, unless less than half of the steps remain.
 
     Beside them stand the faults, with what was done about each, in sentences, and the steps of the past that a model
     needs for signals that are late. With `cut` False the episodes are only a sample of the data, so that nothing can be
     left out.
     """
     report = audit(episodes)
-    rest = episodes
+    rest, kinds, mended, out = episodes, set[str](), set[str](), set[str]()
     if cut and any(fault.places for fault in report.faults):
+        kinds = decide_places(episodes, report.faults)
+        rest, mended = bridge_spikes(episodes, report.faults)
+        bad = tuple(fault for fault in report.faults if fault.name in kinds - mended)
         with suppress(DataError):  # every row is at fault
-            left = report.without_faults(episodes)
+            left = replace(report, faults=bad).without_faults(rest) if bad else rest
             if sum(map(len, left)) >= _LEAST * sum(map(len, episodes)):
-                rest = left
+                rest, out = left, kinds - mended
     notes: list[str] = []
     for fault in report.faults:
         if fault.name in _REPAIRED:
             continue
-        if fault.places and rest is not episodes:
+        if fault.name in mended:
+            done = "these readings were replaced by the line between their neighbours"
+        elif fault.places and fault.name in out:
             done = "these rows were left out"
+        elif fault.places and cut and fault.name not in kinds:
+            done = "these rows were kept: models without them forecast the other rows no better"
         elif fault.steps:
             done = f"models that see {fault.steps} steps of the past are tried: embedding=km.Delay({fault.steps})"
         else:
@@ -302,7 +310,7 @@ class DividedData:
     seen
         Some of the fitted episodes, which stand for the training data in the report.
     held_out
-        Episodes that no fit sees.
+        Episodes that the judged model's fit does not see.
     horizon
         Steps ahead.
     size
@@ -313,6 +321,8 @@ class DividedData:
         Steps of the past that a model needs for signals that are late.
     reading
         Keywords of `load_episodes` that read the same data again.
+    learned
+        Records without their held-out ends, where `fitted` holds all rows: the model to judge is fitted to them.
     """
 
     fitted: Source | Episodes
@@ -323,6 +333,7 @@ class DividedData:
     notes: tuple[str, ...]
     delay: int
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    learned: Episodes | None = None
 
 
 def divide_files(
@@ -432,7 +443,7 @@ def _divide_episodes(
 
 
 def _divide_records(records: Episodes, ahead: int, size: str, repaired: tuple[str, ...], delay: int) -> DividedData:
-    """Hold out the last fifth of each record, in blocks; the rest stays in one piece, on which models run freely."""
+    """Hold out the last fifth of each record, in blocks, to judge; choice and last fit take the whole record."""
     shortest = ahead + max(delay, *DELAYS)
     learned: list[Episode] = []
     held_out: list[Episode] = []
@@ -446,11 +457,12 @@ def _divide_records(records: Episodes, ahead: int, size: str, repaired: tuple[st
         raise DataError(_say_too_short(len(records), ahead, _SHORTER))
     note = (
         f"the last fifth of {'each' if len(records) > 1 else 'the'} record is held out, in {len(held_out)} blocks; "
-        "models run freely over the rest"
+        "the chosen model is fitted without it to be judged, and then to all rows"
     )
     train = records.with_episodes(learned)
     seen, _ = take_sample(Held(train), _JUDGED)
-    return DividedData(train, seen, records.with_episodes(held_out), ahead, size, (*repaired, note), delay)
+    judged = records.with_episodes(held_out)
+    return DividedData(records, seen, judged, ahead, size, (*repaired, note), delay, learned=train)
 
 
 def drop_origins(episodes: Episodes) -> Episodes:

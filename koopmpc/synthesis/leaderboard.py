@@ -122,6 +122,8 @@ class Selection(Value):
         Steps ahead, and parts of the data that errors were measured on.
     notes
         What was done to the data, in sentences.
+    refined
+        Steps of the forecasts that the chosen model was refined on; 0 if one-step least squares stood.
     """
 
     predictor: AnyPredictor
@@ -133,6 +135,7 @@ class Selection(Value):
     folds: int
     notes: tuple[str, ...]
     bilinear: BilinearPredictor | None = None
+    refined: int = 0
 
     @property
     def best(self) -> LeaderboardRow:

@@ -18,9 +18,11 @@ from koopmpc.identify.records.narx import DELAYS, FOLDS, choose_structure, is_wo
 from koopmpc.identify.records.state_space import HiddenStructure
 from koopmpc.identify.records.structure import EXACT, Structure, fit_structure
 from koopmpc.parallel import Progress
+from koopmpc.predict.base import replace_report
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.synthesis.candidates import Candidate, fit_candidate
-from koopmpc.synthesis.leaderboard import LeaderboardRow, choose_model
+from koopmpc.synthesis.cross_validation import smooth_data
+from koopmpc.synthesis.leaderboard import LeaderboardRow, Selection, choose_model
 from koopmpc.validate.scoring import AnyPredictor, forecast_errors
 from koopmpc.values import Value
 
@@ -233,39 +235,52 @@ def _stretch_errors(
 
 def refine_structure(
     structure: Structure, model: AnyPredictor, data: Episodes, first: int, horizon: int
-) -> AnyPredictor:
-    """Return the model refined on forecasts of many steps, or the model itself where that does not help unseen rows.
+) -> tuple[AnyPredictor, int]:
+    """Return the model refined on forecasts of many steps, and of how many; the model and 0 where unseen rows lose.
 
-    The structure is fitted to the first three quarters of each record and refined there, on segments of 2.5 and of 10
-    horizons; the error on the last quarter, in free run and in short forecasts, decides between the three: it must
-    fall on both halves of that quarter. The model of all rows is then refined in the same way.
+    In turn the structure is fitted without one quarter of each record and refined there, on segments of 2.5 and of 10
+    horizons. Errors on both halves of the quarters, in free run and in short forecasts, decide between the three: over
+    these eight blocks a refinement must err by more than one standard error less, and on most of them. The model of all
+    rows is then refined in the same way.
     """
     truth = cut_pieces(data)
-    spans = [(len(e) * (FOLDS - 1) // FOLDS, len(e)) for e in truth]
     scale = np.concatenate([episode.X for episode in truth]).std(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
-    learned = truth.with_episodes([e.cut(0, low) for e, (low, _) in zip(truth, spans, strict=True) if low > first])
     relift = isinstance(model, BilinearPredictor)
-
-    def measure(one: AnyPredictor) -> Float[np.ndarray, " halves"]:
-        return np.array(_stretch_errors(one, truth, spans, scale, first, horizon, relift=relift))
-
+    before, after = list[float](), dict[int, list[float]]()
     try:
-        start = fit_structure(structure, learned)
-        tried = {
-            h: refine(start, learned, horizon=h, held_out=learned, iterations=_ITERATIONS)
-            for h in _segments(learned, horizon)
-        }
-        if not tried:
-            return model
-        before, after = measure(start), {h: measure(one) for h, one in tried.items()}
+        for fold in range(FOLDS):
+            spans = [(len(e) * fold // FOLDS, len(e) * (fold + 1) // FOLDS) for e in truth]
+            kept = [e.cut(*part) for e, span in zip(truth, spans, strict=True) for part in _sides(e, span)]
+            learned = truth.with_episodes([e for e in kept if len(e) > first])
+            start = fit_structure(structure, learned)
+            before += _stretch_errors(start, truth, spans, scale, first, horizon, relift=relift)
+            for h in _segments(truth, horizon) if not fold else tuple(after):
+                long = learned.with_episodes([e for e in learned if len(e) >= h + max(DELAYS)])
+                one = refine(start, long, horizon=h, held_out=long, iterations=_ITERATIONS)
+                after.setdefault(h, []).extend(_stretch_errors(one, truth, spans, scale, first, horizon, relift=relift))
+        if not after:
+            return model, 0
         best = min(after, key=lambda h: float(np.prod(after[h])))
-        if not (after[best] < before).all() or np.prod(after[best]) > _GAIN**2 * np.prod(before):
-            return model
+        if not is_surely_better(np.array(after[best]), np.array(before)):
+            return model, 0
         refined = refine(model, truth, horizon=best, held_out=truth, iterations=_ITERATIONS)
     except KoopmpcError:  # a record is too short for its segments
-        return model
-    return refined if _is_calm(refined, truth, first, relift) or not structure.calm else model
+        return model, 0
+    calm = _is_calm(refined, truth, first, relift) or not structure.calm
+    return (refined, best) if calm else (model, 0)
+
+
+def _sides(episode: Episode, span: tuple[int, int]) -> list[tuple[int, int]]:
+    """Return the rows before and behind a span."""
+    return [(a, b) for a, b in ((0, span[0]), (span[1], len(episode))) if b > a]
+
+
+def is_surely_better(errors: Float[np.ndarray, " blocks"], than: Float[np.ndarray, " blocks"]) -> bool:
+    """Return whether errors are smaller by 2 %, by more than one standard error, and on most of the blocks."""
+    gap = np.log(np.maximum(errors, EXACT)) - np.log(np.maximum(than, EXACT))
+    least = max(gap.std(ddof=1) / np.sqrt(len(gap)), -np.log(_GAIN))
+    return bool(-gap.mean() > least and np.median(gap) < 0)
 
 
 def _segments(data: Episodes, horizon: int) -> list[int]:
@@ -390,3 +405,29 @@ def choose_by_free_run(runs: Sequence[FreeRun], sizes: Sequence[float]) -> int:
     best = min(places, key=lambda i: runs[i].error)
     near = [i for i in places if not is_worse(runs[i].errors, runs[best].errors)]
     return min(near, key=lambda i: (sizes[i], runs[i].error))
+
+
+def fit_again(selection: Selection, episodes: Episodes) -> AnyPredictor:
+    """Return the chosen model of a selection fitted to other rows: the same observables, ridge and refinement.
+
+    Parameters
+    ----------
+    selection
+        The choice.
+    episodes
+        Logs like those of the choice; their inputs are moved as the chosen model's were.
+    """
+    row, data = selection.best, selection.predictor.align(episodes)
+    if row.structure is None:
+        data = smooth_data(Held(data), data)[1]
+    model = _fit_quietly(row.candidate, row.ridge, data)
+    if selection.refined:
+        pieces = cut_pieces(data)
+        room = selection.refined + max(DELAYS)
+        long = pieces.with_episodes([e for e in pieces if len(e) >= room])
+        if len(long):
+            model = refine(model, long, horizon=selection.refined, held_out=long, iterations=_ITERATIONS)
+    report = model.report
+    if selection.predictor.input_lead and report is not None:
+        model = replace_report(model, replace(report, input_lead=selection.predictor.input_lead))
+    return model

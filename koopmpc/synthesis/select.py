@@ -43,7 +43,7 @@ from koopmpc.synthesis.cross_validation import (
     usual_horizon,
 )
 from koopmpc.synthesis.hidden_states import judge_hidden_states
-from koopmpc.synthesis.leaderboard import LeaderboardRow, Selection, choose_model, make_row
+from koopmpc.synthesis.leaderboard import Selection, choose_model, make_row
 from koopmpc.synthesis.records import (
     advance_inputs,
     is_late,
@@ -239,17 +239,20 @@ def select(
             )
             break
 
-    def refit(row: LeaderboardRow) -> AnyPredictor:
+    refined: dict[int, int] = {}
+
+    def refit(place: int) -> AnyPredictor:
+        row = rows[place]
         read = ReadOptions(workers=workers, scheduler=scheduler, progress=report_stage(progress, f"fit of {row.title}"))
         model = fit_candidate(row.candidate, source if row.structure is None else measured[0], row.ridge, read)
         if isinstance(row.structure, Structure):
-            model = refine_structure(row.structure, model, measured[1], first, ahead)
+            model, refined[place] = refine_structure(row.structure, model, measured[1], first, ahead)
         if lead and model.report is not None:
             report = replace(model.report, input_lead=lead, changes=(*model.report.changes, LATE))
             model = replace_report(model, report)
         return model
 
-    models = {place: refit(rows[place]) for place in dict.fromkeys([*found.values(), chosen])}
+    models = {place: refit(place) for place in dict.fromkeys([*found.values(), chosen])}
     best_linear, best_bilinear = models[linear], models[found.get("bilinear", chosen)]
     return Selection(
         predictor=models[chosen],
@@ -261,6 +264,7 @@ def select(
         folds=data.number,
         notes=(*notes, *short, *data.notes),
         bilinear=best_bilinear if isinstance(best_bilinear, BilinearPredictor) else None,
+        refined=refined.get(chosen, 0),
     )
 
 
