@@ -1,0 +1,112 @@
+"""The maximal positively invariant polytope {z: H Aᵏ z ≤ h for all k ≥ 0} of z⁺ = A z (Gilbert and Tan, 1991)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from scipy.optimize import linprog
+
+from koopmpc import checks
+from koopmpc.errors import CertificateError, DataError
+from koopmpc.values import Value
+
+_TOLERANCE = 1e-9  # a row is redundant if it exceeds its bound by at most this share of it
+
+
+@dataclass(frozen=True, eq=False)
+class InvariantPolytope(Value):
+    """{z: H z ≤ h}: a state in it stays in it, and keeps the limits for ever.
+
+    Attributes
+    ----------
+    H, h
+        (p, n), (p,) without redundant rows; h > 0.
+    steps
+        The limits of so many steps imply those of all later ones.
+    """
+
+    H: Float[np.ndarray, "p n"]
+    h: Float[np.ndarray, " p"]
+    steps: int
+
+    def contains(self, Z: ArrayLike) -> np.ndarray:
+        """Return whether a state (n,), or each row of states (M, n), lies in the polytope."""
+        return np.asarray((np.asarray(Z, dtype=np.float64) @ self.H.T <= self.h * (1 + _TOLERANCE)).all(axis=-1))
+
+
+def find_invariant_set(A: ArrayLike, H: ArrayLike, h: ArrayLike, *, most_steps: int = 200) -> InvariantPolytope:
+    """Return the largest set of states from which z⁺ = A z keeps H z ≤ h for ever.
+
+    With a feedback u = −K z on a lifted linear model, A is A − B K, and limits of inputs are rows −K and K of H. The
+    set is of the model: an error of the model is not part of it. Redundant rows are found by linear programs.
+
+    Parameters
+    ----------
+    A
+        (n, n) with all eigenvalues inside the unit circle.
+    H, h
+        (p, n), (p,) the limits; h > 0, so that the origin lies strictly inside.
+    most_steps
+        Give up if later steps still add limits after so many.
+
+    Raises
+    ------
+    DataError
+        A is not stable, or the limits exclude the origin.
+    CertificateError
+        The polytope does not end within `most_steps`.
+
+    References
+    ----------
+    Gilbert & Tan, "Linear systems with state and control constraints: the theory and application of maximal output
+    admissible sets", IEEE Trans. Automat. Contr. 36, 1991.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> found = km.guarantees.find_invariant_set([[0.5, 1.0], [0.0, 0.5]], [[1, 0], [-1, 0]], [1, 1])
+    >>> found.steps, found.contains([[0.9, 0.0], [0.9, 0.9]]).tolist()
+    (1, [True, False])
+    """
+    transition = checks.bounded(A, "A", (None, None))
+    transition = checks.array(transition, "A", (len(transition), len(transition)))
+    rows = checks.bounded(H, "H", (None, len(transition)))
+    bounds = checks.vector(h, "h", len(rows))
+    limit = checks.count(most_steps, "most_steps")
+    if (bounds <= 0).any():
+        i = int(np.argmin(bounds))
+        raise DataError(f"h[{i}] is {bounds[i]:g}, so the limits exclude the set point at 0; move it inside them")
+    radius = float(np.abs(np.linalg.eigvals(transition)).max())
+    if radius >= 1:
+        raise DataError(f"A has the spectral radius {radius:.6g}, so no loop of it rests; stabilise it first")
+    live = np.linalg.norm(rows, axis=1) > 0
+    unit = rows[live] / bounds[live, None]
+    kept, new = unit, unit @ transition
+    for step in range(limit):
+        added = np.array([_largest(row, kept) > 1 + _TOLERANCE for row in new], dtype=np.bool_)
+        if not added.any():
+            kept = _drop_redundant(kept)
+            return InvariantPolytope(kept, np.ones(len(kept)), step)
+        kept = np.vstack([kept, new[added]])
+        new = new @ transition
+    raise CertificateError(
+        f"the polytope does not end: limits of step {limit} still cut it. The loop is slow (spectral radius"
+        f" {radius:.6g}); raise most_steps, or limit more of the states"
+    )
+
+
+def _largest(row: Float[np.ndarray, " n"], H: Float[np.ndarray, "p n"]) -> float:
+    """Return max row·z over H z ≤ 1; inf where nothing bounds it."""
+    found = linprog(-row, A_ub=H, b_ub=np.ones(len(H)), bounds=(None, None), method="highs")
+    return float(-found.fun) if found.status == 0 and found.fun is not None else np.inf
+
+
+def _drop_redundant(H: Float[np.ndarray, "p n"]) -> Float[np.ndarray, "kept n"]:
+    """Return the rows of {H z ≤ 1} that the others do not imply."""
+    alive = np.ones(len(H), dtype=np.bool_)
+    for i in range(len(H)):
+        alive[i] = False
+        others = H[alive]
+        alive[i] = not len(others) or _largest(H[i], others) > 1 + _TOLERANCE
+    return H[alive]
