@@ -67,7 +67,7 @@ def find_invariant_set(A: ArrayLike, H: ArrayLike, h: ArrayLike, *, most_steps: 
     >>> import koopmpc as km
     >>> found = km.guarantees.find_invariant_set([[0.5, 1.0], [0.0, 0.5]], [[1, 0], [-1, 0]], [1, 1])
     >>> found.steps, found.contains([[0.9, 0.0], [0.9, 0.9]]).tolist()
-    (1, [True, False])
+    (2, [True, False])
     """
     transition = checks.bounded(A, "A", (None, None))
     transition = checks.array(transition, "A", (len(transition), len(transition)))
