@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from koopmpc.errors import DataError, DefinitenessError, ShapeError
 
 HUGE = 1e30  # a state or a reference beyond it is a bad one: its square overflows
+MOST = 2**31 - 1  # refuse a larger number of steps, episodes or tries: C and CasADi count no further
 LARGEST = 1e100  # refuse a matrix of a model or a weight with a larger entry: products of three of them overflow
 
 ByName = Mapping[str, float]
@@ -210,11 +211,13 @@ def positive(value: float, name: str, unit: str = "") -> float:
 
 
 def count(value: int, name: str, least: int = 1) -> int:
-    """Return `value` as an int of at least `least`."""
+    """Return `value` as an int from `least` to 2³¹ − 1."""
     if isinstance(value, bool) or not isinstance(cast(object, value), int | np.integer):
         raise DataError(f"{name} is {value!r}; pass a whole number")
     if value < least:
         raise DataError(f"{name} is {value}; it must be at least {least}")
+    if value > MOST:
+        raise DataError(f"{name} is {value:.3g}; it must be at most {MOST}")
     return int(value)
 
 

@@ -172,6 +172,8 @@ def _knock(scheduler: str) -> None:
 
 def _close(cluster: Any) -> None:
     """Take down a local cluster, by force where Dask fails to: it does if a worker that died is started just then."""
+    from distributed.core import Status
+
     try:
         cluster.close()
     except (Exception, CancelledError):
@@ -181,8 +183,7 @@ def _close(cluster: Any) -> None:
                 os.kill(nanny.pid, getattr(signal, "SIGKILL", signal.SIGTERM))
         with suppress(Exception, CancelledError):
             cluster.sync(cluster.scheduler.close)
-        statuses: Any = type(cluster.status)
-        cluster.status = statuses.closed  # else it warns, and tries again at the end of the program
+        cluster.status = Status.closed  # else it warns, and tries again at the end of the program
 
 
 @contextmanager

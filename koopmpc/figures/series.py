@@ -260,6 +260,11 @@ def runs(tasks: Mapping[str, Mapping[str, Run]]) -> "Figure":
     DataError
         There is no run, or the runs have different plants.
     """
+    checks.kind(tasks, "tasks", Mapping, "pass {title: {name: run}}")
+    for title, task in tasks.items():
+        checks.kind(task, f"the runs of {title!r}", Mapping, "pass {name: run}")
+        for name, run in task.items():
+            checks.kind(run, repr(name), Run, "pass what km.simulate returned")
     all_runs = [run for task in tasks.values() for run in task.values()]
     if not all_runs or not all(tasks.values()):
         raise DataError("there is no run to draw; pass at least one a column")

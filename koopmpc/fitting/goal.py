@@ -273,6 +273,10 @@ def _load_toml(file: Path) -> dict[str, Any]:
     disk.existing(file, "koopmpc fit LOGS --goal-template writes one")
     try:
         return tomllib.loads(file.read_text())
+    except RecursionError as error:
+        raise LogError(
+            f"{file} nests its brackets too deep to be read; koopmpc fit LOGS --goal-template shows what is needed"
+        ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise LogError(f"{file} is not valid TOML: {error}; koopmpc fit LOGS --goal-template shows one") from error
 

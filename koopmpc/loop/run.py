@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Plan, Status
@@ -269,6 +270,20 @@ class About(Value):
         tracked = None if self.cost is None else bind_outputs(self.cost.of, self.states)
         names = self.states if tracked is None else tracked.names
         return tuple(names) if len(names) == nr else tuple(f"reference {i}" for i in range(nr))
+
+
+def check_judges(cost: object, limits: object) -> None:
+    """Raise where what a run is judged by is no Cost, or no Limits; None is left out.
+
+    Raises
+    ------
+    DataError
+        It is of another class.
+    """
+    if cost is not None:
+        checks.kind(cost, "cost", Cost, "pass km.Cost(Q=…, R=…), or leave it out")
+    if limits is not None:
+        checks.kind(limits, "limits", Limits, "pass km.Limits(u_min=…, u_max=…), or leave it out")
 
 
 def bind_outputs(outputs: Lifting, states: Sequence[str]) -> Lifting | None:

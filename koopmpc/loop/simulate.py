@@ -19,7 +19,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Fallible, Move, Plan
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.faults import Fault, Injections, Wiring
-from koopmpc.loop.run import LoopRows, Run, Step, bind_outputs
+from koopmpc.loop.run import LoopRows, Run, Step, bind_outputs, check_judges
 from koopmpc.plants.plant import Plant, SimulatedPlant, read_measurement, require_plant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import Predictor
@@ -122,6 +122,7 @@ def simulate(
     ((101, 2), (100, 1), True)
     """
     steps, rng = checks.count(steps, "steps"), checks.generator(rng)
+    check_judges(cost, limits)
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
     _require_match(plant, controller, angles)
     nx, nu, N, model = len(plant.states), controller.nu, controller.horizon, predictor_of(controller)

@@ -232,6 +232,7 @@ def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) ->
            [0.0125]])
     """
     checks.positive(dt, "dt", "s")
+    checks.members(integrator, "the integrator", ("step",), "pass one of km.plants, as km.plants.RK4()")
     F = integrator.step(build_right_side(dynamics), dt)
     h, outputs = build_output(dynamics)
     return StepMap(F, dt, h, dynamics.states, dynamics.inputs, outputs, find_scene(dynamics))

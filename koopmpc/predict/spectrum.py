@@ -21,6 +21,7 @@ from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 _ROUNDING = float(np.finfo(float).eps)
 _ROWS = 4096  # evaluate the eigenfunctions of so many states at once, to bound the memory
+_FITTED = "pass one that edmd returned"
 
 
 def continuous_eigenvalues(predictor: LinearPredictor) -> Complex[np.ndarray, " nz"]:
@@ -28,6 +29,7 @@ def continuous_eigenvalues(predictor: LinearPredictor) -> Complex[np.ndarray, " 
 
     λ = 0 gives −∞; a frequency beyond π/dt is folded back.
     """
+    checks.members(predictor, "the predictor", ("eigenvalues", "modes", "point_names", "nu"), _FITTED)
     values = predictor.eigenvalues
     with np.errstate(divide="ignore"):
         growth = np.log(np.abs(values)) / predictor.dt
@@ -53,6 +55,7 @@ def amplitudes(predictor: LinearPredictor, x: ArrayLike) -> Complex[np.ndarray, 
     ShapeError
         x has another number of columns than the predictor has states.
     """
+    checks.members(predictor, "the predictor", ("eigenvalues", "modes", "point_names", "nu"), _FITTED)
     states, width = checks.array(x, "x"), len(predictor.point_names)
     modes, lifting = _lift_modes(predictor)
     if states.ndim == 1:
@@ -84,6 +87,7 @@ def reconstruct(predictor: LinearPredictor, x0: ArrayLike, times: ArrayLike) -> 
     ShapeError
         x0 has another number of columns than the predictor has states, or the times are not a vector.
     """
+    checks.members(predictor, "the predictor", ("eigenvalues", "modes", "point_names", "nu"), _FITTED)
     t = checks.array(times, "times", (None,))
     b = amplitudes(predictor, x0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -175,6 +179,7 @@ def evolution_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
     ----------
     Snyder & Song, "Koopman operator theory for nonlinear dynamic modeling using dynamic mode decomposition", 2021.
     """
+    checks.members(predictor, "the predictor", ("eigenvalues", "modes", "point_names", "nu"), _FITTED)
     if predictor.nu + predictor.nw:
         raise DataError(
             "the predictor has inputs, and φ(x_k) = λᵏ φ(x₀) holds only without inputs; pass an autonomous fit, or use "

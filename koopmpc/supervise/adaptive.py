@@ -76,7 +76,8 @@ class Adaptive(Published):
     Raises
     ------
     DataError
-        The controller's model has an embedding, or another lifting, dt or names than what `online` learns.
+        The controller's model has an embedding, or another lifting, dt or names than what `online` learns; its
+        estimator does not measure all states.
     """
 
     def __init__(
@@ -93,6 +94,12 @@ class Adaptive(Published):
         model = controller.predictor
         if model.embedding is not None:
             raise DataError("the controller's model has an embedding, and OnlineEDMD takes none; fit one without")
+        observer = controller.observer
+        if observer.ny != model.nx:
+            raise DataError(
+                f"the controller's estimator takes {observer.ny} measurements, and Adaptive learns from all {model.nx} "
+                "states; pass a controller that measures the states"
+            )
         online.check(model)
         self.controller, self.online = controller, online
         self.dt, self.nu, self.horizon = controller.dt, controller.nu, controller.horizon

@@ -95,6 +95,8 @@ def train(
     source, generator = source_of(episodes), np.random.default_rng(rng)
     if not source.replayable:
         raise DataError("a stream is read once, and train needs it more often; save it, and pass that")
+    if embedding is not None:
+        checks.kind(embedding, "embedding", Delay, "pass km.Delay(steps)")
     sized = None if embedding is None else embedding.match(source.states, source.inputs)
     given = check_lifting(lifting).bind(source.states if sized is None else sized.names)
     pieces = _draw_pieces(source, N + (0 if sized is None else sized.steps), most, generator)

@@ -233,6 +233,8 @@ def forecast(
     DataError
         The episode ends before the horizon, or the conformal band was made with the other value of `relift`.
     """
+    checks.members(predictor, "the predictor", ("nx", "nu", "embedding"), "pass one that a fit returned")
+    checks.kind(episode, "episode", Episode, "pass one episode, as episodes[0]")
     nx, nu = episode.X.shape[1], episode.U.shape[1]
     if (nx, nu) != (predictor.nx, predictor.nu):
         raise ShapeError(

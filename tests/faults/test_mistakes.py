@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.fitting.goal import read_goal
+from koopmpc.predict import spectrum
 
 pytestmark = pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
 
@@ -83,6 +85,10 @@ KEPT = {  # what is no garbage in some places: a function for an excitation, Non
     "noise": [None],
     "trust train": [None],
     "simulate cost": [None],
+    "simulate limits": [None],
+    "recorder cost": [None],
+    "recorder limits": [None],
+    "train embedding": [None],
     "candidates": [None],
     "delays": [GARBAGE[4], None],
     "embedding": [None],
@@ -99,6 +105,14 @@ TAKES = {
     "simulate cost": lambda bad: km.simulate(
         PLANT, km.LQR(LIFTED, PENDULUM.cost), x0=[0, 0], reference=[0, 0], steps=2, cost=bad
     ),
+    "simulate limits": lambda bad: km.simulate(
+        PLANT, km.LQR(LIFTED, PENDULUM.cost), x0=[0, 0], reference=[0, 0], steps=2, limits=bad
+    ),
+    "recorder cost": lambda bad: km.Recorder("run.rrd", dt=0.1, states=["a"], inputs=["u"], cost=bad),
+    "recorder limits": lambda bad: km.Recorder("run.rrd", dt=0.1, states=["a"], inputs=["u"], limits=bad),
+    "integrator": lambda bad: km.discretize(PENDULUM.dynamics, 0.05, integrator=bad),
+    "train embedding": lambda bad: km.train(km.Gaussian([[0.0, 0.0]], 1.0), EPISODES, embedding=bad),
+    "kic episodes": lambda bad: km.identify.kic(bad, km.State()),
     "candidates": lambda bad: km.select(EPISODES, candidates=bad, horizon=2, folds=2),
     "delays": lambda bad: km.select(EPISODES, candidates=[km.State()], delays=bad, horizon=2, folds=2),
     "smoother": lambda bad: km.data.Smoother.of(bad),
@@ -128,6 +142,43 @@ def test_garbage_is_refused_in_a_sentence(where):
         if not any(bad is kept for kept in KEPT.get(where, [])):
             with pytest.raises(km.KoopmpcError):
                 TAKES[where](bad)
+
+
+SPECTRA = {
+    "continuous_eigenvalues": lambda bad: spectrum.continuous_eigenvalues(bad),
+    "amplitudes": lambda bad: spectrum.amplitudes(bad, [0.0, 0.0]),
+    "reconstruct": lambda bad: spectrum.reconstruct(bad, [0.0, 0.0], [0.0]),
+    "evolution_error": lambda bad: spectrum.evolution_error(bad, EPISODES),
+    "forecast": lambda bad: km.validate.forecast(LIFTED, bad),
+    "runs": lambda bad: km.figures.runs(bad),
+    "runs of a title": lambda bad: km.figures.runs({"a": bad}),
+    "run of a name": lambda bad: km.figures.runs({"a": {"b": bad}}),
+}
+
+
+@pytest.mark.parametrize("where", SPECTRA)
+def test_garbage_is_refused_in_a_sentence_where_models_and_runs_are_judged(where):
+    for bad in GARBAGE:
+        with pytest.raises(km.KoopmpcError):
+            SPECTRA[where](bad)
+
+
+def test_a_horizon_beyond_all_counting_is_refused():
+    with pytest.raises(km.errors.DataError, match=r"horizon is 1e\+30; it must be at most 2147483647"):
+        km.KoopmanMPC(LIFTED, PENDULUM.cost, PENDULUM.limits, 10**30)
+
+
+def test_a_controller_that_measures_one_state_does_not_adapt():
+    online = km.OnlineEDMD.start(EPISODES, LIFTED.lifting)
+    watched = km.KoopmanMPC(LIFTED, PENDULUM.cost, horizon=8, estimator=km.LiftedKalman(LIFTED.states[:1]))
+    with pytest.raises(km.errors.DataError, match="takes 1 measurements, and Adaptive learns from all 2 states"):
+        km.supervise.Adaptive(watched, online)
+
+
+def test_a_goal_that_nests_too_deep_is_refused(tmp_path: Path):
+    (goal := tmp_path / "goal.toml").write_text("a = " + 5000 * "[" + 5000 * "]" + "\n")
+    with pytest.raises(km.errors.LogError, match="nests its brackets too deep"):
+        read_goal(goal, EPISODES)
 
 
 @pytest.mark.parametrize("settings", ["max_iter", [("max_iter", 5)], 5])

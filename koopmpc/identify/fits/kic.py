@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError
 from koopmpc.identify.fits.edmd import edmd
@@ -55,6 +56,7 @@ def kic(
     Proctor, Brunton & Kutz, "Generalizing Koopman theory to allow for inputs and control", SIAM J. Appl. Dyn. Syst. 17,
     2018.
     """
+    checks.kind(episodes, "episodes", Episodes, "pass Episodes, of km.collect or km.load_episodes")
     if not episodes.nu:
         raise DataError("the episodes have no inputs; fit them with edmd")
     if inputs not in ("exogenous", "state", "constant"):
