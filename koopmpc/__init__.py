@@ -142,11 +142,13 @@ else:
             ),
             "controllers": (
                 "control.lqr",
+                "control.pid",
                 "control.linear.koopman_mpc",
                 "control.nonlinear.bilinear_mpc",
                 "control.nonlinear.nonlinear_mpc",
                 "supervise.adaptive",
                 "supervise.guarded",
+                "supervise.station",
                 "guarantees.certificate",
             ),
             "monitor": ("supervise.monitor",),

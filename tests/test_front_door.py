@@ -102,7 +102,7 @@ def test_a_name_that_moved_one_level_down_says_where_it_is(room: str, name: str)
     assert getattr(getattr(km, room), name).__name__ == name
 
 
-@pytest.mark.parametrize("name", ["Adaptive", "Guarded", "Monitor"])
+@pytest.mark.parametrize("name", ["Adaptive", "Guarded", "Monitor", "Station"])
 def test_a_name_that_moved_to_another_room_says_where_it_is(name: str) -> None:
     with pytest.raises(AttributeError, match=rf"km\.control\.{name} has moved: it is km\.supervise\.{name} now"):
         getattr(km.control, name)

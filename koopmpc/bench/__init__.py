@@ -7,6 +7,7 @@ from koopmpc.lazy import attach
 if TYPE_CHECKING:
     from koopmpc.bench.controllers import CONTROLLERS as CONTROLLERS
     from koopmpc.bench.controllers import Prepared as Prepared
+    from koopmpc.bench.controllers import register_law as register_law
     from koopmpc.bench.inspect import Where as Where
     from koopmpc.bench.inspect import compared as compared
     from koopmpc.bench.inspect import inspected as inspected

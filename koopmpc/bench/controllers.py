@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -12,11 +12,13 @@ from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from koopmpc import disk
 from koopmpc.bench.problem import Problem
 from koopmpc.checks import nearest
 from koopmpc.control.cost import state_tracking
+from koopmpc.control.function import as_controller
 from koopmpc.control.kinds import BenchEntry, list_bench
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller
@@ -289,6 +291,27 @@ CONTROLLERS["designed"] = BenchEntry(
     _build_designed,
     on_request=True,  # a design takes up to a minute
 )
+
+
+def register_law(name: str, law: Callable[..., ArrayLike], explanation: str = "A function u = f(y, r).") -> None:
+    """Register a plain function u = f(y, r) as a controller of the bench, which runs where it is named.
+
+    Call it in the file of a problem, so that each worker process of a sweep calls it too.
+
+    Parameters
+    ----------
+    name, explanation
+        For ``koopmpc run -c`` and for ``koopmpc explain``.
+    law
+        (ny,) measurement and (nr,) reference row to (nu,) inputs. Nothing clips them: a sweep reports an input that is
+        beyond a limit.
+    """
+
+    def build(parts: Any, limits: Limits) -> Controller:
+        del limits
+        return as_controller(law, parts.problem.dt, len(parts.step_map.inputs))
+
+    CONTROLLERS[name] = BenchEntry(name, explanation, "equations", build, on_request=True)
 
 
 def is_learned(name: str) -> bool:

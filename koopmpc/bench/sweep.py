@@ -79,7 +79,8 @@ def sweep(
         The problems; `load_problem("cart_pole:recover")` holds one case alone.
     controllers
         Some of lqr, koopman-lqr, linear-mpc, koopman-mpc, offset-free, bilinear-mpc, bilinear-offset, nonlinear-mpc,
-        adaptive and designed; by default the controllers that each problem names, where it names none the first eight.
+        adaptive, pid, designed, or laws of `register_law`; by default the controllers that each problem names, where
+        it names none the first eight.
     folder
         Receives sweep.json, a line for each run in rows/, results.parquet, models/, and for runs that are logged
         <problem>-<case>-<controller>.rrd. Workers on other machines must reach it by the same path.

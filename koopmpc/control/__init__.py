@@ -17,10 +17,12 @@ if TYPE_CHECKING:
     from koopmpc.control.move import Fallible as Fallible
     from koopmpc.control.move import Plan as Plan
     from koopmpc.control.nonlinear.staged_program import StagedProgram as StagedProgram
+    from koopmpc.control.pid import PID as PID
     from koopmpc.control.program import Program as Program
     from koopmpc.control.program import SavedController as SavedController
     from koopmpc.control.riccati import Gain as Gain
 else:
     __getattr__, __dir__, __all__ = attach(
-        __name__, moved={"Adaptive": "supervise", "Guarded": "supervise", "Monitor": "supervise"}
+        __name__,
+        moved={"Adaptive": "supervise", "Guarded": "supervise", "Monitor": "supervise", "Station": "supervise"},
     )

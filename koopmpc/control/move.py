@@ -72,6 +72,8 @@ class Move:
     refused
         Whether the measurement was too far from its prediction: it entered neither the estimate nor the history of
         delays, and the prediction stood in.
+    actor
+        Who acted, of a `Station`: "manual", "automatic" or "standby"; empty elsewhere.
     """
 
     u: Float[np.ndarray, " nu"]
@@ -83,6 +85,7 @@ class Move:
     solver: str = ""
     known: bool | None = None
     refused: bool = False
+    actor: str = ""
 
     @classmethod
     def hold(cls, u: Float[np.ndarray, " nu"], status: Status, solve_time: float = 0.0) -> "Move":

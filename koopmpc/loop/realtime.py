@@ -20,6 +20,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.control.function import as_controller
 from koopmpc.control.move import Controller, Move, Status
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.loop.run import Step
@@ -127,7 +128,7 @@ class _Watchdog:
 
 
 def realtime(
-    controller: Controller,
+    controller: Controller | Callable[..., ArrayLike],
     plant: Plant,
     *,
     dt: float,
@@ -185,6 +186,7 @@ def realtime(
     """
     dt = checks.positive(dt, "dt", "s")
     require_plant(plant)
+    controller = as_controller(controller, dt, len(plant.inputs))
     checks.members(controller, "the controller", CONTROLLER, HOW)
     if abs(dt - controller.dt) > 1e-12 * dt:
         raise DataError(f"the controller has dt = {controller.dt:g} s, the loop {dt:g} s; use one dt for both")

@@ -126,6 +126,8 @@ class StepRows(Value):
         m entries: which solver made the move, "osqp" or "daqp", "" where none was asked or it is not known, by default.
     refused
         (m,) 1 where a measurement was too far from its prediction and was not used; zeros by default.
+    actor
+        m entries: who acted, of a `Station`; "" by default.
     """
 
     X: Float[np.ndarray, "n nx"]
@@ -148,6 +150,7 @@ class StepRows(Value):
     refused: Int[np.ndarray, " mr"] = field(
         default_factory=_no_numbers, metadata={"move": MoveColumn(0, np.int64, "solver/refused")}
     )
+    actor: tuple[str, ...] = field(default_factory=tuple, metadata={"move": MoveColumn("", log="solver/actor")})
     u_reference: Float[np.ndarray, "m nu"] = field(default_factory=lambda: np.empty((0, 0)))
 
     def __post_init__(self) -> None:
@@ -322,9 +325,9 @@ class Run(About, StepRows):
         (T+1, nx) true states, (T+1, ny) measurements, (T+1, nr) references.
     U, u_reference
         (T, nu) inputs as applied, and the inputs that hold the reference.
-    status, fallback, solve_time, iterations, slack, known, solver, refused
+    status, fallback, solve_time, iterations, slack, known, solver, refused, actor
         T entries each: how each step ended, how long it took [s], what its solver did, whether its model knew,
-        which solver it was, and whether the measurement was refused.
+        which solver it was, whether the measurement was refused, and who acted.
     plans
         The plan of each step, where asked for.
     cost, limits, dt, states, inputs, outputs, angles, metadata

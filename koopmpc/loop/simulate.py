@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
+from koopmpc.control.function import as_controller
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Fallible, Move, Plan
 from koopmpc.errors import DataError, ShapeError
@@ -38,7 +39,7 @@ _MOVE = tuple(f.name for f in fields(Move) if f.default is MISSING)  # what a us
 
 def simulate(
     plant: StepMap | Plant,
-    controller: Controller,
+    controller: Controller | Callable[..., ArrayLike],
     *,
     x0: ArrayLike | None,
     reference: ArrayLike,
@@ -64,7 +65,7 @@ def simulate(
     plant
         A StepMap, or any Plant. For model mismatch pass a plant that differs from the controller's model.
     controller
-        Any Controller with the plant's dt. It is reset to x0 at the beginning.
+        Any Controller with the plant's dt, or a function u = f(y, r). It is reset to x0 at the beginning.
     x0
         (nx,) initial state; None: the plant chooses its own initial state.
     reference
@@ -124,7 +125,9 @@ def simulate(
     steps, rng = checks.count(steps, "steps"), checks.generator(rng)
     check_judges(cost, limits)
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
-    _require_match(plant, controller, angles)
+    if hasattr(plant, "dt") and hasattr(plant, "inputs"):
+        controller = as_controller(controller, plant.dt, len(plant.inputs))
+    controller = _require_match(plant, controller, angles)
     nx, nu, N, model = len(plant.states), controller.nu, controller.horizon, predictor_of(controller)
     wiring = _Wiring(
         plant=plant,
@@ -332,8 +335,8 @@ def checked_input(move: Move, nu: int, k: int) -> Float[np.ndarray, " nu"]:
     return u
 
 
-def _require_match(plant: StepMap | Plant, controller: Controller, angles: Sequence[int]) -> None:
-    """Raise where plant and controller lack a member, or do not fit each other."""
+def _require_match(plant: StepMap | Plant, controller: Any, angles: Sequence[int]) -> Controller:
+    """Return the controller; raise where plant and controller lack a member, or do not fit each other."""
     checks.members(controller, "the controller", CONTROLLER, HOW)
     if not isinstance(plant, StepMap):
         require_plant(plant)
@@ -345,6 +348,7 @@ def _require_match(plant: StepMap | Plant, controller: Controller, angles: Seque
     outside = [i for i in angles if not 0 <= i < nx]
     if outside:
         raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
+    return controller
 
 
 def _tracked_rows(

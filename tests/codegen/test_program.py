@@ -139,6 +139,8 @@ def test_each_registered_kind_is_interpreted_or_says_why_not(models):
         km.NonlinearMPC,
         km.supervise.Adaptive,
         km.supervise.Guarded,
+        km.supervise.Station,
+        km.control.PID,
         km.control.EigenfunctionLQR,
         km.guarantees.CertifiedFeedback,  # tests/guarantees exports it
     }  # the next test
@@ -155,6 +157,7 @@ def test_each_kind_without_c_code_says_why_and_export_raises_that_sentence(model
         "it uses ipopt or a CasADi solver": km.NonlinearMPC(plant, COST, limits, 5),
         "its model changes while it runs": km.supervise.Adaptive(km.KoopmanMPC(model, COST, limits, 5), online),
         "it holds two controllers": km.supervise.Guarded(watched, feedback),
+        "it holds several controllers": km.supervise.Station(watched, feedback),
         "koopmpc has no C code for its law": km.control.EigenfunctionLQR(
             energy, km.Cost(Q=1, R=1, of=energy), dt=0.05, B=[[0], [1]], eigenvalue=0.0
         ),

@@ -58,6 +58,7 @@ def stateful(model):
         "NonlinearMPC": km.NonlinearMPC(PLANT, cost, limits, 3),
         "Adaptive": km.supervise.Adaptive(km.KoopmanMPC(model, cost, limits, 8), online),
         "Guarded": km.supervise.Guarded(watched, km.LQR(model, cost)),
+        "Station": km.supervise.Station(mpc, km.LQR(model, cost)),
         "plant": km.plants.SimulatedPlant(PLANT),
     }
     return found | {f"observer of {name}": found[name].observer for name in ("KoopmanMPC", "estimated", "filtered")}

@@ -42,7 +42,7 @@ show(lambda: collect(Pendulum()))
     assert len(lines) == 4
 
 
-def test_a_plain_function_is_no_controller_and_an_array_no_move():
+def test_a_function_of_three_arguments_is_no_controller_and_an_array_no_move():
     lines = shown(
         PARTS
         + """
@@ -50,7 +50,6 @@ show(lambda: simulate(plant, lambda y, reference, applied: y))
 show(lambda: simulate(plant, Push()))
 """
     )
-    assert lines[0].startswith(
-        "DataError the controller is a function and has no dt, nu, horizon, reset; a Controller has dt [s]"
-    )
+    assert lines[0].startswith("DataError the function ")
+    assert "write def f(y, r), which returns the input u" in lines[0]
     assert lines[1].startswith("DataError what the controller returned is a ndarray and has no u, status, fallback, ")

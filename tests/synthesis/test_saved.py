@@ -29,6 +29,10 @@ def controllers():
         km.supervise.Guarded(
             km.KoopmanMPC(linear, COST, LIMITS, 9, monitor=data()), km.LQR(linear, COST, LIMITS), patience=2
         ),
+        km.control.PID([2.0], [0.5], [0.1], dt=linear.dt, limits=LIMITS, b=0.5),
+        km.supervise.Station(
+            km.KoopmanMPC(linear, COST, LIMITS, 9), km.LQR(linear, COST, LIMITS), limits=LIMITS, ramp=[0.5, 1.0]
+        ),
     ]
 
 
@@ -38,7 +42,7 @@ def moves(controller):
     return np.array([controller(rng.uniform(-0.4, 0.4, 2), [1.0, 0.0]).u for _ in range(4)])
 
 
-@pytest.mark.parametrize("place", range(6))
+@pytest.mark.parametrize("place", range(8))
 def test_a_loaded_controller_is_of_the_same_kind_and_steers_to_the_bit_as_the_saved_one(place, tmp_path):
     controller = controllers()[place]
     controller.save(tmp_path / "c.npz")

@@ -1,0 +1,79 @@
+"""FunctionController: a plain function u = f(y, r) where a loop expects a controller."""
+
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.control.move import Controller, Fallback, Move, Status
+from koopmpc.errors import DataError, ShapeError
+
+MEMBERS = ("dt", "nu", "horizon", "reset")
+"""What a controller has and a plain function lacks."""
+
+
+class FunctionController:
+    """u_k = f(y_k, r_k), with no preview.
+
+    Parameters
+    ----------
+    function
+        f(y, r) → u: (ny,) measurement and (nr,) reference row, as copies, to (nu,) inputs or a number.
+    dt, nu
+        Sampling time [s], and number of inputs.
+
+    Raises
+    ------
+    DataError
+        The function does not take two arguments.
+    """
+
+    horizon = 0
+
+    def __init__(self, function: Callable[..., ArrayLike], dt: float, nu: int) -> None:
+        checks.takes(function, "the function", 2, "write def f(y, r), which returns the input u")
+        self.function, self.dt, self.nu = function, dt, nu
+        FunctionController.reset(self)
+
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Set the input that is held if the first measurement is bad, zero by default."""
+        del x0
+        self._last = np.zeros(self.nu) if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
+
+    def __call__(
+        self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
+    ) -> Move:
+        """Return f(y, r); if y or r is not finite and u is not either, the last input.
+
+        Raises
+        ------
+        DataError, ShapeError
+            The function returned no (nu,) numbers, or a number that is not finite for finite y and r.
+        """
+        del w
+        start = perf_counter()
+        if applied is not None:
+            self._last = checks.array(applied, "applied", (self.nu,), finite=False)
+        measured, rows = np.array(y, dtype=np.float64), np.array(reference, dtype=np.float64)
+        row: Float[np.ndarray, " nr"] = rows[0] if rows.ndim == 2 else rows
+        known = bool(np.isfinite(measured).all() and np.isfinite(row).all())
+        u = np.atleast_1d(checks.array(self.function(measured, row), "u of the function", finite=False))
+        if u.shape != (self.nu,):
+            raise ShapeError(f"the function returned u of shape {u.shape}, expected ({self.nu},), one value an input")
+        if np.isfinite(u).all():
+            self._last = u
+            return Move(u.copy(), Status.UNCONSTRAINED, Fallback.NONE, perf_counter() - start, 0)
+        if known:
+            raise DataError(f"the function returned u = {u} for a finite y and r; return finite numbers")
+        return Move.hold(self._last.copy(), Status.BAD_MEASUREMENT, perf_counter() - start)
+
+
+def as_controller(controller: Controller | Callable[..., Any], dt: float, nu: int) -> Controller:
+    """Return a controller as it is, and a plain function u = f(y, r) as a controller of this dt and so many inputs."""
+    if callable(controller) and not any(hasattr(controller, name) for name in MEMBERS):
+        return FunctionController(controller, dt, nu)
+    return cast("Controller", controller)

@@ -1,0 +1,283 @@
+"""Station: manual and automatic control of one plant, and a standby; switches without a bump."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from time import perf_counter
+from typing import Any, Literal, cast, get_args
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.checks import HUGE, numbers
+from koopmpc.control.function import as_controller
+from koopmpc.control.kinds import ControllerKind, register_controller
+from koopmpc.control.limits import Limits, clip_input
+from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
+from koopmpc.control.program import Program, Published, SavedController, no_export
+from koopmpc.errors import DataError
+
+Mode = Literal["manual", "automatic", "standby"]
+_BUMP = 0.01  # after a switch u moves by this share of its range a step, unless the controller takes over exactly
+
+
+class Station(Published):
+    """A manual/automatic station: a hand value, a primary controller, or a standby one acts, inside the limits.
+
+    All controllers are called at every step with the input that was applied, so that their estimators go on. Where one
+    begins to act that has `take_over(y, reference, u)`, as `PID` has, it starts from the applied input to the digit.
+    Others have no state that could be set to give that input; u then moves towards theirs by at most `bump` a step
+    until it is reached. The standby also acts after `patience` steps in sequence at which the primary controller fell
+    back or did not know the step, until it has been well for as many. `Move.actor` says who acted.
+
+    Parameters
+    ----------
+    controller
+        The primary controller, which acts in the mode "automatic".
+    standby
+        A controller of the same plant, or a function u = f(y, r); None: the applied input is held.
+    limits
+        Limits of the inputs and their changes, for whoever acts.
+    mode
+        "manual", "automatic" or "standby" at every reset.
+    hand
+        (nu,) hand value at every reset; None: the applied input.
+    bump
+        (nu,) see above; by default 1 % of the range of an input, without a bound where its range is infinite.
+    ramp
+        (nr,) by how much set points move at most [1/s]. They start from the first reference, and after the mode
+        "manual" from y where y and r have the same length.
+    patience
+        See above.
+
+    Attributes
+    ----------
+    mode
+        The mode now.
+    actor
+        Who acted last: "manual", "automatic" or "standby".
+
+    Raises
+    ------
+    DataError
+        One is no controller; the two have another dt or number of inputs; an argument is none of those above.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> pid = km.control.PID(kp=2.0, ki=1.0, dt=0.1)
+    >>> station = km.supervise.Station(pid, limits=km.Limits(u_min=0, u_max=1), mode="manual", hand=[0.5])
+    >>> station([0.8], [0.8]).u
+    array([0.5])
+    >>> station.switch("automatic")
+    >>> move = station([0.8], [0.8])
+    >>> move.u, move.actor
+    (array([0.5]), 'automatic')
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        standby: Controller | Callable[..., ArrayLike] | None = None,
+        *,
+        limits: Limits | None = None,
+        mode: Mode = "automatic",
+        hand: ArrayLike | None = None,
+        bump: ArrayLike | None = None,
+        ramp: ArrayLike | None = None,
+        patience: int = 3,
+    ) -> None:
+        needed = ("dt", "nu", "horizon", "reset")
+        checks.members(controller, "the controller", needed, "pass a KoopmanMPC, an LQR or another Controller")
+        self.controller, self.dt, self.nu = controller, controller.dt, controller.nu
+        self.standby = None if standby is None else as_controller(standby, self.dt, self.nu)
+        if self.standby is not None:
+            checks.members(self.standby, "the standby", needed, "pass a PID, an LQR, or a function u = f(y, r)")
+            for name in ("dt", "nu"):
+                mine, other = getattr(controller, name), getattr(self.standby, name)
+                if mine != other:
+                    raise DataError(f"the controller has {name} = {mine:g}, the standby {other:g}; they must agree")
+        self.horizon = max(controller.horizon, 0 if self.standby is None else self.standby.horizon)
+        self.limits = limits or Limits()
+        self.inputs, self.rates = self.limits.inputs(self.nu), self.limits.rates(self.nu)
+        width = np.where(np.isfinite(self.inputs.high - self.inputs.low), self.inputs.high - self.inputs.low, np.inf)
+        self.bump = _BUMP * width if bump is None else checks.vector(bump, "bump", self.nu, infinite=True)
+        if (self.bump <= 0).any():
+            raise DataError(f"bump is {self.bump}; pass changes above 0 a step")
+        self.ramp = None if ramp is None else np.atleast_1d(checks.array(ramp, "ramp"))
+        if self.ramp is not None and (self.ramp <= 0).any():
+            raise DataError(f"ramp is {self.ramp}; pass changes above 0 a second")
+        self._patience = checks.count(patience, "patience")
+        self._first_mode, self._first_hand = _check_mode(mode), hand if hand is None else self._check_hand(hand)
+        Station.reset(self)
+
+    def as_data(self) -> SavedController:
+        """Return what the station was made of.
+
+        Raises
+        ------
+        DataError
+            A controller in it is not of koopmpc.
+        """
+        options: dict[str, Any] = {
+            "mode": self._first_mode,
+            "hand": self._first_hand,
+            "bump": self.bump,
+            "ramp": self.ramp,
+            "patience": self._patience,
+            "standby": None,
+        }
+        for name, part in (("controller", self.controller), ("standby", self.standby)):
+            if part is None:
+                continue
+            if not isinstance(part, Published):
+                raise DataError(f"a {type(part).__name__} is not a controller of koopmpc and cannot be saved as data")
+            options[name] = part.as_data()
+        return SavedController("Station", None, limits=self.limits, options=options)
+
+    @classmethod
+    def from_data(cls, saved: SavedController) -> "Station":
+        """Return the station that is made of these data, in which the parts are controllers again."""
+        options = dict(saved.options)
+        return cls(options.pop("controller"), options.pop("standby"), limits=saved.limits, **options)
+
+    def build_program(self, reference: ArrayLike | None) -> Program:
+        """Raise the DataError that says why no C code can be generated."""
+        raise no_export(self, "it holds several controllers; export each of them")
+
+    @property
+    def predictor(self) -> Any:
+        """The model of the primary controller; None where it has none."""
+        return getattr(self.controller, "predictor", None)
+
+    def _check_hand(self, u: ArrayLike) -> Float[np.ndarray, " nu"]:
+        return checks.vector(u, "hand", self.nu)
+
+    def set_hand(self, u: ArrayLike) -> None:
+        """Set the (nu,) hand value; it acts in the mode "manual", inside the limits."""
+        self._hand = self._check_hand(u)
+
+    def switch(self, mode: Mode) -> None:
+        """Change the mode from the next step on; "manual" begins with the applied input."""
+        if _check_mode(mode) == "manual" and self.mode != "manual":
+            self._hand = None
+        self.mode = mode
+
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Begin a run in the first mode, with the first hand value."""
+        zero = np.clip(np.zeros(self.nu), *self.inputs)
+        self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
+        self.mode, self._hand = self._first_mode, self._first_hand
+        self.actor: str = ""
+        self._ill, self._replaced, self._approaching = 0, False, False
+        self._set_point: Float[np.ndarray, " nr"] | None = None
+        self.controller.reset(x0, u_prev)
+        if self.standby is not None:
+            self.standby.reset(x0, u_prev)
+
+    def plan(self) -> Plan | None:
+        """Return the plan behind the last move; None where it had none."""
+        look = cast("Callable[[], Plan | None] | None", getattr(self.controller, "plan", None))
+        return look() if look is not None and self.actor == "automatic" and not self._approaching else None
+
+    def __call__(
+        self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
+    ) -> Move:
+        """Return the input of whoever acts."""
+        start = perf_counter()
+        if applied is not None:
+            got = checks.array(applied, "applied", (self.nu,), finite=False)
+            self._last = got if (np.abs(got) < HUGE).all() else self._last
+        measured, rows = numbers(y, "y"), self._ramp_rows(numbers(y, "y"), numbers(reference, "reference"))
+        last = self._last
+        first = self.controller(measured, _rows_of(rows, self.controller), last, w)
+        second = None
+        if self.standby is not None:
+            second = self.standby(measured, _rows_of(rows, self.standby), last, w)
+        actor = self._choose(first)
+        begins, self.actor = actor != self.actor and self.actor != "", actor
+        move = self._ask(actor, begins, first, second, measured, rows, w)
+        u = move.u
+        if self._approaching:
+            near = np.clip(u, last - self.bump, last + self.bump)
+            self._approaching, u = not np.array_equal(near, u), near
+        u = clip_input(u, self.inputs, self.rates, last)
+        self._last = u
+        status = move.status if np.array_equal(u, move.u) else Status.SATURATED
+        fallback = Fallback.OTHER_CONTROLLER if actor == "standby" else move.fallback
+        return replace(
+            move,
+            u=u.copy(),
+            status=status if fallback is Fallback.NONE else move.status,
+            fallback=fallback,
+            known=first.known,
+            actor=actor,
+            solve_time=perf_counter() - start,
+        )
+
+    def _choose(self, first: Move) -> str:
+        """Return who acts: by the mode, and by how the primary controller does."""
+        ill = first.fallback is not Fallback.NONE or first.known is False
+        self._ill = self._ill + 1 if ill != self._replaced else 0
+        if self._ill >= self._patience:
+            self._replaced, self._ill = not self._replaced, 0
+        return "standby" if self.mode == "automatic" and self._replaced else self.mode
+
+    def _ask(
+        self,
+        actor: str,
+        begins: bool,
+        first: Move,
+        second: Move | None,
+        y: Float[np.ndarray, " ny"],
+        rows: Float[np.ndarray, "..."],
+        w: ArrayLike | None,
+    ) -> Move:
+        """Return the move of whoever acts; one that begins takes over the applied input where it can."""
+        if actor == "manual":
+            self._approaching = False
+            hand = self._last if self._hand is None else self._hand
+            return Move(hand.copy(), Status.UNCONSTRAINED, Fallback.NONE, 0.0, 0)
+        acting, move = (self.controller, first) if actor == "automatic" else (self.standby, second)
+        if acting is None or move is None:
+            return Move.hold(self._last.copy(), first.status)
+        if begins:
+            take_over = getattr(acting, "take_over", None)
+            self._approaching = take_over is None
+            if take_over is not None:
+                own = _rows_of(rows, acting)
+                take_over(y, own, self._last)
+                return acting(y, own, self._last, w)
+        return move
+
+    def _ramp_rows(self, y: Float[np.ndarray, " ny"], rows: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Return the reference rows with set points that move by at most `ramp` a second."""
+        if self.ramp is None:
+            return rows
+        table = np.atleast_2d(rows)
+        most = np.broadcast_to(self.ramp * self.dt, (table.shape[1],))
+        now = table[0] if self._set_point is None else self._set_point
+        if self.actor == "manual" and y.shape == now.shape and np.isfinite(y).all():
+            now = y  # set points follow the measurement while a hand acts
+        ahead, at = np.empty((self.horizon + 1, table.shape[1])), now
+        for k in range(len(ahead)):
+            at = at + np.clip(table[min(k, len(table) - 1)] - at, -most, most)
+            ahead[k] = at
+        if np.isfinite(ahead[0]).all():
+            self._set_point = ahead[0].copy()
+        return ahead
+
+
+def _check_mode(mode: Mode) -> Mode:
+    if mode not in get_args(Mode):
+        raise DataError(f'mode is {mode!r}; pass "manual", "automatic" or "standby"')
+    return mode
+
+
+def _rows_of(rows: Float[np.ndarray, "..."], controller: Controller) -> Float[np.ndarray, "..."]:
+    """Return the rows of the reference that this controller reads."""
+    return rows if rows.ndim == 1 else rows[: controller.horizon + 1]
+
+
+register_controller(ControllerKind(Station))
