@@ -142,10 +142,10 @@ else:
             ),
             "controllers": (
                 "control.lqr",
-                "control.pid",
                 "control.linear.koopman_mpc",
                 "control.nonlinear.bilinear_mpc",
                 "control.nonlinear.nonlinear_mpc",
+                "control.pid",
                 "supervise.adaptive",
                 "supervise.guarded",
                 "supervise.station",

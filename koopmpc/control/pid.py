@@ -118,7 +118,7 @@ class PID(FeedbackLaw):
         self._forget()
 
     @classmethod
-    def tuned(
+    def tune(
         cls,
         model: LinearPredictor,
         cost: Cost,
@@ -319,7 +319,7 @@ def _pair(gains: Float[np.ndarray, "n n"]) -> list[int]:
 
 def _build_pid(parts: Any, limits: Limits) -> PID:
     problem = parts.problem
-    return PID.tuned(parts.local_model, problem.cost, limits, bias=problem.equilibrium[1])
+    return PID.tune(parts.local_model, problem.cost, limits, bias=problem.equilibrium[1])
 
 
 register_controller(

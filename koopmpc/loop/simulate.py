@@ -125,7 +125,7 @@ def simulate(
     steps, rng = checks.count(steps, "steps"), checks.generator(rng)
     check_judges(cost, limits)
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
-    if hasattr(plant, "dt") and hasattr(plant, "inputs"):
+    if not hasattr(controller, "reset") and hasattr(plant, "dt") and hasattr(plant, "inputs"):
         controller = as_controller(controller, plant.dt, len(plant.inputs))
     controller = _require_match(plant, controller, angles)
     nx, nu, N, model = len(plant.states), controller.nu, controller.horizon, predictor_of(controller)

@@ -350,7 +350,7 @@ def test_an_unknown_controller_suggests_the_nearest(swept, tmp_path):
         match=r"no controller 'koopman-mcp', did you mean 'koopman-mpc'\?; there are lqr, koopman-lqr",
     ):
         km.sweep([swept[0]], ["koopman-mcp"], folder=tmp_path)
-    assert list(km.bench.CONTROLLERS) == [*EIGHT, "adaptive", "designed"]
+    assert list(km.bench.CONTROLLERS) == [*EIGHT, "pid", "adaptive", "designed"]
 
 
 def test_a_case_that_comes_twice_is_refused_before_anything_runs(swept, tmp_path):

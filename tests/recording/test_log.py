@@ -128,6 +128,7 @@ def test_what_is_kept_of_a_move_is_what_the_move_has(tmp_path: Path) -> None:
         "solver": "daqp",
         "known": True,
         "refused": True,
+        "actor": "manual",
     }
     assert {field.name for field in fields(km.Move)} == {"u", *told}
 

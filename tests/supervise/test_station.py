@@ -65,7 +65,7 @@ def test_the_integral_of_a_pid_leaves_no_error_and_does_not_wind_up():
 
 
 def test_simc_recovers_the_first_order_plant_and_settles_it():
-    pid = km.control.PID.tuned(TANK, COST, BOX)
+    pid = km.control.PID.tune(TANK, COST, BOX)
     tau = -0.1 / np.log(0.9)
     theta = 0.05  # half a step for the hold; the plant has no delay of its own
     assert pid.kp[0] == pytest.approx(tau / (2 * 2.0 * theta), rel=0.1)
@@ -77,7 +77,7 @@ def test_simc_recovers_the_first_order_plant_and_settles_it():
 
 def test_simc_pairs_by_relative_gains():
     A, B = np.diag([0.8, 0.9]), np.array([[0.02, 0.4], [0.3, 0.01]])
-    pid = km.control.PID.tuned(model_of(A, B), km.Cost(Q=[1, 1], R=1))
+    pid = km.control.PID.tune(model_of(A, B), km.Cost(Q=[1, 1], R=1))
     assert pid.outputs.tolist() == pid.references.tolist() == [1, 0]
 
 
@@ -92,7 +92,7 @@ def test_simc_pairs_by_relative_gains():
 )
 def test_simc_says_why_it_has_no_rule(A, B, Q, said):
     with pytest.raises(km.errors.DataError, match=said):
-        km.control.PID.tuned(model_of(A, B), km.Cost(Q=Q, R=1))
+        km.control.PID.tune(model_of(A, B), km.Cost(Q=Q, R=1))
 
 
 def test_gains_of_two_signs_and_short_signals_are_refused():
