@@ -82,7 +82,7 @@ class Station(Published):
         standby: Controller | Callable[..., ArrayLike] | None = None,
         *,
         limits: Limits | None = None,
-        mode: Mode = "automatic",
+        mode: Mode | str = "automatic",
         hand: ArrayLike | None = None,
         bump: ArrayLike | None = None,
         ramp: ArrayLike | None = None,
@@ -158,17 +158,19 @@ class Station(Published):
         """Set the (nu,) hand value; it acts in the mode "manual", inside the limits."""
         self._hand = self._check_hand(u)
 
-    def switch(self, mode: Mode) -> None:
+    def switch(self, mode: Mode | str) -> None:
         """Change the mode from the next step on; "manual" begins with the applied input."""
-        if _check_mode(mode) == "manual" and self.mode != "manual":
+        wanted = _check_mode(mode)
+        if wanted == "manual" and self.mode != "manual":
             self._hand = None
-        self.mode = mode
+        self.mode = wanted
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Begin a run in the first mode, with the first hand value."""
         zero = np.clip(np.zeros(self.nu), *self.inputs)
         self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
-        self.mode, self._hand = self._first_mode, self._first_hand
+        self.mode: Mode = self._first_mode
+        self._hand = self._first_hand
         self.actor: str = ""
         self._ill, self._replaced, self._approaching = 0, False, False
         self._set_point: Float[np.ndarray, " nr"] | None = None
@@ -269,10 +271,10 @@ class Station(Published):
         return ahead
 
 
-def _check_mode(mode: Mode) -> Mode:
+def _check_mode(mode: str) -> Mode:
     if mode not in get_args(Mode):
         raise DataError(f'mode is {mode!r}; pass "manual", "automatic" or "standby"')
-    return mode
+    return cast("Mode", mode)
 
 
 def _rows_of(rows: Float[np.ndarray, "..."], controller: Controller) -> Float[np.ndarray, "..."]:
