@@ -109,7 +109,8 @@ class Station(Published):
         if self.ramp is not None and (self.ramp <= 0).any():
             raise DataError(f"ramp is {self.ramp}; pass changes above 0 a second")
         self._patience = checks.count(patience, "patience")
-        self._first_mode, self._first_hand = _check_mode(mode), hand if hand is None else self._check_hand(hand)
+        self._first_mode: Mode = _check_mode(mode)
+        self._first_hand = hand if hand is None else self._check_hand(hand)
         Station.reset(self)
 
     def as_data(self) -> SavedController:
