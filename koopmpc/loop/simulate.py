@@ -20,7 +20,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Fallible, Move, Plan
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.faults import Fault, Injections, Wiring
-from koopmpc.loop.run import LoopRows, Run, Step, bind_outputs, check_judges
+from koopmpc.loop.run import LoopRows, Run, Step, bind_outputs
 from koopmpc.plants.plant import Plant, SimulatedPlant, read_measurement, require_plant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import Predictor
@@ -123,7 +123,8 @@ def simulate(
     ((101, 2), (100, 1), True)
     """
     steps, rng = checks.count(steps, "steps"), checks.generator(rng)
-    check_judges(cost, limits)
+    if limits is not None:  # the cost is checked with the reference
+        checks.kind(limits, "limits", Limits, "pass km.Limits(u_min=…, u_max=…), or leave it out")
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
     if not hasattr(controller, "reset") and hasattr(plant, "dt") and hasattr(plant, "inputs"):
         controller = as_controller(controller, plant.dt, len(plant.inputs))
