@@ -86,7 +86,7 @@ class Guarded(Published):
     @property
     def predictor(self) -> Any:
         """The model of the first controller; None where it has none."""
-        return getattr(self.controller, "predictor", None)
+        return getattr(self.controller, "predictor", getattr(self.controller, "model", None))
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Begin a run with the first controller."""

@@ -2,6 +2,7 @@
 
 import copy
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -272,3 +273,18 @@ def test_a_billionth_of_each_state_is_inside_whatever_the_errors_are():
         worst = max(float(np.sum((W @ v) ** 2)) for v in shares)
         ranked = np.sort(np.sum((errors @ W.T) ** 2, axis=1))[49]
         assert max(worst, ranked) == pytest.approx(1.0)
+
+
+def test_a_guard_of_models_of_outputs_starts_a_run_whose_state_it_does_not_know():
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
+    step = ca.vertcat(x[0] + 0.1 * x[1], x[1] + 0.1 * (u[0] - x[1] - x[0]))
+    F, h = ca.Function("F", [x, u], [step]), ca.Function("h", [x], [x[0]])
+    plant = km.StepMap(F, 0.1, h, states=("p", "v"), inputs=("u",), outputs=("p",))
+    data = km.collect(plant, km.Uniform([-1, -1], [1, 1]), km.Noise(-2, 2), episodes=20, steps=30)
+    cost, limits, past = km.Cost(1.0, 0.1), km.Limits(-2, 2), km.Delay(1)
+    bilinear = km.bilinear_edmd(data, km.State() + km.Constant(), embedding=past, ridge=1e-8)
+    linear = km.edmd(data, km.State() + km.Constant(), embedding=past, ridge=1e-8)
+    main = km.BilinearMPC(bilinear, cost, limits, 10, monitor=data)
+    guard = km.supervise.Guarded(main, km.KoopmanMPC(linear, cost, limits, 10))
+    run = km.simulate(plant, guard, x0=[0.5, 0.0], reference=[0.2], steps=60)
+    assert abs(run.X[-1, 0] - 0.2) < 0.1
