@@ -39,17 +39,17 @@ def train(
 ) -> LinearPredictor:
     """Fit ψ(x⁺; p) = A ψ(x; p) + B u with the numbers p of ψ trained: centres, widths, frequencies.
 
-    The error that p minimises is that of x_{k+h} over h = 1 … horizon, predicted from x_k and u_k … u_{k+h−1}, relative
-    to the size of each state, as `km.score` has it. For each p the matrices A and B are those of `edmd`, so p alone is
-    searched for (variable projection), by L-BFGS; CasADi differentiates ψ, and the gradient goes back through the least
-    squares and the horizon. Of all iterates the one that predicts the held-out data best is taken. Where its fit is not
-    better there by 1 %, or where the error is below 1e-6 already, the lifting stays as it is: on the held-out data the
-    result is never worse than ``edmd(episodes, lifting, ridge=ridge)``.
+    p minimises the errors of forecasts of x_{k+h}, h = 1 … horizon, from x_k and u_k … u_{k+h−1}, relative to the size
+    of each state as in `km.score`. For each p, A and B are those of `edmd`, so L-BFGS searches for p alone (variable
+    projection). CasADi differentiates ψ; the gradient is that of the least squares and of the whole horizon. The
+    iterate with the smallest error on the held-out data is taken. If it is not better there by 1 %, or if the error of
+    the given lifting is below 1e-6, the lifting is not changed. On the held-out data the result is therefore never
+    worse than ``edmd(episodes, lifting, ridge=ridge)``.
 
     Parameters
     ----------
     lifting
-        ψ; what is trained are the numbers of `Gaussian`, `ThinPlate` and `RandomFourier` in it, wherever they stand.
+        ψ. The numbers of each `Gaussian`, `ThinPlate` and `RandomFourier` in it are trained.
         Standardize states of different units: ``Standardized.of(episodes, lifting)``.
     episodes
         As in `edmd`. Training works on at most `windows` pieces of them; the fit at the end reads all.
@@ -61,7 +61,7 @@ def train(
     embedding, ridge
         As in `edmd`; the ridge must be above zero.
     windows
-        Largest number of pieces of `horizon` steps, drawn at random; memory and time go with it.
+        Largest number of pieces of `horizon` steps, drawn at random; memory and time grow with it.
     iterations
         Largest number of iterations.
     rng
@@ -70,8 +70,8 @@ def train(
     Returns
     -------
     predictor
-        That of `edmd` on the trained lifting, which is ``predictor.lifting``: other fits take it as they take any. The
-        errors before and after stand in ``predictor.report.changes``.
+        The fit of `edmd` on the trained lifting, ``predictor.lifting``, which every other fit accepts. The errors
+        before and after are in ``predictor.report.changes``.
 
     Raises
     ------
