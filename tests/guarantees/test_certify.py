@@ -191,6 +191,7 @@ def test_a_scenario_bound_is_broken_as_rarely_as_it_promises():
     assert np.mean(missed) <= 0.1 + 3 * np.sqrt(0.1 * 0.9 / 60)
 
 
+@pytest.mark.slow
 def test_a_set_point_that_is_no_equilibrium_gives_a_ball_that_loops_reach(tanks):
     plant, model, data, limits, x, u, _ = tanks
     off = x + np.array([0.05, -0.05])
@@ -203,6 +204,7 @@ def test_a_set_point_that_is_no_equilibrium_gives_a_ball_that_loops_reach(tanks)
     assert "an ultimate bound, not stability" in certificate.page()
 
 
+@pytest.mark.slow
 def test_noise_gives_a_ball_and_loops_with_noise_stay_in_it(tanks):
     plant, model, data, limits, x, u, _ = tanks
     certificate = km.certify(model, data, limits, x=x, u=u, noise=0.01)

@@ -42,7 +42,7 @@ def free_error(model, data):
     return float(np.sqrt(np.mean((X - points.X[:, :1]) ** 2)))
 
 
-@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("late", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_free_run_of_the_chosen_model_is_that_of_the_plant(late):
     found, fresh = selection(late), oscillator(late=late, seed=9, noise=0.0)
     assert found.predictor.embedding is not None
