@@ -26,9 +26,10 @@ typed: $(VENV)/installed-dev
 full: $(VENV)/installed-dev
 	$(TYPED) --cov --cov-report=term -m "(slow or not slow) and not speed and not loops and not real"
 
-# 200 small changes of the library, of which the tests must notice 92 %: about half an hour on two cores.
+# 200 small changes of the library, of which the tests must notice 92 %: about an hour on two cores. SEED=N draws others.
+SEED ?= 0
 mutants: $(VENV)/installed-dev
-	$(PINNED) $(BIN)/python -m tests.mutation
+	$(PINNED) $(BIN)/python -m tests.mutation --seed $(SEED)
 
 loops: $(VENV)/installed-dev
 	KOOPMPC_TESTS=bare $(PINNED) $(BIN)/python -m pytest -n 2 --benchmark-disable -m loops tests/closed_loop
@@ -40,9 +41,10 @@ real: $(VENV)/installed-dev
 speed: $(VENV)/installed-dev
 	KOOPMPC_TESTS=bare $(PINNED) $(BIN)/python -m pytest tests/speed -m speed --benchmark-columns=median,iqr,rounds --benchmark-sort=name
 
-# Ten minutes of closed loops with faults, damaged files and interrupts; memory must stay flat.
+# Closed loops with faults, damaged files, designs, kills and interrupts, for MINUTES; memory must stay flat.
+MINUTES ?= 10
 soak: $(VENV)/installed-dev
-	$(PINNED) $(BIN)/python -m tests.faults.soak
+	$(PINNED) $(BIN)/python -m tests.faults.soak --minutes $(MINUTES)
 
 # Three controllers in C on an emulated Cortex-M4F; says so where the Debian packages for it are missing.
 embedded: $(VENV)/installed-dev

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from koopmpc.errors import DataError, DefinitenessError, ShapeError
 
 HUGE = 1e30  # a state or a reference beyond it is a bad one: its square overflows
+_REAL = np.dtype(np.float64)
 MOST = 2**31 - 1  # refuse a larger number of steps, episodes or tries: C and CasADi count no further
 LARGEST = 1e100  # refuse a matrix of a model or a weight with a larger entry: products of three of them overflow
 
@@ -301,7 +302,7 @@ def numbers(value: ArrayLike | None, name: str) -> Float[np.ndarray, "..."]:
         It is no array of numbers.
     """
     try:
-        if value is not None:
+        if value is not None and getattr(value, "dtype", _REAL).kind != "c":  # numpy would only warn of these
             return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         pass

@@ -10,9 +10,11 @@ import secrets
 import shutil
 import stat
 import tempfile
+import time
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from functools import cache
+from glob import escape
 from multiprocessing.util import Finalize
 from os import PathLike
 from pathlib import Path
@@ -68,6 +70,7 @@ def writing(path: str | PathLike[str]) -> Generator[BinaryIO]:
         part = beside(file)
         try:  # before the file is there, so that no interrupt leaves it
             stream = _Stream(part, "wb" if part == file else "xb")
+            _lock(stream.fileno())
             with io.BufferedWriter(stream) as buffered:
                 yield cast("BinaryIO", buffered)
                 buffered.flush()
@@ -105,10 +108,20 @@ def beside(file: Path) -> Path:
     """Return the path of a new file beside this one; a device or a pipe itself."""
     if file.exists() and not file.is_file():
         return file
+    _remove_abandoned(file)
     return file.with_name(f".{file.name[:80]}.{secrets.token_hex(4)}{PART}")
 
 
 PART = ".part"  # ends the name of a file that is being written
+_ABANDONED = 3600.0  # [s] after which one that no process holds and nobody has written to is what a killed one left
+
+
+def _remove_abandoned(file: Path) -> None:
+    """Remove what processes that were killed while they wrote this file left beside it."""
+    for part in file.parent.glob(f".{escape(file.name[:80])}.{'[0-9a-f]' * 8}{PART}"):
+        with suppress(OSError), part.open("rb") as stream:
+            if time.time() - part.stat().st_mtime > _ABANDONED and _lock(stream.fileno()):
+                part.unlink()
 
 
 def settle(part: Path, file: Path, number: int) -> None:

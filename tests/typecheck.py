@@ -18,11 +18,7 @@ from typing import Any
 import jaxtyping
 import numpy as np
 from beartype import BeartypeConf, beartype
-from numpy._typing._array_like import _Buffer
-from numpy._typing._nested_sequence import _NestedSequence
 
-_NestedSequence.register(tuple)  # numpy takes a tuple as ArrayLike, though it has no __reversed__
-_Buffer.register(np.ndarray)  # an array is ArrayLike at the first try in Python 3.11 too, as in 3.12
 # Ints pass for floats; what does not fit is a TypeError, as jaxtyping's own errors are.
 beartyped = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=jaxtyping.TypeCheckError))
 
@@ -37,6 +33,11 @@ _typed_before: dict[
 
 def hook() -> None:
     """Let every module of koopmpc that is imported from now on check its types."""
+    from numpy._typing._array_like import _Buffer  # which the lowest numpy that is allowed has not
+    from numpy._typing._nested_sequence import _NestedSequence
+
+    _NestedSequence.register(tuple)  # numpy takes a tuple as ArrayLike, though it has no __reversed__
+    _Buffer.register(np.ndarray)  # an array is ArrayLike at the first try in Python 3.11 too, as in 3.12
     if sys.version_info < (3, 12):  # later versions ask a protocol once for its attributes, too
         typing._get_protocol_attrs = functools.cache(typing._get_protocol_attrs)
     jaxtyping.jaxtyped = _checked  # the decorator that the import hook writes above each function and class

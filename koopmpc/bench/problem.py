@@ -176,7 +176,11 @@ class Problem:
     file: str = field(default="", init=False)  # `replace` leaves it out, for the file no longer holds that problem
 
     def __post_init__(self) -> None:
+        checks.members(self.dynamics, "dynamics", ("nx", "nu", "states", "inputs"), "pass Dynamics of yours")
         nx, nu = self.dynamics.nx, self.dynamics.nu
+        checks.kind(self.equilibrium, "equilibrium", (tuple, list), "pass (x, u) of a resting plant")
+        if len(self.equilibrium) != 2:
+            raise ShapeError(f"equilibrium has {len(self.equilibrium)} parts; pass (x, u) of a resting plant")
         x, u = self.equilibrium
         point = checks.array(x, "equilibrium x", (nx,)), checks.vector(u, "equilibrium u", nu)
         object.__setattr__(self, "equilibrium", point)
@@ -306,6 +310,7 @@ def load_problem(problem: str | Path) -> Problem:
     >>> problem.dt, list(problem.cases)
     (0.05, ['upright', 'hang', 'hold'])
     """
+    checks.kind(problem, "problem", (str, Path), "pass a problem's name or the path of its file")
     text = str(problem)
     path, case = _find(text), ""
     name, colon, last = text.rpartition(":")
@@ -340,9 +345,12 @@ def new_problem(name: str | Path) -> Path:
     return path
 
 
+_LONGEST = 256  # bytes of a file's name from which on systems refuse to look
+
+
 def _find(text: str) -> Path | None:
     path = Path(text)
-    if path.is_file():
+    if len(path.name.encode()) < _LONGEST and path.is_file():
         return path
     return next((entry.path for entry in list_problems() if entry.name == text), None)
 

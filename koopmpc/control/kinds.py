@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from koopmpc import checks
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller
 from koopmpc.control.program import Published, SavedController
@@ -67,6 +68,7 @@ _BENCH: dict[str, BenchEntry] = {}
 
 def register_controller(kind: ControllerKind) -> None:
     """Register a kind of controller, by the name of its class; a kind of the same name is replaced."""
+    checks.kind(kind, "kind", ControllerKind, "see docs/extending.md")
     _KINDS[kind.controller.__name__] = kind
     _BENCH.update({entry.name: entry for entry in kind.bench})
 

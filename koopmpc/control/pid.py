@@ -92,6 +92,11 @@ class PID(FeedbackLaw):
         bias: ArrayLike = 0.0,
     ) -> None:
         gains = [np.atleast_1d(checks.array(value, name)) for value, name in ((kp, "kp"), (ki, "ki"), (kd, "kd"))]
+        for given, name in ((outputs, "outputs"), (references, "references")):
+            if given is not None:
+                checks.kind(given, name, (tuple, list, range, np.ndarray), "pass one index a loop")
+        if limits is not None:
+            checks.kind(limits, "limits", Limits, "pass km.Limits(u_min=…, u_max=…)")
         nu = max(len(outputs) if outputs is not None else 1, *(g.size for g in gains))
         self.kp, self.ki, self.kd = (
             checks.vector(value, name, nu) for value, name in ((kp, "kp"), (ki, "ki"), (kd, "kd"))

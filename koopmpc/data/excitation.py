@@ -177,6 +177,9 @@ class Multisine(OpenLoop):
     def __init__(
         self, amplitude: ArrayLike, period: float, harmonics: int | Sequence[int], offset: ArrayLike = 0.0
     ) -> None:
+        checks.kind(
+            harmonics, "harmonics", (int, tuple, list, range, np.ndarray), "pass their number, or a list of them"
+        )
         chosen = range(1, checks.count(harmonics, "harmonics") + 1) if isinstance(harmonics, int) else harmonics
         size = _inputs(amplitude, "amplitude")
         freeze(

@@ -344,7 +344,7 @@ class LiftedKalman(Value):
             object.__setattr__(self, "outputs", tuple(given))
         else:
             object.__setattr__(self, "outputs", checks.array(cast("ArrayLike", given), "outputs", (None, None)))
-        if self.disturbance not in ("input", "output"):
+        if not checks.among(self.disturbance, ("input", "output")):
             raise DataError(f'disturbance is {self.disturbance!r}; pass "input" or "output"')
         for name in ("process", "drift", "noise"):
             if getattr(self, name) is None:

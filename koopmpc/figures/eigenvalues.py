@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.figures.style import CYCLIC, SEQUENTIAL, Width, make_figure, styled
 from koopmpc.lifting.base import find_state
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.validate.residuals import ResidualDMD, check_residuals
 from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Value
@@ -58,6 +58,7 @@ def spectrum(predictor: AnyPredictor, residuals: ResidualDMD | ArrayLike | None 
     """
     from matplotlib.lines import Line2D
 
+    checks.kind(predictor, "predictor", (LinearPredictor, BilinearPredictor), "pass a model, as edmd returns")
     checked = None if residuals is None else check_residuals(predictor, residuals)
     values: Any = predictor.eigenvalues if checked is None else checked.eigenvalues
     whole = 1.12 * max(1.0, float(np.abs(values).max(initial=0.0)))
@@ -177,6 +178,9 @@ def make_plane(states: Sequence[str], axes: Axes, over: Over, at: ArrayLike | No
     DataError
         There is no such state, both axes are the same state, or a range is empty.
     """
+    checks.kind(axes, "plane", (tuple, list), "pass the two states that span it, by index or name")
+    if len(axes) != 2:
+        raise ShapeError(f"plane names {len(axes)} states; pass the two that span it")
     first, second = (find_state(state, states, "the plane") for state in axes)
     if first == second:
         raise DataError(f"both axes of the plane are {states[first]}; name two different states")
@@ -262,6 +266,7 @@ def eigenfunction_maps(
     DataError
         There is no such eigenfunction or state, a range is empty, A is defective, or φ_j is 0 on the plane.
     """
+    checks.kind(predictor, "predictor", (LinearPredictor, BilinearPredictor), "pass a model, as edmd returns")
     embedded = predictor.embed(over) if isinstance(over, Episodes) else over
     grid = make_plane(predictor.point_names, plane, embedded, at, points)
     phi = evaluate_eigenfunctions(predictor, which, grid)

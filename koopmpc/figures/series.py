@@ -111,6 +111,7 @@ def run(run: Run, *, states: StateChoice | None = None, width: Width = "one colu
     DataError
         There are too many states for one figure.
     """
+    checks.kind(run, "run", Run, "pass what simulate or load_run returns")
     chosen, nu, t = choose_states(states, run.states), len(run.inputs), run.time
     drawing, axes = _stack_panels(len(chosen), nu, 1, width)
     tracked = run.name_references(run.reference.shape[1])
@@ -195,7 +196,10 @@ def error(
     """
     from matplotlib.ticker import MaxNLocator
 
+    checks.kind(scores, "scores", (Score, Mapping), "pass what score returns, or several by name")
     named = {"": scores} if isinstance(scores, Score) else dict(scores)
+    for each in named.values():
+        checks.kind(each, "a score", Score, "pass what score returns")
     if not named:
         raise DataError("there is no score; pass one, or several by name")
     first, *others = named.values()
@@ -324,6 +328,8 @@ def reconstruction(
         There is no case, or dt is not above zero.
     """
     dt = checks.positive(dt, "dt", "s")
+    checks.kind(cases, "cases", Mapping, "pass name → (true states, reconstructions)")
+    states = checks.texts(states, "states")
     if not cases:
         raise DataError("there is no case to draw; pass at least one")
     drawing, grid = _arrange_columns([*states, "relative error"], list(cases), 0.92)

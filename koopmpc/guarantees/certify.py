@@ -237,6 +237,7 @@ class _Search:
 
 def _check_constants(error: tuple[float, float] | None, lipschitz: float | None, estimated: bool) -> tuple[float, ...]:
     """Return the constants that the user gives: two, one or none."""
+    checks.kind(estimated, "estimated", (bool, np.bool_), "pass True or False")
     if error is not None and lipschitz is not None:
         raise DataError("error and lipschitz are both given; pass one of them")
     if (error is not None or lipschitz is not None) and estimated:

@@ -276,10 +276,8 @@ def find_state(state: int | str, states: Sequence[str], who: str) -> int:
 
 def find_states(chosen: StateChoice | None, states: Sequence[str], who: str) -> list[int]:
     """Return the indices of the chosen states; None chooses all states."""
-    if chosen is None:
-        return list(range(len(states)))
-    choices = [chosen] if isinstance(chosen, int | str) else chosen
-    return [find_state(state, states, who) for state in choices]
+    choices = freeze_choice(chosen)
+    return list(range(len(states))) if choices is None else [find_state(state, states, who) for state in choices]
 
 
 def freeze_choice(chosen: StateChoice | None) -> tuple[int | str, ...] | None:
@@ -287,4 +285,7 @@ def freeze_choice(chosen: StateChoice | None) -> tuple[int | str, ...] | None:
     if chosen is None:
         return None
     choices = [chosen] if isinstance(chosen, int | str | np.integer) else chosen
-    return tuple(state if isinstance(state, str) else int(state) for state in choices)
+    try:
+        return tuple(state if isinstance(state, str) else int(state) for state in choices)
+    except (TypeError, ValueError, OverflowError):
+        raise DataError(f"states is {chosen!r:.60}; pass names of states or their indices") from None

@@ -56,6 +56,7 @@ class ONNX(Lifting):
     chosen: tuple[int | str, ...] | None
 
     def __init__(self, path: str | Path, states: StateChoice | None = None, names: Sequence[str] | None = None) -> None:
+        checks.kind(path, "path", (str, Path), "pass the path of an .onnx file")
         file = Path(path)
         graph = _read_network(file)
         labels = tuple(f"{file.stem}{i}" for i in range(graph.m)) if names is None else checks.texts(names, "names")

@@ -73,9 +73,11 @@ class Injections(Injection):
     def __init__(self, faults: Sequence[Fault], wiring: Wiring, rng: np.random.Generator) -> None:
         if isinstance(cast(object, faults), Fault):
             raise DataError(f"faults is {faults}; pass a list of faults, for example faults=[{faults}]")
+        checks.kind(faults, "faults", (tuple, list), "pass a list of faults")
         for fault in faults:
             if not isinstance(cast(object, fault), Fault):
                 raise DataError(f"faults holds {fault!r}; pass objects, for example faults=[km.faults.NaNSensor()]")
+        checks.kind(rng, "rng", np.random.Generator, "pass numpy.random.default_rng(seed)")
         self._parts = [fault.start(wiring, own) for fault, own in zip(faults, rng.spawn(len(faults)), strict=True)]
 
     def measured(self, k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " ny"]:
@@ -112,9 +114,11 @@ class _Windowed(Fault):
             checks.count(self.end, "end", self.begin + 1)
         for name in ("probability", "fraction"):
             share = getattr(self, name, 0.0)
-            if not 0.0 <= float(checks.array(share, name, ())) <= 1.0:
+            if not 0.0 <= (share := float(checks.array(share, name, ()))) <= 1.0:
                 raise DataError(f"{name} is {share:g}; it must be between 0 and 1")
         channels: Sequence[int] | None = getattr(self, "channels", None)
+        if channels is not None:
+            checks.kind(channels, "channels", (tuple, list, range, np.ndarray), "pass a list of indices")
         if channels is not None:  # kept as a tuple, so that nobody changes the fault afterwards
             object.__setattr__(self, "channels", tuple(checks.count(i, "channels", 0) for i in channels))
 

@@ -17,7 +17,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Move, Plan, Status
 from koopmpc.data.files.frames import build_frame
-from koopmpc.errors import Hint
+from koopmpc.errors import DataError, Hint
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
 from koopmpc.predict.base import Predictor
@@ -186,6 +186,11 @@ class StepRows(Value):
     @staticmethod
     def join(parts: Sequence["StepRows"]) -> "StepRows":
         """Return consecutive parts as one, without the last move where the state that it led to is missing."""
+        checks.kind(parts, "parts", (tuple, list), "pass a list of StepRows")
+        if not parts:
+            raise DataError("parts is empty; pass one StepRows at least")
+        for part in parts:
+            checks.kind(part, "a part", StepRows, "pass a list of StepRows")
         moves = sum(len(part.X) for part in parts) - 1
         whole: dict[str, Any] = {}
         for name in (f.name for f in fields(StepRows)):
@@ -258,6 +263,8 @@ class About(Value):
         names = self.states, self.inputs
         for part in ("cost", "limits"):
             given: Cost | Limits | None = getattr(self, part)
+            if given is not None:
+                checks.kind(given, part, Cost if part == "cost" else Limits, "leave it out, or pass one of km")
             if given is not None and any(isinstance(value, Mapping) for value in vars(given).values()):
                 object.__setattr__(self, part, given.resolve(*names))
         check_rows = getattr(super(), "__post_init__", None)
@@ -270,6 +277,7 @@ class About(Value):
 
     def name_references(self, nr: int) -> tuple[str, ...]:
         """Return the names of the `nr` outputs that the references belong to."""
+        nr = checks.count(nr, "nr", 0)
         tracked = None if self.cost is None else bind_outputs(self.cost.of, self.states)
         names = self.states if tracked is None else tracked.names
         return tuple(names) if len(names) == nr else tuple(f"reference {i}" for i in range(nr))
@@ -344,7 +352,7 @@ class Run(About, StepRows):
 
     def take_first(self, steps: int) -> "Run":
         """Return the first steps of this run as a run without plans; itself where it has no more."""
-        if steps >= self.steps:
+        if checks.count(steps, "steps") >= self.steps:
             return self
         rows = {name: values[: steps + (name in _OF_STATES)] for name, values in self.columns().items()}
         return replace(self, **rows, plans=None)

@@ -66,7 +66,10 @@ class GymPlant:
         start: Callable[[Any, Float[np.ndarray, " nx"]], object] | None = None,
         scene: Scene | None = None,
     ) -> None:
-        self.env = gymnasium.make(env) if isinstance(env, str) else env
+        try:
+            self.env = gymnasium.make(env) if isinstance(env, str) else env
+        except gymnasium.error.Error as error:
+            raise DataError(f"Gymnasium makes no environment {env!r}: {error}") from None
         checks.kind(self.env, "env", gymnasium.Env, "pass an environment, or its name as a text")
         self._core: Any = self.env.unwrapped
         self._name = type(self._core).__name__ if self.env.spec is None else self.env.spec.id

@@ -303,6 +303,8 @@ def _store_fields(
 ) -> None:
     """Check the fields that all predictors share and store them."""
     states, inputs = checks.texts(states, "states"), checks.texts(inputs, "inputs")
+    if embedding is not None:
+        checks.kind(embedding, "embedding", Delay, "pass km.Delay(steps)")
     bound_embedding = None if embedding is None else embedding.bind(states, inputs)
     bound = check_lifting(lifting).bind(states if bound_embedding is None else bound_embedding.names)
     nz, nx, nu = bound.nz, len(states), len(inputs)

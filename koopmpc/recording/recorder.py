@@ -141,9 +141,9 @@ class Recorder:
             cost=cost,
             limits=limits,
             dt=checks.positive(dt, "dt", "s"),
-            states=tuple(states),
-            inputs=tuple(inputs),
-            outputs=tuple(states if outputs is None else outputs),
+            states=checks.texts(states, "states"),
+            inputs=checks.texts(inputs, "inputs"),
+            outputs=checks.texts(states if outputs is None else outputs, "outputs"),
             angles=tuple(angles),
             metadata=dict(metadata or {}),
         )

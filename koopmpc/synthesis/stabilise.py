@@ -11,7 +11,7 @@ from koopmpc import checks
 from koopmpc.control.lqr import dlqr
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Excitation, Feedback, Noise
-from koopmpc.errors import DataError, FitWarning, KoopmpcError
+from koopmpc.errors import DataError, FitWarning, KoopmpcError, ShapeError
 from koopmpc.plants.plant import Plant, SimulatedPlant, require_plant
 from koopmpc.plants.step_map import StepMap
 from koopmpc.values import Value
@@ -118,6 +118,9 @@ def stabilise(
     require_plant(plant)
     draw = checks.generator(rng)
     nu = len(plant.inputs)
+    checks.kind(equilibrium, "equilibrium", (tuple, list), "pass (x, u) of the resting plant")
+    if len(equilibrium) != 2:
+        raise ShapeError(f"equilibrium has {len(equilibrium)} parts; pass (x, u) of the resting plant")
     x_ref = np.atleast_1d(checks.array(equilibrium[0], "the equilibrium's state"))
     nx = len(x_ref)
     if len(plant.outputs) != nx:

@@ -92,7 +92,7 @@ def train(
     N, most = checks.count(horizon, "horizon"), checks.count(windows, "windows")
     checks.count(iterations, "iterations")
     weight = checks.positive(ridge, "ridge")
-    source, generator = source_of(episodes), np.random.default_rng(rng)
+    source, generator = source_of(episodes), checks.generator(rng)
     if not source.replayable:
         raise DataError("a stream is read once, and train needs it more often; save it, and pass that")
     if embedding is not None:

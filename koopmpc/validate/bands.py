@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.episodes import Episode, Episodes, episodes_of
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.validate.scoring import AnyPredictor, Score, embed_episodes, forecast_errors, score
@@ -146,7 +146,7 @@ def conformal(
     trajectory: Cleaveland et al., "Conformal prediction regions for time series using linear complementarity
     programming", AAAI 2024.
     """
-    level = float(checks.array(level, "level", ()))
+    episodes, level = episodes_of(episodes), float(checks.array(level, "level", ()))
     if not 0 < level < 1:
         raise DataError(f"level is {level:g}; pass a probability between 0 and 1, such as 0.9")
     if len(episodes) < 2:

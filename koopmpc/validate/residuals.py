@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
-from koopmpc.data.source import Source
+from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.moments.moments import Moments, both_sides
 from koopmpc.identify.moments.read import second_moments
@@ -55,9 +55,11 @@ def compute_moments(
     ShapeError, DataError
         The episodes and the predictor differ in states, inputs, disturbances or dt.
     """
+    source_of(episodes)
     if isinstance(model, Lifting):
         lifting, driven = model, not bilinear
     else:
+        checks.kind(model, "model", (LinearPredictor, BilinearPredictor), "pass a model, or a lifting")
         check_same_names(model, episodes)
         lifting, embedding, bilinear = model.lifting, model.embedding, isinstance(model, BilinearPredictor)
         driven = isinstance(model, LinearPredictor) and model.nw > 0

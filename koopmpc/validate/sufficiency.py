@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episodes
+from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.moments.moments import Moments, both_sides
@@ -215,7 +215,7 @@ def coverage(
     DataError
         An entry of `low` is above that of `high`.
     """
-    n = episodes.nx + episodes.nu
+    n = episodes_of(episodes).nx + episodes.nu
     samples = sum(len(episode) for episode in episodes)
     bins = (
         min(_MOST_BINS, max(int(np.sqrt(samples / _CELL_SAMPLES)), 2)) if bins is None else checks.count(bins, "bins")
@@ -317,7 +317,7 @@ def persistency(episodes: Episodes, order: int) -> Persistency:
     Waarde et al., "Willems' fundamental lemma for state-space systems and its extension to multiple datasets",
     IEEE Control Syst. Lett. 4, 2020.
     """
-    order = checks.count(order, "order")
+    episodes, order = episodes_of(episodes), checks.count(order, "order")
     if episodes.nu == 0:
         raise DataError("the episodes have no inputs; persistency needs episodes with inputs")
     longest = max(len(episode) for episode in episodes)

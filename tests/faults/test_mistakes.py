@@ -10,6 +10,8 @@ import pytest
 import koopmpc as km
 from koopmpc.fitting.goal import read_goal
 from koopmpc.predict import spectrum
+from tests.faults.garbage import foreign
+from tests.tiers import slow
 
 pytestmark = pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
 
@@ -135,6 +137,22 @@ TAKES = {
     "problems": lambda bad: km.sweep(bad, ["lqr"], folder="nowhere"),
     "store": lambda bad: km.sweep([PENDULUM], ["lqr"], folder=bad),
 }
+
+
+@pytest.mark.parametrize("calls", [400, *slow([20_000])])
+@pytest.mark.filterwarnings("ignore")
+def test_drawn_calls_end_in_a_value_or_an_error_of_ours(calls, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert list(foreign(calls, calls)) == []
+
+
+@pytest.mark.parametrize("bad", [[1j, 0.0], np.array([1j, 0.0]), np.array([1 + 0j, 0.0])])
+def test_complex_readings_are_refused_by_every_controller(stateful, bad):
+    for name, each in stateful.items():
+        if "observer" not in name and name != "plant":
+            each.reset()
+            with pytest.raises(km.KoopmpcError, match="y is complex"):
+                each(bad, [0.0, 0.0])
 
 
 @pytest.mark.parametrize("where", TAKES)

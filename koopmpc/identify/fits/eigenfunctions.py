@@ -94,6 +94,7 @@ def eigenfunctions(
     checks.kind(episodes, "episodes", Episodes, "collect or load some")
     if not checks.among(by, ("steps", "derivatives")):
         raise DataError(f'by is {by!r}; pass "steps" or "derivatives"')
+    growth = float(checks.array(growth, "growth", ()))
     if growth < 1:
         raise DataError(f"growth is {growth:g}; pass a factor of at least 1")
     tolerance, count = checks.positive(tolerance, "tolerance"), checks.count(count, "count")

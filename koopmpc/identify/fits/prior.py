@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -160,6 +160,10 @@ class Prior(Value):
         combinations: Sequence[Combination] = (),
         dissipation: Dissipation | None = None,
     ) -> None:
+        if rows is not None:
+            checks.kind(rows, "rows", Mapping, 'pass {"x [m]": {"v [m/s]": 0.1}}')
+            for name, row in rows.items():
+                checks.kind(row, f"rows[{name!r}]", Mapping, 'pass {"v [m/s]": 0.1}')
         known = {
             name: {other: float(checks.array(v, f"rows[{name!r}]", ())) for other, v in row.items()}
             for name, row in (rows or {}).items()
@@ -176,7 +180,7 @@ class Prior(Value):
             lower_B=checks.array(lower_B, "lower_B", infinite=True),
             upper_B=checks.array(upper_B, "upper_B", infinite=True),
             symmetric=bool(symmetric),
-            combinations=tuple(combinations),
+            combinations=_check_combinations(combinations),
             dissipation=dissipation,
         )
 
@@ -184,6 +188,14 @@ class Prior(Value):
     def couples_rows(self) -> bool:
         """True if the prior couples rows of [A B] by symmetry, combinations or dissipation."""
         return self.symmetric or bool(self.combinations) or self.dissipation is not None
+
+
+def _check_combinations(given: object) -> tuple[Combination, ...]:
+    checks.kind(given, "combinations", (tuple, list), "pass a list of Combination")
+    found = tuple(cast("Sequence[Combination]", given))
+    for each in found:
+        checks.kind(each, "an entry of combinations", Combination, "pass a list of Combination")
+    return found
 
 
 @dataclass(frozen=True, eq=False)

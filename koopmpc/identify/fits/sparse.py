@@ -137,7 +137,7 @@ def sparse_edmd(
     Zou, "The adaptive lasso and its oracle properties", J. Am. Stat. Assoc. 101, 2006.
     """
     penalty = checks.positive(penalty, "penalty")
-    if over not in ("observables", "entries"):
+    if not checks.among(over, ("observables", "entries")):
         raise DataError(f'over is {over!r}; pass "observables" or "entries"')
     regression = read_regression(episodes, lifting, embedding, "sparse_edmd", **options)
     names, nz = regression.lifting.names, regression.lifting.nz

@@ -108,10 +108,11 @@ def source_episodes(source: Source) -> Episodes:
 
 def check_list(values: Sequence[int] | int, least: int) -> list[int]:
     """Return whole numbers, each once, in ascending order."""
+    checks.kind(values, "a list of sizes", (int, np.integer, tuple, list, range), "pass a whole number, or several")
     given = [values] if isinstance(values, int | np.integer) else list(values)
-    found = sorted({checks.count(int(value), "delays and degrees", least) for value in given})
+    found = sorted({checks.count(value, "a size", least) for value in given})
     if not found:
-        raise DataError("delays or degrees is empty; pass at least one number")
+        raise DataError("a list of sizes is empty; pass at least one number")
     return found
 
 
