@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal, cast
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from koopmpc import disk
+from koopmpc import checks, disk
 from koopmpc.errors import DataError
 from koopmpc.lifting.base import StateChoice, find_states
 
@@ -105,7 +105,7 @@ def make_figure(
     """
     from matplotlib.figure import Figure
 
-    if width not in WIDTHS:
+    if not checks.among(width, WIDTHS):
         raise DataError(f"width is {width!r}; pass one of {', '.join(WIDTHS)}")
     drawing = Figure(figsize=(WIDTHS[width], height), layout="constrained")
     return drawing, drawing.subplots(rows, columns, squeeze=False, **more)

@@ -10,7 +10,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
+from operator import index
+from typing import ClassVar, cast
 
 import casadi as ca
 import numpy as np
@@ -269,7 +270,7 @@ def find_state(state: int | str, states: Sequence[str], who: str) -> int:
         matches = [i for i, name in enumerate(states) if state in (name, strip_unit(name))]
         if len(matches) == 1:
             return matches[0]
-    elif -len(states) <= state < len(states):
+    elif isinstance(cast(object, state), int | np.integer) and -len(states) <= state < len(states):
         return state % len(states)
     raise DataError(f"{who} is asked for state {state!r}; the states are {', '.join(states)}, or 0 … {len(states) - 1}")
 
@@ -286,6 +287,6 @@ def freeze_choice(chosen: StateChoice | None) -> tuple[int | str, ...] | None:
         return None
     choices = [chosen] if isinstance(chosen, int | str | np.integer) else chosen
     try:
-        return tuple(state if isinstance(state, str) else int(state) for state in choices)
+        return tuple(state if isinstance(state, str) else index(state) for state in choices)
     except (TypeError, ValueError, OverflowError):
         raise DataError(f"states is {chosen!r:.60}; pass names of states or their indices") from None

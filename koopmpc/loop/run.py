@@ -154,6 +154,8 @@ class StepRows(Value):
     u_reference: Float[np.ndarray, "m nu"] = field(default_factory=lambda: np.empty((0, 0)))
 
     def __post_init__(self) -> None:
+        for name in ("X", "Y", "U", "reference", "u_reference"):
+            checks.kind(getattr(self, name), name, np.ndarray, "a Run comes of simulate or load_run")
         if not self.u_reference.size:
             object.__setattr__(self, "u_reference", np.zeros(self.U.shape))
         for column in MOVE_COLUMNS:

@@ -137,6 +137,8 @@ class Recorder:
         if path is None and not live:
             raise DataError("a Recorder needs somewhere to write: pass a path, live=True, or both")
         check_judges(cost, limits)
+        if metadata is not None:
+            checks.kind(metadata, "metadata", Mapping, "pass names with numbers and texts")
         self._about = About(
             cost=cost,
             limits=limits,

@@ -99,6 +99,8 @@ class Station(Published):
                 if mine != other:
                     raise DataError(f"the controller has {name} = {mine:g}, the standby {other:g}; they must agree")
         self.horizon = max(controller.horizon, 0 if self.standby is None else self.standby.horizon)
+        if limits is not None:
+            checks.kind(limits, "limits", Limits, "pass km.Limits(u_min=…, u_max=…)")
         self.limits = limits or Limits()
         self.inputs, self.rates = self.limits.inputs(self.nu), self.limits.rates(self.nu)
         width = np.where(np.isfinite(self.inputs.high - self.inputs.low), self.inputs.high - self.inputs.low, np.inf)

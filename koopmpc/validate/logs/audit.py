@@ -140,6 +140,8 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditR
         The data are not Episodes, or the times do not match them.
     """
     data = _take_first(episodes_of(data))
+    if times is not None:
+        checks.kind(times, "times", (tuple, list), "pass one array of times an episode")
     faults = [] if times is None else list(find_clock_faults(data, times))
     log = Log(data)
     for check in (*_VALUE_CHECKS, *(_INPUT_CHECKS if data.nu else ())):
