@@ -4,6 +4,7 @@ import os
 import shlex
 import subprocess
 import sys
+import tomllib
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -281,3 +282,28 @@ def test_logs_are_served_to_this_machine_alone_until_the_server_is_stopped(call,
         ours = [line.split()[3] for line in listening.splitlines() if f":{port} " in line or f":{data} " in line]
         assert all(place.startswith("127.0.0.1:") for place in ours)
     assert not is_up(port)
+
+
+def test_without_a_command_the_four_ways_in_are_shown_each_with_a_command_that_exists(call):
+    done = subprocess.run([sys.executable, "-m", "koopmpc"], capture_output=True, text=True)
+    listed = call("--help").stdout
+    assert done.returncode == 0, done.stderr
+    assert "--help" in done.stdout
+    for word in ("run", "new", "fit", "export", "doctor"):
+        assert f"koopmpc {word}" in done.stdout
+        assert f" {word} " in listed
+
+
+def test_the_doctor_names_what_is_missing_and_how_it_is_had(call, monkeypatch):
+    well = call("doctor")
+    assert well.exit_code == 0
+    assert version("casadi") in well.stdout
+    monkeypatch.setenv("PATH", "/nowhere")
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr("koopmpc.cli.start.find_spec", lambda name: None)
+    ill = " ".join(call("doctor").stdout.split())
+    assert "none of $CC, cc, gcc, clang" in ill
+    for extra in tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]:
+        assert extra in ("dev", "docs", "peers") or f"[{extra}]'" in ill, extra

@@ -14,5 +14,7 @@ def app(*arguments: Any, **options: Any) -> None:
     with ENDING:
         from koopmpc.cli.app import app as commands
 
+        if not arguments and len(sys.argv) == 1:
+            arguments = (["start"],)
         commands(*arguments, **options)
     sys.exit(0)

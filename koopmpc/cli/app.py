@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from koopmpc.cli import sweeps
+from koopmpc.cli import start, sweeps
 from koopmpc.cli.console import (
     bar,
     console,
@@ -435,5 +435,6 @@ def reproduce(
 
 
 app.command("run")(sweeps.run_problem)
-for command in (sweeps.bench, sweeps.report, sweeps.compare, sweeps.inspect, sweeps.replay):
+app.command("start")(start.show_ways)
+for command in (sweeps.bench, sweeps.report, sweeps.compare, sweeps.inspect, sweeps.replay, start.doctor):
     app.command()(command)
