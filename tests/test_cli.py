@@ -307,3 +307,13 @@ def test_the_doctor_names_what_is_missing_and_how_it_is_had(call, monkeypatch):
         "optional-dependencies"
     ]:
         assert extra in ("dev", "docs", "peers") or f"[{extra}]'" in ill, extra
+
+
+def test_the_doctor_says_what_is_missing_where_half_an_extra_is_installed(call, monkeypatch):
+    monkeypatch.setattr("koopmpc.cli.start.find_spec", lambda name: None if name == "mcap" else name)
+    assert "[ros]'" in " ".join(call("doctor").stdout.split())
+
+
+def test_what_new_prints_last_is_the_line_that_runs_it(call):
+    made = call("new", "mine")
+    assert shlex.split(made.stdout.split("run it: ")[1])[-2:] == ["run", "mine.py"]

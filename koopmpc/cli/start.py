@@ -27,22 +27,22 @@ CORE = ("numpy", "scipy", "casadi", "osqp", "daqp", "cvxpy", "rerun-sdk", "pyarr
 class Extra(NamedTuple):
     """What an optional package is for."""
 
-    module: str
+    modules: tuple[str, ...]
     extra: str
     purpose: str
 
 
 EXTRAS = (
-    Extra("distributed", "dask", "sweeps and fits on a Dask cluster"),
-    Extra("gymnasium", "gym", "plants that are Gymnasium environments"),
-    Extra("imageio_ffmpeg", "video", "export-video to .mp4"),
-    Extra("sklearn", "sklearn", "KoopmanRegressor in a pipeline"),
-    Extra("fmpy", "fmu", "plants that are FMUs"),
-    Extra("pandas", "pandas", "data frames in and out"),
-    Extra("h5py", "hdf5", "logs in .h5 and MATLAB's v7.3 files"),
-    Extra("asammdf", "mdf", "logs in .mf4"),
-    Extra("rosbags", "ros", "logs in .mcap and .db3"),
-    Extra("asyncua", "opcua", "plants behind an OPC UA server"),
+    Extra(("distributed",), "dask", "sweeps and fits on a Dask cluster"),
+    Extra(("gymnasium",), "gym", "plants that are Gymnasium environments"),
+    Extra(("imageio_ffmpeg",), "video", "export-video to .mp4"),
+    Extra(("sklearn",), "sklearn", "KoopmanRegressor in a pipeline"),
+    Extra(("fmpy",), "fmu", "plants that are FMUs"),
+    Extra(("pandas",), "pandas", "data frames in and out"),
+    Extra(("h5py",), "hdf5", "logs in .h5 and MATLAB's v7.3 files"),
+    Extra(("asammdf",), "mdf", "logs in .mf4"),
+    Extra(("rosbags", "mcap"), "ros", "logs in .mcap and .db3"),
+    Extra(("asyncua",), "opcua", "plants behind an OPC UA server"),
 )
 
 
@@ -81,7 +81,7 @@ def doctor() -> None:
     said = f"OPENBLAS_NUM_THREADS={threads}" if threads else "not pinned; OPENBLAS_NUM_THREADS=1 makes timings steady"
     rows.append((threads == "1", "BLAS threads", f"{said}; {os.cpu_count()} processors"))
     for extra in EXTRAS:
-        found = find_spec(extra.module) is not None
+        found = all(find_spec(module) is not None for module in extra.modules)
         rows.append((found, extra.extra, extra.purpose if found else f"{extra.purpose}: {install(extra.extra)}"))
     table = Table.grid(padding=(0, 1))
     for good, name, says in rows:
