@@ -6,8 +6,10 @@ A new family is added here.
 
 from koopmpc.lifting import composed as composed
 from koopmpc.lifting import fourier as fourier
+from koopmpc.lifting import neurons as neurons
 from koopmpc.lifting import radial as radial
 from koopmpc.lifting import saturated as saturated
 from koopmpc.lifting import state as state
 from koopmpc.lifting.composed import Projected as Projected
+from koopmpc.lifting.neurons import Neurons as Neurons
 from koopmpc.lifting.saturated import Saturated as Saturated

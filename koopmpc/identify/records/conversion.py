@@ -15,6 +15,7 @@ from koopmpc.identify.records.hidden import HiddenModel, RecordSegments, join_se
 from koopmpc.identify.regression import compute_scale_factor
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Projected, Sum
+from koopmpc.lifting.neurons import Neurons
 from koopmpc.lifting.saturated import Saturated
 from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.predict.base import FitReport
@@ -89,13 +90,16 @@ def to_standard(model: LinearPredictor | BilinearPredictor, units: SignalUnits) 
     # in standard units z⁺ = (A + Σ ūᵢ Nᵢ) ψ + B ū + Σ v (scale B + scale N ψ), ψ = [z, 1, monomials]
     A = A + np.einsum("i,inz->nz", mean_u, N)
     A[:, n] += B @ mean_u
-    degree = 1 if psi.nz == n + 1 else max(map(_degree_of, psi.names[n + 1 :]))
-    E = np.hstack([A[:, n : n + 1], A[:, :n], A[:, n + 1 :]])
-    blocks = [np.hstack([(B[:, i : i + 1] + N[i][:, n : n + 1]), N[i][:, :n], N[i][:, n + 1 :]]) * s
+    V = _weights_of(psi)
+    q = 0 if V is None else len(V)
+    last = psi.nz - q
+    degree = 1 if last == n + 1 else max(map(_degree_of, psi.names[n + 1 : last]))
+    E = np.hstack([A[:, n : n + 1], A[:, :n], A[:, n + 1 : last]])
+    blocks = [np.hstack([(B[:, i : i + 1] + N[i][:, n : n + 1]), N[i][:, :n], N[i][:, n + 1 : last]]) * s
               for i, s in enumerate(scale_u)]  # fmt: skip
     terms = list_terms(n, nu, degree)
     width = (len(terms) - (E.shape[1] - 1)) // max(nu, 1)  # products of an input: those of lower degree
-    E = np.hstack([E, *(block[:, :width] for block in blocks)])
+    E = np.hstack([E, *(block[:, :width] for block in blocks), A[:, last:]])
     mean, scale = units.zeta(embedding.steps)
     encoder = np.hstack([T[:, :-1] * scale, (T[:, -1] + T[:, :-1] @ mean)[:, None]])
     H = C / units.scale[:ny, None]
@@ -103,7 +107,13 @@ def to_standard(model: LinearPredictor | BilinearPredictor, units: SignalUnits) 
     bound = np.full(n, np.inf)
     if isinstance(embedding, HiddenState):
         bound = embedding.reach
-    return HiddenModel(terms, E, H, encoder, bound)
+    return HiddenModel(terms, E, H, encoder, bound, V)
+
+
+def _weights_of(lifting: Lifting) -> Float[np.ndarray, "q n1"] | None:
+    """Return the weights of the neurons that end a lifting; None without any."""
+    last = lifting.parts[-1] if isinstance(lifting, Sum) else lifting
+    return last.weights if isinstance(last, Neurons) else None
 
 
 def _degree_of(name: str) -> int:
@@ -131,10 +141,15 @@ def from_standard(
             high = np.concatenate([np.full(ny, np.inf), found.bound])
             monomials = Saturated(monomials, -high, high)
         lifting = State(hidden_names(n)) + Constant() + monomials
-    nz = 1 + len(list_terms(n, 0, degree))
-    A = np.hstack([found.E[:, 1 : 1 + n], found.E[:, :1], found.E[:, 1 + n : nz]])
-    N, B = np.zeros((nu, n, nz)), np.zeros((n, nu))
-    width = (found.E.shape[1] - nz) // max(nu, 1)
+    elif found.V is not None:
+        lifting = State(hidden_names(n)) + Constant()
+    if found.V is not None:
+        lifting = lifting + Neurons(found.V, states=hidden_names(n))
+    nz, q = 1 + len(list_terms(n, 0, degree)), len(found.neurons)
+    last = found.E.shape[1] - q
+    A = np.hstack([found.E[:, 1 : 1 + n], found.E[:, :1], found.E[:, 1 + n : nz], found.E[:, last:]])
+    N, B = np.zeros((nu, n, nz + q)), np.zeros((n, nu))
+    width = (last - nz) // max(nu, 1)
     for i in range(nu):
         block = found.E[:, nz + i * width : nz + (i + 1) * width] / scale_u[i]
         B[:, i] = block[:, 0]
@@ -143,7 +158,7 @@ def from_standard(
     A = A - np.einsum("i,inz->nz", mean_u, N)
     A[:, n] -= B @ mean_u
     about = episodes.dt, episodes.states, episodes.inputs
-    if degree == 1:
+    if degree == 1 and not q:
         # z = T ζ without an offset: z − t takes the place of z
         A[:, n] += A[:, :n] @ t - t
         C[:, -1] += C[:, :-1] @ t
@@ -155,6 +170,7 @@ def from_standard(
         return LinearPredictor(
             transition, np.vstack([B, np.zeros((1, nu))]), C, psi, *about, report, embedding=delay, scale=factor
         )
+    nz += q
     whole = np.zeros((nz, nz))
     whole[:n], whole[n, n] = A, 1.0
     driven, products = np.vstack([B, np.zeros((nz - n, nu))]), np.zeros((nu, nz, nz))

@@ -15,7 +15,7 @@ _FAR = 1e3  # a state beyond this many spreads has left the model
 
 @dataclass(frozen=True, eq=False)
 class HiddenModel:
-    """z⁺ = E φ(z, u), y = H [z; 1] and z = T [ζ; 1], φ = [1; products of z; inputs times such products].
+    """z⁺ = E φ(z, u), y = H [z; 1] and z = T [ζ; 1], φ = [1; products; u times products; tanh(V [z; 1])].
 
     All signals are deviations from their means, in standard deviations.
 
@@ -24,9 +24,11 @@ class HiddenModel:
     terms
         The factors of each product as indices of [1, z, u], from 1, padded with 0.
     E, H, T
-        (n, 1 + terms), (ny, n + 1) and (n, nζ + 1).
+        (n, 1 + terms + q), (ny, n + 1) and (n, nζ + 1).
     bound
         (n,) in terms with two factors of z or more, |z| counts as this at most: outside of the data they are constant.
+    V
+        (q, n + 1) slopes and offsets of the neurons tanh(V [z; 1]); None without any.
     """
 
     terms: Terms
@@ -34,6 +36,12 @@ class HiddenModel:
     H: Float[np.ndarray, "ny n1"]
     T: Float[np.ndarray, "n nzeta1"]
     bound: Float[np.ndarray, " n"]
+    V: Float[np.ndarray, "q n1"] | None = None
+
+    @property
+    def neurons(self) -> Float[np.ndarray, "q n1"]:
+        """V, of no rows without neurons."""
+        return np.zeros((0, self.order + 1)) if self.V is None else self.V
 
     @property
     def order(self) -> int:
@@ -42,14 +50,20 @@ class HiddenModel:
 
     @property
     def parameters(self) -> Float[np.ndarray, " p"]:
-        """All entries of E, H and T in one row."""
-        return np.concatenate([self.E.ravel(), self.H.ravel(), self.T.ravel()])
+        """All entries of E, H, T and V in one row."""
+        return np.concatenate([self.E.ravel(), self.H.ravel(), self.T.ravel(), self.neurons.ravel()])
 
     def with_parameters(self, p: Float[np.ndarray, " p"]) -> "HiddenModel":
-        """Return the model with other entries of E, H and T."""
-        a, b = self.E.size, self.E.size + self.H.size
-        E, H, T = p[:a].reshape(self.E.shape), p[a:b].reshape(self.H.shape), p[b:].reshape(self.T.shape)
-        return replace(self, E=E, H=H, T=T)
+        """Return the model with other entries of E, H, T and V."""
+        shapes = self.E.shape, self.H.shape, self.T.shape, self.neurons.shape
+        parts = np.split(p, np.cumsum([a * b for a, b in shapes])[:-1])
+        E, H, T, V = (part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
+        return replace(self, E=E, H=H, T=T, V=V if len(V) else None)
+
+    def add_neurons(self, V: Float[np.ndarray, "q n1"]) -> "HiddenModel":
+        """Return the same model with further neurons, their coefficients zero."""
+        E = np.hstack([self.E, np.zeros((self.order, len(V)))])
+        return replace(self, E=E, V=np.vstack([self.neurons, V]))
 
     def raise_degree(self, degree: int) -> "HiddenModel":
         """Return the same model with all products up to a degree, the new ones with coefficients of zero."""
@@ -135,7 +149,7 @@ class SimulationError:
         z = start_states(model, data.points)
         with np.errstate(over="ignore", invalid="ignore"):
             for k, u in enumerate(data.inputs):
-                z = self._features(z, u)[0] @ model.E.T
+                z = read_features(model, z, u) @ model.E.T
                 if not (np.abs(z) < _FAR).all():
                     return np.inf
                 gap = _gap(z @ model.H[:, :-1].T + model.H[:, -1], data, k)
@@ -148,22 +162,26 @@ class SimulationError:
         model, p = self.model.with_parameters(theta), len(theta)
         (m, ny), n, nphi = data.outputs.shape[1:], model.order, model.E.shape[1]
         first, last = model.E.size, model.E.size + model.H.size
+        begin, q = last + model.T.size, len(model.neurons)
+        W = model.E[:, nphi - q :]
         C = model.H[:, :-1]
         ones = np.ones((m, 1))
         D = np.zeros((m, p, n))
         E_part = D[:, :first].reshape(m, n, nphi, n)  # a view: the rows of E in D
         own = np.arange(n)
         outputs = np.arange(len(model.H))
-        D[:, last:].reshape(m, n, -1, n)[:, own, :, own] = np.hstack([data.points, ones])
+        D[:, last:begin].reshape(m, n, -1, n)[:, own, :, own] = np.hstack([data.points, ones])
         z = start_states(model, data.points)
         gradient, matrix = np.zeros(p), np.zeros((p, p))
         rows, gaps = list[np.ndarray](), list[np.ndarray]()
         for k, u in enumerate(data.inputs):
-            phi, slope = self._features(z, u, model.E)
-            assert slope is not None, "it was asked for"
+            phi, slope = self._features(model, z, u)
             D = np.matmul(D, slope.transpose(0, 2, 1))
             E_part = D[:, :first].reshape(m, n, nphi, n)
             E_part[:, own, :, own] += phi
+            if q:
+                bent = (1 - phi[:, nphi - q :] ** 2)[:, :, None] * np.hstack([z, ones])[:, None]  # (m, q, n + 1)
+                D[:, begin:].reshape(m, q, n + 1, n)[...] += bent[..., None] * W.T[:, None]
             z = phi @ model.E.T
             gap = _gap(z @ C.T + model.H[:, -1], data, k)
             J = D @ C.T  # (m, p, ny)
@@ -181,14 +199,12 @@ class SimulationError:
         return gradient / data.outputs.size, matrix / data.outputs.size
 
     def _features(
-        self, z: Float[np.ndarray, "m n"], u: Float[np.ndarray, "m nu"], E: Float[np.ndarray, "n nphi"] | None = None
-    ) -> tuple[Float[np.ndarray, "m nphi"], Float[np.ndarray, "m n n"] | None]:
-        """Return φ, and with E also ∂(E φ)/∂z."""
-        terms, n = self.model.terms, z.shape[1]
-        phi = read_features(self.model, z, u)
-        if E is None:
-            return phi, None
-        bound = self.model.bound
+        self, model: HiddenModel, z: Float[np.ndarray, "m n"], u: Float[np.ndarray, "m nu"]
+    ) -> tuple[Float[np.ndarray, "m nphi"], Float[np.ndarray, "m n n"]]:
+        """Return φ and ∂(E φ)/∂z."""
+        terms, n, E = model.terms, z.shape[1], model.E
+        phi = read_features(model, z, u)
+        bound = model.bound
         V = np.hstack([np.ones((len(z), 1)), np.clip(z, -bound, bound), u])
         inside = (np.abs(z) < bound).astype(float)
         slope = np.zeros((len(z), n, n))
@@ -199,6 +215,9 @@ class SimulationError:
                 rest[s] = reduce(np.multiply, others, np.ones((len(z), len(terms))))
             part = rest[s][:, places]
             slope[:, :, j - 1] += (part * inside[:, j - 1 : j] if bounded else part) @ E[:, places + 1].T
+        if q := len(self.model.neurons):
+            bent = (1 - phi[:, -q:] ** 2)[:, None] * E[:, -q:]  # (m, n, q)
+            slope += bent @ model.neurons[:, :-1]
         return phi, slope
 
 
@@ -247,6 +266,8 @@ def read_features(
         curved = is_nonlinear(model.terms, model.order)
         near = np.hstack([one, np.clip(z, -model.bound, model.bound), u])
         phi[:, 1:][:, curved] = evaluate_terms(model.terms[curved], near)
+    if model.V is not None:
+        phi = np.hstack([phi, np.tanh(z @ model.V[:, :-1].T + model.V[:, -1])])
     return phi
 
 

@@ -1,0 +1,228 @@
+"""The sizes of models with a hidden state, their errors on unseen rows, and what their fits have in common."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episodes
+from koopmpc.identify.records.conversion import SignalUnits, cut_segments
+from koopmpc.identify.records.free_run import HELD
+from koopmpc.identify.records.hidden import (
+    HiddenModel,
+    RecordSegments,
+    join_segments,
+    simulate_hidden,
+    start_states,
+)
+from koopmpc.identify.records.narx import is_worse
+from koopmpc.identify.records.structure import EXACT, HORIZON
+from koopmpc.identify.records.unseen import BLOCKS, UNSEEN
+from koopmpc.predict.base import FitReport
+from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.values import Value
+
+ROWS = 4000  # rows that a search learns from, at most: of longer records evenly spread pieces are taken
+PIECE = 1000  # rows of such a piece
+STEPS = 8_000  # steps of all segments of one length, about
+OVERLAP = 3  # a long segment begins behind this share of the one before
+SHORT_OVERLAP = 7  # a short one behind this share
+RESTS = 10  # rows at the least or the largest reading, at least, that make it a rail
+ROBUST = 1.0  # share of the error of one step that counts as noise in the rows where the state begins
+_LOST = 1e3  # an error counts as this many spreads at most
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenStructure(Value):
+    """The sizes of a polynomial state-space model, and its errors on unseen rows.
+
+    Attributes
+    ----------
+    order, degree
+        Order of the hidden state, and total degree of the polynomials.
+    delays, horizon
+        Past rows from which the state begins, and steps of the segments that the fit forecasts; 0 where `subspace` is
+        taken as it is.
+    rails
+        (2, ny) the least and the largest reading of each sensor; None where none saturates.
+    errors
+        (blocks,) errors in spreads of free runs and forecasts on the last quarter of each record.
+    calm
+        It stays within three times the range of the data, in free run over each record twice.
+    parameters
+        Number of coefficients.
+    neurons
+        Number of neurons in the dynamics.
+    """
+
+    order: int
+    degree: int
+    delays: int
+    horizon: int
+    rails: Float[np.ndarray, "2 ny"] | None
+    errors: Float[np.ndarray, " blocks"]
+    calm: bool
+    parameters: int
+    neurons: int = 0
+
+    @cached_property
+    def error(self) -> float:
+        """Geometric mean of the errors of the blocks."""
+        return float(np.exp(np.log(np.maximum(self.errors, EXACT)).mean()))
+
+    @property
+    def is_nonlinear(self) -> bool:
+        """Whether the state has products or neurons."""
+        return self.degree > 1 or self.neurons > 0
+
+    def describe(self) -> str:
+        """Return a sentence on the model and its error."""
+        kind = f"polynomials of degree {self.degree}" if self.degree > 1 else "linear dynamics"
+        kind += f" and {self.neurons} neuron{'s' * (self.neurons != 1)}" if self.neurons else ""
+        how = f"fitted to forecasts of {self.horizon} steps" if self.horizon else "by a subspace method"
+        return (
+            f"a hidden state of order {self.order} with {kind}, which begins with {self.delays} past rows, {how}; on "
+            f"unseen rows, in free run and {HORIZON} steps ahead, it errs by {self.error:.3g} spreads"
+        )
+
+
+def choose_hidden(found: Sequence[HiddenStructure]) -> HiddenStructure:
+    """Return the structure of the fewest coefficients within one standard error of the best; a calm one if any is."""
+    calm = [one for one in found if one.calm] or list(found)
+    best = min(calm, key=lambda one: one.error)
+    return min(
+        (one for one in calm if not is_worse(one.errors, best.errors)), key=lambda one: (one.parameters, one.error)
+    )
+
+
+def find_rails(episodes: Episodes) -> Float[np.ndarray, "2 ny"] | None:
+    """Return the rails of sensors that rest at their least or largest reading; None where none does.
+
+    A rail shows in at least ten rows, and at least a quarter of them follow each other.
+    """
+    rails = np.vstack([np.full(episodes.nx, -np.inf), np.full(episodes.nx, np.inf)])
+    Y = np.concatenate([e.X for e in episodes])
+    for i, column in enumerate(Y.T):
+        for side, value in enumerate((column.min(), column.max())):
+            at = column == value
+            if at.sum() >= RESTS and (at[1:] & at[:-1]).sum() >= at.sum() / 4 and not at.all():
+                rails[side, i] = value
+    return rails if np.isfinite(rails).any() else None
+
+
+def thin_records(episodes: Episodes) -> Episodes:
+    """Return the records, of many rows evenly spread pieces."""
+    pieces = [
+        e.cut(len(e) * i // count, len(e) * (i + 1) // count)
+        for e in episodes
+        for count in [-(-len(e) // PIECE)]
+        for i in range(count)
+    ]
+    total = sum(map(len, pieces))
+    return episodes if total <= ROWS else episodes.with_episodes(pieces[:: -(-total // ROWS)])
+
+
+def is_calm_hidden(model: HiddenModel, data: Episodes, units: SignalUnits, delays: int) -> bool:
+    """Return whether a model stays within three times the range of the data, run over each record twice."""
+    for e in data:
+        if len(e) <= delays:
+            continue
+        part = join_segments(cut_segments(data.with_episodes([e]), units, delays, len(e) - delays, 1))
+        out = simulate_hidden(model, part.points, np.concatenate([part.inputs, part.inputs]))
+        if not (
+            np.abs(out) < HELD * np.abs((e.X - units.mean[: units.ny]) / units.scale[: units.ny]).max(axis=0)
+        ).all():
+            return False
+    return True
+
+
+def find_noise(start: LinearPredictor, units: SignalUnits) -> float:
+    """Return the noise in ζ: the error of one step of the linear model, in spreads."""
+    assert start.report is not None, "it was fitted"
+    return ROBUST * float(np.max(start.report.residual / units.scale[: units.ny]))
+
+
+def normalise(model: HiddenModel, points: Float[np.ndarray, "m nzeta"]) -> HiddenModel:
+    """Return a linear model whose state has mean zero and a spread of one at these points."""
+    z, n = start_states(model, points), model.order
+    mean, size = z.mean(axis=0), z.std(axis=0)
+    size = np.where(size > 0, size, 1.0)
+    E, H, T = model.E.copy(), model.H.copy(), model.T.copy()
+    E[:, 0] += E[:, 1 : 1 + n] @ mean - mean
+    H[:, -1] += H[:, :-1] @ mean
+    T[:, -1] -= mean
+    E[:, 1 : 1 + n] *= size
+    H[:, :-1] *= size
+    return replace(model, E=E / size[:, None], H=H, T=T / size[:, None])
+
+
+def cut_sets(
+    data: Episodes,
+    units: SignalUnits,
+    delays: int,
+    horizon: int,
+    spans: Sequence[tuple[int, int]],
+    short: int = HORIZON,
+    steps_of_all: int = STEPS,
+) -> list[RecordSegments]:
+    """Return long segments, which tell slow modes, and many short ones, which tell where the state begins."""
+    room = max(b - max(a, delays) for a, b in spans)
+    found: list[RecordSegments] = []
+    for steps, overlap in ((max(min(horizon, room), 1), OVERLAP), (max(min(short, room), 1), SHORT_OVERLAP)):
+        total = sum(max(b - max(a, delays) - steps + 1, 0) for a, b in spans)
+        apart = max(steps // overlap, total * steps // steps_of_all, 1)
+        found.append(join_segments(cut_segments(data, units, delays, steps, apart, spans)))
+    return found
+
+
+def measure_hidden(model: HiddenModel, data: Episodes, units: SignalUnits, delays: int) -> Float[np.ndarray, " blocks"]:
+    """Return errors on four parts of the last quarters, in spreads: geometric means of free run and forecasts."""
+    free: list[np.ndarray] = []
+    short: list[np.ndarray] = []
+    for e in data:
+        one, spans = data.with_episodes([e]), [(round((1 - UNSEEN) * len(e)), len(e))]
+        ((a, b),) = spans
+        for horizon, gaps in ((b - max(a, delays), free), (HORIZON, short)):
+            if b - max(a, delays) < max(horizon, 2):
+                continue
+            part = join_segments(cut_segments(one, units, delays, horizon, horizon, spans))
+            out = simulate_hidden(model, part.points, part.inputs)
+            if units.rails is not None:
+                out = np.clip(out, *units.rails)
+            gaps.append((out - part.outputs).transpose(1, 0, 2).reshape(-1, units.ny))
+    errors, parts = np.ones(BLOCKS), [np.array_split(np.concatenate(gaps), BLOCKS) for gaps in (free, short) if gaps]
+    for part in parts:
+        sizes = [np.sqrt(np.mean(np.minimum(np.abs(gap), _LOST) ** 2)) if len(gap) else 1.0 for gap in part]
+        errors *= np.maximum(sizes, EXACT) ** (1 / len(parts))
+    return errors
+
+
+def report_fit(structure: HiddenStructure, found: HiddenModel, units: SignalUnits, data: Episodes) -> FitReport:
+    """Return the report of a fit."""
+    part = join_segments(cut_segments(data, units, structure.delays, 1, 1))
+    size = units.scale[: units.ny]
+    gap = simulate_hidden(found, part.points, part.inputs)[0] - part.outputs[0]
+    return FitReport(
+        method="neural_state_space" if structure.neurons else "polynomial_state_space",
+        route=f"simulation error over segments of {structure.horizon} steps",
+        samples=part.points.shape[0],
+        condition=float(np.linalg.cond(start_states(found, part.points))),
+        rank=found.E.shape[1],
+        columns=found.E.shape[1],
+        ridge=0.0,
+        residual=size * np.sqrt(np.mean(gap**2, axis=0)),
+        state_residual=np.zeros(units.ny),
+        changes=(structure.describe(),),
+    )
+
+
+def check_rails(rails: ArrayLike, ny: int) -> Float[np.ndarray, "2 ny"]:
+    """Return the rails, one pair for each output."""
+    given = checks.array(rails, "rails", infinite=True)
+    if given.shape == (2,):
+        given = np.repeat(given[:, None], ny, axis=1)
+    return checks.array(given, "rails", (2, ny), infinite=True)

@@ -1,0 +1,425 @@
+"""neural_state_space: a hidden state of small order whose dynamics have bends, fitted by simulation error."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from math import factorial
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source, source_of
+from koopmpc.errors import DataError, KoopmpcError
+from koopmpc.identify.levenberg_marquardt import minimise
+from koopmpc.identify.records.conversion import SignalUnits, from_standard, to_standard
+from koopmpc.identify.records.forward import list_terms
+from koopmpc.identify.records.hidden import (
+    HiddenModel,
+    RecordSegments,
+    Sets,
+    SimulationError,
+    read_features,
+    start_states,
+)
+from koopmpc.identify.records.hidden_structure import (
+    HiddenStructure,
+    check_rails,
+    choose_hidden,
+    cut_sets,
+    find_noise,
+    is_calm_hidden,
+    measure_hidden,
+    normalise,
+    report_fit,
+)
+from koopmpc.identify.records.narx import Ask, check_list, source_episodes
+from koopmpc.identify.records.structure import HORIZON
+from koopmpc.identify.records.subspace import build_realisation, compute_block_moments
+from koopmpc.identify.records.unseen import UNSEEN
+from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+
+ORDERS = (1, 2, 3, 4)  # orders of the hidden state that are tried
+NEURONS = (1, 3, 6)  # numbers of neurons that are tried
+DEGREES = (1, 2)  # total degrees of the polynomials beside them
+GAINED = 0.9  # try a larger order only if the last one lowered the error to less than this share
+ROWS = 12_000  # rows that a search learns from, at most: of longer records evenly spread pieces are taken
+PIECE = 4_000  # rows of such a piece
+STEPS = 30_000  # steps of all segments of one length, about
+WINDOWS = 8, 40  # past rows from which the state begins, at least and at most
+SEGMENTS = 50, 200  # steps of the shorter segments, at least and at most
+LONGER = 5  # the longer segments have this many times the steps of the shorter ones
+PACE = 10  # the past rows reach over 1/10 of the rows in which the outputs move by their spread
+_FULL = 8  # of more past rows only the smooth part tells where the state begins
+_SMOOTH = 3  # degree in time of that part
+_DRAWN = 40  # candidates for neurons, of random directions
+_SHARP = (1.0, 4.0, 16.0)  # slopes of candidates along the output and its differences, for each spread
+_PLACES = (0.1, 0.5, 0.9)  # quantiles at which their bends lie
+_SOFT = 1e-6  # weight of the diagonal where the best candidates are sought
+_ITERATIONS = 40  # Levenberg-Marquardt steps for each number of neurons
+_PATIENCE = 8  # steps in a row that do not lower the error on unseen rows
+_CONVERGED = 1e-3  # a step that lowers the squared error by a smaller share is the last
+_POLISH = 15  # steps on all rows, at the end
+
+
+def neural_state_space(
+    episodes: Episodes | Source,
+    order: int | Sequence[int] = ORDERS,
+    neurons: int | Sequence[int] = NEURONS,
+    *,
+    degree: int | Sequence[int] = 1,
+    rails: ArrayLike | None = None,
+) -> BilinearPredictor:
+    """Fit z⁺ = E φ(z, u) + W tanh(V [z; 1]), y = C z + c with a hidden state z, by its simulation error over segments.
+
+    A few neurons hold what polynomials cannot: dry friction, a diode, a tank that overflows, hysteresis. φ holds 1, z
+    and u, and from degree 2 on products of z and inputs times such products. Each segment begins with z_0 = T [ζ; 1], a
+    linear function of the past rows ζ.
+
+    The linear model starts with `subspace`, or with z = the output and its differences, whichever forecasts better.
+    Candidates for neurons bend along the output, its differences, and random directions. Those are taken, one after
+    the other, which lower the simulation error most to first order. Levenberg-Marquardt then fits E, W, V, C, c and T
+    together. The length of the segments follows the pace of the outputs.
+
+    Parameters
+    ----------
+    episodes
+        Records of one plant: outputs as states.
+    order, neurons, degree
+        Order of z, number of neurons and total degree of the polynomials; several of each are tried. Of all models
+        within one standard error of the best, in free run and in forecasts of 20 steps on the last quarter of each
+        record, the one with the fewest coefficients is taken.
+    rails
+        As in `polynomial_state_space`.
+
+    Raises
+    ------
+    DataError
+        The records are too short for the segments and the past rows; no output moves; a stream is read twice.
+
+    References
+    ----------
+    Schoukens, "Improved initialization of state-space artificial neural networks", ECC 2021.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> import numpy as np
+    >>> u, y, v = np.random.default_rng(0).uniform(-1, 1, 600), np.zeros(601), 0.0
+    >>> for k in range(600):
+    ...     v = 0.9 * v + u[k] - 0.3 * np.tanh(10 * v)
+    ...     y[k + 1] = v
+    >>> data = km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["y"], ["u"])
+    >>> model = km.identify.neural_state_space(data, order=1, neurons=1)
+    >>> start = model.embed(data)[0].X[0]
+    >>> bool(abs(model.step_map().rollout(start, u[8:, None])[:, 0] - y[8:]).max() < 0.02 * y.std())
+    True
+    """
+    source = source_of(episodes)
+    if source.disturbances:
+        raise DataError("the data have measured disturbances, which this fit does not know; pass them as inputs")
+    whole = source_episodes(source)
+    limits = None if rails is None else check_rails(rails, whole.nx)
+    found = search_neural(whole, check_list(order, 1), check_list(neurons, 1), check_list(degree, 1), rails=limits)
+    model = fit_neural(choose_hidden(found), whole)
+    assert isinstance(model, BilinearPredictor), "neurons are nonlinear"
+    return model
+
+
+def search_neural(
+    episodes: Episodes,
+    orders: Sequence[int] = ORDERS,
+    neurons: Sequence[int] = NEURONS,
+    degrees: Sequence[int] = DEGREES,
+    *,
+    rails: Float[np.ndarray, "2 ny"] | None = None,
+    ask: Ask | None = None,
+) -> list[HiddenStructure]:
+    """Return structures with their errors on the last quarter of each record.
+
+    Orders are tried upwards, until one gains less than a tenth. Degrees above the first are tried with the best order.
+
+    Raises
+    ------
+    DataError
+        The records are too short for all of them.
+    """
+    data = spread_records(episodes)
+    delays, horizon = choose_window(data)
+    found: list[HiddenStructure] = []
+    reasons: list[KoopmpcError] = []
+
+    def try_chain(order: int, degree: int) -> None:
+        if ask is not None:
+            ask(f"neurons with a hidden state of order {order}", len(found), len(orders) * len(neurons))
+        try:
+            for model, units in fit_chain(data, order, degree, delays, horizon, neurons, rails):
+                errors = measure_hidden(model, data, units, delays)
+                calm = is_calm_hidden(model, data, units, delays)
+                size = model.E.size + model.neurons.size
+                found.append(
+                    HiddenStructure(
+                        order, degree, delays, horizon, rails, errors, calm, size, neurons=len(model.neurons)
+                    )
+                )
+        except KoopmpcError as error:
+            reasons.append(error)
+
+    least = np.inf
+    for n in sorted(orders):
+        try_chain(n, min(degrees))
+        best = min((one.error for one in found), default=np.inf)
+        if n > 1 and not best < GAINED * least:
+            break
+        least = best
+    if found:
+        order = min(found, key=lambda one: one.error).order
+        for degree in sorted(degrees)[1:]:
+            try_chain(order, degree)
+    if not found:
+        raise reasons[0] if reasons else DataError("no structure was asked for; pass orders and neurons")
+    return found
+
+
+def fit_neural(structure: HiddenStructure, episodes: Episodes) -> LinearPredictor | BilinearPredictor:
+    """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows."""
+    s, data = structure, spread_records(episodes)
+    counts = [q for q in NEURONS if q < s.neurons] + [s.neurons]
+    found, units = list(fit_chain(data, s.order, s.degree, s.delays, s.horizon, counts, s.rails))[-1]
+    basis = smooth_basis(units.ny, data.nu, s.delays)
+    whole = _project(_cut(data, units, s.delays, s.horizon, [(0, len(e)) for e in data]), basis)
+    small = replace(found, T=np.hstack([found.T[:, :-1] @ basis.T, found.T[:, -1:]]))
+    theta, _ = minimise(SimulationError(small), small.parameters, whole, whole, _POLISH, converged=_CONVERGED)
+    polished = _widen(small.with_parameters(theta), basis)
+    if is_calm_hidden(polished, data, units, s.delays) or not is_calm_hidden(found, data, units, s.delays):
+        found = polished
+    return from_standard(found, units, episodes, s.delays, report_fit(structure, found, units, data))
+
+
+def spread_records(episodes: Episodes) -> Episodes:
+    """Return the records, of very many rows evenly spread pieces."""
+    pieces = [
+        e.cut(len(e) * i // count, len(e) * (i + 1) // count)
+        for e in episodes
+        for count in [-(-len(e) // PIECE)]
+        for i in range(count)
+    ]
+    total = sum(map(len, pieces))
+    return episodes if total <= ROWS else episodes.with_episodes(pieces[:: -(-total // ROWS)])
+
+
+def choose_window(data: Episodes) -> tuple[int, int]:
+    """Return the past rows from which a state begins and the steps of long segments, by the pace of the outputs.
+
+    The pace is the number of rows in which an output moves by its spread: √(spread² / mean square of its differences).
+    """
+    spread = np.concatenate([e.X for e in data]).std(axis=0)
+    moves = np.sqrt(np.mean(np.concatenate([np.diff(e.X, axis=0) for e in data]) ** 2, axis=0))
+    live = (spread > 0) & (moves > 0)
+    pace = float(np.min(spread[live] / moves[live])) if live.any() else 1.0
+    delays = int(np.clip(round(pace / PACE), *WINDOWS))
+    short = int(np.clip(round(pace / 3), *SEGMENTS))
+    room = min(round((1 - UNSEEN) * len(e)) for e in data) - delays
+    return delays, min(LONGER * short, max(room // 2, HORIZON))
+
+
+def fit_chain(
+    data: Episodes,
+    order: int,
+    degree: int,
+    delays: int,
+    horizon: int,
+    neurons: Sequence[int],
+    rails: Float[np.ndarray, "2 ny"] | None,
+) -> Iterator[tuple[HiddenModel, SignalUnits]]:
+    """Yield models with more and more neurons that learn from the first three quarters of each record."""
+    units = SignalUnits.of(data, rails)
+    basis = smooth_basis(units.ny, data.nu, delays)
+    ends = [round((1 - UNSEEN) * len(e)) for e in data]
+    spans = [(0, a) for a in ends], [(a, len(e)) for e, a in zip(data, ends, strict=True)]
+    steps = [max(horizon // LONGER, 1), horizon]
+    sets = [tuple(_project(_cut(data, units, delays, h, part), basis) for part in spans) for h in steps]
+    learned = data.with_episodes([e.cut(0, a) for e, a in zip(data, ends, strict=True) if a > 0])
+    model, noise = _start(learned, units, order, delays, basis, sets[0])
+    if degree > 1:
+        model = _fit(model.raise_degree(degree), noise, sets[0])
+    rng = np.random.default_rng(0)
+    for before, count in pairwise([0, *neurons]):
+        drawn = draw_neurons(model, sets[0][0][0], rng)
+        model = model.add_neurons(take_neurons(model, sets[0][0], drawn, count - before, noise))
+        for part in sets:
+            model = _fit(model, noise, part)
+        yield _widen(model, basis), units
+
+
+def _cut(
+    data: Episodes, units: SignalUnits, delays: int, horizon: int, spans: Sequence[tuple[int, int]]
+) -> list[RecordSegments]:
+    return cut_sets(data, units, delays, horizon, spans, max(HORIZON, horizon // LONGER), STEPS)
+
+
+def _fit(model: HiddenModel, noise: float, part: tuple[Sets, ...]) -> HiddenModel:
+    """Return the model that Levenberg-Marquardt finds; it stops on the unseen segments."""
+    theta, _ = minimise(
+        SimulationError(model, noise), model.parameters, *part, _ITERATIONS, patience=_PATIENCE, converged=_CONVERGED
+    )  # fmt: skip
+    return model.with_parameters(theta)
+
+
+def _start(
+    learned: Episodes,
+    units: SignalUnits,
+    order: int,
+    delays: int,
+    basis: Float[np.ndarray, "k nzeta"],
+    part: tuple[Sets, ...],
+) -> tuple[HiddenModel, float]:
+    """Return the linear model to begin with, and the noise of a row: of two starts the one that forecasts better."""
+    starts = [start_with_differences(units, order, delays)]
+    noise = np.inf
+    try:
+        found = build_realisation(compute_block_moments(learned, delays), order)
+        starts.append(to_standard(found, units))
+        noise = find_noise(found, units)
+    except KoopmpcError:  # too short, or no subspace of this order
+        pass
+    fitted: list[tuple[float, HiddenModel]] = []
+    for one in starts:
+        small = replace(one, T=np.hstack([one.T[:, :-1] @ basis.T, one.T[:, -1:]]))
+        small = normalise(small, part[0][-1].points)
+        error = SimulationError(small)
+        if len(fitted) == 0:
+            noise = min(noise, np.sqrt(error.evaluate(small.parameters, [_first_step(part[0][-1])])))
+        if np.isfinite(error.evaluate(small.parameters, part[0])):
+            small = _fit(small, float(noise), part)
+            fitted.append((error.evaluate(small.parameters, part[1]), small))
+    if not fitted:
+        raise DataError(f"no linear model of order {order} has a forecast that stays finite; pass another order")
+    return min(fitted, key=lambda pair: pair[0])[1], float(noise)
+
+
+def _first_step(data: RecordSegments) -> RecordSegments:
+    rails = (None, None) if data.low is None or data.high is None else (data.low[:1], data.high[:1])
+    return RecordSegments(data.points, data.inputs[:1], data.outputs[:1], *rails)
+
+
+def start_with_differences(units: SignalUnits, order: int, delays: int) -> HiddenModel:
+    """Return z = the outputs and their derivatives in time, one per row, which go on as polynomials in time do.
+
+    The past rows give them by least squares. It is what every plant looks like where samples are fast.
+    """
+    ny, nu = units.ny, len(units.mean) - units.ny
+    owner = [i % ny for i in range(order)]
+    rank = [i // ny for i in range(order)]
+    E, H, T = np.zeros((order, 1 + order + nu)), np.zeros((ny, order + 1)), np.zeros((order, _size(ny, nu, delays) + 1))
+    lags = -np.arange(delays + 1.0)[:, None]
+    for i in range(order):
+        own = [j for j in range(order) if owner[j] == owner[i]]
+        powers = np.arange(len(own))
+        derivatives = np.linalg.pinv(lags**powers / [factorial(int(p)) for p in powers])
+        T[i, _rows_of(owner[i], ny, nu, delays)] = derivatives[rank[i]]
+        for j in own:
+            if rank[j] >= rank[i]:
+                E[i, 1 + j] = 1 / factorial(rank[j] - rank[i])
+        if rank[i] == 0:
+            H[owner[i], i] = 1.0
+    return HiddenModel(list_terms(order, nu, 1), E, H, T, np.full(order, np.inf))
+
+
+def _size(ny: int, nu: int, delays: int) -> int:
+    return ny + delays * (ny + nu)
+
+
+def _rows_of(signal: int, ny: int, nu: int, delays: int) -> Int[np.ndarray, " rows"]:
+    """Return the places in ζ of an output, newest first, or of an input, signals ny and more."""
+    past = ny + np.arange(delays) * (ny + nu)
+    return np.append(signal, past + nu + signal) if signal < ny else past + signal - ny
+
+
+def smooth_basis(ny: int, nu: int, delays: int) -> Float[np.ndarray, "k nzeta"]:
+    """Return orthonormal rows, of many past rows Legendre polynomials in time of each signal; of few all of ζ."""
+    n = _size(ny, nu, delays)
+    if delays <= _FULL:
+        return np.eye(n)
+    rows: list[np.ndarray] = []
+    for signal in range(ny + nu):
+        places = _rows_of(signal, ny, nu, delays)
+        time = np.linspace(-1, 1, len(places))
+        part = np.zeros((_SMOOTH + 1, n))
+        part[:, places] = np.linalg.qr(np.polynomial.legendre.legvander(time, _SMOOTH))[0].T
+        rows.append(part)
+    return np.vstack(rows)
+
+
+def _project(parts: Sets, basis: Float[np.ndarray, "k nzeta"]) -> list[RecordSegments]:
+    return [replace(part, points=part.points @ basis.T) for part in parts]
+
+
+def _widen(model: HiddenModel, basis: Float[np.ndarray, "k nzeta"]) -> HiddenModel:
+    """Return the model whose T takes ζ itself."""
+    return replace(model, T=np.hstack([model.T[:, :-1] @ basis, model.T[:, -1:]]))
+
+
+def draw_neurons(model: HiddenModel, data: RecordSegments, rng: np.random.Generator) -> Float[np.ndarray, "count n1"]:
+    """Return candidates that bend along the outputs, their differences and random directions, where z has been."""
+    z = _visit(model, data)
+    n, A = model.order, model.E[:, 1 : 1 + model.order]
+    found: list[np.ndarray] = []
+
+    def add(direction: Float[np.ndarray, " n"], slope: float, place: float) -> None:
+        size = float((z @ direction).std())
+        if np.isfinite(size) and size > 0:
+            found.append(np.append(direction, -place) * slope / size)
+
+    for output in model.H:
+        direction, place = output[:-1], -output[-1]
+        for _ in range(n):
+            along = z @ direction
+            for slope in _SHARP:
+                for at in (place, *np.quantile(along, _PLACES)):
+                    add(direction, slope, float(at))
+            direction, place = direction @ A - direction, 0.0
+    for _ in range(_DRAWN):
+        direction, slope = rng.standard_normal(n), 10 ** rng.uniform(0, 1.2)
+        add(direction, float(slope), float(z[rng.integers(len(z))] @ direction))
+    return np.array(found).reshape(-1, n + 1)
+
+
+def _visit(model: HiddenModel, data: RecordSegments) -> Float[np.ndarray, "rows n"]:
+    """Return the states of all steps of these segments, those that stay near the data."""
+    z = start_states(model, data.points)
+    found = [z]
+    for u in data.inputs:
+        z = read_features(model, z, u) @ model.E.T
+        found.append(z)
+    states = np.concatenate(found)
+    return states[(np.abs(states) < 10 * np.abs(found[0]).max()).all(axis=1)]
+
+
+def take_neurons(
+    model: HiddenModel, data: Sets, drawn: Float[np.ndarray, "count n1"], most: int, noise: float
+) -> Float[np.ndarray, "q n1"]:
+    """Return the neurons that lower the simulation error most, one after the other, to first order in their weights.
+
+    Forward orthogonal least squares on the sensitivities: a candidate gains gᵀ S⁻¹ g, g and S the gradient and the
+    Gauss-Newton matrix of its weights after all other coefficients, and the neurons taken before, have adjusted.
+    """
+    wide = model.add_neurons(drawn)
+    gradient, matrix = SimulationError(wide, noise).derivatives(wide.parameters, data)
+    (n, width), count = wide.E.shape, len(drawn)
+    places = np.arange(n * width).reshape(n, width)
+    matrix = matrix + _SOFT * np.diag(matrix.diagonal() + 1e-12)
+    known = np.concatenate([places[:, : width - count].ravel(), n * width + np.arange(model.H.size)])
+    taken: list[int] = []
+    while len(taken) < min(most, count):
+        own = np.concatenate([known, *(places[:, width - count + i] for i in taken)])
+        inverse = np.linalg.pinv(matrix[np.ix_(own, own)], hermitian=True)
+        gains = np.full(count, -1.0)
+        for i in set(range(count)) - set(taken):
+            new = places[:, width - count + i]
+            cross = matrix[np.ix_(own, new)]
+            left = gradient[new] - cross.T @ (inverse @ gradient[own])
+            gains[i] = left @ np.linalg.lstsq(matrix[np.ix_(new, new)] - cross.T @ inverse @ cross, left, rcond=1e-9)[0]
+        taken.append(int(np.argmax(gains)))
+    return drawn[taken]
