@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from math import factorial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,14 +13,15 @@ from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.identify.levenberg_marquardt import minimise
 from koopmpc.identify.records.conversion import SignalUnits, from_standard, to_standard
-from koopmpc.identify.records.forward import list_terms
 from koopmpc.identify.records.hidden import (
     HiddenModel,
     RecordSegments,
     Sets,
     SimulationError,
     read_features,
+    smooth_basis,
     start_states,
+    start_with_differences,
 )
 from koopmpc.identify.records.hidden_structure import (
     HiddenStructure,
@@ -51,8 +51,6 @@ WINDOWS = 8, 40  # past rows from which the state begins, at least and at most
 SEGMENTS = 50, 200  # steps of the shorter segments, at least and at most
 LONGER = 5  # the longer segments have this many times the steps of the shorter ones
 PACE = 10  # the past rows reach over 1/10 of the rows in which the outputs move by their spread
-_FULL = 8  # of more past rows only the smooth part tells where the state begins
-_SMOOTH = 3  # degree in time of that part
 _DRAWN = 40  # candidates for neurons, of random directions
 _SHARP = (1.0, 4.0, 16.0)  # slopes of candidates along the output and its differences, for each spread
 _PLACES = (0.1, 0.5, 0.9)  # quantiles at which their bends lie
@@ -276,7 +274,7 @@ def _start(
     part: tuple[Sets, ...],
 ) -> tuple[HiddenModel, float]:
     """Return the linear model to begin with, and the noise of a row: of two starts the one that forecasts better."""
-    starts = [start_with_differences(units, order, delays)]
+    starts = [start_with_differences(units.ny, len(units.mean) - units.ny, order, delays)]
     noise = np.inf
     try:
         found = build_realisation(compute_block_moments(learned, delays), order)
@@ -302,54 +300,6 @@ def _start(
 def _first_step(data: RecordSegments) -> RecordSegments:
     rails = (None, None) if data.low is None or data.high is None else (data.low[:1], data.high[:1])
     return RecordSegments(data.points, data.inputs[:1], data.outputs[:1], *rails)
-
-
-def start_with_differences(units: SignalUnits, order: int, delays: int) -> HiddenModel:
-    """Return z = the outputs and their derivatives in time, one per row, which go on as polynomials in time do.
-
-    The past rows give them by least squares. It is what every plant looks like where samples are fast.
-    """
-    ny, nu = units.ny, len(units.mean) - units.ny
-    owner = [i % ny for i in range(order)]
-    rank = [i // ny for i in range(order)]
-    E, H, T = np.zeros((order, 1 + order + nu)), np.zeros((ny, order + 1)), np.zeros((order, _size(ny, nu, delays) + 1))
-    lags = -np.arange(delays + 1.0)[:, None]
-    for i in range(order):
-        own = [j for j in range(order) if owner[j] == owner[i]]
-        powers = np.arange(len(own))
-        derivatives = np.linalg.pinv(lags**powers / [factorial(int(p)) for p in powers])
-        T[i, _rows_of(owner[i], ny, nu, delays)] = derivatives[rank[i]]
-        for j in own:
-            if rank[j] >= rank[i]:
-                E[i, 1 + j] = 1 / factorial(rank[j] - rank[i])
-        if rank[i] == 0:
-            H[owner[i], i] = 1.0
-    return HiddenModel(list_terms(order, nu, 1), E, H, T, np.full(order, np.inf))
-
-
-def _size(ny: int, nu: int, delays: int) -> int:
-    return ny + delays * (ny + nu)
-
-
-def _rows_of(signal: int, ny: int, nu: int, delays: int) -> Int[np.ndarray, " rows"]:
-    """Return the places in ζ of an output, newest first, or of an input, signals ny and more."""
-    past = ny + np.arange(delays) * (ny + nu)
-    return np.append(signal, past + nu + signal) if signal < ny else past + signal - ny
-
-
-def smooth_basis(ny: int, nu: int, delays: int) -> Float[np.ndarray, "k nzeta"]:
-    """Return orthonormal rows, of many past rows Legendre polynomials in time of each signal; of few all of ζ."""
-    n = _size(ny, nu, delays)
-    if delays <= _FULL:
-        return np.eye(n)
-    rows: list[np.ndarray] = []
-    for signal in range(ny + nu):
-        places = _rows_of(signal, ny, nu, delays)
-        time = np.linspace(-1, 1, len(places))
-        part = np.zeros((_SMOOTH + 1, n))
-        part[:, places] = np.linalg.qr(np.polynomial.legendre.legvander(time, _SMOOTH))[0].T
-        rows.append(part)
-    return np.vstack(rows)
 
 
 def _project(parts: Sets, basis: Float[np.ndarray, "k nzeta"]) -> list[RecordSegments]:
@@ -408,12 +358,13 @@ def take_neurons(
     wide = model.add_neurons(drawn)
     gradient, matrix = SimulationError(wide, noise).derivatives(wide.parameters, data)
     (n, width), count = wide.E.shape, len(drawn)
-    places = np.arange(n * width).reshape(n, width)
-    matrix = matrix + _SOFT * np.diag(matrix.diagonal() + 1e-12)
-    known = np.concatenate([places[:, : width - count].ravel(), n * width + np.arange(model.H.size)])
+    places: Int[np.ndarray, "n w"] = np.arange(n * width, dtype=np.intp).reshape(n, width)
+    matrix: Float[np.ndarray, "p p"] = matrix + _SOFT * np.diag(matrix.diagonal() + 1e-12)
+    output = np.arange(n * width, n * width + model.H.size, dtype=np.intp)
+    known: Int[np.ndarray, " known"] = np.concatenate([places[:, : width - count].ravel(), output])
     taken: list[int] = []
     while len(taken) < min(most, count):
-        own = np.concatenate([known, *(places[:, width - count + i] for i in taken)])
+        own: Int[np.ndarray, " known"] = np.concatenate([known, *(places[:, width - count + i] for i in taken)])
         inverse = np.linalg.pinv(matrix[np.ix_(own, own)], hermitian=True)
         gains = np.full(count, -1.0)
         for i in set(range(count)) - set(taken):

@@ -32,6 +32,7 @@ from koopmpc.identify.records.hidden_structure import (
     find_rails as find_rails,
 )
 from koopmpc.identify.records.narx import Ask, check_list, source_episodes
+from koopmpc.identify.records.neural import fit_neural
 from koopmpc.identify.records.subspace import build_realisation, compute_block_moments
 from koopmpc.identify.records.unseen import UNSEEN
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor

@@ -1,0 +1,87 @@
+"""Hidden states with neurons: exact derivatives, exact conversion, and friction that a polynomial cannot hold."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.errors import ShapeError
+from koopmpc.identify.records.conversion import SignalUnits, from_standard, to_standard
+from koopmpc.identify.records.hidden import SimulationError, smooth_basis, start_with_differences
+from koopmpc.lifting import Neurons
+from tests.identify.test_hidden_state import random_model, random_segments
+
+
+@pytest.mark.parametrize(("degree", "ny", "nu"), [(1, 1, 1), (2, 2, 2)])
+def test_the_derivatives_by_the_neurons_are_those_of_finite_differences(degree, ny, nu):
+    rng = np.random.default_rng(0)
+    plain = random_model(rng, 2, degree, ny, nu)
+    model = plain.add_neurons(rng.standard_normal((3, 3)))
+    data = random_segments(model, rng, nu=nu)
+    assert SimulationError(model).evaluate(model.parameters, [data]) == pytest.approx(
+        SimulationError(plain).evaluate(plain.parameters, [data]), rel=1e-12
+    )  # their weights begin at zero
+    error = SimulationError(model)
+    theta = model.parameters + 0.1 * rng.standard_normal(model.parameters.size)
+    gradient, matrix = error.derivatives(theta, [data])
+    for j in range(theta.size):
+        up, down = theta.copy(), theta.copy()
+        up[j] += 1e-6
+        down[j] -= 1e-6
+        slope = (error.evaluate(up, [data]) - error.evaluate(down, [data])) / 4e-6
+        assert gradient[j] == pytest.approx(slope, rel=1e-4, abs=1e-7)
+    assert np.linalg.eigvalsh(matrix).min() > -1e-9 * np.abs(matrix).max()
+
+
+def test_differences_go_on_as_a_parabola_does():
+    model = start_with_differences(1, 1, 3, 12)
+    time = np.arange(-12.0, 1.0)[::-1]
+    y = 0.3 * time**2 - time + 2
+    zeta = np.concatenate([y[:1], np.column_stack([np.zeros(12), y[1:]]).ravel()])
+    z = model.T @ np.append(zeta, 1.0)
+    for k in (1, 2, 3):
+        z = model.E[:, 1:4] @ z
+        assert (model.H[:, :-1] @ z)[0] == pytest.approx(0.3 * k**2 - k + 2, abs=1e-9)
+    basis = smooth_basis(1, 1, 12)
+    assert np.allclose(basis @ basis.T, np.eye(len(basis)), atol=1e-12)
+    assert np.allclose(zeta @ basis.T @ basis, zeta, atol=1e-9)  # a parabola is smooth
+
+
+def test_neurons_are_functions_of_the_chosen_states():
+    lifting = Neurons([[2.0, 0.5], [-1.0, 0.0]], states="v [m/s]").bind(["p [m]", "v [m/s]"])
+    x = np.array([[3.0, 0.25]])
+    assert np.allclose(lifting(x), np.tanh([[1.0, -0.25]]))
+    symbol = ca.SX.sym("x", 2)
+    assert np.allclose(np.asarray(ca.Function("f", [symbol], [lifting.symbolic(symbol)])(x.ravel())).T, lifting(x))
+    with pytest.raises(ShapeError, match="3 states"):
+        Neurons([[1.0, 0.0]]).bind(["a", "b", "c"])
+
+
+@pytest.mark.slow
+def test_dry_friction_is_found_and_the_model_is_used_as_any_other(tmp_path):
+    def record(seed, steps=1500):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.uniform(-1, 1, steps // 15 + 1), 15)[:steps]
+        y, v = np.zeros(steps + 1), 0.0
+        for k in range(steps):
+            v = 0.95 * v + 0.2 * u[k] - 0.08 * np.tanh(20 * v)
+            y[k + 1] = v
+        y += 0.002 * rng.standard_normal(steps + 1)
+        return km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["v [m/s]"], ["u"])
+
+    data, fresh = record(0), record(1)
+    model = km.identify.neural_state_space(data, order=1, neurons=[1, 2])
+    other = km.identify.polynomial_state_space(data, 1, 3)
+
+    def error(one):
+        free = one.step_map().rollout(one.embed(fresh)[0].X[0], fresh[0].U[one.embedding.steps :])[:, 0]
+        return float(np.sqrt(np.mean((free - fresh[0].X[one.embedding.steps :, 0]) ** 2)))
+
+    assert error(model) < 0.004
+    assert error(model) < 0.5 * error(other)
+    model.save(tmp_path / "model.npz")
+    assert km.load_model(tmp_path / "model.npz") == model
+    units = SignalUnits.of(data, None)
+    again = from_standard(to_standard(model, units), units, data, model.embedding.steps, model.report)
+    for name in ("A", "B", "N", "C"):
+        assert np.allclose(getattr(model, name), getattr(again, name), rtol=1e-9, atol=1e-9)
