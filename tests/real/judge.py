@@ -81,21 +81,25 @@ def free_run(model: km.LinearPredictor | km.BilinearPredictor, test: Record, rel
     return np.vstack([test.Y_test[: test.known - 1], X])
 
 
+def has_diverged(test: Record, Y: np.ndarray) -> bool:
+    """Return whether a free run leaves the measured outputs by ten ranges of the learning part, or all numbers."""
+    error = test.error(Y)
+    gap = np.abs(Y - test.Y_test).max() if len(test.outputs) == 1 else error
+    return not np.isfinite(error) or bool(gap > test.diverged)
+
+
 def _entry(model: km.LinearPredictor | km.BilinearPredictor, test: Record, seconds: float) -> Entry:
     """Judge a model as its controller uses it: KoopmanMPC lifts once, BilinearMPC at each step."""
     relift = isinstance(model, km.BilinearPredictor)
     Y = free_run(model, test, relift)
     free = test.error(Y)
-    gap = np.abs(Y - test.Y_test).max() if len(test.outputs) == 1 else free
     episode = km.Episodes(
         [km.Episode(X=test.Y_test, U=test.U_test[:-1])], test.dt, model.states, model.inputs
     )  # fmt: skip
     episode = model.align(episode)
     ahead = km.score(model, episode, HORIZON, stride=10, relift=relift).rmse
     scale = test.Y_test.std(axis=0) if len(test.outputs) > 1 else 1.0
-    return Entry(
-        free, float(np.sqrt(np.mean((ahead / scale) ** 2))), seconds, not np.isfinite(free) or gap > test.diverged
-    )
+    return Entry(free, float(np.sqrt(np.mean((ahead / scale) ** 2))), seconds, has_diverged(test, Y))
 
 
 def _select(record: Record) -> dict[str, Entry]:
@@ -135,7 +139,9 @@ def _fit(record: Record) -> Entry:
 def _yardstick(which: str, record: Record) -> Entry | None:
     begun = time.perf_counter()
     Y = YARDSTICKS[which](record)
-    return None if Y is None else Entry(record.error(Y), seconds=time.perf_counter() - begun)
+    if Y is None:
+        return None
+    return Entry(record.error(Y), seconds=time.perf_counter() - begun, diverged=has_diverged(record, Y))
 
 
 def worst(entries: list[Entry]) -> Entry:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from tests.real.judge import KNOWING, OURS, Entry, free_run, measure, names, worst
+from tests.real.judge import KNOWING, OURS, Entry, free_run, has_diverged, measure, names, worst
 from tests.real.records import FOLDER, RECORDS, Record
 from tests.real.table import load, losses, save, text
 from tests.real.twins import TWINS
-from tests.real.yardsticks import arx, choose
+from tests.real.yardsticks import YARDSTICKS, arx, choose
 
 
 def linear_record(rng, rows=400, order=3):
@@ -69,6 +69,18 @@ def test_losses_are_named_and_yardsticks_are_free_to_lose():
     new = {"r": {"fit": Entry(1.04), "select": Entry(1.06), "ARX": Entry(9.0)}}
     assert [line.split(":")[0] for line in losses(new, old)] == ["r, select"]
     assert "diverges" in losses({"r": {"fit": Entry(9.0, diverged=True)}}, old)[0]
+
+
+def test_a_free_run_that_leaves_ten_ranges_has_diverged_whoever_made_it(monkeypatch):
+    record = linear_record(np.random.default_rng(2), rows=60)
+    assert not has_diverged(record, record.Y_test)
+    far = record.Y_test.copy()
+    far[-1] += 1.1 * record.diverged
+    assert has_diverged(record, far)
+    assert has_diverged(record, np.full_like(far, np.nan))
+    monkeypatch.setitem(RECORDS, "linear", lambda: record)
+    monkeypatch.setitem(YARDSTICKS, "ARX", lambda _: far)
+    assert measure("linear", ("ARX",))["ARX"].diverged
 
 
 def test_a_table_is_read_as_it_was_written(tmp_path):

@@ -80,6 +80,8 @@ def neural_state_space(
     the other, which lower the simulation error most to first order. Levenberg-Marquardt then fits E, W, V, C, c and T
     together. The length of the segments follows the pace of the outputs.
 
+    The linear part may be unstable: a free run on other inputs than the data's can grow. Run the model on fresh rows.
+
     Parameters
     ----------
     episodes
@@ -259,8 +261,10 @@ def _cut(
 
 def _fit(model: HiddenModel, noise: float, part: tuple[Sets, ...]) -> HiddenModel:
     """Return the model that Levenberg-Marquardt finds; it stops on the unseen segments."""
+    fitted, judged = part
     theta, _ = minimise(
-        SimulationError(model, noise), model.parameters, *part, _ITERATIONS, patience=_PATIENCE, converged=_CONVERGED
+        SimulationError(model, noise), model.parameters, fitted, judged, _ITERATIONS,
+        patience=_PATIENCE, converged=_CONVERGED,
     )  # fmt: skip
     return model.with_parameters(theta)
 
