@@ -80,7 +80,7 @@ def neural_state_space(
     the other, which lower the simulation error most to first order. Levenberg-Marquardt then fits E, W, V, C, c and T
     together. The length of the segments follows the pace of the outputs.
 
-    The linear part may be unstable: a free run on other inputs than the data's can grow. Run the model on fresh rows.
+    A free run on other inputs than those of the data can diverge: run the model on fresh rows.
 
     Parameters
     ----------
