@@ -155,7 +155,8 @@ class StepRows(Value):
 
     def __post_init__(self) -> None:
         for name in ("X", "Y", "U", "reference", "u_reference"):
-            checks.kind(getattr(self, name), name, np.ndarray, "a Run comes of simulate or load_run")
+            if not isinstance(getattr(self, name), np.ndarray):
+                raise DataError(f"{name} is no array; a Run is what simulate or load_run returns")
         if not self.u_reference.size:
             object.__setattr__(self, "u_reference", np.zeros(self.U.shape))
         for column in MOVE_COLUMNS:
@@ -265,8 +266,8 @@ class About(Value):
         names = self.states, self.inputs
         for part in ("cost", "limits"):
             given: Cost | Limits | None = getattr(self, part)
-            if given is not None:
-                checks.kind(given, part, Cost if part == "cost" else Limits, "leave it out, or pass one of km")
+            if given is not None and not isinstance(cast(object, given), Cost | Limits):
+                raise DataError(f"{part} is a {type(given).__name__}; leave it out, or pass a km.Cost or km.Limits")
             if given is not None and any(isinstance(value, Mapping) for value in vars(given).values()):
                 object.__setattr__(self, part, given.resolve(*names))
         check_rows = getattr(super(), "__post_init__", None)
@@ -279,7 +280,6 @@ class About(Value):
 
     def name_references(self, nr: int) -> tuple[str, ...]:
         """Return the names of the `nr` outputs that the references belong to."""
-        nr = checks.count(nr, "nr", 0)
         tracked = None if self.cost is None else bind_outputs(self.cost.of, self.states)
         names = self.states if tracked is None else tracked.names
         return tuple(names) if len(names) == nr else tuple(f"reference {i}" for i in range(nr))

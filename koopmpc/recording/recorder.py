@@ -6,7 +6,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Event, Thread
 from types import TracebackType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -137,8 +137,8 @@ class Recorder:
         if path is None and not live:
             raise DataError("a Recorder needs somewhere to write: pass a path, live=True, or both")
         check_judges(cost, limits)
-        if metadata is not None:
-            checks.kind(metadata, "metadata", Mapping, "pass names with numbers and texts")
+        if not isinstance(cast(object, metadata), Mapping | None):
+            raise DataError(f"metadata is a {type(metadata).__name__}; pass names with numbers and texts")
         self._about = About(
             cost=cost,
             limits=limits,
