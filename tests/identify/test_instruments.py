@@ -1,0 +1,101 @@
+"""Instrumental regression: exact where least squares is, unbiased under feedback with noisy sensors, refused without."""
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.errors import DataError, FitWarning, ShapeError
+
+A, B = np.array([[0.9, 0.1], [-0.1, 0.8]]), np.array([[0.0], [0.2]])
+TRUTH = np.hstack([A, B])
+
+
+def run_loop(rng, steps, *, sensor=0.0, process=0.0, moves=True, gain=(1.5, 0.15)):
+    """Return a record of a PI loop on the first state, and its set point."""
+    held = -(-steps // 12)
+    r = np.repeat(rng.choice([-1.0, 1.0], held), 12)[:steps, None] if moves else np.ones((steps, 1))
+    x, total = np.zeros(2), 0.0
+    X, U = np.empty((steps + 1, 2)), np.empty((steps, 1))
+    for k in range(steps):
+        X[k] = x + sensor * rng.standard_normal(2)
+        error = r[k, 0] - X[k, 0]
+        total += error
+        U[k] = gain[0] * error + gain[1] * total
+        x = A @ x + B @ U[k] + process * rng.standard_normal(2)
+    X[-1] = x + sensor * rng.standard_normal(2)
+    return km.Episodes([km.Episode(X=X, U=U)], dt=0.1), [r]
+
+
+def fit(data, r, **options):
+    model = km.identify.instrumental_edmd(data, km.State(), r, **options)
+    return np.hstack([model.A, model.B])
+
+
+def fit_plain(data):
+    model = km.edmd(data, km.State())
+    return np.hstack([model.A, model.B])
+
+
+def test_a_loop_without_noise_gives_the_plant_exactly():
+    data, r = run_loop(np.random.default_rng(0), 400)
+    np.testing.assert_allclose(fit(data, r), TRUTH, atol=1e-9)
+
+
+def test_units_of_the_states_and_of_the_set_point_change_nothing_else():
+    data, r = run_loop(np.random.default_rng(1), 400, sensor=0.05)
+    T = np.diag([1e3, 1e-2])
+    moved = km.Episodes([km.Episode(X=data[0].X @ T, U=data[0].U)], dt=0.1)
+    K = fit(moved, [1e4 * r[0]])
+    np.testing.assert_allclose(np.linalg.solve(T, K[:, :2] @ T), fit(data, r)[:, :2], rtol=1e-6, atol=1e-8)
+
+
+def test_noisy_sensors_bias_least_squares_and_not_the_instruments():
+    rng = np.random.default_rng(2)
+    records = [run_loop(rng, 800, sensor=0.2) for _ in range(30)]
+    plain = np.linalg.norm(np.mean([fit_plain(d) for d, _ in records], axis=0) - TRUTH)
+    ours = np.linalg.norm(np.mean([fit(d, r) for d, r in records], axis=0) - TRUTH)
+    assert ours <= plain / 5
+
+
+@pytest.mark.slow
+def test_the_bias_over_100_records_stays_within_three_standard_errors_which_fall_with_the_length():
+    rng, bound = np.random.default_rng(3), {}
+    for steps in (500, 2000, 8000):
+        records = [run_loop(rng, steps, sensor=0.1) for _ in range(100)]
+        plain = np.linalg.norm(np.mean([fit_plain(d) for d, _ in records], axis=0) - TRUTH)
+        ours = np.array([fit(d, r) for d, r in records])
+        bias = np.linalg.norm(ours.mean(axis=0) - TRUTH)
+        bound[steps] = 3 * np.linalg.norm(ours.std(axis=0)) / np.sqrt(len(ours))
+        print(f"M = {steps}: bias {bias:.2g}, three errors {bound[steps]:.2g}, least squares {plain:.2g}")  # noqa: T201
+        assert bias <= plain / 5
+        assert bias <= bound[steps]
+    assert bound[8000] <= 1.2 * bound[500] * (500 / 8000) ** 0.5
+
+
+def test_a_constant_set_point_is_refused():
+    data, r = run_loop(np.random.default_rng(4), 400, sensor=0.1, moves=False)
+    with pytest.raises(DataError, match="not identifiable from these logs"):
+        fit(data, r)
+
+
+def test_a_signal_that_does_not_act_on_the_loop_is_refused():
+    rng = np.random.default_rng(5)
+    data, _ = run_loop(rng, 400, sensor=0.1)
+    with pytest.raises(DataError, match="not identifiable"):
+        fit(data, [rng.standard_normal((400, 1))])
+
+
+def test_a_short_record_with_much_noise_is_called_weak():
+    data, r = run_loop(np.random.default_rng(7), 150, sensor=0.4)
+    with pytest.warns(FitWarning, match="the instruments are weak"):
+        fit(data, r)
+
+
+def test_set_points_of_other_lengths_are_refused():
+    data, r = run_loop(np.random.default_rng(6), 50)
+    with pytest.raises(ShapeError, match="pass one an episode"):
+        fit(data, [])
+    with pytest.raises(ShapeError, match=r"instruments\[0\] has 40 rows for 50 steps"):
+        fit(data, [r[0][:40]])
+    with pytest.raises(DataError, match="fewer than lags"):
+        fit(data, r, lags=51)
