@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
+from scipy.stats import chi2
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
@@ -18,6 +19,7 @@ from koopmpc.identify.solve import (
     rounding_cutoff,
     scale_to_unit_norm,
     scaled_rank,
+    solve,
 )
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.predictors import LinearPredictor
@@ -27,7 +29,12 @@ CHANCE = 2.0  # refuse below this F: instruments that have no effect on the plan
 
 
 def instrumental_edmd(
-    episodes: Episodes, lifting: Lifting, instruments: Sequence[ArrayLike], *, lags: int = 12
+    episodes: Episodes,
+    lifting: Lifting,
+    instruments: Sequence[ArrayLike],
+    *,
+    lags: int = 12,
+    level: float | None = None,
 ) -> LinearPredictor:
     """Fit z⁺ = A z + B u by two-stage least squares, with the set point of a closed loop as instrument.
 
@@ -47,6 +54,8 @@ def instrumental_edmd(
         Set point or added test signal of each episode, in its order: (T, nr) or (T + 1, nr), where row k acts on u_k.
     lags
         Rows of the set point in q; the first lags − 1 steps of each episode are left out.
+    level
+        Return least squares unless the test of Hausman finds it biased at this level, 0.01 say; by default never.
 
     Raises
     ------
@@ -65,7 +74,8 @@ def instrumental_edmd(
     ----------
     Söderström & Stoica, "Instrumental variable methods for system identification", Springer 1983; Van den Hof &
     Schrama, "An indirect method for transfer function estimation from closed loop data", Automatica 29, 1993;
-    Staiger & Stock, "Instrumental variables regression with weak instruments", Econometrica 65, 1997.
+    Staiger & Stock, "Instrumental variables regression with weak instruments", Econometrica 65, 1997;
+    Hausman, "Specification tests in econometrics", Econometrica 46, 1978.
     """
     episodes = episodes_of(episodes)
     if not episodes.nu:
@@ -92,6 +102,12 @@ def instrumental_edmd(
     weak = f"the instruments are weak (F = {strength:.2g}, {WEAK:.0f} expected); move the set point more, or log longer"
     size = column_norms(explained)
     K = np.linalg.lstsq(explained / size, target)[0] / size[:, None]
+    if level is not None:
+        plain_fit = solve(regression.rows.keep_targets(nz)).K
+        chance = _compare(regression.rows, explained, K - plain_fit, plain_fit)
+        if chance > checks.positive(level, "level"):
+            rule = f"least squares, not found biased by the instruments (chance {chance:.2g})"
+            return build_predictor(regression, build_result(regression, plain_fit, rule=rule))
     result = build_result(
         regression,
         K,
@@ -137,3 +153,24 @@ def _measure_strength(rows: RegressionRows, explained: Float[np.ndarray, "q n"])
     rho = np.linalg.svd(np.linalg.solve(root.T, np.transpose(explained / size)), compute_uv=False)[-1]
     share = min(float(rho) ** 2, 1.0)
     return np.inf if share == 1.0 else share / (1 - share) * max(rows.samples - rank, 1) / rank
+
+
+def _compare(
+    rows: RegressionRows,
+    explained: Float[np.ndarray, "q n"],
+    difference: Float[np.ndarray, "n nz"],
+    K: Float[np.ndarray, "n nz"],
+) -> float:
+    """Return the chance of so large a difference from least squares K if K has no bias (Hausman 1978).
+
+    dᵀ((PᵀΠP)⁻¹ − (PᵀP)⁻¹)⁺d / σ² is χ² with n degrees of freedom; the least of all targets, times their number.
+    """
+    size = column_norms(rows.P)
+    inner, outer = explained / size, rows.P / size
+    spread = np.linalg.inv(inner.T @ inner) - np.linalg.inv(outer.T @ outer)
+    noise = rows.residual(np.arange(len(K.T)), K) ** 2
+    d = difference * size[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = np.sum(d * (np.linalg.pinv(spread, rcond=1e-10) @ d), axis=0) / noise
+    chances = np.asarray(chi2.sf(np.nan_to_num(value), len(K)), dtype=np.float64)
+    return min(1.0, len(K.T) * float(np.min(chances)))

@@ -99,3 +99,21 @@ def test_set_points_of_other_lengths_are_refused():
         fit(data, [r[0][:40]])
     with pytest.raises(DataError, match="fewer than lags"):
         fit(data, r, lags=51)
+
+
+def compare_fits(records, **noise):
+    """Return the bias and the variance of least squares and of `level=0.01`, over many records."""
+    rng = np.random.default_rng(0)
+    logs = [run_loop(rng, 800, **noise) for _ in range(records)]
+    both = np.array([[fit_plain(d) for d, _ in logs], [fit(d, r, level=0.01) for d, r in logs]])
+    bias = np.linalg.norm(both.mean(axis=1) - TRUTH, axis=(1, 2))
+    return bias, both.var(axis=1).sum(axis=(1, 2))
+
+
+@pytest.mark.parametrize("records", [20, pytest.param(100, marks=pytest.mark.slow)])
+def test_least_squares_stays_with_process_noise_alone_and_goes_with_noisy_sensors(records):
+    _, variance = compare_fits(records, process=0.05)
+    assert variance[1] <= 1.1 * variance[0]
+    bias, _ = compare_fits(records, sensor=0.1)
+    assert bias[1] <= bias[0] / 5
+    print(f"{records} records: variance {variance[1] / variance[0]:.3f}, bias {bias[1] / bias[0]:.3f} of least squares")  # noqa: T201
