@@ -26,7 +26,7 @@ typed: $(VENV)/installed-dev
 full: $(VENV)/installed-dev
 	$(TYPED) --cov --cov-report=term -m "(slow or not slow) and not speed and not loops and not real"
 
-# 200 small changes of the library, of which the tests must notice 92 %: about an hour on two cores. SEED=N draws others.
+# 200 small changes of the library, of which the tests must notice 92 %: half an hour or more on two cores. SEED=N draws others.
 SEED ?= 0
 mutants: $(VENV)/installed-dev
 	$(PINNED) $(BIN)/python -m tests.mutation --seed $(SEED)

@@ -14,7 +14,6 @@ import time
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from functools import cache
-from glob import escape
 from multiprocessing.util import Finalize
 from os import PathLike
 from pathlib import Path
@@ -118,10 +117,17 @@ _ABANDONED = 3600.0  # [s] after which one that no process holds and nobody has 
 
 def _remove_abandoned(file: Path) -> None:
     """Remove what processes that were killed while they wrote this file left beside it."""
-    for part in file.parent.glob(f".{escape(file.name[:80])}.{'[0-9a-f]' * 8}{PART}"):
-        with suppress(OSError), part.open("rb") as stream:
-            if time.time() - part.stat().st_mtime > _ABANDONED and _lock(stream.fileno()):
-                part.unlink()
+    for part in _list_parts(file.parent):
+        if part.name[: -len(PART) - 9] == f".{file.name[:80]}":
+            with suppress(OSError), part.open("rb") as stream:
+                if time.time() - part.stat().st_mtime > _ABANDONED and _lock(stream.fileno()):
+                    part.unlink()
+
+
+@cache
+def _list_parts(folder: Path) -> tuple[Path, ...]:
+    """Return the unfinished files that this process found in a folder at its first save: a sweep saves thousands."""
+    return tuple(folder.glob(f".*.{'[0-9a-f]' * 8}{PART}"))
 
 
 def settle(part: Path, file: Path, number: int) -> None:

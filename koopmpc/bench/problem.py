@@ -6,6 +6,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -345,18 +346,19 @@ def new_problem(name: str | Path) -> Path:
     return path
 
 
-_LONGEST = 256  # bytes of a file's name from which on systems refuse to look
-
-
 def _find(text: str) -> Path | None:
     path = Path(text)
-    if len(path.name.encode()) < _LONGEST and path.is_file():
-        return path
+    with suppress(OSError):  # of a name that is too long for a file
+        if path.is_file():
+            return path
     return next((entry.path for entry in list_problems() if entry.name == text), None)
 
 
 def _unknown(text: str) -> str:
-    if Path(text).is_dir():
+    folder = False
+    with suppress(OSError):
+        folder = Path(text).is_dir()
+    if folder:
         inside = ", ".join(str(path) for path in _files(Path(text))) or "there is none in it"
         return f"{text} is a folder; pass the path of one problem file: {inside}"
     if text.endswith(".py") or "/" in text or "\\" in text:

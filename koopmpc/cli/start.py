@@ -14,7 +14,7 @@ from koopmpc.cli.console import console, format_command
 from koopmpc.errors import install
 
 WAYS = (
-    ("a problem that comes with koopmpc", ("run", "cart_pole"), "lists of them: koopmpc list"),
+    ("a problem that comes with koopmpc", ("run", "cart_pole"), "koopmpc list names them all"),
     ("equations of your own", ("new", "my_plant"), "writes my_plant.py, which runs; put your plant in its place"),
     ("logs of a plant", ("fit", "LOGS"), "a .csv or a folder; --goal-template begins a controller's design"),
     ("a controller on hardware", ("export", "CONTROLLER.npz"), "C99 without a heap; in Python: km.realtime"),

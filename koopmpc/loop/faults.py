@@ -119,7 +119,7 @@ class _Windowed(Fault):
         channels: Sequence[int] | None = getattr(self, "channels", None)
         if channels is not None:
             checks.kind(channels, "channels", (tuple, list, range, np.ndarray), "pass a list of indices")
-        if channels is not None:  # kept as a tuple, so that nobody changes the fault afterwards
+            # kept as a tuple, so that nobody changes the fault afterwards
             object.__setattr__(self, "channels", tuple(checks.count(i, "channels", 0) for i in channels))
 
     def _at(self, k: int) -> bool:

@@ -263,11 +263,10 @@ class About(Value):
     metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def __post_init__(self) -> None:
+        check_judges(self.cost, self.limits)
         names = self.states, self.inputs
         for part in ("cost", "limits"):
             given: Cost | Limits | None = getattr(self, part)
-            if given is not None and not isinstance(cast(object, given), Cost | Limits):
-                raise DataError(f"{part} is a {type(given).__name__}; leave it out, or pass a km.Cost or km.Limits")
             if given is not None and any(isinstance(value, Mapping) for value in vars(given).values()):
                 object.__setattr__(self, part, given.resolve(*names))
         check_rows = getattr(super(), "__post_init__", None)

@@ -16,7 +16,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.move import Plan
 from koopmpc.disk import path_of
 from koopmpc.errors import DataError
-from koopmpc.loop.run import About, Run, Step, StepRows, check_judges
+from koopmpc.loop.run import About, Run, Step, StepRows
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.viewer import PORT, find_viewer, is_up, quiet, why_none
 from koopmpc.recording.writer import Writer, block_of_steps
@@ -136,7 +136,6 @@ class Recorder:
     ) -> None:
         if path is None and not live:
             raise DataError("a Recorder needs somewhere to write: pass a path, live=True, or both")
-        check_judges(cost, limits)
         if not isinstance(cast(object, metadata), Mapping | None):
             raise DataError(f"metadata is a {type(metadata).__name__}; pass names with numbers and texts")
         self._about = About(

@@ -411,3 +411,8 @@ def test_a_function_is_told_how_to_become_a_plant():
         km.errors.DataError, match=r"the step map .* has no nx, measure; .* pass a Plant without a wrapper"
     ):
         km.plants.SimulatedPlant(plant)
+
+
+def test_a_problem_whose_name_is_too_long_for_a_file_is_unknown():
+    with pytest.raises(km.errors.ProblemError, match="there is no problem"):
+        km.load_problem("x" * 300)

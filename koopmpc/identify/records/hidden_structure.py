@@ -114,16 +114,16 @@ def find_rails(episodes: Episodes) -> Float[np.ndarray, "2 ny"] | None:
     return rails if np.isfinite(rails).any() else None
 
 
-def thin_records(episodes: Episodes) -> Episodes:
-    """Return the records, of many rows evenly spread pieces."""
+def thin_records(episodes: Episodes, most: int = ROWS, piece: int = PIECE) -> Episodes:
+    """Return the records; of more than `most` rows, evenly spread pieces of `piece` rows."""
     pieces = [
         e.cut(len(e) * i // count, len(e) * (i + 1) // count)
         for e in episodes
-        for count in [-(-len(e) // PIECE)]
+        for count in [-(-len(e) // piece)]
         for i in range(count)
     ]
     total = sum(map(len, pieces))
-    return episodes if total <= ROWS else episodes.with_episodes(pieces[:: -(-total // ROWS)])
+    return episodes if total <= most else episodes.with_episodes(pieces[:: -(-total // most)])
 
 
 def is_calm_hidden(model: HiddenModel, data: Episodes, units: SignalUnits, delays: int) -> bool:

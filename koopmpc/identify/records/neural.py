@@ -33,6 +33,7 @@ from koopmpc.identify.records.hidden_structure import (
     measure_hidden,
     normalise,
     report_fit,
+    thin_records,
 )
 from koopmpc.identify.records.narx import Ask, check_list, source_episodes
 from koopmpc.identify.records.structure import HORIZON
@@ -145,7 +146,7 @@ def search_neural(
     DataError
         The records are too short for all of them.
     """
-    data = spread_records(episodes)
+    data = thin_records(episodes, ROWS, PIECE)
     delays, horizon = choose_window(data)
     found: list[HiddenStructure] = []
     reasons: list[KoopmpcError] = []
@@ -184,7 +185,7 @@ def search_neural(
 
 def fit_neural(structure: HiddenStructure, episodes: Episodes) -> LinearPredictor | BilinearPredictor:
     """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows."""
-    s, data = structure, spread_records(episodes)
+    s, data = structure, thin_records(episodes, ROWS, PIECE)
     counts = [q for q in NEURONS if q < s.neurons] + [s.neurons]
     found, units = list(fit_chain(data, s.order, s.degree, s.delays, s.horizon, counts, s.rails))[-1]
     basis = smooth_basis(units.ny, data.nu, s.delays)
@@ -195,18 +196,6 @@ def fit_neural(structure: HiddenStructure, episodes: Episodes) -> LinearPredicto
     if is_calm_hidden(polished, data, units, s.delays) or not is_calm_hidden(found, data, units, s.delays):
         found = polished
     return from_standard(found, units, episodes, s.delays, report_fit(structure, found, units, data))
-
-
-def spread_records(episodes: Episodes) -> Episodes:
-    """Return the records, of very many rows evenly spread pieces."""
-    pieces = [
-        e.cut(len(e) * i // count, len(e) * (i + 1) // count)
-        for e in episodes
-        for count in [-(-len(e) // PIECE)]
-        for i in range(count)
-    ]
-    total = sum(map(len, pieces))
-    return episodes if total <= ROWS else episodes.with_episodes(pieces[:: -(-total // ROWS)])
 
 
 def choose_window(data: Episodes) -> tuple[int, int]:
