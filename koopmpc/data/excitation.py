@@ -135,7 +135,7 @@ class PRBS(Levels):
 
     def __init__(self, low: ArrayLike, high: ArrayLike, hold: int = 1, order: int = 10) -> None:
         super().__init__(low, high, hold)
-        if order not in ORDERS:
+        if checks.count(order, "order") not in ORDERS:
             raise DataError(f"order is {order}; choose {ORDERS[0]} … {ORDERS[-1]}")
         freeze(self, order=order)
 

@@ -134,6 +134,7 @@ class Recorder:
         live: bool = False,
         port: int = PORT,
     ) -> None:
+        checks.kind(live, "live", (bool, np.bool_), "pass True or False")
         if path is None and not live:
             raise DataError("a Recorder needs somewhere to write: pass a path, live=True, or both")
         if not isinstance(cast(object, metadata), Mapping | None):
