@@ -1,10 +1,12 @@
-"""Every Python block of docs/controllers.md runs, one after the other, and the page says what they show."""
+"""The Python blocks of docs/controllers.md and docs/how/hidden_states.md run, and the pages say what they show."""
 
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from tests.docs.page import run
 
 DOCS = Path(__file__).parents[1] / "docs"
 TEXT = (DOCS / "controllers.md").read_text()
@@ -19,21 +21,29 @@ def found():
     return names
 
 
+@pytest.fixture(scope="module")
+def hidden(tmp_path_factory):
+    return run("how/hidden_states.md", tmp_path_factory.mktemp("page"))[0]
+
+
 def test_the_examples_show_what_the_page_says(found):
     km = found["km"]
     offsets = []
     for name in ("mpc", "exact"):
-        run = km.simulate(found["heavy"], found[name], x0=found["x"], reference=[0.5, 0.0], steps=250)
-        offsets.append(abs(run.X[-1, 0] - 0.5))
+        loop = km.simulate(found["heavy"], found[name], x0=found["x"], reference=[0.5, 0.0], steps=250)
+        offsets.append(abs(loop.X[-1, 0] - 0.5))
     assert offsets[0] > 0.01
     assert offsets[1] < 1e-6
-    assert abs(found["state"][0] - 0.5) < 1e-3
-    assert abs(found["swing"][0]) < 1e-2
     assert abs(found["energy"](found["up"].X)[-1] - found["upright"]) < 1e-2
     assert np.abs(found["up"].U).max() <= 2.0
     assert np.abs(found["up"].X[:, 0]).min() < 0.2
     assert found["again"].iterations < found["move"].iterations
     assert np.abs(found["run"].U).max() <= 25
+
+
+def test_one_sensor_is_enough_by_its_past_and_by_a_filter(hidden):
+    assert abs(hidden["state"][0] - 0.5) < 1e-3
+    assert abs(hidden["swing"][0]) < 1e-2
 
 
 def test_every_source_that_the_table_of_features_names_is_at_its_foot():

@@ -1,4 +1,4 @@
-"""Every Python block of docs/identification.md runs, one after the other, and prints what the page shows."""
+"""Every Python block of docs/how/trust.md runs, one after the other, and prints what the page shows."""
 
 import contextlib
 import io
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-TEXT = (Path(__file__).parents[1] / "docs" / "identification.md").read_text()
+TEXT = (Path(__file__).parents[1] / "docs" / "how" / "trust.md").read_text()
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
@@ -18,7 +18,7 @@ def pages():
     names, pairs = {}, []
     for source, shown in re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", TEXT, re.DOTALL):
         with contextlib.redirect_stdout(io.StringIO()) as out:
-            exec(compile(source, "docs/identification.md", "exec"), names)
+            exec(compile(source, "docs/how/trust.md", "exec"), names)
         pairs.append((shown, out.getvalue()))
     return names, pairs
 

@@ -20,7 +20,7 @@ from koopmpc.values import Value, Viewing
 
 GAIN = 0.1  # the least gain that a horizon gives: d forgets within twenty steps, however long the plan
 REACH = (
-    0.15  # share of the horizon over which a misfit must hardly change to be taken as it is, see docs/offset_free.md
+    0.15  # share of the horizon over which a misfit must hardly change to be taken as it is, see docs/why/disturbance_estimate.md
 )
 
 

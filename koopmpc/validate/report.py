@@ -192,7 +192,7 @@ def trust(
     - the conformal band is infinite because there are too few episodes;
     - closed-loop forecasts stay in the band significantly less often than its level.
 
-    An example on a pendulum over 12 steps (docs/identification.md):
+    An example on a pendulum over 12 steps (docs/how/trust.md):
 
     - A good model, fitted to the region where it is used, has a band of 4.6 % of the range at the last step, and 0.13
       times the error of x̂ = x_k.

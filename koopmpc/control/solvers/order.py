@@ -19,7 +19,7 @@ FINISHER = DAQP  # solves to rounding what an inexact solver leaves, the targets
 RESCUER = "osqp"  # answers where the finisher has none; it is set up when it is first asked
 
 # The rule of solver="auto": the solver that is asked first. `python -m tests.speed.first_solver` measures it, and
-# docs/controllers.md has the table: the time of steps with a QP, OSQP first over DAQP first, by size and structure.
+# docs/research.md has the table: the time of steps with a QP, OSQP first over DAQP first, by size and structure.
 # DAQP won the ten tasks, the random loops and all sizes up to N 200 and nu 4. OSQP won loops with limits of inputs
 # alone, n ≥ 400 and more than two thirds of the planned inputs at a limit, by up to 2.8; with few of them at a limit
 # DAQP won the same sizes by up to 46. How many there will be is not known when a controller is built: one row for all.

@@ -39,7 +39,7 @@ class LogFault(Value):
     Attributes
     ----------
     name
-        Kind of the fault; docs/identification.md lists all kinds.
+        Kind of the fault; docs/how/audit.md lists all kinds.
     says
         The fault, with its numbers.
     do
