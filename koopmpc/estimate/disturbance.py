@@ -19,7 +19,7 @@ from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value, Viewing
 
 GAIN = 0.1  # the least gain that a horizon gives: d forgets within twenty steps, however long the plan
-REACH = 0.15  # share of the horizon over which a misfit must hardly change to be taken as it is, see docs/why/disturbance_estimate.md
+REACH = 0.15  # d is the last misfit if misfits hardly change over this share of the horizon (docs/why)
 
 
 @dataclass(frozen=True, eq=False)
