@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -20,6 +20,15 @@ from koopmpc.values import Value
 
 _CONSTANT = 1e-12  # share of the mean square below which a variance is rounding
 Read = TypeVar("Read", np.ndarray, ca.Function)
+
+
+@runtime_checkable
+class WeighsEnd(Protocol):
+    """What knows a terminal weight for a cost, such as a certificate."""
+
+    def weigh_end(self, cost: "Cost") -> Float[np.ndarray, "n n"]:
+        """Return the weight."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +50,8 @@ class Cost(Value):
         positive definite.
     Q_N
         Terminal weight in place of the tail, of x_N − r_N if (nx, nx), of z_N − z_r if (nz, nz), where z_r is the
-        equilibrium that comes nearest to r_N.
+        equilibrium that comes nearest to r_N. Or a Certificate: its V times the number that makes it fall by at least
+        the stage cost.
     of
         The tracked outputs as observables of the state; the references have as many columns. A controller on a
         lifted predictor finds them in its own lifting by name: any lifted coordinates may be tracked.
@@ -75,13 +85,15 @@ class Cost(Value):
 
     Q: ArrayLike | checks.ByName
     R: ArrayLike | checks.ByName
-    Q_N: ArrayLike | None = None
+    Q_N: "ArrayLike | WeighsEnd | None" = None
     of: Lifting = field(default_factory=State)
     u_target: Literal["equilibrium", "zero"] | ArrayLike = "equilibrium"
     R_delta: ArrayLike | checks.ByName | None = None
     tail: int | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.Q_N, WeighsEnd):
+            object.__setattr__(self, "Q_N", self.Q_N.weigh_end(replace(self, Q_N=None)))
         checks.kind(self.of, "of", Lifting, 'for example km.State("theta"), or km.Fourier(1, states="theta")')
         for name in ("Q", "R", "Q_N", "R_delta"):
             value = getattr(self, name)

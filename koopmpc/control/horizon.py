@@ -24,6 +24,7 @@ from scipy.linalg import block_diag
 from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.riccati import Law, Stage
 from koopmpc.control.target import Targets, Units
+from koopmpc.control.terminal.sets import EndRows
 from koopmpc.predict.predictors import LinearPredictor
 
 Coordinates = Literal["auto", "riccati", "plain"]
@@ -206,7 +207,7 @@ class Terminal(NamedTuple):
 
 @dataclass(frozen=True)
 class Condensed:
-    """v = [u_0 …; u_0 − u_{−1} …; G z_1 … G z_N] = F_x ξ_0 + F_r r + F_α α + F_u u_r + F_g g + f + D w, a u a block.
+    """v = [u_0 …; u_0 − u_{−1} …; G z_1 … G z_N; terminal rows] = F_x ξ_0 + F_r r + F_α α + F_u u_r + F_g g + f + D w, a u a block.
 
     ξ_0 is z_0, or [z_0; u_{−1}]; r holds the N + 1 reference rows one after the other, α the targets' coordinates of
     the same rows, u_r their input targets where these are given as numbers, g the preview of disturbances. The changes
@@ -229,9 +230,18 @@ class Condensed:
 
 
 def condense(
-    horizon: Horizon, law: Law, terminal: Terminal, targets: Targets, units: Units, coordinates: Coordinates
+    horizon: Horizon,
+    law: Law,
+    terminal: Terminal,
+    targets: Targets,
+    units: Units,
+    coordinates: Coordinates,
+    end: EndRows | None = None,
 ) -> Condensed:
-    """Return the maps of a horizon in these units whose blocks follow `law`; "auto" chooses coordinates by cond(H)."""
+    """Return the maps of a horizon in these units whose blocks follow `law`; "auto" chooses coordinates by cond(H).
+
+    The rows of a terminal set, `end` in the units of the model, stand at the end of v.
+    """
     h, signals = horizon, horizon.signals
     moves, nu, nx = law.K.shape
     nz, ng, nf = len(h.A), len(h.G), signals.size
@@ -265,7 +275,13 @@ def condense(
     rows = [U.reshape(n, -1)]
     if h.bounded:
         rows.append((U - np.concatenate([last[None], U[:-1]])).reshape(n, -1))
-    v = np.vstack([*rows, (h.G @ Z).reshape(h.N * ng, Z.shape[2])])
+    rows.append((h.G @ Z).reshape(h.N * ng, Z.shape[2]))
+    if end is not None:
+        last_input = units.inputs[:, None] * U[-1]
+        ends = end.F @ np.vstack([units.L @ Z[-1], last_input])[: end.F.shape[1]]
+        ends[:, nx + nf - 1] += end.offset
+        rows.append(ends)
+    v = np.vstack(rows)
     W = v[:, nx + nf :]
     reference, target, given = _pull_of_targets(h, terminal, targets, U[:, :, nx + nf :], Z[:, :, nx + nf :])
     most = WELL_CONDITIONED if len(v) > n else INPUTS_ALONE
@@ -288,7 +304,8 @@ def condense(
 def _of_model(maps: Condensed, h: Horizon, units: Units) -> Condensed:
     """Return maps that were made in these units in the units of the model."""
     moves = len(h.blocks) * (1 + h.bounded)
-    rows = np.concatenate([np.tile(units.inputs, moves), np.tile(units.limited, h.N)])[:, None]
+    ends = len(maps.offset) - moves * len(units.inputs) - h.N * len(units.limited)  # rows of a terminal set
+    rows = np.concatenate([np.tile(units.inputs, moves), np.tile(units.limited, h.N), np.ones(ends)])[:, None]
     back = units.inverse if h.size == len(units.inverse) else block_diag(units.inverse, np.diag(1 / units.inputs))
     drive, nd = maps.from_drive.copy(), h.signals.nd
     if nd:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting, strip_unit
 from koopmpc.values import Value
@@ -101,6 +102,12 @@ class Limits(Value):
         min(k, K). Metrics count from the limits themselves. `tightened` makes it of a model's errors.
     capped
         A sentence for each state for which `tightened` made less margin than the errors ask for.
+    terminal
+        Where predictive controllers end their plans: a Certificate, or a `TerminalSet` such as
+        `km.guarantees.find_terminal_set` makes.
+    terminal_slack
+        (linear, quadratic) weight of leaving the terminal set by the share ε of its size; "auto" as in `slack`; None
+        makes the set hard.
 
     Raises
     ------
@@ -128,8 +135,12 @@ class Limits(Value):
     du_slack: Slack | None = None
     margin: ArrayLike | None = None
     capped: tuple[str, ...] = ()
+    terminal: TerminalSet | HasTerminalSet | None = None
+    terminal_slack: Slack | Literal["auto"] | None = "auto"
 
     def __post_init__(self) -> None:
+        if self.terminal is not None:
+            object.__setattr__(self, "terminal", read_terminal_set(self.terminal))
         for low, high, name in _ENDS:
             for end in (low, high):
                 value = getattr(self, end)
@@ -147,9 +158,9 @@ class Limits(Value):
             value = getattr(self, end)
             if value is not None and (sign * np.array(checks.list_values(value)) > 0).any():
                 raise DataError(f"{end} is {value}; an input must be free to stay, so keep 0 inside its rates")
-        for name in ("slack", "du_slack"):
+        for name in ("slack", "du_slack", "terminal_slack"):
             value = getattr(self, name)
-            if value is not None and not (name == "slack" and isinstance(value, str) and value == "auto"):
+            if value is not None and not (name != "du_slack" and isinstance(value, str) and value == "auto"):
                 object.__setattr__(self, name, _weights(cast("Slack", value), name))
         if self.margin is not None:
             object.__setattr__(self, "margin", self._margin(checks.array(self.margin, "margin", (None, None))))
@@ -237,6 +248,19 @@ class Limits(Value):
         if not np.isfinite(rows).all():
             raise DataError("band is infinite for a state with one limit alone; pass a finite band")
         return replace(self, margin=rows, capped=tuple(said))
+
+    @property
+    def end_set(self) -> TerminalSet | None:
+        """The terminal set, None without one."""
+        return self.terminal if isinstance(self.terminal, TerminalSet) else None
+
+    def end_softness(self, count: int, scale: float = 1.0) -> Softness:
+        """Return how soft the `count` rows of the terminal set are, of which 1 is the size of the set."""
+        if isinstance(self.terminal_slack, str):
+            linear, quadratic = np.full(count, LINEAR * scale), np.full(count, QUADRATIC * scale)
+        else:
+            linear, quadratic = _prices(self.terminal_slack, "terminal_slack", count, "one a row of the terminal set")
+        return Softness(linear, quadratic, np.full(count, SOFTENED))
 
     def inputs(self, nu: int) -> Interval:
         """Return the box of the inputs."""
@@ -347,7 +371,7 @@ def _is_set(low: Bound, high: Bound) -> bool:
 def _weights(slack: Slack, name: str) -> Slack:
     """Return checked (linear, quadratic), each a float or a vector."""
     if not isinstance(cast(object, slack), tuple | list | np.ndarray) or len(slack) != 2:
-        known = ' "auto",' if name == "slack" else ""
+        known = ' "auto",' if name != "du_slack" else ""
         raise ShapeError(f"{name} is {slack!r}; pass (linear, quadratic),{known} or None for hard limits")
     linear = checks.array(slack[0], f"the linear weight of {name}", infinite=True)
     quadratic = checks.array(slack[1], f"the quadratic weight of {name}")

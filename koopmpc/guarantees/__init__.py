@@ -5,11 +5,13 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.control.terminal.sets import TerminalSet as TerminalSet
     from koopmpc.guarantees.certificate import Certificate as Certificate
     from koopmpc.guarantees.certificate import CertifiedFeedback as CertifiedFeedback
     from koopmpc.guarantees.certificate import load_certificate as load_certificate
     from koopmpc.guarantees.certify import certify as certify
     from koopmpc.guarantees.invariant_set import InvariantPolytope as InvariantPolytope
     from koopmpc.guarantees.invariant_set import find_invariant_set as find_invariant_set
+    from koopmpc.guarantees.terminal_set import find_terminal_set as find_terminal_set
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -10,14 +10,17 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import HUGE
+from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import Program, SavedController, no_export
+from koopmpc.control.terminal.sets import TerminalSet
 from koopmpc.errors import CertificateError, DataError
 from koopmpc.guarantees.deviation import DeviationModel
 from koopmpc.guarantees.error_bounds import ErrorBound
+from koopmpc.lifting.base import find_observables
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.text import format_markdown_table
@@ -137,6 +140,30 @@ class Certificate(Value):
             fallen |= np.sqrt(self.value(X_next)) <= np.sqrt(self.decay * self.value(X)) + delta + 1e-9
         return float(1 - fallen.mean())
 
+    def terminal_set(self) -> TerminalSet:
+        """Return {V ≤ 1} as `Limits(terminal=…)` takes it."""
+        kept = tuple(int(i) for i in self.deviation.kept)
+        return TerminalSet(self.deviation.z, of=self.deviation.lifting, W=np.linalg.inv(self.P), kept=kept)
+
+    def weigh_end(self, cost: Cost) -> Float[np.ndarray, "n n"]:
+        """Return s P⁻¹ for which s V falls by at least the stage cost in every step, as `Cost(Q_N=…)` takes it.
+
+        In a step V falls by (1 − ρ) V, and ℓ ≤ λ V in the region, so s = λ / (1 − ρ). With v = (I − G)⁻¹K φ and
+        ‖G‖ ≤ γ < 1 in the region, λ is the largest eigenvalue of SᵀQ S + KᵀK ‖R‖ / (1 − γ)² in the coordinates P^½;
+        for a feedback without products it is that of SᵀQ S + KᵀR K. A certificate with a larger `decay` asks for a
+        smaller s. Weights of observables count from (nz, nz) on, those of states alone are (nx, nx).
+
+        Raises
+        ------
+        CertificateError
+            The certificate has a ball, so V does not fall everywhere; or the bound γ is not below 1.
+        ObservableError
+            The cost tracks an observable that the certificate does not hold.
+        DataError
+            The cost weighs changes of the inputs, which V does not know.
+        """
+        return weigh_decrease(self, cost)
+
     def controller(self, limits: Limits | None = None) -> "CertifiedFeedback":
         """Return the feedback as a controller; `limits` in place of those of the certificate."""
         return CertifiedFeedback(self, limits)
@@ -176,6 +203,46 @@ def load_certificate(path: str | Path) -> Certificate:
         The file is missing, damaged, or does not hold a certificate.
     """
     return load_value(path, Certificate)
+
+
+def weigh_decrease(certificate: Certificate, cost: Cost) -> Float[np.ndarray, "n n"]:
+    """Return the weight of `Certificate.weigh_end`."""
+    c, deviation = certificate, certificate.deviation
+    if c.ball > 0:
+        raise CertificateError(
+            "Q_N is a certificate with a ball: inside it V does not fall, so it cannot pay for the stage cost; pass a"
+            " certificate of an equilibrium with exact measurements"
+        )
+    cost = cost.resolve(c.states, c.inputs)
+    of = cost.of.bind(c.states)
+    (Q, R), n, nu = cost.matrices(of.nz, len(c.inputs)), len(c.P), len(c.inputs)
+    if cost.rate(nu) is not None:
+        raise DataError("Q_N is a certificate, and the cost has R_delta, which V does not know; leave R_delta out")
+    place = {int(kept): i for i, kept in enumerate(deviation.kept)}
+    S = np.zeros((of.nz, n))
+    for row, index in enumerate(find_observables(deviation.lifting, of)):
+        if int(index) in place:
+            S[row, place[int(index)]] = 1.0
+    root = np.linalg.cholesky(c.P)
+    if np.abs(c.K_w).max(initial=0.0) > 0:
+        # G = Σ_k (K_w)_k φ_k in the region: ‖G‖² ≤ Σ over the entries in the coordinates P^½
+        parts = c.K_w.reshape(nu, nu, n) @ root
+        gamma = float(np.linalg.norm(parts.reshape(nu * nu, n), 2)) if nu == 1 else float(np.linalg.norm(parts))
+        if gamma >= 1:
+            raise CertificateError(
+                "the feedback of the certificate is a quotient whose input cannot be bounded in its region; certify a"
+                " smaller region, or leave Q_N out"
+            )
+        spent = c.K.T @ c.K * float(np.linalg.norm(R, 2)) / (1 - gamma) ** 2
+    else:
+        spent = c.K.T @ R @ c.K
+    worst = float(np.linalg.eigvalsh(root.T @ (S.T @ Q @ S + spent) @ root)[-1])
+    weight = worst / (1 - c.decay) * np.linalg.inv(c.P)
+    if n == deviation.lifting.nz:
+        return (weight + weight.T) / 2
+    whole = np.zeros((deviation.lifting.nz, deviation.lifting.nz))
+    whole[np.ix_(deviation.kept, deviation.kept)] = (weight + weight.T) / 2
+    return whole
 
 
 class CertifiedFeedback(FeedbackLaw):

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import linprog
 
 from koopmpc import checks
+from koopmpc.control.terminal.sets import TerminalSet
 from koopmpc.errors import CertificateError, DataError
 from koopmpc.values import Value
 
@@ -30,16 +31,23 @@ class InvariantPolytope(Value):
     h: Float[np.ndarray, " p"]
     steps: int
 
+    def terminal_set(self) -> TerminalSet:
+        """Return the set of the lifted coordinates of a model, as `Limits(terminal=…)` takes it."""
+        return TerminalSet(np.zeros(self.H.shape[1]), H=self.H, h=self.h)
+
     def contains(self, Z: ArrayLike) -> np.ndarray:
         """Return whether a state (n,), or each row of states (M, n), lies in the polytope."""
         return np.asarray((np.asarray(Z, dtype=np.float64) @ self.H.T <= self.h * (1 + _TOLERANCE)).all(axis=-1))
 
 
-def find_invariant_set(A: ArrayLike, H: ArrayLike, h: ArrayLike, *, most_steps: int = 200) -> InvariantPolytope:
-    """Return the largest set of states from which z⁺ = A z keeps H z ≤ h for ever.
+def find_invariant_set(
+    A: ArrayLike, H: ArrayLike, h: ArrayLike, *, error: ArrayLike | None = None, most_steps: int = 200
+) -> InvariantPolytope:
+    """Return the largest set of states from which z⁺ = A z + r keeps H z ≤ h for ever, for every |r| ≤ error.
 
-    With a feedback u = −K z on a lifted linear model, A is A − B K, and limits of inputs are rows −K and K of H. The
-    set is of the model: an error of the model is not part of it. Redundant rows are found by linear programs.
+    With a feedback u = −K z on a lifted linear model, A is A − B K, and limits of inputs are rows −K and K of H. After
+    k steps the errors have moved row H_i by Σ_{j<k} |H_i Aʲ| error at most, by which its limit is tightened. Redundant
+    rows are found by linear programs.
 
     Parameters
     ----------
@@ -47,6 +55,8 @@ def find_invariant_set(A: ArrayLike, H: ArrayLike, h: ArrayLike, *, most_steps: 
         (n, n) with all eigenvalues inside the unit circle.
     H, h
         (p, n), (p,) the limits; h > 0, so that the origin lies strictly inside.
+    error
+        (n,) or a number: the largest |r| of each coordinate in a step; by default 0, and the set is the model's own.
     most_steps
         Give up if later steps still add limits after so many.
 
@@ -55,12 +65,13 @@ def find_invariant_set(A: ArrayLike, H: ArrayLike, h: ArrayLike, *, most_steps: 
     DataError
         A is not stable, or the limits exclude the origin.
     CertificateError
-        The polytope does not end within `most_steps`.
+        The polytope does not end within `most_steps`, or the errors leave nothing of the limits.
 
     References
     ----------
     Gilbert & Tan, "Linear systems with state and control constraints: the theory and application of maximal output
-    admissible sets", IEEE Trans. Automat. Contr. 36, 1991.
+    admissible sets", IEEE Trans. Automat. Contr. 36, 1991. Kolmanovsky & Gilbert, "Theory and computation of
+    disturbance invariant sets for discrete-time linear systems", Math. Probl. Eng. 4, 1998.
 
     Examples
     --------
@@ -80,16 +91,25 @@ def find_invariant_set(A: ArrayLike, H: ArrayLike, h: ArrayLike, *, most_steps: 
     radius = float(np.abs(np.linalg.eigvals(transition)).max())
     if radius >= 1:
         raise DataError(f"A has the spectral radius {radius:.6g}, so no loop of it rests; stabilise it first")
+    reach = np.zeros(len(transition)) if error is None else checks.vector(error, "error", len(transition))
+    if (reach < 0).any():
+        raise DataError(f"error is {reach.tolist()}; its entries are sizes, 0 or above")
     live = np.linalg.norm(rows, axis=1) > 0
-    unit = rows[live] / bounds[live, None]
-    kept, new = unit, unit @ transition
+    kept = rows[live] / bounds[live, None]
+    row, room = kept.copy(), np.ones(len(kept))
     for step in range(limit):
-        added = np.array([_largest(row, kept) > 1 + _TOLERANCE for row in new], dtype=np.bool_)
+        room = room - np.abs(row) @ reach
+        row = row @ transition
+        if (room <= 0).any():
+            raise CertificateError(
+                f"the errors of {step + 1} steps use up a limit whole; take a model with a smaller error, or wider limits"
+            )
+        new = row / room[:, None]
+        added = np.array([_largest(each, kept) > 1 + _TOLERANCE for each in new], dtype=np.bool_)
         if not added.any():
             kept = _drop_redundant(kept)
             return InvariantPolytope(kept, np.ones(len(kept)), step)
         kept = np.vstack([kept, new[added]])
-        new = new @ transition
     raise CertificateError(
         f"the polytope does not end: limits of step {limit} still cut it. The loop is slow (spectral radius"
         f" {radius:.6g}); raise most_steps, or limit more of the states"

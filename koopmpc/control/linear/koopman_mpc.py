@@ -19,10 +19,11 @@ from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controlle
 from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.linear.plan import plan_map, planned_states
 from koopmpc.control.move import Move, Plan, Status, alone, busy
-from koopmpc.control.program import LinearProgram, linear_parts, publish_estimator, reference_table
+from koopmpc.control.program import LinearProgram, linear_parts, no_export, publish_estimator, reference_table
 from koopmpc.control.solvers import FINISHER, order_solvers
 from koopmpc.control.solvers.base import StepQP, StepSolver
 from koopmpc.control.solvers.daqp import DAQP, DAQPSetup
+from koopmpc.control.terminal.cuts import BallSolver
 from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
@@ -211,7 +212,8 @@ class KoopmanMPC(MPCBase):
         coordinates = self._wanted or turns[0].solver.coordinates
         self._map = plan_map(predictor, track, self._blocks, coordinates, disturbed=disturbed)
         self._options = {"solver": self._solver, "settings": settings}
-        self._qps = StepSolver(self._map.qp, turns)
+        ball = self._map.ball
+        self._qps = StepSolver(self._map.qp, turns) if ball is None else BallSolver(self._map.qp, turns, ball)
         rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference_key: bytes | None = None
@@ -227,6 +229,8 @@ class KoopmanMPC(MPCBase):
     def build_program(self, reference: ArrayLike | None) -> CondensedProgram:
         """Return the data of a step."""
         plan, track = self._map, self._map.track
+        if plan.ball is not None:
+            raise no_export(self, "it adds tangent cuts of a terminal ellipsoid; use a polytope, or no terminal set")
         rows = reference_table(reference, len(track.Q))
         estimator = publish_estimator(
             self._initial.observer,
@@ -309,7 +313,10 @@ class KoopmanMPC(MPCBase):
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
         self._map = plan_map(predictor, track, self._blocks, coordinates, disturbed=self._disturbed)
         self.predictor, self._states = predictor, None
-        self._qps.update(self._map.qp)
+        if isinstance(self._qps, BallSolver) and self._map.ball is not None:
+            self._qps.change(self._map.qp, self._map.ball)
+        else:
+            self._qps.update(self._map.qp)
         self._reference_key = None
         self._initial.update(predictor)
         if self._watch is not None:
@@ -469,6 +476,11 @@ class KoopmanMPC(MPCBase):
             moved = plan.targets.coordinates(self._reference, e) - plan.targets.nearest(self._reference, e)
             v += plan.maps.from_target @ moved.ravel()
             if (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
+                return self._return_free_plan(t, start)
+        if plan.ball is not None and isinstance(self._qps, BallSolver) and self._qps.contains(v):
+            others = np.ones(n, dtype=np.bool_)
+            others[plan.ball.rows] = False
+            if (v >= plan.low[:n])[others].all() and (v <= plan.high[:n])[others].all():
                 return self._return_free_plan(t, start)
         inputs, room = plan.track.inputs, None
         if self._hard_rates is not None:

@@ -14,6 +14,8 @@ from koopmpc.control.limits import Interval, Softness, preview_margin
 from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
+from koopmpc.control.terminal.cuts import Ball, make_ball
+from koopmpc.control.terminal.sets import EndRows, read_end
 from koopmpc.control.terminal_cost import terminal_of
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Viewing
@@ -67,6 +69,8 @@ class PlanMap(Viewing):
         Whether a target enters the plan.
     qp
         The QP of w.
+    ball
+        The entries of v that a terminal ellipsoid limits; their limits here are those of a box inside it.
     given_ahead
         The rows of a given u_target, the last one repeated for a preview.
     moving
@@ -77,13 +81,20 @@ class PlanMap(Viewing):
 
     _VIEWS = ("met", "met_low", "met_high")
 
-    def __init__(self, track: LiftedTracking, targets: Targets, horizon: Horizon, maps: Condensed) -> None:
+    def __init__(
+        self, track: LiftedTracking, targets: Targets, horizon: Horizon, maps: Condensed, end: EndRows | None = None
+    ) -> None:
         self.track, self.targets = track, targets
         self.moves, self.blocks = len(maps.hessian), horizon.blocks
         self.deviation = maps.deviation[: self.moves]
-        limits = _plan_limits(track, horizon, maps.deviation)
+        limits = _plan_limits(track, horizon, maps.deviation, end)
         self.qp = _step_qp(maps, limits, 0 if track.rates is None else len(track.inputs.low))
         low, high, nv = limits.low, limits.high, len(limits.low)
+        self.ball: Ball | None = None
+        if end is not None and end.ball:
+            softness = track.limits.end_softness(len(end.F), track.sizes.scale)
+            self.ball = make_ball(softness, maps.deviation, maps.unit, nv - len(end.F))
+            low[self.ball.rows], high[self.ball.rows] = -self.ball.inner, self.ball.inner
         last, first = horizon.disturbance(horizon.N - 1), np.zeros((nv, 0))
         self.disturbance = np.zeros((len(horizon.A), 0)) if last is None else last[:, :-1]
         driven = self.disturbance.shape[1] > 0
@@ -202,8 +213,10 @@ def plan_map(
     parts = build_stages(own, aims)
     end = terminal_of(predictor, cost, own, aims, units.inverse)
     law = recursion(parts, end.P, end.p)
-    maps = condense(own, law, end, aims, units, coordinates)
-    return PlanMap(track, targets, horizon, _scale_deviation(maps, track.inputs, len(blocks)))
+    wanted = track.limits.end_set
+    rows = None if wanted is None else read_end(wanted, predictor)
+    maps = condense(own, law, end, aims, units, coordinates, rows)
+    return PlanMap(track, targets, horizon, _scale_deviation(maps, track.inputs, len(blocks)), rows)
 
 
 def _fold_targets(maps: Condensed, targets: Targets) -> Condensed:
@@ -261,7 +274,9 @@ def planned_states(
     return np.concatenate([part.reshape((N + 1) * nx, -1) for part in parts], axis=1)
 
 
-def _plan_limits(track: LiftedTracking, horizon: Horizon, D: Float[np.ndarray, "nv nw"]) -> PlanLimits:
+def _plan_limits(
+    track: LiftedTracking, horizon: Horizon, D: Float[np.ndarray, "nv nw"], end: EndRows | None
+) -> PlanLimits:
     """Return the limits of a plan whose entries move by D w."""
     moves, N, nu = len(horizon.blocks), horizon.N, horizon.B.shape[1]
     starts = np.cumsum([0, *horizon.blocks[:-1]])
@@ -271,6 +286,11 @@ def _plan_limits(track: LiftedTracking, horizon: Horizon, D: Float[np.ndarray, "
     if track.rates is not None:
         groups.append((track.rates, track.rate_softness, held))
     groups.append((track.outputs, track.softness, np.arange(1, N + 1)))
+    ends = 0 if end is None else len(end.F)
+    if end is not None:  # the set stays where it is from step to step; cuts take the place of a ball's limits
+        high = np.full(ends, np.inf if end.ball else 1.0)
+        softness = track.limits.end_softness(ends, track.sizes.scale)
+        groups.append((Interval(np.full(ends, -np.inf), high), softness, np.zeros(1, dtype=np.intp)))
     parts: list[list[np.ndarray]] = []
     first = 0
     for bounds, softness, following in groups:
@@ -283,8 +303,9 @@ def _plan_limits(track: LiftedTracking, horizon: Horizon, D: Float[np.ndarray, "
     low, high, linear, quadratic, allowance, size, place = (np.concatenate(part) for part in zip(*parts, strict=True))
     if track.margin.any():
         margin = preview_margin(track.margin, N).ravel()
-        low[len(low) - len(margin) :] += margin
-        high[len(high) - len(margin) :] -= margin
+        last = len(low) - ends
+        low[last - len(margin) : last] += margin
+        high[last - len(margin) : last] -= margin
     return PlanLimits(low, high, Softness(linear, quadratic, allowance), size, place)
 
 

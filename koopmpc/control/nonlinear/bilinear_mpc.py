@@ -13,14 +13,14 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
-from koopmpc.control.limits import Interval, Limits
+from koopmpc.control.limits import SOFTENED, Interval, Limits
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
 from koopmpc.control.nonlinear.staged_program import StagedProgram, find_targets, first_gain, trace_functions
 from koopmpc.control.nonlinear.stagewise import list_sides, weights
-from koopmpc.control.program import publish_estimator, reference_table, trace_lifting
+from koopmpc.control.program import no_export, publish_estimator, reference_table, trace_lifting
 from koopmpc.control.solvers.daqp import daqp_settings
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
@@ -37,6 +37,8 @@ SETTLED = (
     1e-6  # a plan is a solution when no input and no state moves by more than this share of its size and the plan's
 )
 FAR = 3.0  # begin a new plan if y is more than this many state sizes from the expected state
+MET = 1e-8  # a plan ends in its terminal set if the value of the set is at most this much above 1
+ENDINGS = 20  # further linearisations of a plan that does not end in its terminal set, at most
 NEARLY = 1e-2  # the same for a plan that is compared with others
 _COPIED = (
     "_initial",
@@ -153,6 +155,8 @@ class BilinearMPC(StagedMPC):
     def build_program(self, reference: ArrayLike | None) -> StagedProgram:
         """Return the data of a step."""
         problem, outputs, model = self._problem, self._outputs, self._map
+        if problem.ends:
+            raise no_export(self, "its C has no terminal set", "a LinearMPC or a KoopmanMPC with a terminal polytope")
         estimator = publish_estimator(self._initial.observer, self._estimator, self._time_limit, "sqp_iterations=1")
         rows, terminal, cost = reference_table(reference, len(outputs.Q)), self._terminal, self.cost
         R, held = weights(problem), int((~problem.free).argmax()) * (not problem.free.all())
@@ -255,8 +259,35 @@ class BilinearMPC(StagedMPC):
         if status not in GOOD and status is not Status.TIME_LIMIT:  # there is no plan, or it has lost the plant
             status, more = self._begin_anew(s, u_prev, deadline)
             iterations += more
+        if self._problem.ends and status in GOOD:
+            status, more = self._meet_end(status, s, u_prev, deadline)
+            iterations += more
         free = iteration.without_limits + (u_prev if self._with_rates else 0.0)
         return StagePlan(iteration.X, iteration.U, status, iterations, iteration.slack, free)
+
+    def _meet_end(
+        self, status: Status, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], deadline: float
+    ) -> tuple[Status, int]:
+        """Linearise on until the plan ends in its terminal set; return how it ended, and the solver's iterations."""
+        iteration, total, before = self._iteration, 0, np.inf
+        hard = bool(np.isinf(self._problem.softness.linear[-1]))
+        for _ in range(ENDINGS):
+            excess = iteration.end_excess()
+            if excess <= MET or (not hard and excess >= 0.9 * before) or perf_counter() > deadline:
+                break
+            before = excess
+            ended, more = self._improve(s, u_prev, 1, deadline)
+            total += more
+            if ended not in GOOD:
+                return ended, total
+            status = ended
+        excess = iteration.end_excess()
+        if hard and excess > MET:
+            return Status.TIME_LIMIT if perf_counter() > deadline else Status.INFEASIBLE, total
+        if excess > SOFTENED:
+            iteration.slack = max(iteration.slack, excess)
+            return Status.SOFTENED, total
+        return status, total
 
     def _begin_anew(
         self, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], deadline: float

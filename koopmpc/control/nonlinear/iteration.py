@@ -87,7 +87,7 @@ class RealTimeIteration:
         margin = problem.margin
         self.low[:, self.low.shape[1] - margin.shape[1] :] += margin
         self.high[:, self.high.shape[1] - margin.shape[1] :] -= margin
-        self._free_stages = problem.free
+        self._free_stages, self._ends, self._limited = problem.free, problem.ends, problem.limited
         ns, nsoft = len(self._sides.row), self._sides.soft
         zeros = np.zeros
         soft = self._sides.row[len(self._sides.row) - self._sides.soft :]
@@ -137,6 +137,8 @@ class RealTimeIteration:
             for place, value in zip(self._terminal, (targets.M.T, targets.L.T, targets.m), strict=True):
                 place[:] = value
         self._linearise.call()
+        if self._ends:  # a terminal set limits the last stage alone
+            self._g[:-1, -self._ends :], self._G[:-1, :, -self._ends :] = 0.0, 0.0
         np.subtract(self._F, self.X[1:], out=self._c)
         self._c += self.e
         np.subtract(x, self.X[0], out=self._x0)
@@ -190,6 +192,11 @@ class RealTimeIteration:
     def gap(self) -> float:
         """The largest defect that the last step has left, as a share of the range of its state in the plan."""
         return float((self._defects / (np.ptp(self.X, axis=0) + 1e-9 * (self._sizes + np.abs(self.X[0])))).max())
+
+    def end_excess(self) -> float:
+        """Return by how much the plan's end leaves its terminal set, whose values are at most 1."""
+        values = np.asarray(self._limited(self.X[-1]).full(), dtype=np.float64).ravel()
+        return float(values[len(values) - self._ends :].max(initial=1.0)) - 1
 
     def cost(self) -> float:
         """Return what the plan costs, its breaches of soft limits included."""

@@ -163,6 +163,8 @@ class Shooting:
             last, share = path_at[:, ng - p.margin.shape[1] : ng], p.margin / row[ng - p.margin.shape[1] :]
             ubg[last] -= share
             lbg[last + ng] += share
+            if p.ends:  # a terminal set limits the last stage alone
+                ubg[path_at[:-1, ng - p.ends : ng]] = np.inf
         unlimited = np.full(nx, np.inf)
         lbx = np.tile(np.concatenate([p.inputs.low, -unlimited, np.zeros(ns)]), (N, 1))
         ubx = np.tile(np.concatenate([p.inputs.high, unlimited, np.full(ns, np.inf)]), (N, 1))

@@ -12,6 +12,7 @@ from scipy.linalg import block_diag
 from koopmpc import checks
 from koopmpc.control.cost import StateTracking
 from koopmpc.control.limits import SOFTENED, Interval, Softness, preview_margin
+from koopmpc.control.terminal.sets import TerminalSet, terminal_function
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.interrupts import raise_swallowed
@@ -177,6 +178,8 @@ class StagedProblem(NamedTuple):
         The stage whose input each stage takes.
     sizes, input_sizes, scale
         What the entries of s and v, and the cost, are measured by, see `Sizes`.
+    ends
+        How many of `limited`, the last ones, are those of a terminal set, and limit the last stage alone.
     """
 
     F: ca.Function
@@ -196,6 +199,7 @@ class StagedProblem(NamedTuple):
     input_sizes: Float[np.ndarray, " nu"]
     margin: Float[np.ndarray, "N nm"]
     scale: float
+    ends: int = 0
 
 
 class StageTargets(NamedTuple):
@@ -235,8 +239,9 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
         margin=preview_margin(o.margin, N),
         scale=o.sizes.scale,
     )
+    wanted = o.limits.end_set
     if not o.with_rates and len(blocks) == N:
-        return plain
+        return plain if wanted is None else _add_end(plain, wanted, model, o)
     unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
     rates = unlimited if o.rates is None else o.rates
     given = np.isfinite(rates.low) | np.isfinite(rates.high)
@@ -251,7 +256,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
     s = ca.SX.sym("s", ns)
     x, last = s[:nx], s[nx : nx + nu]
     hard = np.full(nu, np.inf), np.zeros(nu), SOFTENED * plain.input_sizes
-    return plain._replace(
+    rated = plain._replace(
         F=after.expand("F") if F.is_a("SXFunction") else after,
         tracked=ca.Function("tracked", [s], [ca.vertcat(o.tracked(x), last)]),
         limited=ca.Function("limited", [s], [ca.vertcat(last, s[nx + nu :], o.limited(x))]),
@@ -264,6 +269,35 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
         soft_rates=soft,
         nx=ns,
         sizes=np.concatenate([plain.sizes, plain.input_sizes, plain.input_sizes[soft]]),
+    )
+    return rated if wanted is None else _add_end(rated, wanted, model, o)
+
+
+def _add_end(problem: StagedProblem, wanted: TerminalSet, model: LearnedMap, o: StateTracking) -> StagedProblem:
+    """Return the problem with the values of a terminal set behind its limited outputs.
+
+    Raises
+    ------
+    DataError
+        The set holds the last input, which the stages do not.
+    """
+    nu, ny, nx = model.nu, model.ny, model.nx
+    if wanted.with_input and not problem.with_rates:
+        raise DataError(
+            "the terminal set holds the last input, and this controller has no limits of rates and no R_delta; make the"
+            " set with the cost and the limits of the controller"
+        )
+    s = ca.SX.sym("s", problem.nx)
+    u = s[nx : nx + nu] if problem.with_rates else ca.SX(nu, 1)
+    end = terminal_function(wanted, tuple(model.model.states), nu)(s[:ny], u)
+    count = int(end.size1())
+    box, soft = problem.box, o.limits.end_softness(count, problem.scale)
+    return problem._replace(
+        limited=ca.Function("limited", [s], [ca.vertcat(problem.limited(s), end)]),
+        box=Interval(np.append(box.low, np.full(count, -np.inf)), np.append(box.high, np.ones(count))),
+        softness=Softness(*(np.concatenate(pair) for pair in zip(problem.softness, soft, strict=True))),
+        margin=np.hstack([problem.margin, np.zeros((len(problem.margin), count))]),
+        ends=count,
     )
 
 

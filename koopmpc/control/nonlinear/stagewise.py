@@ -127,6 +127,10 @@ def plan_cost(problem: StagedProblem) -> ca.Function:
         inwards[:, len(soft) - problem.margin.shape[1] :] = problem.margin
         low, high = (ca.DM((end + sign * inwards).T) for end, sign in zip(problem.box, (1, -1), strict=True))
         over = ca.fmax(ca.fmax(low - g, g - high), 0)
+        if problem.ends:  # a terminal set limits the last stage alone
+            counts = np.ones((len(soft), N))
+            counts[-problem.ends :, :-1] = 0.0
+            over = over * ca.DM(counts)
         cost += ca.dot(linear, ca.sum2(over)) + ca.dot(quadratic, ca.sum2(over**2))
     return ca.Function("plan_cost", [X, U, R, U_r, M, L, m], [cost])
 

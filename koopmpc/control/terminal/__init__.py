@@ -1,0 +1,1 @@
+"""Terminal sets: where a plan has to end, as a polytope or an ellipsoid of the lifted state."""

@@ -1,0 +1,188 @@
+"""`TerminalSet`: where a plan has to end; its rows on the lifted state of a predictor, or on the state of a map."""
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
+
+from koopmpc import checks
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.lifting.base import Lifting, find_observables
+from koopmpc.lifting.state import State
+from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.values import Value
+
+_ADVICE = "make one with km.guarantees.find_terminal_set, or pass a Certificate"
+
+
+@dataclass(frozen=True, eq=False)
+class TerminalSet(Value):
+    """{ξ: H (ξ − c) ≤ h}, or {ξ: (ξ − c)ᵀW(ξ − c) ≤ 1}, of observables ξ at the end of a plan.
+
+    Attributes
+    ----------
+    center
+        (n,) c.
+    of
+        The observables; None for all lifted coordinates of the controller's own model (of a map, its states).
+    H, h
+        (p, n), (p,) of a polytope, h > 0; None for an ellipsoid.
+    W
+        (n, n) positive definite, of an ellipsoid; None for a polytope.
+    with_input
+        Whether the last input u_{N−1} stands behind the observables in ξ.
+    kept
+        (k,) which of the observables ξ holds; None for all. A Constant cannot be one of them.
+
+    Raises
+    ------
+    DataError
+        Neither or both of H and W are given; h is not above zero; W is not positive definite.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> box = km.guarantees.TerminalSet([0.0], of=km.State([0]), H=[[1.0], [-1.0]], h=[0.1, 0.1])
+    >>> box.contains([[0.05], [0.2]]).tolist()
+    [True, False]
+    """
+
+    center: ArrayLike
+    of: Lifting | None = None
+    H: ArrayLike | None = None
+    h: ArrayLike | None = None
+    W: ArrayLike | None = None
+    with_input: bool = False
+    kept: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        center = checks.array(self.center, "center", (None,))
+        n = len(center)
+        object.__setattr__(self, "center", center)
+        if self.of is not None:
+            checks.kind(self.of, "of", Lifting, "for example km.State()")
+        if (self.H is None) == (self.W is None) or (self.H is None) != (self.h is None):
+            raise DataError("a terminal set is a polytope, H and h, or an ellipsoid, W; pass one of the two")
+        if self.W is not None:
+            object.__setattr__(self, "W", checks.weight(self.W, "W", n, definite=True))
+            return
+        H = checks.array(self.H if self.H is not None else [], "H", (None, n))
+        h = checks.vector(self.h if self.h is not None else [], "h", len(H))
+        if (h <= 0).any() or not np.linalg.norm(H, axis=1).all():
+            raise DataError("h must be above 0 and no row of H zero, so that the center lies inside; move the center")
+        object.__setattr__(self, "H", H)
+        object.__setattr__(self, "h", h)
+
+    @property
+    def is_ellipsoid(self) -> bool:
+        """Whether the set is an ellipsoid."""
+        return self.W is not None
+
+    def measure(self, xi: ArrayLike) -> Float[np.ndarray, "..."]:
+        """Return the gauge of points ξ (n,) or (M, n): the set is where it is at most 1, the center where it is 0."""
+        moved = np.asarray(xi, dtype=np.float64) - self.center
+        return np.asarray(
+            np.linalg.norm(moved @ self.rows.T, axis=-1) if self.is_ellipsoid else (moved @ self.rows.T).max(axis=-1)
+        )
+
+    def contains(self, xi: ArrayLike) -> np.ndarray:
+        """Return whether a point ξ (n,), or each row of points (M, n), lies in the set."""
+        return np.asarray(self.measure(xi) <= 1 + 1e-9)
+
+    @property
+    def rows(self) -> Float[np.ndarray, "p n"]:
+        """F: the set is F (ξ − c) ≤ 1 row by row for a polytope, ‖F (ξ − c)‖ ≤ 1 for an ellipsoid."""
+        if self.W is not None:
+            return np.linalg.cholesky(np.asarray(self.W)).T
+        H = np.asarray(self.H, dtype=np.float64)
+        return H / np.asarray(self.h, dtype=np.float64)[:, None]
+
+
+@runtime_checkable
+class HasTerminalSet(Protocol):
+    """What knows a terminal set of its own, such as a certificate."""
+
+    def terminal_set(self) -> TerminalSet:
+        """Return the set."""
+        ...
+
+
+class EndRows(NamedTuple):
+    """F ξ_N − F c on ξ_N = z_N, or [z_N; u_{N−1}]: below 1 row by row, or below 1 in norm where it is a `ball`."""
+
+    F: Float[np.ndarray, "p nx"]
+    offset: Float[np.ndarray, " p"]
+    ball: bool
+
+
+def read_terminal_set(given: object) -> TerminalSet:
+    """Return the terminal set that a user passes.
+
+    Raises
+    ------
+    DataError
+        It is neither a set nor has one.
+    """
+    found = given.terminal_set() if isinstance(given, HasTerminalSet) else given
+    checks.kind(found, "terminal", TerminalSet, _ADVICE)
+    assert isinstance(found, TerminalSet)
+    return found
+
+
+def read_end(wanted: TerminalSet, predictor: LinearPredictor) -> EndRows:
+    """Return the rows of a terminal set on the lifted state of a predictor.
+
+    Raises
+    ------
+    ObservableError
+        The lifting lacks an observable of the set.
+    ShapeError
+        The set has another number of coordinates.
+    """
+    names, nz, nu = predictor.states, predictor.nz, predictor.nu
+    if wanted.of is None:
+        E = np.eye(nz)
+    else:
+        bound = wanted.of.bind(names)
+        whole = np.eye(nz)
+        E = (
+            predictor.C[bound.state_indices]
+            if isinstance(bound, State)
+            else whole[find_observables(predictor.lifting, bound)]
+        )
+    E = E if wanted.kept is None else E[list(wanted.kept)]
+    if wanted.with_input:
+        E = block_diag(E, np.eye(nu))
+    F, center = wanted.rows, np.asarray(wanted.center)
+    _require_size(len(center), len(E))
+    return EndRows(F @ E, -F @ center, wanted.is_ellipsoid)
+
+
+def terminal_function(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> ca.Function:
+    """Return (x, u_{N−1}) → values that are at most 1 where x lies in the set: F (ξ − c), or (ξ − c)ᵀW(ξ − c).
+
+    Raises
+    ------
+    ShapeError
+        The set has another number of coordinates.
+    """
+    x, u = ca.SX.sym("x", len(states)), ca.SX.sym("u", nu)
+    xi = x if wanted.of is None else wanted.of.bind(states).symbolic(x)
+    xi = xi if wanted.kept is None else xi[list(wanted.kept), 0]
+    xi = ca.vertcat(xi, u) if wanted.with_input else xi
+    center = np.asarray(wanted.center)
+    _require_size(len(center), xi.size1())
+    value = ca.mtimes(ca.DM(wanted.rows), xi - ca.DM(center))
+    return ca.Function("terminal", [x, u], [ca.densify(ca.sumsqr(value) if wanted.is_ellipsoid else value)])
+
+
+def _require_size(had: int, wanted: int) -> None:
+    if had != wanted:
+        raise ShapeError(
+            f"the terminal set has {had} coordinates, the model {wanted}; make the set of this model, or name its"
+            " observables with of="
+        )

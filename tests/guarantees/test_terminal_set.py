@@ -1,0 +1,289 @@
+"""Terminal sets and costs: a plan that ends in its set stays feasible, its cost falls, and an ellipsoid is met."""
+
+import warnings
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.signal
+
+import koopmpc as km
+
+
+def draw_model(rng, n=None, nu=None):
+    """Return a random controllable linear model, some of them unstable."""
+    n = int(rng.integers(1, 4)) if n is None else n
+    nu = int(rng.integers(1, min(n, 2) + 1)) if nu is None else nu
+    A = rng.normal(size=(n, n))
+    A *= rng.uniform(0.5, 1.1) / np.abs(np.linalg.eigvals(A)).max()
+    B = rng.normal(size=(n, nu))
+    system = scipy.signal.dlti(A, B, np.eye(n), np.zeros((n, nu)), dt=0.1)
+    return km.LinearPredictor.from_state_space(system)
+
+
+def make_cart():
+    """Return a double integrator."""
+    system = scipy.signal.dlti([[1.0, 0.3], [0.0, 1.0]], [[0.0], [0.3]], np.eye(2), np.zeros((2, 1)), dt=0.3)
+    return km.LinearPredictor.from_state_space(system)
+
+
+def draw_task(rng):
+    """Return a model, a cost, limits, a set point and the weight of its stationary tail on [x; u_prev]."""
+    model = draw_model(rng)
+    n, nu = model.nx, model.nu
+    Q, R = rng.uniform(0.1, 2, n), rng.uniform(0.05, 1, nu)
+    R_delta = rng.uniform(0.05, 1, nu) if rng.uniform() < 0.3 else None
+    rates = rng.uniform(0.4, 1.0) if rng.uniform() < 0.4 else None
+    box = {"u_min": -1, "u_max": rng.uniform(0.7, 1.3, nu), "x_max": rng.uniform(1, 3, n), "du_max": rates}
+    u_r = rng.uniform(-0.1, 0.1, nu)
+    x_r = np.linalg.solve(np.eye(n) - model.A, model.B @ u_r)
+    if not (x_r < 0.5 * box["x_max"]).all():
+        x_r, u_r = np.zeros(n), np.zeros(nu)
+    cost = km.Cost(Q=Q, R=R, R_delta=R_delta)
+    if nu > 1 or R_delta is not None or rates is not None:  # the input that holds a reference need not be unique
+        x_r = np.zeros(n)
+    A, B, weights, S = model.A, model.B, np.diag(Q), None
+    if R_delta is not None:
+        A = scipy.linalg.block_diag(A, np.zeros((nu, nu)))
+        B = np.vstack([model.B, np.eye(nu)])
+        weights = scipy.linalg.block_diag(np.diag(Q), np.diag(R_delta))
+        S = np.vstack([np.zeros((n, nu)), -np.diag(R_delta)])
+    R_all = np.diag(R) + (0 if R_delta is None else np.diag(R_delta))
+    P = scipy.linalg.solve_discrete_are(A, B, weights, R_all, s=S)
+    return model, cost, box, x_r, P
+
+
+def stage_cost(cost, x, u, last):
+    """Return what a step costs, from deviations."""
+    spent = x @ (cost.Q * x) + u @ (cost.R * u)
+    return spent + (0 if cost.R_delta is None else (u - last) @ (cost.R_delta * (u - last)))
+
+
+def plan_cost(cost, P, plan, x_r, u_r, last):
+    """Return what a plan costs, its first state included."""
+    X, U, total = plan.X - x_r, plan.U - u_r, 0.0
+    before = last - u_r
+    for x, u in zip(X[:-1], U, strict=True):
+        total += stage_cost(cost, x, u, before)
+        before = u
+    end = X[-1] if cost.R_delta is None else np.concatenate([X[-1], before])
+    return total + end @ P @ end
+
+
+def run_loops(seed, starts, steps=100):
+    """Return the loops of one random task, of these those feasible at first, later INFEASIBLE ones, and rises of J."""
+    rng = np.random.default_rng(seed)
+    model, cost, box, x_r, P = draw_task(rng)
+    try:
+        found = km.guarantees.find_terminal_set(model, cost, km.Limits(**box), x_r)
+    except km.errors.CertificateError:  # a slow loop whose polytope does not end
+        return 0, 0, 0, 0
+    limits = km.Limits(**box, slack=None, terminal=found, terminal_slack=None)
+    mpc = km.KoopmanMPC(model, cost, limits, horizon=int(rng.integers(2, 9)))
+    u_r = np.linalg.lstsq(model.B, x_r - model.A @ x_r, rcond=None)[0]
+    feasible = lost = rises = 0
+    for _ in range(starts):
+        x, last = x_r + rng.normal(size=model.nx) * rng.uniform(0.2, 1.5), np.clip(np.zeros(model.nu), -1, box["u_max"])
+        mpc.reset(u_prev=last)
+        before = None
+        for k in range(steps):
+            move = mpc(x, x_r)
+            if move.status is km.Status.INFEASIBLE:
+                lost += k > 0
+                break
+            if move.status not in (km.Status.OPTIMAL, km.Status.UNCONSTRAINED):
+                lost += 1
+                break
+            feasible += k == 0
+            J = plan_cost(cost, P, mpc.plan(), x_r, u_r, last)
+            if before is not None:
+                rises += before + 1e-8 * (1 + before) < J
+            before = J - stage_cost(cost, x - x_r, move.u - u_r, last - u_r)
+            x, last = model.A @ x + model.B @ move.u, move.u
+    return starts, feasible, lost, rises
+
+
+def count_loops(plants, starts, steps=100):
+    counts = np.sum([run_loops(seed, starts, steps) for seed in range(plants)], axis=0)
+    print("loops, feasible, lost, rises:", counts.tolist())
+    return counts
+
+
+def test_a_loop_that_is_feasible_once_stays_so_and_its_cost_falls_by_the_stage_cost():
+    loops, feasible, lost, rises = count_loops(7, 7, 40)
+    assert loops >= 42
+    assert feasible > loops // 4
+    assert (lost, rises) == (0, 0)
+
+
+@pytest.mark.slow
+def test_ten_thousand_loops_stay_feasible_and_their_cost_falls():
+    loops, feasible, lost, rises = count_loops(220, 50)
+    assert loops >= 10_000
+    assert feasible > loops // 4
+    assert (lost, rises) == (0, 0)
+
+
+def solve_cone_program(model, cost, box, x0, N, Q_N, W):
+    """Return the inputs and the states of a plan that ends in {xᵀW x ≤ 1}, by Clarabel, None where there is none."""
+    import cvxpy as cp
+
+    X, U = cp.Variable((N + 1, model.nx)), cp.Variable((N, model.nu))
+    root, end = np.linalg.cholesky(W).T, np.linalg.cholesky(Q_N).T
+    tracked = cp.sum_squares(X[1:N] @ np.diag(np.sqrt(cost.Q))) if N > 1 else 0
+    spent = tracked + cp.sum_squares(U @ np.diag(np.sqrt(cost.R))) + cp.sum_squares(end @ X[N])
+    keeps = [X[0] == x0, box["u_min"] <= U, box["u_max"] >= U, cp.norm(root @ X[N]) <= 1]
+    keeps += [X[1:] == X[:-1] @ model.A.T + U @ model.B.T, X[1:] <= np.tile(box["x_max"], (N, 1))]
+    problem = cp.Problem(cp.Minimize(spent), keeps)
+    for digits in (11, 9, 8):
+        tolerance = 10.0**-digits
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of an inaccurate answer, which is not taken
+            problem.solve(solver=cp.CLARABEL, tol_gap_abs=tolerance, tol_gap_rel=tolerance, tol_feas=tolerance)
+        if problem.status in ("optimal", "infeasible"):
+            return (U.value, X.value) if problem.status == "optimal" else None
+    raise AssertionError(problem.status)
+
+
+def compare_with_cone_program(seeds):
+    """Return how many plans agreed with Clarabel's, of these those with an active ellipsoid, and infeasible ones."""
+    agreed = active = infeasible = 0
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        model = draw_model(rng, n=int(rng.integers(2, 6)))
+        n, nu, N = model.nx, model.nu, int(rng.integers(2, 9))
+        root = rng.normal(size=(n, n)) + 0.3 * np.eye(n)
+        W = root.T @ root * 10 ** rng.uniform(0, 4) + 1e-3 * np.eye(n)
+        Q_N = np.diag(rng.uniform(0.1, 1, n))
+        cost = km.Cost(Q=rng.uniform(0.1, 2, n), R=rng.uniform(0.05, 1, nu), Q_N=Q_N)
+        box = {"u_min": -1.0, "u_max": 1.0, "x_max": rng.uniform(1, 3, n)}
+        end = km.guarantees.TerminalSet(np.zeros(n), of=km.State(), W=W)
+        limits = km.Limits(**box, slack=None, terminal=end, terminal_slack=None)
+        mpc = km.KoopmanMPC(model, cost, limits, horizon=N)
+        x0 = rng.normal(size=n) * rng.uniform(0.2, 1.5)
+        move, oracle = mpc(x0, np.zeros(n)), solve_cone_program(model, cost, box, x0, N, Q_N, W)
+        if oracle is None:
+            assert move.status is km.Status.INFEASIBLE, (seed, move.status)
+            infeasible += 1
+            continue
+        assert move.status in (km.Status.OPTIMAL, km.Status.UNCONSTRAINED), (seed, move.status)
+        plan = mpc.plan()
+        gauge = float(end.measure(plan.X[-1]))
+        assert gauge <= 1 + 1.1e-8, (seed, gauge)
+        missed = np.abs(plan.U - oracle[0]).max()
+        assert missed < 1e-4, (seed, missed)
+        agreed, active = agreed + 1, active + (gauge > 1 - 1e-6)
+    print("agreed, with an active ellipsoid, infeasible:", agreed, active, infeasible)
+    return agreed, active, infeasible
+
+
+def test_an_ellipsoid_by_tangent_cuts_is_that_of_a_cone_program():
+    agreed, active, infeasible = compare_with_cone_program(range(25))
+    assert agreed >= 10
+    assert active >= 3
+    assert infeasible >= 1
+
+
+@pytest.mark.slow
+def test_five_hundred_ellipsoids_are_those_of_a_cone_program():
+    agreed, active, _ = compare_with_cone_program(range(1000, 1500))
+    assert agreed >= 250
+    assert active >= 80
+
+
+def test_a_soft_set_gives_way_where_a_hard_one_is_infeasible_and_agrees_with_it_elsewhere():
+    rng, model = np.random.default_rng(3), make_cart()
+    cost, box = km.Cost(Q=1, R=0.1), {"u_min": -1, "u_max": 1}
+    for kind in ("polytope", "ellipsoid"):
+        end = km.guarantees.find_terminal_set(model, cost, km.Limits(**box), [0.0, 0.0], kind=kind)
+        soft = km.KoopmanMPC(model, cost, km.Limits(**box, terminal=end), horizon=4)
+        hard = km.KoopmanMPC(model, cost, km.Limits(**box, terminal=end, terminal_slack=None), horizon=4)
+        seen = set()
+        for _ in range(40):
+            x = rng.normal(size=2) * rng.uniform(0.1, 2)
+            soft.reset()
+            hard.reset()
+            gave, kept = soft(x, [0, 0]), hard(x, [0, 0])
+            seen.add(kept.status.name)
+            if kept.status is km.Status.INFEASIBLE:
+                assert gave.status is km.Status.SOFTENED
+                assert gave.slack > 0
+            else:
+                assert gave.status is kept.status
+                assert gave.u == pytest.approx(kept.u, abs=1e-6)
+        assert "INFEASIBLE" in seen
+        assert len(seen) > 1
+
+
+def test_a_polytope_tightened_by_errors_is_invariant_under_them():
+    rng = np.random.default_rng(0)
+    A, H, error = np.array([[0.8, 0.3], [-0.2, 0.7]]), np.vstack([np.eye(2), -np.eye(2)]), np.array([0.05, 0.02])
+    found = km.guarantees.find_invariant_set(A, H, np.ones(4), error=error)
+    plain = km.guarantees.find_invariant_set(A, H, np.ones(4))
+    Z = rng.uniform(-1, 1, (4000, 2))
+    Z = Z[found.contains(Z)]
+    assert len(Z) > 100
+    assert plain.contains(Z).all()
+    worst = error * rng.choice([-1, 1], Z.shape)
+    assert found.contains(Z @ A.T + worst).all()
+    with pytest.raises(km.errors.CertificateError, match="use up a limit whole"):
+        km.guarantees.find_invariant_set(A, H, np.ones(4), error=[0.5, 0.5])
+
+
+def test_an_ellipsoid_is_refused_in_c_and_a_polytope_acts_there_as_in_python(tmp_path):
+    model = make_cart()
+    cost, box = km.Cost(Q=1, R=0.1), {"u_min": -1, "u_max": 1}
+    ends = {
+        kind: km.guarantees.find_terminal_set(model, cost, km.Limits(**box), [0.0, 0.0], kind=kind)
+        for kind in ("polytope", "ellipsoid")
+    }
+    refused = km.KoopmanMPC(model, cost, km.Limits(**box, terminal=ends["ellipsoid"]), horizon=3)
+    with pytest.raises(km.errors.DataError, match="tangent cuts"):
+        km.export(refused, tmp_path / "refused", reference=[0.0, 0.0])
+    mpc = km.KoopmanMPC(model, cost, km.Limits(**box, terminal=ends["polytope"]), horizon=3)
+    same = km.compiled(mpc)
+    rng, ended = np.random.default_rng(1), set()
+    for _ in range(30):
+        x = rng.normal(size=2) * rng.uniform(0.1, 2)
+        mpc.reset()
+        same.reset()
+        a, b = mpc(x, [0, 0]), same(x, [0, 0])
+        ended.add(a.status.name)
+        assert a.u == pytest.approx(b.u, abs=1e-7)
+        assert a.status is b.status
+    assert {"OPTIMAL", "SOFTENED"} <= ended
+
+
+def test_a_controller_with_a_terminal_set_is_saved_and_copied(tmp_path):
+    model = draw_model(np.random.default_rng(3), n=2, nu=1)
+    cost, box = km.Cost(Q=1, R=0.1), {"u_min": -1, "u_max": 1}
+    end = km.guarantees.find_terminal_set(model, cost, km.Limits(**box), [0.0, 0.0], kind="ellipsoid")
+    mpc = km.KoopmanMPC(model, cost, km.Limits(**box, terminal=end, terminal_slack=None), horizon=4)
+    mpc.save(tmp_path / "mpc.npz")
+    again = km.load_controller(tmp_path / "mpc.npz")
+    assert again.limits == mpc.limits
+    x = 0.9 * np.linalg.solve(model.A, [1.0, 1.0])
+    assert again(x, [0, 0]).u.tolist() == mpc(x, [0, 0]).u.tolist()
+
+
+def test_bad_input_is_an_error_that_says_what_to_do():
+    model = draw_model(np.random.default_rng(3), n=2, nu=1)
+    cost, limits = km.Cost(Q=1, R=0.1), km.Limits(u_min=-1, u_max=1)
+    find, make = km.guarantees.find_terminal_set, km.guarantees.TerminalSet
+    with pytest.raises(km.errors.DataError, match="no limits"):
+        find(model, cost, km.Limits(), [0, 0])
+    with pytest.raises(km.errors.DataError, match="strictly inside"):
+        find(model, cost, km.Limits(x_min=0.0, x_max=1.0, u_min=-1, u_max=1), [0, 0])
+    with pytest.raises(km.errors.DataError, match="terminal is a"):
+        km.Limits(terminal=[1.0])
+    with pytest.raises(km.errors.DataError, match="pass one of the two"):
+        make([0.0])
+    with pytest.raises(km.errors.ShapeError, match="3 coordinates"):
+        km.KoopmanMPC(model, cost, km.Limits(terminal=make(np.zeros(3), W=1.0)))
+    with pytest.raises(km.errors.CertificateError, match="up to 12"):
+        find(draw_model(np.random.default_rng(1), n=13, nu=1), cost, limits, np.zeros(13))
+    still = km.LinearPredictor.from_state_space(
+        scipy.signal.dlti(np.diag([1.0, 0.5]), [[0.0], [1.0]], np.eye(2), np.zeros((2, 1)), dt=1.0)
+    )
+    with pytest.raises(km.errors.DataError, match="spectral radius 1"):
+        find(still, cost, limits, [0, 0])
