@@ -207,7 +207,9 @@ class Terminal(NamedTuple):
 
 @dataclass(frozen=True)
 class Condensed:
-    """v = [u_0 …; u_0 − u_{−1} …; G z_1 … G z_N; terminal rows] = F_x ξ_0 + F_r r + F_α α + F_u u_r + F_g g + f + D w, a u a block.
+    """v = [u_0 …; u_0 − u_{−1} …; G z_1 … G z_N; F z_N] = F_x ξ_0 + F_r r + F_α α + F_u u_r + F_g g + f + D w.
+
+    A u is that of a block; the rows F z_N are those of a terminal set.
 
     ξ_0 is z_0, or [z_0; u_{−1}]; r holds the N + 1 reference rows one after the other, α the targets' coordinates of
     the same rows, u_r their input targets where these are given as numbers, g the preview of disturbances. The changes

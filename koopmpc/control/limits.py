@@ -135,8 +135,8 @@ class Limits(Value):
     du_slack: Slack | None = None
     margin: ArrayLike | None = None
     capped: tuple[str, ...] = ()
-    terminal: TerminalSet | HasTerminalSet | None = None
-    terminal_slack: Slack | Literal["auto"] | None = "auto"
+    terminal: "TerminalSet | HasTerminalSet | None" = None
+    terminal_slack: "Slack | Literal['auto'] | None" = "auto"
 
     def __post_init__(self) -> None:
         if self.terminal is not None:
@@ -248,11 +248,6 @@ class Limits(Value):
         if not np.isfinite(rows).all():
             raise DataError("band is infinite for a state with one limit alone; pass a finite band")
         return replace(self, margin=rows, capped=tuple(said))
-
-    @property
-    def end_set(self) -> TerminalSet | None:
-        """The terminal set, None without one."""
-        return self.terminal if isinstance(self.terminal, TerminalSet) else None
 
     def end_softness(self, count: int, scale: float = 1.0) -> Softness:
         """Return how soft the `count` rows of the terminal set are, of which 1 is the size of the set."""

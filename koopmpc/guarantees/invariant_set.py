@@ -102,7 +102,8 @@ def find_invariant_set(
         row = row @ transition
         if (room <= 0).any():
             raise CertificateError(
-                f"the errors of {step + 1} steps use up a limit whole; take a model with a smaller error, or wider limits"
+                f"the errors of {step + 1} steps use up a limit whole; take a model with a smaller error, or wider"
+                " limits"
             )
         new = row / room[:, None]
         added = np.array([_largest(each, kept) > 1 + _TOLERANCE for each in new], dtype=np.bool_)

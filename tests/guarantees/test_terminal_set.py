@@ -105,7 +105,7 @@ def run_loops(seed, starts, steps=100):
 
 def count_loops(plants, starts, steps=100):
     counts = np.sum([run_loops(seed, starts, steps) for seed in range(plants)], axis=0)
-    print("loops, feasible, lost, rises:", counts.tolist())
+    print("loops, feasible, lost, rises:", counts.tolist())  # noqa: T201
     return counts
 
 
@@ -173,7 +173,7 @@ def compare_with_cone_program(seeds):
         missed = np.abs(plan.U - oracle[0]).max()
         assert missed < 1e-4, (seed, missed)
         agreed, active = agreed + 1, active + (gauge > 1 - 1e-6)
-    print("agreed, with an active ellipsoid, infeasible:", agreed, active, infeasible)
+    print("agreed, with an active ellipsoid, infeasible:", agreed, active, infeasible)  # noqa: T201
     return agreed, active, infeasible
 
 

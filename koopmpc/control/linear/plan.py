@@ -213,7 +213,7 @@ def plan_map(
     parts = build_stages(own, aims)
     end = terminal_of(predictor, cost, own, aims, units.inverse)
     law = recursion(parts, end.P, end.p)
-    wanted = track.limits.end_set
+    wanted = track.limits.terminal
     rows = None if wanted is None else read_end(wanted, predictor)
     maps = condense(own, law, end, aims, units, coordinates, rows)
     return PlanMap(track, targets, horizon, _scale_deviation(maps, track.inputs, len(blocks)), rows)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, cast
 import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost, StateTracking
@@ -440,8 +441,9 @@ class TerminalTargets:
         self._cost, self._outputs, self._most = cost, outputs, most
         self._hold = isinstance(cost.u_target, str) and cost.u_target == "equilibrium"
         self.equilibria = Equilibria(model, cost, outputs)
-        if cost.Q_N is not None:
-            checks.weight(cost.Q_N, "Q_N", model.ny)
+        self._end_weight = cast("ArrayLike | None", cost.Q_N)
+        if self._end_weight is not None:
+            checks.weight(self._end_weight, "Q_N", model.ny)
             if not self.equilibria.of_state:
                 raise ShapeError("Q_N weighs x_N − r_N, but the reference is not of the state; leave Q_N out")
         self._known: dict[bytes, TerminalTarget] = {}
@@ -451,7 +453,7 @@ class TerminalTargets:
     def program(self) -> TailProgram:
         """Return the data of the terminal cost."""
         o, nr, su = self._outputs, len(self._outputs.Q), self._outputs.sizes.inputs
-        scale, weights, Q_N = o.sizes.scale, o.Q.diagonal(), self._cost.Q_N
+        scale, weights, Q_N = o.sizes.scale, o.Q.diagonal(), self._end_weight
         size = np.sqrt(scale / np.where(weights > 0, weights, scale))
         if self.equilibria.of_state:
             size = self.equilibria.size[:nr]
@@ -519,7 +521,8 @@ class TerminalTargets:
         o, (nx, nu, nr) = self._outputs, (self.equilibria.model.nx, self.equilibria.model.nu, len(row))
         n = nx + nu * (o.R_delta is not None and self._cost.Q_N is None) + nr
         M, L, V = (np.zeros((n, columns)) for columns in (nr, nx, nu))
-        M[:nr] = checks.root(o.Q if self._cost.Q_N is None else checks.weight(self._cost.Q_N, "Q_N", nr))
+        end = self._end_weight
+        M[:nr] = checks.root(o.Q if end is None else checks.weight(end, "Q_N", nr))
         begin = self.equilibria.guess(row)
         return TerminalTarget(begin, begin.u * self._hold, M, L, V, M @ row, np.zeros((nu, nx)))
 
@@ -545,9 +548,10 @@ class TerminalTargets:
         o, nx, nr = self._outputs, len(found.x), len(row)
         at, u = self.equilibria.linearise(found.x, found.u), found.u * self._hold
         slope = self.equilibria.slope(at) * self._hold
-        if self._cost.Q_N is not None:
+        end = self._end_weight
+        if end is not None:
             M, L, V = (np.zeros((nx + nr, columns)) for columns in (nr, nx, len(u)))
-            M[:nr] = checks.root(checks.weight(self._cost.Q_N, "Q_N", nr))
+            M[:nr] = checks.root(checks.weight(end, "Q_N", nr))
             return TerminalTarget(found, u, M, L, V, M @ row, slope)
         (sx, su), tail = np.split(self.equilibria.size, [nx]), self.program()
         sr, scale, Q_s, R = tail.row_size, tail.scale, tail.Q, tail.R

@@ -10,8 +10,9 @@ J. Control Optim. 43, 2005.
 """
 
 from time import perf_counter
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
+import casadi as ca
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -195,7 +196,7 @@ class RealTimeIteration:
 
     def end_excess(self) -> float:
         """Return by how much the plan's end leaves its terminal set, whose values are at most 1."""
-        values = np.asarray(self._limited(self.X[-1]).full(), dtype=np.float64).ravel()
+        values = np.array(cast(ca.DM, self._limited(self.X[-1])), dtype=np.float64).ravel()
         return float(values[len(values) - self._ends :].max(initial=1.0)) - 1
 
     def cost(self) -> float:

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from koopmpc import checks
 from koopmpc.control.cost import StateTracking
 from koopmpc.control.limits import SOFTENED, Interval, Softness, preview_margin
-from koopmpc.control.terminal.sets import TerminalSet, terminal_function
+from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set, terminal_function
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
 from koopmpc.interrupts import raise_swallowed
@@ -239,7 +239,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
         margin=preview_margin(o.margin, N),
         scale=o.sizes.scale,
     )
-    wanted = o.limits.end_set
+    wanted = o.limits.terminal
     if not o.with_rates and len(blocks) == N:
         return plain if wanted is None else _add_end(plain, wanted, model, o)
     unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
@@ -273,7 +273,9 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
     return rated if wanted is None else _add_end(rated, wanted, model, o)
 
 
-def _add_end(problem: StagedProblem, wanted: TerminalSet, model: LearnedMap, o: StateTracking) -> StagedProblem:
+def _add_end(
+    problem: StagedProblem, given: TerminalSet | HasTerminalSet, model: LearnedMap, o: StateTracking
+) -> StagedProblem:
     """Return the problem with the values of a terminal set behind its limited outputs.
 
     Raises
@@ -281,7 +283,7 @@ def _add_end(problem: StagedProblem, wanted: TerminalSet, model: LearnedMap, o: 
     DataError
         The set holds the last input, which the stages do not.
     """
-    nu, ny, nx = model.nu, model.ny, model.nx
+    wanted, nu, ny, nx = read_terminal_set(given), model.nu, model.ny, model.nx
     if wanted.with_input and not problem.with_rates:
         raise DataError(
             "the terminal set holds the last input, and this controller has no limits of rates and no R_delta; make the"

@@ -25,8 +25,8 @@ _NEWTON = 60  # steps of the secular equation, at most
 class Ball:
     """y = y_0 + D w has to stay in the unit ball; y_0 are the entries `rows` of a plan.
 
-    `linear` and `quadratic` are the prices of leaving it, as a QP of w counts; linear = inf is a hard ball. A plan whose
-    entries are all below `inner` is in it.
+    `linear` and `quadratic` are the prices of leaving it, as a QP of w counts; linear = inf is a hard ball. A plan
+    whose entries are all below `inner` is in it.
     """
 
     rows: slice
@@ -80,7 +80,8 @@ class BallSolver(StepSolver):
 
     def _forget_cuts(self) -> None:
         self._cuts = np.zeros((MOST, len(self.ball.D)))
-        self._used, self._pushes = np.zeros(MOST, dtype=np.bool_), np.zeros(MOST)
+        self._used = np.zeros(MOST, dtype=np.bool_)
+        self._pushes: Float[np.ndarray, " n"] = np.zeros(MOST)
 
     def change(self, qp: StepQP, ball: Ball) -> None:
         """Go on with new matrices of the same size; the warm start is kept, and no cut."""
@@ -90,7 +91,8 @@ class BallSolver(StepSolver):
     def rest(self) -> None:
         """Forget the last answer and its cuts."""
         super().rest()
-        self._used[:], self._pushes[:] = False, 0.0
+        self._used[:] = False
+        self._pushes = np.zeros(MOST)
 
     def reset(self) -> None:
         """Forget all earlier solves, so that a run repeats to the bit."""
@@ -182,8 +184,8 @@ class BallSolver(StepSolver):
     def _touch(self, y: Float[np.ndarray, " p"], found: QPSolution) -> Float[np.ndarray, " p"] | None:
         """Return the point of the ball where the QP has its solution if its active rows stay as they are, or None.
 
-        With w = w_p + Z q on the active rows and y = b + M q, the solution is (1 + λ s_i²) ŷ_i = b̂_i in the left
-        singular vectors of M, and λ solves ‖y‖ = 1.
+        On the active rows w = w_p + Z q, and y = b + M q. In the left singular vectors of M the solution is
+        ŷ_i = b̂_i / (1 + λ s_i²), where λ solves ‖y‖ = 1.
         """
         active: Bool[np.ndarray, " m"] = found.y != 0
         back = solve_triangular(self._root, np.eye(len(self._root)), lower=True).T  # w = back q with ‖q‖² = wᵀP w

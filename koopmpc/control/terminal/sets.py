@@ -84,10 +84,10 @@ class TerminalSet(Value):
 
     def measure(self, xi: ArrayLike) -> Float[np.ndarray, "..."]:
         """Return the gauge of points ξ (n,) or (M, n): the set is where it is at most 1, the center where it is 0."""
-        moved = np.asarray(xi, dtype=np.float64) - self.center
-        return np.asarray(
-            np.linalg.norm(moved @ self.rows.T, axis=-1) if self.is_ellipsoid else (moved @ self.rows.T).max(axis=-1)
-        )
+        points: np.ndarray = np.asarray(xi, dtype=np.float64)
+        center: np.ndarray = np.asarray(self.center, dtype=np.float64)
+        values: np.ndarray = (points - center) @ self.rows.T
+        return np.asarray(np.linalg.norm(values, axis=-1) if self.is_ellipsoid else values.max(axis=-1))
 
     def contains(self, xi: ArrayLike) -> np.ndarray:
         """Return whether a point ξ (n,), or each row of points (M, n), lies in the set."""
@@ -133,7 +133,7 @@ def read_terminal_set(given: object) -> TerminalSet:
     return found
 
 
-def read_end(wanted: TerminalSet, predictor: LinearPredictor) -> EndRows:
+def read_end(given: TerminalSet | HasTerminalSet, predictor: LinearPredictor) -> EndRows:
     """Return the rows of a terminal set on the lifted state of a predictor.
 
     Raises
@@ -143,7 +143,7 @@ def read_end(wanted: TerminalSet, predictor: LinearPredictor) -> EndRows:
     ShapeError
         The set has another number of coordinates.
     """
-    names, nz, nu = predictor.states, predictor.nz, predictor.nu
+    wanted, names, nz, nu = read_terminal_set(given), predictor.states, predictor.nz, predictor.nu
     if wanted.of is None:
         E = np.eye(nz)
     else:
