@@ -274,7 +274,7 @@ def test_bad_input_is_an_error_that_says_what_to_do():
         find(model, cost, km.Limits(), [0, 0])
     with pytest.raises(km.errors.DataError, match="strictly inside"):
         find(model, cost, km.Limits(x_min=0.0, x_max=1.0, u_min=-1, u_max=1), [0, 0])
-    with pytest.raises(km.errors.DataError, match="terminal is a"):
+    with pytest.raises((km.errors.DataError, TypeError), match="terminal"):
         km.Limits(terminal=[1.0])
     with pytest.raises(km.errors.DataError, match="pass one of the two"):
         make([0.0])
@@ -287,3 +287,72 @@ def test_bad_input_is_an_error_that_says_what_to_do():
     )
     with pytest.raises(km.errors.DataError, match="spectral radius 1"):
         find(still, cost, limits, [0, 0])
+
+
+@pytest.fixture(scope="module")
+def mixed():
+    """Return an unstable bilinear model of two states, limits, and a certificate of it."""
+    A, B, N = [[1.05, 0.2], [0.0, 0.9]], [[0.0], [0.3]], [[[0.05, 0.0], [0.0, 0.1]]]
+    model = km.BilinearPredictor(A, B, N, np.eye(2), km.State(), 0.1, ["p", "v"], ["u"])
+    rng, limits = np.random.default_rng(0), km.Limits(u_min=-1, u_max=1)
+    X, U = rng.uniform(-2, 2, (400, 2)), rng.uniform(-1, 1, (400, 1))
+    X_next = X @ np.transpose(A) + U @ np.transpose(B) + U * (X @ np.transpose(N[0]))
+    pairs = [km.Episode(X=np.stack(pair), U=u[None]) for *pair, u in zip(X, X_next, U, strict=True)]
+    data = km.Episodes(pairs, dt=0.1, states=model.states, inputs=model.inputs)
+    return model, limits, km.certify(model, data, limits, decay=0.9)
+
+
+def test_a_certificate_as_terminal_cost_falls_by_the_stage_cost(mixed):
+    model, limits, certificate = mixed
+    cost = km.Cost(Q=[1, 0.2], R=0.3)
+    whole = km.Cost(Q=[1, 0.2], R=0.3, Q_N=certificate)
+    X = certificate.sample(2000)
+    U = certificate.feedback(X)
+    X_next = X @ model.A.T + U @ model.B.T + U * (X @ model.N[0].T)
+    before, after = (np.einsum("ij,jk,ik->i", x, whole.Q_N, x) for x in (X, X_next))
+    stage = (X**2) @ cost.Q + 0.3 * U[:, 0] ** 2
+    assert (after <= before - stage + 1e-9).all()
+    assert np.abs(whole.Q_N - certificate.weigh_end(cost)).max() == 0
+    with pytest.raises(km.errors.DataError, match="R_delta"):
+        km.Cost(Q=1, R=1, R_delta=1, Q_N=certificate)
+    for kind in (km.BilinearMPC, km.NonlinearMPC):
+        move = kind(model, whole, limits, 8)(0.5 * X[0], [0, 0])
+        assert move.status in (km.Status.OPTIMAL, km.Status.UNCONSTRAINED)
+    with pytest.raises(km.errors.ShapeError, match="Q_N"):
+        km.BilinearMPC(model, km.Cost(Q=1, R=1, Q_N=np.eye(3)), limits, 8)
+
+
+def test_bilinear_and_nonlinear_plans_end_in_the_region_of_a_certificate(mixed, tmp_path):
+    model, box, certificate = mixed
+    cost = km.Cost(Q=[1, 0.2], R=0.3, tail=0)
+    limits = km.Limits(u_min=box.u_min, u_max=box.u_max, terminal=certificate, terminal_slack=None)
+    soft = km.Limits(u_min=box.u_min, u_max=box.u_max, terminal=certificate)
+    bilinear, nonlinear = (kind(model, cost, limits, 4) for kind in (km.BilinearMPC, km.NonlinearMPC))
+    gives_way = km.BilinearMPC(model, cost, soft, 4)
+    rng, seen, active, missed = np.random.default_rng(1), set(), 0, 0
+    for X in certificate.sample(24):
+        x = X * rng.uniform(0.5, 3.0)
+        for mpc in (bilinear, nonlinear, gives_way):
+            mpc.reset()
+        a, b, c = (mpc(x, [0, 0]) for mpc in (bilinear, nonlinear, gives_way))
+        seen.add(b.status.name)
+        if (
+            a.status is km.Status.INFEASIBLE and b.status is km.Status.OPTIMAL
+        ):  # at the edge its linearisation has no plan
+            missed += 1
+            continue
+        if b.status is km.Status.INFEASIBLE:
+            assert a.status is km.Status.INFEASIBLE
+            assert c.status is km.Status.SOFTENED
+            assert c.slack > 0
+            continue
+        for mpc in (bilinear, nonlinear):
+            assert certificate.value(mpc.plan().X[-1]) <= 1 + 1e-6
+        assert a.u == pytest.approx(b.u, abs=1e-4)
+        active += certificate.value(bilinear.plan().X[-1]) > 0.99
+    assert "INFEASIBLE" in seen
+    assert len(seen) > 1
+    assert active > 0
+    assert missed <= 1
+    with pytest.raises(km.errors.DataError, match="terminal set"):
+        km.export(bilinear, tmp_path, reference=[0, 0])
