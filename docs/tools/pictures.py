@@ -269,6 +269,23 @@ def guarantees() -> Any:
     return km.plot.certificate(certified, data, runs)
 
 
+def manual_automatic() -> Any:
+    """The run of the page on manual and automatic control."""
+    return _run_of("how/manual_automatic.md")
+
+
+def on_off() -> Any:
+    """The run of the page on inputs with levels."""
+    return _run_of("how/on_off.md")
+
+
+def _run_of(page: str) -> Any:
+    """Return a picture of the run that the first block of a page makes."""
+    names: dict[str, Any] = {"__name__": "page"}
+    exec(compile(re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)[0], page, "exec"), names)
+    return km.plot.run(names["run"], width="two columns")
+
+
 def _tanks() -> tuple[Any, ...]:
     """Return the page's tanks: plant, model, fresh pairs, limits and set point."""
     names: dict[str, Any] = {"__name__": "page"}
@@ -289,6 +306,8 @@ PICTURES: dict[str, Callable[[], Any]] = {
         choosing_by_closed_loop,
         what_trust_means,
         guarantees,
+        on_off,
+        manual_automatic,
     )
 }
 

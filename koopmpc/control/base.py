@@ -16,6 +16,7 @@ from koopmpc.control.cost import Tracking
 from koopmpc.control.limits import clip_input
 from koopmpc.control.move import Fallback, Move, Status, Token
 from koopmpc.control.program import Published, SavedController
+from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.control.watching import StepMonitor, StepWatch
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import (
@@ -260,6 +261,8 @@ class MPCBase(Published):
         self._initial = InitialCondition(
             model, observer, N, self._latency, with_rates=self._with_rates, estimated=estimator is not None
         )
+        levels = self.limits.input_levels(self.nu)
+        self._held = None if levels is None else HeldLevels(levels)
         self._token: Token = [0]
         self._inside = 0
         self._watch = None if monitor is None else monitor.watch(model, self._latency)
@@ -297,6 +300,10 @@ class MPCBase(Published):
         self._kept: Float[np.ndarray, " nv"] | None = None
         self._age, self._planned = 0, False
         self._given = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
+        if self._held is not None:
+            if u_prev is None:
+                self._given = self._held.round(zero, None, None)
+            self._held.reset(self._given)
         self._initial.reset(x0, self._given)
         if self._watch is not None:
             self._watch.reset()
@@ -351,6 +358,25 @@ class MPCBase(Published):
             **saved.options,
         )
 
+    def _count_held(self, applied: ArrayLike | None) -> None:
+        """Count the step for which the input that acted, or that was returned last, held its levels."""
+        if self._held is None:
+            return
+        acted = self._given
+        if applied is not None and not self._latency:
+            got = np.asarray(applied, dtype=np.float64)
+            if got.shape == (self.nu,) and (np.abs(got) < HUGE).all():
+                acted = got
+        self._held.take(acted)
+
+    def _round(self, u: Float[np.ndarray, " nu"], before: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
+        """Return the input on the levels that dwell times and rates allow."""
+        if self._held is None:
+            return u
+        if self._rates is None:
+            return self._held.round(u, None, None)
+        return self._held.round(u, before + self._rates.low, before + self._rates.high)
+
     def _keep(self, plan: Float[np.ndarray, " nv"]) -> None:
         """Keep a good plan (by reference, for speed); its first entries are the moves."""
         self._kept, self._age, self._planned = plan, 0, True
@@ -400,7 +426,10 @@ class MPCBase(Published):
             got = np.asarray(applied, dtype=np.float64)
             if got.shape == (self.nu,) and (np.abs(got) < HUGE).all():
                 before = got
-        if self._kept is not None and self._age + 1 < self._N:
+        late = self._held is not None and status is Status.TIME_LIMIT  # no plan was found: hold the levels
+        if late:
+            u, fallback = before, Fallback.HOLD
+        elif self._kept is not None and self._age + 1 < self._N:
             self._age += 1
             first = self.nu * int(self._move_of[self._age])
             u, fallback = self._kept[first : first + self.nu], Fallback.SHIFTED_PLAN
@@ -408,6 +437,8 @@ class MPCBase(Published):
             self._kept = None
             u, fallback = (before, Fallback.HOLD) if free is None else (free, Fallback.CLIPPED_LQR)
         self._given = clip_input(u, self._inputs, self._rates, before)
+        if self._held is not None:
+            self._given = self._round(self._given, before)
         taken = perf_counter() - start
         status = status if taken <= self._allowed else Status.TIME_LIMIT
         return Move(self._given.copy(), status, fallback, taken, iterations, solver=solver)

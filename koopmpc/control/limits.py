@@ -2,26 +2,44 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, cast
+from typing import Literal, cast
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.control.bounds.boxes import SOFTENED as SOFTENED
+from koopmpc.control.bounds.boxes import Bound as Bound
+from koopmpc.control.bounds.boxes import Interval as Interval
+from koopmpc.control.bounds.boxes import LimitRows as LimitRows
+from koopmpc.control.bounds.boxes import SizedLimits as SizedLimits
+from koopmpc.control.bounds.boxes import Slack as Slack
+from koopmpc.control.bounds.boxes import Softness as Softness
+from koopmpc.control.bounds.boxes import check_prices, require_room
+from koopmpc.control.bounds.boxes import clip_input as clip_input
+from koopmpc.control.bounds.boxes import half_width as half_width
+from koopmpc.control.bounds.boxes import magnitude as magnitude
+from koopmpc.control.bounds.boxes import measure_violation as measure_violation
+from koopmpc.control.bounds.boxes import preview_margin as preview_margin
+from koopmpc.control.stepped.levels import (
+    DwellByInput,
+    InputLevels,
+    LevelsByInput,
+    build_levels,
+    check_dwell,
+    check_levels,
+    order_entries,
+)
 from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting, strip_unit
 from koopmpc.values import Value
 
-SOFTENED = 1e-4  # a slack above this share of the size of its limit is reported
 LINEAR = 1e4  # default linear weight of a slack as a share of its limit's size, times the scale of the cost
 QUADRATIC = 1e2  # the quadratic weight, in the same unit
 TIGHTEST = 0.2  # share of the range by which a limit is tightened at most
 _AHEAD = 5  # steps of an error band that tighten limits
-Slack = tuple[ArrayLike, ArrayLike]
-Bound = ArrayLike | checks.ByName | None  # of a limit, as a user writes it
-
 
 _ENDS = (
     ("u_min", "u_max", "input"),
@@ -29,47 +47,6 @@ _ENDS = (
     ("x_min", "x_max", "state"),
     ("y_min", "y_max", "output"),
 )  # fields of the lower and the upper limit, and what they limit
-
-
-class Interval(NamedTuple):
-    """low ≤ v ≤ high, entry by entry; ±inf where there is no limit."""
-
-    low: Float[np.ndarray, " n"]
-    high: Float[np.ndarray, " n"]
-
-
-class Softness(NamedTuple):
-    """linear ε + quadratic ε² is what a row's violation ε costs; linear = inf is a hard row.
-
-    A violation above its `allowance`, 1e-4 of the limit's size, is reported.
-    """
-
-    linear: Float[np.ndarray, " n"]
-    quadratic: Float[np.ndarray, " n"]
-    allowance: Float[np.ndarray, " n"]
-
-
-class LimitRows(NamedTuple):
-    """The limited outputs [x; y] that have a limit: which they are, their limits, how soft each is, and its margins."""
-
-    kept: Bool[np.ndarray, " n"]
-    box: Interval
-    softness: Softness
-    margin: Float[np.ndarray, "K n"]
-
-
-class SizedLimits(NamedTuple):
-    """Limits in the sizes of a model: of its inputs, of their changes, and of the limited outputs [x; y] in `rows`.
-
-    `rates` is None where nothing limits the changes. `hard_rates` are the rate limits that are hard, with ±inf in place
-    of the others; None where none is.
-    """
-
-    inputs: Interval
-    rates: Interval | None
-    hard_rates: Interval | None
-    rate_softness: Softness
-    rows: LimitRows
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +85,21 @@ class Limits(Value):
     terminal_slack
         (linear, quadratic) weight of leaving the terminal set by the share ε of its size; "auto" as in `slack`; None
         makes the set hard.
+    levels
+        On/off and stepped inputs: ``{"pump": [0, 1]}``, or an entry for each input, None for a continuous one. Two
+        levels, or evenly spaced ones, from the lowest to the highest. Plans and fallbacks are on these levels.
+    dwell
+        Steps that an input stays at a level once it went there: ``{"pump": (3, 5)}``, at least 3 on and 5 off; one
+        number for inputs of more levels. The lowest level is off.
+    level_steps
+        Steps of the horizon in which levels and dwell times count; later inputs may be between them. None for all.
 
     Raises
     ------
     DataError
         Crossed limits; rate limits without zero between them; y limits without `of`; a negative slack weight; a
-        negative margin, or one that makes limits cross.
+        negative margin, or one that makes limits cross; levels that are not evenly spaced, outside the input's
+        limits, or farther apart than du_max.
 
     Examples
     --------
@@ -137,6 +123,9 @@ class Limits(Value):
     capped: tuple[str, ...] = ()
     terminal: "TerminalSet | HasTerminalSet | None" = None
     terminal_slack: "Slack | Literal['auto'] | None" = "auto"
+    levels: LevelsByInput | None = None
+    dwell: DwellByInput | None = None
+    level_steps: int | None = None
 
     def __post_init__(self) -> None:
         if self.terminal is not None:
@@ -149,7 +138,7 @@ class Limits(Value):
                 elif value is not None:
                     object.__setattr__(self, end, checks.array(value, end, infinite=True))
             if not any(isinstance(getattr(self, end), Mapping) for end in (low, high)):
-                _require_room(getattr(self, low), getattr(self, high), low, high, name)
+                require_room(getattr(self, low), getattr(self, high), low, high, name)
         if (self.y_min is not None or self.y_max is not None) and self.of is None:
             raise DataError("y_min and y_max limit observables; say which with of=, for example of=km.Fourier(1)")
         if self.of is not None:
@@ -161,9 +150,22 @@ class Limits(Value):
         for name in ("slack", "du_slack", "terminal_slack"):
             value = getattr(self, name)
             if value is not None and not (name != "du_slack" and isinstance(value, str) and value == "auto"):
-                object.__setattr__(self, name, _weights(cast("Slack", value), name))
+                object.__setattr__(self, name, check_prices(cast("Slack", value), name))
         if self.margin is not None:
             object.__setattr__(self, "margin", self._margin(checks.array(self.margin, "margin", (None, None))))
+        self._check_levels()
+
+    def _check_levels(self) -> None:
+        """Check the levels, their dwell times, and the steps in which they count."""
+        if self.levels is None:
+            if self.dwell is not None or self.level_steps is not None:
+                raise DataError("dwell and level_steps are of inputs on levels; pass levels, or leave them out")
+            return
+        object.__setattr__(self, "levels", check_levels(self.levels))
+        if self.dwell is not None:
+            object.__setattr__(self, "dwell", check_dwell(self.dwell))
+        if self.level_steps is not None:
+            object.__setattr__(self, "level_steps", checks.count(self.level_steps, "level_steps"))
 
     def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Limits":
         """Return the limits with arrays in place of limits by name; an omitted name has no limit.
@@ -174,7 +176,12 @@ class Limits(Value):
             A name is unknown or fits two, or limits cross.
         """
         named = [end for pair in _ENDS for end in pair[:2] if isinstance(getattr(self, end), Mapping)]
-        if not named:
+        entries = {
+            field: order_entries(getattr(self, field), field, inputs)
+            for field in ("levels", "dwell")
+            if isinstance(getattr(self, field), Mapping)
+        }
+        if not named and not entries:
             return self
         outputs = () if self.of is None else self.of.bind(tuple(states)).names
         known = {"u": inputs, "d": inputs, "x": states, "y": outputs}
@@ -186,6 +193,7 @@ class Limits(Value):
                 )
                 for end in named
             },
+            **entries,
         )
 
     def _margin(self, margin: Float[np.ndarray, "K nx"]) -> Float[np.ndarray, "K nx"]:
@@ -254,12 +262,34 @@ class Limits(Value):
         if isinstance(self.terminal_slack, str):
             linear, quadratic = np.full(count, LINEAR * scale), np.full(count, QUADRATIC * scale)
         else:
-            linear, quadratic = _prices(self.terminal_slack, "terminal_slack", count, "one a row of the terminal set")
+            linear, quadratic = _spread_prices(
+                self.terminal_slack, "terminal_slack", count, "one a row of the terminal set"
+            )
         return Softness(linear, quadratic, np.full(count, SOFTENED))
 
     def inputs(self, nu: int) -> Interval:
-        """Return the box of the inputs."""
-        return _box(self.u_min, self.u_max, "u_min", "u_max", nu)
+        """Return the box of the inputs; that of an input on levels is from its lowest to its highest one."""
+        box = _box(self.u_min, self.u_max, "u_min", "u_max", nu)
+        if self.levels is not None and not isinstance(self.levels, Mapping):
+            at = self.input_levels(nu)
+            if at is not None:
+                box.low[at.which], box.high[at.which] = at.first, at.values(at.count - 1)
+        return box
+
+    def input_levels(self, nu: int) -> InputLevels | None:
+        """Return the levels of nu inputs that are between their limits; None where none has any.
+
+        Raises
+        ------
+        DataError
+            No level is between the limits of its input, or two are farther apart than du_max.
+        """
+        if self.levels is None or isinstance(self.levels, Mapping):
+            return None
+        dwell = None if self.dwell is None or isinstance(self.dwell, Mapping) else self.dwell
+        hard = self._rates(nu) if self.du_slack is None else None
+        box = _box(self.u_min, self.u_max, "u_min", "u_max", nu)
+        return build_levels(self.levels, dwell, self.level_steps, *box, hard)
 
     def rates(self, nu: int) -> Interval | None:
         """Return the box of u_k − u_{k−1}; None where nothing limits it."""
@@ -276,7 +306,7 @@ class Limits(Value):
 
     def rate_softness(self, nu: int) -> Softness:
         """Return how soft the rate limits of each input are."""
-        linear, quadratic = _prices(self.du_slack, "du_slack", nu, "one an input")
+        linear, quadratic = _spread_prices(self.du_slack, "du_slack", nu, "one an input")
         box = self._rates(nu)
         size = np.where(np.isnan(half_width(box)), magnitude(box), half_width(box))
         return Softness(linear, quadratic, SOFTENED * np.where(size > 0, size, 1.0))
@@ -310,7 +340,7 @@ class Limits(Value):
             linear, quadratic = LINEAR * scale / size, QUADRATIC * scale / size**2
         else:
             mine = np.repeat([_is_set(self.x_min, self.x_max), _is_set(self.y_min, self.y_max)], [nx, ny])
-            given = _prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
+            given = _spread_prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
             linear[mine], quadratic[mine] = given
         kept = np.isfinite(low) | np.isfinite(high)
         softness = Softness(linear[kept], quadratic[kept], SOFTENED * size[kept])
@@ -326,58 +356,26 @@ class Limits(Value):
         return Interval(*(np.concatenate(each) for each in zip(self.states(nx), outputs, strict=True)))
 
 
-def preview_margin(margin: Float[np.ndarray, "K n"], N: int) -> Float[np.ndarray, "N n"]:
-    """Return the margins of the steps 1 … N."""
-    return margin[np.minimum(np.arange(N), len(margin) - 1)]
+def refuse_levels(limits: Limits | None, who: str) -> None:
+    """Raise where inputs are on levels, for a law that does not search over them.
 
-
-def half_width(box: Interval) -> Float[np.ndarray, " n"]:
-    """Return half the width of limits with two finite ends, NaN where there are fewer, or no width."""
-    low, high = box
-    both = np.isfinite(low) & np.isfinite(high)
-    width = np.where(both, high, 0.0) - np.where(both, low, 0.0)
-    return np.where(width > 0, width / 2, np.nan)
-
-
-def magnitude(box: Interval) -> Float[np.ndarray, " n"]:
-    """Return the absolute value of the finite end that is farther from 0; 0 where there is none."""
-    low, high = (np.where(np.isfinite(end), np.abs(end), 0.0) for end in box)
-    return np.maximum(low, high)
-
-
-def measure_violation(value: Float[np.ndarray, " n"], box: Interval) -> float:
-    """Return how far the value that is farthest outside its limits is outside; 0 where all are inside."""
-    return float(np.maximum(box.low - value, value - box.high).max(initial=0.0))
-
-
-def clip_input(
-    u: Float[np.ndarray, " nu"], inputs: Interval, rates: Interval | None, last: Float[np.ndarray, " nu"]
-) -> Float[np.ndarray, " nu"]:
-    """Return the input inside its limits, and as far as they allow within a change inside `rates` from the last."""
-    if rates is not None:
-        u = np.clip(u, last + rates.low, last + rates.high)
-    return np.clip(u, *inputs)
+    Raises
+    ------
+    DataError
+        The limits have levels.
+    """
+    if limits is not None and limits.levels is not None:
+        raise DataError(
+            f"the limits have levels={limits.levels}, which {who} does not keep;"
+            " take a KoopmanMPC or a LinearMPC, or pass limits without levels"
+        )
 
 
 def _is_set(low: Bound, high: Bound) -> bool:
     return low is not None or high is not None
 
 
-def _weights(slack: Slack, name: str) -> Slack:
-    """Return checked (linear, quadratic), each a float or a vector."""
-    if not isinstance(cast(object, slack), tuple | list | np.ndarray) or len(slack) != 2:
-        known = ' "auto",' if name != "du_slack" else ""
-        raise ShapeError(f"{name} is {slack!r}; pass (linear, quadratic),{known} or None for hard limits")
-    linear = checks.array(slack[0], f"the linear weight of {name}", infinite=True)
-    quadratic = checks.array(slack[1], f"the quadratic weight of {name}")
-    if linear.ndim > 1 or quadratic.ndim > 1:
-        raise ShapeError(f"{name} has weights of {linear.ndim} and {quadratic.ndim} dimensions; pass vectors")
-    if (linear < 0).any() or (quadratic < 0).any() or not (linear.any() or quadratic.any()):
-        raise DataError(f"{name} is {slack}; pass weights (linear, quadratic) ≥ 0, one above zero, or None")
-    return (linear if linear.ndim else float(linear)), (quadratic if quadratic.ndim else float(quadratic))
-
-
-def _prices(
+def _spread_prices(
     slack: Slack | None, name: str, n: int, what: str
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the linear and quadratic price of n rows."""
@@ -394,28 +392,6 @@ def _prices(
             f"{name} has both weights zero at index {int(free[0])}; give one above zero, or remove the limit"
         )
     return linear, quadratic
-
-
-def _require_room(
-    low: Float[np.ndarray, "..."] | None,
-    high: Float[np.ndarray, "..."] | None,
-    low_name: str,
-    high_name: str,
-    name: str,
-) -> None:
-    """Raise where no number is between the limits."""
-    lower, upper = (
-        np.atleast_1d(-np.inf if low is None else low),
-        np.atleast_1d(np.inf if high is None else high),
-    )
-    if lower.shape != upper.shape and 1 not in (lower.size, upper.size):
-        raise ShapeError(
-            f"{low_name} has shape {lower.shape} and {high_name} {upper.shape}; pass one limit a row, or scalars"
-        )
-    a, b = np.broadcast_arrays(lower, upper)
-    checks.refuse_crossed(a, b, name)
-    if (lower == np.inf).any() or (upper == -np.inf).any():
-        raise DataError(f"{low_name} is +inf or {high_name} is −inf somewhere; use −inf, +inf where there is no limit")
 
 
 def _box(low: Bound, high: Bound, low_name: str, high_name: str, n: int) -> Interval:

@@ -17,7 +17,7 @@ from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.horizon import horizon_of
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
-from koopmpc.control.limits import Interval, Limits, clip_input
+from koopmpc.control.limits import Interval, Limits, clip_input, refuse_levels
 from koopmpc.control.move import Fallback, Move, Status, Token, alone
 from koopmpc.control.program import LinearProgram, Published, SavedController, linear_parts, reference_table
 from koopmpc.control.riccati import Gain
@@ -189,6 +189,7 @@ class LQR(FeedbackLaw):
         advice = "fit one with edmd, or linearise with LinearPredictor.local; from_state_space takes matrices"
         checks.kind(predictor, "predictor", LinearPredictor, advice)
         track = lifted_tracking(predictor, cost, limits)
+        refuse_levels(limits, "an LQR")
         self.predictor, self.cost, self.limits = predictor, track.cost, None if limits is None else track.limits
         units, C = Units.of(predictor, track), track.tracked
         h = horizon_of(predictor, track, (1,), disturbed=False).in_units(units)
@@ -458,6 +459,7 @@ class EigenfunctionLQR(FeedbackLaw):
         kept = ca.if_else(ca.sum1(ca.fabs(x)) < HUGE, 1.0, np.nan) * x
         both = ca.densify(ca.vertcat(eigenfunction.symbolic(kept), self.law(kept, aim)))
         self._read = Buffered(ca.Function("u", [x, aim], [both], {"cse": True}))
+        refuse_levels(limits, "an EigenfunctionLQR")
         sized = Limits() if limits is None else limits
         super().__init__(checks.positive(dt, "dt", "s"), x.numel(), sized.inputs(nu), sized.rates(nu))
 

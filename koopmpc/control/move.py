@@ -72,6 +72,9 @@ class Move:
     refused
         Whether the measurement was too far from its prediction: it entered neither the estimate nor the history of
         delays, and the prediction stood in.
+    gap
+        With inputs on levels, the share of the plan's cost above that of the plan without limits that a better plan
+        may save; 0 where the plan is the best one.
     actor
         Who acted, of a `Station`: "manual", "automatic" or "standby"; empty elsewhere.
     """
@@ -86,6 +89,7 @@ class Move:
     known: bool | None = None
     refused: bool = False
     actor: str = ""
+    gap: float = 0.0
 
     @classmethod
     def hold(cls, u: Float[np.ndarray, " nu"], status: Status, solve_time: float = 0.0) -> "Move":

@@ -16,7 +16,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
-from koopmpc.control.limits import Limits
+from koopmpc.control.limits import Limits, refuse_levels
 from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import SavedController
@@ -97,6 +97,7 @@ class PID(FeedbackLaw):
                 checks.kind(given, name, (tuple, list, range, np.ndarray), "pass one index a loop")
         if limits is not None:
             checks.kind(limits, "limits", Limits, "pass km.Limits(u_min=…, u_max=…)")
+        refuse_levels(limits, "a PID")
         nu = max(len(outputs) if outputs is not None else 1, *(g.size for g in gains))
         self.kp, self.ki, self.kd = (
             checks.vector(value, name, nu) for value, name in ((kp, "kp"), (ki, "ki"), (kd, "kd"))

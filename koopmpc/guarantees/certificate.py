@@ -12,7 +12,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import ControllerKind, register_controller
-from koopmpc.control.limits import Interval, Limits
+from koopmpc.control.limits import Interval, Limits, refuse_levels
 from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import Program, SavedController, no_export
@@ -262,6 +262,7 @@ class CertifiedFeedback(FeedbackLaw):
         checks.kind(certificate, "certificate", Certificate, "make one with km.certify")
         self.certificate, self.limits = certificate, limits
         sized = limits or certificate.limits or Limits()
+        refuse_levels(sized, "a CertifiedFeedback")
         nu = len(certificate.inputs)
         box: Interval = sized.inputs(nu)
         super().__init__(certificate.dt, len(certificate.states), box, sized.rates(nu))

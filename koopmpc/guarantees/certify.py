@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.limits import Limits
+from koopmpc.control.limits import Limits, refuse_levels
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import CertificateError, DataError
 from koopmpc.guarantees.certificate import Certificate
@@ -280,6 +280,7 @@ def _find_room(
     names = model.lifting.bound_states
     allowed = Limits() if limits is None else limits
     checks.kind(allowed, "limits", Limits, "or None for none")
+    refuse_levels(allowed, "a certificate")
     if allowed.du_max is not None or allowed.du_min is not None:
         raise DataError("limits of changes of the inputs are not part of a certificate; pass limits without du_max")
     low, high = pairs.X.min(axis=0), pairs.X.max(axis=0)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from koopmpc import checks
 from koopmpc.control.cost import Cost, Sizes
 from koopmpc.control.limits import SOFTENED, Interval, Limits
+from koopmpc.control.stepped.levels import NEAR
 from koopmpc.errors import ShapeError
 from koopmpc.loop.run import Run, bind_outputs
 from koopmpc.text import format_duration
@@ -37,7 +38,8 @@ class Metrics(Value):
     violation_share
         Largest violation of any state, output or rate limit as a share of the limit's range; see `violation_shares`.
     input_violation
-        Largest violation of any input limit, in its unit; every controller of this library keeps it at zero.
+        Largest violation of any input limit, in its unit; every controller of this library keeps it at zero. Where an
+        input is on levels, the distance from the nearest one counts.
     effort
         Σ_{k=0}^{T−1} ‖u_k‖² dt.
     settling_time
@@ -145,7 +147,6 @@ def metrics(run: Run) -> Metrics:
     """
     checks.kind(run, "run", Run, "simulate returns one")
     error = tracking_error(run)
-    nu = run.U.shape[1]
     stage, moved, changed = cost_terms(run, error)
     p50, p99 = np.quantile(run.solve_time, [0.5, 0.99])
     return Metrics(
@@ -154,7 +155,7 @@ def metrics(run: Run) -> Metrics:
         final_error=error[-1].copy(),
         violation=float(beyond(run).max()),
         violation_share=float(violation_shares(run).max()),
-        input_violation=0.0 if run.limits is None else float(_excess(run.U, *run.limits.inputs(nu)).max(initial=0.0)),
+        input_violation=0.0 if run.limits is None else _input_violation(run.U, run.limits),
         effort=float((run.U**2).sum() * run.dt),
         settling_time=_settling_time(stage, run.dt),
         solve_time_p50=float(p50),
@@ -273,6 +274,16 @@ def stack_limited(
     """Return the rows [x; of(x)] of all that limits can be of, and the box of these."""
     Y = X[:, :0] if limits.of is None else limits.of.bind(states)(X)
     return np.hstack([X, Y]), limits.ends(X.shape[1], Y.shape[1])
+
+
+def _input_violation(U: Float[np.ndarray, "T nu"], limits: Limits) -> float:
+    """Return by how much the input farthest outside its limits is outside them, or from its nearest level."""
+    nu = U.shape[1]
+    beyond, levels = float(_excess(U, *limits.inputs(nu)).max(initial=0.0)), limits.input_levels(nu)
+    if levels is None:
+        return beyond
+    away = np.abs(levels.indices(U) - levels.nearest(U))
+    return max(beyond, float((levels.spacing * np.where(away > NEAR, away, 0.0)).max(initial=0.0)))
 
 
 def _excess(

@@ -16,6 +16,7 @@ from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.limits import Limits, clip_input
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
 from koopmpc.control.program import Program, Published, SavedController, no_export
+from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.errors import DataError
 
 Mode = Literal["manual", "automatic", "standby"]
@@ -38,7 +39,7 @@ class Station(Published):
     standby
         A controller of the same plant, or a function u = f(y, r); None: the applied input is held.
     limits
-        Limits of the inputs and their changes, for whoever acts.
+        Limits of the inputs and their changes, for whoever acts. Inputs with `levels` are rounded to an allowed one.
     mode
         "manual", "automatic" or "standby" at every reset.
     hand
@@ -105,6 +106,10 @@ class Station(Published):
         self.inputs, self.rates = self.limits.inputs(self.nu), self.limits.rates(self.nu)
         width = np.where(np.isfinite(self.inputs.high - self.inputs.low), self.inputs.high - self.inputs.low, np.inf)
         self.bump = _BUMP * width if bump is None else checks.vector(bump, "bump", self.nu, infinite=True)
+        levels = self.limits.input_levels(self.nu)
+        self._held = None if levels is None else HeldLevels(levels)
+        if levels is not None:  # an input on levels moves by a level or not at all
+            self.bump = np.where(np.isin(np.arange(self.nu), levels.which), np.inf, self.bump)
         if (self.bump <= 0).any():
             raise DataError(f"bump is {self.bump}; pass changes above 0 a step")
         self.ramp = None if ramp is None else np.atleast_1d(checks.array(ramp, "ramp"))
@@ -172,6 +177,9 @@ class Station(Published):
         """Begin a run in the first mode, with the first hand value."""
         zero = np.clip(np.zeros(self.nu), *self.inputs)
         self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
+        if self._held is not None:
+            self._last = self._last if u_prev is not None else self._held.round(zero, None, None)
+            self._held.reset(self._last)
         self.mode: Mode = self._first_mode
         self._hand = self._first_hand
         self.actor: str = ""
@@ -196,6 +204,8 @@ class Station(Published):
             self._last = got if (np.abs(got) < HUGE).all() else self._last
         measured, rows = numbers(y, "y"), self._ramp_rows(numbers(y, "y"), numbers(reference, "reference"))
         last = self._last
+        if self._held is not None:
+            self._held.take(last)
         first = self.controller(measured, _rows_of(rows, self.controller), last, w)
         second = None
         if self.standby is not None:
@@ -208,6 +218,9 @@ class Station(Published):
             near = np.clip(u, last - self.bump, last + self.bump)
             self._approaching, u = not np.array_equal(near, u), near
         u = clip_input(u, self.inputs, self.rates, last)
+        if self._held is not None:
+            ends = (None, None) if self.rates is None else (last + self.rates.low, last + self.rates.high)
+            u = self._held.round(u, *ends)
         self._last = u
         status = move.status if np.array_equal(u, move.u) else Status.SATURATED
         fallback = Fallback.OTHER_CONTROLLER if actor == "standby" else move.fallback

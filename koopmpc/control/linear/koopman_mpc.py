@@ -20,9 +20,10 @@ from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.linear.plan import plan_map, planned_states
 from koopmpc.control.move import Move, Plan, Status, alone, busy
 from koopmpc.control.program import LinearProgram, linear_parts, no_export, publish_estimator, reference_table
-from koopmpc.control.solvers import FINISHER, order_solvers
+from koopmpc.control.solvers import FINISHER, exact_turn, order_solvers
 from koopmpc.control.solvers.base import StepQP, StepSolver
 from koopmpc.control.solvers.daqp import DAQP, DAQPSetup
+from koopmpc.control.stepped.search import LevelSolver
 from koopmpc.control.terminal.cuts import BallSolver
 from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
@@ -212,8 +213,14 @@ class KoopmanMPC(MPCBase):
         coordinates = self._wanted or turns[0].solver.coordinates
         self._map = plan_map(predictor, track, self._blocks, coordinates, disturbed=disturbed)
         self._options = {"solver": self._solver, "settings": settings}
+        self._levels: LevelSolver | None = None
         ball = self._map.ball
-        self._qps = StepSolver(self._map.qp, turns) if ball is None else BallSolver(self._map.qp, turns, ball)
+        if self._held is not None:
+            if ball is not None:
+                raise DataError("the limits have levels and a terminal ellipsoid; pass a polytope, or no terminal set")
+            self._qps = self._levels = LevelSolver(self._map.qp, exact_turn(turns), self._held, self._blocks, self.nu)
+        else:
+            self._qps = StepSolver(self._map.qp, turns) if ball is None else BallSolver(self._map.qp, turns, ball)
         rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference_key: bytes | None = None
@@ -228,6 +235,10 @@ class KoopmanMPC(MPCBase):
 
     def build_program(self, reference: ArrayLike | None) -> CondensedProgram:
         """Return the data of a step."""
+        if self._held is not None:
+            raise no_export(
+                self, "its inputs are on levels, and the search over them has no C code", "one without levels"
+            )
         plan, track = self._map, self._map.track
         if plan.ball is not None:
             raise no_export(self, "it adds tangent cuts of a terminal ellipsoid; use a polytope, or no terminal set")
@@ -363,6 +374,8 @@ class KoopmanMPC(MPCBase):
             self._going = True
             origin = self._initial
             origin.take(y, self._given, applied, w)
+            if self._held is not None:
+                self._count_held(applied)
             if self._rows_left:  # the next call has its own row of a given u_target
                 self._given_row, self._reference_key = self._given_row + 1, None
             plan, t = self._map, self._spare
@@ -371,14 +384,16 @@ class KoopmanMPC(MPCBase):
                 np.greater_equal(t, plan.low, out=plan.met_low)
                 np.less_equal(t, plan.high, out=plan.met_high)
                 # no 0 byte: every limit is met, and nothing is NaN (NaN meets no limit)
-                move = self._solve_limited(t, applied, start) if 0 in plan.met else self._return_free_plan(t, start)
+                ask = self._solve_limited if 0 in plan.met else self._return_free_plan
+                move = ask(t, applied, start)
             else:
                 moving.start[:] = origin.known
                 moving.matrix.dot(moving.known, moving.t)
                 np.greater_equal(moving.t, moving.low, out=moving.met_low)
                 np.less_equal(moving.t, moving.high, out=moving.met_high)
                 t[: plan.planned] = moving.t[: plan.planned]
-                move = self._solve_moving(t, applied, start) if 0 in moving.met else self._return_free_plan(t, start)
+                ask = self._solve_moving if 0 in moving.met else self._return_free_plan
+                move = ask(t, applied, start)
             if origin.refused:
                 move.refused = True
             watch = self._watch
@@ -445,7 +460,9 @@ class KoopmanMPC(MPCBase):
                 v += maps.from_target @ (targets.coordinates(R) - alpha).ravel()
         column[: plan.planned] = v
 
-    def _return_free_plan(self, t: Float[np.ndarray, " nt"], start: float) -> Move:
+    def _return_free_plan(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
+        if self._levels is not None and not self._levels.accepts(t):
+            return self._solve_qp(t, applied, start)
         self._qps.rest()
         self._plan, self._spare = t, self._plan
         self._keep(t)
@@ -460,12 +477,12 @@ class KoopmanMPC(MPCBase):
             self._aim()
             plan.matrix.dot(self._initial.known, t)
             if (t >= plan.low).all() and (t <= plan.high).all():
-                return self._return_free_plan(t, start)
+                return self._return_free_plan(t, applied, start)
         return self._solve_limited(t, applied, start)
 
     def _solve_limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Handle a step in which the plan or its target breaks a limit, or something is not finite."""
-        plan, origin, u_prev = self._map, self._initial, self._initial.u_prev
+        plan, origin = self._map, self._initial
         if not t.dot(t) < HUGE * HUGE:
             self._qps.cool()
             return self._fail(None, applied, Status.BAD_MEASUREMENT, 0, start)
@@ -476,12 +493,17 @@ class KoopmanMPC(MPCBase):
             moved = plan.targets.coordinates(self._reference, e) - plan.targets.nearest(self._reference, e)
             v += plan.maps.from_target @ moved.ravel()
             if (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
-                return self._return_free_plan(t, start)
+                return self._return_free_plan(t, applied, start)
         if plan.ball is not None and isinstance(self._qps, BallSolver) and self._qps.contains(v):
             others = np.ones(n, dtype=np.bool_)
             others[plan.ball.rows] = False
             if (v >= plan.low[:n])[others].all() and (v <= plan.high[:n])[others].all():
-                return self._return_free_plan(t, start)
+                return self._return_free_plan(t, applied, start)
+        return self._solve_qp(t, applied, start)
+
+    def _solve_qp(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
+        """Return the move of the QP of the deviation from the plan t."""
+        plan, u_prev, v = self._map, self._initial.u_prev, t[: self._map.planned]
         inputs, room = plan.track.inputs, None
         if self._hard_rates is not None:
             room = Interval(inputs.low - u_prev, inputs.high - u_prev)
@@ -498,10 +520,16 @@ class KoopmanMPC(MPCBase):
         u = U[: self.nu]
         if self._hard_rates is not None:
             u[:] = clip_input(u, inputs, self._hard_rates, u_prev)
+        gap = 0.0
+        if self._levels is not None:
+            gap = self._levels.place(U)
         self._plan, self._spare = t, self._plan  # swap: the previous plan's array becomes the spare
         self._keep(t)
         status = Status.SOFTENED if gave_way else Status.OPTIMAL
-        return self._move(u.copy(), status, found.iterations, start, gave_way, found.solver)
+        move = self._move(u.copy(), status, found.iterations, start, gave_way, found.solver)
+        if gap:
+            move.status, move.gap = Status.TIME_LIMIT, gap
+        return move
 
 
 class LinearMPC(KoopmanMPC):

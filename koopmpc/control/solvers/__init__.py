@@ -2,4 +2,5 @@
 
 from koopmpc.control.solvers.order import FINISHER as FINISHER
 from koopmpc.control.solvers.order import SOLVERS as SOLVERS
+from koopmpc.control.solvers.order import exact_turn as exact_turn
 from koopmpc.control.solvers.order import order_solvers as order_solvers

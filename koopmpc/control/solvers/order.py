@@ -48,3 +48,16 @@ def order_solvers(solver: str, settings: Mapping[str, Any]) -> list[SolverTurn]:
     if not kind.exact:
         turns.append(SolverTurn(SOLVERS[FINISHER.name], {}))
     return [*turns, SolverTurn(SOLVERS[RESCUER], {}, late=True)]
+
+
+def exact_turn(turns: list[SolverTurn]) -> SolverTurn:
+    """Return the turn of the exact solver, which the search over the levels of inputs needs.
+
+    Raises
+    ------
+    DataError
+        A solver was chosen that is not exact.
+    """
+    if not turns[0].solver.exact:
+        raise DataError(f'solver is {turns[0].solver.name!r}; inputs on levels need "daqp", or "auto"')
+    return turns[0]

@@ -1,0 +1,1 @@
+"""What limits are made of: boxes, softness, and the checks of a user's numbers."""

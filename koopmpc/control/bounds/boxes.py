@@ -1,0 +1,124 @@
+"""Boxes of limits, how soft each row is, and the checks that `Limits` makes of what a user passes."""
+
+from typing import NamedTuple, cast
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.errors import DataError, ShapeError
+
+SOFTENED = 1e-4  # a slack above this share of the size of its limit is reported
+Slack = tuple[ArrayLike, ArrayLike]
+Bound = ArrayLike | checks.ByName | None  # of a limit, as a user writes it
+
+
+class Interval(NamedTuple):
+    """low ≤ v ≤ high, entry by entry; ±inf where there is no limit."""
+
+    low: Float[np.ndarray, " n"]
+    high: Float[np.ndarray, " n"]
+
+
+class Softness(NamedTuple):
+    """linear ε + quadratic ε² is what a row's violation ε costs; linear = inf is a hard row.
+
+    A violation above its `allowance`, 1e-4 of the limit's size, is reported.
+    """
+
+    linear: Float[np.ndarray, " n"]
+    quadratic: Float[np.ndarray, " n"]
+    allowance: Float[np.ndarray, " n"]
+
+
+class LimitRows(NamedTuple):
+    """The limited outputs [x; y] that have a limit: which they are, their limits, how soft each is, and its margins."""
+
+    kept: Bool[np.ndarray, " n"]
+    box: Interval
+    softness: Softness
+    margin: Float[np.ndarray, "K n"]
+
+
+class SizedLimits(NamedTuple):
+    """Limits in the sizes of a model: of its inputs, of their changes, and of the limited outputs [x; y] in `rows`.
+
+    Without limits of changes `rates` is None. `hard_rates` are the rate limits that are hard, with ±inf in place
+    of the others; None where none is.
+    """
+
+    inputs: Interval
+    rates: Interval | None
+    hard_rates: Interval | None
+    rate_softness: Softness
+    rows: LimitRows
+
+
+def preview_margin(margin: Float[np.ndarray, "K n"], N: int) -> Float[np.ndarray, "N n"]:
+    """Return the margins of the steps 1 … N."""
+    return margin[np.minimum(np.arange(N), len(margin) - 1)]
+
+
+def half_width(box: Interval) -> Float[np.ndarray, " n"]:
+    """Return half the width of limits with two finite ends, NaN where there are fewer, or no width."""
+    low, high = box
+    both = np.isfinite(low) & np.isfinite(high)
+    width = np.where(both, high, 0.0) - np.where(both, low, 0.0)
+    return np.where(width > 0, width / 2, np.nan)
+
+
+def magnitude(box: Interval) -> Float[np.ndarray, " n"]:
+    """Return the absolute value of the finite end that is farther from 0; 0 where there is none."""
+    low, high = (np.where(np.isfinite(end), np.abs(end), 0.0) for end in box)
+    return np.maximum(low, high)
+
+
+def measure_violation(value: Float[np.ndarray, " n"], box: Interval) -> float:
+    """Return how far the value that is farthest outside its limits is outside; 0 where all are inside."""
+    return float(np.maximum(box.low - value, value - box.high).max(initial=0.0))
+
+
+def clip_input(
+    u: Float[np.ndarray, " nu"], inputs: Interval, rates: Interval | None, last: Float[np.ndarray, " nu"]
+) -> Float[np.ndarray, " nu"]:
+    """Return the input inside its limits, and as far as they allow within a change inside `rates` from the last."""
+    if rates is not None:
+        u = np.clip(u, last + rates.low, last + rates.high)
+    return np.clip(u, *inputs)
+
+
+def check_prices(slack: Slack, name: str) -> Slack:
+    """Return checked (linear, quadratic), each a float or a vector."""
+    if not isinstance(cast(object, slack), tuple | list | np.ndarray) or len(slack) != 2:
+        known = ' "auto",' if name != "du_slack" else ""
+        raise ShapeError(f"{name} is {slack!r}; pass (linear, quadratic),{known} or None for hard limits")
+    linear = checks.array(slack[0], f"the linear weight of {name}", infinite=True)
+    quadratic = checks.array(slack[1], f"the quadratic weight of {name}")
+    if linear.ndim > 1 or quadratic.ndim > 1:
+        raise ShapeError(f"{name} has weights of {linear.ndim} and {quadratic.ndim} dimensions; pass vectors")
+    if (linear < 0).any() or (quadratic < 0).any() or not (linear.any() or quadratic.any()):
+        raise DataError(f"{name} is {slack}; pass weights (linear, quadratic) ≥ 0, one above zero, or None")
+    return (linear if linear.ndim else float(linear)), (quadratic if quadratic.ndim else float(quadratic))
+
+
+def require_room(
+    low: Float[np.ndarray, "..."] | None,
+    high: Float[np.ndarray, "..."] | None,
+    low_name: str,
+    high_name: str,
+    name: str,
+) -> None:
+    """Raise where no number is between the limits."""
+    lower, upper = (
+        np.atleast_1d(-np.inf if low is None else low),
+        np.atleast_1d(np.inf if high is None else high),
+    )
+    if lower.shape != upper.shape and 1 not in (lower.size, upper.size):
+        raise ShapeError(
+            f"{low_name} has shape {lower.shape} and {high_name} {upper.shape}; pass one limit a row, or scalars"
+        )
+    a, b = np.broadcast_arrays(lower, upper)
+    checks.refuse_crossed(a, b, name)
+    if (lower == np.inf).any() or (upper == -np.inf).any():
+        raise DataError(f"{low_name} is +inf or {high_name} is −inf somewhere; use −inf, +inf where there is no limit")

@@ -1,0 +1,276 @@
+"""The levels of on/off and stepped inputs, their dwell times, and how long each input has held its level."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.values import Value
+
+LevelsByInput = Mapping[str, ArrayLike] | Sequence[ArrayLike | None]
+DwellByInput = Mapping[str, Any] | Sequence[Any]
+
+NEAR = 1e-6  # an input is on a level if it is nearer to it than this share of the spacing
+_EVEN = 1e-9  # levels are evenly spaced if they differ by less than this share of the spacing
+FREE = 1_000_000_000  # steps that an input is taken to have held its level at the start of a run
+
+
+@dataclass(frozen=True, eq=False)
+class InputLevels(Value):
+    """u_i ∈ {first_i, first_i + spacing_i, …, first_i + (count_i − 1) spacing_i} for the inputs `which`.
+
+    Attributes
+    ----------
+    which
+        (n,) the inputs that have levels, from 0.
+    first, spacing, count
+        (n,) the lowest level, the distance to the next one, and how many there are.
+    dwell
+        (n, 2) least steps at the lowest level, and at each other one; 1 where an input may change in every step.
+    steps
+        Steps of the horizon in which the levels count; None for all.
+    """
+
+    which: Int[np.ndarray, " leveled"]
+    first: Float[np.ndarray, " leveled"]
+    spacing: Float[np.ndarray, " leveled"]
+    count: Int[np.ndarray, " leveled"]
+    dwell: Int[np.ndarray, "leveled 2"]
+    steps: int | None
+
+    def indices(self, u: Float[np.ndarray, "*rows nu"]) -> Float[np.ndarray, "*rows leveled"]:
+        """Return where the inputs are between the levels: 0 for the lowest, 1 for the next, with fractions."""
+        return (u[..., self.which] - self.first) / self.spacing
+
+    def nearest(self, u: Float[np.ndarray, "*rows nu"]) -> Int[np.ndarray, "*rows leveled"]:
+        """Return the index of the nearest level of each input."""
+        return np.clip(np.rint(self.indices(u)), 0, self.count - 1).astype(np.intp)
+
+    def values(self, index: Int[np.ndarray, "*rows leveled"]) -> Float[np.ndarray, "*rows leveled"]:
+        """Return the levels of these indices."""
+        return self.first + self.spacing * index
+
+    def least(self, index: Int[np.ndarray, " leveled"]) -> Int[np.ndarray, " leveled"]:
+        """Return for how many steps each input has to hold the level of this index."""
+        return np.where(index == 0, self.dwell[:, 0], self.dwell[:, 1])
+
+    def count_broken(self, U: Float[np.ndarray, "T nu"]) -> tuple[int, int]:
+        """Return how many values of a run are on no level, and how many changes came before their dwell time."""
+        at, index = self.indices(U), self.nearest(U)
+        off = int((np.abs(at - index) > NEAR).sum())
+        early = 0
+        for i in range(len(self.which)):
+            changes = np.flatnonzero(np.diff(index[:, i])) + 1
+            for begin, end in itertools.pairwise(changes):
+                early += int(end - begin < self.dwell[i, int(index[begin, i] != 0)])
+        return off, early
+
+
+class HeldLevels:
+    """Which level each input is at, and for how many steps: what dwell times count from."""
+
+    def __init__(self, levels: InputLevels) -> None:
+        self.levels = levels
+        self.index = np.zeros(len(levels.which), np.intp)
+        self.steps = np.full(len(levels.which), FREE)
+        self._begins = True
+
+    def reset(self, u: Float[np.ndarray, " nu"]) -> None:
+        """Start at the input u, from which every input may change at once."""
+        self.index, self._begins = self.levels.nearest(u), True
+        self.steps = np.full(len(self.index), FREE)
+
+    def take(self, u: Float[np.ndarray, " nu"]) -> None:
+        """Count one step of the input u that acted."""
+        index = self.levels.nearest(u)
+        changed = (index != self.index) & (not self._begins)
+        self.steps = np.where(changed, 1, np.minimum(self.steps + 1, FREE))
+        self.index, self._begins = index, False
+
+    def round(
+        self, u: Float[np.ndarray, " nu"], low: Float[np.ndarray, " nu"] | None, high: Float[np.ndarray, " nu"] | None
+    ) -> Float[np.ndarray, " nu"]:
+        """Return the input with the nearest levels that dwell times, and the limits low … high of rates, allow."""
+        levels, index = self.levels, self.levels.nearest(u)
+        if low is not None and high is not None:  # no change beyond a rate because of rounding
+            least = np.ceil(levels.indices(low) - NEAR)
+            most = np.floor(levels.indices(high) + NEAR)
+            inside = (least <= most) & (least < levels.count) & (most >= 0)
+            index = np.where(inside, np.clip(index, least, most), index).astype(np.intp)
+        held = self.steps < levels.least(self.index)
+        rounded = u.copy()
+        rounded[levels.which] = levels.values(np.where(held, self.index, index))
+        return rounded
+
+    def tighten(self, box: "LevelBox", blocks: Sequence[int]) -> bool:
+        """Narrow the box of a plan's indices by the dwell times; return False where nothing is left."""
+        levels = self.levels
+        for i in range(len(levels.which)):
+            if levels.dwell[i].max() < 2:
+                continue
+            level, steps, low, high = int(self.index[i]), int(self.steps[i]), box.low[:, i], box.high[:, i]
+            for k in range(len(low)):
+                if steps < levels.dwell[i, int(level != 0)]:
+                    if not low[k] <= level <= high[k]:
+                        return False
+                    low[k] = high[k] = level
+                if low[k] != high[k]:
+                    break
+                if low[k] != level:
+                    level, steps = int(low[k]), 0
+                steps += blocks[k]
+        return True
+
+
+class LevelBox(NamedTuple):
+    """The lowest and the highest index of a level that each move of a plan may have."""
+
+    low: Int[np.ndarray, "moves leveled"]
+    high: Int[np.ndarray, "moves leveled"]
+
+
+def _starts(blocks: Sequence[int]) -> Int[np.ndarray, " moves"]:
+    """Return the first step of each block of moves."""
+    return np.cumsum([0, *blocks[:-1]])
+
+
+def leveled_moves(levels: InputLevels, blocks: Sequence[int]) -> int:
+    """Return how many moves of a plan have levels."""
+    return len(blocks) if levels.steps is None else int(np.searchsorted(_starts(blocks), levels.steps))
+
+
+def check_levels(levels: Any) -> Any:
+    """Return levels with an array for each input, None where one has none.
+
+    Raises
+    ------
+    DataError
+        They are not two, or not evenly spaced and in order.
+    """
+    if isinstance(levels, Mapping):
+        named = cast("Mapping[str, Any]", levels)
+        if not named:
+            raise DataError('levels is {}; pass levels by the name of an input, for example {"pump": [0, 1]}')
+        return {str(name): _check_values(values, str(name)) for name, values in named.items()}
+    if not isinstance(levels, Sequence) or isinstance(levels, str):
+        raise DataError(
+            f'levels is {levels!r}; pass them by name, {{"pump": [0, 1]}}, or for each input, [[0, 1], None]'
+        )
+    rows = cast("Sequence[Any]", levels)
+    if rows and all(isinstance(value, int | float) for value in rows):
+        raise DataError(f"levels is {levels!r}; pass one list for each input, for example [[0, 1]]")
+    return tuple(None if each is None else _check_values(each, f"input {i}") for i, each in enumerate(rows))
+
+
+def _check_values(values: Any, name: str) -> Float[np.ndarray, " count"]:
+    row = checks.array(values, f"levels of {name}", (None,))
+    if len(row) < 2:
+        raise DataError(f"the levels of {name} are {row.tolist()}; pass two or more, or limits for one fixed value")
+    gaps = np.diff(row)
+    if (gaps <= 0).any() or np.ptp(gaps) > _EVEN * float(gaps.max()):
+        raise DataError(
+            f"the levels of {name} are {row.tolist()}; pass two, or evenly spaced ones from the lowest to the highest"
+        )
+    return row
+
+
+def check_dwell(dwell: Any) -> Any:
+    """Return dwell times as (least steps at the lowest level, least steps at another) of each input.
+
+    Raises
+    ------
+    DataError
+        A dwell time is no whole number above zero.
+    """
+    if isinstance(dwell, Mapping):
+        named = cast("Mapping[str, Any]", dwell)
+        return {str(name): _check_pair(pair, str(name)) for name, pair in named.items()}
+    if isinstance(dwell, Sequence) and not isinstance(dwell, str):
+        rows = cast("Sequence[Any]", dwell)
+        return tuple(None if pair is None else _check_pair(pair, f"input {i}") for i, pair in enumerate(rows))
+    raise DataError(f'dwell is {dwell!r}; pass steps by name, {{"pump": (3, 5)}}: at least 3 on and 5 off')
+
+
+def _check_pair(pair: Any, name: str) -> tuple[int, int]:
+    """Return (on, off) of one input."""
+    what = f"the dwell time of {name}"
+    if isinstance(pair, Sequence | np.ndarray) and not isinstance(pair, str):
+        parts = cast("Sequence[Any]", pair)
+        if len(parts) != 2:
+            raise ShapeError(f"{what} is {pair!r}; pass one number of steps, or (on, off)")
+        return checks.count(parts[0], what), checks.count(parts[1], what)
+    steps = checks.count(cast("Any", pair), what)
+    return steps, steps
+
+
+def order_entries(given: Any, what: str, inputs: Sequence[str]) -> tuple[Any, ...]:
+    """Return entries by name in the order of the inputs, None for an omitted one.
+
+    Raises
+    ------
+    DataError
+        A name is unknown, or fits two.
+    """
+    named = cast("Mapping[str, Any]", given)
+    names = list(named)
+    place = checks.order_by_name({name: float(i) for i, name in enumerate(names)}, what, inputs, np.nan)
+    return tuple(None if np.isnan(at) else named[names[int(at)]] for at in place)
+
+
+def build_levels(
+    levels: Sequence[Any],
+    dwell: Sequence[Any] | None,
+    steps: int | None,
+    low: Float[np.ndarray, " nu"],
+    high: Float[np.ndarray, " nu"],
+    rates: tuple[Float[np.ndarray, " nu"], Float[np.ndarray, " nu"]] | None,
+) -> InputLevels | None:
+    """Return the levels of nu inputs that are inside their limits; None where no input has any.
+
+    Raises
+    ------
+    ShapeError
+        There is not one entry for each input.
+    DataError
+        No level is between the limits of its input; two levels are farther apart than du_max; a dwell time without
+        levels, or one time for "on" of an input with more than two.
+    """
+    nu = len(low)
+    if len(levels) != nu or (dwell is not None and len(dwell) != nu):
+        came = len(levels) if len(levels) != nu else len(dwell or ())
+        raise ShapeError(f"levels and dwell have {came} entries, the plant {nu} inputs; pass one for each, or None")
+    which = [i for i, row in enumerate(levels) if row is not None]
+    parts: list[tuple[float, float, int, tuple[int, int]]] = []
+    times = [None] * nu if dwell is None else list(dwell)
+    for i in range(nu):
+        if levels[i] is None:
+            if times[i] is not None:
+                raise DataError(f"input {i} has a dwell time and no levels; give it levels, for example [0, 1]")
+            continue
+        row = np.asarray(levels[i], dtype=np.float64)
+        spacing, reach = float(row[1] - row[0]), _EVEN * float(row[1] - row[0])
+        allowed = row[(row >= low[i] - reach) & (row <= high[i] + reach)]
+        if not len(allowed):
+            raise DataError(
+                f"no level of input {i}, {row.tolist()}, is between its limits {low[i]:g} … {high[i]:g};"
+                " pass wider limits, or other levels"
+            )
+        if rates is not None and len(allowed) > 1 and spacing > min(rates[1][i], -rates[0][i]) + reach:
+            raise DataError(
+                f"a level of input {i} is {spacing:g} from the next one, and it may change by"
+                f" {min(rates[1][i], -rates[0][i]):g} in a step; pass a du_max of the spacing or more"
+            )
+        on, off = times[i] or (1, 1)
+        if on != off and len(row) > 2:
+            raise DataError(f"input {i} has {len(row)} levels and dwell times for on and off; pass one time for all")
+        parts.append((float(allowed[0]), spacing, len(allowed), (off if allowed[0] == row[0] else on, on)))
+    if not parts:
+        return None
+    first, gaps, count, pairs = zip(*parts, strict=True)
+    return InputLevels(np.array(which), np.array(first), np.array(gaps), np.array(count), np.array(pairs), steps)
