@@ -104,8 +104,8 @@ def page(path: Path, *, pictures: bool = True) -> Page:
         made.text("## What fails here, and why")
         made.items(told)
     lines = len(source.splitlines())
-    made.text("## The file { data-search-exclude }", f"problems/{path.name}, {lines} lines, to run and to copy:")
-    made.code(source.rstrip(), "py")
+    made.text("## The file { data-search-exclude }", f"`problems/{path.name}`, {lines} lines, to run and to copy:")
+    made.code(f'--8<-- "problems/{path.name}"', "py")  # the site shows the file itself
     made.write(f"{name}.md")
     return made
 

@@ -47,7 +47,9 @@ def test_the_library_holds_what_its_page_lists():
     pages = Path(__file__).parents[2] / "docs" / "problems"
     for name, path in FILES.items():
         text = (pages / f"{name}.md").read_text("utf-8")
-        assert path.read_text("utf-8").rstrip() in text, f"{name}: run docs/tools/gallery.py"
+        lines = len(path.read_text("utf-8").splitlines())
+        assert f"`problems/{path.name}`, {lines} lines" in text, f"{name}: run docs/tools/gallery.py --pages"
+        assert f'--8<-- "problems/{path.name}"' in text  # which the site replaces by the file
         for picture in ("run.png", "run.gif"):
             assert f"({name}/{picture})" in text
             assert (pages / name / picture).stat().st_size <= 200_000

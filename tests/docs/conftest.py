@@ -1,0 +1,19 @@
+"""The site, built once for all tests that read it."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.docs.page import DOCS
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory):
+    """Return the folder of the site, built strictly."""
+    pytest.importorskip("material", reason="the extra docs is not installed")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    subprocess.run(command, cwd=DOCS.parent, check=True, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"})
+    return folder
