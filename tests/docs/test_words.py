@@ -26,5 +26,7 @@ def test_every_page_that_is_listed_exists():
 
 
 def test_code_tables_targets_and_front_matter_are_no_prose():
-    page = "---\nboost: 2\n---\n# One two\n\n[three](four/five.md) six.\n\n```python\nseven = 8\n```\n\n| nine | ten |\n"
+    page = (
+        "---\nboost: 2\n---\n# One two\n\n[three](four/five.md) six.\n\n```python\nseven = 8\n```\n\n| nine | ten |\n"
+    )
     assert count_prose(page) == 4
