@@ -47,7 +47,7 @@ class Outflow(km.Dynamics):
         return u - ca.sqrt(x - 0.2)
 
 
-@pytest.mark.parametrize("solver", ["ipopt", "fatrop", "sqpmethod", None])
+@pytest.mark.parametrize("solver", ["ipopt", "sqpmethod", None])
 def test_a_step_where_the_model_is_not_a_number_says_so_by_its_status_alone(solver, capfd):
     plant = km.discretize(Outflow(), dt=0.1)
     asked = plant, km.Cost(Q=[1.0], R=0.1), km.Limits(u_min=0, u_max=2), 5

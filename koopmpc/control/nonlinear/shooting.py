@@ -1,0 +1,304 @@
+"""Shooting: the nonlinear program of a horizon by multiple shooting, solved by one of CasADi's solvers."""
+
+from collections.abc import Mapping
+from time import perf_counter
+from typing import Any, Literal, NamedTuple, cast
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.control.limits import SOFTENED, Interval
+from koopmpc.control.move import Status
+from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
+from koopmpc.control.nonlinear.ranges import find_undefined
+from koopmpc.errors import DataError
+from koopmpc.interrupts import raise_swallowed
+
+NLPSolver = Literal["ipopt", "fatrop", "sqpmethod"]
+OPTIONS: Mapping[str, Mapping[str, Any]] = {
+    "ipopt": {
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "ipopt.max_iter": 300,
+        "ipopt.warm_start_init_point": "yes",
+    },
+    "fatrop": {"fatrop.print_level": 0, "fatrop.max_iter": 300, "structure_detection": "manual"},
+    "sqpmethod": {
+        "qpsol": "qrqp",
+        "max_iter": 100,
+        "convexify_strategy": "eigen-clip",
+        "print_header": False,
+        "print_iteration": False,
+        "print_status": False,
+        "qpsol_options": {"print_iter": False, "print_header": False, "error_on_fail": False},
+    },
+}
+# A step that failed says so by its status; nobody asks how the cost depends on the parameters.
+_QUIET = {"show_eval_warnings": False, "calc_lam_p": False}
+_STATUS = {
+    "Solve_Succeeded": Status.OPTIMAL,
+    "Solved_To_Acceptable_Level": Status.OPTIMAL,
+    "Maximum_Iterations_Exceeded": Status.MAX_ITERATIONS,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+    "Maximum_CpuTime_Exceeded": Status.TIME_LIMIT,
+    "Maximum_WallTime_Exceeded": Status.TIME_LIMIT,
+    "SOLVER_RET_SUCCESS": Status.OPTIMAL,
+    "SOLVER_RET_LIMITED": Status.MAX_ITERATIONS,
+    "SOLVER_RET_INFEASIBLE": Status.INFEASIBLE,
+}
+
+
+class Start(NamedTuple):
+    """Where a solver begins: its variables, and the multipliers of their bounds and of its constraints."""
+
+    v: Float[np.ndarray, " n"]
+    bounds: Float[np.ndarray, " n"]
+    constraints: Float[np.ndarray, " m"]
+
+
+class NLPSolution(NamedTuple):
+    """Inputs, states and slacks of the stages, their cost, how the solver ended, and the start of the next step."""
+
+    U: Float[np.ndarray, "N nu"]
+    X: Float[np.ndarray, "N nx"]
+    slacks: Float[np.ndarray, "N ns"]
+    cost: float
+    status: Status
+    iterations: int
+    start: Start
+
+
+class Shooting:
+    """The nonlinear program of a horizon: variables (u_k, x_{k+1}, ε_{k+1}) stage by stage, ε ≥ 0 the slacks.
+
+    The constraints are x_{k+1} = F(x_k, u_k) + e_k and the limits. The solver works on shares: of the sizes of inputs,
+    states and limits, and of the scale of the cost, so that its tolerances mean the same in all units.
+
+    Parameters
+    ----------
+    problem, theta
+        The stages, and the θ of their F.
+    solver, settings
+        CasADi's solver, and its settings by CasADi's names.
+
+    Raises
+    ------
+    DataError
+        The solver refuses its settings.
+
+    References
+    ----------
+    Bock & Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", IFAC 1984.
+    """
+
+    @raise_swallowed()
+    def __init__(
+        self,
+        problem: StagedProblem,
+        theta: Float[np.ndarray, " nt"],
+        solver: NLPSolver,
+        settings: Mapping[str, Any],
+        timed: bool = False,
+    ) -> None:
+        p, N = problem, len(problem.free)
+        nx, nu, nr, ng = p.nx, p.F.size1_in(1), len(p.Q), len(p.box.low)
+        moved = nx - p.with_rates * (nu + len(p.soft_rates))  # entries of s that a disturbance moves
+        x, u = ca.MX.sym("x", nx), ca.MX.sym("u", nu)
+        F, smooth = ca.Function("F", [x, u], [p.F(x, u, ca.DM(theta))]), p.F.is_a("SXFunction")
+        F = F.expand() if smooth else F
+        linear, quadratic, allowance = p.softness
+        soft = np.flatnonzero(np.isfinite(linear))
+        ns = len(soft)
+        self.allowance, row = allowance[soft], allowance / SOFTENED
+        self._sizes = np.concatenate([p.input_sizes, p.sizes, row[soft]])
+        W = ca.MX.sym("W", nu + nx + ns, N)
+        whole = ca.DM(self._sizes) * W
+        U, X, E = whole[:nu, :], whole[nu : nu + nx, :], whole[nu + nx :, :]
+        x0, r, u_r, e = (ca.MX.sym("p", *size) for size in ((nx, 1), (nr, N), (nu, N), (moved, N)))
+        M, L, m = (ca.MX.sym("terminal", nx + nr, columns) for columns in (nr, nx, 1))
+
+        # gap_1; gap_2, path_1; …; gap_N, path_{N−1}; path_N, the order in which fatrop finds the stages, with its sign
+        ahead = F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U) + ca.vertcat(e, ca.MX(nx - moved, N))
+        gaps = W[nu : nu + nx, :] - ahead / ca.DM(p.sizes)
+        end = M @ p.tracked(X[:, N - 1]) + L @ X[:, N - 1] - m
+        f = _weigh(U - u_r, p.R) + ca.sumsqr(end)
+        if N > 1:
+            f += _weigh(p.tracked.map(N - 1)(X[:, : N - 1]) - r[:, : N - 1], p.Q)
+        path, low, high = ca.MX(0, N), np.zeros(0), np.zeros(0)
+        if ng:
+            values, infinite = p.limited.map(N)(X), np.full(ng, np.inf)
+            relaxed = ca.DM(np.eye(ng)[:, soft]) @ E if ns else ca.MX(ng, N)
+            if ns:
+                f += ca.sum2(ca.DM(linear[soft]).T @ E + ca.DM(quadratic[soft]).T @ E**2)
+            path = ca.vertcat(values - relaxed, values + relaxed) / ca.DM(np.tile(row, 2))
+            low, high = np.concatenate([-infinite, p.box.low / row]), np.concatenate([p.box.high / row, infinite])
+        npath = path.shape[0]
+        g = [
+            gaps[:, k] if part == 0 else path[:, k - part]
+            for k in range(N + 1)
+            for part in (0, 1)
+            if part <= k < N + part and (npath or part == 0)
+        ]
+        places = np.arange(N)[:, None] * (nx + npath)
+        gap_at = places - npath + np.arange(nx)
+        gap_at[0] += npath
+        path_at = places + nx + nx + np.arange(npath)
+        path_at[-1] -= nx
+        self._next_g = np.empty(N * (nx + npath), dtype=np.intp)
+        for at in (gap_at, path_at):
+            self._next_g[at] = np.vstack([at[1:], at[-1:]])
+        stages = np.arange(W.numel()).reshape(N, -1)
+        self._next_v = np.vstack([stages[1:], stages[-1:]]).ravel()
+        lbg, ubg = np.zeros(len(self._next_g)), np.zeros(len(self._next_g))
+        lbg[path_at], ubg[path_at] = low, high
+        if ng:  # [values − ε ≤ high; values + ε ≥ low], the last outputs of each moved inwards
+            last, share = path_at[:, ng - p.margin.shape[1] : ng], p.margin / row[ng - p.margin.shape[1] :]
+            ubg[last] -= share
+            lbg[last + ng] += share
+            if p.ends:  # a terminal set limits the last stage alone
+                ubg[path_at[:-1, ng - p.ends : ng]] = np.inf
+        unlimited = np.full(nx, np.inf)
+        lbx = np.tile(np.concatenate([p.inputs.low, -unlimited, np.zeros(ns)]), (N, 1))
+        ubx = np.tile(np.concatenate([p.inputs.high, unlimited, np.full(ns, np.inf)]), (N, 1))
+        lbx[~p.free, :nu] = ubx[~p.free, :nu] = 0.0
+        lbx, ubx = lbx / self._sizes, ubx / self._sizes
+        self._bounds = {"lbx": lbx.ravel(), "ubx": ubx.ravel(), "lbg": lbg, "ubg": ubg}
+        parameters = ca.veccat(x0, r, u_r, e, M, L, m)
+        nlp = {"x": ca.vec(W), "p": parameters, "f": f / p.scale, "g": ca.vertcat(*g)}
+        given: dict[str, Any] = {"expand": smooth, "error_on_fail": False, "print_time": False}
+        self._start_is_number: ca.Function | None = None
+        if solver == "fatrop":
+            _refuse_undefined(F, p.tracked, p.limited)
+            self._start_is_number = _is_number(nlp)
+            given |= {
+                "N": N,
+                "nx": [0] + [nx] * N,
+                "nu": [nu] + [ns + nu] * (N - 1) + [ns],
+                "ng": [0] + [npath] * N,
+            }
+        self._clock = _Clock(W.numel(), len(lbg)) if timed and solver != "fatrop" else None
+        if self._clock is not None:
+            given["iteration_callback"] = self._clock
+        try:
+            with raise_swallowed():
+                self._solver = ca.nlpsol("shooting", solver, nlp, {**_QUIET, **OPTIONS[solver], **given, **settings})
+        except (RuntimeError, NotImplementedError, TypeError) as error:
+            reason = [line for line in str(error).splitlines() if line.strip()][-1].strip()
+            raise DataError(
+                f"{solver} was not built with settings {dict(settings)}: {reason}; pass its own settings by CasADi's "
+                'names, for example {"ipopt.tol": 1e-8}'
+            ) from error
+        self._scale = p.scale
+        self._shape, self._split = (N, nu + nx + ns), (nu, nu + nx)
+
+    def at(self, X: Float[np.ndarray, "N nx"], U: Float[np.ndarray, "N nu"]) -> Start:
+        """Return a start with these states x_1 … x_N and inputs."""
+        W = np.zeros(self._shape)
+        W[:, : self._split[0]], W[:, self._split[0] : self._split[1]] = U, X
+        return Start((W / self._sizes).ravel(), np.zeros(W.size), np.zeros(len(self._next_g)))
+
+    def solve(
+        self,
+        x0: Float[np.ndarray, " nx"],
+        targets: StageTargets,
+        e: Float[np.ndarray, "N n"],
+        start: Start,
+        first: Interval,
+        deadline: float = np.inf,
+    ) -> NLPSolution:
+        """Solve from `start` with u_0 inside `first`; ipopt and sqpmethod end after the iteration of the deadline."""
+        if self._clock is not None:
+            self._clock.deadline = deadline
+        nu, t = self._split[0], targets
+        for end, value in zip(("lbx", "ubx"), first, strict=True):
+            self._bounds[end][:nu] = value / self._sizes[:nu]
+        p = [x0, t.R.ravel(), t.U.ravel(), e.ravel(), t.M.ravel("F"), t.L.ravel("F"), t.m]
+        begin = {"x0": start.v, "lam_x0": start.bounds, "lam_g0": start.constraints}
+        U, X, slacks = np.split(start.v.reshape(self._shape) * self._sizes, self._split, axis=1)
+        failed = NLPSolution(U, X, slacks, np.inf, Status.FAILED, 0, start)
+        if self._start_is_number is not None and not float(self._start_is_number(start.v, np.concatenate(p))):
+            return failed
+        with raise_swallowed():
+            try:
+                found = cast("dict[str, Any]", self._solver(p=np.concatenate(p), **self._bounds, **begin))
+            except RuntimeError:  # CasADi refuses bounds that overflow
+                return failed
+            stats = self._solver.stats()
+            v, bounds, constraints = (found[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
+        unified = str(stats.get("unified_return_status"))
+        status = _STATUS.get(str(stats["return_status"]), _STATUS.get(unified, Status.FAILED))
+        if self._clock is not None and self._clock.rang:
+            status = Status.TIME_LIMIT
+        if not np.isfinite(v).all():
+            status = Status.FAILED
+        U, X, slacks = np.split(v.reshape(self._shape) * self._sizes, self._split, axis=1)
+        after = Start(v[self._next_v], bounds[self._next_v], constraints[self._next_g])
+        return NLPSolution(
+            U, X, slacks, self._scale * float(found["f"]), status, int(stats.get("iter_count", 0)), after
+        )
+
+
+class _Clock(ca.Callback):
+    """What a solver asks after each of its iterations: whether the deadline is over."""
+
+    def __init__(self, nv: int, ng: int) -> None:
+        super().__init__()
+        self._sizes = {"x": nv, "f": 1, "g": ng, "lam_x": nv, "lam_g": ng}
+        self._deadline, self.rang = np.inf, False
+        self.construct("clock", {})
+
+    @property
+    def deadline(self) -> float:
+        """When the solver is stopped [s of `perf_counter`]; a new one lets it run again."""
+        return self._deadline
+
+    @deadline.setter
+    def deadline(self, value: float) -> None:
+        self._deadline, self.rang = value, False
+
+    def get_n_in(self) -> int:
+        """Return how many values of an iteration CasADi passes."""
+        return int(ca.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        """Return 1: whether to stop."""
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Return the shape of a value, empty for those that this problem has not."""
+        return ca.Sparsity.dense(self._sizes.get(ca.nlpsol_out(i), 0), 1)
+
+    def eval(self, _: Any) -> list[float]:
+        """Return [1.0] where the deadline is over."""
+        self.rang = perf_counter() > self._deadline
+        return [float(self.rang)]
+
+
+def _refuse_undefined(*functions: ca.Function) -> None:
+    """Raise a DataError where one of these may be no number: fatrop factors a matrix of NaN again and again.
+
+    Nothing stops it then, so that no step of a loop may meet one.
+    """
+    for function in functions:
+        found = find_undefined(function)
+        if found is not None:
+            raise DataError(
+                f"fatrop does not end where a model is no number, and this one holds {found}; "
+                'pass solver="ipopt" or "sqpmethod", or write the model so that it is a number everywhere'
+            )
+
+
+def _is_number(nlp: Mapping[str, ca.MX]) -> ca.Function:
+    """Return (variables, parameters) → whether cost, constraints and their slope along (1, …, 1) are finite there.
+
+    fatrop does not end where they are not: it factors a matrix of NaN again and again.
+    """
+    v, values = nlp["x"], ca.vertcat(nlp["f"], nlp["g"])
+    size = ca.sumsqr(values) + ca.sumsqr(ca.jtimes(values, v, ca.MX.ones(v.numel())))
+    return ca.Function("is_number", [v, nlp["p"]], [size < ca.inf])
+
+
+def _weigh(columns: ca.MX, Q: Float[np.ndarray, "n n"]) -> ca.MX:
+    """Return Σ over columns of eᵀQe."""
+    return ca.sum1(ca.sum2(columns * ca.mtimes(ca.DM(Q), columns)))
