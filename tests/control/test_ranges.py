@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.control.nonlinear.ranges import find_undefined
+from koopmpc.control.nonlinear.ranges import find_undefined_operation
 
 NAMED = {
     "pendulum": lambda x: ca.sin(x[0]) / (1 + 0.2 * ca.sin(x[0]) ** 2),
@@ -45,7 +45,7 @@ def with_slopes(f: ca.Function, at) -> np.ndarray:
 @pytest.mark.parametrize("name", NAMED)
 def test_what_is_a_number_everywhere_is_accepted_and_is_one(name):
     rng, f = np.random.default_rng(0), function(NAMED[name])
-    assert find_undefined(f) is None
+    assert find_undefined_operation(f) is None
     for at in [np.zeros(2), np.ones(2), -np.ones(2), *rng.normal(0, 30, (50, 2))]:
         assert np.isfinite(with_slopes(f, at)).all()
 
@@ -53,7 +53,7 @@ def test_what_is_a_number_everywhere_is_accepted_and_is_one(name):
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_may_be_none_is_refused_by_its_name(name):
     of, word = REFUSED[name]
-    assert word in find_undefined(function(of))
+    assert word in find_undefined_operation(function(of))
 
 
 LEAVES = st.one_of(st.sampled_from(["x", "y"]), st.floats(-3, 3).map(lambda v: round(v, 2)))
@@ -86,7 +86,7 @@ def grown(tree, x):
 @given(TREES, st.lists(st.floats(-20, 20), min_size=2, max_size=2))
 def test_no_accepted_expression_meets_what_is_no_number(tree, at):
     f = function(lambda x: grown(tree, x) + 0 * x[0])
-    if find_undefined(f) is None:
+    if find_undefined_operation(f) is None:
         values = with_slopes(f, at)
         assert np.isfinite(values).all() or np.abs(values[np.isfinite(values)]).max(initial=0) > 1e100  # an overflow
 

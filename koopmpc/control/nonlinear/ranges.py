@@ -50,7 +50,7 @@ _COMPARED = {"LT", "LE", "EQ", "NE", "AND", "OR"}
 _NAMES = {int(getattr(ca, name)): name.removeprefix("OP_") for name in dir(ca) if name.startswith("OP_")}
 
 
-def find_undefined(function: ca.Function) -> str | None:
+def find_undefined_operation(function: ca.Function) -> str | None:
     """Return an operation that may be no number, or have no slope, for some arguments; None where all are numbers.
 
     Each value is bounded by an interval, from the constants on; inputs are any number. Bounds do not know that two
@@ -68,18 +68,18 @@ def find_undefined(function: ca.Function) -> str | None:
         found: Range | str = _ALL
         if name == "CONST":
             value = float(function.instruction_constant(k))
-            found = (value, value) if isfinite(value) else "a constant that is no number"
+            found = (value, value) if isfinite(value) else "a constant that is not finite"
         elif name == "MUL" and read[0] == read[1]:
             found = _square(*work[read[0]])
         elif name != "INPUT":
-            found = _bound(name, [work[i] for i in read])
+            found = _range(name, [work[i] for i in read])
         if isinstance(found, str):
             return found
         work[written[0]] = found
     return None
 
 
-def _bound(name: str, read: list[Range]) -> Range | str:
+def _range(name: str, read: list[Range]) -> Range | str:
     """Return the range of an operation, or why it may be no number."""
     if len(read) == 1 and name in _ALONE:
         return _refuse(name, *read[0]) or _ALONE[name](*read[0])

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from koopmpc.control.limits import SOFTENED, Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
-from koopmpc.control.nonlinear.ranges import find_undefined
+from koopmpc.control.nonlinear.ranges import find_undefined_operation
 from koopmpc.errors import DataError
 from koopmpc.interrupts import raise_swallowed
 
@@ -169,7 +169,7 @@ class Shooting:
         given: dict[str, Any] = {"expand": smooth, "error_on_fail": False, "print_time": False}
         self._start_is_number: ca.Function | None = None
         if solver == "fatrop":
-            _refuse_undefined(F, p.tracked, p.limited)
+            _demand_numbers(F, p.tracked, p.limited)
             self._start_is_number = _is_number(nlp)
             given |= {
                 "N": N,
@@ -275,16 +275,16 @@ class _Clock(ca.Callback):
         return [float(self.rang)]
 
 
-def _refuse_undefined(*functions: ca.Function) -> None:
+def _demand_numbers(*functions: ca.Function) -> None:
     """Raise a DataError where one of these may be no number: fatrop factors a matrix of NaN again and again.
 
     Nothing stops it then, so that no step of a loop may meet one.
     """
     for function in functions:
-        found = find_undefined(function)
+        found = find_undefined_operation(function)
         if found is not None:
             raise DataError(
-                f"fatrop does not end where a model is no number, and this one holds {found}; "
+                f"fatrop does not end where a model is not a number, and this one has {found}; "
                 'pass solver="ipopt" or "sqpmethod", or write the model so that it is a number everywhere'
             )
 
