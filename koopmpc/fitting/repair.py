@@ -127,6 +127,8 @@ def audit_episodes(episodes: Episodes, *, cut: bool = True) -> tuple[Episodes, t
             done = fault.do
         notes.append(f"{fault.name}: {_locate_fault(fault, episodes)}; {done}")
     notes += [f"input timing: {doubt}" for doubt in report.doubts]
+    if report.memory is not None and report.memory.shows_hidden_state:
+        notes.append(f"hidden state: {report.memory}; models with delays are tried")
     return rest, tuple(notes), report.delay
 
 

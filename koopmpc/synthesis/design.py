@@ -75,7 +75,7 @@ from koopmpc.synthesis.judging import (
     measure_errors,
     rate_runs,
 )
-from koopmpc.synthesis.select import RIDGES, report_stage
+from koopmpc.synthesis.select import LONGER, RIDGES, report_stage
 from koopmpc.synthesis.surrogates import (
     Surrogate,
     choose_surrogates,
@@ -85,6 +85,7 @@ from koopmpc.synthesis.surrogates import (
     is_unstable,
 )
 from koopmpc.text import to_percent
+from koopmpc.validate.memory import find_hidden_state
 
 FOLDS = 3  # folds of the data; models are fitted to two of them
 OFF = 0.2  # in half of the final runs the inputs act by this share more or less
@@ -108,7 +109,7 @@ def design(
     starts: ArrayLike | None = None,
     angles: Sequence[int] = (),
     candidates: Sequence[Candidate | Lifting] | None = None,
-    delays: Sequence[int] = (0, 1, 2),
+    delays: Sequence[int] | None = None,
     bilinear: bool = True,
     tighten: bool = True,
     smooth: bool = True,
@@ -163,7 +164,7 @@ def design(
     candidates
         Models to try, as in `select`.
     delays
-        Past steps to try in an embedding.
+        Past steps to try in an embedding; by default 0, 1 and 2, and 4 where the data show a hidden state.
     bilinear
         Try bilinear models too, unless there are measured disturbances; the surrogates are then bilinear.
     tighten
@@ -224,7 +225,11 @@ def design(
     if smooth:
         source, held, freed, noise = smooth_data(source, held)
         notes = (*notes, *freed)
-    past = check_delays(delays)
+    past = check_delays((0, 1, 2) if delays is None else delays)
+    memory = find_hidden_state(measured) if max(past) else None
+    hidden = memory is not None and memory.shows_hidden_state
+    if hidden and delays is None:
+        past = [*past, *LONGER]
     models = _list_models(held, asked, candidates, past, bilinear and held.nw == 0, draw)
     first = max(one.delays for one in models)
     room = int(np.median([len(episode) for episode in held])) - first
@@ -244,7 +249,8 @@ def design(
             cross_validate, trials, report_stage(progress, "models"), size=lambda trial: trial.candidate.size
         )
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
-        test, doubts, holds = _prepare_test(folds, asked, choose_surrogates(results, floor), tighten, noise, pool)
+        pair = choose_surrogates(results, floor, hidden=hidden)
+        test, doubts, holds = _prepare_test(folds, asked, pair, tighten, noise, pool)
         doubts = [*left.values(), *doubts]
         for sentence in doubts:
             warnings.warn(sentence, FitWarning, stacklevel=2)
@@ -298,6 +304,10 @@ def design(
         blind += find_blind_range(test.episodes, asked, neighbours)
         blind += compare_longer_horizon(test, rows[best].recipe, controller, neighbours, draw)
     controller.reset()
+    remembered = [] if not hidden else [f"{memory}; models with delays were tried"]
+    if hidden and not rows[best].recipe.candidate.delays:
+        blind.append(f"{memory}, and the chosen model sees no past rows: measure that state, or compare delays=[4, 8]")
+        remembered = []
     expected = replace(_summarise_expected(test, outcomes[best]), fresh=fresh)
     return Design(
         controller=controller,
@@ -313,7 +323,7 @@ def design(
             *test.limits(outcomes[best].band).capped,
             *find_unweighted_limits(asked, held),
         ),
-        notes=(*notes, *short, *folds.notes, *turned),
+        notes=(*notes, *short, *folds.notes, *turned, *remembered),
         standby=standby,
     )
 

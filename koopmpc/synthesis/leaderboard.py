@@ -225,6 +225,7 @@ def choose_model(
     kind: str | None = None,
     alike: float = EXACT,
     among: Sequence[int] | None = None,
+    hidden: bool = False,
 ) -> int:
     """Return the smallest model whose worst fold is within one standard error of the best one's.
 
@@ -233,12 +234,13 @@ def choose_model(
     they do where some of the state is not measured: elsewhere the past tells a linear model which input the data
     would have applied next, and a controller applies others. Linear models that grow too fast are left out. In place
     of a linear model whose errors count as equal, a bilinear one is taken if its own are at most a hundredth of them.
-    `among` holds the places to choose from; by default all.
+    `among` holds the places to choose from; by default all. Where the data show a hidden state, `hidden`, models with
+    delays need not halve the error.
     """
     asked = [i for i in (range(len(rows)) if among is None else among) if kind is None or rows[i].kind == kind]
     places = [i for i in asked if not _runaway(rows[i], rows)] or asked
     present = [i for i in places if not rows[i].delays]
-    if present and not min(rows[i].worst for i in places) < HALF * min(rows[i].worst for i in present):
+    if present and not hidden and not min(rows[i].worst for i in places) < HALF * min(rows[i].worst for i in present):
         places = present
     best = min((rows[i] for i in places), key=lambda row: row.worst)
     near = [i for i in places if rows[i].worst <= max(best.worst + best.deviation, alike)]
@@ -247,7 +249,7 @@ def choose_model(
         i for i in places if rows[i].kind == "bilinear" and max(rows[i].worst, EXACT) <= _WORTH * rows[chosen].worst
     ]
     if rows[chosen].kind == "linear" and exact:
-        return choose_model(rows, "bilinear", EXACT, exact)
+        return choose_model(rows, "bilinear", EXACT, exact, hidden)
     return chosen
 
 

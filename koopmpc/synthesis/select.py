@@ -52,9 +52,11 @@ from koopmpc.synthesis.records import (
     propose_structures,
     refine_structure,
 )
+from koopmpc.validate.memory import find_hidden_state
 from koopmpc.validate.scoring import AnyPredictor
 
 ENOUGH = 1e-2  # error of a forecast, as a share of the states' spread, below which a controller gains nothing
+LONGER = (4,)  # further past steps that are tried where a hidden state shows
 RIDGES = tuple(10.0**power for power in range(-9, -2))
 LATE = (
     "the inputs were moved up by one row: the log's row k holds the outputs after its inputs have acted; "
@@ -123,7 +125,8 @@ def select(
         ridge ε² on deviations of unit norm. With less, a state and its past, which are almost functions of each other,
         get large weights of opposite signs, which cancel on the training data alone.
     delays
-        Past steps to try in an embedding; by default 0, 1 and 2, and of records up to 12.
+        Past steps to try in an embedding; by default 0, 1 and 2, also 4 where the data show a hidden state, and of
+        records up to 12.
     bilinear
         Try z⁺ = A z + B u + Σ uᵢ Nᵢ z too, where there are inputs and no measured disturbances.
     relift
@@ -193,6 +196,11 @@ def select(
     if smooth:
         source, held, freed, _ = smooth_data(source, held)
         notes = (*notes, *freed)
+    memory = find_hidden_state(measured[1]) if max(past) and not record else None
+    hidden = memory is not None and memory.shows_hidden_state
+    if hidden:
+        past = past if delays is not None else [*past, *LONGER]
+        notes = (*notes, f"{memory}; models with delays are tried, and need not halve the error")
     given = (
         propose_candidates(held, past, both, draw)
         if candidates is None
@@ -225,8 +233,10 @@ def select(
         rows, chosen, found = judge_finalists(rows, held, measured[1], first, ahead, told, ran)
     else:
         kinds = {row.kind for row in rows}
-        found = {kind: choose_model(rows, kind, alike) for kind in ("linear", "bilinear") if kind in kinds}
-        chosen = choose_model(rows, alike=alike)
+        found = {
+            kind: choose_model(rows, kind, alike, hidden=hidden) for kind in ("linear", "bilinear") if kind in kinds
+        }
+        chosen = choose_model(rows, alike=alike, hidden=hidden)
         found |= {"bilinear": chosen} if rows[chosen].bilinear else {}
     linear = found.get("linear", chosen)
     for place, which in ((chosen, f"all {len(rows)} candidates"), (linear, "all linear candidates")):

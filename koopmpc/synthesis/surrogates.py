@@ -122,13 +122,14 @@ class Holding:
         return self._known[key]
 
 
-def choose_surrogates(results: Sequence[Tried], floor: float) -> list[Recipe]:
+def choose_surrogates(results: Sequence[Tried], floor: float, hidden: bool = False) -> list[Recipe]:
     """Return the two models of the surrogates: the one with the smallest error, and the best of another family.
 
     They are bilinear if bilinear models were tried. A model with delays is taken only if it halves the error, which
-    happens if a part of the state is not measured. The second family extrapolates differently, so closed loops show
-    errors that only one of the models has. If the error of the best of another family is more than three times as
-    large, the second best of the same family is taken, or the best itself.
+    happens if a part of the state is not measured, or if the data show a `hidden` state and its error is less. The
+    second family extrapolates differently, so closed loops show errors that only one of the models has. If the error
+    of the best of another family is more than three times as large, the second best of the same family is taken, or
+    the best itself.
     """
     places = [tried.best(floor) for tried in results]
     error = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
@@ -136,7 +137,7 @@ def choose_surrogates(results: Sequence[Tried], floor: float) -> list[Recipe]:
     bilinear = [i for i in ranked if results[i].candidate.bilinear] or ranked
     pool = [i for i in bilinear if not results[i].candidate.delays] or bilinear
     late = [i for i in bilinear if results[i].candidate.delays]
-    if late and error[late[0]] < HALF * error[pool[0]]:
+    if late and error[late[0]] < (1.0 if hidden else HALF) * error[pool[0]]:
         pool = late
     first = pool[0]
     rest = [i for i in pool[1:] if error[i] <= SECOND * error[first]]

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from koopmpc.validate.binomial import count_runs_needed as count_runs_needed
     from koopmpc.validate.logs.audit import AuditReport as AuditReport
     from koopmpc.validate.logs.audit import audit as audit
+    from koopmpc.validate.memory import Memory as Memory
+    from koopmpc.validate.memory import find_hidden_state as find_hidden_state
     from koopmpc.validate.report import TrustReport as TrustReport
     from koopmpc.validate.report import trust as trust
     from koopmpc.validate.residuals import Invariance as Invariance

@@ -17,6 +17,7 @@ from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.terminal import build_table, label_lines, render_text
 from koopmpc.text import shorten_observable, to_percent, with_unit
 from koopmpc.validate.bands import BandCoverage, ConformalBand, conformal
+from koopmpc.validate.memory import Memory, find_hidden_state
 from koopmpc.validate.residuals import Invariance, ResidualDMD, compute_moments, measure_eigenpairs, measure_invariance
 from koopmpc.validate.scoring import AnyPredictor, Score, score
 from koopmpc.validate.sufficiency import Coverage, Persistency, coverage, explain_inputs, persistency
@@ -86,6 +87,9 @@ class TrustReport(Value):
         Sampling time [s].
     inputs
         Names of the inputs in the order of `feedback`.
+    memory
+        What past rows tell beyond the present one, on the same episodes as `coverage`; None for a model that sees past
+        rows or has a hidden state.
     """
 
     score: Score
@@ -104,6 +108,7 @@ class TrustReport(Value):
     radius: float
     dt: float
     inputs: tuple[str, ...]
+    memory: Memory | None = None
 
     @property
     def error(self) -> Float[np.ndarray, "horizon nx"]:
@@ -139,6 +144,7 @@ class TrustReport(Value):
             _check_dictionary,
             _check_fit,
             _check_inputs,
+            _check_memory,
             _check_band,
             _check_closed_loop,
         )
@@ -189,6 +195,7 @@ def trust(
     - the errors on held-out episodes are more than twice those on the training episodes;
     - more than 5 % of the held-out samples lie in cells without training data;
     - the inputs do not excite to order 2, or ψ(x) explains more than 90 % of an input (feedback);
+    - past rows tell what the present one does not, so that a state is hidden, and the model does not see them;
     - the conformal band is infinite because there are too few episodes;
     - closed-loop forecasts stay in the band significantly less often than its level.
 
@@ -266,6 +273,7 @@ def trust(
         radius=float(np.abs(predictor.eigenvalues[0])),
         dt=predictor.dt,
         inputs=total.inputs,
+        memory=find_hidden_state(judged) if predictor.embedding is None else None,
     )
 
 
@@ -373,6 +381,11 @@ def _check_inputs(report: TrustReport) -> Iterator[tuple[str, str]]:
                 f"feedback: the observables explain most of the inputs ({names}), so A and B are hard to separate",
                 "add noise to the inputs",
             )
+
+
+def _check_memory(report: TrustReport) -> Iterator[tuple[str, str]]:
+    if report.memory is not None and report.memory.shows_hidden_state:
+        yield str(report.memory), "fit with delays (embedding=km.Delay(2)), with a hidden state, or measure that state"
 
 
 def _check_band(report: TrustReport) -> Iterator[tuple[str, str]]:

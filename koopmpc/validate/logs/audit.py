@@ -23,8 +23,10 @@ from koopmpc.validate.logs.alignment import (
 from koopmpc.validate.logs.changes import find_changes
 from koopmpc.validate.logs.log import Log, LogFault, Place, find_stretches, list_places
 from koopmpc.validate.logs.timing import InputTiming, Timing, find_same_row_inputs, measure_timing
+from koopmpc.validate.memory import Memory, find_hidden_state
 from koopmpc.values import Value
 
+DELAYS = "Fit with delays (embedding=km.Delay(2)) or with a hidden state (km.identify.subspace), or measure that state"
 Check = Callable[[Log], Iterator[LogFault]]
 _VALUE_CHECKS: tuple[Check, ...] = (
     values.find_repeated_columns,
@@ -58,12 +60,15 @@ class AuditReport(Value):
         Number of episodes and steps that were checked.
     timing
         For each input, whether it acts on the row after its own or within its own row.
+    memory
+        What past rows tell beyond the present one, which shows a hidden state; None where faults stand in the way.
     """
 
     faults: tuple[LogFault, ...]
     episodes: int
     steps: int
     timing: tuple[InputTiming, ...] = ()
+    memory: Memory | None = None
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -103,6 +108,8 @@ class AuditReport(Value):
         """Return the report: a summary, then each fault with its remedy."""
         checked = f"{self.episodes} episode{'s' * (self.episodes > 1)}, {self.steps} steps"
         doubts = [("input timing", f"{doubt}.") for doubt in self.doubts]
+        if self.memory is not None and self.memory.shows_hidden_state:
+            doubts.append(("hidden state", f"{self.memory}. {DELAYS}."))
         if not self.faults and not doubts:
             return f"no fault found in {checked}"
         count = len(self.faults)
@@ -121,6 +128,8 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditR
       row, or after an input is clipped at the limit of its actuator.
     - Timing: an input acts within its own row: a feedthrough, or a log whose input column is one row late. Under
       feedback one log cannot tell, and the report says so.
+    - Memory: in logs without a fault, past rows tell of the next one what the present row does not, so that a state is
+      hidden (`find_hidden_state`).
     - Changes: an episode follows the law of the others after a sign, unit, offset, order of columns or sample time is
       corrected.
 
@@ -161,7 +170,8 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditR
         faults += late_signals or list(find_saturated_actuators(Log(rest.data)))
     timing = measure_timing(Log(rest.data)) if rest is not None and "inputs together" not in kinds else ()
     faults += find_same_row_inputs(timing)
-    return AuditReport(tuple(faults), len(data), sum(map(len, data)), timing)
+    memory = None if faults else find_hidden_state(data)
+    return AuditReport(tuple(faults), len(data), sum(map(len, data)), timing, memory)
 
 
 def _take_first(data: Episodes) -> Episodes:
