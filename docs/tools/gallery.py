@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from drawn import stamp
 from standings import format_goals, format_standings
 
 import koopmpc as km
@@ -40,6 +41,7 @@ def page(path: Path, *, pictures: bool = True) -> Page:
     case = next(iter(problem.cases))
     if pictures:
         draw(problem, best, case)
+        stamp(f"problems/{name}/run.{kind}" for kind in ("png", "gif"))
     made = Page(FOLDER, beside=name)
     title, _, about = (ast.get_docstring(ast.parse(source)) or name).partition("\n\n")
     made.text(f"# {name}: {title.partition(': ')[2].rstrip('.') or title}", *about.split("\n\n"))

@@ -4,12 +4,18 @@ import re
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from drawn import stamp
 
 import koopmpc as km
+from koopmpc.bench.controllers import Prepared
+from koopmpc.bench.single import run_closed_loop
+from koopmpc.bench.store import RunRow
 from koopmpc.figures.style import LIMIT, REFERENCE, TRUTH, draw_legend, line_style, make_figure, styled
+from koopmpc.recording.video import export_video
 
 DOCS = Path(__file__).parents[1]
 
@@ -279,6 +285,28 @@ def on_off() -> Any:
     return _run_of("how/on_off.md")
 
 
+def cart_pole() -> Any:
+    """The cart-pole recovers from 0.5 rad, and stands in the wind, as `koopmpc run cart_pole` runs it."""
+    prepared = Prepared(km.load_problem("cart_pole"))
+    tasks = {}
+    for case in ("recover", "wind"):
+        x0 = tuple(prepared.problem.cases[case].x0)
+        rows = [RunRow("cart_pole", case, name, x0=x0) for name in ("koopman-mpc", "bilinear-offset", "nonlinear-mpc")]
+        tasks[f"cart_pole:{case}"] = {row.controller: run_closed_loop(prepared, row, plans=False) for row in rows}
+    return km.plot.runs(tasks)
+
+
+def swing_up(path: Path) -> None:
+    """Write the animation of the front page: a cart-pole swings up under a model of random pushes."""
+    prepared = Prepared(km.load_problem("cart_pole_swing"))
+    x0 = tuple(prepared.problem.cases["hang"].x0)
+    run = run_closed_loop(prepared, RunRow("cart_pole_swing", "hang", "bilinear-mpc", x0=x0), plans=True)
+    with TemporaryDirectory() as folder:
+        log = Path(folder) / "run.rrd"
+        km.record(run, log)
+        export_video(log, path, width=640, fps=16, until=4.0, speed=0.8)
+
+
 def _run_of(page: str) -> Any:
     """Return a picture of the run that the first block of a page makes."""
     names: dict[str, Any] = {"__name__": "page"}
@@ -308,16 +336,23 @@ PICTURES: dict[str, Callable[[], Any]] = {
         guarantees,
         on_off,
         manual_automatic,
+        cart_pole,
     )
 }
+ANIMATIONS: dict[str, Callable[[Path], None]] = {"swing_up": swing_up}
 
 
 def write(names: Iterable[str]) -> None:
-    """Write the pictures with these names."""
+    """Write the pictures and animations with these names, and say that they are new."""
     for name in names:
-        made = PICTURES[name]()
-        made.savefig(DOCS / "pictures" / f"{name}.png", dpi=130, metadata={"Software": None})
+        if name in ANIMATIONS:
+            file = f"pictures/{name}.gif"
+            ANIMATIONS[name](DOCS / file)
+        else:
+            file = f"pictures/{name}.png"
+            PICTURES[name]().savefig(DOCS / file, dpi=130, metadata={"Software": None})
+        stamp([file])
 
 
 if __name__ == "__main__":
-    write(sys.argv[1:] or PICTURES)
+    write(sys.argv[1:] or [*PICTURES, *ANIMATIONS])

@@ -1,15 +1,53 @@
 """The examples in README, docs/problems.md and docs/faults.md run as they stand."""
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import koopmpc as km
 
+README = Path(__file__).parents[2] / "README.md"
+ROW = re.compile(r"^  ([\w-]+) +([\d.e+]+) +([\d.e+]+)  +(does not reach|within 5 %|[\d.]+ s) ", re.MULTILINE)
 
-def test_the_ten_lines_of_the_readme_run_and_print_and_record(tmp_path, monkeypatch, capsys):
-    text = (Path(__file__).parents[2] / "README.md").read_text()
+
+def read_table(text):
+    """Return (cost, ratio, settles) by controller of a table of `koopmpc run`."""
+    return {name: (float(cost), float(ratio), settles) for name, cost, ratio, settles in ROW.findall(text)}
+
+
+def test_the_table_of_the_readme_has_all_controllers_of_its_command():
+    text = README.read_text(encoding="utf-8")
+    (task,) = re.findall(r"^koopmpc run (\S+)", text, re.MULTILINE)
+    table = text.partition("```text\n")[2].partition("```")[0]
+    assert table.splitlines()[0] == task
+    name, _, case = task.partition(":")
+    problem = km.load_problem(name)
+    assert case in problem.cases
+    assert list(read_table(table)) == list(problem.controllers or km.bench.CONTROLLERS)[: len(read_table(table))]
+    assert len(read_table(table)) == 8
+
+
+@pytest.mark.slow
+def test_the_table_of_the_readme_is_what_its_command_prints(tmp_path):
+    text = README.read_text(encoding="utf-8")
+    (task,) = re.findall(r"^koopmpc run (\S+)", text, re.MULTILINE)
+    command = [sys.executable, "-m", "koopmpc", "run", task]
+    environment = os.environ | {"COLUMNS": "120", "PYTHONPATH": str(README.parent)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    shown, printed = read_table(text), read_table(done.stdout)
+    assert list(shown) == list(printed)
+    for name, (cost, ratio, settles) in printed.items():
+        assert shown[name][:2] == pytest.approx((cost, ratio), rel=0.02), name
+        assert shown[name][2] == settles, name
+
+
+def test_the_twelve_lines_of_the_readme_run_and_print_and_record(tmp_path, monkeypatch, capsys):
+    text = README.read_text(encoding="utf-8")
     (source,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     found = {}
