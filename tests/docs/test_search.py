@@ -41,7 +41,9 @@ def first(site):
         pytest.skip("node, which runs the worker of the site's search, is not on the path")
     command = [node, str(Path(__file__).with_name("search.js")), str(site), *WANTED, *MORE]
     found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    return {query: (pages or [""])[0].removesuffix(".html") for query, pages in zip((*WANTED, *MORE), found, strict=True)}
+    return {
+        query: (pages or [""])[0].removesuffix(".html") for query, pages in zip((*WANTED, *MORE), found, strict=True)
+    }
 
 
 @pytest.mark.slow
