@@ -307,6 +307,11 @@ def swing_up(path: Path) -> None:
         export_video(log, path, width=640, fps=16, until=4.0, speed=0.8)
 
 
+def own_blocks() -> Any:
+    """The run of the page on blocks of held inputs."""
+    return _run_of("how/own_blocks.md")
+
+
 def _run_of(page: str) -> Any:
     """Return a picture of the run that the first block of a page makes."""
     names: dict[str, Any] = {"__name__": "page"}
@@ -335,6 +340,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         what_trust_means,
         guarantees,
         on_off,
+        own_blocks,
         manual_automatic,
         cart_pole,
     )

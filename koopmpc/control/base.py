@@ -4,7 +4,7 @@ import copy
 from collections import deque
 from collections.abc import Sequence
 from time import perf_counter
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,6 +16,7 @@ from koopmpc.control.cost import Tracking
 from koopmpc.control.limits import clip_input
 from koopmpc.control.move import Fallback, Move, Status, Token
 from koopmpc.control.program import Published, SavedController
+from koopmpc.control.stepped.blocks import Moves, find_move_blocks
 from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.control.watching import StepMonitor, StepWatch
 from koopmpc.errors import DataError, ShapeError
@@ -171,32 +172,6 @@ class InitialCondition(Viewing):
         self.W[:] = rows if rows.ndim == 1 else rows[self._latency :]
 
 
-def find_blocks(moves: int | Sequence[int] | None, horizon: int) -> tuple[int, ...]:
-    """Return the lengths of the blocks of steps in which a plan of N steps holds its inputs: move blocking.
-
-    They are N ones, or M moves of which the last is held, or `moves` itself.
-
-    Raises
-    ------
-    DataError
-        The horizon is no whole number above zero; there are more moves than steps; the lengths do not sum to N.
-    """
-    N = checks.count(horizon, "horizon")
-    if moves is None:
-        return (1,) * N
-    if isinstance(moves, Sequence):
-        lengths = tuple(checks.count(b, "a block of moves") for b in moves)
-        if sum(lengths) != N:
-            raise DataError(f"the blocks of moves {lengths} sum to {sum(lengths)}, the horizon is {N}")
-        return lengths
-    if not isinstance(cast(object, moves), int | np.integer):
-        raise DataError(f"moves is {moves!r}; pass how many moves there are, or a tuple of the blocks' lengths")
-    M = checks.count(moves, "moves")
-    if M > N:
-        raise DataError(f"moves is {M}, the horizon {N}; a horizon has at most a move a step")
-    return (1,) * (M - 1) + (N - M + 1,)
-
-
 class MPCBase(Published):
     """A controller whose plan has N steps, of an input that acts `latency` steps after it was computed.
 
@@ -216,6 +191,8 @@ class MPCBase(Published):
         The tracked and limited outputs, with their weights and limits.
     moves, horizon
         N steps, and which of them hold their inputs, see `find_blocks`.
+    inputs
+        Names of the inputs.
     observer, estimator
         The observer of this controller, and the rule that started it, None where y is the state.
     latency
@@ -236,8 +213,9 @@ class MPCBase(Published):
         dt: float,
         model: LinearPredictor | StateModel,
         tracking: Tracking[Any],
-        moves: int | Sequence[int] | None,
+        moves: Moves,
         horizon: int,
+        inputs: Sequence[str],
         observer: StateObserver,
         estimator: Estimator | None,
         latency: int,
@@ -249,12 +227,13 @@ class MPCBase(Published):
         self.cost, self.limits = tracking.cost, tracking.limits
         self._inputs, self._rates, self._hard_rates = tracking.inputs, tracking.rates, tracking.hard_rates
         self.dt, self.nu = dt, len(self._inputs.low)
-        self._blocks = blocks = find_blocks(moves, horizon)
+        self._moves = find_move_blocks(moves, horizon, inputs)
+        self._blocks = blocks = self._moves.lengths
         self._N = N = sum(blocks)
         self._latency = checks.count(latency, "latency", 0)
         self.horizon = N + self._latency  # steps of preview
         self._move_of: Int[np.ndarray, " N"] = np.arange(N) if stagewise else np.repeat(np.arange(len(blocks)), blocks)
-        self._with_rates = tracking.with_rates or (stagewise and len(blocks) < N)
+        self._with_rates = tracking.with_rates or (stagewise and (len(blocks) < N or self._moves.own))
         self._time_limit = time_limit
         self._allowed = np.inf if time_limit is None else checks.positive(time_limit, "time_limit", "s")
         self._estimator = estimator
@@ -331,7 +310,7 @@ class MPCBase(Published):
             sum(self._blocks),
             self._estimator,
             self._latency,
-            self._blocks,
+            self._moves.given,
             self._time_limit,
             options,
             None if self._watch is None else self._watch.monitor,

@@ -42,7 +42,8 @@ class SavedController(Value):
     model
         The predictor of the controller; None where it has none.
     cost, limits, horizon, estimator, latency, moves, time_limit
-        Arguments of the controller; `moves` are the lengths of the blocks of held inputs.
+        Arguments of the controller; `moves` are the lengths of the blocks of held inputs, by
+        name where each input has its own.
     options
         The arguments that only this class has.
     monitor
@@ -56,7 +57,7 @@ class SavedController(Value):
     horizon: int = 0
     estimator: Value | None = None
     latency: int = 0
-    moves: tuple[int, ...] = ()
+    moves: tuple[int, ...] | Mapping[str, tuple[int, ...]] = ()
     time_limit: float | None = None
     options: Mapping[str, Any] = field(default_factory=dict[str, Any])
     monitor: StepMonitor | None = None

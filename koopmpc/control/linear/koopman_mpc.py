@@ -1,6 +1,6 @@
 """KoopmanMPC: the Riccati solution first, a QP only where a limit is active; LinearMPC is one on a linearisation."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, ClassVar, cast
@@ -23,6 +23,7 @@ from koopmpc.control.program import LinearProgram, linear_parts, no_export, publ
 from koopmpc.control.solvers import FINISHER, exact_turn, order_solvers
 from koopmpc.control.solvers.base import StepQP, StepSolver
 from koopmpc.control.solvers.daqp import DAQP, DAQPSetup
+from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.stepped.search import LevelSolver
 from koopmpc.control.terminal.cuts import BallSolver
 from koopmpc.control.watching import StepMonitor, find_monitor
@@ -117,7 +118,8 @@ class KoopmanMPC(MPCBase):
         N steps of the predictor's dt. The attribute of this name is N + latency, the steps of reference that are read.
     moves
         Move blocking. A number M: M inputs, the last one held to the end of the horizon. A sequence: how many steps
-        each input is held; they sum to N. By default every step has its own input.
+        each input is held; they sum to N. By default every step has its own input. Or by name for each input its own,
+        ``{"valve": (1, 1, 2, 4), "heater": 2}``; one that is left out has an input in every step.
     estimator
         Estimates z and a disturbance d of every lifted coordinate, so that no offset is left: `LiftedDisturbance`
         where y is the state, `LiftedKalman` where y is some of it. Without one y is the state, and d zero.
@@ -178,7 +180,7 @@ class KoopmanMPC(MPCBase):
         *,
         estimator: Estimator | None = None,
         latency: int = 0,
-        moves: int | Sequence[int] | None = None,
+        moves: Moves = None,
         solver: str = "auto",
         settings: Mapping[str, Any] | None = None,
         time_limit: float | None = None,
@@ -202,6 +204,7 @@ class KoopmanMPC(MPCBase):
             track,
             moves,
             horizon,
+            predictor.inputs,
             start_observer(estimator, predictor, checks.count(horizon, "horizon")),
             estimator,
             latency,
@@ -211,7 +214,7 @@ class KoopmanMPC(MPCBase):
         )
         self.predictor, self._disturbed = predictor, disturbed
         coordinates = self._wanted or turns[0].solver.coordinates
-        self._map = plan_map(predictor, track, self._blocks, coordinates, disturbed=disturbed)
+        self._map = plan_map(predictor, track, self._moves, coordinates, disturbed=disturbed)
         self._options = {"solver": self._solver, "settings": settings}
         self._levels: LevelSolver | None = None
         ball = self._map.ball
@@ -322,7 +325,7 @@ class KoopmanMPC(MPCBase):
                 raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
         track = lifted_tracking(predictor, self.cost, self.limits)
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
-        self._map = plan_map(predictor, track, self._blocks, coordinates, disturbed=self._disturbed)
+        self._map = plan_map(predictor, track, self._moves, coordinates, disturbed=self._disturbed)
         self.predictor, self._states = predictor, None
         if isinstance(self._qps, BallSolver) and self._map.ball is not None:
             self._qps.change(self._map.qp, self._map.ball)

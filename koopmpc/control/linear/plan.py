@@ -4,15 +4,17 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.horizon import Condensed, Coordinates, Horizon, build_stages, condense, horizon_of
 from koopmpc.control.limits import Interval, Softness, preview_margin
+from koopmpc.control.linear.blocking import tie_moves
 from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers.base import StepQP
+from koopmpc.control.stepped.blocks import MoveBlocks
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
 from koopmpc.control.terminal.cuts import Ball, make_ball
 from koopmpc.control.terminal.sets import EndRows, read_end
@@ -82,12 +84,20 @@ class PlanMap(Viewing):
     _VIEWS = ("met", "met_low", "met_high")
 
     def __init__(
-        self, track: LiftedTracking, targets: Targets, horizon: Horizon, maps: Condensed, end: EndRows | None = None
+        self,
+        track: LiftedTracking,
+        targets: Targets,
+        horizon: Horizon,
+        maps: Condensed,
+        end: EndRows | None = None,
+        held: Bool[np.ndarray, "moves nu"] | None = None,
     ) -> None:
         self.track, self.targets = track, targets
         self.moves, self.blocks = len(maps.hessian), horizon.blocks
         self.deviation = maps.deviation[: self.moves]
         limits = _plan_limits(track, horizon, maps.deviation, end)
+        if held is not None and held.any():
+            _drop_held(limits, held, track)
         self.qp = _step_qp(maps, limits, 0 if track.rates is None else len(track.inputs.low))
         low, high, nv = limits.low, limits.high, len(limits.low)
         self.ball: Ball | None = None
@@ -116,7 +126,7 @@ class PlanMap(Viewing):
             high = np.concatenate([high, free, t_high + reach])
         self.planned = nv
         self.low, self.high = np.maximum(low, -HUGE), np.minimum(high, HUGE)  # inf meets no limit
-        self.box = Interval(self.low[: self.moves], self.high[: self.moves])
+        self.box = Interval(*(np.tile(end, len(horizon.blocks)) for end in track.inputs))
         self.inside = np.clip(0.0, self.low[nv:], self.high[nv:])
         from_state = np.zeros((len(low), horizon.size))
         from_state[:nv] = maps.from_state
@@ -200,7 +210,7 @@ class MovingMap(Viewing):
 def plan_map(
     predictor: LinearPredictor,
     track: LiftedTracking,
-    blocks: tuple[int, ...],
+    moves: MoveBlocks,
     coordinates: Coordinates,
     *,
     disturbed: bool,
@@ -208,15 +218,18 @@ def plan_map(
     """Return the plan of a predictor: its horizon, solved by the Riccati recursion, condensed, and limited."""
     targets, units = targets_of(predictor, track), Units.of(predictor, track)
     aims, cost = units.targets(targets), units.cost(track.cost)
-    horizon = horizon_of(predictor, track, blocks, disturbed=disturbed)
+    horizon = horizon_of(predictor, track, moves.lengths, disturbed=disturbed)
     own = horizon.in_units(units)
     parts = build_stages(own, aims)
     end = terminal_of(predictor, cost, own, aims, units.inverse)
     law = recursion(parts, end.P, end.p)
     wanted = track.limits.terminal
     rows = None if wanted is None else read_end(wanted, predictor)
-    maps = condense(own, law, end, aims, units, coordinates, rows)
-    return PlanMap(track, targets, horizon, _scale_deviation(maps, track.inputs, len(blocks)), rows)
+    maps = condense(own, law, end, aims, units, "riccati" if moves.own else coordinates, rows)
+    if moves.own:
+        maps = tie_moves(maps, moves.held)
+    scaled = _scale_deviation(maps, track.inputs, len(moves.lengths))
+    return PlanMap(track, targets, horizon, scaled, rows, moves.held)
 
 
 def _fold_targets(maps: Condensed, targets: Targets) -> Condensed:
@@ -307,6 +320,19 @@ def _plan_limits(
         low[last - len(margin) : last] += margin
         high[last - len(margin) : last] -= margin
     return PlanLimits(low, high, Softness(linear, quadratic, allowance), size, place)
+
+
+def _drop_held(limits: PlanLimits, held: Bool[np.ndarray, "moves nu"], track: LiftedTracking) -> None:
+    """Remove the limits of inputs that keep their value, and of their changes; the search over levels needs its own."""
+    nu = held.shape[1]
+    levels = track.limits.input_levels(nu)
+    searched = np.zeros(nu, dtype=np.bool_)
+    if levels is not None:
+        searched[levels.which] = True
+    rows = np.flatnonzero((held & ~searched).ravel())
+    if track.rates is not None:
+        rows = np.append(rows, held.size + np.flatnonzero(held.ravel()))
+    limits.low[rows], limits.high[rows] = -np.inf, np.inf
 
 
 def _step_qp(maps: Condensed, limits: PlanLimits, changes: int) -> StepQP:

@@ -1,6 +1,6 @@
 """BilinearMPC: real-time iteration on a bilinear predictor, or on any map, in the dimension of the state."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from time import perf_counter
 from typing import Any
@@ -22,8 +22,10 @@ from koopmpc.control.nonlinear.staged_program import StagedProgram, find_targets
 from koopmpc.control.nonlinear.stagewise import list_sides, weights
 from koopmpc.control.program import no_export, publish_estimator, reference_table, trace_lifting
 from koopmpc.control.solvers.daqp import daqp_settings
+from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.estimate.observer import Estimator
 from koopmpc.interrupts import raise_swallowed
@@ -134,10 +136,14 @@ class BilinearMPC(StagedMPC):
         sqp_iterations: int = 1,
         estimator: Estimator | None = None,
         latency: int = 0,
-        moves: int | Sequence[int] | None = None,
+        moves: Moves = None,
         time_limit: float | None = None,
         monitor: StepMonitor | Episodes | None = None,
     ) -> None:
+        if isinstance(moves, Mapping):
+            raise DataError(
+                f"moves is {dict(moves)}; a BilinearMPC holds all inputs in the same blocks: pass a number or lengths"
+            )
         super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
         self._sqp_iterations = checks.count(sqp_iterations, "sqp_iterations")
         self._iteration = RealTimeIteration(self._problem, compiles_model=self._compiles_model)
@@ -183,7 +189,7 @@ class BilinearMPC(StagedMPC):
             weighs_changes=outputs.R_delta is not None,
             soft_rates=problem.soft_rates,
             free=problem.free,
-            held_from=problem.held_from,
+            held_from=problem.held_from[:, 0],
             hard_rates=outputs.hard_rates,
             Q=problem.Q,
             R=problem.R,

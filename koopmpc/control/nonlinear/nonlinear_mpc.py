@@ -1,7 +1,7 @@
 """NonlinearMPC: multiple shooting and a nonlinear program a step; the oracle that others are measured against."""
 
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from time import perf_counter
 from typing import Any
 
@@ -18,6 +18,7 @@ from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolution, NLPSolver, Shooting, Start
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC, StagePlan
 from koopmpc.control.program import Program, no_export
+from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
@@ -100,7 +101,7 @@ class NonlinearMPC(StagedMPC):
         settings: Mapping[str, Any] | None = None,
         estimator: Estimator | None = None,
         latency: int = 0,
-        moves: int | Sequence[int] | None = None,
+        moves: Moves = None,
         time_limit: float | None = None,
         monitor: StepMonitor | Episodes | None = None,
     ) -> None:

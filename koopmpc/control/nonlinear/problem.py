@@ -12,6 +12,7 @@ from scipy.linalg import block_diag
 from koopmpc import checks
 from koopmpc.control.cost import StateTracking
 from koopmpc.control.limits import SOFTENED, Interval, Softness, preview_margin
+from koopmpc.control.stepped.blocks import MoveBlocks
 from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set, terminal_function
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
@@ -174,8 +175,8 @@ class StagedProblem(NamedTuple):
         Limits of `limited`, what it costs to break them, and by how much each stage moves the last of them inwards.
     free
         Whether a stage has an input; else v is zero there.
-    held_from
-        The stage whose input each stage takes.
+    held_from, own
+        The stage whose value of each input each stage takes, and whether some input has blocks of its own.
     sizes, input_sizes, scale
         What the entries of s and v, and the cost, are measured by, see `Sizes`.
     ends
@@ -191,7 +192,7 @@ class StagedProblem(NamedTuple):
     box: Interval
     softness: Softness
     free: Bool[np.ndarray, " N"]
-    held_from: Int[np.ndarray, " N"]
+    held_from: Int[np.ndarray, "N nu"]
     with_rates: bool
     soft_rates: Int[np.ndarray, " nsoft"]
     nx: int
@@ -200,6 +201,7 @@ class StagedProblem(NamedTuple):
     margin: Float[np.ndarray, "N nm"]
     scale: float
     ends: int = 0
+    own: bool = False
 
 
 class StageTargets(NamedTuple):
@@ -213,8 +215,9 @@ class StageTargets(NamedTuple):
 
 
 @raise_swallowed()
-def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int, ...]) -> StagedProblem:
+def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks) -> StagedProblem:
     """Return the problem of a horizon that is cut into blocks of held inputs."""
+    blocks = moves.lengths
     o, N, F = outputs, sum(blocks), model.F
     starts = np.cumsum([0, *blocks[:-1]])
     free = np.zeros(N, dtype=np.bool_)
@@ -230,7 +233,8 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
         box=o.outputs,
         softness=o.softness,
         free=free,
-        held_from=np.repeat(starts, blocks),
+        held_from=np.repeat(starts[moves.origins()], blocks, axis=0),
+        own=moves.own,
         with_rates=False,
         soft_rates=np.zeros(0, dtype=np.intp),
         nx=nx,
@@ -240,7 +244,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, blocks: tuple[int,
         scale=o.sizes.scale,
     )
     wanted = o.limits.terminal
-    if not o.with_rates and len(blocks) == N:
+    if not o.with_rates and len(blocks) == N and not moves.own:
         return plain if wanted is None else _add_end(plain, wanted, model, o)
     unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
     rates = unlimited if o.rates is None else o.rates

@@ -161,7 +161,9 @@ class Shooting:
         unlimited = np.full(nx, np.inf)
         lbx = np.tile(np.concatenate([p.inputs.low, -unlimited, np.zeros(ns)]), (N, 1))
         ubx = np.tile(np.concatenate([p.inputs.high, unlimited, np.full(ns, np.inf)]), (N, 1))
-        lbx[~p.free, :nu] = ubx[~p.free, :nu] = 0.0
+        held = np.zeros(lbx.shape, dtype=np.bool_)
+        held[:, :nu] = p.held_from != np.arange(N)[:, None]
+        lbx[held] = ubx[held] = 0.0
         lbx, ubx = lbx / self._sizes, ubx / self._sizes
         self._bounds = {"lbx": lbx.ravel(), "ubx": ubx.ravel(), "lbg": lbg, "ubg": ubg}
         parameters = ca.veccat(x0, r, u_r, e, M, L, m)

@@ -1,7 +1,6 @@
 """What BilinearMPC and NonlinearMPC share: a step from the measurement, over the targets of its stages, to a Move."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from time import perf_counter
 from typing import NamedTuple
 
@@ -17,6 +16,7 @@ from koopmpc.control.limits import Interval, Limits, clip_input, measure_violati
 from koopmpc.control.move import Move, Plan, Status, alone
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
+from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator, start_observer
@@ -66,7 +66,7 @@ class StagedMPC(MPCBase):
         cost: Cost,
         limits: Limits | None,
         horizon: int,
-        moves: int | Sequence[int] | None,
+        moves: Moves,
         estimator: Estimator | None,
         latency: int,
         time_limit: float | None,
@@ -84,6 +84,7 @@ class StagedMPC(MPCBase):
             o,
             moves,
             horizon,
+            model.inputs,
             start_observer(estimator, given, checks.count(horizon, "horizon")),
             estimator,
             latency,
@@ -91,7 +92,7 @@ class StagedMPC(MPCBase):
             stagewise=True,
             monitor=None if monitor is None else find_monitor(monitor, model),
         )
-        self._problem = staged_problem(given, o, self._blocks)
+        self._problem = staged_problem(given, o, self._moves)
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
         self._disturbed = estimator is not None or given.nw > 0
 
@@ -279,7 +280,7 @@ class StagedMPC(MPCBase):
         U = np.minimum(np.maximum(U, low), high)
         if not self._with_rates:
             return X, U
-        before = np.vstack([u_prev, U[self._problem.held_from]])
+        before = np.vstack([u_prev, U[self._problem.held_from, np.arange(self.nu)]])
         V = np.diff(before, axis=0)
         late = np.vstack([np.zeros(self.nu), V])[:, self._problem.soft_rates]
         return np.hstack([X, before, late]), V
