@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc import data as data
     from koopmpc import errors as errors
     from koopmpc import estimate as estimate
+    from koopmpc import experiment as experiment
     from koopmpc import guarantees as guarantees
     from koopmpc import identify as identify
     from koopmpc import loop as loop
@@ -60,6 +61,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
     from koopmpc.estimate.extended import ExtendedKalman as ExtendedKalman
     from koopmpc.estimate.kalman import LiftedKalman as LiftedKalman
+    from koopmpc.experiment.planning import next_experiment as next_experiment
     from koopmpc.guarantees.certify import certify as certify
     from koopmpc.identify import moments as moments
     from koopmpc.identify.fits.bilinear import bilinear_edmd as bilinear_edmd

@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.move import Controller, Fallback, Move, Status
+from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, ShapeError
 
+_LONGEST = 100_000  # steps of an excitation that stands for a controller; it holds the last input then
 MEMBERS = ("dt", "nu", "horizon", "reset")
 """What a controller has and a plain function lacks."""
 
@@ -72,8 +74,43 @@ class FunctionController:
         return Move.hold(self._last.copy(), Status.BAD_MEASUREMENT, perf_counter() - start)
 
 
-def as_controller(controller: Controller | Callable[..., Any], dt: float, nu: int) -> Controller:
-    """Return a controller as it is, and a plain function u = f(y, r) as a controller of this dt and so many inputs."""
+class ExcitationController(FunctionController):
+    """An excitation where a loop expects a controller: u_k = policy(k, y_k), whatever the reference.
+
+    Parameters
+    ----------
+    excitation
+        The excitation; after `reset` it begins with the same draws again.
+    dt
+        Sampling time [s].
+
+    Raises
+    ------
+    DataError
+        It cannot run at this dt.
+    """
+
+    def __init__(self, excitation: Excitation, dt: float) -> None:
+        self._excitation = excitation
+        super().__init__(self._follow, dt, excitation.nu)
+        self.reset()
+
+    def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
+        """Begin the excitation again."""
+        super().reset(x0, u_prev)
+        self._k = 0
+        self._policy = self._excitation.start(_LONGEST, self.dt, np.random.default_rng(0))
+
+    def _follow(self, y: Float[np.ndarray, " ny"], reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nu"]:
+        del reference
+        k, self._k = self._k, self._k + 1
+        return self._policy(min(k, _LONGEST - 1), y)
+
+
+def as_controller(controller: Controller | Excitation | Callable[..., Any], dt: float, nu: int) -> Controller:
+    """Return a controller as it is; an excitation, or a plain function u = f(y, r), as a controller of this dt."""
+    if isinstance(controller, Excitation):
+        return ExcitationController(controller, dt)
     if callable(controller) and not any(hasattr(controller, name) for name in MEMBERS):
         return FunctionController(controller, dt, nu)
     return cast("Controller", controller)

@@ -102,7 +102,7 @@ def collect(
         )
     with np.errstate(over="ignore", invalid="ignore"):  # `_finite` reports a plant that diverges
         if not isinstance(plant, StepMap):
-            policies = [_start(excitation, length, plant.dt, nu, own) for own in streams]
+            policies = [_start(excitation, e, length, plant.dt, nu, own) for e, own in enumerate(streams)]
             begins = [None] * count if starts is None else starts
             runs = [_drive(plant, *each, length) for each in zip(range(count), begins, policies, streams, strict=True)]
         elif starts is None:
@@ -142,7 +142,7 @@ def _batch(
     if isinstance(excitation, OpenLoop):
         U = np.stack([excitation.sequence(steps, plant.dt, own) for own in streams])
         return plant.rollouts(starts, U), U
-    policies = [_start(excitation, steps, plant.dt, plant.nu, own) for own in streams]
+    policies = [_start(excitation, e, steps, plant.dt, plant.nu, own) for e, own in enumerate(streams)]
     X = np.empty((len(starts), steps + 1, plant.nx))
     moves = np.empty((len(starts), steps, plant.nu))
     X[:, 0] = starts
@@ -164,10 +164,12 @@ def _measure_rows(plant: StepMap, X: Float[np.ndarray, "E rows nx"]) -> Float[np
     return np.stack([plant.measure(row) for row in X.reshape(-1, plant.nx)]).reshape(*X.shape[:2], plant.ny)
 
 
-def _start(excitation: Excitation | InputFunction, steps: int, dt: float, nu: int, rng: np.random.Generator) -> Policy:
+def _start(
+    excitation: Excitation | InputFunction, episode: int, steps: int, dt: float, nu: int, rng: np.random.Generator
+) -> Policy:
     """Return the policy of one episode."""
     if isinstance(excitation, Excitation):
-        return excitation.start(steps, dt, rng)
+        return excitation.choose_episode(episode).start(steps, dt, rng)
     checks.members(excitation, "excitation", ("__call__",), "pass Noise(low, high), or a function (k, y, rng) -> u")
     checks.takes(excitation, "excitation", 3, "pass a function (k, y, rng) -> u")
     return lambda k, y: checks.vector(excitation(k, y, rng), "the excitation's u", nu)

@@ -28,6 +28,11 @@ class Excitation(Value, ABC):
     def start(self, steps: int, dt: float, rng: np.random.Generator) -> Policy:
         """Return the policy u_k = policy(k, y) of one episode of `steps` steps of dt [s]."""
 
+    def choose_episode(self, number: int) -> "Excitation":
+        """Return the excitation of the episode with this number; most excitations are the same for all."""
+        del number
+        return self
+
 
 class OpenLoop(Excitation):
     """An excitation that does not look at y."""

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.function import as_controller
 from koopmpc.control.move import Controller, Move, Status
+from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.loop.run import Step
 from koopmpc.loop.simulate import CONTROLLER, HOW, checked_input, predictor_of, rows_ahead
@@ -128,7 +129,7 @@ class _Watchdog:
 
 
 def realtime(
-    controller: Controller | Callable[..., ArrayLike],
+    controller: Controller | Excitation | Callable[..., ArrayLike],
     plant: Plant,
     *,
     dt: float,
@@ -148,7 +149,8 @@ def realtime(
     Parameters
     ----------
     controller, plant
-        As for `simulate`, but plant.step(u) applies u and returns at once, with the newest measurement. Where the plant
+        As for `simulate`, excitations included, but plant.step(u) applies u and returns at once, with the newest
+        measurement. Where the plant
         has read() → y, it is called when a step begins, so that no y is older than that, and step may return None.
         Where it has stop(u), that sends the safe input; it may be called from another thread while `step` waits.
     dt

@@ -18,6 +18,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.function import as_controller
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Fallible, Move, Plan
+from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.loop.faults import Fault, Injections, Wiring
 from koopmpc.loop.run import LoopRows, Run, Step, bind_outputs
@@ -39,7 +40,7 @@ _MOVE = tuple(f.name for f in fields(Move) if f.default is MISSING)  # what a us
 
 def simulate(
     plant: StepMap | Plant,
-    controller: Controller | Callable[..., ArrayLike],
+    controller: Controller | Excitation | Callable[..., Any],
     *,
     x0: ArrayLike | None,
     reference: ArrayLike,
@@ -65,7 +66,7 @@ def simulate(
     plant
         A StepMap, or any Plant. For model mismatch pass a plant that differs from the controller's model.
     controller
-        Any Controller with the plant's dt, or a function u = f(y, r). It is reset to x0 at the beginning.
+        Any Controller with the plant's dt, a function u = f(y, r), or an excitation. It is reset to x0 first.
     x0
         (nx,) initial state; None: the plant chooses its own initial state.
     reference
