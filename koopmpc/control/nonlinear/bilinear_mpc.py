@@ -40,7 +40,7 @@ SETTLED = (
 )
 FAR = 3.0  # begin a new plan if y is more than this many state sizes from the expected state
 MET = 1e-8  # a plan ends in its terminal set if the value of the set is at most this much above 1
-ENDINGS = 20  # further linearisations of a plan that does not end in its terminal set, at most
+ENDINGS = 20  # further linearisations, at most, of a plan that breaks a hard limit or misses its terminal set
 NEARLY = 1e-2  # the same for a plan that is compared with others
 _COPIED = (
     "_initial",
@@ -262,14 +262,30 @@ class BilinearMPC(StagedMPC):
         if self._warm and jump.max() <= FAR:
             self._shift(u_prev)
             status, iterations = self._improve(s, u_prev, self._sqp_iterations, deadline)
+            status, more = self._meet_limits(status, s, u_prev, deadline)
+            iterations += more
         if status not in GOOD and status is not Status.TIME_LIMIT:  # there is no plan, or it has lost the plant
             status, more = self._begin_anew(s, u_prev, deadline)
+            iterations += more
+            status, more = self._meet_limits(status, s, u_prev, deadline)
             iterations += more
         if self._problem.ends and status in GOOD:
             status, more = self._meet_end(status, s, u_prev, deadline)
             iterations += more
         free = iteration.without_limits + (u_prev if self._with_rates else 0.0)
         return StagePlan(iteration.X, iteration.U, status, iterations, iteration.slack, free)
+
+    def _meet_limits(
+        self, status: Status, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], deadline: float
+    ) -> tuple[Status, int]:
+        """Linearise on until the plan keeps its hard limits; return how it ended, and the solver's iterations."""
+        iteration, total = self._iteration, 0
+        for _ in range(ENDINGS):
+            if status not in GOOD or iteration.excess() <= 1 or perf_counter() > deadline:
+                return status, total
+            status, more = self._improve(s, u_prev, 1, deadline)
+            total += more
+        return (status if status not in GOOD or iteration.excess() <= 1 else Status.MAX_ITERATIONS), total
 
     def _meet_end(
         self, status: Status, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], deadline: float
@@ -309,7 +325,8 @@ class BilinearMPC(StagedMPC):
             total += iterations
             rank = (2, 0.0)
             if ended in GOOD:
-                rank = (0, iteration.cost()) if iteration.gap < FOLLOWED else (1, iteration.gap)
+                followed = iteration.gap < FOLLOWED and iteration.excess() <= FOLLOWED / SOFTENED
+                rank = (0, iteration.cost()) if followed else (1, max(iteration.gap, SOFTENED * iteration.excess()))
             if rank < best:
                 best, status, kept = rank, ended, (iteration.X.copy(), iteration.U.copy(), iteration.slack)
             if perf_counter() > deadline:

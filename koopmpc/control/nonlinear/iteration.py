@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Bool, Float
 
-from koopmpc.control.limits import Interval, Softness
+from koopmpc.control.limits import SOFTENED, Interval, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.stagewise import (
@@ -93,6 +93,10 @@ class RealTimeIteration:
         zeros = np.zeros
         soft = self._sides.row[len(self._sides.row) - self._sides.soft :]
         self._allowance = problem.softness.allowance[soft - nu]
+        self._hard = np.flatnonzero(np.isinf(linear))
+        self._hard_allowance = allowance[self._hard]
+        self._outputs = problem.limited.map(N) if len(self._hard) else None
+        self._F_of = problem.F
         self.length, self._defects = 1.0, zeros(nx)  # of the last step, and the defects that it has left
         self.slack = 0.0  # of the soft limit that the plan breaks most, where that is more than its allowance
         self.multipliers: Float[np.ndarray, " m"] | None = None  # of a program that the active-set method has finished
@@ -198,6 +202,33 @@ class RealTimeIteration:
         """Return by how much the plan's end leaves its terminal set, whose values are at most 1."""
         values = np.array(cast(ca.DM, self._limited(self.X[-1])), dtype=np.float64).ravel()
         return float(values[len(values) - self._ends :].max(initial=1.0)) - 1
+
+    def excess(self) -> float:
+        """Return by how much the inputs break a hard limit on the model, in units of what counts as broken.
+
+        Where they break none, but the states of the plan do, the states become those of the model.
+        """
+        if self._outputs is None:
+            return 0.0
+        states = self.X.copy()
+        for k, u in enumerate(self.U):
+            states[k + 1] = np.array(cast(ca.DM, self._F_of(states[k], u, self.theta))).ravel() + self.e[k]
+        if not np.isfinite(states).all():
+            return np.inf
+        past = self._past(states)
+        if past <= 1 < self._past(self.X):
+            self.X[:] = states
+        return past
+
+    def _past(self, X: Float[np.ndarray, "N1 nx"]) -> float:
+        """Return by how much these states break a hard limit, in units of what counts as broken."""
+        assert self._outputs is not None
+        values = np.array(cast(ca.DM, self._outputs(X[1:].T)), dtype=np.float64).T[:, self._hard]
+        rows = self._shape[2] + self._hard
+        past = np.maximum(self.low[:, rows] - values, values - self.high[:, rows])
+        if self._ends:
+            past[:-1, self._hard >= self._shape[3] - self._ends] = 0.0
+        return float((past / self._hard_allowance).max())
 
     def cost(self) -> float:
         """Return what the plan costs, its breaches of soft limits included."""
