@@ -15,6 +15,7 @@ from koopmpc.control.nonlinear.equilibrium import PSEUDO, RANK
 from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
 from koopmpc.control.nonlinear.iteration import DIGITS, ENOUGH, MOST, PRECISE, STUCK
 from koopmpc.control.nonlinear.staged_program import StagedProgram
+from koopmpc.control.nonlinear.stagewise import list_hard_outputs
 from koopmpc.control.program import LinearProgram, Published, StepProgram, no_export
 from koopmpc.control.riccati import SETTLED as RESTED
 from koopmpc.control.solvers.daqp import FEW
@@ -473,7 +474,11 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         high[:, high.shape[1] - inwards :] -= p.margin
     tables.sizes["BOX_ROWS"] = len(low)
     soft = np.isfinite(softness.linear)
+    hard = list_hard_outputs(softness, nu * p.with_rates)
+    tables.sizes["HARD_OUTPUTS"] = len(hard)
     tables.plan |= {
+        "hard_output": hard.astype(np.intc),
+        "hard_allowance": softness.allowance[hard],
         "Q": p.Q,
         "R": p.R,
         "R_held": p.R_held,

@@ -264,3 +264,62 @@ def test_of_the_states_that_hold_a_reference_the_one_near_the_data_is_taken(side
     mpc = km.BilinearMPC(model, cost, km.Limits(u_min=-3, u_max=3), 10)
     run = km.simulate(plant, mpc, x0=[1.2, 1.1 * side], reference=[1] if tracked else [1, 0], steps=80, cost=cost)
     np.testing.assert_allclose(run.X[-1], [1, side], atol=1e-3)
+
+
+def strongly_bilinear(seed):
+    """Return a random bilinear model with a large product of state and input, a controller with hard limits, and its g(X) ≤ 0.5."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(2, 2))
+    A *= rng.uniform(0.8, 1.15) / np.abs(np.linalg.eigvals(A)).max()
+    B = rng.normal(size=(2, 1))
+    N = rng.uniform(0.3, 1.2) * rng.normal(size=(2, 2))
+    model = km.BilinearPredictor(A, B, N[None], np.eye(2), km.State(), 0.1, ["p", "v"], ["u"])
+    if seed % 2:
+        squares = km.Monomials(2, states=[0, 1]).bind(("p", "v"))
+        limits = km.Limits(u_min=-1, u_max=1, of=squares, y_max=[0.5] * squares.nz, slack=None)
+        limited = squares
+    else:
+        limits = km.Limits(u_min=-1, u_max=1, x_min=-0.5, x_max=0.5, slack=None)
+        limited = np.abs
+    mpc = km.BilinearMPC(model, km.Cost(Q=[1, 0.2], R=0.3), limits, 12)
+    return rng, mpc, lambda x, u: A @ x + B @ u + u[0] * N @ x, limited
+
+
+def count_broken_plans(seeds, twins=()):
+    """Return how many solved plans there were, and how many of them break a hard limit on the model."""
+    solved = broken = 0
+    for seed in seeds:
+        rng, mpc, ahead, limited = strongly_bilinear(seed)
+        twin = km.compiled(mpc) if seed in twins else None
+        for _ in range(12):
+            x, reference = rng.uniform(-1, 1, 2), rng.uniform(-0.8, 0.8, 2)
+            for each in filter(None, (mpc, twin)):
+                each.reset()
+            for _ in range(4):
+                move = mpc(x, reference)
+                if twin is not None:
+                    same = twin(x, reference)
+                    assert same.status is move.status
+                    assert same.u == pytest.approx(move.u, abs=1e-5)
+                if move.status not in GOOD:
+                    break
+                X = [x]
+                for u in mpc.plan().U:
+                    X.append(ahead(X[-1], u))
+                most = max(limited(np.array(X[1:])).max(), limited(mpc.plan().X[1:]).max())
+                solved, broken = solved + 1, broken + (most > 0.5 * (1 + 1.01e-4))
+                x = X[1]
+    return solved, broken
+
+
+def test_a_plan_that_counts_as_solved_keeps_its_hard_limits_on_the_model():
+    solved, broken = count_broken_plans([0, 18, 25, 55], twins=[0])
+    assert solved > 100
+    assert broken == 0
+
+
+@pytest.mark.slow
+def test_plans_of_sixty_models_keep_their_hard_limits():
+    solved, broken = count_broken_plans(range(60), twins=[18, 25, 51])
+    assert solved > 1500
+    assert broken == 0

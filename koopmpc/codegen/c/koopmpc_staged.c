@@ -14,10 +14,11 @@
 #include "koopmpc_stages.h"
 #include "koopmpc_table.h"
 
-enum { EACH = 12, AGAIN = 10, PLAN_S = (STEPS + 1) * NS, PLAN_V = STEPS * NV };
+enum { EACH = 12, AGAIN = 10, ENDINGS = 20, PLAN_S = (STEPS + 1) * NS, PLAN_V = STEPS * NV };
 #define NEAR_OF ((koopmpc_real)0.2)      /* F may differ from its linearisation by this share of a change */
 #define SHORTEST ((koopmpc_real)0.001)   /* shortest length of a step */
 #define FOLLOWED ((koopmpc_real)0.02)    /* a plan follows the model if its defects are below this share of a range */
+#define BROKEN ((koopmpc_real)1e-4)      /* a hard limit is broken by more than this share of its size */
 #define NEARLY ((koopmpc_real)1e-2)      /* plans are compared once an iteration moves them by less than this share */
 #define FAR_OFF ((koopmpc_real)3)        /* the plan restarts if y is more than this many state sizes from the prediction */
 
@@ -228,6 +229,48 @@ static void restore(koopmpc_state *s) {
   s->slack = s->best_slack;
 }
 
+#if KOOPMPC_HARD_OUTPUTS
+/** By how much the state after stage k breaks a hard limit, in units of what counts as broken; at least `past`. */
+static koopmpc_real past_of(const koopmpc_state *s, int k, const koopmpc_real *next, koopmpc_real past) {
+  koopmpc_real outputs[NG + NG * NS + 1];
+  koopmpc_limited(next, outputs);
+  for (int i = 0; i < KOOPMPC_HARD_OUTPUTS; i++) {
+    const int row = koopmpc_hard_output[i];
+    const koopmpc_real under = (koopmpc_low_of(s, k, NV + row) - outputs[row]) / koopmpc_hard_allowance[i];
+    const koopmpc_real over = (outputs[row] - koopmpc_high_of(s, k, NV + row)) / koopmpc_hard_allowance[i];
+    if (!(under <= past)) past = under;
+    if (!(over <= past)) past = over;
+  }
+  return past;
+}
+
+/** The same of the states to which the plan's inputs lead; if they keep the limits and the plan's do not, they replace them. */
+static koopmpc_real excess_of(koopmpc_state *s) {
+  koopmpc_real before[NS], next[NS], past = 0, planned = 0;
+  koopmpc_copy(before, s->S, NS);
+  for (int k = 0; k < STEPS; k++) {
+    follow(s, k, before, s->V + k * NV, next);
+    if (!koopmpc_usable(next, NS)) return KOOPMPC_HUGE;
+    past = past_of(s, k, next, past);
+    planned = past_of(s, k, s->S + (k + 1) * NS, planned);
+    koopmpc_copy(before, next, NS);
+  }
+  for (int k = 0; k < STEPS && past <= 1 && !(planned <= 1); k++)
+    follow(s, k, s->S + k * NS, s->V + k * NV, s->S + (k + 1) * NS);
+  return past;
+}
+
+/** Iterate on until the plan keeps its hard limits; returns how it ended. */
+static koopmpc_status meet_limits(koopmpc_state *s, koopmpc_status status, const koopmpc_real *x,
+                                  const koopmpc_real *u_prev, int *iterations) {
+  for (int k = 0; k < ENDINGS; k++) {
+    if (!is_good(status) || excess_of(s) <= 1) return status;
+    status = improve(s, x, u_prev, 1, KOOPMPC_SETTLED, iterations);
+  }
+  return !is_good(status) || excess_of(s) <= 1 ? status : KOOPMPC_MAX_ITERATIONS;
+}
+#endif
+
 /** Choose the cheapest plan of several starts; plans that follow the model come first. */
 static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev,
                                  int *iterations) {
@@ -244,8 +287,13 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
     ended = improve(s, x, u_prev, EACH, NEARLY, iterations);
     if (is_good(ended)) {
       const koopmpc_real gap = gap_of(s);
-      kind = gap < FOLLOWED ? 0 : 1;
-      value = kind == 0 ? koopmpc_cost(s) : gap;
+#if KOOPMPC_HARD_OUTPUTS
+      const koopmpc_real excess = BROKEN * excess_of(s);
+#else
+      const koopmpc_real excess = 0;
+#endif
+      kind = gap < FOLLOWED && excess <= FOLLOWED ? 0 : 1;
+      value = kind == 0 ? koopmpc_cost(s) : gap > excess ? gap : excess;
     }
     if (kind < best_kind || (kind == best_kind && value < best)) {
       best_kind = kind;
@@ -427,9 +475,17 @@ static koopmpc_status solve(koopmpc_state *s, const koopmpc_real *stage, const k
     if (near) {
       shift(s, u_prev);
       status = improve(s, stage, u_prev, KOOPMPC_ITERATIONS, KOOPMPC_SETTLED, iterations);
+#if KOOPMPC_HARD_OUTPUTS
+      status = meet_limits(s, status, stage, u_prev, iterations);
+#endif
     }
   }
-  if (!is_good(status)) status = begin_anew(s, stage, u_prev, iterations);
+  if (!is_good(status)) {
+    status = begin_anew(s, stage, u_prev, iterations);
+#if KOOPMPC_HARD_OUTPUTS
+    status = meet_limits(s, status, stage, u_prev, iterations);
+#endif
+  }
   return status;
 }
 

@@ -325,8 +325,9 @@ class BilinearMPC(StagedMPC):
             total += iterations
             rank = (2, 0.0)
             if ended in GOOD:
-                followed = iteration.gap < FOLLOWED and iteration.excess() <= FOLLOWED / SOFTENED
-                rank = (0, iteration.cost()) if followed else (1, max(iteration.gap, SOFTENED * iteration.excess()))
+                gap, broken = iteration.gap, SOFTENED * iteration.excess()
+                followed = gap < FOLLOWED and broken <= FOLLOWED
+                rank = (0, iteration.cost()) if followed else (1, max(gap, broken))
             if rank < best:
                 best, status, kept = rank, ended, (iteration.X.copy(), iteration.U.copy(), iteration.slack)
             if perf_counter() > deadline:

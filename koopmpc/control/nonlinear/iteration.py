@@ -16,13 +16,15 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Bool, Float
 
-from koopmpc.control.limits import SOFTENED, Interval, Softness
+from koopmpc.checks import HUGE
+from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.stagewise import (
     RiccatiSweeps,
     interior_step,
     linearisation,
+    list_hard_outputs,
     list_sides,
     plan_cost,
     simulation,
@@ -93,10 +95,10 @@ class RealTimeIteration:
         zeros = np.zeros
         soft = self._sides.row[len(self._sides.row) - self._sides.soft :]
         self._allowance = problem.softness.allowance[soft - nu]
-        self._hard = np.flatnonzero(np.isinf(linear))
+        self._hard = list_hard_outputs(problem.softness, nu * problem.with_rates)
         self._hard_allowance = allowance[self._hard]
         self._outputs = problem.limited.map(N) if len(self._hard) else None
-        self._F_of = problem.F
+        self._step_of = problem.F
         self.length, self._defects = 1.0, zeros(nx)  # of the last step, and the defects that it has left
         self.slack = 0.0  # of the soft limit that the plan breaks most, where that is more than its allowance
         self.multipliers: Float[np.ndarray, " m"] | None = None  # of a program that the active-set method has finished
@@ -212,9 +214,9 @@ class RealTimeIteration:
             return 0.0
         states = self.X.copy()
         for k, u in enumerate(self.U):
-            states[k + 1] = np.array(cast(ca.DM, self._F_of(states[k], u, self.theta))).ravel() + self.e[k]
-        if not np.isfinite(states).all():
-            return np.inf
+            states[k + 1] = np.array(cast(ca.DM, self._step_of(states[k], u, self.theta))).ravel() + self.e[k]
+            if not np.abs(states[k + 1]).max() < HUGE:
+                return np.inf
         past = self._past(states)
         if past <= 1 < self._past(self.X):
             self.X[:] = states
@@ -223,7 +225,7 @@ class RealTimeIteration:
     def _past(self, X: Float[np.ndarray, "N1 nx"]) -> float:
         """Return by how much these states break a hard limit, in units of what counts as broken."""
         assert self._outputs is not None
-        values = np.array(cast(ca.DM, self._outputs(X[1:].T)), dtype=np.float64).T[:, self._hard]
+        values = np.array(self._outputs(X[1:].T), dtype=np.float64).T[:, self._hard]
         rows = self._shape[2] + self._hard
         past = np.maximum(self.low[:, rows] - values, values - self.high[:, rows])
         if self._ends:

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.control.limits import SOFTENED, Interval, half_width
+from koopmpc.control.limits import SOFTENED, Interval, Softness, half_width
 from koopmpc.control.nonlinear.problem import StagedProblem
 
 _SHORT = 0.995  # share of the way to the nearest bound
@@ -107,6 +107,12 @@ def linearisation(problem: StagedProblem) -> ca.Function:
     g_k, G = limited.map(N)(X[:, 1:]) if ng else (ca.MX(0, N), ca.MX(0, N * nx))
     found = [A, ca.densify(B), F, Q, q, ca.DM(problem.R) @ (U - U_r), g_k, G]
     return ca.Function("linearisation", [X, U, R, U_r, *goal, t], found)
+
+
+def list_hard_outputs(softness: Softness, inputs: int) -> Int[np.ndarray, " n"]:
+    """Return which limited outputs of a stage are hard; its first ones are the inputs where their changes count."""
+    hard = np.flatnonzero(np.isinf(softness.linear))
+    return hard[hard >= inputs]
 
 
 def plan_cost(problem: StagedProblem) -> ca.Function:
