@@ -329,6 +329,7 @@ def test_bilinear_and_nonlinear_plans_end_in_the_region_of_a_certificate(mixed, 
     soft = km.Limits(u_min=box.u_min, u_max=box.u_max, terminal=certificate)
     bilinear, nonlinear = (kind(model, cost, limits, 4) for kind in (km.BilinearMPC, km.NonlinearMPC))
     gives_way = km.BilinearMPC(model, cost, soft, 4)
+    without_plan = (km.Status.INFEASIBLE, km.Status.MAX_ITERATIONS)
     rng, seen, active, missed = np.random.default_rng(1), set(), 0, 0
     for X in certificate.sample(24):
         x = X * rng.uniform(0.5, 3.0)
@@ -336,13 +337,11 @@ def test_bilinear_and_nonlinear_plans_end_in_the_region_of_a_certificate(mixed, 
             mpc.reset()
         a, b, c = (mpc(x, [0, 0]) for mpc in (bilinear, nonlinear, gives_way))
         seen.add(b.status.name)
-        if (
-            a.status is km.Status.INFEASIBLE and b.status is km.Status.OPTIMAL
-        ):  # at the edge its linearisation has no plan
-            missed += 1
+        if a.status in without_plan and b.status is km.Status.OPTIMAL:
+            missed += 1  # at the edge of what is feasible its linearisation has no plan
             continue
         if b.status is km.Status.INFEASIBLE:
-            assert a.status is km.Status.INFEASIBLE
+            assert a.status in without_plan
             assert c.status is km.Status.SOFTENED
             assert c.slack > 0
             continue

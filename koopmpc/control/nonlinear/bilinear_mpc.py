@@ -262,13 +262,15 @@ class BilinearMPC(StagedMPC):
         if self._warm and jump.max() <= FAR:
             self._shift(u_prev)
             status, iterations = self._improve(s, u_prev, self._sqp_iterations, deadline)
-            status, more = self._meet_limits(status, s, u_prev, deadline)
-            iterations += more
+            if iteration.limits_outputs:
+                status, more = self._meet_limits(status, s, u_prev, deadline)
+                iterations += more
         if status not in GOOD and status is not Status.TIME_LIMIT:  # there is no plan, or it has lost the plant
             status, more = self._begin_anew(s, u_prev, deadline)
             iterations += more
-            status, more = self._meet_limits(status, s, u_prev, deadline)
-            iterations += more
+            if iteration.limits_outputs:
+                status, more = self._meet_limits(status, s, u_prev, deadline)
+                iterations += more
         if self._problem.ends and status in GOOD:
             status, more = self._meet_end(status, s, u_prev, deadline)
             iterations += more
@@ -325,7 +327,8 @@ class BilinearMPC(StagedMPC):
             total += iterations
             rank = (2, 0.0)
             if ended in GOOD:
-                gap, broken = iteration.gap, SOFTENED * iteration.excess()
+                gap = iteration.gap
+                broken = SOFTENED * iteration.excess() if iteration.limits_outputs else 0.0
                 followed = gap < FOLLOWED and broken <= FOLLOWED
                 rank = (0, iteration.cost()) if followed else (1, max(gap, broken))
             if rank < best:

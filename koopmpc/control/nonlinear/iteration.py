@@ -97,7 +97,8 @@ class RealTimeIteration:
         self._allowance = problem.softness.allowance[soft - nu]
         self._hard = list_hard_outputs(problem.softness, nu * problem.with_rates)
         self._hard_allowance = allowance[self._hard]
-        self._outputs = problem.limited.map(N) if len(self._hard) else None
+        self.limits_outputs = bool(len(self._hard))
+        self._outputs = problem.limited.map(N)
         self._step_of = problem.F
         self.length, self._defects = 1.0, zeros(nx)  # of the last step, and the defects that it has left
         self.slack = 0.0  # of the soft limit that the plan breaks most, where that is more than its allowance
@@ -210,8 +211,6 @@ class RealTimeIteration:
 
         Where they break none, but the states of the plan do, the states become those of the model.
         """
-        if self._outputs is None:
-            return 0.0
         states = self.X.copy()
         for k, u in enumerate(self.U):
             states[k + 1] = np.array(cast(ca.DM, self._step_of(states[k], u, self.theta))).ravel() + self.e[k]
@@ -224,7 +223,6 @@ class RealTimeIteration:
 
     def _past(self, X: Float[np.ndarray, "N1 nx"]) -> float:
         """Return by how much these states break a hard limit, in units of what counts as broken."""
-        assert self._outputs is not None
         values = np.array(self._outputs(X[1:].T), dtype=np.float64).T[:, self._hard]
         rows = self._shape[2] + self._hard
         past = np.maximum(self.low[:, rows] - values, values - self.high[:, rows])
