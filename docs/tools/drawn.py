@@ -28,12 +28,6 @@ PAPERS = {  # folder of docs/papers -> the module of koopmpc/papers that draws i
     "snyder": "snyder.py",
     "williams": "kevrekidis.py",
 }
-PAGES = {  # pictures that show the run of a page -> the page
-    "start": "start.md",
-    "guarantees": "why/guarantees.md",
-    "manual_automatic": "how/manual_automatic.md",
-    "on_off": "how/on_off.md",
-}
 
 
 def list_pictures() -> list[str]:
@@ -50,9 +44,8 @@ def inputs_of(picture: str) -> list[str]:
     if folder.startswith("papers/"):
         return [f"koopmpc/papers/{PAPERS[folder.partition('/')[2]]}"]
     if name.startswith("real_"):
-        return ["tests/real/pictures.py"]
-    drawing = [f"docs/tools/pictures.py:{name}"]
-    return drawing + ([f"docs/{PAGES[name]}"] if name in PAGES else [])
+        return ["tests/real/pictures.py:draw"]
+    return [f"docs/tools/pictures.py:{name}"]
 
 
 def digest_inputs(picture: str, read: Callable[[str], str] | None = None) -> str:
@@ -61,10 +54,11 @@ def digest_inputs(picture: str, read: Callable[[str], str] | None = None) -> str
     parts: list[str] = []
     for each in inputs_of(picture):
         path, _, function = each.partition(":")
-        text = read(path)
-        if path.endswith(".md"):
-            text = "\n".join(re.findall(r"```python[^\n]*\n(.*?)```", text, re.DOTALL))
-        parts.append(_strip_words(_select(text, function) if function else text))
+        parts.append(_strip_words(_select(read(path), function) if function else read(path)))
+    code = "".join(parts)
+    for page in sorted({name for name in re.findall(r"[\"']([\w/-]+\.md)[\"']", code) if (DOCS / name).exists()}):
+        blocks = re.findall(r"```python[^\n]*\n(.*?)```", read(f"docs/{page}"), re.DOTALL)
+        parts += [_strip_words(block) for block in (blocks if page == "start.md" else blocks[:1])]
     problems = re.findall(r"load_problem\([\"'](\w+)", "".join(parts))
     parts += [_strip_words(read(f"problems/{name}.py")) for name in sorted(set(problems))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
