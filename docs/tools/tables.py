@@ -1,7 +1,7 @@
 """The tables of `koopmpc run` in README.md and docs/bench.md, measured now: `python docs/tools/tables.py [TASK…]`.
 
-A table stands between ```text and ```, and its first line is its task. Costs are the same on every machine to some digits;
-times are of this machine and its load.
+A table stands between ```text and ```, and its first line is its task. Costs are the same on every machine to some
+digits; times are of this machine and its load.
 """
 
 import os
