@@ -263,7 +263,7 @@ def _fits(limits: Limits, dynamics: Dynamics, what: str) -> None:
         limits = limits.resolve(dynamics.states, dynamics.inputs)
         limits.inputs(dynamics.nu)
         limits.rates(dynamics.nu)
-        limits.rows(dynamics.nx, 0 if limits.of is None else limits.of.bind(dynamics.states).nz)
+        limits.find_rows(dynamics.nx, 0 if limits.of is None else limits.of.bind(dynamics.states).nz)
     except KoopmpcError as error:
         raise ShapeError(f"{what}: {error}") from error
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
 from koopmpc.control.cost import Tracking
-from koopmpc.control.limits import clip_input
+from koopmpc.control.limits import Interval, clip_input
 from koopmpc.control.move import Fallback, Move, Status, Token
 from koopmpc.control.program import Published, SavedController
 from koopmpc.control.stepped.blocks import Moves, find_move_blocks
@@ -240,7 +240,7 @@ class MPCBase(Published):
         self._initial = InitialCondition(
             model, observer, N, self._latency, with_rates=self._with_rates, estimated=estimator is not None
         )
-        levels = self.limits.input_levels(self.nu)
+        levels = self.limits.base.input_levels(self.nu)
         self._held = None if levels is None else HeldLevels(levels)
         self._token: Token = [0]
         self._inside = 0
@@ -275,7 +275,7 @@ class MPCBase(Published):
         DataError
             x0 or u_prev is of another length, or holds what is no finite number; pass None where it is not known.
         """
-        zero = np.clip(np.zeros(self.nu), *self._inputs)
+        zero = np.clip(np.zeros(self.nu), *self._present_limits()[0])
         self._kept: Float[np.ndarray, " nv"] | None = None
         self._age, self._planned = 0, False
         self._given = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
@@ -349,12 +349,17 @@ class MPCBase(Published):
         self._held.take(acted)
 
     def _round(self, u: Float[np.ndarray, " nu"], before: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
-        """Return the input on the levels that dwell times and rates allow."""
+        """Return the input on the levels that limits, dwell times and rates allow."""
         if self._held is None:
             return u
-        if self._rates is None:
-            return self._held.round(u, None, None)
-        return self._held.round(u, before + self._rates.low, before + self._rates.high)
+        box, rates = self._present_limits()
+        if rates is None:
+            return self._held.round(u, None, None, box)
+        return self._held.round(u, before + rates.low, before + rates.high, box)
+
+    def _present_limits(self) -> tuple[Interval, Interval | None]:
+        """Return the box of the next input and that of its change; a subclass knows where they move in time."""
+        return self._inputs, self._rates
 
     def _keep(self, plan: Float[np.ndarray, " nv"]) -> None:
         """Keep a good plan (by reference, for speed); its first entries are the moves."""
@@ -415,7 +420,7 @@ class MPCBase(Published):
         else:
             self._kept = None
             u, fallback = (before, Fallback.HOLD) if free is None else (free, Fallback.CLIPPED_LQR)
-        self._given = clip_input(u, self._inputs, self._rates, before)
+        self._given = clip_input(u, *self._present_limits(), before)
         if self._held is not None:
             self._given = self._round(self._given, before)
         taken = perf_counter() - start

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.limits import Interval, Limits, Softness, half_width, magnitude
+from koopmpc.control.limits import Interval, Limits, Movable, Softness, half_width, magnitude
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import Lifting, find_observables
@@ -249,7 +249,8 @@ class Tracking(Generic[Read]):
     moves `outputs` inwards, see `Limits`. R_delta and `rates` are None where the change of the inputs is free, and
     `with_rates` says whether it counts. `hard_rates` are those of `SizedLimits`. `given` are the rows of a u_target
     that is given as numbers, None for one by name. `Q_root` and `R_root` are S with SᵀS = Q and R. `sizes` are those of
-    states, inputs, limits and cost.
+    states, inputs, limits and cost. Where limits have rows, all these are of their widest values, and `movable` says
+    which inputs, rates and outputs [x; of(x)] have a limit, or may get one.
     """
 
     cost: Cost
@@ -271,23 +272,31 @@ class Tracking(Generic[Read]):
     Q_root: Float[np.ndarray, "nr nr"]
     R_root: Float[np.ndarray, "nu nu"]
     sizes: Sizes
+    movable: Movable
 
 
 LiftedTracking: TypeAlias = Tracking[np.ndarray]
 StateTracking: TypeAlias = Tracking[ca.Function]
 
 
-def lifted_tracking(predictor: LinearPredictor, cost: Cost, limits: Limits | None) -> LiftedTracking:
+def lifted_tracking(
+    predictor: LinearPredictor, cost: Cost, limits: Limits | None, *, in_time: bool = False
+) -> LiftedTracking:
     """Return what `cost` tracks and `limits` bound, as matrices on the lifted coordinates of `predictor`.
+
+    `in_time` says that who asks knows limits with rows.
 
     Raises
     ------
+    DataError
+        Limits have rows in time, and who asks does not know them.
     ObservableError
         The cost or a limit is on an observable that the lifting lacks.
     ShapeError
         A weight or a limit has another size than what it weighs or limits.
     """
     cost, limits = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
+    _refuse_rows(limits, in_time)
     C, G = select_rows(predictor, cost.of), predictor.C
     if limits.of is not None:
         G = np.vstack([G, select_rows(predictor, limits.of)])
@@ -303,12 +312,16 @@ def state_tracking(
     limits: Limits | None,
     size: int | None = None,
     ranges: Mapping[str, float] | None = None,
+    *,
+    in_time: bool = False,
 ) -> StateTracking:
     """Return what `cost` tracks and `limits` bound, as functions of these states.
 
-    The functions take `size` values, the states first; by default the states alone. `ranges` as for `Sizes`.
+    The functions take `size` values, the states first; by default the states alone. `ranges` as for `Sizes`, and
+    `in_time` as for `lifted_tracking`.
     """
     cost, limits = check_cost_and_limits(cost, limits, states, inputs)
+    _refuse_rows(limits, in_time)
     nx, nu = len(states), len(inputs)
     point = ca.SX.sym("x", nx if size is None else size)
     x, of = point[:nx], cost.of.bind(states)
@@ -324,6 +337,16 @@ def state_tracking(
         nu,
         ranges,
     )
+
+
+def _refuse_rows(limits: Limits, in_time: bool) -> None:
+    """Raise where limits have rows in time and who asks does not know them."""
+    if limits.in_time and not in_time:
+        end = next(iter(limits.count_rows()))
+        raise DataError(
+            f"{end} has a row for each step, which this controller or search does not know; pass limits.at(step), or a "
+            "KoopmanMPC or LinearMPC"
+        )
 
 
 def _tracking(
@@ -349,8 +372,9 @@ def _tracking(
         raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
     nx = len(states)
     (Q, R), R_delta, rows = cost.matrices(nr, nu), cost.rate(nu), cost.given_inputs(nu)
-    sizes = Sizes.of(cost.of.bind(states), Q, R, limits, states, ranges)
-    sized = limits.find_sizes(nx, len(sizes.rows) - nx, nu, sizes.rows, sizes.scale)
+    base = limits.base
+    sizes = Sizes.of(cost.of.bind(states), Q, R, base, states, ranges)
+    sized = base.find_sizes(nx, len(sizes.rows) - nx, nu, sizes.rows, sizes.scale)
     low, high = sized.inputs
     if rows is not None:
         reach = 1e-9 * np.maximum(np.abs(rows), np.abs(rows).max(axis=0))
@@ -381,6 +405,7 @@ def _tracking(
         Q_root=checks.root(Q),
         R_root=checks.root(R),
         sizes=sizes,
+        movable=base.movable(nx, len(sizes.rows) - nx, nu),
     )
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -13,15 +13,18 @@ from koopmpc.control.bounds.boxes import SOFTENED as SOFTENED
 from koopmpc.control.bounds.boxes import Bound as Bound
 from koopmpc.control.bounds.boxes import Interval as Interval
 from koopmpc.control.bounds.boxes import LimitRows as LimitRows
+from koopmpc.control.bounds.boxes import Movable as Movable
 from koopmpc.control.bounds.boxes import SizedLimits as SizedLimits
 from koopmpc.control.bounds.boxes import Slack as Slack
 from koopmpc.control.bounds.boxes import Softness as Softness
-from koopmpc.control.bounds.boxes import check_prices, require_room
+from koopmpc.control.bounds.boxes import check_prices, is_finite
 from koopmpc.control.bounds.boxes import clip_input as clip_input
 from koopmpc.control.bounds.boxes import half_width as half_width
 from koopmpc.control.bounds.boxes import magnitude as magnitude
 from koopmpc.control.bounds.boxes import measure_violation as measure_violation
 from koopmpc.control.bounds.boxes import preview_margin as preview_margin
+from koopmpc.control.in_time import bounds
+from koopmpc.control.in_time.bounds import BoundByName, hold_rows
 from koopmpc.control.stepped.levels import (
     DwellByInput,
     InputLevels,
@@ -49,6 +52,10 @@ _ENDS = (
 )  # fields of the lower and the upper limit, and what they limit
 
 
+BOUNDS = tuple(end for pair in _ENDS for end in pair[:2])
+"""Names of the bounds of `Limits`."""
+
+
 @dataclass(frozen=True, eq=False)
 class Limits(Value):
     """u_min ≤ u_k ≤ u_max and du_min ≤ u_k − u_{k−1} ≤ du_max, x_min ≤ x_k ≤ x_max and y_min ≤ of(x_k) ≤ y_max.
@@ -60,7 +67,8 @@ class Limits(Value):
     ----------
     u_min, u_max, x_min, x_max, y_min, y_max
         Scalars or vectors; None or ±inf where there is no limit. Or by name, ``{"torque": 25}``, with or without the
-        unit; an omitted name has no limit. The names are looked up when a controller is built.
+        unit; an omitted name has no limit. The names are looked up when a controller is built. Or limits in time: rows
+        (T, n), by name a value a step. Row k is that of u_k, u_k − u_{k−1}, x_k and y_k; the last one is held.
     of
         Observables of the state that y_min and y_max limit. A controller on a lifted predictor finds them in its
         own lifting by name.
@@ -93,6 +101,8 @@ class Limits(Value):
         number for inputs of more levels. The lowest level is off.
     level_steps
         Steps of the horizon in which levels and dwell times count; later inputs may be between them. None for all.
+    rows
+        Bounds that limit nothing now, and that a step may bring, such as ``("x_max",)``; see `with_bounds`.
 
     Raises
     ------
@@ -108,16 +118,16 @@ class Limits(Value):
     >>> hard = km.Limits(u_min=-25, u_max=25, du_max=8, x_max=[1.2, 4], slack=None)
     """
 
-    u_min: ArrayLike | checks.ByName | None = None
-    u_max: ArrayLike | checks.ByName | None = None
-    x_min: ArrayLike | checks.ByName | None = None
-    x_max: ArrayLike | checks.ByName | None = None
+    u_min: ArrayLike | BoundByName | None = None
+    u_max: ArrayLike | BoundByName | None = None
+    x_min: ArrayLike | BoundByName | None = None
+    x_max: ArrayLike | BoundByName | None = None
     of: Lifting | None = None
-    y_min: ArrayLike | checks.ByName | None = None
-    y_max: ArrayLike | checks.ByName | None = None
+    y_min: ArrayLike | BoundByName | None = None
+    y_max: ArrayLike | BoundByName | None = None
     slack: Slack | Literal["auto"] | None = "auto"
-    du_min: ArrayLike | checks.ByName | None = None
-    du_max: ArrayLike | checks.ByName | None = None
+    du_min: ArrayLike | BoundByName | None = None
+    du_max: ArrayLike | BoundByName | None = None
     du_slack: Slack | None = None
     margin: ArrayLike | None = None
     capped: tuple[str, ...] = ()
@@ -126,6 +136,7 @@ class Limits(Value):
     levels: LevelsByInput | None = None
     dwell: DwellByInput | None = None
     level_steps: int | None = None
+    rows: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.terminal is not None:
@@ -133,19 +144,21 @@ class Limits(Value):
         for low, high, name in _ENDS:
             for end in (low, high):
                 value = getattr(self, end)
-                if isinstance(value, Mapping):
-                    object.__setattr__(self, end, checks.check_named(value, end, infinite=True))
-                elif value is not None:
-                    object.__setattr__(self, end, checks.array(value, end, infinite=True))
+                if value is not None:
+                    object.__setattr__(self, end, bounds.check_bound(value, end))
             if not any(isinstance(getattr(self, end), Mapping) for end in (low, high)):
-                require_room(getattr(self, low), getattr(self, high), low, high, name)
+                bounds.require_room(getattr(self, low), getattr(self, high), low, high, name)
+        unknown = [name for name in self.rows if name not in BOUNDS]
+        if isinstance(cast(object, self.rows), str) or unknown:
+            raise DataError(f"rows is {self.rows!r}; pass a tuple of {', '.join(BOUNDS)}")
+        object.__setattr__(self, "rows", tuple(self.rows))
         if (self.y_min is not None or self.y_max is not None) and self.of is None:
             raise DataError("y_min and y_max limit observables; say which with of=, for example of=km.Fourier(1)")
         if self.of is not None:
             checks.kind(self.of, "of", Lifting, 'for example km.Fourier(1, states="theta")')
         for end, sign in (("du_min", 1.0), ("du_max", -1.0)):
             value = getattr(self, end)
-            if value is not None and (sign * np.array(checks.list_values(value)) > 0).any():
+            if value is not None and any((sign * np.asarray(v) > 0).any() for v in _values(value)):
                 raise DataError(f"{end} is {value}; an input must be free to stay, so keep 0 inside its rates")
         for name in ("slack", "du_slack", "terminal_slack"):
             value = getattr(self, name)
@@ -188,18 +201,91 @@ class Limits(Value):
         return replace(
             self,
             **{
-                end: checks.order_by_name(
-                    getattr(self, end), end, known[end[0]], np.inf if end.endswith("max") else -np.inf
-                )
+                end: bounds.order_bound(getattr(self, end), end, known[end[0]], _free(end))
                 for end in named
             },
             **entries,
         )
 
+    @property
+    def in_time(self) -> bool:
+        """Whether a bound has a row for each step."""
+        return any(bounds.is_rows(getattr(self, end)) for end in BOUNDS)
+
+    @property
+    def base(self) -> "Limits":
+        """The same limits without rows: of each bound its widest finite value, by which sizes and slacks count."""
+        ends = {end: getattr(self, end) for end in BOUNDS}
+        rows = {end: bounds.find_widest(value, _free(end)) for end, value in ends.items() if np.ndim(value) == 2}
+        return replace(self, **rows) if rows else self
+
+    def with_bounds(self, **ends: Bound) -> "Limits":
+        """Return the limits with other bounds, scalars, vectors or rows; all else stays, and bounds that are not named.
+
+        Raises
+        ------
+        DataError
+            A name is that of no bound; limits cross.
+        """
+        unknown = [name for name in ends if name not in BOUNDS]
+        if unknown:
+            raise DataError(f"{unknown[0]} is no bound of Limits; the bounds are {', '.join(BOUNDS)}")
+        return replace(self, **cast("Any", ends))
+
+    def at(self, step: int) -> "Limits":
+        """Return the limits of one step, without rows; past their end the last row holds."""
+        k, ends = checks.count(step, "step", 0), {end: getattr(self, end) for end in BOUNDS}
+        rows = {end: bounds.narrow(value[min(k, len(value) - 1)]) for end, value in ends.items() if np.ndim(value) == 2}
+        return replace(self, **rows) if rows else self
+
+    def count_rows(self) -> dict[str, int]:
+        """Return the number of rows of each bound that has some."""
+        return {end: len(getattr(self, end)) for end in BOUNDS if np.ndim(getattr(self, end)) == 2}
+
+    def input_rows(self, nu: int, first: int, count: int) -> Interval:
+        """Return the boxes (count, nu) of the inputs u_first …, from level to level where they have some."""
+        box, levels = self._hold("u", nu, first, count), self.base.input_levels(nu)
+        if levels is None:
+            return box
+        inside, low, high = levels.inside(box), box.low.copy(), box.high.copy()
+        for end, index in ((low, inside.low), (high, inside.high)):
+            end[:, levels.which] = np.where(inside.low <= inside.high, levels.values(index), end[:, levels.which])
+        return Interval(low, high)
+
+    def rate_rows(self, nu: int, first: int, count: int) -> Interval:
+        """Return the boxes (count, nu) of u_k − u_{k−1} from k = first on; the last row is held."""
+        box = self._hold("du", nu, first, count)
+        if self.du_min is None and self.du_max is not None:
+            return Interval(-box.high, box.high)
+        return box
+
+    def output_rows(self, nx: int, ny: int, first: int, count: int) -> Interval:
+        """Return the boxes (count, nx + ny) of [x_k; of(x_k)] from k = first on; ny is 0 without `of`."""
+        parts = [self._hold("x", nx, first, count)]
+        if ny:
+            parts.append(self._hold("y", ny, first, count))
+        return Interval(*(np.hstack(each) for each in zip(*parts, strict=True)))
+
+    def _hold(self, what: str, n: int, first: int, count: int) -> Interval:
+        low, high = f"{what}_min", f"{what}_max"
+        return Interval(
+            hold_rows(getattr(self, low), low, n, first, count, -np.inf),
+            hold_rows(getattr(self, high), high, n, first, count, np.inf),
+        )
+
+    def _declared(self, what: str) -> bool:
+        return f"{what}_min" in self.rows or f"{what}_max" in self.rows
+
+    def movable(self, nx: int, ny: int, nu: int) -> "Movable":
+        """Return which inputs, rates and outputs [x; of(x)] have a row: those with a finite or a declared bound."""
+        base = self.base
+        inputs = is_finite(base.inputs(nu)) | self._declared("u")
+        return Movable(inputs, is_finite(base._rates(nu)) | self._declared("du"), base.find_rows(nx, ny).kept)
+
     def _margin(self, margin: Float[np.ndarray, "K nx"]) -> Float[np.ndarray, "K nx"]:
         if (margin < 0).any() or not len(margin):
             raise DataError(f"margin is {margin.tolist()}; pass rows of numbers of 0 or above, one a step")
-        low, high = self.states(margin.shape[1])
+        low, high = self.base.states(margin.shape[1])
         most = margin.max(axis=0)
         crossed = np.flatnonzero(low + most > high - most)
         if crossed.size:
@@ -294,7 +380,7 @@ class Limits(Value):
     def rates(self, nu: int) -> Interval | None:
         """Return the box of u_k − u_{k−1}; None where nothing limits it."""
         box = self._rates(nu)
-        return box if (np.isfinite(box.low) | np.isfinite(box.high)).any() else None
+        return box if self._declared("du") or is_finite(box).any() else None
 
     def _rates(self, nu: int) -> Interval:
         low = (
@@ -316,7 +402,7 @@ class Limits(Value):
 
         `sizes` are those of [x; of(x)], `scale` that of the cost, see `Sizes`.
         """
-        rows, rates, rate_softness = self.rows(nx, ny, sizes, scale), self.rates(nu), self.rate_softness(nu)
+        rows, rates, rate_softness = self.find_rows(nx, ny, sizes, scale), self.rates(nu), self.rate_softness(nu)
         hard = np.isinf(rate_softness.linear)
         hard_rates = None
         if rates is not None and hard.any():
@@ -331,7 +417,7 @@ class Limits(Value):
         """Return the box of the observables `of`."""
         return _box(self.y_min, self.y_max, "y_min", "y_max", ny)
 
-    def rows(self, nx: int, ny: int, sizes: Float[np.ndarray, " n"] | None = None, scale: float = 1.0) -> LimitRows:
+    def find_rows(self, nx: int, ny: int, sizes: Float[np.ndarray, " n"] | None = None, scale: float = 1.0) -> LimitRows:
         """Return the limits of [x; of(x)], the rows that have one; ny is 0 without `of`, `sizes` are 1 if None."""
         low, high = self.ends(nx, ny)
         size = np.ones(nx + ny) if sizes is None else sizes
@@ -339,10 +425,11 @@ class Limits(Value):
         if isinstance(self.slack, str):
             linear, quadratic = LINEAR * scale / size, QUADRATIC * scale / size**2
         else:
-            mine = np.repeat([_is_set(self.x_min, self.x_max), _is_set(self.y_min, self.y_max)], [nx, ny])
+            x, y = self._declared("x"), self._declared("y")
+            mine = np.repeat([x or _is_set(self.x_min, self.x_max), y or _is_set(self.y_min, self.y_max)], [nx, ny])
             given = _spread_prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
             linear[mine], quadratic[mine] = given
-        kept = np.isfinite(low) | np.isfinite(high)
+        kept = is_finite(Interval(low, high)) | np.repeat([self._declared("x"), self._declared("y")], [nx, ny])
         softness = Softness(linear[kept], quadratic[kept], SOFTENED * size[kept])
         margin = np.zeros((1, nx + ny))
         if self.margin is not None:
@@ -371,6 +458,16 @@ def refuse_levels(limits: Limits | None, who: str) -> None:
         )
 
 
+def _free(end: str) -> float:
+    """Return the value of a bound that does not limit."""
+    return np.inf if end.endswith("max") else -np.inf
+
+
+def _values(bound: Any) -> list[Any]:
+    """Return the values of a checked bound, those of each name where it is by name."""
+    return list(cast("BoundByName", bound).values()) if isinstance(bound, Mapping) else [bound]
+
+
 def _is_set(low: Bound, high: Bound) -> bool:
     return low is not None or high is not None
 
@@ -395,6 +492,9 @@ def _spread_prices(
 
 
 def _box(low: Bound, high: Bound, low_name: str, high_name: str, n: int) -> Interval:
+    for end, name in ((low, low_name), (high, high_name)):
+        if np.ndim(cast("Any", end)) == 2:
+            raise DataError(f"{name} has a row for each step, and one set of limits is read here; pass limits.at(step)")
     return Interval(
         checks.vector(-np.inf if low is None else low, low_name, n, infinite=True),
         checks.vector(np.inf if high is None else high, high_name, n, infinite=True),

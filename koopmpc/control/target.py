@@ -45,6 +45,7 @@ class Targets:
     low: Float[np.ndarray, " nl"]
     high: Float[np.ndarray, " nl"]
     size: Float[np.ndarray, " nl"]  # the finite end of each limit that is farther from 0
+    values: Float[np.ndarray, " nl"]  # of the limited inputs and outputs at [z0; u0], from which the limits count
     hard: int
     weighted: Float[np.ndarray, "nr na"]
     from_disturbance: Float[np.ndarray, "na nz"]
@@ -59,21 +60,25 @@ class Targets:
         return alpha if e is None else alpha + self.from_disturbance @ e
 
     def coordinates(
-        self, R: Float[np.ndarray, "T nr"], e: Float[np.ndarray, " nz"] | None = None
+        self, R: Float[np.ndarray, "T nr"], e: Float[np.ndarray, " nz"] | None = None, box: Interval | None = None
     ) -> Float[np.ndarray, "T na"]:
-        """Return α for each row of references, inside the limits."""
+        """Return α for each row of references, inside the limits; `box` has limits (T, nl) of each row."""
         alpha = self.nearest(R, e)
         pushed = np.zeros(len(self.rows)) if e is None else self.rows_disturbance @ e
         values = alpha @ self.rows.T
-        low, high = self.low - pushed, self.high - pushed
+        low, high = (self.low - pushed, self.high - pushed) if box is None else (box.low - pushed, box.high - pushed)
         slack = ROUNDING * (np.abs(values) + self.size)
         outside = ((values < low - slack) | (values > high + slack)).any(axis=1)
         for k in np.flatnonzero(outside):
             key = R[k].tobytes() + (b"" if e is None else e.tobytes())
+            own = low, high
+            if box is not None:
+                own = low[k], high[k]
+                key += box.low[k].tobytes() + box.high[k].tobytes()
             if key not in self._known:
                 if len(self._known) >= KEPT:
                     self._known.clear()
-                self._known[key] = self._inside(alpha[k], low, high)
+                self._known[key] = self._inside(alpha[k], *own)
             alpha[k] = self._known[key]
         return alpha
 
@@ -286,6 +291,7 @@ def targets(
         low=low,
         high=high,
         size=magnitude(Interval(low, high)),
+        values=values,
         hard=nu,
         weighted=weighted,
         from_disturbance=from_disturbance,

@@ -113,7 +113,7 @@ def check_task(
     cost.matrices(of.nz, data.nu)
     ny = 0 if limits.of is None else limits.of.bind(states).nz
     limits.inputs(data.nu)
-    limits.rows(nx, ny)
+    limits.find_rows(nx, ny)
     rows = checks.array(reference, "reference")
     if rows.ndim > 2 or (rows.shape or (1,))[-1] != of.nz or not rows.size:
         raise ShapeError(

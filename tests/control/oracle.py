@@ -13,7 +13,7 @@ TIGHT = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}
 def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=None, C=None, of=None):
     """U (N, nu) and the least cost, by CLARABEL; None where there is none.
 
-    `of` is the matrix of limited observables.
+    `of` is the matrix of limited observables. Row k of limits in time is that of u_k, u_k − u_{k−1}, x_k and y_k.
     """
     import cvxpy as cp
 
@@ -34,16 +34,17 @@ def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=No
         first += b
 
     def limit(values, low, high, linear, quadratic):
-        """Hold values (n,) between the scalars low and high, with slack where `linear` is finite."""
+        """Hold values (n,) between low and high, (n,) each, with slack where `linear` is finite."""
         nonlocal objective, held
         slack = 0
         if np.isfinite(linear):
             slack = cp.Variable(values.shape[0], nonneg=True)
             objective += linear * cp.sum(slack) + quadratic * cp.sum_squares(slack)
-        if np.isfinite(low):
-            held += [values + slack >= low]
-        if np.isfinite(high):
-            held += [values - slack <= high]
+        lower, upper = np.flatnonzero(np.isfinite(low)), np.flatnonzero(np.isfinite(high))
+        if len(lower):
+            held += [(values + slack)[lower] >= low[lower]]
+        if len(upper):
+            held += [(values - slack)[upper] <= high[upper]]
 
     def weights(slack, n):
         if slack is None:
@@ -63,26 +64,24 @@ def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=No
     F, h = end_of(model, cost, targets, R, e, C)
     objective += cp.sum_squares(F @ (Z[N] if F.shape[1] == nz else cp.hstack([Z[N], U[N - 1]])) - h)
 
-    box = limits.inputs(nu)
+    box = limits.input_rows(nu, 0, N)
     for i in range(nu):
-        limit(U[:, i], box.low[i], box.high[i], np.inf, 0.0)
+        limit(U[:, i], box.low[:, i], box.high[:, i], np.inf, 0.0)
     if limits.du_max is not None or limits.du_min is not None:
-        high = np.broadcast_to(np.inf if limits.du_max is None else limits.du_max, (nu,))
-        low = -high if limits.du_min is None else np.broadcast_to(limits.du_min, (nu,))
+        low, high = limits.rate_rows(nu, 0, N)
         linear, quadratic = weights(limits.du_slack, nu)
         starts = np.cumsum([0, *blocks[:-1]])
         for i in range(nu):
             changes = cp.hstack([U[k, i] - (u_prev[i] if k == 0 else U[k - 1, i]) for k in starts])
-            limit(changes, low[i], high[i], linear[i], quadratic[i])
-    G, low, high, given = model.C, *limits.states(model.nx), []
+            limit(changes, low[starts, i], high[starts, i], linear[i], quadratic[i])
+    G, (low, high) = model.C, limits.output_rows(model.nx, 0 if of is None else len(of), 1, N)
     given = [limits.x_min is not None or limits.x_max is not None] * model.nx
     if of is not None:
-        y = limits.outputs(len(of))
-        G, low, high = np.vstack([G, of]), np.append(low, y.low), np.append(high, y.high)
+        G = np.vstack([G, of])
         given += [True] * len(of)
     places = np.flatnonzero(given)
     for i, linear, quadratic in zip(places, *weights(limits.slack, len(places)), strict=True):
-        limit(Z[1:] @ G[i], low[i], high[i], linear, quadratic)
+        limit(Z[1:] @ G[i], low[:, i], high[:, i], linear, quadratic)
 
     value = minimum(objective, held)
     return None if value is None else (U.value, value)
@@ -128,15 +127,12 @@ def targets_of(model, cost, limits, R, e, C, of=None):
     span[free] = basis
     S = scipy.linalg.sqrtm(cost.matrices(len(C), nu)[0]).real
     at = S @ C @ span[:nz]
-    G, low, high = model.C, *limits.states(model.nx)
-    if of is not None:
-        y = limits.outputs(len(of))
-        G, low, high = np.vstack([G, of]), np.append(low, y.low), np.append(high, y.high)
-    box = limits.inputs(nu)
+    G = model.C if of is None else np.vstack([model.C, of])
     rows = np.hstack([np.zeros((nu, nz)), np.eye(nu)]), np.hstack([G, np.zeros((len(G), nu))])
-    ends = (box.low, box.high), (low, high)
     found = []
     for k, r in enumerate(R):
+        now = limits.at(k)
+        ends = now.inputs(nu), now.ends(model.nx, len(G) - model.nx)
         v = base + span @ np.linalg.lstsq(at, S @ (r - C @ base[:nz]), rcond=1e-8)[0]
         if any(beyond(M @ v, *end) for M, end in zip(rows, ends, strict=True)):
             beta, weight = cp.Variable(span.shape[1]), 1e-9 * np.trace(at.T @ at)

@@ -125,7 +125,7 @@ def loop(seed, solver=None, large=False, bilinear=False, build=None):
     W = rng.normal(size=(STEPS + N + 3, nw))
     noises = rng.normal(size=(STEPS, nx))
     outcome = Outcome(seed, options["solver"])
-    kept = limits.rows(nx, 0)
+    kept = limits.find_rows(nx, 0)
     outcome.hard_states = bool(np.isinf(kept.softness.linear).any())
     try:
         if bilinear:

@@ -153,7 +153,7 @@ def _written_down(kind, mpc, limits, pair, weights, scale, hard_rates):
         np.concatenate([np.tile(part, N) for part in (box[i], (sign * no if rates is None else rates[i]), states[i])])
         for i, sign in ((0, -1.0), (1, 1.0))
     ]
-    soft_rates, price = limits.rate_softness(nu), limits.rows(nx, 0)
+    soft_rates, price = limits.rate_softness(nu), limits.find_rows(nx, 0)
     prices = [np.full(nx, fill) for fill in (np.inf, 0.0)]
     for whole, part in zip(prices, price.softness[:2], strict=True):
         whole[price.kept] = part

@@ -7,11 +7,12 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.control.in_time.bounds import BoundByName
 from koopmpc.errors import DataError, ShapeError
 
 SOFTENED = 1e-4  # a slack above this share of the size of its limit is reported
 Slack = tuple[ArrayLike, ArrayLike]
-Bound = ArrayLike | checks.ByName | None  # of a limit, as a user writes it
+Bound = ArrayLike | BoundByName | None  # of a limit, as a user writes it
 
 
 class Interval(NamedTuple):
@@ -30,6 +31,14 @@ class Softness(NamedTuple):
     linear: Float[np.ndarray, " n"]
     quadratic: Float[np.ndarray, " n"]
     allowance: Float[np.ndarray, " n"]
+
+
+class Movable(NamedTuple):
+    """Which inputs, rates and limited outputs [x; of(x)] have a limit, or may get one in time."""
+
+    inputs: Bool[np.ndarray, " nu"]
+    rates: Bool[np.ndarray, " nu"]
+    outputs: Bool[np.ndarray, " n"]
 
 
 class LimitRows(NamedTuple):
@@ -58,6 +67,11 @@ class SizedLimits(NamedTuple):
 def preview_margin(margin: Float[np.ndarray, "K n"], N: int) -> Float[np.ndarray, "N n"]:
     """Return the margins of the steps 1 … N."""
     return margin[np.minimum(np.arange(N), len(margin) - 1)]
+
+
+def is_finite(box: Interval) -> Bool[np.ndarray, " n"]:
+    """Return which rows have a limit."""
+    return np.isfinite(box.low) | np.isfinite(box.high)
 
 
 def half_width(box: Interval) -> Float[np.ndarray, " n"]:
@@ -100,25 +114,3 @@ def check_prices(slack: Slack, name: str) -> Slack:
     if (linear < 0).any() or (quadratic < 0).any() or not (linear.any() or quadratic.any()):
         raise DataError(f"{name} is {slack}; pass weights (linear, quadratic) ≥ 0, one above zero, or None")
     return (linear if linear.ndim else float(linear)), (quadratic if quadratic.ndim else float(quadratic))
-
-
-def require_room(
-    low: Float[np.ndarray, "..."] | None,
-    high: Float[np.ndarray, "..."] | None,
-    low_name: str,
-    high_name: str,
-    name: str,
-) -> None:
-    """Raise where no number is between the limits."""
-    lower, upper = (
-        np.atleast_1d(-np.inf if low is None else low),
-        np.atleast_1d(np.inf if high is None else high),
-    )
-    if lower.shape != upper.shape and 1 not in (lower.size, upper.size):
-        raise ShapeError(
-            f"{low_name} has shape {lower.shape} and {high_name} {upper.shape}; pass one limit a row, or scalars"
-        )
-    a, b = np.broadcast_arrays(lower, upper)
-    checks.refuse_crossed(a, b, name)
-    if (lower == np.inf).any() or (upper == -np.inf).any():
-        raise DataError(f"{low_name} is +inf or {high_name} is −inf somewhere; use −inf, +inf where there is no limit")

@@ -15,9 +15,11 @@ from koopmpc.checks import HUGE, numbers
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, lifted_tracking
 from koopmpc.control.horizon import Coordinates
+from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.linear.plan import plan_map, planned_states
+from koopmpc.control.linear.windows import LimitWindows, limit_windows
 from koopmpc.control.move import Move, Plan, Status, alone, busy
 from koopmpc.control.program import LinearProgram, linear_parts, no_export, publish_estimator, reference_table
 from koopmpc.control.solvers import FINISHER, exact_turn, order_solvers
@@ -170,6 +172,13 @@ class KoopmanMPC(MPCBase):
     """
 
     _wanted: ClassVar[Coordinates | None] = None  # QP coordinates, set by a subclass in tests; None: the solver's
+    _rows_of_limits: LimitWindows | None = None  # of the controller's own limits in time
+    _window: LimitWindows | None = None  # by which the limits of the last step were set
+    _called_with: Limits | None = None  # the limits in time of the last call that had some
+    _step = 0  # calls since reset, as far as limits move in time
+    _row = 0  # row of the windows that belongs to the last step
+    _pushed = False  # whether limits in time moved a target that the plan's last column is aimed at
+    _free_steps: Sequence[bool] = ()  # steps in which they would move none
 
     def __init__(
         self,
@@ -197,7 +206,7 @@ class KoopmanMPC(MPCBase):
         settings = dict(settings or {})
         turns = order_solvers(solver, settings)
         self._solver = turns[0].solver.name
-        track, disturbed = lifted_tracking(predictor, cost, limits), estimator is not None
+        track, disturbed = lifted_tracking(predictor, cost, limits, in_time=True), estimator is not None
         super().__init__(
             predictor.dt,
             predictor,
@@ -215,6 +224,7 @@ class KoopmanMPC(MPCBase):
         self.predictor, self._disturbed = predictor, disturbed
         coordinates = self._wanted or turns[0].solver.coordinates
         self._map = plan_map(predictor, track, self._moves, coordinates, disturbed=disturbed)
+        self._hold_limits()
         self._options = {"solver": self._solver, "settings": settings}
         self._levels: LevelSolver | None = None
         ball = self._map.ball
@@ -245,6 +255,11 @@ class KoopmanMPC(MPCBase):
         plan, track = self._map, self._map.track
         if plan.ball is not None:
             raise no_export(self, "it adds tangent cuts of a terminal ellipsoid; use a polytope, or no terminal set")
+        if self.limits.in_time:
+            raise DataError(
+                "the controller's limits have rows in time, and C code keeps one set of limits; make it with "
+                "limits.at(step)"
+            )
         rows = reference_table(reference, len(track.Q))
         estimator = publish_estimator(
             self._initial.observer,
@@ -304,6 +319,10 @@ class KoopmanMPC(MPCBase):
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; see `MPCBase`."""
+        self._step, self._row, self._window = 0, 0, self._rows_of_limits
+        if self._called_with is not None:
+            self._map.restore_limits()
+            self._called_with = self._reference_key = None
         super().reset(x0, u_prev)
         self._qps.reset()
         self._going = False
@@ -323,7 +342,7 @@ class KoopmanMPC(MPCBase):
         for name in ("lifting", "dt", "states", "inputs", "disturbances"):
             if getattr(predictor, name) != getattr(self.predictor, name):
                 raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
-        track = lifted_tracking(predictor, self.cost, self.limits)
+        track = lifted_tracking(predictor, self.cost, self.limits, in_time=True)
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
         self._map = plan_map(predictor, track, self._moves, coordinates, disturbed=self._disturbed)
         self.predictor, self._states = predictor, None
@@ -331,6 +350,7 @@ class KoopmanMPC(MPCBase):
             self._qps.change(self._map.qp, self._map.ball)
         else:
             self._qps.update(self._map.qp)
+        self._hold_limits()
         self._reference_key = None
         self._initial.update(predictor)
         if self._watch is not None:
@@ -342,6 +362,7 @@ class KoopmanMPC(MPCBase):
         reference: ArrayLike,
         applied: ArrayLike | None = None,
         w: ArrayLike | None = None,
+        limits: Limits | None = None,
     ) -> Move:
         """Return the first input of the plan for measurement y.
 
@@ -356,6 +377,17 @@ class KoopmanMPC(MPCBase):
         w
             (nw,) measured disturbances, held over the horizon, or rows w_k … w_{k+N+latency−1}; missing rows repeat
             the last one. By default zero.
+        limits
+            Limits of this step in place of the controller's own, best made by their `with_bounds`: bounds that hold,
+            or rows of which row 0 is that of this step. Only bounds move: a limit must be finite in the controller's
+            own limits, or declared in their `rows`, whose sizes and slack weights hold.
+
+        Raises
+        ------
+        DataError
+            Limits that cross in some step, or that the controller has no row for.
+        ShapeError
+            A size that does not fit; limits with fewer rows than the plan reads.
         """
         try:
             held = self._token.pop()
@@ -372,6 +404,8 @@ class KoopmanMPC(MPCBase):
                 finite = self._take_reference(target)
                 moving = self._map.moving if finite and self._going else None
                 self._reference_key, self._aimed = key, False
+            if self._window is not None or limits is not None:
+                self._move_limits(limits, moving is not None)
             if moving is None and not self._aimed:
                 self._aim()
             self._going = True
@@ -381,6 +415,8 @@ class KoopmanMPC(MPCBase):
                 self._count_held(applied)
             if self._rows_left:  # the next call has its own row of a given u_target
                 self._given_row, self._reference_key = self._given_row + 1, None
+            if self._window is not None:
+                self._step += 1
             plan, t = self._map, self._spare
             if moving is None:
                 plan.matrix.dot(origin.known, t)
@@ -403,6 +439,50 @@ class KoopmanMPC(MPCBase):
             return move if watch is None else self._judge_step(watch, move, applied, start)
         finally:
             self._token.append(held)
+
+    def _hold_limits(self) -> None:
+        """Make the windows of the controller's own limits, where these move in time."""
+        self._called_with = self._window = self._rows_of_limits = None
+        if self.limits.in_time:
+            self._rows_of_limits = self._window = self._make_windows(self.limits, at_call=False)
+
+    def _make_windows(self, limits: Limits, *, at_call: bool) -> LimitWindows:
+        model = self.predictor
+        return limit_windows(self._map, limits, model.states, model.inputs, self._latency, at_call=at_call)
+
+    def _move_limits(self, limits: Limits | None, moving: bool) -> None:
+        """Put the limits of this step into the plan, and let targets that they move be found again."""
+        window = self._rows_of_limits
+        if limits is not None or window is not self._window:
+            window = self._change_window(limits)
+        if window is None:
+            return
+        k = self._step if self._step < window.last else window.last
+        if window is not self._rows_of_limits:
+            k = 0
+        self._row = k
+        if moving:
+            window.write_moving(k)
+            return
+        window.write(k)
+        if self._aimed and self._map.aims_inside and (self._pushed or not self._free_steps[k]):
+            self._aimed = False
+
+    def _change_window(self, limits: Limits | None) -> LimitWindows | None:
+        """Return the windows of the limits of a call, or of the controller's own, where the last call had others."""
+        if limits is not None and limits is not self._called_with:
+            own = check_bounds_alone(limits, self.limits, self.predictor.states, self.predictor.inputs)
+            self._at_call, self._called_with = self._make_windows(own, at_call=True), limits
+        window = self._rows_of_limits if limits is None else self._at_call
+        if window is not self._window:
+            self._window, self._aimed = window, self._aimed and not self._map.aims_inside
+        if window is None:
+            self._map.restore_limits()
+        return window
+
+    def _present_limits(self) -> tuple[Interval, Interval | None]:
+        window = self._window
+        return super()._present_limits() if window is None else window.first_inputs(self._row)
 
     def plan(self) -> Plan | None:
         """Return the plan of the last call; None where it had none."""
@@ -455,12 +535,18 @@ class KoopmanMPC(MPCBase):
         if plan.track.given is not None:
             v += maps.from_given @ self._given_ahead().reshape(-1)
         if plan.aimed:
-            alpha = targets.nearest(R)
+            alpha, window = targets.nearest(R), self._window
             if plan.disturbance.shape[1]:
                 values = (alpha @ targets.rows.T)[:, plan.checked]
                 column[plan.planned :] = np.concatenate([values.min(axis=0), values.max(axis=0)])
-            else:
+            elif window is None:
                 v += maps.from_target @ (targets.coordinates(R) - alpha).ravel()
+            else:
+                k = self._row
+                self._free_steps = window.find_free_steps(alpha @ targets.rows.T).tolist()
+                self._pushed = not self._free_steps[k]
+                if self._pushed:
+                    v += maps.from_target @ (targets.coordinates(R, box=window.target_box(k)) - alpha).ravel()
         column[: plan.planned] = v
 
     def _return_free_plan(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
@@ -473,9 +559,11 @@ class KoopmanMPC(MPCBase):
 
     def _solve_moving(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Handle a step like `_solve_limited`, of a plan t from one product with the reference."""
-        plan, moving, n = self._map, self._map.moving, self._map.planned
+        plan, moving, n, window = self._map, self._map.moving, self._map.planned, self._window
+        if window is not None:
+            window.write(self._row)
         if moving is not None and moving.met_low[n:].all() and moving.met_high[n:].all():
-            t[n:] = plan.inside  # no limit moves a target
+            t[n:] = plan.inside if window is None else np.clip(0.0, plan.low[n:], plan.high[n:])
         else:
             self._aim()
             plan.matrix.dot(self._initial.known, t)
@@ -485,7 +573,7 @@ class KoopmanMPC(MPCBase):
 
     def _solve_limited(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Handle a step in which the plan or its target breaks a limit, or something is not finite."""
-        plan, origin = self._map, self._initial
+        plan, origin, window = self._map, self._initial, self._window
         if not t.dot(t) < HUGE * HUGE:
             self._qps.cool()
             return self._fail(None, applied, Status.BAD_MEASUREMENT, 0, start)
@@ -493,7 +581,8 @@ class KoopmanMPC(MPCBase):
         if n < len(t) and not ((t[n:] >= plan.low[n:]).all() and (t[n:] <= plan.high[n:]).all()):
             # the disturbance puts a target outside its limits: use the nearest one inside
             e = plan.disturbance @ origin.drive
-            moved = plan.targets.coordinates(self._reference, e) - plan.targets.nearest(self._reference, e)
+            box = None if window is None else window.target_box(self._row)
+            moved = plan.targets.coordinates(self._reference, e, box) - plan.targets.nearest(self._reference, e)
             v += plan.maps.from_target @ moved.ravel()
             if (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
                 return self._return_free_plan(t, applied, start)
@@ -507,22 +596,27 @@ class KoopmanMPC(MPCBase):
     def _solve_qp(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Return the move of the QP of the deviation from the plan t."""
         plan, u_prev, v = self._map, self._initial.u_prev, t[: self._map.planned]
-        inputs, room = plan.track.inputs, None
-        if self._hard_rates is not None:
+        window = self._window
+        inputs, room, hard_rates, bounds, conflict = plan.track.inputs, None, self._hard_rates, None, 0.0
+        if window is not None:
+            (bounds, conflict), k = window.find_bounds(u_prev), self._row
+            inputs, hard_rates = window.first_inputs(k)[0], None if hard_rates is None else window.hard_rates(k)
+        if hard_rates is not None:
             room = Interval(inputs.low - u_prev, inputs.high - u_prev)
         deadline = None if np.isinf(self._allowed) else start + self._allowed
-        found, gave_way = self._qps.solve(v, room, deadline)
+        found, gave_way = self._qps.solve(v, room, deadline, bounds)
+        gave_way = max(gave_way, conflict)
         status = Status.FAILED if self.solver_fails else found.status
         if status is not Status.OPTIMAL:
             self._qps.cool()
             return self._fail(v[: self.nu], applied, status, found.iterations, start, found.solver)
-        U, (low, high) = t[: plan.moves], plan.box
+        U, low, high = t[: plan.moves], plan.low[: plan.moves], plan.high[: plan.moves]
         U += plan.deviation.dot(found.v)
         np.maximum(U, low, out=U)
         np.minimum(U, high, out=U)
         u = U[: self.nu]
-        if self._hard_rates is not None:
-            u[:] = clip_input(u, inputs, self._hard_rates, u_prev)
+        if hard_rates is not None:
+            u[:] = clip_input(u, inputs, hard_rates, u_prev)
         gap = 0.0
         if self._levels is not None:
             gap = self._levels.place(U)

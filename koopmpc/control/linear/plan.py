@@ -30,7 +30,7 @@ class PlanLimits(NamedTuple):
 
     `size` is the norm of the entry's row of D, root mean square of all stages. `next` is the entry that takes the place
     of this one when the plan moves on by one step: the same output one step later, or the move that holds then. Where
-    the plan has ended by then, it is the number of entries.
+    the plan has ended by then, it is the number of entries. `kept` are those that have a limit, or may get one in time.
     """
 
     low: Float[np.ndarray, " nv"]
@@ -38,6 +38,7 @@ class PlanLimits(NamedTuple):
     softness: Softness
     size: Float[np.ndarray, " nv"]
     next: Int[np.ndarray, " nv"]
+    kept: Bool[np.ndarray, " nv"]
 
 
 class PlanMap(Viewing):
@@ -61,14 +62,18 @@ class PlanMap(Viewing):
         Lengths of the blocks of steps in which an input is held.
     moves, planned
         Entries of the inputs, which come first, and of v.
-    box, inside
-        Limits of the inputs, and values of the last rows of t that meet their limits.
+    inside
+        Values of the last rows of t that meet their limits.
+    limits, low, high
+        The limits of t where none move in time, lower ones first, and those of this step.
+    limited_targets, row_size
+        Which limited values of a target have limits, or may get some in time; the size of each row of the QP.
     deviation
         How a solution w of the QP moves the inputs.
     disturbance
         (nz, ng) what g adds to z⁺ at the end of the horizon.
-    aimed
-        Whether a target enters the plan.
+    aimed, aims_inside
+        Whether a target enters the plan, and whether the last column of M is that of targets inside the limits.
     qp
         The QP of w.
     ball
@@ -81,7 +86,7 @@ class PlanMap(Viewing):
         A byte for each limit, met or not; `met_low` and `met_high` are views of the lower and of the upper ones.
     """
 
-    _VIEWS = ("met", "met_low", "met_high")
+    _VIEWS = ("met", "met_low", "met_high", "low", "high")
 
     def __init__(
         self,
@@ -108,13 +113,15 @@ class PlanMap(Viewing):
         last, first = horizon.disturbance(horizon.N - 1), np.zeros((nv, 0))
         self.disturbance = np.zeros((len(horizon.A), 0)) if last is None else last[:, :-1]
         driven = self.disturbance.shape[1] > 0
+        self.limited_targets = np.concatenate([track.movable.inputs, np.ones(len(track.outputs.low), np.bool_)])
+        self.row_size = limits.size[self.qp.source]
         self.checked = np.zeros(len(targets.low), dtype=np.bool_)
         self.aimed = bool(maps.from_target.any())
         self.maps = _fold_targets(maps, targets) if self.aimed else maps
         if driven:
             first = maps.from_drive
         if driven and self.aimed:
-            self.checked = checked = np.isfinite(targets.low) | np.isfinite(targets.high)
+            self.checked = checked = self.limited_targets
             from_disturbance = targets.from_disturbance @ self.disturbance
             every = maps.from_target.reshape(nv, horizon.N + 1, -1).sum(axis=1)
             moved = (targets.rows @ from_disturbance + targets.rows_disturbance @ self.disturbance)[checked]
@@ -124,9 +131,11 @@ class PlanMap(Viewing):
             reach = ROUNDING * targets.size[checked]
             low = np.concatenate([low, t_low - reach, -free])
             high = np.concatenate([high, free, t_high + reach])
-        self.planned = nv
-        self.low, self.high = np.maximum(low, -HUGE), np.minimum(high, HUGE)  # inf meets no limit
+        self.planned, self.aims_inside = nv, self.aimed and not driven
+        self.limits = np.concatenate([np.maximum(low, -HUGE), np.minimum(high, HUGE)])  # inf meets no limit
+        self.low, self.high = self.limits[: len(low)], self.limits[len(low) :]
         self.box = Interval(*(np.tile(end, len(horizon.blocks)) for end in track.inputs))
+        self.held = held
         self.inside = np.clip(0.0, self.low[nv:], self.high[nv:])
         from_state = np.zeros((len(low), horizon.size))
         from_state[:nv] = maps.from_state
@@ -136,9 +145,17 @@ class PlanMap(Viewing):
         self.moving = MovingMap.of(self, len(track.tracked), len(track.inputs.low))
         self._see()
 
+    def restore_limits(self) -> None:
+        """Set the limits that hold where none move in time."""
+        for part in (self, self.moving):
+            if part is not None:
+                half = len(part.limits) // 2
+                part.low, part.high = part.limits[:half], part.limits[half:]
+
     def _see(self) -> None:
         """Make the bytes and their views; see `Viewing`."""
-        rows = len(self.low)
+        rows = len(self.limits) // 2
+        self.low, self.high = self.limits[:rows], self.limits[rows:]
         self.met = bytearray(2 * rows)
         met = np.frombuffer(self.met, dtype=np.bool_)
         self.met_low, self.met_high = met[:rows], met[rows:]
@@ -158,7 +175,7 @@ class MovingMap(Viewing):
         A byte for each limit, as in `PlanMap`.
     """
 
-    _VIEWS = ("met", "met_low", "met_high", "start", "flat", "rows", "given")
+    _VIEWS = ("met", "met_low", "met_high", "low", "high", "start", "flat", "rows", "given")
 
     def __init__(self, plan: "PlanMap", nr: int, nu: int) -> None:
         maps, targets, fixed = plan.maps, plan.targets, plan.matrix[: plan.planned, :-1]
@@ -167,7 +184,7 @@ class MovingMap(Viewing):
         low, high = [plan.low[: plan.planned]], [plan.high[: plan.planned]]
         tests = np.zeros((0, fixed.shape[1] + 1 + maps.from_reference.shape[1]))
         if plan.aimed:
-            limited = np.isfinite(targets.low) | np.isfinite(targets.high)
+            limited = plan.limited_targets
             K = targets.rows[limited] @ targets.from_reference
             drive = np.zeros((len(K), fixed.shape[1]))
             if plan.checked.any():
@@ -181,7 +198,7 @@ class MovingMap(Viewing):
             parts.append(maps.from_given)
             tests = np.column_stack([tests, np.zeros((len(tests), maps.from_given.shape[1]))])
         self.matrix = np.ascontiguousarray(np.vstack([np.column_stack(parts), tests]))
-        self.low, self.high = np.maximum(np.concatenate(low), -HUGE), np.minimum(np.concatenate(high), HUGE)
+        self.limits = np.concatenate([*(np.maximum(end, -HUGE) for end in low), *(np.minimum(end, HUGE) for end in high)])
         self.t, self.known = np.zeros(len(self.matrix)), np.zeros(self.matrix.shape[1])
         self._sizes = fixed.shape[1] + 1, steps, nr, nu
         self._see()
@@ -190,6 +207,7 @@ class MovingMap(Viewing):
         """Make the views; see `Viewing`."""
         first, steps, nr, nu = self._sizes
         count, last = len(self.t), first + steps * nr
+        self.low, self.high = self.limits[:count], self.limits[count:]
         self.met = bytearray(2 * count)
         met = np.frombuffer(self.met, dtype=np.bool_)
         self.met_low, self.met_high = met[:count], met[count:]
@@ -294,32 +312,35 @@ def _plan_limits(
     moves, N, nu = len(horizon.blocks), horizon.N, horizon.B.shape[1]
     starts = np.cumsum([0, *horizon.blocks[:-1]])
     held = np.append(np.repeat(np.arange(moves), horizon.blocks), moves)[starts + 1]
-    none = np.zeros(nu)
-    groups = [(track.inputs, Softness(np.full(nu, np.inf), none, none), held)]
+    none, can_move = np.zeros(nu), track.movable
+    groups = [(track.inputs, Softness(np.full(nu, np.inf), none, none), held, can_move.inputs)]
     if track.rates is not None:
-        groups.append((track.rates, track.rate_softness, held))
-    groups.append((track.outputs, track.softness, np.arange(1, N + 1)))
+        groups.append((track.rates, track.rate_softness, held, can_move.rates))
+    every = np.ones(len(track.outputs.low), np.bool_)
+    groups.append((track.outputs, track.softness, np.arange(1, N + 1), every))
     ends = 0 if end is None else len(end.F)
     if end is not None:  # the set stays where it is from step to step; cuts take the place of a ball's limits
         high = np.full(ends, np.inf if end.ball else 1.0)
         softness = track.limits.end_softness(ends, track.sizes.scale)
-        groups.append((Interval(np.full(ends, -np.inf), high), softness, np.zeros(1, dtype=np.intp)))
+        groups.append((Interval(np.full(ends, -np.inf), high), softness, np.zeros(1, dtype=np.intp), np.isfinite(high)))
     parts: list[list[np.ndarray]] = []
     first = 0
-    for bounds, softness, following in groups:
+    for bounds, softness, following, kept in groups:
         stages, width = len(following), len(bounds.low)
         size = _row_sizes(D[first : first + stages * width], stages)
         place = first + width * following[:, None] + np.arange(width)
         place[following >= stages] = len(D)
-        parts.append([*(np.tile(each, stages) for each in (*bounds, *softness, size)), place.ravel()])
+        parts.append([*(np.tile(each, stages) for each in (*bounds, *softness, size, kept)), place.ravel()])
         first += stages * width
-    low, high, linear, quadratic, allowance, size, place = (np.concatenate(part) for part in zip(*parts, strict=True))
+    low, high, linear, quadratic, allowance, size, kept, place = (
+        np.concatenate(part) for part in zip(*parts, strict=True)
+    )
     if track.margin.any():
         margin = preview_margin(track.margin, N).ravel()
         last = len(low) - ends
         low[last - len(margin) : last] += margin
         high[last - len(margin) : last] -= margin
-    return PlanLimits(low, high, Softness(linear, quadratic, allowance), size, place)
+    return PlanLimits(low, high, Softness(linear, quadratic, allowance), size, place, kept)
 
 
 def _drop_held(limits: PlanLimits, held: Bool[np.ndarray, "moves nu"], track: LiftedTracking) -> None:
@@ -332,7 +353,7 @@ def _drop_held(limits: PlanLimits, held: Bool[np.ndarray, "moves nu"], track: Li
     rows = np.flatnonzero((held & ~searched).ravel())
     if track.rates is not None:
         rows = np.append(rows, held.size + np.flatnonzero(held.ravel()))
-    limits.low[rows], limits.high[rows] = -np.inf, np.inf
+    limits.low[rows], limits.high[rows], limits.kept[rows] = -np.inf, np.inf, False
 
 
 def _step_qp(maps: Condensed, limits: PlanLimits, changes: int) -> StepQP:
@@ -341,13 +362,12 @@ def _step_qp(maps: Condensed, limits: PlanLimits, changes: int) -> StepQP:
     Every row is measured by the norm of its row of D, so that the price of its violation is, too.
     """
     D, unit, n = maps.deviation, maps.unit, len(maps.hessian)
-    limited = np.isfinite(limits.low) | np.isfinite(limits.high)
-    source = np.flatnonzero(limited)
+    source = np.flatnonzero(limits.kept)
     size, (linear, quadratic, allowance) = limits.size[source], limits.softness
     row = np.full(len(D) + 1, len(source))
     row[source] = np.arange(len(source))
     first = np.arange(n, n + changes)
-    hard = first[limited[first] & np.isinf(linear[first])]
+    hard = first[limits.kept[first] & np.isinf(linear[first])]
     return StepQP(
         P=maps.hessian,
         q=np.zeros(n),

@@ -268,7 +268,11 @@ class StepSolver:
                 solver.reset()
 
     def solve(
-        self, plan: Float[np.ndarray, " nv"], room: Interval | None, deadline: float | None
+        self,
+        plan: Float[np.ndarray, " nv"],
+        room: Interval | None,
+        deadline: float | None,
+        bounds: Interval | None = None,
     ) -> tuple[QPSolution, float]:
         """Return the least deviation w from the plan, and how far a soft limit gave way, 0 where none did.
 
@@ -279,11 +283,13 @@ class StepSolver:
             exclude each other the input limit wins.
         deadline
             The time by `perf_counter` at which the step must have ended; None for none.
+        bounds
+            Limits of this step in place of those of the QP.
         """
-        qp, moved, limits, conflict = self.qp, self._moved, None, 0.0
+        qp, moved, limits, conflict = self.qp, self._moved, bounds, 0.0
         np.multiply(plan[self._rows], qp.scale, out=moved)
         if room is not None:
-            limits, conflict = self._widen_rates(room)
+            limits, conflict = self._widen_rates(room, Interval(qp.low, qp.high) if bounds is None else bounds)
         found, answers = self._ask_all(moved, limits, deadline)
         if not answers or found.status is not Status.OPTIMAL:
             self._last = None
@@ -354,10 +360,10 @@ class StepSolver:
         past = np.maximum(value - high[rows], low[rows] - value) / qp.scale[rows]
         return float(past[past > qp.softness.allowance[rows]].max(initial=0.0))
 
-    def _widen_rates(self, room: Interval) -> tuple[Interval, float]:
-        """Return the limits with the first rates as wide as the input limits need, and by how much, in their unit."""
+    def _widen_rates(self, room: Interval, bounds: Interval) -> tuple[Interval, float]:
+        """Return these limits with the first rates as wide as those of the inputs need, and by how much, in their unit."""
         qp = self.qp
-        low, high = qp.low.copy(), qp.high.copy()
+        low, high = bounds.low.copy(), bounds.high.copy()
         rows, which = qp.rate_rows, qp.rate_inputs
         scale = qp.scale[rows]
         lowest = np.minimum(low[rows], room.high[which] * scale)

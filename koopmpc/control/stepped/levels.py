@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.control.bounds.boxes import Interval
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.values import Value
 
@@ -56,6 +57,12 @@ class InputLevels(Value):
         """Return the levels of these indices."""
         return self.first + self.spacing * index
 
+    def inside(self, box: Interval) -> "LevelBox":
+        """Return the lowest and highest index of the levels inside limits of all inputs; crossed where none is."""
+        low, high = (np.clip(self.indices(np.asarray(end)), -1.0, self.count) for end in box)
+        least, most = np.ceil(low - NEAR), np.floor(high + NEAR)
+        return LevelBox(np.maximum(least, 0).astype(np.intp), np.minimum(most, self.count - 1).astype(np.intp))
+
     def least(self, index: Int[np.ndarray, " leveled"]) -> Int[np.ndarray, " leveled"]:
         """Return for how many steps each input has to hold the level of this index."""
         return np.where(index == 0, self.dwell[:, 0], self.dwell[:, 1])
@@ -94,9 +101,16 @@ class HeldLevels:
         self.index, self._begins = index, False
 
     def round(
-        self, u: Float[np.ndarray, " nu"], low: Float[np.ndarray, " nu"] | None, high: Float[np.ndarray, " nu"] | None
+        self,
+        u: Float[np.ndarray, " nu"],
+        low: Float[np.ndarray, " nu"] | None,
+        high: Float[np.ndarray, " nu"] | None,
+        box: Interval | None = None,
     ) -> Float[np.ndarray, " nu"]:
-        """Return the input with the nearest levels that dwell times, and the limits low … high of rates, allow."""
+        """Return the input with the nearest levels that dwell times, and the limits low … high of rates, allow.
+
+        Where the `box` of the inputs moves in time, it wins over dwell times and rates.
+        """
         levels, index = self.levels, self.levels.nearest(u)
         if low is not None and high is not None:  # no change beyond a rate because of rounding
             least = np.ceil(levels.indices(low) - NEAR)
@@ -104,8 +118,11 @@ class HeldLevels:
             inside = (least <= most) & (least < levels.count) & (most >= 0)
             index = np.where(inside, np.clip(index, least, most), index).astype(np.intp)
         held = self.steps < levels.least(self.index)
-        rounded = u.copy()
-        rounded[levels.which] = levels.values(np.where(held, self.index, index))
+        rounded, index = u.copy(), np.where(held, self.index, index)
+        if box is not None:
+            inside = levels.inside(box)
+            index = np.clip(index, inside.low, inside.high)
+        rounded[levels.which] = levels.values(index)
         return rounded
 
     def tighten(self, box: "LevelBox", blocks: Sequence[int]) -> bool:

@@ -94,13 +94,22 @@ class LevelSolver(StepSolver):
         low, high = own.low - moved, own.high - moved
         levels, shape = self.held.levels, self.index.shape
         self._moved_levels = moved[self._flat].reshape(shape)
-        top = np.broadcast_to(levels.count - 1, shape)
-        root = LevelBox(np.zeros(shape, np.intp), top.copy())
+        root = LevelBox(np.zeros(shape, np.intp), np.broadcast_to(levels.count - 1, shape).copy())
+        if limits is not None:  # the limits of the inputs may move in time
+            factor = self._factor.reshape(shape)
+            ends = (own.low[self._rows_of] / factor, own.high[self._rows_of] / factor)
+            low_index, high_index = (np.clip((end - levels.first) / levels.spacing, -1.0, levels.count) for end in ends)
+            root = LevelBox(
+                np.maximum(np.ceil(low_index - NEAR), 0).astype(np.intp),
+                np.minimum(np.floor(high_index + NEAR), levels.count - 1).astype(np.intp),
+            )
+            if (root.low > root.high).any():
+                return QPSolution(self._cold[0].copy(), self._cold[1].copy(), Status.INFEASIBLE, 0, self.first.name), True
         self.nodes, self.gap = 0, 0.0
         best, cost, iterations, unproven = None, np.inf, 0, np.inf
         stack = [_Node(0.0, root, *self._cold)]
         if self._known:
-            shifted = np.vstack([self.index[1:], self.index[-1:]])
+            shifted = np.clip(np.vstack([self.index[1:], self.index[-1:]]), root.low, root.high)
             stack.append(_Node(0.0, LevelBox(shifted.copy(), shifted.copy()), *self._cold))
         ended = Status.INFEASIBLE
         while stack:

@@ -105,29 +105,38 @@ class BallSolver(StepSolver):
         return bool(y.dot(y) <= 1.0)
 
     def solve(
-        self, plan: Float[np.ndarray, " nv"], room: Interval | None, deadline: float | None
+        self,
+        plan: Float[np.ndarray, " nv"],
+        room: Interval | None,
+        deadline: float | None,
+        bounds: Interval | None = None,
     ) -> tuple[QPSolution, float]:
         """Return the least deviation w from the plan that ends in the ball; see `StepSolver.solve`."""
         if self._used.any():
             found, gave_way = QPSolution(np.zeros(len(self.qp.q)), np.zeros(len(self.qp.A)), Status.OPTIMAL, 0, ""), 0.0
         else:
-            found, gave_way = super().solve(plan, room, deadline)
+            found, gave_way = super().solve(plan, room, deadline, bounds)
             if found.status is not Status.OPTIMAL:
                 return found, gave_way
             y = plan[self.ball.rows] + self.ball.D @ found.v
             if np.linalg.norm(y) <= 1 + MET:
                 return found, gave_way
             self._add_cut(y, found, np.multiply(plan[self._rows], self.qp.scale))
-        return self._cut(plan, room, deadline, found)
+        return self._cut(plan, room, deadline, found, bounds)
 
     def _cut(
-        self, plan: Float[np.ndarray, " nv"], room: Interval | None, deadline: float | None, found: QPSolution
+        self,
+        plan: Float[np.ndarray, " nv"],
+        room: Interval | None,
+        deadline: float | None,
+        found: QPSolution,
+        bounds: Interval | None,
     ) -> tuple[QPSolution, float]:
         """Solve with the cuts, and add one after the other, until the plan ends in the ball."""
         qp, ball, solver, m = self.qp, self.ball, self._cutter, len(self.qp.A)
-        moved, limits, conflict = np.multiply(plan[self._rows], qp.scale), None, 0.0
+        moved, limits, conflict = np.multiply(plan[self._rows], qp.scale), bounds, 0.0
         if room is not None:
-            limits, conflict = self._widen_rates(room)
+            limits, conflict = self._widen_rates(room, bounds or Interval(qp.low, qp.high))
         low, high = (qp.low, qp.high) if limits is None else limits
         y_0, iterations, last = plan[ball.rows], found.iterations, self._last
         v, rows, tighter = found.v, found.y, 0.0

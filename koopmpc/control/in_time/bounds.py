@@ -1,0 +1,144 @@
+"""Bounds in time: a bound as rows (T, n), row k for step k of a run, the last one held."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.errors import DataError, ShapeError
+
+BoundByName = Mapping[str, ArrayLike]  # of each signal a number, or one a step
+
+
+def is_rows(bound: Any) -> bool:
+    """Return whether a checked bound, or one of a bound by name, is a row a step."""
+    if isinstance(bound, Mapping):
+        return any(np.ndim(cast("Any", value)) for value in cast("BoundByName", bound).values())
+    return np.ndim(bound) == 2
+
+
+def check_bound(bound: Any, end: str) -> Any:
+    """Return a bound as a float64 array of at most two dimensions, or as numbers and columns by name.
+
+    Raises
+    ------
+    ShapeError
+        It has more than two dimensions, no row, or columns of unequal lengths.
+    DataError
+        It holds NaN or no numbers.
+    """
+    if not isinstance(bound, Mapping):
+        value = checks.array(bound, end, infinite=True)
+        if value.ndim > 2 or (value.ndim == 2 and not value.size):
+            raise ShapeError(f"{end} has shape {value.shape}; pass a scalar, a vector, or rows (steps, n)")
+        return value
+    named = cast("BoundByName", bound)
+    columns = {name: value for name, value in named.items() if np.ndim(value)}
+    checked: dict[str, Any] = dict(
+        checks.check_named({n: 0.0 if n in columns else v for n, v in named.items()}, end, infinite=True)
+    )
+    for name, value in columns.items():
+        checked[name] = checks.array(value, f"{end}[{name!r}]", (None,), infinite=True)
+    lengths = sorted({len(checked[name]) for name in columns})
+    if len(lengths) > 1 or 0 in lengths:
+        raise ShapeError(f"{end} has columns of {lengths} steps; pass one of the same length for each name")
+    return checked
+
+
+def order_bound(bound: BoundByName, end: str, names: Sequence[str], omitted: float) -> Float[np.ndarray, "..."]:
+    """Return a bound by name as a vector, or as rows (T, n) where a name has one a step."""
+    values = [np.asarray(value, dtype=np.float64) for value in bound.values()]
+    place = checks.order_by_name({name: float(i) for i, name in enumerate(bound)}, end, names, -1.0)
+    steps = max((len(value) for value in values if value.ndim), default=0)
+    columns = [
+        np.full(max(steps, 1), omitted) if i < 0 else np.broadcast_to(values[int(i)], max(steps, 1)) for i in place
+    ]
+    rows = np.column_stack(columns) if columns else np.empty((max(steps, 1), 0))
+    return rows if steps else rows[0].copy()
+
+
+def hold_rows(
+    bound: ArrayLike | None, end: str, n: int, first: int, count: int, omitted: float
+) -> Float[np.ndarray, "count n"]:
+    """Return rows first … first + count − 1 of a bound of n signals; what is no row is held, as the last row is.
+
+    Raises
+    ------
+    ShapeError
+        Its rows have another number of signals.
+    """
+    value = checks.array(omitted if bound is None else bound, end, infinite=True)
+    if value.ndim < 2:
+        return np.broadcast_to(checks.vector(value, end, n, infinite=True), (count, n))
+    if value.shape[1] not in (1, n):
+        raise ShapeError(f"{end} has shape {value.shape}; pass rows of {n}, one value each, or one for all")
+    rows = value[np.minimum(np.arange(first, first + count), len(value) - 1)]
+    return np.broadcast_to(rows, (count, n))
+
+
+def narrow(bound: Float[np.ndarray, " n"]) -> Float[np.ndarray, "..."]:
+    """Return a vector of one entry as a scalar, which holds for all signals as the column that it is of does."""
+    return bound.reshape(()) if bound.size == 1 else bound
+
+
+def find_widest(bound: Float[np.ndarray, "T n"], omitted: float) -> Float[np.ndarray, "..."]:
+    """Return the widest finite value of each column, `omitted`, which is ±inf, where a column has none."""
+    known = np.isfinite(bound)
+    widest = np.where(known, bound, -omitted)
+    ends = widest.max(axis=0) if omitted > 0 else widest.min(axis=0)
+    return narrow(np.where(known.any(axis=0), ends, omitted))
+
+
+def require_room(low: Any, high: Any, low_name: str, high_name: str, name: str) -> None:
+    """Raise where no number is between the limits, in any row.
+
+    Raises
+    ------
+    ShapeError
+        The two have other numbers of signals, or of rows.
+    DataError
+        They cross; a lower limit is +inf, or an upper one −inf.
+    """
+    lower = np.atleast_1d(-np.inf if low is None else low)
+    upper = np.atleast_1d(np.inf if high is None else high)
+    steps = max([len(end) for end in (lower, upper) if end.ndim == 2], default=0)
+    if not steps:
+        if lower.shape != upper.shape and 1 not in (lower.size, upper.size):
+            raise ShapeError(
+                f"{low_name} has shape {lower.shape} and {high_name} {upper.shape}; pass one limit a row, or scalars"
+            )
+        a, b = np.broadcast_arrays(lower, upper)
+        checks.refuse_crossed(a, b, name)
+    else:
+        widths = {end.shape[-1] for end in (lower, upper)} - {1}
+        if len(widths) > 1:
+            raise ShapeError(f"{low_name} has shape {lower.shape} and {high_name} {upper.shape}; pass rows as wide")
+        width = max(widths, default=1)
+        lower, upper = (end.reshape(()) if end.shape == (1,) else end for end in (lower, upper))
+        a = hold_rows(lower, low_name, width, 0, steps, -np.inf)
+        b = hold_rows(upper, high_name, width, 0, steps, np.inf)
+        refuse_crossed_rows(a, b, name)
+    if (lower == np.inf).any() or (upper == -np.inf).any():
+        raise DataError(f"{low_name} is +inf or {high_name} is −inf somewhere; use −inf, +inf where there is no limit")
+
+
+def refuse_crossed_rows(
+    low: Float[np.ndarray, "T n"],
+    high: Float[np.ndarray, "T n"],
+    name: str,
+    signals: Sequence[str] = (),
+    first: int = 0,
+    why: str = "",
+) -> None:
+    """Raise where a lower limit is above its upper one, and name the signal and the step; row 0 is step `first`."""
+    crossed = np.argwhere(low > high)
+    if len(crossed):
+        k, i = (int(v) for v in crossed[0])
+        signal = signals[i] if signals else f"index {i}"
+        raise DataError(
+            f"{name} limits cross for {signal} at step {first + k}: lower {low[k, i]:g} is above upper "
+            f"{high[k, i]:g}{why}; swap or widen them"
+        )

@@ -1,0 +1,82 @@
+"""What limits in time need of a controller: a row in its program for each of them, and rows for its whole preview."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from koopmpc.control.limits import Interval, Limits, Movable
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.values import same
+
+_FIXED = ("of", "slack", "du_slack", "margin")  # what stays as a controller was made
+_GROUPS = ("u", "du", "x")
+
+
+def require_preview(limits: Limits, steps: int) -> None:
+    """Raise where a bound has fewer rows than a plan reads from the present step on, u_0 … and x_0 … x_steps.
+
+    Raises
+    ------
+    ShapeError
+        A bound has too few rows.
+    """
+    for end, count in limits.count_rows().items():
+        needed = steps + (end[0] in "xy")
+        if count < needed:
+            raise ShapeError(
+                f"{end} has {count} rows, the plan reads rows 0 … {needed - 1}, and row {count} is missing; "
+                f"pass {needed} rows, or a vector that holds"
+            )
+
+
+def check_bounds_alone(limits: object, own: Limits, states: Sequence[str], inputs: Sequence[str]) -> Limits:
+    """Return the limits of a call with arrays in place of names.
+
+    Raises
+    ------
+    DataError
+        They are no Limits, or differ from the controller's own in more than bounds.
+    """
+    if not isinstance(limits, Limits):
+        raise DataError(f"limits is a {type(limits).__name__}; pass controller.limits.with_bounds(u_max=…)")
+    other = [name for name in _FIXED if not same(getattr(limits, name), getattr(own, name))]
+    if other:
+        raise DataError(
+            f"limits at a call move bounds alone, and these have another {other[0]} than the controller's; pass "
+            "controller.limits.with_bounds(u_max=…)"
+        )
+    return limits.resolve(states, inputs)
+
+
+def require_movable(
+    movable: Movable, boxes: tuple[Interval, Interval, Interval], inputs: Sequence[str], outputs: Sequence[str], nx: int
+) -> None:
+    """Raise where a limit is set that has no row in the program of a controller.
+
+    Parameters
+    ----------
+    movable
+        Which inputs, rates and outputs have a row.
+    boxes
+        The limits of these in time, (steps, n) each.
+    inputs, outputs
+        Their names; the first `nx` outputs are states.
+
+    Raises
+    ------
+    DataError
+        A limit has no row.
+    """
+    for group, can_move, box in zip(_GROUPS, movable, boxes, strict=True):
+        low, high = (np.isfinite(end) & ~can_move for end in box)
+        missing = np.argwhere(low | high)
+        if len(missing):
+            k, i = (int(v) for v in missing[0])
+            names = outputs if group == "x" else inputs
+            kind = "y" if group == "x" and i >= nx else group
+            end = f"{kind}_{'min' if low[k, i] else 'max'}"
+            raise DataError(
+                f"{end} limits {names[i]} at step {k}, and the controller was made without a limit there; "
+                f'give it a finite one, or Limits(rows=("{end}",))'
+            )
+

@@ -1,0 +1,301 @@
+"""LimitWindows: limits in time as the right-hand sides of a PlanMap; matrices, sizes and slack weights stay."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.lib.stride_tricks import sliding_window_view
+
+from koopmpc.checks import HUGE
+from koopmpc.control.in_time.bounds import refuse_crossed_rows
+from koopmpc.control.in_time.preview import require_movable, require_preview
+from koopmpc.control.limits import Interval, Limits, preview_margin
+from koopmpc.control.linear.plan import MovingMap, PlanMap
+from koopmpc.control.target import ROUNDING
+from koopmpc.errors import DataError
+
+_PAGE = 2**15  # entries of limits that are made at once: more cost a step more than 0.1 ms
+_SHARE = 1e-5  # a rate that gives way by more of its allowance than this is reported
+
+
+@dataclass(eq=False)
+class _Pages:
+    """The limits of a map of the plan in consecutive steps, a page of them at a time: a step takes one row.
+
+    Attributes
+    ----------
+    table, entries
+        The table of `LimitWindows`, and where the limits of the map stand in it, from the first row of a step on.
+    latency, last
+        The row of step 0, and the last step with a window of its own.
+    outputs, margin
+        Where the outputs of all stages stand among the limits, and what moves them inwards.
+    """
+
+    table: Float[np.ndarray, "rows W2"]
+    entries: Int[np.ndarray, " n"]
+    latency: int
+    last: int
+    outputs: slice
+    margin: Float[np.ndarray, " outputs"] | None
+    first: int = 0
+    low: Float[np.ndarray, "page nt"] = field(default_factory=lambda: np.empty((0, 0)))
+    high: Float[np.ndarray, "page nt"] = field(default_factory=lambda: np.empty((0, 0)))
+
+    def turn(self, target: PlanMap | MovingMap, k: int) -> None:
+        """Put the limits of step k into a map."""
+        i = k - self.first
+        if not 0 <= i < len(self.low):
+            self._fill(k)
+            i = 0
+        target.low, target.high = self.low[i], self.high[i]
+
+    def _fill(self, k: int) -> None:
+        """Make the page that begins with step k."""
+        steps = min(max(1, _PAGE // max(len(self.entries), 1)), self.last + 1 - k)
+        width, half = self.table.shape[1], len(self.entries) // 2
+        rows = (k + self.latency + np.arange(steps)) * width
+        page = self.table.reshape(-1)[rows[:, None] + self.entries]
+        self.first, self.low, self.high = k, page[:, :half].copy(), page[:, half:].copy()
+        if self.margin is not None:
+            self.low[:, self.outputs] += self.margin
+            self.high[:, self.outputs] -= self.margin
+
+
+class _Columns(NamedTuple):
+    """Where the columns of a kind stand in the table: `first` … `first` + `count` − 1."""
+
+    first: int
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class LimitWindows:
+    """The limits of each step of a run, taken from one table with a row for each step.
+
+    Attributes
+    ----------
+    last
+        The step from which on all windows are the same.
+    table
+        (rows, 2 W) lower limits, then upper ones: of the inputs over each length of a block, of their changes, of the
+        outputs, of targets, of targets with their rounding, and the tightest of these over a preview.
+    endless
+        Whether an entry has no limit somewhere.
+    targets, swept
+        Where targets stand in the table, and the tightest limits of targets.
+    hard
+        Which rates are hard; None where none is.
+    """
+
+    plan: PlanMap
+    last: int
+    latency: int
+    table: Float[np.ndarray, "rows W2"]
+    endless: bool
+    targets: _Columns
+    swept: _Columns
+    hard: Bool[np.ndarray, " nu"] | None
+    _plan_pages: _Pages
+    _moving_pages: _Pages
+
+    def _row(self, k: int) -> int:
+        return min(k, self.last) + self.latency
+
+    def write(self, k: int) -> None:
+        """Put the limits of step k into the plan."""
+        self._plan_pages.turn(self.plan, k)
+
+    def write_moving(self, k: int) -> None:
+        """Put the limits of step k into the map of a reference that moves."""
+        assert self.plan.moving is not None, "only a plan that has this map is asked"
+        self._moving_pages.turn(self.plan.moving, k)
+
+    def target_box(self, k: int) -> Interval:
+        """Return the (N+1, nl) limits of the targets of the preview of step k."""
+        first, count = self.targets
+        rows, W = slice(self._row(k), self._row(k) + sum(self.plan.blocks) + 1), self.table.shape[1] // 2
+        return Interval(self.table[rows, first : first + count], self.table[rows, W + first : W + first + count])
+
+    def find_free_steps(self, values: Float[np.ndarray, "N1 nl"]) -> Bool[np.ndarray, " T"]:
+        """Return in which steps no target with these limited values is outside its limits anywhere in the preview."""
+        first, count = self.swept
+        W, rows = self.table.shape[1] // 2, slice(self.latency, self.latency + self.last + 1)
+        limited = values[:, self.plan.limited_targets]
+        low, high = self.table[rows, first : first + count], self.table[rows, W + first : W + first + count]
+        return ((limited.min(axis=0) >= low) & (limited.max(axis=0) <= high)).all(axis=1)
+
+    def first_inputs(self, k: int) -> tuple[Interval, Interval | None]:
+        """Return the box of the input that acts first in step k, and that of its change."""
+        W, nu, row = self.table.shape[1] // 2, len(self.plan.track.inputs.low), self.table[self._row(k)]
+        box = Interval(row[:nu], row[W : W + nu])
+        rates = None if self.plan.track.rates is None else Interval(row[nu : 2 * nu], row[W + nu : W + 2 * nu])
+        return box, rates
+
+    def hard_rates(self, k: int) -> Interval:
+        """Return the hard limits of the first change in step k, ±inf in place of the others."""
+        _, rates = self.first_inputs(k)
+        assert rates is not None and self.hard is not None, "only asked where there are hard rates"
+        return Interval(np.where(self.hard, rates.low, -np.inf), np.where(self.hard, rates.high, np.inf))
+
+    def find_bounds(self, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval, float]:
+        """Return the limits of the QP as they stand in the plan, and by how much rates ahead are wider than theirs."""
+        plan, conflict = self.plan, 0.0
+        low, high = plan.low[: plan.planned], plan.high[: plan.planned]
+        if self.hard is not None:
+            low, high = low.copy(), high.copy()
+            conflict = self._open_rates(low, high, u_prev)
+        source, size = plan.qp.source, plan.row_size
+        low, high = low[source], high[source]
+        if self.endless:
+            low, high = np.where(low > -HUGE, low, -np.inf), np.where(high < HUGE, high, np.inf)
+        return Interval(low / size, high / size), conflict
+
+    def _open_rates(
+        self, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"], u_prev: Float[np.ndarray, " nu"]
+    ) -> float:
+        """Widen hard rates of later moves as far as the limits of the inputs need, and return by how much at most.
+
+        Where the limits of an input move by more than its rate, they win. The inputs that can be reached inside all
+        limits are followed from move to move; the rates of the first move are left as they are.
+        """
+        nu, moves, hard = len(self.plan.track.inputs.low), len(self.plan.blocks), self.hard
+        shape, n = (moves, nu), moves * nu
+        below, above = low[:n].reshape(shape), high[:n].reshape(shape)
+        falls, rises = low[n : 2 * n].reshape(shape), high[n : 2 * n].reshape(shape)
+        fits = (below[1:] - below[:-1] <= rises[1:]) & (above[1:] - above[:-1] >= falls[1:])
+        if (fits | ~hard).all():
+            return 0.0
+        least, most = (np.clip(u_prev + change[0], below[0], above[0]) for change in (falls, rises))
+        conflict = np.zeros(nu)
+        for j in range(1, moves):
+            least, most = least + falls[j], most + rises[j]
+            short, long = hard & (most < below[j]), hard & (least > above[j])
+            missing = np.where(short, below[j] - most, 0.0) + np.where(long, least - above[j], 0.0)
+            rises[j] += np.where(short, missing, 0.0)
+            falls[j] -= np.where(long, missing, 0.0)
+            conflict = np.maximum(conflict, missing)
+            least, most = np.clip(least, below[j], above[j]), np.clip(most, below[j], above[j])
+        allowed = _SHARE * self.plan.track.rate_softness.allowance
+        return float(conflict[conflict > allowed].max(initial=0.0))
+
+
+def limit_windows(
+    plan: PlanMap, limits: Limits, states: Sequence[str], inputs: Sequence[str], latency: int, *, at_call: bool
+) -> LimitWindows:
+    """Return the windows of limits with rows for a plan.
+
+    Parameters
+    ----------
+    states, inputs
+        Names of the model.
+    at_call
+        Whether row 0 is that of the present step, and there is no other step.
+
+    Raises
+    ------
+    DataError
+        A limit has no row in the plan; limits cross in some step; the limits have a terminal set.
+    ShapeError
+        A bound has too few rows for the plan, or as many signals as it should not.
+    """
+    track, targets = plan.track, plan.targets
+    N, nu, nx = sum(plan.blocks), len(inputs), len(states)
+    names = [*states, *(() if limits.of is None else limits.of.bind(tuple(states)).names)]
+    if at_call:
+        require_preview(limits, N + latency)
+    if plan.planned != len(plan.blocks) * nu * (1 + (track.rates is not None)) + N * len(track.outputs.low):
+        raise DataError("limits in time were passed with a terminal set, which holds for its own limits; leave one out")
+    steps = 1 if at_call else max(limits.count_rows().values(), default=1)
+    count = steps + latency + N
+    box, change = limits.input_rows(nu, 0, count), limits.rate_rows(nu, 0, count)
+    every = limits.output_rows(nx, len(names) - nx, 0, count)
+    require_movable(track.movable, (box, change, every), inputs, names, nx)
+    kept = track.movable.outputs
+    outputs, shown = Interval(every.low[:, kept], every.high[:, kept]), [n for n, k in zip(names, kept, strict=True) if k]
+    blocks = {b: _sweep(box, b) for b in sorted({1, *plan.blocks})}
+    for b, swept in blocks.items():
+        refuse_crossed_rows(*swept, "input", inputs, why=f" within a block of {b} held steps" if b > 1 else "")
+    refuse_crossed_rows(*change, "rate", inputs)
+    _require_levels(plan, blocks, inputs)
+    most = track.margin.max(axis=0, initial=0.0)
+    why = " once tightened by the margin" if most.any() else ""
+    refuse_crossed_rows(outputs.low + most, outputs.high - most, "state and output", shown, why=why)
+
+    raw = Interval(*(np.hstack([a, b]) - targets.values for a, b in zip(box, outputs, strict=True)))
+    limited, reach = plan.limited_targets, ROUNDING * targets.size[plan.limited_targets]
+    test = Interval(raw.low[:, limited] - reach, raw.high[:, limited] + reach)
+    swept_raw = _sweep(Interval(raw.low[:, limited], raw.high[:, limited]), N + 1)
+    tightest = Interval(swept_raw.low - reach, swept_raw.high + reach)
+    free = Interval(np.full((count, 1), -HUGE), np.full((count, 1), HUGE))
+    parts = [box, *([] if track.rates is None else [change]), outputs, raw, test, tightest, free]
+    parts += [swept for b, swept in blocks.items() if b > 1]
+    widths = [part.low.shape[1] for part in parts]
+    starts = np.cumsum([0, *widths]).tolist()
+    at = iter(starts)
+    u_at, du_at = next(at), next(at) if track.rates is not None else 0
+    out_at, raw_at, test_at, tight_at, free_at = (next(at) for _ in range(5))
+    block_at = {b: next(at) for b in blocks if b > 1} | {1: u_at}
+    table = np.hstack([np.hstack([part[i] for part in parts]) for i in (0, 1)])
+    W = starts[-1]
+
+    first = np.cumsum([0, *plan.blocks[:-1]])
+    places = [(k * 2 * W + block_at[b] + np.arange(nu)) for k, b in zip(first.tolist(), plan.blocks, strict=True)]
+    if track.rates is not None:
+        places += [k * 2 * W + du_at + np.arange(nu) for k in first.tolist()]
+    places += [(k + 1) * 2 * W + out_at + np.arange(outputs.low.shape[1]) for k in range(N)]
+    mine = np.concatenate(places).astype(np.intp)
+    low_places, high_places = [mine], [mine + W]
+    if len(plan.low) > plan.planned:
+        checked = tight_at + np.flatnonzero(plan.checked[limited])
+        low_places += [checked, np.full(len(checked), free_at)]
+        high_places += [np.full(len(checked), W + free_at), W + checked]
+    tests = (np.arange(N + 1)[:, None] * 2 * W + test_at + np.arange(len(reach))).ravel() if plan.aimed else mine[:0]
+    margin = preview_margin(track.margin, N).ravel() if track.margin.any() else None
+    planned = table[:, : raw_at], table[:, W : W + raw_at]
+    table = np.clip(table, -HUGE, HUGE)
+    pages = [
+        _Pages(table, places.astype(np.intp), latency, steps - 1, slice(len(mine) - N * len(shown), len(mine)), margin)
+        for places in (np.concatenate([*low_places, *high_places]), np.concatenate([mine, tests, mine + W, tests + W]))
+    ]
+    return LimitWindows(
+        plan=plan,
+        last=steps - 1,
+        latency=latency,
+        table=table,
+        endless=not all(np.isfinite(part).all() for part in planned),
+        targets=_Columns(raw_at, raw.low.shape[1]),
+        swept=_Columns(tight_at, len(reach)),
+        hard=None if track.hard_rates is None else np.isinf(track.rate_softness.linear),
+        _plan_pages=pages[0],
+        _moving_pages=pages[1],
+    )
+
+
+def _require_levels(plan: PlanMap, boxes: Mapping[int, Interval], inputs: Sequence[str]) -> None:
+    """Raise where an input on levels has none between its limits, at some step or within a block of held steps."""
+    levels = plan.track.limits.base.input_levels(len(inputs))
+    if levels is None:
+        return
+    for b, box in boxes.items():
+        inside = levels.inside(box)
+        none = np.argwhere(inside.low > inside.high)
+        if len(none):
+            k, j = (int(v) for v in none[0])
+            i = int(levels.which[j])
+            raise DataError(
+                f"no level of {inputs[i]} is between its limits {box.low[k, i]:g} … {box.high[k, i]:g} at step {k}"
+                f"{f', within a block of {b} held steps' if b > 1 else ''}; pass wider limits, or other levels"
+            )
+
+
+def _sweep(rows: Interval, steps: int) -> Interval:
+    """Return the tightest limits over so many steps from each one on; the last row is held."""
+    if steps == 1:
+        return rows
+    low, high = (np.vstack([end, np.broadcast_to(end[-1], (steps - 1, end.shape[1]))]) for end in rows)
+    return Interval(
+        sliding_window_view(low, steps, axis=0).max(axis=-1), sliding_window_view(high, steps, axis=0).min(axis=-1)
+    )

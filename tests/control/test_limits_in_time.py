@@ -1,0 +1,220 @@
+"""Limits in time: constant rows change nothing, moving ones give CVXPY's plan, and the present row is always kept."""
+
+import copy
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.errors import DataError, ShapeError
+from tests.control.models import PRECISE, Told, linear
+from tests.control.oracle import oracle
+
+N, T = 8, 30
+A, B = np.array([[1.02, 0.2], [-0.1, 0.95]]), np.array([[0.02, 0.1], [0.2, -0.05]])
+COST = km.Cost(Q=[2, 0.5], R=[0.1, 0.2])
+
+
+def constant(limits, steps=40):
+    """The same limits, each bound as so many equal rows."""
+    ends = {name: getattr(limits, name) for name in ("u_min", "u_max", "x_min", "x_max", "du_min", "du_max")}
+    return limits.with_bounds(
+        **{name: np.tile(np.atleast_1d(end), (steps, 1)) for name, end in ends.items() if end is not None}
+    )
+
+
+def moving_limits(seed, *, rates=None, slack=(50.0, 5.0)):
+    """Limits that wander from row to row, by less than the rates allow."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(T + N + 2)[:, None] + rng.uniform(0, 9, size=2)
+    u_max = 0.5 + 0.25 * np.sin(t / 2)
+    x_max = 0.7 + 0.3 * np.cos(t / 3)
+    if rates is not None:
+        rates = rates + 0.1 * np.cos(t)
+    return km.Limits(u_min=-u_max - 0.1, u_max=u_max, x_min=-0.8, x_max=x_max, du_max=rates, slack=slack)
+
+
+def wander(mpc, model, reference, steps, seed=3, **more):
+    """The moves of a noisy closed loop."""
+    rng, x, moves = np.random.default_rng(seed), np.array([0.6, -0.4]), []
+    mpc.reset(x)
+    for k in range(steps):
+        rows = reference[k : k + N + 4] if reference.ndim == 2 else reference
+        move = mpc(x, rows, **{name: value(k) for name, value in more.items()})
+        moves.append(move)
+        x = model.A @ x + model.B @ move.u + 0.02 * rng.normal(size=2)
+    return moves
+
+
+REFERENCES = {
+    "held": np.array([0.4, 0.0]),
+    "beyond the limits": np.array([2.0, -2.0]),
+    "moving": np.column_stack([0.9 * np.sin(np.arange(80) / 4), np.zeros(80)]),
+}
+
+
+@pytest.mark.parametrize("reference", REFERENCES.values(), ids=REFERENCES)
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"moves": (1, 2, 5)}, {"latency": 1}, {"estimator": Told([0.02, -0.05])}, {"solver": "osqp"}],
+    ids=["plain", "blocks", "latency", "estimator", "osqp"],
+)
+def test_constant_rows_give_the_same_inputs_to_the_bit(options, reference):
+    model = linear(A, B)
+    own = km.Limits(u_min=-0.6, u_max=[0.5, 0.6], du_max=0.3, x_max=[0.7, np.inf])
+    plain = wander(km.KoopmanMPC(model, COST, own, N, **options), model, reference, 25)
+    rows = wander(km.KoopmanMPC(model, COST, constant(own), N, **options), model, reference, 25)
+    called = wander(
+        km.KoopmanMPC(model, COST, own, N, **options),
+        model,
+        reference,
+        25,
+        limits=lambda k: constant(own) if k % 3 else None,
+    )
+    for a, b, c in zip(plain, rows, called, strict=True):
+        assert np.array_equal(a.u, b.u) and np.array_equal(a.u, c.u)
+        assert (a.status, a.slack, a.iterations) == (b.status, b.slack, b.iterations) == (c.status, c.slack, c.iterations)
+    assert {m.status for m in plain} & {km.Status.OPTIMAL, km.Status.SOFTENED}
+
+
+@pytest.mark.parametrize("blocks", [None, (1, 2, 5)], ids=["every step", "blocks"])
+@pytest.mark.parametrize(("rates", "slack"), [(None, (50.0, 5.0)), (0.3, (50.0, 5.0)), (0.3, None)])
+def test_moving_rows_give_the_plan_of_cvxpy(rates, slack, blocks):
+    """At each step of a loop the plan is the optimum within the rows from this step on."""
+    model, limits = linear(A, B), moving_limits(2, rates=rates, slack=slack)
+    mpc = km.KoopmanMPC(model, COST, limits, N, moves=blocks, settings=PRECISE | {})
+    reference, x, u, seen = REFERENCES["moving"], np.array([0.5, -0.3]), np.zeros(2), []
+    mpc.reset(x, u_prev=u)
+    for k in range(12):
+        rows = reference[k : k + N + 1]
+        move = mpc(x, rows)
+        now = limits.with_bounds(**{end: getattr(limits, end)[k:] for end in limits.count_rows()})
+        found = oracle(model, COST, now, x, rows, u_prev=u, blocks=blocks)
+        if found is None:
+            assert move.status is km.Status.INFEASIBLE
+        else:
+            plan = mpc.plan()
+            assert plan is not None
+            np.testing.assert_allclose(plan.U, found[0], atol=2e-5)
+            seen.append(move.status)
+        box = limits.at(k).inputs(2)
+        assert (move.u >= box.low).all() and (move.u <= box.high).all()
+        u, x = move.u, A @ x + B @ move.u
+    assert km.Status.OPTIMAL in seen or km.Status.SOFTENED in seen
+
+
+def test_rows_at_a_call_are_those_of_a_controller_in_that_step():
+    model, limits = linear(A, B), moving_limits(5, rates=0.4)
+    own = km.KoopmanMPC(model, COST, limits, N)
+    other = km.KoopmanMPC(model, COST, limits.base, N)
+    rows = {end: getattr(limits, end) for end in limits.count_rows()}
+    a = wander(own, model, REFERENCES["moving"], 20)
+    b = wander(
+        other,
+        model,
+        REFERENCES["moving"],
+        20,
+        limits=lambda k: other.limits.with_bounds(**{end: value[k:] for end, value in rows.items()}),
+    )
+    assert all(np.array_equal(m.u, n.u) for m, n in zip(a, b, strict=True))
+    assert len({m.status for m in a}) > 1
+    after, plain = other([0.5, 0.2], [0, 0]), km.KoopmanMPC(model, COST, limits.base, N)
+    plain.reset(u_prev=b[-1].u)
+    assert np.allclose(after.u, plain([0.5, 0.2], [0, 0]).u, atol=1e-12)  # the next call has its own limits again
+
+
+def test_a_limit_that_falls_faster_than_its_rate_wins_and_the_step_says_so():
+    """du_max is 0.1, the box of step 3 ends 0.5 below that of step 2: the plan is solved, and reported as SOFTENED."""
+    model = linear(A, B)
+    u_max = np.full((N + 5, 2), 1.0)
+    u_max[3:] = -0.4
+    mpc = km.KoopmanMPC(model, COST, km.Limits(u_min=-1, u_max=u_max, du_max=0.1), N)
+    x = np.array([-1.0, -1.0])
+    mpc.reset(x, u_prev=[0.9, 0.9])
+    inputs = []
+    for k in range(6):
+        move = mpc(x, [2.0, 2.0])
+        inputs.append(move.u)
+        assert move.status in {km.Status.SOFTENED, km.Status.OPTIMAL}, move
+        assert (move.u <= u_max[k] + 1e-12).all()
+        x = A @ x + B @ move.u
+    changes = np.diff(np.vstack([[0.9, 0.9], *inputs]), axis=0)
+    assert (np.abs(np.delete(changes, 3, axis=0)) <= 0.1 + 1e-7).all()  # every other change keeps its rate
+
+
+def test_a_failed_step_keeps_the_row_of_its_step():
+    model = linear(A, B)
+    u_max = np.linspace(1.0, 0.05, T)[:, None] * np.ones(2)
+    mpc = km.KoopmanMPC(model, COST, km.Limits(u_min=-u_max, u_max=u_max), N)
+    x = np.array([-2.0, -2.0])
+    for k in range(T):
+        mpc.solver_fails = k % 3 > 0
+        move = mpc(x if k % 5 else [np.nan, 0.0], [2.0, 2.0])
+        assert (np.abs(move.u) <= u_max[k] + 1e-12).all()
+    mpc.reset()
+    assert (np.abs(mpc(x, [2.0, 2.0]).u) <= u_max[0]).all()
+
+
+def test_copies_files_and_update_go_on_from_the_same_row(tmp_path):
+    model, limits = linear(A, B), moving_limits(8)
+    mpc = km.KoopmanMPC(model, COST, limits, N)
+    x = np.array([0.7, 0.5])
+    for _ in range(4):
+        mpc(x, [0.4, 0.2])
+    twin = copy.copy(mpc)
+    mpc.update(model)
+    a, b = mpc(x, [0.4, 0.2]), twin(x, [0.4, 0.2])
+    np.testing.assert_allclose(a.u, b.u, atol=1e-9)
+    mpc.save(tmp_path / "mpc.npz")
+    again = km.load_controller(tmp_path / "mpc.npz")
+    mpc.reset()
+    assert np.array_equal(mpc(x, [0.4, 0.2]).u, again(x, [0.4, 0.2]).u)
+
+
+def test_a_declared_bound_may_come_at_a_call():
+    model = linear(A, B)
+    own = km.Limits(u_min=-1, u_max=1, rows=("x_max",), slack=(1e3, 10.0))
+    mpc, x, rows = km.KoopmanMPC(model, COST, own, N), np.array([0.3, 0.1]), np.tile([0.6, 0.0], (N + 1, 1))
+    free = km.KoopmanMPC(model, COST, km.Limits(u_min=-1, u_max=1), N)
+    assert np.allclose(mpc(x, rows).u, free(x, rows).u, atol=1e-9)
+    mpc.reset()
+    now = own.with_bounds(x_max=[0.4, np.inf])
+    move, found = mpc(x, rows, limits=now), oracle(model, COST, now, x, rows)
+    np.testing.assert_allclose(move.u, found[0][0], atol=1e-5)
+    assert not np.allclose(move.u, free(x, rows).u, atol=1e-3)
+
+
+def test_bad_rows_are_refused_in_sentences_that_name_row_and_step():
+    model, good = linear(A, B), km.Limits(u_min=-1, u_max=1)
+    mpc = km.KoopmanMPC(model, COST, good, N)
+    falling = np.ones((12, 2))
+    falling[7, 1] = -2.0
+    with pytest.raises(DataError, match="input limits cross for index 1 at step 7"):
+        km.Limits(u_min=-1, u_max=falling)
+    with pytest.raises(ShapeError, match="u_max has 5 rows, the plan reads rows 0 … 7, and row 5 is missing"):
+        mpc([0, 0], [0, 0], limits=good.with_bounds(u_max=np.ones((5, 2))))
+    with pytest.raises(DataError, match=r"x_max limits x0 at step 3.*rows=\(\"x_max\",\)"):
+        x_max = np.full((12, 2), np.inf)
+        x_max[3, 0] = 1.0
+        mpc([0, 0], [0, 0], limits=good.with_bounds(x_max=x_max))
+    with pytest.raises(DataError, match="another slack"):
+        mpc([0, 0], [0, 0], limits=km.Limits(u_min=-1, u_max=1, slack=None))
+    with pytest.raises(DataError, match="v_max is no bound"):
+        good.with_bounds(v_max=3)
+    with pytest.raises(DataError, match="pass a tuple of u_min"):
+        km.Limits(rows=("theta",))
+    with pytest.raises(DataError, match="within a block of 7 held steps"):
+        low, high = np.tile([-1.0], (12, 1)), np.tile([-0.5], (12, 1))
+        low[4:], high[4:] = 0.0, 0.5
+        km.KoopmanMPC(model, COST, km.Limits(u_min=low, u_max=high), N, moves=(1, 7))
+    with pytest.raises(DataError, match="does not know"):
+        km.LQR(model, COST, km.Limits(u_min=-1, u_max=falling + 3))
+    assert mpc([0.1, 0], [0, 0]).status.value < 4  # a refused call leaves the controller as it was
+
+
+def test_limits_by_name_may_have_a_value_a_step():
+    limits = km.Limits(u_max={"pump": [1.0, 0.5, 0.2]}, x_max={"b": 2.0}).resolve(("a [K]", "b [K]"), ("fan", "pump [V]"))
+    assert np.array_equal(limits.u_max, [[np.inf, 1.0], [np.inf, 0.5], [np.inf, 0.2]])
+    assert np.array_equal(limits.x_max, [np.inf, 2.0])
+    assert np.array_equal(limits.at(9).u_max, [np.inf, 0.2])
+    assert np.array_equal(limits.base.u_max, [np.inf, 1.0])
