@@ -280,6 +280,11 @@ def manual_automatic() -> Any:
     return _run_of("how/manual_automatic.md")
 
 
+def limits_in_time() -> Any:
+    """The run of the page on limits in time."""
+    return _run_of("how/limits_in_time.md")
+
+
 def on_off() -> Any:
     """The run of the page on inputs with levels."""
     return _run_of("how/on_off.md")
@@ -339,6 +344,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         choosing_by_closed_loop,
         what_trust_means,
         guarantees,
+        limits_in_time,
         on_off,
         own_blocks,
         manual_automatic,

@@ -100,7 +100,7 @@ def failures(run: Run, steps: int) -> list[str]:
         k = int(np.argwhere(~np.isfinite(run.U))[0][0])
         found.append(f"u is {run.U[k]} at step {k}")
     elif run.limits is not None:
-        low, high = run.limits.inputs(run.U.shape[1])
+        low, high = run.limits.input_rows(run.U.shape[1], 0, len(run.U))
         beyond = np.maximum(low - run.U, run.U - high)
         room = _TOLERANCE * (1.0 + np.abs(run.U))
         if (beyond > room).any():

@@ -200,10 +200,7 @@ class Limits(Value):
         known = {"u": inputs, "d": inputs, "x": states, "y": outputs}
         return replace(
             self,
-            **{
-                end: bounds.order_bound(getattr(self, end), end, known[end[0]], _free(end))
-                for end in named
-            },
+            **{end: bounds.order_bound(getattr(self, end), end, known[end[0]], _free(end)) for end in named},
             **entries,
         )
 
@@ -384,7 +381,7 @@ class Limits(Value):
 
     def _rates(self, nu: int) -> Interval:
         low = (
-            -checks.array(self.du_max, "du_max", infinite=True)
+            -checks.array(cast("ArrayLike", self.du_max), "du_max", infinite=True)
             if self.du_min is None and self.du_max is not None
             else self.du_min
         )
@@ -417,7 +414,9 @@ class Limits(Value):
         """Return the box of the observables `of`."""
         return _box(self.y_min, self.y_max, "y_min", "y_max", ny)
 
-    def find_rows(self, nx: int, ny: int, sizes: Float[np.ndarray, " n"] | None = None, scale: float = 1.0) -> LimitRows:
+    def find_rows(
+        self, nx: int, ny: int, sizes: Float[np.ndarray, " n"] | None = None, scale: float = 1.0
+    ) -> LimitRows:
         """Return the limits of [x; of(x)], the rows that have one; ny is 0 without `of`, `sizes` are 1 if None."""
         low, high = self.ends(nx, ny)
         size = np.ones(nx + ny) if sizes is None else sizes
@@ -496,6 +495,6 @@ def _box(low: Bound, high: Bound, low_name: str, high_name: str, n: int) -> Inte
         if np.ndim(cast("Any", end)) == 2:
             raise DataError(f"{name} has a row for each step, and one set of limits is read here; pass limits.at(step)")
     return Interval(
-        checks.vector(-np.inf if low is None else low, low_name, n, infinite=True),
-        checks.vector(np.inf if high is None else high, high_name, n, infinite=True),
+        checks.vector(-np.inf if low is None else cast("ArrayLike", low), low_name, n, infinite=True),
+        checks.vector(np.inf if high is None else cast("ArrayLike", high), high_name, n, infinite=True),
     )

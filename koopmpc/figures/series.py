@@ -26,7 +26,7 @@ from koopmpc.figures.style import (
     styled,
 )
 from koopmpc.lifting.base import StateChoice
-from koopmpc.loop.run import Run
+from koopmpc.loop.run import Run, limits_of
 from koopmpc.validate.bands import Bands, forecast
 from koopmpc.validate.scoring import AnyPredictor, Score
 
@@ -151,11 +151,15 @@ def draw_limits(axes: Any, run: Run, kind: str, i: int) -> list[float]:
     """Draw the finite limits of the i-th of the "states" or "inputs", and return them."""
     if run.limits is None:
         return []
-    ends = getattr(run.limits, kind)(len(getattr(run, kind)))
-    finite = [float(end[i]) for end in ends if np.isfinite(end[i])]
-    for value in finite:
-        axes.axhline(value, **LIMIT, label="limit")
-    return finite
+    ends = limits_of(run, kind, np.arange(run.steps + (kind == "states")))
+    shown = [end[:, i] for end in ends if np.isfinite(end[:, i]).any()]
+    for values in shown:
+        if np.ptp(values) == 0:
+            axes.axhline(float(values[0]), **LIMIT, label="limit")
+        else:
+            finite = np.where(np.isfinite(values), values, np.nan)
+            axes.plot(run.time[: len(values)], finite, **LIMIT, drawstyle="steps-post", label="limit")
+    return sorted({float(v) for values in shown for v in (values.min(), values.max()) if np.isfinite(v)})
 
 
 def _draw_statuses(axes: Any, run: Run) -> None:

@@ -241,8 +241,8 @@ def violation_shares(run: Run, ranges: Float[np.ndarray, " n"] | None = None) ->
         if ranges is None:
             cost = run.cost or Cost(1, 1)
             tracked = cost.of.bind(run.states)
-            ranges = 2 * Sizes.of(tracked, *cost.matrices(tracked.nz, nu), run.limits, run.states, None).rows
-        rate_ranges = 2 * run.limits.rate_softness(nu).allowance / SOFTENED
+            ranges = 2 * Sizes.of(tracked, *cost.matrices(tracked.nz, nu), run.limits.base, run.states, None).rows
+        rate_ranges = 2 * run.limits.base.rate_softness(nu).allowance / SOFTENED
         shares[1:] = (states / ranges).max(axis=1, initial=0.0)
         shares[2:] = np.maximum(shares[2:], (rates / rate_ranges).max(axis=1, initial=0.0))
     return shares
@@ -263,23 +263,29 @@ def beyond(run: Run) -> Float[np.ndarray, " T1"]:
 
 def _broken(run: Run, limits: Limits) -> tuple[Float[np.ndarray, "T n"], Float[np.ndarray, "T0 nu"]]:
     """Return by how much x_1 … x_T and their limited outputs are beyond their limits, and each change of the input."""
-    values, box = stack_limited(limits, _states(run)[1:], run.states)
-    changed, rates = np.diff(run.U, axis=0), limits.rates(run.U.shape[1])
-    return _excess(values, *box), np.zeros(changed.shape) if rates is None else _excess(changed, *rates)
+    values, changed = _stack(limits, _states(run)[1:], run.states), np.diff(run.U, axis=0)
+    nx, (T0, nu) = len(run.states), changed.shape
+    box, rates = limits.output_rows(nx, values.shape[1] - nx, 1, len(values)), limits.rate_rows(nu, 1, T0)
+    return _excess(values, *box), _excess(changed, *rates)
+
+
+def _stack(limits: Limits, X: Float[np.ndarray, "M nx"], states: Sequence[str]) -> Float[np.ndarray, "M n"]:
+    return np.hstack([X, X[:, :0] if limits.of is None else limits.of.bind(states)(X)])
 
 
 def stack_limited(
     limits: Limits, X: Float[np.ndarray, "M nx"], states: Sequence[str]
 ) -> tuple[Float[np.ndarray, "M n"], Interval]:
     """Return the rows [x; of(x)] of all that limits can be of, and the box of these."""
-    Y = X[:, :0] if limits.of is None else limits.of.bind(states)(X)
-    return np.hstack([X, Y]), limits.ends(X.shape[1], Y.shape[1])
+    values = _stack(limits, X, states)
+    return values, limits.ends(X.shape[1], values.shape[1] - X.shape[1])
 
 
 def _input_violation(U: Float[np.ndarray, "T nu"], limits: Limits) -> float:
     """Return by how much the input farthest outside its limits is outside them, or from its nearest level."""
     nu = U.shape[1]
-    beyond, levels = float(_excess(U, *limits.inputs(nu)).max(initial=0.0)), limits.input_levels(nu)
+    beyond = float(_excess(U, *limits.input_rows(nu, 0, len(U))).max(initial=0.0))
+    levels = limits.base.input_levels(nu)
     if levels is None:
         return beyond
     away = np.abs(levels.indices(U) - levels.nearest(U))
@@ -287,13 +293,13 @@ def _input_violation(U: Float[np.ndarray, "T nu"], limits: Limits) -> float:
 
 
 def _excess(
-    values: Float[np.ndarray, "T n"], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
+    values: Float[np.ndarray, "T n"], low: Float[np.ndarray, "T n"], high: Float[np.ndarray, "T n"]
 ) -> Float[np.ndarray, "T n"]:
-    """Return by how much each value is beyond its limits; where there is no limit, not even inf or NaN is beyond."""
+    """Return by how much each value is beyond the limits of its row; without a limit, not even inf or NaN is beyond."""
     beyond = np.zeros(values.shape)
     for end, sign in ((low, -1.0), (high, 1.0)):
         known = np.isfinite(end)
-        beyond[:, known] = np.maximum(beyond[:, known], sign * (values[:, known] - end[known]))
+        beyond[known] = np.maximum(beyond[known], sign * (values[known] - end[known]))
     return beyond
 
 

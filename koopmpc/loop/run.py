@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Limits
+from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.move import Fallback, Move, Plan, Status
 from koopmpc.data.files.frames import build_frame
 from koopmpc.errors import DataError, Hint
@@ -296,6 +296,15 @@ def check_judges(cost: object, limits: object) -> None:
         checks.kind(cost, "cost", Cost, "pass km.Cost(Q=…, R=…), or leave it out")
     if limits is not None:
         checks.kind(limits, "limits", Limits, "pass km.Limits(u_min=…, u_max=…), or leave it out")
+
+
+def limits_of(about: About, kind: str, k: Int[np.ndarray, " n"]) -> Interval:
+    """Return the limits of the "states" or the "inputs" at steps k, a row each; ±inf where there is none."""
+    count, limits = len(getattr(about, kind)), about.limits or Limits()
+    at = k if limits.in_time else np.zeros_like(k)
+    rows = int(at.max(initial=-1)) + 1
+    low, high = limits.input_rows(count, 0, rows) if kind == "inputs" else limits.output_rows(count, 0, 0, rows)
+    return Interval(low[at], high[at])
 
 
 def bind_outputs(outputs: Lifting, states: Sequence[str]) -> Lifting | None:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.function import as_controller
+from koopmpc.control.in_time.preview import require_preview
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Fallible, Move, Plan
 from koopmpc.data.excitation import Excitation
@@ -76,7 +77,8 @@ def simulate(
         Number of steps T. If the plant ends the episode earlier, as a `GymPlant` may, the run ends there with a
         UserWarning, and the reason is in the metadata under "ended".
     cost, limits
-        What the run is judged by; kept in the Run.
+        What the run is judged by; kept in the Run. Limits in time have rows for all its steps. The controller has
+        limits of its own, whose rows move along with the run.
     u_reference
         (nu,) or (steps, nu): the inputs that hold the reference. The metrics charge ‖u_k − u_reference_k‖²_R, so
         staying at the reference costs nothing. By default they are those of the cost's u_target if that is given as
@@ -126,6 +128,7 @@ def simulate(
     steps, rng = checks.count(steps, "steps"), checks.generator(rng)
     if limits is not None:  # the cost is checked with the reference
         checks.kind(limits, "limits", Limits, "pass km.Limits(u_min=…, u_max=…), or leave it out")
+        require_preview(limits.resolve(plant.states, plant.inputs), steps, "the run")
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
     if not hasattr(controller, "reset") and hasattr(plant, "dt") and hasattr(plant, "inputs"):
         controller = as_controller(controller, plant.dt, len(plant.inputs))
@@ -145,7 +148,7 @@ def simulate(
     y0, state = wiring.start_plant(x0)
     wiring.noise = None if noise is None else _noise(noise, steps, len(y0))
     if faults:
-        box = (limits or Limits()).resolve(plant.states, plant.inputs).inputs(nu)
+        box = (limits or Limits()).resolve(plant.states, plant.inputs).base.inputs(nu)
         wiring.faults = Injections(faults, Wiring(len(y0), box), rng)
     rows = LoopRows(
         wiring.sense(0, y0),

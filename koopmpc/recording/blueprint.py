@@ -10,7 +10,7 @@ import numpy as np
 
 from koopmpc.control.move import Fallback, Status
 from koopmpc.figures.style import SEQUENTIAL, map_colors
-from koopmpc.loop.run import About
+from koopmpc.loop.run import About, limits_of
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.description import drawable, status_words
 from koopmpc.recording.rrd import times
@@ -108,7 +108,7 @@ def styles(about: About, nr: int, horizon: int) -> dict[str, Any]:
         "control/u": _lines(
             about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, interpolation_mode="StepAfter"
         ),
-        "control/limits": _lines(["limits"] * len(input_limits(about)), LIMIT, 1.0),
+        "control/limits": _lines(["limits"] * len(input_limits(about)), LIMIT, 1.0, **_stepped(about)),
         "solver/time_ms": _lines(["solve time [ms]"], color(2), 1.5),
         "solver/deadline_ms": _lines(["deadline [ms]"], LIMIT, 1.0),
         "solver/status": _statuses(),
@@ -116,7 +116,7 @@ def styles(about: About, nr: int, horizon: int) -> dict[str, Any]:
     found |= {f"plots/u/ahead/{j}": _points(["prediction"] * len(about.inputs), _PREDICTION, 1.6) for j in stages}
     for panel in panels(about, nr):
         limits = panel.label("limits", [name for name, _ in panel.limits])
-        found[f"{panel.entity}/limits"] = _lines(limits, LIMIT, 1.0)
+        found[f"{panel.entity}/limits"] = _lines(limits, LIMIT, 1.0, **_stepped(about))
         predicted = panel.label("prediction", [about.states[i] for i in panel.states])
         points = _points(predicted, _PREDICTION, 1.6)
         found |= {f"{panel.entity}/ahead/{j}": points for j in stages}
@@ -124,13 +124,36 @@ def styles(about: About, nr: int, horizon: int) -> dict[str, Any]:
 
 
 def input_limits(about: About) -> list[_Limit]:
-    """Return the finite input limits, lower ones first: name and value of each."""
-    return [] if about.limits is None else _finite(about.inputs, about.limits.inputs(len(about.inputs)))
+    """Return the finite input limits, lower ones first: name and value of each, of limits in time the widest."""
+    return [] if about.limits is None else _finite(about.inputs, about.limits.base.inputs(len(about.inputs)))
 
 
 def state_limits(about: About) -> list[_Limit]:
-    """Return the finite limits of states, lower ones first: name and value of each."""
-    return [] if about.limits is None else _finite(about.states, about.limits.states(len(about.states)))
+    """Return the finite limits of states, lower ones first: name and value of each, of limits in time the widest."""
+    return [] if about.limits is None else _finite(about.states, about.limits.base.states(len(about.states)))
+
+
+def limit_lines(about: About, kind: str, names: Sequence[str], k: np.ndarray) -> np.ndarray:
+    """Return the limits of `names` among the "states" or "inputs" at steps k, a column each; NaN where there is none.
+
+    The columns are those of `state_limits` or `input_limits`.
+    """
+    own = list(getattr(about, kind))
+    ends = limits_of(about, kind, k)
+    widest = ends if about.limits is None else getattr(about.limits.base, kind)(len(own))
+    places = [
+        (end, own.index(name))
+        for end in (0, 1)
+        for name in own
+        if name in names and np.isfinite(widest[end][own.index(name)])
+    ]
+    lines = np.column_stack([ends[end][:, i] for end, i in places]) if places else np.empty((len(k), 0))
+    return np.where(np.isfinite(lines), lines, np.nan)
+
+
+def _stepped(about: About) -> dict[str, Any]:
+    """Return how limits in time are drawn: from row to row."""
+    return {"interpolation_mode": "StepAfter"} if about.limits is not None and about.limits.in_time else {}
 
 
 def _finite(names: Sequence[str], ends: Any) -> list[_Limit]:

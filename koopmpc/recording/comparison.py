@@ -17,10 +17,9 @@ from koopmpc.recording.blueprint import (
     color,
     draw_line,
     frame_views,
-    input_limits,
+    limit_lines,
     readable,
     shared_time,
-    state_limits,
     write_page,
 )
 from koopmpc.recording.description import drawable, table_figures, title_of
@@ -131,10 +130,14 @@ def _marks(runs: Sequence[Run], title: str) -> list[tuple[str, Any, np.ndarray, 
             values = run.reference[:, tracked.index(title)]
             key = b"r" + (values[:1] if np.ptp(values) == 0 else values).tobytes()
             found.setdefault(key, ("reference", REFERENCE, values, run.dt))
-        for name, value in (*state_limits(run), *input_limits(run)):
-            if name == title:
-                line = ("limits", LIMIT, np.full(2, value), run.steps * run.dt)
-                found.setdefault(b"l" + np.float64(value).tobytes(), line)
+        for kind in ("states", "inputs"):
+            lines = limit_lines(run, kind, [title], np.arange(run.steps + (kind == "states")))
+            for values in lines.T:
+                if np.ptp(values) == 0:
+                    line = ("limits", LIMIT, np.full(2, values[0]), run.steps * run.dt)
+                    found.setdefault(b"l" + values[:1].tobytes(), line)
+                else:
+                    found.setdefault(b"l" + values.tobytes(), ("limits", LIMIT, values, run.dt))
     return list(found.values())
 
 

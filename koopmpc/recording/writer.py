@@ -25,7 +25,7 @@ from koopmpc.recording.blueprint import (
     ahead,
     blueprint,
     draw_eigenvalues,
-    input_limits,
+    limit_lines,
     panels,
     status_value,
     styles,
@@ -216,8 +216,7 @@ class Writer:
                 kept = np.flatnonzero(values != column.absent)
                 self._vectors(column.log, k[kept], values[kept, None].astype(np.float64))
         ends = self._ends(k)
-        limits = [value for _, value in input_limits(self._about)]
-        self._vectors(Entity.INPUT_LIMITS, ends, np.tile(limits, (len(ends), 1)))
+        self._limits(Entity.INPUT_LIMITS, "inputs", self._about.inputs, k)
         if len(ends):
             powers = np.full(len(ends), np.log10(self._about.dt))
             line = rr.DynamicArchetype.columns(VIEW, components={LOG_TIME: powers})
@@ -348,6 +347,12 @@ class Writer:
         last = k[-1] if self._steps is None else self._steps
         return np.unique([k[0], last]) if self._steps is None or k[0] == 0 else k[:0]
 
+    def _limits(self, entity: str, kind: str, names: Sequence[str], k: np.ndarray) -> None:
+        """Write the limits of these "states" or "inputs": in time at every step, else where their lines end."""
+        limits = self._about.limits
+        at = k if limits is not None and limits.in_time else self._ends(k)
+        self._vectors(entity, at, limit_lines(self._about, kind, names, at))
+
     def _found_spans(self, rows: LogBlock) -> dict[str, list[float]]:
         """Return the least and the largest value of each plot of states; of a running loop nothing is known yet."""
         if self._steps is None:
@@ -368,10 +373,9 @@ class Writer:
         """
         self._plans |= {step: (X, U) for step, X, U in self._plans_of(rows) if np.isfinite(U).any()}
         N = len(next(iter(self._plans.values()))[1]) if self._plans else 0
-        shown, ends = panels(self._about, self._nr), self._ends(k)
+        shown = panels(self._about, self._nr)
         for panel in shown:
-            limits = [value for _, value in panel.limits]
-            self._vectors(f"{panel.entity}/limits", ends, np.tile(limits, (len(ends), 1)))
+            self._limits(f"{panel.entity}/limits", "states", [self._about.states[i] for i in panel.states], k)
         for j in ahead(N):
             of = [step for step in self._plans if k[0] <= step + j <= k[-1]]
             if not of:

@@ -72,20 +72,30 @@ def test_constant_rows_give_the_same_inputs_to_the_bit(options, reference):
         limits=lambda k: constant(own) if k % 3 else None,
     )
     for a, b, c in zip(plain, rows, called, strict=True):
-        assert np.array_equal(a.u, b.u) and np.array_equal(a.u, c.u)
-        assert (a.status, a.slack, a.iterations) == (b.status, b.slack, b.iterations) == (c.status, c.slack, c.iterations)
+        assert np.array_equal(a.u, b.u)
+        assert np.array_equal(a.u, c.u)
+        assert (
+            (a.status, a.slack, a.iterations) == (b.status, b.slack, b.iterations) == (c.status, c.slack, c.iterations)
+        )
     assert {m.status for m in plain} & {km.Status.OPTIMAL, km.Status.SOFTENED}
 
 
-@pytest.mark.parametrize("blocks", [None, (1, 2, 5)], ids=["every step", "blocks"])
-@pytest.mark.parametrize(("rates", "slack"), [(None, (50.0, 5.0)), (0.3, (50.0, 5.0)), (0.3, None)])
+@pytest.mark.parametrize(
+    ("rates", "slack", "blocks"),
+    [
+        pytest.param(0.3, (50.0, 5.0), None, id="soft"),
+        pytest.param(None, (50.0, 5.0), None, id="without rates", marks=pytest.mark.slow),
+        pytest.param(0.3, (50.0, 5.0), (1, 2, 5), id="blocks", marks=pytest.mark.slow),
+        pytest.param(0.3, None, None, id="hard", marks=pytest.mark.slow),
+    ],
+)
 def test_moving_rows_give_the_plan_of_cvxpy(rates, slack, blocks):
     """At each step of a loop the plan is the optimum within the rows from this step on."""
     model, limits = linear(A, B), moving_limits(2, rates=rates, slack=slack)
     mpc = km.KoopmanMPC(model, COST, limits, N, moves=blocks, settings=PRECISE | {})
     reference, x, u, seen = REFERENCES["moving"], np.array([0.5, -0.3]), np.zeros(2), []
     mpc.reset(x, u_prev=u)
-    for k in range(12):
+    for k in range(8):
         rows = reference[k : k + N + 1]
         move = mpc(x, rows)
         now = limits.with_bounds(**{end: getattr(limits, end)[k:] for end in limits.count_rows()})
@@ -98,7 +108,7 @@ def test_moving_rows_give_the_plan_of_cvxpy(rates, slack, blocks):
             np.testing.assert_allclose(plan.U, found[0], atol=2e-5)
             seen.append(move.status)
         box = limits.at(k).inputs(2)
-        assert (move.u >= box.low).all() and (move.u <= box.high).all()
+        assert (move.u == np.clip(move.u, *box)).all()
         u, x = move.u, A @ x + B @ move.u
     assert km.Status.OPTIMAL in seen or km.Status.SOFTENED in seen
 
@@ -193,9 +203,9 @@ def test_bad_rows_are_refused_in_sentences_that_name_row_and_step():
         km.Limits(u_min=-1, u_max=falling)
     with pytest.raises(ShapeError, match="u_max has 5 rows, the plan reads rows 0 … 7, and row 5 is missing"):
         mpc([0, 0], [0, 0], limits=good.with_bounds(u_max=np.ones((5, 2))))
+    x_max = np.full((12, 2), np.inf)
+    x_max[3, 0] = 1.0
     with pytest.raises(DataError, match=r"x_max limits x0 at step 3.*rows=\(\"x_max\",\)"):
-        x_max = np.full((12, 2), np.inf)
-        x_max[3, 0] = 1.0
         mpc([0, 0], [0, 0], limits=good.with_bounds(x_max=x_max))
     with pytest.raises(DataError, match="another slack"):
         mpc([0, 0], [0, 0], limits=km.Limits(u_min=-1, u_max=1, slack=None))
@@ -203,9 +213,9 @@ def test_bad_rows_are_refused_in_sentences_that_name_row_and_step():
         good.with_bounds(v_max=3)
     with pytest.raises(DataError, match="pass a tuple of u_min"):
         km.Limits(rows=("theta",))
+    low, high = np.tile([-1.0], (12, 1)), np.tile([-0.5], (12, 1))
+    low[4:], high[4:] = 0.0, 0.5
     with pytest.raises(DataError, match="within a block of 7 held steps"):
-        low, high = np.tile([-1.0], (12, 1)), np.tile([-0.5], (12, 1))
-        low[4:], high[4:] = 0.0, 0.5
         km.KoopmanMPC(model, COST, km.Limits(u_min=low, u_max=high), N, moves=(1, 7))
     with pytest.raises(DataError, match="does not know"):
         km.LQR(model, COST, km.Limits(u_min=-1, u_max=falling + 3))
@@ -213,8 +223,32 @@ def test_bad_rows_are_refused_in_sentences_that_name_row_and_step():
 
 
 def test_limits_by_name_may_have_a_value_a_step():
-    limits = km.Limits(u_max={"pump": [1.0, 0.5, 0.2]}, x_max={"b": 2.0}).resolve(("a [K]", "b [K]"), ("fan", "pump [V]"))
+    limits = km.Limits(u_max={"pump": [1.0, 0.5, 0.2]}, x_max={"b": 2.0}).resolve(
+        ("a [K]", "b [K]"), ("fan", "pump [V]")
+    )
     assert np.array_equal(limits.u_max, [[np.inf, 1.0], [np.inf, 0.5], [np.inf, 0.2]])
     assert np.array_equal(limits.x_max, [np.inf, 2.0])
     assert np.array_equal(limits.at(9).u_max, [np.inf, 0.2])
     assert np.array_equal(limits.base.u_max, [np.inf, 1.0])
+
+
+def test_levels_keep_to_those_inside_the_rows_and_maintenance_stops_a_pump():
+    """A pump on levels that may not run in steps 6 to 9: plan, fallback and dwell times obey the row."""
+    model = linear(A, B)
+    u_max = np.array([[1.0, 0.5]] * T)
+    u_max[6:10, 0] = 0.3
+    limits = km.Limits(u_min=[0, -0.5], u_max=u_max, levels=[[0, 0.5, 1], None], dwell=[(2, 2), None])
+    mpc = km.KoopmanMPC(model, COST, limits, N)
+    x, seen = np.array([-0.8, -0.5]), set()
+    for k in range(14):
+        mpc.solver_fails = k in (7, 11)
+        move = mpc(x, [0.6, 0.4])
+        seen.add(move.u[0])
+        assert move.u[0] in (0.0, 0.5, 1.0)
+        assert (move.u <= u_max[k]).all()
+        x = A @ x + B @ move.u
+    assert len(seen) > 1
+    u_max[8, 0], low = 0.4, np.zeros((T, 2))
+    low[8, 0] = 0.1
+    with pytest.raises(DataError, match="no level of u0 is between its limits 0.1 … 0.4 at step 8"):
+        km.KoopmanMPC(model, COST, limits.with_bounds(u_min=low, u_max=u_max), N)

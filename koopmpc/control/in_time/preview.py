@@ -12,8 +12,8 @@ _FIXED = ("of", "slack", "du_slack", "margin")  # what stays as a controller was
 _GROUPS = ("u", "du", "x")
 
 
-def require_preview(limits: Limits, steps: int) -> None:
-    """Raise where a bound has fewer rows than a plan reads from the present step on, u_0 … and x_0 … x_steps.
+def require_preview(limits: Limits, steps: int, who: str = "the plan") -> None:
+    """Raise where a bound has fewer rows than a plan or a run reads, u_0 … u_{steps−1} and x_0 … x_steps.
 
     Raises
     ------
@@ -24,7 +24,7 @@ def require_preview(limits: Limits, steps: int) -> None:
         needed = steps + (end[0] in "xy")
         if count < needed:
             raise ShapeError(
-                f"{end} has {count} rows, the plan reads rows 0 … {needed - 1}, and row {count} is missing; "
+                f"{end} has {count} rows, {who} reads rows 0 … {needed - 1}, and row {count} is missing; "
                 f"pass {needed} rows, or a vector that holds"
             )
 
@@ -79,4 +79,3 @@ def require_movable(
                 f"{end} limits {names[i]} at step {k}, and the controller was made without a limit there; "
                 f'give it a finite one, or Limits(rows=("{end}",))'
             )
-

@@ -457,15 +457,15 @@ class KoopmanMPC(MPCBase):
             window = self._change_window(limits)
         if window is None:
             return
-        k = self._step if self._step < window.last else window.last
-        if window is not self._rows_of_limits:
-            k = 0
+        k, plan = self._step, self._map
+        if k > window.last:
+            k = window.last
         self._row = k
         if moving:
-            window.write_moving(k)
+            window.moving_pages.turn(plan.moving, k)
             return
-        window.write(k)
-        if self._aimed and self._map.aims_inside and (self._pushed or not self._free_steps[k]):
+        window.plan_pages.turn(plan, k)
+        if self._aimed and plan.aims_inside and (self._pushed or not self._free_steps[k]):
             self._aimed = False
 
     def _change_window(self, limits: Limits | None) -> LimitWindows | None:
@@ -561,7 +561,7 @@ class KoopmanMPC(MPCBase):
         """Handle a step like `_solve_limited`, of a plan t from one product with the reference."""
         plan, moving, n, window = self._map, self._map.moving, self._map.planned, self._window
         if window is not None:
-            window.write(self._row)
+            window.plan_pages.turn(plan, self._row)
         if moving is not None and moving.met_low[n:].all() and moving.met_high[n:].all():
             t[n:] = plan.inside if window is None else np.clip(0.0, plan.low[n:], plan.high[n:])
         else:

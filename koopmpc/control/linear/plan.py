@@ -198,7 +198,9 @@ class MovingMap(Viewing):
             parts.append(maps.from_given)
             tests = np.column_stack([tests, np.zeros((len(tests), maps.from_given.shape[1]))])
         self.matrix = np.ascontiguousarray(np.vstack([np.column_stack(parts), tests]))
-        self.limits = np.concatenate([*(np.maximum(end, -HUGE) for end in low), *(np.minimum(end, HUGE) for end in high)])
+        self.limits = np.concatenate(
+            [*(np.maximum(end, -HUGE) for end in low), *(np.minimum(end, HUGE) for end in high)]
+        )
         self.t, self.known = np.zeros(len(self.matrix)), np.zeros(self.matrix.shape[1])
         self._sizes = fixed.shape[1] + 1, steps, nr, nu
         self._see()

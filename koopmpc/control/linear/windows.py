@@ -44,12 +44,13 @@ class _Pages:
     low: Float[np.ndarray, "page nt"] = field(default_factory=lambda: np.empty((0, 0)))
     high: Float[np.ndarray, "page nt"] = field(default_factory=lambda: np.empty((0, 0)))
 
-    def turn(self, target: PlanMap | MovingMap, k: int) -> None:
+    def turn(self, target: PlanMap | MovingMap | None, k: int) -> None:
         """Put the limits of step k into a map."""
         i = k - self.first
         if not 0 <= i < len(self.low):
             self._fill(k)
             i = 0
+        assert target is not None, "a map that is not there is never asked"
         target.low, target.high = self.low[i], self.high[i]
 
     def _fill(self, k: int) -> None:
@@ -65,10 +66,10 @@ class _Pages:
 
 
 class _Columns(NamedTuple):
-    """Where the columns of a kind stand in the table: `first` … `first` + `count` − 1."""
+    """Where the columns of a kind stand in the table: `first` … `first` + `width` − 1."""
 
     first: int
-    count: int
+    width: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +89,8 @@ class LimitWindows:
         Where targets stand in the table, and the tightest limits of targets.
     hard
         Which rates are hard; None where none is.
+    plan_pages, moving_pages
+        The limits of the plan, and of its map of a reference that moves.
     """
 
     plan: PlanMap
@@ -98,20 +101,11 @@ class LimitWindows:
     targets: _Columns
     swept: _Columns
     hard: Bool[np.ndarray, " nu"] | None
-    _plan_pages: _Pages
-    _moving_pages: _Pages
+    plan_pages: _Pages
+    moving_pages: _Pages
 
     def _row(self, k: int) -> int:
         return min(k, self.last) + self.latency
-
-    def write(self, k: int) -> None:
-        """Put the limits of step k into the plan."""
-        self._plan_pages.turn(self.plan, k)
-
-    def write_moving(self, k: int) -> None:
-        """Put the limits of step k into the map of a reference that moves."""
-        assert self.plan.moving is not None, "only a plan that has this map is asked"
-        self._moving_pages.turn(self.plan.moving, k)
 
     def target_box(self, k: int) -> Interval:
         """Return the (N+1, nl) limits of the targets of the preview of step k."""
@@ -137,7 +131,8 @@ class LimitWindows:
     def hard_rates(self, k: int) -> Interval:
         """Return the hard limits of the first change in step k, ±inf in place of the others."""
         _, rates = self.first_inputs(k)
-        assert rates is not None and self.hard is not None, "only asked where there are hard rates"
+        assert rates is not None, "only asked where there are hard rates"
+        assert self.hard is not None, "only asked where there are hard rates"
         return Interval(np.where(self.hard, rates.low, -np.inf), np.where(self.hard, rates.high, np.inf))
 
     def find_bounds(self, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval, float]:
@@ -166,6 +161,7 @@ class LimitWindows:
         below, above = low[:n].reshape(shape), high[:n].reshape(shape)
         falls, rises = low[n : 2 * n].reshape(shape), high[n : 2 * n].reshape(shape)
         fits = (below[1:] - below[:-1] <= rises[1:]) & (above[1:] - above[:-1] >= falls[1:])
+        assert hard is not None, "only asked where there are hard rates"
         if (fits | ~hard).all():
             return 0.0
         least, most = (np.clip(u_prev + change[0], below[0], above[0]) for change in (falls, rises))
@@ -214,7 +210,10 @@ def limit_windows(
     every = limits.output_rows(nx, len(names) - nx, 0, count)
     require_movable(track.movable, (box, change, every), inputs, names, nx)
     kept = track.movable.outputs
-    outputs, shown = Interval(every.low[:, kept], every.high[:, kept]), [n for n, k in zip(names, kept, strict=True) if k]
+    outputs, shown = (
+        Interval(every.low[:, kept], every.high[:, kept]),
+        [n for n, k in zip(names, kept, strict=True) if k],
+    )
     blocks = {b: _sweep(box, b) for b in sorted({1, *plan.blocks})}
     for b, swept in blocks.items():
         refuse_crossed_rows(*swept, "input", inputs, why=f" within a block of {b} held steps" if b > 1 else "")
@@ -254,7 +253,7 @@ def limit_windows(
         high_places += [np.full(len(checked), W + free_at), W + checked]
     tests = (np.arange(N + 1)[:, None] * 2 * W + test_at + np.arange(len(reach))).ravel() if plan.aimed else mine[:0]
     margin = preview_margin(track.margin, N).ravel() if track.margin.any() else None
-    planned = table[:, : raw_at], table[:, W : W + raw_at]
+    planned = table[:, :raw_at], table[:, W : W + raw_at]
     table = np.clip(table, -HUGE, HUGE)
     pages = [
         _Pages(table, places.astype(np.intp), latency, steps - 1, slice(len(mine) - N * len(shown), len(mine)), margin)
@@ -269,8 +268,8 @@ def limit_windows(
         targets=_Columns(raw_at, raw.low.shape[1]),
         swept=_Columns(tight_at, len(reach)),
         hard=None if track.hard_rates is None else np.isinf(track.rate_softness.linear),
-        _plan_pages=pages[0],
-        _moving_pages=pages[1],
+        plan_pages=pages[0],
+        moving_pages=pages[1],
     )
 
 

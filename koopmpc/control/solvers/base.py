@@ -361,7 +361,7 @@ class StepSolver:
         return float(past[past > qp.softness.allowance[rows]].max(initial=0.0))
 
     def _widen_rates(self, room: Interval, bounds: Interval) -> tuple[Interval, float]:
-        """Return these limits with the first rates as wide as those of the inputs need, and by how much, in their unit."""
+        """Return these limits, the first rates as wide as those of the inputs need, and by how much, in their unit."""
         qp = self.qp
         low, high = bounds.low.copy(), bounds.high.copy()
         rows, which = qp.rate_rows, qp.rate_inputs

@@ -104,7 +104,9 @@ class LevelSolver(StepSolver):
                 np.minimum(np.floor(high_index + NEAR), levels.count - 1).astype(np.intp),
             )
             if (root.low > root.high).any():
-                return QPSolution(self._cold[0].copy(), self._cold[1].copy(), Status.INFEASIBLE, 0, self.first.name), True
+                return QPSolution(
+                    self._cold[0].copy(), self._cold[1].copy(), Status.INFEASIBLE, 0, self.first.name
+                ), True
         self.nodes, self.gap = 0, 0.0
         best, cost, iterations, unproven = None, np.inf, 0, np.inf
         stack = [_Node(0.0, root, *self._cold)]
