@@ -118,16 +118,16 @@ class Limits(Value):
     >>> hard = km.Limits(u_min=-25, u_max=25, du_max=8, x_max=[1.2, 4], slack=None)
     """
 
-    u_min: ArrayLike | BoundByName | None = None
-    u_max: ArrayLike | BoundByName | None = None
-    x_min: ArrayLike | BoundByName | None = None
-    x_max: ArrayLike | BoundByName | None = None
+    u_min: "Bound" = None
+    u_max: "Bound" = None
+    x_min: "Bound" = None
+    x_max: "Bound" = None
     of: Lifting | None = None
-    y_min: ArrayLike | BoundByName | None = None
-    y_max: ArrayLike | BoundByName | None = None
+    y_min: "Bound" = None
+    y_max: "Bound" = None
     slack: Slack | Literal["auto"] | None = "auto"
-    du_min: ArrayLike | BoundByName | None = None
-    du_max: ArrayLike | BoundByName | None = None
+    du_min: "Bound" = None
+    du_max: "Bound" = None
     du_slack: Slack | None = None
     margin: ArrayLike | None = None
     capped: tuple[str, ...] = ()
@@ -226,7 +226,7 @@ class Limits(Value):
         """
         unknown = [name for name in ends if name not in BOUNDS]
         if unknown:
-            raise DataError(f"{unknown[0]} is no bound of Limits; the bounds are {', '.join(BOUNDS)}")
+            raise DataError(f"Limits has no bound {unknown[0]}; it has {', '.join(BOUNDS)}")
         return replace(self, **cast("Any", ends))
 
     def at(self, step: int) -> "Limits":
@@ -270,14 +270,14 @@ class Limits(Value):
             hold_rows(getattr(self, high), high, n, first, count, np.inf),
         )
 
-    def _declared(self, what: str) -> bool:
+    def _declares(self, what: str) -> bool:
         return f"{what}_min" in self.rows or f"{what}_max" in self.rows
 
     def movable(self, nx: int, ny: int, nu: int) -> "Movable":
         """Return which inputs, rates and outputs [x; of(x)] have a row: those with a finite or a declared bound."""
         base = self.base
-        inputs = is_finite(base.inputs(nu)) | self._declared("u")
-        return Movable(inputs, is_finite(base._rates(nu)) | self._declared("du"), base.find_rows(nx, ny).kept)
+        inputs = is_finite(base.inputs(nu)) | self._declares("u")
+        return Movable(inputs, is_finite(base._rates(nu)) | self._declares("du"), base.find_rows(nx, ny).kept)
 
     def _margin(self, margin: Float[np.ndarray, "K nx"]) -> Float[np.ndarray, "K nx"]:
         if (margin < 0).any() or not len(margin):
@@ -377,7 +377,7 @@ class Limits(Value):
     def rates(self, nu: int) -> Interval | None:
         """Return the box of u_k − u_{k−1}; None where nothing limits it."""
         box = self._rates(nu)
-        return box if self._declared("du") or is_finite(box).any() else None
+        return box if self._declares("du") or is_finite(box).any() else None
 
     def _rates(self, nu: int) -> Interval:
         low = (
@@ -424,11 +424,11 @@ class Limits(Value):
         if isinstance(self.slack, str):
             linear, quadratic = LINEAR * scale / size, QUADRATIC * scale / size**2
         else:
-            x, y = self._declared("x"), self._declared("y")
+            x, y = self._declares("x"), self._declares("y")
             mine = np.repeat([x or _is_set(self.x_min, self.x_max), y or _is_set(self.y_min, self.y_max)], [nx, ny])
             given = _spread_prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
             linear[mine], quadratic[mine] = given
-        kept = is_finite(Interval(low, high)) | np.repeat([self._declared("x"), self._declared("y")], [nx, ny])
+        kept = is_finite(Interval(low, high)) | np.repeat([self._declares("x"), self._declares("y")], [nx, ny])
         softness = Softness(linear[kept], quadratic[kept], SOFTENED * size[kept])
         margin = np.zeros((1, nx + ny))
         if self.margin is not None:

@@ -108,7 +108,7 @@ def styles(about: About, nr: int, horizon: int) -> dict[str, Any]:
         "control/u": _lines(
             about.inputs, [color(i) for i in range(len(about.inputs))], 2.0, interpolation_mode="StepAfter"
         ),
-        "control/limits": _lines(["limits"] * len(input_limits(about)), LIMIT, 1.0, **_stepped(about)),
+        "control/limits": _lines(["limits"] * len(input_limits(about)), LIMIT, 1.0, **_step_style(about)),
         "solver/time_ms": _lines(["solve time [ms]"], color(2), 1.5),
         "solver/deadline_ms": _lines(["deadline [ms]"], LIMIT, 1.0),
         "solver/status": _statuses(),
@@ -116,7 +116,7 @@ def styles(about: About, nr: int, horizon: int) -> dict[str, Any]:
     found |= {f"plots/u/ahead/{j}": _points(["prediction"] * len(about.inputs), _PREDICTION, 1.6) for j in stages}
     for panel in panels(about, nr):
         limits = panel.label("limits", [name for name, _ in panel.limits])
-        found[f"{panel.entity}/limits"] = _lines(limits, LIMIT, 1.0, **_stepped(about))
+        found[f"{panel.entity}/limits"] = _lines(limits, LIMIT, 1.0, **_step_style(about))
         predicted = panel.label("prediction", [about.states[i] for i in panel.states])
         points = _points(predicted, _PREDICTION, 1.6)
         found |= {f"{panel.entity}/ahead/{j}": points for j in stages}
@@ -138,9 +138,11 @@ def limit_lines(about: About, kind: str, names: Sequence[str], k: np.ndarray) ->
 
     The columns are those of `state_limits` or `input_limits`.
     """
+    if about.limits is None:
+        return np.empty((len(k), 0))
     own = list(getattr(about, kind))
     ends = limits_of(about, kind, k)
-    widest = ends if about.limits is None else getattr(about.limits.base, kind)(len(own))
+    widest = getattr(about.limits.base, kind)(len(own))
     places = [
         (end, own.index(name))
         for end in (0, 1)
@@ -151,7 +153,7 @@ def limit_lines(about: About, kind: str, names: Sequence[str], k: np.ndarray) ->
     return np.where(np.isfinite(lines), lines, np.nan)
 
 
-def _stepped(about: About) -> dict[str, Any]:
+def _step_style(about: About) -> dict[str, Any]:
     """Return how limits in time are drawn: from row to row."""
     return {"interpolation_mode": "StepAfter"} if about.limits is not None and about.limits.in_time else {}
 

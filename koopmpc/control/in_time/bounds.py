@@ -63,7 +63,7 @@ def order_bound(bound: BoundByName, end: str, names: Sequence[str], omitted: flo
 def hold_rows(
     bound: ArrayLike | None, end: str, n: int, first: int, count: int, omitted: float
 ) -> Float[np.ndarray, "count n"]:
-    """Return rows first … first + count − 1 of a bound of n signals; what is no row is held, as the last row is.
+    """Return rows first … first + count − 1 of a bound of n signals; a vector is held, as the last row is.
 
     Raises
     ------
