@@ -56,8 +56,15 @@ REFERENCES = {
 @pytest.mark.parametrize("reference", REFERENCES.values(), ids=REFERENCES)
 @pytest.mark.parametrize(
     "options",
-    [{}, {"moves": (1, 2, 5)}, {"latency": 1}, {"estimator": Told([0.02, -0.05])}, {"solver": "osqp"}],
-    ids=["plain", "blocks", "latency", "estimator", "osqp"],
+    [
+        {},
+        {"moves": (1, 2, 5)},
+        {"moves": {"u0": (2, 6), "u1": (1, 3, 4)}},
+        {"latency": 1},
+        {"estimator": Told([0.02, -0.05])},
+        {"solver": "osqp"},
+    ],
+    ids=["plain", "blocks", "own blocks", "latency", "estimator", "osqp"],
 )
 def test_constant_rows_give_the_same_inputs_to_the_bit(options, reference):
     model = linear(A, B)
@@ -150,6 +157,22 @@ def test_a_limit_that_falls_faster_than_its_rate_wins_and_the_step_says_so():
         x = A @ x + B @ move.u
     changes = np.diff(np.vstack([[0.9, 0.9], *inputs]), axis=0)
     assert (np.abs(np.delete(changes, 3, axis=0)) <= 0.1 + 1e-7).all()  # every other change keeps its rate
+
+
+def test_inputs_with_blocks_of_their_own_keep_the_rows_of_all_steps_in_which_they_are_held():
+    model, limits = linear(A, B), moving_limits(4, rates=0.3)
+    mpc = km.KoopmanMPC(model, COST, limits, N, moves={"u0": (2, 6), "u1": (1, 3, 4)})
+    x, solved = np.array([0.6, -0.4]), 0
+    for k in range(T):
+        move, plan = mpc(x, [1.5, -1.0]), mpc.plan()
+        if plan is not None:
+            box = limits.input_rows(2, k, N)
+            assert (box.low - 1e-9 <= plan.U).all()
+            assert (box.high + 1e-9 >= plan.U).all()
+            assert np.ptp(plan.U[:2, 0]) == np.ptp(plan.U[1:4, 1]) == 0
+            solved += move.status in {km.Status.OPTIMAL, km.Status.SOFTENED}
+        x = A @ x + B @ move.u
+    assert solved > 5
 
 
 def test_a_failed_step_keeps_the_row_of_its_step():

@@ -1,6 +1,6 @@
 """KoopmanMPC: the Riccati solution first, a QP only where a limit is active; LinearMPC is one on a linearisation."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, ClassVar, cast
@@ -599,7 +599,7 @@ class KoopmanMPC(MPCBase):
         window = self._window
         inputs, room, hard_rates, bounds, conflict = plan.track.inputs, None, self._hard_rates, None, 0.0
         if window is not None:
-            (bounds, conflict), k = window.find_bounds(u_prev), self._row
+            (bounds, conflict), k = window.find_bounds(self._row, u_prev), self._row
             inputs, hard_rates = window.first_inputs(k)[0], None if hard_rates is None else window.hard_rates(k)
         if hard_rates is not None:
             room = Interval(inputs.low - u_prev, inputs.high - u_prev)
@@ -610,7 +610,7 @@ class KoopmanMPC(MPCBase):
         if status is not Status.OPTIMAL:
             self._qps.cool()
             return self._fail(v[: self.nu], applied, status, found.iterations, start, found.solver)
-        U, low, high = t[: plan.moves], plan.low[: plan.moves], plan.high[: plan.moves]
+        U, (low, high) = t[: plan.moves], plan.box if window is None else window.input_box(self._row)
         U += plan.deviation.dot(found.v)
         np.maximum(U, low, out=U)
         np.minimum(U, high, out=U)

@@ -60,10 +60,12 @@ class PlanMap(Viewing):
     ----------
     blocks
         Lengths of the blocks of steps in which an input is held.
+    held, tied
+        Which inputs keep their value from move to move; which of these moves have no limits of their own.
     moves, planned
         Entries of the inputs, which come first, and of v.
-    inside
-        Values of the last rows of t that meet their limits.
+    box, inside
+        Limits of the inputs of all moves, and values of the last rows of t that meet their limits.
     limits, low, high
         The limits of t where none move in time, lower ones first, and those of this step.
     limited_targets, row_size
@@ -135,7 +137,9 @@ class PlanMap(Viewing):
         self.limits = np.concatenate([np.maximum(low, -HUGE), np.minimum(high, HUGE)])  # inf meets no limit
         self.low, self.high = self.limits[: len(low)], self.limits[len(low) :]
         self.box = Interval(*(np.tile(end, len(horizon.blocks)) for end in track.inputs))
-        self.held = held
+        self.held, self.tied = held, np.zeros(self.moves, dtype=np.bool_)
+        if held is not None:
+            self.tied = held.ravel() & ~limits.kept[: self.moves]
         self.inside = np.clip(0.0, self.low[nv:], self.high[nv:])
         from_state = np.zeros((len(low), horizon.size))
         from_state[:nv] = maps.from_state

@@ -1,6 +1,6 @@
 """LimitWindows: limits in time as the right-hand sides of a PlanMap; matrices, sizes and slack weights stay."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -89,6 +89,8 @@ class LimitWindows:
         Where targets stand in the table, and the tightest limits of targets.
     hard
         Which rates are hard; None where none is.
+    moves
+        Where the limits of all moves stand, those that an input keeps included.
     plan_pages, moving_pages
         The limits of the plan, and of its map of a reference that moves.
     """
@@ -101,6 +103,7 @@ class LimitWindows:
     targets: _Columns
     swept: _Columns
     hard: Bool[np.ndarray, " nu"] | None
+    moves: Int[np.ndarray, " moves"]
     plan_pages: _Pages
     moving_pages: _Pages
 
@@ -128,6 +131,11 @@ class LimitWindows:
         rates = None if self.plan.track.rates is None else Interval(row[nu : 2 * nu], row[W + nu : W + 2 * nu])
         return box, rates
 
+    def input_box(self, k: int) -> Interval:
+        """Return the limits of all moves of step k, one after the other."""
+        rows = self.table.reshape(-1)[self._row(k) * self.table.shape[1] :]
+        return Interval(rows[self.moves], rows[self.moves + self.table.shape[1] // 2])
+
     def hard_rates(self, k: int) -> Interval:
         """Return the hard limits of the first change in step k, ±inf in place of the others."""
         _, rates = self.first_inputs(k)
@@ -135,13 +143,13 @@ class LimitWindows:
         assert self.hard is not None, "only asked where there are hard rates"
         return Interval(np.where(self.hard, rates.low, -np.inf), np.where(self.hard, rates.high, np.inf))
 
-    def find_bounds(self, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval, float]:
+    def find_bounds(self, k: int, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval, float]:
         """Return the limits of the QP as they stand in the plan, and by how much rates ahead are wider than theirs."""
         plan, conflict = self.plan, 0.0
         low, high = plan.low[: plan.planned], plan.high[: plan.planned]
         if self.hard is not None:
             low, high = low.copy(), high.copy()
-            conflict = self._open_rates(low, high, u_prev)
+            conflict = self._open_rates(low, high, self.input_box(k), u_prev)
         source, size = plan.qp.source, plan.row_size
         low, high = low[source], high[source]
         if self.endless:
@@ -149,7 +157,11 @@ class LimitWindows:
         return Interval(low / size, high / size), conflict
 
     def _open_rates(
-        self, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"], u_prev: Float[np.ndarray, " nu"]
+        self,
+        low: Float[np.ndarray, " nv"],
+        high: Float[np.ndarray, " nv"],
+        box: Interval,
+        u_prev: Float[np.ndarray, " nu"],
     ) -> float:
         """Widen hard rates of later moves as far as the limits of the inputs need, and return by how much at most.
 
@@ -158,16 +170,17 @@ class LimitWindows:
         """
         nu, moves, hard = len(self.plan.track.inputs.low), len(self.plan.blocks), self.hard
         shape, n = (moves, nu), moves * nu
-        below, above = low[:n].reshape(shape), high[:n].reshape(shape)
+        below, above = (end.reshape(shape) for end in box)
         falls, rises = low[n : 2 * n].reshape(shape), high[n : 2 * n].reshape(shape)
+        held = np.zeros(shape, np.bool_) if self.plan.held is None else self.plan.held
         fits = (below[1:] - below[:-1] <= rises[1:]) & (above[1:] - above[:-1] >= falls[1:])
         assert hard is not None, "only asked where there are hard rates"
-        if (fits | ~hard).all():
+        if (fits | held[1:] | ~hard).all():
             return 0.0
         least, most = (np.clip(u_prev + change[0], below[0], above[0]) for change in (falls, rises))
         conflict = np.zeros(nu)
         for j in range(1, moves):
-            least, most = least + falls[j], most + rises[j]
+            least, most = least + np.where(held[j], 0.0, falls[j]), most + np.where(held[j], 0.0, rises[j])
             short, long = hard & (most < below[j]), hard & (least > above[j])
             missing = np.where(short, below[j] - most, 0.0) + np.where(long, least - above[j], 0.0)
             rises[j] += np.where(short, missing, 0.0)
@@ -214,11 +227,12 @@ def limit_windows(
         Interval(every.low[:, kept], every.high[:, kept]),
         [n for n, k in zip(names, kept, strict=True) if k],
     )
-    blocks = {b: _sweep(box, b) for b in sorted({1, *plan.blocks})}
+    start, length = _find_holds(plan, nu)
+    blocks = {b: _sweep(box, b) for b in sorted({1, *length.ravel().tolist()})}
     for b, swept in blocks.items():
-        refuse_crossed_rows(*swept, "input", inputs, why=f" within a block of {b} held steps" if b > 1 else "")
+        used = np.ones(nu, np.bool_) if b == 1 else (length == b).any(axis=0)
+        _require_inputs(plan, swept, inputs, used, f" within a block of {b} held steps" if b > 1 else "")
     refuse_crossed_rows(*change, "rate", inputs)
-    _require_levels(plan, blocks, inputs)
     most = track.margin.max(axis=0, initial=0.0)
     why = " once tightened by the margin" if most.any() else ""
     refuse_crossed_rows(outputs.low + most, outputs.high - most, "state and output", shown, why=why)
@@ -241,9 +255,12 @@ def limit_windows(
     W = starts[-1]
 
     first = np.cumsum([0, *plan.blocks[:-1]])
-    places = [(k * 2 * W + block_at[b] + np.arange(nu)) for k, b in zip(first.tolist(), plan.blocks, strict=True)]
+    columns = np.vectorize(block_at.__getitem__, otypes=[np.intp])(length)
+    moves = (start * 2 * W + columns + np.arange(nu)).ravel()
+    places: list[Int[np.ndarray, " n"]] = [np.where(plan.tied, free_at, moves)]
     if track.rates is not None:
-        places += [k * 2 * W + du_at + np.arange(nu) for k in first.tolist()]
+        changes = (first[:, None] * 2 * W + du_at + np.arange(nu)).ravel()
+        places.append(changes if plan.held is None else np.where(plan.held.ravel(), free_at, changes).astype(np.intp))
     places += [(k + 1) * 2 * W + out_at + np.arange(outputs.low.shape[1]) for k in range(N)]
     mine = np.concatenate(places).astype(np.intp)
     low_places, high_places = [mine], [mine + W]
@@ -268,26 +285,39 @@ def limit_windows(
         targets=_Columns(raw_at, raw.low.shape[1]),
         swept=_Columns(tight_at, len(reach)),
         hard=None if track.hard_rates is None else np.isinf(track.rate_softness.linear),
+        moves=moves,
         plan_pages=pages[0],
         moving_pages=pages[1],
     )
 
 
-def _require_levels(plan: PlanMap, boxes: Mapping[int, Interval], inputs: Sequence[str]) -> None:
-    """Raise where an input on levels has none between its limits, at some step or within a block of held steps."""
+def _find_holds(plan: PlanMap, nu: int) -> tuple[Int[np.ndarray, "moves nu"], Int[np.ndarray, "moves nu"]]:
+    """Return the first step of what holds the value of each move and input, and for how many steps it is held."""
+    blocks = np.array(plan.blocks)
+    origin = np.repeat(np.arange(len(blocks))[:, None], nu, axis=1)
+    if plan.held is not None:
+        origin = np.maximum.accumulate(np.where(plan.held, 0, origin), axis=0)
+    length = np.array([[blocks[origin[:, i] == origin[j, i]].sum() for i in range(nu)] for j in range(len(blocks))])
+    return np.cumsum([0, *plan.blocks[:-1]])[origin], length
+
+
+def _require_inputs(
+    plan: PlanMap, box: Interval, inputs: Sequence[str], used: Bool[np.ndarray, " nu"], why: str
+) -> None:
+    """Raise where limits of inputs cross, or an input on levels has none between them, of the inputs in use."""
     levels = plan.track.limits.base.input_levels(len(inputs))
-    if levels is None:
-        return
-    for b, box in boxes.items():
-        inside = levels.inside(box)
+    low, high = np.where(used, box.low, -np.inf), np.where(used, box.high, np.inf)
+    if levels is not None:
+        inside = levels.inside(Interval(low, high))
         none = np.argwhere(inside.low > inside.high)
         if len(none):
             k, j = (int(v) for v in none[0])
             i = int(levels.which[j])
             raise DataError(
-                f"no level of {inputs[i]} is between its limits {box.low[k, i]:g} … {box.high[k, i]:g} at step {k}"
-                f"{f', within a block of {b} held steps' if b > 1 else ''}; pass wider limits, or other levels"
+                f"no level of {inputs[i]} is between its limits {low[k, i]:g} … {high[k, i]:g} at step {k}{why}; "
+                "pass wider limits, or other levels"
             )
+    refuse_crossed_rows(low, high, "input", inputs, why=why)
 
 
 def _sweep(rows: Interval, steps: int) -> Interval:
