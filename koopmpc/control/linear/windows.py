@@ -260,7 +260,9 @@ def limit_windows(
     places: list[Int[np.ndarray, " n"]] = [np.where(plan.tied, free_at, moves)]
     if track.rates is not None:
         changes = (first[:, None] * 2 * W + du_at + np.arange(nu)).ravel()
-        places.append(changes if plan.held is None else np.where(plan.held.ravel(), free_at, changes).astype(np.intp))
+        if plan.held is not None:
+            changes[plan.held.ravel()] = free_at
+        places.append(changes)
     places += [(k + 1) * 2 * W + out_at + np.arange(outputs.low.shape[1]) for k in range(N)]
     mine = np.concatenate(places).astype(np.intp)
     low_places, high_places = [mine], [mine + W]
