@@ -70,6 +70,14 @@ def count_prose(text: str) -> int:
     return len(re.findall(r"\S*\w\S*", APART.sub("", text)))
 
 
+def find_long(text: str) -> list[str]:
+    """Return the beginnings of paragraphs above 120 words and of sentences above 40."""
+    paragraphs = re.split(r"\n\s*\n|\n(?=- |\d+\. )", APART.sub("", text))
+    sentences = [each for part in paragraphs for each in re.split(r"(?<=[.;:?!])\s+", part)]
+    long = [each for each in paragraphs if count_prose(each) > 120] + [s for s in sentences if len(s.split()) > 40]
+    return [" ".join(each.split())[:80] for each in long]
+
+
 def count_pages() -> dict[str, int]:
     """Return the words of prose of each page of docs/."""
     paths = {str(path.relative_to(DOCS)): path for path in sorted(DOCS.rglob("*.md"))}
