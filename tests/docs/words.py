@@ -74,7 +74,9 @@ def find_long(text: str) -> list[str]:
     """Return the beginnings of paragraphs above 120 words and of sentences above 40."""
     paragraphs = re.split(r"\n\s*\n|\n(?=- |\d+\. )", APART.sub("", text))
     sentences = [each for part in paragraphs for each in re.split(r"(?<=[.;:?!])\s+", part)]
-    long = [each for each in paragraphs if count_prose(each) > 120] + [each for each in sentences if count_prose(each) > 40]
+    long = [each for each in paragraphs if count_prose(each) > 120] + [
+        each for each in sentences if count_prose(each) > 40
+    ]
     return [" ".join(each.split())[:80] for each in long]
 
 
