@@ -313,6 +313,23 @@ def swing_up(path: Path) -> None:
         export_video(log, path, width=640, fps=16, until=4.0, speed=0.8)
 
 
+def unequal_rates() -> Any:
+    """A log with a slow sensor, and the forecast of the model that was fitted to it."""
+    names: dict[str, Any] = {"__name__": "page"}
+    text = (DOCS / "how/unequal_rates.md").read_text()
+    exec(compile(re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0], "page", "exec"), names)
+    logs, model, data = names["logs"], names["model"], names["data"]
+    ahead = model.rollout(logs[0].X[0], logs[0].U)
+    made, axes = make_figure(1, 2, width="two columns", height=2.4)
+    time = logs.dt * np.arange(len(ahead))
+    for i, axis in enumerate(axes[0]):
+        axis.plot(time, data.X[0][:, i], "o", markersize=2.5, color="#0072b2", label="measured")
+        axis.plot(time, ahead[:, i], **line_style(1), label="forecast from row 0")
+        axis.set(xlabel="time [s]", ylabel=logs.states[i])
+    draw_legend(made, axes[0], 2)
+    return made
+
+
 def own_blocks() -> Any:
     """The run of the page on blocks of held inputs."""
     return _run_of("how/own_blocks.md")
@@ -382,6 +399,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         limits_in_time,
         on_off,
         own_blocks,
+        unequal_rates,
         manual_automatic,
         next_experiment,
         next_design,
