@@ -248,7 +248,7 @@ def _fit_from(
         cells, starts = _cut(data, bridged, length)
         theta, starts, value, taken = _minimise(error, theta, starts, cells, iterations)
         steps += taken
-    return _Found(value, steps, theta, _simulated(data, error, theta, starts, cells))
+    return _Found(value, steps, theta, _simulate_all(data, error, theta, starts, cells))
 
 
 def _minimise(
@@ -312,7 +312,7 @@ def _cut(data: PartialEpisodes, bridged: Episodes, horizon: int) -> tuple[_Cells
     return _Cells(cells, np.isfinite(cells), np.concatenate(U, axis=1)), np.concatenate(starts)
 
 
-def _simulated(
+def _simulate_all(
     data: PartialEpisodes,
     error: _MeasuredError,
     theta: Float[np.ndarray, "nx nphi"],
