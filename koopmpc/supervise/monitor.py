@@ -8,8 +8,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.checks import numbers
 from koopmpc.control.base import InitialCondition
+from koopmpc.control.nonlinear.problem import LearnedMap
 from koopmpc.control.watching import StepMonitor, register_monitor
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError
@@ -140,14 +140,15 @@ class Watch(Viewing):
         Steps until an input acts; the prediction that is compared is that of the plan's start.
     """
 
-    _VIEWS = ("_now", "_before", "_z", "_u", "_acted", "_error", "_reach", "_old_z")
+    _VIEWS = ("_halves", "_error", "_reach")
 
     def __init__(self, monitor: Monitor, model: LinearPredictor | StateModel, latency: int) -> None:
         self.monitor, self._latency = monitor, latency
         nx, n = len(monitor.band), len(monitor.leverage)
         self._n, self._nu = n, n - monitor.lifting.nz
-        self._rows, self._found, self._matrix = np.zeros(2 * n), np.zeros(nx + n), np.zeros((nx + n, 2 * n))
-        self._matrix[nx:, n:] = monitor.leverage
+        self._rows, self._found = np.zeros(2 * n), np.zeros(nx + n)  # two steps in turn: nothing is moved
+        self._matrices = np.zeros((2, nx + n, 2 * n))  # of the steps at which the first and the second half is new
+        self._matrices[0, nx:, :n] = self._matrices[1, nx:, n:] = monitor.leverage
         self._psi = None if isinstance(model, LinearPredictor) else buffer_lifting(monitor.lifting)
         self.update(model)
         self._see()
@@ -156,9 +157,9 @@ class Watch(Viewing):
     def _see(self) -> None:
         """Make the views; see `Viewing`."""
         n, nx = self._n, len(self.monitor.band)
-        self._before, self._now = self._rows[:n], self._rows[n:]
-        self._acted = self._before[n - self._nu :]
-        self._z, self._u = self._now[: n - self._nu], self._now[n - self._nu :]
+        nz = n - self._nu
+        halves = [(self._rows[low : low + nz], self._rows[low + nz : low + n]) for low in (0, n)]
+        self._halves = [(*halves[new], *halves[1 - new], self._matrices[new]) for new in (0, 1)]
         self._error, self._reach = self._found[:nx], self._found[nx:]
 
     def update(self, model: LinearPredictor | StateModel) -> None:
@@ -167,60 +168,89 @@ class Watch(Viewing):
         if isinstance(model, LinearPredictor):
             nx, n, nz = len(W), self._n, model.nz
             C = W @ model.C
-            self._matrix[:nx, :nz], self._matrix[:nx, nz:n] = C @ model.A, C @ model.B
-            self._matrix[:nx, n : n + nz] = -C
+            for new, low, last in ((0, 0, n), (1, n, 0)):  # where the step and the one before it are
+                self._matrices[new, :nx, last : last + n] = np.hstack([C @ model.A, C @ model.B])
+                self._matrices[new, :nx, low : low + nz] = -C
             self._pushed = C @ model.E, C
+        learned = model.model if isinstance(model, LearnedMap) else None
+        self._gain: Float[np.ndarray, "nx m"] | None = None
+        if isinstance(learned, BilinearPredictor):  # its C and its ψ give the prediction without a call of its map
+            C = W @ learned.C
+            self._gain = np.hstack([C @ learned.A, C @ learned.B, *(C @ N for N in learned.N)])
+            self._lifted = np.zeros(self._gain.shape[1])
         self._extra: Float[np.ndarray, " nx"] | None = None
 
     def reset(self) -> None:
         """Forget the step before: the first step of a run has no prediction to be compared with."""
-        self._first, self.inside, self.fits = True, True, True
+        self._new, self._first, self._fast, self.inside, self.fits = 0, True, False, True, True
         self._rows[:] = 0.0
         self._extra = None
         self._old: tuple[np.ndarray, ...] | None = None
 
     def look(self, start: InitialCondition, u: Float[np.ndarray, " nu"], applied: ArrayLike | None) -> bool:
         """Return whether the step that starts here, with input u, is known."""
-        self._before[:] = self._now
+        self._new = 1 - self._new
+        z, now, before, acted, matrix = self._halves[self._new]
         if applied is not None and not self._latency:
-            self._acted[:] = applied
-        psi = self._psi
+            acted[:] = applied
+        if self._fast:  # most steps: a linear model, nothing that drives it, and the state as foretold
+            z[:] = start.z
+            now[:] = u
+            matrix.dot(self._rows, self._found)
+            if self._found.dot(self._found) <= 1.0:  # both checks at once
+                self.inside = self.fits = True
+                return True
+        psi, found, extra = self._psi, self._found, self._extra
         if psi is None:
-            self._z[:] = start.z
+            z[:] = start.z
         else:
             psi.arguments[0][:] = start.z
             psi.evaluate()
-            self._z[:] = psi.results[0]
-        self._u[:] = u
-        self._matrix.dot(self._rows, self._found)
-        reach = self._reach
+            z[:] = psi.results[0]
+        now[:] = u
+        matrix.dot(self._rows, found)
+        reach, error = self._reach, self._error
         self.inside = bool(reach.dot(reach) <= 1.0)
-        if self._first:
-            self._first = False
-            self.fits = True
-        elif psi is None:
-            error = self._error
-            if self._extra is not None:
-                error += self._extra
-            self.fits = bool(error.dot(error) <= 1.0)
-        else:
-            self.fits = self._matches_prediction(start, applied)
+        if extra is not None and psi is None:
+            error += extra
+        self.fits = self._first or bool(error.dot(error) <= 1.0)
+        if psi is not None and not self._first:
+            self.fits = self._matches_prediction(start, before, acted)
+        self._first, self._fast = False, psi is None and not start.drive.size
         if psi is None and start.drive.size:
             E, C = self._pushed
             extra = E @ start.W[0] if start.W.size else np.zeros(len(C))
             self._extra = extra + C @ start.d if start.d.size else extra
         elif psi is not None:
-            w = start.W[0].copy() if start.W.size else np.zeros(0)
-            self._old = start.z.copy(), u.copy(), w, start.d.copy() if start.d.size else np.zeros(len(start.z))
+            self._keep_step(start, u)
         return self.inside and self.fits
 
-    def _matches_prediction(self, start: InitialCondition, applied: ArrayLike | None) -> bool:
-        """Return whether the state is the one that a nonlinear model predicted."""
-        model, W = self._model, self.monitor.band
-        if self._old is None or isinstance(model, LinearPredictor):
+    def _keep_step(self, start: InitialCondition, u: Float[np.ndarray, " nu"]) -> None:
+        """Keep what predicts the next state by a nonlinear model."""
+        model, drive = self._model, start.drive.size > 0
+        w = start.W[0] if start.W.size else np.zeros(0)
+        d = start.d if start.d.size else np.zeros(len(start.z))
+        if self._gain is None:
+            self._old = start.z.copy(), w.copy(), d.copy()
+        elif drive and isinstance(model, LearnedMap):
+            self._extra = self.monitor.band @ (model.E @ w + d)[: len(self.monitor.band)]
+
+    def _matches_prediction(
+        self, start: InitialCondition, before: Float[np.ndarray, " nz"], acted: Float[np.ndarray, " nu"]
+    ) -> bool:
+        """Return whether the state is the one that a nonlinear model predicted from the step before."""
+        model, W, gain = self._model, self.monitor.band, self._gain
+        if gain is not None:
+            nz, nu, lifted = len(before), len(acted), self._lifted
+            lifted[:nz], lifted[nz : nz + nu] = before, acted
+            np.multiply(acted[:, None], before, out=lifted[nz + nu :].reshape(nu, nz))
+            error = gain.dot(lifted)
+            error -= W.dot(start.z[: len(W)])
+            if self._extra is not None:
+                error += self._extra
+        elif self._old is None or isinstance(model, LinearPredictor):
             return True
-        z, u, w, d = self._old
-        if applied is not None and not self._latency:
-            u = numbers(applied, "applied")
-        error = W @ (model.advance(z, u, w, d) - start.z)[: len(W)]
+        else:
+            z, w, d = self._old
+            error = W @ (model.advance(z, acted, w, d) - start.z)[: len(W)]
         return bool(error.dot(error) <= 1.0)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import RenderableType
 
+from koopmpc import checks
 from koopmpc.control.kinds import build_controller
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
@@ -20,7 +21,7 @@ from koopmpc.predict.base import load_value, save_value
 from koopmpc.supervise.guarded import Guarded
 from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Recipe
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap
+from koopmpc.synthesis.fresh.neighbours import NeighbourMap, choose_starts_to_record
 from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_share, bound_value, cost_interval
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.terminal import build_leaderboard, label_lines, render_text
@@ -266,6 +267,21 @@ class Design:
             )
         main = build_controller(self.controller.as_data())
         return Guarded(main, build_controller(self.standby.as_data()), patience=patience)
+
+    def starts_to_record(self, count: int = 8) -> Float[np.ndarray, "n nx"]:
+        """Return states of the goal's range that have no data around them: episodes from there make it known.
+
+        Each is the farthest from the data and from those before it; none, (0, nx), where the range is known.
+        `km.plot.blindness` draws them.
+
+        Raises
+        ------
+        DataError
+            The design has no nearest rows; `count` is below 1.
+        """
+        if self.evidence.neighbours is None:
+            raise DataError("the design keeps no rows of its data; make it again with this version")
+        return choose_starts_to_record(self.evidence.asked, self.evidence.neighbours, checks.count(count, "count"))
 
     @property
     def best(self) -> DesignRow:

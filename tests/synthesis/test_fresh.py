@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 import koopmpc as km
 from koopmpc.synthesis.designed import ExpectedLoop, choose_row
 from koopmpc.synthesis.fresh.horizon import choose_horizon
-from koopmpc.synthesis.fresh.loops import draw_starts, goal_box
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap
+from koopmpc.synthesis.fresh.loops import draw_starts
+from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box, probe_range
 from koopmpc.synthesis.fresh.verdict import bound_share, bound_value, cost_interval
 from koopmpc.synthesis.judging import measure_errors
 from tests.closed_loop.controllers import Parts
@@ -130,6 +130,76 @@ def test_fresh_loops_change_no_choice():
     assert without.leaderboard == fresh().leaderboard
     assert without.controller.predictor == fresh().controller.predictor
     assert without.expected.fresh is None
+
+
+def diagonal(count=20):
+    """Return logs of two decayed states that are always nearly equal: each has its range, and the plane is unknown."""
+    rng, runs = np.random.default_rng(0), []
+    for _ in range(count):
+        X, U = [np.repeat(rng.uniform(-1, 1), 2)], rng.uniform(-1, 1, (30, 1))
+        for u in U:
+            X.append(0.9 * X[-1] + 0.1 * u + 0.002 * rng.standard_normal(2))
+        runs.append(km.Episode(X=np.array(X), U=U))
+    return km.Episodes(runs, 0.1)
+
+
+@cache
+def narrow():
+    return designed(diagonal(), limits=km.Limits(u_min=-1, u_max=1), loops=6)
+
+
+def test_starts_to_record_lie_outside_the_data_far_from_each_other_and_make_the_range_known():
+    design = narrow()
+    asked, rows = design.evidence.asked, design.evidence.neighbours
+    X = design.starts_to_record(12)
+    low, high = goal_box(asked)
+    assert X.shape == (12, 2)
+    assert ((low <= X) & (high >= X)).all()
+    assert rows.find_outside_states(X).all()
+    assert abs(X[0, 0] - X[0, 1]) == pytest.approx(np.abs(np.diff(design.starts_to_record(256))).max(), rel=0.2)
+    assert (design.starts_to_record(3) == X[:3]).all()
+    away = [
+        find_share_outside(NeighbourMap.of(data, None, np.zeros(2)), asked)
+        for data in (diagonal(), diagonal().with_episodes([*diagonal(), *decayed(design.starts_to_record(40))]))
+    ]
+    assert away[1] < 0.5 * away[0]
+
+
+def find_share_outside(rows, asked):
+    return float(probe_range(asked, rows)[1].mean())
+
+
+def decayed(starts):
+    rng = np.random.default_rng(1)
+    for x in starts:
+        X, U = [x], rng.uniform(-1, 1, (30, 1))
+        for u in U:
+            X.append(0.9 * X[-1] + 0.1 * u)
+        yield km.Episode(X=np.array(X), U=U)
+
+
+def test_the_picture_of_blindness_shows_data_and_range_and_where_to_record(tmp_path):
+    figure = km.plot.blindness(narrow())
+    panel = figure.axes[0]
+    assert "of the goal's range has no data around it" in panel.get_title()
+    drawn = {line.get_label(): len(line.get_xdata()) for line in panel.get_lines()}
+    assert drawn["record from here"] == 6
+    assert drawn["range without data"] == round(
+        256 * find_share_outside(narrow().evidence.neighbours, narrow().evidence.asked)
+    )
+    again = tmp_path / "controller.npz"
+    narrow().save(again)
+    km.plot.save(figure, tmp_path / "blind.png")
+    assert (tmp_path / "blind.png").stat().st_size > 5000
+    with pytest.raises(km.errors.DataError, match="both axes are"):
+        km.plot.blindness(narrow(), axes=(1, 1))
+
+
+def test_a_design_without_rows_of_its_data_has_no_picture():
+    old = replace(narrow(), evidence=replace(narrow().evidence, neighbours=None))
+    for ask in (km.plot.blindness, type(old).starts_to_record):
+        with pytest.raises(km.errors.DataError, match="keeps no rows of its data"):
+            ask(old)
 
 
 def test_fresh_starts_stay_in_the_range_of_the_goal_or_of_the_starts():

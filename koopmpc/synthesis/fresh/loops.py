@@ -5,7 +5,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Float, Int
 
 from koopmpc.data.angles import find_angles
@@ -18,7 +17,7 @@ from koopmpc.plants.plant import Transition
 from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Recipe
 from koopmpc.synthesis.designed import BREAKS
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap
+from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box, probe_range
 from koopmpc.synthesis.fresh.verdict import FreshLoops
 from koopmpc.synthesis.judging import LITTLE, Condition, LoopTest, run_on_surrogate
 from koopmpc.synthesis.surrogates import Surrogate
@@ -32,19 +31,11 @@ GAIN = 0.1  # in fresh loops inputs act by up to this share more or less
 CORNERS = 8  # corners of the goal's range from which loops run, at most
 COMPARED = 12  # fresh loops in which two horizons are compared
 MUCH = 0.9  # a horizon that costs this share of the given one is much better
-PROBES = 256  # points of the goal's range that are looked up in the data
+DRAWN = 400  # states outside the data that are kept for a picture, at most
 BLIND_RANGE = 0.3  # share of them outside the data above which a design says so
 BLIND = 0.05  # share of steps outside the data above which a design says where they are
 
 Row = tuple[float, float, float]  # cost, violation, share of the steps outside the data
-
-
-def goal_box(asked: DesignTask) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
-    """Return the range of the goal: what both the limits and the range of the data allow."""
-    low, high = asked.limits.states(len(asked.low))
-    low, high = np.maximum(low, asked.low), np.minimum(high, asked.high)
-    empty = low > high
-    return np.where(empty, asked.low, low), np.where(empty, asked.high, high)
 
 
 def draw_starts(asked: DesignTask, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n nx"]:
@@ -120,7 +111,9 @@ def run_fresh_loops(
     edges = [run(nominal[0], x0, 1.0, True, int(seeds[loops + i])) for i, x0 in enumerate(corners)]
     cost, violation, share = np.array(results).reshape(-1, 3).T
     corner_cost, corner_violation, corner_share = np.array(edges).reshape(-1, 3).T
-    fresh = FreshLoops(cost, violation, share, tuple(kinds), corner_cost, corner_violation, corner_share)
+    away = np.concatenate([np.zeros((0, test.episodes.nx)), *(states for states, _ in outside)])
+    away = away[:: -(-len(away) // DRAWN) or 1]
+    fresh = FreshLoops(cost, violation, share, tuple(kinds), corner_cost, corner_violation, corner_share, away)
     return fresh, _describe_outside(test.episodes, asked, neighbours, fresh, outside[: len(results)])
 
 
@@ -129,15 +122,13 @@ def find_blind_range(data: Episodes, asked: DesignTask, neighbours: NeighbourMap
     kept = [i for i in range(data.nx) if i not in neighbours.ignored]
     if neighbours.embedding is not None or len(kept) < 2:
         return []
-    low, high = goal_box(asked)
-    X = low + (high - low) * scipy.stats.qmc.Halton(data.nx, scramble=False).random(PROBES)
-    U = np.tile(neighbours.middle, (len(X), 1))
-    away = neighbours.find_outside(X, U)
+    X, away = probe_range(asked, neighbours)
     share = float(away.mean())
     if share <= BLIND_RANGE:
         return []
+    low, high = goal_box(asked)
     size = np.where(high > low, high - low, 1.0)
-    distance, _ = neighbours.tree.query(neighbours.scale_rows(X, U))
+    distance, _ = neighbours.tree.query(neighbours.scale_states(X))
     place = int(np.argmax(np.where(away, distance, 0.0)))
     rows = np.concatenate([episode.X for episode in data])
     apart = np.abs(rows - X[place])[:, kept] / size[kept]
@@ -147,7 +138,7 @@ def find_blind_range(data: Episodes, asked: DesignTask, neighbours: NeighbourMap
     return [
         f"{to_percent(share)} of the goal's range, which is what limits and ranges of the signals allow, has no data "
         f"around it, such as {shown} at the same time: from there the controller guesses, and its moves say "
-        "known = False; record episodes that start there, or run design.guarded()"
+        "known = False; record episodes that start there (design.starts_to_record()), or run design.guarded()"
     ]
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy.stats
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
@@ -12,6 +13,7 @@ from scipy.spatial import KDTree
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.scene import Scene
+from koopmpc.synthesis.asked import DesignTask
 from koopmpc.values import Value
 
 MOST = 6000  # rows that are kept
@@ -20,6 +22,7 @@ LEAST = 12  # neighbours at least
 RIDGE = 1e-4  # of the local slope, as a share of its largest squared direction
 KNOWN = 0.99  # share of the data's own rows that is inside the data
 ROOM = 1.5  # a row is outside if its neighbours are this many times as far as those of KNOWN
+PROBES = 256  # points of the goal's range that are looked up in the data
 GRID = 1e-9  # spread below which a column counts as constant
 
 
@@ -38,6 +41,8 @@ class NeighbourMap(Value):
         (M, n) v of each row.
     steps
         (M, nzeta) ζ⁺ − ζ.
+    points
+        (M, nx) state of each row, without its past.
     episode
         (M,) number of the episode of each row, which a bootstrap draws as a whole.
     scale
@@ -58,6 +63,7 @@ class NeighbourMap(Value):
 
     rows: Float[np.ndarray, "M n"]
     steps: Float[np.ndarray, "M nzeta"]
+    points: Float[np.ndarray, "M nx"]
     episode: Int[np.ndarray, " M"]
     scale: Float[np.ndarray, " n"]
     ignored: tuple[int, ...]
@@ -93,6 +99,7 @@ class NeighbourMap(Value):
         return cls(
             rows=np.ascontiguousarray((V / scale)[::apart]),
             steps=np.ascontiguousarray(steps[::apart]),
+            points=np.concatenate([e.X[:-1, : data.nx] for e in points])[::apart],
             episode=number[::apart],
             scale=scale,
             ignored=tuple(ignored),
@@ -133,10 +140,21 @@ class NeighbourMap(Value):
 
     def find_outside(self, Z: Float[np.ndarray, "T nzeta"], U: Float[np.ndarray, "T nu"]) -> Bool[np.ndarray, " T"]:
         """Return which rows [ζ; u] have no data around them."""
-        V = self.scale_rows(Z, U)
+        return self._is_far(self.scale_rows(Z, U))
+
+    def _is_far(self, V: Float[np.ndarray, "n v"]) -> Bool[np.ndarray, " n"]:
         V = np.where(np.isfinite(V), V, 1e6)
         distance, _ = self.tree.query(V, self.near)
         return np.reshape(distance, (len(V), -1))[:, -1] > self.reach
+
+    def scale_states(self, X: Float[np.ndarray, "n nx"]) -> Float[np.ndarray, "n v"]:
+        """Return v over its spread at rest in these states, with inputs as they are on average."""
+        Z = X if self.embedding is None else np.array([self.start(x) for x in X]).reshape(len(X), self.steps.shape[1])
+        return self.scale_rows(Z, np.tile(self.middle, (len(X), 1)))
+
+    def find_outside_states(self, X: Float[np.ndarray, "n nx"]) -> Bool[np.ndarray, " n"]:
+        """Return which of these states have no data around them, with inputs as they are on average."""
+        return self._is_far(self.scale_states(X))
 
     def draw(self, rng: np.random.Generator, gain: float = 1.0) -> "NeighbourPlant":
         """Return a plant of one bootstrap sample of the episodes, whose inputs act `gain` times as in the data."""
@@ -208,3 +226,33 @@ class NeighbourPlant:
             slope = np.asarray(np.linalg.solve(S, (D * share[:, None]).T @ (missed - mean)), dtype=np.float64)
             value = np.asarray(value + mean + (v - center) @ slope, dtype=np.float64)
         return zeta + value
+
+
+def goal_box(asked: DesignTask) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
+    """Return the range of the goal: what both the limits and the range of the data allow."""
+    low, high = asked.limits.states(len(asked.low))
+    low, high = np.maximum(low, asked.low), np.minimum(high, asked.high)
+    empty = low > high
+    return np.where(empty, asked.low, low), np.where(empty, asked.high, high)
+
+
+def probe_range(
+    asked: DesignTask, neighbours: NeighbourMap
+) -> tuple[Float[np.ndarray, "probes nx"], Bool[np.ndarray, " probes"]]:
+    """Return evenly spread points of the goal's range, and which of them have no data around them."""
+    low, high = goal_box(asked)
+    X = low + (high - low) * scipy.stats.qmc.Halton(len(low), scramble=False).random(PROBES)
+    return X, neighbours.find_outside_states(X)
+
+
+def choose_starts_to_record(asked: DesignTask, neighbours: NeighbourMap, count: int) -> Float[np.ndarray, "n nx"]:
+    """Return at most `count` points outside the data, each the farthest from the data and from those before it."""
+    X, away = probe_range(asked, neighbours)
+    X = X[away]
+    V = neighbours.scale_states(X)
+    distance = np.asarray(neighbours.tree.query(V)[0]) if len(X) else np.zeros(0)
+    chosen: list[int] = []
+    while len(chosen) < min(count, len(X)):
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(V - V[chosen[-1]], axis=1))
+    return X[chosen]

@@ -28,6 +28,8 @@ class FreshLoops(Value):
         (loops,) what stood in for the plant: "neighbours" or "models".
     corner_cost, corner_violation, corner_outside
         (corners,) the same of loops from the corners of the goal's range, which say nothing of a probability.
+    outside_states
+        (n, nx) states of the loops that have no data around them, at most 400.
     """
 
     cost: Float[np.ndarray, " loops"]
@@ -37,6 +39,7 @@ class FreshLoops(Value):
     corner_cost: Float[np.ndarray, " corners"]
     corner_violation: Float[np.ndarray, " corners"]
     corner_outside: Float[np.ndarray, " corners"]
+    outside_states: Float[np.ndarray, "n nx"]
 
     @property
     def counts(self) -> dict[str, int]:

@@ -1,0 +1,98 @@
+# pyright: basic
+"""The figure of a design's blindness: where starts, references or the way there have no data around them."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from koopmpc import checks
+from koopmpc.errors import DataError
+from koopmpc.figures.style import LIMIT, draw_legend, line_style, make_figure, styled
+from koopmpc.lifting.base import find_state
+from koopmpc.lifting.state import State
+from koopmpc.synthesis.asked import DesignTask
+from koopmpc.synthesis.designed import Design
+from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box, probe_range
+from koopmpc.text import to_percent
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_BLIND = "#d55e00"
+_MOST_POINTS = 3000  # rows of the data that are drawn
+
+
+@styled
+def blindness(design: Design, axes: tuple[int | str, int | str] | None = None, record: int = 6) -> "Figure":
+    """Draw where a design has no data: points of the goal's range, starts, the reference, and states of its loops.
+
+    A point of the plane stands for a state with all its values, so known and unknown ones may lie over each other.
+
+    Parameters
+    ----------
+    design
+        Of `km.design`.
+    axes
+        The two states, by index or by name; by default the two in which the points without data lie farthest from it.
+    record
+        Number of states to draw from which to record episodes (`Design.starts_to_record`).
+
+    Raises
+    ------
+    DataError
+        The design has one state, or keeps no rows of its data; the two axes are the same.
+    """
+    checks.kind(design, "design", Design, "make one with km.design")
+    evidence, neighbours = design.evidence, design.evidence.neighbours
+    if neighbours is None:
+        raise DataError("the design keeps no rows of its data; make it again with this version")
+    names, asked = neighbours.states, evidence.asked
+    if len(names) < 2:
+        raise DataError(
+            "a plane needs two states, and this design has one alone; design.advice says in words where data lack"
+        )
+    X, away = probe_range(asked, neighbours)
+    i, j = (
+        _choose_axes(asked, neighbours, X[away])
+        if axes is None
+        else (find_state(axis, names, "the figure") for axis in axes)
+    )
+    if i == j:
+        raise DataError(f"both axes are {names[i]!r}; choose two states")
+    drawing, grid = make_figure(1, width="one column", height=3.6)
+    panel = grid[0, 0]
+    rows = neighbours.points
+    points = rows[:: max(1, len(rows) // _MOST_POINTS)]
+    panel.plot(*points[:, [i, j]].T, ".", color="#9a9a9a", markersize=1.2, label="data")
+    panel.plot(*X[away][:, [i, j]].T, "x", color=_BLIND, markersize=2.6, alpha=0.6, label="range without data")
+    low, high = (end[[i, j]] for end in goal_box(asked))
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
+    panel.plot(*(low + corners * (high - low)).T, **LIMIT, label="range of the goal")
+    fresh = evidence.expected.fresh
+    if fresh is not None and len(fresh.outside_states):
+        panel.plot(*fresh.outside_states[:, [i, j]].T, ".", color=_BLIND, markersize=2, label="loops outside the data")
+    starts = asked.starts
+    unknown = neighbours.find_outside_states(starts)
+    panel.plot(*starts[~unknown][:, [i, j]].T, "o", color=line_style(0)["color"], label="starts")
+    panel.plot(*starts[unknown][:, [i, j]].T, "o", color=_BLIND, mec="black", label="starts outside the data")
+    of = asked.cost.of.bind(names)
+    tracked = list(of.state_indices) if isinstance(of, State) else []
+    if i in tracked and j in tracked:
+        panel.plot(*asked.reference[:, [tracked.index(i), tracked.index(j)]].T, "*k", markersize=6, label="reference")
+    advised = design.starts_to_record(record)
+    panel.plot(*advised[:, [i, j]].T, "D", mfc="none", mec="black", markersize=5, label="record from here")
+    panel.set(xlabel=names[i], ylabel=names[j])
+    panel.set_title(f"{to_percent(float(away.mean()))} of the goal's range has no data around it")
+    draw_legend(drawing, [panel], 2)
+    return drawing
+
+
+def _choose_axes(asked: DesignTask, neighbours: NeighbourMap, blind: np.ndarray) -> tuple[int, int]:
+    """Return the two states in which the points without data lie farthest from the nearest row, by the data's range."""
+    if not len(blind):
+        return 0, 1
+    size = np.where(asked.high > asked.low, asked.high - asked.low, 1.0)
+    _, nearest = neighbours.tree.query(neighbours.scale_states(blind))
+    apart = (np.abs(neighbours.points[nearest] - blind) / size).mean(axis=0)
+    first, second = sorted(np.argsort(-apart, kind="stable")[:2].tolist())
+    return first, second
