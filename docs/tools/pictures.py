@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import chdir
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,7 +15,7 @@ import koopmpc as km
 from koopmpc.bench.controllers import Prepared
 from koopmpc.bench.single import run_closed_loop
 from koopmpc.bench.store import RunRow
-from koopmpc.figures.style import LIMIT, REFERENCE, TRUTH, draw_legend, line_style, make_figure, styled
+from koopmpc.figures.style import LIMIT, REFERENCE, TRUTH, draw_band, draw_legend, line_style, make_figure, styled
 from koopmpc.recording.video import export_video
 
 DOCS = Path(__file__).parents[1]
@@ -312,9 +313,60 @@ def swing_up(path: Path) -> None:
         export_video(log, path, width=640, fps=16, until=4.0, speed=0.8)
 
 
+def unequal_rates() -> Any:
+    """A log with a slow sensor, and the forecast of the model that was fitted to it."""
+    names: dict[str, Any] = {"__name__": "page"}
+    text = (DOCS / "how/unequal_rates.md").read_text()
+    exec(compile(re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0], "page", "exec"), names)
+    logs, model, data = names["logs"], names["model"], names["data"]
+    ahead = model.rollout(logs[0].X[0], logs[0].U)
+    made, axes = make_figure(1, 2, width="two columns", height=2.4)
+    time = logs.dt * np.arange(len(ahead))
+    for i, axis in enumerate(axes[0]):
+        axis.plot(time, data.X[0][:, i], "o", markersize=2.5, color="#0072b2", label="measured")
+        axis.plot(time, ahead[:, i], **line_style(1), label="forecast from row 0")
+        axis.set(xlabel="time [s]", ylabel=logs.states[i])
+    draw_legend(made, axes[0], 2)
+    return made
+
+
 def own_blocks() -> Any:
     """The run of the page on blocks of held inputs."""
     return _run_of("how/own_blocks.md")
+
+
+def next_experiment() -> Any:
+    """The first plan and the last one of the page on the next experiment, with their logs."""
+    plans = _run_page("how/next_experiment.md")["plans"]
+    drawing, axes = make_figure(3, 2, width="two columns", height=4.0, sharex=True)
+    for column, (plan, log) in zip(axes.T, (plans[0], plans[-1]), strict=True):
+        t = np.arange(plan.steps + 1) * plan.dt
+        for panel, i in zip(column, range(2), strict=False):
+            draw_band(panel, t, plan.low[0, :, i], plan.high[0, :, i], 0, "90 % band")
+            panel.plot(t, plan.X[0, :, i], **line_style(0, len(t)), label="expected")
+            panel.plot(t, log[0].X[:, i], **TRUTH, label="measured")
+            for end in (plan.x_low[i], plan.x_high[i]):
+                panel.axhline(end, **LIMIT, label="limit")
+        column[2].stairs(plan.U[0, :, 0], t, baseline=None, **TRUTH)
+        column[2].set(xlabel="time [s]", xlim=(0, t[-1]))
+    for panel, name in zip(axes[:, 0], ("x [m]", "v [m/s]", "F [N]"), strict=True):
+        panel.set_ylabel(name)
+    draw_legend(drawing, axes[0, :1], 4)
+    return drawing
+
+
+def next_design() -> Any:
+    """The closed loop at the end of the page on the next experiment."""
+    return km.plot.run(_run_page("how/next_experiment.md")["run"], width="two columns")
+
+
+def _run_page(page: str) -> dict[str, Any]:
+    """Run all blocks of a page in a folder of its own, and return the names that they leave."""
+    names: dict[str, Any] = {"__name__": "page"}
+    with TemporaryDirectory() as folder, chdir(folder):
+        for source in re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL):
+            exec(compile(source, page, "exec"), names)
+    return names
 
 
 def _run_of(page: str) -> Any:
@@ -347,7 +399,10 @@ PICTURES: dict[str, Callable[[], Any]] = {
         limits_in_time,
         on_off,
         own_blocks,
+        unequal_rates,
         manual_automatic,
+        next_experiment,
+        next_design,
         cart_pole,
     )
 }

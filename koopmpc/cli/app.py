@@ -112,6 +112,11 @@ def fit(
     goal_template: Annotated[
         bool, typer.Option("--goal-template", help="Write goal.toml for these logs, to be changed, and stop.")
     ] = False,
+    plan: Annotated[
+        Path | None, typer.Option("--next", help="With --goal: plan the next experiment, and write it as this .csv.")
+    ] = None,
+    plan_steps: Annotated[int | None, typer.Option("--next-steps", help="Steps of an episode of --next.")] = None,
+    plan_episodes: Annotated[int, typer.Option("--next-episodes", help="Episodes of --next.")] = 1,
 ) -> None:
     """Choose a model for logged data, fit it, and say whether to trust it; with a goal, design a controller."""
     from koopmpc.fitting.fit import fit_data
@@ -155,10 +160,22 @@ def fit(
             if horizon is not None:
                 raise DataError(f"--horizon {horizon} is of no use with --goal; write horizon = {horizon} into {goal}")
         with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
-            designed = design_data(source, goal, folder, progress=progress, **how)
+            designed = design_data(
+                source,
+                goal,
+                folder,
+                progress=progress,
+                plan=plan,
+                plan_steps=plan_steps,
+                plan_episodes=plan_episodes,
+                **how,
+            )
         say(f"controller: {designed.controller}, report: {designed.page}")
         say(f"check it: {format_command('check', designed.controller)}\nuse it:\n{designed.usage}")
         return
+    if plan is not None:
+        with friendly():
+            raise DataError("--next needs --goal: what the controller is to do decides what is worth learning")
     with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
         done = fit_data(source, folder, horizon=horizon, progress=progress, **how)
     for failure in done.failures:

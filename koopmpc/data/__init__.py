@@ -7,6 +7,7 @@ from koopmpc.lazy import attach
 if TYPE_CHECKING:
     from koopmpc.data.episodes import Snapshots as Snapshots
     from koopmpc.data.files.folder import Files as Files
+    from koopmpc.data.partial import PartialEpisodes as PartialEpisodes
     from koopmpc.data.smoother import Mender as Mender
     from koopmpc.data.smoother import Smoother as Smoother
     from koopmpc.data.source import Source as Source

@@ -420,6 +420,11 @@ def explain_wrong_data(given: object, others: str) -> DataError:
     if isinstance(given, str | PathLike) or kind == "DataFrame":
         name = "frame" if kind == "DataFrame" else repr(str(cast("object", given)))
         return DataError(f"episodes is a {kind}; pass km.load_episodes({name}), which reads it")
+    if kind == "PartialEpisodes":
+        return DataError(
+            "episodes is a PartialEpisodes, in which cells were not measured; pass its complete_pairs(), or fit with"
+            " km.identify.unequal_rates"
+        )
     return DataError(f"episodes is a {kind}; pass Episodes([Episode(X=…, U=…), …], dt), {others}")
 
 

@@ -17,13 +17,16 @@ from jaxtyping import Float
 from koopmpc import checks, disk
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
-from koopmpc.data.episodes import Episodes
+from koopmpc.data.episodes import Episodes, join_sets
+from koopmpc.data.files.folder import Files
 from koopmpc.data.files.load import load_episodes
+from koopmpc.data.source import Source
 from koopmpc.errors import DataError, LogError
 from koopmpc.figures.blindness import blindness
 from koopmpc.figures.style import save
 from koopmpc.fitting.fit import Say, describe_data, ignore_text
-from koopmpc.fitting.repair import IN_MEMORY, Data, collect_notes, read_logs
+from koopmpc.fitting.further import FurtherData, plan_further
+from koopmpc.fitting.repair import IN_MEMORY, Data, collect_notes, find_logs, read_logs
 from koopmpc.lifting.state import State
 from koopmpc.page import Page
 from koopmpc.parallel import StageProgress
@@ -75,6 +78,8 @@ class DesignedData:
         Paths of the controller file, and of the report in Markdown.
     usage
         Lines of Python that load the controller.
+    further
+        The next experiment, where one was asked for.
     """
 
     design: Design
@@ -82,6 +87,7 @@ class DesignedData:
     controller: Path
     page: Path
     usage: str
+    further: FurtherData | None = None
 
 
 def design_data(
@@ -96,9 +102,14 @@ def design_data(
     say: Say | None = None,
     progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
+    plan: str | PathLike[str] | None = None,
+    plan_steps: int | None = None,
+    plan_episodes: int = 1,
     **reading: Any,
 ) -> DesignedData:
     """Read data and a goal, design a controller, and write controller.npz and controller.md.
+
+    With `plan` the next experiment is planned, too; where the data suffice for no design it is all that is written.
 
     The data are read and repaired as by `fit_data`; the other arguments are the same as there.
 
@@ -110,6 +121,9 @@ def design_data(
         A file as `write_template` writes it.
     bilinear, workers, scheduler, memory, say, progress, rng
         As for `fit_data`.
+    plan, plan_steps, plan_episodes
+        The .csv of the next experiment, its picture beside it, and steps and number of its episodes, see
+        `next_experiment`.
     reading
         Keywords of `load_episodes` for plain tables, which replace those in the section [logs] of the goal. Without
         ``inputs`` the inputs of the goal are inputs.
@@ -119,13 +133,23 @@ def design_data(
     LogError
         A file cannot be read, or the folder not written.
     DataError
-        The data are not of one plant, or too few; the goal names what the data do not have.
+        The data are not of one plant, or too few; the goal names what the data do not have; `plan` is no .csv.
     """
+    if plan is not None and Path(plan).suffix.lower() != ".csv":
+        raise DataError(f"the plan {plan} does not end with .csv; a plan is a table of text")
     place, draw = Path(folder), checks.generator(rng)
     tell = ignore_text if say is None else say
     pushed = list_goal_inputs(goal)
     reading = load_reading(goal) | {name: value for name, value in reading.items() if value is not None}
-    split = read_logs(data, None, draw, memory, reading, _SHORT, ask=not pushed)
+    further = partial(plan_goal, file=plan, steps=plan_steps, episodes=plan_episodes, tell=tell)
+    try:
+        split = read_logs(data, None, draw, memory, reading, _SHORT, ask=not pushed)
+    except DataError as refusal:
+        if plan is None:
+            raise
+        few = join_sets([part.load() for part in Files(find_logs(data), **reading).parts()])
+        further(few, read_goal(goal, few), refusal=refusal)
+        raise
     missed = tuple(name for name in pushed if name in split.seen.states)
     if missed and "inputs" not in reading:  # the goal knows inputs that no name in the logs shows
         reading["inputs"] = (*split.seen.inputs, *missed)
@@ -133,21 +157,26 @@ def design_data(
     about = describe_data(split)
     tell(about)
     asked = read_goal(goal, split.seen)
-    with collect_notes([]):  # its advice says the same
-        designed = design(
-            split.fitted,
-            asked.cost,
-            asked.limits,
-            horizon=asked.horizon,
-            reference=asked.reference,
-            angles=asked.angles,
-            bilinear=bilinear,
-            workers=workers,
-            scheduler=scheduler,
-            progress=progress,
-            rng=draw,
-        )
+    try:
+        with collect_notes([]):  # its advice says the same
+            designed = design(
+                split.fitted,
+                asked.cost,
+                asked.limits,
+                horizon=asked.horizon,
+                reference=asked.reference,
+                angles=asked.angles,
+                bilinear=bilinear,
+                workers=workers,
+                scheduler=scheduler,
+                progress=progress,
+                rng=draw,
+            )
+    except DataError as refusal:
+        further(split.fitted, asked, refusal=refusal)
+        raise
     tell(str(designed))
+    planned = further(split.fitted, asked, designed)
     file = place / "controller.npz"
     designed.save(file)
     usage = f'import koopmpc as km\ncontroller = km.load_controller("{file.as_posix()}")'
@@ -164,13 +193,57 @@ def design_data(
         )
     page.text("## What to expect")
     page.code(str(designed.expected))
+    if planned is not None:
+        page.text("## The next experiment")
+        page.code(str(planned))
     page.text("## Choice")
     page.code(str(designed))
     page.text("## Goal")
     page.code(Path(goal).read_text(), "toml")
     page.text("## Data")
     page.code(about)
-    return DesignedData(designed, asked, file, page.write("controller.md"), usage)
+    return DesignedData(designed, asked, file, page.write("controller.md"), usage, planned)
+
+
+def plan_goal(
+    data: Episodes | Source,
+    asked: Goal,
+    known: Design | None = None,
+    *,
+    file: str | PathLike[str] | None,
+    steps: int | None,
+    episodes: int,
+    tell: Say,
+    refusal: DataError | None = None,
+) -> FurtherData | None:
+    """Plan and say the next experiment for a goal, where a file is given; raise if it follows a refused design.
+
+    Raises
+    ------
+    DataError
+        The design was refused, and the plan is written: both in one message.
+    """
+    if file is None:
+        return None
+    with collect_notes([]):
+        further = plan_further(
+            data,
+            asked.cost,
+            asked.limits,
+            asked.reference,
+            file,
+            horizon=asked.horizon,
+            design=known,
+            steps=steps,
+            episodes=episodes,
+        )
+    tell(str(further))
+    if refusal is not None and further.file is not None:
+        raise DataError(
+            f"{refusal}\nthe next experiment is planned in {further.file}: record it, and fit again with its logs "
+            "beside the old ones"
+        ) from refusal
+    return further
 
 
 def write_template(data: Data, *, horizon: int | None = None, memory: int = IN_MEMORY, **reading: Any) -> str:

@@ -22,5 +22,6 @@ if TYPE_CHECKING:
     from koopmpc.identify.records.state_space import polynomial_state_space as polynomial_state_space
     from koopmpc.identify.records.subspace import subspace as subspace
     from koopmpc.identify.regressor import KoopmanRegressor as KoopmanRegressor
+    from koopmpc.identify.unequal import unequal_rates as unequal_rates
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

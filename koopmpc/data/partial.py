@@ -1,0 +1,131 @@
+"""PartialEpisodes: runs in which some states were not measured in every row, as sensors of unequal rates do."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.values import Value, freeze
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class PartialEpisodes(Value):
+    """Runs x_0 … x_T under u_0 … u_{T−1}, in which NaN in X means: not measured in this row.
+
+    They are no Episodes, so that nothing takes a missing number for one. Fits of one step take `complete_pairs()`;
+    `km.identify.unequal_rates` fits to the measured cells alone. Nothing is interpolated.
+
+    Parameters
+    ----------
+    X
+        Of each run (T+1, nx), NaN where a state was not measured.
+    U
+        Of each run (T, nu), complete.
+    dt
+        Sampling time of the rows [s].
+    states, inputs
+        Names, x1 … and u1 … by default.
+
+    Raises
+    ------
+    ShapeError
+        X has not one row more than U; the runs have other numbers of states or inputs.
+    DataError
+        There is no run; a state was never measured; U has NaN, or X inf.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> X = [[0.0, 1.0], [0.1, float("nan")], [0.2, float("nan")], [0.3, 1.3]]  # the second sensor is slow
+    >>> data = km.data.PartialEpisodes(X=[X], U=[[[1.0], [0.5], [0.2]]], dt=0.1)
+    >>> data.count_measured().tolist()
+    [4, 2]
+    """
+
+    X: tuple[Float[np.ndarray, "T1 nx"], ...]
+    U: tuple[Float[np.ndarray, "T nu"], ...]
+    dt: float
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+
+    def __init__(
+        self,
+        *,
+        X: Sequence[ArrayLike],
+        U: Sequence[ArrayLike],
+        dt: float,
+        states: Sequence[str] | None = None,
+        inputs: Sequence[str] | None = None,
+    ) -> None:
+        runs = [checks.array(each, f"X of run {i}", (None, None), finite=False) for i, each in enumerate(X)]
+        moves = [checks.array(each, f"U of run {i}", (None, None)) for i, each in enumerate(U)]
+        if not runs or len(runs) != len(moves):
+            raise DataError(f"X has {len(runs)} runs and U {len(moves)}; pass one array of each for every run")
+        for i, (x, u) in enumerate(zip(runs, moves, strict=True)):
+            if len(x) != len(u) + 1 or x.shape[1] != runs[0].shape[1] or u.shape[1] != moves[0].shape[1]:
+                raise ShapeError(
+                    f"run {i} has X {x.shape} and U {u.shape}; X has one row more than U, and all runs the same columns"
+                )
+            infinite = np.argwhere(np.isinf(x))
+            if len(infinite):
+                raise DataError(f"X of run {i} is inf in row {infinite[0, 0]}; pass NaN where nothing was measured")
+        nx, nu = runs[0].shape[1], moves[0].shape[1]
+        names = checks.names(states, "states", "x", nx), checks.names(inputs, "inputs", "u", nu)
+        counts = sum((np.isfinite(x).sum(axis=0) for x in runs), np.zeros(nx, dtype=np.intp))
+        if (counts == 0).any():
+            raise DataError(f"{names[0][int(counts.argmin())]} was never measured; leave it out of the states")
+        freeze(
+            self,
+            X=tuple(runs),
+            U=tuple(moves),
+            dt=checks.positive(dt, "dt", "s"),
+            states=names[0],
+            inputs=names[1],
+        )
+
+    def count_measured(self) -> np.ndarray:
+        """Return in how many rows each state was measured."""
+        return np.sum([np.isfinite(x).sum(axis=0) for x in self.X], axis=0)
+
+    def find_gap(self) -> int:
+        """Return the most rows from one measurement of a state to its next one."""
+        most = 1
+        for x in self.X:
+            for column in np.isfinite(x).T:
+                rows = np.concatenate([[-1], np.flatnonzero(column), [len(column)]])
+                most = max(most, int(np.diff(rows).max()))
+        return most
+
+    def complete_pairs(self, least: int = 1) -> Episodes:
+        """Return the stretches of rows in which everything was measured, as Episodes: their pairs fit one step.
+
+        Parameters
+        ----------
+        least
+            Refuse where there are fewer pairs of complete rows, one after the other.
+
+        Raises
+        ------
+        DataError
+            Too few pairs are complete; the message has their number.
+        """
+        least = checks.count(least, "least")
+        found: list[Episode] = []
+        for x, u in zip(self.X, self.U, strict=True):
+            whole = np.atleast_1d(np.isfinite(x).all(axis=1))
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], whole, [False]]).astype(int)))
+            for first, last in zip(edges[::2], edges[1::2], strict=True):
+                if last - first > 1:
+                    found.append(Episode(X=x[first:last], U=u[first : last - 1]))
+        pairs, every = sum(map(len, found)), sum(map(len, self.U))
+        if pairs < least:
+            raise DataError(
+                f"{pairs} of {every} pairs of rows are complete, and {least} are needed; fit to the measured cells"
+                " with km.identify.unequal_rates"
+            )
+        return Episodes(found, self.dt, states=self.states, inputs=self.inputs)

@@ -1,0 +1,56 @@
+"""koopmpc fit --goal --next: a refused design with a plan, new logs beside the old, and the stop rule."""
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import koopmpc as km
+from koopmpc.cli.app import app
+from koopmpc.fitting.goal import design_data
+from tests.fitting.test_goal import GOAL, NAMES, A, B, logs
+
+
+def few():
+    rng, x = np.random.default_rng(3), np.array([0.0, 0.0])
+    X, U = [x], 0.3 * np.repeat(rng.uniform(-1, 1, (6, 1)), 4, axis=0)
+    for u in U:
+        x = A @ x + B @ u
+        X.append(x)
+    return km.Episodes([km.Episode(X=np.array(X) + 1e-3 * rng.standard_normal((25, 2)), U=U)], 0.1, *NAMES)
+
+
+def test_a_refused_design_comes_with_a_plan_that_stays_inside_the_limits(tmp_path):
+    few().save(tmp_path / "few.npz")
+    (tmp_path / "goal.toml").write_text(GOAL)
+    with pytest.raises(km.KoopmpcError, match="the next experiment is planned in"):
+        design_data(tmp_path / "few.npz", tmp_path / "goal.toml", tmp_path, plan=tmp_path / "plan.csv")
+    assert (tmp_path / "plan.png").stat().st_size > 1000
+    lines = [line for line in (tmp_path / "plan.csv").read_text().splitlines() if not line.startswith("#")]
+    head, table = lines[0].split(","), np.array([line.split(",") for line in lines[1:]], dtype=float)
+    assert table[:, head.index("high speed [m/s]")].max() <= 0.8
+    assert np.abs(table[:, head.index("force [N/kg]")]).max() <= 2.0
+
+
+@pytest.mark.slow
+def test_with_enough_logs_the_design_is_made_and_no_plan_is_written(tmp_path):
+    logs().save(tmp_path / "logs.npz")
+    (tmp_path / "goal.toml").write_text(GOAL)
+    made = design_data(
+        tmp_path / "logs.npz", tmp_path / "goal.toml", tmp_path, plan=tmp_path / "plan.csv", bilinear=False
+    )
+    assert made.further is not None
+    assert "another experiment is not worth its length" in str(made.further)
+    assert not (tmp_path / "plan.csv").exists()
+    assert "not worth its length" in made.page.read_text()
+
+
+def test_a_plan_needs_a_goal_and_a_table(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    logs().save("logs.npz")
+    (tmp_path / "goal.toml").write_text(GOAL)
+    alone = CliRunner().invoke(app, ["fit", "logs.npz", "--next", "plan.csv"])
+    assert alone.exit_code == 2
+    assert "--next needs --goal" in alone.output + alone.stderr
+    sheet = CliRunner().invoke(app, ["fit", "logs.npz", "--goal", "goal.toml", "--next", "plan.xlsx"])
+    assert sheet.exit_code == 2
+    assert "does not end with .csv" in sheet.output + sheet.stderr

@@ -1,0 +1,127 @@
+"""Fits to sensors of unequal rates: exact plants, order of the error in noise, invariances, and errors."""
+
+import os
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+
+
+def draw(seed, noise=0.0, keep=10, runs=3, T=300):
+    """A random stable linear plant, and its runs with one state measured in every tenth row."""
+    rng = np.random.default_rng(seed)
+    n, nu = int(rng.integers(2, 5)), int(rng.integers(1, 3))
+    A, B = rng.standard_normal((n, n)), rng.standard_normal((n, nu))
+    A *= rng.uniform(0.5, 0.98) / np.abs(np.linalg.eigvals(A)).max()
+    X, U = [], []
+    for _ in range(runs):
+        u, x = rng.standard_normal((T, nu)), [rng.standard_normal(n)]
+        for v in u:
+            x.append(A @ x[-1] + B @ v)
+        rows = np.array(x) + noise * rng.standard_normal((T + 1, n))
+        rows[np.arange(T + 1) % keep > 0, n - 1] = np.nan
+        X.append(rows)
+        U.append(u)
+    return A, B, km.data.PartialEpisodes(X=X, U=U, dt=0.1)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 11])
+def test_an_exact_linear_plant_is_recovered_from_every_tenth_row(seed):
+    A, B, data = draw(seed)
+    model = km.identify.unequal_rates(data, km.State())
+    np.testing.assert_allclose(model.A, A, atol=1e-6)
+    np.testing.assert_allclose(model.B, B, atol=1e-6)
+    assert model.report.samples == data.count_measured().sum()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(12, 40))
+def test_more_exact_linear_plants_are_recovered(seed):
+    A, B, data = draw(seed)
+    model = km.identify.unequal_rates(data, km.State())
+    np.testing.assert_allclose(np.hstack([model.A, model.B]), np.hstack([A, B]), atol=1e-6)
+
+
+def test_the_error_falls_with_the_noise():
+    errors = []
+    for noise in (1e-2, 1e-4):
+        A, _, data = draw(1, noise)
+        errors.append(np.abs(km.identify.unequal_rates(data, km.State()).A - A).max())
+    assert errors[0] < 0.05
+    assert errors[1] < 0.03 * errors[0]
+
+
+def test_units_change_nothing():
+    A, _, data = draw(11)
+    size = np.array([1e3, 1e-2])
+    scaled = km.data.PartialEpisodes(X=[x * size for x in data.X], U=data.U, dt=0.1)
+    model = km.identify.unequal_rates(scaled, km.State())
+    np.testing.assert_allclose(model.A / size[:, None] * size, A, atol=1e-6)
+
+
+def test_a_nonlinear_plant_is_recovered_too():
+    rng, X, U = np.random.default_rng(0), [], []
+    for _ in range(4):
+        u, x = rng.uniform(-1, 1, (120, 1)), [rng.uniform(-1, 1, 2)]
+        for v in u:
+            a, b = x[-1]
+            x.append(np.array([0.9 * a + 0.1 * b, 0.8 * b - 0.2 * a**2 + 0.3 * v[0]]))
+        rows = np.array(x)
+        rows[np.arange(121) % 4 > 0, 0] = np.nan
+        X.append(rows)
+        U.append(u)
+    data = km.data.PartialEpisodes(X=X, U=U, dt=0.1, states=["a", "b"])
+    model = km.identify.unequal_rates(data, km.State() + km.Monomials(2))
+    places = [model.lifting.names.index(name) for name in ("a", "b")]
+    found = dict(zip(model.lifting.names, model.A[places[1]], strict=True))
+    assert found["b"] == pytest.approx(0.8, abs=1e-6)
+    assert found["a^2"] == pytest.approx(-0.2, abs=1e-6)
+    assert model.B[places[1], 0] == pytest.approx(0.3, abs=1e-6)
+
+
+def test_complete_pairs_are_those_of_complete_rows_and_fit_one_step():
+    A, _, data = draw(1)
+    with pytest.raises(km.errors.DataError, match="0 of 900 pairs of rows are complete, and 1 are needed"):
+        data.complete_pairs()
+    X = [x.copy() for x in draw(1, keep=1)[2].X]
+    X[0][7, 0] = X[1][0, 1] = np.nan
+    some = km.data.PartialEpisodes(X=X, U=data.U, dt=0.1)
+    pairs = some.complete_pairs()
+    assert sum(map(len, pairs)) == 900 - 3
+    np.testing.assert_allclose(km.edmd(pairs, km.State()).A, A, atol=1e-9)
+    with pytest.raises(km.errors.DataError, match="897 of 900 pairs of rows are complete, and 898 are needed"):
+        some.complete_pairs(898)
+
+
+X, U = [[0.0, 1.0], [np.nan, 1.0], [2.0, 1.0]], [[1.0], [1.0]]
+REFUSED = {
+    "X has 1 runs and U 2": {"X": [X], "U": [U, U]},
+    "one row more than U": {"X": [X], "U": [U[:1]]},
+    "is inf in row 1": {"X": [[[0.0], [np.inf], [1.0]]], "U": [U]},
+    "x1 was never measured": {"X": [[[0.0, np.nan]] * 3], "U": [U]},
+    "U of run 0": {"X": [X], "U": [[[np.nan], [1.0]]]},
+}
+
+
+@pytest.mark.parametrize("said", REFUSED)
+def test_runs_that_cannot_be_are_refused(said):
+    with pytest.raises((km.errors.DataError, km.errors.ShapeError), match=said):
+        km.data.PartialEpisodes(**REFUSED[said], dt=0.1)
+
+
+def test_fits_say_what_they_cannot_take():
+    data = km.data.PartialEpisodes(X=[X], U=[U], dt=0.1)
+    with pytest.raises(km.errors.DataError, match="cells were measured, and the fit has"):
+        km.identify.unequal_rates(data, km.State())
+    with pytest.raises(km.errors.DataError, match="the longest has 2, pass a shorter horizon"):
+        km.identify.unequal_rates(data, km.State(), horizon=5)
+    with pytest.raises(km.errors.DataError, match="lacks a state"):
+        km.identify.unequal_rates(data, km.State(["x0"]))
+
+
+@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+def test_one_step_fits_name_what_takes_partial_rows():
+    data = km.data.PartialEpisodes(X=[X], U=[U], dt=0.1)
+    with pytest.raises(km.errors.DataError, match="complete_pairs"):
+        km.edmd(data, km.State())
