@@ -1,13 +1,16 @@
 """Hidden states with neurons: exact derivatives, exact conversion, and friction that a polynomial cannot hold."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import ShapeError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.records.conversion import SignalUnits, from_standard, to_standard
-from koopmpc.identify.records.hidden import SimulationError, smooth_basis, start_with_differences
+from koopmpc.identify.records.hidden import SimulationError, simulate_hidden, smooth_basis, start_with_differences
+from koopmpc.identify.records.neurons.contained import ContainedError, contain
 from koopmpc.lifting import Neurons
 from tests.identify.test_hidden_state import random_model, random_segments
 
@@ -55,6 +58,56 @@ def test_neurons_are_functions_of_the_chosen_states():
     assert np.allclose(np.asarray(ca.Function("f", [symbol], [lifting.symbolic(symbol)])(x.ravel())).T, lifting(x))
     with pytest.raises(ShapeError, match="3 states"):
         Neurons([[1.0, 0.0]]).bind(["a", "b", "c"])
+
+
+def growing_model(rng, radius=1.05):
+    model = random_model(rng, 3, 1).add_neurons(rng.standard_normal((2, 4)))
+    E = model.E.copy()
+    E[:, 1:4] = np.diag([radius, 0.7, 0.2]) + 0.05 * rng.standard_normal((3, 3))
+    E[:, -2:] = rng.standard_normal((3, 2))
+    return replace(model, E=E)
+
+
+def test_the_weight_on_growth_has_the_derivative_of_finite_differences():
+    rng = np.random.default_rng(1)
+    model = growing_model(rng)
+    data, theta = random_segments(model, rng), model.parameters
+    plain, error = SimulationError(model), ContainedError(SimulationError(model))
+    gradient = error.derivatives(theta, [data])[0] - plain.derivatives(theta, [data])[0]
+    assert np.abs(gradient).max() > 100
+    for j in range(model.E.size):
+        up, down = theta.copy(), theta.copy()
+        up[j] += 1e-6
+        down[j] -= 1e-6
+        slope = (error.evaluate(up, [data]) - error.evaluate(down, [data])) / 4e-6
+        own = (plain.evaluate(up, [data]) - plain.evaluate(down, [data])) / 4e-6
+        assert gradient[j] == pytest.approx(slope - own, rel=1e-4, abs=1e-3)
+
+
+def test_a_contained_model_never_leaves_all_numbers():
+    rng = np.random.default_rng(2)
+    wild = growing_model(rng)
+    inputs, points = rng.uniform(-1, 1, (300, 1, 1)), rng.standard_normal((1, 5))
+    stopped = np.abs(simulate_hidden(wild, points, inputs)).max()  # where a state has 1000 spreads
+    model = contain(wild)
+    assert np.abs(np.linalg.eigvals(model.E[:, 1:4])).max() <= 1
+    assert np.abs(simulate_hidden(model, points, inputs)).max() < 0.5 * stopped
+    assert contain(model) is model
+    z = 1e6 * rng.standard_normal((3, 1))
+    far = z.copy()
+    for _ in range(2000):
+        far = model.E[:, 1:4] @ far  # what is left of the dynamics far away
+    assert np.abs(far).max() < 100 * np.abs(z).max()
+
+
+def test_a_growing_free_run_is_refused_in_a_sentence(monkeypatch):
+    rng = np.random.default_rng(0)
+    data = km.Episodes(
+        [km.Episode(X=rng.standard_normal((400, 1)), U=rng.standard_normal((399, 1)))], 1.0, ["y"], ["u"]
+    )  # fmt: skip
+    monkeypatch.setattr("koopmpc.identify.records.neural.is_calm_anywhere", lambda *_: False)
+    with pytest.raises(DataError, match="with neurons and without; pass another order"):
+        km.identify.neural_state_space(data, order=1, neurons=1)
 
 
 @pytest.mark.slow

@@ -169,29 +169,32 @@ class SimulationError:
         W = model.E[:, nphi - q :]
         C = model.H[:, :-1]
         ones = np.ones((m, 1))
-        D = np.zeros((m, p, n))
-        E_part = D[:, :first].reshape(m, n, nphi, n)  # a view: the rows of E in D
+        zeta = np.hstack([data.points, ones])
+        D = np.zeros((m, first + model.neurons.size, n))  # by E and V
         own = np.arange(n)
-        outputs = np.arange(len(model.H))
-        D[:, last:begin].reshape(m, n, -1, n)[:, own, :, own] = np.hstack([data.points, ones])
         z = start_states(model, data.points)
+        begun = np.tile(np.eye(n), (m, 1, 1))  # by the state in which a segment begins
         gradient, matrix = np.zeros(p), np.zeros((p, p))
         rows, gaps = list[np.ndarray](), list[np.ndarray]()
         for k, u in enumerate(data.inputs):
             phi, slope = self._features(model, z, u)
-            D = np.matmul(D, slope.transpose(0, 2, 1))
-            E_part = D[:, :first].reshape(m, n, nphi, n)
-            E_part[:, own, :, own] += phi
+            turned = slope.transpose(0, 2, 1)
+            D, begun = np.matmul(D, turned), np.matmul(begun, turned)
+            D[:, :first].reshape(m, n, nphi, n)[:, own, :, own] += phi  # a view: the rows of E in D
             if q:
                 bent = (1 - phi[:, nphi - q :] ** 2)[:, :, None] * np.hstack([z, ones])[:, None]  # (m, q, n + 1)
-                D[:, begin:].reshape(m, q, n + 1, n)[...] += bent[..., None] * W.T[:, None]
+                D[:, first:].reshape(m, q, n + 1, n)[...] += bent[..., None] * W.T[:, None]
             z = phi @ model.E.T
             gap = _gap(z @ C.T + model.H[:, -1], data, k)
-            J = D @ C.T  # (m, p, ny)
-            J[:, first:last].reshape(m, ny, n + 1, ny)[:, outputs, :, outputs] += np.hstack([z, ones])
-            J = J.transpose(0, 2, 1)
+            J = np.zeros((m, ny, p))
+            moved = (D @ C.T).transpose(0, 2, 1)
+            J[:, :, :first], J[:, :, begin:] = moved[:, :, :first], moved[:, :, first:]
+            for i in range(ny):
+                J[:, i, first + i * (n + 1) : first + (i + 1) * (n + 1)] = np.hstack([z, ones])
+            early = (begun @ C.T).transpose(0, 2, 1)[..., None] * zeta[:, None, None]  # (m, ny, n, nζ + 1)
+            J[:, :, last:begin] = early.reshape(m, ny, -1)
             if data.low is not None:
-                J = J * ~_is_silent(z @ C.T + model.H[:, -1], data, k)[:, :, None]
+                J *= ~_is_silent(z @ C.T + model.H[:, -1], data, k)[:, :, None]
             rows.append(J.reshape(m * ny, p))
             gaps.append(gap.ravel())
             if len(rows) == _STEPS or k + 1 == len(data.inputs):
@@ -263,15 +266,24 @@ def read_features(
     model: HiddenModel, z: Float[np.ndarray, "m n"], u: Float[np.ndarray, "m nu"]
 ) -> Float[np.ndarray, "m nphi"]:
     """Return φ(z, u)."""
-    one = np.ones((len(z), 1))
-    phi = np.hstack([one, evaluate_terms(model.terms, np.hstack([one, z, u]))])
+    n, products = model.order, len(model.terms)
+    phi = np.empty((len(z), model.E.shape[1]))
+    signals = np.empty((len(z), 1 + n + u.shape[1]))
+    phi[:, 0] = signals[:, 0] = 1.0
+    signals[:, 1 : 1 + n], signals[:, 1 + n :] = z, u
+    phi[:, 1 : 1 + products] = signals[:, 1:] if is_plain(model) else evaluate_terms(model.terms, signals)
     if (np.abs(z) > model.bound).any():
-        curved = is_nonlinear(model.terms, model.order)
-        near = np.hstack([one, np.clip(z, -model.bound, model.bound), u])
-        phi[:, 1:][:, curved] = evaluate_terms(model.terms[curved], near)
+        curved = np.flatnonzero(is_nonlinear(model.terms, n))
+        signals[:, 1 : 1 + n] = np.clip(z, -model.bound, model.bound)
+        phi[:, 1 + curved] = evaluate_terms(model.terms[curved], signals)
     if model.V is not None:
-        phi = np.hstack([phi, np.tanh(z @ model.V[:, :-1].T + model.V[:, -1])])
+        phi[:, 1 + products :] = np.tanh(z @ model.V[:, :-1].T + model.V[:, -1])
     return phi
+
+
+def is_plain(model: HiddenModel) -> bool:
+    """Return whether the products are z and u themselves, in this order."""
+    return model.terms.shape[1] == 1 and len(model.terms) == int(model.terms[-1, 0])
 
 
 def is_nonlinear(terms: Terms, order: int) -> Bool[np.ndarray, " nt"]:

@@ -33,6 +33,8 @@ OVERLAP = 3  # a long segment begins behind this share of the one before
 SHORT_OVERLAP = 7  # a short one behind this share
 RESTS = 10  # rows at the least or the largest reading, at least, that make it a rail
 ROBUST = 1.0  # share of the error of one step that counts as noise in the rows where the state begins
+FAR = 10.0  # ranges of the data that a free run from other states may leave, at most
+_STARTS = 8  # rows of each record at which it begins
 _LOST = 1e3  # an error counts as this many spreads at most
 
 
@@ -57,6 +59,8 @@ class HiddenStructure(Value):
         Number of coefficients.
     neurons
         Number of neurons in the dynamics.
+    start
+        Which of the starts for neurons it was.
     """
 
     order: int
@@ -68,6 +72,7 @@ class HiddenStructure(Value):
     calm: bool
     parameters: int
     neurons: int = 0
+    start: int = 0
 
     @cached_property
     def error(self) -> float:
@@ -136,6 +141,27 @@ def is_calm_hidden(model: HiddenModel, data: Episodes, units: SignalUnits, delay
         if not (
             np.abs(out) < HELD * np.abs((e.X - units.mean[: units.ny]) / units.scale[: units.ny]).max(axis=0)
         ).all():
+            return False
+    return True
+
+
+def is_calm_anywhere(model: HiddenModel, data: Episodes, units: SignalUnits, delays: int) -> bool:
+    """Return whether a model also stays within ten ranges if inputs follow states that they did not follow in the data.
+
+    Each record runs once over with all its inputs, from eight of its rows.
+    """
+    if not is_calm_hidden(model, data, units, delays):
+        return False
+    for e in data:
+        if len(e) <= delays + _STARTS:
+            continue
+        points = join_segments(cut_segments(data.with_episodes([e]), units, delays, 1, (len(e) - delays) // _STARTS))
+        inputs = (e.U - units.mean[units.ny :]) / units.scale[units.ny :]
+        out = simulate_hidden(model, points.points, np.repeat(inputs[:, None], len(points.points), axis=1))
+        low, high = (
+            ((one(e.X, axis=0)) - units.mean[: units.ny]) / units.scale[: units.ny] for one in (np.min, np.max)
+        )
+        if not ((out > low - FAR * (high - low)) & (out < high + FAR * (high - low))).all():
             return False
     return True
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc.data.episodes import Episodes
@@ -18,9 +18,7 @@ from koopmpc.identify.records.hidden import (
     RecordSegments,
     Sets,
     SimulationError,
-    read_features,
     smooth_basis,
-    start_states,
     start_with_differences,
 )
 from koopmpc.identify.records.hidden_structure import (
@@ -29,13 +27,15 @@ from koopmpc.identify.records.hidden_structure import (
     choose_hidden,
     cut_sets,
     find_noise,
-    is_calm_hidden,
+    is_calm_anywhere,
     measure_hidden,
     normalise,
     report_fit,
     thin_records,
 )
 from koopmpc.identify.records.narx import Ask, check_list, source_episodes
+from koopmpc.identify.records.neurons.candidates import draw_neurons, take_neurons
+from koopmpc.identify.records.neurons.contained import ContainedError, contain
 from koopmpc.identify.records.structure import HORIZON
 from koopmpc.identify.records.subspace import build_realisation, compute_block_moments
 from koopmpc.identify.records.unseen import UNSEEN
@@ -52,10 +52,7 @@ WINDOWS = 8, 40  # past rows from which the state begins, at least and at most
 SEGMENTS = 50, 200  # steps of the shorter segments, at least and at most
 LONGER = 5  # the longer segments have this many times the steps of the shorter ones
 PACE = 10  # the past rows reach over 1/10 of the rows in which the outputs move by their spread
-_DRAWN = 40  # candidates for neurons, of random directions
-_SHARP = (1.0, 4.0, 16.0)  # slopes of candidates along the output and its differences, for each spread
-_PLACES = (0.1, 0.5, 0.9)  # quantiles at which their bends lie
-_SOFT = 1e-6  # weight of the diagonal where the best candidates are sought
+STARTS = 2  # sets of candidates for the neurons that the best order is tried with
 _ITERATIONS = 40  # Levenberg-Marquardt steps for each number of neurons
 _PATIENCE = 8  # steps in a row that do not lower the error on unseen rows
 _CONVERGED = 1e-3  # a step that lowers the squared error by a smaller share is the last
@@ -81,7 +78,9 @@ def neural_state_space(
     the other, which lower the simulation error most to first order. Levenberg-Marquardt then fits E, W, V, C, c and T
     together. The length of the segments follows the pace of the outputs.
 
-    A free run on other inputs than those of the data can diverge: run the model on fresh rows.
+    Far from the data the dynamics are linear, z⁺ = A z and a bounded rest, and no eigenvalue of A is above one: free
+    runs do not grow exponentially. A model that leaves the data by ten ranges, from eight rows of each record over all
+    its inputs, is taken only where all do.
 
     Parameters
     ----------
@@ -97,7 +96,8 @@ def neural_state_space(
     Raises
     ------
     DataError
-        The records are too short for the segments and the past rows; no output moves; a stream is read twice.
+        The records are too short for the segments and the past rows; no output moves; a stream is read twice; the free
+        runs of all models leave the data.
 
     References
     ----------
@@ -139,7 +139,8 @@ def search_neural(
 ) -> list[HiddenStructure]:
     """Return structures with their errors on the last quarter of each record.
 
-    Orders are tried upwards, until one gains less than a tenth. Degrees above the first are tried with the best order.
+    Orders are tried upwards, until one gains less than a tenth. Degrees above the first, and other starts for the
+    neurons, are tried with the best order.
 
     Raises
     ------
@@ -151,51 +152,66 @@ def search_neural(
     found: list[HiddenStructure] = []
     reasons: list[KoopmpcError] = []
 
-    def try_chain(order: int, degree: int) -> None:
+    def try_chain(order: int, degree: int, start: int = 0) -> None:
         if ask is not None:
             ask(f"neurons with a hidden state of order {order}", len(found), len(orders) * len(neurons))
+        plan = HiddenStructure(order, degree, delays, horizon, rails, np.ones(1), False, 0, start=start)
         try:
-            for model, units in fit_chain(data, order, degree, delays, horizon, neurons, rails):
+            for model, units in fit_chain(data, plan, neurons):
                 errors = measure_hidden(model, data, units, delays)
-                calm = is_calm_hidden(model, data, units, delays)
-                size = model.E.size + model.neurons.size
-                found.append(
-                    HiddenStructure(
-                        order, degree, delays, horizon, rails, errors, calm, size, neurons=len(model.neurons)
-                    )
-                )
+                calm = is_calm_anywhere(model, data, units, delays)
+                size, count = model.E.size + model.neurons.size, len(model.neurons)
+                found.append(replace(plan, errors=errors, calm=calm, parameters=size, neurons=count))
         except KoopmpcError as error:
             reasons.append(error)
+
+    def best_error() -> float:
+        return min((one.error for one in found if one.calm), default=np.inf)
 
     least = np.inf
     for n in sorted(orders):
         try_chain(n, min(degrees))
-        best = min((one.error for one in found), default=np.inf)
-        if n > 1 and not best < GAINED * least:
+        if n > 1 and not best_error() < GAINED * least:
             break
-        least = best
+        least = best_error()
     if found:
-        order = min(found, key=lambda one: one.error).order
+        best = choose_hidden(found)
         for degree in sorted(degrees)[1:]:
-            try_chain(order, degree)
+            try_chain(best.order, degree)
+        for start in range(1, STARTS):
+            try_chain(best.order, min(degrees), start)
     if not found:
         raise reasons[0] if reasons else DataError("no structure was asked for; pass orders and neurons")
     return found
 
 
 def fit_neural(structure: HiddenStructure, episodes: Episodes) -> LinearPredictor | BilinearPredictor:
-    """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows."""
+    """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows.
+
+    Where that is not calm, the last one before it that is: before the polish, with fewer neurons, or without any.
+
+    Raises
+    ------
+    DataError
+        The free runs of all of them leave the data.
+    """
     s, data = structure, thin_records(episodes, ROWS, PIECE)
     counts = [q for q in NEURONS if q < s.neurons] + [s.neurons]
-    found, units = list(fit_chain(data, s.order, s.degree, s.delays, s.horizon, counts, s.rails))[-1]
+    chain = list(fit_chain(data, s, counts, plain=True))
+    found, units = chain[-1]
     basis = smooth_basis(units.ny, data.nu, s.delays)
-    whole = _project(_cut(data, units, s.delays, s.horizon, [(0, len(e)) for e in data]), basis)
+    whole = _project(_cut(data, units, s, s.horizon, [(0, len(e)) for e in data]), basis)
     small = replace(found, T=np.hstack([found.T[:, :-1] @ basis.T, found.T[:, -1:]]))
-    theta, _ = minimise(SimulationError(small), small.parameters, whole, whole, _POLISH, converged=_CONVERGED)
-    polished = _widen(small.with_parameters(theta), basis)
-    if is_calm_hidden(polished, data, units, s.delays) or not is_calm_hidden(found, data, units, s.delays):
-        found = polished
-    return from_standard(found, units, episodes, s.delays, report_fit(structure, found, units, data))
+    error = ContainedError(SimulationError(small))
+    theta, _ = minimise(error, small.parameters, whole, whole, _POLISH, converged=_CONVERGED)
+    polished = contain(_widen(small.with_parameters(theta), basis))
+    for one in (polished, *(model for model, _ in reversed(chain))):
+        if is_calm_anywhere(one, data, units, s.delays):
+            return from_standard(one, units, episodes, s.delays, report_fit(structure, one, units, data))
+    raise DataError(
+        f"free runs of a hidden state of order {s.order} leave ten ranges of the data, with neurons and without; pass "
+        "another order, or use polynomial_state_space"
+    )
 
 
 def choose_window(data: Episodes) -> tuple[int, int]:
@@ -214,26 +230,26 @@ def choose_window(data: Episodes) -> tuple[int, int]:
 
 
 def fit_chain(
-    data: Episodes,
-    order: int,
-    degree: int,
-    delays: int,
-    horizon: int,
-    neurons: Sequence[int],
-    rails: Float[np.ndarray, "2 ny"] | None,
+    data: Episodes, structure: HiddenStructure, neurons: Sequence[int], *, plain: bool = False
 ) -> Iterator[tuple[HiddenModel, SignalUnits]]:
-    """Yield models with more and more neurons that learn from the first three quarters of each record."""
-    units = SignalUnits.of(data, rails)
-    basis = smooth_basis(units.ny, data.nu, delays)
+    """Yield models with more and more neurons that learn from the first three quarters of each record.
+
+    With `plain` the linear model that they begin with comes first.
+    """
+    s = structure
+    units = SignalUnits.of(data, s.rails)
+    basis = smooth_basis(units.ny, data.nu, s.delays)
     ends = [round((1 - UNSEEN) * len(e)) for e in data]
     spans = [(0, a) for a in ends], [(a, len(e)) for e, a in zip(data, ends, strict=True)]
-    steps = [max(horizon // LONGER, 1), horizon]
-    sets = [tuple(_project(_cut(data, units, delays, h, part), basis) for part in spans) for h in steps]
+    steps = [max(s.horizon // LONGER, 1), s.horizon]
+    sets = [tuple(_project(_cut(data, units, s, h, part), basis) for part in spans) for h in steps]
     learned = data.with_episodes([e.cut(0, a) for e, a in zip(data, ends, strict=True) if a > 0])
-    model, noise = _start(learned, units, order, delays, basis, sets[0])
-    if degree > 1:
-        model = _fit(model.raise_degree(degree), noise, sets[0])
-    rng = np.random.default_rng(0)
+    model, noise = _start(learned, units, s.order, s.delays, basis, sets[0])
+    if s.degree > 1:
+        model = _fit(model.raise_degree(s.degree), noise, sets[0])
+    if plain:
+        yield _widen(model, basis), units
+    rng = np.random.default_rng(s.start)
     for before, count in pairwise([0, *neurons]):
         drawn = draw_neurons(model, sets[0][0][0], rng)
         model = model.add_neurons(take_neurons(model, sets[0][0], drawn, count - before, noise))
@@ -243,19 +259,19 @@ def fit_chain(
 
 
 def _cut(
-    data: Episodes, units: SignalUnits, delays: int, horizon: int, spans: Sequence[tuple[int, int]]
+    data: Episodes, units: SignalUnits, structure: HiddenStructure, horizon: int, spans: Sequence[tuple[int, int]]
 ) -> list[RecordSegments]:
-    return cut_sets(data, units, delays, horizon, spans, max(HORIZON, horizon // LONGER), STEPS)
+    return cut_sets(data, units, structure.delays, horizon, spans, max(HORIZON, horizon // LONGER), STEPS)
 
 
 def _fit(model: HiddenModel, noise: float, part: tuple[Sets, ...]) -> HiddenModel:
-    """Return the model that Levenberg-Marquardt finds; it stops on the unseen segments."""
+    """Return the model that Levenberg-Marquardt finds, whose linear part does not grow; unseen segments stop it."""
     fitted, judged = part
     theta, _ = minimise(
-        SimulationError(model, noise), model.parameters, fitted, judged, _ITERATIONS,
+        ContainedError(SimulationError(model, noise)), model.parameters, fitted, judged, _ITERATIONS,
         patience=_PATIENCE, converged=_CONVERGED,
     )  # fmt: skip
-    return model.with_parameters(theta)
+    return contain(model.with_parameters(theta))
 
 
 def _start(
@@ -302,68 +318,3 @@ def _project(parts: Sets, basis: Float[np.ndarray, "k nzeta"]) -> list[RecordSeg
 def _widen(model: HiddenModel, basis: Float[np.ndarray, "k nzeta"]) -> HiddenModel:
     """Return the model whose T takes ζ itself."""
     return replace(model, T=np.hstack([model.T[:, :-1] @ basis, model.T[:, -1:]]))
-
-
-def draw_neurons(model: HiddenModel, data: RecordSegments, rng: np.random.Generator) -> Float[np.ndarray, "count n1"]:
-    """Return candidates that bend along the outputs, their differences and random directions, where z has been."""
-    z = _visit(model, data)
-    n, A = model.order, model.E[:, 1 : 1 + model.order]
-    found: list[np.ndarray] = []
-
-    def add(direction: Float[np.ndarray, " n"], slope: float, place: float) -> None:
-        size = float((z @ direction).std())
-        if np.isfinite(size) and size > 0:
-            found.append(np.append(direction, -place) * slope / size)
-
-    for output in model.H:
-        direction, place = output[:-1], -output[-1]
-        for _ in range(n):
-            along = z @ direction
-            for slope in _SHARP:
-                for at in (place, *np.quantile(along, _PLACES)):
-                    add(direction, slope, float(at))
-            direction, place = direction @ A - direction, 0.0
-    for _ in range(_DRAWN):
-        direction, slope = rng.standard_normal(n), 10 ** rng.uniform(0, 1.2)
-        add(direction, float(slope), float(z[rng.integers(len(z))] @ direction))
-    return np.array(found).reshape(-1, n + 1)
-
-
-def _visit(model: HiddenModel, data: RecordSegments) -> Float[np.ndarray, "rows n"]:
-    """Return the states of all steps of these segments, those that stay near the data."""
-    z = start_states(model, data.points)
-    found = [z]
-    for u in data.inputs:
-        z = read_features(model, z, u) @ model.E.T
-        found.append(z)
-    states = np.concatenate(found)
-    return states[(np.abs(states) < 10 * np.abs(found[0]).max()).all(axis=1)]
-
-
-def take_neurons(
-    model: HiddenModel, data: Sets, drawn: Float[np.ndarray, "count n1"], most: int, noise: float
-) -> Float[np.ndarray, "q n1"]:
-    """Return the neurons that lower the simulation error most, one after the other, to first order in their weights.
-
-    Forward orthogonal least squares on the sensitivities: a candidate gains gᵀ S⁻¹ g, g and S the gradient and the
-    Gauss-Newton matrix of its weights after all other coefficients, and the neurons taken before, have adjusted.
-    """
-    wide = model.add_neurons(drawn)
-    gradient, matrix = SimulationError(wide, noise).derivatives(wide.parameters, data)
-    (n, width), count = wide.E.shape, len(drawn)
-    places: Int[np.ndarray, "n w"] = np.arange(n * width, dtype=np.intp).reshape(n, width)
-    matrix: Float[np.ndarray, "p p"] = matrix + _SOFT * np.diag(matrix.diagonal() + 1e-12)
-    output = np.arange(n * width, n * width + model.H.size, dtype=np.intp)
-    known: Int[np.ndarray, " known"] = np.concatenate([places[:, : width - count].ravel(), output])
-    taken: list[int] = []
-    while len(taken) < min(most, count):
-        own: Int[np.ndarray, " known"] = np.concatenate([known, *(places[:, width - count + i] for i in taken)])
-        inverse = np.linalg.pinv(matrix[np.ix_(own, own)], hermitian=True)
-        gains = np.full(count, -1.0)
-        for i in set(range(count)) - set(taken):
-            new = places[:, width - count + i]
-            cross = matrix[np.ix_(own, new)]
-            left = gradient[new] - cross.T @ (inverse @ gradient[own])
-            gains[i] = left @ np.linalg.lstsq(matrix[np.ix_(new, new)] - cross.T @ inverse @ cross, left, rcond=1e-9)[0]
-        taken.append(int(np.argmax(gains)))
-    return drawn[taken]

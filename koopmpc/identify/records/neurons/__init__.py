@@ -1,0 +1,1 @@
+"""What fits of hidden states with neurons need beside the hidden state itself."""
