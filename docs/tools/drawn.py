@@ -2,8 +2,9 @@
 
 docs/pictures/drawn.json holds a digest of each picture and of its inputs: the code that draws it, the problem file or
 the blocks of the page that it shows. Comments, docstrings and line breaks do not count, nor does the library that this
-code calls. The tools that draw stamp what they wrote; after `koopmpc reproduce`, and once its pictures are copied to
-docs/papers/, `python docs/tools/drawn.py papers/kaiser` stamps those of a folder.
+code calls. The tools that draw stamp what they wrote; after `koopmpc reproduce`, once its pictures are copied to
+docs/papers/, `python docs/tools/drawn.py papers/kaiser` stamps those of a folder; after `python -m tests.real.pictures`
+name the picture, as pictures/real_robot_arm.png.
 """
 
 import ast
@@ -109,6 +110,6 @@ def _select(text: str, function: str) -> str:
 
 if __name__ == "__main__":
     if sys.argv[1:]:
-        stamp(each for each in list_pictures() if each.startswith(tuple(f"{name}/" for name in sys.argv[1:])))
+        stamp(each for each in list_pictures() if any(f"{each}/".startswith(f"{name}/") for name in sys.argv[1:]))
     for picture in find_stale():
         sys.stdout.write(f"{picture}: draw it again, from {', '.join(inputs_of(picture))}\n")
