@@ -23,12 +23,11 @@ from koopmpc.figures.reports import draw_attraction, draw_profiles, draw_step_ti
 from koopmpc.figures.style import render_svg
 from koopmpc.loop.metrics import Metrics
 from koopmpc.loop.run import Run
-from koopmpc.page import Page
+from koopmpc.page import Page, rename_ids, wrap_html
 from koopmpc.recording.description import STATUS_WORDS
 from koopmpc.recording.reader import load_run
 from koopmpc.terminal import build_plain_table
 from koopmpc.text import format_duration, format_markdown_table
-from koopmpc.values import checksum
 
 _SURE = (0.025, 0.975)  # the ends of an interval
 _STARTS = 10  # from which a map of starts is drawn
@@ -444,37 +443,18 @@ def _links(section: _Section) -> str:
     return ", ".join(f"[{log}]({log})" for log in section.logs)
 
 
-_STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;color:#111;background:#fff;max-width:1100px;margin:0 auto;padding:1rem}
-h1{font-size:1.5rem}h2{font-size:1.2rem;margin-top:2.5rem;border-top:1px solid #bbb;padding-top:1rem}
-.wide{overflow-x:auto}table{border-collapse:collapse;font-size:.85rem;font-variant-numeric:tabular-nums}
-th,td{padding:.25rem .6rem;text-align:right;white-space:nowrap;border-bottom:1px solid #ddd}
-th:first-child,td:first-child,th:nth-child(2),td:nth-child(2){text-align:left}
-th{border-bottom:2px solid #555}figure{margin:1.5rem 0;overflow-x:auto}
-figure svg{width:100%;min-width:560px;height:auto}figcaption{font-size:.85rem;color:#333}
-details{font-size:.85rem}a{color:#003a7d;overflow-wrap:anywhere}
-"""
-
-
 def _html(intro: Page, sections: Sequence[_Section]) -> str:
     """Return the Markdown of the report as one HTML page, with pictures; what looks like HTML in a text is escaped."""
     render = MarkdownIt("commonmark", {"html": False}).enable("table").render
-    parts = [render(intro.markdown)]
+    parts, number = [render(intro.markdown)], 0
     for each in sections:
         table = render(format_markdown_table(each.headings, each.lines))
-        parts.append(f"{render(f'## {each.title}')}<div class=wide>{table}</div>")
+        parts.append(f"{render(f'## {each.title}')}<div class='wide words'>{table}</div>")
         for picture, text in each.pictures:
-            parts.append(f"<figure>{_own_ids(picture)}<figcaption>{render(text)}</figcaption></figure>")
+            number += 1
+            parts.append(
+                f"<figure>{rename_ids(picture, f'p{number}-')}<figcaption>{render(text)}</figcaption></figure>"
+            )
         if each.logs:
             parts.append(f"<details><summary>{len(each.logs)} logs</summary>{render(_links(each))}</details>")
-    start = '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-    view = '<meta name="viewport" content="width=device-width,initial-scale=1"><title>Sweep</title>'
-    return f"{start}{view}<style>{_STYLE}</style></head><body>{''.join(parts)}</body></html>"
-
-
-def _own_ids(picture: str) -> str:
-    """Return an SVG whose ids no other of the page has: references to them would end in the first."""
-    mark = f"p{checksum(picture.encode()):x}-"
-    for before in ('id="', 'href="#', "url(#"):
-        picture = picture.replace(before, before + mark)
-    return picture
+    return wrap_html("Sweep", "".join(parts))

@@ -1,18 +1,20 @@
 # pyright: basic
 """The figure of a design's blindness: where starts, references or the way there have no data around them."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.errors import DataError
-from koopmpc.figures.style import LIMIT, draw_legend, line_style, make_figure, styled
+from koopmpc.figures.style import LIMIT, draw_legend, fit_label, line_style, make_figure, styled
 from koopmpc.lifting.base import find_state
 from koopmpc.lifting.state import State
 from koopmpc.synthesis.asked import DesignTask
-from koopmpc.synthesis.designed import Design
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box, probe_range
+from koopmpc.synthesis.designed import Design, Evidence
+from koopmpc.synthesis.fresh.neighbours import NeighbourMap, choose_starts_to_record, goal_box, probe_range
 from koopmpc.text import to_percent
 
 if TYPE_CHECKING:
@@ -22,7 +24,6 @@ _BLIND = "#d55e00"
 _MOST_POINTS = 3000  # rows of the data that are drawn
 
 
-@styled
 def blindness(design: Design, axes: tuple[int | str, int | str] | None = None, record: int = 6) -> "Figure":
     """Draw where a design has no data: points of the goal's range, starts, the reference, and states of its loops.
 
@@ -43,7 +44,18 @@ def blindness(design: Design, axes: tuple[int | str, int | str] | None = None, r
         The design has one state, or keeps no rows of its data; the two axes are the same.
     """
     checks.kind(design, "design", Design, "make one with km.design")
-    evidence, neighbours = design.evidence, design.evidence.neighbours
+    return draw_blindness(design.evidence, axes, record)
+
+
+@styled
+def draw_blindness(
+    evidence: Evidence,
+    axes: tuple[int | str, int | str] | None = None,
+    record: int = 6,
+    loops: "Sequence[Float[np.ndarray, 'T nx']]" = (),
+) -> "Figure":
+    """Draw the figure of `blindness` from the evidence of a design, with the states of closed loops."""
+    neighbours = evidence.neighbours
     if neighbours is None:
         raise DataError("the design keeps no rows of its data; make it again with this version")
     names, asked = neighbours.states, evidence.asked
@@ -79,9 +91,12 @@ def blindness(design: Design, axes: tuple[int | str, int | str] | None = None, r
     tracked = list(of.state_indices) if isinstance(of, State) else []
     if i in tracked and j in tracked:
         panel.plot(*asked.reference[:, [tracked.index(i), tracked.index(j)]].T, "*k", markersize=6, label="reference")
-    advised = design.starts_to_record(record)
+    for k, X in enumerate(loops):
+        panel.plot(X[:, i], X[:, j], color=line_style(0)["color"], linewidth=0.8, label="loops" if k == 0 else None)
+    advised = choose_starts_to_record(asked, neighbours, checks.count(record, "record"))
     panel.plot(*advised[:, [i, j]].T, "D", mfc="none", mec="black", markersize=5, label="record from here")
-    panel.set(xlabel=names[i], ylabel=names[j])
+    panel.set_xlabel(names[i].replace("$", r"\$"))
+    panel.set_ylabel(**fit_label(names[j], 2.4))
     panel.set_title(f"{to_percent(float(away.mean()))} of the goal's range has no data around it")
     draw_legend(drawing, [panel], 2)
     return drawing

@@ -19,6 +19,7 @@ from koopmpc.figures.style import (
     choose_states,
     draw_band,
     draw_legend,
+    fit_label,
     follow_truth,
     limit_axis,
     line_style,
@@ -84,10 +85,11 @@ def rollout(
         panel.plot(t, ahead.truth[:, i], **TRUTH, label="truth")
         panel.plot(t, ahead.predicted[:, i], **line_style(0, len(t)), label="prediction")
         ylim = follow_truth(ahead.truth[:, i], [ahead.predicted[:, i]], _BEYOND_TRUTH)
-        panel.set(ylabel=ahead.states[i], ylim=ylim)
+        panel.set_ylim(ylim)
+        panel.set_ylabel(**fit_label(ahead.states[i], _STATE_HEIGHT))
     for panel, name, u in zip(axes[len(chosen) :], ahead.inputs, ahead.U.T, strict=True):
         panel.stairs(u, t, baseline=None, **TRUTH)
-        panel.set_ylabel(name)
+        panel.set_ylabel(**fit_label(name, _INPUT_HEIGHT))
     axes[-1].set(xlabel="time ahead [s]", xlim=(0, t[-1]))
     draw_legend(drawing, axes[:1], 3)
     return drawing
@@ -120,11 +122,11 @@ def run(run: Run, *, states: StateChoice | None = None, width: Width = "one colu
             panel.plot(t, run.reference[:, tracked.index(run.states[i])], **REFERENCE, label="reference")
         panel.plot(t, run.X[:, i], **TRUTH, label="state")
         draw_limits(panel, run, "states", i)
-        panel.set_ylabel(run.states[i])
+        panel.set_ylabel(**fit_label(run.states[i], _STATE_HEIGHT))
     for j, panel in enumerate(axes[len(chosen) : -1]):
         panel.stairs(run.U[:, j], t, baseline=None, **TRUTH)
         draw_limits(panel, run, "inputs", j)
-        panel.set_ylabel(run.inputs[j])
+        panel.set_ylabel(**fit_label(run.inputs[j], _INPUT_HEIGHT))
     _draw_statuses(axes[-1], run)
     axes[-1].set(xlabel="time [s]", xlim=(0, t[-1]))
     draw_legend(drawing, axes[:-1], 3)
@@ -225,7 +227,9 @@ def error(
             )
             draw_band(panel, ahead, low, high, j, f"{name} 5 to 95 %".strip())
             panel.plot(ahead, rmse, **line_style(j, score.horizon), label=f"{name} RMSE".strip())
-        panel.set(ylabel=f"error of\n{first.states[i]}", xlim=(1, max(s.horizon for s in named.values())))
+        panel.set_xlim(1, max(s.horizon for s in named.values()))
+        label = fit_label(first.states[i], 1.35)
+        panel.set_ylabel(f"error of\n{label['ylabel']}", fontsize=label["fontsize"])
         panel.set_ylim(*_choose_error_axis([_find_extent(score, i) for score in named.values()]))
     for unused in axes.flat[len(chosen) :]:
         unused.remove()
@@ -394,7 +398,7 @@ def _arrange_columns(labels: Sequence[str], titles: Sequence[str], height: float
     for panel, title in zip(grid[0], titles, strict=True):
         panel.set_title(title)
     for panel, label in zip(grid[:, 0], labels, strict=True):
-        panel.set_ylabel(label)
+        panel.set_ylabel(**fit_label(label, height))
     for panel in grid[-1]:
         panel.set_xlabel("time [s]")
     drawing.align_ylabels(list(grid[:, 0]))

@@ -5,6 +5,7 @@ Figures are made as `matplotlib.figure.Figure`, without pyplot. They need no dis
 state. matplotlib is imported only when a figure is drawn.
 """
 
+import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO, StringIO
@@ -33,6 +34,8 @@ CYCLIC = "twilight"  # colour map for phases; it ends with its first colour
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#7b3294", "#c28e00", "#5a5a5a")  # distinct for colour-blind readers
 _DASHES = ((0, (5, 1.5)), "-", (0, (1, 1)), "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (8, 2)))
 _MARKERS = ("o", "s", "^", "D", "v", "x")
+_LETTERS = 17.0  # letters of 8 pt in an inch
+_LINES = 4  # lines of a label that keep its size
 _MOST_STATES = 12  # largest number of states in one figure
 _SUFFIXES = (".png", ".pdf", ".svg")
 _RC: dict[str, Any] = {
@@ -128,6 +131,24 @@ def line_style(i: int, points: int = 0) -> dict[str, Any]:
     return look
 
 
+def fit_label(name: str, height: float, size: float = 8.0) -> dict[str, Any]:
+    """Return the arguments of `set_ylabel` by which a name fits beside a panel of this height [in].
+
+    Long names are broken at blanks and underscores, the unit first; what is still too long gets a smaller font. A $ is
+    a letter of the name, and begins no formula.
+    """
+    room = max(int(height * _LETTERS * 8.0 / size), 6)
+    short, bracket, unit = name.partition(" [")
+    lines = [name]
+    if len(name) > room:
+        words = textwrap.wrap(short.replace("_", "_ "), room, break_long_words=False)
+        lines = [line.replace("_ ", "_") for line in words] or [short]
+        lines += [f"[{unit}"] * bool(bracket)
+    longest = max(map(len, lines))
+    smaller = min(1.0, room / longest, _LINES / len(lines))
+    return {"ylabel": "\n".join(lines).replace("$", r"\$"), "fontsize": max(size * smaller, 4.5)}
+
+
 def draw_band(axes: "Axes", x: Any, low: Any, high: Any, i: int, label: str | None = None) -> None:
     """Shade from `low` to `high` in the colour of the i-th curve, with thin edges in its dashes."""
     look = line_style(i)
@@ -149,7 +170,8 @@ def draw_legend(drawing: "Figure", axes: "Iterable[Axes]", columns: int) -> None
     for panel in axes:
         handles, labels = panel.get_legend_handles_labels()
         entries |= dict(zip(labels, handles, strict=True))
-    drawing.legend(list(entries.values()), list(entries), loc="outside upper center", ncols=min(len(entries), columns))
+    names = [label.replace("$", r"\$") for label in entries]  # a name begins no formula
+    drawing.legend(list(entries.values()), names, loc="outside upper center", ncols=min(len(entries), columns))
 
 
 def limit_axis(low: float, high: float, lowest: float, highest: float, beyond: float) -> tuple[float, float]:

@@ -13,10 +13,11 @@ from koopmpc import checks
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.errors import LogError
+from koopmpc.fitting.report import write_design_report
 from koopmpc.loop.faults import ActuatorLoss, DroppedSamples, Fault, FrozenSensor, NaNSensor, SensorDelay, SolverFailure
 from koopmpc.loop.metrics import metrics, tracking_error, violation_shares
 from koopmpc.loop.run import Step
-from koopmpc.page import Page
+from koopmpc.page import HtmlPage
 from koopmpc.parallel import StageProgress
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign, read_controller, rebuild_controller
@@ -188,7 +189,7 @@ def check_controller(
     path
         The file of a design.
     folder
-        Where check.md is written.
+        Where report.html is written, the report of the design with the verdict on top.
     runs
         How many runs there are of each kind.
     faults
@@ -233,10 +234,10 @@ def check_controller(
     reasons += broken if faults else []
     lost_inside, doubts = bench.run_anywhere(runs, draw)
     reasons += lost_inside
-    page = Path(folder, "check.md")
+    page = Path(folder, "report.html")
     kept = not (reasons or doubts)
     result = Checked(kept, tuple(reasons), tuple(broken), tuple(figures), cold, hot, controller.dt, page, tuple(doubts))
-    _page(result, Path(folder), path, saved)
+    _write_page(result, path, saved, controller)
     return result
 
 
@@ -405,30 +406,37 @@ def _reasons(
     return said, broken
 
 
-def _page(result: Checked, folder: Path, path: str | Path, saved: SavedDesign) -> None:
-    one = saved.controller
-    page = Page(folder)
-    page.text("# Acceptance", f"**{_VERDICTS[result.verdict].capitalize()}.**")
-    page.items([*result.reasons, *result.doubts] or ["Nothing speaks against it."])
-    page.text(
-        f"`{Path(path).name}`: a {one.name} with a horizon of {one.horizon} steps of {result.dt:g} s, driven on "
-        f"{len(saved.evidence.surrogates)} models that were learned from its logs. An error that all of these models "
-        "share does not show in these runs."
-    )
-    page.table(["kind of run", *(heading.replace("\n", " ") for heading in _NUMBERS)], map(_row, result.figures))
-    page.text("## With faults")
-    if set(result.broken) - set(result.reasons):
-        page.text("A goal says nothing of what breaks, so this does not count. `koopmpc check --faults` counts it.")
-    nothing = f"no run was lost, and no limit violated by more than {to_percent(ALLOWED_OFF)} of its range"
-    page.items(result.broken or [nothing])
-    page.text("## Statuses")
-    page.table(
-        ["kind of run", "steps"],
-        [[f.kind.name, ", ".join(f"{count} {name}" for name, count in f.statuses)] for f in result.figures],
-    )
-    page.text("## Times")
-    cold, hot = format_duration(result.cold), format_duration(result.hot)
-    page.items([f"the first step of a fresh controller: {cold}", f"99 % of all others: at most {hot}"])
-    page.text("## What was expected at its design")
-    page.code(str(saved.evidence.expected))
-    page.write(result.page.name)
+def _write_page(result: Checked, path: str | Path, saved: SavedDesign, controller: AnyMPC) -> None:
+    """Write the report of the design with the verdict of the check on top."""
+
+    def add_verdict(page: HtmlPage) -> None:
+        kind = {"kept": "good", "not kept": "bad", "cannot say": "doubt"}[result.verdict]
+        reasons = [*result.reasons, *result.doubts] or ["Nothing speaks against it."]
+        page.verdict(kind, f"{_VERDICTS[result.verdict].capitalize()}.", *reasons)
+
+    def add_tested(page: HtmlPage) -> None:
+        page.heading("What was tested")
+        page.text(
+            f"{len(result.figures)} kinds of runs on {len(saved.evidence.surrogates)} models that were learned from "
+            "its logs. An error that all of these models share does not show in these runs."
+        )
+        page.table(["kind of run", *(heading.replace("\n", " ") for heading in _NUMBERS)], map(_row, result.figures))
+        page.heading("With faults", 3)
+        if set(result.broken) - set(result.reasons):
+            page.text("A goal says nothing of what breaks, so this does not count. koopmpc check --faults counts it.")
+        nothing = f"no run was lost, and no limit violated by more than {to_percent(ALLOWED_OFF)} of its range"
+        page.items(result.broken or [nothing])
+        page.heading("How steps ended", 3)
+        statuses = [[f.kind.name, ", ".join(f"{n} {name}" for name, n in f.statuses)] for f in result.figures]
+        page.table(["kind of run", "steps"], statuses, words=True)
+        page.heading("Times", 3)
+        cold, hot = format_duration(result.cold), format_duration(result.hot)
+        page.items(
+            [
+                f"the first step of a fresh controller: {cold}",
+                f"99 % of all others: at most {hot}; dt is {result.dt:g} s",
+            ]
+        )
+
+    file = Path(path).as_posix()
+    write_design_report(saved, controller, result.page, file, verdict=add_verdict, tested=add_tested)

@@ -3,7 +3,6 @@
 import math
 import tomllib
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from inspect import Parameter, signature
@@ -21,18 +20,22 @@ from koopmpc.data.episodes import Episodes, join_sets
 from koopmpc.data.files.folder import Files
 from koopmpc.data.files.load import load_episodes
 from koopmpc.data.source import Source
-from koopmpc.errors import DataError, LogError
-from koopmpc.figures.blindness import blindness
-from koopmpc.figures.style import save
+from koopmpc.errors import DataError, KoopmpcError, LogError
 from koopmpc.fitting.fit import Say, describe_data, ignore_text
 from koopmpc.fitting.further import FurtherData, plan_further
-from koopmpc.fitting.repair import IN_MEMORY, Data, collect_notes, find_logs, read_logs
-from koopmpc.lifting.state import State
-from koopmpc.page import Page
+from koopmpc.fitting.repair import IN_MEMORY, Data, DividedData, collect_notes, find_logs, read_logs
+from koopmpc.fitting.report import write_design_report
+from koopmpc.identify.fits.edmd import edmd
+from koopmpc.lifting.state import Constant, State
 from koopmpc.parallel import StageProgress
+from koopmpc.predict.base import load_value
 from koopmpc.synthesis.cross_validation import usual_horizon
 from koopmpc.synthesis.design import design
-from koopmpc.synthesis.designed import Design
+from koopmpc.synthesis.designed import Design, SavedDesign, rebuild_controller
+from koopmpc.validate.bands import Forecast, forecast
+from koopmpc.validate.logs.summary import LogSummary
+from koopmpc.validate.report import trust
+from koopmpc.validate.scoring import score
 
 _SHORT = "record more episodes, or longer ones"  # what to do where logs are too few
 _TOP = {"horizon", "logs", "states", "inputs"}
@@ -75,7 +78,7 @@ class DesignedData:
     goal
         The goal that was read.
     controller, page
-        Paths of the controller file, and of the report in Markdown.
+        Paths of the controller file, and of the report, one HTML page that needs no other file.
     usage
         Lines of Python that load the controller.
     further
@@ -107,7 +110,7 @@ def design_data(
     plan_episodes: int = 1,
     **reading: Any,
 ) -> DesignedData:
-    """Read data and a goal, design a controller, and write controller.npz and controller.md.
+    """Read data and a goal, design a controller, and write controller.npz and report.html.
 
     With `plan` the next experiment is planned, too; where the data suffice for no design it is all that is written.
 
@@ -178,31 +181,59 @@ def design_data(
     tell(str(designed))
     planned = further(split.fitted, asked, designed)
     file = place / "controller.npz"
-    designed.save(file)
+    designed.save(file, logs=_summarise_logs(split, designed, about, Path(goal).read_text(), planned, draw))
     usage = f'import koopmpc as km\ncontroller = km.load_controller("{file.as_posix()}")'
-    page = Page(place)
-    page.text("# Controller report", f"Chosen: {designed.best.title}.")
-    page.code(usage, "python")
-    if designed.advice:
-        page.text("## Advice")
-        page.items(designed.advice)
-    with suppress(DataError):  # of one state there is no plane
-        figure = blindness(designed)
-        page.picture(
-            "blindness", "Where the data are, and where starts, range and loops have none.", partial(save, figure)
-        )
-    page.text("## What to expect")
-    page.code(str(designed.expected))
-    if planned is not None:
-        page.text("## The next experiment")
-        page.code(str(planned))
-    page.text("## Choice")
-    page.code(str(designed))
-    page.text("## Goal")
-    page.code(Path(goal).read_text(), "toml")
-    page.text("## Data")
-    page.code(about)
-    return DesignedData(designed, asked, file, page.write("controller.md"), usage, planned)
+    saved = load_value(file, SavedDesign)
+    page = write_design_report(saved, rebuild_controller(saved, file), place / "report.html", file.as_posix())
+    return DesignedData(designed, asked, file, page, usage, planned)
+
+
+_FORECASTS = 3  # held-out stretches whose forecasts a report may draw
+
+
+def _summarise_logs(
+    split: DividedData,
+    designed: Design,
+    about: str,
+    goal: str,
+    planned: FurtherData | None,
+    rng: np.random.Generator,
+) -> LogSummary:
+    """Return what a report shows of the logs, with forecasts of rows that the chosen model did not learn from."""
+    assert split.excerpt is not None, "divide_files makes it"
+    model, horizon = designed.controller.as_data().model, split.horizon
+    assert model is not None, "every design has a model"
+    forecasts, findings = list[Forecast](), list[str]()
+    error = plain = np.zeros((0, model.nx))
+    with collect_notes([]):  # the fits repeat the doubts of the design
+        try:
+            if split.learned is not None:  # a record: the controller's model knows its end
+                model = designed.best.recipe.fit(split.learned)
+            seen, held_out = (model.align(data) for data in (split.seen, split.held_out))
+            report = trust(model, held_out, horizon, rng=rng)
+            verdict, error = str(report).partition("\n")[0], report.score.rmse
+            findings = [f"{finding.says}; {finding.do}" for finding in report.findings]
+            plain = score(edmd(seen, State() + Constant()), held_out, horizon).rmse
+            bands = report.band if np.isfinite(report.band.width).all() else report.score
+            relift = report.band.relift
+            forecasts = [forecast(model, e, horizon, bands=bands, relift=relift) for e in list(held_out)[:_FORECASTS]]
+        except KoopmpcError as failure:  # the report is to say so, and a design is not to be lost for it
+            verdict = f"Its forecasts could not be judged: {failure}"
+    return LogSummary(
+        excerpt=split.excerpt,
+        about=about.partition("\n! ")[0],
+        notes=(*split.notes, *designed.notes),
+        verdict=verdict,
+        findings=tuple(findings),
+        forecasts=tuple(forecasts),
+        error=error,
+        plain=plain,
+        title=designed.best.title,
+        advice=designed.advice,
+        choice=str(designed),
+        goal=goal,
+        plan="" if planned is None else str(planned),
+    )
 
 
 def plan_goal(

@@ -2,11 +2,11 @@
 
 import warnings
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -24,8 +24,9 @@ from koopmpc.identify.records.narx import DELAYS
 from koopmpc.synthesis.cross_validation import cut_blocks, replace_glitches, take_sample, usual_horizon
 from koopmpc.synthesis.records import is_record
 from koopmpc.text import with_unit
-from koopmpc.validate.logs.audit import audit
+from koopmpc.validate.logs.audit import Remainder, audit
 from koopmpc.validate.logs.log import LogFault, Place, list_places
+from koopmpc.validate.logs.summary import LogExcerpt, excerpt_logs
 
 Data = str | PathLike[str] | Iterable[str | PathLike[str]]
 _SHORTER = "pass a shorter --horizon, or more data"  # advice if too few episodes are as long as the horizon
@@ -94,23 +95,46 @@ _REPAIRED = ("constant input", "repeated column", "wrapped angle")  # faults tha
 _LEAST = 0.5  # rows at fault are left out if at least this share of the steps remains
 
 
-def audit_episodes(episodes: Episodes, *, cut: bool = True) -> tuple[Episodes, tuple[str, ...], int]:
+class Audited(NamedTuple):
+    """Episodes after the audit.
+
+    Attributes
+    ----------
+    rest
+        The episodes without the rows that `decide_places` leaves out.
+    notes
+        The faults, with what was done about each, in sentences.
+    delay
+        Steps of the past that a model needs for signals that are late.
+    origins
+        Place of each of these episodes in the logs.
+    doubtful
+        Places that are suspected, and were kept.
+    """
+
+    rest: Episodes
+    notes: tuple[str, ...]
+    delay: int
+    origins: tuple[Place, ...]
+    doubtful: tuple[Place, ...]
+
+
+def audit_episodes(episodes: Episodes, *, cut: bool = True) -> Audited:
     """Return the episodes without the rows that `decide_places` leaves out, unless less than half of the steps remain.
 
-    Beside them stand the faults, with what was done about each, in sentences, and the steps of the past that a model
-    needs for signals that are late. With `cut` False the episodes are only a sample of the data, so that nothing can be
-    left out.
+    With `cut` False the episodes are only a sample of the data, so that nothing can be left out.
     """
     report = audit(episodes)
     rest, kinds, mended, out = episodes, set[str](), set[str](), set[str]()
+    whole = Remainder.of(episodes)
+    origins = whole.origins
     if cut and any(fault.places for fault in report.faults):
         kinds = decide_places(episodes, report.faults)
         rest, mended = bridge_spikes(episodes, report.faults)
         bad = tuple(fault for fault in report.faults if fault.name in kinds - mended)
-        with suppress(DataError):  # every row is at fault
-            left = replace(report, faults=bad).without_faults(rest) if bad else rest
-            if sum(map(len, left)) >= _LEAST * sum(map(len, episodes)):
-                rest, out = left, kinds - mended
+        left = Remainder.of(rest).without([place for fault in bad for place in fault.places]) if bad else None
+        if left is not None and sum(map(len, left.data)) >= _LEAST * sum(map(len, episodes)):
+            rest, origins, out = left.data, left.origins, kinds - mended
     notes: list[str] = []
     for fault in report.faults:
         if fault.name in _REPAIRED:
@@ -129,7 +153,9 @@ def audit_episodes(episodes: Episodes, *, cut: bool = True) -> tuple[Episodes, t
     notes += [f"input timing: {doubt}" for doubt in report.doubts]
     if report.memory is not None and report.memory.shows_hidden_state:
         notes.append(f"hidden state: {report.memory}; models with delays are tried")
-    return rest, tuple(notes), report.delay
+    kept = [fault for fault in report.faults if fault.name not in out | mended | {*_REPAIRED}]
+    doubtful = tuple(place for fault in kept for place in fault.places)
+    return Audited(rest, tuple(notes), report.delay, origins, doubtful)
 
 
 _NAMED = 3  # places of a fault that a note names
@@ -325,6 +351,8 @@ class DividedData:
         Keywords of `load_episodes` that read the same data again.
     learned
         Records without their held-out ends, where `fitted` holds all rows: the model to judge is fitted to them.
+    excerpt
+        Rows of the logs as they were read, for pictures, with marks where they were repaired.
     """
 
     fitted: Source | Episodes
@@ -336,6 +364,7 @@ class DividedData:
     delay: int
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
     learned: Episodes | None = None
+    excerpt: LogExcerpt | None = None
 
 
 def divide_files(
@@ -358,13 +387,17 @@ def divide_files(
     size = sum(file.stat().st_size for file in files.files)
     amount = f"{len(files.files)} file{'s' * (len(files.files) > 1)}, {_format_bytes(size)}"
     if size <= memory or len(parts) < 2:
-        episodes, faults, delay = audit_episodes(join_sets([part.load() for part in parts]))
+        logs = join_sets([part.load() for part in parts])
+        episodes, faults, delay, origins, doubtful = audit_episodes(logs)
         repair = find_repairs(episodes)
         whole = repair(episodes)
         _, sound, replaced = replace_glitches(Held(whole), whole)
         notes = (*faults, *repair.notes, *replaced)
-        return _divide_episodes(drop_origins(sound), horizon, rng, amount, notes, delay, short)
-    episodes, faults, delay = audit_episodes(take_sample(files, _JUDGED)[0], cut=False)
+        unwrapped = [episodes.states[i] for i in repair.unwrapped]
+        split = _divide_episodes(drop_origins(sound), horizon, rng, amount, notes, delay, short)
+        return replace(split, excerpt=excerpt_logs(logs, sound, origins, doubtful, unwrapped))
+    logs = take_sample(files, _JUDGED)[0]
+    episodes, faults, delay, *_ = audit_episodes(logs, cut=False)
     repair = find_repairs(episodes)
     past = max(PAST, delay)
     source, _, replaced = replace_glitches(repair.source(files), repair(episodes))
@@ -391,6 +424,7 @@ def divide_files(
         amount,
         (*faults, *repair.notes, *replaced, note),
         delay,
+        excerpt=excerpt_logs(logs),
     )
 
 

@@ -26,6 +26,7 @@ from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_share, bound_value
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.terminal import build_leaderboard, label_lines, render_text
 from koopmpc.text import to_percent
+from koopmpc.validate.logs.summary import LogSummary
 from koopmpc.values import Value
 
 ALIKE = 0.005  # scores that differ by this share are alike
@@ -204,10 +205,19 @@ class Evidence(Value):
 
 @dataclass(frozen=True, eq=False)
 class SavedDesign(Value):
-    """A designed controller in a file, with the evidence on which it can be checked."""
+    """A designed controller in a file, with the evidence on which it can be checked.
+
+    Attributes
+    ----------
+    controller, evidence
+        What the controller is made of, and what speaks for it.
+    logs
+        What a report shows of its logs; None where it was designed from episodes in memory.
+    """
 
     controller: SavedController
     evidence: Evidence
+    logs: LogSummary | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,15 +303,22 @@ class Design:
         """What to expect of `controller`: an estimate, and no promise."""
         return self.evidence.expected
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, *, logs: LogSummary | None = None) -> None:
         """Write the controller and its evidence as data; `km.load_controller` and ``koopmpc check`` read it.
+
+        Parameters
+        ----------
+        path
+            The file to write.
+        logs
+            What a report shows of the logs, as ``koopmpc fit --goal`` makes it.
 
         Raises
         ------
         LogError
             The path cannot be written.
         """
-        save_value(SavedDesign(self.controller.as_data(), self.evidence), path)
+        save_value(SavedDesign(self.controller.as_data(), self.evidence, logs), path)
 
     def __str__(self) -> str:
         """Return the choice, what to expect of it, advice, and the first rows of the leaderboard."""

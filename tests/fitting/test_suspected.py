@@ -29,7 +29,7 @@ def test_a_fifth_of_a_record_that_is_stuck_goes_from_learned_and_unseen_parts_al
     for first in range(60, 1960, 200):
         stuck[first : first + 40] = True
         y[first : first + 40] = y[first]
-    rest, notes, _ = audit_episodes(record(y, u))
+    rest, notes, *_ = audit_episodes(record(y, u))
     assert any("were left out" in note for note in notes)
     kept = np.concatenate([e.X[:, 0] for e in rest])
     values, counts = np.unique(kept, return_counts=True)
@@ -41,7 +41,7 @@ def test_a_fifth_of_a_record_that_is_stuck_goes_from_learned_and_unseen_parts_al
 def test_equal_neighbours_of_a_slow_and_quantised_sensor_stay(seed):
     y, u = tank(2000, seed, quantum=0.01)
     data = record(y, u)
-    rest, notes, _ = audit_episodes(data)
+    rest, notes, *_ = audit_episodes(data)
     assert len(rest) == 1
     assert len(rest[0]) == len(data[0])
     assert not any("left out" in note for note in notes)
@@ -50,7 +50,7 @@ def test_equal_neighbours_of_a_slow_and_quantised_sensor_stay(seed):
 def test_rows_at_both_rails_stay_unless_models_do_better_without_them():
     y, u = tank(2000)
     clipped = np.clip(y, np.quantile(y, 0.02), np.quantile(y, 0.98))
-    rest, notes, _ = audit_episodes(record(clipped, u))
+    rest, notes, *_ = audit_episodes(record(clipped, u))
     (note,) = [note for note in notes if note.startswith("sensor at its limit")]
     assert ("were kept" in note) == (sum(map(len, rest)) == 2000)
     assert len(rest) < 10 or "were left out" in note
@@ -59,7 +59,7 @@ def test_rows_at_both_rails_stay_unless_models_do_better_without_them():
 def test_single_wild_readings_always_go_and_leave_the_record_in_one_piece():
     y, u = tank(1500)
     y[[200, 700, 1100]] += 3.0
-    rest, notes, _ = audit_episodes(record(y, u))
+    rest, notes, *_ = audit_episodes(record(y, u))
     assert max(float(e.X.max()) for e in rest) < 3.0
     assert len(rest) == 1
     assert any(note.startswith("spikes") and "replaced by the line" in note for note in notes)
