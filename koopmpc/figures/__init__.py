@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
-    from koopmpc.figures.blindness import blindness as blindness
+    from koopmpc.figures.blind_regions import blindness as blindness
     from koopmpc.figures.eigenvalues import eigenfunction_maps as eigenfunction_maps
     from koopmpc.figures.eigenvalues import spectrum as spectrum
     from koopmpc.figures.plans import plan as plan

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.control.limits import Interval
-from koopmpc.figures.blindness import draw_blindness
+from koopmpc.figures.blind_regions import draw_blindness
 from koopmpc.figures.evidence import draw_forecast, draw_log, draw_loops
 from koopmpc.figures.style import render_svg
 from koopmpc.lifting.base import strip_unit
