@@ -313,6 +313,14 @@ def swing_up(path: Path) -> None:
         export_video(log, path, width=640, fps=16, until=4.0, speed=0.8)
 
 
+def priorities() -> Any:
+    """Both runs of the page on priorities of soft limits."""
+    names: dict[str, Any] = {"__name__": "page"}
+    text = (DOCS / "how/priorities.md").read_text()
+    exec(compile(re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0], "page", "exec"), names)
+    return km.plot.runs({"two_tanks": names["runs"]})
+
+
 def unequal_rates() -> Any:
     """A log with a slow sensor, and the forecast of the model that was fitted to it."""
     names: dict[str, Any] = {"__name__": "page"}
@@ -400,6 +408,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         on_off,
         own_blocks,
         unequal_rates,
+        priorities,
         manual_automatic,
         next_experiment,
         next_design,

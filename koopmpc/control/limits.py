@@ -101,6 +101,10 @@ class Limits(Value):
         number for inputs of more levels. The lowest level is off.
     level_steps
         Steps of the horizon in which levels and dwell times count; later inputs may be between them. None for all.
+    priority
+        Which soft limits are kept longest, ``{"pressure": 2, "level": 1}``, or an entry for every state and then for
+        every observable of `of`; others have 0. A limit gives way only as far as no limit of a lower priority can
+        spare it that, whatever the weights are. For KoopmanMPC and LinearMPC.
     rows
         Bounds that limit nothing now, and that a step may bring, such as ``("x_max",)``; see `with_bounds`.
 
@@ -137,6 +141,7 @@ class Limits(Value):
     dwell: DwellByInput | None = None
     level_steps: int | None = None
     rows: tuple[str, ...] = ()
+    priority: "Mapping[str, int] | ArrayLike | None" = None
 
     def __post_init__(self) -> None:
         if self.terminal is not None:
@@ -166,6 +171,8 @@ class Limits(Value):
                 object.__setattr__(self, name, check_prices(cast("Slack", value), name))
         if self.margin is not None:
             object.__setattr__(self, "margin", self._margin(checks.array(self.margin, "margin", (None, None))))
+        if self.priority is not None and not isinstance(self.priority, Mapping):
+            object.__setattr__(self, "priority", checks.array(self.priority, "priority", (None,)))
         self._check_levels()
 
     def _check_levels(self) -> None:
@@ -440,6 +447,21 @@ class Limits(Value):
         """Return the box of [x; of(x)]; ny is 0 without `of`."""
         outputs = self.outputs(ny) if ny else Interval(np.zeros(0), np.zeros(0))
         return Interval(*(np.concatenate(each) for each in zip(self.states(nx), outputs, strict=True)))
+
+
+def refuse_priority(limits: Limits | None, who: str) -> None:
+    """Raise where soft limits have priorities, for a controller that weighs them alone.
+
+    Raises
+    ------
+    DataError
+        The limits have priorities.
+    """
+    if limits is not None and limits.priority is not None:
+        raise DataError(
+            f"the limits have a priority, which {who} does not know; take a KoopmanMPC or a LinearMPC, or weigh the"
+            " limits with slack="
+        )
 
 
 def refuse_levels(limits: Limits | None, who: str) -> None:

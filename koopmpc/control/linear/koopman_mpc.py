@@ -26,6 +26,7 @@ from koopmpc.control.solvers import FINISHER, exact_turn, order_solvers
 from koopmpc.control.solvers.base import StepQP, StepSolver
 from koopmpc.control.solvers.daqp import DAQP, DAQPSetup
 from koopmpc.control.stepped.blocks import Moves
+from koopmpc.control.stepped.priorities import PrioritySolver, spread_priorities
 from koopmpc.control.stepped.search import LevelSolver
 from koopmpc.control.terminal.cuts import BallSolver
 from koopmpc.control.watching import StepMonitor, find_monitor
@@ -229,9 +230,17 @@ class KoopmanMPC(MPCBase):
         self._levels: LevelSolver | None = None
         ball = self._map.ball
         if self._held is not None:
+            if self.limits.priority is not None:
+                raise DataError("the limits have levels and a priority; pass one of the two")
             if ball is not None:
                 raise DataError("the limits have levels and a terminal ellipsoid; pass a polytope, or no terminal set")
             self._qps = self._levels = LevelSolver(self._map.qp, exact_turn(turns), self._held, self._blocks, self.nu)
+        elif self.limits.priority is not None:
+            if ball is not None:
+                raise DataError(
+                    "the limits have a priority and a terminal ellipsoid; pass a polytope, or no terminal set"
+                )
+            self._qps = PrioritySolver(self._map.qp, [exact_turn(turns), *turns[1:]], self._priorities())
         else:
             self._qps = StepSolver(self._map.qp, turns) if ball is None else BallSolver(self._map.qp, turns, ball)
         rows = len(self._map.matrix)
@@ -243,6 +252,12 @@ class KoopmanMPC(MPCBase):
         self._rows = np.zeros((self._N + 1, len(track.tracked)))
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # the states of a plan, once somebody asks for one
 
+    def _priorities(self) -> Int[np.ndarray, " nv"]:
+        """Return the priority of each entry of a plan."""
+        plan = self._map
+        first = plan.moves * (1 if plan.track.rates is None else 2)
+        return spread_priorities(self.limits, self.predictor.states, (first, self._N, plan.planned))
+
     def _made_of(self) -> tuple[str, LinearPredictor, dict[str, Any]]:
         return "KoopmanMPC", self.predictor, self._options
 
@@ -252,6 +267,8 @@ class KoopmanMPC(MPCBase):
             raise no_export(
                 self, "its inputs are on levels, and the search over them has no C code", "one without levels"
             )
+        if self.limits.priority is not None:
+            raise no_export(self, "its C weighs soft limits, and knows no priority", "one without a priority")
         plan, track = self._map, self._map.track
         if plan.ball is not None:
             raise no_export(self, "it adds tangent cuts of a terminal ellipsoid; use a polytope, or no terminal set")

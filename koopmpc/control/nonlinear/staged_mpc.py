@@ -12,7 +12,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, data_ranges, state_tracking
-from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation, refuse_levels
+from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation, refuse_levels, refuse_priority
 from koopmpc.control.move import Move, Plan, Status, alone
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
@@ -78,6 +78,7 @@ class StagedMPC(MPCBase):
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
         self._outputs = o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges)
         refuse_levels(o.limits, f"a {type(self).__name__}")
+        refuse_priority(o.limits, f"a {type(self).__name__}")
         super().__init__(
             model.dt,
             given,

@@ -51,7 +51,7 @@ def order_solvers(solver: str, settings: Mapping[str, Any]) -> list[SolverTurn]:
 
 
 def exact_turn(turns: list[SolverTurn]) -> SolverTurn:
-    """Return the turn of the exact solver, which the search over the levels of inputs needs.
+    """Return the turn of the exact solver, which the search over levels and the order of priorities need.
 
     Raises
     ------
@@ -59,5 +59,7 @@ def exact_turn(turns: list[SolverTurn]) -> SolverTurn:
         A solver was chosen that is not exact.
     """
     if not turns[0].solver.exact:
-        raise DataError(f'solver is {turns[0].solver.name!r}; inputs on levels need "daqp", or "auto"')
+        raise DataError(
+            f'solver is {turns[0].solver.name!r}; inputs on levels and priorities of limits need "daqp", or "auto"'
+        )
     return turns[0]
