@@ -190,6 +190,9 @@ def fit(
 def check(
     controller: Annotated[Path, typer.Argument(help="What `koopmpc fit --goal` or the save of a design wrote.")],
     runs: Annotated[int, typer.Option("--runs", help="Runs of each kind.")] = 12,
+    new: Annotated[
+        list[Path] | None, typer.Option("--new", help="New logs of the plant: has it changed since the design?")
+    ] = None,
     faults: Annotated[
         bool, typer.Option("--faults", help="Ask that the goal is kept with broken sensors, inputs and solvers, too.")
     ] = False,
@@ -199,10 +202,12 @@ def check(
 
     Exit code 0: the goal is kept. 1: it is not. 3: the logs do not show whether it is.
     """
+    from koopmpc.fitting.changed import read_new_logs
     from koopmpc.fitting.check import check_controller
 
     with friendly(), folder_of(logs, "check") as folder, bar("runs") as progress:
-        done = check_controller(controller, folder, runs=runs, faults=faults, progress=progress)
+        logged = None if not new else read_new_logs(controller, new)
+        done = check_controller(controller, folder, runs=runs, faults=faults, new=logged, progress=progress)
     say(f"{done}\n\nreport: {done.page}")
     if done.verdict != "kept":
         raise typer.Exit(1 if done.reasons else 3)

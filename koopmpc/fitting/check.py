@@ -12,7 +12,9 @@ from jaxtyping import Float
 from koopmpc import checks
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
+from koopmpc.data.episodes import Episodes
 from koopmpc.errors import LogError
+from koopmpc.fitting.changed import ComparedLogs, compare_logs
 from koopmpc.fitting.report import write_design_report
 from koopmpc.loop.faults import ActuatorLoss, DroppedSamples, Fault, FrozenSensor, NaNSensor, SensorDelay, SolverFailure
 from koopmpc.loop.metrics import metrics, tracking_error, violation_shares
@@ -110,6 +112,8 @@ class Checked:
         Sampling time [s].
     page
         Path of the report.
+    compared
+        What new logs say, where they are given.
     """
 
     kept: bool
@@ -121,6 +125,7 @@ class Checked:
     dt: float
     page: Path
     doubts: tuple[str, ...] = ()
+    compared: ComparedLogs | None = None
 
     @property
     def verdict(self) -> str:
@@ -136,6 +141,8 @@ class Checked:
         aside = [f"- {one}" for one in self.broken if one not in self.reasons]
         aside = ["with faults, which do not count (--faults counts them):", *aside] if aside else []
         reasons = [f"- {reason}" for reason in (*self.reasons, *self.doubts)]
+        if self.compared is not None and self.compared.holds:
+            aside = [*aside, f"new logs: {self.compared.sentence}"]
         return render_text(verdict, *reasons, *aside, "", build_table(_HEADINGS, rows), "", times)
 
 
@@ -160,6 +167,7 @@ def check_controller(
     *,
     runs: int = 12,
     faults: bool = False,
+    new: Episodes | None = None,
     progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
 ) -> Checked:
@@ -194,6 +202,8 @@ def check_controller(
         How many runs there are of each kind.
     faults
         Whether the goal is to be kept with faults as well.
+    new
+        New logs of the plant, to see whether it has changed since the design; states and inputs of the design.
     progress
         Called with what is done, how many of it are, and how many there are.
     rng
@@ -234,9 +244,16 @@ def check_controller(
     reasons += broken if faults else []
     lost_inside, doubts = bench.run_anywhere(runs, draw)
     reasons += lost_inside
+    compared = None
+    if new is not None:
+        kept_kinds = [one.kind.name for one in figures if not _reasons(evidence, [one], cold, hot, controller.dt)[0]]
+        compared = compare_logs(evidence.logs, new, kept_kinds)
+        reasons += [compared.sentence] if compared.holds is False else []
+        doubts += [compared.sentence] if compared.holds is None else []
     page = Path(folder, "report.html")
     kept = not (reasons or doubts)
-    result = Checked(kept, tuple(reasons), tuple(broken), tuple(figures), cold, hot, controller.dt, page, tuple(doubts))
+    said = tuple(reasons), tuple(broken), tuple(figures)
+    result = Checked(kept, *said, cold, hot, controller.dt, page, tuple(doubts), compared)
     _write_page(result, path, saved, controller)
     return result
 

@@ -20,11 +20,11 @@ from koopmpc.control.program import Program, Published, SavedController, no_expo
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.identify.fits.online import OnlineEDMD
 from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.validate.drift import exceeds_usual
 
 _BETTER = 1 / 3  # of the error of the model in use that a new one may have on pairs that neither has seen
 _SHORTEST = 20  # pairs that the memory holds by default, where the horizon is shorter
 _WORSE = 1.25  # times the error of an earlier model from which on the model in use is given up for it
-_SUFFICES = 1.5  # times the residuals of its own fit up to which the model in use is left alone
 _PERSISTENT = 3  # samples in sequence that are off before they count as a change of the plant
 _KEPT = 5  # earlier models that can be gone back to
 
@@ -242,8 +242,7 @@ class Adaptive(Published):
         if usual is None:
             return False
         with np.errstate(over="ignore", invalid="ignore"):
-            found = np.sqrt(((self._errors(model, pairs) * self._size) ** 2).mean(axis=0))
-        return bool((found <= _SUFFICES * usual).all())
+            return not exceeds_usual(self._errors(model, pairs) * self._size, usual)
 
     def _error(self, model: LinearPredictor, pairs: list[LearnedPair]) -> float:
         with np.errstate(over="ignore", invalid="ignore"):

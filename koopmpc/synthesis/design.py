@@ -15,7 +15,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.data.angles import find_angles
-from koopmpc.data.episodes import Episodes
+from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.estimate.disturbance import LiftedDisturbance
@@ -95,6 +95,7 @@ _BILINEAR = 3  # bilinear models of the first round that are tried with an estim
 _GAINS = (None, 0.5)  # gains of the estimators
 GAINED = 0.01  # another end of the horizon is tried on further models if it costs this share less
 WORRY = 0.05  # a bound of lost loops above this is advice
+_KEPT = 6000  # steps of the data that a saved design keeps, to compare new logs with
 _STRETCHES = 4  # runs start at this many places of a long reference
 _TURNS = 0.9 * 2 * np.pi  # [rad] an angle whose range in the data is larger makes whole turns
 
@@ -315,7 +316,9 @@ def design(
         leaderboard=rows,
         chosen=best,
         chosen_linear=linear,
-        evidence=Evidence(asked, test.surrogates, test.low, test.high, expected, holds, neighbours),
+        evidence=Evidence(
+            asked, test.surrogates, test.low, test.high, expected, holds, neighbours, _keep_logs(measured)
+        ),
         advice=(
             *doubts,
             *blind,
@@ -326,6 +329,12 @@ def design(
         notes=(*notes, *short, *folds.notes, *turned, *remembered),
         standby=standby,
     )
+
+
+def _keep_logs(measured: Episodes) -> Episodes:
+    """Return episodes of about so many steps as a comparison with new logs needs, spread evenly over the data."""
+    apart = max(sum(map(len, measured)) // _KEPT, 1)
+    return measured.with_episodes([Episode(X=e.X, U=e.U) for e in list(measured)[::apart]])
 
 
 def _confirm_first(

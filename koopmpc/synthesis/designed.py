@@ -16,6 +16,7 @@ from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.program import SavedController
+from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, KoopmpcError, LogError
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.supervise.guarded import Guarded
@@ -192,6 +193,8 @@ class Evidence(Value):
         True if the reference is constant and an input inside the limits holds it.
     neighbours
         Stand-in by the nearest rows of the data; None in a design without fresh loops.
+    logs
+        Some of the data, as measured, with which new logs are compared; None in files of earlier designs.
     """
 
     asked: DesignTask
@@ -201,6 +204,7 @@ class Evidence(Value):
     expected: ExpectedLoop
     goal_can_be_held: bool
     neighbours: NeighbourMap | None = None
+    logs: Episodes | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from koopmpc.validate.bands import forecast as forecast
     from koopmpc.validate.binomial import bound_failure_rate as bound_failure_rate
     from koopmpc.validate.binomial import count_runs_needed as count_runs_needed
+    from koopmpc.validate.drift import DriftReport as DriftReport
+    from koopmpc.validate.drift import find_drift as find_drift
     from koopmpc.validate.logs.audit import AuditReport as AuditReport
     from koopmpc.validate.logs.audit import audit as audit
     from koopmpc.validate.memory import Memory as Memory

@@ -12,6 +12,7 @@ from koopmpc.data.episodes import Episode, Episodes, episodes_of
 from koopmpc.errors import DataError
 from koopmpc.terminal import label_lines, render_text
 from koopmpc.text import to_percent
+from koopmpc.validate.drift import DriftReport, find_drift
 from koopmpc.validate.logs import values
 from koopmpc.validate.logs.alignment import (
     find_dependent_inputs,
@@ -60,6 +61,8 @@ class AuditReport(Value):
         Number of episodes and steps that were checked.
     timing
         For each input, whether it acts on the row after its own or within its own row.
+    drift
+        What changed since the data `against`; None without them.
     memory
         What past rows tell beyond the present one, which shows a hidden state; None where faults stand in the way.
     """
@@ -69,6 +72,7 @@ class AuditReport(Value):
     steps: int
     timing: tuple[InputTiming, ...] = ()
     memory: Memory | None = None
+    drift: DriftReport | None = None
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -110,6 +114,8 @@ class AuditReport(Value):
         doubts = [("input timing", f"{doubt}.") for doubt in self.doubts]
         if self.memory is not None and self.memory.shows_hidden_state:
             doubts.append(("hidden state", f"{self.memory}. {DELAYS}."))
+        if self.drift is not None:
+            doubts.append(("drift", f"{self.drift.verdict}: {'; '.join(self.drift.sentences)}."))
         if not self.faults and not doubts:
             return f"no fault found in {checked}"
         count = len(self.faults)
@@ -118,7 +124,7 @@ class AuditReport(Value):
         return render_text(f"{summary} found in {checked}", label_lines([*pairs, *doubts]))
 
 
-def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditReport:
+def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None, against: Episodes | None = None) -> AuditReport:
     """Look for faults of recorders, sensors and actuators in logs, before a model is fitted to them.
 
     - Values: a live sensor never repeats a number. Repeated numbers show a sensor that is stuck, at its limit, coarse
@@ -142,6 +148,8 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditR
     times
         (T+1,) time stamps [s] of the rows of each episode, to find jitter and resets of the clock; without them the
         audit does not check the clock. `load_episodes` cuts at resets, and refuses steps that differ by more than 2 %.
+    against
+        The data of a design, to compare these new logs with, see `find_drift`.
 
     Raises
     ------
@@ -171,7 +179,8 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None) -> AuditR
     timing = measure_timing(Log(rest.data)) if rest is not None and "inputs together" not in kinds else ()
     faults += find_same_row_inputs(timing)
     memory = None if faults else find_hidden_state(data)
-    return AuditReport(tuple(faults), len(data), sum(map(len, data)), timing, memory)
+    drift = None if against is None else find_drift(against, data)
+    return AuditReport(tuple(faults), len(data), sum(map(len, data)), timing, memory, drift)
 
 
 def _take_first(data: Episodes) -> Episodes:
