@@ -2,6 +2,7 @@
 
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -307,6 +308,17 @@ def test_the_doctor_names_what_is_missing_and_how_it_is_had(call, monkeypatch):
         "optional-dependencies"
     ]:
         assert extra in ("dev", "docs", "peers") or f"[{extra}]'" in ill, extra
+
+
+def test_the_doctor_tries_the_compiler_and_says_what_it_said(call, monkeypatch, tmp_path):
+    broken = tmp_path / "cc"
+    broken.write_text("#!/bin/sh\necho 'math.h: no such file' >&2\nexit 4\n")
+    broken.chmod(0o755)
+    monkeypatch.setenv("CC", str(broken))
+    said = " ".join(call("doctor").stdout.split())
+    assert "ended with 4: math.h: no such file" in said.replace(" -", "-")
+    monkeypatch.setenv("CC", "cc" if shutil.which("cc") else "gcc")
+    assert "plants at full speed" in " ".join(call("doctor").stdout.split())
 
 
 def test_the_doctor_says_what_is_missing_where_half_an_extra_is_installed(call, monkeypatch):

@@ -7,7 +7,7 @@ from mkdocs.config.defaults import MkDocsConfig
 
 
 def on_config(config: MkDocsConfig) -> None:
-    """Put the pages of a folder, by their titles up to a colon or a comma, in place of its name (a hook of MkDocs)."""
+    """Put the pages of a folder, titled up to a colon or else a comma, in place of its name: a hook of MkDocs."""
     docs = Path(config.docs_dir)
     for entry in config.nav or []:
         for title, pages in entry.items():
@@ -17,9 +17,10 @@ def on_config(config: MkDocsConfig) -> None:
 def _pages(page: Any, docs: Path) -> list[Any]:
     if not (isinstance(page, str) and page.endswith("/")):
         return [page]
-    return [{_title(path): f"{page}{path.name}"} for path in sorted((docs / page).glob("*.md"))]
+    paths = sorted((docs / page).glob("*.md"))
+    return [{_title(path): f"{page}{path.name}"} for path in paths]
 
 
 def _title(path: Path) -> str:
     heading = path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
-    return heading.partition(":")[0].partition(",")[0]
+    return heading.partition(":" if ":" in heading else ",")[0]

@@ -60,7 +60,7 @@ def show_ways() -> None:
 
 def doctor() -> None:
     """Say what is installed, and what is missing for what: packages, extras, compiler, viewer, BLAS threads."""
-    from koopmpc.plants.routines import find_compiler
+    from koopmpc.plants.routines import find_compiler, try_compiler
     from koopmpc.recording.viewer import program
 
     rows: list[tuple[bool, str, str]] = [
@@ -68,11 +68,11 @@ def doctor() -> None:
         (True, "packages", ", ".join(f"{name} {_version_of(name)}" for name in CORE)),
     ]
     compiler = find_compiler()
-    rows.append(
-        (True, "C compiler", f"{' '.join(compiler)}: km.compiled, --compiled, and plants at full speed")
-        if compiler
-        else (False, "C compiler", "none of $CC, cc, gcc, clang; without one: no km.compiled, and slower plants")
-    )
+    lacks = "none of $CC, cc, gcc, clang is there" if compiler is None else try_compiler(compiler)
+    if compiler is not None and not lacks:
+        rows.append((True, "C compiler", f"{' '.join(compiler)}: km.compiled, --compiled, and plants at full speed"))
+    else:
+        rows.append((False, "C compiler", f"{lacks}; until one works: no km.compiled, and slower plants"))
     there = program().exists()
     shown = sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     what = "opens logs" if there and shown else "no display: logs are written all the same" if there else "not found"

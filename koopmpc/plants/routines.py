@@ -26,6 +26,7 @@ Kernel = Callable[[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]],
 
 # Without fused multiply-adds and -march the machine code gives the interpreter's numbers on all machines of a kind.
 _FLAGS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+_PROBE = 30.0  # a compiler has this long for a program of one line [s]
 _STEPS_A_THREAD = 50_000  # least steps for one thread: they take about 5 ms, and starting a thread takes 0.1 ms
 _LOOP = """
 #ifdef _WIN32
@@ -114,6 +115,24 @@ def find_compiler() -> list[str] | None:
         if words and shutil.which(words[0]):
             return words
     return None
+
+
+def try_compiler(command: list[str]) -> str:
+    """Return why a C compiler does not make a library that loads, by a program of one line; empty where it does."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, library = Path(folder) / "probe.c", Path(folder) / "probe.so"
+        source.write_text("#include <math.h>\ndouble koopmpc_probe(double x) { return 2.0 * sqrt(x); }\n")
+        words = [*command, "-O1", "-fPIC", "-shared", str(source), "-o", str(library), "-lm"]
+        try:
+            made = subprocess.run(words, capture_output=True, text=True, timeout=_PROBE, check=False)
+            if made.returncode:
+                said = (made.stderr or made.stdout).strip().splitlines()
+                return f"{' '.join(command)} ended with {made.returncode}: {said[0] if said else 'it said nothing'}"
+            probe = ctypes.CDLL(str(library)).koopmpc_probe
+            probe.argtypes, probe.restype = [ctypes.c_double], ctypes.c_double
+            return "" if probe(4.0) == 4.0 else f"{' '.join(command)} makes code that computes wrong numbers"
+        except (OSError, subprocess.SubprocessError) as error:
+            return f"{' '.join(command)} does not work: {error}"
 
 
 def compile_kernel(F: ca.Function, command: list[str], cache: Path | None) -> Kernel:

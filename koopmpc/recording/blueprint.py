@@ -288,15 +288,17 @@ def blueprint(
     shown.append(plot("solver/log", _STEP_TIME, time, slowest))
     status = rrb.StateTimelineView(origin="solver/status", name="How each step ended")
     left = rrb.Vertical(*shown, status, row_shares=[1.0] * len(shown) + [max(0.5, 0.12 * len(shown))])
+    circle = [] if model is None else [eigenvalue_views(model)[0]]
     texts = rrb.Tabs(
         rrb.TextDocumentView(origin="metrics", name="Metrics"),
         rrb.TextDocumentView(origin="description", name="Description"),
         rrb.TextLogView(origin="log", name="Log"),
+        *(circle if extent is None else []),  # without an animation the plots get the room
     )
-    beside = rrb.Vertical if extent is None else rrb.Horizontal
-    right, shares = texts if model is None else beside(eigenvalue_views(model)[0], texts), [2.6, 1.0]
-    if extent is not None:  # without an animation the plots get the room
-        right, shares = rrb.Vertical(_animation(extent), right, row_shares=[3.0, 2.0]), [1.0, 1.0]
+    right, shares = texts, [2.6, 1.0]
+    if extent is not None:
+        below = rrb.Horizontal(*circle, texts) if circle else texts
+        right, shares = rrb.Vertical(_animation(extent), below, row_shares=[3.0, 2.0]), [1.0, 1.0]
     title = rrb.TextDocumentView(origin="title", name="Run", titlebar=False)
     return frame_views(rrb.Vertical(title, rrb.Horizontal(left, right, column_shares=shares), row_shares=[1.0, 18.0]))
 

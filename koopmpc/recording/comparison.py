@@ -70,7 +70,7 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
             *(_view(entity, title, curves, i == 0, longest) for i, (entity, title, curves) in enumerate(plots))
         ),
         rrb.TextDocumentView(origin="metrics", name="Metrics"),
-        column_shares=[2.0, 1.0],
+        column_shares=[1.5, 1.0],  # the table names figures and holds a column a run,
     )
     with file_recording(path, "koopmpc-comparison", frame_views(layout)) as rec:
         rec.send_recording_name(drawable(" against ".join(names)))

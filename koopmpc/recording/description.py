@@ -63,7 +63,12 @@ def application_of(about: About) -> str:
 
 
 def title_of(about: About) -> str:
-    """Return problem, case, controller and fault in one line, without those that are unknown."""
+    """Return problem, case, controller and fault in one line, without those that are unknown; or the run's own title.
+
+    A run has a title of its own by ``simulate(…, metadata={"title": "tank, new valve"})``.
+    """
+    if "title" in about.metadata:
+        return str(about.metadata["title"])
     parts = [about.metadata.get(key) for key in ("problem", "case", "controller", "fault")]
     known = [str(p) for p in parts if p is not None]
     if "problem" not in about.metadata:  # a user's own script: the plant's names tell what was driven

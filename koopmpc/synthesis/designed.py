@@ -324,6 +324,19 @@ class Design:
         """
         save_value(SavedDesign(self.controller.as_data(), self.evidence, logs), path)
 
+    def _find_twins(self) -> tuple[list[int], list[int]]:
+        """Return the rows to print, and for each row the place in them: rows that differ in the tail alone are one."""
+        kept: list[int] = []
+        leads: list[int] = []
+        known: dict[tuple[str, ...], int] = {}
+        for i, row in enumerate(self.leaderboard):
+            key = (str(replace(row.recipe, tail=None)), f"{row.recipe.ridge}", *_list_figures(row))
+            if key not in known:
+                known[key] = len(kept)
+                kept.append(i)
+            leads.append(known[key])
+        return kept, leads
+
     def __str__(self) -> str:
         """Return the choice, what to expect of it, advice, and the first rows of the leaderboard."""
         parts: list[RenderableType] = [f"chosen: {self.best.title}"]
@@ -333,16 +346,17 @@ class Design:
         parts += ["", "expected", str(self.expected), ""]
         rows: list[list[str]] = []
         titles = Counter(row.title for row in self.leaderboard)
-        for row in self.leaderboard:
+        kept, leads = self._find_twins()
+        for row in (self.leaderboard[i] for i in kept):
             title = (
                 row.title
                 if titles[row.title] == 1
                 else f"{row.title} (ridge {row.recipe.ridge:.0e})".replace("0e+00", "0")
             )
-            figures = [f"{row.score:.3f}", f"{row.worst:.3f}", to_percent(row.violation), f"{row.lost} of {row.runs}"]
-            rows.append([title, *figures])
+            twin = len(rows) in [leads[i] for i in range(len(leads)) if i not in kept]
+            rows.append([title + "; the same with another end of the horizon" * twin, *_list_figures(row)])
         headings = ["controller", "score", "worst\nrun", "viol-\nation", "lost\nruns"]
-        parts.append(build_leaderboard(headings, rows, self.chosen, place)[0])
+        parts.append(build_leaderboard(headings, rows, leads[self.chosen], None if place is None else leads[place])[0])
         parts += [
             "",
             "A score is the mean over closed loops on surrogates of the cost, with a price on violations, relative to "
@@ -355,6 +369,10 @@ class Design:
         if self.notes:
             said += ["", *self.notes]
         return "\n".join(said)
+
+
+def _list_figures(row: DesignRow) -> list[str]:
+    return [f"{row.score:.3f}", f"{row.worst:.3f}", to_percent(row.violation), f"{row.lost} of {row.runs}"]
 
 
 def _format_spread(values: Float[np.ndarray, " runs"]) -> str:

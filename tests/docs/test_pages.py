@@ -1,5 +1,6 @@
 """Every page of the site: its blocks run, its pictures have words, its links lead somewhere, and the menu has it."""
 
+import base64
 import json
 import re
 import sys
@@ -105,6 +106,14 @@ def test_every_page_is_in_the_menu():
     assert set(PAGES) <= set(listed)
 
 
+def test_no_two_entries_of_a_menu_have_one_title():
+    from menu import _title
+
+    for folder in ("papers", "problems"):
+        titles = [_title(path) for path in (DOCS / folder).glob("*.md")]
+        assert len(titles) == len(set(titles)), folder
+
+
 def test_pictures_of_the_site_are_small():
     for path in [*(DOCS / "pictures").iterdir(), *DOCS.rglob("*.gif")]:
         assert path.stat().st_size <= 200_000, path
@@ -117,6 +126,10 @@ def test_the_notebook_is_the_start_page_and_runs(tmp_path, monkeypatch, capsys):
     assert made == notebook(PAGE.read_text(encoding="utf-8")), "run python docs/tools/notebook.py"
     cells = ["".join(cell["source"]) for cell in made["cells"] if cell["cell_type"] == "code"]
     page = blocks("start.md")
+    outputs = ["".join("".join(out["text"]) for out in c["outputs"]) for c in made["cells"] if "outputs" in c]
+    assert [text.strip() for text in outputs] == [(block.shown or "").strip() for block in page]
+    held = [base64.b64decode(one["image/png"]) for c in made["cells"] for one in c.get("attachments", {}).values()]
+    assert (DOCS / "pictures" / "start.png").read_bytes() in held
     assert [cell.strip() for cell in cells] == [block.source.strip() for block in page]
     names: dict = {"__name__": "notebook"}
     monkeypatch.chdir(tmp_path)

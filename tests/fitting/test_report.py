@@ -1,5 +1,7 @@
 """The report of a design: one file without links or scripts, its marks where the logs were repaired, its escapes."""
 
+import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -143,6 +145,22 @@ def test_a_design_from_memory_has_a_page_too(made, tmp_path):
     assert load_value(tmp_path / "design.npz", SavedDesign).logs is None
     page = Reader(check_controller(tmp_path / "design.npz", tmp_path, runs=1).page.read_text())
     assert [heading for heading in page.headings if heading in SECTIONS] == SECTIONS
+
+
+def test_rows_of_a_leaderboard_that_differ_in_the_tail_alone_are_one(made):
+    design, row = made.design, made.design.best
+    twin = replace(row, recipe=replace(row.recipe, tail=3))
+    other = replace(twin, score=9.876)
+    for place in (0, len(design.leaderboard)):
+        board = [*design.leaderboard]
+        board[place:place] = [twin]
+        chosen = design.chosen + (place == 0)
+        text = str(replace(design, leaderboard=(*board, other), chosen=chosen))
+        rows = re.findall(r"%  +\d+ of \d+$", text, re.MULTILINE)
+        assert len(rows) <= len(design.leaderboard) + 1
+        assert any("the same with another end of the horizon" in line for line in rows)
+        assert sum(line.startswith("→") for line in text.splitlines()) == 1
+        assert any("9.876" in line for line in text.splitlines()) or len(design.leaderboard) > 14
 
 
 def test_logs_are_kept_whole_and_marked_where_a_file_was_repaired(tmp_path):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.loop.run import About, StepRows
-from koopmpc.recording.description import _FORMAT, drawable, from_json, to_json, to_markdown
+from koopmpc.recording.description import _FORMAT, drawable, from_json, title_of, to_json, to_markdown
 from koopmpc.recording.reader import read_columns
 from koopmpc.recording.scenes import ReferenceScenes
 from koopmpc.recording.writer import block_of_run, blocks
@@ -282,3 +282,11 @@ def test_the_description_is_exact_data() -> None:
     about, steps = from_json(to_json(About(**run.about()), 20))
     assert about == About(**run.about())
     assert steps == 20
+
+
+def test_a_run_has_a_title_of_its_own(tmp_path: Path) -> None:
+    plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
+    told = {"title": "bench 3, new valve"}
+    run = km.simulate(plant, lambda y, r: [0.0], x0=[0.5, 0], reference=[0, 0], steps=5, metadata=told)
+    km.record(run, tmp_path / "run.rrd")
+    assert title_of(km.load_run(tmp_path / "run.rrd")) == "bench 3, new valve"
