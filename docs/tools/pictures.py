@@ -281,6 +281,11 @@ def manual_automatic() -> Any:
     return _run_of("how/manual_automatic.md")
 
 
+def measured_disturbances() -> Any:
+    """The run of the page on measured disturbances."""
+    return _run_of("how/measured_disturbances.md")
+
+
 def limits_in_time() -> Any:
     """The run of the page on limits in time."""
     return _run_of("how/limits_in_time.md")
@@ -405,6 +410,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         what_trust_means,
         guarantees,
         limits_in_time,
+        measured_disturbances,
         on_off,
         own_blocks,
         unequal_rates,

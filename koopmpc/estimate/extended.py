@@ -181,7 +181,8 @@ class ExtendedObserver:
             return self._begin(y, u)
         n, ny = self._model.nz, self.ny
         F = np.eye(n + ny)
-        F[:n, :n] = self._map.linearize(self.z, u).A
+        slope = getattr(self._model, "slope", None) if getattr(self._model, "scheduled", 0) else None
+        F[:n, :n] = self._map.linearize(self.z, u).A if slope is None else slope(self.z, u, w)
         F[:ny, n:] = np.eye(ny) if self._disturbed else 0.0
         z = np.array(self._model.advance(self.z, u, w, self.d), dtype=np.float64)
         Q = scipy.linalg.block_diag(self._Q, self._drift)

@@ -222,7 +222,9 @@ def fit_ensemble(
         raise DataError("no episode is longer than the past that the model needs; pass longer logs")
     points = model.embed(data.with_episodes(episodes))
     bilinear = isinstance(model, BilinearPredictor)
-    nw = 0 if isinstance(model, BilinearPredictor) else model.nw
+    if bilinear and model.nw:
+        raise DataError("an experiment knows no measured disturbances of a bilinear model; plan it with one of edmd")
+    nw = model.nw
     nx, total = model.nx, sum(map(len, points))
     blocks: list[tuple[np.ndarray, np.ndarray]] = []
     length = max(total // BLOCKS, 5)

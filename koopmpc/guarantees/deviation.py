@@ -80,8 +80,11 @@ def deviate(model: LinearPredictor | BilinearPredictor, x: ArrayLike, u: ArrayLi
         )
     if model.embedding is not None:
         raise DataError("the model has delays, and a certificate needs the whole state; fit it without an embedding")
-    if isinstance(model, LinearPredictor) and model.nw:
-        raise DataError("the model has measured disturbances, which a certificate does not know; fit it without W")
+    if model.nw:
+        raise DataError(
+            "the model has measured disturbances, which a certificate does not know; fit it without W, or pass "
+            "model.at(w) of a bilinear one"
+        )
     x_s, u_s = checks.vector(x, "x", model.nx), checks.vector(u, "u", model.nu)
     C_missed = float(np.abs(model.C @ model.lifting(x_s) - x_s).max())
     if C_missed > _EXACT * (1 + float(np.abs(x_s).max())) or not _reads_states(model):

@@ -208,10 +208,11 @@ class LinearPredictor(Predictor):
 
 @dataclass(frozen=True, eq=False, init=False)
 class BilinearPredictor(Predictor):
-    """A lifted bilinear predictor z⁺ = A z + B u + Σ uᵢ Nᵢ z, x ≈ C z, z₀ = ψ(x₀).
+    """A lifted bilinear predictor z⁺ = A z + B u + E w + Σ uᵢ Nᵢ z + Σ wⱼ Sⱼ z, x ≈ C z, z₀ = ψ(x₀).
 
     The effect of an input may depend on the state, as for a force that turns with the body on which it acts. A linear
-    predictor has one B for all states.
+    predictor has one B for all states. Measured disturbances w act alike: with S they are scheduling signals of a
+    linear parameter-varying model.
 
     Attributes
     ----------
@@ -219,6 +220,8 @@ class BilinearPredictor(Predictor):
         Those of every `Predictor`: A is (nz, nz), B (nz, nu), C (nx, nz), names have units, dt is in seconds.
     N
         (nu, nz, nz), one matrix for each input.
+    E, S, disturbances, nw
+        (nz, nw) and (nw, nz, nz), the effects of the measured disturbances w, their names, and how many there are.
 
     Raises
     ------
@@ -232,6 +235,10 @@ class BilinearPredictor(Predictor):
     """
 
     N: Float[np.ndarray, "nu nz nz"]
+    E: Float[np.ndarray, "nz nw"]
+    S: Float[np.ndarray, "nw nz nz"]
+    disturbances: tuple[str, ...]
+    nw: int = field(init=False)
 
     def __init__(
         self,
@@ -246,12 +253,48 @@ class BilinearPredictor(Predictor):
         report: FitReport | None = None,
         embedding: Delay | None = None,
         scale: ArrayLike | None = None,
+        E: ArrayLike | None = None,
+        S: ArrayLike | None = None,
+        disturbances: Sequence[str] | None = None,
     ) -> None:
         _store_fields(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
-        freeze(self, N=checks.bounded(N, "N", (len(inputs), self.nz, self.nz)))
+        nz = self.nz
+        drift = np.zeros((nz, 0)) if E is None else checks.bounded(E, "E", (nz, None))
+        nw = drift.shape[1]
+        names = tuple(f"w{i}" for i in range(nw)) if disturbances is None else tuple(disturbances)
+        if len(names) != nw:
+            raise ShapeError(f"disturbances has {len(names)} names and E {nw} columns; give one name each")
+        schedule = np.zeros((nw, nz, nz)) if S is None else checks.bounded(S, "S", (nw, nz, nz))
+        freeze(self, N=checks.bounded(N, "N", (len(inputs), nz, nz)), E=drift, S=schedule, disturbances=names, nw=nw)
 
-    def rollout(self, x0: ArrayLike, U: ArrayLike, *, history: Episode | None = None) -> Float[np.ndarray, "steps nx"]:
-        """Return x_k ≈ C z_k of z_{k+1} = (A + Σ uᵢ Nᵢ) z_k + B u_k, z_0 = ψ(x0), lifted once at the start.
+    @property
+    def is_scheduled(self) -> bool:
+        """Whether a measured disturbance multiplies the state."""
+        return bool(self.S.any())
+
+    def at(self, w: ArrayLike) -> "BilinearPredictor":
+        """Return the model without measured disturbances for constant ones, w: A + Σ wⱼ Sⱼ in place of A.
+
+        The part E w is added to it, and needs a `Constant` among the observables.
+
+        Raises
+        ------
+        DataError
+            The lifting has no Constant, and E w is not zero.
+        """
+        values, constant = checks.array(w, "w", (self.nw,)), self.lifting.constant_index
+        A, push = self.A + np.tensordot(values, self.S, 1), self.E @ values
+        if constant is None and push.any():
+            raise DataError("a constant w pushes the state, which needs a Constant; add km.Constant() to the lifting")
+        if constant is not None:
+            A[:, constant] += push
+        about = (self.C, self.lifting, self.dt, self.states, self.inputs, self.report, self.embedding, self.scale)
+        return BilinearPredictor(A, self.B, self.N, *about)
+
+    def rollout(
+        self, x0: ArrayLike, U: ArrayLike, W: ArrayLike | None = None, *, history: Episode | None = None
+    ) -> Float[np.ndarray, "steps nx"]:
+        """Return x_k ≈ C z_k of z_{k+1} = (A + Σ uᵢ Nᵢ + Σ wⱼ Sⱼ) z_k + B u_k + E w_k, z_0 = ψ(x0), lifted once.
 
         Parameters
         ----------
@@ -259,22 +302,51 @@ class BilinearPredictor(Predictor):
             (nx,) initial state; with an embedding and no history the point ζ_0.
         U
             (T, nu) inputs.
+        W
+            (T, nw) measured disturbances; zero by default.
         history
             The steps that led to x0, its last row x0 itself; only with an embedding.
         """
         inputs = checks.array(U, "U", (None, self.nu))
+        rows = np.zeros((len(inputs), self.nw)) if W is None else checks.array(W, "W", (len(inputs), self.nw))
         start = self.start(x0, history)
         Z = np.empty((len(inputs) + 1, self.nz))
         Z[0] = self.lifting(start)
         for k, u in enumerate(inputs):
             Z[k + 1] = self.A @ Z[k] + self.B @ u + u @ (self.N @ Z[k])
+            if self.nw:
+                Z[k + 1] += self.E @ rows[k] + rows[k] @ (self.S @ Z[k])
         X = self._clip(Z @ self.C.T)
         X[0] = start[: self.nx]
         return X
 
     def step_map(self) -> StepMap:
-        """Return the re-lifted map x⁺ = C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)) as a StepMap; with an embedding, of ζ."""
+        """Return the re-lifted map x⁺ = C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)) as a StepMap; with an embedding, of ζ.
+
+        Measured disturbances are zero in it; `at` makes a model of other constant ones.
+        """
         return _build_step_map(self, self.N)
+
+
+def relift_rollout(
+    predictor: LinearPredictor | BilinearPredictor,
+    x0: Float[np.ndarray, " n"],
+    U: Float[np.ndarray, "T nu"],
+    W: Float[np.ndarray, "T nw"],
+) -> Float[np.ndarray, "T1 n"]:
+    """Return the states, or points under an embedding, of forecasts that are lifted afresh at every step."""
+    if not predictor.nw:
+        return predictor.step_map().rollout(x0, U)
+    points = np.empty((len(U) + 1, len(x0)))
+    points[0] = x0
+    for k, (u, w) in enumerate(zip(U, W, strict=True)):
+        z = predictor.lifting(points[k])
+        z_next = predictor.A @ z + predictor.B @ u + predictor.E @ w
+        if isinstance(predictor, BilinearPredictor):
+            z_next += u @ (predictor.N @ z) + w @ (predictor.S @ z)
+        x, embedding = predictor.C @ z_next, predictor.embedding
+        points[k + 1] = x if embedding is None else embedding.shift(points[k], u, embedding.clip(x))
+    return points
 
 
 def load_model(path: str | Path) -> LinearPredictor | BilinearPredictor:

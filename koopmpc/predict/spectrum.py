@@ -132,7 +132,7 @@ def check_same_names(predictor: LinearPredictor | BilinearPredictor, episodes: E
     """Raise if data and predictor differ in states, inputs, dt, or the disturbances of the predictor."""
     checks.members(predictor, "the model", ("states", "inputs", "dt"), "pass one that edmd or bilinear_edmd returned")
     checks.members(episodes, "episodes", ("states", "inputs", "dt"), "pass Episodes, of collect or load_episodes")
-    known = predictor.disturbances if isinstance(predictor, LinearPredictor) else ()
+    known = getattr(predictor, "disturbances", ())
     for model_names, data_names, what in (
         (predictor.states, episodes.states, "states"),
         (predictor.inputs, episodes.inputs, "inputs"),

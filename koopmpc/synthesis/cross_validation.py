@@ -375,22 +375,20 @@ def fit_ridges(candidate: Candidate, total: Moments, like: Episodes, ridges: tup
     """Return the predictor of each ridge on these moments, without the checks that a report would need."""
     if isinstance(candidate.structure, Structure):  # fitted without a ridge
         return [solve_structure(candidate.structure, total)] * len(ridges)
-    task, nz, nu, which = build_regression(total, "select"), total.nz, like.nu, total.products
+    task, nz, nu, nw, which = build_regression(total, "select"), total.nz, like.nu, like.nw, total.products
     C = task.C
     assert C is not None, "an extended regression has its C"
     models: list[AnyPredictor] = []
     for K in _solutions(candidate, task, ridges, which):
-        A, B = K[:nz].T, K[nz : nz + nu].T
+        A, B, E = K[:nz].T, K[nz : nz + nu].T, K[nz + nu : nz + nu + nw].T
+        names, past = like.disturbances, candidate.embedding
         common = (C, candidate.lifting, like.dt, like.states, like.inputs)
         if candidate.bilinear:
-            N = np.zeros((nu, nz, nz))
-            N[:, :, which] = K[nz + nu :].reshape(nu, -1, nz).transpose(0, 2, 1)
-            models.append(BilinearPredictor(A, B, N, *common, embedding=candidate.embedding))
+            N = np.zeros((nu + nw, nz, nz))
+            N[:, :, which] = K[nz + nu + nw :].reshape(nu + nw, -1, nz).transpose(0, 2, 1)
+            models.append(BilinearPredictor(A, B, N[:nu], *common, E=E, S=N[nu:], disturbances=names, embedding=past))
         else:
-            E = K[nz + nu :].T
-            models.append(
-                LinearPredictor(A, B, *common, E=E, disturbances=like.disturbances, embedding=candidate.embedding)
-            )
+            models.append(LinearPredictor(A, B, *common, E=E, disturbances=names, embedding=past))
     return models
 
 
@@ -422,7 +420,7 @@ def _moments(candidate: Candidate, episodes: Episodes) -> Moments:
     """Return moments as triangular factors, whatever their condition, so that all folds are solved in the same way."""
     products = candidate.structure.has_products if isinstance(candidate.structure, Structure) else candidate.bilinear
     return second_moments(
-        episodes if candidate.bilinear else episodes.driven(),
+        episodes.driven(),
         candidate.lifting,
         embedding=candidate.embedding,
         route="qr",

@@ -167,7 +167,7 @@ def design(
     delays
         Past steps to try in an embedding; by default 0, 1 and 2, and 4 where the data show a hidden state.
     bilinear
-        Try bilinear models too, unless there are measured disturbances; the surrogates are then bilinear.
+        Try bilinear models too; the surrogates are then bilinear.
     tighten
         Tighten the limits of every controller (`Limits.tightened`) by its model's errors on the fold that it does not
         know, by at most half of the distance from the reference to the limit.
@@ -231,7 +231,7 @@ def design(
     hidden = memory is not None and memory.shows_hidden_state
     if hidden and delays is None:
         past = [*past, *LONGER]
-    models = _list_models(held, asked, candidates, past, bilinear and held.nw == 0, draw)
+    models = _list_models(held, asked, candidates, past, bilinear, draw)
     first = max(one.delays for one in models)
     room = int(np.median([len(episode) for episode in held])) - first
     forecast = min(ahead, max(room, 1))

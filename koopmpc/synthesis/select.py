@@ -128,7 +128,7 @@ def select(
         Past steps to try in an embedding; by default 0, 1 and 2, also 4 where the data show a hidden state, and of
         records up to 12.
     bilinear
-        Try z⁺ = A z + B u + Σ uᵢ Nᵢ z too, where there are inputs and no measured disturbances.
+        Try z⁺ = A z + B u + E w + Σ uᵢ Nᵢ z + Σ wⱼ Sⱼ z too, where there are inputs.
     relift
         Judge a bilinear model by forecasts that lift afresh at each step, as BilinearMPC plans, `step_map()` simulates
         and `score(relift=True)` measures; then errors below 1 % of the spread are all alike, for a controller corrects
@@ -183,7 +183,7 @@ def select(
             stacklevel=2,
         )
     checks.kind(bilinear, "bilinear", bool, "pass True or False")
-    both = bilinear and source.nu > 0 and source.nw == 0
+    both = bilinear and source.nu > 0
     record = candidates is None and is_record(held)
     if smooth:
         source, held, replaced = replace_glitches(source, held)

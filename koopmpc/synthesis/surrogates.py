@@ -90,6 +90,7 @@ class Surrogate(Value):
     @raise_swallowed()
     def _map(self, gain: float) -> LearnedMap:
         given = learned_map(self.model)
+        given = given.at(self.w)
         if gain == 1.0:
             return given
         x, u, theta = (ca.SX.sym(name, n) for name, n in (("x", given.nx), ("u", given.nu), ("t", len(given.theta))))

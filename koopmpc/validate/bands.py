@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.predict.predictors import relift_rollout
 from koopmpc.validate.scoring import AnyPredictor, Score, embed_episodes, forecast_errors, score
 from koopmpc.values import Value
 
@@ -253,10 +253,9 @@ def forecast(
     U, x, W = episode.U[start : start + steps], episode.X[start], episode.W[start : start + steps]
     with np.errstate(over="ignore", invalid="ignore"):
         if relift:
-            predicted = predictor.step_map().rollout(x, U)[:, :nx]
+            predicted = relift_rollout(predictor, x, U, W)[:, :nx]
         else:
-            disturbances = (W,) if isinstance(predictor, LinearPredictor) and predictor.nw else ()
-            predicted = predictor.rollout(x, U, *disturbances)
+            predicted = predictor.rollout(x, U, *((W,) if predictor.nw else ()))
     overflowed = ~np.logical_and.accumulate(np.isfinite(predicted).all(axis=1))
     predicted[overflowed] = np.nan
     below, above, name = _band_offsets(bands, steps, nx, relift)

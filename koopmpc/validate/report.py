@@ -254,7 +254,7 @@ def trust(
     low, high = _find_range(held_out)
     covered = coverage(judged) if train is None else coverage(judged, low=low, high=high)
     judged_total = total if train is None else compute_moments(train, predictor)
-    driven = judged if isinstance(predictor, BilinearPredictor) else judged.driven()
+    driven = judged if isinstance(predictor, BilinearPredictor) and not predictor.nw else judged.driven()
     order = min(_MOST_ORDER, max(len(episode) for episode in driven))
     return TrustReport(
         score=errors,

@@ -62,7 +62,7 @@ def compute_moments(
         checks.kind(model, "model", (LinearPredictor, BilinearPredictor), "pass a model, or a lifting")
         check_same_names(model, episodes)
         lifting, embedding, bilinear = model.lifting, model.embedding, isinstance(model, BilinearPredictor)
-        driven = isinstance(model, LinearPredictor) and model.nw > 0
+        driven = model.nw > 0
     rows = episodes.driven() if driven else episodes
     return second_moments(rows, lifting, embedding=embedding, route="qr", bilinear=bilinear)
 
@@ -150,8 +150,9 @@ def _step_matrix(predictor: AnyPredictor, total: Moments) -> Float[np.ndarray, "
         return np.vstack([A, predictor.B.T, predictor.E.T])
     products = total.products
     constant = np.setdiff1d(np.arange(total.nz), products)  # u times the Constant is u: add it to the inputs
-    B = predictor.B.T + predictor.N[:, :, constant].sum(axis=2)
-    N = predictor.N[:, :, products].transpose(0, 2, 1).reshape(-1, total.nz)
+    every = np.concatenate([predictor.N, predictor.S])
+    B = np.hstack([predictor.B, predictor.E]).T + every[:, :, constant].sum(axis=2)
+    N = every[:, :, products].transpose(0, 2, 1).reshape(-1, total.nz)
     return np.vstack([A, B, N])
 
 

@@ -153,9 +153,9 @@ def forecast_errors(
     order.
     """
     A, C = predictor.A.T, predictor.C.T
-    bilinear = isinstance(predictor, BilinearPredictor)
-    G = predictor.B.T if bilinear else np.hstack([predictor.B, predictor.E]).T
-    for X, V, rows in _split_blocks(points, starts, horizon, 0 if bilinear else predictor.nw):
+    G = np.hstack([predictor.B, predictor.E]).T
+    products = np.concatenate([predictor.N, predictor.S]) if isinstance(predictor, BilinearPredictor) else ()
+    for X, V, rows in _split_blocks(points, starts, horizon, predictor.nw):
         point = X[rows]
         z = predictor.lifting(point)
         truth = np.empty((horizon, len(rows), predictor.nx))
@@ -164,9 +164,8 @@ def forecast_errors(
             for h in range(horizon):
                 v = V[rows + h]
                 z_next = z @ A + v @ G
-                if bilinear:
-                    for i, N in enumerate(predictor.N):
-                        z_next += v[:, i : i + 1] * (z @ N.T)
+                for i, N in enumerate(products):
+                    z_next += v[:, i : i + 1] * (z @ N.T)
                 truth[h] = X[rows + h + 1, : predictor.nx]
                 x = z_next @ C
                 if predictor.embedding is not None:

@@ -153,7 +153,6 @@ MISTAKES = [
         lambda: km.Episodes([PUSHED], 0.1, disturbances=("p", "q")),
     ),
     (DATA, r"which dmdc does not fit; use edmd on State\(\)", lambda: km.dmdc(disturbed())),
-    (DATA, r"a bilinear fit leaves out; use edmd", lambda: km.bilinear_edmd(disturbed(), km.State())),
     (
         SHAPE,
         r"the episodes have disturbances \(gust\), the predictor has \(load \[N\], wind \[m/s\]\)",

@@ -147,7 +147,7 @@ class BilinearMPC(StagedMPC):
         super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
         self._sqp_iterations = checks.count(sqp_iterations, "sqp_iterations")
         self._iteration = RealTimeIteration(self._problem, compiles_model=self._compiles_model)
-        self._iteration.theta[:] = self._map.theta
+        self._iteration.set_theta(self._map.theta)
         self._e = self._iteration.e[:, : self._map.nx]
         self._X, self._U = self._iteration.X[:, : self._map.nx], np.zeros((self._N, self.nu))
 
@@ -161,6 +161,12 @@ class BilinearMPC(StagedMPC):
     def build_program(self, reference: ArrayLike | None) -> StagedProgram:
         """Return the data of a step."""
         problem, outputs, model = self._problem, self._outputs, self._map
+        if problem.scheduled:
+            raise no_export(
+                self,
+                "measured disturbances multiply its state, which its C does not know",
+                "a BilinearMPC on model.at(w), for one constant w",
+            )
         if problem.ends:
             raise no_export(self, "its C has no terminal set", "a LinearMPC or a KoopmanMPC with a terminal polytope")
         estimator = publish_estimator(self._initial.observer, self._estimator, self._time_limit, "sqp_iterations=1")
@@ -243,7 +249,10 @@ class BilinearMPC(StagedMPC):
             The model is of another kind, has another lifting, dt, states, inputs or disturbances, or is a StepMap.
         """
         super().update(model)
-        self._iteration.theta[:] = self._map.theta
+        self._iteration.set_theta(self._map.theta)
+
+    def _schedule(self, W: Float[np.ndarray, "N nw"]) -> None:
+        self._iteration.W[:] = W
 
     def _solve(
         self,
@@ -361,7 +370,7 @@ class BilinearMPC(StagedMPC):
             return
         motion = rest.copy()
         for k in range(N):
-            motion[k + 1] = self._map.step(motion[k], u) + self._e[k]
+            motion[k + 1] = self._map.step(motion[k], u, self._initial.W[k]) + self._e[k]
         if np.abs(motion).max() < HUGE:
             yield motion, U
 
@@ -413,7 +422,7 @@ class BilinearMPC(StagedMPC):
         X, U = self._trajectory(self._iteration.X, self._iteration.U)
         X = X.copy()
         X[:-1], U[:-1] = X[1:], U[1:]
-        X[-1] = self._map.step(X[-2], U[-1]) + self._e[-1]
+        X[-1] = self._map.step(X[-2], U[-1], self._initial.W[-1]) + self._e[-1]
         self._enter(X, U, u_prev)
 
 

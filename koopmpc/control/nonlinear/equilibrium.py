@@ -484,6 +484,12 @@ class TerminalTargets:
             if found is not None:
                 self._known[key] = self._target(row, found)
 
+    def begin_with(self, model: LearnedMap) -> None:
+        """Forget all targets, and find those of this θ."""
+        self.equilibria.update(model)
+        self._known, self._last = {}, None
+        self._missed.clear()
+
     def __call__(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
         """Return the target of a row, kept for the next time, or until `forget_missed` where none was found."""
         key = row.tobytes()

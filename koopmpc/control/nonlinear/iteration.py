@@ -62,7 +62,8 @@ class StageStep(NamedTuple):
 class RealTimeIteration:
     """The quadratic program along a plan X (N+1, nx), U (N, nu): δx_0 = x − X_0, c_k = F(X_k, U_k) + e_k − X_{k+1}.
 
-    Each step reads `theta`, `e`, and `low` and `high`, the limits of [U_k; g(X_{k+1})].
+    Each step reads `theta`, its part `W`, the w_k that multiply the state, `e`, and `low` and `high`, the limits of
+    [U_k; g(X_{k+1})].
 
     Parameters
     ----------
@@ -104,7 +105,9 @@ class RealTimeIteration:
         self.slack = 0.0  # of the soft limit that the plan breaks most, where that is more than its allowance
         self.multipliers: Float[np.ndarray, " m"] | None = None  # of a program that the active-set method has finished
         self.X, self.U = zeros((N + 1, nx)), zeros((N, nu))
-        self.theta, self.e = zeros(problem.F.size1_in(2)), zeros((N, nx))
+        self.theta, self.e = zeros(problem.theta_size), zeros((N, nx))
+        self._scheduled = problem.scheduled
+        self.W = self.theta[len(self.theta) - N * problem.scheduled :].reshape(N, problem.scheduled)
         self._R, self._U_r = zeros((N, nr)), zeros((N, nu))
         self._targets: StageTargets | None = None  # those that the routines have
         self._terminal = zeros((nr, nx + nr)), zeros((nx, nx + nr)), zeros(nx + nr)  # columns as rows
@@ -213,13 +216,24 @@ class RealTimeIteration:
         """
         states = self.X.copy()
         for k, u in enumerate(self.U):
-            states[k + 1] = np.array(cast(ca.DM, self._step_of(states[k], u, self.theta))).ravel() + self.e[k]
+            states[k + 1] = np.array(cast(ca.DM, self._step_of(states[k], u, self._theta_of(k)))).ravel() + self.e[k]
             if not np.abs(states[k + 1]).max() < HUGE:
                 return np.inf
         past = self._past(states)
         if past <= 1 < self._past(self.X):
             self.X[:] = states
         return past
+
+    def _theta_of(self, k: int) -> Float[np.ndarray, " nt"]:
+        """Return θ of stage k."""
+        if not self._scheduled:
+            return self.theta
+        return np.concatenate([self.theta[: len(self.theta) - self.W.size], self.W[k]])
+
+    def set_theta(self, theta: Float[np.ndarray, " nt"]) -> None:
+        """Set the θ of a model; the w of all stages stay."""
+        n = len(theta) - self._scheduled
+        self.theta[:n] = theta[:n]
 
     def _past(self, X: Float[np.ndarray, "N1 nx"]) -> float:
         """Return by how much these states break a hard limit, in units of what counts as broken."""

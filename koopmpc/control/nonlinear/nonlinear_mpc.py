@@ -112,7 +112,7 @@ class NonlinearMPC(StagedMPC):
         self._options = solver, dict(settings or {}), time_limit is not None
         self._own = {"solver": solver, "starts": self._starts, "settings": dict(settings or {})}
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
-        self._e = np.zeros((self._N, self._map.nx))
+        self._e, self._W = np.zeros((self._N, self._map.nx)), np.zeros((self._N, self._map.scheduled))
 
     def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
         return "NonlinearMPC", self.model, self._own
@@ -134,6 +134,9 @@ class NonlinearMPC(StagedMPC):
         super().update(model)
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
 
+    def _schedule(self, W: Float[np.ndarray, "N nw"]) -> None:
+        self._W[:] = W
+
     def _solve(
         self,
         s: Float[np.ndarray, " ns"],
@@ -144,7 +147,7 @@ class NonlinearMPC(StagedMPC):
         starts = [self._next] if self._warm else self._guesses(s[: self._map.nx], u_prev)
         solved: list[NLPSolution] = []
         for start in starts:
-            solved.append(self._shooting.solve(s, self._targets, self._e, start, first, deadline))
+            solved.append(self._shooting.solve(s, self._targets, self._e, start, first, deadline, self._W))
             if perf_counter() > deadline:
                 break
         iterations = sum(found.iterations for found in solved)
@@ -165,8 +168,8 @@ class NonlinearMPC(StagedMPC):
         for _ in range(self._starts - 1):
             U = np.repeat(rng.uniform(low, high, (-(-N // _HOLD), self.nu)), _HOLD, axis=0)[:N]
             X = [x]
-            for u, e in zip(U, self._e, strict=True):
-                X.append(self._map.step(X[-1], u) + e)
+            for u, e, w in zip(U, self._e, self._initial.W, strict=True):
+                X.append(self._map.step(X[-1], u, w) + e)
             if np.isfinite(X).all():
                 guesses.append((np.array(X), U))
         stages = [self._stages(X, U, u_prev) for X, U in guesses]

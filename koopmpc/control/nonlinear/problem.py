@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -29,6 +29,8 @@ _SHARED = ("lifting", "embedding", "dt", "states", "inputs", "disturbances")
 class LearnedMap:
     """x⁺ = F(x, u, θ) + E w + d, θ being the matrices of the model: another model of the same lifting is another θ.
 
+    Where w multiplies the state, it is the last part of θ, zero in `theta`, and `at` makes the map of another w.
+
     Of a predictor F is C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)), lifted afresh each step, and θ holds C A, C B and C Nᵢ. Under
     an embedding x is the point ζ of the plant's state and its past, the state first; F also shifts the past, which
     neither w nor d moves. A StepMap has no θ.
@@ -41,6 +43,8 @@ class LearnedMap:
         (nx, nw) gain of the measured disturbances.
     nx, ny, nu, nw
         Entries of x, of the plant's state, of u and of w.
+    scheduled
+        How many entries of w, the last ones of θ, multiply the state: all or none.
     embedding
         What makes x of the plant's state and its past; None where x is that state.
     center
@@ -58,6 +62,7 @@ class LearnedMap:
     nu: int
     nw: int
     embedding: Delay | None
+    scheduled: int = 0
     lifting: None = None  # a plan is made of states, and none of them is lifted
     nz: int = field(init=False)  # a plan is made of x
     center: Float[np.ndarray, " ny"] | None = field(init=False)
@@ -92,9 +97,30 @@ class LearnedMap:
                 raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
         return replace(self, model=model, theta=_theta(model), E=_gain(model, self.nx))
 
-    def step(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nx"]:
-        """Return F(x, u, θ)."""
-        return self._buffer(x, u, self.theta)[0]
+    def at(self, w: Float[np.ndarray, " nw"]) -> "LearnedMap":
+        """Return the map for which w multiplies the state; itself where w only adds to it."""
+        return self if not self.scheduled else replace(self, theta=self.schedule(w))
+
+    def schedule(self, w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " nt"]:
+        """Return θ with this w."""
+        return np.concatenate([self.theta[: len(self.theta) - self.scheduled], w[: self.scheduled]])
+
+    def step(
+        self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"] | None = None
+    ) -> Float[np.ndarray, " nx"]:
+        """Return F(x, u, θ), with the products of w where it has some."""
+        return self._buffer(x, u, self.theta if w is None or not self.scheduled else self.schedule(w))[0]
+
+    def slope(
+        self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
+    ) -> Float[np.ndarray, "nx nx"]:
+        """Return ∂F/∂x."""
+        return np.array(self._slope(x, u, self.schedule(w)), dtype=np.float64)
+
+    @cached_property
+    def _slope(self) -> Any:
+        x, u, t = (ca.SX.sym(name, self.F.size1_in(i)) for i, name in enumerate("xut"))
+        return ca.Function("slope", [x, u, t], [ca.densify(ca.jacobian(self.F(x, u, t), x))])
 
     def advance(
         self,
@@ -104,7 +130,7 @@ class LearnedMap:
         d: Float[np.ndarray, " nx"],
     ) -> Float[np.ndarray, " nx"]:
         """Return F(z, u, θ) + E w + d, as observers ask for it."""
-        return self.step(z, u) + self.E @ w + d
+        return self.step(z, u, w) + self.E @ w + d
 
     @cached_property
     def _buffer(self) -> Buffered:
@@ -136,22 +162,30 @@ def learned_map(model: ModelOrMap) -> LearnedMap:
     for i in range(nu if isinstance(model, BilinearPredictor) else 0):
         theta.append(ca.SX.sym(f"CN{i}", ny, nz))
         A = A + u[i] * theta[-1]
+    scheduled = model.nw if isinstance(model, BilinearPredictor) and model.is_scheduled else 0
+    if scheduled:
+        w = ca.SX.sym("w", scheduled)
+        for j in range(scheduled):
+            theta.append(ca.SX.sym(f"CS{j}", ny, nz))
+            A = A + w[j] * theta[-1]
+        theta.append(w)
     x_next = A @ z + B @ u
     if model.embedding is not None:
         x_next = model.embedding.without_rails().symbolic(x, u, x_next)
     F = ca.Function("F", [x, u, ca.vertcat(*map(ca.vec, theta))], [ca.densify(x_next)], {"cse": True})
     E = _gain(model, nx)
-    return LearnedMap(model, F, _theta(model), E, nx, ny, nu, E.shape[1], model.embedding)
+    return LearnedMap(model, F, _theta(model), E, nx, ny, nu, E.shape[1], model.embedding, scheduled)
 
 
 def _theta(model: LinearPredictor | BilinearPredictor) -> Float[np.ndarray, " nt"]:
     parts = [model.A, model.B, *(model.N if isinstance(model, BilinearPredictor) else ())]
-    return np.concatenate([(model.C @ part).ravel("F") for part in parts])
+    schedule = isinstance(model, BilinearPredictor) and model.is_scheduled
+    parts += list(model.S) if isinstance(model, BilinearPredictor) and schedule else []
+    theta = np.concatenate([(model.C @ part).ravel("F") for part in parts])
+    return np.concatenate([theta, np.zeros(model.nw)]) if schedule else theta
 
 
 def _gain(model: LinearPredictor | BilinearPredictor, nx: int) -> Float[np.ndarray, "nx nw"]:
-    if isinstance(model, BilinearPredictor):
-        return np.zeros((nx, 0))
     E = np.zeros((nx, model.nw))
     E[: model.nx] = model.C @ model.E
     return E
@@ -175,6 +209,8 @@ class StagedProblem(NamedTuple):
         Limits of `limited`, what it costs to break them, and by how much each stage moves the last of them inwards.
     free
         Whether a stage has an input; else v is zero there.
+    scheduled
+        How many of the measured disturbances multiply the state; they are the last entries of θ.
     held_from, own
         The stage whose value of each input each stage takes, and whether some input has blocks of its own.
     sizes, input_sizes, scale
@@ -202,6 +238,19 @@ class StagedProblem(NamedTuple):
     scale: float
     ends: int = 0
     own: bool = False
+    scheduled: int = 0
+
+    def stage_theta(self, theta: ca.MX, k: int) -> ca.MX:
+        """Return the θ of stage k out of [θ; w_0; …; w_{N−1}], all of them where w multiplies no state."""
+        if not self.scheduled:
+            return theta
+        n, s = self.F.size1_in(2) - self.scheduled, self.scheduled
+        return ca.vertcat(theta[:n], theta[n + k * s : n + (k + 1) * s])
+
+    @property
+    def theta_size(self) -> int:
+        """Entries of [θ; w_0; …; w_{N−1}]."""
+        return self.F.size1_in(2) + self.scheduled * (len(self.free) - 1)
 
 
 class StageTargets(NamedTuple):
@@ -242,6 +291,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks)
         input_sizes=o.sizes.inputs,
         margin=preview_margin(o.margin, N),
         scale=o.sizes.scale,
+        scheduled=model.scheduled,
     )
     wanted = o.limits.terminal
     if not o.with_rates and len(blocks) == N and not moves.own:

@@ -105,7 +105,9 @@ class Shooting:
         nx, nu, nr, ng = p.nx, p.F.size1_in(1), len(p.Q), len(p.box.low)
         moved = nx - p.with_rates * (nu + len(p.soft_rates))  # entries of s that a disturbance moves
         x, u = ca.MX.sym("x", nx), ca.MX.sym("u", nu)
-        F, smooth = ca.Function("F", [x, u], [p.F(x, u, ca.DM(theta))]), p.F.is_a("SXFunction")
+        w = ca.MX.sym("w", p.scheduled)
+        matrices = ca.vertcat(ca.MX(ca.DM(theta[: len(theta) - p.scheduled])), w)
+        F, smooth = ca.Function("F", [x, u, w], [p.F(x, u, matrices)]), p.F.is_a("SXFunction")
         F = F.expand() if smooth else F
         linear, quadratic, allowance = p.softness
         soft = np.flatnonzero(np.isfinite(linear))
@@ -115,11 +117,12 @@ class Shooting:
         W = ca.MX.sym("W", nu + nx + ns, N)
         whole = ca.DM(self._sizes) * W
         U, X, E = whole[:nu, :], whole[nu : nu + nx, :], whole[nu + nx :, :]
-        x0, r, u_r, e = (ca.MX.sym("p", *size) for size in ((nx, 1), (nr, N), (nu, N), (moved, N)))
+        sizes = ((nx, 1), (nr, N), (nu, N), (moved, N), (p.scheduled, N))
+        x0, r, u_r, e, schedule = (ca.MX.sym("p", *size) for size in sizes)
         M, L, m = (ca.MX.sym("terminal", nx + nr, columns) for columns in (nr, nx, 1))
 
         # gap_1; gap_2, path_1; …; gap_N, path_{N−1}; path_N, the order in which fatrop finds the stages, with its sign
-        ahead = F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U) + ca.vertcat(e, ca.MX(nx - moved, N))
+        ahead = F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U, schedule) + ca.vertcat(e, ca.MX(nx - moved, N))
         gaps = W[nu : nu + nx, :] - ahead / ca.DM(p.sizes)
         end = M @ p.tracked(X[:, N - 1]) + L @ X[:, N - 1] - m
         f = _weigh(U - u_r, p.R) + ca.sumsqr(end)
@@ -166,7 +169,7 @@ class Shooting:
         lbx[held] = ubx[held] = 0.0
         lbx, ubx = lbx / self._sizes, ubx / self._sizes
         self._bounds = {"lbx": lbx.ravel(), "ubx": ubx.ravel(), "lbg": lbg, "ubg": ubg}
-        parameters = ca.veccat(x0, r, u_r, e, M, L, m)
+        parameters = ca.veccat(x0, r, u_r, e, M, L, m, schedule)
         nlp = {"x": ca.vec(W), "p": parameters, "f": f / p.scale, "g": ca.vertcat(*g)}
         given: dict[str, Any] = {"expand": smooth, "error_on_fail": False, "print_time": False}
         self._start_is_number: ca.Function | None = None
@@ -208,6 +211,7 @@ class Shooting:
         start: Start,
         first: Interval,
         deadline: float = np.inf,
+        schedule: Float[np.ndarray, "N ns"] | None = None,
     ) -> NLPSolution:
         """Solve from `start` with u_0 inside `first`; ipopt and sqpmethod end after the iteration of the deadline."""
         if self._clock is not None:
@@ -216,6 +220,7 @@ class Shooting:
         for end, value in zip(("lbx", "ubx"), first, strict=True):
             self._bounds[end][:nu] = value / self._sizes[:nu]
         p = [x0, t.R.ravel(), t.U.ravel(), e.ravel(), t.M.ravel("F"), t.L.ravel("F"), t.m]
+        p += [] if schedule is None else [schedule.ravel()]
         begin = {"x0": start.v, "lam_x0": start.bounds, "lam_g0": start.constraints}
         U, X, slacks = np.split(start.v.reshape(self._shape) * self._sizes, self._split, axis=1)
         failed = NLPSolution(U, X, slacks, np.inf, Status.FAILED, 0, start)

@@ -96,6 +96,7 @@ class StagedMPC(MPCBase):
         self._problem = staged_problem(given, o, self._moves)
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
         self._disturbed = estimator is not None or given.nw > 0
+        self._scheduled_for = np.zeros(given.nw)
 
     @property
     def model(self) -> ModelOrMap:
@@ -114,6 +115,9 @@ class StagedMPC(MPCBase):
         self._warm, self._moved, self._row = False, False, 0
         self._forget_targets()
         self._terminal.forget_missed()
+        if self._scheduled_for.any():
+            self._scheduled_for = np.zeros(self._map.nw)
+            self._terminal.begin_with(self._map)
         self._e[:] = 0.0
 
     @alone
@@ -126,7 +130,7 @@ class StagedMPC(MPCBase):
             The model is of another kind, has another lifting, dt, states, inputs or disturbances, or is a StepMap.
         """
         self._map = self._map.replace_model(model)
-        self._terminal.update(self._map)
+        self._terminal.update(self._map.at(self._scheduled_for))
         self._initial.update(self._map)
         if self._watch is not None:
             self._watch.update(self._map)
@@ -201,7 +205,19 @@ class StagedMPC(MPCBase):
             return False
         self._moved = self._moved or bool((e[-1] != self._e[-1]).any())
         self._e[:] = e
+        if self._map.scheduled:
+            if not np.abs(initial.W).max() < HUGE:
+                return False
+            self._schedule(initial.W)
+            if (initial.W[-1] != self._scheduled_for).any():  # the last row of the preview holds at the target
+                self._scheduled_for = initial.W[-1].copy()
+                self._terminal.update(self._map.at(initial.W[-1]))
+                self._forget_targets()
         return True
+
+    def _schedule(self, W: Float[np.ndarray, "N nw"]) -> None:
+        """Take over the measured disturbances that multiply the state, a row a stage."""
+        raise NotImplementedError
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> bool:
         """Find the targets of a reference where it has changed; return whether it is finite."""

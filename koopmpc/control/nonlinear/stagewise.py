@@ -94,7 +94,8 @@ def linearisation(problem: StagedProblem) -> ca.Function:
     R, U_r = ca.MX.sym("R", nr, N), ca.MX.sym("U_r", nu, N)
     goal = [ca.MX.sym("goal", nx + nr, columns) for columns in (nr, nx, 1)]
     # called stage by stage, for a map would copy θ for each of them
-    stages = [dynamics(X[:, k], U[:, k], t) for k in range(N)]
+    every = t if not problem.scheduled else ca.MX.sym("t", problem.theta_size)
+    stages = [dynamics(X[:, k], U[:, k], problem.stage_theta(every, k)) for k in range(N)]
     A = ca.horzcat(*(stage[0] for stage in stages))
     B = ca.horzcat(
         *(each[1] if free else ca.MX(ca.DM(nx, nu)) for each, free in zip(stages, problem.free, strict=True))
@@ -106,7 +107,7 @@ def linearisation(problem: StagedProblem) -> ca.Function:
         Q, q = ca.horzcat(Q_k, Q), ca.horzcat(q_k, q)
     g_k, G = limited.map(N)(X[:, 1:]) if ng else (ca.MX(0, N), ca.MX(0, N * nx))
     found = [A, ca.densify(B), F, Q, q, ca.DM(problem.R) @ (U - U_r), g_k, G]
-    return ca.Function("linearisation", [X, U, R, U_r, *goal, t], found)
+    return ca.Function("linearisation", [X, U, R, U_r, *goal, every], found)
 
 
 def list_hard_outputs(softness: Softness, inputs: int) -> Int[np.ndarray, " n"]:
@@ -144,8 +145,8 @@ def plan_cost(problem: StagedProblem) -> ca.Function:
 def simulation(problem: StagedProblem) -> ca.Function:
     """Return (X, U, θ) → F(X_k, U_k), stage beside stage."""
     nx, nu, N = problem.nx, problem.F.size1_in(1), len(problem.free)
-    X, U, t = ca.MX.sym("X", nx, N), ca.MX.sym("U", nu, N), ca.MX.sym("t", problem.F.size1_in(2))
-    found = ca.horzcat(*(problem.F(X[:, k], U[:, k], t) for k in range(N)))
+    X, U, t = ca.MX.sym("X", nx, N), ca.MX.sym("U", nu, N), ca.MX.sym("t", problem.theta_size)
+    found = ca.horzcat(*(problem.F(X[:, k], U[:, k], problem.stage_theta(t, k)) for k in range(N)))
     return ca.Function("simulation", [X, U, t], [found])
 
 

@@ -1,4 +1,4 @@
-"""Bilinear extended dynamic mode decomposition: z⁺ = A z + B u + Σ uᵢ Nᵢ z on z = ψ(x)."""
+"""Bilinear extended dynamic mode decomposition: z⁺ = A z + B u + E w + Σ uᵢ Nᵢ z + Σ wⱼ Sⱼ z on z = ψ(x)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,9 +40,11 @@ def bilinear_edmd(
     difference: bool = False,
     **options: Unpack[ReadOptions],
 ) -> BilinearPredictor:
-    """Fit ψ(x⁺) = A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x) by least squares on M snapshot pairs.
+    """Fit ψ(x⁺) = A ψ(x) + B u + E w + Σ uᵢ Nᵢ ψ(x) + Σ wⱼ Sⱼ ψ(x) by least squares on M snapshot pairs.
 
-    Nothing is added to the lifting. If it holds a Constant, the columns of Nᵢ for it are zero, because B multiplies uᵢ.
+    Nothing is added to the lifting. If it holds a Constant, the columns of Nᵢ and Sⱼ for it are zero, because B
+    multiplies uᵢ and E wⱼ. Where the episodes hold measured disturbances W, these act as inputs do; with wⱼ ψ(x) the
+    model is linear parameter-varying, and wⱼ a scheduling signal.
 
     Parameters
     ----------
@@ -59,8 +61,8 @@ def bilinear_edmd(
     rank
         As in `edmd`: z = U_rᵀ ψ(x) on unscaled columns, and u⊗z for the products.
     products
-        Names of the observables that inputs multiply, for an input-affine model ψ(x⁺) = A ψ(x) + G(x) u whose G
-        is spanned by 1 and these; all by default.
+        Names of the observables that inputs and measured disturbances multiply, for an input-affine model
+        ψ(x⁺) = A ψ(x) + G(x) u whose G is spanned by 1 and these; all by default.
     difference
         Regress ψ(x⁺) − ψ(x) and add I to A. Without a ridge and on independent columns the model is the same. With a
         ridge, or a cut of singular values, the model is drawn towards z⁺ = z instead of z⁺ = 0. For a short dt this is
@@ -99,15 +101,14 @@ def bilinear_edmd(
     source = source_of(episodes)
     if source.nu == 0:
         raise DataError("the episodes have no inputs; pass them to edmd, or give each Episode its U")
-    if source.nw:
-        raise DataError("the episodes hold measured disturbances, which a bilinear fit leaves out; use edmd")
     ridge = check_ridge(ridge)
     if rank is not None and products is not None:
         raise DataError("a rank mixes all observables, so inputs cannot multiply some of them; pass one of the two")
-    total = second_moments(source, lifting, bilinear=True, embedding=embedding, **options)
-    regression = build_regression(total, "bilinear_edmd")
+    delays = embedding if embedding is None or not source.nw else embedding.match(source.states, source.inputs)
+    total = second_moments(source.driven(), lifting, bilinear=True, embedding=delays, **options)
+    regression = build_regression(total, "bilinear_edmd", disturbances=source.disturbances)
     assert regression.C is not None, "an extended regression has its C"
-    bound, nz, nu = regression.lifting, total.nz, source.nu
+    bound, nz, nu = regression.lifting, total.nz, source.nu + source.nw
     which = total.products if products is None else _find_products(total, products)
     rows = _keep_products(regression.rows, total, which)
     names = tuple(f"{u} * {bound.names[int(i)]}" for u in total.inputs for i in which)
@@ -130,9 +131,10 @@ def bilinear_edmd(
     N[:, :, which] = K[r + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
     regression = replace(regression, rows=replace(rows, P=P, constant=constant))
     solved = describe_solve(regression.rows, ridge, solution.ridge)
+    own = source.nu
     result = FitResult(
         A=K[:r].T,
-        B=K[r : r + nu].T,
+        B=K[r : r + own].T,
         C=C,
         lifting=bound,
         residual=regression.rows.residual(regression.x_next, K @ C.T),
@@ -146,15 +148,18 @@ def bilinear_edmd(
     return BilinearPredictor(
         result.A,
         result.B,
-        N,
+        N[:own],
         C,
         bound,
         regression.dt,
         regression.states,
-        regression.inputs,
+        source.inputs,
         build_report(regression, result),
         regression.embedding,
         compute_scale_factor(P[:, :r], rows.samples),
+        E=K[r + own : r + nu].T if source.nw else None,
+        S=N[own:] if source.nw else None,
+        disturbances=source.disturbances if source.nw else None,
     )
 
 

@@ -158,7 +158,7 @@ def refine(
     if is_hidden(model):
         return _refine_hidden(model, episodes_of(episodes), horizon, held_out, iterations)
     places = _state_rows(model)
-    if isinstance(model, LinearPredictor) and model.nw:
+    if model.nw:
         raise DataError("the model has measured disturbances, which refine does not know; refine a model without them")
     whole = episodes_of(episodes)
     learn, unseen = _parts(whole) if held_out is None else (list(whole), list(episodes_of(held_out)))
