@@ -70,7 +70,7 @@ followed("design_all", lambda: km.design(data, cost, limits, **task), ground=Tru
 """
 MOST = {  # files, returns
     "edmd": (8, 6),
-    "bilinear_edmd": (8, 6),
+    "bilinear_edmd": (8, 7),
     "KoopmanMPC": (17, 20),
     "step": (5, 3),
     "BilinearMPC": (14, 16),
