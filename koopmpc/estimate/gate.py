@@ -12,7 +12,7 @@ from koopmpc.plants.routines import bind_interpreter
 from koopmpc.values import Viewing
 
 # A reading is refused if an innovation exceeds this many times the running 0.9 quantile of its size. Of Gaussian
-# innovations the bound is eight standard deviations.
+# innovations the bound is about ten standard deviations: where the running quantile rests it is above 1.64.
 BEYOND = 5.0
 BRIDGED = 5  # refused readings in sequence for which a prediction stands in; the next one is used
 FEW = 10  # no reading is refused before so many innovations of a run have come

@@ -197,6 +197,36 @@ def test_the_bound_follows_the_spread_of_the_innovations_and_the_steps_of_the_ou
     assert gate.judge(np.array([1 + 1.1 * BEYOND * LEAST]), np.ones(1))
 
 
+def test_the_bound_is_five_times_the_size_above_which_an_innovation_widens_it():
+    """Predictions are the last readings, so that no predicted step adds to the bound."""
+
+    def least(holds) -> float:
+        low, high = 0.0, 1e3
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (low, middle) if holds(middle) else (middle, high)
+        return high
+
+    def is_refused(gate: ReadingGate, size: float) -> bool:
+        return copy.deepcopy(gate).judge(np.array([last + size]), np.array([last]))
+
+    def bound_after(gate: ReadingGate, size: float) -> float:
+        after = copy.deepcopy(gate)
+        assert not after.judge(np.array([last + size]), np.array([last]))
+        at = np.array([last + size])
+        return least(lambda more: copy.deepcopy(after).judge(at + more, at))
+
+    for seed in range(3):
+        gate, rng, last = ReadingGate(1), np.random.default_rng(seed), 0.0
+        for _ in range(100):
+            y = last + rng.normal()
+            gate.judge(np.array([y]), np.array([last]))
+            last = y
+        bound = least(lambda size, gate=gate: is_refused(gate, size))
+        quantile = least(lambda size, gate=gate, bound=bound: size >= bound or bound_after(gate, size) > bound)
+        assert abs(bound / quantile - 5.0) < 1e-6
+
+
 def test_a_missing_entry_is_neither_judged_nor_refused():
     mpc = built("KoopmanMPC, filter")
     x = np.array([0.2, 0.0])

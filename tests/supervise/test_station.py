@@ -95,6 +95,17 @@ def test_simc_says_why_it_has_no_rule(A, B, Q, said):
         km.control.PID.tune(model_of(A, B), km.Cost(Q=Q, R=1))
 
 
+def test_an_integrator_is_told_from_a_constant_by_its_row_and_not_by_its_column():
+    """Both have a pole of 1: a Constant keeps its value, an integrator keeps it only while nothing else acts."""
+    filled = model_of([[1.0, 0.1], [0.0, 0.9]], [[0.0], [1.0]])  # the first state integrates the second one
+    with pytest.raises(km.errors.DataError, match="not stable where it is linearised, largest pole 1;"):
+        km.control.PID.tune(filled, km.Cost(Q=[1, 0], R=1))
+    A, B, C = np.array([[0.9, 0.05], [0.0, 1.0]]), np.array([[0.2], [0.0]]), np.array([[1.0, 0.0]])
+    pushed = km.LinearPredictor(A, B, C, km.State() + km.Constant(), 0.1, ("x0",), ("u0",))
+    one, other = km.control.PID.tune(pushed, COST, BOX), km.control.PID.tune(TANK, COST, BOX)
+    np.testing.assert_allclose([one.kp, one.ki], [other.kp, other.ki], rtol=1e-9)
+
+
 def test_gains_of_two_signs_and_short_signals_are_refused():
     with pytest.raises(km.errors.DataError, match="gains of one loop have one sign"):
         km.control.PID(1.0, -1.0, dt=0.1)
