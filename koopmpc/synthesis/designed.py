@@ -325,15 +325,20 @@ class Design:
         save_value(SavedDesign(self.controller.as_data(), self.evidence, logs), path)
 
     def _find_twins(self) -> tuple[list[int], list[int]]:
-        """Return the rows to print, and for each row the place in them: rows that differ in the tail alone are one."""
+        """Return the rows to print, and for each row its place among them.
+
+        Rows with the same figures that differ only in the ridge or in the end of the horizon are printed as one.
+        """
         kept: list[int] = []
         leads: list[int] = []
         known: dict[tuple[str, ...], int] = {}
         for i, row in enumerate(self.leaderboard):
-            key = (str(replace(row.recipe, tail=None)), f"{row.recipe.ridge}", *_list_figures(row))
+            key = (str(replace(row.recipe, tail=None)), *_list_figures(row))
             if key not in known:
                 known[key] = len(kept)
                 kept.append(i)
+            elif i == self.chosen:
+                kept[known[key]] = i
             leads.append(known[key])
         return kept, leads
 
@@ -347,14 +352,14 @@ class Design:
         rows: list[list[str]] = []
         titles = Counter(row.title for row in self.leaderboard)
         kept, leads = self._find_twins()
-        for row in (self.leaderboard[i] for i in kept):
+        for i in kept:
+            row, twins = self.leaderboard[i], [k for k, lead in enumerate(leads) if lead == len(rows) and k != i]
             title = (
                 row.title
                 if titles[row.title] == 1
                 else f"{row.title} (ridge {row.recipe.ridge:.0e})".replace("0e+00", "0")
             )
-            twin = len(rows) in [leads[i] for i in range(len(leads)) if i not in kept]
-            rows.append([title + "; the same with another end of the horizon" * twin, *_list_figures(row)])
+            rows.append([title + f"; {len(twins)} more alike" * bool(twins), *_list_figures(row)])
         headings = ["controller", "score", "worst\nrun", "viol-\nation", "lost\nruns"]
         parts.append(build_leaderboard(headings, rows, leads[self.chosen], None if place is None else leads[place])[0])
         parts += [
