@@ -21,6 +21,7 @@ MEMBERS = 12  # bootstrap models
 BLOCKS = 24  # stretches of the data that the bootstrap draws from
 WINDOW = 25  # steps of the forecasts that calibrate a band
 _FOLDS = 3  # parts of the data that are forecast by models of the others
+UNUSUAL = 1.5  # bands of plans are this much wider than those of windows, for a plan is the oddest of a library
 _MOST_WINDOWS = 300  # forecasts that calibrate a band
 _RUN = 30  # residuals are drawn in runs of this many steps, for misfit lasts
 _FARTHEST = 1e8  # leverage, over its mean, from which on errors do not grow further
@@ -312,7 +313,7 @@ def calibrate_bands(
     Ensembles of two thirds of the data forecast windows of the last third, the outermost windows together, since a
     plan may lead out of the data. A score is the largest error of a window in units of the spread. An experiment is as
     long as n windows, so that q is the quantile of level^(1/n); where the windows are too few for it, that of a
-    log-normal law of the scores.
+    log-normal law of the scores. It is raised by a half, since a plan is chosen for being unusual.
     """
     past = 0 if model.embedding is None else model.embedding.steps
     length = max(min(WINDOW, steps, max(len(e) for e in data) - past), 1)
@@ -347,8 +348,8 @@ def calibrate_bands(
     share = level ** (1.0 / max(-(-steps // length), 1))
     rank = int(np.ceil((len(ranked) + 1) * share - 1e-9))
     if rank <= len(ranked):
-        return max(float(ranked[rank - 1]), 1.0)
+        return max(UNUSUAL * float(ranked[rank - 1]), 1.0)
     logs = np.asarray(np.log(np.maximum(ranked, 1e-3)), dtype=np.float64)
     quantile = float(np.asarray(student.ppf(share, len(logs) - 1), dtype=np.float64))
     wide = float(logs.std(ddof=1)) * (1 + 1 / len(logs)) ** 0.5 * quantile
-    return max(math.exp(float(logs.sum()) / len(logs) + wide), float(ranked[-1]), 1.0)
+    return max(UNUSUAL * math.exp(float(logs.sum()) / len(logs) + wide), UNUSUAL * float(ranked[-1]), 1.0)

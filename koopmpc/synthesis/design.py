@@ -55,6 +55,7 @@ from koopmpc.synthesis.cross_validation import (
     take_sample,
 )
 from koopmpc.synthesis.designed import Design, DesignRow, Evidence, ExpectedLoop, choose_row
+from koopmpc.synthesis.feedback import require_episodes, use_instruments
 from koopmpc.synthesis.fresh.horizon import choose_horizon
 from koopmpc.synthesis.fresh.loops import (
     compare_longer_horizon,
@@ -114,6 +115,7 @@ def design(
     bilinear: bool = True,
     tighten: bool = True,
     smooth: bool = True,
+    instruments: Sequence[ArrayLike] | None = None,
     sample: int = 30_000,
     loops: int = 60,
     workers: int | None = None,
@@ -174,6 +176,10 @@ def design(
     smooth
         Replace glitches, and learn from smoothed states if the states contain noise (see `select`); the surrogates
         then measure with this noise.
+    instruments
+        For each episode (T, nr) or (T + 1, nr) rows of the set point of the loop that made the logs, or of a signal
+        added to its inputs. Where the logs hold feedback, least squares is found biased and unseen rows gain, models
+        are fitted to what these rows explain of states and inputs (two-stage method); the notes say whether.
     sample
         Approximate number of snapshot pairs that the choice uses.
     loops
@@ -203,10 +209,15 @@ def design(
     """
     draw, fresh_loops = checks.generator(rng), checks.count(loops, "loops", 0)
     ahead = 1 if horizon is None else checks.count(horizon, "horizon")
+    used, projected = "", np.zeros(0)
+    if instruments is not None:
+        data, projected, used = use_instruments(require_episodes(data), instruments)
+        smooth = smooth and not projected.any()
     source = source_of(data)
     if source.nu == 0:
         raise DataError("the data have no inputs, so there is nothing to control; give each Episode its U")
     held, notes = take_sample(source, checks.count(sample, "sample"))
+    notes = (*notes, used) if used else notes
     if smooth:
         source, held, replaced = replace_glitches(source, held)
         notes = (*notes, *replaced)
@@ -222,7 +233,7 @@ def design(
         source = source_of(held)
         if notes:
             notes = (f"chosen on and fitted to a sample of {len(held)} episodes, without those left out",)
-    noise, measured = np.zeros(held.nx), held
+    noise, measured = projected if projected.any() else np.zeros(held.nx), held
     if smooth:
         source, held, freed, noise = smooth_data(source, held)
         notes = (*notes, *freed)

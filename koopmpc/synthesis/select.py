@@ -42,6 +42,7 @@ from koopmpc.synthesis.cross_validation import (
     take_sample,
     usual_horizon,
 )
+from koopmpc.synthesis.feedback import require_episodes, use_instruments
 from koopmpc.synthesis.hidden_states import judge_hidden_states
 from koopmpc.synthesis.leaderboard import Selection, choose_model, make_row
 from koopmpc.synthesis.records import (
@@ -75,6 +76,7 @@ def select(
     bilinear: bool = True,
     relift: bool = True,
     smooth: bool = True,
+    instruments: Sequence[ArrayLike] | None = None,
     sample: int = 30_000,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -138,6 +140,10 @@ def select(
         Replace glitches with a `Mender`, and where the states hold noise, free them of it with a `Smoother`. Least
         squares on noisy states makes an unstable plant look tame, and so do forecasts that begin at them. The notes
         tell what was found.
+    instruments
+        For each episode (T, nr) or (T + 1, nr) rows of the set point of the loop that made the logs, or of a signal
+        added to its inputs. Where the logs hold feedback, least squares is found biased and unseen rows gain, models
+        are fitted to what these rows explain of states and inputs (two-stage method); the notes say whether.
     sample
         Snapshot pairs to choose on, about.
     workers, scheduler
@@ -164,11 +170,16 @@ def select(
     ----------
     Breiman, Friedman, Olshen & Stone, "Classification and Regression Trees", 1984, section 3.4.3.
     """
-    source, draw = source_of(episodes), checks.generator(rng)
+    draw, used = checks.generator(rng), ""
+    if instruments is not None:
+        episodes, freed_noise, used = use_instruments(require_episodes(episodes), instruments)
+        smooth = smooth and not freed_noise.any()
+    source = source_of(episodes)
     weights = RIDGES if ridges is None else check_ridges(ridges)
     folds = checks.count(folds, "folds", 2)
     past = check_delays((0, 1, 2) if delays is None else delays)
     held, notes = take_sample(source, checks.count(sample, "sample"))
+    notes = (*notes, used) if used else notes
     for i, count in count_wraps(held).items():
         warnings.warn(
             f"{held.states[i]} jumps by 2π {count} times: it was wrapped, and a model of it as a state cannot follow; "
