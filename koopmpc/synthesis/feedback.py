@@ -31,8 +31,8 @@ def project_on_instruments(
     """Return the episodes with states and inputs as the set points explain them, and the (nx,) size of the rest.
 
     The first stage of the two-stage method: x_k and u_k are regressed on r_k … r_{k−lags+1} and a constant over all
-    episodes. A share lags / M of the noise variance remains, and feedback no longer carries it from y to u. Models of any kind can
-    be fitted to the result; if the loop is linear and settles within the lags, they are consistent.
+    episodes. A share lags / M of the noise variance remains, and feedback no longer carries it from y to u. Models of
+    any kind can be fitted to the result; if the loop is linear and settles within the lags, they are consistent.
 
     Parameters
     ----------
