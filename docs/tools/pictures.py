@@ -286,6 +286,11 @@ def measured_disturbances() -> Any:
     return _run_of("how/measured_disturbances.md")
 
 
+def prices() -> Any:
+    """The run of the page on prices."""
+    return _run_of("how/prices.md")
+
+
 def limits_in_time() -> Any:
     """The run of the page on limits in time."""
     return _run_of("how/limits_in_time.md")
@@ -410,6 +415,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         what_trust_means,
         guarantees,
         limits_in_time,
+        prices,
         measured_disturbances,
         on_off,
         own_blocks,

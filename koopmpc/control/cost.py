@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeAlias, TypeVar, cast, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.control.bounds.boxes import Bound
+from koopmpc.control.in_time import bounds
 from koopmpc.control.limits import Interval, Limits, Movable, Softness, half_width, magnitude
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.interrupts import raise_swallowed
@@ -33,7 +35,7 @@ class WeighsEnd(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Cost(Value):
-    """Σ_{k=1}^{N−1} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{N−1} (‖u_k − u_r‖²_R + ‖u_k − u_{k−1}‖²_{R_delta}) + V(z_N).
+    """Σ_{k=1}^{N−1} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{N−1} (‖u_k − u_r‖²_R + pᵀu_k + ‖u_k − u_{k−1}‖²_{R_delta}) + V(z_N).
 
     V is by default the cost-to-go of the same tracking problem over a tail of steps after the horizon, without limits
     and with an input of its own at each step: x_N and every later state are weighed by Q, inputs by R around u_r and
@@ -61,6 +63,11 @@ class Cost(Value):
         the k-th step after the controller's reset, the last one from then on.
     R_delta
         Weight of the changes of the inputs from step to step, ⪰ 0; a scalar or a vector is a diagonal.
+    price
+        p, what a unit of each input costs in a step: (nu,), or rows (k, nu) such as those of a tariff, which go with
+        the steps as those of u_target do. By name, ``{"heater": 0.3}``, or a value a step; an omitted input is free. R
+        must be positive definite. `KoopmanMPC`, `LinearMPC`, `BilinearMPC` and `NonlinearMPC` know it; the end of the last
+        two does not.
     tail
         Steps of the tail; 0 is Q_N = Q. By default it lasts until the gain and the feedforward rest; on a model that
         was fitted to data until the gain rests as far as the model is accurate, that is, until a further step changes
@@ -90,6 +97,7 @@ class Cost(Value):
     u_target: Literal["equilibrium", "zero"] | ArrayLike = "equilibrium"
     R_delta: ArrayLike | checks.ByName | None = None
     tail: int | None = None
+    price: "Bound" = None
 
     def __post_init__(self) -> None:
         if isinstance(self.Q_N, WeighsEnd):
@@ -119,6 +127,11 @@ class Cost(Value):
             if rows.ndim > 2 or not rows.size:
                 raise ShapeError(f"u_target has shape {rows.shape}, expected (nu,) or rows (k, nu), one a step")
             object.__setattr__(self, "u_target", rows)
+        if self.price is not None:
+            price = bounds.check_bound(self.price, "price")
+            if not all(np.isfinite(np.asarray(value)).all() for value in bounds.list_bound(price)):
+                raise DataError("price holds an infinite number; pass what a unit of an input costs in a step")
+            object.__setattr__(self, "price", price)
         if self.tail is not None:
             object.__setattr__(self, "tail", int(checks.count(self.tail, "tail", 0)))
             if self.Q_N is not None:
@@ -135,8 +148,11 @@ class Cost(Value):
         fields: dict[str, Any] = {
             name: value for name in ("Q", "R", "R_delta") if isinstance(value := getattr(self, name), Mapping)
         }
+        priced: dict[str, Any] = {}
+        if isinstance(self.price, Mapping):
+            priced["price"] = bounds.order_bound(self.price, "price", inputs, 0.0)
         if not fields:
-            return self
+            return replace(self, **priced) if priced else self
         known = {"Q": self.of.bind(tuple(states)).names if "Q" in fields else ()}
         omitted = {"Q": 0.0, "R": None, "R_delta": 0.0}
         return replace(
@@ -145,6 +161,7 @@ class Cost(Value):
                 name: checks.order_by_name(value, name, known.get(name, inputs), omitted[name])
                 for name, value in fields.items()
             },
+            **priced,
         )
 
     def matrices(self, nr: int, nu: int) -> tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]]:
@@ -167,6 +184,29 @@ class Cost(Value):
                 f"u_target has shape {np.shape(self.u_target)}, expected ({nu},) or rows (k, {nu}), one value an input"
             )
         return rows
+
+    def price_rows(self, nu: int, first: int, count: int) -> Float[np.ndarray, "count nu"]:
+        """Return the prices of the inputs of `count` steps from `first` on; the last row is held."""
+        return bounds.hold_rows(cast("ArrayLike | None", self.price), "price", nu, first, count, 0.0)
+
+    def find_shift(self, nu: int) -> Float[np.ndarray, "T nu"] | None:
+        """Return −½ R⁻¹ p, by which a price moves the inputs that cost nothing, a row a step; None without a price.
+
+        ‖u − u_r‖²_R + pᵀu = ‖u − u_r + ½ R⁻¹ p‖²_R + const.
+
+        Raises
+        ------
+        DataError
+            R is not positive definite.
+        """
+        if self.price is None:
+            return None
+        price = np.asarray(self.price)
+        steps = len(price) if price.ndim == 2 else 1
+        R = checks.weight(self.R, "R", nu)
+        if np.linalg.eigvalsh(R).min() <= 0:
+            raise DataError("a price needs an R above zero for every input, by which it is paid back; raise R")
+        return -0.5 * np.linalg.solve(R, self.price_rows(nu, 0, steps).T).T
 
     def rate(self, nu: int) -> Float[np.ndarray, "nu nu"] | None:
         """Return R_delta (nu, nu), None where the changes of the inputs cost nothing."""
@@ -250,7 +290,7 @@ class Tracking(Generic[Read]):
     `with_rates` says whether it counts. `hard_rates` are those of `SizedLimits`. `given` are the rows of a u_target
     that is given as numbers, None for one by name. `Q_root` and `R_root` are S with SᵀS = Q and R. `sizes` are those of
     states, inputs, limits and cost. Where limits have rows, all these are of their widest values, and `movable` says
-    which inputs, rates and outputs [x; of(x)] have a limit, or may get one.
+    which inputs, rates and outputs [x; of(x)] have a limit, or may get one. `shift` is what a price adds to u_r.
     """
 
     cost: Cost
@@ -273,6 +313,7 @@ class Tracking(Generic[Read]):
     R_root: Float[np.ndarray, "nu nu"]
     sizes: Sizes
     movable: Movable
+    shift: Float[np.ndarray, "K nu"] | None
 
 
 LiftedTracking: TypeAlias = Tracking[np.ndarray]
@@ -284,12 +325,12 @@ def lifted_tracking(
 ) -> LiftedTracking:
     """Return what `cost` tracks and `limits` bound, as matrices on the lifted coordinates of `predictor`.
 
-    `in_time` says that who asks knows limits with rows.
+    `in_time` says that who asks knows limits with rows, and prices of inputs.
 
     Raises
     ------
     DataError
-        Limits have rows in time, and who asks does not know them.
+        Limits have rows in time, or the cost has a price, and who asks does not know them.
     ObservableError
         The cost or a limit is on an observable that the lifting lacks.
     ShapeError
@@ -297,6 +338,8 @@ def lifted_tracking(
     """
     cost, limits = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
     _refuse_rows(limits, in_time)
+    if not in_time:
+        refuse_price(cost)
     C, G = select_rows(predictor, cost.of), predictor.C
     if limits.of is not None:
         G = np.vstack([G, select_rows(predictor, limits.of)])
@@ -314,14 +357,17 @@ def state_tracking(
     ranges: Mapping[str, float] | None = None,
     *,
     in_time: bool = False,
+    priced: bool = False,
 ) -> StateTracking:
     """Return what `cost` tracks and `limits` bound, as functions of these states.
 
-    The functions take `size` values, the states first; by default the states alone. `ranges` as for `Sizes`, and
-    `in_time` as for `lifted_tracking`.
+    The functions take `size` values, the states first; by default the states alone. `ranges` as for `Sizes`,
+    `in_time` as for `lifted_tracking`; `priced` says that who asks knows prices of inputs.
     """
     cost, limits = check_cost_and_limits(cost, limits, states, inputs)
     _refuse_rows(limits, in_time)
+    if not priced:
+        refuse_price(cost)
     nx, nu = len(states), len(inputs)
     point = ca.SX.sym("x", nx if size is None else size)
     x, of = point[:nx], cost.of.bind(states)
@@ -337,6 +383,25 @@ def state_tracking(
         nu,
         ranges,
     )
+
+
+def add_held(
+    first: Float[np.ndarray, "K nu"] | None, second: Float[np.ndarray, "M nu"] | None
+) -> Float[np.ndarray, "T nu"] | None:
+    """Return the sum of two tables whose last rows are held; None where neither is there."""
+    if first is None or second is None:
+        return second if first is None else first
+    steps = np.arange(max(len(first), len(second)))
+    return first[np.minimum(steps, len(first) - 1)] + second[np.minimum(steps, len(second) - 1)]
+
+
+def refuse_price(cost: Cost) -> None:
+    """Raise where inputs have a price, for a law or a search that does not know it."""
+    if cost.price is not None:
+        raise DataError(
+            "the cost has a price, which this controller or search does not know; take a KoopmanMPC, a BilinearMPC or "
+            "a NonlinearMPC, or leave the price out"
+        )
 
 
 def _refuse_rows(limits: Limits, in_time: bool) -> None:
@@ -406,6 +471,7 @@ def _tracking(
         R_root=checks.root(R),
         sizes=sizes,
         movable=base.movable(nx, len(sizes.rows) - nx, nu),
+        shift=cost.find_shift(nu),
     )
 
 

@@ -27,8 +27,8 @@ class Metrics(Value):
     ----------
     cost
         J = Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k − u_reference_k‖²_R, and with R_delta also
-        Σ_{k=1}^{T−1} ‖u_k − u_{k−1}‖²_{R_delta}. It is not multiplied by dt. It is NaN where the run has no Cost, or
-        where its plant hides the state.
+        Σ_{k=1}^{T−1} ‖u_k − u_{k−1}‖²_{R_delta}, with a price Σ_{k=0}^{T−1} p_kᵀu_k. It is not
+        multiplied by dt. It is NaN where the run has no Cost, or where its plant hides the state.
     tracking_rmse
         (nr,) root-mean-square of each tracked output's error of(x_k) − r_k over k = 1 … T, in its unit.
     final_error
@@ -183,7 +183,7 @@ def running_cost(run: Run) -> Float[np.ndarray, " T1"]:
 def cost_terms(
     run: Run, error: Float[np.ndarray, "T1 nr"]
 ) -> tuple[Float[np.ndarray, " T1"], Float[np.ndarray, " T"], Float[np.ndarray, " T0"]]:
-    """Return ‖error_k‖²_Q, ‖u_k − u_reference_k‖²_R and ‖u_k − u_{k−1}‖²_{R_delta}; without a cost Q = I, R = 0."""
+    """Return ‖error_k‖²_Q, ‖u_k − u_reference_k‖²_R + pᵀu_k, ‖u_k − u_{k−1}‖²_{R_delta}; by default Q = I, R = 0."""
     nr, nu = error.shape[1], run.U.shape[1]
     Q, R = (np.eye(nr), np.zeros((nu, nu))) if run.cost is None else run.cost.matrices(nr, nu)
     R_delta = None if run.cost is None else run.cost.rate(nu)
@@ -191,6 +191,8 @@ def cost_terms(
     stage, moved, changed = (
         np.zeros(len(rows)) if W is None else np.einsum("ki,ij,kj->k", rows, W, rows) for rows, W in weighed
     )
+    if run.cost is not None and run.cost.price is not None:
+        moved = moved + np.einsum("ki,ki->k", run.cost.price_rows(nu, 0, len(run.U)), run.U)
     return stage, moved, changed
 
 

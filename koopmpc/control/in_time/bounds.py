@@ -20,6 +20,11 @@ def is_rows(bound: Any) -> bool:
     return np.ndim(bound) == 2
 
 
+def list_bound(bound: Any) -> list[Any]:
+    """Return the values of a checked bound, those of each name where it is by name."""
+    return list(cast("BoundByName", bound).values()) if isinstance(bound, Mapping) else [bound]
+
+
 def check_bound(bound: Any, end: str) -> Any:
     """Return a bound as a float64 array of at most two dimensions, or as numbers and columns by name.
 

@@ -272,6 +272,8 @@ class KoopmanMPC(MPCBase):
         plan, track = self._map, self._map.track
         if plan.ball is not None:
             raise no_export(self, "it adds tangent cuts of a terminal ellipsoid; use a polytope, or no terminal set")
+        if track.shift is not None:
+            raise no_export(self, "its cost has a price, which its C does not know", "one without a price")
         if self.limits.in_time:
             raise DataError(
                 "the controller's limits have rows in time, and C code keeps one set of limits; make it with "
@@ -527,9 +529,8 @@ class KoopmanMPC(MPCBase):
             R[:] = reference
         else:
             R[:] = checks.reference_rows(reference, self._N, R.shape[1], latency)
-        given = self._map.track.given
-        if given is not None:
-            self._rows_left = self._given_row + 1 < len(given)
+        if self._map.has_given:
+            self._rows_left = self._given_row + 1 < len(self._map.given_ahead) - self._N
             if moving is not None:
                 moving.given[:] = self._given_ahead()
         return dasum(R.reshape(-1) if moving is None else moving.flat) < HUGE
@@ -552,7 +553,7 @@ class KoopmanMPC(MPCBase):
             return
         v = maps.from_reference.dot(R.reshape(-1))
         v += maps.offset
-        if plan.track.given is not None:
+        if plan.has_given:
             v += maps.from_given @ self._given_ahead().reshape(-1)
         if plan.aimed:
             alpha, window = targets.nearest(R), self._window

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from koopmpc import checks
 from koopmpc.checks import HUGE
-from koopmpc.control.cost import LiftedTracking
+from koopmpc.control.cost import LiftedTracking, add_held
 from koopmpc.control.horizon import Condensed, Coordinates, Horizon, build_stages, condense, horizon_of
 from koopmpc.control.limits import Interval, Softness, preview_margin
 from koopmpc.control.linear.blocking import tie_moves
@@ -80,8 +80,8 @@ class PlanMap(Viewing):
         The QP of w.
     ball
         The entries of v that a terminal ellipsoid limits; their limits here are those of a box inside it.
-    given_ahead
-        The rows of a given u_target, the last one repeated for a preview.
+    given_ahead, has_given
+        The rows of a given u_target, moved by a price, the last one repeated for a preview, and whether there are some.
     moving
         The map of a reference that moves, where one product is fast.
     met
@@ -144,7 +144,9 @@ class PlanMap(Viewing):
         from_state = np.zeros((len(low), horizon.size))
         from_state[:nv] = maps.from_state
         self.matrix = np.ascontiguousarray(np.column_stack([from_state, first, np.zeros(len(low))]))
-        given = np.zeros((1, len(track.inputs.low))) if track.given is None else track.given
+        asked = add_held(track.given, track.shift)
+        given = np.zeros((1, len(track.inputs.low))) if asked is None else asked
+        self.has_given = asked is not None
         self.given_ahead = np.vstack([given, np.tile(given[-1], (horizon.N, 1))])
         self.moving = MovingMap.of(self, len(track.tracked), len(track.inputs.low))
         self._see()
@@ -183,7 +185,7 @@ class MovingMap(Viewing):
 
     def __init__(self, plan: "PlanMap", nr: int, nu: int) -> None:
         maps, targets, fixed = plan.maps, plan.targets, plan.matrix[: plan.planned, :-1]
-        steps, given = maps.from_reference.shape[1] // nr, plan.track.given
+        steps, given = maps.from_reference.shape[1] // nr, plan.has_given
         parts = [fixed, maps.offset[:, None], maps.from_reference]
         low, high = [plan.low[: plan.planned]], [plan.high[: plan.planned]]
         tests = np.zeros((0, fixed.shape[1] + 1 + maps.from_reference.shape[1]))
@@ -198,7 +200,7 @@ class MovingMap(Viewing):
             reach = ROUNDING * targets.size[limited]
             low.append(np.tile(targets.low[limited] - reach, steps))
             high.append(np.tile(targets.high[limited] + reach, steps))
-        if given is not None:
+        if given:
             parts.append(maps.from_given)
             tests = np.column_stack([tests, np.zeros((len(tests), maps.from_given.shape[1]))])
         self.matrix = np.ascontiguousarray(np.vstack([np.column_stack(parts), tests]))

@@ -161,6 +161,8 @@ class BilinearMPC(StagedMPC):
     def build_program(self, reference: ArrayLike | None) -> StagedProgram:
         """Return the data of a step."""
         problem, outputs, model = self._problem, self._outputs, self._map
+        if outputs.shift is not None:
+            raise no_export(self, "its cost has a price, which its C does not know", "one without a price")
         if problem.scheduled:
             raise no_export(
                 self,

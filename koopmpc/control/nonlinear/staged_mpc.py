@@ -76,7 +76,7 @@ class StagedMPC(MPCBase):
         self._forget_targets()
         self._map = given = learned_map(model)
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
-        self._outputs = o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges)
+        self._outputs = o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, priced=True)
         refuse_levels(o.limits, f"a {type(self).__name__}")
         refuse_priority(o.limits, f"a {type(self).__name__}")
         super().__init__(
@@ -245,13 +245,15 @@ class StagedMPC(MPCBase):
             U = np.clip(U + slopes @ e, *self._outputs.inputs)
             U[held] = end.u
         self._moved = False
-        rows = self._outputs.given
+        rows, shift = self._outputs.given, self._outputs.shift
+        ahead = np.arange(self._N + 1) + self._row + self._latency
         if rows is not None:  # row k of a given u_target counts at the k-th step
-            ahead = np.arange(self._N + 1) + self._row + self._latency
             given = rows[np.minimum(ahead, len(rows) - 1)]
             U, end = given[:-1], end._replace(u=given[-1], m=end.m + end.V @ given[-1])
-            self._moved = self._row + 1 < len(rows)
-            self._row += self._moved
+        if shift is not None:
+            U = U + shift[np.minimum(ahead[:-1], len(shift) - 1)]
+        self._moved = self._row + 1 < max(len(table) for table in (rows, shift, [0]) if table is not None)
+        self._row += self._moved
         trajectory = rows is not None and not held[-1]  # the reference goes on, so it ends at no equilibrium
         if self.cost.Q_N is None and (trajectory or self.cost.tail == 0):
             M, nr = np.zeros_like(end.M), len(R[-1])

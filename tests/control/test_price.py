@@ -1,0 +1,99 @@
+"""Prices of inputs: CVXPY's plan, the shift of a target that they are, tariffs that move along, and metrics."""
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+from koopmpc.errors import DataError
+from tests.control.models import linear
+from tests.control.oracle import targets_of
+
+N = 10
+A, B = np.array([[0.95, 0.2], [-0.1, 0.9]]), np.array([[0.02, 0.1], [0.2, -0.05]])
+R = np.array([[0.2, 0.05], [0.05, 0.3]])
+LIMITS = km.Limits(u_min=-0.4, u_max=0.6, x_max=[0.7, np.inf], slack=None)
+TARIFF = np.column_stack([0.3 * np.sign(np.sin(np.arange(40) / 3)), np.linspace(-0.2, 0.4, 40)])
+
+
+def cheapest(model, x, rows, price, u_r, limits):
+    """The inputs of least cost, as a program in CVXPY without a tail."""
+    import cvxpy as cp
+
+    X, U = cp.Variable((N + 1, 2)), cp.Variable((N, 2))
+    cost, held = 0, [X[0] == x]
+    for k in range(N):
+        held += [X[k + 1] == model.A @ X[k] + model.B @ U[k], U[k] >= -0.4, U[k] <= 0.6, X[k + 1][0] <= 0.7]
+        cost += cp.quad_form(U[k] - u_r[k], R) + price[k] @ U[k]
+        cost += 2.0 * cp.square(X[k + 1][0] - rows[k + 1][0]) + 0.1 * cp.square(X[k + 1][1] - rows[k + 1][1])
+    cp.Problem(cp.Minimize(cost), held).solve(cp.CLARABEL)
+    return U.value
+
+
+@pytest.mark.parametrize("u_target", ["zero", "equilibrium"])
+@pytest.mark.parametrize("kind", [km.KoopmanMPC, km.BilinearMPC, km.NonlinearMPC])
+def test_the_plan_is_the_cheapest_and_a_tariff_moves_along(kind, u_target):
+    model = linear(A, B)
+    cost = km.Cost(Q=[2.0, 0.1], R=R, tail=0, u_target=u_target, price=TARIFF)
+    mpc, x = kind(model, cost, LIMITS, N), np.array([0.3, -0.2])
+    rows = np.tile([0.4, 0.0], (N + 1, 1))
+    statuses = set()
+    for k in range(4):
+        move = mpc(x, rows)
+        statuses.add(move.status)
+        u_r = [np.zeros(2)] * N
+        if u_target == "equilibrium":
+            u_r = [u for _, u in targets_of(model, cost, LIMITS, rows, np.zeros(2), np.eye(2))][:N]
+        wanted = cheapest(model, x, rows, TARIFF[k : k + N], u_r, LIMITS)
+        np.testing.assert_allclose(mpc.plan().U, wanted, atol=2e-4)
+        x = A @ x + B @ move.u
+    assert km.Status.OPTIMAL in statuses
+
+
+def test_a_price_is_a_shift_of_the_target_to_the_bit_also_in_the_tail():
+    """‖u‖²_R + pᵀu = ‖u + ½ R⁻¹ p‖²_R + const, and the tail holds the last row of both."""
+    model, p = linear(A, B), np.array([0.1, -0.08])
+    shift = -0.5 * np.linalg.solve(R, p)
+    priced = km.KoopmanMPC(model, km.Cost(Q=[2, 0.1], R=R, u_target="zero", price=p), LIMITS, N)
+    shifted = km.KoopmanMPC(model, km.Cost(Q=[2, 0.1], R=R, u_target=shift), LIMITS, N)
+    x = np.array([0.3, -0.2])
+    for _ in range(5):
+        a, b = priced(x, [0.2, 0.0]), shifted(x, [0.2, 0.0])
+        np.testing.assert_allclose(a.u, b.u, atol=1e-12)
+        x = A @ x + B @ a.u
+
+
+def test_metrics_count_the_price_and_a_tariff_saves(tmp_path):
+    model = linear(A, B)
+    plant = model.step_map()
+    with_price = km.Cost(Q=[2.0, 0.1], R=R, u_target="zero", price=TARIFF)
+    plain = km.Cost(Q=[2.0, 0.1], R=R, u_target="zero")
+    costs = []
+    for cost in (with_price, plain):
+        mpc = km.KoopmanMPC(model, cost, LIMITS, N)
+        run = km.simulate(plant, mpc, x0=[0.3, -0.2], reference=[0.3, 0], steps=30, cost=with_price, limits=LIMITS)
+        by_hand = sum(
+            2.0 * (x[0] - 0.3) ** 2 + 0.1 * x[1] ** 2 + u @ R @ u + p @ u
+            for x, u, p in zip(run.X[1:], run.U, TARIFF, strict=False)
+        )
+        assert km.metrics(run).cost == pytest.approx(by_hand)
+        costs.append(by_hand)
+    assert costs[0] < costs[1]
+    km.record(run, tmp_path / "run.rrd")
+    assert km.load_run(tmp_path / "run.rrd").cost == with_price
+    mpc = km.KoopmanMPC(model, with_price, LIMITS, N)
+    mpc.save(tmp_path / "mpc.npz")
+    assert km.load_controller(tmp_path / "mpc.npz").cost == with_price
+
+
+def test_prices_by_name_and_what_is_refused():
+    model = linear(A, B)
+    named = km.Cost(Q=1, R=R, price={"u1": [0.1, 0.2]}).resolve(model.states, model.inputs)
+    assert np.array_equal(named.price, [[0, 0.1], [0, 0.2]])
+    with pytest.raises(DataError, match="R above zero"):
+        km.KoopmanMPC(model, km.Cost(Q=[1, 1], R=[1, 0], price=[0, 1]), LIMITS, N)
+    with pytest.raises(DataError, match="does not know"):
+        km.LQR(model, km.Cost(Q=[1, 1], R=R, price=[0, 1]))
+    with pytest.raises(DataError, match="infinite"):
+        km.Cost(Q=1, R=R, price=[np.inf, 0])
+    obstacle = km.KoopmanMPC(model, km.Cost(Q=[1, 1], R=R, price=[0, 1]), LIMITS, N).program().obstacle
+    assert "price" in obstacle
