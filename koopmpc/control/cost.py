@@ -65,9 +65,9 @@ class Cost(Value):
         Weight of the changes of the inputs from step to step, ⪰ 0; a scalar or a vector is a diagonal.
     price
         p, what a unit of each input costs in a step: (nu,), or rows (k, nu) such as those of a tariff, which go with
-        the steps as those of u_target do. By name, ``{"heater": 0.3}``, or a value a step; an omitted input is free. R
-        must be positive definite. `KoopmanMPC`, `LinearMPC`, `BilinearMPC` and `NonlinearMPC` know it; the end of the last
-        two does not.
+        the steps as those of u_target do. By name, ``{"heater": 0.3}``, or a value a step; an omitted input is free.
+        R must be positive definite. `KoopmanMPC`, `LinearMPC`, `BilinearMPC` and `NonlinearMPC` know it; the end of the
+        last two does not.
     tail
         Steps of the tail; 0 is Q_N = Q. By default it lasts until the gain and the feedforward rest; on a model that
         was fitted to data until the gain rests as far as the model is accurate, that is, until a further step changes

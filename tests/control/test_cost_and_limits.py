@@ -123,7 +123,8 @@ show(lambda: km.metrics([1, 2]))
         'ShapeError slack is 5; pass (linear, quadratic), "auto", or None for hard limits',
         'DataError of is a str, expected a Lifting; for example km.Fourier(1, states="theta")',
         'DataError of is a str, expected a Lifting; for example km.State("theta"), or km.Fourier(1, states="theta")',
-        "DataError moves is array([ 1, 19]); pass how many moves there are, or a tuple of the blocks' lengths",
+        "DataError moves is array([ 1, 19]); pass how many moves there are, a tuple of the blocks' lengths, or one by the "
+        'name of each input, {"pump": (1, 1, 2, 4)}',
         "DataError settings is a list, expected a Mapping; pass the solver's own by name, for example "
         '{"max_iter": 100}',
         "DataError estimator is 'kalman'; pass an object, for example km.LiftedDisturbance()",
