@@ -281,6 +281,15 @@ def manual_automatic() -> Any:
     return _run_of("how/manual_automatic.md")
 
 
+def from_pid() -> Any:
+    """The loops of the page on the way from a PID, on its twin."""
+    names: dict[str, Any] = {"__name__": "page"}
+    with TemporaryDirectory() as folder, chdir(folder):
+        for source in re.findall(r"```python\n(.*?)```", (DOCS / "how/from_pid.md").read_text(), re.DOTALL)[:-1]:
+            exec(compile(source, "from_pid.md", "exec"), names)
+    return km.plot.runs({"two tanks": names["runs"]})
+
+
 def measured_disturbances() -> Any:
     """The run of the page on measured disturbances."""
     return _run_of("how/measured_disturbances.md")
@@ -422,6 +431,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         unequal_rates,
         priorities,
         manual_automatic,
+        from_pid,
         next_experiment,
         next_design,
         cart_pole,

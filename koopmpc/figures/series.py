@@ -295,15 +295,16 @@ def _draw_task(panels: Any, runs: Mapping[str, Run], names: list[str]) -> None:
     """Draw the runs of one task in a column of panels, states first."""
     first = next(iter(runs.values()))
     nx = len(first.states)
-    tracked = first.name_references(first.reference.shape[1]) == first.states
+    tracked = first.name_references(first.reference.shape[1])
     for i, panel in enumerate(panels):
         curves = [run.X[:, i] if i < nx else run.U[:, i - nx] for run in runs.values()]
         for name, run, values in zip(runs, runs.values(), curves, strict=True):
             panel.plot(run.time[: len(values)], values, **line_style(names.index(name), len(values)), label=name)
         required: list[float] = []  # values that the axis must show in addition to the runs
-        if i < nx and tracked:
-            panel.plot(first.time, first.reference[:, i], **REFERENCE, label="reference")
-            required = first.reference[:, i].tolist()
+        if i < nx and first.states[i] in tracked:
+            rows = first.reference[:, tracked.index(first.states[i])]
+            panel.plot(first.time, rows, **REFERENCE, label="reference")
+            required = rows.tolist()
         elif i >= nx:
             required = draw_limits(panel, first, "inputs", i - nx)
         lows, highs = [float(v.min()) for v in curves], [float(v.max()) for v in curves]

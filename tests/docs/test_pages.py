@@ -17,6 +17,7 @@ ELSEWHERE = {  # pages whose claims are tested beyond what they print, and where
     "design-from-data.md": "tests/test_docs_design_from_data.py",
     "faults.md": "tests/bench/test_docs.py",
     "how/compiled.md": "tests/test_docs_on_the_machine.py",
+    "how/from_pid.md": "tests/test_docs_from_pid.py",
     "how/fmu.md": "tests/test_docs_plants.py",
     "how/gymnasium.md": "tests/test_docs_plants.py",
     "how/hidden_states.md": "tests/test_docs_controllers.py",

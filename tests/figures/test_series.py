@@ -142,3 +142,27 @@ def test_runs_of_a_report_show_the_limits_that_are_near() -> None:
     assert theta.get_ylim()[1] < 1  # a limit far away does not flatten the curve
     assert omega.get_ylim()[1] > 0.3
     assert torque.get_ylim()[0] < -5
+
+
+def test_runs_show_the_reference_of_the_states_that_their_cost_tracks():
+    plant = km.discretize(km.load_problem("two_tanks").dynamics, 4.0)
+    cost = km.Cost(Q=1.0, R=0.1, of=km.State("lower"))
+    loop = km.simulate(plant, lambda y, r: [3.0], x0=[5, 5], reference=[7.5], steps=4, cost=cost)
+    upper, lower, _ = km.plot.runs({"": {"a": loop}}).axes
+    drawn = [line.get_ydata() for line in lower.lines if line.get_label() == "reference"]
+    np.testing.assert_array_equal(drawn, [np.full(5, 7.5)])
+    assert not [line for line in upper.lines if line.get_label() == "reference"]
+
+
+def test_long_names_of_signals_end_beside_their_panel_and_a_dollar_is_a_letter():
+    names = ["temperature of the second heat exchanger, outlet [degC]", "cost_of_energy_$_per_hour_and_unit [$]"]
+    X = np.random.default_rng(0).normal(size=(30, 2))
+    model = km.LinearPredictor(
+        np.eye(2), np.ones((2, 1)), np.eye(2), km.State(), 1.0, names, ["feed of the reactor [l/s]"]
+    )
+    episode = km.Episode(X=X, U=np.ones((29, 1)))
+    drawing = km.plot.rollout(model, episode, 5)
+    drawing.canvas.draw()
+    for axes in drawing.axes:
+        box, panel = axes.yaxis.label.get_window_extent(), axes.get_window_extent()
+        assert box.height <= 1.12 * panel.height, axes.get_ylabel()
