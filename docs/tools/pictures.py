@@ -332,6 +332,11 @@ def swing_up(path: Path) -> None:
         export_video(log, path, width=640, fps=16, until=4.0, speed=0.8)
 
 
+def periodic() -> Any:
+    """The run of the page on periodic disturbances."""
+    return _run_of("how/periodic.md")
+
+
 def priorities() -> Any:
     """Both runs of the page on priorities of soft limits."""
     names: dict[str, Any] = {"__name__": "page"}
@@ -430,6 +435,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         own_blocks,
         unequal_rates,
         priorities,
+        periodic,
         manual_automatic,
         from_pid,
         next_experiment,

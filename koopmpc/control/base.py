@@ -4,7 +4,7 @@ import copy
 from collections import deque
 from collections.abc import Sequence
 from time import perf_counter
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -39,7 +39,8 @@ class InitialCondition(Viewing):
 
     z is predicted over these L steps, z ← F(z, u) + E w + d with the inputs that are still to act. u_{−1} is there
     where the change of inputs counts, d where it is estimated. The parts are views: `z`, `u_prev`, `W`, `d`, and
-    `drive`, which is W and d.
+    `drive`, which is W and d. Where the observer forecasts a periodic disturbance, w_k is [w_k; p_k] in `known`, and
+    `periodic` is a view of p.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ class InitialCondition(Viewing):
         Whether u_{−1} is needed, and whether the observer finds d.
     """
 
-    _VIEWS = ("z", "u_prev", "drive", "W", "d")
+    _VIEWS = ("z", "u_prev", "drive", "W", "periodic", "d")
 
     def __init__(
         self,
@@ -69,7 +70,9 @@ class InitialCondition(Viewing):
         more = estimated or latency or with_rates or model.nw or model.embedding is not None
         self._measured = None if more or not isinstance(observer, Measured) else observer  # set if z depends on y alone
         self._shape = (observer.ny,)
-        self.known = np.zeros(model.nz + model.nu * with_rates + N * model.nw + model.nz * estimated + 1)
+        self._np = model.nz if hasattr(observer, "forecast") else 0  # entries of a periodic disturbance
+        drives = N * (model.nw + self._np)
+        self.known = np.zeros(model.nz + model.nu * with_rates + drives + model.nz * estimated + 1)
         self.known[-1] = 1.0
         self.refused = False  # whether the observer refused the last y
         self._ahead = np.zeros((latency + 1, model.nw))
@@ -83,7 +86,9 @@ class InitialCondition(Viewing):
         self.z = self.known[:nz]
         self.u_prev = self.known[nz:first]
         self.drive = self.known[first:-1]
-        self.W, self.d = self.drive[: N * nw].reshape(N, nw), self.drive[N * nw :]
+        whole = nw + self._np
+        ahead = self.drive[: N * whole].reshape(N, whole)
+        self.W, self.periodic, self.d = ahead[:, :nw], ahead[:, nw:], self.drive[N * whole :]
 
     def reset(self, x0: ArrayLike | None, last: Float[np.ndarray, " nu"]) -> None:
         """Start at x0, where it is known, with the input `last` acting until the first one arrives."""
@@ -149,8 +154,12 @@ class InitialCondition(Viewing):
         if self._ahead.size:  # a disturbance that is not finite keeps its last value
             self._w = np.where(np.abs(self._ahead[0]) < HUGE, self._ahead[0], self._w)
         z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
+        p = np.zeros((self._latency, 1))
+        if self._np:
+            forecast: np.ndarray = cast("Any", observer).forecast(self._latency + len(self.periodic))
+            p, self.periodic[:] = forecast[: self._latency], forecast[self._latency :]
         for i in range(self._latency):
-            z = self._model.advance(z, self._sent[i + 1], self._ahead[i], d)
+            z = self._model.advance(z, self._sent[i + 1], self._ahead[i], d + p[i])
         self.z[:] = z
         if self._estimated:
             self.d[:] = d

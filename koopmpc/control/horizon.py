@@ -64,6 +64,7 @@ class Horizon:
     with_rates: bool
     bounded: bool
     disturbed: bool
+    periodic: int = 0
 
     N: int = field(init=False)  # steps
     size: int = field(init=False)  # entries of ξ
@@ -84,6 +85,14 @@ class Horizon:
         e = np.zeros((len(self.A), signals.size))
         e[:, signals.w[k]] = self.E
         e[:, signals.d] = np.eye(len(self.A), signals.nd)
+        return e
+
+    def rest_disturbance(self) -> Float[np.ndarray, "nz nf"] | None:
+        """Return what acts at the end of the horizon and goes on so: all but a periodic disturbance."""
+        e = self.disturbance(self.N - 1)
+        if e is not None and self.periodic:
+            last = self.signals.w[self.N - 1].stop
+            e[:, last - self.periodic : last] = 0.0
         return e
 
     def in_units(self, units: Units) -> "Horizon":
@@ -152,7 +161,7 @@ def input_target(h: Horizon, targets: Targets) -> Float[np.ndarray, "nu nf"]:
     """Return u_r as a matrix on f, without the part W α; the last disturbance of the preview is held."""
     u_r = np.zeros((len(targets.u0), h.signals.size))
     u_r[:, -1] = targets.u0
-    moved = h.disturbance(h.N - 1)
+    moved = h.rest_disturbance()
     return u_r if moved is None else u_r + targets.u_disturbance @ moved
 
 
@@ -172,13 +181,18 @@ def _weights(
 
 
 def horizon_of(
-    predictor: LinearPredictor, track: LiftedTracking, blocks: tuple[int, ...], *, disturbed: bool
+    predictor: LinearPredictor,
+    track: LiftedTracking,
+    blocks: tuple[int, ...],
+    *,
+    disturbed: bool,
+    periodic: bool = False,
 ) -> Horizon:
-    """Return the horizon of a predictor for what it tracks and limits."""
+    """Return the horizon of a predictor for what it tracks and limits; a periodic disturbance acts on all of z."""
     return Horizon(
         A=predictor.A,
         B=predictor.B,
-        E=predictor.E,
+        E=np.hstack([predictor.E, np.eye(predictor.nz)]) if periodic else predictor.E,
         C=track.tracked,
         G=track.limited,
         Q=track.Q,
@@ -188,6 +202,7 @@ def horizon_of(
         with_rates=track.with_rates,
         bounded=track.rates is not None,
         disturbed=disturbed,
+        periodic=predictor.nz if periodic else 0,
     )
 
 

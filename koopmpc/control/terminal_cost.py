@@ -75,6 +75,7 @@ def terminal_of(
     P[:n, :n], p_g[:n] = tail.P, tail.p  # u_{N−1} may be there for its limits alone
     of_e, of_r, of_u = np.split(p_g, [D.shape[1], D.shape[1] + nr], axis=1)
     p = of_u @ input_target(h, targets)
+    of_e[:, signals.nw - h.periodic : signals.nw] = 0.0
     p[:, last] += of_e[:, : signals.nw]
     p[:, d] += of_e[:, signals.nw :]
     return Terminal(P, p, of_r, of_u @ targets.W, of_u)
@@ -100,7 +101,7 @@ def _weigh_end(predictor: LinearPredictor, cost: Cost, h: Horizon, targets: Targ
         return Terminal(P, p, reference, target, given)
     z_r = np.zeros((nz, h.signals.size))
     z_r[:, -1] = targets.z0
-    moved = h.disturbance(h.N - 1)
+    moved = h.rest_disturbance()
     if moved is not None:
         z_r += targets.z_disturbance @ moved
     P[:nz, :nz], p[:nz], target[:nz] = weight, -weight @ z_r, -weight @ targets.Z

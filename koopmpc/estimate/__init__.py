@@ -6,5 +6,6 @@ from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
     from koopmpc.estimate.observer import Estimator as Estimator
+    from koopmpc.estimate.periodic import find_period as find_period
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -13,6 +13,7 @@ from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
 from koopmpc.estimate.gate import gate_graph
 from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
+from koopmpc.estimate.periodic import PeriodicObserver, find_harmonics
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.routines import bind_interpreter
 from koopmpc.predict.predictors import LinearPredictor
@@ -54,10 +55,18 @@ class LiftedDisturbance(Value):
         By default 1 − exp(−4/N), so that misfits are remembered over a quarter of the horizon, and at least 0.1; and
         1 where misfits hardly change.
 
+    period
+        Of a disturbance that repeats itself, a shaft or the day [s]. Then d_k is a constant and harmonics of this
+        period, found in the misfits by recursive least squares over the last three periods, and plans know how d goes
+        on. `km.estimate.find_period` finds a period in logs. In a KoopmanMPC or LinearMPC.
+    harmonics
+        How many harmonics of the period, at most; those faster than two samples are left out.
+
     Raises
     ------
     DataError
-        The gain is outside (0, 1].
+        The gain is outside (0, 1], or given with a period; a period is not above zero; when a controller is built, it
+        is shorter than two samples.
 
     References
     ----------
@@ -80,13 +89,34 @@ class LiftedDisturbance(Value):
     """
 
     gain: float | None = None
+    period: float | None = None
+    harmonics: int = 3
 
     def __post_init__(self) -> None:
+        checks.count(self.harmonics, "harmonics")
+        if self.period is not None:
+            checks.positive(self.period, "period", "s")
+            if self.gain is not None:
+                raise DataError(
+                    "gain and period are both given; harmonics are learned over three periods: leave out gain"
+                )
         if self.gain is not None and checks.positive(self.gain, "gain") > 1:
             raise DataError(f"gain is {self.gain:g}; it must be in (0, 1], and 1 is deadbeat")
 
-    def start(self, model: LinearPredictor | StateModel, horizon: int) -> "DisturbanceObserver":
-        """Return the observer of one controller with plans of this many steps."""
+    def start(self, model: LinearPredictor | StateModel, horizon: int) -> "DisturbanceObserver | PeriodicObserver":
+        """Return the observer of one controller with plans of this many steps.
+
+        Raises
+        ------
+        DataError
+            The period is shorter than two samples; or the controller plans in the state, and there is a period.
+        """
+        if self.period is not None:
+            if not isinstance(model, LinearPredictor):
+                raise DataError(
+                    "a LiftedDisturbance with a period is for a KoopmanMPC or a LinearMPC; leave out period"
+                )
+            return PeriodicObserver(model, find_harmonics(self.period, model.dt, self.harmonics))
         if self.gain is not None:
             return DisturbanceObserver(model, self.gain, 0.0)
         return DisturbanceObserver(model, max(1 - exp(-4 / horizon), GAIN), max(REACH * horizon, 1.0))

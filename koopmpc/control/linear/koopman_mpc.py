@@ -224,7 +224,9 @@ class KoopmanMPC(MPCBase):
         )
         self.predictor, self._disturbed = predictor, disturbed
         coordinates = self._wanted or turns[0].solver.coordinates
-        self._map = plan_map(predictor, track, self._moves, coordinates, disturbed=disturbed)
+        self._map = plan_map(
+            predictor, track, self._moves, coordinates, disturbed=disturbed, periodic=self._initial.periodic.size > 0
+        )
         self._hold_limits()
         self._options = {"solver": self._solver, "settings": settings}
         self._levels: LevelSolver | None = None
@@ -363,7 +365,14 @@ class KoopmanMPC(MPCBase):
                 raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
         track = lifted_tracking(predictor, self.cost, self.limits, in_time=True)
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
-        self._map = plan_map(predictor, track, self._moves, coordinates, disturbed=self._disturbed)
+        self._map = plan_map(
+            predictor,
+            track,
+            self._moves,
+            coordinates,
+            disturbed=self._disturbed,
+            periodic=self._initial.periodic.size > 0,
+        )
         self.predictor, self._states = predictor, None
         if isinstance(self._qps, BallSolver) and self._map.ball is not None:
             self._qps.change(self._map.qp, self._map.ball)
@@ -512,7 +521,13 @@ class KoopmanMPC(MPCBase):
             return None
         if self._states is None:
             rates = self._with_rates
-            self._states = planned_states(self.predictor, self._move_of, with_rates=rates, disturbed=self._disturbed)
+            self._states = planned_states(
+                self.predictor,
+                self._move_of,
+                with_rates=rates,
+                disturbed=self._disturbed,
+                periodic=self._initial.periodic.size > 0,
+            )
         moves = self._plan[: len(self._blocks) * self.nu]
         X = self._states.dot(np.concatenate((moves, self._initial.known)))
         return Plan(X.reshape(self._N + 1, -1), moves.reshape(-1, self.nu)[self._move_of])

@@ -112,7 +112,7 @@ class PlanMap(Viewing):
             softness = track.limits.end_softness(len(end.F), track.sizes.scale)
             self.ball = make_ball(softness, maps.deviation, maps.unit, nv - len(end.F))
             low[self.ball.rows], high[self.ball.rows] = -self.ball.inner, self.ball.inner
-        last, first = horizon.disturbance(horizon.N - 1), np.zeros((nv, 0))
+        last, first = horizon.rest_disturbance(), np.zeros((nv, 0))
         self.disturbance = np.zeros((len(horizon.A), 0)) if last is None else last[:, :-1]
         driven = self.disturbance.shape[1] > 0
         self.limited_targets = np.concatenate([track.movable.inputs, np.ones(len(track.outputs.low), np.bool_)])
@@ -240,11 +240,12 @@ def plan_map(
     coordinates: Coordinates,
     *,
     disturbed: bool,
+    periodic: bool = False,
 ) -> PlanMap:
     """Return the plan of a predictor: its horizon, solved by the Riccati recursion, condensed, and limited."""
     targets, units = targets_of(predictor, track), Units.of(predictor, track)
     aims, cost = units.targets(targets), units.cost(track.cost)
-    horizon = horizon_of(predictor, track, moves.lengths, disturbed=disturbed)
+    horizon = horizon_of(predictor, track, moves.lengths, disturbed=disturbed, periodic=periodic)
     own = horizon.in_units(units)
     parts = build_stages(own, aims)
     end = terminal_of(predictor, cost, own, aims, units.inverse)
@@ -289,13 +290,20 @@ def _row_sizes(rows: Float[np.ndarray, "m nw"], stages: int) -> Float[np.ndarray
 
 
 def planned_states(
-    predictor: LinearPredictor, move_of: Int[np.ndarray, " N"], *, with_rates: bool, disturbed: bool
+    predictor: LinearPredictor,
+    move_of: Int[np.ndarray, " N"],
+    *,
+    with_rates: bool,
+    disturbed: bool,
+    periodic: bool = False,
 ) -> Float[np.ndarray, "N1nx nvk"]:
     """Return the matrix that takes [moves; z; u_{−1}; w_0 … w_{N−1}; d; 1] to C z_0 … C z_N, one below the other.
 
     z_{k+1} = A z_k + B u_k + E w_k + d; u_{−1} is there `with_rates`, d where it is estimated. Move move_of[k] is u_k.
     """
     A, B, E, C, N = predictor.A, predictor.B, predictor.E, predictor.C, len(move_of)
+    if periodic:  # [w_k; p_k] in place of w_k
+        E = np.hstack([E, np.eye(len(A))])
     nx, nz, nu, nw = len(C), len(A), B.shape[1], E.shape[1]
     from_z = np.empty((N + 1, nx, nz))  # C Aᵏ
     from_z[0] = C

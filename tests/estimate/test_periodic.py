@@ -1,0 +1,124 @@
+"""Periodic disturbances: forecasts of exact harmonics, loops on them, periods found in logs, and errors."""
+
+import numpy as np
+import pytest
+
+import koopmpc as km
+
+DT, PERIOD = 0.5, 7.3
+A, B = np.array([[0.9, 0.1], [-0.1, 0.8]]), np.array([[0.0], [0.3]])
+MODEL = km.LinearPredictor(A, B, np.eye(2), km.State().bind(("a", "b")), DT, ("a", "b"), ("u",))
+
+
+def push(k):
+    """A constant, and two harmonics of the period, on both states."""
+    turn = 2 * np.pi * k * DT / PERIOD
+    return np.array([0.02 + 0.05 * np.sin(turn + 1), 0.1 * np.cos(turn) - 0.04 * np.sin(2 * turn)])
+
+
+def run(mpc, steps, r=(0.0, 0.0), latency=0):
+    x, X, U, moves, sent = np.zeros(2), [], [], [], [np.zeros(1)] * latency
+    for k in range(steps):
+        move = mpc(x, np.array(r))
+        sent.append(move.u)
+        x = A @ x + B @ sent.pop(0) + push(k)
+        X.append(x)
+        U.append(move.u)
+        moves.append(move)
+    return np.array(X), np.array(U), moves
+
+
+def controller(latency=0, **estimator):
+    cost = km.Cost(Q=[0, 1], R=1e-6, u_target="zero")
+    told = km.LiftedDisturbance(**estimator)
+    return km.KoopmanMPC(MODEL, cost, km.Limits(u_min=-5, u_max=5), 12, estimator=told, latency=latency)
+
+
+@pytest.mark.parametrize("latency", [0, 2])
+def test_the_plan_of_an_exact_model_foretells_the_disturbance(latency):
+    mpc = controller(latency, period=PERIOD)
+    run(mpc, 900, latency=latency)
+    observer = mpc.observer
+    ahead = observer.d + observer.forecast(12)
+    np.testing.assert_allclose(ahead, [push(900 - 1 + i) for i in range(12)], atol=1e-6)
+    states = mpc.plan().X
+    assert np.isfinite(states).all()
+
+
+def test_a_loop_with_the_period_has_no_error_where_one_without_has():
+    knowing, plain = (run(controller(**kind), 300)[0][200:, 1] for kind in ({"period": PERIOD}, {}))
+    assert np.abs(knowing).max() < 1e-4
+    assert np.abs(plain).max() > 1e-2
+
+
+def test_without_a_disturbance_nothing_changes():
+    cost = km.Cost(Q=1.0, R=0.1)
+    plain = km.KoopmanMPC(MODEL, cost, km.Limits(), 10)
+    knowing = km.KoopmanMPC(MODEL, cost, km.Limits(), 10, estimator=km.LiftedDisturbance(period=PERIOD))
+    x = np.array([1.0, -0.5])
+    for _ in range(10):
+        u = plain(x, [0.3, 0.0]).u
+        np.testing.assert_allclose(knowing(x, [0.3, 0.0]).u, u, atol=1e-12)
+        x = A @ x + B @ u
+
+
+def test_the_planned_states_are_those_that_come():
+    mpc = controller(period=PERIOD)
+    X, _, _ = run(mpc, 300)
+    planned = mpc.plan().X
+    np.testing.assert_allclose(planned[1], X[-1], atol=1e-5)
+
+
+def test_runs_repeat_and_files_keep_the_period(tmp_path):
+    mpc = controller(period=PERIOD)
+    first = run(mpc, 30)[1]
+    mpc.reset()
+    np.testing.assert_array_equal(run(mpc, 30)[1], first)
+    mpc.save(tmp_path / "mpc.npz")
+    np.testing.assert_array_equal(run(km.load_controller(tmp_path / "mpc.npz"), 30)[1], first)
+
+
+def test_missed_and_wild_readings_do_not_end_the_phase():
+    mpc, x, rng = controller(period=PERIOD), np.zeros(2), np.random.default_rng(0)
+    for k in range(400):
+        y = np.full(2, np.nan) if k % 50 == 7 else x + 100.0 * (k % 60 == 11)
+        u = mpc(y, np.zeros(2)).u
+        assert np.abs(u).max() <= 5
+        x = A @ x + B @ u + push(k) + 1e-6 * rng.standard_normal(2)
+    np.testing.assert_allclose(mpc.observer.d + mpc.observer.forecast(1)[0], push(399), atol=1e-2)
+
+
+def logs(seed, amplitude=0.1, noise=0.05, period=PERIOD, T=600):
+    rng, X = np.random.default_rng(seed), [np.zeros(2)]
+    U = rng.standard_normal((T, 1))
+    for k, u in enumerate(U):
+        wave = amplitude * np.sin(2 * np.pi * k * DT / period + seed)
+        X.append(A @ X[-1] + B @ u + np.array([0, wave]) + noise * rng.standard_normal(2))
+    return km.Episodes([km.Episode(X=np.array(X), U=U)], DT, states=["a", "b"], inputs=["u"])
+
+
+@pytest.mark.parametrize("period", [1.7, 7.3, 61.0])
+def test_a_period_is_found_in_logs(period):
+    found = km.estimate.find_period(MODEL, logs(0, period=period))
+    assert found == pytest.approx(period, rel=0.02)
+
+
+def test_noise_has_no_period():
+    for seed in range(3):
+        with pytest.raises(km.errors.DataError, match="no period stands out"):
+            km.estimate.find_period(MODEL, logs(seed, amplitude=0.0))
+
+
+def test_bad_periods_are_refused_in_a_sentence(tmp_path):
+    with pytest.raises(km.errors.DataError, match=r"period is 0.9 s, less than two samples of 0.5 s"):
+        controller(period=0.9)
+    with pytest.raises(km.errors.DataError, match="period"):
+        km.LiftedDisturbance(period=-1.0)
+    with pytest.raises(km.errors.DataError, match="leave out gain"):
+        km.LiftedDisturbance(gain=0.5, period=3.0)
+    with pytest.raises(km.errors.DataError, match="for a KoopmanMPC or a LinearMPC"):
+        km.BilinearMPC(
+            MODEL.step_map(), km.Cost(Q=1, R=1), km.Limits(), 5, estimator=km.LiftedDisturbance(period=PERIOD)
+        )
+    with pytest.raises(km.errors.DataError, match="period"):
+        km.export(controller(period=PERIOD), tmp_path)
