@@ -73,7 +73,7 @@ MOST = {  # files, returns
     "bilinear_edmd": (8, 7),
     "KoopmanMPC": (17, 20),
     "step": (5, 3),
-    "BilinearMPC": (15, 18),
+    "BilinearMPC": (15, 20),
     "bilinear_step": (7, 5),
     "simulate": (9, 15),
     # with the files of the ground and of liftings, which those above leave out
