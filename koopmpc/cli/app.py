@@ -112,6 +112,10 @@ def fit(
     goal_template: Annotated[
         bool, typer.Option("--goal-template", help="Write goal.toml for these logs, to be changed, and stop.")
     ] = False,
+    set_point: Annotated[
+        str | None,
+        typer.Option("--set-point", help="With --goal: columns with set points of the loop that made the logs, r,s,…"),
+    ] = None,
     plan: Annotated[
         Path | None, typer.Option("--next", help="With --goal: plan the next experiment, and write it as this .csv.")
     ] = None,
@@ -165,6 +169,7 @@ def fit(
                 goal,
                 folder,
                 progress=progress,
+                set_points=() if set_point is None else split(set_point),
                 plan=plan,
                 plan_steps=plan_steps,
                 plan_episodes=plan_episodes,

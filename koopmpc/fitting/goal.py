@@ -2,7 +2,7 @@
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from inspect import Parameter, signature
@@ -25,6 +25,7 @@ from koopmpc.fitting.fit import Say, describe_data, ignore_text
 from koopmpc.fitting.further import FurtherData, plan_further
 from koopmpc.fitting.repair import IN_MEMORY, Data, DividedData, collect_notes, find_logs, read_logs
 from koopmpc.fitting.report import write_design_report
+from koopmpc.fitting.set_points import take_set_points
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
 from koopmpc.parallel import StageProgress
@@ -105,6 +106,7 @@ def design_data(
     say: Say | None = None,
     progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
+    set_points: Sequence[str] = (),
     plan: str | PathLike[str] | None = None,
     plan_steps: int | None = None,
     plan_episodes: int = 1,
@@ -124,6 +126,8 @@ def design_data(
         A file as `write_template` writes it.
     bilinear, workers, scheduler, memory, say, progress, rng
         As for `fit_data`.
+    set_points
+        Columns with the set points of the loop that made the logs: instruments of `design`.
     plan, plan_steps, plan_episodes
         The .csv of the next experiment, its picture beside it, and steps and number of its episodes, see
         `next_experiment`.
@@ -144,6 +148,8 @@ def design_data(
     tell = ignore_text if say is None else say
     pushed = list_goal_inputs(goal)
     reading = load_reading(goal) | {name: value for name, value in reading.items() if value is not None}
+    if set_points:
+        reading["disturbances"] = [*reading.get("disturbances", ()), *set_points]
     further = partial(plan_goal, file=plan, steps=plan_steps, episodes=plan_episodes, tell=tell)
     try:
         split = read_logs(data, None, draw, memory, reading, _SHORT, ask=not pushed)
@@ -157,6 +163,7 @@ def design_data(
     if missed and "inputs" not in reading:  # the goal knows inputs that no name in the logs shows
         reading["inputs"] = (*split.seen.inputs, *missed)
         split = read_logs(data, None, draw, memory, reading, _SHORT)
+    split, instruments = take_set_points(split, set_points)
     about = describe_data(split)
     tell(about)
     asked = read_goal(goal, split.seen)
@@ -170,6 +177,7 @@ def design_data(
                 reference=asked.reference,
                 angles=asked.angles,
                 bilinear=bilinear,
+                instruments=instruments,
                 workers=workers,
                 scheduler=scheduler,
                 progress=progress,

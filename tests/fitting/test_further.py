@@ -54,3 +54,30 @@ def test_a_plan_needs_a_goal_and_a_table(tmp_path, monkeypatch):
     sheet = CliRunner().invoke(app, ["fit", "logs.npz", "--goal", "goal.toml", "--next", "plan.xlsx"])
     assert sheet.exit_code == 2
     assert "does not end with .csv" in sheet.output + sheet.stderr
+
+
+def write_closed_loop(path, runs=6, steps=150):
+    rng, lines = np.random.default_rng(0), ["run,t,position,speed,force,goal"]
+    for run in range(runs):
+        x, goals = np.zeros(2), np.repeat(rng.choice([-0.4, 0.4], steps // 15), 15)
+        for k, goal in enumerate(goals):
+            y = x + [0.03, 0.05] * rng.standard_normal(2)
+            u = 3.0 * (goal - y[0]) - 2.0 * y[1]
+            lines.append(f"{run},{0.1 * k:.1f},{y[0]:.6f},{y[1]:.6f},{u:.6f},{goal}")
+            x = A @ x + B[:, 0] * u
+    path.write_text("\n".join(lines))
+
+
+PLAIN = GOAL.replace(" [m]", "").replace(" [m/s]", "").replace(" [N/kg]", "")
+
+
+@pytest.mark.slow
+def test_set_points_in_a_table_are_instruments_of_the_design(tmp_path):
+    write_closed_loop(tmp_path / "loop.csv")
+    (tmp_path / "goal.toml").write_text(PLAIN)
+    made = design_data(tmp_path / "loop.csv", tmp_path / "goal.toml", tmp_path, set_points=["goal"], bilinear=False)
+    assert any("rows of the set point explain" in note for note in made.design.notes), made.design.notes
+    model = made.design.controller.predictor
+    assert model.states == ("position", "speed")
+    with pytest.raises(km.KoopmpcError, match="wish"):
+        design_data(tmp_path / "loop.csv", tmp_path / "goal.toml", tmp_path, set_points=["wish"], bilinear=False)
