@@ -34,7 +34,7 @@ def take_set_points(
         raise DataError("--set-point goes with logs that fit into memory; pass fewer logs")
     missing = [name for name in names if name not in split.fitted.disturbances]
     if missing:
-        raise DataError(f"{missing[0]} is no column of the logs; --set-point names columns of a table")
+        raise DataError(f"the logs lack the column {missing[0]}; --set-point names columns of a table")
     taken = [split.fitted.disturbances.index(name) for name in names]
     signals = [e.W[:, taken] for e in split.fitted]
 
