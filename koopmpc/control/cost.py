@@ -313,7 +313,7 @@ class Tracking(Generic[Read]):
     R_root: Float[np.ndarray, "nu nu"]
     sizes: Sizes
     movable: Movable
-    shift: Float[np.ndarray, "K nu"] | None
+    shift: Float[np.ndarray, "prices nu"] | None
 
 
 LiftedTracking: TypeAlias = Tracking[np.ndarray]

@@ -17,6 +17,7 @@ from koopmpc.control.limits import SOFTENED, Interval, Limits
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.problem import ModelOrMap
+from koopmpc.control.nonlinear.rows import StageLimits
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
 from koopmpc.control.nonlinear.staged_program import StagedProgram, find_targets, first_gain, trace_functions
 from koopmpc.control.nonlinear.stagewise import list_sides, weights
@@ -47,6 +48,7 @@ _COPIED = (
     "_kept",
     "_age",
     "_given",
+    "_limit_step",
     "_planned",
     "_warm",
     "_moved",
@@ -161,6 +163,8 @@ class BilinearMPC(StagedMPC):
     def build_program(self, reference: ArrayLike | None) -> StagedProgram:
         """Return the data of a step."""
         problem, outputs, model = self._problem, self._outputs, self._map
+        if self.limits.in_time:
+            raise no_export(self, "its limits have rows in time, and its C keeps one set", "one with limits.at(step)")
         if outputs.shift is not None:
             raise no_export(self, "its cost has a price, which its C does not know", "one without a price")
         if problem.scheduled:
@@ -252,6 +256,10 @@ class BilinearMPC(StagedMPC):
         """
         super().update(model)
         self._iteration.set_theta(self._map.theta)
+
+    def _limit(self, limits: StageLimits | None) -> None:
+        low, high = self._base_limits if limits is None else limits.stages
+        self._iteration.low[:], self._iteration.high[:] = low, high
 
     def _schedule(self, W: Float[np.ndarray, "N nw"]) -> None:
         self._iteration.W[:] = W

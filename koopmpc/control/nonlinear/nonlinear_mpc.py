@@ -15,6 +15,7 @@ from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controlle
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import ModelOrMap
+from koopmpc.control.nonlinear.rows import StageLimits
 from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolution, NLPSolver, Shooting, Start
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC, StagePlan
 from koopmpc.control.program import Program, no_export
@@ -133,6 +134,11 @@ class NonlinearMPC(StagedMPC):
         """Go on with another predictor of the same lifting, as `BilinearMPC.update`; the solver is built again."""
         super().update(model)
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
+
+    def _limit(self, limits: StageLimits | None) -> None:
+        low, high = self._base_limits if limits is None else limits.stages
+        nu = self.nu
+        self._shooting.set_limits(Interval(low[:, :nu], high[:, :nu]), Interval(low[:, nu:], high[:, nu:]))
 
     def _schedule(self, W: Float[np.ndarray, "N nw"]) -> None:
         self._W[:] = W

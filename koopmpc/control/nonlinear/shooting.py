@@ -194,8 +194,17 @@ class Shooting:
                 f"{solver} was not built with settings {dict(settings)}: {reason}; pass its own settings by CasADi's "
                 'names, for example {"ipopt.tol": 1e-8}'
             ) from error
-        self._scale = p.scale
+        self._scale, self._path_at, self._path_row = p.scale, path_at, row
         self._shape, self._split = (N, nu + nx + ns), (nu, nu + nx)
+
+    def set_limits(self, inputs: Interval, outputs: Interval) -> None:
+        """Set the limits (N, nu) of the inputs of all stages, and those (N, ng) of their outputs."""
+        nu, ng = inputs.low.shape[1], outputs.low.shape[1]
+        for end, value in zip(("lbx", "ubx"), inputs, strict=True):
+            self._bounds[end].reshape(self._shape)[:, :nu] = value / self._sizes[:nu]
+        if ng:
+            self._bounds["ubg"][self._path_at[:, :ng]] = outputs.high / self._path_row
+            self._bounds["lbg"][self._path_at[:, ng:]] = outputs.low / self._path_row
 
     def at(self, X: Float[np.ndarray, "N nx"], U: Float[np.ndarray, "N nu"]) -> Start:
         """Return a start with these states x_1 … x_N and inputs."""

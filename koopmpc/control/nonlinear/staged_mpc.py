@@ -12,10 +12,12 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, data_ranges, state_tracking
+from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation, refuse_levels, refuse_priority
 from koopmpc.control.move import Move, Plan, Status, alone
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
+from koopmpc.control.nonlinear.rows import StageLimits, check_rows, find_stage_limits
 from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
@@ -58,6 +60,9 @@ class StagedMPC(MPCBase):
 
     _e: Float[np.ndarray, "N nx"]  # e_k = E w_k + d of the step
     _targets: StageTargets  # of the step
+    _box: Interval  # limits of the inputs of the step, one for all stages or a row each
+    _at_call: Limits
+    _called_with: Limits | None
     _warm: bool  # whether the next step starts from the plan of the last one
 
     def __init__(
@@ -76,7 +81,8 @@ class StagedMPC(MPCBase):
         self._forget_targets()
         self._map = given = learned_map(model)
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
-        self._outputs = o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, priced=True)
+        o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, in_time=True, priced=True)
+        self._outputs, self._box, self._limit_step, self._called_with = o, o.inputs, 0, None
         refuse_levels(o.limits, f"a {type(self).__name__}")
         refuse_priority(o.limits, f"a {type(self).__name__}")
         super().__init__(
@@ -97,6 +103,8 @@ class StagedMPC(MPCBase):
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
         self._disturbed = estimator is not None or given.nw > 0
         self._scheduled_for = np.zeros(given.nw)
+        if self.limits.in_time:
+            check_rows(self.limits, o, self._problem, None)
 
     @property
     def model(self) -> ModelOrMap:
@@ -111,6 +119,10 @@ class StagedMPC(MPCBase):
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
+        self._limit_step, inputs = 0, self._outputs.inputs
+        if self.limits.in_time:
+            low, high = self.limits.input_rows(self.nu, 0, 1)
+            self._box = Interval(np.maximum(low, inputs.low), np.minimum(high, inputs.high))
         super().reset(x0, u_prev)
         self._warm, self._moved, self._row = False, False, 0
         self._forget_targets()
@@ -152,13 +164,56 @@ class StagedMPC(MPCBase):
         reference: ArrayLike,
         applied: ArrayLike | None = None,
         w: ArrayLike | None = None,
+        limits: Limits | None = None,
     ) -> Move:
         """Return the first input of the plan for state y; arguments as for KoopmanMPC."""
         start = perf_counter()
+        if limits is not None or self.limits.in_time or self._box is not self._outputs.inputs:
+            self._move_limits(limits)
         move = self._step(y, reference, applied, w, start)
         move.refused = self._initial.refused
         watch = self._watch
         return move if watch is None else self._judge_step(watch, move, applied, start)
+
+    def _move_limits(self, limits: Limits | None) -> None:
+        """Set the limits of this step: those of the call, or the controller's own."""
+        outputs, problem, own, first = self._outputs, self._problem, self.limits, self._limit_step
+        if limits is not None:
+            if limits is not self._called_with:
+                model = self._map.model
+                own = check_bounds_alone(limits, self.limits, tuple(model.states), tuple(model.inputs))
+                check_rows(own, outputs, problem, self._N + self._latency)
+                self._called_with, self._at_call = limits, own
+            own, first = self._at_call, 0
+        elif not own.in_time:
+            self._box = outputs.inputs
+            self._limit(None)
+            return
+        found = find_stage_limits(own, outputs, problem, first + self._latency, self._base_limits)
+        self._box = found.inputs
+        self._limit(found)
+        self._limit_step += 1
+
+    @property
+    def _base_limits(self) -> Interval:
+        """The limits of all stages as the controller was made."""
+        problem, N = self._problem, self._N
+        low, high = (np.tile(np.concatenate([problem.inputs[i], problem.box[i]]), (N, 1)) for i in (0, 1))
+        count = problem.margin.shape[1]
+        low[:, low.shape[1] - count :] += problem.margin
+        high[:, high.shape[1] - count :] -= problem.margin
+        return Interval(low, high)
+
+    def _limit(self, limits: StageLimits | None) -> None:
+        """Take over the limits of a step; None for those of the constructor."""
+        raise NotImplementedError
+
+    def _first_box(self) -> Interval:
+        """Return the limits of the first input."""
+        return self._box if self._box.low.ndim == 1 else Interval(self._box.low[0], self._box.high[0])
+
+    def _present_limits(self) -> tuple[Interval, Interval | None]:
+        return self._first_box(), self._rates
 
     def _step(
         self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None, w: ArrayLike | None, start: float
@@ -179,7 +234,7 @@ class StagedMPC(MPCBase):
         self._X, self._U = self._trajectory(found.S, found.V)
         slack, u = found.slack, self._U[0]
         if self._hard_rates is not None:
-            u[:] = clip_input(u, self._outputs.inputs, self._hard_rates, u_prev)
+            u[:] = clip_input(u, self._first_box(), self._hard_rates, u_prev)
             if conflict:
                 slack = max(slack, measure_violation(u - u_prev, self._hard_rates))
         self._keep(self._U.ravel())
@@ -280,9 +335,9 @@ class StagedMPC(MPCBase):
     ) -> tuple[Float[np.ndarray, " ns"], Interval, bool]:
         """Return s_0, the limits of v_0, and whether rates were widened: where they exclude those of u, these win."""
         low, high = self._problem.inputs
+        inputs = self._first_box()
         if not self._with_rates:
-            return x, self._problem.inputs, False
-        inputs = self._outputs.inputs
+            return x, inputs, False
         widened = Interval(np.minimum(low, inputs.high - u_prev), np.maximum(high, inputs.low - u_prev))
         reach = 1e-9 * (np.abs(u_prev) + self._problem.input_sizes)
         conflict = bool((widened.low < low - reach).any() or (widened.high > high + reach).any())
@@ -295,7 +350,7 @@ class StagedMPC(MPCBase):
         u_prev: Float[np.ndarray, " nu"],
     ) -> tuple[Float[np.ndarray, "N1 ns"], Float[np.ndarray, "N nu"]]:
         """Return a plan of states and inputs in s and v, its inputs inside their limits and held in each block."""
-        low, high = self._outputs.inputs
+        low, high = self._box
         U = np.minimum(np.maximum(U, low), high)
         if not self._with_rates:
             return X, U
@@ -308,7 +363,7 @@ class StagedMPC(MPCBase):
         self, S: Float[np.ndarray, "N1 ns"], V: Float[np.ndarray, "N nu"]
     ) -> tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]]:
         """Return the states and the inputs of a plan, the inputs inside their limits."""
-        nx, (low, high) = self._map.nx, self._outputs.inputs
+        nx, (low, high) = self._map.nx, self._box
         if self._with_rates:
             V = S[0, nx : nx + self.nu] + np.cumsum(V * self._problem.free[:, None], axis=0)
         return S[:, :nx], np.minimum(np.maximum(V, low), high)

@@ -1,0 +1,101 @@
+"""Limits in time for the stages of BilinearMPC and NonlinearMPC: rows of u, x and y in place of the constructor's."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.control.cost import StateTracking
+from koopmpc.control.in_time.bounds import refuse_crossed_rows
+from koopmpc.control.in_time.preview import require_preview
+from koopmpc.control.limits import Interval, Limits
+from koopmpc.control.nonlinear.problem import StagedProblem
+from koopmpc.errors import DataError
+
+_FAR = 1e3  # a row without a limit is this many sizes beyond the widest one, where it limits nothing
+
+
+class StageLimits(NamedTuple):
+    """The limits of a plan: of its inputs (N, nu), and of [v_k; g(s_{k+1})] as an iteration reads them."""
+
+    inputs: Interval
+    stages: Interval
+
+
+def check_rows(limits: Limits, outputs: StateTracking, problem: StagedProblem, preview: int | None) -> None:
+    """Raise where limits in time ask for what the stages do not have.
+
+    Parameters
+    ----------
+    preview
+        Steps that a call reads; None for the rows of a run.
+
+    Raises
+    ------
+    DataError
+        The rates have rows, moves are blocked, there is a terminal set; limits cross; a bound is set that is infinite
+        in the constructor's limits.
+    ShapeError
+        A bound has too few rows.
+    """
+    counts = limits.count_rows()
+    rates = next((end for end in counts if end.startswith("du")), None)
+    if rates is not None:
+        raise DataError(
+            f"{rates} has rows, which this controller does not know; give it one value, or take a KoopmanMPC"
+        )
+    if problem.own or not problem.free.all():
+        raise DataError("limits in time were passed with moves that are held; leave moves out, or take a KoopmanMPC")
+    if problem.ends:
+        raise DataError("limits in time were passed with a terminal set, which holds for its own limits; leave one out")
+    if preview is not None:
+        require_preview(limits, preview)
+    count = max(counts.values(), default=1)
+    nu, n = len(outputs.inputs.low), len(outputs.movable.outputs)
+    nx = len(outputs.sizes.states)
+    base = outputs.limits.base
+    for what, rows, widest in (
+        ("input", limits.input_rows(nu, 0, count), base.inputs(nu)),
+        ("state and output", limits.output_rows(nx, n - nx, 0, count), base.ends(nx, n - nx)),
+    ):
+        refuse_crossed_rows(*rows, what)
+        for end, own, name in zip(rows, widest, ("lower", "upper"), strict=True):
+            missing = np.argwhere(np.isfinite(end) & ~np.isfinite(own))
+            if len(missing):
+                k, i = (int(v) for v in missing[0])
+                raise DataError(
+                    f"the {what} of index {i} gets a {name} limit at step {k}, and the controller has none; "
+                    "give it a finite one"
+                )
+
+
+def find_stage_limits(
+    limits: Limits, outputs: StateTracking, problem: StagedProblem, first: int, base: Interval
+) -> StageLimits:
+    """Return the limits of a plan whose first input acts in step `first`; `base` are the stages' own (N, n)."""
+    N, nu, kept = len(problem.free), len(outputs.inputs.low), outputs.movable.outputs
+    nx = len(outputs.sizes.states)
+    inputs = limits.input_rows(nu, first, N)
+    every = limits.output_rows(nx, len(kept) - nx, first + 1, N)
+    low, high = base.low.copy(), base.high.copy()
+    column = nu * problem.with_rates
+    low[:, column : column + nu] = _reach(inputs.low, low[:, column : column + nu], outputs.sizes.inputs, -1.0)
+    high[:, column : column + nu] = _reach(inputs.high, high[:, column : column + nu], outputs.sizes.inputs, 1.0)
+    count = int(kept.sum())
+    if count:
+        margin = problem.margin if problem.margin.shape[1] == count else np.zeros((N, count))
+        size = outputs.sizes.rows[kept]
+        low[:, -count:] = _reach(every.low[:, kept] + margin, low[:, -count:], size, -1.0)
+        high[:, -count:] = _reach(every.high[:, kept] - margin, high[:, -count:], size, 1.0)
+    own = Interval(
+        np.where(np.isfinite(inputs.low), inputs.low, outputs.inputs.low),
+        np.where(np.isfinite(inputs.high), inputs.high, outputs.inputs.high),
+    )
+    return StageLimits(own, Interval(low, high))
+
+
+def _reach(
+    rows: Float[np.ndarray, "N n"], base: Float[np.ndarray, "N n"], size: Float[np.ndarray, " n"], sign: float
+) -> Float[np.ndarray, "N n"]:
+    """Return the rows, far beyond the base where they have no limit and it has."""
+    return np.where(np.isfinite(rows), rows, base + sign * _FAR * size)
