@@ -234,7 +234,7 @@ def find_repairs(episodes: Episodes) -> Repair:
     Raises
     ------
     DataError
-        No state moves.
+        No state moves, or no input.
     """
     notes: list[str] = []
     X = np.concatenate([e.X for e in episodes])
@@ -245,6 +245,14 @@ def find_repairs(episodes: Episodes) -> Repair:
     if not states:
         raise DataError(
             f"no state moves: {', '.join(episodes.states)} are constant; check the columns, or pass --states"
+        )
+    if nu and not [i for i in both if i < nu] and not np.ptp(driven[:, :nu], axis=0).any():
+        still = ", ".join(
+            f"{name} is {value:g} throughout" for name, value in zip(episodes.inputs, driven[0], strict=False)
+        )
+        raise DataError(
+            f"no input moves: {still}, so what it does cannot be learned; record a run in which it moves, or name "
+            'other columns: --inputs "u", or --states "y" --inputs "" for a plant that runs by itself'
         )
     turns = {i: count for i, count in count_wraps(episodes).items() if i in states}
     for i, count in turns.items():
@@ -268,7 +276,7 @@ def _find_useful(columns: Float[np.ndarray, "m n"], names: tuple[str, ...], note
         column = columns[:, i]
         twin = next((names[j] for j in kept if np.array_equal(column, columns[:, j])), None)
         if np.ptp(column) == 0:
-            notes.append(f"left out: {name} is {column[0]:g} throughout")
+            notes.append(f"left out: {name} is {column[0]:g} throughout, so what it does cannot be learned")
         elif twin is not None:
             notes.append(f"left out: {name} repeats {twin}")
         else:
@@ -410,7 +418,7 @@ def divide_files(
     if len(held_out) < 2:
         held_out = _keep_long([b for e in judged for b in cut_blocks(e, 2 * (ahead + past))], ahead + past)
     if len(held_out) < 2:
-        raise DataError(_say_too_short(len(judged), ahead, short))
+        raise DataError(_say_too_short(len(judged), ahead + past, short))
     seen, _ = take_sample(rest, _JUDGED)
     note = (
         f"larger than {_format_bytes(memory)}, so read in {len(parts)} parts: {len(out)} of them "
@@ -458,7 +466,7 @@ def _divide_episodes(
             )
     long = [i for i, episode in enumerate(whole) if len(episode) >= shortest]
     if len(long) < 4:
-        raise DataError(_say_too_short(len(episodes), ahead, short))
+        raise DataError(_say_too_short(len(episodes), shortest, short))
     count = max(round(_SHARE * len(long)), min(_ENOUGH, len(long) // 3), 2)
     # blocks in order are held out evenly spread, episodes at random
     order = [int((i + 0.5) * len(long) / count) for i in range(count)]
@@ -490,7 +498,11 @@ def _divide_records(records: Episodes, ahead: int, size: str, repaired: tuple[st
         block = max(shortest, (last - first) // _ENOUGH)
         held_out += _keep_long(cut_blocks(record.cut(first, last), block), shortest)
     if len(held_out) < 2:
-        raise DataError(_say_too_short(len(records), ahead, _SHORTER))
+        raise DataError(
+            f"{len(records)} record{'s' * (len(records) > 1)} of at most {max(map(len, records))} steps: the last "
+            f"fifth must hold two blocks of {shortest} steps, horizon and past rows, so {round(2 * shortest / _SHARE)} "
+            f"in all; {_SHORTER}"
+        )
     note = (
         f"the last fifth of {'each' if len(records) > 1 else 'the'} record is held out, in {len(held_out)} blocks; "
         "the chosen model is fitted without it to be judged, and then to all rows"
@@ -510,9 +522,9 @@ def _keep_long(episodes: Sequence[Episode], shortest: int) -> list[Episode]:
     return [episode for episode in episodes if len(episode) >= shortest]
 
 
-def _say_too_short(episodes: int, horizon: int, advice: str) -> str:
+def _say_too_short(episodes: int, shortest: int, advice: str) -> str:
     return (
-        f"{episodes} episode{'s' * (episodes > 1)} of these lengths give too few of {horizon + PAST} steps, horizon "
+        f"{episodes} episode{'s' * (episodes > 1)} of these lengths give too few of {shortest} steps, horizon "
         f"and delays, to fit to some and judge by others; {advice}"
     )
 

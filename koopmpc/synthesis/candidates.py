@@ -40,6 +40,7 @@ MOST = 120  # observables of a lifting that is tried unasked
 _REGRESSORS = 260  # [ψ(x) u u⊗ψ(x)] of a model that is tried unasked
 _EACH = 10  # snapshot pairs for each regressor, at least
 _POINTS = 2000  # of the data that distances are taken of
+_APART = 1e-3  # centres that agree in multiples of this many spreads coincide; one of them is kept
 _FLOOR = 1e-3  # weight of data that are far from every visited state
 _NEAR = 0.3  # this quantile of the squared distances is the square of the weights' width
 _VISITED = 300  # visited states that distances are taken to, at most
@@ -218,7 +219,8 @@ def _trigonometric(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> Itera
     if found:
         which, where = found, ", ".join(strip_unit(states[i]) for i in found)
     else:
-        which = [i for i, name in enumerate(states) if "[" not in name and 0.2 < np.ptp(X[:, i]) < 50]
+        near = np.abs(X).min(axis=0) < 2 * np.pi  # numbers near 95 are no angles
+        which = [i for i, name in enumerate(states) if "[" not in name and 0.2 < np.ptp(X[:, i]) < 50 and near[i]]
         where = "all"
     if not which:
         return
@@ -241,6 +243,7 @@ def _scale_liftings(
     points = (X[rng.choice(len(X), min(len(X), _POINTS), replace=False)] - whole.mean) / whole.scale
     points = np.asarray(np.unique(points, axis=0), dtype=np.float64)
     rng.shuffle(points)
+    points = points[np.sort(np.unique(np.round(points / _APART), axis=0, return_index=True)[1])]
     base = State() + Constant()
 
     def scale(lifting: Lifting) -> Lifting:

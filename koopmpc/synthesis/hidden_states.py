@@ -1,4 +1,4 @@
-"""Models of records with a hidden state: linear and polynomial ones, with the sensor's rails and without."""
+"""Models of records with a hidden state: linear and polynomial ones, with rails and without, and neurons."""
 
 from dataclasses import replace
 from time import perf_counter
@@ -9,6 +9,7 @@ from jaxtyping import Float
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError, hide_fit_warnings
 from koopmpc.identify.records.narx import FOLDS
+from koopmpc.identify.records.neural import PIECE, ROWS, search_neural
 from koopmpc.identify.records.state_space import (
     HiddenStructure,
     choose_hidden,
@@ -27,6 +28,8 @@ from koopmpc.validate.scoring import AnyPredictor
 
 FAR = 1.2  # a kind that errs by this many times the least error is left out
 LOST = 1.0  # a model that errs by more spreads than this on one stretch is not taken where another one is calm
+PAYS = 0.9  # neurons are judged if they lower the error on unseen rows to less than this share
+_NEURAL_ORDERS = (2, 3, 4)  # orders of hidden states with neurons
 _ORDERS = (1, 2, 3, 4)  # orders of hidden states that simulation error is tried on
 
 
@@ -41,7 +44,9 @@ def judge_hidden_states(
     """Return the best models with a hidden state, one of each kind, and how they run over stretches that no fit saw.
 
     The kinds are the subspace model, the linear and the polynomial one of least simulation error, and where a sensor
-    rests at its least or largest reading, the polynomial one with these rails. Where records are too short for a kind,
+    rests at its least or largest reading, the polynomial one with these rails; and the one with neurons, with the rails
+    if the best one before has them. With neurons only
+    what is calm and errs by a tenth less than all others is judged. Where records are too short for a kind,
     it is left out.
 
     Parameters
@@ -65,12 +70,12 @@ def judge_hidden_states(
     except KoopmpcError:
         pass
     rails = find_rails(measured)
+
+    def ask(_: str, done: int, total: int) -> None:
+        if progress is not None:
+            progress(done, total)
+
     for limits in (None,) if rails is None else (None, rails):
-
-        def ask(_: str, done: int, total: int) -> None:
-            if progress is not None:
-                progress(done, total)
-
         try:
             tried = search_hidden(measured, _ORDERS, rails=limits, ask=ask)
         except KoopmpcError:
@@ -79,6 +84,17 @@ def judge_hidden_states(
             same = [one for one in tried if one.is_nonlinear is kind]
             if same and (kind or limits is None):
                 found.append(choose_hidden(same))
+    if bilinear:
+        try:
+            saturates = bool(found) and min(found, key=lambda one: one.error).rails is not None
+            tried = search_neural(
+                measured, _ORDERS, degrees=(1,), rails=rails if saturates else None, quick=True, ask=ask
+            )
+        except KoopmpcError:
+            tried = []
+        best = min([rival, *(one.error for one in found if one.calm)])
+        calm = [one for one in tried if one.calm and one.error < PAYS * best]
+        found += [choose_hidden(calm)] if calm else []
     least = min((one.error for one in found), default=np.inf)
     found = [one for one in found if one.error < FAR * min(least, rival)]
     searched = (perf_counter() - begun) / max(len(found), 1)
@@ -96,11 +112,12 @@ def _judge(
 ) -> tuple[LeaderboardRow, FreeRun]:
     """Return the line of the leaderboard and the free runs of a structure."""
     begun, models = perf_counter(), list[AnyPredictor]()
-    data = measured if len(measured) > 1 else thin_records(measured)
+    size = (ROWS, PIECE) if structure.neurons else ()
+    data = measured if len(measured) > 1 else thin_records(measured, *size)
 
     def fit(episodes: Episodes) -> AnyPredictor:
         with hide_fit_warnings():
-            models.append(fit_hidden(structure, episodes))
+            models.append(fit_hidden(structure, episodes, quick=True))
         return models[-1]
 
     start = max(first, structure.delays)
@@ -111,7 +128,10 @@ def _judge(
     rails = "" if structure.rails is None else ", saturating sensor"
     how = "simulation error" if structure.horizon else "subspace"
     name = f"hidden state of order {structure.order}"
-    name += f", degree {structure.degree}" if structure.is_nonlinear else f", {how}"
+    if structure.neurons:
+        name += f", {structure.neurons} neuron{'s' * (structure.neurons != 1)}"
+    else:
+        name += f", degree {structure.degree}" if structure.is_nonlinear else f", {how}"
     row = LeaderboardRow(
         name=name + rails,
         bilinear=isinstance(whole, BilinearPredictor),

@@ -48,6 +48,7 @@ GAINED = 0.9  # try a larger order only if the last one lowered the error to les
 ROWS = 12_000  # rows that a search learns from, at most: of longer records evenly spread pieces are taken
 PIECE = 4_000  # rows of such a piece
 STEPS = 30_000  # steps of all segments of one length, about
+QUICK_STEPS = 10_000  # the same in a search of many sizes
 WINDOWS = 8, 40  # past rows from which the state begins, at least and at most
 SEGMENTS = 50, 200  # steps of the shorter segments, at least and at most
 LONGER = 5  # the longer segments have this many times the steps of the shorter ones
@@ -135,12 +136,14 @@ def search_neural(
     degrees: Sequence[int] = DEGREES,
     *,
     rails: Float[np.ndarray, "2 ny"] | None = None,
+    quick: bool = False,
     ask: Ask | None = None,
 ) -> list[HiddenStructure]:
     """Return structures with their errors on the last quarter of each record.
 
     Orders are tried upwards, until one gains less than a tenth. Degrees above the first, and other starts for the
-    neurons, are tried with the best order.
+    neurons, are tried with the best order. `quick` is as in `fit_neural`, and without
+    other starts.
 
     Raises
     ------
@@ -157,7 +160,7 @@ def search_neural(
             ask(f"neurons with a hidden state of order {order}", len(found), len(orders) * len(neurons))
         plan = HiddenStructure(order, degree, delays, horizon, rails, np.ones(1), False, 0, start=start)
         try:
-            for model, units in fit_chain(data, plan, neurons):
+            for model, units in fit_chain(data, plan, neurons, quick=quick):
                 errors = measure_hidden(model, data, units, delays)
                 calm = is_calm_anywhere(model, data, units, delays)
                 size, count = model.E.size + model.neurons.size, len(model.neurons)
@@ -178,17 +181,20 @@ def search_neural(
         best = choose_hidden(found)
         for degree in sorted(degrees)[1:]:
             try_chain(best.order, degree)
-        for start in range(1, STARTS):
+        for start in range(1, 1 if quick else STARTS):
             try_chain(best.order, min(degrees), start)
     if not found:
         raise reasons[0] if reasons else DataError("no structure was asked for; pass orders and neurons")
     return found
 
 
-def fit_neural(structure: HiddenStructure, episodes: Episodes) -> LinearPredictor | BilinearPredictor:
+def fit_neural(
+    structure: HiddenStructure, episodes: Episodes, *, quick: bool = False
+) -> LinearPredictor | BilinearPredictor:
     """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows.
 
-    Where that is not calm, the last one before it that is: before the polish, with fewer neurons, or without any.
+    With `quick` a third of the segments and half of the steps are taken, and nothing is polished. Where that is not
+    calm, the last one before it that is: before the polish, with fewer neurons, or without any.
 
     Raises
     ------
@@ -197,21 +203,27 @@ def fit_neural(structure: HiddenStructure, episodes: Episodes) -> LinearPredicto
     """
     s, data = structure, thin_records(episodes, ROWS, PIECE)
     counts = [q for q in NEURONS if q < s.neurons] + [s.neurons]
-    chain = list(fit_chain(data, s, counts, plain=True))
-    found, units = chain[-1]
-    basis = smooth_basis(units.ny, data.nu, s.delays)
-    whole = _project(_cut(data, units, s, s.horizon, [(0, len(e)) for e in data]), basis)
-    small = replace(found, T=np.hstack([found.T[:, :-1] @ basis.T, found.T[:, -1:]]))
-    error = ContainedError(SimulationError(small))
-    theta, _ = minimise(error, small.parameters, whole, whole, _POLISH, converged=_CONVERGED)
-    polished = contain(_widen(small.with_parameters(theta), basis))
-    for one in (polished, *(model for model, _ in reversed(chain))):
+    chain = list(fit_chain(data, s, counts, quick=quick, plain=True))
+    units, models = chain[-1][1], [model for model, _ in reversed(chain)]
+    if not quick:
+        models.insert(0, _polish(models[0], data, units, s))
+    for one in models:
         if is_calm_anywhere(one, data, units, s.delays):
             return from_standard(one, units, episodes, s.delays, report_fit(structure, one, units, data))
     raise DataError(
         f"free runs of a hidden state of order {s.order} leave ten ranges of the data, with neurons and without; pass "
         "another order, or use polynomial_state_space"
     )
+
+
+def _polish(model: HiddenModel, data: Episodes, units: SignalUnits, structure: HiddenStructure) -> HiddenModel:
+    """Return the model after some steps on all rows."""
+    basis = smooth_basis(units.ny, data.nu, structure.delays)
+    whole = _project(_cut(data, units, structure, structure.horizon, [(0, len(e)) for e in data]), basis)
+    small = replace(model, T=np.hstack([model.T[:, :-1] @ basis.T, model.T[:, -1:]]))
+    error = ContainedError(SimulationError(small))
+    theta, _ = minimise(error, small.parameters, whole, whole, _POLISH, converged=_CONVERGED)
+    return contain(_widen(small.with_parameters(theta), basis))
 
 
 def choose_window(data: Episodes) -> tuple[int, int]:
@@ -230,11 +242,11 @@ def choose_window(data: Episodes) -> tuple[int, int]:
 
 
 def fit_chain(
-    data: Episodes, structure: HiddenStructure, neurons: Sequence[int], *, plain: bool = False
+    data: Episodes, structure: HiddenStructure, neurons: Sequence[int], *, quick: bool = False, plain: bool = False
 ) -> Iterator[tuple[HiddenModel, SignalUnits]]:
     """Yield models with more and more neurons that learn from the first three quarters of each record.
 
-    With `plain` the linear model that they begin with comes first.
+    With `plain` the linear model that they begin with comes first; `quick` is as in `fit_neural`.
     """
     s = structure
     units = SignalUnits.of(data, s.rails)
@@ -242,11 +254,12 @@ def fit_chain(
     ends = [round((1 - UNSEEN) * len(e)) for e in data]
     spans = [(0, a) for a in ends], [(a, len(e)) for e, a in zip(data, ends, strict=True)]
     steps = [max(s.horizon // LONGER, 1), s.horizon]
-    sets = [tuple(_project(_cut(data, units, s, h, part), basis) for part in spans) for h in steps]
+    most = QUICK_STEPS if quick else STEPS
+    sets = [tuple(_project(_cut(data, units, s, h, part, most), basis) for part in spans) for h in steps]
     learned = data.with_episodes([e.cut(0, a) for e, a in zip(data, ends, strict=True) if a > 0])
-    model, noise = _start(learned, units, s.order, s.delays, basis, sets[0])
+    model, noise = _start(learned, units, s, basis, sets[0], quick)
     if s.degree > 1:
-        model = _fit(model.raise_degree(s.degree), noise, sets[0])
+        model = _fit(model.raise_degree(s.degree), noise, sets[0], quick)
     if plain:
         yield _widen(model, basis), units
     rng = np.random.default_rng(s.start)
@@ -254,22 +267,28 @@ def fit_chain(
         drawn = draw_neurons(model, sets[0][0][0], rng)
         model = model.add_neurons(take_neurons(model, sets[0][0], drawn, count - before, noise))
         for part in sets:
-            model = _fit(model, noise, part)
+            model = _fit(model, noise, part, quick)
         yield _widen(model, basis), units
 
 
 def _cut(
-    data: Episodes, units: SignalUnits, structure: HiddenStructure, horizon: int, spans: Sequence[tuple[int, int]]
+    data: Episodes,
+    units: SignalUnits,
+    structure: HiddenStructure,
+    horizon: int,
+    spans: Sequence[tuple[int, int]],
+    most: int = STEPS,
 ) -> list[RecordSegments]:
-    return cut_sets(data, units, structure.delays, horizon, spans, max(HORIZON, horizon // LONGER), STEPS)
+    return cut_sets(data, units, structure.delays, horizon, spans, max(HORIZON, horizon // LONGER), most)
 
 
-def _fit(model: HiddenModel, noise: float, part: tuple[Sets, ...]) -> HiddenModel:
+def _fit(model: HiddenModel, noise: float, part: tuple[Sets, ...], quick: bool) -> HiddenModel:
     """Return the model that Levenberg-Marquardt finds, whose linear part does not grow; unseen segments stop it."""
     fitted, judged = part
+    iterations, patience = (_ITERATIONS // 2, _PATIENCE // 2) if quick else (_ITERATIONS, _PATIENCE)
     theta, _ = minimise(
-        ContainedError(SimulationError(model, noise)), model.parameters, fitted, judged, _ITERATIONS,
-        patience=_PATIENCE, converged=_CONVERGED,
+        ContainedError(SimulationError(model, noise)), model.parameters, fitted, judged, iterations,
+        patience=patience, converged=_CONVERGED,
     )  # fmt: skip
     return contain(model.with_parameters(theta))
 
@@ -277,12 +296,13 @@ def _fit(model: HiddenModel, noise: float, part: tuple[Sets, ...]) -> HiddenMode
 def _start(
     learned: Episodes,
     units: SignalUnits,
-    order: int,
-    delays: int,
+    structure: HiddenStructure,
     basis: Float[np.ndarray, "k nzeta"],
     part: tuple[Sets, ...],
+    quick: bool,
 ) -> tuple[HiddenModel, float]:
     """Return the linear model to begin with, and the noise of a row: of two starts the one that forecasts better."""
+    order, delays = structure.order, structure.delays
     starts = [start_with_differences(units.ny, len(units.mean) - units.ny, order, delays)]
     noise = np.inf
     try:
@@ -299,7 +319,7 @@ def _start(
         if len(fitted) == 0:
             noise = min(noise, np.sqrt(error.evaluate(small.parameters, [_first_step(part[0][-1])])))
         if np.isfinite(error.evaluate(small.parameters, part[0])):
-            small = _fit(small, float(noise), part)
+            small = _fit(small, float(noise), part, quick)
             fitted.append((error.evaluate(small.parameters, part[1]), small))
     if not fitted:
         raise DataError(f"no linear model of order {order} has a forecast that stays finite; pass another order")

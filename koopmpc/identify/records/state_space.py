@@ -185,11 +185,16 @@ def search_hidden(
     return found
 
 
-def fit_hidden(structure: HiddenStructure, episodes: Episodes) -> LinearPredictor | BilinearPredictor:
-    """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows."""
+def fit_hidden(
+    structure: HiddenStructure, episodes: Episodes, *, quick: bool = False
+) -> LinearPredictor | BilinearPredictor:
+    """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows.
+
+    `quick` is as in `fit_neural`; other kinds are fitted as fast in any case.
+    """
     s = structure
     if s.neurons:
-        return fit_neural(s, episodes)
+        return fit_neural(s, episodes, quick=quick)
     if not s.horizon:
         return build_realisation(compute_block_moments(episodes, s.delays), s.order)
     data = thin_records(episodes)
