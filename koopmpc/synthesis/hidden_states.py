@@ -88,7 +88,7 @@ def judge_hidden_states(
         try:
             saturates = bool(found) and min(found, key=lambda one: one.error).rails is not None
             tried = search_neural(
-                measured, _ORDERS, degrees=(1,), rails=rails if saturates else None, quick=True, ask=ask
+                measured, _NEURAL_ORDERS, degrees=(1,), rails=rails if saturates else None, quick=True, ask=ask
             )
         except KoopmpcError:
             tried = []

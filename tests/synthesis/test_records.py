@@ -133,6 +133,35 @@ def test_a_hidden_state_is_taken_where_it_pays_on_unseen_rows():
     assert free_error(found.predictor, fresh) < 0.05 * fresh[0].X.std()
 
 
+@pytest.mark.slow
+def test_neurons_are_taken_where_they_pay_and_a_controller_plans_with_them():
+    """Dry friction, whose corner no polynomial of a hidden state holds."""
+
+    def friction(seed, rows=1500):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.uniform(-1, 1, rows // 15 + 1), 15)[:rows]
+        y, v = np.zeros(rows + 1), 0.0
+        for k in range(rows):
+            v = 0.95 * v + 0.2 * u[k] - 0.08 * np.tanh(20 * v)
+            y[k + 1] = v
+        y += 0.002 * rng.standard_normal(rows + 1)
+        return km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["v [m/s]"], ["u"])
+
+    found, fresh = km.select(friction(0), horizon=10), friction(1)
+    assert "neuron" in found.best.title
+    others = [row.free for row in found.leaderboard if "neuron" not in row.title and np.isfinite(row.free)]
+    assert found.best.free < 0.9 * min(others)
+    assert free_error(found.predictor, fresh) < 0.03 * fresh[0].X.std()
+    mpc = km.BilinearMPC(
+        found.predictor, km.Cost(Q=1, R=1e-3), km.Limits(u_min=-1, u_max=1), horizon=10, estimator=km.ExtendedKalman()
+    )
+    v = 0.0
+    for _ in range(60):
+        u = float(mpc([v], [0.4]).u[0])
+        v = 0.95 * v + 0.2 * u - 0.08 * np.tanh(20 * v)
+    assert v == pytest.approx(0.4, abs=0.02)
+
+
 def test_of_models_alike_one_without_a_hidden_state_is_taken():
     found = selection(False)
     hidden = [row for row in found.leaderboard if "hidden state" in row.title]
