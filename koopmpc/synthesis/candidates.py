@@ -219,7 +219,7 @@ def _trigonometric(states: Sequence[str], X: Float[np.ndarray, "M nx"]) -> Itera
     if found:
         which, where = found, ", ".join(strip_unit(states[i]) for i in found)
     else:
-        near = np.abs(X).min(axis=0) < 2 * np.pi  # numbers near 95 are no angles
+        near = np.abs(X).min(axis=0) < 2 * np.pi  # numbers near 95 are hardly angles
         which = [i for i, name in enumerate(states) if "[" not in name and 0.2 < np.ptp(X[:, i]) < 50 and near[i]]
         where = "all"
     if not which:
