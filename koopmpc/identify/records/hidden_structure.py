@@ -133,14 +133,14 @@ def thin_records(episodes: Episodes, most: int = ROWS, piece: int = PIECE) -> Ep
 
 def is_calm_hidden(model: HiddenModel, data: Episodes, units: SignalUnits, delays: int) -> bool:
     """Return whether a model stays within three times the range of the data, run over each record twice."""
+    X = (np.concatenate([e.X for e in data]) - units.mean[: units.ny]) / units.scale[: units.ny]
+    reach = HELD * np.abs(X).max(axis=0)
     for e in data:
         if len(e) <= delays:
             continue
         part = join_segments(cut_segments(data.with_episodes([e]), units, delays, len(e) - delays, 1))
         out = simulate_hidden(model, part.points, np.concatenate([part.inputs, part.inputs]))
-        if not (
-            np.abs(out) < HELD * np.abs((e.X - units.mean[: units.ny]) / units.scale[: units.ny]).max(axis=0)
-        ).all():
+        if not (np.abs(out) < reach).all():
             return False
     return True
 
@@ -152,15 +152,14 @@ def is_calm_anywhere(model: HiddenModel, data: Episodes, units: SignalUnits, del
     """
     if not is_calm_hidden(model, data, units, delays):
         return False
+    X = (np.concatenate([e.X for e in data]) - units.mean[: units.ny]) / units.scale[: units.ny]
+    low, high = X.min(axis=0), X.max(axis=0)
     for e in data:
         if len(e) <= delays + _STARTS:
             continue
         points = join_segments(cut_segments(data.with_episodes([e]), units, delays, 1, (len(e) - delays) // _STARTS))
         inputs = (e.U - units.mean[units.ny :]) / units.scale[units.ny :]
         out = simulate_hidden(model, points.points, np.repeat(inputs[:, None], len(points.points), axis=1))
-        low, high = (
-            ((one(e.X, axis=0)) - units.mean[: units.ny]) / units.scale[: units.ny] for one in (np.min, np.max)
-        )
         if not ((out > low - FAR * (high - low)) & (out < high + FAR * (high - low))).all():
             return False
     return True
