@@ -97,11 +97,12 @@ def select(
 
     Fewer than ten long episodes of at most four states are records. On records sparse polynomials of up to 12 past rows
     are tried too, as `km.identify.narx` finds them, and hidden states, as `km.identify.subspace`,
-    `km.identify.polynomial_state_space` and `km.identify.neural_state_space` find them; the best
-    models of each kind run freely over stretches that no fit saw. The geometric mean of their errors in free run and in forecasts of the horizon then
-    decides, over all kinds together and without a rule on delays. A model whose free run leaves three times the range of the data is taken only
-    where all do. If models with the inputs one row up err by 20 % less, and nothing speaks of feedback, the log's input
-    column is late: the model has ``input_lead`` 1, and ``model.align(logs)`` moves the inputs of other logs.
+    `km.identify.polynomial_state_space` and `km.identify.neural_state_space` find them; the best models of each kind
+    run freely over stretches that no fit saw. The geometric mean of their errors in free run and in forecasts of the
+    horizon then decides, over all kinds together and without a rule on delays. A model whose free run leaves three
+    times the range of the data is taken only where all do. If models with the inputs one row up err by 20 % less, and
+    nothing speaks of feedback, the log's input column is late: the model has ``input_lead`` 1, and
+    ``model.align(logs)`` moves the inputs of other logs.
 
     A source larger than memory is chosen on a sample of it, whole episodes from evenly spread parts; the winner is
     then fitted to all of it, part by part.
