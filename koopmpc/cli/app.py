@@ -134,9 +134,13 @@ def fit(
         "resample": resample,
         "columns": None if columns is None else split_columns(columns),
     }
+
+    def say_line(text: str) -> None:
+        say(f"{text}\n")
+
     if goal_template:
         with friendly():
-            path = new_file(Path("goal.toml"), write_template(source, horizon=horizon, **reading))
+            path = new_file(Path("goal.toml"), write_template(source, horizon=horizon, say=say_line, **reading))
         say(f"written: {path}; say in it what you want")
         more = ["--linear"] * linear
         for option, value, usual in (
@@ -148,9 +152,6 @@ def fit(
             more += [option, str(value)] * (value != usual)
         say(f"then: {format_command('fit', *data, '--goal', path, *more)}")
         return
-
-    def say_line(text: str) -> None:
-        say(f"{text}\n")
 
     how: dict[str, Any] = {
         "bilinear": not linear,

@@ -287,7 +287,7 @@ def runs(tasks: Mapping[str, Mapping[str, Run]]) -> "Figure":
     names = list(dict.fromkeys(name for task in tasks.values() for name in task))
     for column, task in zip(grid.T, tasks.values(), strict=True):
         _draw_task(column, task, names)
-    draw_legend(drawing, grid.flat, 4)
+    draw_legend(drawing, grid.flat, 4 if len(tasks) > 1 else 2)
     return drawing
 
 

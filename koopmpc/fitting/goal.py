@@ -285,7 +285,9 @@ def plan_goal(
     return further
 
 
-def write_template(data: Data, *, horizon: int | None = None, memory: int = IN_MEMORY, **reading: Any) -> str:
+def write_template(
+    data: Data, *, horizon: int | None = None, memory: int = IN_MEMORY, say: Say | None = None, **reading: Any
+) -> str:
     """Return the text of a goal file for the plant of some logs, with the ranges found and how the logs are read.
 
     Parameters
@@ -294,6 +296,8 @@ def write_template(data: Data, *, horizon: int | None = None, memory: int = IN_M
         As for `fit_data`.
     horizon
         Steps ahead that the controller looks; by default it follows from the lengths of the episodes.
+    say
+        Called with what was understood of the logs: which columns are states and inputs, and what is wrong with them.
 
     Raises
     ------
@@ -304,6 +308,7 @@ def write_template(data: Data, *, horizon: int | None = None, memory: int = IN_M
     if not split.seen.nu:
         advice = "the logs have no input, so nothing can be controlled; pass --inputs u,v"
         raise DataError("\n".join([advice, *split.notes]))
+    (ignore_text if say is None else say)(describe_data(split))
     both = split.seen.with_episodes([*split.seen, *split.held_out])
     return format_template(both, horizon=horizon, reading=split.reading)
 

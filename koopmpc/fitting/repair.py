@@ -45,7 +45,7 @@ def read_logs(
     """Return the data of logs as `divide_files` makes them; the notes begin with how the logs were read.
 
     `options` holds keywords of `load_episodes`; None counts as not given. Unequal steps are interpolated
-    to their median unless ``resample`` is given, and a note says so.
+    to their median, or a number of two digits near it, unless ``resample`` is given, and a note says so.
 
     Raises
     ------
@@ -65,12 +65,22 @@ def read_logs(
         except UnevenSamplingError as uneven:
             if "resample" in reading:
                 raise
-            notes.append(f"{str(uneven).rpartition('; pass')[0]}; interpolated to {uneven.dt:g} s")
-            reading["resample"] = uneven.dt
+            dt = round_step(uneven.dt)
+            notes.append(f"{str(uneven).rpartition('; pass')[0]}; interpolated to {dt:g} s")
+            reading["resample"] = dt
             files = Files(logs, **reading)
             split = divide_files(files, horizon, rng, memory, short)
     how = [*shorten_notes(notes, files.files), *describe_guesses(files.files, reading)]
     return replace(split, notes=(*how, *split.notes), reading=reading)
+
+
+_NEAR = 0.005  # a median step this close to a number of two digits is taken for it: recorders have such steps
+
+
+def round_step(dt: float) -> float:
+    """Return the sample time of two digits that a median step [s] stands for, or the median where none is near."""
+    plain = float(f"{dt:.2g}")
+    return plain if abs(dt - plain) <= _NEAR * plain else dt
 
 
 def find_logs(data: Data) -> Data:

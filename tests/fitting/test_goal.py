@@ -17,7 +17,7 @@ from koopmpc.cli.app import app
 from koopmpc.control.base import MPCBase
 from koopmpc.fitting.check import RunKind, check_controller
 from koopmpc.fitting.goal import design_data, format_template, load_reading, read_goal, write_template
-from koopmpc.fitting.repair import read_logs
+from koopmpc.fitting.repair import read_logs, round_step
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign
 
@@ -175,6 +175,21 @@ def test_a_goal_file_keeps_every_keyword_that_reads_the_logs_and_a_call_replaces
         path.write_text(wrong)
         with pytest.raises(km.KoopmpcError, match=words):
             load_reading(path)
+
+
+@pytest.mark.parametrize(
+    ("median", "step"), [(2.002, 2.0), (0.0501, 0.05), (0.33333, 0.33333), (1.0, 1.0), (7.3e-4, 7.3e-4)]
+)
+def test_an_uneven_clock_has_the_step_that_its_recorder_was_set_to(median, step):
+    assert round_step(median) == step
+
+
+def test_a_template_says_which_columns_are_inputs_and_that_this_was_guessed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tank_logs(tmp_path / "csv")
+    said = " ".join(CliRunner().invoke(app, ["fit", "csv", "--goal-template"]).stdout.split())
+    assert "which columns are inputs was guessed from their names; --inputs" in said
+    assert re.search(r"inputs .*heater \[kW\]", said)
 
 
 def test_a_goal_file_keeps_the_step_that_an_uneven_clock_was_brought_to(tmp_path):
