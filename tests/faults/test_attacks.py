@@ -53,7 +53,7 @@ ATTACKS = {
 @pytest.mark.parametrize("attack", ATTACKS)
 @pytest.mark.parametrize("kind", BUILDS)
 def test_a_loop_is_where_it_would_be_some_time_after_readings_that_were_stuck_or_lost(kind, attack):
-    X, U = attacked(kind, lambda y, last: y)
+    X, _ = attacked(kind, lambda y, last: y)
     X_a, U_a = attacked(kind, ATTACKS[attack])
     low, high = LIMITS.inputs(1)
     assert np.isfinite(U_a).all()
