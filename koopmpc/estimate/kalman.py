@@ -21,6 +21,7 @@ from koopmpc.errors import DataError, ObservableError, ShapeError
 from koopmpc.estimate.disturbance import GAIN
 from koopmpc.estimate.gate import ReadingGate, gate_graph
 from koopmpc.estimate.observer import EstimatorProgram, StateModel
+from koopmpc.estimate.periodic import find_harmonics
 from koopmpc.lifting.base import Lifting, strip_unit
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value, Viewing
@@ -49,11 +50,19 @@ class Augmented:
         H: Float[np.ndarray, "ny nz"],
         Bd: Float[np.ndarray, "nz nd"],
         Cd: Float[np.ndarray, "ny nd"],
+        turns: Float[np.ndarray, " h"] | None = None,
     ) -> None:
+        self.turn: Float[np.ndarray, "nd nd"] = np.eye(Cd.shape[1])
+        self.steady = Cd.shape[1]
+        if turns is not None:  # beside each constant d the cosine and the sine of each harmonic, [d; c_1; s_1; c_2; …]
+            rotations = [np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]]) for a in turns]
+            shown = np.tile([1.0, 0.0], len(turns))
+            self.turn = np.kron(scipy.linalg.block_diag(np.eye(1), *rotations), np.eye(Cd.shape[1]))
+            Bd, Cd = (np.hstack([part, np.kron(shown, part)]) for part in (Bd, Cd))
         nz, nd, n = predictor.nz, Cd.shape[1], len(kept)
         self.predictor, self.kept = predictor, kept
         A, known = predictor.A[np.ix_(kept, kept)], np.delete(np.arange(nz), kept)
-        self.F = np.block([[A, Bd[kept]], [np.zeros((nd, n)), np.eye(nd)]])
+        self.F = np.block([[A, Bd[kept]], [np.zeros((nd, n)), self.turn]])
         driven = np.hstack([predictor.B, predictor.E])[kept]
         self.G = np.vstack([driven, np.zeros((nd, driven.shape[1]))])
         self.f = np.append(predictor.A[np.ix_(kept, known)].sum(axis=1), np.zeros(nd))
@@ -65,7 +74,9 @@ class Augmented:
         self.one = np.zeros(nz)
         self.one[known] = 1.0
         self.to_d = np.zeros((nz, n + nd))
-        self.to_d[kept, n:] = Bd[kept] + shift - A @ shift
+        self.to_d[kept, n:] = Bd[kept] + shift @ self.turn - A @ shift
+        self.to_periodic = self.to_d[:, n + self.steady :].copy()  # and `to_d` gives the constant part alone
+        self.to_d[:, n + self.steady :] = 0.0
 
 
 FilterModel = tuple[Augmented, Float[np.ndarray, "n n"], Float[np.ndarray, "ny ny"]]
@@ -245,6 +256,31 @@ class KalmanFilter(Viewing):
         return self._gains[key]
 
 
+class PeriodicFilter(KalmanFilter):
+    """The observer of a `LiftedKalman` with a period: each disturbance is a constant and harmonics that turn."""
+
+    def forecast(self, steps: int) -> Float[np.ndarray, "steps nz"]:
+        """Return the periodic part of d in the steps from now on; `d` is the constant part."""
+        system = self._system
+        first = len(system.kept) + system.steady
+        turn, now = system.turn[system.steady :, system.steady :], self._s[first:].copy()
+        rows = np.empty((steps, len(system.one)))
+        for row in rows:
+            row[:] = system.to_periodic @ now
+            now = turn @ now
+        return rows
+
+    def program(self) -> FilterProgram:
+        """Raise the DataError that says why no C code can be generated.
+
+        Raises
+        ------
+        DataError
+            Always.
+        """
+        raise DataError("the estimator has a period, which the C code does not know; export one without a period")
+
+
 def _find_rails(predictor: LinearPredictor, system: Augmented) -> Float[np.ndarray, "2 ny"] | None:
     """Return the rails of the outputs that are states of the model; None where no sensor saturates."""
     if predictor.embedding is None or predictor.embedding.rails is None:
@@ -312,6 +348,8 @@ class LiftedKalman(Value):
         model misses in a transient for disturbances.
     delay
         y is `delay` steps old; what followed is predicted from the inputs that acted since.
+    period, harmonics
+        Of disturbances that repeat themselves [s], as in `LiftedDisturbance`: each is a constant and harmonics.
     patience
         How many samples in a row without any measurement are bridged by prediction; after them the state is unknown.
 
@@ -335,6 +373,8 @@ class LiftedKalman(Value):
     noise: ArrayLike | None = None
     delay: int = 0
     patience: int = 10
+    period: float | None = None
+    harmonics: int = 3
 
     def __post_init__(self) -> None:
         given = self.outputs
@@ -354,6 +394,9 @@ class LiftedKalman(Value):
             object.__setattr__(self, name, stored)
         checks.count(self.delay, "delay", 0)
         checks.count(self.patience, "patience", 0)
+        checks.count(self.harmonics, "harmonics")
+        if self.period is not None:
+            checks.positive(self.period, "period", "s")
 
     def start(self, model: LinearPredictor | StateModel, horizon: int) -> KalmanFilter:
         """Return the observer of one controller with plans of this many steps.
@@ -370,7 +413,8 @@ class LiftedKalman(Value):
                 "LiftedKalman filters the lifted state of a linear predictor, and this controller plans in the state "
                 "itself; pass a LiftedDisturbance"
             )
-        return KalmanFilter(partial(self._model, min(horizon / 4, SLOWEST)), model, self.delay, self.patience)
+        kind = KalmanFilter if self.period is None else PeriodicFilter
+        return kind(partial(self._model, min(horizon / 4, SLOWEST)), model, self.delay, self.patience)
 
     def _model(self, settling: float, predictor: LinearPredictor) -> FilterModel:
         """Return the filter's matrices for a predictor, or say why there are none; `settling` in steps."""
@@ -407,6 +451,18 @@ class LiftedKalman(Value):
             drift = np.diag(_settling(F, M, process, R_scaled, settling))
         else:
             drift = checks.weight(self.drift, "drift", ny) / units[n:, n:]
+        if self.period is not None:
+            turns = find_harmonics(self.period, predictor.dt, self.harmonics)
+            model = Augmented(predictor, kept, H, Bd, Cd, turns)
+            own = np.concatenate([size[:n], np.tile(size[n:], 1 + 2 * len(turns))])
+            F, M, units = model.F * own / own[:, None], model.M * own / y_size[:, None], np.outer(own, own)
+            lost = hidden(F, M)
+            if lost is not None:
+                raise DataError(
+                    f"a disturbance of period {self.period:g} s cannot be told from a mode of the model at the same"
+                    " frequency; measure more, or pass another period or fewer harmonics"
+                )
+            drift = np.kron(np.eye(1 + 2 * len(turns)), drift)
         P = _stationary(F, M, scipy.linalg.block_diag(process, drift), R_scaled)
         return model, P * units, R
 

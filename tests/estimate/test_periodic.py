@@ -122,3 +122,36 @@ def test_bad_periods_are_refused_in_a_sentence(tmp_path):
         )
     with pytest.raises(km.errors.DataError, match="period"):
         km.export(controller(period=PERIOD), tmp_path)
+
+
+def kalman(**more):
+    cost = km.Cost(Q=[0, 1], R=1e-6, u_target="zero")
+    told = km.LiftedKalman(["a", "b"], **more)
+    return km.KoopmanMPC(MODEL, cost, km.Limits(u_min=-5, u_max=5), 12, estimator=told)
+
+
+@pytest.mark.parametrize("disturbance", ["input", "output"])
+def test_a_filter_foretells_the_disturbance_of_its_own_model(disturbance):
+    """The error of a one-step forecast of y dies out where the disturbance is a constant and two harmonics."""
+    mpc = kalman(period=PERIOD, disturbance=disturbance)
+    plain = kalman(disturbance=disturbance)
+    errors = []
+    for each in (mpc, plain):
+        x, late = np.zeros(2), []
+        for k in range(500):
+            move = each(x, np.zeros(2))
+            foretold = each.plan().X[1]
+            wave = np.array([0.0, push(k)[1]])
+            x = A @ x + B @ move.u + (wave if disturbance == "input" else push(k))
+            late.append(np.abs(foretold - x).max())
+        errors.append(max(late[-50:]))
+    assert errors[0] < 1e-5
+    assert errors[1] > 1e-2
+
+
+def test_a_filter_without_a_period_is_the_same_as_ever_and_bad_periods_are_refused():
+    assert not hasattr(kalman().observer, "forecast")
+    with pytest.raises(km.errors.DataError, match="less than two samples"):
+        kalman(period=0.9)
+    with pytest.raises(km.errors.DataError, match="period"):
+        kalman(period=0.0)
