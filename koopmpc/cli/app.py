@@ -109,6 +109,12 @@ def fit(
     logs: Logs = Path("logs"),
     name: Annotated[str, typer.Option("--name", help="Ends the name of the folder.")] = "fit",
     goal: Annotated[Path | None, typer.Option("--goal", help="A goal file: design a controller that keeps it.")] = None,
+    coverage: Annotated[
+        float | None, typer.Option("--coverage", help="With a goal: share of loops that are to keep their limits.")
+    ] = None,
+    certify: Annotated[
+        bool, typer.Option("--certify", help="With a goal: seek a certificate of stability, and write its page.")
+    ] = False,
     goal_template: Annotated[
         bool, typer.Option("--goal-template", help="Write goal.toml for these logs, to be changed, and stop.")
     ] = False,
@@ -169,6 +175,8 @@ def fit(
                 source,
                 goal,
                 folder,
+                coverage=coverage,
+                certify=certify,
                 progress=progress,
                 set_points=() if set_point is None else split(set_point),
                 plan=plan,
@@ -182,6 +190,9 @@ def fit(
     if plan is not None:
         with friendly():
             raise DataError("--next needs --goal: what the controller is to do decides what is worth learning")
+    if coverage is not None or certify:
+        with friendly():
+            raise DataError("--coverage and --certify are for a controller; pass --goal, too")
     with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
         done = fit_data(source, folder, horizon=horizon, progress=progress, **how)
     for failure in done.failures:
@@ -202,6 +213,12 @@ def check(
     faults: Annotated[
         bool, typer.Option("--faults", help="Ask that the goal is kept with broken sensors, inputs and solvers, too.")
     ] = False,
+    rate: Annotated[
+        float, typer.Option("--rate", help="Wished bound on the share of failing loops; it says how many are run.")
+    ] = 0.05,
+    on_plant: Annotated[
+        Path | None, typer.Option("--on-plant", help="A log of this controller on its plant, an episode a run.")
+    ] = None,
     logs: Logs = Path("logs"),
 ) -> None:
     """Test a designed controller from random starts, with noise, inputs 20 % off and faults.
@@ -209,11 +226,18 @@ def check(
     Exit code 0: the goal is kept. 1: it is not. 3: the logs do not show whether it is.
     """
     from koopmpc.fitting.changed import read_new_logs
+    from koopmpc.data.files.load import load_episodes
     from koopmpc.fitting.check import check_controller
+    from koopmpc.fitting.verdict import plan_verdict
 
+    with friendly():
+        say(plan_verdict(rate))
+        seen = None if on_plant is None else load_episodes(on_plant)
     with friendly(), folder_of(logs, "check") as folder, bar("runs") as progress:
         logged = None if not new else read_new_logs(controller, new)
-        done = check_controller(controller, folder, runs=runs, faults=faults, new=logged, progress=progress)
+        done = check_controller(
+            controller, folder, runs=runs, faults=faults, rate=rate, on_plant=seen, new=logged, progress=progress
+        )
     say(f"{done}\n\nreport: {done.page}")
     if done.verdict != "kept":
         raise typer.Exit(1 if done.reasons else 3)

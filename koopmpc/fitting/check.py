@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -16,6 +17,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import LogError
 from koopmpc.fitting.changed import ComparedLogs, compare_logs
 from koopmpc.fitting.report import write_design_report
+from koopmpc.fitting.verdict import PlantVerdict, RateVerdict, judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.loop.faults import ActuatorLoss, DroppedSamples, Fault, FrozenSensor, NaNSensor, SensorDelay, SolverFailure
 from koopmpc.loop.metrics import metrics, tracking_error, violation_shares
 from koopmpc.loop.run import Step
@@ -102,6 +104,10 @@ class Checked:
         Sentences that say why it is not kept.
     doubts
         Sentences that say where nobody can say whether it is kept, for there are no data.
+    rate
+        Exact bound on the share of fresh independent loops that break a limit or are lost.
+    plant
+        The same of logged runs on the plant, where they were given.
     broken
         Sentences that say what happened in runs with faults; among the reasons too, where these were asked to count.
     figures
@@ -126,6 +132,8 @@ class Checked:
     page: Path
     doubts: tuple[str, ...] = ()
     compared: ComparedLogs | None = None
+    rate: RateVerdict | None = None
+    plant: PlantVerdict | None = None
 
     @property
     def verdict(self) -> str:
@@ -143,7 +151,9 @@ class Checked:
         reasons = [f"- {reason}" for reason in (*self.reasons, *self.doubts)]
         if self.compared is not None and self.compared.holds:
             aside = [*aside, f"new logs: {self.compared.sentence}"]
-        return render_text(verdict, *reasons, *aside, "", build_table(_HEADINGS, rows), "", times)
+        verdicts = [each for each in (self.rate, self.plant) if each is not None]
+        bound = ["", *(f"- {sentence}" for each in verdicts for sentence in each.list_sentences())]
+        return render_text(verdict, *reasons, *aside, "", build_table(_HEADINGS, rows), "", times, *bound)
 
 
 _VERDICTS = {
@@ -168,6 +178,8 @@ def check_controller(
     runs: int = 12,
     faults: bool = False,
     new: Episodes | None = None,
+    rate: float = 0.05,
+    on_plant: Episodes | None = None,
     progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
 ) -> Checked:
@@ -204,6 +216,10 @@ def check_controller(
         Whether the goal is to be kept with faults as well.
     new
         New logs of the plant, to see whether it has changed since the design; states and inputs of the design.
+    rate
+        Wished bound on the share of loops that break a limit or are lost; it says how many fresh loops are run.
+    on_plant
+        Logged runs of this controller on its plant, each an episode; they are judged beside the stand-ins.
     progress
         Called with what is done, how many of it are, and how many there are.
     rng
@@ -213,6 +229,8 @@ def check_controller(
     ------
     LogError
         The file holds no design, or is damaged.
+    DataError
+        The logged runs are not of this controller.
     """
     saved, draw, runs = read_controller(path), checks.generator(rng), checks.count(runs, "runs")
     if not isinstance(saved, SavedDesign):
@@ -250,10 +268,15 @@ def check_controller(
         compared = compare_logs(evidence.logs, new, kept_kinds)
         reasons += [compared.sentence] if compared.holds is False else []
         doubts += [compared.sentence] if compared.holds is None else []
+    controller.reset()
+    told = None if progress is None else partial(progress, "fresh loops")
+    verdict = judge_rate(evidence, controller, rate, draw, told)
+    plant = None if on_plant is None else judge_plant_runs(evidence, controller, on_plant)
     page = Path(folder, "report.html")
     kept = not (reasons or doubts)
     said = tuple(reasons), tuple(broken), tuple(figures)
-    result = Checked(kept, *said, cold, hot, controller.dt, page, tuple(doubts), compared)
+    verdicts = tuple(doubts), compared, verdict, plant
+    result = Checked(kept, *said, cold, hot, controller.dt, page, *verdicts)
     _write_page(result, path, saved, controller)
     return result
 
@@ -438,6 +461,11 @@ def _write_page(result: Checked, path: str | Path, saved: SavedDesign, controlle
             "its logs. An error that all of these models share does not show in these runs."
         )
         page.table(["kind of run", *(heading.replace("\n", " ") for heading in _NUMBERS)], map(_row, result.figures))
+        if result.rate is not None:
+            page.heading("How often it fails", 3)
+            page.text(f"Said before the loops: {plan_verdict(result.rate.wished)}.")
+            plant = [] if result.plant is None else result.plant.list_sentences()
+            page.items([*result.rate.list_sentences(), *plant])
         page.heading("With faults", 3)
         if set(result.broken) - set(result.reasons):
             page.text("A goal says nothing of what breaks, so this does not count. koopmpc check --faults counts it.")

@@ -3,7 +3,7 @@
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from inspect import Parameter, signature
 from os import PathLike
@@ -21,6 +21,7 @@ from koopmpc.data.files.folder import Files
 from koopmpc.data.files.load import load_episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError, KoopmpcError, LogError
+from koopmpc.fitting.certified import describe_certificate
 from koopmpc.fitting.fit import Say, describe_data, ignore_text
 from koopmpc.fitting.further import FurtherData, plan_further
 from koopmpc.fitting.repair import IN_MEMORY, Data, DividedData, collect_notes, find_logs, read_logs
@@ -39,7 +40,7 @@ from koopmpc.validate.report import trust
 from koopmpc.validate.scoring import score
 
 _SHORT = "record more episodes, or longer ones"  # what to do where logs are too few
-_TOP = {"horizon", "logs", "states", "inputs"}
+_TOP = {"horizon", "coverage", "certify", "logs", "states", "inputs"}
 _READING = {
     name for name, argument in signature(load_episodes).parameters.items() if argument.kind is Parameter.KEYWORD_ONLY
 }
@@ -59,6 +60,10 @@ class Goal:
         (nr,) or rows (T+1, nr) of the states that the cost weighs.
     angles
         Indices of states whose errors wrap.
+    coverage
+        Share of loops on stand-ins that are to keep their limits; None asks for no promise.
+    certify
+        Whether a certificate of stability is sought at the reference.
     """
 
     cost: Cost
@@ -66,6 +71,8 @@ class Goal:
     horizon: int
     reference: Float[np.ndarray, "..."]
     angles: tuple[int, ...]
+    coverage: float | None = None
+    certify: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +107,8 @@ def design_data(
     folder: str | PathLike[str],
     *,
     bilinear: bool = True,
+    coverage: float | None = None,
+    certify: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
     memory: int = IN_MEMORY,
@@ -124,6 +133,9 @@ def design_data(
         As for `fit_data`.
     goal
         A file as `write_template` writes it.
+    coverage, certify
+        Replace those of the goal: a promised share of loops that keep their limits, and a certificate of stability,
+        whose page is certificate.md. A refused certificate is a sentence of the report.
     bilinear, workers, scheduler, memory, say, progress, rng
         As for `fit_data`.
     set_points
@@ -167,6 +179,7 @@ def design_data(
     about = describe_data(split)
     tell(about)
     asked = read_goal(goal, split.seen)
+    asked = replace(asked, coverage=coverage or asked.coverage, certify=certify or asked.certify)
     try:
         with collect_notes([]):  # its advice says the same
             designed = design(
@@ -178,6 +191,7 @@ def design_data(
                 angles=asked.angles,
                 bilinear=bilinear,
                 instruments=instruments,
+                coverage=asked.coverage,
                 workers=workers,
                 scheduler=scheduler,
                 progress=progress,
@@ -187,9 +201,15 @@ def design_data(
         further(split.fitted, asked, refusal=refusal)
         raise
     tell(str(designed))
+    certified = ""
+    if asked.certify:
+        unseen = split.held_out if split.learned is None else None
+        certified = describe_certificate(designed, asked.reference, unseen, place)
+        tell(certified)
     planned = further(split.fitted, asked, designed)
     file = place / "controller.npz"
-    designed.save(file, logs=_summarise_logs(split, designed, about, Path(goal).read_text(), planned, draw))
+    summary = _summarise_logs(split, designed, about, Path(goal).read_text(), planned, draw)
+    designed.save(file, logs=replace(summary, certified=certified))
     usage = f'import koopmpc as km\ncontroller = km.load_controller("{file.as_posix()}")'
     saved = load_value(file, SavedDesign)
     page = write_design_report(saved, rebuild_controller(saved, file), place / "report.html", file.as_posix())
@@ -334,6 +354,8 @@ def format_template(data: Episodes, *, horizon: int | None = None, reading: Mapp
         "# time to compute; a shorter one sees limits and overshoot too late.",
         "",
         f"horizon = {horizon}  # steps of {data.dt:g} s that the controller looks ahead",
+        "# coverage = 0.95  # share of loops on learned stand-ins that are to keep the limits; verified on fresh ones",
+        "# certify = true  # seek a certificate of stability at the reference, from logs that the model has not seen",
     ]
     if reading:
         lines += ["", "[logs]  # how koopmpc fit reads them; an option such as --resample replaces the value here"]
@@ -459,7 +481,12 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
         raise DataError(
             f"{file} gives a horizon of {horizon!r}; write a whole number of steps of {data.dt:g} s, 1 or more"
         )
-    limited = np.isfinite(change).any()
+    limited, certify = np.isfinite(change).any(), tree.get("certify", False)
+    if certify not in (True, False):
+        raise DataError(f"{file}: certify is {certify!r}; write true or false")
+    coverage = _read_number(tree, "coverage", 0.0, str(file))
+    if "coverage" in tree and not 0 < coverage < 1:
+        raise DataError(f"{file}: coverage is {coverage:g}; write a share between 0 and 1, such as 0.95")
     return Goal(
         cost=Cost(
             Q=Q[tracked],
@@ -471,6 +498,8 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
         horizon=horizon,
         reference=reference[0] if steps == 1 else reference,
         angles=tuple(angles),
+        coverage=coverage or None,
+        certify=bool(certify),
     )
 
 

@@ -90,6 +90,8 @@ def write_design_report(
     _add_blind(page, evidence, loops)
     page.heading("What it promises")
     page.items(_list_promise(evidence))
+    if logs is not None and logs.certified:
+        page.text(logs.certified)
     page.heading("What to record next, and what else would help")
     advice = () if logs is None else logs.advice
     if advice:
@@ -374,9 +376,11 @@ def _list_promise(evidence: Evidence) -> list[str]:
             "No loops were run after the choice, so nothing is promised.",
             f"In the choice {expected.lost} of {len(expected.cost) + len(expected.cost_off)} loops were lost.",
         ]
+    promise = [] if evidence.promise is None else [f"{str(evidence.promise)[:1].upper()}{str(evidence.promise)[1:]}."]
     number, lost = len(fresh.cost), int(np.sum(~np.isfinite(fresh.cost)))
     low, high = expected.cost_interval
     return [
+        *promise,
         f"Of {number} loops after the choice, {lost} were lost: fewer than {to_percent(expected.lost_bound)} of loops "
         "like these are (95 % confidence).",
         f"In 95 % of them {_say_violated(expected.violation_bound)}.",

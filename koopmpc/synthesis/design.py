@@ -56,6 +56,7 @@ from koopmpc.synthesis.cross_validation import (
 )
 from koopmpc.synthesis.designed import Design, DesignRow, Evidence, ExpectedLoop, choose_row
 from koopmpc.synthesis.feedback import require_episodes, use_instruments
+from koopmpc.synthesis.fresh.coverage import check_coverage, get_model, keep_limits
 from koopmpc.synthesis.fresh.horizon import choose_horizon
 from koopmpc.synthesis.fresh.loops import (
     compare_longer_horizon,
@@ -65,6 +66,7 @@ from koopmpc.synthesis.fresh.loops import (
     watch_data,
 )
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap
+from koopmpc.synthesis.fresh.promise import CoveragePromise
 from koopmpc.synthesis.judging import (
     Condition,
     Job,
@@ -118,6 +120,7 @@ def design(
     instruments: Sequence[ArrayLike] | None = None,
     sample: int = 30_000,
     loops: int = 60,
+    coverage: float | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     progress: StageProgress | None = None,
@@ -184,6 +187,10 @@ def design(
         Approximate number of snapshot pairs that the choice uses.
     loops
         Number of fresh loops after the choice; 59 without a failure bound a probability by 5 %, 299 by 1 %.
+    coverage
+        Share of loops on stand-ins that are to keep their limits, such as 0.95. The least margin that gives it is
+        chosen on `loops` loops and verified on as many others, in place of `tighten`; `promise` of the design says
+        what is promised, and the advice says so where no margin gives it.
     workers, scheduler
         As in `koopmpc.parallel.map_tasks`; a task is a model, or a controller with all its runs.
     progress
@@ -208,6 +215,7 @@ def design(
         left out.
     """
     draw, fresh_loops = checks.generator(rng), checks.count(loops, "loops", 0)
+    wished = None if coverage is None else check_coverage(coverage, fresh_loops)
     ahead = 1 if horizon is None else checks.count(horizon, "horizon")
     used, projected = "", np.zeros(0)
     if instruments is not None:
@@ -262,7 +270,7 @@ def design(
         )
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
         pair = choose_surrogates(results, floor, hidden=hidden)
-        test, doubts, holds = _prepare_test(folds, asked, pair, tighten, noise, pool)
+        test, doubts, holds = _prepare_test(folds, asked, pair, tighten and wished is None, noise, pool)
         doubts = [*left.values(), *doubts]
         for sentence in doubts:
             warnings.warn(sentence, FitWarning, stacklevel=2)
@@ -309,6 +317,13 @@ def design(
         standby = recipe.controller(model, asked.cost, test.limits(outcomes[plain].band), ahead)
     embedding = test.surrogates[0].model.embedding
     neighbours = NeighbourMap.of(test.episodes, embedding, test.surrogates[0].noise, test.ignored, test.turning)
+    promise: CoveragePromise | None = None
+    if wished is not None:
+        recipe, band = rows[best].recipe, outcomes[best].band
+        promise, limits = keep_limits(test, recipe, controller, neighbours, band, wished, fresh_loops, draw)
+        if limits.margin is not None:
+            model = get_model(controller)
+            controller = watch_data(recipe, model, recipe.controller(model, asked.cost, limits, ahead), measured)
     fresh, blind = run_fresh_loops(test, controller, neighbours, fresh_loops, draw) if fresh_loops else (None, [])
     held_inputs = next(one.u_reference for one in test.conditions if one.gain == 1.0)
     blind += find_blind_reference(test.episodes, asked, neighbours, held_inputs)
@@ -328,10 +343,11 @@ def design(
         chosen=best,
         chosen_linear=linear,
         evidence=Evidence(
-            asked, test.surrogates, test.low, test.high, expected, holds, neighbours, _keep_logs(measured)
+            asked, test.surrogates, test.low, test.high, expected, holds, neighbours, _keep_logs(measured), promise
         ),
         advice=(
             *doubts,
+            *([] if promise is None or promise.holds else [str(promise)]),
             *blind,
             *_give_advice(rows, best, linear, expected),
             *test.limits(outcomes[best].band).capped,

@@ -23,6 +23,7 @@ from koopmpc.supervise.guarded import Guarded
 from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Recipe
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap, choose_starts_to_record
+from koopmpc.synthesis.fresh.promise import CoveragePromise
 from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_share, bound_value, cost_interval
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.terminal import build_leaderboard, label_lines, render_text
@@ -195,6 +196,8 @@ class Evidence(Value):
         Stand-in by the nearest rows of the data; None in a design without fresh loops.
     logs
         Some of the data, as measured, with which new logs are compared; None in files of earlier designs.
+    promise
+        The promised share of loops that keep their limits; None if no `coverage` was asked for.
     """
 
     asked: DesignTask
@@ -205,6 +208,7 @@ class Evidence(Value):
     goal_can_be_held: bool
     neighbours: NeighbourMap | None = None
     logs: Episodes | None = None
+    promise: CoveragePromise | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,6 +311,11 @@ class Design:
         """What to expect of `controller`: an estimate, and no promise."""
         return self.evidence.expected
 
+    @property
+    def promise(self) -> CoveragePromise | None:
+        """The promised share of loops that keep their limits; None if no `coverage` was asked for."""
+        return self.evidence.promise
+
     def save(self, path: str | Path, *, logs: LogSummary | None = None) -> None:
         """Write the controller and its evidence as data; `km.load_controller` and ``koopmpc check`` read it.
 
@@ -369,6 +378,8 @@ class Design:
             "best; l the best linear one. Rows without inputs 20 % off are of the first round and stand last.",
         ]
         said = [render_text(*parts)]
+        if self.promise is not None:
+            said += ["", render_text(str(self.promise))]
         if self.advice:
             said += ["", render_text(*(f"- {sentence}" for sentence in self.advice))]
         if self.notes:

@@ -75,6 +75,8 @@ class LogSummary(Value):
         The goal file.
     plan
         The next experiment in words; empty where none was asked for.
+    certified
+        What came of the certificate, in a sentence; empty where none was asked for.
     """
 
     excerpt: LogExcerpt
@@ -90,6 +92,7 @@ class LogSummary(Value):
     choice: str
     goal: str
     plan: str = ""
+    certified: str = ""
 
 
 def excerpt_logs(

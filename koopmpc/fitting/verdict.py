@@ -1,0 +1,170 @@
+"""RateVerdict: an exact bound on the share of loops that break a limit, from fresh independent loops on stand-ins."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.data.episodes import Episodes
+from koopmpc.errors import DataError
+from koopmpc.loop.metrics import stack_limited
+from koopmpc.synthesis.designed import Evidence
+from koopmpc.synthesis.fresh.drawn import KEPT, LoopPool
+from koopmpc.text import to_percent
+from koopmpc.validate.binomial import bound_failure_rate, count_runs_needed
+
+CONFIDENCE = 0.95  # of the bound
+SAME = 0.02  # a logged input is the controller's if it differs by at most this share of the input's range
+OWN = 0.9  # least share of logged inputs that are the controller's
+
+
+@dataclass(frozen=True)
+class RateVerdict:
+    """The result of fresh independent loops.
+
+    Attributes
+    ----------
+    wished
+        The bound that the number of loops was chosen for.
+    loops, broken, lost
+        Number of loops, of those that broke a limit by more than 1 % of its range, and of those that were lost.
+    on_rows, on_models
+        How many loops were on nearest neighbours of the logged rows, and on learned models.
+    """
+
+    wished: float
+    loops: int
+    broken: int
+    lost: int
+    on_rows: int
+    on_models: int
+
+    @property
+    def failures(self) -> int:
+        """How many loops broke a limit or were lost."""
+        return self.broken + self.lost
+
+    @property
+    def bound(self) -> float:
+        """Exact upper bound, at 95 %, of the probability that a loop drawn like these fails (Clopper and Pearson)."""
+        return bound_failure_rate(self.failures, self.loops, confidence=CONFIDENCE)
+
+    def list_sentences(self) -> list[str]:
+        """Return what was found, on what, and what that is worth."""
+        starts = "a start of the logs moved by up to 5 % of its range"
+        return [
+            f"{self.broken} of {self.loops} fresh loops broke a limit by more than {to_percent(KEPT)} of its range and "
+            f"{self.lost} were lost: with {to_percent(CONFIDENCE)} confidence at most {to_percent(self.bound)} of "
+            "loops drawn like these do either",
+            f"each loop drew {starts}, its noise, and its stand-in: {self.on_rows} were on nearest neighbours of the "
+            f"logged rows, {self.on_models} on models learned from them",
+            "all stand-ins come from the same logs: where the logs are blind, so are they, and the bound does not hold "
+            "for the plant",
+        ]
+
+
+def plan_verdict(rate: float) -> str:
+    """Return how many loops a bound of `rate` needs, in words."""
+    none, one = count_runs_needed(rate), count_runs_needed(rate, failures=1)
+    return (
+        f"a bound of {to_percent(rate)} on the share of failing loops needs {none} loops without a failure, or {one} "
+        f"with one; {none} are run"
+    )
+
+
+def judge_rate(
+    evidence: Evidence,
+    controller: Any,
+    rate: float,
+    rng: np.random.Generator,
+    report: Callable[[int, int], None] | None = None,
+) -> RateVerdict:
+    """Return the verdict of as many fresh loops as a bound of `rate` needs when none fails.
+
+    The number is fixed before the loops: a number that grows until the bound is met loses the confidence.
+    """
+    count = count_runs_needed(rate)
+    pool = LoopPool(evidence.asked, evidence.surrogates, evidence.neighbours, evidence.low, evidence.high)
+    broken = lost = rows = 0
+    for i, loop in enumerate(pool.draw(count, rng)):
+        result = pool.run(controller, loop)
+        lost += not np.isfinite(result.violation)
+        broken += bool(np.isfinite(result.violation)) and not result.keeps
+        rows += loop.place < 0
+        if report is not None:
+            report(i + 1, count)
+    return RateVerdict(rate, count, broken, lost, rows, count - rows)
+
+
+@dataclass(frozen=True)
+class PlantVerdict:
+    """The result of logged runs of the controller on the plant.
+
+    Attributes
+    ----------
+    runs, failures
+        Number of runs, and of those that broke a limit by more than 1 % of its range.
+    own
+        Share of the logged inputs that the controller asks for in the logged states.
+    """
+
+    runs: int
+    failures: int
+    own: float
+
+    @property
+    def bound(self) -> float:
+        """Exact upper bound, at 95 %, of the probability that a run drawn like these fails (Clopper and Pearson)."""
+        return bound_failure_rate(self.failures, self.runs, confidence=CONFIDENCE)
+
+    @property
+    def next_fails(self) -> float:
+        """(k + 1) / (n + 1): at most so probably the next run fails, on average over starts and sets of runs."""
+        return (self.failures + 1) / (self.runs + 1)
+
+    def list_sentences(self) -> list[str]:
+        """Return what was found, and what it is worth."""
+        return [
+            f"on the plant {self.failures} of {self.runs} logged runs broke a limit by more than {to_percent(KEPT)} of "
+            f"its range: with {to_percent(CONFIDENCE)} confidence at most {to_percent(self.bound)} of runs drawn like "
+            "these do",
+            f"the next run from a start drawn like theirs keeps its limits with a probability of "
+            f"{to_percent(1 - self.next_fails)} or more, on average over starts; {to_percent(CONFIDENCE)} needs "
+            f"{round(1 / (1 - CONFIDENCE)) - 1} runs without a failure",
+        ]
+
+
+def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> PlantVerdict:
+    """Return the verdict of logged runs of this controller on its plant.
+
+    Raises
+    ------
+    DataError
+        The logs have other states or inputs, or less than nine tenths of their inputs are this controller's.
+    """
+    asked, nx, nu = evidence.asked, len(evidence.asked.low), controller.nu
+    if logs.nx != nx or logs.nu != nu:
+        raise DataError(f"the logs have {logs.nx} states and {logs.nu} inputs, the design {nx} and {nu}")
+    low, high = asked.limits.inputs(nu)
+    spread = np.ptp(np.concatenate([episode.U for episode in logs]), axis=0)
+    size = np.where(np.isfinite(high - low), high - low, np.maximum(spread, 1e-12))
+    failures, alike, steps = 0, 0, 0
+    for episode in logs:
+        controller.reset(episode.X[0])
+        last: Float[np.ndarray, " nu"] | None = None
+        for k, u in enumerate(episode.U):
+            rows = asked.reference[min(k, len(asked.reference) - 1) :][: controller.horizon + 1]
+            move = controller(episode.X[k], rows, applied=last)
+            alike, steps, last = alike + bool((np.abs(move.u - u) <= SAME * size).all()), steps + 1, u
+        values, box = stack_limited(asked.limits, episode.X[1:], logs.states)
+        over = np.maximum(box.low - values, values - box.high) / asked.limit_sizes
+        failures += bool(over.max(initial=0.0) > KEPT)
+    own = alike / max(steps, 1)
+    if own < OWN:
+        raise DataError(
+            f"in the logged states this controller asks for {to_percent(own)} of the logged inputs: these are no runs "
+            "of this controller towards its reference; pass logs of it"
+        )
+    return PlantVerdict(len(logs), failures, own)

@@ -1,0 +1,227 @@
+"""promise_coverage: a margin with which a stated share of loops on stand-ins keeps its limits, chosen and verified."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc import checks
+from koopmpc.control.limits import Limits
+from koopmpc.errors import DataError, KoopmpcError
+from koopmpc.synthesis.asked import limit_margins
+from koopmpc.synthesis.candidates import Designed, Recipe
+from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool, LoopResult
+from koopmpc.synthesis.fresh.neighbours import NeighbourMap
+from koopmpc.synthesis.fresh.promise import CoveragePromise
+from koopmpc.synthesis.fresh.tube import find_tube
+from koopmpc.synthesis.judging import LoopTest
+from koopmpc.validate.scoring import AnyPredictor
+
+SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)  # times the tube that are tried as a margin, the least one first
+FINER = 2  # halvings between the last scale that fails and the first that holds
+
+
+def most_failures(loops: int, coverage: float) -> int:
+    """Return how many of these loops may fail so that one more loop keeps its limits with a probability of `coverage`.
+
+    (k + 1) / (n + 1) ≤ 1 − coverage (Angelopoulos, Bates, Fisch, Lei & Schuster, "Conformal risk control", ICLR 2024).
+    Negative for fewer than ⌈1/α⌉ − 1 loops.
+    """
+    return int(np.floor((1 - coverage) * (loops + 1) + 1e-9)) - 1
+
+
+def check_coverage(coverage: float, loops: int) -> float:
+    """Return the share, checked.
+
+    Raises
+    ------
+    DataError
+        It is not between 0 and 1, or needs more loops.
+    """
+    share = checks.positive(coverage, "coverage")
+    if share >= 1:
+        raise DataError(f"coverage is {share:g}; pass a share below 1, such as 0.95")
+    if most_failures(loops, share) < 0:
+        needed = int(np.ceil(1 / (1 - share) - 1e-9)) - 1
+        raise DataError(f"coverage={share:g} needs {needed} loops or more to choose a margin; pass loops={needed}")
+    return share
+
+
+def get_model(controller: Any) -> AnyPredictor:
+    """Return the learned model of a designed controller."""
+    return getattr(controller, "predictor", None) or controller.model
+
+
+def keep_limits(
+    test: LoopTest,
+    recipe: Recipe,
+    controller: Designed,
+    neighbours: NeighbourMap,
+    band: Float[np.ndarray, "h nx"],
+    coverage: float,
+    loops: int,
+    rng: np.random.Generator,
+) -> tuple[CoveragePromise, Limits]:
+    """Return the promise of a design's controller, and its limits.
+
+    The tube is that of the model's one-step errors, the first row of `band`, around the reference; for a model of past
+    rows, and where no feedback holds the model, it is the band itself.
+    """
+    asked, model = test.asked, get_model(controller)
+    width = np.where(np.isfinite(band), band, asked.high - asked.low)
+    rest = test.surrogates[0].holding(asked.cost, asked.limits)(asked.reference[0])
+    nx = len(asked.low)
+    tube = find_tube(model, asked, width[0], np.asarray(rest.x)[:nx], np.asarray(rest.u))
+    return promise_coverage(
+        LoopPool(asked, test.surrogates, neighbours, test.low, test.high),
+        lambda limits: recipe.controller(model, asked.cost, limits, asked.horizon),
+        width if tube is None else tube,
+        limit_margins(asked, test.episodes),
+        coverage,
+        loops,
+        rng,
+    )
+
+
+def promise_coverage(
+    pool: LoopPool,
+    build: Callable[[Limits], Any],
+    tube: Float[np.ndarray, "h nx"],
+    room: Float[np.ndarray, " nx"],
+    coverage: float,
+    loops: int,
+    rng: np.random.Generator,
+) -> tuple[CoveragePromise, Limits]:
+    """Return the promise, and the limits with the margin that it rests on.
+
+    The least factor on the tube is taken with which few enough of the first loops fail; of a growing and a rigid margin
+    the one whose loops cost less. Then it is fixed, and as many further loops are run.
+
+    Parameters
+    ----------
+    pool
+        The distribution of loops.
+    build
+        Limits → a controller.
+    tube
+        (h, nx) half-widths of each state along a plan.
+    room
+        (nx,) the largest margin of each state.
+    coverage
+        Wished share of loops that keep their limits.
+    loops
+        Number of loops of the choice, and of the verification.
+    rng
+        Draws the loops.
+    """
+    first, second, allowed = pool.draw(loops, rng), pool.draw(loops, rng), most_failures(loops, coverage)
+    limits = replace(pool.asked.limits, margin=None, capped=())
+    low, high = limits.states(tube.shape[1])
+    limited = np.isfinite(low) | np.isfinite(high)
+    rigid = np.tile(tube.max(axis=0), (1, 1))
+
+    def widen(rows: Float[np.ndarray, "h nx"], scale: float) -> Float[np.ndarray, "h nx"]:
+        return np.minimum(scale * np.where(limited, rows, 0.0), room)
+
+    def attempt(rows: Float[np.ndarray, "h nx"], scale: float) -> _Attempt | None:
+        margin = widen(rows, scale)
+        try:
+            inside = replace(limits, margin=margin) if margin.any() else limits
+            controller = build(inside)
+        except KoopmpcError:  # limits that cross
+            return None
+        results = _run_until(pool, controller, first, allowed)
+        return _Attempt(scale, margin, inside, controller, results)
+
+    plain = attempt(rigid, 0.0)
+    assert plain is not None, "limits without a margin do not cross"
+    chosen, shape, found = plain, "none", plain.failures <= allowed
+    if not found and limited.any():
+        options: list[tuple[float, str, _Attempt]] = []
+        widest: list[tuple[str, _Attempt]] = []
+        for name, rows in (("growing", tube), ("rigid", rigid)):
+            best, last = _find_least(lambda scale, rows=rows: attempt(rows, scale), allowed)
+            options += [] if best is None else [(best.cost, name, best)]
+            widest += [] if last is None else [(name, last)]
+        if options:
+            _, shape, chosen = min(options, key=lambda option: option[:2])
+            found = True
+        else:  # none holds: the one with the fewest failures of all loops
+            every = [("none", plain), *widest]
+            counts = [_count_failures([pool.run(one.controller, loop) for loop in first]) for _, one in every]
+            shape, chosen = every[int(np.argmin(counts))]
+    whole = [pool.run(chosen.controller, loop) for loop in first] if len(chosen.results) < loops else chosen.results
+    fresh = [pool.run(chosen.controller, loop) for loop in second]
+    promise = CoveragePromise(
+        coverage=coverage,
+        shape=shape,
+        scale=chosen.scale,
+        margin=chosen.margin,
+        chosen_from=loops,
+        chosen_failures=_count_failures(whole),
+        verified_on=loops,
+        failures=_count_failures(fresh),
+        found=found,
+    )
+    return promise, chosen.limits
+
+
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """A margin, its controller, and the loops that were run before too many of them failed."""
+
+    scale: float
+    margin: Float[np.ndarray, "h nx"]
+    limits: Limits
+    controller: Any
+    results: Sequence[LoopResult]
+
+    @property
+    def failures(self) -> int:
+        return _count_failures(self.results)
+
+    @property
+    def cost(self) -> float:
+        """Mean cost of the loops that were not lost."""
+        known = [result.cost for result in self.results if np.isfinite(result.cost)]
+        return float(np.mean(known)) if known else np.inf
+
+
+def _count_failures(results: Sequence[LoopResult]) -> int:
+    return sum(not result.keeps for result in results)
+
+
+def _run_until(pool: LoopPool, controller: Any, loops: Sequence[DrawnLoop], allowed: int) -> list[LoopResult]:
+    """Return the results of loops, up to the one that is one failure too many."""
+    results: list[LoopResult] = []
+    failures = 0
+    for loop in loops:
+        results.append(pool.run(controller, loop))
+        failures += not results[-1].keeps
+        if failures > allowed:
+            break
+    return results
+
+
+def _find_least(attempt: Callable[[float], _Attempt | None], allowed: int) -> tuple[_Attempt | None, _Attempt | None]:
+    """Return the attempt with the least scale that holds, None where none does, and the last one that was tried."""
+    below, best, last = 0.0, None, None
+    for scale in SCALES:
+        tried = attempt(scale)
+        if tried is None or (last is not None and np.array_equal(tried.margin, last.margin)):
+            break  # the limits cross, or the room is used up
+        last = tried
+        if tried.failures <= allowed:
+            best = tried
+            break
+        below = scale
+    for _ in range(FINER if best is not None else 0):
+        assert best is not None
+        tried = attempt((below + best.scale) / 2)
+        if tried is not None and tried.failures <= allowed:
+            best = tried
+        else:
+            below = (below + best.scale) / 2
+    return best, last
