@@ -47,7 +47,7 @@ class RateVerdict:
         return self.broken + self.lost
 
     @property
-    def bound(self) -> float:
+    def failure_bound(self) -> float:
         """Exact upper bound, at 95 %, of the probability that a loop drawn like these fails (Clopper and Pearson)."""
         return bound_failure_rate(self.failures, self.loops, confidence=CONFIDENCE)
 
@@ -56,7 +56,7 @@ class RateVerdict:
         starts = "a start of the logs moved by up to 5 % of its range"
         return [
             f"{self.broken} of {self.loops} fresh loops broke a limit by more than {to_percent(KEPT)} of its range and "
-            f"{self.lost} were lost: with {to_percent(CONFIDENCE)} confidence at most {to_percent(self.bound)} of "
+            f"{self.lost} were lost: with {to_percent(CONFIDENCE)} confidence at most {to_percent(self.failure_bound)} of "
             "loops drawn like these do either",
             f"each loop drew {starts}, its noise, and its stand-in: {self.on_rows} were on nearest neighbours of the "
             f"logged rows, {self.on_models} on models learned from them",
@@ -115,7 +115,7 @@ class PlantVerdict:
     own: float
 
     @property
-    def bound(self) -> float:
+    def failure_bound(self) -> float:
         """Exact upper bound, at 95 %, of the probability that a run drawn like these fails (Clopper and Pearson)."""
         return bound_failure_rate(self.failures, self.runs, confidence=CONFIDENCE)
 
@@ -128,7 +128,7 @@ class PlantVerdict:
         """Return what was found, and what it is worth."""
         return [
             f"on the plant {self.failures} of {self.runs} logged runs broke a limit by more than {to_percent(KEPT)} of "
-            f"its range: with {to_percent(CONFIDENCE)} confidence at most {to_percent(self.bound)} of runs drawn like "
+            f"its range: with {to_percent(CONFIDENCE)} confidence at most {to_percent(self.failure_bound)} of runs drawn like "
             "these do",
             f"the next run from a start drawn like theirs keeps its limits with a probability of "
             f"{to_percent(1 - self.next_fails)} or more, on average over starts; {to_percent(CONFIDENCE)} needs "
@@ -164,7 +164,7 @@ def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> Pla
     own = alike / max(steps, 1)
     if own < OWN:
         raise DataError(
-            f"in the logged states this controller asks for {to_percent(own)} of the logged inputs: these are no runs "
-            "of this controller towards its reference; pass logs of it"
+            f"in the logged states this controller asks for {to_percent(own)} of the logged inputs: the logs hold other runs, not those "
+            "of this controller towards its reference; pass these"
         )
     return PlantVerdict(len(logs), failures, own)

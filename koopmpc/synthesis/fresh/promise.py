@@ -57,7 +57,7 @@ class CoveragePromise(Value):
         return bool(self.failures > 0 and beyond < REFUTED)
 
     @property
-    def bound(self) -> float:
+    def failure_bound(self) -> float:
         """Exact upper bound, at 95 %, of the probability that a loop drawn like these fails."""
         return bound_failure_rate(self.failures, self.verified_on)
 
@@ -67,7 +67,7 @@ class CoveragePromise(Value):
         how = "without a margin" if self.shape == "none" else f"with a {self.shape} margin of {self.scale:.3g} tubes"
         seen = (
             f"{self.failures} of {self.verified_on} loops that took no part in the choice failed, so that at most "
-            f"{to_percent(self.bound)} of loops do, with 95 % confidence"
+            f"{to_percent(self.failure_bound)} of loops do, with 95 % confidence"
         )
         if not self.found:
             return (

@@ -1,0 +1,117 @@
+"""How often a controller fails: an exact bound from fresh loops on stand-ins, and from logged runs on the plant."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+from typer.testing import CliRunner
+
+import koopmpc as km
+from koopmpc.cli.app import app
+from koopmpc.fitting.check import check_controller
+from koopmpc.fitting.goal import design_data, read_goal
+from koopmpc.fitting.verdict import judge_plant_runs, judge_rate, plan_verdict
+from koopmpc.predict.base import load_value, save_value
+from koopmpc.synthesis.designed import SavedDesign, rebuild_controller
+from tests.fitting.test_goal import GOAL, NAMES, A, B, logs
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("designed")
+    logs().save(folder / "logs.npz")
+    goal = GOAL.replace("horizon = 15", "horizon = 8\ncoverage = 0.9\ncertify = true")
+    (folder / "goal.toml").write_text(goal)
+    return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", bilinear=False)
+
+
+def load(made):
+    saved = load_value(made.controller, SavedDesign)
+    return saved, rebuild_controller(saved, made.controller)
+
+
+def run_plant(made, count, gain=1.0):
+    """Return logged runs of the design's controller on the true plant, its inputs times `gain`."""
+    _, controller = load(made)
+    rng, found = np.random.default_rng(5), []
+    for _ in range(count):
+        controller.reset()
+        X, U = [rng.uniform(-0.5, 0.5, 2)], []
+        for _ in range(25):
+            U.append(gain * controller(X[-1], [0.5, 0.0]).u)
+            X.append(A @ X[-1] + B @ U[-1])
+        found.append(km.Episode(X=np.array(X), U=np.array(U)))
+    return km.Episodes(found, 0.1, *NAMES)
+
+
+def test_the_bound_of_a_verdict_is_the_exact_binomial_one_and_its_number_of_loops_is_said_before(made):
+    saved, controller = load(made)
+    verdict = judge_rate(saved.evidence, controller, 0.2, np.random.default_rng(0))
+    assert verdict.loops == km.validate.count_runs_needed(0.2)
+    assert verdict.on_rows + verdict.on_models == verdict.loops
+    assert scipy.stats.binom.cdf(verdict.failures, verdict.loops, verdict.failure_bound) == pytest.approx(0.05)
+    assert "59 loops without a failure, or 93 with one; 59 are run" in plan_verdict(0.05)
+    again = judge_rate(saved.evidence, controller, 0.2, np.random.default_rng(0))
+    assert again == verdict
+
+
+def test_loops_that_break_a_narrower_limit_are_counted(made):
+    """The controller keeps the limit of its goal; judged by one half as wide it cannot."""
+    saved, controller = load(made)
+    asked = saved.evidence.asked
+    narrow = replace(saved.evidence, asked=replace(asked, limits=km.Limits(u_min=-2, u_max=2, x_max=[np.inf, 0.1])))
+    loops = [judge_rate(one, controller, 0.2, np.random.default_rng(0)) for one in (saved.evidence, narrow)]
+    assert loops[0].failures < loops[1].failures
+    assert loops[0].failure_bound < loops[1].failure_bound
+
+
+def test_logged_runs_on_the_plant_are_judged_and_those_of_another_controller_refused(made, tmp_path):
+    saved, controller = load(made)
+    verdict = judge_plant_runs(saved.evidence, controller, run_plant(made, 20))
+    assert (verdict.runs, verdict.failures) == (20, 0)
+    assert verdict.own > 0.99
+    assert verdict.failure_bound == pytest.approx(1 - 0.05 ** (1 / 20))
+    assert verdict.next_fails == pytest.approx(1 / 21)
+    with pytest.raises(km.errors.DataError, match="the logs hold other runs"):
+        judge_plant_runs(saved.evidence, controller, run_plant(made, 3, gain=0.5))
+    with pytest.raises(km.errors.DataError, match="3 states"):
+        judge_plant_runs(
+            saved.evidence, controller, km.Episodes([km.Episode(X=np.zeros((4, 3)), U=np.zeros((3, 1)))], 0.1)
+        )
+    done = check_controller(made.controller, tmp_path, runs=1, rate=0.4, on_plant=run_plant(made, 20))
+    assert done.rate.loops == km.validate.count_runs_needed(0.4)
+    assert "on the plant 0 of 20 logged runs" in " ".join(str(done).split())
+    assert "How often it fails" in done.page.read_text()
+
+
+def test_the_goal_file_asks_for_coverage_and_a_certificate_and_the_report_answers(made, tmp_path):
+    promise = made.design.promise
+    assert promise.coverage == 0.9
+    assert promise.verified_on == 60
+    text = " ".join(made.page.read_text().split())
+    assert "90 % of" in text
+    assert "ertificate" in text
+    saved, _ = load(made)
+    assert saved.evidence.promise == promise
+    for wrong in ("coverage = 1.5", "certify = 3"):
+        (tmp_path / "goal.toml").write_text(GOAL.replace("horizon = 15", wrong))
+        with pytest.raises(km.errors.DataError, match=wrong.partition(" ")[0]):
+            read_goal(tmp_path / "goal.toml", logs())
+
+
+def test_options_of_a_goal_need_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    logs().save(tmp_path / "logs.npz")
+    result = CliRunner().invoke(app, ["fit", "logs.npz", "--coverage", "0.95"])
+    assert result.exit_code == 2
+    assert "pass --goal, too" in " ".join(result.stderr.split())
+
+
+def test_a_design_without_neighbours_is_judged_on_its_models(made, tmp_path):
+    saved, controller = load(made)
+    verdict = judge_rate(replace(saved.evidence, neighbours=None), controller, 0.5, np.random.default_rng(0))
+    assert verdict.on_rows == 0
+    assert verdict.on_models == verdict.loops
+    save_value(saved, tmp_path / "again.npz")
+    assert load_value(tmp_path / "again.npz", SavedDesign).evidence.promise == saved.evidence.promise
