@@ -225,8 +225,8 @@ def check(
 
     Exit code 0: the goal is kept. 1: it is not. 3: the logs do not show whether it is.
     """
-    from koopmpc.fitting.changed import read_new_logs
     from koopmpc.data.files.load import load_episodes
+    from koopmpc.fitting.changed import read_new_logs
     from koopmpc.fitting.check import check_controller
     from koopmpc.fitting.verdict import plan_verdict
 

@@ -56,8 +56,8 @@ class RateVerdict:
         starts = "a start of the logs moved by up to 5 % of its range"
         return [
             f"{self.broken} of {self.loops} fresh loops broke a limit by more than {to_percent(KEPT)} of its range and "
-            f"{self.lost} were lost: with {to_percent(CONFIDENCE)} confidence at most {to_percent(self.failure_bound)} of "
-            "loops drawn like these do either",
+            f"{self.lost} were lost: with {to_percent(CONFIDENCE)} confidence at most "
+            f"{to_percent(self.failure_bound)} of loops drawn like these do either",
             f"each loop drew {starts}, its noise, and its stand-in: {self.on_rows} were on nearest neighbours of the "
             f"logged rows, {self.on_models} on models learned from them",
             "all stand-ins come from the same logs: where the logs are blind, so are they, and the bound does not hold "
@@ -128,8 +128,8 @@ class PlantVerdict:
         """Return what was found, and what it is worth."""
         return [
             f"on the plant {self.failures} of {self.runs} logged runs broke a limit by more than {to_percent(KEPT)} of "
-            f"its range: with {to_percent(CONFIDENCE)} confidence at most {to_percent(self.failure_bound)} of runs drawn like "
-            "these do",
+            f"its range: with {to_percent(CONFIDENCE)} confidence at most "
+            f"{to_percent(self.failure_bound)} of runs drawn like these do",
             f"the next run from a start drawn like theirs keeps its limits with a probability of "
             f"{to_percent(1 - self.next_fails)} or more, on average over starts; {to_percent(CONFIDENCE)} needs "
             f"{round(1 / (1 - CONFIDENCE)) - 1} runs without a failure",
@@ -164,7 +164,7 @@ def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> Pla
     own = alike / max(steps, 1)
     if own < OWN:
         raise DataError(
-            f"in the logged states this controller asks for {to_percent(own)} of the logged inputs: the logs hold other runs, not those "
-            "of this controller towards its reference; pass these"
+            f"in the logged states this controller asks for {to_percent(own)} of the logged inputs: the "
+            "logs hold other runs, not those of this controller towards its reference; pass these"
         )
     return PlantVerdict(len(logs), failures, own)

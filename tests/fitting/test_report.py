@@ -120,7 +120,7 @@ def test_the_page_of_a_design_is_one_file_with_every_section_and_the_wild_readin
 
 
 def test_the_page_of_a_check_shows_the_same_and_the_verdict_first(made, tmp_path):
-    done = check_controller(made.controller, tmp_path, runs=1)
+    done = check_controller(made.controller, tmp_path, runs=1, rate=0.5)
     page = Reader(done.page.read_text())
     assert is_alone(page)
     assert [heading for heading in page.headings if heading in SECTIONS] == SECTIONS
@@ -143,7 +143,7 @@ def test_a_design_from_memory_has_a_page_too(made, tmp_path):
     design = made.design
     design.save(tmp_path / "design.npz")
     assert load_value(tmp_path / "design.npz", SavedDesign).logs is None
-    page = Reader(check_controller(tmp_path / "design.npz", tmp_path, runs=1).page.read_text())
+    page = Reader(check_controller(tmp_path / "design.npz", tmp_path, runs=1, rate=0.5).page.read_text())
     assert [heading for heading in page.headings if heading in SECTIONS] == SECTIONS
 
 
