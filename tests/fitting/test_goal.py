@@ -238,7 +238,7 @@ def test_the_page_shows_what_to_expect_and_the_goal(made):
 
 
 def test_a_design_that_keeps_its_goal_passes_the_check_and_its_page_says_so(made, tmp_path):
-    done = check_controller(made.controller, tmp_path, runs=4, rate=0.5, rate=0.5)
+    done = check_controller(made.controller, tmp_path, runs=4, rate=0.5)
     assert done.kept, str(done)
     text = done.page.read_text()
     assert "<b>The goal is kept.</b>" in text
@@ -258,14 +258,14 @@ def test_where_starts_of_the_goals_range_have_no_data_around_them_nobody_can_say
     kept = {name: getattr(rows, name)[corner] for name in ("rows", "steps", "points", "episode")}
     few = replace(rows, **kept)
     save_value(replace(saved, evidence=replace(saved.evidence, neighbours=few)), tmp_path / "design.npz")
-    done = check_controller(tmp_path / "design.npz", tmp_path, runs=3, rate=0.5, rate=0.5)
+    done = check_controller(tmp_path / "design.npz", tmp_path, runs=3, rate=0.5)
     assert (done.verdict, done.kept, done.reasons) == ("cannot say", False, ())
     assert any("of the steps have no data around them" in doubt for doubt in done.doubts)
     assert str(done).startswith("NOBODY CAN SAY")
 
 
 def test_a_check_repeats_for_a_seed(made, tmp_path):
-    first, second = (check_controller(made.controller, tmp_path, runs=2, rate=0.5, rate=0.5).figures for _ in range(2))
+    first, second = (check_controller(made.controller, tmp_path, runs=2, rate=0.5).figures for _ in range(2))
     assert first == second
 
 
@@ -274,7 +274,7 @@ def test_a_controller_that_misses_its_goal_fails_the_check_with_the_reason(tmp_p
     text = GOAL.replace("weight = 0.01", "weight = 1000.0")  # an input so dear that nothing is reached
     (tmp_path / "goal.toml").write_text(text)
     made = design_data(tmp_path / "logs.npz", tmp_path / "goal.toml", tmp_path / "out", bilinear=False)
-    done = check_controller(made.controller, tmp_path, runs=3, rate=0.5, rate=0.5)
+    done = check_controller(made.controller, tmp_path, runs=3, rate=0.5)
     assert not done.kept
     assert any("off its reference, 5 % are allowed" in reason for reason in done.reasons)
     assert str(done).startswith("THE GOAL IS NOT KEPT")
@@ -289,7 +289,7 @@ def test_an_input_beyond_its_limits_under_a_fault_fails_the_check(made, tmp_path
         return move
 
     monkeypatch.setattr(MPCBase, "_fail", careless)
-    done = check_controller(made.controller, tmp_path, runs=2, rate=0.5, rate=0.5)
+    done = check_controller(made.controller, tmp_path, runs=2, rate=0.5)
     outside = {one.kind.name: one.outside for one in done.figures}
     assert outside["sensor NaN"] > 0
     assert outside["as in the data"] == 0
@@ -301,8 +301,7 @@ def test_runs_lost_under_a_fault_are_told_and_count_only_where_that_is_asked(mad
     frozen = [RunKind("as in the data"), RunKind("sensor frozen", faults=(km.faults.FrozenSensor(begin=2),))]
     monkeypatch.setattr("koopmpc.fitting.check.kinds", lambda *_, **__: frozen)
     done, strict = (
-        check_controller(made.controller, tmp_path / str(how), runs=3, rate=0.5, rate=0.5, faults=how)
-        for how in (False, True)
+        check_controller(made.controller, tmp_path / str(how), runs=3, rate=0.5, faults=how) for how in (False, True)
     )
     assert (done.kept, strict.kept) == (True, False)
     assert done.broken == strict.broken == strict.reasons
@@ -442,7 +441,7 @@ def test_a_check_judges_by_the_cost_of_the_design_with_its_target_inputs_and_inp
     def checked_cost(**weights):
         asked = replace(saved.evidence.asked, cost=km.Cost(Q=[0, 0], R=1.0, **weights))
         save_value(replace(saved, evidence=replace(saved.evidence, asked=asked)), tmp_path / "design.npz")
-        return check_controller(tmp_path / "design.npz", tmp_path, runs=1, rate=0.5, rate=0.5).figures[0].cost
+        return check_controller(tmp_path / "design.npz", tmp_path, runs=1, rate=0.5).figures[0].cost
 
     zero, one, two = (checked_cost(u_target=[c]) for c in (0.0, 1.0, 2.0))
     assert two - 2 * one + zero == pytest.approx(2 * saved.evidence.asked.steps)
