@@ -183,7 +183,7 @@ def run_random_loop(seed):
 
 
 def test_random_loops_stay_on_levels_through_every_failure():
-    statuses = [status for seed in range(20) for status in run_random_loop(seed)]
+    statuses = [status for seed in range(10) for status in run_random_loop(seed)]
     assert {km.Status.OPTIMAL, km.Status.FAILED, km.Status.BAD_MEASUREMENT} <= set(statuses)
 
 
@@ -215,7 +215,7 @@ def test_without_time_for_a_plan_the_input_is_held():
 def test_the_gap_of_a_search_that_is_cut_off_bounds_what_its_plan_misses(monkeypatch):
     rng, seen = np.random.default_rng(3), 0
     limits = km.Limits(levels=[[-1, 1]], x_max=1e6, slack=(3.0, 5.0))
-    for _ in range(30):
+    for _ in range(12):
         model = draw_model(rng, 1)
         cost = km.Cost(Q=np.ones(3), R=np.ones(1), R_delta=np.full(1, 0.1), Q_N=np.eye(3), u_target=[0.0])
         free = km.KoopmanMPC(model, cost, km.Limits(), 9)
@@ -234,7 +234,7 @@ def test_the_gap_of_a_search_that_is_cut_off_bounds_what_its_plan_misses(monkeyp
             assert (move.status is km.Status.TIME_LIMIT) == (move.gap > 0)
         else:
             assert move.status is km.Status.MAX_ITERATIONS
-    assert seen > 3
+    assert seen > 1
 
 
 def test_levels_of_the_first_steps_alone_leave_later_ones_between():

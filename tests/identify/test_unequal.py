@@ -43,6 +43,7 @@ def test_more_exact_linear_plants_are_recovered(seed):
     np.testing.assert_allclose(np.hstack([model.A, model.B]), np.hstack([A, B]), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_error_falls_with_the_noise():
     errors = []
     for noise in (1e-2, 1e-4):
