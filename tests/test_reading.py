@@ -74,7 +74,7 @@ MOST = {  # files, returns
     "KoopmanMPC": (17, 23),
     "step": (5, 3),
     "BilinearMPC": (15, 24),
-    "bilinear_step": (9, 6),
+    "bilinear_step": (7, 5),
     "simulate": (9, 15),
     # with the files of the ground and of liftings, which those above leave out
     "simulate_all": (9, 20),

@@ -275,3 +275,39 @@ def test_levels_keep_to_those_inside_the_rows_and_maintenance_stops_a_pump():
     low[8, 0] = 0.1
     with pytest.raises(DataError, match=r"no level of u0 is between its limits 0\.1 … 0\.4 at step 8"):
         km.KoopmanMPC(model, COST, limits.with_bounds(u_min=low, u_max=u_max), N)
+
+
+@pytest.mark.slow
+def test_random_loops_with_rows_levels_prices_and_failures_keep_every_limit():
+    """0 exceptions, 0 inputs outside the row of their step, 0 between levels."""
+    solved = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        nx, nu, steps, horizon = int(rng.integers(1, 4)), int(rng.integers(1, 3)), 30, int(rng.integers(3, 12))
+        A = rng.normal(size=(nx, nx))
+        A *= rng.uniform(0.5, 1.08) / np.abs(np.linalg.eigvals(A)).max()
+        model = linear(A, rng.normal(size=(nx, nu)))
+
+        def walk(centre, reach, n, rng=rng, steps=steps):
+            return np.repeat(rng.uniform(centre - reach, centre + reach, (steps, n)), 4, axis=0)[: steps + 20]
+
+        ends = {"u_min": -walk(1.0, 0.7, nu), "u_max": walk(1.0, 0.7, nu), "x_max": walk(1.5, 1.2, nx)}
+        levels = rng.random() < 0.3
+        if levels:
+            ends["u_min"] = np.minimum(ends["u_min"], -0.01)
+        elif rng.random() < 0.5:
+            ends["du_max"] = walk(0.5, 0.4, nu)
+        rows = km.Limits(**ends, **({"levels": [[-2, -1, 0, 1, 2], *[None] * (nu - 1)]} if levels else {}))
+        options = {"latency": int(rng.random() < 0.3), "moves": int(rng.integers(1, horizon + 1))}
+        mpc = km.KoopmanMPC(model, km.Cost(Q=1.0, R=0.1, price=walk(0.0, 0.3, nu)), rows, horizon, **options)
+        x, reference = rng.normal(size=nx), rng.normal(size=nx)
+        mpc.reset(x)
+        for k in range(steps):
+            mpc.solver_fails = rng.random() < 0.1
+            move = mpc(x + (np.nan if rng.random() < 0.03 else 0.0), reference)
+            low, high = rows.input_rows(nu, k + options["latency"], 1)
+            np.testing.assert_allclose(move.u, np.clip(move.u, low[0], high[0]), atol=1e-9)
+            assert not levels or abs(move.u[0] - round(move.u[0])) < 1e-9
+            solved += move.fallback is km.control.Fallback.NONE
+            x = np.clip(A @ x + model.B @ move.u + 0.02 * rng.normal(size=nx), -1e4, 1e4)
+    assert solved > 1000

@@ -63,6 +63,7 @@ class StagedMPC(MPCBase):
     _box: Interval  # limits of the inputs of the step, one for all stages or a row each
     _at_call: Limits
     _called_with: Limits | None
+    _timed: bool  # whether the controller's own limits move in time
     _warm: bool  # whether the next step starts from the plan of the last one
 
     def __init__(
@@ -83,6 +84,7 @@ class StagedMPC(MPCBase):
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
         o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, in_time=True, priced=True)
         self._outputs, self._box, self._limit_step, self._called_with = o, o.inputs, 0, None
+        self._timed = o.limits.in_time
         refuse_levels(o.limits, f"a {type(self).__name__}")
         refuse_priority(o.limits, f"a {type(self).__name__}")
         super().__init__(
@@ -103,7 +105,7 @@ class StagedMPC(MPCBase):
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
         self._disturbed = estimator is not None or given.nw > 0
         self._scheduled_for = np.zeros(given.nw)
-        if self.limits.in_time:
+        if self._timed:
             check_rows(self.limits, o, self._problem, None)
 
     @property
@@ -120,7 +122,7 @@ class StagedMPC(MPCBase):
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
         self._limit_step, inputs = 0, self._outputs.inputs
-        if self.limits.in_time:
+        if self._timed:
             low, high = self.limits.input_rows(self.nu, 0, 1)
             self._box = Interval(np.maximum(low, inputs.low), np.minimum(high, inputs.high))
         super().reset(x0, u_prev)
@@ -168,7 +170,7 @@ class StagedMPC(MPCBase):
     ) -> Move:
         """Return the first input of the plan for state y; arguments as for KoopmanMPC."""
         start = perf_counter()
-        if limits is not None or self.limits.in_time or self._box is not self._outputs.inputs:
+        if limits is not None or self._timed or self._box is not self._outputs.inputs:
             self._move_limits(limits)
         move = self._step(y, reference, applied, w, start)
         move.refused = self._initial.refused
@@ -185,7 +187,7 @@ class StagedMPC(MPCBase):
                 check_rows(own, outputs, problem, self._N + self._latency)
                 self._called_with, self._at_call = limits, own
             own, first = self._at_call, 0
-        elif not own.in_time:
+        elif not self._timed:
             self._box = outputs.inputs
             self._limit(None)
             return
