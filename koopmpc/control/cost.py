@@ -75,6 +75,10 @@ class Cost(Value):
         errors of such a model. Of that length, its halves, N and none the shortest is taken whose loop on the model
         itself, with inputs half a step late, costs within 0.5 % of the least. BilinearMPC and NonlinearMPC have no
         tail by default: without Q_N and tail their end costs the Riccati solution at the equilibrium nearest to r_N.
+    beyond
+        What a reference does after the rows that a step is given, in BilinearMPC and NonlinearMPC. "rest": the last row
+        stays. "motion": it goes on by the linear recurrence that all these rows obey, as sines, ramps and their sums
+        do, and the end of the plan aims there; rows that obey none rest. It needs neither Q_N nor tail.
 
     Raises
     ------
@@ -98,6 +102,7 @@ class Cost(Value):
     R_delta: ArrayLike | checks.ByName | None = None
     tail: int | None = None
     price: "Bound" = None
+    beyond: Literal["rest", "motion"] = "rest"
 
     def __post_init__(self) -> None:
         if isinstance(self.Q_N, WeighsEnd):
@@ -132,6 +137,10 @@ class Cost(Value):
             if not all(np.isfinite(np.asarray(value)).all() for value in bounds.list_bound(price)):
                 raise DataError("price holds an infinite number; pass what a unit of an input costs in a step")
             object.__setattr__(self, "price", price)
+        if self.beyond not in ("rest", "motion"):
+            raise DataError(f'beyond is {self.beyond!r}; pass "rest" or "motion"')
+        if self.beyond == "motion" and not (self.Q_N is None and self.tail is None):
+            raise DataError('beyond="motion" moves the end that the default costs; leave Q_N and tail out')
         if self.tail is not None:
             object.__setattr__(self, "tail", int(checks.count(self.tail, "tail", 0)))
             if self.Q_N is not None:
@@ -330,7 +339,8 @@ def lifted_tracking(
     Raises
     ------
     DataError
-        Limits have rows in time, or the cost has a price, and who asks does not know them.
+        Limits have rows in time, or the cost has a price, and who asks does not know them; or ``cost.beyond`` is
+        "motion".
     ObservableError
         The cost or a limit is on an observable that the lifting lacks.
     ShapeError
@@ -340,6 +350,10 @@ def lifted_tracking(
     _refuse_rows(limits, in_time)
     if not in_time:
         refuse_price(cost)
+    if cost.beyond == "motion":
+        raise DataError(
+            'beyond="motion" needs a BilinearMPC or a NonlinearMPC; leave it out, or pass more reference rows'
+        )
     C, G = select_rows(predictor, cost.of), predictor.C
     if limits.of is not None:
         G = np.vstack([G, select_rows(predictor, limits.of)])

@@ -331,6 +331,11 @@ def design(
         blind += find_blind_range(test.episodes, asked, neighbours)
         blind += compare_longer_horizon(test, rows[best].recipe, controller, neighbours, draw)
     controller.reset()
+    if rows[best].recipe.motion:
+        blind.append(
+            "beyond its rows the controller takes the reference to go on as it moved; its C cannot yet: for C code pass a "
+            "cost with tail=0"
+        )
     remembered = [] if not hidden else [f"{memory}; models with delays were tried"]
     if hidden and not rows[best].recipe.candidate.delays:
         blind.append(f"{memory}, and the chosen model sees no past rows: measure that state, or compare delays=[4, 8]")
@@ -527,15 +532,18 @@ def _judge_rounds(
     linear = [one for one in ranked if not one.candidate.bilinear][:_LINEAR]
     bilinear = [one for one in ranked if one.candidate.bilinear][:_BILINEAR]
     estimators = (None, *(LiftedDisturbance(gain=gain) for gain in _GAINS))
-    ends = (None, 0, test.asked.horizon)
+    cost = test.asked.cost
+    ends: list[dict[str, Any]] = [{}, {"tail": 0}, {"tail": test.asked.horizon}]
+    if test.asked.moves and cost.Q_N is None and cost.tail is None:
+        ends.append({"motion": True})
     second = [replace(one, estimator=each) for one in bilinear[:1] for each in estimators]
-    second += [replace(one, tail=tail) for one in bilinear[:1] for tail in ends[1:]]
+    second += [replace(one, **end) for one in bilinear[:1] for end in ends[1:]]
     third: list[Recipe] = []
     for place, one in enumerate(linear):
-        some_ends = ends[:2] if one.tail is None else (0,)
+        some_ends = (None, 0) if one.tail is None else (0,)
         some = [replace(one, estimator=each, tail=tail) for tail in some_ends for each in estimators]
         if test.asked.moves and one.tail is None:
-            some.append(replace(one, tail=ends[2]))
+            some.append(replace(one, tail=test.asked.horizon))
         (second if place == 0 else third).extend(some)
     jobs = _list_jobs(second, screened, first, every)
     outcomes = pool.map(run, jobs, report_stage(progress, "closed loops of the best"), size=Job.size)
@@ -543,13 +551,13 @@ def _judge_rounds(
         tried_ones = average_ratios(rate_runs(outcomes[: len(estimators)]), test.weights)
         best = estimators[int(np.argmin(tried_ones))]
         tried_ends = average_ratios(
-            rate_runs([outcomes[i] for i in (0, len(estimators), len(estimators) + 1)]), test.weights
+            rate_runs([outcomes[0], *outcomes[len(estimators) : len(estimators) + len(ends) - 1]]), test.weights
         )
-        end = ends[int(np.argmin(tried_ends))] if tried_ends.min() < (1 - GAINED) * tried_ends[0] else None
-        third.append(replace(bilinear[0], estimator=best, tail=end, weighted=True))
-        third += [replace(one, estimator=best, tail=end) for one in bilinear[1:]]
-        if end is not None and best is not None:
-            third.append(replace(bilinear[0], estimator=best, tail=end))
+        end = ends[int(np.argmin(tried_ends))] if tried_ends.min() < (1 - GAINED) * tried_ends[0] else {}
+        third.append(replace(bilinear[0], estimator=best, weighted=True, **end))
+        third += [replace(one, estimator=best, **end) for one in bilinear[1:]]
+        if end and best is not None:
+            third.append(replace(bilinear[0], estimator=best, **end))
     jobs = _list_jobs(third, screened, first, every)
     outcomes += pool.map(run, jobs, report_stage(progress, "closed loops of the last"), size=Job.size)
     return _build_leaderboard(test, (screened, first), ([*second, *third], outcomes))

@@ -173,6 +173,10 @@ class BilinearMPC(StagedMPC):
                 "measured disturbances multiply its state, which its C does not know",
                 "a BilinearMPC on model.at(w), for one constant w",
             )
+        if self.cost.beyond != "rest":
+            raise no_export(
+                self, 'its C rests at the last reference row, and its cost has beyond="motion"', "one without it"
+            )
         if problem.ends:
             raise no_export(self, "its C has no terminal set", "a LinearMPC or a KoopmanMPC with a terminal polytope")
         estimator = publish_estimator(self._initial.observer, self._estimator, self._time_limit, "sqp_iterations=1")

@@ -16,6 +16,7 @@ from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation, refuse_levels, refuse_priority
 from koopmpc.control.move import Move, Plan, Status, alone
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
+from koopmpc.control.nonlinear.motion import extend_rows, shift_target
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.control.nonlinear.rows import StageLimits, check_rows, find_stage_limits
 from koopmpc.control.stepped.blocks import Moves
@@ -24,6 +25,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator, start_observer
 from koopmpc.plants.step_map import StepMap
 
+_BEYOND = 10  # horizons for which a reference goes on beyond its rows
 GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
 
 
@@ -45,7 +47,8 @@ class Preview(NamedTuple):
     """What the rows of a reference ask for, before disturbances: see `StagedMPC._aim`.
 
     R holds the rows r_0 … r_N, U and `slopes` the reference inputs and ∂u/∂e of all but the last, `held` says which of
-    these equal the last one, and `target` is the last one's.
+    these equal the last one, and `target` is the last one's. `beyond` holds the rows after them where the reference
+    goes on as it moved, else none.
     """
 
     R: Float[np.ndarray, "N1 nr"]
@@ -53,6 +56,7 @@ class Preview(NamedTuple):
     slopes: Float[np.ndarray, "N nu nx"]
     held: Bool[np.ndarray, " N"]
     target: TerminalTarget
+    beyond: Float[np.ndarray, "T nr"]
 
 
 class StagedMPC(MPCBase):
@@ -293,9 +297,10 @@ class StagedMPC(MPCBase):
                 np.array([target.slope for target in targets]),
                 (R[:-1] == R[-1]).all(axis=1),
                 end,
+                extend_rows(R, _BEYOND * self._N if self.cost.beyond == "motion" else 0),
             )
             self._reference = key
-        R, U, slopes, held, end = self._preview
+        R, U, slopes, held, end, beyond = self._preview
         if self._disturbed:  # the last disturbance of the preview stays
             e = self._e[-1]
             end = self._target = self._terminal.find_disturbed(R[-1], e, self._target)
@@ -316,6 +321,10 @@ class StagedMPC(MPCBase):
             M, nr = np.zeros_like(end.M), len(R[-1])
             M[:nr] = self._outputs.Q_root
             end = end._replace(M=M, L=np.zeros_like(end.L), V=np.zeros_like(end.V), m=M @ R[-1])
+        if len(beyond) and rows is None:
+            point, outputs = end.equilibrium, self._outputs
+            at, hold = self._terminal.equilibria.linearise(point.x, point.u), self.cost.u_target == "equilibrium"
+            end = shift_target(end, at, outputs.Q, outputs.R, np.vstack([R[-1], beyond]), hold=hold)
         rated = self._with_rates
         self._targets = self._add_last_input(R[1:], U, end) if rated else StageTargets(R[1:], U, end.M, end.L, end.m)
         return True

@@ -1,0 +1,86 @@
+"""Cost(beyond="motion"): a reference goes on by its linear recurrence, and the end of a short plan aims there."""
+
+import os
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import koopmpc as km
+from koopmpc.control.nonlinear.motion import extend_rows
+
+A, B = np.array([[1.0, 0.1], [-0.2, 0.95]]), np.array([[0.005], [0.1]])
+
+
+def line(x, u):
+    return ca.mtimes(ca.DM(A), x) + ca.mtimes(ca.DM(B), u)
+
+
+def plant():
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
+    F, h = ca.Function("F", [x, u], [line(x, u)]), ca.Function("h", [x], [x])
+    return km.StepMap(F, 0.1, h, ("p", "v"), ("u",), ("p", "v"))
+
+
+@given(
+    period=st.floats(5, 200),
+    phase=st.floats(0, 6),
+    slope=st.floats(-2, 2),
+    offset=st.floats(-50, 50),
+    size=st.floats(0.1, 9),
+)
+@settings(max_examples=60, deadline=None)
+def test_sines_and_ramps_go_on(period, phase, slope, offset, size):
+    k = np.arange(70)
+    sine, ramp = size * np.sin(2 * np.pi * k / period + phase) + offset, slope * k + offset
+    rows = np.column_stack([sine, ramp, np.full(70, offset)])
+    further = extend_rows(rows[:20], 50)
+    if np.ptp(rows[:20], axis=0).max() > 1e-3:
+        assert further.shape == (50, 3)
+        np.testing.assert_allclose(further, rows[20:], atol=2e-4 * (1 + np.abs(rows).max()))
+
+
+def test_rows_that_rest_or_obey_no_recurrence_do_not_go_on():
+    rng = np.random.default_rng(0)
+    step = np.repeat([0.0, 1.0], [9, 6])
+    for column in (np.ones(15), step, rng.uniform(size=15), 1.2 ** np.arange(15)):
+        assert extend_rows(column[:, None], 30).shape == (0, 1)
+    assert extend_rows(np.column_stack([np.sin(np.arange(15)), step]), 30).shape == (0, 2)
+    assert extend_rows(np.arange(5.0)[:, None], 30).shape == (0, 1)  # too few rows to tell
+
+
+@pytest.mark.parametrize("u_target", ["equilibrium", "zero"])
+def test_without_limits_a_short_plan_moves_as_one_that_sees_everything(u_target):
+    """The end is exact on a linear plant: eight steps with the recurrence are as good as 160 with the true rows."""
+    k = np.arange(400)
+    rows = 0.7 * np.sin(2 * np.pi * k / 50) + 0.2
+    cost = {"Q": [5.0, 0.3], "R": 0.2, "u_target": u_target}
+    rows = np.column_stack([rows, 0 * rows])
+    short, blind = (km.BilinearMPC(plant(), km.Cost(**cost, beyond=way), None, 8) for way in ("motion", "rest"))
+    whole = km.BilinearMPC(plant(), km.Cost(**cost), None, 160)
+    for first in (0, 13, 31):
+        seen = rows[first : first + 9]
+        true = whole([0.1, -0.2], rows[first : first + 161]).u
+        assert short([0.1, -0.2], seen).u == pytest.approx(true, rel=2e-5)
+        assert abs(blind([0.1, -0.2], seen).u - true) > 1e-3
+
+
+def test_a_reference_that_rests_is_followed_as_before():
+    both = [km.BilinearMPC(plant(), km.Cost(Q=[5, 1], R=0.2, beyond=way), None, 8) for way in ("motion", "rest")]
+    for rows in ([0.3, 0.0], np.column_stack([np.repeat([0.0, 1.0], [4, 5]), np.zeros(9)])):
+        moved, rested = (one([0.1, -0.2], rows).u for one in both)
+        assert (moved == rested).all()
+
+
+@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+def test_it_is_refused_where_it_cannot_be():
+    with pytest.raises(km.errors.DataError, match="leave Q_N and tail out"):
+        km.Cost(Q=[1, 1], R=1, tail=0, beyond="motion")
+    with pytest.raises(km.errors.DataError, match='pass "rest" or "motion"'):
+        km.Cost(Q=[1, 1], R=1, beyond="hold")
+    cost = km.Cost(Q=[1, 1], R=1, beyond="motion")
+    with pytest.raises(km.errors.DataError, match="needs a BilinearMPC"):
+        km.LinearMPC(plant(), [0, 0], [0], cost, None, 5)
+    assert "rests at the last reference row" in km.BilinearMPC(plant(), cost, None, 5).program().obstacle
