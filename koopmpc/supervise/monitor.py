@@ -172,7 +172,7 @@ class Watch(Viewing):
                 self._matrices[new, :nx, last : last + n] = np.hstack([C @ model.A, C @ model.B])
                 self._matrices[new, :nx, low : low + nz] = -C
             self._pushed = C @ model.E, C
-        learned = model.model if isinstance(model, LearnedMap) else None
+        learned = model.model if isinstance(model, LearnedMap) and not model.scheduled else None
         self._gain: Float[np.ndarray, "nx m"] | None = None
         if isinstance(learned, BilinearPredictor):  # its C and its ψ give the prediction without a call of its map
             C = W @ learned.C

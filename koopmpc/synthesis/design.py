@@ -333,8 +333,8 @@ def design(
     controller.reset()
     if rows[best].recipe.motion:
         blind.append(
-            "beyond its rows the controller takes the reference to go on as it moved; its C cannot yet: for C code pass a "
-            "cost with tail=0"
+            "beyond its rows the controller takes the reference to go on as it moved, which its C cannot yet: "
+            "for C code pass a cost with tail=0"
         )
     remembered = [] if not hidden else [f"{memory}; models with delays were tried"]
     if hidden and not rows[best].recipe.candidate.delays:
