@@ -60,7 +60,7 @@ def shift_target(
 
     With x̃ = x − x_r and δ_k = r_k − of(x_r) the cost-to-go is x̃ᵀP x̃ − 2 p_Nᵀx̃ + …, so the target moves by P⁺p_N.
     Backward from p = 0 after the last row, p_k = JᵀQ δ_k + (A − B K)ᵀ p_{k+1} − Kᵀ R v_k. v_k is the input that costs
-    nothing, from u_r on: the one that holds δ_k if inputs count from there (`hold`), else −u_r. P is the cost of the end.
+    nothing, from u_r on: the one that holds δ_k if inputs count from there (`hold`), else −u_r. P is the end's cost.
 
     References
     ----------
