@@ -366,7 +366,7 @@ def design(
 def _keep_logs(measured: Episodes) -> Episodes:
     """Return episodes of about so many steps as a comparison with new logs needs, spread evenly over the data."""
     apart = max(sum(map(len, measured)) // _KEPT, 1)
-    return measured.with_episodes([Episode(X=e.X, U=e.U) for e in list(measured)[::apart]])
+    return measured.with_episodes([Episode(X=e.X, U=e.U, W=e.W) for e in list(measured)[::apart]])
 
 
 def _confirm_first(
