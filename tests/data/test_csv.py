@@ -74,7 +74,7 @@ def test_gaps_cut_and_no_pair_spans_one(tmp_path: Path, T: int, holes: set[int],
     if len(pairs) == T - 1:
         read = km.load_episodes(file, dt=1.0)
     else:
-        with pytest.warns(km.FitWarning, match=r"gaps \(after row .*\) cut 1 episodes into \d+; \d+ of \d+ rows"):
+        with pytest.warns(km.FitWarning, match=r"gaps? \(after row .*\) cut 1 episode into \d+; \d+ of \d+ rows"):
             read = km.load_episodes(file, dt=1.0)
     found = [int(x) for e in read for x in e.X[:-1, 0]]
     assert found == pairs
@@ -126,7 +126,10 @@ def test_the_index_that_pandas_writes_is_no_state_and_a_clock_of_another_name_is
     file = text(tmp_path / "zeit.csv", "\n".join(["Zeit,x,u", *own]) + "\n")
     with pytest.warns(km.FitWarning, match="'Zeit' grows by the same in each row"):
         assert km.load_episodes(file, dt=0.1).states == ("Zeit", "x")
-    with pytest.warns(km.FitWarning), pytest.raises(km.errors.DataError, match="'Zeit' looks like it; its columns"):
+    with (
+        pytest.warns(km.FitWarning),
+        pytest.raises(km.errors.DataError, match="'Zeit' looks like it: rename it by columns=; its columns"),
+    ):
         km.load_episodes(file)
 
 
@@ -282,6 +285,6 @@ def test_a_column_of_labels_is_no_state(tmp_path: Path) -> None:
 
 def test_truth_values_with_one_missing_cut_an_episode(tmp_path: Path) -> None:
     file = table(tmp_path, ["true", "false", "", "true", "false"])
-    with pytest.warns(km.FitWarning, match="1 gaps .* cut 1 episodes into 2; 1 of 5 rows are lost"):
+    with pytest.warns(km.FitWarning, match="1 gap .* cut 1 episode into 2; 1 of 5 rows are lost"):
         read = km.load_episodes(file)
     assert [episode.X[:, 0].tolist() for episode in read] == [[1, 0], [1, 0]]

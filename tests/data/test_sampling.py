@@ -93,10 +93,10 @@ def test_what_resampling_cuts_and_leaves_out_is_told():
     assert words(signals(np.arange(6))) == words(signals([0, 1, 2.2, 3.1, 4, 4.9])) == []
     uneven = signals([0, 1, 2, 3.9, 5, 6])
     (said_of_gaps,) = words(uneven, signals(np.arange(4), first=7))
-    assert said_of_gaps.startswith("f: 1 gaps (after row 3) cut 2 episodes into 3; 0 of 10 rows are lost")
+    assert said_of_gaps.startswith("f: 1 gap (after row 3) cut 2 episodes into 3; 0 of 10 rows are lost")
     assert said_of_gaps.endswith("a gap is a step between complete rows of more than 1.5 times the usual one")
     empty = signals(np.arange(6), X=[0, 1, np.nan, 3, 4, 5])
-    assert words(empty)[0].startswith("f: 1 gaps (after row 2) cut 1 episodes into 2; 1 of 6 rows are lost")
+    assert words(empty)[0].startswith("f: 1 gap (after row 2) cut 1 episode into 2; 1 of 6 rows are lost")
     left_out = "f: 1 of 6 rows have an empty cell or repeat a time; they were left out before resampling"
     assert words(empty, dt=2.0) == [left_out]  # a step of 2 is no gap for a dt of 2
     assert words(signals([0, 1, 2, 2, 3, 4])) == [left_out]
@@ -108,14 +108,14 @@ def test_episodes_end_at_gaps_and_what_is_lost_is_counted():
     assert [e.X[:, 0].tolist() for e in found] == [[0, 1], [3, 4, 5], [9, 10]]
     assert [e.U[:, 0].tolist() for e in found] == [[0], [3, 4], [9]]
     assert [e.W[:, 0].tolist() for e in found] == [[0], [3, 4], [9]]
-    assert words == ["f: 2 gaps (after row 6, 10) cut 1 episodes into 3; 4 of 11 rows are lost"]
+    assert words == ["f: 2 gaps (after row 6, 10) cut 1 episode into 3; 4 of 11 rows are lost"]
     u = [0, 1, 2, np.nan, 4, 5, 6]  # the input of row 4 is unknown: it leads nowhere, and ends an episode
     found, words = said(lambda: episodes_from([signals(None, X=np.arange(7), U=u)], 1.0, "f"))
     assert [e.X[:, 0].tolist() for e in found] == [[0, 1, 2, 3], [4, 5, 6]]
-    assert words == ["f: 1 gaps (after row 4) cut 1 episodes into 2; 0 of 7 rows are lost"]
+    assert words == ["f: 1 gap (after row 4) cut 1 episode into 2; 0 of 7 rows are lost"]
     many = [signals(None, X=[0, 1, np.nan] * 4 + [0, 1])]
     assert (
-        "4 gaps (after row 2, 5, 8, …) cut 1 episodes into 5; 4 of 14 rows"
+        "4 gaps (after row 2, 5, 8, …) cut 1 episode into 5; 4 of 14 rows"
         in said(lambda: episodes_from(many, 1, "f"))[1][0]
     )
     found, words = said(lambda: episodes_from([signals(None, X=[1, 2]), signals(None, X=[3])], 1.0, "f"))
@@ -249,7 +249,7 @@ def test_more_rows_than_memory_holds_are_refused_before_they_are_made(tmp_path, 
     for free, fits in ((1.01 * needed, True), (0.99 * needed, False), (None, True)):
         monkeypatch.setattr("koopmpc.disk.memory", lambda free=free: free)
         if fits:
-            with pytest.warns(km.FitWarning, match=r"1 gaps \(after row 2\) cut 2 episodes into 3; 0 of 6 rows"):
+            with pytest.warns(km.FitWarning, match=r"1 gap \(after row 2\) cut 2 episodes into 3; 0 of 6 rows"):
                 assert len(km.load_episodes(tmp_path / "log.csv", resample=0.01)) == 3
         else:
             with pytest.raises(
@@ -267,5 +267,5 @@ def test_a_column_is_doubted_once_where_it_is_constant_or_repeats_an_earlier_one
     assert words == ["'y' repeats 'x'", "'z' repeats 'x'", "'z' repeats 'y'", "'c' is 4 throughout"]
     with warnings.catch_warnings():
         warnings.simplefilter("error", ColumnWarning)
-        with pytest.warns(km.FitWarning, match="gaps"):
+        with pytest.warns(km.FitWarning, match="gap"):
             km.load_episodes(tmp_path / "log.csv", states=["x", "y", "c"], inputs=["u"])  # told, not guessed

@@ -115,8 +115,11 @@ def resample(parts: list[Signals], dt: float, where: str) -> list[Signals]:
 
 def _warn_of_gaps(where: str, gaps: list[int], before: int, after: int, rest: str) -> None:
     shown = ", ".join(str(row) for row in gaps[:3]) + (", …" if len(gaps) > 3 else "")
+    count = f"{len(gaps)} gap{'s' * (len(gaps) != 1)}"
     at = f" (after row {shown})" if gaps else ""
-    warnings.warn(f"{where}: {len(gaps)} gaps{at} cut {before} episodes into {after}; {rest}", FitWarning, stacklevel=3)
+    warnings.warn(
+        f"{where}: {count}{at} cut {before} episode{'s' * (before != 1)} into {after}; {rest}", FitWarning, stacklevel=3
+    )
 
 
 def _advancing(part: Signals) -> Signals:

@@ -134,7 +134,9 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
         dt = _find_exact_step(columns[SAVED[1]], time)
     if dt is None:
         if time is None:
-            clock = next((f"; {name!r} looks like it" for name in found.states if _even(values[name])), "")
+            clock = next(
+                (f"; {name!r} looks like it: rename it by columns=" for name in found.states if _even(values[name])), ""
+            )
             raise DataError(
                 f"{where} does not say its sample time: pass dt=, or add a column 'time [s]'{clock}; its columns are "
                 f"{', '.join(names)}"
