@@ -299,3 +299,24 @@ def test_a_horizon_too_short_to_stop_before_a_limit_is_told_with_both_numbers():
         sentences = parts.design.advice
     assert any("a horizon of 12 steps in place of 6" in sentence for sentence in sentences)
     assert judged(parts, "designed", 0).promise["violation"] > 0.01
+
+
+@pytest.mark.slow
+def test_the_heater_with_a_hidden_lag_stays_on():
+    """A design of such logs once switched it off for ever; now it says that a state is hidden, and tries past rows."""
+    task = MORE["hidden lag"]
+    found = designed(
+        task.data(0),
+        km.Cost(Q=task.Q, R=task.R),
+        task.limits,
+        horizon=task.horizon,
+        reference=task.reference,
+        candidates=[km.State() + km.Constant()],
+        delays=None,
+    )
+    assert any(sentence.startswith("a hidden state shows") for sentence in (*found.notes, *found.advice))
+    assert max(row.recipe.candidate.delays for row in found.leaderboard) == 4
+    for x0 in ([0.9, 22.0, 0.0], [0.35, 38.0, 40.0], [0.94, 28.6, 0.0]):
+        run = km.simulate(task.plant, found.controller, x0=x0, reference=task.reference, steps=task.steps)
+        assert np.abs(run.X[-1, :2] - task.reference).max() < 0.2
+        assert 20 < run.U[-5:, 1].mean() < 35
