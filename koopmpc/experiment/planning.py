@@ -131,6 +131,12 @@ def next_experiment(
     held, notes = take_sample(source_of(data), SAMPLE)
     if not held.nu:
         raise DataError("the data have no inputs, so there is nothing to plan; give each Episode its U")
+    still = [name for name, low, high in zip(held.inputs, *_find_ends(held), strict=True) if low == high]
+    if still:
+        raise DataError(
+            f"{', '.join(still)} never moves in the data, so no model says what a plan would do; record a first log "
+            "with small steps of it by hand"
+        )
     if design is not None:
         checks.kind(design, "design", Design, "pass what km.design returns")
         reference = design.evidence.asked.reference if reference is None else reference
@@ -258,16 +264,28 @@ def _cut(episode: Any, length: int) -> list[Any]:
     return [episode.cut(k, min(k + length, len(episode))) for k in ends if min(k + length, len(episode)) - k > 1]
 
 
+def build_law(model: Model, asked: DesignTask) -> KoopmanMPC | BilinearMPC:
+    """Return the predictive controller of a model; without limits of observables that its lifting lacks."""
+    kind: Any = BilinearMPC if isinstance(model, BilinearPredictor) else KoopmanMPC
+    try:
+        return kind(model, asked.cost, asked.limits, asked.horizon)
+    except KoopmpcError:
+        if asked.limits.of is None:
+            raise
+        plain = replace(asked.limits, of=None, y_min=None, y_max=None, slack="auto")
+        return kind(model, asked.cost, plain, asked.horizon)
+
+
+def _find_ends(data: Episodes) -> tuple[Float[np.ndarray, " nu"], Float[np.ndarray, " nu"]]:
+    U = np.concatenate([e.U for e in data])
+    return U.min(axis=0), U.max(axis=0)
+
+
 def simulate_visits(
     ensemble: Ensemble, model: Model, data: Episodes, asked: DesignTask, design: Design | None, rng: np.random.Generator
 ) -> Visits:
     """Return what the designed loop visits on the model and on some bootstrap models."""
-    if design is not None:
-        law = build_controller(design.controller.as_data())
-    elif isinstance(model, BilinearPredictor):
-        law = BilinearMPC(model, asked.cost, asked.limits, asked.horizon)
-    else:
-        law = KoopmanMPC(model, asked.cost, asked.limits, asked.horizon)
+    law = build_controller(design.controller.as_data()) if design is not None else build_law(model, asked)
     chosen = asked.starts[:_LOOPS]
     runs = [
         visit_loop(ensemble, law, member, x0, asked.reference, asked.steps)

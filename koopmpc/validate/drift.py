@@ -225,7 +225,8 @@ class _Law:
             if value < least - 0.05 * data.nx:
                 S = E.T @ E / max(len(E) - P.shape[1], 1)
                 size = np.sqrt(np.mean((T - X) ** 2, axis=0))
-                S += np.diag((1e-4 * np.maximum(size, 1e-300)) ** 2)
+                floor = 1e-12 * np.maximum(np.abs(X).max(axis=0), 1.0)
+                S += np.diag(np.maximum(1e-4 * size, floor) ** 2)
                 root = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
                 whitener = np.ascontiguousarray(np.asarray(np.linalg.inv(root), dtype=np.float64).T)
                 bound = float(np.quantile(leverage, _INSIDE))

@@ -213,6 +213,18 @@ def test_a_duration_shorter_than_the_past_is_refused(logs):
         km.next_experiment(km.Episodes([km.Episode(X=e.X) for e in logs], 0.1), COST, LIMITS, reference=[1, 0])
 
 
+def test_inputs_that_never_move_ask_for_a_first_log_by_hand():
+    idle = km.Episodes([km.Episode(X=np.zeros((30, 2)), U=np.zeros((29, 1)))] * 3, 0.1)
+    with pytest.raises(km.errors.DataError, match="u0 never moves in the data"):
+        km.next_experiment(idle, COST, LIMITS, reference=[0, 0])
+
+
+def test_limits_of_observables_hold_for_the_band(logs):
+    limits = km.Limits(u_min=-2, u_max=2, of=km.Monomials(2, states=[1]), y_min=-1, y_max=0.25)
+    plan = km.next_experiment(logs, COST, limits, reference=[1, 0], steps=60)
+    assert (np.maximum(np.abs(plan.low), np.abs(plan.high))[:, 1:, 1] ** 2 <= 0.25 + 1e-9).all()
+
+
 def test_the_picture_shows_plan_and_log(plan, tmp_path):
     new = km.collect(CART, plan.starts, plan, episodes=2, steps=80)
     drawing = km.plot.plan(plan, 1, log=new)
@@ -220,3 +232,16 @@ def test_the_picture_shows_plan_and_log(plan, tmp_path):
     km.plot.save(drawing, tmp_path / "plan.png")
     with pytest.raises(km.errors.ShapeError, match="pass the logs of this plan"):
         km.plot.plan(plan, 1, log=new[:1])
+
+
+@pytest.mark.slow
+def test_a_design_gives_reference_model_and_controller():
+    data = log_noisily(CART, km.Uniform([-0.5, -0.2], [0.5, 0.2]), km.Noise(-1, 1, hold=4), 0.002, episodes=8, steps=40)
+    with km.errors.hide_fit_warnings():
+        designed = km.design(
+            data, COST, LIMITS, reference=[0.4, 0], horizon=12, bilinear=False, delays=(0,), loops=0, tighten=False
+        )
+    plan = km.next_experiment(data, COST, LIMITS, design=designed, steps=60)
+    assert (plan.low[:, 1:] >= [-2, -1]).all()
+    assert (plan.high[:, 1:] <= [2, 1]).all()
+    assert plan.after < plan.before

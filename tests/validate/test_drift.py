@@ -90,6 +90,11 @@ def test_quiet_logs_and_logs_elsewhere_say_nothing(old):
     assert "0 of 300 new rows are inside" in str(away) or away.inside < 40
 
 
+def test_data_at_rest_say_nothing(old):
+    rest = km.Episodes([km.Episode(X=np.zeros((80, 2)), U=np.zeros((79, 1)))] * 3, 0.1)
+    assert km.validate.find_drift(rest, old).verdict == "cannot say"
+
+
 def test_a_change_of_units_changes_no_verdict(old):
     new = log(*SPRING, 1, 500, np.random.default_rng(5), 0.003, gain=0.8)
 
