@@ -344,7 +344,7 @@ def test_what_files_have_in_common_is_said_once_and_no_column_of_one_file_is_jud
         (tmp_path / f"{i:02d}.csv").write_text("\n".join(lines))
     told = []
     found = fit_data(tmp_path, tmp_path / "out", horizon=10, bilinear=False, say=told.append)
-    (gaps,) = [line for line in told[0].splitlines() if "gaps" in line]
+    (gaps,) = [line for line in told[0].splitlines() if " gap" in line]
     assert gaps.startswith(f"! {tmp_path / '00.csv'} and 11 more files: 1 gap (after row 10)")
     assert "throughout" not in told[0]  # load is constant in each file, and not over all of them
     assert "load" in found.selection.predictor.states
