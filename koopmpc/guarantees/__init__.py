@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from koopmpc.guarantees.certify import certify as certify
     from koopmpc.guarantees.invariant_set import InvariantPolytope as InvariantPolytope
     from koopmpc.guarantees.invariant_set import find_invariant_set as find_invariant_set
+    from koopmpc.guarantees.step_effort import ObservedIterations as ObservedIterations
+    from koopmpc.guarantees.step_effort import observe_iterations as observe_iterations
     from koopmpc.guarantees.terminal_set import find_terminal_set as find_terminal_set
 else:
     __getattr__, __dir__, __all__ = attach(__name__)
