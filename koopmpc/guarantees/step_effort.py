@@ -3,15 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.errors import DataError
+from koopmpc.guarantees.certify import Corners
 from koopmpc.validate.binomial import bound_failure_rate
 from koopmpc.values import Value
-
-Corners = tuple[ArrayLike, ArrayLike]
 
 
 @dataclass(frozen=True)
