@@ -150,7 +150,7 @@ class Certificate(Value):
 
         In a step V falls by (1 − ρ) V, and ℓ ≤ λ V in the region, so s = λ / (1 − ρ). With v = (I − G)⁻¹K φ and
         ‖G‖ ≤ γ < 1 in the region, λ is the largest eigenvalue of SᵀQ S + KᵀK ‖R‖ / (1 − γ)² in the coordinates P^½;
-        for a feedback without products it is that of SᵀQ S + KᵀR K. A certificate with a larger `decay` asks for a
+        for a feedback without products it is that of SᵀQ S + KᵀR K. A certificate with a smaller `decay` asks for a
         smaller s. Weights of observables count from (nz, nz) on, those of states alone are (nx, nx).
 
         Raises

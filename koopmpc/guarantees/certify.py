@@ -345,6 +345,11 @@ def _explain_failure(search: _Search) -> str:
             "no certificate: the data have too few independent episodes for a bound of the error; collect 30 or more,"
             " best of one step each"
         )
+    if decay is not None and not is_stabilisable(model, decay) and is_stabilisable(model, DECAY):
+        return (
+            f"no certificate: V cannot fall to decay={decay:g} of itself in each step, for a mode of the model that no"
+            " input moves falls more slowly. Pass a decay nearer to 1, or leave it out"
+        )
     if not is_stabilisable(model, decay or DECAY):
         return (
             "no certificate: the model itself cannot be stabilised around the set point, whatever its error. Its linear"

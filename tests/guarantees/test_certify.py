@@ -265,6 +265,8 @@ def test_a_refusal_names_the_error_or_the_model():
     small = km.Limits(u_min=-0.01, u_max=0.01)
     assert km.certify(free, data, small, error=(0, 0), region=(-5, 5)).margin > 0  # the region shrinks with the limits
     blind = km.BilinearPredictor(free.A, 0 * free.B, free.N * 0, free.C, INVARIANT, 0.01, plant.states, plant.inputs)
+    with pytest.raises(km.errors.CertificateError, match="nearer to 1"):  # x1 falls to 0.96 of its square by itself
+        km.certify(free, data, error=(0, 0), region=(-5, 5), decay=0.5)
     with pytest.raises(km.errors.CertificateError, match="an unstable mode that no input moves"):
         km.certify(blind, data, error=(0, 0))
 
