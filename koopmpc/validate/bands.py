@@ -1,6 +1,7 @@
 """Split-conformal bands |x_{k+h} − x̂_{k+h}| ≤ q s_h, and one forecast with its band beside the measured states."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +16,7 @@ from koopmpc.values import Value
 
 Rng = np.random.Generator | int
 
+_BLOCKS = 60  # of one record, at most
 _SCALE_SHARE = 0.25  # share of the episodes that determine the scale s_h; the others calibrate q
 _NORMAL = 1.959964  # two-sided 95 % quantile of the normal distribution
 
@@ -123,8 +125,10 @@ def conformal(
     predictor
         A model that was fitted to other episodes.
     episodes
-        At least two, each at least `horizon` steps long. If fewer than level / (1 − level) of them remain for the
-        calibration (9 for 90 %), no finite band reaches the level, and the band is infinite.
+        At least two, each at least `horizon` steps long; or one record, which is cut into blocks of the horizon and the
+        model's past. Blocks of one record are exchangeable only about, so its band is a little less sure. If fewer than
+        level / (1 − level) of them remain for the calibration (9 for 90 %), no finite band reaches the level, and the
+        band is infinite.
     horizon
         Steps ahead.
     level
@@ -137,7 +141,8 @@ def conformal(
     Raises
     ------
     DataError
-        There is only one episode, one is shorter than the horizon, or the level is not between 0 and 1.
+        There is only one episode and it is too short for two blocks, one is shorter than the horizon, or the level is
+        not between 0 and 1.
 
     References
     ----------
@@ -149,8 +154,12 @@ def conformal(
     episodes, level = episodes_of(episodes), float(checks.array(level, "level", ()))
     if not 0 < level < 1:
         raise DataError(f"level is {level:g}; pass a probability between 0 and 1, such as 0.9")
+    episodes = cut_record(predictor, episodes, horizon)
     if len(episodes) < 2:
-        raise DataError("a conformal band needs two episodes, one for the scale and one to calibrate; got 1")
+        raise DataError(
+            "a conformal band needs two episodes, one for the scale and one to calibrate; got 1, too short for two "
+            "blocks of the horizon and the model's past"
+        )
     source = checks.generator(rng)
     share = max(round(_SCALE_SHARE * len(episodes)), 1) / len(episodes)
     scaling, calibration = episodes.split(share, source)
@@ -160,6 +169,18 @@ def conformal(
     floor = np.maximum(np.finfo(float).eps * size, np.finfo(float).tiny)  # the scale of a model without errors
     uncalibrated = ConformalBand(np.maximum(scale, floor), np.inf, level, len(calibration), relift, predictor.states)
     return uncalibrated.recalibrate(predictor, calibration, rng=source)
+
+
+def cut_record(predictor: AnyPredictor, episodes: Episodes, horizon: int) -> Episodes:
+    """Return one record in blocks, each as long as the horizon and the model's past; several episodes as they are."""
+    if len(episodes) != 1:
+        return episodes
+    record, past = episodes[0], 0 if predictor.embedding is None else predictor.embedding.steps
+    count = min(len(record) // (horizon + past), _BLOCKS)
+    if count < 2:
+        return episodes
+    ends = [len(record) * i // count for i in range(count + 1)]
+    return episodes.with_episodes([record.cut(a, b) for a, b in pairwise(ends)])
 
 
 Bands = ConformalBand | Score | ArrayLike

@@ -16,7 +16,7 @@ from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.terminal import build_table, label_lines, render_text
 from koopmpc.text import shorten_observable, to_percent, with_unit
-from koopmpc.validate.bands import BandCoverage, ConformalBand, conformal
+from koopmpc.validate.bands import BandCoverage, ConformalBand, conformal, cut_record
 from koopmpc.validate.memory import Memory, find_hidden_state
 from koopmpc.validate.residuals import Invariance, ResidualDMD, compute_moments, measure_eigenpairs, measure_invariance
 from koopmpc.validate.scoring import AnyPredictor, Score, score
@@ -246,8 +246,12 @@ def trust(
     horizon, source = checks.count(horizon, "horizon"), checks.generator(rng)
     relift = isinstance(predictor, BilinearPredictor)
     errors = score(predictor, episodes_of(held_out), horizon, relift=relift)
+    held_out = cut_record(predictor, episodes_of(held_out), horizon)
     if len(held_out) < 2:
-        raise DataError("there is 1 held-out episode; the conformal band needs 2 or more")
+        raise DataError(
+            "there is 1 held-out episode, too short for two blocks of the horizon and the model's past; the conformal "
+            "band needs 2 or more"
+        )
     band = conformal(predictor, held_out, horizon, level=level, relift=relift, rng=source)
     total = compute_moments(held_out, predictor)
     judged = held_out if train is None else episodes_of(train)

@@ -7,6 +7,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.data.angles import find_angles
+from koopmpc.synthesis.candidates import propose_candidates
 from koopmpc.synthesis.cross_validation import Trial, cross_validate, make_folds, take_sample, usual_horizon
 from koopmpc.synthesis.leaderboard import choose_model
 from tests.roundtrip import returned
@@ -449,3 +450,28 @@ def test_a_bilinear_model_with_a_hundredth_of_the_error_is_worth_its_step():
     assert exact.best.kind == "bilinear"
     hidden = km.select(noisy(episodes_of(product), 0.02), candidates=[PLAIN], horizon=8)
     assert hidden.best.kind == "linear"
+
+
+def level(offset, rng, names=("y",)):
+    """Return a record of a plant whose output stays about an offset, read in steps of 1e-4 spreads at least."""
+    y, u = np.zeros(301), rng.uniform(-1, 1, 300)
+    for k in range(300):
+        y[k + 1] = 0.9 * y[k] + 0.5 * u[k]
+    return km.Episodes([km.Episode(X=(offset + y)[:, None], U=u[:, None])], 0.1, list(names), ["u"])
+
+
+@pytest.mark.parametrize(("offset", "turns"), [(0.0, True), (95.0, False)])
+def test_a_number_without_a_unit_is_an_angle_only_if_it_comes_near_zero(offset, turns):
+    rng = np.random.default_rng(0)
+    names = [one.name for one in propose_candidates(level(offset, rng), (0,), False, rng)]
+    assert any("fourier 1" in name for name in names) is turns
+
+
+def test_of_centres_at_one_place_one_is_kept():
+    rng = np.random.default_rng(0)
+    data = level(0.0, rng)
+    steps = np.round(data[0].X, 0)  # a coarse sensor, whose readings jitter by a millionth
+    jitter = 1e-6 * rng.standard_normal(steps.shape)
+    coarse = data.with_episodes([km.Episode(X=steps + jitter, U=data[0].U)])
+    tried = [one for one in propose_candidates(coarse, (0,), False, rng) if "gaussian" in one.name]
+    assert {one.name for one in tried} == {f"gaussian {len(np.unique(steps))}"}

@@ -105,6 +105,20 @@ def test_feedback_breaks_the_promise_and_calibrating_on_it_restores_it() -> None
     assert abs(fresh.share - 0.9) < chance
 
 
+def test_one_record_is_cut_into_blocks_whose_band_covers_the_next_record() -> None:
+    shares = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        record, fresh = nonlinear(1, rng, steps=900), nonlinear(1, rng, steps=900)
+        band = km.validate.conformal(MODEL, record, STEPS, rng=seed)
+        assert band.episodes == 45  # of 60 blocks a quarter gives the scale
+        blocks = fresh.with_episodes([fresh[0].cut(a, a + STEPS) for a in range(0, 900 - STEPS, STEPS)])
+        shares.append(band.measure_coverage(MODEL, blocks, rng=rng).share)
+    assert abs(np.mean(shares) - 42 / 46) < 3 * np.sqrt(0.09 / (8 * 45))  # the rank of 45 scores
+    two = nonlinear(1, np.random.default_rng(0), steps=2 * STEPS)
+    assert np.isinf(km.validate.conformal(MODEL, two, STEPS).quantile)
+
+
 def test_bad_input_is_refused() -> None:
     rng = np.random.default_rng(7)
     data = nonlinear(4, rng)

@@ -207,6 +207,6 @@ def test_bad_input_is_refused(data) -> None:
     with pytest.raises(km.errors.DataError, match="has 40 steps, the horizon is 41"):
         km.trust(model, held_out, 41)
     with pytest.raises(km.errors.DataError, match="there is 1 held-out episode"):
-        km.trust(model, held_out[:1], 5)
+        km.trust(model, held_out[:1], 25)
     with pytest.raises(km.errors.ShapeError, match="the episodes have states"):
         km.trust(model, km.Episodes([km.Episode(X=e.X, U=e.U) for e in held_out], 0.05), 5)
