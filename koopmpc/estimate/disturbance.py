@@ -20,7 +20,7 @@ from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value, Viewing
 
 GAIN = 0.1  # the least gain that a horizon gives: d forgets within twenty steps, however long the plan
-REACH = 0.15  # d is the last misfit if misfits hardly change over this share of the horizon (docs/why)
+REACH = 0.4  # d is the last misfit if misfits hardly change over this share of the horizon (docs/why)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class LiftedDisturbance(Value):
 
     Exact measurements need no mean. If the gain is not given, and c' = 1 − L² D / max(Σ (C e)ᵢ²/sᵢ², Σ (C d)ᵢ²/sᵢ²) is
     above c, the last misfit takes the place of the mean: d ← d + c' (e − d). D is the running mean of
-    Σ (C e − C e⁻)ᵢ²/sᵢ², the squared change of a misfit in a step, and L is 0.15 N. Noise and transients that turn
+    Σ (C e − C e⁻)ᵢ²/sᵢ², the squared change of a misfit in a step, and L is 0.4 N. Noise and transients that turn
     within L steps leave c' at zero.
 
     A reading at a rail of its sensor, as the model's `Delay` has them, teaches nothing if the prediction is beyond it.
