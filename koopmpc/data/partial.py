@@ -62,6 +62,8 @@ class PartialEpisodes(Value):
         states: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
     ) -> None:
+        for given, name in ((X, "X"), (U, "U")):
+            checks.kind(given, name, (tuple, list, np.ndarray), "pass one array for every run")
         runs = [checks.array(each, f"X of run {i}", (None, None), finite=False) for i, each in enumerate(X)]
         moves = [checks.array(each, f"U of run {i}", (None, None)) for i, each in enumerate(U)]
         if not runs or len(runs) != len(moves):

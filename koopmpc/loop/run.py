@@ -128,6 +128,8 @@ class StepRows(Value):
         (m,) 1 where a measurement was too far from its prediction and was not used; zeros by default.
     actor
         m entries: who acted, of a `Station`; "" by default.
+    gap
+        (m,) share of its cost that a better plan of inputs on levels might save; zeros by default.
     """
 
     X: Float[np.ndarray, "n nx"]
@@ -151,6 +153,9 @@ class StepRows(Value):
         default_factory=_no_numbers, metadata={"move": MoveColumn(0, np.int64, "solver/refused")}
     )
     actor: tuple[str, ...] = field(default_factory=tuple, metadata={"move": MoveColumn("", log="solver/actor")})
+    gap: Float[np.ndarray, " mg"] = field(
+        default_factory=_no_numbers, metadata={"move": MoveColumn(0.0, np.float64, "solver/gap")}
+    )
     u_reference: Float[np.ndarray, "m nu"] = field(default_factory=lambda: np.empty((0, 0)))
 
     def __post_init__(self) -> None:

@@ -21,6 +21,7 @@ from koopmpc.control.nonlinear.stagewise import (
     solve_unconstrained,
     weights,
 )
+from koopmpc.control.stepped.blocks import find_move_blocks
 
 OF = km.Fourier(1, "a") + km.State("b")
 Q, R, R_DELTA = [[3, 1, 0], [1, 2, 0.5], [0, 0.5, 1]], [[0.4, 0.1], [0.1, 0.3]], [[0.7, 0.2], [0.2, 0.5]]
@@ -48,8 +49,9 @@ def problem_of(kind: str) -> StagedProblem:
     cost = km.Cost(Q, R, of=OF, R_delta=R_DELTA if kind == "rated" else None)
     limits = {"rated": LIMITS, "plain": BOXED, "free": km.Limits()}[kind]
     given = learned_map(plant)
+    moves = (1, 2, 1) if kind == "rated" else None
     return staged_problem(
-        given, state_tracking(plant.states, plant.inputs, cost, limits), (1, 2, 1) if kind == "rated" else (1,) * 4
+        given, state_tracking(plant.states, plant.inputs, cost, limits), find_move_blocks(moves, 4, plant.inputs)
     )
 
 
@@ -173,7 +175,7 @@ def test_stages_with_rates_hold_the_last_input_and_soft_changes_and_are_weighed_
     np.testing.assert_array_equal(rated.softness.quadratic, [0, 0, 3, 2, 0, 0])
     np.testing.assert_array_equal(rated.margin, [[0.01, 0.02, 0]] + 3 * [[0.03, 0.04, 0]])
     assert rated.free.tolist() == [True, True, False, True]
-    assert rated.held_from.tolist() == [0, 1, 1, 3]
+    assert rated.held_from.tolist() == [[0, 0], [1, 1], [1, 1], [3, 3]]
     assert rated.input_sizes[0] == 1.25  # half the width of its limits
     np.testing.assert_array_equal(rated.sizes, [*plain.sizes, *rated.input_sizes, rated.input_sizes[1]])
     np.testing.assert_allclose(rated.softness.allowance[:2], SOFTENED * rated.input_sizes)

@@ -53,7 +53,7 @@ def test_the_next_step_starts_from_the_plan_moved_on_by_one_step_of_the_model(mo
     assert np.abs(e).max() > 1e-3
     mpc._shift(before.U[0])
     X, U = mpc._trajectory(mpc._iteration.X, mpc._iteration.U)
-    wanted = np.vstack([before.U[1:], before.U[-1:]])[mpc._problem.held_from]
+    wanted = np.vstack([before.U[1:], before.U[-1:]])[mpc._problem.held_from[:, 0]]
     np.testing.assert_allclose(U, wanted, atol=1e-12)
     np.testing.assert_allclose(X[:-1], before.X[1:], atol=1e-12)
     np.testing.assert_allclose(X[-1], mpc.step_map(before.X[-1], before.U[-1]) + e, atol=1e-12)

@@ -129,6 +129,7 @@ def test_what_is_kept_of_a_move_is_what_the_move_has(tmp_path: Path) -> None:
         "known": True,
         "refused": True,
         "actor": "manual",
+        "gap": 0.125,
     }
     assert {field.name for field in fields(km.Move)} == {"u", *told}
 
