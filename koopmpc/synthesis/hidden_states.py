@@ -30,6 +30,7 @@ FAR = 1.2  # a kind that errs by this many times the least error is left out
 LOST = 1.0  # a model that errs by more spreads than this on one stretch is not taken where another one is calm
 PAYS = 0.9  # neurons are judged if they lower the error on unseen rows to less than this share
 _NEURAL_ORDERS = (2, 3, 4)  # orders of hidden states with neurons
+_SENSORS = 2  # neurons are tried on records of at most so many sensors: with more of them little is hidden
 _ORDERS = (1, 2, 3, 4)  # orders of hidden states that simulation error is tried on
 
 
@@ -44,9 +45,9 @@ def judge_hidden_states(
     """Return the best models with a hidden state, one of each kind, and how they run over stretches that no fit saw.
 
     The kinds are the subspace model, the linear and the polynomial one of least simulation error, and where a sensor
-    rests at its least or largest reading, the polynomial one with these rails; and the one with neurons, with the rails
-    if the best one before has them. With neurons only
-    what is calm and errs by a tenth less than all others is judged. Where records are too short for a kind,
+    rests at its least or largest reading, the polynomial one with these rails; and for one or two sensors the one with
+    neurons, with the rails if the best one before has them. With neurons only what is calm and errs by a tenth less
+    than all others is judged. Where records are too short for a kind,
     it is left out.
 
     Parameters
@@ -84,7 +85,7 @@ def judge_hidden_states(
             same = [one for one in tried if one.is_nonlinear is kind]
             if same and (kind or limits is None):
                 found.append(choose_hidden(same))
-    if bilinear:
+    if bilinear and measured.nx <= _SENSORS:
         try:
             saturates = bool(found) and min(found, key=lambda one: one.error).rails is not None
             tried = search_neural(
