@@ -8,6 +8,7 @@ import pytest
 import koopmpc as km
 from tests.estimate.test_readings import KINDS, LIMITS, PROBLEM, TRUE, WHOLE, model
 from tests.faults.test_glitches import PLANT, online, pairs, worst
+from tests.tiers import slow
 
 EXTENDED = "BilinearMPC, extended filter"
 BUILDS = KINDS | {
@@ -50,7 +51,7 @@ ATTACKS = {
 }
 
 
-@pytest.mark.parametrize("attack", ATTACKS)
+@pytest.mark.parametrize("attack", ["stuck", "lost", *slow(["one stuck", "one lost"])])
 @pytest.mark.parametrize("kind", BUILDS)
 def test_a_loop_is_where_it_would_be_some_time_after_readings_that_were_stuck_or_lost(kind, attack):
     X, _ = attacked(kind, lambda y, last: y)

@@ -108,8 +108,8 @@ def neural_state_space(
     --------
     >>> import koopmpc as km
     >>> import numpy as np
-    >>> u, y, v = np.random.default_rng(0).uniform(-1, 1, 600), np.zeros(601), 0.0
-    >>> for k in range(600):
+    >>> u, y, v = np.random.default_rng(0).uniform(-1, 1, 300), np.zeros(301), 0.0
+    >>> for k in range(300):
     ...     v = 0.9 * v + u[k] - 0.3 * np.tanh(10 * v)
     ...     y[k + 1] = v
     >>> data = km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["y"], ["u"])
