@@ -21,7 +21,7 @@ from koopmpc.control.riccati import SETTLED as RESTED
 from koopmpc.control.solvers.daqp import FEW
 from koopmpc.control.target import ROUNDING
 from koopmpc.errors import DataError
-from koopmpc.estimate.disturbance import DisturbanceProgram
+from koopmpc.estimate.disturbance import EXACT, DisturbanceProgram
 from koopmpc.estimate.kalman import FilterProgram
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
@@ -89,6 +89,13 @@ class Tables:
     reals: dict[str, float] = field(default_factory=dict)
     conditioning: float = 0.0
     notes: list[str] = field(default_factory=list)
+
+    def define(self, reals: Mapping[str, float]) -> None:
+        """Add constants of the C code, each under a name that nothing else has: the later one would be used by both."""
+        twice = sorted(self.reals.keys() & reals.keys())
+        if twice:
+            raise ValueError(f"the C code has two constants of the name {twice[0]}; give one of them another name")
+        self.reals |= reals
 
     @property
     def is_lqr(self) -> bool:
@@ -185,13 +192,15 @@ def _add_settings(tables: Tables, *, single: bool) -> None:
     if single:
         settings |= {name: max(settings[name], least) for name, least in _SINGLE.items()}
     tables.settings = settings
-    tables.reals |= {
-        "PRIMAL_TOL": settings["primal_tol"],
-        "ZERO_TOL": settings["zero_tol"],
-        "WIDER": 1e-5 if single else 1e-8,
-        "ACCURACY": 5e-3 if single else 1e-6,
-        "ROUNDING": 1e-6 if single else ROUNDING,
-    }
+    tables.define(
+        {
+            "PRIMAL_TOL": settings["primal_tol"],
+            "ZERO_TOL": settings["zero_tol"],
+            "WIDER": 1e-5 if single else 1e-8,
+            "ACCURACY": 5e-3 if single else 1e-6,
+            "ROUNDING": 1e-6 if single else ROUNDING,
+        }
+    )
 
 
 def _add_gate(tables: Tables, gate: Graph | None, ny: int) -> None:
@@ -234,7 +243,7 @@ def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram) ->
         }
     elif isinstance(estimator, DisturbanceProgram):
         sizes["ESTIMATOR"] = 1
-        tables.reals |= {"GAIN": estimator.gain, "REACH": estimator.reach}
+        tables.define({"GAIN": estimator.gain, "STEADY": estimator.reach, "EXACT": EXACT})
     _add_gate(tables, estimator.gate, sizes["NY"])
     if isinstance(program, StagedProgram):
         plan |= {"C": stack(np.eye(program.ny, program.nx)), "E": stack(program.E)}
@@ -512,8 +521,7 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         "tail_D": p.tail.R_delta,
         "tail_end": p.tail.end,
     }
-    tables.reals["TAIL_SCALE"] = p.tail.scale
-    tables.reals |= {name: values[single] for name, values in _TOLERANCES.items()}
+    tables.define({"TAIL_SCALE": p.tail.scale} | {name: values[single] for name, values in _TOLERANCES.items()})
     _add_finish(tables, p, low, high)
     _add_estimator(tables, p)
     tables.targets = {"table": p.table}

@@ -19,6 +19,7 @@ from koopmpc.plants.routines import bind_interpreter
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value, Viewing
 
+EXACT = 0.99  # where a misfit hardly changes to this degree, the last one is nearer than any mean
 GAIN = 0.1  # the least gain that a horizon gives: d forgets within twenty steps, however long the plan
 REACH = 0.4  # d is the last misfit if misfits hardly change over this share of the horizon (docs/why)
 
@@ -40,7 +41,7 @@ class LiftedDisturbance(Value):
     d = m = e.
 
     Exact measurements need no mean. If the gain is not given, and c' = 1 − L² D / max(Σ (C e)ᵢ²/sᵢ², Σ (C d)ᵢ²/sᵢ²) is
-    above c, the last misfit takes the place of the mean: d ← d + c' (e − d). D is the running mean of
+    above c or above 0.99, the last misfit takes the place of the mean: d ← d + c' (e − d). D is the running mean of
     Σ (C e − C e⁻)ᵢ²/sᵢ², the squared change of a misfit in a step, and L is 0.4 N. Noise and transients that turn
     within L steps leave c' at zero.
 
@@ -281,7 +282,7 @@ def _rule(
     turned = reach**2 * change_new
     largest = ca.dot(ca.fmax(f_new**2, (C @ d) ** 2), weights)
     exact = ca.if_else(ca.logic_and(learned > 0, turned < largest), 1 - turned / largest, 0) if reach else 0
-    d_new = d + ca.if_else(share < exact, exact * (e - d), share * (m_new - d))
+    d_new = d + ca.if_else(ca.logic_or(share < exact, exact > EXACT), exact * (e - d), share * (m_new - d))
     starts = ca.logic_and(flags[1], good)
     before = ca.vertcat(m, d, f, rough, squares, change, ca.if_else(starts, 0, learned), ca.if_else(starts, 1, newest))
     count = ca.fmin(learned + 1, 2)

@@ -177,7 +177,7 @@ class Estimate:
             self.change = change if count == 1 else self.change + gain * (change - self.change)
             largest = (np.maximum(f**2, (C @ self.d) ** 2) * weights).sum()
             exact = max(1 - self.rule.reach**2 * self.change / largest, 0) if largest else 0.0
-        self.d = self.d + (exact * (misfit - self.d) if share < exact else share * (m - self.d))
+        self.d = self.d + (exact * (misfit - self.d) if share < exact or exact > 0.99 else share * (m - self.d))
 
     def filtered(self, y, u, w):
         rule = self.rule

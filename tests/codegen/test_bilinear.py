@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.codegen.tables import Tables
 from tests.compiler import find_compiler
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
@@ -156,6 +157,30 @@ def test_a_closed_loop_under_soft_limits_costs_the_same(swung):
     assert abs(costs[1] / costs[0] - 1) < 1e-6
     assert runs[1].status == runs[0].status
     assert km.Status.SOFTENED in runs[0].status
+
+
+def test_a_loop_that_learns_what_the_model_lacks_is_that_of_python_to_rounding(swung):
+    """Its estimator and its iteration have constants of one name each: where two share one, plans end too early."""
+    plant, model = swung
+    limits = km.Limits(**BOX, du_max=2.0, x_min=[-np.inf, -1.0], x_max=[np.inf, 1.0])
+    controller = km.BilinearMPC(model, COST, limits, 20, estimator=km.LiftedDisturbance())
+    fast, rng = km.compiled(controller), np.random.default_rng(0)
+    x, reference = np.array([0.4, 0.0]), np.zeros(2)
+    for k in range(120):
+        if k % 20 == 0:
+            reference = np.array([rng.uniform(-0.5, 0.5), 0.0])
+        y = x + 1e-3 * rng.normal(size=2)
+        a, b = controller(y, reference), fast(y, reference)
+        assert a.status is b.status
+        np.testing.assert_allclose(b.u, a.u, rtol=0, atol=1e-8)
+        x = np.add(plant(x, a.u), [0.0, 0.02])  # a load that the model does not know
+
+
+def test_a_constant_of_the_c_code_has_one_meaning():
+    tables = Tables(program=None, sizes={}, functions={})
+    tables.define({"REACH": 1e-9})
+    with pytest.raises(ValueError, match="two constants of the name REACH"):
+        tables.define({"REACH": 8.0, "GAIN": 0.1})
 
 
 def test_it_swings_up_in_c_as_it_does_in_python(swung):

@@ -85,10 +85,10 @@ def test_the_gain_follows_the_horizon_and_is_never_below_a_tenth():
 
 
 def test_exact_measurements_need_no_mean():
-    """A load is known with its second misfit, and followed within five steps; a mean of gain 0.1 lags nine behind."""
+    """A load is known with its second misfit, and followed where it drifts; a mean of gain 0.1 lags nine steps behind."""
     assert (after(np.ones(30))[2:] == 1).all()
     drifting = 1 + 0.01 * np.arange(200)
-    assert np.abs(after(drifting)[3:] - drifting[2:-1]).max() < 0.05
+    assert np.abs(after(drifting)[3:] - drifting[2:-1]).max() < 0.002
     assert np.abs(after(drifting, 0.1)[100:] - drifting[99:-1]).min() > 0.08
 
 

@@ -53,8 +53,8 @@ static void learn(koopmpc_state *s, koopmpc_real *misfit) {
     largest += (square > believed[i] * believed[i] ? square : believed[i] * believed[i]) * s->weights[i];
   }
   if (s->learned) s->change = s->learned > 1 ? s->change + weight * (changed - s->change) : changed;
-  changed = KOOPMPC_REACH * KOOPMPC_REACH * s->change;
-  exact = KOOPMPC_REACH > 0 && s->learned && changed < largest ? 1 - changed / largest : 0;
+  changed = KOOPMPC_STEADY * KOOPMPC_STEADY * s->change;
+  exact = KOOPMPC_STEADY > 0 && s->learned && changed < largest ? 1 - changed / largest : 0;
   if (s->learned < 2) s->learned++;
   koopmpc_copy(s->newest, misfit, NZ);
   for (int i = 0; i < NZ + 2 * NX; i++) s->means[i] += weight * (s->newest[i] - s->means[i]);
@@ -66,7 +66,7 @@ static void learn(koopmpc_state *s, koopmpc_real *misfit) {
     most += (mean > square ? mean : square) * s->weights[i];
   }
   share = varied < most ? 1 - varied / most : 0;
-  for (int i = 0; i < NZ; i++) s->d[i] += share < exact ? exact * (misfit[i] - s->d[i]) : share * (s->means[i] - s->d[i]);
+  for (int i = 0; i < NZ; i++) s->d[i] += share < exact || exact > KOOPMPC_EXACT ? exact * (misfit[i] - s->d[i]) : share * (s->means[i] - s->d[i]);
 }
 
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
