@@ -271,6 +271,12 @@ def test_levels_keep_to_those_inside_the_rows_and_maintenance_stops_a_pump():
         assert (move.u <= u_max[k]).all()
         x = A @ x + B @ move.u
     assert len(seen) > 1
+    constant_rows, moves = np.tile([1.0, 0.5], (T, 1)), {"u0": (2, 6), "u1": (1, 3, 4)}
+    own, rows = (
+        [move.u for move in wander(km.KoopmanMPC(model, COST, each, N, moves=moves), model, np.array([0.6, 0.4]), 10)]
+        for each in (limits.with_bounds(u_max=[1.0, 0.5]), limits.with_bounds(u_max=constant_rows))
+    )
+    np.testing.assert_array_equal(own, rows)
     u_max[8, 0], low = 0.4, np.zeros((T, 2))
     low[8, 0] = 0.1
     with pytest.raises(DataError, match=r"no level of u0 is between its limits 0\.1 … 0\.4 at step 8"):

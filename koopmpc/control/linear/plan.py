@@ -96,14 +96,14 @@ class PlanMap(Viewing):
         targets: Targets,
         horizon: Horizon,
         maps: Condensed,
-        end: EndRows | None = None,
-        held: Bool[np.ndarray, "moves nu"] | None = None,
+        end: EndRows | None,
+        held: Bool[np.ndarray, "moves nu"],
     ) -> None:
         self.track, self.targets = track, targets
         self.moves, self.blocks = len(maps.hessian), horizon.blocks
         self.deviation = maps.deviation[: self.moves]
         limits = _plan_limits(track, horizon, maps.deviation, end)
-        if held is not None and held.any():
+        if held.any():
             _drop_held(limits, held, track)
         self.qp = _step_qp(maps, limits, 0 if track.rates is None else len(track.inputs.low))
         low, high, nv = limits.low, limits.high, len(limits.low)
@@ -137,9 +137,7 @@ class PlanMap(Viewing):
         self.limits = np.concatenate([np.maximum(low, -HUGE), np.minimum(high, HUGE)])  # inf meets no limit
         self.low, self.high = self.limits[: len(low)], self.limits[len(low) :]
         self.box = Interval(*(np.tile(end, len(horizon.blocks)) for end in track.inputs))
-        self.held, self.tied = held, np.zeros(self.moves, dtype=np.bool_)
-        if held is not None:
-            self.tied = held.ravel() & ~limits.kept[: self.moves]
+        self.held, self.tied = held, held.ravel() & ~limits.kept[: self.moves]
         self.inside = np.clip(0.0, self.low[nv:], self.high[nv:])
         from_state = np.zeros((len(low), horizon.size))
         from_state[:nv] = maps.from_state
@@ -362,7 +360,7 @@ def _plan_limits(
 def _drop_held(limits: PlanLimits, held: Bool[np.ndarray, "moves nu"], track: LiftedTracking) -> None:
     """Remove the limits of inputs that keep their value, and of their changes; the search over levels needs its own."""
     nu = held.shape[1]
-    levels = track.limits.input_levels(nu)
+    levels = track.limits.base.input_levels(nu)
     searched = np.zeros(nu, dtype=np.bool_)
     if levels is not None:
         searched[levels.which] = True

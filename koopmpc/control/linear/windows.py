@@ -172,7 +172,7 @@ class LimitWindows:
         shape, n = (moves, nu), moves * nu
         below, above = (end.reshape(shape) for end in box)
         falls, rises = low[n : 2 * n].reshape(shape), high[n : 2 * n].reshape(shape)
-        held = np.zeros(shape, np.bool_) if self.plan.held is None else self.plan.held
+        held = self.plan.held
         fits = (below[1:] - below[:-1] <= rises[1:]) & (above[1:] - above[:-1] >= falls[1:])
         assert hard is not None, "only asked where there are hard rates"
         if (fits | held[1:] | ~hard).all():
@@ -260,8 +260,7 @@ def limit_windows(
     places: list[Int[np.ndarray, " n"]] = [np.where(plan.tied, free_at, moves)]
     if track.rates is not None:
         changes = (first[:, None] * 2 * W + du_at + np.arange(nu)).ravel()
-        if plan.held is not None:
-            changes[plan.held.ravel()] = free_at
+        changes[plan.held.ravel()] = free_at
         places.append(changes)
     places += [(k + 1) * 2 * W + out_at + np.arange(outputs.low.shape[1]) for k in range(N)]
     mine = np.concatenate(places).astype(np.intp)
@@ -296,9 +295,7 @@ def limit_windows(
 def _find_holds(plan: PlanMap, nu: int) -> tuple[Int[np.ndarray, "moves nu"], Int[np.ndarray, "moves nu"]]:
     """Return the first step of what holds the value of each move and input, and for how many steps it is held."""
     blocks = np.array(plan.blocks)
-    origin = np.repeat(np.arange(len(blocks))[:, None], nu, axis=1)
-    if plan.held is not None:
-        origin = np.maximum.accumulate(np.where(plan.held, 0, origin), axis=0)
+    origin = np.maximum.accumulate(np.where(plan.held, 0, np.arange(len(blocks))[:, None]), axis=0)
     length = np.array([[blocks[origin[:, i] == origin[j, i]].sum() for i in range(nu)] for j in range(len(blocks))])
     return np.cumsum([0, *plan.blocks[:-1]])[origin], length
 
