@@ -348,14 +348,16 @@ class MPCBase(Published):
 
     def _count_held(self, applied: ArrayLike | None) -> None:
         """Count the step for which the input that acted, or that was returned last, held its levels."""
-        if self._held is None:
-            return
-        acted = self._given
-        if applied is not None and not self._latency:
+        if self._held is not None:
+            self._held.take(self._given if self._latency else self._find_last(applied))
+
+    def _find_last(self, applied: ArrayLike | None) -> Float[np.ndarray, " nu"]:
+        """Return the input that acted last, as far as `applied` is one; else the last one returned."""
+        if applied is not None:
             got = np.asarray(applied, dtype=np.float64)
             if got.shape == (self.nu,) and (np.abs(got) < HUGE).all():
-                acted = got
-        self._held.take(acted)
+                return got
+        return self._given
 
     def _round(self, u: Float[np.ndarray, " nu"], before: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nu"]:
         """Return the input on the levels that limits, dwell times and rates allow."""
@@ -414,11 +416,7 @@ class MPCBase(Published):
             The input that acted last, if it is not the last input returned.
         """
         self._planned = False
-        before = self._given
-        if applied is not None:
-            got = np.asarray(applied, dtype=np.float64)
-            if got.shape == (self.nu,) and (np.abs(got) < HUGE).all():
-                before = got
+        before = self._find_last(applied)
         late = self._held is not None and status is Status.TIME_LIMIT  # no plan was found: hold the levels
         if late:
             u, fallback = before, Fallback.HOLD
@@ -429,9 +427,7 @@ class MPCBase(Published):
         else:
             self._kept = None
             u, fallback = (before, Fallback.HOLD) if free is None else (free, Fallback.CLIPPED_LQR)
-        self._given = clip_input(u, *self._present_limits(), before)
-        if self._held is not None:
-            self._given = self._round(self._given, before)
+        self._given = self._round(clip_input(u, *self._present_limits(), before), before)
         taken = perf_counter() - start
         status = status if taken <= self._allowed else Status.TIME_LIMIT
         return Move(self._given.copy(), status, fallback, taken, iterations, solver=solver)
