@@ -347,9 +347,8 @@ def lifted_tracking(
         A weight or a limit has another size than what it weighs or limits.
     """
     cost, limits = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
-    _refuse_rows(limits, in_time)
     if not in_time:
-        refuse_price(cost)
+        _refuse_steps(cost, limits)
     if cost.beyond == "motion":
         raise DataError(
             'beyond="motion" needs a BilinearMPC or a NonlinearMPC; leave it out, or pass more reference rows'
@@ -371,17 +370,15 @@ def state_tracking(
     ranges: Mapping[str, float] | None = None,
     *,
     in_time: bool = False,
-    priced: bool = False,
 ) -> StateTracking:
     """Return what `cost` tracks and `limits` bound, as functions of these states.
 
     The functions take `size` values, the states first; by default the states alone. `ranges` as for `Sizes`,
-    `in_time` as for `lifted_tracking`; `priced` says that who asks knows prices of inputs.
+    `in_time` as for `lifted_tracking`.
     """
     cost, limits = check_cost_and_limits(cost, limits, states, inputs)
-    _refuse_rows(limits, in_time)
-    if not priced:
-        refuse_price(cost)
+    if not in_time:
+        _refuse_steps(cost, limits)
     nx, nu = len(states), len(inputs)
     point = ca.SX.sym("x", nx if size is None else size)
     x, of = point[:nx], cost.of.bind(states)
@@ -409,22 +406,18 @@ def add_held(
     return first[np.minimum(steps, len(first) - 1)] + second[np.minimum(steps, len(second) - 1)]
 
 
-def refuse_price(cost: Cost) -> None:
-    """Raise where inputs have a price, for a law or a search that does not know it."""
+def _refuse_steps(cost: Cost, limits: Limits) -> None:
+    """Raise where limits have rows in time or inputs a price, for a law or a search that knows neither."""
+    if limits.in_time:
+        end = next(iter(limits.count_rows()))
+        raise DataError(
+            f"{end} has a row for each step, which this controller or search does not know; pass limits.at(step), or "
+            "take a KoopmanMPC, a LinearMPC, a BilinearMPC or a NonlinearMPC"
+        )
     if cost.price is not None:
         raise DataError(
             "the cost has a price, which this controller or search does not know; take a KoopmanMPC, a BilinearMPC or "
             "a NonlinearMPC, or leave the price out"
-        )
-
-
-def _refuse_rows(limits: Limits, in_time: bool) -> None:
-    """Raise where limits have rows in time and who asks does not know them."""
-    if limits.in_time and not in_time:
-        end = next(iter(limits.count_rows()))
-        raise DataError(
-            f"{end} has a row for each step, which this controller or search does not know; pass limits.at(step), or a "
-            "KoopmanMPC or LinearMPC"
         )
 
 

@@ -86,7 +86,7 @@ class StagedMPC(MPCBase):
         self._forget_targets()
         self._map = given = learned_map(model)
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
-        o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, in_time=True, priced=True)
+        o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, in_time=True)
         self._outputs, self._box, self._limit_step, self._called_with = o, o.inputs, 0, None
         self._timed = o.limits.in_time
         refuse_levels(o.limits, f"a {type(self).__name__}")
