@@ -361,6 +361,13 @@ def order_by_name(given: Any, what: str, names: Sequence[str], omitted: float | 
     return np.array([values.get(i, omitted) for i in range(len(names))], dtype=np.float64)
 
 
+def order_entries(given: Mapping[str, Any], what: str, names: Sequence[str]) -> list[Any]:
+    """Return entries of any kind in the order of the names of a plant, None for an omitted one; see `order_by_name`."""
+    entries = list(given.values())
+    place = order_by_name({name: float(i) for i, name in enumerate(given)}, what, names, np.nan)
+    return [None if np.isnan(at) else entries[int(at)] for at in place]
+
+
 def _stem(name: str) -> str:
     """Return a name without its unit."""
     return name.partition("[")[0].strip()

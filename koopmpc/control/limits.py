@@ -24,7 +24,7 @@ from koopmpc.control.bounds.boxes import magnitude as magnitude
 from koopmpc.control.bounds.boxes import measure_violation as measure_violation
 from koopmpc.control.bounds.boxes import preview_margin as preview_margin
 from koopmpc.control.in_time import bounds
-from koopmpc.control.in_time.bounds import BoundByName, hold_rows
+from koopmpc.control.in_time.bounds import hold_rows
 from koopmpc.control.stepped.levels import (
     DwellByInput,
     InputLevels,
@@ -32,7 +32,6 @@ from koopmpc.control.stepped.levels import (
     build_levels,
     check_dwell,
     check_levels,
-    order_entries,
 )
 from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set
 from koopmpc.errors import DataError, ShapeError
@@ -163,7 +162,7 @@ class Limits(Value):
             checks.kind(self.of, "of", Lifting, 'for example km.Fourier(1, states="theta")')
         for end, sign in (("du_min", 1.0), ("du_max", -1.0)):
             value = getattr(self, end)
-            if value is not None and any((sign * np.asarray(v) > 0).any() for v in _values(value)):
+            if value is not None and any((sign * np.asarray(v) > 0).any() for v in bounds.list_bound(value)):
                 raise DataError(f"{end} is {value}; an input must be free to stay, so keep 0 inside its rates")
         for name in ("slack", "du_slack", "terminal_slack"):
             value = getattr(self, name)
@@ -197,7 +196,7 @@ class Limits(Value):
         """
         named = [end for pair in _ENDS for end in pair[:2] if isinstance(getattr(self, end), Mapping)]
         entries = {
-            field: order_entries(getattr(self, field), field, inputs)
+            field: tuple(checks.order_entries(getattr(self, field), field, inputs))
             for field in ("levels", "dwell")
             if isinstance(getattr(self, field), Mapping)
         }
@@ -248,7 +247,8 @@ class Limits(Value):
 
     def input_rows(self, nu: int, first: int, count: int) -> Interval:
         """Return the boxes (count, nu) of the inputs u_first …, from level to level where they have some."""
-        box, levels = self._hold("u", nu, first, count), self.base.input_levels(nu)
+        box = self._hold("u", nu, first, count)
+        levels = None if self.levels is None else self.base.input_levels(nu)
         if levels is None:
             return box
         inside, low, high = levels.inside(box), box.low.copy(), box.high.copy()
@@ -482,11 +482,6 @@ def refuse_levels(limits: Limits | None, who: str) -> None:
 def _free(end: str) -> float:
     """Return the value of a bound that does not limit."""
     return np.inf if end.endswith("max") else -np.inf
-
-
-def _values(bound: Any) -> list[Any]:
-    """Return the values of a checked bound, those of each name where it is by name."""
-    return list(cast("BoundByName", bound).values()) if isinstance(bound, Mapping) else [bound]
 
 
 def _is_set(low: Bound, high: Bound) -> bool:

@@ -55,12 +55,9 @@ def check_bound(bound: Any, end: str) -> Any:
 
 def order_bound(bound: BoundByName, end: str, names: Sequence[str], omitted: float) -> Float[np.ndarray, "..."]:
     """Return a bound by name as a vector, or as rows (T, n) where a name has one a step."""
-    values = [np.asarray(value, dtype=np.float64) for value in bound.values()]
-    place = checks.order_by_name({name: float(i) for i, name in enumerate(bound)}, end, names, -1.0)
-    steps = max((len(value) for value in values if value.ndim), default=0)
-    columns = [
-        np.full(max(steps, 1), omitted) if i < 0 else np.broadcast_to(values[int(i)], max(steps, 1)) for i in place
-    ]
+    steps = max((len(np.asarray(value)) for value in bound.values() if np.ndim(value)), default=0)
+    values = [omitted if value is None else value for value in checks.order_entries(bound, end, names)]
+    columns = [np.broadcast_to(np.asarray(value, dtype=np.float64), max(steps, 1)) for value in values]
     rows = np.column_stack(columns) if columns else np.empty((max(steps, 1), 0))
     return rows if steps else rows[0].copy()
 

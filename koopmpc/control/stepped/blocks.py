@@ -81,9 +81,7 @@ def find_move_blocks(moves: Moves, horizon: int, inputs: Sequence[str]) -> MoveB
     if not isinstance(moves, Mapping):
         lengths = find_blocks(moves, horizon)
         return MoveBlocks(lengths, np.zeros((len(lengths), len(inputs)), dtype=np.bool_), lengths)
-    names = list(moves)
-    at = checks.order_by_name({name: float(i) for i, name in enumerate(names)}, "moves", inputs, np.nan)
-    each = [find_blocks(None if np.isnan(i) else moves[names[int(i)]], horizon) for i in at]
+    each = [find_blocks(given, horizon) for given in checks.order_entries(moves, "moves", inputs)]
     starts = [set(np.cumsum([0, *lengths[:-1]]).tolist()) for lengths in each]
     union = sorted(set[int]().union(*starts))
     held = np.array([[start not in own for own in starts] for start in union], dtype=np.bool_)

@@ -59,7 +59,11 @@ class InputLevels(Value):
 
     def inside(self, box: Interval) -> "LevelBox":
         """Return the lowest and highest index of the levels inside limits of all inputs; crossed where none is."""
-        low, high = (np.clip(self.indices(np.asarray(end)), -1.0, self.count) for end in box)
+        return self.between(*(np.asarray(end)[..., self.which] for end in box))
+
+    def between(self, low: Float[np.ndarray, "*rows leveled"], high: Float[np.ndarray, "*rows leveled"]) -> "LevelBox":
+        """Return what `inside` does for limits of those inputs alone that have levels."""
+        low, high = (np.clip((end - self.first) / self.spacing, -1.0, self.count) for end in (low, high))
         least, most = np.ceil(low - NEAR), np.floor(high + NEAR)
         return LevelBox(np.maximum(least, 0).astype(np.intp), np.minimum(most, self.count - 1).astype(np.intp))
 
@@ -224,20 +228,6 @@ def _check_pair(pair: Any, name: str) -> tuple[int, int]:
         return checks.count(parts[0], what), checks.count(parts[1], what)
     steps = checks.count(cast("Any", pair), what)
     return steps, steps
-
-
-def order_entries(given: Any, what: str, inputs: Sequence[str]) -> tuple[Any, ...]:
-    """Return entries by name in the order of the inputs, None for an omitted one.
-
-    Raises
-    ------
-    DataError
-        A name is unknown, or fits two.
-    """
-    named = cast("Mapping[str, Any]", given)
-    names = list(named)
-    place = checks.order_by_name({name: float(i) for i, name in enumerate(names)}, what, inputs, np.nan)
-    return tuple(None if np.isnan(at) else named[names[int(at)]] for at in place)
 
 
 def build_levels(

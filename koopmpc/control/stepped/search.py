@@ -97,12 +97,7 @@ class LevelSolver(StepSolver):
         root = LevelBox(np.zeros(shape, np.intp), np.broadcast_to(levels.count - 1, shape).copy())
         if limits is not None:  # the limits of the inputs may move in time
             factor = self._factor.reshape(shape)
-            ends = (own.low[self._rows_of] / factor, own.high[self._rows_of] / factor)
-            low_index, high_index = (np.clip((end - levels.first) / levels.spacing, -1.0, levels.count) for end in ends)
-            root = LevelBox(
-                np.maximum(np.ceil(low_index - NEAR), 0).astype(np.intp),
-                np.minimum(np.floor(high_index + NEAR), levels.count - 1).astype(np.intp),
-            )
+            root = levels.between(own.low[self._rows_of] / factor, own.high[self._rows_of] / factor)
             if (root.low > root.high).any():
                 return QPSolution(
                     self._cold[0].copy(), self._cold[1].copy(), Status.INFEASIBLE, 0, self.first.name
