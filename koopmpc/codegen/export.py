@@ -23,7 +23,7 @@ from koopmpc.codegen.sources import (
 )
 from koopmpc.codegen.tables import Precision, Tables, make_tables, read_program
 from koopmpc.codegen.unit import write_unit
-from koopmpc.control.linear.koopman_mpc import CondensedProgram
+from koopmpc.control.linear.condensed_program import CondensedProgram
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.iteration import MOST
 from koopmpc.control.nonlinear.staged_program import StagedProgram

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.control.limits import Interval
-from koopmpc.control.linear.koopman_mpc import CondensedProgram
+from koopmpc.control.linear.condensed_program import CondensedProgram
 from koopmpc.control.lqr import FeedbackProgram
 from koopmpc.control.nonlinear.bilinear_mpc import SETTLED
 from koopmpc.control.nonlinear.equilibrium import PSEUDO, RANK

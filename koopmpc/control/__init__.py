@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from koopmpc.control.kinds import ControllerKind as ControllerKind
     from koopmpc.control.kinds import list_kinds as list_kinds
     from koopmpc.control.kinds import register_controller as register_controller
-    from koopmpc.control.linear.koopman_mpc import CondensedProgram as CondensedProgram
+    from koopmpc.control.linear.condensed_program import CondensedProgram as CondensedProgram
     from koopmpc.control.lqr import EigenfunctionLQR as EigenfunctionLQR
     from koopmpc.control.lqr import FeedbackProgram as FeedbackProgram
     from koopmpc.control.move import Controller as Controller

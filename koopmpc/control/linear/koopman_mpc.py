@@ -1,12 +1,12 @@
 """KoopmanMPC: the Riccati solution first, a QP only where a limit is active; LinearMPC is one on a linearisation."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import Any, ClassVar, cast
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from scipy.linalg.blas import dasum
 
@@ -18,13 +18,14 @@ from koopmpc.control.horizon import Coordinates
 from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits, clip_input
+from koopmpc.control.linear.condensed_program import CondensedProgram
 from koopmpc.control.linear.plan import plan_map, planned_states
 from koopmpc.control.linear.windows import LimitWindows, limit_windows
 from koopmpc.control.move import Move, Plan, Status, alone, busy
-from koopmpc.control.program import LinearProgram, linear_parts, no_export, publish_estimator, reference_table
+from koopmpc.control.program import linear_parts, no_export, publish_estimator, reference_table
 from koopmpc.control.solvers import FINISHER, exact_turn, order_solvers
-from koopmpc.control.solvers.base import StepQP, StepSolver
-from koopmpc.control.solvers.daqp import DAQP, DAQPSetup
+from koopmpc.control.solvers.base import StepSolver
+from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.stepped.priorities import PrioritySolver, spread_priorities
 from koopmpc.control.stepped.search import LevelSolver
@@ -33,70 +34,13 @@ from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import LiftedDisturbance
-from koopmpc.estimate.observer import Estimator, EstimatorProgram, start_observer
+from koopmpc.estimate.observer import Estimator, start_observer
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import LinearPredictor
 
 _OTHER_SOLVER = (
     "The controller solves with OSQP; this C solves with DAQP, to rounding: inputs differ by OSQP's tolerance."
 )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CondensedProgram(LinearProgram):
-    """t = M [z; u_{−1}; g] + m(r), g = [w_0 … w_{N−1}; d]: the plan, and the QP of the deviation w where a limit acts.
-
-    The first entries of t are the moves; they become t + deviation w. m(r) = offset + from_reference [r_0; …; r_N]
-    + from_given [u_r; …] + from_target [α_0 − ᾱ_0; …; α_N − ᾱ_N], ᾱ the coordinates of a target as if there were no
-    limits. The last entries of t are the lowest and highest values of the limits `checked` of the targets. Where one
-    is outside [low, high], g has moved a target outside its limits, and from_target moves the plan to the nearest one
-    inside.
-
-    Attributes
-    ----------
-    N, latency
-        Steps of the plan, and steps until its first input acts.
-    move_of
-        (N,) the move that is the input of each step.
-    with_rates
-        Whether u_{−1} is part of what the plan starts from.
-    hard_rates
-        Hard limits of the changes of inputs, ±inf where one has none; None without.
-    M, low, high
-        The plan's matrix, and the limits of t.
-    offset, from_reference, from_target, from_given
-        The parts of m(r).
-    aimed
-        Whether a target enters the plan.
-    checked, disturbance
-        The limits of the targets that g may break; (nz, ng) what g adds to z⁺ at the end of the horizon.
-    qp, deviation
-        ½ wᵀw → min within low ≤ A w + scale t[source] ≤ high, and how w moves the moves.
-    solver
-        The same QP as DAQP solves it.
-    estimator
-        How z and d follow from y.
-    """
-
-    N: int
-    latency: int
-    move_of: Int[np.ndarray, " N"]
-    with_rates: bool
-    hard_rates: Interval | None
-    M: Float[np.ndarray, "nt known"]
-    low: Float[np.ndarray, " nt"]
-    high: Float[np.ndarray, " nt"]
-    offset: Float[np.ndarray, " planned"]
-    from_reference: Float[np.ndarray, "planned preview"]
-    from_target: Float[np.ndarray, "planned target"]
-    from_given: Float[np.ndarray, "planned inputs"]
-    aimed: bool
-    checked: Bool[np.ndarray, " checked"]
-    disturbance: Float[np.ndarray, "nz ng"]
-    qp: StepQP
-    deviation: Float[np.ndarray, "moves nw"]
-    solver: DAQPSetup
-    estimator: EstimatorProgram
 
 
 class KoopmanMPC(MPCBase):
