@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, ShapeError
 from tests.control.models import linear
 from tests.control.oracle import oracle
 from tests.control.test_limits_in_time import REFERENCES, constant, moving_limits
@@ -77,6 +77,16 @@ def test_a_failed_step_keeps_its_row_and_copies_go_on(kind):
     twin = copy.copy(mpc)
     for k in (8, 9):
         assert (np.abs(twin(x, [2.0, 2.0]).u) <= u_max[k] + 1e-9).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_call_that_is_refused_counts_as_no_step(kind):
+    u_max = np.linspace(1.0, 0.05, 20)[:, None] * np.ones(2)
+    mpc, twin = (kind(linear(A, B), cost(), km.Limits(u_min=-u_max, u_max=u_max), N) for _ in range(2))
+    for _ in range(3):
+        with pytest.raises(ShapeError):
+            mpc([0.0, 0.0, 0.0], [2.0, 2.0])
+        assert (mpc([-2.0, -2.0], [2.0, 2.0]).u == twin([-2.0, -2.0], [2.0, 2.0]).u).all()
 
 
 def test_what_the_stages_do_not_have_is_refused():

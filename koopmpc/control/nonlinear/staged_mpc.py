@@ -177,6 +177,8 @@ class StagedMPC(MPCBase):
         if limits is not None or self._timed or self._box is not self._outputs.inputs:
             self._move_limits(limits)
         move = self._step(y, reference, applied, w, start)
+        if self._timed:  # a call that was refused counts as no step
+            self._limit_step += 1
         move.refused = self._initial.refused
         watch = self._watch
         return move if watch is None else self._judge_step(watch, move, applied, start)
@@ -198,7 +200,6 @@ class StagedMPC(MPCBase):
         found = find_stage_limits(own, outputs, problem, first + self._latency, self._base_limits)
         self._box = found.inputs
         self._limit(found)
-        self._limit_step += 1
 
     @property
     def _base_limits(self) -> Interval:
