@@ -232,6 +232,10 @@ def test_bad_rows_are_refused_in_sentences_that_name_row_and_step():
         mpc([0, 0], [0, 0], limits=good.with_bounds(x_max=x_max))
     with pytest.raises(DataError, match="another slack"):
         mpc([0, 0], [0, 0], limits=km.Limits(u_min=-1, u_max=1, slack=None))
+    with pytest.raises(DataError, match="another levels"):
+        mpc([0, 0], [0, 0], limits=km.Limits(u_min=-1, u_max=1, levels=[[-1, 1], None]))
+    with pytest.raises(DataError, match="another priority"):
+        mpc([0, 0], [0, 0], limits=km.Limits(u_min=-1, u_max=1, priority={"x0": 1}))
     with pytest.raises(DataError, match="no bound v_max"):
         good.with_bounds(v_max=3)
     with pytest.raises(DataError, match="pass a tuple of u_min"):

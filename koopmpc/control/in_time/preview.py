@@ -1,14 +1,15 @@
 """What limits in time need of a controller: a row in its program for each of them, and rows for its whole preview."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 
-from koopmpc.control.limits import Interval, Limits, Movable
+from koopmpc.control.limits import BOUNDS, Interval, Limits, Movable
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.values import same
 
-_FIXED = ("of", "slack", "du_slack", "margin")  # what stays as a controller was made
+_FIXED = tuple(f.name for f in fields(Limits) if f.name not in (*BOUNDS, "rows", "capped"))  # stay as they were made
 _GROUPS = ("u", "du", "x")
 
 
@@ -39,13 +40,14 @@ def check_bounds_alone(limits: object, own: Limits, states: Sequence[str], input
     """
     if not isinstance(limits, Limits):
         raise DataError(f"limits is a {type(limits).__name__}; pass controller.limits.with_bounds(u_max=…)")
-    other = [name for name in _FIXED if not same(getattr(limits, name), getattr(own, name))]
+    known = limits.resolve(states, inputs)
+    other = [name for name in _FIXED if not same(getattr(known, name), getattr(own, name))]
     if other:
         raise DataError(
             f"limits at a call move bounds alone, and these have another {other[0]} than the controller's; pass "
             "controller.limits.with_bounds(u_max=…)"
         )
-    return limits.resolve(states, inputs)
+    return known
 
 
 def require_movable(
