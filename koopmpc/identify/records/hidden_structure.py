@@ -21,7 +21,7 @@ from koopmpc.identify.records.hidden import (
 )
 from koopmpc.identify.records.narx import is_worse
 from koopmpc.identify.records.structure import EXACT, HORIZON
-from koopmpc.identify.records.unseen import BLOCKS, UNSEEN
+from koopmpc.identify.records.unseen import UNSEEN, average_gaps
 from koopmpc.predict.base import FitReport
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
@@ -35,7 +35,6 @@ RESTS = 10  # rows at the least or the largest reading, at least, that make it a
 ROBUST = 1.0  # share of the error of one step that counts as noise in the rows where the state begins
 FAR = 10.0  # ranges of the data that a free run from other states may leave, at most
 _STARTS = 8  # rows of each record at which it begins
-_LOST = 1e3  # an error counts as this many spreads at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,11 +218,7 @@ def measure_hidden(model: HiddenModel, data: Episodes, units: SignalUnits, delay
             if units.rails is not None:
                 out = np.clip(out, *units.rails)
             gaps.append((out - part.outputs).transpose(1, 0, 2).reshape(-1, units.ny))
-    errors, parts = np.ones(BLOCKS), [np.array_split(np.concatenate(gaps), BLOCKS) for gaps in (free, short) if gaps]
-    for part in parts:
-        sizes = [np.sqrt(np.mean(np.minimum(np.abs(gap), _LOST) ** 2)) if len(gap) else 1.0 for gap in part]
-        errors *= np.maximum(sizes, EXACT) ** (1 / len(parts))
-    return errors
+    return average_gaps(free, short)
 
 
 def report_fit(structure: HiddenStructure, found: HiddenModel, units: SignalUnits, data: Episodes) -> FitReport:

@@ -142,8 +142,7 @@ def search_neural(
     """Return structures with their errors on the last quarter of each record.
 
     Orders are tried upwards, until one gains less than a tenth. Degrees above the first, and other starts for the
-    neurons, are tried with the best order. `quick` is as in `fit_neural`, and without
-    other starts.
+    neurons, are tried with the best order. `quick` is as in `fit_neural`, and without other starts.
 
     Raises
     ------
@@ -222,10 +221,10 @@ def _polish(model: HiddenModel, data: Episodes, units: SignalUnits, structure: H
     """Return the model after some steps on all rows."""
     basis = smooth_basis(units.ny, data.nu, structure.delays)
     whole = _project(_cut(data, units, structure, structure.horizon, [(0, len(e)) for e in data]), basis)
-    small = replace(model, T=np.hstack([model.T[:, :-1] @ basis.T, model.T[:, -1:]]))
+    small = _change_past(model, basis.T)
     error = ContainedError(SimulationError(small))
     theta, _ = minimise(error, small.parameters, whole, whole, _POLISH, converged=_CONVERGED)
-    return contain(_widen(small.with_parameters(theta), basis))
+    return contain(_change_past(small.with_parameters(theta), basis))
 
 
 def choose_window(data: Episodes) -> tuple[int, int]:
@@ -263,14 +262,14 @@ def fit_chain(
     if s.degree > 1:
         model = _fit(model.raise_degree(s.degree), noise, sets[0], quick)
     if plain:
-        yield _widen(model, basis), units
+        yield _change_past(model, basis), units
     rng = np.random.default_rng(s.start)
     for before, count in pairwise([0, *neurons]):
         drawn = draw_neurons(model, sets[0][0][0], rng)
         model = model.add_neurons(take_neurons(model, sets[0][0], drawn, count - before, noise))
         for part in sets:
             model = _fit(model, noise, part, quick)
-        yield _widen(model, basis), units
+        yield _change_past(model, basis), units
 
 
 def _cut(
@@ -315,8 +314,7 @@ def _start(
         pass
     fitted: list[tuple[float, HiddenModel]] = []
     for one in starts:
-        small = replace(one, T=np.hstack([one.T[:, :-1] @ basis.T, one.T[:, -1:]]))
-        small = normalise(small, part[0][-1].points)
+        small = normalise(_change_past(one, basis.T), part[0][-1].points)
         error = SimulationError(small)
         if len(fitted) == 0:
             noise = min(noise, np.sqrt(error.evaluate(small.parameters, [_first_step(part[0][-1])])))
@@ -337,6 +335,6 @@ def _project(parts: Sets, basis: Float[np.ndarray, "k nzeta"]) -> list[RecordSeg
     return [replace(part, points=part.points @ basis.T) for part in parts]
 
 
-def _widen(model: HiddenModel, basis: Float[np.ndarray, "k nzeta"]) -> HiddenModel:
-    """Return the model whose T takes ζ itself."""
+def _change_past(model: HiddenModel, basis: Float[np.ndarray, "k points"]) -> HiddenModel:
+    """Return the model whose T takes points in place of `basis` times points."""
     return replace(model, T=np.hstack([model.T[:, :-1] @ basis, model.T[:, -1:]]))

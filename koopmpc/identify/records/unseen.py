@@ -45,10 +45,18 @@ def measure_forecasts(
             short.append((roll_out(model, points[starts - past], U) - truth).reshape(-1, model.nx))
     if not free:
         raise DataError(f"no record is longer than the {past} past rows; pass fewer delays, or longer records")
-    parts = [np.array_split(np.concatenate(gaps), BLOCKS) for gaps in (free, short) if gaps]
+    return average_gaps(*([gap / spread for gap in gaps] for gaps in (free, short)))
+
+
+def average_gaps(*kinds: list[Float[np.ndarray, "..."]]) -> Float[np.ndarray, " blocks"]:
+    """Return the root-mean-square error of each of four parts of the rows, in spreads: its mean over the kinds.
+
+    The mean is the geometric one, over those kinds that have rows.
+    """
+    parts = [np.array_split(np.concatenate(gaps), BLOCKS) for gaps in kinds if gaps]
     errors = np.ones(BLOCKS)
     for part in parts:
-        sizes = [np.sqrt(np.mean(np.minimum(np.abs(gap / spread), _LOST) ** 2)) if len(gap) else 1.0 for gap in part]
+        sizes = [np.sqrt(np.mean(np.minimum(np.abs(gap), _LOST) ** 2)) if len(gap) else 1.0 for gap in part]
         errors *= np.maximum(sizes, EXACT) ** (1 / len(parts))
     return errors
 
