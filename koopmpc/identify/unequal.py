@@ -145,8 +145,8 @@ def unequal_rates(
     measured, x̂_{k+1} = Θ [ψ(x̂_k); u_k] lifted afresh. Levenberg-Marquardt with exact derivatives; first states are
     eliminated segment by segment. It starts at least squares on rows whose gaps are bridged by straight lines, by held
     values, and by the mean, and takes the least error of the three; only the start depends on them. Segments become
-    longer in two steps.
-    Rows of observables other than the states come from `edmd` on the states that the model itself simulates.
+    longer in two steps. Rows of observables other than the states come from `edmd` on the states that the model itself
+    simulates.
 
     Parameters
     ----------

@@ -34,8 +34,8 @@ CHANCE = 1e-4  # or so large that chance makes them so in this share of cases
 def exceeds_usual(errors: Float[np.ndarray, "n nx"], usual: Float[np.ndarray, " nx"]) -> bool:
     """Return whether errors of a model are larger than on its own data: by half, and by more than chance allows.
 
-    The test of a change that `find_drift` begins with, and that `Adaptive` makes while it runs: the mean square of n
-    errors of a state over its usual one is compared with χ²_n / n at a level of 1e-4.
+    The test of a change that `Adaptive` makes while it runs: the mean square of n errors of a state over its usual one
+    is compared with χ²_n / n at a level of 1e-4.
     """
     n = max(len(errors), 1)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -171,10 +171,15 @@ def _cut_blocks(data: Episodes) -> Iterator["_Rows"]:
         for k in range(0, len(e), length):
             kept.append((e.X[k : min(k + length, len(e))], e.U[k : k + length], e.X[k + 1 : k + 1 + length]))
             if sum(len(rows[0]) for rows in kept) >= length:
-                yield tuple(np.concatenate(part) for part in zip(*kept, strict=True))  # pyright: ignore[reportReturnType]
+                yield _join_rows(kept)
                 kept = []
     if sum(len(rows[0]) for rows in kept) > length // 2:
-        yield tuple(np.concatenate(part) for part in zip(*kept, strict=True))  # pyright: ignore[reportReturnType]
+        yield _join_rows(kept)
+
+
+def _join_rows(parts: Sequence["_Rows"]) -> "_Rows":
+    X, U, after = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return X, U, after
 
 
 _Rows = tuple[Float[np.ndarray, "n nx"], Float[np.ndarray, "n nu"], Float[np.ndarray, "n nx"]]
@@ -187,7 +192,6 @@ class _Measured:
     size: Float[np.ndarray, " c"]
     error: Float[np.ndarray, " c"]
     gain: Float[np.ndarray, " c"]
-    directions: Float[np.ndarray, "c c"]
     whole: float
 
 
@@ -316,7 +320,7 @@ class _Law:
         diagonal = np.maximum(np.diag(inner)[1:], 1e-300)
         size = inner[0, 1:] / diagonal
         whole = float(inner[0, 0] - (np.sum(E**2) - np.sum(products[0] * _free(P, products[0]))))
-        return _Measured(size, 1 / np.sqrt(diagonal), inner[0, 1:] ** 2 / diagonal, inner[1:, 1:], whole)
+        return _Measured(size, 1 / np.sqrt(diagonal), inner[0, 1:] ** 2 / diagonal, whole)
 
 
 def _mean_groups(ones: Float[np.ndarray, "n g"], rows: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:

@@ -118,7 +118,7 @@ def find_hidden_state(data: Episodes) -> Memory:
     Parameters
     ----------
     data
-        Logs of the states as they are measured, without delays; about 3000 rows of them are read.
+        Logs of the states as they are measured, without delays; about 2500 rows of them are read.
 
     Returns
     -------
@@ -171,9 +171,9 @@ def _stack_rows(data: Episodes) -> _Rows | None:
     for e in long if len(long) < 50 else long[:: int(np.ceil(share))]:
         Z, V = (e.X - x_mean) / x_size, (e.U[:, moving] - u_mean) / u_size
         pieces = 1 if len(long) >= 50 or share == 1.0 else 8
-        kept = len(e) if pieces == 1 else int(len(e) / share)
-        for low in np.linspace(0, len(e) - kept, 1) if pieces == 1 else np.linspace(0, len(e) - kept // 8, 8):
-            k = np.arange(int(low) + past, int(low) + max(kept // pieces, past + 1))
+        kept = (len(e) if pieces == 1 else int(len(e) / share)) // pieces
+        for low in np.linspace(0, len(e) - kept, pieces):
+            k = np.arange(int(low) + past, int(low) + max(kept, past + 1))
             k = k[k < len(e)]
             if not len(k):
                 continue
