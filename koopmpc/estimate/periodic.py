@@ -12,7 +12,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError
-from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
+from koopmpc.estimate.observer import EstimatorProgram, Measured
 from koopmpc.predict.predictors import LinearPredictor
 
 PERIODS = 3.0  # harmonics are learned over the last so many periods
@@ -58,16 +58,13 @@ class PeriodicObserver(Measured):
 
     _remembers = True
 
-    def __init__(self, model: LinearPredictor | StateModel, turns: Float[np.ndarray, " h"]) -> None:
+    def __init__(self, model: LinearPredictor, turns: Float[np.ndarray, " h"]) -> None:
         super().__init__(model)
         self._turns = turns
         unknown = np.ones(self._model.nz)
-        if isinstance(model, LinearPredictor):
-            constant = model.lifting.constant_index
-            if constant is not None:
-                unknown[constant] = 0.0
-        else:
-            unknown[self.ny :] = 0.0
+        constant = model.lifting.constant_index
+        if constant is not None:
+            unknown[constant] = 0.0
         self._unknown, self._none = unknown, np.zeros(self._model.nz)
         self._forget = float(np.exp(-1 / max(PERIODS * 2 * np.pi / turns[0], SHORTEST)))
         self.reset()

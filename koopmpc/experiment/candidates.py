@@ -1,6 +1,6 @@
 """Candidate excitations: random steps, sums of sines, and loops with moved set points and dither, at several sizes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -133,6 +133,3 @@ class InputLimiter:
             u = np.clip(u, self.last + self.rates.low, self.last + self.rates.high)
         self.last = np.clip(u, self.box.low, self.box.high)
         return self.last
-
-
-LimiterFactory = Callable[[], InputLimiter]

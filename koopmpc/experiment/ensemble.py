@@ -96,12 +96,9 @@ class Ensemble(Value):
         """Number of states."""
         return self.theta.shape[2]
 
-    def regressors(
-        self, points: Float[np.ndarray, "M n"], U: Float[np.ndarray, "M nu"], W: Float[np.ndarray, "M nw"] | None = None
-    ) -> Float[np.ndarray, "M p"]:
+    def regressors(self, points: Float[np.ndarray, "M n"], U: Float[np.ndarray, "M nu"]) -> Float[np.ndarray, "M p"]:
         """Return the rows φ(ζ, u), in the units of the model."""
-        if W is None:
-            W = np.broadcast_to(self.w, (len(points), len(self.w)))
+        W = np.broadcast_to(self.w, (len(points), len(self.w)))
         return stack_regressors(self.lifting(points), U, W, bilinear=self.bilinear)
 
     def start(self, x0: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " n"]:
@@ -244,7 +241,8 @@ def fit_ensemble(
     change = np.where(change > 0, change, 1e-12)
     ridge = 1e-8 * max(len(P), 1) * np.eye(len(size))
     own = own_theta * size[:, None]
-    least = own + _solve(grams.sum(axis=0) + ridge, crosses.sum(axis=0) - grams.sum(axis=0) @ own)
+    gram = grams.sum(axis=0)
+    least = own + _solve(gram + ridge, crosses.sum(axis=0) - gram @ own)
     residuals = T - (P / size) @ least
     residuals *= np.sqrt(len(P) / max(len(P) - len(size), len(P) / 4))  # what the fit itself took out
     noise = np.asarray(np.sqrt(np.mean(residuals**2, axis=0)), dtype=np.float64)
@@ -267,7 +265,6 @@ def fit_ensemble(
     scale = np.maximum(np.abs(X).max(axis=0), 1e-12)
     theta = np.array(thetas) / size[:, None]
     shift = own_theta - least / size[:, None] if shift is None else shift
-    gram = grams.sum(axis=0)
     return Ensemble(
         model.lifting,
         model.embedding,

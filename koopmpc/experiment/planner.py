@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -145,7 +146,7 @@ class Planner:
             notes=tuple(notes),
         )
 
-    @property
+    @cached_property
     def _box(self) -> Interval:
         """Limits of the inputs, and their range in the data where there are none."""
         U = np.concatenate([e.U for e in self.data])
@@ -154,7 +155,7 @@ class Planner:
             np.where(np.isfinite(low), low, U.min(axis=0)), np.where(np.isfinite(high), high, U.max(axis=0))
         )
 
-    @property
+    @cached_property
     def _rates(self) -> Interval:
         nu = self.data.nu
         rates = self.asked.limits.rates(nu)
@@ -235,8 +236,9 @@ class Planner:
             members = self._run_members(points[:, some], U[:, some], K)
             half = self.reach * self.ensemble.spread(members[..., : self.data.nx])
             safe = self._find_inside(points[:, some, : self.data.nx], half)
-            for place in np.flatnonzero(safe):
-                i = some[int(place)]
+            if safe.any():
+                place = int(np.argmax(safe))
+                i = some[place]
                 return SafeCandidate(
                     U[:, i],
                     points[:, i, : self.data.nx],

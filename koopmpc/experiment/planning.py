@@ -15,7 +15,7 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episodes
+from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.experiment.ensemble import Ensemble, Fit, calibrate_bands, fit_ensemble
@@ -259,7 +259,7 @@ def rank_fits(data: Episodes, embedding: Delay | None, rng: np.random.Generator)
     return [fits[first], *(fits[i] for i in others[:_RIVALS])]
 
 
-def _cut(episode: Any, length: int) -> list[Any]:
+def _cut(episode: Episode, length: int) -> list[Episode]:
     ends = range(0, len(episode), length)
     return [episode.cut(k, min(k + length, len(episode))) for k in ends if min(k + length, len(episode)) - k > 1]
 

@@ -47,8 +47,7 @@ def judge_hidden_states(
     The kinds are the subspace model, the linear and the polynomial one of least simulation error, and where a sensor
     rests at its least or largest reading, the polynomial one with these rails; and for one or two sensors the one with
     neurons, with the rails if the best one before has them. With neurons only what is calm and errs by a tenth less
-    than all others is judged. Where records are too short for a kind,
-    it is left out.
+    than all others is judged. Where records are too short for a kind, it is left out.
 
     Parameters
     ----------

@@ -120,7 +120,7 @@ def promise_coverage(
     limits = replace(pool.asked.limits, margin=None, capped=())
     low, high = limits.states(tube.shape[1])
     limited = np.isfinite(low) | np.isfinite(high)
-    rigid = np.tile(tube.max(axis=0), (1, 1))
+    rigid = tube.max(axis=0, keepdims=True)
 
     def widen(rows: Float[np.ndarray, "h nx"], scale: float) -> Float[np.ndarray, "h nx"]:
         return np.minimum(scale * np.where(limited, rows, 0.0), room)

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from koopmpc.control.riccati import find_gain, one_step, stationary
 from koopmpc.errors import KoopmpcError
@@ -19,17 +18,15 @@ _LONGEST = 400  # steps of a tube, at most
 
 
 def propagate_errors(
-    A: Float[np.ndarray, "n n"], error: ArrayLike, steps: int, *, C: ArrayLike | None = None
-) -> Float[np.ndarray, "steps m"]:
-    """Return half-widths of C e_k, k = 1 … steps, for e_{k+1} = A e_k + w, e_0 = 0 and every |w| ≤ error.
+    A: Float[np.ndarray, "n n"], error: Float[np.ndarray, " n"], steps: int
+) -> Float[np.ndarray, "steps n"]:
+    """Return half-widths of e_k, k = 1 … steps, for e_{k+1} = A e_k + w, e_0 = 0 and every |w| ≤ error.
 
-    |C e_k| is at most Σ_{j<k} |C Aʲ| error, and errors of these sizes with fitting signs reach it.
+    |e_k| is at most Σ_{j<k} |Aʲ| error, and errors of these sizes with fitting signs reach it.
     """
-    size = np.asarray(error, dtype=np.float64)
-    row = np.eye(len(A)) if C is None else np.atleast_2d(np.asarray(C, dtype=np.float64))
-    width, widths = np.zeros(len(row)), np.zeros((steps, len(row)))
+    row, width, widths = np.eye(len(A)), np.zeros(len(A)), np.zeros((steps, len(A)))
     for k in range(steps):
-        width = width + np.abs(row) @ size
+        width = width + np.abs(row) @ error
         row = row @ A
         widths[k] = width
     return widths
