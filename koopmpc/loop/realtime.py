@@ -150,8 +150,8 @@ def realtime(
     ----------
     controller, plant
         As for `simulate`, excitations included, but plant.step(u) applies u and returns at once, with the newest
-        measurement. Where the plant
-        has read() → y, it is called when a step begins, so that no y is older than that, and step may return None.
+        measurement. Where the plant has read() → y, it is called when a step begins, so that no y is older than that,
+        and step may return None.
         Where it has stop(u), that sends the safe input; it may be called from another thread while `step` waits.
     dt
         Time from step to step [s].

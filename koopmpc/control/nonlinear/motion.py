@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc import checks
 from koopmpc.control.nonlinear.equilibrium import Linearisation, TerminalTarget
 
 _ORDERS = (2, 3, 4, 6)  # of linear recurrences with a constant: a ramp or a sine has 2, two sines have 4
@@ -85,8 +86,7 @@ def shift_target(
 def _hold_inputs(at: Linearisation, Q: Float[np.ndarray, "nr nr"]) -> Float[np.ndarray, "nu nr"]:
     """Return G, ∂u/∂r of the equilibrium that comes nearest to a row."""
     nx = len(at.A)
-    values, vectors = np.linalg.eigh(Q)
-    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    root = checks.root(Q)
     # the equilibria are the null space of [A − 1, B]; of these the nearest to the row, with the least x and u
     _, sizes, rows = np.linalg.svd(np.hstack([at.A - np.eye(nx), at.B]))
     rank = int(np.sum(sizes > 1e-10 * sizes[0]))

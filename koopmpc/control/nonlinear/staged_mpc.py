@@ -211,9 +211,9 @@ class StagedMPC(MPCBase):
         high[:, high.shape[1] - count :] -= problem.margin
         return Interval(low, high)
 
+    @abstractmethod
     def _limit(self, limits: StageLimits | None) -> None:
         """Take over the limits of a step; None for those of the constructor."""
-        raise NotImplementedError
 
     def _first_box(self) -> Interval:
         """Return the limits of the first input."""
@@ -277,9 +277,9 @@ class StagedMPC(MPCBase):
                 self._forget_targets()
         return True
 
+    @abstractmethod
     def _schedule(self, W: Float[np.ndarray, "N nw"]) -> None:
         """Take over the measured disturbances that multiply the state, a row a stage."""
-        raise NotImplementedError
 
     def _aim(self, reference: Float[np.ndarray, "..."]) -> bool:
         """Find the targets of a reference where it has changed; return whether it is finite."""
