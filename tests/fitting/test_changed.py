@@ -9,7 +9,7 @@ from koopmpc.cli.app import app
 from koopmpc.fitting.changed import compare_logs, read_new_logs
 from koopmpc.predict.base import load_value
 from koopmpc.synthesis.designed import SavedDesign
-from tests.fitting.test_goal import NAMES, A, B, logs, made  # noqa: F401
+from tests.fitting.mass import NAMES, A, B, logs
 
 
 def record(gain=1.0, seed=5, sigma=1e-3):
@@ -37,7 +37,7 @@ def test_a_design_holds_on_the_same_plant_and_where_its_runs_bear_the_change(old
 
 
 @pytest.mark.slow
-def test_the_command_compares_new_logs_with_those_of_the_design(made, tmp_path, monkeypatch):  # noqa: F811
+def test_the_command_compares_new_logs_with_those_of_the_design(made, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     kept = load_value(made.controller, SavedDesign).evidence.logs
     assert (kept.states, kept.inputs) == NAMES

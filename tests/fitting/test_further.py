@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.fitting.goal import design_data
-from tests.fitting.test_goal import GOAL, NAMES, A, B, logs
+from tests.fitting.mass import GOAL, NAMES, A, B, logs
 
 
 def few():

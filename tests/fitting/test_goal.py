@@ -20,45 +20,7 @@ from koopmpc.fitting.goal import design_data, format_template, load_reading, rea
 from koopmpc.fitting.repair import read_logs, round_step
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign
-
-A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])
-NAMES = ("position [m]", "speed [m/s]"), ("force [N/kg]",)
-
-
-def logs(count=16, steps=40):
-    rng, made = np.random.default_rng(0), []
-    for _ in range(count):
-        X, U = [rng.uniform(-1, 1, 2)], np.repeat(rng.uniform(-2, 2, (steps // 4, 1)), 4, axis=0)
-        for u in U:
-            X.append(A @ X[-1] + B @ u)
-        made.append(km.Episode(X=np.array(X), U=U))
-    return km.Episodes(made, 0.1, *NAMES)
-
-
-GOAL = """
-horizon = 15
-
-[states."position [m]"]
-reference = 0.5
-weight = 1.0
-
-[states."speed [m/s]"]
-reference = 0.0
-weight = 0.1
-limits = [-0.8, 0.8]
-
-[inputs."force [N/kg]"]
-weight = 0.01
-limits = [-2.0, 2.0]
-"""
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("designed")
-    logs().save(folder / "logs.npz")
-    (folder / "goal.toml").write_text(GOAL)
-    return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", bilinear=False)
+from tests.fitting.mass import GOAL, NAMES, A, B, logs
 
 
 def test_inputs_that_only_the_goal_file_names_are_inputs(tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ from koopmpc.fitting.goal import design_data, read_goal
 from koopmpc.fitting.verdict import judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign, rebuild_controller
-from tests.fitting.test_goal import GOAL, NAMES, A, B, logs
+from tests.fitting.mass import GOAL, NAMES, A, B, logs
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,14 @@
+"""A controller that was designed from logs of the mass, made anew for each file of tests."""
+
+import pytest
+
+from koopmpc.fitting.goal import design_data
+from tests.fitting.mass import GOAL, logs
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("designed")
+    logs().save(folder / "logs.npz")
+    (folder / "goal.toml").write_text(GOAL)
+    return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", bilinear=False)

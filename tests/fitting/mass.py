@@ -1,0 +1,36 @@
+"""A mass on a rail: its exact equations, logs of it, and a goal for its controller, which many tests here design."""
+
+import numpy as np
+
+import koopmpc as km
+
+A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])
+NAMES = ("position [m]", "speed [m/s]"), ("force [N/kg]",)
+
+
+def logs(count=16, steps=40):
+    rng, made = np.random.default_rng(0), []
+    for _ in range(count):
+        X, U = [rng.uniform(-1, 1, 2)], np.repeat(rng.uniform(-2, 2, (steps // 4, 1)), 4, axis=0)
+        for u in U:
+            X.append(A @ X[-1] + B @ u)
+        made.append(km.Episode(X=np.array(X), U=U))
+    return km.Episodes(made, 0.1, *NAMES)
+
+
+GOAL = """
+horizon = 15
+
+[states."position [m]"]
+reference = 0.5
+weight = 1.0
+
+[states."speed [m/s]"]
+reference = 0.0
+weight = 0.1
+limits = [-0.8, 0.8]
+
+[inputs."force [N/kg]"]
+weight = 0.01
+limits = [-2.0, 2.0]
+"""
