@@ -17,6 +17,7 @@ from koopmpc.figures.style import (
     choose_states,
     draw_band,
     draw_legend,
+    fit_label,
     limit_axis,
     line_style,
     make_figure,
@@ -88,7 +89,8 @@ def plan(
         ends = [float(end[i]) for end in (plan.x_low, plan.x_high) if np.isfinite(end[i])]
         for end in ends:
             panel.axhline(end, **LIMIT, label="limit")
-        panel.set(ylabel=plan.states[i], ylim=limit_axis(bottom, top, min([bottom, *ends]), max([top, *ends]), _BEYOND))
+        panel.set_ylim(limit_axis(bottom, top, min([bottom, *ends]), max([top, *ends]), _BEYOND))
+        panel.set_ylabel(**fit_label(plan.states[i], _STATE_HEIGHT))
     rest = list(axes[len(chosen) :])
     if points is not None:
         rest.pop(0).plot(t, points[0], **REFERENCE, label="set point")
@@ -97,7 +99,7 @@ def plan(
         panel.stairs(one.U[0, :, j], t, baseline=None, **TRUTH)
         for end in (plan.box.low[j], plan.box.high[j]):
             panel.axhline(end, **LIMIT)
-        panel.set_ylabel(name)
+        panel.set_ylabel(**fit_label(name, _INPUT_HEIGHT))
     axes[-1].set(xlabel="time [s]", xlim=(0, t[-1]))
     draw_legend(drawing, axes[: len(chosen) + 1], 4)
     return drawing

@@ -1,7 +1,7 @@
 """km.next_experiment: safe plans that teach where the loop works, their bands, files and sentences."""
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -232,6 +232,13 @@ def test_the_picture_shows_plan_and_log(plan, tmp_path):
     km.plot.save(drawing, tmp_path / "plan.png")
     with pytest.raises(km.errors.ShapeError, match="pass the logs of this plan"):
         km.plot.plan(plan, 1, log=new[:1])
+
+
+def test_a_dollar_in_a_name_is_a_letter_and_a_long_name_gets_lines_of_its_own(plan, tmp_path):
+    long = "temperature of the upper vessel [degC]"
+    drawing = km.plot.plan(replace(plan, states=(long, "b"), inputs=("a $u_{$ [N]",)))
+    km.plot.save(drawing, tmp_path / "plan.png")
+    assert drawing.axes[0].get_ylabel().count("\n") >= 1
 
 
 @pytest.mark.slow
