@@ -117,18 +117,32 @@ def instrumental_edmd(
     return build_predictor(regression, result)
 
 
-def _attach_lagged_rows(episodes: Episodes, instruments: Sequence[ArrayLike], lags: int) -> tuple[Episodes, Episodes]:
-    """Return the episodes without their first lags − 1 steps, and the same with lagged instruments beside W."""
+def check_instruments(episodes: Episodes, instruments: Sequence[ArrayLike]) -> list[Float[np.ndarray, "rows nr"]]:
+    """Return the signals with T + 1 rows each, the last one repeated where it is missing.
+
+    Raises
+    ------
+    ShapeError
+        There is not one array an episode, of one row a step.
+    """
     if len(instruments) != len(episodes):
         raise ShapeError(f"instruments has {len(instruments)} arrays for {len(episodes)} episodes; pass one an episode")
-    later: list[Episode] = []
-    joined: list[Episode] = []
+    found: list[np.ndarray] = []
     for i, (e, signal) in enumerate(zip(episodes, instruments, strict=True)):
         R = checks.array(signal, f"instruments[{i}]", (None, None))
         if len(R) not in (len(e), len(e) + 1):
             raise ShapeError(
                 f"instruments[{i}] has {len(R)} rows for {len(e)} steps; pass one a step, row k beside u_k"
             )
+        found.append(R if len(R) == len(e) + 1 else np.vstack([R, R[-1:]]))
+    return found
+
+
+def _attach_lagged_rows(episodes: Episodes, instruments: Sequence[ArrayLike], lags: int) -> tuple[Episodes, Episodes]:
+    """Return the episodes without their first lags − 1 steps, and the same with lagged instruments beside W."""
+    later: list[Episode] = []
+    joined: list[Episode] = []
+    for i, (e, R) in enumerate(zip(episodes, check_instruments(episodes, instruments), strict=True)):
         if len(e) < lags:
             raise DataError(
                 f"episode {i} has {len(e)} steps, fewer than lags = {lags}; pass fewer lags, or longer logs"

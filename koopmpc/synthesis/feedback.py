@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError, KoopmpcError, ShapeError, hide_fit_warnings
+from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.instruments import instrumental_edmd
+from koopmpc.identify.instruments import check_instruments, instrumental_edmd
 from koopmpc.lifting.state import Constant, State
 from koopmpc.text import to_percent
 from koopmpc.validate.scoring import score
@@ -55,7 +55,7 @@ def project_on_instruments(
     Van den Hof & Schrama, "An indirect method for transfer function estimation from closed loop data", Automatica 29,
     1993.
     """
-    signals = check_instruments(episodes, instruments)
+    signals = _check(episodes, instruments)
     kept = [(e, r) for e, r in zip(episodes, signals, strict=True) if len(e) > lags]
     if not kept:
         raise DataError(f"no episode is longer than the {lags} rows of the set point that a projection sees")
@@ -72,18 +72,9 @@ def project_on_instruments(
     return episodes.with_episodes(made), np.asarray(rest.std(axis=0), dtype=np.float64)
 
 
-def check_instruments(episodes: Episodes, instruments: Sequence[ArrayLike]) -> list[Float[np.ndarray, "rows nr"]]:
-    """Return the signals with T + 1 rows each, the last one repeated where it is missing."""
+def _check(episodes: Episodes, instruments: Sequence[ArrayLike]) -> list[Float[np.ndarray, "rows nr"]]:
     checks.kind(instruments, "instruments", Sequence, "pass a list with the set point of each episode")
-    if len(instruments) != len(episodes):
-        raise ShapeError(f"instruments has {len(instruments)} arrays for {len(episodes)} episodes; pass one an episode")
-    found: list[np.ndarray] = []
-    for i, (e, signal) in enumerate(zip(episodes, instruments, strict=True)):
-        r = checks.array(signal, f"instruments[{i}]", (None, None))
-        if len(r) not in (len(e), len(e) + 1):
-            raise ShapeError(f"instruments[{i}] has {len(r)} rows for {len(e)} steps; pass one a step")
-        found.append(r if len(r) == len(e) + 1 else np.vstack([r, r[-1:]]))
-    return found
+    return check_instruments(episodes, instruments)
 
 
 def use_instruments(
@@ -107,7 +98,7 @@ def use_instruments(
     ShapeError
         The instruments do not fit the episodes.
     """
-    signals, none = check_instruments(episodes, instruments), np.zeros(episodes.nx)
+    signals, none = _check(episodes, instruments), np.zeros(episodes.nx)
     plain = State() + Constant()
     share = float(feedback_share(episodes, plain)[: episodes.nu].max())
     if share < FEEDBACK:
