@@ -21,7 +21,7 @@ from koopmpc.errors import DataError, ObservableError, ShapeError
 from koopmpc.estimate.disturbance import GAIN
 from koopmpc.estimate.gate import ReadingGate, gate_graph
 from koopmpc.estimate.observer import EstimatorProgram, StateModel
-from koopmpc.estimate.periodic import find_harmonics
+from koopmpc.estimate.periodic import NO_CODE, find_harmonics
 from koopmpc.lifting.base import Lifting, strip_unit
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value, Viewing
@@ -278,7 +278,7 @@ class PeriodicFilter(KalmanFilter):
         DataError
             Always.
         """
-        raise DataError("the estimator has a period, which the C code does not know; export one without a period")
+        raise DataError(NO_CODE)
 
 
 def _find_rails(predictor: LinearPredictor, system: Augmented) -> Float[np.ndarray, "2 ny"] | None:

@@ -17,6 +17,7 @@ from koopmpc.predict.predictors import LinearPredictor
 
 PERIODS = 3.0  # harmonics are learned over the last so many periods
 SHORTEST = 20.0  # and over at least so many steps
+NO_CODE = "the estimator has a period, which the C code does not know; export one without a period"
 _DENSITY = 8  # trial frequencies in each 1/T of the longest episode
 _CHANCE = 1e-4  # a period is believed if noise shows as strong a line less often than this
 
@@ -85,7 +86,7 @@ class PeriodicObserver(Measured):
         DataError
             Always.
         """
-        raise DataError("the estimator has a period, which the C code does not know; export one without a period")
+        raise DataError(NO_CODE)
 
     def forecast(self, steps: int) -> Float[np.ndarray, "steps nz"]:
         """Return the periodic part of d in the steps from now on; `d` is the constant part."""
