@@ -104,9 +104,7 @@ def run_loops(seed, starts, steps=100):
 
 
 def count_loops(plants, starts, steps=100):
-    counts = np.sum([run_loops(seed, starts, steps) for seed in range(plants)], axis=0)
-    print("loops, feasible, lost, rises:", counts.tolist())  # noqa: T201
-    return counts
+    return np.sum([run_loops(seed, starts, steps) for seed in range(plants)], axis=0)
 
 
 def test_a_loop_that_is_feasible_once_stays_so_and_its_cost_falls_by_the_stage_cost():
@@ -173,7 +171,6 @@ def compare_with_cone_program(seeds):
         missed = np.abs(plan.U - oracle[0]).max()
         assert missed < 1e-4, (seed, missed)
         agreed, active = agreed + 1, active + (gauge > 1 - 1e-6)
-    print("agreed, with an active ellipsoid, infeasible:", agreed, active, infeasible)  # noqa: T201
     return agreed, active, infeasible
 
 

@@ -66,7 +66,6 @@ def test_the_bias_over_100_records_stays_within_three_standard_errors_which_fall
         ours = np.array([fit(d, r) for d, r in records])
         bias = np.linalg.norm(ours.mean(axis=0) - TRUTH)
         bound[steps] = 3 * np.linalg.norm(ours.std(axis=0)) / np.sqrt(len(ours))
-        print(f"M = {steps}: bias {bias:.2g}, three errors {bound[steps]:.2g}, least squares {plain:.2g}")  # noqa: T201
         assert bias <= plain / 5
         assert bias <= bound[steps]
     assert bound[8000] <= 1.2 * bound[500] * (500 / 8000) ** 0.5
@@ -116,4 +115,3 @@ def test_least_squares_stays_with_process_noise_alone_and_goes_with_noisy_sensor
     assert variance[1] <= 1.1 * variance[0]
     bias, _ = compare_fits(records, sensor=0.1)
     assert bias[1] <= bias[0] / 5
-    print(f"{records} records: variance {variance[1] / variance[0]:.3f}, bias {bias[1] / bias[0]:.3f} of least squares")  # noqa: T201

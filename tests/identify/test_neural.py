@@ -110,19 +110,21 @@ def test_a_growing_free_run_is_refused_in_a_sentence(monkeypatch):
         km.identify.neural_state_space(data, order=1, neurons=1)
 
 
+def friction_record(seed, steps=1500):
+    """Return the record of a velocity under dry friction, with noise."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-1, 1, steps // 15 + 1), 15)[:steps]
+    y, v = np.zeros(steps + 1), 0.0
+    for k in range(steps):
+        v = 0.95 * v + 0.2 * u[k] - 0.08 * np.tanh(20 * v)
+        y[k + 1] = v
+    y += 0.002 * rng.standard_normal(steps + 1)
+    return km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["v [m/s]"], ["u"])
+
+
 @pytest.mark.slow
 def test_dry_friction_is_found_and_the_model_is_used_as_any_other(tmp_path):
-    def record(seed, steps=1500):
-        rng = np.random.default_rng(seed)
-        u = np.repeat(rng.uniform(-1, 1, steps // 15 + 1), 15)[:steps]
-        y, v = np.zeros(steps + 1), 0.0
-        for k in range(steps):
-            v = 0.95 * v + 0.2 * u[k] - 0.08 * np.tanh(20 * v)
-            y[k + 1] = v
-        y += 0.002 * rng.standard_normal(steps + 1)
-        return km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["v [m/s]"], ["u"])
-
-    data, fresh = record(0), record(1)
+    data, fresh = friction_record(0), friction_record(1)
     model = km.identify.neural_state_space(data, order=1, neurons=[1, 2])
     other = km.identify.polynomial_state_space(data, 1, 3)
 

@@ -10,6 +10,7 @@ from koopmpc.errors import DataError
 from koopmpc.synthesis.candidates import relift_model
 from koopmpc.synthesis.records import FreeRun, choose_by_free_run, is_fed_back, is_late, is_record
 from tests.identify.test_hidden_state import saturating_record
+from tests.identify.test_neural import friction_record
 
 
 def oscillator(rows=420, noise=0.01, late=False, gain=None, seed=0):
@@ -138,18 +139,7 @@ def test_a_hidden_state_is_taken_where_it_pays_on_unseen_rows():
 @pytest.mark.slow
 def test_neurons_are_taken_where_they_pay_and_a_controller_plans_with_them():
     """Dry friction, whose corner no polynomial of a hidden state holds."""
-
-    def friction(seed, rows=1500):
-        rng = np.random.default_rng(seed)
-        u = np.repeat(rng.uniform(-1, 1, rows // 15 + 1), 15)[:rows]
-        y, v = np.zeros(rows + 1), 0.0
-        for k in range(rows):
-            v = 0.95 * v + 0.2 * u[k] - 0.08 * np.tanh(20 * v)
-            y[k + 1] = v
-        y += 0.002 * rng.standard_normal(rows + 1)
-        return km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["v [m/s]"], ["u"])
-
-    found, fresh = km.select(friction(0), horizon=10), friction(1)
+    found, fresh = km.select(friction_record(0), horizon=10), friction_record(1)
     assert "neuron" in found.best.title
     others = [row.free for row in found.leaderboard if "neuron" not in row.title and np.isfinite(row.free)]
     assert found.best.free < 0.9 * min(others)
