@@ -16,7 +16,7 @@ from koopmpc.control.move import Status
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import LogError
 from koopmpc.fitting.changed import ComparedLogs, compare_logs
-from koopmpc.fitting.report import write_design_report
+from koopmpc.fitting.report import OFF, write_design_report
 from koopmpc.fitting.verdict import PlantVerdict, RateVerdict, judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.loop.faults import ActuatorLoss, DroppedSamples, Fault, FrozenSensor, NaNSensor, SensorDelay, SolverFailure
 from koopmpc.loop.metrics import metrics, tracking_error, violation_shares
@@ -34,7 +34,6 @@ ALLOWED = 0.01  # allowed violation, as a share of the range, in runs as in the 
 ALLOWED_OFF = 0.05  # the same where noise or inputs differ from the data
 ARRIVED = 0.05  # error over the last tenth of a run, as a share of the data's range
 LONGER = 3  # times the runs of the design that there is for arriving at a reference: a start may be far, a limit slow
-OFF = 0.2  # inputs are weaker or stronger by this share
 UNKNOWN = 0.1  # share of steps outside the data above which the verdict is "cannot say"
 LOUD = 3.0  # noise is this many times that of the data
 _GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)

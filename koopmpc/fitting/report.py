@@ -24,7 +24,7 @@ from koopmpc.text import shorten_observable, to_percent, with_unit
 from koopmpc.validate.logs.summary import LogExcerpt, LogSummary
 
 LOOPS = 3  # loops of a kind that a report draws
-OFF = 0.2  # inputs of some loops act by this share more or less
+OFF = 0.2  # inputs of some loops, and of some runs of a check, act by this share more or less
 _SHOWN = 8  # signals of a kind that are drawn
 _FORECASTS = 2  # held-out stretches that are drawn
 _ADVISED = 6  # states from which to record that are named
