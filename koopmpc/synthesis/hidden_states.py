@@ -8,16 +8,10 @@ from jaxtyping import Float
 
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError, hide_fit_warnings
+from koopmpc.identify.records.hidden_structure import HiddenStructure, choose_hidden, find_rails, thin_records
 from koopmpc.identify.records.narx import FOLDS
 from koopmpc.identify.records.neural import PIECE, ROWS, search_neural
-from koopmpc.identify.records.state_space import (
-    HiddenStructure,
-    choose_hidden,
-    find_rails,
-    fit_hidden,
-    search_hidden,
-    thin_records,
-)
+from koopmpc.identify.records.state_space import fit_hidden, search_hidden
 from koopmpc.identify.records.subspace import choose_sizes
 from koopmpc.parallel import Progress
 from koopmpc.predict.base import sorted_eigen

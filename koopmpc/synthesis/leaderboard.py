@@ -7,7 +7,7 @@ import numpy as np
 from rich.console import RenderableType
 
 from koopmpc.data.delay import Delay
-from koopmpc.identify.records.state_space import HiddenStructure
+from koopmpc.identify.records.hidden_structure import HiddenStructure
 from koopmpc.identify.records.structure import Structure
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.base import sorted_eigen

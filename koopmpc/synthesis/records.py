@@ -14,8 +14,8 @@ from koopmpc.errors import KoopmpcError, hide_fit_warnings
 from koopmpc.identify.fits.refinement import refine
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.records.free_run import HELD, PIECE, ROWS
+from koopmpc.identify.records.hidden_structure import HiddenStructure
 from koopmpc.identify.records.narx import DELAYS, FOLDS, choose_structure, is_worse, search_structures
-from koopmpc.identify.records.state_space import HiddenStructure
 from koopmpc.identify.records.structure import EXACT, Structure, fit_structure
 from koopmpc.parallel import Progress
 from koopmpc.predict.base import replace_report

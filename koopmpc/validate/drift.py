@@ -1,4 +1,4 @@
-"""`find_drift` compares new logs with the data of a design: what has changed, within a false-alarm rate."""
+"""`find_drift` compares new logs with the data of a design: what has changed, by how much, and how surely."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -28,9 +28,6 @@ from koopmpc.identify.records.hidden_structure import (
     report_fit,
     thin_records,
 )
-from koopmpc.identify.records.hidden_structure import (
-    find_rails as find_rails,
-)
 from koopmpc.identify.records.narx import Ask, check_list, source_episodes
 from koopmpc.identify.records.neural import fit_neural
 from koopmpc.identify.records.subspace import build_realisation, compute_block_moments
