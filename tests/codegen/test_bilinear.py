@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.codegen.tables import Tables
+from koopmpc.codegen.tables import Tables, read_program
 from tests.compiler import find_compiler
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
@@ -176,8 +176,9 @@ def test_a_loop_that_learns_what_the_model_lacks_is_that_of_python_to_rounding(s
         x = np.add(plant(x, a.u), [0.0, 0.02])  # a load that the model does not know
 
 
-def test_a_constant_of_the_c_code_has_one_meaning():
-    tables = Tables(program=None, sizes={}, functions={})
+def test_a_constant_of_the_c_code_has_one_meaning(swung):
+    program = read_program(km.BilinearMPC(swung[1], COST, km.Limits(**BOX), 5))
+    tables = Tables(program=program, sizes={}, functions={})
     tables.define({"REACH": 1e-9})
     with pytest.raises(ValueError, match="two constants of the name REACH"):
         tables.define({"REACH": 8.0, "GAIN": 0.1})
