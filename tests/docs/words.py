@@ -40,6 +40,7 @@ KINDS = {  # pages outside of these folders
     "what_can_go_wrong.md": "reference",
     "bench.md": "evidence",
     "c_speed.md": "evidence",
+    "speed.md": "evidence",
     "beside_others.md": "evidence",
     "closed_loop.md": "evidence",
     "designs.md": "evidence",

@@ -1,0 +1,1 @@
+"""The figures of docs/speed.md: each measured in turns with its yardstick, and with the same figure of another commit."""
