@@ -71,7 +71,7 @@ OPENINGS = {
 
 FORKED = """
 import json, os, sys
-import casadi, numpy, pyarrow, scipy.linalg  # other libraries take long to import, and know nothing of koopmpc
+import casadi, jaxtyping, numpy, pyarrow.parquet, rerun, rerun.chunk, scipy.linalg, scipy.sparse, scipy.spatial.transform  # slow, and know nothing of koopmpc
 ended = {}
 for name, script in json.load(sys.stdin).items():
     child = os.fork()

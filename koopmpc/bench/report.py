@@ -183,14 +183,14 @@ def median_interval(values: Float[np.ndarray, " n"]) -> tuple[float, float, floa
     with probability P(Bin(n, k/n) ≥ m) = I_{k/n}(m, n − m + 1), which needs no drawing. The ends are the first x_(k) at
     which this is 2.5 % for the lower median, m = ⌈n/2⌉, and 97.5 % for the upper one, m = ⌊n/2⌋ + 1.
     """
-    from scipy.stats import beta
+    from scipy.special import betaincinv
 
     ordered = np.sort(values[np.isfinite(values)])
     n = len(ordered)
     if not n:
         return float("nan"), float("nan"), float("nan")
     low, high = (
-        ordered[int(np.ceil(n * beta.ppf(share, m, n - m + 1))) - 1]
+        ordered[int(np.ceil(n * betaincinv(m, n - m + 1, share))) - 1]
         for share, m in zip(_SURE, ((n + 1) // 2, n // 2 + 1), strict=True)
     )
     return float(np.median(ordered)), float(low), float(high)

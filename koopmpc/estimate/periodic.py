@@ -3,10 +3,9 @@
 from typing import cast
 
 import numpy as np
-import scipy.optimize
-import scipy.stats
 from jaxtyping import Float
 from numpy.typing import ArrayLike
+from scipy.special import fdtrc
 
 from koopmpc import checks
 from koopmpc.checks import HUGE
@@ -195,10 +194,12 @@ def find_period(model: LinearPredictor, episodes: Episodes) -> float:
             explained += float(((basis.T @ row) ** 2).sum())
         return explained / total
 
+    from scipy.optimize import minimize_scalar  # slow to import
+
     grid = 2 * np.pi * np.arange(_DENSITY, _DENSITY * longest // 2 + 1) / (_DENSITY * longest)
     values = np.array([explain(turn) for turn in grid])
     best, step = int(values.argmax()), grid[1] - grid[0]
-    found = scipy.optimize.minimize_scalar(
+    found = minimize_scalar(
         lambda turn: -explain(turn), bounds=(grid[best] - step, grid[best] + step), method="bounded",
         options={"xatol": 1e-9},
     )  # fmt: skip
@@ -208,7 +209,7 @@ def find_period(model: LinearPredictor, episodes: Episodes) -> float:
     chance = (
         len(grid)
         / _DENSITY
-        * float(scipy.stats.f.sf(share / free * (count - free) / (1 - min(share, 1 - 1e-12)), free, count - free))
+        * float(fdtrc(free, count - free, share / free * (count - free) / (1 - min(share, 1 - 1e-12))))
     )
     if chance > _CHANCE:
         raise DataError(

@@ -7,8 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtrit
 
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
@@ -318,7 +317,7 @@ def calibrate_bands(
     for e in data:
         windows += [e.cut(k, k + past + length) for k in range(0, len(e) - past - length + 1, length)]
     if len(windows) < 2:
-        return float(norm.ppf((1 + level) / 2)) * 3
+        return float(ndtri((1 + level) / 2)) * 3
     middle = np.median(np.concatenate([e.X for e in windows]), axis=0)
     extent = [float(np.max(np.abs(e.X - middle) / whole.scale)) for e in windows]
     order = np.argsort(np.argsort(extent, kind="stable")) * _FOLDS // len(windows)  # the outermost are the last part
@@ -347,6 +346,6 @@ def calibrate_bands(
     if rank <= len(ranked):
         return max(UNUSUAL * float(ranked[rank - 1]), 1.0)
     logs = np.asarray(np.log(np.maximum(ranked, 1e-3)), dtype=np.float64)
-    quantile = float(np.asarray(student.ppf(share, len(logs) - 1), dtype=np.float64))
+    quantile = float(np.asarray(stdtrit(len(logs) - 1, share), dtype=np.float64))
     wide = float(logs.std(ddof=1)) * (1 + 1 / len(logs)) ** 0.5 * quantile
     return max(UNUSUAL * math.exp(float(logs.sum()) / len(logs) + wide), UNUSUAL * float(ranked[-1]), 1.0)

@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import linprog
 
 from koopmpc.errors import DataError
 from koopmpc.validate.binomial import bound_failure_rate
@@ -149,6 +148,8 @@ def bound_by_scenario(
     # samples rarely have φ or v near 0 alone: each constant is at least half the usual error per unit of both
     usual = 0.5 * float(np.median(size / np.maximum(phi + v, 1e-300))) / unit
     bounds = [(0.0 if i == 2 else usual, None) for i in range(len(columns))]
+    from scipy.optimize import linprog  # slow to import
+
     found = linprog(means, A_ub=-rows, b_ub=-size / unit, bounds=bounds, method="highs")
     if found.status != 0:
         return None

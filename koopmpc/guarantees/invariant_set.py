@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.optimize import linprog
 
 from koopmpc import checks
 from koopmpc.control.terminal.sets import TerminalSet
@@ -119,6 +118,8 @@ def find_invariant_set(
 
 def _largest(row: Float[np.ndarray, " n"], H: Float[np.ndarray, "p n"]) -> float:
     """Return max row·z over H z ≤ 1; inf where nothing bounds it."""
+    from scipy.optimize import linprog  # slow to import
+
     found = linprog(-row, A_ub=H, b_ub=np.ones(len(H)), bounds=(None, None), method="highs")
     return float(-found.fun) if found.status == 0 and found.fun is not None else np.inf
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
@@ -186,5 +186,5 @@ def _compare(
     d = difference * size[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         value = np.sum(d * (np.linalg.pinv(spread, rcond=1e-10) @ d), axis=0) / noise
-    chances = np.asarray(chi2.sf(np.nan_to_num(value), len(K)), dtype=np.float64)
+    chances = np.asarray(chdtrc(len(K), np.nan_to_num(value)), dtype=np.float64)
     return min(1.0, len(K.T) * float(np.min(chances)))

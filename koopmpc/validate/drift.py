@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError, ShapeError
@@ -40,7 +40,7 @@ def exceeds_usual(errors: Float[np.ndarray, "n nx"], usual: Float[np.ndarray, " 
     n = max(len(errors), 1)
     with np.errstate(over="ignore", invalid="ignore"):
         found = np.asarray(np.sqrt((errors**2).mean(axis=0)), dtype=np.float64)
-    bound = max(TOLERANCE, float(np.sqrt(chi2.ppf(1 - CHANCE, n) / n)))
+    bound = max(TOLERANCE, float(np.sqrt(chdtri(n, CHANCE) / n)))
     return not bool((found <= bound * usual).all())
 
 

@@ -75,7 +75,7 @@ def quick(few, monkeypatch):
 def fitted(tmp_path_factory):
     """Return the folder of one call without any option, what it printed, and fresh data of the same plant."""
     place = tmp_path_factory.mktemp("fit")
-    write_csv(cart_pole(25, steps=60), place / "csv")
+    write_csv(cart_pole(18, steps=60), place / "csv")
     command = [sys.executable, "-m", "koopmpc", "fit", "csv"]
     result = subprocess.run(command, cwd=place, capture_output=True, encoding="utf8", check=False)
     assert result.returncode == 0, result.stderr
@@ -94,7 +94,7 @@ def test_csv_logs_of_an_unknown_plant_give_a_predictor_without_any_option(fitted
         patch.chdir(folder.parents[1])
         exec(usage, held)  # what is printed runs as it stands
     model = held["model"]
-    plain = km.edmd(cart_pole(25, steps=60), km.State() + km.Constant(), ridge=1e-9)
+    plain = km.edmd(cart_pole(18, steps=60), km.State() + km.Constant(), ridge=1e-9)
     horizon = int(re.search(r"horizon (\d+) steps", result.stdout).group(1))
     assert horizon >= 10
     lifted = isinstance(model, km.BilinearPredictor)  # as its controller does
@@ -106,7 +106,7 @@ def test_csv_logs_of_an_unknown_plant_give_a_predictor_without_any_option(fitted
 def test_it_prints_what_it_understood_the_leaderboard_and_the_verdict(fitted):
     folder, result, _ = fitted
     out = result.stdout
-    assert "25 episodes of 60 steps, 1500 in all" in out
+    assert "18 episodes of 60 steps, 1080 in all" in out
     assert "dt = 0.02 s" in out
     assert re.search(r"states +x .*\n +theta .*\n +v .*\n +omega .*\ninputs +force", out)
     assert "linear: x, 1 " in out

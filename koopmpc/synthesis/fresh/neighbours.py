@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
@@ -240,8 +239,10 @@ def probe_range(
     asked: DesignTask, neighbours: NeighbourMap
 ) -> tuple[Float[np.ndarray, "probes nx"], Bool[np.ndarray, " probes"]]:
     """Return evenly spread points of the goal's range, and which of them have no data around them."""
+    from scipy.stats.qmc import Halton  # slow to import
+
     low, high = goal_box(asked)
-    X = low + (high - low) * scipy.stats.qmc.Halton(len(low), scramble=False).random(PROBES)
+    X = low + (high - low) * Halton(len(low), scramble=False).random(PROBES)
     return X, neighbours.find_outside_states(X)
 
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Float
+from scipy.special import betainc
 
 from koopmpc.text import to_percent
 from koopmpc.validate.binomial import bound_failure_rate
@@ -53,8 +53,9 @@ class CoveragePromise(Value):
     @property
     def is_refuted(self) -> bool:
         """Whether so many failures have a probability below 5 % if the promise is true."""
-        beyond = scipy.stats.binom.sf(self.failures - 1, self.verified_on, 1 - self.coverage)
-        return bool(self.failures > 0 and beyond < REFUTED)
+        if not self.failures:
+            return False
+        return bool(betainc(self.failures, self.verified_on - self.failures + 1, 1 - self.coverage) < REFUTED)
 
     @property
     def failure_bound(self) -> float:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Float
+from scipy.special import betaincinv
 
 from koopmpc.values import Value
 
@@ -54,7 +54,7 @@ def bound_share(failures: int, loops: int, sure: float = SURE) -> float:
     """
     if failures >= loops:
         return 1.0
-    return float(scipy.stats.beta.ppf(sure, failures + 1, loops - failures))
+    return float(betaincinv(failures + 1, loops - failures, sure))
 
 
 def bound_value(values: Float[np.ndarray, " n"], sure: float = SURE) -> float:

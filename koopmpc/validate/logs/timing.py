@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy.special import chdtrc, fdtrc
 
 from koopmpc.lifting.base import strip_unit
 from koopmpc.validate.logs.log import Log, LogFault
@@ -249,7 +249,7 @@ def _explain_feedback(rows: _Rows, j: int, limits: _Strictness) -> str:
     more, free = both.shape[1] - own.shape[1], ones - both.shape[1] - 1
     if joint < 1e-9 * float((u**2).sum()):
         return "the rows before determine it"
-    if more > 0 and stats.f.sf((alone - joint) / more / (joint / free), more, free) < limits.significance:
+    if more > 0 and fdtrc(more, free, (alone - joint) / more / (joint / free)) < limits.significance:
         return "past outputs predict it, so it is a feedback"
     nx, nu = rows.after.shape[1], rows.same.shape[1]
     if rows.repeated[j] < _REPEATED:
@@ -258,7 +258,7 @@ def _explain_feedback(rows: _Rows, j: int, limits: _Strictness) -> str:
         base, proxy = (float((_leave_out(Q, u) ** 2).sum()) for Q in (short, few))
         more, free = few.shape[1] - short.shape[1], ones - few.shape[1] - 1
         explained = base - proxy > limits.share * (base - alone)
-        if more > 0 and explained and stats.f.sf((base - proxy) / more / (proxy / free), more, free) < _INSTRUMENTS:
+        if more > 0 and explained and fdtrc(more, free, (base - proxy) / more / (proxy / free)) < _INSTRUMENTS:
             return "outputs predict it as well as its own past does, so it may be a feedback"
     # two-stage least squares of u = −K y + r with the past as instruments: r must not follow from the past
     predicted = both @ (both.T @ rows.after)
@@ -269,6 +269,6 @@ def _explain_feedback(rows: _Rows, j: int, limits: _Strictness) -> str:
     if not (np.abs(K[:, 0]) > limits.gain * errors).any():
         return ""
     explained = float(((both.T @ r) ** 2).sum()) / max(rest / ones, 1e-300)
-    if stats.chi2.sf(explained, both.shape[1] - nx) > _INSTRUMENTS:
+    if chdtrc(both.shape[1] - nx, explained) > _INSTRUMENTS:
         return "its past follows from the outputs as under a proportional feedback"
     return ""
