@@ -8,7 +8,10 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change: bytes `start` to `end` of a file become `text`; `first` and `last` are the lines around it."""
+    """One change: bytes `start` to `end` of a file become `text`; `first` and `last` are the lines around it.
+
+    `operator` is the kind of what is changed: Compare, Constant, Return, …
+    """
 
     file: str
     first: int
@@ -16,6 +19,7 @@ class Mutant:
     start: int
     end: int
     text: str
+    operator: str = ""
 
     def of(self, source: bytes) -> bytes:
         """Return the source with the change in it."""
@@ -160,6 +164,7 @@ def mutants(file: str, source: bytes) -> Iterator[Mutant]:
                 starts[old.lineno - 1] + old.col_offset,
                 starts[old.end_lineno - 1] + old.end_col_offset,
                 text if isinstance(new, ast.stmt | ast.Name | ast.Attribute | ast.Constant) else f"({text})",
+                type(node).__name__,
             )
         for child in _children(node):
             yield from visit(child, statement)

@@ -1,12 +1,18 @@
 """Changes of a source file are those that are asked for, one at a time, and leave alone what is only said."""
 
 import ast
+import hashlib
+import subprocess
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
-from tests.mutation.__main__ import drawn_of
+import koopmpc as km
+from tests.compiler import find_compiler
+from tests.mutation.c_changes import c_mutants
 from tests.mutation.changes import mutants
+from tests.mutation.draw import drawn_of, list_changes, read_sources, room_of
 from tests.tiers import slow
 
 SOURCE = '''"""Words with 1 < 2."""
@@ -56,7 +62,9 @@ def test_what_stands_in_for_a_divisor_of_zero_and_a_most_of_rounds_stay() -> Non
     assert not any(line.endswith("size, 2.0)") or "201" in line for line in found)
 
 
-@pytest.mark.parametrize("name", ["control/lqr.py", *slow(["data/files/parquet.py", "loop/simulate.py"])])
+@pytest.mark.parametrize(
+    "name", ["estimate/gate.py", *slow(["control/lqr.py", "data/files/parquet.py", "loop/simulate.py"])]
+)
 def test_every_change_of_the_library_is_a_program_that_differs(name: str) -> None:
     source = (Path(__file__).parents[2] / "koopmpc" / name).read_bytes()
     whole, made = ast.dump(ast.parse(source)), list(mutants(name, source))
@@ -75,3 +83,85 @@ def test_a_change_stays_drawn_when_its_line_moves_and_when_others_come_and_go(se
     before, after = drawn("a.py", path.read_bytes(), 30), drawn("b.py", moved + path.read_bytes(), 33)
     assert len(set(before)) == 30
     assert set(before) <= set(after)
+
+
+C = """#include "a.h"  /* 1 < 2 */
+#define TWO 2
+enum { N = 3 };
+static void f(const double *x, koopmpc_real *y) {
+  double z[N] = {0}; /* what it holds */
+  for (int i = 0; i < N; i++) y[i] -= *x * (double)*y; // and 1 + 1
+  if (x && z[0] < 1e-9) return;
+  g(y, "a < b");
+}
+"""
+EXPECTED_OF_C = [
+    "double z[N] = {1}; /* what it holds */",
+    "for (int i = 1; i < N; i++) y[i] -= *x * (double)*y; // and 1 + 1",
+    "for (int i = 0; i <= N; i++) y[i] -= *x * (double)*y; // and 1 + 1",
+    "for (int i = 0; i < N; i++) y[i] += *x * (double)*y; // and 1 + 1",
+    "for (int i = 0; i < N; i++) y[i] -= *x / (double)*y; // and 1 + 1",
+    "for (int i = 0; i < N; i++) ; // and 1 + 1",
+    "if (!(x && z[0] < 1e-9)) return;",
+    "if (x || z[0] < 1e-9) return;",
+    "if (x && z[1] < 1e-9) return;",
+    ";",
+]
+
+
+def test_each_change_of_c_is_one_place_that_does_something() -> None:
+    source = C.encode()
+    assert sorted(mutant.lines(source)[1] for mutant in c_mutants("file.c", source)) == sorted(EXPECTED_OF_C)
+
+
+def controllers():
+    """Controllers whose C takes different files."""
+    problem = km.load_problem("pendulum")
+    plant = km.discretize(problem.dynamics, problem.dt)
+    asked = problem.cost, problem.limits, problem.horizon
+    data = km.collect(plant, problem.training.x0, problem.training.excitation, episodes=20, steps=40, rng=0)
+    yield km.KoopmanMPC(km.edmd(data, problem.lifting), *asked, estimator=km.LiftedDisturbance())
+    yield km.BilinearMPC(km.bilinear_edmd(data, problem.lifting), *asked)
+    yield km.LQR(km.edmd(data, problem.lifting), problem.cost)
+
+
+@pytest.mark.slow
+def test_changed_c_compiles(tmp_path: Path) -> None:
+    """One of forty changes of each file, in a program that is compiled from it."""
+    compiler = find_compiler()
+    if compiler is None:
+        pytest.skip("no C compiler")
+    tried = Counter()
+    for number, controller in enumerate(controllers()):
+        folder = tmp_path / str(number)
+        km.export(controller, folder)
+        for path in folder.glob("koopmpc*.c"):
+            own = Path(km.__file__).parent / "codegen/c" / path.name
+            if not own.exists() or path.read_bytes() != own.read_bytes():
+                continue
+            source = path.read_bytes()
+            for mutant in c_mutants(path.name, source):
+                if hashlib.sha256(f"{number} {mutant}".encode()).digest()[0] < 6:
+                    path.write_bytes(mutant.of(source))
+                    done = subprocess.run(
+                        [*compiler, "-fsyntax-only", "-w", path], cwd=folder, capture_output=True, text=True
+                    )
+                    assert not done.returncode, (mutant.lines(source), done.stderr)
+                    tried[path.name] += 1
+            path.write_bytes(source)
+    assert sum(tried.values()) > 100
+
+
+def test_other_seeds_draw_from_every_room_and_every_kind_of_change() -> None:
+    sources = {
+        name: text
+        for name, text in read_sources(4).items()
+        if "/cli/" in name or "/loop/" in name or name.endswith(".c")
+    }
+    everything = list_changes(sources)
+    drawn = drawn_of(everything, 4, 60)
+    rooms = Counter(room_of(mutant.file) for mutant in drawn)
+    assert set(rooms) == {"cli", "loop", "c"}
+    assert max(rooms.values()) - min(rooms.values()) <= 1
+    assert len({mutant.operator for mutant in drawn}) >= 10
+    assert not any("daqp/" in name for name in read_sources(4))

@@ -22,8 +22,30 @@ OPTIONS = ("-x", "-q", "--benchmark-disable", "-p", "no:cacheprovider", "-p", "n
 MEMORY = 8 << 30  # [bytes]
 
 
-def outcome(tests: list[str], seconds: int) -> int:
-    """Return the exit code of these tests in a child, negative where a signal ended it: SIGXCPU, when its time was up."""
+class Watch:
+    """A plugin that ends the run after so many seconds of processor time, and keeps which test failed."""
+
+    def __init__(self, enough: float) -> None:
+        self._enough, self.failed = enough, ""
+
+    @pytest.hookimpl
+    def pytest_runtest_logreport(self, report):
+        if report.failed:
+            self.failed = report.nodeid
+
+    @pytest.hookimpl
+    def pytest_runtest_teardown(self, item):
+        if sum(os.times()[:4]) > self._enough:
+            item.session.shouldstop = "enough"
+
+
+def outcome(tests: list[str], seconds: int, enough: float) -> tuple[int, str]:
+    """Return the exit code of these tests in a child, and the test that failed.
+
+    The code is 0 too where the tests took `enough` seconds, and negative where a signal ended the child: SIGXCPU, when
+    its time was up.
+    """
+    ours, theirs = os.pipe()
     child = os.fork()
     if not child:
         for stream in range(3):
@@ -31,12 +53,18 @@ def outcome(tests: list[str], seconds: int) -> int:
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         signal.alarm(4 * seconds)  # where it waits instead
-        os._exit(pytest.main([*OPTIONS, *tests]))
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        watch = Watch(enough)
+        code = pytest.main([*OPTIONS, *tests], plugins=[watch])
+        os.write(theirs, watch.failed.encode())
+        os._exit(0 if code == pytest.ExitCode.INTERRUPTED and not watch.failed else code)
+    os.close(theirs)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    with os.fdopen(ours) as pipe:
+        return code, pipe.read()
 
 
 for name in LIBRARIES:
     import_module(name)
 for line in sys.stdin:
-    sys.stdout.write(f"{outcome(*json.loads(line))}\n")
+    sys.stdout.write(json.dumps(outcome(*json.loads(line))) + "\n")
     sys.stdout.flush()
