@@ -1,8 +1,8 @@
 """Refinement of a fitted model on its simulation error: from one step ahead to many."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -15,6 +15,7 @@ from koopmpc.identify.levenberg_marquardt import minimise
 from koopmpc.identify.records.conversion import SignalUnits, cut_segments, from_standard, is_hidden, to_standard
 from koopmpc.identify.records.hidden import SimulationError, join_segments
 from koopmpc.interrupts import raise_swallowed
+from koopmpc.plants.routines import bind_interpreter
 from koopmpc.predict.base import FitReport
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.predict.spectrum import check_same_names
@@ -40,8 +41,13 @@ class MultiStepError:
     """
 
     @raise_swallowed()
-    def __init__(self, model: LinearPredictor | BilinearPredictor, size: Float[np.ndarray, " nx"]) -> None:
-        self.embedding, self.size = model.embedding, size
+    def __init__(
+        self,
+        model: LinearPredictor | BilinearPredictor,
+        size: Float[np.ndarray, " nx"],
+        free: Int[np.ndarray, " f"] | None = None,
+    ) -> None:
+        self.embedding, self.size, self._free = model.embedding, size, free
         zeta, u = ca.SX.sym("zeta", len(model.point_names)), ca.SX.sym("u", model.nu)
         z = model.lifting.symbolic(zeta)
         products = [ca.kron(u, z)] if isinstance(model, BilinearPredictor) else []
@@ -49,15 +55,16 @@ class MultiStepError:
         theta = ca.SX.sym("theta", model.nx, phi.numel())
         slope = ca.densify(ca.jacobian(theta @ phi, zeta))
         self._features = ca.Function("features", [zeta, u], [phi], {"cse": True})
-        self._slopes = ca.Function("slopes", [zeta, u, theta], [phi, slope], {"cse": True})
+        self._slopes = ca.Function("slopes", [zeta, u, ca.vec(theta.T)], [phi, slope], {"cse": True})
         self.shape = model.nx, phi.numel()
+        self._bound: dict[tuple[bool, int], tuple[list[np.ndarray], Callable[[], None], Any]] = {}
 
     def evaluate(self, theta: Float[np.ndarray, "nx nphi"], data: Segments) -> float:
         """Return the mean squared relative error over all segments and steps; inf where a forecast overflows."""
         total, point = 0.0, data.points
         with np.errstate(over="ignore", invalid="ignore"):
             for u, truth in zip(data.inputs, data.states, strict=True):
-                x = self._features_of(point, u) @ theta.T
+                x = self._evaluate(point, u)[0] @ theta.T
                 total += float(np.sum(((x - truth) / self.size) ** 2))
                 if not np.isfinite(total):
                     return np.inf
@@ -65,34 +72,48 @@ class MultiStepError:
         return total / data.states.size
 
     @raise_swallowed()
-    def _features_of(self, point: Float[np.ndarray, "m npoint"], u: Float[np.ndarray, "m nu"]) -> np.ndarray:
-        """Return φ of every segment, (m, nphi)."""
-        values = cast("Any", self._features.map(len(point))(point.T, u.T))
-        return np.asarray(values, dtype=np.float64).T
+    def _evaluate(self, *values: np.ndarray) -> list[np.ndarray]:
+        """Return φ of every segment, (m, nphi), of points and inputs; with Θ also the slopes, (m, npoint, nx)."""
+        slopes, (m, npoint), (nx, count) = len(values) > 2, values[0].shape, self.shape
+        if (slopes, m) not in self._bound:
+            function = self._slopes.map("all", "serial", m, [2], []) if slopes else self._features.map(m)
+            given = [np.zeros(value.shape) for value in values]
+            out = [np.zeros((m, count)), np.zeros((m, npoint, nx))][: 1 + slopes]
+            self._bound[slopes, m] = ([*given, *out], *bind_interpreter(function, given, out))
+        arrays, evaluate, _ = self._bound[slopes, m]
+        for array, value in zip(arrays, values, strict=False):
+            array[...] = value
+        evaluate()
+        return arrays[len(values) :]
 
     @raise_swallowed()
     def derivatives(
         self, theta: Float[np.ndarray, "nx nphi"], data: Segments
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
-        """Return half the gradient of `evaluate` by Θ, row after row, and the Gauss-Newton matrix."""
+        """Return half the gradient of `evaluate` by Θ, row after row, and the Gauss-Newton matrix.
+
+        Entries of Θ that are not among `free` count as constants.
+        """
         (nx, count), (m, n) = self.shape, data.points.shape
-        gradient, matrix = np.zeros(nx * count), np.zeros((nx * count, nx * count))
-        slopes = self._slopes.map("slopes_of_all", "serial", m, [2], [])
-        point, moved, rows = data.points, np.zeros((m, nx * count, n)), np.arange(nx)
+        free = np.arange(nx * count) if self._free is None else self._free
+        rows, columns, every = free // count, free % count, np.arange(len(free))
+        slopes, squares = np.zeros(len(free)), np.zeros((len(free), len(free)))
+        point, moved = data.points, np.zeros((m, len(free), n))
         for u, truth in zip(data.inputs, data.states, strict=True):
-            values = cast("Sequence[Any]", slopes(point.T, u.T, theta))
-            phi, slope = (np.asarray(value, dtype=np.float64) for value in values)
-            D = moved @ slope.reshape(nx, m, n).transpose(1, 2, 0)  # (m, nx nphi, nx)
-            D.reshape(m, nx, count, nx)[:, rows, :, rows] += phi.T
-            x = phi.T @ theta.T
+            phi, slope = self._evaluate(point, u, theta)
+            D = moved @ slope  # (m, f, nx)
+            D[:, every, rows] += phi[:, columns]
+            x = phi @ theta.T
             weighed = (D / self.size).transpose(0, 2, 1).reshape(m * nx, -1)
-            gradient += weighed.T @ ((x - truth) / self.size).ravel()
-            matrix += weighed.T @ weighed
+            slopes += weighed.T @ ((x - truth) / self.size).ravel()
+            squares += weighed.T @ weighed
             if self.embedding is None:
                 point, moved = x, D
             else:
                 point = self.embedding.shift(point, u, x)
                 moved = self.embedding.shift(moved, np.zeros((*D.shape[:2], u.shape[1])), D)
+        gradient, matrix = np.zeros(nx * count), np.zeros((nx * count, nx * count))
+        gradient[free], matrix[np.ix_(free, free)] = slopes, squares
         return gradient / data.states.size, matrix / data.states.size
 
 
@@ -166,8 +187,9 @@ def refine(
     size = np.where(size > 0, size, 1.0)
     fitted = _segments(model, whole.with_episodes(learn), horizon, "to learn from")
     judged = _segments(model, whole.with_episodes(unseen), horizon, "held out")
-    error, start = MultiStepError(model, size), _theta(model, places)
+    start = _theta(model, places)
     free = np.flatnonzero(start.ravel())
+    error = MultiStepError(model, size, free)
     theta, steps = minimise(error, start, fitted, judged, iterations, free=free)
     before, after = error.evaluate(start, judged), error.evaluate(theta, judged)
     if not after < before:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from math import factorial
 
 import numpy as np
@@ -115,15 +114,14 @@ class SimulationError:
     def __init__(self, model: HiddenModel, noise: float = 0.0) -> None:
         self.model, self._noise = model, noise
         self._encoder = np.arange(model.T.size).reshape(model.T.shape)[:, :-1].ravel() + model.E.size + model.H.size
-        n, curved = model.order, is_nonlinear(model.terms, model.order)
-        kinds = (~curved, curved) if np.isfinite(model.bound).all() else (np.ones(len(curved), dtype=np.bool_),)
-        self._places = [  # slot, entry of z, terms that have it in this slot, whether they are bounded
-            (s, j, places, bounded)
-            for s, slot in enumerate(model.terms.T)
-            for j in range(1, n + 1)
-            for bounded, kind in enumerate(kinds)
-            for places in [np.flatnonzero((slot == j) & kind)]
-            if len(places)
+        n, limited = model.order, bool(np.isfinite(model.bound).all())
+        factors = [tuple(v for v in term if v) for term in model.terms.tolist()]
+        place = {(): 0} | {term: t for t, term in enumerate(factors, 1)}
+        # ∂(v₁ v₂ v₃)/∂v₁ is a shorter product: term, entry of z, the product that is left, how often the entry occurs
+        self._slopes = [
+            (t, j - 1, place[term[: term.index(j)] + term[term.index(j) + 1 :]], term.count(j), limited and bends)
+            for t, (term, bends) in enumerate(zip(factors, is_nonlinear(model.terms, n).tolist(), strict=True), 1)
+            for j in sorted({v for v in term if v <= n})
         ]
 
     def evaluate(self, theta: Float[np.ndarray, " p"], data: Sets) -> float:
@@ -148,82 +146,90 @@ class SimulationError:
         return self._noise**2 / min(len(part.inputs) for part in data)
 
     def _evaluate(self, theta: Float[np.ndarray, " p"], data: RecordSegments) -> float:
-        model, total = self.model.with_parameters(theta), 0.0
-        z = start_states(model, data.points)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for k, u in enumerate(data.inputs):
-                z = read_features(model, z, u) @ model.E.T
-                if not (np.abs(z) < _FAR).all():
-                    return np.inf
-                gap = _gap(z @ model.H[:, :-1].T + model.H[:, -1], data, k)
-                total += float(np.sum(gap**2))
-        return total / data.outputs.size
+        model = self.model.with_parameters(theta)
+        z = _list_states(model, start_states(model, data.points), data.inputs)[1:]
+        if not (np.abs(z) < _FAR).all():
+            return np.inf
+        return float(np.mean(_gap(z @ model.H[:, :-1].T + model.H[:, -1], data) ** 2))
 
     def _derivatives(
         self, theta: Float[np.ndarray, " p"], data: RecordSegments
     ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
-        model, p = self.model.with_parameters(theta), len(theta)
-        (m, ny), n, nphi = data.outputs.shape[1:], model.order, model.E.shape[1]
-        first, last = model.E.size, model.E.size + model.H.size
-        begin, q = last + model.T.size, len(model.neurons)
-        W = model.E[:, nphi - q :]
-        C = model.H[:, :-1]
-        ones = np.ones((m, 1))
-        zeta = np.hstack([data.points, ones])
-        D = np.zeros((m, first + model.neurons.size, n))  # by E and V
-        own = np.arange(n)
-        z = start_states(model, data.points)
-        begun = np.tile(np.eye(n), (m, 1, 1))  # by the state in which a segment begins
-        gradient, matrix = np.zeros(p), np.zeros((p, p))
-        rows, gaps = list[np.ndarray](), list[np.ndarray]()
-        for k, u in enumerate(data.inputs):
-            phi, slope = self._features(model, z, u)
-            turned = slope.transpose(0, 2, 1)
-            D, begun = np.matmul(D, turned), np.matmul(begun, turned)
-            D[:, :first].reshape(m, n, nphi, n)[:, own, :, own] += phi  # a view: the rows of E in D
-            if q:
-                bent = (1 - phi[:, nphi - q :] ** 2)[:, :, None] * np.hstack([z, ones])[:, None]  # (m, q, n + 1)
-                D[:, first:].reshape(m, q, n + 1, n)[...] += bent[..., None] * W.T[:, None]
-            z = phi @ model.E.T
-            gap = _gap(z @ C.T + model.H[:, -1], data, k)
-            J = np.zeros((m, ny, p))
-            moved = (D @ C.T).transpose(0, 2, 1)
-            J[:, :, :first], J[:, :, begin:] = moved[:, :, :first], moved[:, :, first:]
+        """Return both by E, H and V and by the state z_0 of each segment, which T ζ gives."""
+        model = self.model.with_parameters(theta)
+        (steps, m, ny), n, nphi = data.outputs.shape, model.order, model.E.shape[1]
+        first, last, own = model.E.size, model.E.size + model.H.size, np.arange(n)
+        weighed = np.flatnonzero(model.E[:, nphi - len(model.neurons) :].any(axis=0))  # V of others changes nothing
+        bends: Int[np.ndarray, " q"] = nphi - len(model.neurons) + weighed
+        C, W, q, width = model.H[:, :-1], model.E[:, bends], len(bends), last + len(bends) * (n + 1)
+        z = _list_states(model, start_states(model, data.points), data.inputs)
+        out = np.concatenate([z, np.ones((steps + 1, m, 1))], axis=2)
+        y = z[1:] @ C.T + model.H[:, -1]
+        gap, told = _gap(y, data), None if data.low is None else ~_is_silent(y, data)
+        D, begun = np.zeros((m, width - last + first, n)), np.tile(np.eye(n), (m, 1, 1))  # by E and V, by z_0
+        slope, both = np.zeros(width), np.zeros((width, width))
+        early, cross, square = np.zeros((m, n)), np.zeros((m, n, width)), np.zeros((m, n, n))
+        for low in range(0, steps, _STEPS):
+            now = slice(low, min(low + _STEPS, steps))
+            count = now.stop - low
+            J, S = np.zeros((m, count, ny, width)), np.empty((m, count, ny, n))
+            phi, turned = self._features(model, z[now].reshape(-1, n), data.inputs[now].reshape(count * m, -1))
+            phi, turned = phi.reshape(count, m, nphi), turned.reshape(count, m, n, n).swapaxes(2, 3)
+            bent = (1 - phi[..., bends] ** 2)[..., None] * out[now, :, None]  # (count, m, q, n + 1)
+            for i in range(count):
+                D, begun = np.matmul(D, turned[i]), np.matmul(begun, turned[i])
+                D[:, :first].reshape(m, n, nphi, n)[:, own, :, own] += phi[i]  # a view: the rows of E in D
+                if q:
+                    D[:, first:].reshape(m, q, n + 1, n)[...] += bent[i][..., None] * W.T[:, None]
+                moved = (D.reshape(-1, n) @ C.T).reshape(m, -1, ny).swapaxes(1, 2)
+                J[:, i, :, :first], J[:, i, :, last:] = moved[:, :, :first], moved[:, :, first:]
+                S[:, i] = (begun @ C.T).swapaxes(1, 2)
             for i in range(ny):
-                J[:, i, first + i * (n + 1) : first + (i + 1) * (n + 1)] = np.hstack([z, ones])
-            early = (begun @ C.T).transpose(0, 2, 1)[..., None] * zeta[:, None, None]  # (m, ny, n, nζ + 1)
-            J[:, :, last:begin] = early.reshape(m, ny, -1)
-            if data.low is not None:
-                J *= ~_is_silent(z @ C.T + model.H[:, -1], data, k)[:, :, None]
-            rows.append(J.reshape(m * ny, p))
-            gaps.append(gap.ravel())
-            if len(rows) == _STEPS or k + 1 == len(data.inputs):
-                block = np.concatenate(rows)
-                gradient += block.T @ np.concatenate(gaps)
-                matrix += block.T @ block
-                rows, gaps = [], []
+                J[:, :, i, first + i * (n + 1) : first + (i + 1) * (n + 1)] = out[1:][now].swapaxes(0, 1)
+            if told is not None:
+                J *= told[now].swapaxes(0, 1)[..., None]
+                S *= told[now].swapaxes(0, 1)[..., None]
+            rows, own_rows = J.reshape(m, -1, width), S.reshape(m, -1, n).swapaxes(1, 2)
+            gaps = gap[now].swapaxes(0, 1).reshape(m, -1)
+            slope += rows.reshape(-1, width).T @ gaps.ravel()
+            both += rows.reshape(-1, width).T @ rows.reshape(-1, width)
+            early += np.matmul(own_rows, gaps[..., None])[..., 0]
+            cross += np.matmul(own_rows, rows)
+            square += np.matmul(own_rows, own_rows.swapaxes(1, 2))
+        gradient, matrix = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
+        begin = last + model.T.size
+        encoder = np.arange(last, begin)
+        by_neurons = begin + weighed[:, None] * (n + 1) + np.arange(n + 1)
+        others: Int[np.ndarray, " width"] = np.append(np.arange(last), by_neurons)
+        zeta = np.hstack([data.points, np.ones((m, 1))])  # z_0 = T [ζ; 1], row after row of T
+        gradient[others], gradient[encoder] = slope, (early.T @ zeta).ravel()
+        matrix[np.ix_(others, others)] = both
+        mixed = (zeta.T @ cross.reshape(m, -1)).reshape(-1, n, width).swapaxes(0, 1).reshape(-1, width)
+        matrix[np.ix_(encoder, others)], matrix[np.ix_(others, encoder)] = mixed, mixed.T
+        pairs = (zeta[:, :, None] * zeta[:, None]).reshape(m, -1).T @ square.reshape(m, -1)
+        size = len(zeta[0])
+        matrix[np.ix_(encoder, encoder)] = (
+            pairs.reshape(size, size, n, n).transpose(2, 0, 3, 1).reshape(n * size, n * size)
+        )
         return gradient / data.outputs.size, matrix / data.outputs.size
 
     def _features(
         self, model: HiddenModel, z: Float[np.ndarray, "m n"], u: Float[np.ndarray, "m nu"]
     ) -> tuple[Float[np.ndarray, "m nphi"], Float[np.ndarray, "m n n"]]:
         """Return φ and ∂(E φ)/∂z."""
-        terms, n, E = model.terms, z.shape[1], model.E
+        n, E, bound, products = z.shape[1], model.E, model.bound, 1 + len(model.terms)
         phi = read_features(model, z, u)
-        bound = model.bound
-        V = np.hstack([np.ones((len(z), 1)), np.clip(z, -bound, bound), u])
-        inside = (np.abs(z) < bound).astype(float)
-        slope = np.zeros((len(z), n, n))
-        rest: dict[int, np.ndarray] = {}
-        for s, j, places, bounded in self._places:
-            if s not in rest:
-                others = [V[:, column] for other, column in enumerate(terms.T) if other != s]
-                rest[s] = reduce(np.multiply, others, np.ones((len(z), len(terms))))
-            part = rest[s][:, places]
-            slope[:, :, j - 1] += (part * inside[:, j - 1 : j] if bounded else part) @ E[:, places + 1].T
+        near, inside = phi[:, :products], np.abs(z) < bound
+        if not inside.all():
+            near = np.ones((len(z), products))
+            near[:, 1:] = evaluate_terms(model.terms, np.hstack([near[:, :1], np.clip(z, -bound, bound), u]))
+        weights = np.zeros((2, products, n, n))  # of terms that bounds do not concern, and of others
+        for t, j, rest, times, bounded in self._slopes:
+            weights[int(bounded), rest, :, j] += times * E[:, t]
+        slope, bounded = near @ weights.reshape(2, products, -1)
+        slope = (slope + bounded * np.tile(inside, n)).reshape(-1, n, n)
         if q := len(self.model.neurons):
-            bent = (1 - phi[:, -q:] ** 2)[:, None] * E[:, -q:]  # (m, n, q)
-            slope += bent @ model.neurons[:, :-1]
+            slope += ((1 - phi[:, -q:] ** 2)[:, None] * E[:, -q:]) @ model.neurons[:, :-1]
         return phi, slope
 
 
@@ -231,12 +237,19 @@ def simulate_hidden(
     model: HiddenModel, points: Float[np.ndarray, "m nzeta"], inputs: Float[np.ndarray, "steps m nu"]
 ) -> Float[np.ndarray, "steps m ny"]:
     """Return ŷ_1, ŷ_2, … from several points ζ."""
-    z, out = start_states(model, points), list[np.ndarray]()
+    return _list_states(model, start_states(model, points), inputs)[1:] @ model.H[:, :-1].T + model.H[:, -1]
+
+
+def _list_states(
+    model: HiddenModel, z: Float[np.ndarray, "m n"], inputs: Float[np.ndarray, "steps m nu"]
+) -> Float[np.ndarray, "steps1 m n"]:
+    """Return z_0, z_1, …, which stop at `_FAR` spreads."""
+    out = np.empty((len(inputs) + 1, *z.shape))
+    out[0] = z
     with np.errstate(over="ignore", invalid="ignore"):
-        for u in inputs:
-            z = np.clip(read_features(model, z, u) @ model.E.T, -_FAR, _FAR)
-            out.append(z @ model.H[:, :-1].T + model.H[:, -1])
-    return np.stack(out)
+        for k, u in enumerate(inputs):
+            np.minimum(np.maximum(read_features(model, out[k], u) @ model.E.T, -_FAR), _FAR, out=out[k + 1])
+    return out
 
 
 def bound_states(model: HiddenModel, data: RecordSegments, reach: float) -> HiddenModel:
@@ -291,16 +304,16 @@ def is_nonlinear(terms: Terms, order: int) -> Bool[np.ndarray, " nt"]:
     return np.sum((terms > 0) & (terms <= order), axis=1) > 1
 
 
-def _is_silent(y: Float[np.ndarray, "m ny"], data: RecordSegments, k: int) -> np.ndarray:
+def _is_silent(y: Float[np.ndarray, "steps m ny"], data: RecordSegments) -> Bool[np.ndarray, "steps m ny"]:
     """Return which readings say nothing: they are at a rail and y lies beyond it."""
     assert data.low is not None
     assert data.high is not None
-    return (data.low[k] & (y < data.outputs[k])) | (data.high[k] & (y > data.outputs[k]))
+    return (data.low & (y < data.outputs)) | (data.high & (y > data.outputs))
 
 
-def _gap(y: Float[np.ndarray, "m ny"], data: RecordSegments, k: int) -> Float[np.ndarray, "m ny"]:
-    gap = y - data.outputs[k]
-    return gap if data.low is None else np.where(_is_silent(y, data, k), 0.0, gap)
+def _gap(y: Float[np.ndarray, "steps m ny"], data: RecordSegments) -> Float[np.ndarray, "steps m ny"]:
+    gap = y - data.outputs
+    return gap if data.low is None else np.where(_is_silent(y, data), 0.0, gap)
 
 
 def start_with_differences(ny: int, nu: int, order: int, delays: int) -> HiddenModel:
