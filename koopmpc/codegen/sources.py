@@ -143,7 +143,8 @@ def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
     """Return the text of every file by its name: header, controller, model, numbers, solver."""
     language = Language(single)
     if tables.is_staged:
-        own = (*_OWN, *_RECEDING, *_STAGED, *(_QP if tables.sizes["FINISH_ROWS"] else ()))
+        own = (*_OWN, *_RECEDING, *_STAGED, *(["koopmpc_motion.c"] if tables.sizes["BEYOND"] else ()))
+        own = (*own, *(_QP if tables.sizes["FINISH_ROWS"] else ()))
     else:
         law = ("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")
         own = (*_OWN, *_QP, "koopmpc_target.c", *law)

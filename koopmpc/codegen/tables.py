@@ -10,6 +10,7 @@ from jaxtyping import Float
 from koopmpc.control.limits import Interval
 from koopmpc.control.linear.condensed_program import CondensedProgram
 from koopmpc.control.lqr import FeedbackProgram
+from koopmpc.control.nonlinear import motion
 from koopmpc.control.nonlinear.bilinear_mpc import SETTLED
 from koopmpc.control.nonlinear.equilibrium import PSEUDO, RANK
 from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
@@ -53,6 +54,15 @@ _TOLERANCES = {
     "SMALL": (1e-7, 1e-4),
     "RESTED": (RESTED, 1e-5),
     "PSEUDO": (PSEUDO, 1e-5),
+    "FITS": (motion.FITS, 1e-4),
+    "GROWS": (motion.GROWS, 1e-3),
+    "DRIFTS": (motion.DRIFTS, 1e-4),
+    "FOLLOWS": (motion.FOLLOWS, 1e-2),
+    "STILL": (motion.STILL, 1e-5),
+    "TERMS": (motion.TERMS, 1e-5),
+    "FLAT": (motion.ROUNDING, 1e-6),
+    "BURSTS": (motion.BURSTS, 1e3),
+    "SEEN": (motion.SEEN, 1e-3),
 }
 _TABLE_NOTE = (
     "`koopmpc_table.h` holds the equilibria of the reference rows that `export` was given, and what the end of the "
@@ -461,6 +471,8 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         "MADE": N + 1 if p.holds else 1,
         "MADE_SIZE": target + 1,
         "TAIL": p.tail.steps,
+        "BEYOND": p.beyond,
+        "RESTS": motion.RESTS,
     }
     arguments = {
         "map": {"x": nx, "u": nu},

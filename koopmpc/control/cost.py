@@ -76,9 +76,10 @@ class Cost(Value):
         itself, with inputs half a step late, costs within 0.5 % of the least. BilinearMPC and NonlinearMPC have no
         tail by default: without Q_N and tail their end costs the Riccati solution at the equilibrium nearest to r_N.
     beyond
-        What a reference does after the rows that a step is given, in BilinearMPC and NonlinearMPC. "rest": the last row
-        stays. "motion": it goes on by the linear recurrence that all these rows obey, as sines, ramps and their sums
-        do, and the end of the plan aims there; rows that obey none rest. It needs neither Q_N nor tail.
+        What a reference does after the rows that a step is given. "rest": the last row stays. "motion", the default of
+        BilinearMPC and NonlinearMPC without Q_N, tail and given u_target: it goes on by the linear recurrence that all
+        these rows obey, as sines, ramps and their sums do, and the end of the plan aims there; rows that obey none
+        rest. Other controllers rest.
 
     Raises
     ------
@@ -102,7 +103,7 @@ class Cost(Value):
     R_delta: ArrayLike | checks.ByName | None = None
     tail: int | None = None
     price: "Bound" = None
-    beyond: Literal["rest", "motion"] = "rest"
+    beyond: Literal["rest", "motion"] | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.Q_N, WeighsEnd):
@@ -137,7 +138,7 @@ class Cost(Value):
             if not all(np.isfinite(np.asarray(value)).all() for value in bounds.list_bound(price)):
                 raise DataError("price holds an infinite number; pass what a unit of an input costs in a step")
             object.__setattr__(self, "price", price)
-        if self.beyond not in ("rest", "motion"):
+        if self.beyond not in ("rest", "motion", None):
             raise DataError(f'beyond is {self.beyond!r}; pass "rest" or "motion"')
         if self.beyond == "motion" and not (self.Q_N is None and self.tail is None):
             raise DataError('beyond="motion" moves the end that the default costs; leave Q_N and tail out')
@@ -145,6 +146,11 @@ class Cost(Value):
             object.__setattr__(self, "tail", int(checks.count(self.tail, "tail", 0)))
             if self.Q_N is not None:
                 raise DataError(f"Q_N and tail = {self.tail} are given; Q_N takes the tail's place: pass one of them")
+
+    @property
+    def moves_on(self) -> bool:
+        """Whether the end of a plan follows a reference that goes on as it moved."""
+        return self.beyond != "rest" and self.Q_N is None and self.tail is None
 
     def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Cost":
         """Return the cost with arrays in place of weights by name.

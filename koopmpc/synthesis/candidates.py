@@ -322,8 +322,8 @@ class Recipe(Value):
         Steps of the cost's tail where the cost names neither a tail nor Q_N; None for the default, 0 is Q_N = Q.
     weighted
         Fit the model again with weights around the states that its closed loops visit.
-    motion
-        The reference goes on as it moved beyond its rows, where the cost names no other end; bilinear models only.
+    rests
+        The reference rests beyond its rows, also where it moved and the cost names no other end; bilinear models only.
     """
 
     candidate: Candidate
@@ -331,7 +331,7 @@ class Recipe(Value):
     estimator: LiftedDisturbance | None = None
     tail: int | None = None
     weighted: bool = False
-    motion: bool = False
+    rests: bool = False
 
     def __str__(self) -> str:
         """Return kind, name and delays of the model, and what the controller has besides the default."""
@@ -343,8 +343,8 @@ class Recipe(Value):
             parts.append("Q_N = Q")
         elif self.tail is not None:
             parts.append(f"a tail of {self.tail} steps")
-        if self.motion:
-            parts.append("the reference goes on")
+        if self.rests:
+            parts.append("the reference rests at its end")
         if estimator is not None:
             parts.append("offset-free" + ("" if estimator.gain is None else f" (gain {estimator.gain:g})"))
         if self.weighted:
@@ -386,9 +386,7 @@ class Recipe(Value):
         if self.tail is not None and cost.Q_N is None and cost.tail is None:
             cost = replace(cost, tail=self.tail)
         kind = kind_for(model)
-        if not self.candidate.bilinear:
+        if self.rests or not self.candidate.bilinear:
             cost = replace(cost, beyond="rest")
-        elif self.motion and cost.Q_N is None and cost.tail is None:
-            cost = replace(cost, beyond="motion")
         build: Any = (kind.brief if brief else None) or kind.controller
         return build(model, cost, limits, horizon, estimator=self.estimator, monitor=monitor)

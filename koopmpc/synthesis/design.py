@@ -331,11 +331,6 @@ def design(
         blind += find_blind_range(test.episodes, asked, neighbours)
         blind += compare_longer_horizon(test, rows[best].recipe, controller, neighbours, draw)
     controller.reset()
-    if rows[best].recipe.motion:
-        blind.append(
-            "beyond its rows the controller takes the reference to go on as it moved, which its C cannot yet: "
-            "for C code pass a cost with tail=0"
-        )
     remembered = [] if not hidden else [f"{memory}; models with delays were tried"]
     if hidden and not rows[best].recipe.candidate.delays:
         blind.append(f"{memory}, and the chosen model sees no past rows: measure that state, or compare delays=[4, 8]")
@@ -534,8 +529,8 @@ def _judge_rounds(
     estimators = (None, *(LiftedDisturbance(gain=gain) for gain in _GAINS))
     cost = test.asked.cost
     ends: list[dict[str, Any]] = [{}, {"tail": 0}, {"tail": test.asked.horizon}]
-    if test.asked.moves and cost.Q_N is None and cost.tail is None:
-        ends.append({"motion": True})
+    if test.asked.moves and cost.moves_on:
+        ends.append({"rests": True})
     second = [replace(one, estimator=each) for one in bilinear[:1] for each in estimators]
     second += [replace(one, **end) for one in bilinear[:1] for end in ends[1:]]
     third: list[Recipe] = []

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 import koopmpc as km
 from koopmpc.control.nonlinear.motion import extend_rows
 
+WAYS = (None, "motion", "rest")
 A, B = np.array([[1.0, 0.1], [-0.2, 0.95]]), np.array([[0.005], [0.1]])
 
 
@@ -36,19 +37,24 @@ def test_sines_and_ramps_go_on(period, phase, slope, offset, size):
     k = np.arange(70)
     sine, ramp = size * np.sin(2 * np.pi * k / period + phase) + offset, slope * k + offset
     rows = np.column_stack([sine, ramp, np.full(70, offset)])
-    further = extend_rows(rows[:20], 50)
-    if np.ptp(rows[:20], axis=0).max() > 1e-3:
-        assert further.shape == (50, 3)
-        np.testing.assert_allclose(further, rows[20:], atol=2e-4 * (1 + np.abs(rows).max()))
+    for columns in (rows[:, ::2], rows[:, 1:]):
+        course = extend_rows(columns[:20], 3)
+        if np.ptp(columns[:20], axis=0).max() > 1e-3:
+            seen = 19 if course.drifts else 50  # a ramp goes on for a horizon, and rests then
+            np.testing.assert_allclose(
+                course.rows[:seen], columns[20 : 20 + seen], atol=2e-4 * (1 + np.abs(rows).max())
+            )
+            assert (course.rows[seen:] == course.rows[seen - 1]).all() or not course.drifts
 
 
 def test_rows_that_rest_or_obey_no_recurrence_do_not_go_on():
     rng = np.random.default_rng(0)
     step = np.repeat([0.0, 1.0], [9, 6])
     for column in (np.ones(15), step, rng.uniform(size=15), 1.2 ** np.arange(15)):
-        assert extend_rows(column[:, None], 30).shape == (0, 1)
-    assert extend_rows(np.column_stack([np.sin(np.arange(15)), step]), 30).shape == (0, 2)
-    assert extend_rows(np.arange(5.0)[:, None], 30).shape == (0, 1)  # too few rows to tell
+        assert extend_rows(column[:, None]).rows.shape == (0, 1)
+    assert extend_rows(np.column_stack([np.sin(np.arange(15)), rng.uniform(size=15)])).rows.shape == (0, 2)
+    assert extend_rows(np.arange(5.0)[:, None]).rows.shape == (0, 1)  # too few rows to tell
+    assert extend_rows(np.round(np.sin(np.arange(15) / 9), 3)[:, None]).rows.shape == (0, 1)  # and rounded ones
 
 
 @pytest.mark.parametrize("u_target", ["equilibrium", "zero"])
@@ -83,4 +89,16 @@ def test_it_is_refused_where_it_cannot_be():
     cost = km.Cost(Q=[1, 1], R=1, beyond="motion")
     with pytest.raises(km.errors.DataError, match="needs a BilinearMPC"):
         km.LinearMPC(plant(), [0, 0], [0], cost, None, 5)
-    assert "rests at the last reference row" in km.BilinearMPC(plant(), cost, None, 5).program().obstacle
+
+
+def test_it_is_the_default_of_plans_over_stages_without_an_end_of_their_own():
+    rows = np.column_stack([np.sin(0.2 * np.arange(9)), np.zeros(9)])
+    for kind in (km.BilinearMPC, km.NonlinearMPC):
+        inputs = [kind(plant(), km.Cost(Q=[5, 1], R=0.2, beyond=way), None, 8)([0.1, 0], rows).u for way in WAYS]
+        assert (inputs[0] == inputs[1]).all()
+        assert abs(inputs[0] - inputs[2]) > 1e-3
+    assert not km.Cost(Q=1, R=1, tail=4).moves_on
+    assert (
+        km.LinearMPC(plant(), [0, 0], [0], km.Cost(Q=[5, 1], R=0.2), None, 8)([0.1, 0], rows).status.name
+        == "UNCONSTRAINED"
+    )

@@ -108,6 +108,9 @@ typedef struct {
   koopmpc_real draftX[(KOOPMPC_N + 1) * KOOPMPC_NZ], draftU[KOOPMPC_MOVES];
   koopmpc_real R[KOOPMPC_N * KOOPMPC_TRACKED], U_r[KOOPMPC_MOVES], u_r[KOOPMPC_MOVES]; /**< targets of the stages */
   koopmpc_real end_M[KOOPMPC_END * KOOPMPC_TRACKED], end_L[KOOPMPC_END * KOOPMPC_POINT], end_m[KOOPMPC_END];
+#if KOOPMPC_BEYOND
+  koopmpc_real beyond[KOOPMPC_BEYOND * KOOPMPC_NR]; /**< rows after those of the reference that moves */
+#endif
   koopmpc_real rest[KOOPMPC_NZ]; /**< the equilibrium that the plan leads to */
   koopmpc_real A[KOOPMPC_N * KOOPMPC_POINT * KOOPMPC_POINT], B[KOOPMPC_MOVES * KOOPMPC_POINT]; /**< the program */
   koopmpc_real Q[KOOPMPC_N * KOOPMPC_POINT * KOOPMPC_POINT], G[KOOPMPC_N * KOOPMPC_LIMITED1 * KOOPMPC_POINT];

@@ -19,7 +19,8 @@ enum {
   LEFT = ROWS_R + SIZE,
   LIMITS = NV + BOX,
   MOST_ROWS = LEFT > NX + LIMITS ? LEFT : NX + LIMITS,
-  NEWTON = 20
+  NEWTON = 20,
+  WIDEST = SIZE > 7 ? SIZE : 7 /* the recurrence of a reference has 7 terms */
 };
 #define RANK ((koopmpc_real)KOOPMPC_RANK)
 #define CLOSE ((koopmpc_real)1e-2)
@@ -32,7 +33,7 @@ static koopmpc_real largest_of(const koopmpc_real *a, int n) {
 }
 
 int koopmpc_inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_real *result, koopmpc_real *null) {
-  koopmpc_real V[SIZE * SIZE], size[SIZE], largest = 0;
+  koopmpc_real V[WIDEST * WIDEST], size[WIDEST], largest = 0;
   int count = 0;
   for (int i = 0; i < n * n; i++) V[i] = i % (n + 1) == 0 ? 1 : 0;
   for (int sweep = 0, turned = 1; sweep < 40 && turned; sweep++) {

@@ -384,6 +384,7 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference) {
 #if KOOPMPC_DISTURBED
   koopmpc_rest(s, own, s->e + (STEPS - 1) * NX);
   koopmpc_copy(own + TARGET_X, s->rest, NX);
+  koopmpc_copy(own + TARGET_U, s->rest_u, NV);
   koopmpc_copy(u_end, s->rest_input, NV);
   koopmpc_copy(own + TARGET_GOAL, s->rest_goal, KOOPMPC_GOAL);
 #else
@@ -416,6 +417,9 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference) {
       own[TARGET_GOAL + i] = koopmpc_dot(koopmpc_Q_root + i * KOOPMPC_NR, last, KOOPMPC_NR);
     }
   }
+#if KOOPMPC_BEYOND
+  koopmpc_move_end(s, own);
+#endif
   koopmpc_fill(s->end_M, 0, KOOPMPC_END * NR);
   koopmpc_fill(s->end_L, 0, KOOPMPC_END * NS);
   for (int i = 0; i < KOOPMPC_GOAL; i++) {

@@ -95,6 +95,9 @@ void koopmpc_factors(const koopmpc_real *at, koopmpc_real *H, koopmpc_real *T);
  */
 const koopmpc_real *koopmpc_find_row(koopmpc_state *s, const koopmpc_real *row, int whole);
 
+/** Move the end's target to where a reference that goes on as it moved asks for it; one that rests moves nothing. */
+void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end);
+
 /** Move the equilibrium of a target, and its cost, to where x = F(x, u) + e. */
 void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_real *e);
 

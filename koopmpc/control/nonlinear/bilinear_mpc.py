@@ -16,6 +16,7 @@ from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controlle
 from koopmpc.control.limits import SOFTENED, Interval, Limits
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
+from koopmpc.control.nonlinear.motion import BEYOND
 from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.rows import StageLimits
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
@@ -173,10 +174,6 @@ class BilinearMPC(StagedMPC):
                 "measured disturbances multiply its state, which its C does not know",
                 "a BilinearMPC on model.at(w), for one constant w",
             )
-        if self.cost.beyond != "rest":
-            raise no_export(
-                self, 'its C rests at the last reference row, and its cost has beyond="motion"', "one without it"
-            )
         if problem.ends:
             raise no_export(self, "its C has no terminal set", "a LinearMPC or a KoopmanMPC with a terminal polytope")
         estimator = publish_estimator(self._initial.observer, self._estimator, self._time_limit, "sqp_iterations=1")
@@ -221,6 +218,7 @@ class BilinearMPC(StagedMPC):
             input_sizes=problem.input_sizes,
             holds=isinstance(cost.u_target, str) and cost.u_target == "equilibrium",
             end="given" if cost.Q_N is not None else "stage" if cost.tail == 0 else "tail",
+            beyond=BEYOND * self._N * self._goes_on,
             table=self.find_targets(rows) if len(rows) else np.zeros((0, 1)),
             disturbed=self._disturbed,
             rest=terminal.equilibria.program(),

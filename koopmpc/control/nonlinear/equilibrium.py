@@ -204,10 +204,21 @@ class Equilibria:
     def slope(self, at: Linearisation) -> Float[np.ndarray, "nu nx"]:
         """Return ∂u/∂e of the equilibrium where no limit is active."""
         nx, size = len(at.A), self.size
+        gain, back, W = self._solve_step(at)
+        return size[nx:, None] * (back @ W @ gain - gain)[nx:] / size[:nx]
+
+    def follow_row(self, at: Linearisation) -> Float[np.ndarray, "n nr"]:
+        """Return ∂(x, u)/∂r of the equilibrium where no limit is active."""
+        return self.size[:, None] * (self._solve_step(at)[1][:, : len(self._weight)] @ self._weight)
+
+    def _solve_step(
+        self, at: Linearisation
+    ) -> tuple[Float[np.ndarray, "n nx"], Float[np.ndarray, "n m"], Float[np.ndarray, "m n"]]:
+        """Return the pseudo-inverse of [A − 1, B], the map from residuals to a step in its null space, and their ∂."""
+        nx, size = len(at.A), self.size
         gain, free = _inverse(np.hstack([at.A - np.eye(nx), at.B]) * size / size[:nx, None])
         W = self._residuals(at)
-        beta = np.linalg.lstsq(self._along(W, free), W @ gain, rcond=None)[0]
-        return size[nx:, None] * (free @ beta - gain)[nx:] / size[:nx]
+        return gain, free @ np.linalg.pinv(self._along(W, free)), W
 
     def near(
         self,
@@ -285,14 +296,12 @@ class Equilibria:
 
     def _factors(self, here: Equilibrium, s: Float[np.ndarray, " n"]) -> Chord:
         """Return the Gauss–Newton step at an equilibrium, s in its sizes."""
-        (nx, nu), size = (self.model.nx, self.model.nu), self.size
+        nx, nu = self.model.nx, self.model.nu
         at = self.linearise(here.x, here.u)
-        gain, free = _inverse(np.hstack([at.A - np.eye(nx), at.B]) * size / size[:nx, None])
-        W = self._residuals(at)
-        back = free @ np.linalg.pinv(self._along(W, free))
+        gain, back, W = self._solve_step(at)
         limited = np.zeros((nu + len(at.G), nx + nu))
         limited[:nu, nx:], limited[nu:, :nx] = np.eye(nu), at.G
-        return Chord(s, back @ W @ gain - gain, back, limited * size)
+        return Chord(s, back @ W @ gain - gain, back, limited * self.size)
 
     def guess(self, row: Float[np.ndarray, " nr"]) -> Equilibrium:
         """Return where the search for the equilibrium of a row begins: the state that it names, inputs at zero."""

@@ -1,95 +1,131 @@
 """A reference that goes on as it moved: its rows beyond the preview, and what they ask of the end of a plan."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.nonlinear.equilibrium import Linearisation, TerminalTarget
 
-_ORDERS = (2, 3, 4, 6)  # of linear recurrences with a constant: a ramp or a sine has 2, two sines have 4
-_EXACT = 1e-6  # share of a column's spread by which the recurrence may miss a row of the preview
-_GROWTH = 1e-3  # a recurrence may grow by this share a step
-_LEAST = 1e-12  # share of the largest row below which a column does not move
+BEYOND = 10  # horizons for which a reference goes on beyond its rows
+ORDERS = (2, 3, 4, 6)  # of linear recurrences with a constant: a ramp or a sine has 2, two sines have 4
+FITS = 1e-9  # share of a column's spread by which the recurrence may miss a row of the preview
+GROWS = 1e-3  # a recurrence may grow by this share a step
+DRIFTS = 1e-7  # a recurrence whose coefficients sum to 1 up to this drifts: it goes on for one horizon, then rests
+FOLLOWS = 1e-2  # a reference drifts on where equilibria follow it up to this share of its way
+RESTS = 3  # equal rows at the end of a preview that say that the reference rests
+STILL = 1e-12  # share of the largest row below which a column does not move
+TERMS = 1e-11  # directions of a column's past below this share of the largest have no coefficient
+ROUNDING = 1e-13  # directions of the inputs below this share of the largest have no gain
+BURSTS = 1e3  # the end stays where the loop behind it, or one without damping, would grow by this factor
+SEEN = 1e-5  # directions of x_N below this share of the largest cost nothing at the end
 
 
-def extend_rows(R: Float[np.ndarray, "N1 nr"], count: int) -> Float[np.ndarray, "T nr"]:
-    """Return `count` rows after R by the shortest linear recurrence r_k = Σ c_i r_{k−i} + c that all rows of R obey.
+class Course(NamedTuple):
+    """Rows of a reference behind its preview, none where it rests, and whether it drifts, as a ramp does."""
 
-    None, (0, nr), if nothing moves, or if a column obeys no such recurrence, or one that grows.
+    rows: Float[np.ndarray, "T nr"]
+    drifts: bool = False
+
+
+def extend_rows(R: Float[np.ndarray, "N1 nr"], horizons: int = BEYOND) -> Course:
+    """Return the rows after R by the shortest linear recurrence r_k = Σ c_i r_{k−i} + c that all rows of R obey.
+
+    None, (0, nr), if the last rows rest, or if a column obeys no such recurrence, or one that grows. A column that
+    drifts goes on for one horizon and rests then.
     """
-    nothing = np.zeros((0, R.shape[1]))
-    if not count or not np.ptp(R, axis=0).any():
+    nothing, N = Course(np.zeros((0, R.shape[1]))), len(R) - 1
+    if not horizons or (R[-RESTS:] == R[-1]).all():
         return nothing
-    columns = [_extend_column(column, count) for column in R.T]
+    columns = [_extend_column(column, horizons * N) for column in R.T]
     known = [column for column in columns if column is not None]
-    return np.column_stack(known) if len(known) == len(columns) else nothing
+    if len(known) < len(columns):
+        return nothing
+    return Course(np.column_stack([rows for rows, _ in known]), any(drifts for _, drifts in known))
 
 
-def _extend_column(r: Float[np.ndarray, " N1"], count: int) -> Float[np.ndarray, " T"] | None:
+def _extend_column(r: Float[np.ndarray, " N1"], count: int) -> tuple[Float[np.ndarray, " T"], bool] | None:
     spread = np.ptp(r)
-    if spread <= _LEAST * np.abs(r).max():
-        return np.full(count, r[-1])
-    base, z = r[-1], (r - r[-1]) / spread
-    for order in _ORDERS:
+    if spread <= STILL * np.abs(r).max() or (r[-RESTS:] == r[-1]).all():
+        return np.full(count, r[-1]), False
+    z = (r - r[-1]) / spread
+    for order in ORDERS:
         rows = len(z) - order
         if rows < order + 2:
             break
         past = np.column_stack([*(z[i : rows + i] for i in range(order)), np.ones(rows)])
-        c: Float[np.ndarray, " n"] = np.asarray(np.linalg.lstsq(past, z[order:], rcond=1e-11)[0], dtype=np.float64)
-        roots = np.roots(np.concatenate([[1.0], -c[:order][::-1]]))
-        if np.abs(past @ c - z[order:]).max() > _EXACT or np.abs(roots).max() > 1 + _GROWTH:
+        c: Float[np.ndarray, " n"] = np.asarray(np.linalg.lstsq(past, z[order:], rcond=TERMS)[0], dtype=np.float64)
+        if np.abs(past @ c - z[order:]).max() > FITS or _grows(c[:order]):
             continue
-        last = z[-order:].copy()
-        values = np.empty(count)
-        for k in range(count):
-            values[k] = c[:order] @ last + c[order]
-            last[:-1], last[-1] = last[1:], values[k]
-        return base + spread * values
+        step = np.eye(order + 1, k=1)
+        step[order - 1], step[order] = c, np.eye(order + 1)[order]
+        ahead = (step @ np.append(z[-order:], 1.0))[None]
+        while len(ahead) < count:  # rows 1 … 2ⁿ, from 1 … 2ⁿ⁻¹
+            ahead, step = np.vstack([ahead, ahead @ step.T]), step @ step
+        values, drifts = ahead[:count, order - 1], bool(abs(1 - c[:order].sum()) < DRIFTS)
+        if drifts:
+            values[len(r) - 1 :] = values[len(r) - 2]
+        return r[-1] + spread * values, drifts
     return None
+
+
+def _grows(c: Float[np.ndarray, " n"]) -> bool:
+    """Return whether r_k = Σ c_i r_{k−n+i} has a root beyond 1 + GROWS, by the Schur–Cohn recursion."""
+    a = -c[::-1] / (1 + GROWS) ** np.arange(1, len(c) + 1)
+    while len(a):
+        last = a[-1]
+        if not abs(last) < 1:
+            return True
+        a = (a[:-1] - last * a[-2::-1]) / (1 - last**2) if len(a) > 1 else a[:0]
+    return False
+
+
+def can_drift(
+    at: Linearisation,
+    followed: Float[np.ndarray, "n nr"],
+    Q_root: Float[np.ndarray, "nr nr"],
+    R: Float[np.ndarray, "N1 nr"],
+) -> bool:
+    """Return whether equilibria hold what the rows R move through: J ∂x/∂r d = d for d from the first to the last."""
+    d = R[-1] - R[0]
+    missed = at.J @ (followed[: len(at.A)] @ d) - d
+    return bool(np.linalg.norm(Q_root @ missed) <= FOLLOWS * np.linalg.norm(Q_root @ d))
 
 
 def shift_target(
     end: TerminalTarget,
     at: Linearisation,
-    Q: Float[np.ndarray, "nr nr"],
-    R: Float[np.ndarray, "nu nu"],
+    weights: tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]],
+    size: Float[np.ndarray, " n"],
     rows: Float[np.ndarray, "T1 nr"],
-    *,
-    hold: bool,
+    held: Float[np.ndarray, "nu nr"] | None,
 ) -> TerminalTarget:
     """Return the target of x_N where the rows r_N, r_{N+1}, … come, by the linear tracking problem behind x_N.
 
     With x̃ = x − x_r and δ_k = r_k − of(x_r) the cost-to-go is x̃ᵀP x̃ − 2 p_Nᵀx̃ + …, so the target moves by P⁺p_N.
     Backward from p = 0 after the last row, p_k = JᵀQ δ_k + (A − B K)ᵀ p_{k+1} − Kᵀ R v_k. v_k is the input that costs
-    nothing, from u_r on: the one that holds δ_k if inputs count from there (`hold`), else −u_r. P is the end's cost.
+    nothing, from u_r on: `held` δ_k where inputs count from the one that holds a row, else −u_r. P is the end's cost.
+    `weights` are Q and R, `size` that of x and u.
 
     References
     ----------
     Anderson & Moore, "Optimal Control: Linear Quadratic Methods", 1990, section 4.3 (servo and tracking problems).
     """
-    A, B, J = at.A, at.B, at.J
-    nx = len(A)
-    S = end.M @ J + end.L
-    P = S.T @ S
-    K: Float[np.ndarray, "nu nx"] = np.linalg.lstsq(R + B.T @ P @ B, B.T @ P @ A, rcond=1e-13)[0]
-    D = rows - at.of
-    pushes: Float[np.ndarray, "T1 nx"] = D @ Q @ J
-    wanted = D @ _hold_inputs(at, Q).T if hold else np.tile(-end.equilibrium.u, (len(D), 1))
-    pushes = pushes - wanted @ (R @ K)
-    closed, p = (A - B @ K).T, np.zeros(nx)
-    for push in pushes[::-1]:
-        p = push + closed @ p
-    moved: Float[np.ndarray, " nx"] = np.asarray(np.linalg.lstsq(P, p, rcond=1e-9)[0], dtype=np.float64)
-    return end._replace(m=end.m + S @ moved)
-
-
-def _hold_inputs(at: Linearisation, Q: Float[np.ndarray, "nr nr"]) -> Float[np.ndarray, "nu nr"]:
-    """Return G, ∂u/∂r of the equilibrium that comes nearest to a row."""
     nx = len(at.A)
-    root = checks.root(Q)
-    # the equilibria are the null space of [A − 1, B]; of these the nearest to the row, with the least x and u
-    _, sizes, rows = np.linalg.svd(np.hstack([at.A - np.eye(nx), at.B]))
-    rank = int(np.sum(sizes > 1e-10 * sizes[0]))
-    null = rows[rank:].T
-    gain: Float[np.ndarray, "n nr"] = np.asarray(np.linalg.lstsq(root @ at.J @ null[:nx], root, rcond=1e-9)[0])
-    return null[nx:] @ gain
+    sx, su = np.split(size, [nx])
+    A, B, J = at.A * sx / sx[:, None], at.B * su / sx[:, None], at.J * sx
+    Q, R = weights[0], weights[1] * np.outer(su, su)
+    S = (end.M @ at.J + end.L) * sx
+    PB = S.T @ (S @ B)
+    K: Float[np.ndarray, "nu nx"] = np.asarray(np.linalg.lstsq(R + B.T @ PB, PB.T @ A, rcond=ROUNDING)[0])
+    D = rows - at.of
+    wanted = np.tile(-end.equilibrium.u / su, (len(D), 1)) if held is None else D @ (held / su[:, None]).T
+    p, closed = D @ Q @ J - wanted @ (R @ K), A - B @ K
+    with np.errstate(over="ignore", invalid="ignore"):
+        while len(p) > 1:  # Σ closedᵀᵏ p_k: neighbours at once
+            if len(p) % 2:
+                p = np.vstack([p, np.zeros(nx)])
+            p, closed = p[::2] + p[1::2] @ closed, closed @ closed
+        stays = np.abs(closed.sum(axis=0)).max() < BURSTS and np.abs(p).max() < checks.HUGE
+    return end._replace(m=end.m + p[0] @ np.linalg.pinv(S, rcond=SEEN)) if stays else end

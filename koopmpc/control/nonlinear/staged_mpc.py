@@ -16,7 +16,7 @@ from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation, refuse_levels, refuse_priority
 from koopmpc.control.move import Move, Plan, Status, alone
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
-from koopmpc.control.nonlinear.motion import extend_rows, shift_target
+from koopmpc.control.nonlinear.motion import BEYOND, Course, can_drift, extend_rows, shift_target
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.control.nonlinear.rows import StageLimits, check_rows, find_stage_limits
 from koopmpc.control.stepped.blocks import Moves
@@ -25,7 +25,6 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator, start_observer
 from koopmpc.plants.step_map import StepMap
 
-_BEYOND = 10  # horizons for which a reference goes on beyond its rows
 GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
 
 
@@ -47,8 +46,7 @@ class Preview(NamedTuple):
     """What the rows of a reference ask for, before disturbances: see `StagedMPC._aim`.
 
     R holds the rows r_0 … r_N, U and `slopes` the reference inputs and ∂u/∂e of all but the last, `held` says which of
-    these equal the last one, and `target` is the last one's. `beyond` holds the rows after them where the reference
-    goes on as it moved, else none.
+    these equal the last one, and `target` is the last one's. `beyond` is how the reference goes on.
     """
 
     R: Float[np.ndarray, "N1 nr"]
@@ -56,7 +54,7 @@ class Preview(NamedTuple):
     slopes: Float[np.ndarray, "N nu nx"]
     held: Bool[np.ndarray, " N"]
     target: TerminalTarget
-    beyond: Float[np.ndarray, "T nr"]
+    beyond: Course
 
 
 class StagedMPC(MPCBase):
@@ -67,6 +65,7 @@ class StagedMPC(MPCBase):
     _box: Interval  # limits of the inputs of the step, one for all stages or a row each
     _at_call: Limits
     _called_with: Limits | None
+    _goes_on: bool  # whether a reference that moves goes on beyond its rows
     _timed: bool  # whether the controller's own limits move in time
     _warm: bool  # whether the next step starts from the plan of the last one
 
@@ -107,6 +106,7 @@ class StagedMPC(MPCBase):
         )
         self._problem = staged_problem(given, o, self._moves)
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
+        self._goes_on = self.cost.moves_on and o.given is None
         self._disturbed = estimator is not None or given.nw > 0
         self._scheduled_for = np.zeros(given.nw)
         if self._timed:
@@ -298,7 +298,7 @@ class StagedMPC(MPCBase):
                 np.array([target.slope for target in targets]),
                 (R[:-1] == R[-1]).all(axis=1),
                 end,
-                extend_rows(R, _BEYOND * self._N if self.cost.beyond == "motion" else 0),
+                extend_rows(R, BEYOND * (self._goes_on and not self._terminal.is_missed(R[-1]))),
             )
             self._reference = key
         R, U, slopes, held, end, beyond = self._preview
@@ -322,10 +322,13 @@ class StagedMPC(MPCBase):
             M, nr = np.zeros_like(end.M), len(R[-1])
             M[:nr] = self._outputs.Q_root
             end = end._replace(M=M, L=np.zeros_like(end.L), V=np.zeros_like(end.V), m=M @ R[-1])
-        if len(beyond) and rows is None:
-            point, outputs = end.equilibrium, self._outputs
-            at, hold = self._terminal.equilibria.linearise(point.x, point.u), self.cost.u_target == "equilibrium"
-            end = shift_target(end, at, outputs.Q, outputs.R, np.vstack([R[-1], beyond]), hold=hold)
+        if len(beyond.rows):
+            point, equilibria, outputs = end.equilibrium, self._terminal.equilibria, self._outputs
+            at, rows = equilibria.linearise(point.x, point.u), np.vstack([R[-1], beyond.rows])
+            followed, nx = equilibria.follow_row(at), self._map.nx
+            if not beyond.drifts or can_drift(at, followed, outputs.Q_root, R):
+                held = followed[nx:] if self.cost.u_target == "equilibrium" else None
+                end = shift_target(end, at, (outputs.Q, outputs.R), equilibria.size, rows, held)
         rated = self._with_rates
         self._targets = self._add_last_input(R[1:], U, end) if rated else StageTargets(R[1:], U, end.M, end.L, end.m)
         return True

@@ -60,6 +60,8 @@ class StagedProgram(StepProgram):
         Whether the input target is that of the equilibrium.
     end
         Terminal cost: "given" by Q_N, "tail" for the cost of a tail, "stage" for Q itself.
+    beyond
+        Rows for which a reference that moves goes on behind the plan; 0 where it rests.
     table
         (rows, size) the target of each reference row: [r, x_r, u_r, active limits of (u_r, g), reference input,
         ∂u/∂e, M, L, V, m, whether an equilibrium was found].
@@ -100,6 +102,7 @@ class StagedProgram(StepProgram):
     input_sizes: Float[np.ndarray, " nu"]
     holds: bool
     end: str
+    beyond: int
     table: Float[np.ndarray, "found size"]
     disturbed: bool
     rest: RestProgram
