@@ -290,7 +290,7 @@ class MPCBase(Published):
         self._given = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
         if self._held is not None:
             if u_prev is None:
-                self._given = self._held.round(zero, None, None)
+                self._given = self._held.round(zero)
             self._held.reset(self._given)
         self._initial.reset(x0, self._given)
         if self._watch is not None:
@@ -364,9 +364,8 @@ class MPCBase(Published):
         if self._held is None:
             return u
         box, rates = self._present_limits()
-        if rates is None:
-            return self._held.round(u, None, None, box)
-        return self._held.round(u, before + rates.low, before + rates.high, box)
+        reach = None if rates is None else Interval(before + rates.low, before + rates.high)
+        return self._held.round(u, reach, box)
 
     def _present_limits(self) -> tuple[Interval, Interval | None]:
         """Return the box of the next input and that of its change; a subclass knows where they move in time."""

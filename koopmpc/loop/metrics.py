@@ -62,6 +62,8 @@ class Metrics(Value):
         Number of steps that the controller's monitor did not know; None where it has none.
     solver
         Number of steps that each QP solver made, by its name: "osqp", or "daqp" where it was asked first or took over.
+    early_changes
+        Number of changes of inputs on levels that came before their dwell time; None without levels.
     """
 
     cost: float
@@ -80,6 +82,7 @@ class Metrics(Value):
     unknown: int | None = None
     violation_share: float = 0.0
     solver: Mapping[str, int] = field(default_factory=dict[str, int])
+    early_changes: int | None = None
 
     def __str__(self) -> str:
         """Return a line a figure."""
@@ -98,6 +101,7 @@ class Metrics(Value):
             "violation": f"{self.violation:.3g}"
             + (f" ({self.violation_share:.3g} of the range)" if self.violation else ""),
             "input violation": f"{self.input_violation:.3g}",
+            **({} if self.early_changes is None else {"changes before dwell": str(self.early_changes)}),
             "effort": f"{self.effort:.6g}",
             "settling time": settles,
             "solve time p50, p99, max": ", ".join(format_duration(t) for t in times),
@@ -149,6 +153,7 @@ def metrics(run: Run) -> Metrics:
     error = tracking_error(run)
     stage, moved, changed = cost_terms(run, error)
     p50, p99 = np.quantile(run.solve_time, [0.5, 0.99])
+    levels = None if run.limits is None else run.limits.base.input_levels(run.U.shape[1])
     return Metrics(
         cost=float("nan") if run.cost is None else float(stage[1:].sum() + moved.sum() + changed.sum()),
         tracking_rmse=np.sqrt(np.mean(error[1:] ** 2, axis=0)),
@@ -166,6 +171,7 @@ def metrics(run: Run) -> Metrics:
         fallback=dict(Counter(f.name for f in run.fallback)),
         unknown=int((run.known == 0).sum()) if (run.known >= 0).any() else None,
         solver=dict(Counter(name for name in run.solver if name)),
+        early_changes=None if levels is None else levels.count_broken(run.U)[1],
     )
 
 

@@ -268,12 +268,25 @@ def test_copies_and_files_keep_levels_and_repeat_to_the_bit(tmp_path):
 
 
 def test_metrics_measure_the_distance_from_the_nearest_level():
-    limits = km.Limits(levels={"pump": [0, 1]})
     plant = km.discretize(km.load_problem("pendulum").dynamics, 0.05)
     run = km.simulate(
         plant, lambda y, r: [0.4], x0=[0, 0], reference=[0, 0], steps=3, limits=km.Limits(levels=[[0, 1]])
     )
     assert km.metrics(run).input_violation == pytest.approx(0.4)
+    assert km.metrics(run).early_changes == 0
+
+
+def test_metrics_count_changes_before_their_dwell_time():
+    plant = km.discretize(km.load_problem("pendulum").dynamics, 0.05)
+    inputs = iter([0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0])  # on for 2 of 3 steps, off for 1 of 2
+    limits = km.Limits(levels=[[0, 1]], dwell=[(3, 2)])
+    run = km.simulate(plant, lambda y, r: [next(inputs)], x0=[0, 0], reference=[0, 0], steps=8, limits=limits)
+    assert km.metrics(run).early_changes == 2
+    assert "changes before dwell" in str(km.metrics(run))
+
+
+def test_levels_by_name_have_the_box_of_their_ends():
+    limits = km.Limits(levels={"pump": [0, 1]})
     assert limits.resolve(("level",), ("pump",)).inputs(1) == (0, 1)
 
 

@@ -439,7 +439,8 @@ class KoopmanMPC(MPCBase):
         if moving:
             window.moving_pages.turn(plan.moving, k)
             return
-        window.plan_pages.turn(plan, k)
+        pages = window.plan_pages
+        plan.low, plan.high = pages.rows.get(k) or pages.fill(k)  # not by a method, for it costs each free step
         if self._aimed and plan.aims_inside and (self._pushed or not self._free_steps[k]):
             self._aimed = False
 

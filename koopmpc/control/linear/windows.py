@@ -40,29 +40,25 @@ class _Pages:
     last: int
     outputs: slice
     margin: Float[np.ndarray, " outputs"] | None
-    first: int = 0
-    low: Float[np.ndarray, "page nt"] = field(default_factory=lambda: np.empty((0, 0)))
-    high: Float[np.ndarray, "page nt"] = field(default_factory=lambda: np.empty((0, 0)))
+    rows: dict[int, tuple[Float[np.ndarray, " nt"], Float[np.ndarray, " nt"]]] = field(default_factory=dict)
 
     def turn(self, target: PlanMap | MovingMap | None, k: int) -> None:
         """Put the limits of step k into a map."""
-        i = k - self.first
-        if not 0 <= i < len(self.low):
-            self._fill(k)
-            i = 0
         assert target is not None, "a map that is not there is never asked"
-        target.low, target.high = self.low[i], self.high[i]
+        target.low, target.high = self.rows.get(k) or self.fill(k)
 
-    def _fill(self, k: int) -> None:
-        """Make the page that begins with step k."""
+    def fill(self, k: int) -> tuple[Float[np.ndarray, " nt"], Float[np.ndarray, " nt"]]:
+        """Make the page that begins with step k, and return its first row."""
         steps = min(max(1, _PAGE // max(len(self.entries), 1)), self.last + 1 - k)
         width, half = self.table.shape[1], len(self.entries) // 2
         rows = (k + self.latency + np.arange(steps)) * width
         page = self.table.reshape(-1)[rows[:, None] + self.entries]
-        self.first, self.low, self.high = k, page[:, :half].copy(), page[:, half:].copy()
+        low, high = page[:, :half].copy(), page[:, half:].copy()
         if self.margin is not None:
-            self.low[:, self.outputs] += self.margin
-            self.high[:, self.outputs] -= self.margin
+            low[:, self.outputs] += self.margin
+            high[:, self.outputs] -= self.margin
+        self.rows = dict(zip(range(k, k + steps), zip(low, high, strict=True), strict=True))  # views: quick to take
+        return self.rows[k]
 
 
 class _Columns(NamedTuple):

@@ -107,18 +107,17 @@ class HeldLevels:
     def round(
         self,
         u: Float[np.ndarray, " nu"],
-        low: Float[np.ndarray, " nu"] | None,
-        high: Float[np.ndarray, " nu"] | None,
+        reach: Interval | None = None,
         box: Interval | None = None,
     ) -> Float[np.ndarray, " nu"]:
-        """Return the input with the nearest levels that dwell times, and the limits low … high of rates, allow.
+        """Return the input with the nearest levels that dwell times, and the `reach` of rates, allow.
 
         Where the `box` of the inputs moves in time, it wins over dwell times and rates.
         """
         levels, index = self.levels, self.levels.nearest(u)
-        if low is not None and high is not None:  # no change beyond a rate because of rounding
-            least = np.ceil(levels.indices(low) - NEAR)
-            most = np.floor(levels.indices(high) + NEAR)
+        if reach is not None:  # no change beyond a rate because of rounding
+            least = np.ceil(levels.indices(reach.low) - NEAR)
+            most = np.floor(levels.indices(reach.high) + NEAR)
             inside = (least <= most) & (least < levels.count) & (most >= 0)
             index = np.where(inside, np.clip(index, least, most), index).astype(np.intp)
         held = self.steps < levels.least(self.index)
