@@ -300,6 +300,11 @@ def prices() -> Any:
     return _run_of("how/prices.md")
 
 
+def stage_cost() -> Any:
+    """The run of the page on a stage cost of one's own."""
+    return _run_of("how/stage_cost.md")
+
+
 def limits_in_time() -> Any:
     """The run of the page on limits in time."""
     return _run_of("how/limits_in_time.md")
@@ -430,6 +435,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         guarantees,
         limits_in_time,
         prices,
+        stage_cost,
         measured_disturbances,
         on_off,
         own_blocks,

@@ -11,12 +11,14 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.bounds.boxes import Bound
+from koopmpc.control.bounds.stage_cost import StageCost, trace_stage
 from koopmpc.control.in_time import bounds
 from koopmpc.control.limits import Interval, Limits, Movable, Softness, half_width, magnitude
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import Lifting, find_observables
 from koopmpc.lifting.state import State
+from koopmpc.plants.graph import Graph
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.values import Value
 
@@ -36,6 +38,8 @@ class WeighsEnd(Protocol):
 @dataclass(frozen=True, eq=False)
 class Cost(Value):
     """Σ_{k=1}^{N−1} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{N−1} (‖u_k − u_r‖²_R + pᵀu_k + ‖u_k − u_{k−1}‖²_{R_delta}) + V(z_N).
+
+    A custom `stage` adds Σ_{k=0}^{N−1} ℓ(x_k, u_k).
 
     V is by default the cost-to-go of the same tracking problem over a tail of steps after the horizon, without limits
     and with an input of its own at each step: x_N and every later state are weighed by Q, inputs by R around u_r and
@@ -75,6 +79,9 @@ class Cost(Value):
         errors of such a model. Of that length, its halves, N and none the shortest is taken whose loop on the model
         itself, with inputs half a step late, costs within 0.5 % of the least. BilinearMPC and NonlinearMPC have no
         tail by default: without Q_N and tail their end costs the Riccati solution at the equilibrium nearest to r_N.
+    stage
+        ℓ(x, u), a number, as a function of CasADi's symbols: ``lambda x, u: x[1] * u[0]``. For BilinearMPC, which
+        convexifies it, and NonlinearMPC; V is of Q and R alone. `metrics` counts it from x_0 and u_0 on.
     beyond
         What a reference does after the rows that a step is given. "rest": the last row stays. "motion", the default of
         BilinearMPC and NonlinearMPC without Q_N, tail and given u_target: it goes on by the linear recurrence that all
@@ -104,6 +111,7 @@ class Cost(Value):
     tail: int | None = None
     price: "Bound" = None
     beyond: Literal["rest", "motion"] | None = None
+    stage: StageCost | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.Q_N, WeighsEnd):
@@ -138,6 +146,8 @@ class Cost(Value):
             if not all(np.isfinite(np.asarray(value)).all() for value in bounds.list_bound(price)):
                 raise DataError("price holds an infinite number; pass what a unit of an input costs in a step")
             object.__setattr__(self, "price", price)
+        if not (callable(cast("object", self.stage)) or isinstance(self.stage, Graph | None)):
+            raise DataError(f"stage is {self.stage!r}; pass a function of x and u, such as lambda x, u: x[0] * u[0]")
         if self.beyond not in ("rest", "motion", None):
             raise DataError(f'beyond is {self.beyond!r}; pass "rest" or "motion"')
         if self.beyond == "motion" and not (self.Q_N is None and self.tail is None):
@@ -153,12 +163,12 @@ class Cost(Value):
         return self.beyond != "rest" and self.Q_N is None and self.tail is None
 
     def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Cost":
-        """Return the cost with arrays in place of weights by name.
+        """Return the cost with arrays in place of weights by name, and a graph in place of the function `stage`.
 
         Raises
         ------
         DataError
-            A name is unknown or fits two, or R does not name every input.
+            A name is unknown or fits two, or R does not name every input; `stage` cannot be written as a graph.
         """
         fields: dict[str, Any] = {
             name: value for name in ("Q", "R", "R_delta") if isinstance(value := getattr(self, name), Mapping)
@@ -166,6 +176,8 @@ class Cost(Value):
         priced: dict[str, Any] = {}
         if isinstance(self.price, Mapping):
             priced["price"] = bounds.order_bound(self.price, "price", inputs, 0.0)
+        if callable(self.stage):
+            priced["stage"] = trace_stage(self.stage, len(states), len(inputs))
         if not fields:
             return replace(self, **priced) if priced else self
         known = {"Q": self.of.bind(tuple(states)).names if "Q" in fields else ()}
@@ -355,6 +367,7 @@ def lifted_tracking(
     cost, limits = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
     if not in_time:
         _refuse_steps(cost, limits)
+    refuse_stage(cost, "a controller on a linear model")
     if cost.beyond == "motion":
         raise DataError(
             'beyond="motion" needs a BilinearMPC or a NonlinearMPC; leave it out, or pass more reference rows'
@@ -424,6 +437,21 @@ def _refuse_steps(cost: Cost, limits: Limits) -> None:
         raise DataError(
             "the cost has a price, which this controller or search does not know; take a KoopmanMPC, a BilinearMPC or "
             "a NonlinearMPC, or leave the price out"
+        )
+
+
+def refuse_stage(cost: Cost, who: str) -> None:
+    """Raise where the cost has a stage of its own.
+
+    Raises
+    ------
+    DataError
+        It has one.
+    """
+    if cost.stage is not None:
+        raise DataError(
+            f"the cost has a stage of its own, which {who} does not know; take a BilinearMPC or a NonlinearMPC, or"
+            " leave stage out"
         )
 
 
@@ -512,6 +540,6 @@ def check_cost_and_limits(
         limits = Limits()
     elif not isinstance(limits, Limits):
         raise DataError(f"limits is a {type(limits).__name__}; pass Limits, or None for none")
-    if any(isinstance(value, Mapping) for value in (*vars(cost).values(), *vars(limits).values())):
+    if callable(cost.stage) or any(isinstance(v, Mapping) for v in (*vars(cost).values(), *vars(limits).values())):
         return cost.resolve(states, inputs), limits.resolve(states, inputs)
     return cost, limits

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
+from koopmpc.control.bounds.stage_cost import evaluate_stage
 from koopmpc.control.cost import Cost, Sizes
 from koopmpc.control.limits import SOFTENED, Interval, Limits
 from koopmpc.control.stepped.levels import NEAR
@@ -27,8 +28,9 @@ class Metrics(Value):
     ----------
     cost
         J = Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k − u_reference_k‖²_R, and with R_delta also
-        Σ_{k=1}^{T−1} ‖u_k − u_{k−1}‖²_{R_delta}, with a price Σ_{k=0}^{T−1} p_kᵀu_k. It is not
-        multiplied by dt. It is NaN where the run has no Cost, or where its plant hides the state.
+        Σ_{k=1}^{T−1} ‖u_k − u_{k−1}‖²_{R_delta}, with a price Σ_{k=0}^{T−1} p_kᵀu_k, with a stage of one's own
+        Σ_{k=0}^{T−1} ℓ(x_k, u_k). It is not multiplied by dt. It is NaN where the run has no Cost, or where its plant
+        hides the state.
     tracking_rmse
         (nr,) root-mean-square of each tracked output's error of(x_k) − r_k over k = 1 … T, in its unit.
     final_error
@@ -189,7 +191,10 @@ def running_cost(run: Run) -> Float[np.ndarray, " T1"]:
 def cost_terms(
     run: Run, error: Float[np.ndarray, "T1 nr"]
 ) -> tuple[Float[np.ndarray, " T1"], Float[np.ndarray, " T"], Float[np.ndarray, " T0"]]:
-    """Return ‖error_k‖²_Q, ‖u_k − u_reference_k‖²_R + pᵀu_k, ‖u_k − u_{k−1}‖²_{R_delta}; by default Q = I, R = 0."""
+    """Return ‖error_k‖²_Q, ‖u_k − u_reference_k‖²_R + pᵀu_k + ℓ(x_k, u_k), ‖u_k − u_{k−1}‖²_{R_delta}.
+
+    By default Q = I and R = 0.
+    """
     nr, nu = error.shape[1], run.U.shape[1]
     Q, R = (np.eye(nr), np.zeros((nu, nu))) if run.cost is None else run.cost.matrices(nr, nu)
     R_delta = None if run.cost is None else run.cost.rate(nu)
@@ -199,6 +204,8 @@ def cost_terms(
     )
     if run.cost is not None and run.cost.price is not None:
         moved = moved + np.einsum("ki,ki->k", run.cost.price_rows(nu, 0, len(run.U)), run.U)
+    if run.cost is not None and run.cost.stage is not None:
+        moved = moved + evaluate_stage(run.cost.stage, _states(run)[:-1], run.U)
     return stage, moved, changed
 
 

@@ -272,7 +272,8 @@ class About(Value):
         names = self.states, self.inputs
         for part in ("cost", "limits"):
             given: Cost | Limits | None = getattr(self, part)
-            if given is not None and any(isinstance(value, Mapping) for value in vars(given).values()):
+            traced = isinstance(given, Cost) and callable(given.stage)
+            if given is not None and (traced or any(isinstance(value, Mapping) for value in vars(given).values())):
                 object.__setattr__(self, part, given.resolve(*names))
         check_rows = getattr(super(), "__post_init__", None)
         if check_rows is not None:

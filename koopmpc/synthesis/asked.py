@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.cost import Cost, check_cost_and_limits
+from koopmpc.control.cost import Cost, check_cost_and_limits, refuse_stage
 from koopmpc.control.limits import Limits, refuse_levels, refuse_priority
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
@@ -108,6 +108,7 @@ def check_task(
     """
     cost, limits = check_cost_and_limits(cost, limits, data.states, data.inputs)
     refuse_levels(limits, "a design")
+    refuse_stage(cost, "a design")
     refuse_priority(limits, "a design")
     nx, states = data.nx, data.states
     of = cost.of.bind(states)

@@ -157,6 +157,14 @@ class BilinearMPC(StagedMPC):
     def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
         return "BilinearMPC", self.model, {"sqp_iterations": self._sqp_iterations}
 
+    @property
+    def stage_is_convex(self) -> bool:
+        """Whether the ``stage`` of the cost was convex along the last plan; else a convex part of it was planned with.
+
+        True where the cost has no stage of its own.
+        """
+        return self._iteration.stage_is_convex
+
     def find_targets(self, reference: Float[np.ndarray, "rows nr"]) -> Float[np.ndarray, "found size"]:
         """Return the `table` of the StagedProgram for these reference rows, each row once."""
         return find_targets(self._terminal, self._map.nx, reference)
@@ -168,6 +176,8 @@ class BilinearMPC(StagedMPC):
             raise no_export(self, "its limits have rows in time, and its C keeps one set", "one with limits.at(step)")
         if outputs.shift is not None:
             raise no_export(self, "its cost has a price, which its C does not know", "one without a price")
+        if problem.stage is not None:
+            raise no_export(self, "its cost has a stage of its own, which its C does not know", "one without a stage")
         if problem.scheduled:
             raise no_export(
                 self,

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 from koopmpc.checks import HUGE
 from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.move import Status
+from koopmpc.control.nonlinear.convex_stage import ConvexStage
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.stagewise import (
     RiccatiSweeps,
@@ -84,8 +85,9 @@ class RealTimeIteration:
         self._softness = Softness(*(np.concatenate(pair) for pair in prices))
         self._sizes, self._input_sizes = problem.sizes, problem.input_sizes
         sweeps, simulate, linearise = RiccatiSweeps(nx, nu, N), simulation(problem), linearisation(problem)
-        free = solve_unconstrained(sweeps, R)
-        interior = interior_step(sweeps, R, self._sides, ng) if len(self._sides.row) else None
+        own = problem.stage is not None  # then R changes from program to program
+        free = solve_unconstrained(sweeps, None if own else R)
+        interior = interior_step(sweeps, None if own else R, self._sides, ng) if len(self._sides.row) else None
         self._limits = Interval(*(np.concatenate([problem.inputs[i], problem.box[i]]) for i in (0, 1)))
         self.low, self.high = (np.tile(end, (N, 1)) for end in self._limits)
         margin = problem.margin
@@ -118,12 +120,16 @@ class RealTimeIteration:
         self._now, state = _views([(N, nx), (N, nu), (N, ns), (N, ns), (N, nsoft), (N, nsoft)])
         self._next, after = _views([each.shape for each in state])
         plan = [self.X, self.U, self._R, self._U_r, *self._terminal, self.theta]
-        self._A, self._stages = A, Stages(A, B, Q, problem.R, self._G, problem.free)
+        self._base_R, self._R_k = R.reshape(nu, N, nu).transpose(1, 0, 2).copy(), zeros((N, nu, nu))
+        self._R_k[:] = self._base_R
+        self._A, self._stages = A, Stages(A, B, Q, self._R_k, self._G, problem.free)
+        self._quadratic, self._gradients = (Q, self._R_k), (q, r)
+        self._own_stage = ConvexStage(problem, self.X, self.U, compiles=compiles_model) if own else None
         self._ahead, self._trial = (zeros((N, nx)), zeros((N, nu))), zeros((N, nx))
         self._simulate = Routine(simulate, [*self._ahead, self.theta], [self._trial], compiles=compiles_model)
         self._linearise = Routine(linearise, plan, [A, B, F, Q, q, r, self._g, self._G], compiles=compiles_model)
         curvature = zeros((N, nu))
-        stages = [A, B, self._c, Q, q, r, self._x0]
+        stages = [A, B, self._c, Q, q, r, self._x0, *([self._R_k] if own else [])]
         self.without_limits = zeros(nu)  # the first input of the last program, had it no limits
         self._dX, self._dU, self._t, self._lam, self._eps, self._nu = state
         parts, self._cost = [self.X, self.U, self._R, self._U_r, *self._terminal], zeros(1)
@@ -134,6 +140,11 @@ class RealTimeIteration:
         self._interior = interior and Routine(
             interior, [*stages, self._G, self._d, self._centring, *state], [*after, self._measures]
         )
+
+    @property
+    def stage_is_convex(self) -> bool:
+        """Whether a custom stage cost was convex along the plan of the last program."""
+        return self._own_stage is None or self._own_stage.convex
 
     @property
     def compiled(self) -> bool:
@@ -148,6 +159,10 @@ class RealTimeIteration:
             for place, value in zip(self._terminal, (targets.M.T, targets.L.T, targets.m), strict=True):
                 place[:] = value
         self._linearise.call()
+        if self._own_stage is not None:
+            (Q, R), (q, r) = self._quadratic, self._gradients
+            R[:] = self._base_R
+            self._own_stage.add(Q, q, R, r)
         if self._ends:  # a terminal set limits the last stage alone
             self._g[:-1, -self._ends :], self._G[:-1, :, -self._ends :] = 0.0, 0.0
         np.subtract(self._F, self.X[1:], out=self._c)
@@ -359,7 +374,7 @@ class Stages(NamedTuple):
     A: Float[np.ndarray, "N nx nx"]
     B: Float[np.ndarray, "N nu nx"]
     Q: Float[np.ndarray, "N nx nx"]
-    R: Float[np.ndarray, "nu nu"]
+    R: Float[np.ndarray, "N nu nu"]
     G: Float[np.ndarray, "N nx ng"]
     free: Bool[np.ndarray, " N"]
 
@@ -396,7 +411,7 @@ def least_deviation(
             P = weight + A[k] @ P @ A[k].T
             continue
         try:
-            K[k], L, P = step(Stage(A[k].T, B[k].T, weight, None, R), P)
+            K[k], L, P = step(Stage(A[k].T, B[k].T, weight, None, R[k]), P)
         except (DefinitenessError, np.linalg.LinAlgError):
             return None
         spread[k] = np.linalg.inv(L).T

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
 
 from koopmpc import checks
-from koopmpc.control.cost import StateTracking
+from koopmpc.control.bounds.stage_cost import trace_stage
+from koopmpc.control.cost import Cost, StateTracking
 from koopmpc.control.limits import SOFTENED, Interval, Softness, preview_margin
 from koopmpc.control.stepped.blocks import MoveBlocks
 from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set, terminal_function
@@ -217,6 +218,8 @@ class StagedProblem(NamedTuple):
         What the entries of s and v, and the cost, are measured by, see `Sizes`.
     ends
         How many of `limited`, the last ones, are those of a terminal set, and limit the last stage alone.
+    stage
+        (s_k, v_k) → ℓ of the cost; None where it has no stage of its own.
     """
 
     F: ca.Function
@@ -239,6 +242,7 @@ class StagedProblem(NamedTuple):
     ends: int = 0
     own: bool = False
     scheduled: int = 0
+    stage: ca.Function | None = None
 
     def stage_theta(self, theta: ca.MX, k: int) -> ca.MX:
         """Return the θ of stage k out of [θ; w_0; …; w_{N−1}], all of them where w multiplies no state."""
@@ -292,6 +296,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks)
         margin=preview_margin(o.margin, N),
         scale=o.sizes.scale,
         scheduled=model.scheduled,
+        stage=_stage_function(o.cost, model, nx, with_rates=False),
     )
     wanted = o.limits.terminal
     if not o.with_rates and len(blocks) == N and not moves.own:
@@ -323,8 +328,19 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks)
         soft_rates=soft,
         nx=ns,
         sizes=np.concatenate([plain.sizes, plain.input_sizes, plain.input_sizes[soft]]),
+        stage=_stage_function(o.cost, model, ns, with_rates=True),
     )
     return rated if wanted is None else _add_end(rated, wanted, model, o)
+
+
+def _stage_function(cost: Cost, model: LearnedMap, ns: int, *, with_rates: bool) -> ca.Function | None:
+    """Return (s, v) → ℓ(x, u), x the state of the plant; None where the cost has no stage of its own."""
+    if cost.stage is None:
+        return None
+    s, v = ca.SX.sym("s", ns), ca.SX.sym("v", model.nu)
+    u = s[model.nx : model.nx + model.nu] + v if with_rates else v
+    value = trace_stage(cost.stage, model.ny, model.nu).symbolic(s[: model.ny], u)
+    return ca.Function("stage", [s, v], [ca.densify(value)])
 
 
 def _add_end(

@@ -128,6 +128,8 @@ class Shooting:
         f = _weigh(U - u_r, p.R) + ca.sumsqr(end)
         if N > 1:
             f += _weigh(p.tracked.map(N - 1)(X[:, : N - 1]) - r[:, : N - 1], p.Q)
+        if p.stage is not None:
+            f += ca.sum2(p.stage.map(N)(ca.horzcat(x0, X[:, : N - 1]), U))
         path, low, high = ca.MX(0, N), np.zeros(0), np.zeros(0)
         if ng:
             values, infinite = p.limited.map(N)(X), np.full(ng, np.inf)
@@ -174,7 +176,7 @@ class Shooting:
         given: dict[str, Any] = {"expand": smooth, "error_on_fail": False, "print_time": False}
         self._start_is_number: ca.Function | None = None
         if solver == "fatrop":
-            _demand_numbers(F, p.tracked, p.limited)
+            _demand_numbers(F, p.tracked, p.limited, *(() if p.stage is None else (p.stage,)))
             self._start_is_number = _is_number(nlp)
             given |= {
                 "N": N,

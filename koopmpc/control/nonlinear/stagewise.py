@@ -139,6 +139,8 @@ def plan_cost(problem: StagedProblem) -> ca.Function:
             counts[-problem.ends :, :-1] = 0.0
             over = over * ca.DM(counts)
         cost += ca.dot(linear, ca.sum2(over)) + ca.dot(quadratic, ca.sum2(over**2))
+    if problem.stage is not None:
+        cost += ca.sum2(problem.stage.map(N)(X[:, :N], U))
     return ca.Function("plan_cost", [X, U, R, U_r, M, L, m], [cost])
 
 
@@ -214,27 +216,33 @@ class RiccatiSweeps:
         return X, U
 
 
-def solve_unconstrained(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"]) -> ca.Function:
-    """Return (A, B, c, Q, q, r, δx_0) → (δX, δU, diag S): the solution without limits, and the inputs' curvatures."""
+def solve_unconstrained(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"] | None) -> ca.Function:
+    """Return (A, B, c, Q, q, r, δx_0) → (δX, δU, diag S): the solution without limits, and the inputs' curvatures.
+
+    Without R here, it is the last argument.
+    """
     nx, nu, N = sweeps.nx, sweeps.nu, sweeps.N
-    A, B, c, Q, q, r, x0 = _problem(nx, nu, N)
-    factors = sweeps.factors(A, B, c, Q, ca.MX(ca.DM(R)))
+    arguments = _problem(nx, nu, N, R)
+    A, B, c, Q, q, r, x0 = arguments[:7]
+    factors = sweeps.factors(A, B, c, Q, arguments[7] if R is None else ca.MX(ca.DM(R)))
     X, U = sweeps.solve(factors, B, c, q, r, x0)
     curvature = ca.sum1(factors[2] ** 2)  # column by column the diagonal of S
-    return ca.Function("unconstrained", [A, B, c, Q, q, r, x0], [X, U, curvature])
+    return ca.Function("unconstrained", arguments, [X, U, curvature])
 
 
-def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"], sides: Sides, ng: int) -> ca.Function:
+def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"] | None, sides: Sides, ng: int) -> ca.Function:
     """Return one predictor–corrector step of the interior-point method.
 
     (A, B, c, Q, q, r, δx_0, G, d, σ; X, U, t, λ, ε, ν) → (X, U, t, λ, ε, ν, [μ, α]): d the plan's distances (ns, N), t
     ≥ 0 their slack variables, λ the multipliers, ε ≥ 0 and ν those of the soft sides, μ the mean complementarity before
     the step, α the step's length. σ is zero in a predictor–corrector step. A step with σ > 0 aims at the
-    complementarity σ μ everywhere and leaves the corrector out: it returns to the central path.
+    complementarity σ μ everywhere and leaves the corrector out: it returns to the central path. Without R here, it is
+    the argument behind δx_0.
     """
     nx, nu, N = sweeps.nx, sweeps.nu, sweeps.N
     ns, nsoft = len(sides.row), sides.soft
-    A, B, c, Q, q, r, x0 = _problem(nx, nu, N)
+    arguments = _problem(nx, nu, N, R)
+    A, B, c, Q, q, r, x0 = arguments[:7]
     G, d, sigma = ca.MX.sym("G", ng, N * nx), ca.MX.sym("d", ns, N), ca.MX.sym("sigma")
     X, U = ca.MX.sym("X", nx, N), ca.MX.sym("U", nu, N)
     t, lam = ca.MX.sym("t", ns, N), ca.MX.sym("lam", ns, N)
@@ -265,7 +273,7 @@ def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"], sides: Si
     eased = w / (1 + w * K)
     gap = d + moved + pad(eps) - t
     weights = (S.T**2) @ eased
-    R_k = ca.MX(ca.DM(R)) + diagonal(weights[:nu, :])
+    R_k = (arguments[7] if R is None else ca.MX(ca.DM(R))) + diagonal(weights[:nu, :])
     Q_k = Q + gram(G, weights[nu:, :]) if ng else Q
     factors = sweeps.factors(A, B, c, Q_k, R_k)
 
@@ -298,12 +306,10 @@ def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"], sides: Si
     length = 1 / ca.fmax(longest(*step[2:]) / _SHORT, 1)
     variables = [X, U, t, lam, eps, nu_]
     after = [v + length * dv for v, dv in zip(variables, step, strict=True)]
-    return ca.Function(
-        "interior_step", [A, B, c, Q, q, r, x0, G, d, sigma, *variables], [*after, ca.vertcat(mu, length)]
-    )
+    return ca.Function("interior_step", [*arguments, G, d, sigma, *variables], [*after, ca.vertcat(mu, length)])
 
 
-def _problem(nx: int, nu: int, N: int) -> list[ca.MX]:
+def _problem(nx: int, nu: int, N: int, R: Float[np.ndarray, "nu m"] | None) -> list[ca.MX]:
     shapes = {
         "A": (nx, N * nx),
         "B": (nx, N * nu),
@@ -312,4 +318,5 @@ def _problem(nx: int, nu: int, N: int) -> list[ca.MX]:
         "q": (nx, N),
         "r": (nu, N),
     }
-    return [ca.MX.sym(name, *shape) for name, shape in shapes.items()] + [ca.MX.sym("x0", nx)]
+    whole = [ca.MX.sym(name, *shape) for name, shape in shapes.items()] + [ca.MX.sym("x0", nx)]
+    return [*whole, ca.MX.sym("R", nu, N * nu)] if R is None else whole
