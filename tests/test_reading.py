@@ -81,7 +81,7 @@ MOST = {  # files, returns
     "record_all": (13, 50),
     "export_all": (19, 30),
     "select_all": (26, 74),  # the leaderboard stands in a file of its own
-    "design_all": (74, 276),  # with fresh loops after the choice, and a monitor
+    "design_all": (74, 279),  # with fresh loops after the choice, and a monitor
 }
 
 
