@@ -214,6 +214,12 @@ class Traced(Lifting):
         return self.graph
 
 
+def bind_lifting(value: object, states: Sequence[str]) -> Lifting:
+    """Return `check_lifting` bound to these states; one that is bound to them already is returned itself."""
+    lifting = check_lifting(value)
+    return lifting if lifting.bound == tuple(states) else lifting.bind(states)
+
+
 def check_lifting(value: object) -> Lifting:
     """Return `value` if it is a Lifting.
 

@@ -21,7 +21,7 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.interrupts import raise_swallowed
-from koopmpc.lifting.base import Lifting, check_lifting
+from koopmpc.lifting.base import Lifting, bind_lifting
 from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant, State
 from koopmpc.plants.step_map import StepMap
@@ -378,7 +378,7 @@ def _store_fields(
     if embedding is not None:
         checks.kind(embedding, "embedding", Delay, "pass km.Delay(steps)")
     bound_embedding = None if embedding is None else embedding.bind(states, inputs)
-    bound = check_lifting(lifting).bind(states if bound_embedding is None else bound_embedding.names)
+    bound = bind_lifting(lifting, states if bound_embedding is None else bound_embedding.names)
     nz, nx, nu = bound.nz, len(states), len(inputs)
     transition = checks.array(A, "A")
     largest = float(np.abs(transition).max(initial=0.0))

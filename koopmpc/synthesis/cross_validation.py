@@ -6,7 +6,7 @@ This is how `select` chooses a ridge; the ``ridge="gcv"`` of a single fit is in 
 from collections.abc import Sequence, Sized
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import islice, pairwise
+from itertools import accumulate, islice, pairwise
 from time import perf_counter
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ from koopmpc.identify.solve import centre_products, solve_path
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.text import with_unit
-from koopmpc.validate.scoring import AnyPredictor, forecast_errors
+from koopmpc.validate.scoring import AnyPredictor, compare_forecasts
 from koopmpc.values import Value
 
 LEAST = 1e-9  # smallest ridge; with less, nearly dependent observables get weights beyond double precision
@@ -354,11 +354,10 @@ def cross_validate(trial: Trial) -> Tried:
     count = max(trial.fold) + 1
     folds = [select_fold(trial.episodes, trial.fold, i) for i in range(count)]
     parts = [_moments(trial.candidate, fold) for fold in folds]
-    total, sizes = reduce(Moments.__add__, parts), _sizes(trial.episodes)
+    (*rests, total), sizes = leave_one_out(parts), _sizes(trial.episodes)
     errors = np.empty((len(trial.ridges), count, trial.horizon))
     for i, fold in enumerate(folds):
-        rest = reduce(Moments.__add__, (part for j, part in enumerate(parts) if j != i))
-        models = fit_ridges(trial.candidate, rest, trial.episodes, trial.ridges)
+        models = fit_ridges(trial.candidate, rests[i], trial.episodes, trial.ridges)
         errors[:, i] = _errors(trial, models, fold, sizes)
     return Tried(
         candidate=trial.candidate,
@@ -369,6 +368,17 @@ def cross_validate(trial: Trial) -> Tried:
         misfit=_misfit(trial.candidate, total),
         seconds=perf_counter() - start,
     )
+
+
+def leave_one_out(parts: Sequence[Moments]) -> list[Moments]:
+    """Return for each part the sum of all others, and last the sum of all.
+
+    All are added from the first part on, so sums up to a part are shared and the rounding is that of plain sums.
+    """
+    before = list(accumulate(parts))
+    rests = [reduce(Moments.__add__, parts[1:])]
+    rests += [reduce(Moments.__add__, parts[i + 2 :], whole) for i, whole in enumerate(before[:-1])]
+    return [*rests, before[-1]]
 
 
 def fit_ridges(candidate: Candidate, total: Moments, like: Episodes, ridges: tuple[float, ...]) -> list[AnyPredictor]:
@@ -443,14 +453,13 @@ def _errors(
     every = [np.arange(late, len(episode) - trial.horizon + 1) for episode in points]
     stride = max(sum(map(len, every)) // _STARTS, 1)
     starts: list[Int[np.ndarray, " n"]] = [k[: 1 + (len(k) - 1) // stride * stride : stride] for k in every]
-    result = np.empty((len(models), trial.horizon))
-    for row, model in zip(result, models, strict=True):
-        total, count = np.zeros(trial.horizon), 0
-        for gap, _ in forecast_errors(model, points, starts, trial.horizon, relift=trial.lifts_at_each_step):
-            with np.errstate(over="ignore"):
-                total += ((gap / sizes) ** 2).mean(axis=2).sum(axis=1)
-            count += gap.shape[1]
-        row[:] = np.sqrt(total / count)
+    total, count = np.zeros((len(models), trial.horizon)), 0
+    for gaps, _ in compare_forecasts(models, points, starts, trial.horizon, relift=trial.lifts_at_each_step):
+        with np.errstate(over="ignore"):
+            total += ((gaps / sizes) ** 2).mean(axis=3).sum(axis=2)
+        count += gaps.shape[2]
+    result = np.sqrt(total / count)
+    for row in result:
         lost = np.flatnonzero(~(row < _DIVERGED))
         if lost.size:
             row[lost[0] :] = np.inf

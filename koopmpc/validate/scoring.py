@@ -152,32 +152,65 @@ def forecast_errors(
     The episodes are those that `embed_episodes` returns. The starts of each episode ascend, and the blocks keep their
     order.
     """
-    A, C = predictor.A.T, predictor.C.T
-    G = np.hstack([predictor.B, predictor.E]).T
-    products = np.concatenate([predictor.N, predictor.S]) if isinstance(predictor, BilinearPredictor) else ()
-    for X, V, rows in _split_blocks(points, starts, horizon, predictor.nw):
-        point = X[rows]
-        z = predictor.lifting(point)
-        truth = np.empty((horizon, len(rows), predictor.nx))
-        gap = np.empty_like(truth)
+    for gaps, truth in compare_forecasts([predictor], points, starts, horizon, relift=relift):
+        yield gaps[0], truth
+
+
+def compare_forecasts(
+    models: Sequence[AnyPredictor],
+    points: Episodes,
+    starts: Sequence[Int[np.ndarray, "_"]],
+    horizon: int,
+    *,
+    relift: bool = False,
+) -> Iterator[tuple[Float[np.ndarray, "models horizon m nx"], Float[np.ndarray, "horizon m nx"]]]:
+    """Yield `forecast_errors` of several models at once, which share lifting, embedding and the kind of model.
+
+    The first observables, the data and each step's calls are those of all models. A forecast that is lifted at every
+    step needs C A and C N only, nx rows in place of nz.
+    """
+    first = models[0]
+    nx, nz, past = first.nx, first.nz, first.embedding
+    M, G, C = (np.array(parts) for parts in zip(*map(_transpose_matrices, models), strict=True))
+    if relift:
+        M, G = M @ C[:, None], G @ C
+    width = nx if relift else nz
+    M = np.ascontiguousarray(np.swapaxes(M, 1, 2)).reshape(len(models), nz, -1)  # one product a step gives A z and N z
+    for X, V, rows in _split_blocks(points, starts, horizon, first.nw, len(models)):
+        point = np.repeat(X[rows][None], len(models), axis=0)
+        z = np.repeat(first.lifting(X[rows])[None], len(models), axis=0)
+        truth = np.empty((horizon, len(rows), nx))
+        gap = np.empty((len(models), *truth.shape))
         with np.errstate(over="ignore", invalid="ignore"):  # a diverging prediction is an infinite error
             for h in range(horizon):
                 v = V[rows + h]
-                z_next = z @ A + v @ G
-                for i, N in enumerate(products):
-                    z_next += v[:, i : i + 1] * (z @ N.T)
-                truth[h] = X[rows + h + 1, : predictor.nx]
-                x = z_next @ C
-                if predictor.embedding is not None:
-                    x = predictor.embedding.clip(x)
-                np.subtract(truth[h], x, out=gap[h])
-                if relift:
-                    past = predictor.embedding
-                    point = x if past is None else past.shift(point, v[:, : predictor.nu], x)
-                    z_next = predictor.lifting(point)
-                z = z_next
+                images = (z @ M).reshape(*z.shape[:2], -1, width)
+                x = z = images[:, :, 0] + v @ G
+                for i in range(images.shape[2] - 1):
+                    z += v[:, i : i + 1] * images[:, :, i + 1]
+                if not relift:
+                    x = z @ C
+                if past is not None:
+                    x = past.clip(x)
+                truth[h] = X[rows + h + 1, :nx]
+                np.subtract(truth[h], x, out=gap[:, h])
+                if relift and h < horizon - 1:
+                    u = np.broadcast_to(v[:, : first.nu], (len(models), len(v), first.nu))
+                    point = x if past is None else past.shift(point, u, x)
+                    z = np.empty((*point.shape[:2], nz))
+                    first.lifting.lift_into(point.reshape(-1, point.shape[2]), z.reshape(-1, nz))
         gap[np.isnan(gap)] = np.inf
         yield gap, truth
+
+
+def _transpose_matrices(
+    model: AnyPredictor,
+) -> tuple[Float[np.ndarray, "products nz nz"], Float[np.ndarray, "nv nz"], Float[np.ndarray, "nz nx"]]:
+    """Return [Aᵀ, N₁ᵀ …, S₁ᵀ …], [B E]ᵀ and Cᵀ."""
+    A = model.A.T[None]
+    if isinstance(model, BilinearPredictor):
+        A = np.concatenate([A, model.N.transpose(0, 2, 1), model.S.transpose(0, 2, 1)])
+    return A, np.hstack([model.B, model.E]).T, model.C.T
 
 
 _Slice = tuple[Episode, Int[np.ndarray, "_"]]  # an episode and its starts in this block
@@ -185,10 +218,10 @@ _Block = tuple[Float[np.ndarray, "m nx"], Float[np.ndarray, "m nv"], Int[np.ndar
 
 
 def _split_blocks(
-    episodes: Episodes, starts: Sequence[Int[np.ndarray, "_"]], horizon: int, nw: int
+    episodes: Episodes, starts: Sequence[Int[np.ndarray, "_"]], horizon: int, nw: int, models: int
 ) -> Iterator[_Block]:
     """Yield blocks of a bounded number of starts, from several short episodes or a part of a long one."""
-    room = most = max(1, min(_BLOCK_STARTS, _BLOCK_NUMBERS // (horizon * episodes.nx)))
+    room = most = max(1, min(_BLOCK_STARTS, _BLOCK_NUMBERS // (horizon * episodes.nx)) // models)
     slices: list[_Slice] = []
     for episode, own_starts in zip(episodes, starts, strict=True):
         first = 0

@@ -17,7 +17,7 @@ from koopmpc.data.source import Changed, Held, Part, Source, source_of
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.rows import ROWS, GramSums, TriangularFactor, lift_chunks, row_columns, split_chunks
-from koopmpc.lifting.base import Lifting, check_lifting
+from koopmpc.lifting.base import Lifting, bind_lifting
 from koopmpc.parallel import Progress, map_tasks
 from koopmpc.values import Arrays, from_data, to_data
 
@@ -96,7 +96,7 @@ def second_moments(
         checks.kind(embedding, "embedding", Delay, "pass km.Delay(2), or leave it out")
         embedding = embedding.match(source.states, source.inputs)
         source = embedding.source(source)
-    bound = check_lifting(lifting).bind(source.states)
+    bound = bind_lifting(lifting, source.states)
     reading = _ReadTask(None, bound, source.inputs, bilinear, _align_weights(weights, source))
     zero = Moments(bound, source.inputs, source.dt, 0, 0.0, "", np.empty((0, 0)), bilinear, embedding)
 
