@@ -61,7 +61,7 @@ def compare_logs(old: Episodes | None, new: Episodes, kept: Sequence[str]) -> Co
         return ComparedLogs(report, True, f"the design still holds: {report.sentences[0]}")
     if report.verdict == "cannot say":
         return ComparedLogs(report, None, f"nobody can say whether the plant has changed: {report.sentences[0]}")
-    gains = [one for one in report.changes if one.name.startswith("the gain of") and abs(one.share) <= _OFF * 1.1]
+    gains = [one for one in report.changes if one.kind == "input" and abs(one.share) <= _OFF * 1.1]
     borne = [f"inputs 20 % {'weaker' if one.share < 0 else 'stronger'}" in kept for one in gains]
     if gains and all(borne) and len(gains) == len(report.changes):
         return ComparedLogs(

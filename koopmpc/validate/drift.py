@@ -60,6 +60,8 @@ class PlantChange:
         Least share that would have been seen.
     explains
         What it explains of the new rows, as a rise of twice the log-likelihood.
+    kind
+        "input" for the gain of an input, "sensor" for that of a sensor, "coefficient", or "speed".
     """
 
     name: str
@@ -67,6 +69,7 @@ class PlantChange:
     sure: float
     error: float
     explains: float
+    kind: str
 
     def __str__(self) -> str:
         """Return the change in words."""
@@ -271,6 +274,12 @@ class _Law:
             *(f"the speed of {x}" for x in states),
         )
 
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kind of each candidate, in the order of `names`."""
+        nx, nu = self.log.data.nx, self.log.data.nu
+        return (*["input"] * nu, *["sensor"] * nx, *["coefficient"] * (nx * (nx + nu)), *["speed"] * nx)
+
     def directions(self, X: Float[np.ndarray, "n nx"], U: Float[np.ndarray, "n nu"]) -> Float[np.ndarray, "c n nx"]:
         """Return how the predictions move with a relative change of each candidate."""
         base, more = self.predict(X, U), 1 + _NUDGE
@@ -361,7 +370,9 @@ def _judge(law: _Law, found: _Measured, null: Sequence[_Measured], rows: int, in
     near = [i for i in changed if scaled[i] >= scaled[best] - max(_CLOSE, float(share[i] * scaled[best]))]
     near.sort(key=lambda i: (i >= single, -float(scaled[i])))
     chosen = tuple(
-        PlantChange(names[i], float(found.size[i]), float(sure[i]), float(SURE * error[i]), float(found.gain[i]))
+        PlantChange(
+            names[i], float(found.size[i]), float(sure[i]), float(SURE * error[i]), float(found.gain[i]), law.kinds[i]
+        )
         for i in near
     )
     first = str(chosen[0]) if len(chosen) == 1 else " or ".join(map(str, chosen)) + ": these cannot be told apart"

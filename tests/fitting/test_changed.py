@@ -31,7 +31,9 @@ def test_a_design_holds_on_the_same_plant_and_where_its_runs_bear_the_change(old
     assert compare_logs(old, record(), ()).holds
     weak = record(gain=0.82)
     report = compare_logs(old, weak, ()).report
-    assert "the gain of force" in {one.name for one in report.changes}
+    assert ("the gain of force", "input") in {(one.name, one.kind) for one in report.changes}
+    borne = compare_logs(old, weak, ("inputs 20 % weaker",))  # the kind of change decides, not its words
+    assert borne.holds is all(one.kind == "input" for one in report.changes)
     assert compare_logs(old, weak, ()).holds is False
     assert "design again" in compare_logs(old, weak, ()).sentence
 
