@@ -149,8 +149,8 @@ def fit_data(
     with collect_notes([]):  # the fits repeat the doubts that stand above
         judged = selection.predictor if split.learned is None else fit_again(selection, split.learned)
         seen, held_out = (judged.align(data) for data in (split.seen, split.held_out))
-        report = trust(judged, held_out, split.horizon, train=seen, rng=draw)
-        plain = score(edmd(seen, State() + Constant()), held_out, split.horizon)
+        report = trust(judged, held_out, split.ahead, train=seen, rng=draw)
+        plain = score(edmd(seen, State() + Constant()), held_out, split.ahead)
     verdict = f"{report}\n\n{_compare_with_plain(report.score, plain)}"
     tell(verdict)
     failures: list[str] = []
@@ -226,7 +226,7 @@ def list_pictures(
     held_out
         Episodes that no fit saw; the first three are forecast.
     """
-    horizon = selection.horizon
+    horizon = report.score.horizon
     finite = bool(np.isfinite(report.band.width).all())
     bands = report.band if finite else report.score
     around = "band that holds whole forecasts nine times in ten" if finite else "5 to 95 % of the errors"
@@ -263,7 +263,7 @@ def describe_data(split: DividedData) -> str:
         if not names and what == "inputs":
             pairs.append(("inputs", "none"))
     steps = sum(map(len, split.held_out))
-    ahead = f"horizon {split.horizon} steps = {split.horizon * seen.dt:.3g} s"
+    ahead = f"horizon {split.ahead} steps = {split.ahead * seen.dt:.3g} s"
     pairs.append(("held out", f"{len(split.held_out)} episodes, {steps} steps; {ahead}"))
     return "\n".join([render_text(label_lines(pairs)), *(f"! {note}" for note in split.notes)])
 

@@ -17,6 +17,7 @@ from koopmpc.data.episodes import Episode, Episodes, join_sets
 from koopmpc.data.files.folder import Files
 from koopmpc.data.files.sampling import UnevenSamplingError
 from koopmpc.data.files.tables import SAVED
+from koopmpc.data.pace import find_pace
 from koopmpc.data.source import Changed, Held, Source, Subset
 from koopmpc.errors import ColumnWarning, DataError, FitWarning, NoInputWarning
 from koopmpc.fitting.suspected import bridge_spikes, decide_places
@@ -371,6 +372,8 @@ class DividedData:
         Records without their held-out ends, where `fitted` holds all rows: the model to judge is fitted to them.
     excerpt
         Rows of the logs as they were read, for pictures, with marks where they were repaired.
+    verdict
+        Steps ahead of the verdict, where they are others than those of the choice.
     """
 
     fitted: Source | Episodes
@@ -383,6 +386,12 @@ class DividedData:
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
     learned: Episodes | None = None
     excerpt: LogExcerpt | None = None
+    verdict: int | None = None
+
+    @property
+    def ahead(self) -> int:
+        """Steps ahead of the verdict."""
+        return self.horizon if self.verdict is None else self.verdict
 
 
 def divide_files(
@@ -465,7 +474,7 @@ def _divide_episodes(
     whole = list(episodes)
     notes: tuple[str, ...] = ()
     if is_record(episodes):
-        return _divide_records(episodes, ahead, size, repaired, delay)
+        return _divide_records(episodes, ahead, size, repaired, delay, follow=horizon is None)
     if len(_keep_long(whole, shortest)) < _ENOUGH:
         block = max(2 * shortest, min(sum(lengths) // (4 * _ENOUGH), _JUDGED // _ENOUGH))
         whole = [piece for episode in episodes for piece in cut_blocks(episode, block)]
@@ -496,9 +505,18 @@ def _divide_episodes(
     )
 
 
-def _divide_records(records: Episodes, ahead: int, size: str, repaired: tuple[str, ...], delay: int) -> DividedData:
-    """Hold out the last fifth of each record, in blocks, to judge; choice and last fit take the whole record."""
-    shortest = ahead + max(delay, *DELAYS)
+def _divide_records(
+    records: Episodes, ahead: int, size: str, repaired: tuple[str, ...], delay: int, *, follow: bool
+) -> DividedData:
+    """Hold out the last fifth of each record, in blocks, to judge; choice and last fit take the whole record.
+
+    With `follow` the verdict looks as far ahead as the outputs remember, but `_ENOUGH` blocks are to remain.
+    """
+    past, verdict = max(delay, *DELAYS), None
+    held = sum(len(e) - max(round((1 - _SHARE) * len(e)), len(e) - _JUDGED) for e in records)
+    if follow and (longer := min(find_pace(records), held // _ENOUGH - past)) > ahead:
+        verdict = longer
+    shortest = (verdict or ahead) + past
     learned: list[Episode] = []
     held_out: list[Episode] = []
     for record in records:
@@ -517,10 +535,14 @@ def _divide_records(records: Episodes, ahead: int, size: str, repaired: tuple[st
         f"the last fifth of {'each' if len(records) > 1 else 'the'} record is held out, in {len(held_out)} blocks; "
         "the chosen model is fitted without it to be judged, and then to all rows"
     )
+    notes = (*repaired, note)
+    if verdict is not None:
+        seconds = f"{verdict * records.dt:.3g} s"
+        notes = (*notes, f"judged {verdict} steps = {seconds} ahead, since the outputs remember that long")
     train = records.with_episodes(learned)
     seen, _ = take_sample(Held(train), _JUDGED)
     judged = records.with_episodes(held_out)
-    return DividedData(records, seen, judged, ahead, size, (*repaired, note), delay, learned=train)
+    return DividedData(records, seen, judged, ahead, size, notes, delay, learned=train, verdict=verdict)
 
 
 def drop_origins(episodes: Episodes) -> Episodes:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 import pytest
+from scipy import signal
 from typer.testing import CliRunner
 
 import koopmpc as km
@@ -15,7 +16,7 @@ import koopmpc.fitting.fit
 from koopmpc.bench.store import RESULTS
 from koopmpc.cli.app import app
 from koopmpc.fitting.fit import fit_data
-from koopmpc.fitting.repair import describe_guesses, divide_files, find_repairs, shorten_notes
+from koopmpc.fitting.repair import describe_guesses, divide_files, find_repairs, read_logs, shorten_notes
 from tests.bench.tiny import write
 
 
@@ -187,6 +188,22 @@ def test_the_end_of_one_long_log_is_held_out_and_that_is_said(tmp_path):
     assert len(found.held_out) >= 4
     last = np.concatenate([e.X[:-1] for e in found.held_out])
     assert np.allclose(last, data[0].X[480:-1])
+
+
+def test_the_verdict_on_a_record_looks_as_far_ahead_as_its_output_remembers(tmp_path):
+    rng = np.random.default_rng(0)
+    u, tau = rng.standard_normal(6000), 60
+    y = signal.lfilter([0, 1], [1, -np.exp(-1 / tau)], u)
+    rows = np.column_stack([0.01 * np.arange(len(y)), u, y])
+    np.savetxt(tmp_path / "slow.csv", rows, delimiter=",", header="time [s],u,y", comments="")
+    split = read_logs(tmp_path / "slow.csv", None, rng, 10**9, {})
+    assert split.horizon == 20  # models are chosen by these
+    assert tau / 2 < split.ahead <= 2 * tau
+    assert all(len(e) >= split.ahead for e in split.held_out)
+    assert len(split.held_out) >= 12  # so that a band is finite
+    assert f"judged {split.ahead} steps = {0.01 * split.ahead:.3g} s ahead" in " ".join(split.notes)
+    asked = read_logs(tmp_path / "slow.csv", 30, rng, 10**9, {})
+    assert (asked.horizon, asked.ahead) == (30, 30)
 
 
 @pytest.mark.usefixtures("quick")
