@@ -98,7 +98,7 @@ class HiddenState(Delay):
     def _advance(
         self, point: Float[np.ndarray, "*batch npoint"], u: Float[np.ndarray, "*batch nu"]
     ) -> Float[np.ndarray, "*batch n"]:
-        psi = self.lifting(point)
+        psi = self.lifting(point.reshape(-1, point.shape[-1])).reshape(*point.shape[:-1], -1)  # any batch
         z = psi @ self.A.T + u @ self.B.T
         for i, Ni in enumerate(self.N):
             z += u[..., i : i + 1] * (psi @ Ni.T)

@@ -142,3 +142,12 @@ class LaggedSpring(km.Dynamics):
     def measure(self, x: ca.SX) -> ca.SX:
         """Return the position."""
         return x[0]
+
+
+@dataclass(frozen=True)
+class BlindFunnel(Funnel):
+    """The funnel whose lower level alone is measured."""
+
+    def measure(self, x: ca.SX) -> ca.SX:
+        """Return the lower level."""
+        return x[1]

@@ -1,4 +1,4 @@
-"""Ten more tasks, each made after a cause for which a design once failed on a plant that nobody had tuned for."""
+"""Twelve more tasks, each made after a cause for which a design once failed on a plant that nobody had tuned for."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -44,6 +44,27 @@ def _log_under_pi(task: LoggedTask, seed: int) -> km.Episodes:
             U.append(u)
         episodes.append(km.Episode(X=np.array(X), U=np.array(U)))
     return km.Episodes(episodes, task.dt, plant.states, plant.inputs)
+
+
+def _record_under_pi(task: LoggedTask, seed: int) -> km.Episodes:
+    """Return one record of the sensor alone, under a PI loop whose set point steps every 40 rows."""
+    rng, plant, t = np.random.default_rng(seed), task.equations, task.training
+    low, high = np.asarray(t.x0.low), np.asarray(t.x0.high)
+    u_low, u_high = float(np.min(task.limits.u_min)), float(np.max(task.limits.u_max))
+    of = plant.states.index(plant.outputs[0])
+    rows = t.episodes * t.steps
+    goals = np.repeat(rng.uniform(low[of], high[of], -(-rows // 40)), 40)[:rows]
+    x, integral = (low + high) / 2, (u_low + u_high) / 2
+    Y, U = np.empty((rows + 1, 1)), np.empty((rows, 1))
+    for k in range(rows + 1):
+        Y[k] = x[of] + task.noise * (high[of] - low[of]) * rng.standard_normal()
+        if k < rows:
+            error = goals[k] - Y[k, 0]
+            integral = np.clip(integral + PI[1] * error, u_low, u_high)
+            noise = 2 * SMALL * (u_high - u_low) * rng.standard_normal()
+            U[k] = np.clip(integral + PI[0] * error + noise, u_low, u_high)
+            x = np.asarray(plant(x, U[k]))
+    return km.Episodes([km.Episode(X=Y, U=U)], task.dt, plant.outputs, plant.inputs)
 
 
 def _sine(amplitude: float, period: float, steps: int, column: int) -> np.ndarray:
@@ -238,6 +259,44 @@ _MORE = (
         reference=np.array([0.7]),
         starts=[[-0.5, 0.0, 0.0]],
         steps=120,
+        noise=1e-3,
+    ),
+    LoggedTask(
+        name="one record of a drive",  # speed and drive are hidden; there is one record of a working PI loop
+        truth=more_plants.LaggedSpring(),
+        dt=0.1,
+        around=([0.0, 0.0, 0.0], [0.0]),
+        training=km.Training(
+            x0=km.Uniform([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]), excitation=km.Noise(-2.5, 2.5), episodes=1, steps=2000
+        ),
+        logged=_record_under_pi,
+        Q=[10.0],
+        R=[0.1],
+        limits=km.Limits(u_min=-2.5, u_max=2.5),
+        horizon=20,
+        tracked=["x [m]"],
+        reference=np.array([0.7]),
+        starts=[[-0.5, 0.0, 0.0]],
+        steps=120,
+        noise=1e-3,
+    ),
+    LoggedTask(
+        name="one record of a tank",  # the upper level is hidden; there is one record of a working PI loop
+        truth=more_plants.BlindFunnel(),
+        dt=0.2,
+        around=([0.5, 0.5], [0.7]),
+        training=km.Training(
+            x0=km.Uniform([0.2, 0.2], [0.9, 0.9]), excitation=km.Noise(0.0, 2.0), episodes=1, steps=2000
+        ),
+        logged=_record_under_pi,
+        Q=[10.0],
+        R=[0.1],
+        limits=km.Limits(u_min=0.0, u_max=2.0),
+        horizon=15,
+        tracked=["lower [m]"],
+        reference=np.array([0.75]),
+        starts=[[0.3, 0.3], [0.8, 0.4]],
+        steps=80,
         noise=1e-3,
     ),
 )

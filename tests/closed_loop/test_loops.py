@@ -41,6 +41,17 @@ def test_a_design_from_data_alone_costs_at_most_a_twentieth_more_than_the_optimu
 
 
 @pytest.mark.loops
+@pytest.mark.parametrize("task", ["one record of a drive", "one record of a tank"])
+def test_a_design_from_one_record_of_one_sensor_under_pi_controls_what_nobody_measured(task, record_property):
+    """Two of three states, or one of two, are hidden; a model with a past or a hidden state stands for them."""
+    table = measure([task], ["designed", "dmdc"], seeds=(0,), workers=1)
+    record_property("closed loops", text(table))
+    designed, dmdc = (table[task][name] for name in ("designed", "dmdc"))
+    assert designed.ratio <= 1.2, text(table)
+    assert designed.ratio <= 1.02 * dmdc.ratio, text(table)
+
+
+@pytest.mark.loops
 @pytest.mark.parametrize(("name", "start"), RUNS)
 def test_the_optimum_is_a_run_of_the_true_plant_whose_metrics_are_its_cost(name, start):
     task, best = TASKS[name], optimum(name, start)

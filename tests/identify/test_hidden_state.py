@@ -184,6 +184,37 @@ def test_exact_data_are_met_from_coefficients_ten_percent_off():
     assert elsewhere == 0
 
 
+@pytest.mark.parametrize("start", ["subspace", "ten percent off"])
+def test_feedthrough_is_met_exactly_by_a_hidden_state_whose_inputs_stand_one_row_up(start):
+    """y_k = C x_k + D u_k: the state of the moved record is [x; u], and its Markov parameters are D, CB, CAB, …"""
+    rng = np.random.default_rng(11)
+    A, B, C = linear_plant(rng, 2)
+    D = rng.standard_normal((1, 1))
+
+    def run(steps):
+        x, U, Y = np.zeros(2), rng.uniform(-1, 1, (steps + 1, 1)), np.empty((steps + 1, 1))
+        for k, u in enumerate(U):
+            Y[k] = C @ x + D @ u
+            x = A @ x + B @ u
+        log = km.Episodes([km.Episode(X=Y, U=U[:-1])], 0.1, ["y0"], ["u0"])
+        return log.with_inputs_advanced(1)
+
+    data, fresh = run(400), run(200)
+    model = km.identify.subspace(data, 3, delays=4)
+    if start != "subspace":
+        units = SignalUnits.of(data, None)
+        found = to_standard(model, units)
+        theta = found.parameters * rng.uniform(0.9, 1.1, found.parameters.size)
+        model = from_standard(found.with_parameters(theta), units, data, 4, model.report)
+    refined = km.identify.refine(model, data, horizon=20, iterations=100)
+    truth = np.concatenate([D[None], markov(A, B, C, 49)])
+    assert np.abs(model_markov(refined) - truth).max() < 1e-6
+    (e,) = fresh
+    past = refined.embedding.steps
+    free = refined.rollout(e.X[past], e.U[past:], history=km.Episode(X=e.X[: past + 1], U=e.U[:past]))
+    assert np.abs(free - e.X[past:]).max() < 1e-6
+
+
 def test_hidden_bilinear_dynamics_are_learned_from_the_output_alone():
     rng = np.random.default_rng(3)
 

@@ -13,7 +13,7 @@ from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.records.narx import check_list, is_worse, source_episodes
-from koopmpc.identify.records.structure import HORIZON
+from koopmpc.identify.records.structure import EXACT, HORIZON
 from koopmpc.identify.records.unseen import cut_quarter, measure_forecasts
 from koopmpc.identify.regression import Regression, build_regression, compute_scale_factor
 from koopmpc.identify.solve import column_norms, solve
@@ -25,6 +25,7 @@ from koopmpc.predict.predictors import LinearPredictor
 DELAYS = (4, 8, 12)  # numbers of past rows that are tried
 ORDERS = (1, 2, 3, 4, 5, 6, 8)  # orders of the hidden state that are tried
 _PRESENT = 1e-2  # weight of C z = y beside A z = s, which alone decides where A is invertible
+_FAST = 0.98  # take the realisation with feedthrough if it lowers the error of one step below this share
 _RESOLVED = 1e-10  # a direction of the past that explains less than this share of the forecasts is rounding error
 
 
@@ -109,23 +110,20 @@ def build_realisation(total: Moments, order: int) -> LinearPredictor:
     regression = build_regression(total, "subspace")
     rows, n, nx = regression.rows, regression.lifting.nz - 1, len(regression.states)
     centred = rows.subtract_means()
-    zeta, u, ahead = centred.P[:, :n], centred.P[:, n + 1 :], centred.T[:, :n]
+    zeta, ahead = centred.P[:, :n], centred.T[:, :n]
     size = np.sqrt((np.sum(ahead[:, :nx] ** 2, axis=0) + centred.rest[:nx]) / rows.samples)
     if not size.any():
         raise DataError("no output moves in these records, so nothing can be learned; pass a record in which they do")
     size = np.where(size > 0, size, 1.0)
     state = _find_state(regression, zeta, order, size)
-    s, s_next = zeta @ state.T, ahead @ state.T
-    # forecasts: s⁺ = A s + A B u and y⁺ = C s + C B u
-    K = np.linalg.lstsq(np.hstack([s, u]), np.hstack([s_next, ahead[:, :nx]]), rcond=None)[0].T
-    m = len(state)
-    A, C = K[:m, :m], K[m:, :m]
-    both = np.vstack([A, C / size[:, None]])
-    B = np.linalg.lstsq(both, np.vstack([K[:m, m:], K[m:, m:] / size[:, None]]), rcond=None)[0]
-    weighed = np.vstack([A, _PRESENT * C / size[:, None]])
-    present = _PRESENT * np.eye(nx, n) / size[:, None]
-    T = np.linalg.lstsq(weighed, np.vstack([state, present]), rcond=None)[0]
-    return _build_model(regression, Realisation(A, B, C, T))
+    plain = _build_model(regression, _realise(regression, state, size))
+    assert plain.report is not None, "it was fitted"
+    if order > nx and not (plain.report.residual <= EXACT * size).all():
+        fast = _build_model(regression, _realise_with_outputs(regression, state[: order - nx], size))
+        assert fast.report is not None, "it was fitted"
+        if np.prod(fast.report.residual / size) < _FAST**nx * np.prod(plain.report.residual / size):
+            return fast
+    return plain
 
 
 class Realisation(NamedTuple):
@@ -135,6 +133,40 @@ class Realisation(NamedTuple):
     B: Float[np.ndarray, "n nu"]
     C: Float[np.ndarray, "nx n"]
     T: Float[np.ndarray, "n nzeta"]
+
+
+def _fit_transition(regression: Regression, state: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "mny mnu"]:
+    """Return K of [s⁺; y⁺] = K [s; u], s = S ζ."""
+    centred, n, nx = regression.rows.subtract_means(), regression.lifting.nz - 1, len(regression.states)
+    zeta, u, ahead = centred.P[:, :n], centred.P[:, n + 1 :], centred.T[:, :n]
+    s, s_next = zeta @ state.T, ahead @ state.T
+    return np.linalg.lstsq(np.hstack([s, u]), np.hstack([s_next, ahead[:, :nx]]), rcond=None)[0].T
+
+
+def _realise(regression: Regression, state: Float[np.ndarray, "m n"], size: Float[np.ndarray, " nx"]) -> Realisation:
+    """Return the realisation with s = A z: forecasts are s⁺ = A s + A B u and y⁺ = C s + C B u."""
+    m, nx = len(state), len(size)
+    K = _fit_transition(regression, state)
+    A, C = K[:m, :m], K[m:, :m]
+    both = np.vstack([A, C / size[:, None]])
+    B = np.linalg.lstsq(both, np.vstack([K[:m, m:], K[m:, m:] / size[:, None]]), rcond=None)[0]
+    weighed = np.vstack([A, _PRESENT * C / size[:, None]])
+    present = _PRESENT * np.eye(nx, state.shape[1]) / size[:, None]
+    T = np.linalg.lstsq(weighed, np.vstack([state, present]), rcond=None)[0]
+    return Realisation(A, B, C, T)
+
+
+def _realise_with_outputs(
+    regression: Regression, state: Float[np.ndarray, "m n"], size: Float[np.ndarray, " nx"]
+) -> Realisation:
+    """Return the realisation z = [s; y]: y⁺ = C s + D u with any D, for inputs that act at once and leave no trace.
+
+    There A of the other realisation is singular, and s = A z has lost what u does.
+    """
+    m, nx = len(state), len(size)
+    K = _fit_transition(regression, state)
+    A = np.hstack([K[:, :m], np.zeros((m + nx, nx))])
+    return Realisation(A, K[:, m:], np.eye(nx, m + nx, m), np.vstack([state, np.eye(nx, state.shape[1])]))
 
 
 def _find_state(
