@@ -1,7 +1,7 @@
 """Surrogates: learned maps that replace the plant when controllers are judged."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -33,21 +33,27 @@ _FAMILIES = ("monomials", "fourier", "gaussian", "thin plate", "random fourier")
 class Surrogate(Value):
     """x⁺ = F(x, u_0 + gain (u − u_0)), F a learned model that is lifted afresh at every step, y = x + noise.
 
+    u_0 is a standard deviation below the mean of the inputs: another gain is a constant load on inputs at their mean,
+    and a controller without an estimator shows its offset there.
+
     Attributes
     ----------
     model
         The predictor.
     middle, w
-        (nu,) u_0 and (nw,) the measured disturbances that act: the means of the data.
+        (nu,) inputs and (nw,) the measured disturbances that act: the means of the data.
     noise
         (nx,) standard deviation of the measurements: the model's one-step error over √2, of noise and misfit, and what
         a smoother took out of the data.
+    spread
+        (nu,) standard deviation of the inputs; (0,) in files of earlier designs, whose u_0 is the mean.
     """
 
     model: AnyPredictor
     middle: Float[np.ndarray, " nu"]
     w: Float[np.ndarray, " nw"]
     noise: Float[np.ndarray, " nx"]
+    spread: Float[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0))
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -94,8 +100,8 @@ class Surrogate(Value):
         if gain == 1.0:
             return given
         x, u, theta = (ca.SX.sym(name, n) for name, n in (("x", given.nx), ("u", given.nu), ("t", len(given.theta))))
-        middle = ca.DM(self.middle)
-        return replace(given, F=ca.Function("F", [x, u, theta], [given.F(x, middle + gain * (u - middle), theta)]))
+        origin = ca.DM(self.middle - self.spread if self.spread.size else self.middle)
+        return replace(given, F=ca.Function("F", [x, u, theta], [given.F(x, origin + gain * (u - origin), theta)]))
 
 
 class Holding:
@@ -155,10 +161,11 @@ def fit_surrogate(
     `smoothed` is the (nx,) standard deviation of the noise that these data no longer hold.
     """
     model = recipe.fit(fitted)
-    driven = np.concatenate([np.hstack([episode.U, episode.W]) for episode in fitted]).mean(axis=0)
+    rows = np.concatenate([np.hstack([episode.U, episode.W]) for episode in fitted])
+    driven, spread = rows.mean(axis=0), rows[:, : fitted.nu].std(axis=0)
     error = score(model, held_out, 1, relift=True).rmse[0]
     noise = np.hypot(np.where(np.isfinite(error), error, 0.0) / np.sqrt(2), smoothed)
-    return Surrogate(model, driven[: fitted.nu], driven[fitted.nu :], noise)
+    return Surrogate(model, driven[: fitted.nu], driven[fitted.nu :], noise, spread)
 
 
 def find_ignored_states(one: Surrogate, X: Float[np.ndarray, "M nx"]) -> list[int]:
