@@ -1,7 +1,11 @@
 """A reference that moves enters the plan by one product with it, or part by part: both give the same inputs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import koopmpc as km
 from tests.control.models import linear
@@ -29,7 +33,7 @@ def preview(kind, k):
 def test_one_product_gives_the_inputs_of_its_parts(cost, limits, latency, offset_free, monkeypatch):
     options = {"estimator": km.LiftedDisturbance() if offset_free else None, "latency": latency}
     at_once = km.KoopmanMPC(linear(A, B), COSTS[cost], LIMITS[limits], N, **options)
-    monkeypatch.setattr("koopmpc.control.linear.plan._LARGEST", 0)
+    monkeypatch.setattr("koopmpc.control.linear.moving._LARGEST", 0)
     by_parts = km.KoopmanMPC(linear(A, B), COSTS[cost], LIMITS[limits], N, **options)
     assert at_once._map.moving is not None
     assert by_parts._map.moving is None
@@ -59,3 +63,40 @@ def test_a_moving_reference_that_is_not_finite_ends_in_bad_measurement():
         assert mpc([0, 0], rows).status is km.Status.BAD_MEASUREMENT
         rows[3, 0] = 0.0
         assert mpc([0, 0], rows).status is km.Status.UNCONSTRAINED
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    cost=st.sampled_from(list(COSTS)),
+    rows=st.sampled_from([1, 3, N + 1, N + 2]),
+    in_time=st.booleans(),
+    narrow=st.booleans(),
+    latency=st.integers(0, 1),
+)
+def test_a_plan_on_the_way_is_the_one_that_is_computed_afresh(seed, cost, rows, in_time, narrow, latency):
+    """The first call after a reset reads its reference part by part: later calls have the same plan, to 1e-9."""
+    rng, room = np.random.default_rng(seed), 0.6 if narrow else 50.0
+    model, base = linear(A, B), COSTS[cost]
+    steps = 4
+    signal = rng.uniform(0.1, 1.0) * np.cumsum(rng.normal(size=(steps + N + 2, 2)), axis=0) * [0.2, 0.0]
+    ends = room * (1 + 0.2 * rng.random((steps + N + 2, 1))) if in_time else room
+
+    def build(k):
+        targets = base.u_target
+        own = base if np.ndim(targets) < 2 else replace(base, u_target=np.asarray(targets)[k:])
+        later = ends[k:] if in_time else ends
+        return km.KoopmanMPC(model, own, km.Limits(-later, later, x_min=[-2, -9], x_max=[2, 9]), N, latency=latency)
+
+    mpc, x, last = build(0), rng.normal(size=2) * 0.3, np.zeros(1)
+    for k in range(steps):
+        reference = signal[k] if rows == 1 else signal[k : k + rows]
+        fresh = build(k)
+        fresh.reset(u_prev=last)
+        move, other = mpc(x, reference), fresh(x, reference)
+        assert move.status is other.status
+        size = 1 + np.abs(other.u).max()
+        np.testing.assert_allclose(move.u, other.u, rtol=0, atol=1e-9 * size)
+        if fresh.plan() is not None:
+            np.testing.assert_allclose(mpc.plan().U, fresh.plan().U, rtol=0, atol=1e-9 * size)
+        last, x = move.u, A @ x + B @ (last if latency else move.u)

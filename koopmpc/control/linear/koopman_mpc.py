@@ -19,9 +19,10 @@ from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.linear.condensed_program import CondensedProgram
+from koopmpc.control.linear.moving import MovingMap
 from koopmpc.control.linear.plan import plan_map, planned_states
 from koopmpc.control.linear.windows import LimitWindows, limit_windows
-from koopmpc.control.move import Move, Plan, Status, alone, busy
+from koopmpc.control.move import Fallback, Move, Plan, Status, alone, busy
 from koopmpc.control.program import linear_parts, no_export, publish_estimator, reference_table
 from koopmpc.control.solvers import FINISHER, exact_turn, order_solvers
 from koopmpc.control.solvers.base import StepSolver
@@ -38,6 +39,10 @@ from koopmpc.estimate.observer import Estimator, start_observer
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import LinearPredictor
 
+_at_least = np.greater_equal  # looked up once, as the three below
+_at_most = np.less_equal
+_FREE = Status.UNCONSTRAINED
+_NONE = Fallback.NONE
 _OTHER_SOLVER = (
     "The controller solves with OSQP; this C solves with DAQP, to rounding: inputs differ by OSQP's tolerance."
 )
@@ -192,7 +197,8 @@ class KoopmanMPC(MPCBase):
         rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
         self._reference_key: bytes | None = None
-        self._given_row, self._rows_left = 0, False  # u_target in rows: which is this step's, and whether others follow
+        self._given_row = 0  # the row of a given u_target that belongs to this step
+        self._read: MovingMap | None = self._map.moving  # the map that holds the reference of the last call
         self._aimed = False  # whether the plan's last column is that of the reference
         self._going = False  # whether a step was made since reset: the first one repeats to the bit in every run
         self._rows = np.zeros((self._N + 1, len(track.tracked)))
@@ -290,9 +296,7 @@ class KoopmanMPC(MPCBase):
             self._called_with = self._reference_key = None
         super().reset(x0, u_prev)
         self._qps.reset()
-        self._going = False
-        if self._given_row:
-            self._given_row, self._rows_left, self._reference_key = 0, False, None
+        self._going, self._given_row = False, 0
 
     @alone
     def update(self, predictor: LinearPredictor) -> None:
@@ -317,6 +321,7 @@ class KoopmanMPC(MPCBase):
             disturbed=self._disturbed,
             periodic=self._initial.periodic.size > 0,
         )
+        self._read = self._map.moving
         self.predictor, self._states = predictor, None
         if isinstance(self._qps, BallSolver) and self._map.ball is not None:
             self._qps.change(self._map.qp, self._map.ball)
@@ -373,11 +378,10 @@ class KoopmanMPC(MPCBase):
             target = numbers(reference, "reference")
             key, moving = target.tobytes(), None
             if key != self._reference_key:
-                finite = self._take_reference(target)
-                moving = self._map.moving if finite and self._going else None
+                moving = self._take_reference(target)
                 self._reference_key, self._aimed = key, False
             if self._window is not None or limits is not None:
-                self._move_limits(limits, moving is not None)
+                self._move_limits(limits, moving)
             if moving is None and not self._aimed:
                 self._aim()
             self._going = True
@@ -385,24 +389,25 @@ class KoopmanMPC(MPCBase):
             origin.take(y, self._given, applied, w)
             if self._held is not None:
                 self._count_held(applied)
-            if self._rows_left:  # the next call has its own row of a given u_target
-                self._given_row, self._reference_key = self._given_row + 1, None
             if self._window is not None:
                 self._step += 1
             plan, t = self._map, self._spare
             if moving is None:
                 plan.matrix.dot(origin.known, t)
-                np.greater_equal(t, plan.low, out=plan.met_low)
-                np.less_equal(t, plan.high, out=plan.met_high)
+                if plan.given is not None:
+                    self._add_given(t)
+                _at_least(t, plan.low, plan.met_low)
+                _at_most(t, plan.high, plan.met_high)
                 # no 0 byte: every limit is met, and nothing is NaN (NaN meets no limit)
                 ask = self._solve_limited if 0 in plan.met else self._return_free_plan
                 move = ask(t, applied, start)
             else:
-                moving.start[:] = origin.known
-                moving.matrix.dot(moving.known, moving.t)
-                np.greater_equal(moving.t, moving.low, out=moving.met_low)
-                np.less_equal(moving.t, moving.high, out=moving.met_high)
-                t[: plan.planned] = moving.t[: plan.planned]
+                whole = moving.multiply(origin.known)
+                if plan.given is not None:
+                    self._add_given(whole)
+                _at_least(whole, moving.low, moving.met_low)
+                _at_most(whole, moving.high, moving.met_high)
+                (t if plan.planned == len(t) else t[: plan.planned])[:] = moving.planned
                 ask = self._solve_moving if 0 in moving.met else self._return_free_plan
                 move = ask(t, applied, start)
             if origin.refused:
@@ -425,7 +430,7 @@ class KoopmanMPC(MPCBase):
         model = self.predictor
         return limit_windows(self._map, limits, model.states, model.inputs, self._latency, at_call=at_call)
 
-    def _move_limits(self, limits: Limits | None, moving: bool) -> None:
+    def _move_limits(self, limits: Limits | None, moving: MovingMap | None) -> None:
         """Put the limits of this step into the plan, and let targets that they move be found again."""
         window = self._rows_of_limits
         if limits is not None or window is not self._window:
@@ -436,8 +441,8 @@ class KoopmanMPC(MPCBase):
         if k > window.last:
             k = window.last
         self._row = k
-        if moving:
-            window.moving_pages.turn(plan.moving, k)
+        if moving is not None:
+            (window.single_pages if moving is plan.single else window.moving_pages).turn(moving, k)
             return
         pages = window.plan_pages
         plan.low, plan.high = pages.rows.get(k) or pages.fill(k)  # not by a method, for it costs each free step
@@ -480,25 +485,35 @@ class KoopmanMPC(MPCBase):
     @property
     def _reference(self) -> Float[np.ndarray, "N1 nr"]:
         """The rows r_k … r_{k+N} of the last call."""
-        return self._rows if self._map.moving is None else self._map.moving.rows
+        rows = self._rows if self._read is None else self._read.rows
+        return rows if len(rows) > self._N else np.repeat(rows, self._N + 1, axis=0)
 
-    def _take_reference(self, reference: Float[np.ndarray, "..."]) -> bool:
-        """Keep the rows of the reference that the plan reads; return whether all are finite."""
-        moving, shape, latency, R = self._map.moving, reference.shape, self._latency, self._reference
-        if shape == R.shape[1:] or (shape == R.shape and not latency):
-            R[:] = reference
+    def _take_reference(self, reference: Float[np.ndarray, "..."]) -> MovingMap | None:
+        """Keep the rows of the reference that the plan reads; return the map that reads them.
+
+        It is None in the first step after `reset`, and where a row is not finite.
+        """
+        plan, shape = self._map, reference.shape
+        if shape == plan.single.shape[1:]:
+            self._read = read = plan.single
+            read.flat[:] = reference
         else:
-            R[:] = checks.reference_rows(reference, self._N, R.shape[1], latency)
-        if self._map.has_given:
-            self._rows_left = self._given_row + 1 < len(self._map.given_ahead) - self._N
-            if moving is not None:
-                moving.given[:] = self._given_ahead()
-        return dasum(R.reshape(-1) if moving is None else moving.flat) < HUGE
+            self._read = read = plan.moving
+            R = self._rows if read is None else read.rows
+            if shape == R.shape and not self._latency:
+                R[:] = reference
+            else:
+                R[:] = checks.reference_rows(reference, self._N, R.shape[1], self._latency)
+        if read is None:
+            return None
+        return read if dasum(read.flat) < HUGE and self._going else None
 
-    def _given_ahead(self) -> Float[np.ndarray, "N1 nu"]:
-        """Return the rows of a given u_target that belong to the reference's."""
-        given, first = self._map.given_ahead, self._given_row + self._latency
-        return given[first : first + self._N + 1] if first < len(given) - self._N else given[-self._N - 1 :]
+    def _add_given(self, t: Float[np.ndarray, " nt"]) -> None:
+        """Add the share of the rows of a given u_target that belong to this step, and go on to the next one."""
+        plan, given = self._map, self._map.given
+        assert given is not None, "the caller knows"
+        t[: plan.planned] += given.at(self._given_row + self._latency)
+        self._given_row += 1
 
     def _aim(self) -> None:
         """Write the part of the plan that depends on the reference into the last column of the plan's matrix.
@@ -507,14 +522,12 @@ class KoopmanMPC(MPCBase):
         BAD_MEASUREMENT.
         """
         plan, maps, targets, R = self._map, self._map.maps, self._map.targets, self._reference
-        column, self._aimed = plan.matrix[:, -1], not self._rows_left
+        column, self._aimed = plan.matrix[:, -1], True
         if not (np.abs(R) < HUGE).all():
             column[:] = np.nan
             return
         v = maps.from_reference.dot(R.reshape(-1))
-        v += maps.offset
-        if plan.has_given:
-            v += maps.from_given @ self._given_ahead().reshape(-1)
+        v += plan.offset
         if plan.aimed:
             alpha, window = targets.nearest(R), self._window
             if plan.disturbance.shape[1]:
@@ -535,12 +548,14 @@ class KoopmanMPC(MPCBase):
             return self._solve_qp(t, applied, start)
         self._qps.rest()
         self._plan, self._spare = t, self._plan
-        self._keep(t)
-        return self._move(self._given.copy(), Status.UNCONSTRAINED, 0, start)
+        self._kept, self._age, self._planned = t, 0, True
+        self._given = u = t[: self.nu]
+        taken = perf_counter() - start  # in this step a call of `_keep` and of `_move` would take 5 % of the time
+        return Move(u.copy(), _FREE if taken <= self._allowed else Status.TIME_LIMIT, _NONE, taken, 0)
 
     def _solve_moving(self, t: Float[np.ndarray, " nt"], applied: ArrayLike | None, start: float) -> Move:
         """Handle a step like `_solve_limited`, of a plan t from one product with the reference."""
-        plan, moving, n, window = self._map, self._map.moving, self._map.planned, self._window
+        plan, moving, n, window = self._map, self._read, self._map.planned, self._window
         if window is not None:
             window.plan_pages.turn(plan, self._row)
         if moving is not None and moving.met_low[n:].all() and moving.met_high[n:].all():
@@ -548,6 +563,8 @@ class KoopmanMPC(MPCBase):
         else:
             self._aim()
             plan.matrix.dot(self._initial.known, t)
+            if plan.given is not None:
+                t[:n] += plan.given.at(self._given_row - 1 + self._latency)
             if (t >= plan.low).all() and (t <= plan.high).all():
                 return self._return_free_plan(t, applied, start)
         return self._solve_limited(t, applied, start)

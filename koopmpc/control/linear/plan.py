@@ -12,6 +12,7 @@ from koopmpc.control.cost import LiftedTracking, add_held
 from koopmpc.control.horizon import Condensed, Coordinates, Horizon, build_stages, condense, horizon_of
 from koopmpc.control.limits import Interval, Softness, preview_margin
 from koopmpc.control.linear.blocking import tie_moves
+from koopmpc.control.linear.moving import GivenShares, MovingMap
 from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.stepped.blocks import MoveBlocks
@@ -21,8 +22,6 @@ from koopmpc.control.terminal.sets import EndRows, read_end
 from koopmpc.control.terminal_cost import terminal_of
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Viewing
-
-_LARGEST = 2**16  # entries of a MovingMap: a larger one takes longer than the sparse products that it replaces
 
 
 class PlanLimits(NamedTuple):
@@ -80,10 +79,10 @@ class PlanMap(Viewing):
         The QP of w.
     ball
         The entries of v that a terminal ellipsoid limits; their limits here are those of a box inside it.
-    given_ahead, has_given
-        The rows of a given u_target, moved by a price, the last one repeated for a preview, and whether there are some.
-    moving
-        The map of a reference that moves, where one product is fast.
+    given, offset
+        The share of rows of a given u_target, moved by a price, None where there are none; what a plan begins with.
+    moving, single
+        The maps of a reference that moves: of a preview, and of one row that is held over the horizon.
     met
         A byte for each limit, met or not; `met_low` and `met_high` are views of the lower and of the upper ones.
     """
@@ -143,15 +142,19 @@ class PlanMap(Viewing):
         from_state[:nv] = maps.from_state
         self.matrix = np.ascontiguousarray(np.column_stack([from_state, first, np.zeros(len(low))]))
         asked = add_held(track.given, track.shift)
-        given = np.zeros((1, len(track.inputs.low))) if asked is None else asked
-        self.has_given = asked is not None
-        self.given_ahead = np.vstack([given, np.tile(given[-1], (horizon.N, 1))])
-        self.moving = MovingMap.of(self, len(track.tracked), len(track.inputs.low))
+        self.given, self.offset = None, self.maps.offset
+        if asked is not None:
+            given = GivenShares(self.maps.from_given, np.vstack([asked, np.tile(asked[-1], (horizon.N, 1))]))
+            if given.last:
+                self.given = given
+            else:
+                self.offset = self.offset + given.at(0)
+        self.moving, self.single = MovingMap.of(self, len(track.tracked))
         self._see()
 
     def restore_limits(self) -> None:
         """Set the limits that hold where none move in time."""
-        for part in (self, self.moving):
+        for part in (self, self.moving, self.single):
             if part is not None:
                 half = len(part.limits) // 2
                 part.low, part.high = part.limits[:half], part.limits[half:]
@@ -163,71 +166,6 @@ class PlanMap(Viewing):
         self.met = bytearray(2 * rows)
         met = np.frombuffer(self.met, dtype=np.bool_)
         self.met_low, self.met_high = met[:rows], met[rows:]
-
-
-class MovingMap(Viewing):
-    """t = M [z; u_{−1}; g; 1; r_0; …; r_N; u_r …]: the plan, and the limited values of each row's target.
-
-    One product serves a reference that moves. Where low ≤ t ≤ high, the plan is the optimum, and no limit moves a
-    target. The input targets u_r are there where they are given.
-
-    Attributes
-    ----------
-    known
-        What M is multiplied by, with the views `start`, `rows`, `given`, and `flat`, the rows one after the other.
-    met
-        A byte for each limit, as in `PlanMap`.
-    """
-
-    _VIEWS = ("met", "met_low", "met_high", "low", "high", "start", "flat", "rows", "given")
-
-    def __init__(self, plan: "PlanMap", nr: int, nu: int) -> None:
-        maps, targets, fixed = plan.maps, plan.targets, plan.matrix[: plan.planned, :-1]
-        steps, given = maps.from_reference.shape[1] // nr, plan.has_given
-        parts = [fixed, maps.offset[:, None], maps.from_reference]
-        low, high = [plan.low[: plan.planned]], [plan.high[: plan.planned]]
-        tests = np.zeros((0, fixed.shape[1] + 1 + maps.from_reference.shape[1]))
-        if plan.aimed:
-            limited = plan.limited_targets
-            K = targets.rows[limited] @ targets.from_reference
-            drive = np.zeros((len(K), fixed.shape[1]))
-            if plan.checked.any():
-                drive = plan.matrix[plan.planned : plan.planned + len(K), :-1]
-            once = np.column_stack([drive, targets.rows[limited] @ targets.offset])
-            tests = np.column_stack([np.tile(once, (steps, 1)), np.kron(np.eye(steps), K)])
-            reach = ROUNDING * targets.size[limited]
-            low.append(np.tile(targets.low[limited] - reach, steps))
-            high.append(np.tile(targets.high[limited] + reach, steps))
-        if given:
-            parts.append(maps.from_given)
-            tests = np.column_stack([tests, np.zeros((len(tests), maps.from_given.shape[1]))])
-        self.matrix = np.ascontiguousarray(np.vstack([np.column_stack(parts), tests]))
-        self.limits = np.concatenate(
-            [*(np.maximum(end, -HUGE) for end in low), *(np.minimum(end, HUGE) for end in high)]
-        )
-        self.t, self.known = np.zeros(len(self.matrix)), np.zeros(self.matrix.shape[1])
-        self._sizes = fixed.shape[1] + 1, steps, nr, nu
-        self._see()
-
-    def _see(self) -> None:
-        """Make the views; see `Viewing`."""
-        first, steps, nr, nu = self._sizes
-        count, last = len(self.t), first + steps * nr
-        self.low, self.high = self.limits[:count], self.limits[count:]
-        self.met = bytearray(2 * count)
-        met = np.frombuffer(self.met, dtype=np.bool_)
-        self.met_low, self.met_high = met[:count], met[count:]
-        self.start = self.known[:first]
-        self.flat = self.known[first:last]
-        self.rows = self.flat.reshape(steps, nr)
-        self.given = self.known[last:].reshape(-1, nu)
-
-    @staticmethod
-    def of(plan: "PlanMap", nr: int, nu: int) -> "MovingMap | None":
-        """Return the map of a plan; None where one product would be slower than its parts."""
-        rows, columns = plan.planned, plan.matrix.shape[1] + plan.maps.from_reference.shape[1]
-        steps = plan.maps.from_reference.shape[1] // nr
-        return MovingMap(plan, nr, nu) if (rows + steps * len(plan.targets.low)) * columns <= _LARGEST else None
 
 
 @checks.explain_overflow()

@@ -12,7 +12,8 @@ from koopmpc.checks import HUGE
 from koopmpc.control.in_time.bounds import refuse_crossed_rows
 from koopmpc.control.in_time.preview import require_movable, require_preview
 from koopmpc.control.limits import Interval, Limits, preview_margin
-from koopmpc.control.linear.plan import MovingMap, PlanMap
+from koopmpc.control.linear.moving import MovingMap
+from koopmpc.control.linear.plan import PlanMap
 from koopmpc.control.target import ROUNDING
 from koopmpc.errors import DataError
 
@@ -87,8 +88,8 @@ class LimitWindows:
         Which rates are hard; None where none is.
     moves
         Where the limits of all moves stand, those that an input keeps included.
-    plan_pages, moving_pages
-        The limits of the plan, and of its map of a reference that moves.
+    plan_pages, moving_pages, single_pages
+        The limits of the plan, and of its maps of a reference that moves.
     """
 
     plan: PlanMap
@@ -102,6 +103,7 @@ class LimitWindows:
     moves: Int[np.ndarray, " moves"]
     plan_pages: _Pages
     moving_pages: _Pages
+    single_pages: _Pages
 
     def _row(self, k: int) -> int:
         return min(k, self.last) + self.latency
@@ -235,7 +237,8 @@ def limit_windows(
 
     raw = Interval(*(np.hstack([a, b]) - targets.values for a, b in zip(box, outputs, strict=True)))
     limited, reach = plan.limited_targets, ROUNDING * targets.size[plan.limited_targets]
-    test = Interval(raw.low[:, limited] - reach, raw.high[:, limited] + reach)
+    shift = targets.rows[limited] @ targets.offset  # the tests of a MovingMap are of K r alone
+    test = Interval(raw.low[:, limited] - reach - shift, raw.high[:, limited] + reach - shift)
     swept_raw = _sweep(Interval(raw.low[:, limited], raw.high[:, limited]), N + 1)
     tightest = Interval(swept_raw.low - reach, swept_raw.high + reach)
     free = Interval(np.full((count, 1), -HUGE), np.full((count, 1), HUGE))
@@ -266,12 +269,17 @@ def limit_windows(
         low_places += [checked, np.full(len(checked), free_at)]
         high_places += [np.full(len(checked), W + free_at), W + checked]
     tests = (np.arange(N + 1)[:, None] * 2 * W + test_at + np.arange(len(reach))).ravel() if plan.aimed else mine[:0]
+    tight = tight_at + np.arange(len(reach)) if plan.aimed else mine[:0]
     margin = preview_margin(track.margin, N).ravel() if track.margin.any() else None
     planned = table[:, :raw_at], table[:, W : W + raw_at]
     table = np.clip(table, -HUGE, HUGE)
     pages = [
         _Pages(table, places.astype(np.intp), latency, steps - 1, slice(len(mine) - N * len(shown), len(mine)), margin)
-        for places in (np.concatenate([*low_places, *high_places]), np.concatenate([mine, tests, mine + W, tests + W]))
+        for places in (
+            np.concatenate([*low_places, *high_places]),
+            np.concatenate([mine, tests, mine + W, tests + W]),
+            np.concatenate([mine, tight, mine + W, tight + W]),
+        )
     ]
     return LimitWindows(
         plan=plan,
@@ -285,6 +293,7 @@ def limit_windows(
         moves=moves,
         plan_pages=pages[0],
         moving_pages=pages[1],
+        single_pages=pages[2],
     )
 
 

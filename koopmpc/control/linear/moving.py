@@ -1,0 +1,120 @@
+"""MovingMap: the plan of a reference that moves, by one product; GivenShares: the part of a given u_target in it."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy.lib.stride_tricks import sliding_window_view
+
+from koopmpc.checks import HUGE
+from koopmpc.control.target import ROUNDING
+from koopmpc.values import Viewing
+
+_TABLE = 2**20  # entries of a table of GivenShares: 8 MB
+_LARGEST = 2**23  # entries of a MovingMap: 64 MB
+
+
+class MovingMap(Viewing):
+    """t = M [z; u_{−1}; g; 1; r_0; …], and after it the limited values of each row's target, K r_k.
+
+    One product serves a reference that moves, and a small one its targets. Where low ≤ t ≤ high, the plan is the
+    optimum, and no limit moves a target. For one row that is held over the horizon, M has one r, and K is part of it.
+
+    Attributes
+    ----------
+    known
+        What M is multiplied by, with the views `start`, `rows`, and `flat`, the rows one after the other.
+    t, planned
+        The product and the values of targets, and of these the plan.
+    shape
+        That of `rows`.
+    met
+        A byte for each limit, as in `PlanMap`.
+    """
+
+    _VIEWS = ("met", "met_low", "met_high", "low", "high", "start", "flat", "rows", "plan", "planned", "tests")
+
+    def __init__(self, plan: Any, nr: int, *, held: bool) -> None:
+        maps, targets, n = plan.maps, plan.targets, plan.planned
+        fixed, shares = plan.matrix[:n, :-1], maps.from_reference
+        if held:
+            shares = shares.reshape(n, -1, nr).sum(axis=1)
+        steps = shares.shape[1] // nr
+        matrix = np.column_stack([fixed, plan.offset, shares])
+        low, high = [plan.limits[:n]], [plan.limits[len(plan.limits) // 2 :][:n]]
+        self.from_row = np.zeros((nr, 0))  # K, transposed, where it is not part of M
+        self.drive: Float[np.ndarray, "nt n"] | None = None  # what a known disturbance adds to K r
+        if plan.aimed:
+            limited = plan.limited_targets
+            K, drive = targets.rows[limited] @ targets.from_reference, np.zeros((int(limited.sum()), fixed.shape[1]))
+            if plan.checked.any():
+                drive = plan.matrix[n : n + len(K), :-1]
+            shift, reach = targets.rows[limited] @ targets.offset, ROUNDING * targets.size[limited]
+            if held:
+                matrix, shift = np.vstack([matrix, np.column_stack([drive, shift, K])]), 0.0 * shift
+            else:
+                self.from_row = np.ascontiguousarray(K.T)
+                self.drive = np.column_stack([drive, 0.0 * shift]) if drive.any() else None
+            low.append(np.tile(np.maximum(targets.low[limited] - reach, -HUGE) - shift, steps))
+            high.append(np.tile(np.minimum(targets.high[limited] + reach, HUGE) - shift, steps))
+        self.matrix, self.limits = np.ascontiguousarray(matrix), np.concatenate([*low, *high])
+        self.t, self.known = np.zeros(len(self.limits) // 2), np.zeros(matrix.shape[1])
+        self._first, self.shape, self._n = fixed.shape[1] + 1, (steps, nr), n
+        self._see()
+
+    def _see(self) -> None:
+        """Make the views; see `Viewing`."""
+        first = self._first
+        count, rows = len(self.t), len(self.matrix)
+        self.low, self.high = self.limits[:count], self.limits[count:]
+        self.met = bytearray(2 * count)
+        met = np.frombuffer(self.met, dtype=np.bool_)
+        self.met_low, self.met_high = met[:count], met[count:]
+        self.start = self.known[:first]
+        self.flat = self.known[first:]
+        self.rows, self.planned = self.flat.reshape(self.shape), self.t[: self._n]
+        self.plan, self.tests = self.t[:rows], self.t[rows:].reshape(self.shape[0], -1)
+
+    def multiply(self, start: Float[np.ndarray, " n"]) -> Float[np.ndarray, " nt"]:
+        """Return t of a step that starts at [z; u_{−1}; g; 1]."""
+        self.start[:] = start
+        self.matrix.dot(self.known, self.plan)
+        if self.tests.size:
+            self.rows.dot(self.from_row, self.tests)
+            if self.drive is not None:
+                self.tests += self.drive.dot(start)
+        return self.t
+
+    @staticmethod
+    def of(plan: Any, nr: int) -> "tuple[MovingMap | None, MovingMap]":
+        """Return the maps of a preview and of a row that is held; None for one that would be too large."""
+        entries = plan.planned * (plan.matrix.shape[1] + plan.maps.from_reference.shape[1])
+        return MovingMap(plan, nr, held=False) if entries <= _LARGEST else None, MovingMap(plan, nr, held=True)
+
+
+class GivenShares:
+    """The part of a plan that rows of a given u_target have, F (u_k, …, u_{k+N}), in step after step.
+
+    Parameters
+    ----------
+    from_given
+        F.
+    rows
+        The rows of u_target, the last one repeated N times.
+    """
+
+    def __init__(self, from_given: Float[np.ndarray, "nv Nnu"], rows: Float[np.ndarray, "T nu"]) -> None:
+        N = from_given.shape[1] // rows.shape[1] - 1
+        self._from_given, self._rows, self.last = from_given, rows, len(rows) - N - 1
+        self._table = None
+        if (self.last + 1) * len(from_given) <= _TABLE:
+            windows = sliding_window_view(rows, N + 1, axis=0).transpose(0, 2, 1)
+            self._table = windows.reshape(self.last + 1, -1) @ from_given.T
+
+    def at(self, k: int) -> Float[np.ndarray, " nv"]:
+        """Return the share of the preview that begins with row k."""
+        k = min(k, self.last)
+        if self._table is not None:
+            return self._table[k]
+        N = len(self._rows) - self.last - 1
+        return self._from_given @ self._rows[k : k + N + 1].reshape(-1)
