@@ -491,7 +491,7 @@ class KoopmanMPC(MPCBase):
     def _take_reference(self, reference: Float[np.ndarray, "..."]) -> MovingMap | None:
         """Keep the rows of the reference that the plan reads; return the map that reads them.
 
-        It is None in the first step after `reset`, and where a row is not finite.
+        The first step after `reset` gets None, as does a row that is not finite.
         """
         plan, shape = self._map, reference.shape
         if shape == plan.single.shape[1:]:
