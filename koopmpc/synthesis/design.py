@@ -55,7 +55,7 @@ from koopmpc.synthesis.cross_validation import (
     take_sample,
 )
 from koopmpc.synthesis.designed import Design, DesignRow, Evidence, ExpectedLoop, choose_row
-from koopmpc.synthesis.feedback import require_episodes, use_instruments
+from koopmpc.synthesis.feedback import remove_feedback, require_episodes
 from koopmpc.synthesis.fresh.coverage import check_coverage, get_model, keep_limits
 from koopmpc.synthesis.fresh.horizon import choose_horizon
 from koopmpc.synthesis.fresh.loops import (
@@ -218,8 +218,9 @@ def design(
     wished = None if coverage is None else check_coverage(coverage, fresh_loops)
     ahead = 1 if horizon is None else checks.count(horizon, "horizon")
     used, projected = "", np.zeros(0)
-    if instruments is not None:
-        data, projected, used = use_instruments(require_episodes(data), instruments)
+    if instruments is not None or (smooth and isinstance(data, Episodes)):
+        loop = remove_feedback(require_episodes(data), instruments)
+        data, projected, used = loop.episodes, loop.noise, loop.sentence
         smooth = smooth and not projected.any()
     source = source_of(data)
     if source.nu == 0:

@@ -1,7 +1,8 @@
 """Logs of closed loops before a choice of models: noise is projected out by the set points where unseen rows gain."""
 
 from collections.abc import Sequence
-from typing import cast
+from dataclasses import dataclass, replace
+from typing import Protocol, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +13,10 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.instruments import check_instruments, instrumental_edmd
+from koopmpc.identify.prediction_error import NOT_IDENTIFIABLE, filter_states, fit_with_gain
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.composed import Standardized
+from koopmpc.lifting.radial import ThinPlate
 from koopmpc.lifting.state import Constant, State
 from koopmpc.text import to_percent
 from koopmpc.validate.scoring import score
@@ -20,8 +25,14 @@ from koopmpc.validate.sufficiency import feedback_share
 FEEDBACK = 0.05  # logs hold feedback where the states explain at least this share of an input
 _LAGS = 40  # rows of the set point that the projection sees: a loop should settle within them
 _EACH = 4  # rows of data for each lag, at least
-_FOLDS = 4  # parts of the rows that are left out in turn
+_FOLDS = 4  # parts of the rows,
+_JUDGED = 2  # of which so many are left out in turn
 _AHEAD = 20  # steps of the forecasts that judge
+_SHORTEST = 40  # rows of an episode in which a filter settles
+_ITERATIONS = 12  # Levenberg-Marquardt steps of a filter's fit
+_LEAST, _MOST = 200, 20_000  # rows of logs without instruments whose noise is looked for
+_PLATES = 20  # thin plates of the model that tells noise from curvature
+_RIDGE = 1e-8  # of the models that judge
 _GAIN = 0.98  # the error on unseen rows must fall to this share
 
 
@@ -77,58 +88,120 @@ def _check(episodes: Episodes, instruments: Sequence[ArrayLike]) -> list[Float[n
     return check_instruments(episodes, instruments)
 
 
-def use_instruments(
-    episodes: Episodes, instruments: Sequence[ArrayLike]
-) -> tuple[Episodes, Float[np.ndarray, " nx"], str]:
-    """Return the data that models are to be fitted to, the noise that was taken out of them, and a sentence.
+@dataclass(frozen=True, eq=False)
+class FeedbackData:
+    """The data that models are to be fitted to, the (nx,) noise that was taken out of them, and a sentence."""
 
-    The projection is used if all of this holds: the logs hold feedback; the instruments identify the plant, and the
-    test of Hausman finds least squares biased; the plain linear model of projected rows has the smaller error in
-    forecasts of unseen, measured rows, by 2 %.
+    episodes: Episodes
+    noise: Float[np.ndarray, " nx"]
+    sentence: str
+
+
+def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None) -> FeedbackData:
+    """Return logs of closed loops without the noise that feedback carries from sensors to inputs, if unseen rows gain.
+
+    Two ways are tried where the logs hold feedback: the states as the filter of `prediction_error` sees them, and,
+    with instruments, `project_on_instruments`, if the test of Hausman finds least squares biased. The linear model of
+    the data must have an error in forecasts of unseen, measured rows that is 2 % below that of least squares, and
+    a model with thin plates must not lose: else what looks like noise is a curvature of the plant.
 
     Parameters
     ----------
     episodes
         Logs of closed loops, as measured.
     instruments
-        As for `project_on_instruments`.
+        As for `project_on_instruments`, or None.
 
     Raises
     ------
     ShapeError
         The instruments do not fit the episodes.
     """
-    signals, none = _check(episodes, instruments), np.zeros(episodes.nx)
-    plain = State() + Constant()
+    signals = None if instruments is None else _check(episodes, instruments)
+    kept = FeedbackData(episodes, np.zeros(episodes.nx), "")
+    total, plain = sum(map(len, episodes)), State() + Constant()
+    if not episodes.nu or (signals is None and not _LEAST <= total <= _MOST):
+        return kept
     share = float(feedback_share(episodes, plain)[: episodes.nu].max())
     if share < FEEDBACK:
-        said = f"the states explain {to_percent(share)} of the inputs"
-        return episodes, none, f"instruments are not used: the logs hold no feedback, for {said}"
-    total = sum(map(len, episodes))
-    width = signals[0].shape[1]
-    lags = min(_LAGS, max(total // (_EACH * width * 4), 2), min(len(e) for e in episodes) // 2)
-    try:
-        with hide_fit_warnings():
-            tested = instrumental_edmd(episodes, plain, signals, lags=min(12, lags), level=0.01)
-    except DataError as reason:
-        return episodes, none, f"instruments are not used: {reason}"
-    assert tested.report is not None
-    if "not found biased" in tested.report.route:
-        return episodes, none, "instruments are not used: least squares is not found biased under this feedback"
-    ratio = _compare_unseen(episodes, signals, lags)
-    if ratio > _GAIN:
-        return (
-            episodes,
-            none,
-            f"instruments are not used: on unseen rows the error is {to_percent(ratio)} of that of least squares",
-        )
-    projected, noise = project_on_instruments(episodes, signals, lags)
-    return (
-        projected,
-        noise,
-        f"models are of states and inputs as {lags} rows of the set point explain them, since the logs hold feedback "
-        f"and noise: on unseen rows the error of a linear model falls to {to_percent(ratio)} of that of least squares",
-    )
+        said = f"the logs hold no feedback, for the states explain {to_percent(share)} of the inputs"
+        return kept if signals is None else replace(kept, sentence=f"instruments are not used: {said}")
+    ways: list[_Way] = [_Filter()]
+    width = 1
+    if signals is not None:
+        width = signals[0].shape[1]
+        lags = min(_LAGS, max(total // (_EACH * width * 4), 2), min(len(e) for e in episodes) // 2)
+        ways.append(_Projection(lags))
+    pieces = list(zip(episodes, [None] * len(episodes) if signals is None else signals, strict=True))
+    found: list[tuple[float, FeedbackData]] = []
+    reason = ""
+    for way in ways:
+        try:
+            with hide_fit_warnings():
+                made, noise = way.apply(episodes, pieces)
+                ratio = _compare_unseen(episodes, pieces, way)
+        except DataError as problem:
+            reason = str(problem)
+            continue
+        if ratio <= _GAIN:
+            said = f"the error of a linear model falls to {to_percent(ratio)} of that of least squares"
+            said = f"{way.describe()}, since the logs hold feedback and noise: on unseen rows {said}"
+            found.append((ratio, FeedbackData(made, noise, said)))
+        else:
+            reason = f"on unseen rows the error is {to_percent(ratio)} of that of least squares"
+    if found:
+        return min(found, key=lambda one: one[0])[1]
+    if signals is None:
+        return replace(kept, sentence=reason if reason.startswith(NOT_IDENTIFIABLE) else "")
+    return replace(kept, sentence=f"instruments are not used: {reason}")
+
+
+_Pieces = Sequence[tuple[Episode, Float[np.ndarray, "rows nr"] | None]]
+
+
+class _Way(Protocol):
+    """A way to take the noise out of logs."""
+
+    settles: int  # rows of an episode that it needs
+
+    def apply(self, episodes: Episodes, pieces: _Pieces) -> tuple[Episodes, Float[np.ndarray, " nx"]]: ...
+
+    def describe(self) -> str: ...
+
+
+class _Filter:
+    settles = _SHORTEST
+
+    def apply(self, episodes: Episodes, pieces: _Pieces) -> tuple[Episodes, Float[np.ndarray, " nx"]]:
+        """Return the states as the filter sees them, and the spread of what it takes out."""
+        logs = episodes.with_episodes([e for e, _ in pieces])
+        start = edmd(logs, State() + Constant())
+        model, gain = fit_with_gain(start, logs, _ITERATIONS)
+        if model is start:
+            raise DataError("least squares is not found biased: no filter of the readings forecasts better")
+        filtered = filter_states(model, gain, logs)
+        rest = np.concatenate([e.X - f.X for e, f in zip(logs, filtered, strict=True)])
+        return filtered, np.asarray(rest.std(axis=0), dtype=np.float64)
+
+    def describe(self) -> str:
+        return "models are of the states as a filter sees them that was fitted together with a linear model"
+
+
+class _Projection:
+    def __init__(self, lags: int) -> None:
+        self.settles = lags
+
+    def apply(self, episodes: Episodes, pieces: _Pieces) -> tuple[Episodes, Float[np.ndarray, " nx"]]:
+        """Return states and inputs as the set points explain them, and the spread of the rest."""
+        logs, signals = episodes.with_episodes([e for e, _ in pieces]), [r for _, r in pieces if r is not None]
+        tested = instrumental_edmd(logs, State() + Constant(), signals, lags=min(12, self.settles), level=0.01)
+        assert tested.report is not None
+        if "not found biased" in tested.report.route:
+            raise DataError("least squares is not found biased under this feedback")
+        return project_on_instruments(logs, signals, self.settles)
+
+    def describe(self) -> str:
+        return f"models are of states and inputs as {self.settles} rows of the set point explain them"
 
 
 def require_episodes(data: object) -> Episodes:
@@ -137,30 +210,42 @@ def require_episodes(data: object) -> Episodes:
     return cast("Episodes", data)
 
 
-def _compare_unseen(episodes: Episodes, signals: Sequence[Float[np.ndarray, "rows nr"]], lags: int) -> float:
-    """Return the error of forecasts by a model of projected rows over that of least squares, on rows neither saw."""
-    pieces: list[tuple[Episode, np.ndarray]] = []
-    block = max(min(len(e) for e in episodes) // _FOLDS, lags + _AHEAD)
-    for e, r in zip(episodes, signals, strict=True):
-        cuts = range(0, len(e), block)
-        pieces += [(e.cut(k, min(k + block, len(e))), r[k : min(k + block, len(e)) + 1]) for k in cuts]
-    pieces = [(e, r) for e, r in pieces if len(e) > lags + 1]
-    if len(pieces) < 2:
-        return 1.0
-    logs: list[float] = []
-    plain = State() + Constant()
-    for fold in range(min(_FOLDS, len(pieces))):
-        seen = [one for i, one in enumerate(pieces) if i % _FOLDS != fold]
-        out = [e for i, (e, _) in enumerate(pieces) if i % _FOLDS == fold]
-        if not seen or not out:
-            continue
+def _compare_unseen(episodes: Episodes, pieces: _Pieces, way: _Way) -> float:
+    """Return the error of forecasts by a linear model of the changed rows over that of least squares, on unseen rows.
+
+    1 where a model with thin plates loses by the change.
+    """
+    block = max(min(len(e) for e in episodes) // _FOLDS, way.settles + _AHEAD)
+    parts = [
+        (e.cut(k, min(k + block, len(e))), None if r is None else r[k : min(k + block, len(e)) + 1])
+        for e, r in pieces
+        for k in range(0, len(e), block)
+    ]
+    parts = [(e, r) for e, r in parts if len(e) > way.settles + 1]
+    logs: list[list[float]] = []
+    for fold in range(min(_JUDGED, len(parts))):
+        seen = [one for i, one in enumerate(parts) if i % _FOLDS != fold]
+        out = [e for i, (e, _) in enumerate(parts) if i % _FOLDS == fold]
+        if not seen:
+            return 1.0
         rest, judged = episodes.with_episodes([e for e, _ in seen]), episodes.with_episodes(out)
         ahead = min(_AHEAD, min(map(len, out)))
         try:
-            with hide_fit_warnings():
-                projected, _ = project_on_instruments(rest, [r for _, r in seen], lags)
-                both = [score(edmd(data, plain), judged, ahead).rmse for data in (projected, rest)]
+            changed, _ = way.apply(episodes, seen)
+            both = [
+                [score(edmd(data, lifting, ridge=_RIDGE), judged, ahead).rmse for data in (changed, rest)]
+                for lifting in (State() + Constant(), _bend(rest))
+            ]
         except KoopmpcError:
             return 1.0
-        logs.append(float(np.mean(np.log(np.maximum(both[0], 1e-300) / np.maximum(both[1], 1e-300)))))
-    return float(np.exp(np.mean(logs))) if logs and np.isfinite(logs).all() else 1.0
+        logs.append([float(np.mean(np.log(np.maximum(a, 1e-300) / np.maximum(b, 1e-300)))) for a, b in both])
+    mean = np.exp(np.mean(logs, axis=0)) if logs else np.ones(2)
+    return float(mean[0]) if np.isfinite(mean).all() and mean[1] <= 1 else 1.0
+
+
+def _bend(episodes: Episodes) -> Lifting:
+    """Return thin plates about rows of the episodes, beside the states."""
+    X = np.concatenate([e.X for e in episodes])
+    whole = Standardized.of(episodes, State())
+    centers = np.unique((X[:: max(len(X) // _PLATES, 1)] - whole.mean) / whole.scale, axis=0)
+    return State() + Constant() + Standardized(ThinPlate(centers), whole.mean, whole.scale)

@@ -42,7 +42,7 @@ from koopmpc.synthesis.cross_validation import (
     take_sample,
     usual_horizon,
 )
-from koopmpc.synthesis.feedback import require_episodes, use_instruments
+from koopmpc.synthesis.feedback import remove_feedback, require_episodes
 from koopmpc.synthesis.hidden_states import judge_hidden_states
 from koopmpc.synthesis.leaderboard import Selection, choose_model, make_row
 from koopmpc.synthesis.records import (
@@ -172,9 +172,12 @@ def select(
     Breiman, Friedman, Olshen & Stone, "Classification and Regression Trees", 1984, section 3.4.3.
     """
     draw, used = checks.generator(rng), ""
-    if instruments is not None:
-        episodes, freed_noise, used = use_instruments(require_episodes(episodes), instruments)
-        smooth = smooth and not freed_noise.any()
+    if instruments is not None or (
+        smooth and isinstance(episodes, Episodes) and not (candidates is None and is_record(episodes))
+    ):
+        loop = remove_feedback(require_episodes(episodes), instruments)
+        episodes, used = loop.episodes, loop.sentence
+        smooth = smooth and not loop.noise.any()
     source = source_of(episodes)
     weights = RIDGES if ridges is None else check_ridges(ridges)
     folds = checks.count(folds, "folds", 2)

@@ -6,7 +6,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.errors import DataError, KoopmpcError
-from koopmpc.identify.fits.refinement import MultiStepError, _segments, _state_rows, _theta
+from koopmpc.identify.fits.refinement import MultiStepError, cut_into_segments, rows_of_states, coefficients_of_states
 
 
 def bilinear_plant(rng, nx=2, nu=1):
@@ -52,8 +52,8 @@ def test_the_derivatives_are_those_of_casadi_and_of_finite_differences(kind, del
     fit = km.edmd if kind == "linear" else km.bilinear_edmd
     model = fit(data, lifting, embedding=embedding, ridge=1e-3)
     error = MultiStepError(model, np.array([0.7, 1.3]))
-    segments = _segments(model, data[:2], 4, "here")
-    theta = _theta(model, _state_rows(model))
+    segments = cut_into_segments(model, data[:2], 4, "here")
+    theta = coefficients_of_states(model, rows_of_states(model))
     gradient, matrix = error.derivatives(theta, segments)
     for j in rng.choice(theta.size, 12, replace=False):
         moved = theta.ravel().copy()
@@ -99,10 +99,10 @@ def test_refining_is_never_worse_than_its_start_on_the_held_out_rows(seed):
     data, unseen = (episodes_of(bilinear_plant(np.random.default_rng(9)), rng, noise=0.3) for _ in range(2))
     start = km.bilinear_edmd(data, km.State() + km.Constant())
     found = km.identify.refine(start, data, horizon=10, held_out=unseen)
-    segments = _segments(start, unseen, 10, "here")
+    segments = cut_into_segments(start, unseen, 10, "here")
     error = MultiStepError(start, np.concatenate([e.X for e in data]).std(axis=0))
-    rows = _state_rows(start)
-    before, after = (error.evaluate(_theta(model, rows), segments) for model in (start, found))
+    rows = rows_of_states(start)
+    before, after = (error.evaluate(coefficients_of_states(model, rows), segments) for model in (start, found))
     assert after <= before
     assert found is start or (after < before and "refined" in found.report.changes[-1])
 

@@ -5,7 +5,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.synthesis.feedback import project_on_instruments, use_instruments
+from koopmpc.synthesis.feedback import project_on_instruments, remove_feedback
 from tests.identify.test_instruments import TRUTH, run_loop
 
 
@@ -18,10 +18,10 @@ def test_noisy_sensors_under_feedback_lose_their_bias():
     ours, plain = [], []
     for seed in range(4):
         data, r = run_loop(np.random.default_rng(seed), 800, sensor=0.2)
-        used, noise, said = use_instruments(data, r)
-        assert said.startswith("models are of states and inputs")
-        assert noise == pytest.approx([0.2, 0.2], rel=0.3)
-        ours.append(fit_plain(used) - TRUTH)
+        found = remove_feedback(data, r)
+        assert found.sentence.startswith("models are of the states as a filter sees them")
+        assert found.noise == pytest.approx([0.2, 0.2], rel=0.1)
+        ours.append(fit_plain(found.episodes) - TRUTH)
         plain.append(fit_plain(data) - TRUTH)
     assert np.linalg.norm(np.mean(ours, axis=0)) <= np.linalg.norm(np.mean(plain, axis=0)) / 5
 
@@ -29,22 +29,24 @@ def test_noisy_sensors_under_feedback_lose_their_bias():
 def test_process_noise_alone_keeps_least_squares_with_its_variance():
     for seed in range(4):
         data, r = run_loop(np.random.default_rng(seed), 800, process=0.05)
-        used, noise, said = use_instruments(data, r)
-        assert used is data
-        assert not noise.any()
-        assert said.startswith("instruments are not used")
+        found = remove_feedback(data, r)
+        assert found.episodes is data
+        assert not found.noise.any()
+        assert found.sentence.startswith("instruments are not used")
 
 
 def test_a_set_point_at_rest_identifies_nothing():
     data, r = run_loop(np.random.default_rng(0), 800, sensor=0.2, moves=False)
-    assert "not identifiable" in use_instruments(data, r)[2]
+    assert "not identifiable" in remove_feedback(data, r).sentence
+    assert "the set point rests" in remove_feedback(data, None).sentence
 
 
 def test_open_loops_need_no_instruments():
     plant = km.LinearPredictor(TRUTH[:, :2], TRUTH[:, 2:], np.eye(2), km.State(), 0.1, ["x", "v"], ["u"]).step_map()
     data = km.collect(plant, [0, 0], km.Noise(-1, 1), episodes=2, steps=300)
-    said = use_instruments(data, [e.U for e in data])[2]
+    said = remove_feedback(data, [e.U for e in data]).sentence
     assert "hold no feedback" in said
+    assert remove_feedback(data, None).episodes is data
 
 
 def test_without_noise_the_projection_changes_nothing_that_matters():
@@ -60,23 +62,25 @@ def test_the_error_falls_with_the_root_of_the_length():
     error = []
     for steps in (600, 2400):
         found = [run_loop(np.random.default_rng(seed), steps, sensor=0.1) for seed in range(12)]
-        error.append(np.sqrt(np.mean([np.sum((fit_plain(use_instruments(*one)[0]) - TRUTH) ** 2) for one in found])))
+        error.append(
+            np.sqrt(np.mean([np.sum((fit_plain(remove_feedback(*one).episodes) - TRUTH) ** 2) for one in found]))
+        )
     assert error[1] <= error[0] / 2 * 1.3  # four times the rows
 
 
-def test_select_and_design_say_whether_they_used_them():
-    data, r = run_loop(np.random.default_rng(1), 1200, sensor=0.2)
-    chosen = km.select(data, candidates=[km.State() + km.Constant()], delays=(0,), bilinear=False, instruments=r)
-    assert any("rows of the set point explain" in note for note in chosen.notes)
+def test_select_says_whether_it_removed_noise_that_feedback_carries():
+    data, _ = run_loop(np.random.default_rng(1), 1200, sensor=0.2)
+    chosen = km.select(data, candidates=[km.State() + km.Constant()], delays=(0,), bilinear=False)
+    assert any("as a filter sees them" in note for note in chosen.notes)
     assert np.linalg.norm(chosen.predictor.A[:2, :2] - TRUTH[:, :2]) < 0.05
 
 
 def test_instruments_that_do_not_fit_are_refused():
     data, r = run_loop(np.random.default_rng(1), 200)
     with pytest.raises(ShapeError, match="pass one an episode"):
-        use_instruments(data, [*r, *r])
+        remove_feedback(data, [*r, *r])
     with pytest.raises(ShapeError, match="pass one a step"):
-        use_instruments(data, [r[0][:-9]])
+        remove_feedback(data, [r[0][:-9]])
     with pytest.raises(DataError, match="no episode is longer"):
         project_on_instruments(data, r, 500)
 
@@ -101,3 +105,18 @@ def test_a_design_from_closed_loop_logs_is_as_good_as_one_from_open_loop_logs():
         run = km.simulate(plant, made.controller, x0=[0, 0], reference=[1, 0], steps=60, cost=cost, limits=limits)
         spent.append(km.metrics(run).cost)
     assert spent[0] <= 1.05 * spent[1]
+
+
+@pytest.mark.parametrize("noise", [0.0, pytest.param(0.02, marks=pytest.mark.slow)])
+def test_logs_of_a_nonlinear_loop_stay_where_its_curvature_could_be_taken_for_noise(noise):
+    plant, rng, logs = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05), np.random.default_rng(0), []
+    for _ in range(4):
+        x, X, U = np.array([rng.uniform(-1, 1), 0.0]), [], []
+        for k in range(120):
+            goal = rng.uniform(-2, 2) if k % 25 == 0 else goal
+            X.append(x + noise * rng.standard_normal(2))
+            U.append([8 * (goal - X[-1][0]) - 3 * X[-1][1]])
+            x = plant(x, U[-1])
+        logs.append(km.Episode(X=np.array([*X, x]), U=np.array(U)))
+    data = km.Episodes(logs, 0.05, plant.states, plant.inputs)
+    assert remove_feedback(data, None).episodes is data

@@ -64,7 +64,7 @@ class MultiStepError:
         total, point = 0.0, data.points
         with np.errstate(over="ignore", invalid="ignore"):
             for u, truth in zip(data.inputs, data.states, strict=True):
-                x = self._evaluate(point, u)[0] @ theta.T
+                x = self.find_features(point, u)[0] @ theta.T
                 total += float(np.sum(((x - truth) / self.size) ** 2))
                 if not np.isfinite(total):
                     return np.inf
@@ -72,7 +72,7 @@ class MultiStepError:
         return total / data.states.size
 
     @raise_swallowed()
-    def _evaluate(self, *values: np.ndarray) -> list[np.ndarray]:
+    def find_features(self, *values: np.ndarray) -> list[np.ndarray]:
         """Return φ of every segment, (m, nphi), of points and inputs; with Θ also the slopes, (m, npoint, nx)."""
         slopes, (m, npoint), (nx, count) = len(values) > 2, values[0].shape, self.shape
         if (slopes, m) not in self._bound:
@@ -100,7 +100,7 @@ class MultiStepError:
         slopes, squares = np.zeros(len(free)), np.zeros((len(free), len(free)))
         point, moved = data.points, np.zeros((m, len(free), n))
         for u, truth in zip(data.inputs, data.states, strict=True):
-            phi, slope = self._evaluate(point, u, theta)
+            phi, slope = self.find_features(point, u, theta)
             D = moved @ slope  # (m, f, nx)
             D[:, every, rows] += phi[:, columns]
             x = phi @ theta.T
@@ -178,23 +178,23 @@ def refine(
     horizon, iterations = checks.count(horizon, "horizon"), checks.count(iterations, "iterations")
     if is_hidden(model):
         return _refine_hidden(model, episodes_of(episodes), horizon, held_out, iterations)
-    places = _state_rows(model)
+    places = rows_of_states(model)
     if model.nw:
         raise DataError("the model has measured disturbances, which refine does not know; refine a model without them")
     whole = episodes_of(episodes)
-    learn, unseen = _parts(whole) if held_out is None else (list(whole), list(episodes_of(held_out)))
+    learn, unseen = split_ends(whole) if held_out is None else (list(whole), list(episodes_of(held_out)))
     size = np.concatenate([episode.X for episode in learn]).std(axis=0)
     size = np.where(size > 0, size, 1.0)
-    fitted = _segments(model, whole.with_episodes(learn), horizon, "to learn from")
-    judged = _segments(model, whole.with_episodes(unseen), horizon, "held out")
-    start = _theta(model, places)
+    fitted = cut_into_segments(model, whole.with_episodes(learn), horizon, "to learn from")
+    judged = cut_into_segments(model, whole.with_episodes(unseen), horizon, "held out")
+    start = coefficients_of_states(model, places)
     free = np.flatnonzero(start.ravel())
     error = MultiStepError(model, size, free)
     theta, steps = minimise(error, start, fitted, judged, iterations, free=free)
     before, after = error.evaluate(start, judged), error.evaluate(theta, judged)
     if not after < before:
         return model
-    return _with_rows(model, places, theta, _describe(horizon, steps, before, after))
+    return with_coefficients(model, places, theta, _describe(horizon, steps, before, after))
 
 
 def _describe(horizon: int, steps: int, before: float, after: float) -> str:
@@ -214,7 +214,7 @@ def _refine_hidden(
     """Refine the dynamics, the output and the encoder of a hidden state on forecasts of `horizon` steps."""
     check_same_names(model, episodes)
     assert model.embedding is not None, "a hidden state begins with past rows"
-    parts = _parts(episodes) if held_out is None else (list(episodes), list(episodes_of(held_out)))
+    parts = split_ends(episodes) if held_out is None else (list(episodes), list(episodes_of(held_out)))
     learn, unseen = (episodes.with_episodes(part) for part in parts)
     delays = model.embedding.steps
     units = SignalUnits.of(learn, model.embedding.rails)
@@ -239,7 +239,7 @@ def _apart(episodes: Episodes, horizon: int) -> int:
     return max(-(-horizon // 2), -(-steps * horizon // ROWS))
 
 
-def _state_rows(model: LinearPredictor | BilinearPredictor) -> Int[np.ndarray, " nx"]:
+def rows_of_states(model: LinearPredictor | BilinearPredictor) -> Int[np.ndarray, " nx"]:
     """Return the places of the states among the observables."""
     places = np.argmax(model.C, axis=1)
     if not np.array_equal(model.C, np.eye(model.nz)[places]):
@@ -249,13 +249,15 @@ def _state_rows(model: LinearPredictor | BilinearPredictor) -> Int[np.ndarray, "
     return places
 
 
-def _theta(model: LinearPredictor | BilinearPredictor, rows: Int[np.ndarray, " nx"]) -> Float[np.ndarray, "nx nphi"]:
+def coefficients_of_states(
+    model: LinearPredictor | BilinearPredictor, rows: Int[np.ndarray, " nx"]
+) -> Float[np.ndarray, "nx nphi"]:
     """Return Θ = C [A B N₁ N₂ …]."""
     products = [Ni[rows] for Ni in model.N] if isinstance(model, BilinearPredictor) else []
     return np.hstack([model.A[rows], model.B[rows], *products])
 
 
-def _with_rows(
+def with_coefficients(
     model: LinearPredictor | BilinearPredictor,
     rows: Int[np.ndarray, " nx"],
     theta: Float[np.ndarray, "nx nphi"],
@@ -276,14 +278,16 @@ def _with_rows(
     return BilinearPredictor(A, B, N, *about, embedding=model.embedding, scale=model.scale)
 
 
-def _parts(episodes: Episodes) -> tuple[list[Episode], list[Episode]]:
+def split_ends(episodes: Episodes) -> tuple[list[Episode], list[Episode]]:
     """Return the beginning of each episode, and its last quarter."""
     at = [round((1 - HELD_OUT) * len(episode)) for episode in episodes]
     learn = [Episode(X=e.X[: k + 1], U=e.U[:k], W=e.W[:k]) for e, k in zip(episodes, at, strict=True)]
     return learn, [Episode(X=e.X[k:], U=e.U[k:], W=e.W[k:]) for e, k in zip(episodes, at, strict=True)]
 
 
-def _segments(model: LinearPredictor | BilinearPredictor, episodes: Episodes, horizon: int, role: str) -> Segments:
+def cut_into_segments(
+    model: LinearPredictor | BilinearPredictor, episodes: Episodes, horizon: int, role: str
+) -> Segments:
     """Return segments that begin every half horizon, or less often where they would have more than `ROWS` steps."""
     past = 0 if model.embedding is None else model.embedding.steps
     long = [episode for episode in episodes if len(episode) >= horizon + past]
