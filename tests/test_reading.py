@@ -80,8 +80,8 @@ MOST = {  # files, returns
     "simulate_all": (9, 20),
     "record_all": (13, 50),
     "export_all": (19, 30),
-    "select_all": (26, 74),  # the leaderboard stands in a file of its own
-    "design_all": (74, 279),  # with fresh loops after the choice, and a monitor
+    "select_all": (29, 82),  # the leaderboard stands in a file of its own; feedback is looked for
+    "design_all": (77, 288),  # with fresh loops after the choice, and a monitor
 }
 
 

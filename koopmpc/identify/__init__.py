@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from koopmpc.identify.fits.refinement import refine as refine
     from koopmpc.identify.fits.sparse import sparse_edmd as sparse_edmd
     from koopmpc.identify.fits.stable import stable_edmd as stable_edmd
+    from koopmpc.identify.innovations import prediction_error as prediction_error
     from koopmpc.identify.instruments import instrumental_edmd as instrumental_edmd
-    from koopmpc.identify.prediction_error import prediction_error as prediction_error
     from koopmpc.identify.records.narx import narx as narx
     from koopmpc.identify.records.neural import neural_state_space as neural_state_space
     from koopmpc.identify.records.state_space import polynomial_state_space as polynomial_state_space

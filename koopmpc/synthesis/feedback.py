@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, cast
+from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -12,8 +12,8 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
+from koopmpc.identify.innovations import NOT_IDENTIFIABLE, filter_states, fit_with_gain
 from koopmpc.identify.instruments import check_instruments, instrumental_edmd
-from koopmpc.identify.prediction_error import NOT_IDENTIFIABLE, filter_states, fit_with_gain
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Standardized
 from koopmpc.lifting.radial import ThinPlate
@@ -30,7 +30,8 @@ _JUDGED = 2  # of which so many are left out in turn
 _AHEAD = 20  # steps of the forecasts that judge
 _SHORTEST = 40  # rows of an episode in which a filter settles
 _ITERATIONS = 12  # Levenberg-Marquardt steps of a filter's fit
-_LEAST, _MOST = 200, 20_000  # rows of logs without instruments whose noise is looked for
+_LEAST = 200  # rows of logs without instruments, from which on their noise is looked for,
+_MOST = 20_000  # and up to which
 _PLATES = 20  # thin plates of the model that tells noise from curvature
 _RIDGE = 1e-8  # of the models that judge
 _GAIN = 0.98  # the error on unseen rows must fall to this share
@@ -124,8 +125,10 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
         return kept
     share = float(feedback_share(episodes, plain)[: episodes.nu].max())
     if share < FEEDBACK:
+        if signals is None:
+            return kept
         said = f"the logs hold no feedback, for the states explain {to_percent(share)} of the inputs"
-        return kept if signals is None else replace(kept, sentence=f"instruments are not used: {said}")
+        return replace(kept, sentence=f"instruments are not used: {said}")
     ways: list[_Way] = [_Filter()]
     width = 1
     if signals is not None:
@@ -159,6 +162,7 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
 _Pieces = Sequence[tuple[Episode, Float[np.ndarray, "rows nr"] | None]]
 
 
+@runtime_checkable
 class _Way(Protocol):
     """A way to take the noise out of logs."""
 

@@ -6,7 +6,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.errors import DataError, KoopmpcError
-from koopmpc.identify.fits.refinement import MultiStepError, cut_into_segments, rows_of_states, coefficients_of_states
+from koopmpc.identify.fits.refinement import MultiStepError, coefficients_of_states, cut_into_segments, rows_of_states
 
 
 def bilinear_plant(rng, nx=2, nu=1):

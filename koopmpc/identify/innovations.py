@@ -231,7 +231,7 @@ def _check_set_point(episodes: Episodes) -> None:
     past = np.concatenate([np.hstack([e.U[_PAST - i : len(e) - i] for i in range(1, _PAST)]) for e in long])
     seen = np.concatenate([np.hstack([e.X[_PAST - i : len(e) - i] for i in range(_PAST)]) for e in long])
     now = np.concatenate([e.U[_PAST:] for e in long])
-    spread = now.std(axis=0)
+    spread = np.asarray(now.std(axis=0), dtype=np.float64)
     rest = [_find_rest(regressors, now) for regressors in (past, np.hstack([past, seen]))]
     for name, alone, both in zip(episodes.inputs, rest[0], rest[1], strict=True):
         size = spread[episodes.inputs.index(name)]
@@ -246,7 +246,8 @@ def _find_rest(regressors: Float[np.ndarray, "M n"], targets: Float[np.ndarray, 
     """Return the standard deviation of the targets that a linear function of the regressors leaves."""
     P = np.hstack([regressors, np.ones((len(regressors), 1))])
     P = P / np.maximum(np.abs(P).max(axis=0), np.finfo(float).tiny)
-    return np.asarray((targets - P @ np.linalg.lstsq(P, targets, rcond=1e-12)[0]).std(axis=0), dtype=np.float64)
+    rest = np.asarray(targets - P @ np.linalg.lstsq(P, targets, rcond=1e-12)[0], dtype=np.float64)
+    return np.asarray(rest.std(axis=0), dtype=np.float64)
 
 
 def _check_excitation(
