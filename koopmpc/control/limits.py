@@ -475,7 +475,7 @@ def refuse_levels(limits: Limits | None, who: str) -> None:
     if limits is not None and limits.levels is not None:
         raise DataError(
             f"the limits have levels={limits.levels}, which {who} does not keep;"
-            " take a KoopmanMPC or a LinearMPC, or pass limits without levels"
+            " take a KoopmanMPC, a LinearMPC, a BilinearMPC or a NonlinearMPC, or pass limits without levels"
         )
 
 

@@ -338,8 +338,6 @@ def test_laws_that_do_not_search_refuse_levels(tmp_path):
     refused = (
         (lambda: km.LQR(TANK, COST, limits), "an LQR does not keep"),
         (lambda: km.control.PID(1.0, dt=1.0, limits=limits), "a PID does not keep"),
-        (lambda: km.BilinearMPC(TANK.step_map(), COST, limits, 5), "a BilinearMPC does not keep"),
-        (lambda: km.NonlinearMPC(TANK.step_map(), COST, limits, 5), "a NonlinearMPC does not keep"),
         (lambda: km.design(data, km.Cost(Q=1, R=1), limits, horizon=3, reference=[0, 0]), "a design does not keep"),
         (lambda: km.export(mpc, tmp_path), "cannot be exported"),
         (lambda: km.KoopmanMPC(TANK, COST, limits, 5, solver="osqp"), 'need "daqp"'),

@@ -29,7 +29,7 @@ from koopmpc.control.solvers.base import StepSolver
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.stepped.priorities import PrioritySolver, spread_priorities
-from koopmpc.control.stepped.search import LevelSolver
+from koopmpc.control.stepped.search import LevelSearch, LevelSolver
 from koopmpc.control.terminal.cuts import BallSolver
 from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
@@ -178,14 +178,15 @@ class KoopmanMPC(MPCBase):
         )
         self._hold_limits()
         self._options = {"solver": self._solver, "settings": settings}
-        self._levels: LevelSolver | None = None
+        self._levels: LevelSearch | None = None
         ball = self._map.ball
         if self._held is not None:
             if self.limits.priority is not None:
                 raise DataError("the limits have levels and a priority; pass one of the two")
             if ball is not None:
                 raise DataError("the limits have levels and a terminal ellipsoid; pass a polytope, or no terminal set")
-            self._qps = self._levels = LevelSolver(self._map.qp, exact_turn(turns), self._held, self._blocks, self.nu)
+            self._levels = LevelSearch(self._held, self._blocks, self.nu)
+            self._qps = LevelSolver(self._map.qp, exact_turn(turns), self._levels)
         elif self.limits.priority is not None:
             if ball is not None:
                 raise DataError(

@@ -16,6 +16,7 @@ from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controlle
 from koopmpc.control.limits import SOFTENED, Interval, Limits
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
+from koopmpc.control.nonlinear.level_stages import StageLevels
 from koopmpc.control.nonlinear.motion import BEYOND
 from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.rows import StageLimits
@@ -25,6 +26,7 @@ from koopmpc.control.nonlinear.stagewise import list_sides, weights
 from koopmpc.control.program import no_export, publish_estimator, reference_table, trace_lifting
 from koopmpc.control.solvers.daqp import daqp_settings
 from koopmpc.control.stepped.blocks import Moves
+from koopmpc.control.stepped.search import LevelSearch
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
@@ -153,6 +155,7 @@ class BilinearMPC(StagedMPC):
         self._iteration.set_theta(self._map.theta)
         self._e = self._iteration.e[:, : self._map.nx]
         self._X, self._U = self._iteration.X[:, : self._map.nx], np.zeros((self._N, self.nu))
+        self._on_levels = None if self._levels is None else StageLevels(self._levels, self._problem)
 
     def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
         return "BilinearMPC", self.model, {"sqp_iterations": self._sqp_iterations}
@@ -178,6 +181,10 @@ class BilinearMPC(StagedMPC):
             raise no_export(self, "its cost has a price, which its C does not know", "one without a price")
         if problem.stage is not None:
             raise no_export(self, "its cost has a stage of its own, which its C does not know", "one without a stage")
+        if self._levels is not None:
+            raise no_export(
+                self, "its inputs are on levels, and the search over them has no C code", "one without levels"
+            )
         if problem.scheduled:
             raise no_export(
                 self,
@@ -248,6 +255,7 @@ class BilinearMPC(StagedMPC):
         )
         held = {name: getattr(self, name) for name in _COPIED}
         iteration = self._iteration
+        held["levels"] = self._levels
         held["plan"] = iteration.X.copy(), iteration.U.copy(), iteration.e.copy()
         return build, (self.model, self.cost, self.limits, self._N), held
 
@@ -255,6 +263,10 @@ class BilinearMPC(StagedMPC):
         """Go on where the original was; the next step searches its targets again."""
         iteration = self._iteration
         iteration.X[:], iteration.U[:], iteration.e[:] = held.pop("plan")
+        levels: LevelSearch | None = held.pop("levels")
+        if levels is not None:
+            self._levels, self._held = levels, levels.held
+            self._on_levels = StageLevels(levels, self._problem)
         self.__dict__.update(held)
         self._forget_targets()
 
@@ -305,8 +317,17 @@ class BilinearMPC(StagedMPC):
         if self._problem.ends and status in GOOD:
             status, more = self._meet_end(status, s, u_prev, deadline)
             iterations += more
+        if self._on_levels is not None and status in GOOD and not self._rests_on_levels():
+            status, more = self._on_levels.improve(iteration, s, self._targets, deadline)
+            iterations += more
         free = iteration.without_limits + (u_prev if self._with_rates else 0.0)
         return StagePlan(iteration.X, iteration.U, status, iterations, iteration.slack, free)
+
+    def _rests_on_levels(self) -> bool:
+        """Return whether the plan without levels is on them."""
+        assert self._levels is not None, "only asked where inputs have levels"
+        _, U = self._trajectory(self._iteration.X, self._iteration.U)
+        return self._levels.accepts(U[self._problem.free].ravel())
 
     def _meet_limits(
         self, status: Status, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], deadline: float

@@ -10,7 +10,7 @@ J. Control Optim. 43, 2005.
 """
 
 from time import perf_counter
-from typing import NamedTuple, cast
+from typing import NamedTuple, Protocol, cast
 
 import casadi as ca
 import numpy as np
@@ -58,6 +58,21 @@ class StageStep(NamedTuple):
     slacks: Float[np.ndarray, "N nsoft"]
     status: Status
     iterations: int
+
+
+class SearchesLevels(Protocol):
+    """What solves the program of the stages with inputs on levels."""
+
+    def solve(
+        self,
+        stages: "Stages",
+        free: Float[np.ndarray, "N nq"],
+        limits: Interval,
+        softness: Softness,
+        deadline: float,
+    ) -> "Deviation | None":
+        """Return the least deviation from the solution without limits; None where it has no digits left."""
+        ...
 
 
 class RealTimeIteration:
@@ -151,8 +166,17 @@ class RealTimeIteration:
         """Whether the iterations run as machine code."""
         return self._linearise.compiled and self._free.compiled
 
-    def step(self, x: Float[np.ndarray, " nx"], targets: StageTargets, deadline: float) -> StageStep:
-        """Return the solution of the quadratic program for the measured state x and these targets along the plan."""
+    def step(
+        self,
+        x: Float[np.ndarray, " nx"],
+        targets: StageTargets,
+        deadline: float,
+        levels: "SearchesLevels | None" = None,
+    ) -> StageStep:
+        """Return the solution of the quadratic program for the measured state x and these targets along the plan.
+
+        With `levels` its inputs are on them.
+        """
         if targets is not self._targets:
             self._targets = targets
             self._R[:], self._U_r[:] = targets.R, targets.U
@@ -173,6 +197,14 @@ class RealTimeIteration:
         y = self._quantities()
         free = np.concatenate([self.U + self._dU, y[:, self._shape[2] :] + self._move_outputs()], axis=1)
         nothing = np.zeros_like(self._eps)
+        if levels is not None:
+            limits = Interval(self.low, self.high)
+            found = (
+                levels.solve(self._stages, free, limits, self._softness, deadline) if np.isfinite(free).all() else None
+            )
+            if found is None:
+                return StageStep(self._dX, self._dU, nothing, Status.FAILED, 0)
+            return self._deviate(free, self._dX.copy(), self._dU.copy(), found, 0)
         if ((free >= self.low) & (free <= self.high)).all() and np.isfinite(self._dX).all():
             return StageStep(self._dX, self._dU, nothing, Status.UNCONSTRAINED, 0)
         if self._interior is None or not np.isfinite(free).all():
@@ -206,7 +238,18 @@ class RealTimeIteration:
             self.X[0], X[:], U[:] = x, X_new, U_new
             self.length, gap = length, error if length == 1 else np.abs(self._trial + self.e - X_new).max(axis=0)
         self._defects = gap
+        self.note_slack(found)
+
+    def find_defect(self) -> float:
+        """Return the largest distance of a planned state from the model's, as a share of its size."""
+        self._ahead[0][:], self._ahead[1][:] = self.X[:-1], self.U
+        self._simulate.call()
+        return float((np.abs(self._trial + self.e - self.X[1:]) / self._sizes).max())
+
+    def note_slack(self, found: StageStep) -> float:
+        """Keep and return the violation of the soft limit that a step breaks most, above its allowance."""
         self.slack = float(found.slacks[found.slacks > self._allowance].max(initial=0.0))
+        return self.slack
 
     def rests(self, found: StageStep, settled: float) -> bool:
         """Return whether no input and no state moved by more than this share of its size and the plan's."""
@@ -326,12 +369,23 @@ class RealTimeIteration:
         iterations: int,
     ) -> StageStep:
         """Return the solution by an active-set method; (δX, δU) is the one without limits, `free` its values."""
-        s = self._sides
         room = Interval(self.low - free, self.high - free)
         found = least_deviation(self._stages, room, self._softness, self.multipliers, deadline - perf_counter())
         if found is None:
             return StageStep(dX, dU, np.zeros_like(self._eps), Status.FAILED, iterations)
         self.multipliers = found.multipliers if found.status is Status.OPTIMAL else None
+        return self._deviate(free, dX, dU, found, iterations)
+
+    def _deviate(
+        self,
+        free: Float[np.ndarray, "N nq"],
+        dX: Float[np.ndarray, "N nx"],
+        dU: Float[np.ndarray, "N nu"],
+        found: "Deviation",
+        iterations: int,
+    ) -> StageStep:
+        """Return the solution without limits, (δX, δU) with the values `free`, and the deviation from it."""
+        s, room = self._sides, Interval(self.low - free, self.high - free)
         self._dX[:], self._dU[:] = dX + found.X, dU + found.U
         moved = np.concatenate([found.U, np.matmul(found.X[:, None, :], self._G)[:, 0]], axis=1)
         rows, sign = s.row[len(s.row) - s.soft :], s.sign[len(s.row) - s.soft :]
@@ -389,18 +443,10 @@ class Deviation(NamedTuple):
     iterations: int
 
 
-def least_deviation(
+def condense_stages(
     stages: Stages,
-    room: Interval,
-    softness: Softness,
-    multipliers: Float[np.ndarray, " m"] | None,
-    seconds: float,
-) -> Deviation | None:
-    """Return the least deviation within `room`, the limits of [ũ_k; G_k x̃_{k+1}] of each stage (N, nu + ng).
-
-    A row costs linear ε + quadratic ε² where it gives way by ε. DAQP starts from the rows that
-    these multipliers push to, and has so many seconds. Returns None where the recursion has no digits left.
-    """
+) -> tuple[Float[np.ndarray, "N1 nx n"], Float[np.ndarray, "N nu n"], Float[np.ndarray, "N nq n"]] | None:
+    """Return x̃_k, ũ_k and [ũ_k; G_k x̃_{k+1}] as matrices on w; None where the recursion has no digits left."""
     A, B, Q, R, G, free = stages
     N, nu, nx = len(B), B.shape[1], B.shape[2]
     K, spread = np.zeros((N, nu, nx)), np.zeros((N, nu, nu))
@@ -424,6 +470,26 @@ def least_deviation(
             U[k][:, nu * at[k] : nu * at[k] + nu] += spread[k]
         X[k + 1] = A[k].T @ X[k] + B[k].T @ U[k]
     rows = np.concatenate([U, G.transpose(0, 2, 1) @ X[1:]], axis=1)
+    return X, U, rows
+
+
+def least_deviation(
+    stages: Stages,
+    room: Interval,
+    softness: Softness,
+    multipliers: Float[np.ndarray, " m"] | None,
+    seconds: float,
+) -> Deviation | None:
+    """Return the least deviation within `room`, the limits of [ũ_k; G_k x̃_{k+1}] of each stage (N, nu + ng).
+
+    A row costs linear ε + quadratic ε² where it gives way by ε. DAQP starts from the rows that
+    these multipliers push to, and has so many seconds. Returns None where the recursion has no digits left.
+    """
+    condensed = condense_stages(stages)
+    if condensed is None:
+        return None
+    X, U, rows = condensed
+    (N, nu, n), free = U.shape, stages.free
     low, high = room
     kept = np.isfinite(low) | np.isfinite(high)
     kept[~free, :nu] = False

@@ -20,6 +20,8 @@ from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolution, NLPSolver, 
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC, StagePlan
 from koopmpc.control.program import Program, no_export
 from koopmpc.control.stepped.blocks import Moves
+from koopmpc.control.stepped.levels import LevelBox
+from koopmpc.control.stepped.search import Relaxed
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
@@ -159,10 +161,61 @@ class NonlinearMPC(StagedMPC):
         iterations = sum(found.iterations for found in solved)
         good = [found for found in solved if found.status is Status.OPTIMAL]
         found = min(good, key=lambda each: each.cost) if good else solved[0]
+        if good and self._levels is not None and not self._rests_on_levels(found, s):
+            found, more = self._search_levels(found, s, first, deadline)
+            iterations += more
+            good = good if found.status is Status.OPTIMAL else []
         self._next = found.start
         slack = float(found.slacks[found.slacks > self._shooting.allowance].max(initial=0.0))
         status = Status.SOFTENED if good and slack else found.status
         return StagePlan(np.vstack([s, found.X]), found.U, status, iterations, slack)
+
+    def _rests_on_levels(self, found: NLPSolution, s: Float[np.ndarray, " ns"]) -> bool:
+        """Return whether the plan without levels is on them."""
+        assert self._levels is not None, "only asked where inputs have levels"
+        _, U = self._trajectory(np.vstack([s, found.X]), found.U)
+        return self._levels.accepts(U[self._problem.free].ravel())
+
+    def _search_levels(
+        self, relaxed: NLPSolution, s: Float[np.ndarray, " ns"], first: Interval, deadline: float
+    ) -> tuple[NLPSolution, int]:
+        """Return the best plan on levels that branch and bound over nonlinear programs finds, and all iterations.
+
+        A node is a local optimum, so that a plan is the best one as far as these are.
+        """
+        search, shooting, N = self._levels, self._shooting, self._N
+        assert search is not None, "only asked where inputs have levels"
+        levels, starts = search.held.levels, np.flatnonzero(self._problem.free)
+        low, high = (np.broadcast_to(end, (N, self.nu)) for end in self._box)
+        inside = levels.inside(
+            Interval(np.maximum.reduceat(low, starts, axis=0), np.minimum.reduceat(high, starts, axis=0))
+        )
+        count = len(search.index)
+        root = LevelBox(inside.low[:count].copy(), inside.high[:count].copy())
+        if (root.low > root.high).any():
+            return relaxed._replace(status=Status.INFEASIBLE), 0
+        blocks = self._blocks[:count]
+        steps, rated = sum(blocks), self._with_rates
+
+        def relax(box: LevelBox, answer: NLPSolution, left: float | None) -> Relaxed:
+            least, most = low.copy(), high.copy()
+            for end, index in ((least, box.low), (most, box.high)):
+                end[:steps, levels.which] = levels.values(np.repeat(index, blocks, axis=0))
+            shooting.set_moves(least, most)
+            here = first if rated else Interval(least[0], most[0])
+            found = shooting.solve(s, self._targets, self._e, answer.start_here, here, deadline, self._W)
+            late = left is not None and perf_counter() > deadline
+            status = Status.TIME_LIMIT if late and found.status is not Status.OPTIMAL else found.status
+            _, U = self._trajectory(np.vstack([s, found.X]), found.U)
+            return Relaxed(status, found.cost, levels.indices(U[starts[:count]]), found.iterations, found)
+
+        end = None if np.isinf(deadline) else deadline
+        found = search.find(relax, root, relaxed, end, relaxed.cost)
+        unlimited = np.full((N, self.nu), np.inf)
+        shooting.set_moves(*((-unlimited, unlimited) if rated else (low, high)))
+        if found.answer is None:
+            return relaxed._replace(status=found.status), found.iterations
+        return found.answer, found.iterations
 
     def _guesses(self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"]) -> list[Start]:
         """Return the guesses of a first step: rest at x_0, then where random held inputs lead."""

@@ -58,7 +58,10 @@ class Start(NamedTuple):
 
 
 class NLPSolution(NamedTuple):
-    """Inputs, states and slacks of the stages, their cost, how the solver ended, and the start of the next step."""
+    """Inputs, states and slacks of the stages, their cost, how the solver ended, and the start of the next step.
+
+    `start_here` is the start of another solve of the same step.
+    """
 
     U: Float[np.ndarray, "N nu"]
     X: Float[np.ndarray, "N nx"]
@@ -67,6 +70,7 @@ class NLPSolution(NamedTuple):
     status: Status
     iterations: int
     start: Start
+    start_here: Start
 
 
 class Shooting:
@@ -197,6 +201,7 @@ class Shooting:
                 'names, for example {"ipopt.tol": 1e-8}'
             ) from error
         self._scale, self._path_at, self._path_row = p.scale, path_at, row
+        self._moves_at = nu + moved if p.with_rates else 0  # the first column of u_k among the variables of a stage
         self._shape, self._split = (N, nu + nx + ns), (nu, nu + nx)
 
     def set_limits(self, inputs: Interval, outputs: Interval) -> None:
@@ -207,6 +212,13 @@ class Shooting:
         if ng:
             self._bounds["ubg"][self._path_at[:, :ng]] = outputs.high / self._path_row
             self._bounds["lbg"][self._path_at[:, ng:]] = outputs.low / self._path_row
+
+    def set_moves(self, low: Float[np.ndarray, "N nu"], high: Float[np.ndarray, "N nu"]) -> None:
+        """Set the limits of the inputs u_k of all stages alone, which a state holds where changes are the variables."""
+        first = self._moves_at
+        for end, value in zip(("lbx", "ubx"), (low, high), strict=True):
+            columns = slice(first, first + value.shape[1])
+            self._bounds[end].reshape(self._shape)[:, columns] = value / self._sizes[columns]
 
     def at(self, X: Float[np.ndarray, "N nx"], U: Float[np.ndarray, "N nu"]) -> Start:
         """Return a start with these states x_1 … x_N and inputs."""
@@ -234,7 +246,7 @@ class Shooting:
         p += [] if schedule is None else [schedule.ravel()]
         begin = {"x0": start.v, "lam_x0": start.bounds, "lam_g0": start.constraints}
         U, X, slacks = np.split(start.v.reshape(self._shape) * self._sizes, self._split, axis=1)
-        failed = NLPSolution(U, X, slacks, np.inf, Status.FAILED, 0, start)
+        failed = NLPSolution(U, X, slacks, np.inf, Status.FAILED, 0, start, start)
         if self._start_is_number is not None and not float(self._start_is_number(start.v, np.concatenate(p))):
             return failed
         with raise_swallowed():
@@ -253,7 +265,14 @@ class Shooting:
         U, X, slacks = np.split(v.reshape(self._shape) * self._sizes, self._split, axis=1)
         after = Start(v[self._next_v], bounds[self._next_v], constraints[self._next_g])
         return NLPSolution(
-            U, X, slacks, self._scale * float(found["f"]), status, int(stats.get("iter_count", 0)), after
+            U,
+            X,
+            slacks,
+            self._scale * float(found["f"]),
+            status,
+            int(stats.get("iter_count", 0)),
+            after,
+            Start(v, bounds, constraints),
         )
 
 

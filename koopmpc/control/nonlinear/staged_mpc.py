@@ -13,13 +13,14 @@ from koopmpc.checks import HUGE
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, data_ranges, state_tracking
 from koopmpc.control.in_time.preview import check_bounds_alone
-from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation, refuse_levels, refuse_priority
+from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation, refuse_priority
 from koopmpc.control.move import Move, Plan, Status, alone
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.motion import BEYOND, Course, can_drift, extend_rows, shift_target
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.control.nonlinear.rows import StageLimits, check_rows, find_stage_limits
 from koopmpc.control.stepped.blocks import Moves
+from koopmpc.control.stepped.search import LevelSearch
 from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator, start_observer
@@ -66,6 +67,7 @@ class StagedMPC(MPCBase):
     _at_call: Limits
     _called_with: Limits | None
     _goes_on: bool  # whether a reference that moves goes on beyond its rows
+    _levels: LevelSearch | None
     _timed: bool  # whether the controller's own limits move in time
     _warm: bool  # whether the next step starts from the plan of the last one
 
@@ -88,7 +90,6 @@ class StagedMPC(MPCBase):
         o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, in_time=True)
         self._outputs, self._box, self._limit_step, self._called_with = o, o.inputs, 0, None
         self._timed = o.limits.in_time
-        refuse_levels(o.limits, f"a {type(self).__name__}")
         refuse_priority(o.limits, f"a {type(self).__name__}")
         super().__init__(
             model.dt,
@@ -105,6 +106,7 @@ class StagedMPC(MPCBase):
             monitor=None if monitor is None else find_monitor(monitor, model),
         )
         self._problem = staged_problem(given, o, self._moves)
+        self._levels = None if self._held is None else LevelSearch(self._held, self._blocks, self.nu)
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
         self._goes_on = self.cost.moves_on and o.given is None
         self._disturbed = estimator is not None or given.nw > 0
@@ -130,6 +132,8 @@ class StagedMPC(MPCBase):
             low, high = self.limits.input_rows(self.nu, 0, 1)
             self._box = Interval(np.maximum(low, inputs.low), np.minimum(high, inputs.high))
         super().reset(x0, u_prev)
+        if self._levels is not None:
+            self._levels.reset()
         self._warm, self._moved, self._row = False, False, 0
         self._forget_targets()
         self._terminal.forget_missed()
@@ -227,6 +231,7 @@ class StagedMPC(MPCBase):
     ) -> Move:
         initial = self._initial
         initial.take(y, self._given, applied, w)
+        self._count_held(applied)
         x, u_prev = initial.z, initial.u_prev if initial.u_prev.size else self._given
         s, first, conflict = self._first_stage(x, u_prev)
         target = checks.numbers(reference, "reference")
@@ -239,13 +244,18 @@ class StagedMPC(MPCBase):
             return self._lose(applied, status, found.iterations, start, found.free)
         self._warm = True
         self._X, self._U = self._trajectory(found.S, found.V)
+        if self._levels is not None:
+            self._levels.place_steps(self._U)
         slack, u = found.slack, self._U[0]
         if self._hard_rates is not None:
             u[:] = clip_input(u, self._first_box(), self._hard_rates, u_prev)
             if conflict:
                 slack = max(slack, measure_violation(u - u_prev, self._hard_rates))
         self._keep(self._U.ravel())
-        return self._move(u.copy(), Status.SOFTENED if conflict else status, found.iterations, start, slack)
+        move = self._move(u.copy(), Status.SOFTENED if conflict else status, found.iterations, start, slack)
+        if self._levels is not None and self._levels.gap:
+            move.status, move.gap = Status.TIME_LIMIT, self._levels.gap
+        return move
 
     @abstractmethod
     def _solve(

@@ -1,15 +1,15 @@
-"""Branch and bound over the levels of inputs: the QP of a step, with some of its moves on levels.
+"""Branch and bound over the levels of inputs: the program of a step, with some of its moves on levels.
 
-Each node is the QP of the step with narrower limits of these moves, solved by the same solver from its parent's active
-rows. Dwell times narrow the levels of later moves before a node is solved. The search goes deep first,
+Each node is the program of the step with narrower limits of these moves, solved by the same solver from its parent's
+solution. Dwell times narrow the levels of later moves before a node is solved. The search goes deep first,
 and starts at the levels of the last plan, so that it has a plan early.
 
 Land & Doig, "An automatic method of solving discrete programming problems", Econometrica 28, 1960.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,51 +23,68 @@ _EQUAL = 1e-9  # a node is worse than the best plan unless it is better by more 
 NODES = 200_000  # nodes of one search, at most
 
 
+class Relaxed(NamedTuple):
+    """The program of a node without levels: how it ended, its cost, and where its moves are between their levels.
+
+    `answer` is what the caller makes of the best node; the nodes below it start there.
+    """
+
+    status: Status
+    cost: float
+    at: Float[np.ndarray, "moves leveled"]
+    iterations: int
+    answer: Any
+
+
 class _Node(NamedTuple):
     bound: float
     box: LevelBox
-    v: Float[np.ndarray, " n"]
-    y: Float[np.ndarray, " m"]
+    answer: Any
 
 
-class LevelSolver(StepSolver):
-    """The QP of a step whose moves are on levels: `solve` returns the best plan found, and `gap` what it may miss.
+class Found(NamedTuple):
+    """What a search ended with: the best answer, None without one, why it has none, and all iterations."""
 
-    Attributes
+    answer: Any
+    status: Status
+    iterations: int
+
+
+class LevelSearch:
+    """The search over the levels of the moves of a plan, whatever program its nodes are.
+
+    Parameters
     ----------
     held
         The levels now, and how long each input has held its own.
+    blocks
+        Steps of each move.
+    nu
+        Inputs of the plant.
+
+    Attributes
+    ----------
     index
         The levels of the last plan, move by move.
     gap
-        (J − bound) / J of the last plan, J its cost above that of the plan without limits; 0 where it is the best.
+        (J − bound) / J of the last plan, J its cost above that of the least cost that is known to be possible; 0 where
+        it is the best.
     nodes
-        QPs of the last search.
+        Programs of the last search.
     """
 
-    def __init__(self, qp: StepQP, turn: SolverTurn, held: HeldLevels, blocks: Sequence[int], nu: int) -> None:
+    def __init__(self, held: HeldLevels, blocks: Sequence[int], nu: int) -> None:
         self.held, self._blocks, self._nu = held, blocks, nu
         self.index = np.zeros((leveled_moves(held.levels, blocks), len(held.levels.which)), np.intp)
         self._known, self.gap, self.nodes = False, 0.0, 0
-        super().__init__(qp, [turn])
-
-    def _hold(self, qp: StepQP) -> None:
-        super()._hold(qp)
-        row = np.full(int(qp.source.max(initial=0)) + 1, -1)
-        row[qp.source] = np.arange(len(qp.source))
-        places = np.arange(len(self.index))[:, None] * self._nu + self.held.levels.which
-        self._rows_of = row[places]
-        self._flat = self._rows_of.ravel()
-        self._of_levels, self._factor = qp.A[self._flat], qp.scale[self._flat]
-        self._soft_rows = np.flatnonzero(np.isfinite(qp.softness.linear))
+        self.repeats = False  # whether the next search is of the same step as the last one
 
     def reset(self) -> None:
-        """Forget all earlier solves, so that a run repeats to the bit."""
-        super().reset()
-        self._known, self.gap = False, 0.0
+        """Forget the levels of the last plan."""
+        self._known, self.gap, self.repeats = False, 0.0, False
 
     def accepts(self, t: Float[np.ndarray, " nt"]) -> bool:
-        """Return whether a plan without limits is on the levels; its moves are then put on them to the bit."""
+        """Return whether a plan without levels is on them; its moves are then put on them to the bit."""
         moves = len(self._blocks) * self._nu
         U = t[:moves].reshape(-1, self._nu)
         at = self.held.levels.indices(U[: len(self.index)])
@@ -86,28 +103,37 @@ class LevelSolver(StepSolver):
         rows[: len(self.index), self.held.levels.which] = self.held.levels.values(self.index)
         return self.gap
 
-    def _ask_all(
-        self, moved: Float[np.ndarray, " m"], limits: Interval | None, deadline: float | None
-    ) -> tuple[QPSolution, bool]:
-        """Search; the answer is the best plan found."""
-        own = limits or Interval(self.qp.low, self.qp.high)
-        low, high = own.low - moved, own.high - moved
-        levels, shape = self.held.levels, self.index.shape
-        self._moved_levels = moved[self._flat].reshape(shape)
-        root = LevelBox(np.zeros(shape, np.intp), np.broadcast_to(levels.count - 1, shape).copy())
-        if limits is not None:  # the limits of the inputs may move in time
-            factor = self._factor.reshape(shape)
-            root = levels.between(own.low[self._rows_of] / factor, own.high[self._rows_of] / factor)
-            if (root.low > root.high).any():
-                return QPSolution(
-                    self._cold[0].copy(), self._cold[1].copy(), Status.INFEASIBLE, 0, self.first.name
-                ), True
+    def place_steps(self, U: Float[np.ndarray, "N nu"]) -> None:
+        """Put the inputs of all steps on the levels found, to the bit."""
+        blocks = self._blocks[: len(self.index)]
+        values = self.held.levels.values(np.repeat(self.index, blocks, axis=0))
+        U[: len(values), self.held.levels.which] = values
+
+    def open_box(self) -> LevelBox:
+        """Return the box of all levels."""
+        shape = self.index.shape
+        return LevelBox(np.zeros(shape, np.intp), np.broadcast_to(self.held.levels.count - 1, shape).copy())
+
+    def find(
+        self,
+        relax: Callable[[LevelBox, Any, float | None], Relaxed],
+        root: LevelBox,
+        start: Any,
+        deadline: float | None,
+        least: float = 0.0,
+    ) -> Found:
+        """Search inside `root`; `relax` solves a node from an answer in so many seconds, `start` is the first answer.
+
+        No node costs less than `least`, from which the gap counts.
+        """
         self.nodes, self.gap = 0, 0.0
-        best, cost, iterations, unproven = None, np.inf, 0, np.inf
-        stack = [_Node(0.0, root, *self._cold)]
+        best: Any = None
+        cost, iterations, unproven = np.inf, 0, np.inf
+        stack = [_Node(least, root, start)]
         if self._known:
-            shifted = np.clip(np.vstack([self.index[1:], self.index[-1:]]), root.low, root.high)
-            stack.append(_Node(0.0, LevelBox(shifted.copy(), shifted.copy()), *self._cold))
+            last = self.index if self.repeats else np.vstack([self.index[1:], self.index[-1:]])
+            last = np.clip(last, root.low, root.high)
+            stack.append(_Node(least, LevelBox(last.copy(), last.copy()), start))
         ended = Status.INFEASIBLE
         while stack:
             node = stack.pop()
@@ -120,7 +146,7 @@ class LevelSolver(StepSolver):
                 stack.append(node)
                 ended = Status.TIME_LIMIT if self.nodes < NODES else Status.MAX_ITERATIONS
                 break
-            found = self._relax(node, low, high, left)
+            found = relax(node.box, node.answer, left)
             self.nodes += 1
             iterations += found.iterations
             if found.status is Status.TIME_LIMIT:
@@ -131,52 +157,25 @@ class LevelSolver(StepSolver):
                 if found.status is not Status.INFEASIBLE:
                     unproven, ended = min(unproven, node.bound), Status.FAILED
                 continue
-            bound = self._cost(found.v, low, high)
-            if bound >= cost - _EQUAL * abs(cost):
+            if found.cost >= cost - _EQUAL * abs(cost):
                 continue
-            at = self._read_levels(found.v)
-            nearest = np.clip(np.rint(at), node.box.low, node.box.high).astype(np.intp)
-            place = self._choose(at, nearest, node.box)
+            nearest = np.clip(np.rint(found.at), node.box.low, node.box.high).astype(np.intp)
+            place = self._choose(found.at, nearest, node.box)
             if place is None:
-                best, cost, self.index = found, bound, nearest
+                best, cost, self.index = found.answer, found.cost, nearest
                 continue
-            self._branch(stack, node.box, place, at, bound, found)
+            self._branch(stack, node.box, place, found)
         worst = min([unproven, *(node.bound for node in stack)])
         self._known = best is not None
         if best is None:
-            cold = self._cold
-            return QPSolution(cold[0].copy(), cold[1].copy(), ended, iterations, self.first.name), True
-        best.iterations = iterations
+            return Found(None, ended, iterations)
         if worst < cost - _EQUAL * abs(cost):
-            self.gap = float(min(max((cost - max(worst, 0.0)) / max(cost, 1e-300), 0.0), 1.0))
-        return best, True
+            self.gap = float(min(max((cost - max(worst, least)) / max(cost - least, 1e-300), 0.0), 1.0))
+        return Found(best, Status.OPTIMAL, iterations)
 
-    def _relax(
-        self, node: _Node, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"], left: float | None
-    ) -> QPSolution:
-        """Return the solution of the QP of a node, levels between the ends of its box being allowed."""
-        levels, low, high = self.held.levels, low.copy(), high.copy()
-        factor = self._factor.reshape(self.index.shape)
-        low[self._rows_of] = factor * levels.values(node.box.low) - self._moved_levels
-        high[self._rows_of] = factor * levels.values(node.box.high) - self._moved_levels
-        self.first.set_bounds(low, np.maximum(low, high))
-        return self.first.solve(node.v, node.y, left)
-
-    def _read_levels(self, v: Float[np.ndarray, " n"]) -> Float[np.ndarray, "moves leveled"]:
-        """Return where the moves of a plan are between their levels."""
-        levels = self.held.levels
-        u = (self._of_levels @ v + self._moved_levels.ravel()) / self._factor
-        return (u.reshape(self.index.shape) - levels.first) / levels.spacing
-
-    def _cost(self, v: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> float:
-        """Return the cost of a solution above that of the plan without limits, soft limits that give way included."""
-        qp, rows = self.qp, self._soft_rows
-        cost = 0.5 * float(v @ qp.P @ v) + float(qp.q @ v)
-        if len(rows):
-            value = qp.A[rows] @ v
-            slack = np.maximum(np.maximum(value - high[rows], low[rows] - value), 0.0)
-            cost += float(qp.softness.linear[rows] @ slack + qp.softness.quadratic[rows] @ slack**2)
-        return cost
+    def find_places(self) -> Int[np.ndarray, "moves leveled"]:
+        """Return where the moves on levels stand in a plan, move by move."""
+        return np.arange(len(self.index))[:, None] * self._nu + self.held.levels.which
 
     def _choose(
         self, at: Float[np.ndarray, "moves leveled"], nearest: Int[np.ndarray, "moves leveled"], box: LevelBox
@@ -197,12 +196,10 @@ class LevelSolver(StepSolver):
         stack: list[_Node],
         box: LevelBox,
         place: tuple[int, int],
-        at: Float[np.ndarray, "moves leveled"],
-        bound: float,
-        found: QPSolution,
+        found: Relaxed,
     ) -> None:
         """Put the nodes of the levels below and above on the stack, the nearer one last, so that it is next."""
-        low, high, value = int(box.low[place]), int(box.high[place]), float(at[place])
+        low, high, value = int(box.low[place]), int(box.high[place]), float(found.at[place])
         middle = int(np.rint(value))
         if abs(value - middle) <= NEAR:
             ends = [(low, middle - 1), (middle + 1, high), (middle, middle)]
@@ -213,4 +210,66 @@ class LevelSolver(StepSolver):
             if low <= first <= last <= high:
                 child = LevelBox(box.low.copy(), box.high.copy())
                 child.low[place], child.high[place] = first, last
-                stack.append(_Node(bound, child, found.v, found.y))
+                stack.append(_Node(found.cost, child, found.answer))
+
+
+class LevelSolver(StepSolver):
+    """The QP of a step whose moves are on levels: `solve` returns the best plan that the `search` finds."""
+
+    def __init__(self, qp: StepQP, turn: SolverTurn, search: LevelSearch) -> None:
+        self.search = search
+        super().__init__(qp, [turn])
+
+    def _hold(self, qp: StepQP) -> None:
+        super()._hold(qp)
+        search = self.search
+        row = np.full(int(qp.source.max(initial=0)) + 1, -1)
+        row[qp.source] = np.arange(len(qp.source))
+        self._rows_of = row[search.find_places()]
+        self._flat = self._rows_of.ravel()
+        self._of_levels, self._factor = qp.A[self._flat], qp.scale[self._flat]
+        self._soft_rows = np.flatnonzero(np.isfinite(qp.softness.linear))
+
+    def reset(self) -> None:
+        """Forget all earlier solves, so that a run repeats to the bit."""
+        super().reset()
+        self.search.reset()
+
+    def _ask_all(
+        self, moved: Float[np.ndarray, " m"], limits: Interval | None, deadline: float | None
+    ) -> tuple[QPSolution, bool]:
+        """Search; the answer is the best plan found."""
+        search, cold = self.search, self._cold
+        own = limits or Interval(self.qp.low, self.qp.high)
+        low, high = own.low - moved, own.high - moved
+        levels, shape = search.held.levels, search.index.shape
+        at_start, root = moved[self._flat].reshape(shape), search.open_box()
+        factor = self._factor.reshape(shape)
+        if limits is not None:  # the limits of the inputs may move in time
+            root = levels.between(own.low[self._rows_of] / factor, own.high[self._rows_of] / factor)
+            if (root.low > root.high).any():
+                return QPSolution(cold[0].copy(), cold[1].copy(), Status.INFEASIBLE, 0, self.first.name), True
+
+        def relax(box: LevelBox, answer: tuple[np.ndarray, np.ndarray], left: float | None) -> Relaxed:
+            least, most = low.copy(), high.copy()
+            least[self._rows_of] = factor * levels.values(box.low) - at_start
+            most[self._rows_of] = factor * levels.values(box.high) - at_start
+            self.first.set_bounds(least, np.maximum(least, most))
+            found = self.first.solve(*answer, left)
+            u = (self._of_levels @ found.v + at_start.ravel()) / self._factor
+            at = (u.reshape(shape) - levels.first) / levels.spacing
+            return Relaxed(found.status, self._cost(found.v, low, high), at, found.iterations, (found.v, found.y))
+
+        found = search.find(relax, root, cold, deadline)
+        v, y = cold if found.answer is None else found.answer
+        return QPSolution(v.copy(), y.copy(), found.status, found.iterations, self.first.name), True
+
+    def _cost(self, v: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> float:
+        """Return the cost of a solution above that of the plan without limits, soft limits that give way included."""
+        qp, rows = self.qp, self._soft_rows
+        cost = 0.5 * float(v @ qp.P @ v) + float(qp.q @ v)
+        if len(rows):
+            value = qp.A[rows] @ v
+            slack = np.maximum(np.maximum(value - high[rows], low[rows] - value), 0.0)
+            cost += float(qp.softness.linear[rows] @ slack + qp.softness.quadratic[rows] @ slack**2)
+        return cost
