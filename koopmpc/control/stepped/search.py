@@ -42,7 +42,7 @@ class _Node(NamedTuple):
     answer: Any
 
 
-class Found(NamedTuple):
+class LevelsFound(NamedTuple):
     """What a search ended with: the best answer, None without one, why it has none, and all iterations."""
 
     answer: Any
@@ -121,7 +121,7 @@ class LevelSearch:
         start: Any,
         deadline: float | None,
         least: float = 0.0,
-    ) -> Found:
+    ) -> LevelsFound:
         """Search inside `root`; `relax` solves a node from an answer in so many seconds, `start` is the first answer.
 
         No node costs less than `least`, from which the gap counts.
@@ -168,10 +168,10 @@ class LevelSearch:
         worst = min([unproven, *(node.bound for node in stack)])
         self._known = best is not None
         if best is None:
-            return Found(None, ended, iterations)
+            return LevelsFound(None, ended, iterations)
         if worst < cost - _EQUAL * abs(cost):
             self.gap = float(min(max((cost - max(worst, least)) / max(cost - least, 1e-300), 0.0), 1.0))
-        return Found(best, Status.OPTIMAL, iterations)
+        return LevelsFound(best, Status.OPTIMAL, iterations)
 
     def find_places(self) -> Int[np.ndarray, "moves leveled"]:
         """Return where the moves on levels stand in a plan, move by move."""
