@@ -179,11 +179,13 @@ def _close(cluster: Any) -> None:
     except (Exception, CancelledError):
         _LOG.debug("Dask did not close its cluster", exc_info=True)
         for nanny in list(cluster.workers.values()):
+            nanny.status = Status.closed  # it neither starts a new worker nor asks for the scheduler that has ended
             with suppress(AttributeError, TypeError, OSError):  # it has no process, or no longer
                 os.kill(nanny.pid, getattr(signal, "SIGKILL", signal.SIGTERM))
         with suppress(Exception, CancelledError):
             cluster.sync(cluster.scheduler.close)
         cluster.status = Status.closed  # else it warns, and tries again at the end of the program
+        cluster.close()  # of a cluster that is closed this ends the thread of its loop
 
 
 @contextmanager

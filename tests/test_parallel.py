@@ -27,6 +27,13 @@ EVERYWHERE = pytest.mark.parametrize("where", ["here", "processes", "dask"], ind
 MORTAL = pytest.mark.parametrize("where", ["processes", "a mortal cluster"], indirect=True)
 
 
+@pytest.fixture(autouse=True)
+def _no_loop_of_dask_survives() -> Iterator[None]:
+    """A loop that goes on draws from `random` while it looks for its scheduler, which breaks other tests by chance."""
+    yield
+    assert "IO loop" not in {thread.name for thread in threading.enumerate()}
+
+
 @pytest.fixture(scope="module")
 def scheduler() -> Iterator[str]:
     with two_workers() as address:

@@ -236,11 +236,15 @@ def test_a_saved_table_is_plain_and_keeps_names_roles_and_dt_whatever_the_names(
         {"states": ["1.5"]},
         {"disturbances": ["wind [N]"]},
         {"inputs": ["w1"]},
+        {"states": ["sound", "step"]},
+        {"states": ["sound", " padded"]},
+        {"states": ["sound", "1.5"]},
     ],
 )
 def test_a_name_that_a_plain_table_would_not_keep_is_refused(tmp_path: Path, names: dict[str, list[str]]) -> None:
-    data = km.Episodes([km.Episode(X=[[0], [1]], U=[[0]], W=[[0]])], 0.1, **names)
-    ((name,),) = names.values()
+    ((*_, name),) = names.values()
+    X = np.arange(2 * len(names.get("states", "x"))).reshape(2, -1)
+    data = km.Episodes([km.Episode(X=X, U=[[0]], W=[[0]])], 0.1, **names)
     with pytest.raises(km.errors.DataError, match=rf"a \.csv file would not keep the name {re.escape(repr(name))}"):
         data.save(tmp_path / "own.csv")
     assert not any(tmp_path.iterdir())

@@ -63,6 +63,13 @@ def test_units_and_origin_do_not_count() -> None:
     assert found(other) == found(data) == [(3, 11, 0), (7, 20, 1)]
 
 
+def test_a_measurement_is_trusted_to_a_tenth_of_what_the_model_misses_at_best() -> None:
+    exact, noisy_one = (km.data.Mender.of(noisy(pendulum_data(), share)).smoother for share in (0.0, 0.2))
+    assert (exact.noise / exact.missed).min() == pytest.approx(0.1, rel=1e-9)
+    assert (exact.noise < 0.3 * exact.missed).all()
+    assert (noisy_one.noise > noisy_one.missed).all()
+
+
 def test_glitches_of_a_long_episode_are_found_wherever_they_are() -> None:
     long = noisy(pendulum_data(episodes=2, steps=2500), 0.01)
     places = [(0, 7, 0), (0, 1001, 1), (0, 1249, 0), (1, 2490, 1)]

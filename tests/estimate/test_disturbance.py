@@ -92,6 +92,15 @@ def test_exact_measurements_need_no_mean():
     assert np.abs(after(drifting, 0.1)[100:] - drifting[99:-1]).min() > 0.08
 
 
+@pytest.mark.parametrize("horizon", [1, 20, 50])
+def test_a_drift_is_followed_as_far_as_it_is_slow_over_two_fifths_of_the_horizon(horizon):
+    """Of misfits f that grow by s a step, d lacks (0.4 N s / f)² s, and N is 2.5 at least."""
+    misfits = 1 + 0.02 * np.arange(900)
+    late = misfits[700:-1]
+    lack = late - after(misfits, horizon=horizon)[701:]
+    np.testing.assert_allclose(lack, (max(0.4 * horizon, 1) * 0.02 / late) ** 2 * 0.02, rtol=0.1)
+
+
 def test_constant_leaks_cost_at_most_three_percent():
     """Two tanks in line, outflows 20 % off, leaks, exact measurements: against the same controller that knows the leaks."""
 

@@ -93,6 +93,14 @@ def test_a_larger_library_holds_the_square_of_the_energy_too_and_both_are_sparse
     np.testing.assert_allclose(fitted @ np.linalg.lstsq(fitted, second, rcond=None)[0], second, atol=1e-6)
 
 
+def test_states_that_rest_are_conserved_alone_and_in_products_whatever_their_units():
+    """Of five functions each has one observable, though any mixture of them is as constant."""
+    starts = np.random.default_rng(0).uniform(-1, 1, (30, 2)) * [1e3, 1e-2]
+    data = km.Episodes([km.Episode(X=np.tile(x, (5, 1))) for x in starts], 0.1, ["a", "b"])
+    found = km.identify.eigenfunctions(data, km.State() + km.Monomials(2))
+    assert sorted(tuple(named(phi)) for phi in found) == sorted([("a",), ("b",), ("a^2",), ("a*b",), ("b^2",)])
+
+
 def test_identities_of_the_library_are_no_eigenfunctions():
     data = free(np.random.default_rng(0).uniform(-1.5, 1.5, (12, 2)), 0.05, 60)
     extra = km.Expressions(lambda x: [ca.sin(x[0]) ** 2, ca.cos(x[0]) ** 2], ["s2", "c2"])

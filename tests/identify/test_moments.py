@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.identify.moments.moments import both_sides
 from koopmpc.identify.moments.rows import ROWS, lift_chunks, row_columns, split_chunks
 from koopmpc.identify.solve import solve
 from tests.identify.plants import brute_force, random_episodes
@@ -187,6 +188,16 @@ def test_data_that_turn_out_worse_than_the_pilot_are_read_again() -> None:
     m = km.moments.second_moments(spoiled, km.State())
     assert m.condition > 1e6
     assert m.route == "qr"
+
+
+@pytest.mark.parametrize("route", ["gram", "qr"])
+@pytest.mark.parametrize("lengths", [[2], [900, 40]])
+def test_the_cut_of_singular_values_is_that_of_matrix_rank_on_all_rows(route: str, lengths: list[int]) -> None:
+    """Gram sums have half the digits."""
+    total = km.moments.second_moments(random_episodes(0, lengths, 2, 1), LIFTING, route=route)
+    m, n = total.samples, len(total.columns.regressors) + total.nz
+    rank_cut = max(m, n) * np.finfo(float).eps  # numpy.linalg.matrix_rank, as a share of the largest
+    assert both_sides(total).cut == pytest.approx(rank_cut if route == "qr" else rank_cut**0.5, rel=1e-12)
 
 
 def test_columns_are_scaled_before_they_are_judged() -> None:
