@@ -258,6 +258,40 @@ def find_outside_limits(asked: DesignTask, data: Episodes) -> list[str]:
     return said
 
 
+def find_poor_logs(asked: DesignTask, data: Episodes, tracked: Sequence[int]) -> list[str]:
+    """Return sentences where logs cannot serve: outside of all limits, from a single start, slower than the reference.
+
+    A reference is too fast if half of the rows that move it move it by more than the logs move that state in any step.
+    """
+    X, said = [episode.X for episode in data], list[str]()
+    least, most = (np.array([ends(one, axis=0) for one in X]) for ends in (np.min, np.max))
+    for name, low, high, under, over in zip(
+        data.states, least.min(axis=0), most.max(axis=0), *asked.limits.states(data.nx), strict=True
+    ):
+        if low > over or high < under:
+            said.append(
+                f"the limits of {strip_unit(name)} allow {under:.4g} to {over:.4g}, and the data go from {low:.4g} to "
+                f"{high:.4g}: no log was inside these limits; record some there, or widen the limits"
+            )
+    first = np.array([one[0] for one in X])
+    if len(X) > 1 and (first == first[0]).all() and (asked.starts == first[0]).all():
+        shown = ", ".join(with_unit(name, f"= {value:.4g}") for name, value in zip(data.states, first[0], strict=True))
+        said.append(
+            f"all {len(X)} episodes start at {shown}: how the loop goes from elsewhere was tried on no such start; "
+            "record episodes from other states, or pass starts="
+        )
+    steps = np.max([np.abs(np.diff(one, axis=0)).max(axis=0) for one in X], axis=0)
+    for column, i in enumerate(tracked):
+        moved = np.abs(np.diff(asked.reference[:, column]))
+        usual = float(np.median(moved[moved > 0])) if (moved > 0).sum() > _FEW else 0.0
+        if usual > steps[i] and i in _weighted_references(asked, data):
+            said.append(
+                f"no input can follow the reference: it moves {strip_unit(data.states[i])} by {usual:.4g} in a step, "
+                f"and no log moves it by more than {steps[i]:.4g}; ask for a slower one"
+            )
+    return said
+
+
 def find_unweighted_limits(asked: DesignTask, data: Episodes) -> list[str]:
     """Return a sentence for each limited state that the cost does not weigh."""
     of = asked.cost.of.bind(data.states)

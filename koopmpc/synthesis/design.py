@@ -28,6 +28,7 @@ from koopmpc.synthesis.asked import (
     check_task,
     find_outside_data,
     find_outside_limits,
+    find_poor_logs,
     find_stray_episodes,
     find_unweighted_limits,
     limit_margins,
@@ -463,7 +464,12 @@ def _prepare_test(
     holds = not asked.moves and not unreachable
     return (
         test,
-        [*unreachable, *find_outside_limits(asked, data), *find_outside_data(asked, data, tracked, free)],
+        [
+            *unreachable,
+            *find_outside_limits(asked, data),
+            *find_outside_data(asked, data, tracked, free),
+            *find_poor_logs(asked, data, tracked),
+        ],
         holds,
     )
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.synthesis.asked import check_task, find_poor_logs
 from koopmpc.synthesis.candidates import Candidate, Recipe
 from koopmpc.synthesis.surrogates import fit_surrogate
 from tests.closed_loop.more_tasks import ALL
@@ -68,3 +69,43 @@ def test_a_sine_costs_at_most_a_tenth_more_than_the_optimum_however_little_of_it
             x = task.plant(x, u)
             spent += np.array(task.Q) @ (x - rows[k + 1]) ** 2 + np.array(task.R) @ (u - inputs[k]) ** 2
         assert spent < 1.1 * least, share
+
+
+def ask(data, limits=None, **more):
+    task = check_task(
+        data,
+        km.Cost(Q=[1.0, 0.1], R=0.1),
+        limits or km.Limits(u_min=-3, u_max=3),
+        8,
+        **{"starts": None, "angles": []} | more,
+    )
+    return find_poor_logs(task, data, [0, 1])
+
+
+def test_logs_that_cannot_serve_are_told_and_others_are_not():
+    data = logs(0.0, 9)
+    sine = np.sin(0.05 * np.arange(60))
+    assert not ask(data, reference=[0.0, 0.0])
+    assert not ask(data, reference=np.column_stack([sine, 0 * sine]))
+    assert not ask(data, reference=np.repeat([[0.0, 0.0], [0.9, 0.0]], 30, axis=0))  # a step is no motion
+
+    beyond = km.Limits(u_min=-3, u_max=3, x_min=[20.0, -np.inf], x_max=[30.0, np.inf])
+    (said,) = ask(data, beyond, reference=[25.0, 0.0])
+    assert said.startswith("the limits of p allow 20 to 30, and the data go from ")
+
+    same = data.with_episodes([km.Episode(X=data[0].X, U=data[0].U)] * 4)
+    (said,) = ask(same, reference=[0.0, 0.0])
+    assert said.startswith("all 4 episodes start at p = ")
+    assert not ask(same, reference=[0.0, 0.0], starts=[[0.1, 0.1]])
+
+    (said,) = ask(data, reference=np.column_stack([0.8 * np.sin(2.0 * np.arange(60)), 0 * sine]))
+    assert said.startswith("no input can follow the reference: it moves p by ")
+
+
+def test_one_episode_is_refused_in_a_sentence():
+    with pytest.raises(
+        km.KoopmpcError, match="of 1 episodes 1 have 40 steps or more, and a choice needs 2: pass a shorter"
+    ):
+        km.design(
+            logs(0.0, 1), km.Cost(Q=[1.0, 0.1], R=0.1), km.Limits(u_min=-3, u_max=3), horizon=40, reference=[0, 0]
+        )
