@@ -17,15 +17,17 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.move import Move, Plan
 from koopmpc.control.program import Program, Published, SavedController, no_export
+from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.identify.fits.online import OnlineEDMD
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.validate.drift import exceeds_usual
+from koopmpc.validate.drift import DriftReport, exceeds_usual, find_drift
 
 _BETTER = 1 / 3  # of the error of the model in use that a new one may have on pairs that neither has seen
 _SHORTEST = 20  # pairs that the memory holds by default, where the horizon is shorter
 _WORSE = 1.25  # times the error of an earlier model from which on the model in use is given up for it
 _PERSISTENT = 3  # samples in sequence that are off before they count as a change of the plant
+_RECALLED = 500  # learned pairs that are compared with the data of a design
 _KEPT = 5  # earlier models that can be gone back to
 
 
@@ -108,6 +110,7 @@ class Adaptive(Published):
         self._usual = None if model.report is None else model.report.residual
         held = max(self.horizon, _SHORTEST) if memory is None else checks.count(memory, "memory")
         self._memory: deque[LearnedPair] = deque(maxlen=held)
+        self._recent: deque[LearnedPair] = deque(maxlen=_RECALLED)
         self._clear()
 
     def as_data(self) -> SavedController:
@@ -123,6 +126,8 @@ class Adaptive(Published):
 
     def _clear(self) -> None:
         self._memory.clear()
+        self._recent.clear()
+        self._changed_at = 0  # pairs learned before the first of those that a model in use did not predict
         self._before: tuple[np.ndarray, np.ndarray, np.ndarray, bool] | None = None
         self._misfits: deque[float] = deque(maxlen=self._memory.maxlen)
         self._off = self._steps = 0
@@ -141,6 +146,33 @@ class Adaptive(Published):
             self.controller.update(self._first)
         self._clear()
         self.controller.reset(x0, u_prev)
+
+    def find_drift(self, data: Episodes) -> DriftReport:
+        """Name what has changed since the data of the design, as `km.validate.find_drift` does.
+
+        New logs are the last 500 pairs that were learned from, from the first that the model in use did not predict
+        as well as its own data.
+
+        Parameters
+        ----------
+        data
+            The data of the first model.
+
+        Raises
+        ------
+        DataError
+            Nothing was learned in this run yet, or the data have other signals.
+        """
+        new = list(self._recent)[max(len(self._recent) - (self.learned - self._changed_at), 0) :]
+        if not new:
+            raise DataError("nothing was learned in this run yet; call the controller first")
+        ends = [i + 1 for i, (one, then) in enumerate(pairwise(new)) if one.x_next is not then.x]
+        episodes: list[Episode] = []
+        for first, end in pairwise([0, *ends, len(new)]):
+            part = new[first:end]
+            X, U = [*(pair.x for pair in part), part[-1].x_next], [pair.u for pair in part]
+            episodes.append(Episode(X=np.array(X), U=np.array(U)))
+        return find_drift(data, Episodes(episodes, self.dt, data.states, data.inputs))
 
     def plan(self) -> Plan | None:
         """Return the plan of the last call; None where it had none."""
@@ -180,6 +212,7 @@ class Adaptive(Published):
             return
         self._misfits.append(misfit)
         self._memory.append(pair)
+        self._recent.append(pair)
         self.online.learn(pair.x, pair.u, pair.x_next, pair.w if len(w) else None)
         self.learned += 1
 
@@ -217,6 +250,7 @@ class Adaptive(Published):
             self._on_trial = None
             return
         if self._on_trial is None:
+            self._changed_at = self._changed_at or max(self.learned - len(pairs), 0)
             try:
                 self._on_trial = self.online.predictor(), self.learned
             except KoopmpcError:  # too little was learned for a fit

@@ -226,3 +226,32 @@ def test_a_fit_of_the_last_steps_does_not_replace_a_model_that_plans_better(reme
     learning = km.supervise.Adaptive(mpc, km.OnlineEDMD.start(little, lifting, **remembers))
     assert missed(learning) <= 1.01 * missed(fixed)
     assert learning.refused + learning.renewed > 0  # models were on trial
+
+
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_it_names_what_changed_since_the_design(share):
+    """The gain of the input falls after 150 steps, or does not."""
+    A, B, rng = np.array([[0.9, 0.1], [-0.1, 0.8]]), np.array([[0.0], [0.2]]), np.random.default_rng(0)
+    plant = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ["x", "v"], ["F"]).step_map()
+    old = km.collect(plant, [0, 0], km.Noise(-2, 2, hold=3), episodes=4, steps=150)
+    old = old.with_episodes([km.Episode(X=e.X + 1e-3 * rng.standard_normal(e.X.shape), U=e.U) for e in old])
+    model = km.edmd(old, km.State() + km.Constant())
+    mpc = km.KoopmanMPC(model, km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=-2, u_max=2), 15)
+    online = km.OnlineEDMD.start(old, km.State() + km.Constant(), forgetting=0.98)
+    learning = km.supervise.Adaptive(mpc, online)
+    with pytest.raises(km.errors.DataError, match="nothing was learned"):
+        learning.find_drift(old)
+    x, goal = np.zeros(2), np.zeros(2)
+    for k in range(450):
+        if k % 15 == 0:
+            goal = np.array([rng.uniform(-0.6, 0.6), 0.0])
+        u = learning(x + 1e-3 * rng.standard_normal(2), goal).u
+        x = A @ x + B @ u * (share if k >= 150 else 1.0)
+    report = learning.find_drift(old)
+    if share == 1:
+        assert report.verdict == "unchanged"
+        assert learning.renewed == 0
+    else:
+        assert learning.renewed >= 1
+        assert report.changes[0].share == pytest.approx(share - 1, abs=0.08)
+        assert "the gain of F" in [change.name for change in report.changes]
