@@ -10,7 +10,7 @@ J. Control Optim. 43, 2005.
 """
 
 from time import perf_counter
-from typing import NamedTuple, Protocol, cast
+from typing import NamedTuple, Protocol, cast, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -60,6 +60,7 @@ class StageStep(NamedTuple):
     iterations: int
 
 
+@runtime_checkable
 class SearchesLevels(Protocol):
     """What solves the program of the stages with inputs on levels."""
 
