@@ -60,6 +60,8 @@ class LeaderboardRow(Value):
         Those of the candidate.
     free
         Error on unseen stretches of a record, in free run and in short forecasts; NaN where none was made.
+    rough
+        Fitted to the rows as they were measured, where smoothed ones did not forecast unseen rows better.
     """
 
     name: str
@@ -82,6 +84,7 @@ class LeaderboardRow(Value):
     structure: Structure | HiddenStructure | None = None
     relifted: bool = False
     free: float = np.nan
+    rough: bool = False
 
     @property
     def kind(self) -> str:

@@ -340,7 +340,8 @@ def judge_finalists(
 
     The best row of each kind runs, with delays and without, sparse or not. Linear models with other observables than
     the states run lifted once and lifted at each step; where that is better, the row becomes one of a bilinear model
-    with N = 0, for those are used so.
+    with N = 0, for those are used so. Where smoothed rows are learned from, measured ones are tried too, and taken
+    unless the smoothed ones gain.
 
     Parameters
     ----------
@@ -367,9 +368,15 @@ def judge_finalists(
             continue
         fit = partial(_fit_quietly, row.candidate, row.ridge)
         run = judge_free_run(fit, learned, measured, first, horizon, relift=row.bilinear)
+        if learned is not measured:
+            raw = judge_free_run(fit, measured, measured, first, horizon, relift=row.bilinear)
+            if (raw.calm, -raw.error) >= (run.calm, -run.error):  # the smoother gains nothing
+                row, run = replace(row, rough=True), raw
+                every[place] = row
         lifted = row.nz > len(row.lifting.bound_states) + 1
         if row.kind == "linear" and lifted:
-            again = judge_free_run(fit, learned, measured, first, horizon, relift=True)
+            seen = measured if row.rough else learned
+            again = judge_free_run(fit, seen, measured, first, horizon, relift=True)
             if again.calm >= run.calm and is_worse(run.errors, again.errors):
                 every[place], run = replace(row, bilinear=True, relifted=True), again
         runs[place] = run
@@ -418,7 +425,7 @@ def fit_again(selection: Selection, episodes: Episodes) -> AnyPredictor:
         Logs like those of the choice; their inputs are moved as the chosen model's were.
     """
     row, data = selection.best, selection.predictor.align(episodes)
-    if row.structure is None:
+    if row.structure is None and not row.rough:
         data = smooth_data(Held(data), data)[1]
     model = _fit_quietly(row.candidate, row.ridge, data)
     if selection.refined:

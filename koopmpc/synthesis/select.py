@@ -64,6 +64,8 @@ LATE = (
     "model.align(logs) does the same to other logs"
 )
 
+ROUGH = "the chosen model learns from the rows as they were measured: smoothed ones forecast unseen rows no better"
+
 
 def select(
     episodes: Episodes | Source,
@@ -139,8 +141,9 @@ def select(
         `rollout` predicts and a linear model is judged, and as exactly as the data allow.
     smooth
         Replace glitches with a `Mender`, and where the states hold noise, free them of it with a `Smoother`. Least
-        squares on noisy states makes an unstable plant look tame, and so do forecasts that begin at them. The notes
-        tell what was found.
+        squares on noisy states makes an unstable plant look tame, and so do forecasts that begin at them. On records
+        fits to the measured rows are tried too, and kept unless smoothing gains on unseen rows. The notes tell what
+        was found.
     instruments
         For each episode (T, nr) or (T + 1, nr) rows of the set point of the loop that made the logs, or of a signal
         added to its inputs. Where the logs hold feedback, least squares is found biased and unseen rows gain, models
@@ -246,6 +249,8 @@ def select(
         ran = judge_hidden_states(measured[1], first, ahead, both, rival, told)
         told = report_stage(progress, "free runs")
         rows, chosen, found = judge_finalists(rows, held, measured[1], first, ahead, told, ran)
+        if held is not measured[1] and (rows[chosen].rough or rows[chosen].structure is not None):
+            notes = (*notes, ROUGH)
     else:
         kinds = {row.kind for row in rows}
         found = {
@@ -269,7 +274,8 @@ def select(
     def refit(place: int) -> AnyPredictor:
         row = rows[place]
         read = ReadOptions(workers=workers, scheduler=scheduler, progress=report_stage(progress, f"fit of {row.title}"))
-        model = fit_candidate(row.candidate, source if row.structure is None else measured[0], row.ridge, read)
+        smoothed = row.structure is None and not row.rough
+        model = fit_candidate(row.candidate, source if smoothed else measured[0], row.ridge, read)
         if isinstance(row.structure, Structure):
             model, refined[place] = refine_structure(row.structure, model, measured[1], first, ahead)
         if lead and model.report is not None:

@@ -18,6 +18,7 @@ class LoggedTask(Task):
     """A task whose training data are logs of a working PI loop with a few changes of its set point."""
 
     logged: Callable[["LoggedTask", int], km.Episodes] | None = None
+    gains: tuple[float, float] = PI
 
     def data(self, seed: int) -> km.Episodes:
         """Return the logs of one seed."""
@@ -60,9 +61,9 @@ def _record_under_pi(task: LoggedTask, seed: int) -> km.Episodes:
         Y[k] = x[of] + task.noise * (high[of] - low[of]) * rng.standard_normal()
         if k < rows:
             error = goals[k] - Y[k, 0]
-            integral = np.clip(integral + PI[1] * error, u_low, u_high)
+            integral = np.clip(integral + task.gains[1] * error, u_low, u_high)
             noise = 2 * SMALL * (u_high - u_low) * rng.standard_normal()
-            U[k] = np.clip(integral + PI[0] * error + noise, u_low, u_high)
+            U[k] = np.clip(integral + task.gains[0] * error + noise, u_low, u_high)
             x = np.asarray(plant(x, U[k]))
     return km.Episodes([km.Episode(X=Y, U=U)], task.dt, plant.outputs, plant.inputs)
 
@@ -270,6 +271,7 @@ _MORE = (
             x0=km.Uniform([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]), excitation=km.Noise(-2.5, 2.5), episodes=1, steps=2000
         ),
         logged=_record_under_pi,
+        gains=(0.1, 0.04),
         Q=[10.0],
         R=[0.1],
         limits=km.Limits(u_min=-2.5, u_max=2.5),

@@ -8,7 +8,14 @@ import pytest
 import koopmpc as km
 from koopmpc.errors import DataError
 from koopmpc.synthesis.candidates import relift_model
-from koopmpc.synthesis.records import FreeRun, choose_by_free_run, is_fed_back, is_late, is_record
+from koopmpc.synthesis.records import (
+    FreeRun,
+    choose_by_free_run,
+    is_fed_back,
+    is_late,
+    is_record,
+    judge_finalists,
+)
 from tests.identify.test_hidden_state import saturating_record
 from tests.identify.test_neural import friction_record
 
@@ -115,6 +122,23 @@ def test_a_linear_model_lifted_at_each_step_is_a_bilinear_one_without_products()
     point = model.embed(data)[0].X[5]
     assert np.allclose(model.step_map()(point, [0.3]), lifted.step_map()(point, [0.3]), rtol=0, atol=1e-14)
     assert "lifted at each step" in lifted.report.changes[-1]
+
+
+def test_smoothed_rows_are_learned_from_only_where_unseen_rows_gain():
+    measured, clean = oscillator(noise=0.3), oscillator(noise=0.0)
+    options = {"horizon": 10, "delays": [2], "smooth": False, "bilinear": False}
+    rows = km.select(measured, candidates=[km.State() + km.Constant()], **options).leaderboard
+    (kept, *_), _, _ = judge_finalists(rows, clean, measured, 2, 10)
+    assert not kept.rough  # the best smoother that there can be
+    blurred = clean[0].X.copy()
+    for _ in range(60):  # a smoother that takes the motion for noise
+        blurred[1:-1] = (blurred[:-2] + 2 * blurred[1:-1] + blurred[2:]) / 4
+    wrong = clean.with_episodes([km.Episode(X=blurred, U=clean[0].U)])
+    (raw, *_), _, _ = judge_finalists(rows, wrong, clean, 2, 10)
+    assert raw.rough
+    (same, *_), _, _ = judge_finalists(rows, clean, clean, 2, 10)
+    assert not same.rough
+    assert raw.free == same.free
 
 
 def test_a_model_that_leaves_the_range_is_taken_only_where_all_do():
