@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import numbers
+from koopmpc.codegen.abreast import ControllersAbreast
 from koopmpc.codegen.sources import Language, write_one_source, write_plant_functions
 from koopmpc.codegen.tables import Precision, make_tables, read_program
 from koopmpc.control.linear.plan import planned_states
@@ -209,7 +210,7 @@ class Compiled:
         sizes = self._sizes
         self.dt, self.nu, self.horizon = program.dt, sizes["NU"], sizes["HORIZON"]
         self.cost, self.limits = getattr(controller, "cost", None), getattr(controller, "limits", None)
-        self._model = program.model
+        self.model = program.model
         find = getattr(controller, "find_targets", None) if isinstance(program, StagedProgram) else None
         self._targets = None if find is None else TargetTable(find)
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # takes a linear plan and its start to the states
@@ -345,7 +346,7 @@ class Compiled:
 
     def plan(self) -> Plan | None:
         """Return the plan of the last call; None where it had none."""
-        sizes, memory, model = self._sizes, _address(self._memory), self._model
+        sizes, memory, model = self._sizes, _address(self._memory), self.model
         U = np.zeros((sizes["N"], self.nu), self._y.dtype)
         if not self._code.koopmpc_plan(memory, _address(U)):
             return None
@@ -400,6 +401,20 @@ class Compiled:
             "slack": slack,
             "solve_time": times,
         }
+
+    def start_abreast(
+        self,
+        rows: Float[np.ndarray, "E R nr"],
+        x0: Float[np.ndarray, "E nx"] | None = None,
+        W: Float[np.ndarray, "w nw"] | None = None,
+    ) -> ControllersAbreast:
+        """Return copies after a reset, one for each reference, that step side by side; see `ControllersAbreast`."""
+        if rows.shape[-1] != self._nr or (W is not None and W.shape[1] != self._nw) or not self._is_double:
+            raise ShapeError(f"the reference has shape {rows.shape}, expected (E, R, {self._nr}), for a double")
+        targets = None
+        if self._targets is not None:
+            targets = np.ascontiguousarray(self._targets.of(np.unique(rows.reshape(-1, self._nr), axis=0)))
+        return ControllersAbreast(self._code, self._sizes, rows, x0, W, targets)
 
     @alone
     def runs(self, plant: StepMap, x0: ArrayLike, reference: ArrayLike, *, steps: int) -> ManyRuns:

@@ -181,7 +181,7 @@ class Planner:
         J = ((ends[: n + nu] - ends[n + nu :]) / (2 * sizes[:, None])).T
         A, B = J[:, :n], J[:, n:]
         Q, R = np.zeros((n, n)), self.asked.cost.matrices(self._outputs(room.x[None]).shape[1], nu)[1]
-        Q[:nx, :nx] = self._weigh_states(room.x)
+        Q[:nx, :nx] = self.asked.weigh_states(room.x, self.data.states, nu)
         tiny = 1.0 / np.maximum(self._widths(point), 1e-9) ** 2
         Q += 1e-6 * np.trace(Q) * np.diag(tiny / tiny.sum())
         R = R + 1e-3 * np.trace(Q) * np.diag(1.0 / np.maximum(room.inputs.high - room.inputs.low, 1e-9) ** 2)
@@ -195,13 +195,6 @@ class Planner:
 
     def _outputs(self, X: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M nr"]:
         return self.asked.cost.of.bind(self.data.states)(X)
-
-    def _weigh_states(self, x: Float[np.ndarray, " nx"]) -> Float[np.ndarray, "nx nx"]:
-        """Return JᵀQJ, the weights of the tracked outputs as weights of the states around x."""
-        nx, sizes = len(x), 1e-4 * np.maximum(self.asked.high - self.asked.low, 1e-9)
-        ends = self._outputs(x + np.vstack([np.diag(sizes), -np.diag(sizes)]))
-        J = ((ends[:nx] - ends[nx:]) / (2 * sizes[:, None])).T
-        return J.T @ self.asked.cost.matrices(len(J), self.data.nu)[0] @ J
 
     def _widths(self, point: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         widths = self.asked.high - self.asked.low

@@ -11,13 +11,15 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.loop.metrics import stack_limited
 from koopmpc.synthesis.designed import Evidence
-from koopmpc.synthesis.fresh.drawn import KEPT, LoopPool
+from koopmpc.synthesis.fresh.abreast import speed_up
+from koopmpc.synthesis.fresh.drawn import KEPT, LoopPool, LoopResult
 from koopmpc.text import to_percent
 from koopmpc.validate.binomial import bound_failure_rate, count_runs_needed
 
 CONFIDENCE = 0.95  # of the bound
 SAME = 0.02  # a logged input is the controller's if it differs by at most this share of the input's range
 OWN = 0.9  # least share of logged inputs that are the controller's
+ROUND = 50  # loops between two reports of progress
 
 
 @dataclass(frozen=True)
@@ -87,14 +89,15 @@ def judge_rate(
     """
     count = count_runs_needed(rate)
     pool = LoopPool(evidence.asked, evidence.surrogates, evidence.neighbours, evidence.low, evidence.high)
-    broken = lost = rows = 0
-    for i, loop in enumerate(pool.draw(count, rng)):
-        result = pool.run(controller, loop)
-        lost += not np.isfinite(result.violation)
-        broken += bool(np.isfinite(result.violation)) and not result.keeps
-        rows += loop.place < 0
+    drawn, fast = pool.draw(count, rng), speed_up(controller)
+    results: list[LoopResult] = []
+    for first in range(0, count, ROUND):
+        results += pool.run(fast, drawn[first : first + ROUND])
         if report is not None:
-            report(i + 1, count)
+            report(len(results), count)
+    lost = sum(result.run is None for result in results)
+    broken = sum(result.run is not None and not result.keeps for result in results)
+    rows = sum(loop.place < 0 for loop in drawn)
     return RateVerdict(rate, count, broken, lost, rows, count - rows)
 
 

@@ -13,6 +13,7 @@ from koopmpc.control.limits import Limits, refuse_levels, refuse_priority
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import strip_unit
+from koopmpc.lifting.composed import evaluate_jacobians
 from koopmpc.lifting.state import State
 from koopmpc.loop.metrics import stack_limited
 from koopmpc.text import with_unit
@@ -73,6 +74,11 @@ class DesignTask(Value):
     def late(self) -> int:
         """The last reference row at which a run can begin."""
         return len(self.reference) - 1 - self.steps
+
+    def weigh_states(self, x: Float[np.ndarray, " nx"], states: Sequence[str], nu: int) -> Float[np.ndarray, "nx nx"]:
+        """Return JᵀQJ, the weights of the tracked outputs as weights of the states around x."""
+        J = evaluate_jacobians(self.cost.of.bind(states), x[None])[0]
+        return J.T @ self.cost.matrices(len(J), nu)[0] @ J
 
     def hull(self, free: Sequence[int], tracked: Sequence[int]) -> tuple[Float[np.ndarray, " nx"], ...]:
         """Return the box that a run must not leave: data, starts and reference, widened by half of the data's range.

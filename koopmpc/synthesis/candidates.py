@@ -306,6 +306,11 @@ class Nearness(Value):
         return _FLOOR + np.exp(-self.squares(episode) / (2 * self.width**2))
 
 
+def get_model(controller: Any) -> AnyPredictor:
+    """Return the learned model of a designed controller."""
+    return getattr(controller, "predictor", None) or controller.model
+
+
 @dataclass(frozen=True, eq=False)
 class Recipe(Value):
     """How a controller is made of data.

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.codegen.compiled import Compiled
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
@@ -40,6 +41,7 @@ from koopmpc.synthesis.candidates import (
     Recipe,
     check_delays,
     expand_candidates,
+    get_model,
     propose_candidates,
 )
 from koopmpc.synthesis.cross_validation import (
@@ -57,10 +59,13 @@ from koopmpc.synthesis.cross_validation import (
 )
 from koopmpc.synthesis.designed import Design, DesignRow, Evidence, ExpectedLoop, choose_row
 from koopmpc.synthesis.feedback import remove_feedback, require_episodes
-from koopmpc.synthesis.fresh.coverage import check_coverage, get_model, keep_limits
+from koopmpc.synthesis.fresh.abreast import speed_up
+from koopmpc.synthesis.fresh.coverage import check_coverage, keep_limits
+from koopmpc.synthesis.fresh.drawn import LoopPool
 from koopmpc.synthesis.fresh.horizon import choose_horizon
 from koopmpc.synthesis.fresh.loops import (
     compare_longer_horizon,
+    describe_outside,
     find_blind_range,
     find_blind_reference,
     run_fresh_loops,
@@ -98,6 +103,8 @@ _LINEAR = 2  # linear models of the first round that are tried with estimators a
 _BILINEAR = 3  # bilinear models of the first round that are tried with an estimator or with weights
 _GAINS = (None, 0.05)  # gains of the estimators: the default, and one for noisy measurements
 GAINED = 0.01  # another end of the horizon is tried on further models if it costs this share less
+MANY = 600  # fresh loops of a controller in machine code
+FEW = 60  # fresh loops of one in Python
 WORRY = 0.05  # a bound of lost loops above this is advice
 _KEPT = 6000  # steps of the data that a saved design keeps, to compare new logs with
 _STRETCHES = 4  # runs start at this many places of a long reference
@@ -120,7 +127,7 @@ def design(
     smooth: bool = True,
     instruments: Sequence[ArrayLike] | None = None,
     sample: int = 30_000,
-    loops: int = 60,
+    loops: int | None = None,
     coverage: float | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -187,11 +194,12 @@ def design(
     sample
         Approximate number of snapshot pairs that the choice uses.
     loops
-        Number of fresh loops after the choice; 59 without a failure bound a probability by 5 %, 299 by 1 %.
+        Number of fresh loops after the choice; 59 without a failure bound a probability by 5 %, 299 by 1 %. None: 600
+        where the controller runs as machine code, 60 where there is no compiler.
     coverage
         Share of loops on stand-ins that are to keep their limits, such as 0.95. The least margin that gives it is
-        chosen on `loops` loops and verified on as many others, in place of `tighten`; `promise` of the design says
-        what is promised, and the advice says so where no margin gives it.
+        chosen on `loops` loops (None: 60) and verified on as many others, in place of `tighten`; `promise` of the
+        design says what is promised, and the advice says so where no margin gives it.
     workers, scheduler
         As in `koopmpc.parallel.map_tasks`; a task is a model, or a controller with all its runs.
     progress
@@ -215,8 +223,8 @@ def design(
         No input inside the limits holds the reference; the reference or a start lies outside the data; an episode is
         left out.
     """
-    draw, fresh_loops = checks.generator(rng), checks.count(loops, "loops", 0)
-    wished = None if coverage is None else check_coverage(coverage, fresh_loops)
+    draw, few = checks.generator(rng), FEW if loops is None else checks.count(loops, "loops", 0)
+    wished = None if coverage is None else check_coverage(coverage, few)
     ahead = 1 if horizon is None else checks.count(horizon, "horizon")
     used, projected = "", np.zeros(0)
     if instruments is not None or (smooth and isinstance(data, Episodes)):
@@ -319,19 +327,23 @@ def design(
         standby = recipe.controller(model, asked.cost, test.limits(outcomes[plain].band), ahead)
     embedding = test.surrogates[0].model.embedding
     neighbours = NeighbourMap.of(test.episodes, embedding, test.surrogates[0].noise, test.ignored, test.turning)
+    drawn_from = LoopPool(asked, test.surrogates, neighbours, test.low, test.high)
     promise: CoveragePromise | None = None
     if wished is not None:
         recipe, band = rows[best].recipe, outcomes[best].band
-        promise, limits = keep_limits(test, recipe, controller, neighbours, band, wished, fresh_loops, draw)
+        promise, limits = keep_limits(test, drawn_from, recipe, controller, band, wished, few, draw)
         if limits.margin is not None:
             model = get_model(controller)
             controller = watch_data(recipe, model, recipe.controller(model, asked.cost, limits, ahead), measured)
-    fresh, blind = run_fresh_loops(test, controller, neighbours, fresh_loops, draw) if fresh_loops else (None, [])
     held_inputs = next(one.u_reference for one in test.conditions if one.gain == 1.0)
-    blind += find_blind_reference(test.episodes, asked, neighbours, held_inputs)
-    if fresh_loops:
+    fresh, blind = None, find_blind_reference(test.episodes, asked, neighbours, held_inputs)
+    if few:
+        fast = speed_up(controller)
+        count = MANY if loops is None and isinstance(fast, Compiled) else few
+        fresh = run_fresh_loops(drawn_from, fast, count, draw)
+        blind = [*describe_outside(test.episodes, asked, fresh), *blind]
         blind += find_blind_range(test.episodes, asked, neighbours)
-        blind += compare_longer_horizon(test, rows[best].recipe, controller, neighbours, draw)
+        blind += compare_longer_horizon(drawn_from, rows[best].recipe, controller, draw)
     controller.reset()
     remembered = [] if not hidden else [f"{memory}; models with delays were tried"]
     if hidden and not rows[best].recipe.candidate.delays:

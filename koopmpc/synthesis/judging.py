@@ -25,6 +25,7 @@ from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Nearness, Recipe
 from koopmpc.synthesis.cross_validation import drop_fold, select_fold
+from koopmpc.synthesis.fresh.acting import Acting
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.validate.scoring import AnyPredictor, score
@@ -183,14 +184,25 @@ class LostError(Exception):
 
 
 class Fenced(SimulatedPlant):
-    """A plant that ends the run where its state leaves the box from low to high."""
+    """A plant that ends the run where its state leaves the box from low to high; its inputs act as `acting` says."""
 
-    def __init__(self, step_map: Transition, low: Float[np.ndarray, " nx"], high: Float[np.ndarray, " nx"]) -> None:
+    def __init__(
+        self,
+        step_map: Transition,
+        low: Float[np.ndarray, " nx"],
+        high: Float[np.ndarray, " nx"],
+        acting: Acting | None = None,
+    ) -> None:
         super().__init__(step_map)
-        self._low, self._high = low, high
+        self._low, self._high, self._acting = low, high, acting
+        self._before: Float[np.ndarray, "1 nu"] | None = None
 
     def step(self, u: ArrayLike, disturbance: ArrayLike | None = None) -> Float[np.ndarray, " ny"]:
         """Return y of the next step, or end the run."""
+        if self._acting is not None:
+            now = np.array(u, dtype=np.float64)[None]
+            before = now if self._before is None else self._before
+            u, self._before = self._acting.change(now, before, np.zeros(1, dtype=np.int64))[0], now
         y = super().step(u, disturbance)
         if not ((y >= self._low) & (y <= self._high)).all():
             raise LostError
@@ -327,16 +339,17 @@ def run_on_surrogate(
     noise: float = 1.0,
     faults: Sequence[Fault] = (),
     observers: Sequence[StepObserver] = (),
+    acting: Acting | None = None,
 ) -> Run | None:
     """Return a closed loop on the plant of a surrogate, with the states without their past; None if it is lost.
 
     The run is lost if a state leaves the box. It is judged by the cost and the limits of the task. `noise` is a factor
-    on the noise of the surrogate.
+    on the noise of the surrogate, and `acting` says how the inputs act, by default as in the data.
     """
     states = surrogate.states
     try:
         run = simulate(
-            Fenced(plant, *box),
+            Fenced(plant, *box, acting),
             controller,
             x0=surrogate.start(x0),
             reference=reference,

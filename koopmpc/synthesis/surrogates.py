@@ -60,6 +60,11 @@ class Surrogate(Value):
         """Names of the states, without their past."""
         return self.model.states
 
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.model.inputs
+
     @raise_swallowed()
     def plant(self, gain: float = 1.0) -> StepMap:
         """Return the plant whose inputs act `gain` times as much as in the data; y is the state without its past."""

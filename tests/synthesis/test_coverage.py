@@ -63,9 +63,8 @@ class DrawnPool(LoopPool):
         needs = np.where(rng.uniform(size=count) < self.hopeless, np.inf, rng.exponential(0.1, count))
         return [DrawnLoop(np.array([need, 0.0]), 0, 1.0, 0, 0) for need in needs]
 
-    def run(self, controller, loop):
-        short = loop.x0[0] > controller
-        return LoopResult(1.0 + controller, 0.05 if short else 0.0)
+    def run(self, controller, loops, *, stretch=1):
+        return [LoopResult(1.0 + controller, 0.05 if loop.x0[0] > controller else 0.0) for loop in loops]
 
 
 def promise(seed, coverage=0.9, loops=60, hopeless=0.0, room=10.0):

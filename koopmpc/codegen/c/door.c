@@ -72,4 +72,29 @@ DOOR void koopmpc_runs(koopmpc_frame *f, koopmpc_whole *run, long runs) {
     run->reports += 4 * run->steps;
   }
 }
+
+/* One step of many controllers side by side, each with a state of its own; `which` names those that take it. */
+typedef struct {
+  long count, size, stride;
+  int first, measured;
+  const long *which;
+  char *states;
+  const double *Y, *rows, *W;
+  double *U;
+  int *reports;
+} koopmpc_abreast;
+DOOR void koopmpc_step_abreast(const koopmpc_abreast *all) {
+  const koopmpc_rows w = {all->W, KOOPMPC_HORIZON > 0 ? KOOPMPC_HORIZON : 1};
+  for (long i = 0; i < all->count; i++) {
+    const long e = all->which[i];
+    const koopmpc_rows reference = {all->rows + e * all->stride, KOOPMPC_HORIZON + 1};
+    double *u = all->U + e * KOOPMPC_NU, applied[KOOPMPC_NU];
+    koopmpc_report report;
+    for (int j = 0; j < KOOPMPC_NU; j++) applied[j] = u[j];
+    koopmpc_step((koopmpc_state *)(all->states + e * all->size), all->Y + e * KOOPMPC_NY, &reference,
+                 all->first ? 0 : applied, all->measured ? &w : 0, u, &report);
+    all->reports[2 * e] = (int)report.status;
+    all->reports[2 * e + 1] = (int)report.fallback;
+  }
+}
 #endif

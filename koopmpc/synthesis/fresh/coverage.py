@@ -11,15 +11,15 @@ from koopmpc import checks
 from koopmpc.control.limits import Limits
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.synthesis.asked import limit_margins
-from koopmpc.synthesis.candidates import Designed, Recipe
+from koopmpc.synthesis.candidates import Designed, Recipe, get_model
+from koopmpc.synthesis.fresh.abreast import speed_up
 from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool, LoopResult
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap
 from koopmpc.synthesis.fresh.promise import CoveragePromise
 from koopmpc.synthesis.fresh.tube import find_tube
 from koopmpc.synthesis.judging import LoopTest
-from koopmpc.validate.scoring import AnyPredictor
 
 SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)  # times the tube that are tried as a margin, the least one first
+ROUND = 20  # loops that are run before their failures are counted
 FINER = 2  # halvings between the last scale that fails and the first that holds
 
 
@@ -49,16 +49,11 @@ def check_coverage(coverage: float, loops: int) -> float:
     return share
 
 
-def get_model(controller: Any) -> AnyPredictor:
-    """Return the learned model of a designed controller."""
-    return getattr(controller, "predictor", None) or controller.model
-
-
 def keep_limits(
     test: LoopTest,
+    pool: LoopPool,
     recipe: Recipe,
     controller: Designed,
-    neighbours: NeighbourMap,
     band: Float[np.ndarray, "h nx"],
     coverage: float,
     loops: int,
@@ -75,7 +70,7 @@ def keep_limits(
     nx = len(asked.low)
     tube = find_tube(model, asked, width[0], np.asarray(rest.x)[:nx], np.asarray(rest.u))
     return promise_coverage(
-        LoopPool(asked, test.surrogates, neighbours, test.low, test.high),
+        pool,
         lambda limits: recipe.controller(model, asked.cost, limits, asked.horizon),
         width if tube is None else tube,
         limit_margins(asked, test.episodes),
@@ -150,10 +145,11 @@ def promise_coverage(
             found = True
         else:  # none holds: the one with the fewest failures of all loops
             every = [("none", plain), *widest]
-            counts = [_count_failures([pool.run(one.controller, loop) for loop in first]) for _, one in every]
+            counts = [_count_failures(pool.run(speed_up(one.controller), first)) for _, one in every]
             shape, chosen = every[int(np.argmin(counts))]
-    whole = [pool.run(chosen.controller, loop) for loop in first] if len(chosen.results) < loops else chosen.results
-    fresh = [pool.run(chosen.controller, loop) for loop in second]
+    fast = speed_up(chosen.controller)
+    whole = pool.run(fast, first) if len(chosen.results) < loops else chosen.results
+    fresh = pool.run(fast, second)
     promise = CoveragePromise(
         coverage=coverage,
         shape=shape,
@@ -194,14 +190,13 @@ def _count_failures(results: Sequence[LoopResult]) -> int:
 
 
 def _run_until(pool: LoopPool, controller: Any, loops: Sequence[DrawnLoop], allowed: int) -> list[LoopResult]:
-    """Return the results of loops, up to the one that is one failure too many."""
+    """Return the results of loops, up to the round with one failure too many."""
     results: list[LoopResult] = []
     failures = 0
-    for loop in loops:
-        results.append(pool.run(controller, loop))
-        failures += not results[-1].keeps
-        if failures > allowed:
-            break
+    while len(results) < len(loops) and failures <= allowed:
+        some = pool.run(controller, loops[len(results) : len(results) + ROUND])
+        results += some
+        failures += _count_failures(some)
     return results
 
 

@@ -1,20 +1,29 @@
-"""LoopPool: independent loops of a controller on stand-ins; each draws its stand-in, start, input gain and noise."""
+"""LoopPool: independent loops of a controller on stand-ins; each draws its stand-in, start, inputs, delay and noise."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.codegen.compiled import Compiled
 from koopmpc.loop.metrics import metrics, violation_shares
-from koopmpc.plants.plant import Transition
+from koopmpc.loop.run import Run
+from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.asked import DesignTask
-from koopmpc.synthesis.fresh.loops import GAIN, NEIGHBOURS, OF, draw_starts
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap
+from koopmpc.synthesis.fresh.abreast import Crowd, CrowdStep, run_abreast
+from koopmpc.synthesis.fresh.acting import Acting
+from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box
 from koopmpc.synthesis.judging import run_on_surrogate
 from koopmpc.synthesis.surrogates import Surrogate
 
 KEPT = 0.01  # a loop keeps its limits if it violates none by more than this share of its range
+NEIGHBOURS = 2 / 3  # share of the loops on nearest neighbours; the others are on learned models
+SHIFT = 0.05  # a fresh start is a start of the task moved by up to this share of the data's range
+GAIN = 0.1  # in fresh loops inputs act by up to this share more or less
+LATE = 0.1  # and up to this share of a step late
+ABREAST = 256  # loops that run side by side, at most: their controllers need about 0.1 MB each
 _PLACES = 4  # a loop begins at one of so many places of a long reference
 
 
@@ -26,6 +35,7 @@ class DrawnLoop(NamedTuple):
     gain: float
     first: int
     seed: int
+    late: float = 0.0
 
 
 class LoopResult(NamedTuple):
@@ -33,6 +43,7 @@ class LoopResult(NamedTuple):
 
     cost: float
     violation: float
+    run: Run | None = None
 
     @property
     def keeps(self) -> bool:
@@ -40,12 +51,23 @@ class LoopResult(NamedTuple):
         return self.violation <= KEPT
 
 
+def draw_starts(asked: DesignTask, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n nx"]:
+    """Return starts of the task, drawn at random, each moved a little inside the data's range and the limits."""
+    pool = np.unique(np.concatenate([asked.starts, asked.first_states]), axis=0)
+    if not any((asked.starts[0] == first).all() for first in asked.first_states):
+        pool = asked.starts  # the user has named them
+    picked = pool[rng.integers(len(pool), size=count)]
+    low, high = goal_box(asked)
+    moved = picked + SHIFT * (asked.high - asked.low) * rng.uniform(-1, 1, picked.shape)
+    return np.clip(moved, np.minimum(low, picked), np.maximum(high, picked))
+
+
 @dataclass(frozen=True, eq=False)
 class LoopPool:
     """The distribution of loops: two in three on bootstrapped nearest neighbours, the others on a learned model.
 
-    Starts are those of the task, moved by up to 5 % of the data's range. On nearest neighbours inputs act by up to
-    10 % more or less. A loop is lost if it leaves the box from `low` to `high`.
+    Starts are those of the task, moved by up to 5 % of the data's range. Inputs act by up to 10 % more or less, and up
+    to a tenth of a step late. A loop is lost if it leaves the box from `low` to `high`.
     """
 
     asked: DesignTask
@@ -53,48 +75,91 @@ class LoopPool:
     neighbours: NeighbourMap | None
     low: Float[np.ndarray, " nx"]
     high: Float[np.ndarray, " nx"]
-    _plants: dict[int, Transition] = field(default_factory=dict[int, Transition])
-    _inputs: dict[tuple[int, int], Float[np.ndarray, "T nu"]] = field(default_factory=dict[tuple[int, int], Any])
+    _plants: dict[int, StepMap] = field(default_factory=dict[int, StepMap])
+    _inputs: dict[int, Float[np.ndarray, "T nu"]] = field(default_factory=dict[int, Any])
 
     def draw(self, count: int, rng: np.random.Generator) -> list[DrawnLoop]:
         """Return independent loops."""
         starts, many = draw_starts(self.asked, count, rng), len(self.surrogates)
         places = rng.integers(many, size=count)
         if self.neighbours is not None:
-            places = np.where(rng.uniform(size=count) < NEIGHBOURS / OF, -1, places)
+            places = np.where(rng.uniform(size=count) < NEIGHBOURS, -1, places)
         gains = 1 + GAIN * rng.uniform(-1, 1, count)
         firsts = self.asked.late * rng.integers(_PLACES, size=count) // (_PLACES - 1)
         seeds = rng.integers(2**31, size=count)
+        late = LATE * rng.uniform(size=count)
         return [
-            DrawnLoop(starts[i], int(places[i]), float(gains[i]), int(firsts[i]), int(seeds[i])) for i in range(count)
+            DrawnLoop(starts[i], int(places[i]), float(gains[i]), int(firsts[i]), int(seeds[i]), float(late[i]))
+            for i in range(count)
         ]
 
-    def run(self, controller: Any, loop: DrawnLoop) -> LoopResult:
-        """Return what became of a loop."""
-        asked, place, own = self.asked, loop.place, self.neighbours
-        stand_in: Surrogate | NeighbourMap = self.surrogates[place]
-        if place < 0 and own is not None:
-            stand_in, plant = own, own.draw(np.random.default_rng(loop.seed), loop.gain)
-        else:
-            if place not in self._plants:
-                self._plants[place] = self.surrogates[place].plant()
-            plant = self._plants[place]
-        rows = asked.reference[loop.first : loop.first + asked.steps + 1]
-        key = max(place, 0), loop.first
-        if key not in self._inputs:
-            self._inputs[key] = self.surrogates[key[0]].find_reference_inputs(asked.cost, asked.limits, rows[:-1])
-        done = run_on_surrogate(
-            asked,
-            stand_in,
-            plant,
-            controller,
-            loop.x0,
-            box=(self.low, self.high),
-            reference=rows,
-            u_reference=self._inputs[key],
-            rng=loop.seed,
-        )
-        if done is None:
+    def run(self, controller: Any, loops: Sequence[DrawnLoop], *, stretch: int = 1) -> list[LoopResult]:
+        """Return what became of these loops, those of a controller in machine code side by side.
+
+        With a constant reference they take `stretch` times the steps of the task.
+        """
+        results: list[LoopResult] = [LoopResult(np.inf, np.inf)] * len(loops)
+        for place in sorted({loop.place for loop in loops}):
+            own = [i for i, loop in enumerate(loops) if loop.place == place]
+            for first in range(0, len(own), ABREAST):
+                some = own[first : first + ABREAST]
+                for i, run in zip(some, self._run_place(controller, [loops[i] for i in some], stretch), strict=True):
+                    results[i] = self._judge(run)
+        return results
+
+    def _judge(self, run: Run | None) -> LoopResult:
+        if run is None:
             return LoopResult(np.inf, np.inf)
-        cost, over = metrics(done).cost, float(violation_shares(done, asked.limit_sizes)[1:].max(initial=0.0))
-        return LoopResult(cost, over) if np.isfinite(cost) else LoopResult(np.inf, np.inf)
+        cost, over = metrics(run).cost, float(violation_shares(run, self.asked.limit_sizes)[1:].max(initial=0.0))
+        return LoopResult(cost, over, run) if np.isfinite(cost) else LoopResult(np.inf, np.inf)
+
+    def _run_place(self, controller: Any, loops: Sequence[DrawnLoop], stretch: int) -> list[Run | None]:
+        """Return the runs of loops that have one stand-in in common."""
+        asked, place, box = self.asked, loops[0].place, (self.low, self.high)
+        near = self.neighbours if place < 0 else None
+        stand_in: Surrogate | NeighbourMap = self.surrogates[max(place, 0)] if near is None else near
+        rows, held = zip(*(self._find_rows(loop, stretch) for loop in loops), strict=True)
+        acting = Acting(stand_in.middle, np.array([one.gain for one in loops]), np.array([one.late for one in loops]))
+        if isinstance(controller, Compiled):
+            crowd = Crowd(stand_in, acting, np.array([loop.x0 for loop in loops]), [loop.seed for loop in loops])
+            step = self._step_model(place)
+            if near is not None:
+                step = near.draw_many([np.random.default_rng(seed) for seed in crowd.seeds]).step
+            return run_abreast(asked, controller, crowd, step, np.array(rows), np.array(held), box)
+        return [
+            run_on_surrogate(
+                asked,
+                stand_in,
+                self._find_model(place) if near is None else near.draw(np.random.default_rng(loop.seed)),
+                controller,
+                loop.x0,
+                box=box,
+                reference=rows[i],
+                u_reference=held[i],
+                rng=loop.seed,
+                acting=acting.take(i),
+            )
+            for i, loop in enumerate(loops)
+        ]
+
+    def _find_rows(self, loop: DrawnLoop, stretch: int) -> tuple[Float[np.ndarray, "T1 nr"], Float[np.ndarray, "T nu"]]:
+        """Return the reference of a loop, and the inputs without cost."""
+        asked, place = self.asked, max(loop.place, 0)
+        given = not isinstance(asked.cost.u_target, str)  # by numbers, which count from the start of a loop
+        if place not in self._inputs:
+            every = asked.reference[:-1] if asked.moves or given else asked.reference[:1]
+            self._inputs[place] = self.surrogates[place].find_reference_inputs(asked.cost, asked.limits, every)
+        steps = asked.steps * (1 if asked.moves else stretch)
+        at = np.minimum(loop.first + np.arange(steps + 1), len(asked.reference) - 1)
+        held = self._inputs[place]
+        return asked.reference[at], held[np.minimum(at[:-1] - given * loop.first, len(held) - 1)]
+
+    def _find_model(self, place: int) -> StepMap:
+        """Return a learned model as a plant; each is built once."""
+        if place not in self._plants:
+            self._plants[place] = self.surrogates[place].plant()
+        return self._plants[place]
+
+    def _step_model(self, place: int) -> CrowdStep:
+        plant = self._find_model(max(place, 0))
+        return lambda Z, U, which: plant.rollouts(Z, U[:, None])[:, 1]

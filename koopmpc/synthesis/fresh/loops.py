@@ -1,33 +1,26 @@
 """run_fresh_loops: the loops of a chosen controller from fresh starts, and where they are outside the data."""
 
-from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from koopmpc.data.angles import find_angles
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.lifting.base import strip_unit
 from koopmpc.lifting.state import State
-from koopmpc.loop.metrics import metrics, violation_shares
-from koopmpc.plants.plant import Transition
 from koopmpc.synthesis.asked import DesignTask
-from koopmpc.synthesis.candidates import Designed, Recipe
+from koopmpc.synthesis.candidates import Designed, Recipe, get_model
 from koopmpc.synthesis.designed import BREAKS
+from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box, probe_range
 from koopmpc.synthesis.fresh.verdict import FreshLoops
-from koopmpc.synthesis.judging import LITTLE, Condition, LoopTest, run_on_surrogate
-from koopmpc.synthesis.surrogates import Surrogate
+from koopmpc.synthesis.judging import LITTLE
 from koopmpc.text import to_percent
 from koopmpc.validate.scoring import AnyPredictor
 
-NEIGHBOURS = 2  # so many loops of OF in a row are on nearest neighbours, the others on learned models
-OF = 3  # see NEIGHBOURS
-SHIFT = 0.05  # a fresh start is a start of the task moved by up to this share of the data's range
-GAIN = 0.1  # in fresh loops inputs act by up to this share more or less
 CORNERS = 8  # corners of the goal's range from which loops run, at most
 COMPARED = 12  # fresh loops in which two horizons are compared
 MUCH = 0.9  # a horizon that costs this share of the given one is much better
@@ -35,86 +28,41 @@ DRAWN = 400  # states outside the data that are kept for a picture, at most
 BLIND_RANGE = 0.3  # share of them outside the data above which a design says so
 BLIND = 0.05  # share of steps outside the data above which a design says where they are
 
-Row = tuple[float, float, float]  # cost, violation, share of the steps outside the data
-
-
-def draw_starts(asked: DesignTask, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n nx"]:
-    """Return starts of the task, drawn at random, each moved a little inside the data's range and the limits."""
-    pool = np.unique(np.concatenate([asked.starts, asked.first_states]), axis=0)
-    if not any((asked.starts[0] == first).all() for first in asked.first_states):
-        pool = asked.starts  # the user has named them
-    picked = pool[rng.integers(len(pool), size=count)]
-    low, high = goal_box(asked)
-    moved = picked + SHIFT * (asked.high - asked.low) * rng.uniform(-1, 1, picked.shape)
-    return np.clip(moved, np.minimum(low, picked), np.maximum(high, picked))
-
 
 def run_fresh_loops(
-    test: LoopTest,
-    controller: Designed,
-    neighbours: NeighbourMap,
-    loops: int,
-    rng: np.random.Generator,
-    *,
-    stretch: int = 1,
-) -> tuple[FreshLoops, list[str]]:
-    """Return the loops, and a sentence if many of their steps are outside the data.
+    pool: LoopPool, controller: Any, loops: int, rng: np.random.Generator, *, stretch: int = 1
+) -> FreshLoops:
+    """Return fresh loops, and loops from the corners of the goal's range, which are on nearest neighbours.
 
     With a constant reference they take `stretch` times the steps of the task.
-
-    Each loop on nearest neighbours draws one bootstrap sample of the episodes and keeps it. The others are on the
-    learned surrogates in turn. Loops from the corners of the goal's range are on nearest neighbours.
     """
-    asked, nominal = test.asked, [test.conditions[i] for i in test.nominal]
-    still = not asked.moves and stretch > 1
-    outside: list[tuple[Float[np.ndarray, "k nx"], Float[np.ndarray, "k nx"]]] = []
-
-    def run(one: Condition, x0: Float[np.ndarray, " nx"], gain: float, on_rows: bool, seed: int) -> Row:
-        stand_in: Surrogate | NeighbourMap = neighbours if on_rows else test.surrogates[one.surrogate]
-        plant: Transition = neighbours.draw(np.random.default_rng(seed), gain) if on_rows else test.plant(one)
-        rows = asked.reference[one.first : one.first + asked.steps + 1]
-        done = run_on_surrogate(
-            asked,
-            stand_in,
-            plant,
-            controller,
-            x0,
-            box=(test.low, test.high),
-            reference=np.repeat(rows, stretch, axis=0)[: stretch * asked.steps + 1] if still else rows,
-            u_reference=np.repeat(one.u_reference, stretch, axis=0) if still else one.u_reference,
-            rng=seed,
-        )
-        if done is None:
-            return (
-                np.inf,
-                np.inf,
-                float(neighbours.find_outside(neighbours.start(x0)[None], neighbours.middle[None])[0]),
-            )
-        share = 0.0
-        if neighbours.embedding is None:
-            away = neighbours.find_outside(done.X[:-1], done.U)
-            share = float(away.mean())
-            outside.append((done.X[:-1][away], done.X[:-1][:1]))
-        over = violation_shares(done, asked.limit_sizes)[1:]
-        return metrics(done).cost, float(over.max(initial=0.0)), share
-
-    starts = draw_starts(asked, loops, rng)
-    kinds = ["neighbours" if i % OF < NEIGHBOURS else "models" for i in range(loops)]
-    places: Int[np.ndarray, " loops"] = rng.integers(len(nominal), size=loops)
-    gains = 1 + GAIN * rng.uniform(-1, 1, loops)
-    seeds = rng.integers(2**31, size=loops + CORNERS)
-    results = [
-        run(nominal[int(places[i])], starts[i], float(gains[i]), kinds[i] == "neighbours", int(seeds[i]))
-        for i in range(loops)
-    ]
-    corners = _list_corners(asked, rng)
-    edges = [run(nominal[0], x0, 1.0, True, int(seeds[loops + i])) for i, x0 in enumerate(corners)]
-    cost, violation, share = np.array(results).reshape(-1, 3).T
-    corner_cost, corner_violation, corner_share = np.array(edges).reshape(-1, 3).T
-    away = np.concatenate([np.zeros((0, test.episodes.nx)), *(states for states, _ in outside)])
-    away = away[:: -(-len(away) // DRAWN) or 1]
-    fresh = FreshLoops(cost, violation, share, tuple(kinds), corner_cost, corner_violation, corner_share, away)
-    return fresh, _describe_outside(test.episodes, asked, neighbours, fresh, outside[: len(results)])
+    asked, near = pool.asked, pool.neighbours
+    assert near is not None, "a design has nearest rows"
+    drawn = pool.draw(loops, rng)
+    corners = [DrawnLoop(x0, -1, 1.0, 0, int(rng.integers(2**31))) for x0 in _list_corners(asked, rng)]
+    results = pool.run(controller, [*drawn, *corners], stretch=stretch)
+    share, away = np.zeros(len(results)), [np.zeros((0, len(asked.low)))]
+    begun = 0
+    for i, (result, loop) in enumerate(zip(results, [*drawn, *corners], strict=True)):
+        if result.run is None:
+            share[i] = float(near.find_outside(near.start(loop.x0)[None], near.middle[None])[0])
+        elif near.embedding is None:
+            X, outside = result.run.X[:-1], near.find_outside(result.run.X[:-1], result.run.U)
+            share[i], begun = outside.mean(), begun + bool(outside[0] and i < loops)
+            away += [X[outside]]
+    states = np.concatenate(away)
+    cost, violation = (np.array([getattr(result, name) for result in results]) for name in ("cost", "violation"))
+    return FreshLoops(
+        cost=cost[:loops],
+        violation=violation[:loops],
+        outside=share[:loops],
+        kinds=tuple(["neighbours" if loop.place < 0 else "models" for loop in drawn]),
+        corner_cost=cost[loops:],
+        corner_violation=violation[loops:],
+        corner_outside=share[loops:],
+        outside_states=states[:: -(-len(states) // DRAWN) or 1],
+        begun_outside=begun,
+    )
 
 
 def find_blind_range(data: Episodes, asked: DesignTask, neighbours: NeighbourMap) -> list[str]:
@@ -150,29 +98,19 @@ def _list_corners(asked: DesignTask, rng: np.random.Generator) -> Float[np.ndarr
     return np.where(rng.uniform(size=(CORNERS, len(low))) < 0.5, low, high)
 
 
-def _describe_outside(
-    data: Episodes,
-    asked: DesignTask,
-    neighbours: NeighbourMap,
-    fresh: FreshLoops,
-    outside: Sequence[tuple[Float[np.ndarray, "k nx"], Float[np.ndarray, "1 nx"]]],
-) -> list[str]:
-    """Return one sentence that says where the loops are outside the data, and what to record."""
-    share = float(fresh.outside.mean()) if len(fresh.outside) else 0.0
-    points = [away for away, _ in outside if len(away)]
-    if share <= BLIND or not points:
+def describe_outside(data: Episodes, asked: DesignTask, fresh: FreshLoops) -> list[str]:
+    """Return one sentence that says where many steps of the loops are outside the data, and what to record."""
+    share, X = float(fresh.outside.mean()) if len(fresh.outside) else 0.0, fresh.outside_states
+    if share <= BLIND or not len(X):
         return []
-    X = np.concatenate(points)
     size = np.where(asked.high > asked.low, asked.high - asked.low, 1.0)
-    center = np.median(X, axis=0)
-    spread = np.ptp(np.concatenate([X, X[:1]]), axis=0) / size
+    center, spread = np.median(X, axis=0), np.ptp(X, axis=0) / size
     named = np.argsort(spread, kind="stable")[: min(2, data.nx)]
     places = ", ".join(f"{strip_unit(data.states[i])} near {center[i]:.3g}" for i in sorted(map(int, named)))
-    begun = sum(bool(len(away)) and bool((away[0] == first[0]).all()) for away, first in outside)
     return [
         f"{to_percent(share)} of the steps of fresh loops lie outside the data, most of them with {places}; "
-        f"{begun} of {len(outside)} loops begin there: record episodes that start and pass there, with inputs like "
-        "those of the loop"
+        f"{fresh.begun_outside} of {len(fresh.outside)} loops begin there: record episodes that start and pass there, "
+        "with inputs like those of the loop"
     ]
 
 
@@ -207,19 +145,15 @@ def watch_data(recipe: Recipe, model: AnyPredictor, controller: Designed, data: 
         return controller
 
 
-def compare_longer_horizon(
-    test: LoopTest, recipe: Recipe, controller: Designed, neighbours: NeighbourMap, rng: np.random.Generator
-) -> list[str]:
+def compare_longer_horizon(pool: LoopPool, recipe: Recipe, controller: Designed, rng: np.random.Generator) -> list[str]:
     """Return a sentence if a horizon twice as long is much better, or keeps limits that the given one breaks.
 
     Both controllers run the same loops: from fresh starts, and from the corners of the goal's range.
     """
     N, seed = controller.horizon, int(rng.integers(2**31))
-    model: Any = getattr(controller, "predictor", None) or getattr(controller, "model", None)
-    longer = recipe.controller(model, controller.cost, controller.limits, 2 * N)
+    longer = recipe.controller(get_model(controller), controller.cost, controller.limits, 2 * N)
     short, long = (
-        run_fresh_loops(test, one, neighbours, COMPARED, np.random.default_rng(seed), stretch=2)[0]
-        for one in (controller, longer)
+        run_fresh_loops(pool, one, COMPARED, np.random.default_rng(seed), stretch=2) for one in (controller, longer)
     )
     costs = [np.concatenate([one.cost, one.corner_cost]) for one in (short, long)]
     over = [np.concatenate([one.violation, one.corner_violation]) for one in (short, long)]

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -155,13 +156,28 @@ class NeighbourMap(Value):
         """Return which of these states have no data around them, with inputs as they are on average."""
         return self._is_far(self.scale_states(X))
 
-    def draw(self, rng: np.random.Generator, gain: float = 1.0) -> "NeighbourPlant":
-        """Return a plant of one bootstrap sample of the episodes, whose inputs act `gain` times as in the data."""
-        number = int(self.episode.max()) + 1
-        counts = np.bincount(rng.integers(number, size=number), minlength=number)[self.episode].astype(np.float64)
-        if np.count_nonzero(counts) < self.near:
-            counts = np.ones(len(self.rows))
-        return NeighbourPlant(self, counts, gain)
+    @cached_property
+    def triangles(self) -> Float[np.ndarray, "P r r"]:
+        """For each episode the triangle of [v, 1, ζ⁺ − ζ], from which least squares on weighted episodes follow."""
+        table = np.hstack([self.rows, np.ones((len(self.rows), 1)), self.steps])
+        size = table.shape[1]
+        found = np.zeros((int(self.episode.max()) + 1, size, size))
+        for number, one in enumerate(found):
+            R = np.linalg.qr(table[self.episode == number], mode="r")
+            one[: len(R)] = R
+        return found
+
+    def draw(self, rng: np.random.Generator) -> "NeighbourPlant":
+        """Return a plant of one bootstrap sample of the episodes."""
+        return NeighbourPlant(self, self.draw_many([rng]))
+
+    def draw_many(self, rngs: Sequence[np.random.Generator]) -> "NeighbourPlants":
+        """Return a plant for each generator, each of one bootstrap sample of the episodes."""
+        number = len(self.triangles)
+        counts = np.array([np.bincount(rng.integers(number, size=number), minlength=number) for rng in rngs], float)
+        sizes = np.bincount(self.episode, minlength=number)
+        counts[((counts > 0) @ sizes) < self.near] = 1.0
+        return NeighbourPlants(self, counts.reshape(-1, number))
 
 
 def _regress(
@@ -177,24 +193,56 @@ def _regress(
     return np.hstack([Z[:, kept], np.sin(angles), np.cos(angles), U, W])
 
 
+class NeighbourPlants:
+    """x⁺ = F(x, u) of a NeighbourMap, for many loops at once, each with weights of the episodes (E, P) of its own."""
+
+    def __init__(self, map_: NeighbourMap, counts: Float[np.ndarray, "E P"]) -> None:
+        self._map, self._counts = map_, counts
+        n = map_.rows.shape[1] + 1
+        triangles = map_.triangles
+        tables = [(np.sqrt(one)[:, None, None] * triangles).reshape(-1, triangles.shape[1]) for one in counts]
+        fits: list[Any] = [np.linalg.lstsq(table[:, :n], table[:, n:], rcond=1e-10)[0] for table in tables]
+        self._affine: Float[np.ndarray, "E n nzeta"] = np.array(fits, dtype=np.float64).reshape(len(counts), n, -1)
+
+    def step(
+        self, Z: Float[np.ndarray, "n nzeta"], U: Float[np.ndarray, "n nu"], which: Int[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n nzeta"]:
+        """Return ζ⁺ of the plants `which`; NaN where ζ or u is not finite."""
+        one, Z_next = self._map, np.full(Z.shape, np.nan)
+        good = np.isfinite(Z).all(axis=1) & np.isfinite(U).all(axis=1)
+        if not good.any():
+            return Z_next
+        Z, U, which = Z[good], U[good], which[good]
+        V = one.scale_rows(Z, U)
+        found = one.tree.query(V, min(2 * one.near, len(one.rows)))
+        distance, places = (np.reshape(part, (len(V), -1)) for part in found)
+        affine, near = self._affine[which], one.rows[places]
+        width = 1.0001 * np.maximum(distance[:, -1:], 1e-12)
+        weight = self._counts[which[:, None], one.episode[places]] * (1 - (distance / width) ** 3) ** 3
+        total = weight.sum(axis=1)
+        share = weight / np.where(total > 0, total, 1.0)[:, None]
+        missed = one.steps[places] - near @ affine[:, :-1] - affine[:, -1:]
+        center, mean = (np.einsum("ek,eki->ei", share, rows) for rows in (near, missed))
+        D = near - center[:, None]
+        weighed = (D * share[..., None]).swapaxes(1, 2)
+        S = weighed @ D
+        tilt = RIDGE * np.einsum("eii->ei", S).max(axis=1) + 1e-300
+        S = np.where((total > 0)[:, None, None], S + tilt[:, None, None] * np.eye(S.shape[1]), np.eye(S.shape[1]))
+        slope = np.asarray(np.linalg.solve(S, weighed @ (missed - mean[:, None])), dtype=np.float64)
+        change = np.einsum("ei,eij->ej", V, affine[:, :-1]) + affine[:, -1]
+        Z_next[good] = Z + change + mean + np.einsum("ei,eij->ej", V - center, slope)
+        return Z_next
+
+
 class NeighbourPlant:
-    """x⁺ = F(x, u) of a NeighbourMap with a weight for each of its rows; see `NeighbourMap.draw`."""
+    """The first of `NeighbourPlants`, a Transition."""
 
     scene: Scene | None = None
 
-    def __init__(self, map_: NeighbourMap, counts: Float[np.ndarray, " M"], gain: float) -> None:
-        self._map, self._gain, self._counts = map_, gain, counts
-        self.dt, self.inputs, self.outputs = map_.dt, map_.inputs, map_.states
+    def __init__(self, map_: NeighbourMap, plants: NeighbourPlants) -> None:
+        self._plants, self._first = plants, np.zeros(1, dtype=np.int64)
+        self.nx, self.dt, self.inputs, self.outputs = map_.steps.shape[1], map_.dt, map_.inputs, map_.states
         self.states = map_.states if map_.embedding is None else map_.embedding.names
-        root = np.sqrt(counts)[:, None]
-        table = np.hstack([map_.rows, np.ones((len(map_.rows), 1))])
-        self._affine = np.linalg.lstsq(root * table, root * map_.steps, rcond=1e-10)[0]
-        self._missed = map_.steps - table @ self._affine
-
-    @property
-    def nx(self) -> int:
-        """Size of ζ."""
-        return self._map.steps.shape[1]
 
     def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
         """Return the state without its past."""
@@ -202,29 +250,8 @@ class NeighbourPlant:
 
     def __call__(self, x: ArrayLike, u: ArrayLike) -> Float[np.ndarray, " nzeta"]:
         """x⁺ = F(x, u)."""
-        one = self._map
         zeta, driven = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
-        driven = one.middle + self._gain * (driven - one.middle)
-        v = one.scale_rows(zeta[None], driven[None])[0]
-        if not np.isfinite(v).all():
-            return np.full_like(zeta, np.nan)
-        distance, found = one.tree.query(v, min(2 * one.near, len(one.rows)))
-        places, distance = np.atleast_1d(found), np.atleast_1d(distance)
-        weight = self._counts[places]
-        width = 1.0001 * max(float(distance[-1]), 1e-12)
-        weight = weight * (1 - (distance / width) ** 3) ** 3
-        total = weight.sum()
-        value: Float[np.ndarray, " nzeta"] = np.append(v, 1.0) @ self._affine
-        if total > 0:
-            near, missed = one.rows[places], self._missed[places]
-            share = weight / total
-            center, mean = share @ near, share @ missed
-            D = near - center
-            S = (D * share[:, None]).T @ D
-            S[np.diag_indices_from(S)] += RIDGE * S.diagonal().max() + 1e-300
-            slope = np.asarray(np.linalg.solve(S, (D * share[:, None]).T @ (missed - mean)), dtype=np.float64)
-            value = np.asarray(value + mean + (v - center) @ slope, dtype=np.float64)
-        return zeta + value
+        return self._plants.step(zeta[None], driven[None], self._first)[0]
 
 
 def goal_box(asked: DesignTask) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:

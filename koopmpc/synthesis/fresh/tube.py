@@ -1,7 +1,5 @@
 """Tubes: how far the errors of a model can move a loop from its plan, step by step, under a local feedback."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 
@@ -10,7 +8,6 @@ from koopmpc.errors import KoopmpcError
 from koopmpc.synthesis.asked import DesignTask
 from koopmpc.validate.scoring import AnyPredictor
 
-_DIFFERENCE = 1e-5  # step of the derivatives, as a share of the range of a state or input
 _ITERATIONS = 10_000  # of the Riccati equation
 _SLACK = 1e-6  # weight of the states in the feedback of the tube, as a share of 1 / range², beside those of the cost
 _RESTED = 1e-4  # the tube ends once a step widens it by less than this share
@@ -50,11 +47,10 @@ def find_tube(
     try:
         at = model.step_map().linearize(x, u)
         A, B = at.A, at.B
-        n, of = len(A), asked.cost.of.bind(model.states)
-        Q, R = asked.cost.matrices(of.nz, B.shape[1])
-        J = _differentiate(of, x, asked.high - asked.low)
-        size = np.maximum(asked.high - asked.low, 1e-12)
-        weight = J.T @ Q @ J + _SLACK * float(np.trace(J.T @ Q @ J @ np.diag(size**2))) / n * np.diag(1 / size**2)
+        n, size = len(A), np.maximum(asked.high - asked.low, 1e-12)
+        R = asked.cost.matrices(asked.reference.shape[1], B.shape[1])[1]
+        tracked = asked.weigh_states(x, model.states, B.shape[1])
+        weight = tracked + _SLACK * float(np.trace(tracked @ np.diag(size**2))) / n * np.diag(1 / size**2)
         stage = one_step(A, B, weight, R + 1e-9 * np.eye(len(R)) * max(float(np.trace(R)), 1e-9), None)
         K, _ = find_gain(stage, stationary(stage, _ITERATIONS).P)
     except (KoopmpcError, np.linalg.LinAlgError):
@@ -65,13 +61,3 @@ def find_tube(
     widths = propagate_errors(loop, error, _LONGEST)
     still = np.flatnonzero((np.diff(widths, axis=0) <= _RESTED * widths[:-1] + 1e-300).all(axis=1))
     return widths[: int(still[0]) + 2] if still.size else widths
-
-
-def _differentiate(f: Any, point: Float[np.ndarray, " n"], span: Float[np.ndarray, " n"]) -> Float[np.ndarray, "m n"]:
-    """Return ∂f at a point, by central differences."""
-    columns: list[np.ndarray] = []
-    for i, width in enumerate(_DIFFERENCE * np.maximum(span, 1e-12)):
-        move = np.zeros(len(point))
-        move[i] = width
-        columns.append((np.asarray(f(point + move)) - np.asarray(f(point - move))) / (2 * width))
-    return np.column_stack(columns)

@@ -30,6 +30,8 @@ class FreshLoops(Value):
         (corners,) the same of loops from the corners of the goal's range, which say nothing of a probability.
     outside_states
         (n, nx) states of the loops that have no data around them, at most 400.
+    begun_outside
+        Number of loops that begin outside the data.
     """
 
     cost: Float[np.ndarray, " loops"]
@@ -40,6 +42,7 @@ class FreshLoops(Value):
     corner_violation: Float[np.ndarray, " corners"]
     corner_outside: Float[np.ndarray, " corners"]
     outside_states: Float[np.ndarray, "n nx"]
+    begun_outside: int = 0
 
     @property
     def counts(self) -> dict[str, int]:

@@ -1,0 +1,124 @@
+"""Closed loops side by side: controllers in machine code and stand-ins in numpy step all loops at once."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from koopmpc.codegen.compiled import Compiled, NoCompilerWarning, compiled
+from koopmpc.control.move import Fallback, Status
+from koopmpc.errors import KoopmpcError
+from koopmpc.loop.run import Run
+from koopmpc.plants.routines import find_compiler
+from koopmpc.synthesis.asked import DesignTask
+from koopmpc.synthesis.fresh.acting import Acting
+from koopmpc.synthesis.fresh.neighbours import NeighbourMap
+from koopmpc.synthesis.surrogates import Surrogate
+
+# ζ⁺ of the loops `which` from their ζ (n, nzeta) and u (n, nu)
+CrowdStep = Callable[
+    [Float[np.ndarray, "n nzeta"], Float[np.ndarray, "n nu"], Int[np.ndarray, " n"]], Float[np.ndarray, "n nzeta"]
+]
+Box = tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]
+_STATUS, _FALLBACK = list(Status), list(Fallback)
+
+
+def speed_up(controller: Any) -> Any:
+    """Return the controller in machine code; itself without a compiler, and where no C code can be generated."""
+    if find_compiler() is None:
+        return controller
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NoCompilerWarning)
+            return compiled(controller)
+    except KoopmpcError:
+        return controller
+
+
+@dataclass(frozen=True, eq=False)
+class Crowd:
+    """Loops that have one stand-in in common.
+
+    Attributes
+    ----------
+    stand_in
+        What stands in for the plant.
+    acting
+        How the inputs of each loop act.
+    starts
+        (E, nx) first states.
+    seeds
+        The seed of each loop's measurement noise, as `simulate` draws it.
+    """
+
+    stand_in: Surrogate | NeighbourMap
+    acting: Acting
+    starts: Float[np.ndarray, "E nx"]
+    seeds: Sequence[int]
+
+    def draw_noise(self, steps: int) -> Float[np.ndarray, "E T1 nx"]:
+        """Return the measurement noise of each loop."""
+        shape = steps + 1, len(self.stand_in.noise)
+        return (
+            np.array([np.random.default_rng(seed).standard_normal(shape) for seed in self.seeds]) * self.stand_in.noise
+        )
+
+
+def run_abreast(
+    asked: DesignTask,
+    controller: Compiled,
+    crowd: Crowd,
+    step: CrowdStep,
+    reference: Float[np.ndarray, "E T1 nr"],
+    u_reference: Float[np.ndarray, "E T nu"],
+    box: Box,
+) -> list[Run | None]:
+    """Return the same loops as `run_on_surrogate` one by one, with its draws; None for one that left the box."""
+    stand_in, (E, T1, _), N, nx = crowd.stand_in, reference.shape, controller.horizon, len(crowd.stand_in.states)
+    Z = np.array([stand_in.start(x0) for x0 in crowd.starts])
+    noise = crowd.draw_noise(T1 - 1)
+    rows = np.concatenate([reference, np.repeat(reference[:, -1:], N, axis=1)], axis=1)
+    W = np.tile(stand_in.w, (N + 1, 1)) if len(stand_in.w) else None
+    fleet = controller.start_abreast(rows, Z if Z.shape[1] == nx else None, W)
+    X, U = np.full((E, T1, nx), np.nan), np.zeros((E, T1 - 1, controller.nu))
+    reports = np.zeros((E, T1 - 1, 2), dtype=np.int64)
+    X[:, 0] = Z[:, :nx]
+    Y, alive = X + noise, np.ones(E, dtype=bool)
+    for k in range(T1 - 1):
+        which = np.flatnonzero(alive)
+        if not which.size:
+            break
+        U[which, k] = fleet.step(k, Y[:, k], which)[which]
+        reports[which, k] = fleet.reports[which]
+        Z[which] = step(Z[which], crowd.acting.change(U[which, k], U[which, max(k - 1, 0)], which), which)
+        X[which, k + 1] = Z[which, :nx]
+        Y[which, k + 1] = X[which, k + 1] + noise[which, k + 1]
+        alive[which] = ((X[which, k + 1] >= box[0]) & (X[which, k + 1] <= box[1])).all(axis=1)
+    nothing = np.zeros(T1 - 1)
+    return [
+        Run(
+            X=X[e],
+            Y=Y[e],
+            U=U[e],
+            reference=reference[e],
+            status=tuple([_STATUS[int(i)] for i in reports[e, :, 0]]),
+            fallback=tuple([_FALLBACK[int(i)] for i in reports[e, :, 1]]),
+            solve_time=nothing,
+            iterations=nothing.astype(np.int64),
+            slack=nothing,
+            cost=asked.cost,
+            limits=asked.limits,
+            u_reference=u_reference[e],
+            dt=controller.dt,
+            states=stand_in.states,
+            inputs=stand_in.inputs,
+            outputs=stand_in.states,
+            angles=asked.angles,
+        )
+        if alive[e]
+        else None
+        for e in range(E)
+    ]
