@@ -22,8 +22,8 @@ from koopmpc.synthesis.surrogates import Surrogate
 CrowdStep = Callable[
     [Float[np.ndarray, "n nzeta"], Float[np.ndarray, "n nu"], Int[np.ndarray, " n"]], Float[np.ndarray, "n nzeta"]
 ]
-Box = tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]
-_STATUS, _FALLBACK = list(Status), list(Fallback)
+_STATUS = list(Status)
+_FALLBACK = list(Fallback)
 
 
 def speed_up(controller: Any) -> Any:
@@ -74,7 +74,7 @@ def run_abreast(
     step: CrowdStep,
     reference: Float[np.ndarray, "E T1 nr"],
     u_reference: Float[np.ndarray, "E T nu"],
-    box: Box,
+    box: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
 ) -> list[Run | None]:
     """Return the same loops as `run_on_surrogate` one by one, with its draws; None for one that left the box."""
     stand_in, (E, T1, _), N, nx = crowd.stand_in, reference.shape, controller.horizon, len(crowd.stand_in.states)
