@@ -13,6 +13,7 @@ from koopmpc.checks import numbers
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.move import Controller, Fallback, Move, Plan
 from koopmpc.control.program import Program, Published, SavedController, no_export
+from koopmpc.control.watching import StepWatch
 from koopmpc.errors import DataError
 
 
@@ -30,14 +31,17 @@ class Guarded(Published):
         Any controller of the same plant that needs no model of where it is: an LQR, a safe feedback.
     patience
         Unknown steps in sequence after which the second takes over. Of 100 steps like the data about 2 are unknown.
+    region
+        Count a step as unknown only where state and input lie outside the data, and not where the measurement alone
+        differs from its prediction: a plant that has changed is the business of an estimator.
 
     Raises
     ------
     DataError
-        One is no controller; the two have another dt or number of inputs.
+        One is no controller; the two have another dt or number of inputs; `region` without a monitor.
     """
 
-    def __init__(self, controller: Controller, standby: Controller, *, patience: int = 3) -> None:
+    def __init__(self, controller: Controller, standby: Controller, *, patience: int = 3, region: bool = False) -> None:
         for what, one in (("the controller", controller), ("the one that stands by", standby)):
             checks.members(
                 one, what, ("dt", "nu", "horizon", "reset"), "pass a KoopmanMPC, an LQR or another Controller"
@@ -52,6 +56,9 @@ class Guarded(Published):
         self.dt, self.nu = controller.dt, controller.nu
         self.horizon = max(controller.horizon, standby.horizon)
         self._patience = checks.count(patience, "patience")
+        self._watch: StepWatch | None = getattr(controller, "watch", None) if region else None
+        if region and self._watch is None:
+            raise DataError("region=True asks the controller's monitor; give it monitor=data")
         self._forget()
 
     def as_data(self) -> SavedController:
@@ -62,7 +69,7 @@ class Guarded(Published):
         DataError
             One of the two cannot be saved as data.
         """
-        options: dict[str, Any] = {"patience": self._patience}
+        options: dict[str, Any] = {"patience": self._patience, "region": self._watch is not None}
         for name, part in (("controller", self.controller), ("standby", self.standby)):
             if not isinstance(part, Published):
                 raise DataError(f"a {type(part).__name__} is not a controller of koopmpc and cannot be saved as data")
@@ -116,7 +123,8 @@ class Guarded(Published):
         second = self.standby(y, _ahead(rows, self.standby), got, w)
         if first.known is None:
             raise DataError("the controller does not say whether it knows; give it monitor=data")
-        against = first.known if self.handed_over else not first.known
+        known = first.known if self._watch is None else self._watch.inside
+        against = known if self.handed_over else not known
         self._in_sequence = self._in_sequence + 1 if against else 0
         if self._in_sequence >= self._patience:
             self.handed_over, self._in_sequence = not self.handed_over, 0

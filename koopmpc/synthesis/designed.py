@@ -266,7 +266,7 @@ class Design:
         """Return a new `km.supervise.Guarded`: `controller`, and the plain linear `standby` outside the data.
 
         A lifted model that has left its data may have the wrong sign there; a linear one goes on straight. Measured on
-        two vessels that no log had so far apart, see docs/closed_loop.md.
+        two vessels that no log had so far apart, see docs/closed_loop.md. A misfit inside the data hands nothing over.
 
         Parameters
         ----------
@@ -284,7 +284,7 @@ class Design:
                 "than 100 rows for a monitor; pass such a candidate, or more data"
             )
         main = build_controller(self.controller.as_data())
-        return Guarded(main, build_controller(self.standby.as_data()), patience=patience)
+        return Guarded(main, build_controller(self.standby.as_data()), patience=patience, region=True)
 
     def starts_to_record(self, count: int = 8) -> Float[np.ndarray, "n nx"]:
         """Return states of the goal's range that have no data around them: episodes from there make it known.

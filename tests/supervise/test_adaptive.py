@@ -142,6 +142,32 @@ def test_only_so_many_unknown_steps_in_sequence_hand_over_and_as_many_known_ones
         assert {move.solve_time for move in moves} == {0.5}  # of both
 
 
+def test_by_region_a_plant_that_has_changed_hands_nothing_over_and_a_state_outside_the_data_does(
+    model, train, tmp_path
+):
+    """A stronger arm inside the data: its misfit is for an estimator, whatever the standby makes of it."""
+    standby = km.LQR(km.edmd(train, km.State()), km.Cost(Q=[100.0, 1.0], R=0.01), LIMITS)
+    handed: dict[tuple[bool, float], int] = {}
+    for region, speed in ((False, 0.0), (True, 0.0), (True, 40.0)):
+        first = km.KoopmanMPC(model, COST, LIMITS, HORIZON, monitor=train)
+        mpc = km.supervise.Guarded(first, standby, patience=2, region=region)
+        run = km.simulate(
+            DriftingArm(np.full(60, 3.0)),
+            mpc,
+            x0=[0.3, speed],
+            reference=[0.3, 0.0],
+            steps=40,
+            cost=COST,
+            limits=LIMITS,
+        )
+        handed[region, speed] = sum(one is km.control.Fallback.OTHER_CONTROLLER for one in run.fallback)
+        mpc.save(tmp_path / "guarded.npz")
+        assert km.load_controller(tmp_path / "guarded.npz").as_data().options["region"] is region
+    assert handed[True, 0.0] == 0 < min(handed[False, 0.0], handed[True, 40.0])
+    with pytest.raises(km.errors.DataError, match="region=True asks the controller's monitor"):
+        km.supervise.Guarded(km.KoopmanMPC(model, COST, LIMITS, HORIZON), standby, region=True)
+
+
 def test_guarded_controllers_must_agree_and_the_first_must_say_what_it_knows(model, train):
     first, other = km.KoopmanMPC(model, COST, LIMITS, HORIZON), km.LQR(model, COST, LIMITS)
     with pytest.raises(km.errors.DataError, match="does not say whether it knows; give it monitor=data"):
