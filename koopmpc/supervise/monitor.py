@@ -144,34 +144,41 @@ class Watch(Viewing):
 
     def __init__(self, monitor: Monitor, model: LinearPredictor | StateModel, latency: int) -> None:
         self.monitor, self._latency = monitor, latency
-        nx, n = len(monitor.band), len(monitor.leverage)
-        self._n, self._nu = n, n - monitor.lifting.nz
-        self._rows, self._found = np.zeros(2 * n), np.zeros(nx + n)  # two steps in turn: nothing is moved
-        self._matrices = np.zeros((2, nx + n, 2 * n))  # of the steps at which the first and the second half is new
-        self._matrices[0, nx:, :n] = self._matrices[1, nx:, n:] = monitor.leverage
+        self._n = len(monitor.leverage)
+        self._nu = self._n - monitor.lifting.nz
         self._psi = None if isinstance(model, LinearPredictor) else buffer_lifting(monitor.lifting)
+        self._lay_out(model, 0)
+        self.reset()
+
+    def _lay_out(self, model: LinearPredictor | StateModel, driven: int) -> None:
+        """Make the rows [ψ(x); u; d] of two steps in turn, so that nothing is moved, with `driven` entries of d."""
+        n, nx, width = self._n, len(self.monitor.band), self._n + driven
+        self._rows, self._found = np.zeros(2 * width), np.zeros(nx + n)
+        self._matrices = np.zeros((2, nx + n, 2 * width))  # of the steps at which the first and the second half is new
+        self._matrices[0, nx:, :n] = self._matrices[1, nx:, width : width + n] = self.monitor.leverage
         self.update(model)
         self._see()
-        self.reset()
 
     def _see(self) -> None:
         """Make the views; see `Viewing`."""
-        n, nx = self._n, len(self.monitor.band)
+        n, nx, width = self._n, len(self.monitor.band), len(self._rows) // 2
         nz = n - self._nu
-        halves = [(self._rows[low : low + nz], self._rows[low + nz : low + n]) for low in (0, n)]
-        self._halves = [(*halves[new], *halves[1 - new], self._matrices[new]) for new in (0, 1)]
+        halves = [np.split(self._rows[low : low + width], [nz, n]) for low in (0, width)]
+        self._halves = [(*halves[new], *halves[1 - new][:2], self._matrices[new]) for new in (0, 1)]
         self._error, self._reach = self._found[:nx], self._found[nx:]
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Compare with the predictions of another model from now on; region and band stay."""
         self._model, W = model, self.monitor.band
         if isinstance(model, LinearPredictor):
-            nx, n, nz = len(W), self._n, model.nz
+            nx, n, nz, width = len(W), self._n, model.nz, len(self._rows) // 2
             C = W @ model.C
-            for new, low, last in ((0, 0, n), (1, n, 0)):  # where the step and the one before it are
+            for new, low, last in ((0, 0, width), (1, width, 0)):  # where the step and the one before it are
                 self._matrices[new, :nx, last : last + n] = np.hstack([C @ model.A, C @ model.B])
                 self._matrices[new, :nx, low : low + nz] = -C
-            self._pushed = C @ model.E, C
+                if width > n:
+                    self._matrices[new, :nx, last + n : last + width] = C
+            self._pushed = C @ model.E
         learned = model.model if isinstance(model, LearnedMap) and not model.scheduled else None
         self._gain: Float[np.ndarray, "nx m"] | None = None
         if isinstance(learned, BilinearPredictor):  # its C and its ψ give the prediction without a call of its map
@@ -190,25 +197,34 @@ class Watch(Viewing):
     def look(self, start: InitialCondition, u: Float[np.ndarray, " nu"], applied: ArrayLike | None) -> bool:
         """Return whether the step that starts here, with input u, is known."""
         self._new = 1 - self._new
-        z, now, before, acted, matrix = self._halves[self._new]
+        z, now, d, before, acted, matrix = self._halves[self._new]
         if applied is not None and not self._latency:
             acted[:] = applied
-        if self._fast:  # most steps: a linear model, nothing that drives it, and the state as foretold
+        if self._fast:  # most steps: a linear model, no measured disturbance, and the state as foretold
             z[:] = start.z
             now[:] = u
-            matrix.dot(self._rows, self._found)
-            if self._found.dot(self._found) <= 1.0:  # both checks at once
+            if d.size:
+                d[:] = start.d
+            found = self._found
+            matrix.dot(self._rows, found)
+            if found.dot(found) <= 1.0:  # both checks at once
                 self.inside = self.fits = True
                 return True
-        psi, found, extra = self._psi, self._found, self._extra
+            reach, error = self._reach, self._error
+            self.inside, self.fits = bool(reach.dot(reach) <= 1.0), bool(error.dot(error) <= 1.0)
+            return self.inside and self.fits
+        psi, extra = self._psi, self._extra
         if psi is None:
-            z[:] = start.z
+            if start.d.size != d.size:  # the first step of a loop with an estimator
+                self._lay_out(self._model, start.d.size)
+                z, now, d, before, acted, matrix = self._halves[self._new]
+            z[:], d[:] = start.z, start.d
         else:
             psi.arguments[0][:] = start.z
             psi.evaluate()
             z[:] = psi.results[0]
         now[:] = u
-        matrix.dot(self._rows, found)
+        matrix.dot(self._rows, self._found)
         reach, error = self._reach, self._error
         self.inside = bool(reach.dot(reach) <= 1.0)
         if extra is not None and psi is None:
@@ -216,13 +232,11 @@ class Watch(Viewing):
         self.fits = self._first or bool(error.dot(error) <= 1.0)
         if psi is not None and not self._first:
             self.fits = self._matches_prediction(start, before, acted)
-        self._first, self._fast = False, psi is None and not start.drive.size
-        if psi is None and start.drive.size:
-            E, C = self._pushed
-            extra = E @ start.W[0] if start.W.size else np.zeros(len(C))
-            self._extra = extra + C @ start.d if start.d.size else extra
-        elif psi is not None:
+        self._first, self._fast = False, psi is None and not start.W.size  # the second step is as all after it
+        if psi is not None:
             self._keep_step(start, u)
+        elif start.W.size:
+            self._extra = self._pushed @ start.W[0]
         return self.inside and self.fits
 
     def _keep_step(self, start: InitialCondition, u: Float[np.ndarray, " nu"]) -> None:

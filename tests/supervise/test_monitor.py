@@ -80,6 +80,19 @@ def test_steps_like_the_data_are_known_and_a_changed_plant_is_not(model, data):
     assert driven(mpc, collected(rng=1, episodes=10, damping=3.0)).mean() < 0.7
 
 
+def test_the_verdict_of_each_step_is_that_of_its_two_norms(model, data):
+    mpc, rng, inside, fits = km.KoopmanMPC(model, COST, LIMITS, 15, monitor=data), np.random.default_rng(0), [], []
+    monitor, expected, x = mpc.watch.monitor, None, np.array([0.3, 0.0])
+    for k in range(80):
+        u, z = mpc(x, [0, 0]).u, model.lifting(x)
+        inside.append(np.linalg.norm(monitor.leverage @ np.concatenate([z, u])) <= 1)
+        fits.append(expected is None or np.linalg.norm(monitor.band @ (expected - x)) <= 1)
+        assert (mpc.watch.inside, mpc.watch.fits) == (inside[-1], fits[-1])
+        expected = model.C @ (model.A @ z + model.B @ u)
+        x = expected + rng.normal(0.0, 0.02 if k % 9 == 4 else 1e-4, 2) + 4.0 * (k % 13 == 12)
+    assert 5 < np.sum(inside) < 80 > np.sum(fits) > 5
+
+
 def test_a_state_or_an_input_beyond_the_data_is_unknown(model, data):
     mpc = km.KoopmanMPC(model, COST, LIMITS, 15, monitor=data)
     assert mpc([0.1, 0.2], [0, 0]).known
