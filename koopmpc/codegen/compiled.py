@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from threading import Lock
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,6 +19,8 @@ from koopmpc.checks import numbers
 from koopmpc.codegen.abreast import ControllersAbreast
 from koopmpc.codegen.sources import Language, write_one_source, write_plant_functions
 from koopmpc.codegen.tables import Precision, make_tables, read_program
+from koopmpc.control.limits import Limits
+from koopmpc.control.linear.condensed_program import CondensedProgram
 from koopmpc.control.linear.plan import planned_states
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, alone, busy
 from koopmpc.control.nonlinear.staged_program import StagedProgram
@@ -164,6 +166,15 @@ class _SingleFrame(ctypes.Structure):
     _fields_ = (*_FIELDS, ("slack", ctypes.c_float), ("refused", ctypes.c_int))
 
 
+_BOUNDS = ("u_low", "u_high", "du_low", "du_high", "x_low", "x_high")
+
+
+class _Bounds(ctypes.Structure):
+    """Rows of limits, as in C."""
+
+    _fields_ = tuple((name, _Rows) for name in _BOUNDS)
+
+
 class _Whole(ctypes.Structure):
     """The arguments and results of a whole run, as in C."""
 
@@ -211,6 +222,9 @@ class Compiled:
         self.dt, self.nu, self.horizon = program.dt, sizes["NU"], sizes["HORIZON"]
         self.cost, self.limits = getattr(controller, "cost", None), getattr(controller, "limits", None)
         self.model = program.model
+        self._bounds = program.bounds if isinstance(program, CondensedProgram) else None
+        self._timed = self._bounds is not None and self.limits is not None and self.limits.in_time
+        self._step, self._at_call = 0, None
         find = getattr(controller, "find_targets", None) if isinstance(program, StagedProgram) else None
         self._targets = None if find is None else TargetTable(find)
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # takes a linear plan and its start to the states
@@ -245,7 +259,10 @@ class Compiled:
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; see the original."""
-        kind = self._y.dtype
+        kind, self._step, self._at_call = self._y.dtype, 0, None
+        if u_prev is None and self._timed and self.limits is not None:
+            box = self.limits.input_rows(self.nu, self._sizes["LATENCY"], 1)
+            u_prev = np.clip(np.zeros(self.nu), box.low[0], box.high[0])
         start, last = (
             None if value is None else np.ascontiguousarray(checks.array(value, name, (size,)), kind)
             for value, name, size in ((x0, "x0", self._sizes["NX"]), (u_prev, "u_prev", self.nu))
@@ -260,8 +277,43 @@ class Compiled:
             self._table = self._targets.of(rows).astype(self._y.dtype)
             self._code.koopmpc_use_targets(_address(self._memory), _address(self._table), len(self._table))
 
+    def _pass_bounds(self, limits: Limits, first: int) -> None:
+        """Pass the limits from step `first` on to the C code."""
+        bounds, sizes, kind = self._bounds, self._sizes, self._y.dtype
+        assert bounds is not None, "only called where limits may move"
+        count, nx = sizes["HORIZON"] + 1, self.model.nx
+        outputs = limits.output_rows(nx, len(bounds.outputs) - nx, first, count)
+        boxes = limits.input_rows(self.nu, first, count), limits.rate_rows(self.nu, first, count)
+        ends = [*(end for box in boxes for end in box), *(end[:, bounds.outputs] for end in outputs)]
+        arrays = [np.ascontiguousarray(np.clip(end, -checks.HUGE, checks.HUGE), kind) for end in ends]
+        rows = _Bounds(*(_Rows(each.ctypes.data, count) for each in arrays))
+        self._code.koopmpc_bound(_address(self._memory), ctypes.c_void_p(ctypes.addressof(rows)))
+
+    def _move_limits(self, limits: Limits | None) -> None:
+        """Set the limits of this step: those of the call, or the controller's own."""
+        if limits is not None and self._bounds is None:
+            raise DataError(
+                "limits were passed, and this C code keeps its own; compile a KoopmanMPC or a LinearMPC whose limits have"
+                ' rows in time, or Limits(rows=("u_max",))'
+            )
+        if limits is not None:
+            if limits is not self._at_call:
+                original = cast("Any", self.original)
+                self._called_with = original.read_limits(limits)
+                original.check_limits(self._called_with)
+            self._at_call = limits
+            self._pass_bounds(self._called_with, 0)
+        elif self.limits is not None:
+            self._at_call = None
+            self._pass_bounds(self.limits, self._step)
+
     def __call__(
-        self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
+        self,
+        y: ArrayLike,
+        reference: ArrayLike,
+        applied: ArrayLike | None = None,
+        w: ArrayLike | None = None,
+        limits: Limits | None = None,
     ) -> Move:
         """Return the next input for measurement y; the arguments are those of the original."""
         try:
@@ -290,6 +342,9 @@ class Compiled:
                 self._aim(target)
             if applied is not None or w is not None or self._has_extras:
                 self._pass_extras(applied, w)
+            if limits is not None or self._timed or self._at_call is not None:
+                self._move_limits(limits)
+                self._step += 1
             self._call(self._pointer)
             u = self._u.copy() if self._is_double else self._u.astype(np.float64)
             if not frame.status and not frame.refused:
@@ -314,9 +369,9 @@ class Compiled:
         call this, and then wait for the measurement. It changes no move and no plan.
         """
         if self._targets is None or self._last_rows:
-            kept = self._memory.copy()
+            kept, step = self._memory.copy(), self._step
             self(self._y, self._reference[: self._count])
-            self._memory[:] = kept
+            self._memory[:], self._step = kept, step
 
     def _pass_extras(self, applied: ArrayLike | None, w: ArrayLike | None) -> None:
         """Pass `applied` and `w`, or that both are missing."""
@@ -381,7 +436,12 @@ class Compiled:
 
         `simulate` uses it if nothing between two steps needs Python.
         """
-        misfit = rows.shape[1] != self._nr or Y.shape[1] != self._ny or (W is not None and W.shape[1] != self._nw)
+        misfit = (
+            self._timed  # each step has limits of its own
+            or rows.shape[1] != self._nr
+            or Y.shape[1] != self._ny
+            or (W is not None and W.shape[1] != self._nw)
+        )
         code = None if misfit else self._compile_plant(plant)
         if code is None:
             return None
@@ -436,6 +496,8 @@ class Compiled:
         ShapeError
             Sizes do not fit.
         """
+        if self._timed:
+            raise DataError("the limits have rows in time, which Python passes step by step; use km.simulate")
         T = checks.count(steps, "steps")
         starts = checks.array(x0, "x0", (None, len(plant.states)))
         given = np.atleast_2d(checks.array(reference, "reference"))
@@ -491,7 +553,7 @@ class Compiled:
         return self.__copy__()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuild, (self.original, self.precision, self._memory)
+        return _rebuild, (self.original, self.precision, self._memory, self._step)
 
 
 def _run_arguments(
@@ -512,10 +574,12 @@ def _run_arguments(
     return whole
 
 
-def _rebuild(controller: Controller, precision: Precision, memory: Float[np.ndarray, " n"]) -> Controller:
+def _rebuild(
+    controller: Controller, precision: Precision, memory: Float[np.ndarray, " n"], step: int = 0
+) -> Controller:
     """Return the controller of a pickle, compiled here, in the state of the pickled one."""
     result = compiled(controller, precision=precision)
     if isinstance(result, Compiled) and result._memory.shape == memory.shape:
-        result._memory[:] = memory
+        result._memory[:], result._step = memory, step
         result._aim(np.zeros((0, result._nr)))  # the address of the table is another one here
     return result

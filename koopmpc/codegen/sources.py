@@ -15,7 +15,7 @@ from koopmpc.errors import DataError
 from koopmpc.plants.graph import Graph
 
 _OWN = ("koopmpc.h", "koopmpc_common.h", "koopmpc_common.c")
-_RECEDING = ("koopmpc_receding.h", "koopmpc_receding.c")
+_RECEDING = ("koopmpc_receding.h", "koopmpc_receding.c", "koopmpc_bounds.h")
 _QP = ("koopmpc_qp.h", "koopmpc_qp.c", "koopmpc_daqp.c")
 _STAGES = ("koopmpc_stages.h", "koopmpc_stages.c", "koopmpc_staged.c")
 _STAGED = (*_STAGES, "koopmpc_rest.c", "koopmpc_rows.c", "koopmpc_finish.c")
@@ -147,6 +147,7 @@ def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
         own = (*own, *(_QP if tables.sizes["FINISH_ROWS"] else ()))
     else:
         law = ("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")
+        law = (*law, *(["koopmpc_bounds.c"] if tables.sizes["BOUNDS"] else ()))
         own = (*_OWN, *_QP, "koopmpc_target.c", *law)
     result = {name: read_shipped("c", name) for name in own}
     result["koopmpc_sizes.h"] = _write_sizes(tables, single=single)

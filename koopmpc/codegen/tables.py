@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.control.limits import Interval
-from koopmpc.control.linear.condensed_program import CondensedProgram
+from koopmpc.control.linear.condensed_program import BoundsProgram, CondensedProgram
 from koopmpc.control.lqr import FeedbackProgram
 from koopmpc.control.nonlinear import motion
 from koopmpc.control.nonlinear.bilinear_mpc import SETTLED
@@ -69,6 +69,12 @@ _TABLE_NOTE = (
     "horizon costs there. Any other row may come at run time: the step that meets it finds its equilibrium from that "
     "of the nearest row, by up to 40 times 20 Gauss-Newton steps, and keeps it. To bound the time of a step, pass all "
     "rows to `export`."
+)
+
+
+_BOUNDS_NOTE = (
+    "Limits that move in time are arguments: call `koopmpc_set_bounds` before a step, with rows from that step on. "
+    "Until then, and after `koopmpc_init`, the widest bounds of the controller hold."
 )
 
 
@@ -142,7 +148,7 @@ def make_tables(program: StepProgram, *, single: bool) -> Tables:
     DataError
         A setting of the solver has no counterpart in C, or C code for this kind of Program is not known.
     """
-    sizes = {"IS_LQR": 0, "IS_STAGED": 0, "NU": program.model.nu, "NR": program.nr}
+    sizes = {"IS_LQR": 0, "IS_STAGED": 0, "BOUNDS": 0, "NU": program.model.nu, "NR": program.nr}
     embedding = None if isinstance(program.model, StepMap) else program.model.embedding
     steps, inputs_too = (0, 0) if embedding is None else (embedding.steps, int(embedding.inputs))
     sizes |= {"DELAYS": steps, "DELAYED_INPUTS": inputs_too, "NZETA": program.lifting.n, "NZ": program.lifting.m}
@@ -417,11 +423,31 @@ def _add_condensed(tables: Tables, program: CondensedProgram) -> None:
         "shift": np.asarray(qp.shift_dual, dtype=np.intc),
         "deviation": stack(program.deviation),
     }
+    if program.bounds is not None:
+        _add_bounds(tables, program.bounds, rated=program.rates is not None)
     if solver.metric is not None:
         values, V = np.linalg.eigh(solver.metric)
         tables.plan |= {"lambda": np.maximum(values, 0.0), "V": V, "MV": solver.M @ V}
     _add_estimator(tables, program)
     _add_memory(tables, moves, m, int(soft.sum()))
+
+
+def _add_bounds(tables: Tables, bounds: BoundsProgram, *, rated: bool) -> None:
+    """Write how rows of limits become those of the plan."""
+    tables.sizes |= {"BOUNDS": 1, "OUTPUTS": bounds.margin.shape[1], "CHANGES": int(rated)}
+    whole = {
+        "hold_first": bounds.first,
+        "hold_count": bounds.count,
+        "move_start": bounds.start,
+        "held": bounds.held,
+        "tied": bounds.tied,
+        "checked_limit": bounds.checked,
+        "hard": bounds.hard,
+    }
+    tables.plan |= {name: values.astype(np.intc).ravel() for name, values in whole.items()}
+    tables.plan |= {"inwards": bounds.margin.ravel(), "rate_allowance": bounds.allowance}
+    tables.targets["target_values"] = bounds.values
+    tables.notes.append(_BOUNDS_NOTE)
 
 
 def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None:

@@ -95,5 +95,5 @@ def test_prices_by_name_and_what_is_refused():
         km.LQR(model, km.Cost(Q=[1, 1], R=R, price=[0, 1]))
     with pytest.raises(DataError, match="infinite"):
         km.Cost(Q=1, R=R, price=[np.inf, 0])
-    obstacle = km.KoopmanMPC(model, km.Cost(Q=[1, 1], R=R, price=[0, 1]), LIMITS, N).program().obstacle
+    obstacle = km.BilinearMPC(model, km.Cost(Q=[1, 1], R=R, price=[0, 1]), LIMITS, N).program().obstacle
     assert "price" in obstacle

@@ -56,6 +56,15 @@ typedef struct {
   int refused;        /**< 1 if y was too far from its prediction, which stood in */
 } koopmpc_report;
 
+#if KOOPMPC_BOUNDS
+/** Limits from this step on: rows as those of a preview, row 0 that of this step; +-1e30 where there is no limit. */
+typedef struct {
+  koopmpc_rows u_low, u_high;   /**< KOOPMPC_NU numbers a row: of the inputs */
+  koopmpc_rows du_low, du_high; /**< KOOPMPC_NU numbers a row: of their changes; read if KOOPMPC_CHANGES is 1 */
+  koopmpc_rows x_low, x_high;   /**< KOOPMPC_OUTPUTS numbers a row: of the states, then the observables, with a limit */
+} koopmpc_bounds;
+#endif
+
 #if KOOPMPC_IS_LQR
 
 /** The state of the controller between two steps. */
@@ -162,6 +171,12 @@ typedef struct {
 #if KOOPMPC_STEEP
   koopmpc_real eased[KOOPMPC_QP_M * KOOPMPC_MOVES + 4 * KOOPMPC_QP_M]; /**< rows of the problem with an added weight */
 #endif
+#if KOOPMPC_BOUNDS
+  koopmpc_real low[KOOPMPC_NT], high[KOOPMPC_NT]; /**< limits of the plan, of its inputs, of targets */
+  koopmpc_real box_low[KOOPMPC_MOVES], box_high[KOOPMPC_MOVES], rate_low[KOOPMPC_NU], rate_high[KOOPMPC_NU];
+  koopmpc_real opened_low[KOOPMPC_MOVES], opened_high[KOOPMPC_MOVES];
+  koopmpc_real target_low[(KOOPMPC_N + 1) * KOOPMPC_NL], target_high[(KOOPMPC_N + 1) * KOOPMPC_NL];
+#endif
   int far;        /**< whether the last solution took proximal points */
   int resumes;    /**< whether the next solve continues from the active rows of this one */
   int unmet;      /**< whether the hard limits of the last solve contradicted each other */
@@ -196,6 +211,15 @@ void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *
  */
 void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *reference, const koopmpc_real *applied,
                   const koopmpc_rows *w, koopmpc_real *u, koopmpc_report *report);
+
+#if KOOPMPC_BOUNDS
+/**
+ * Set the limits of the next steps, until it is called again; koopmpc_init takes those of the controller.
+ * @param s      the state
+ * @param bounds the limits from this step on; lower ones must not be above upper ones
+ */
+void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *bounds);
+#endif
 
 /**
  * Write the inputs of the last plan.

@@ -64,9 +64,14 @@ int koopmpc_refuse(koopmpc_real *memory, const koopmpc_real *y, const koopmpc_re
 }
 #endif
 
-void koopmpc_admit(koopmpc_real *u, const koopmpc_real *low, const koopmpc_real *high, const koopmpc_real *last) {
+void koopmpc_admit_within(koopmpc_real *u, const koopmpc_real *low, const koopmpc_real *high, const koopmpc_real *last,
+                          const koopmpc_real *least, const koopmpc_real *most) {
   for (int i = 0; i < KOOPMPC_NU; i++) {
     if (low) u[i] = koopmpc_clip(u[i], last[i] + low[i], last[i] + high[i]);
-    u[i] = koopmpc_clip(u[i], koopmpc_input_low[i], koopmpc_input_high[i]);
+    u[i] = koopmpc_clip(u[i], least[i], most[i]);
   }
+}
+
+void koopmpc_admit(koopmpc_real *u, const koopmpc_real *low, const koopmpc_real *high, const koopmpc_real *last) {
+  koopmpc_admit_within(u, low, high, last, koopmpc_input_low, koopmpc_input_high);
 }

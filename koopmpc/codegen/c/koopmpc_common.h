@@ -60,6 +60,14 @@ void koopmpc_nearest(const koopmpc_real *r, const koopmpc_real *e, koopmpc_real 
 /** Coordinates of the nearest target inside the limits; 1 if a limit moved it. */
 int koopmpc_target(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha);
 
+/** The same inside the limits `low` and `high` of KOOPMPC_NL values. */
+int koopmpc_target_within(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *e, const koopmpc_real *least,
+                          const koopmpc_real *most, koopmpc_real *alpha);
+
+/** Clip the change of u since `last` to (low, high), unless `low` is NULL; then clip u to `least` and `most`. */
+void koopmpc_admit_within(koopmpc_real *u, const koopmpc_real *low, const koopmpc_real *high, const koopmpc_real *last,
+                          const koopmpc_real *least, const koopmpc_real *most);
+
 /** Clip the change of u since `last` to (low, high), unless `low` is NULL; then clip u to its limits. */
 void koopmpc_admit(koopmpc_real *u, const koopmpc_real *low, const koopmpc_real *high, const koopmpc_real *last);
 

@@ -7,6 +7,7 @@
  */
 #include <math.h>
 
+#include "koopmpc_bounds.h"
 #include "koopmpc_limits.h"
 #include "koopmpc_plan.h"
 #include "koopmpc_qp.h"
@@ -23,6 +24,18 @@
 static const koopmpc_real *given_row(const koopmpc_state *s, int k) {
   const int row = s->row + KOOPMPC_LATENCY + k;
   return koopmpc_given + KOOPMPC_NU * (row < KOOPMPC_GIVEN ? row : KOOPMPC_GIVEN - 1);
+}
+#endif
+
+#if KOOPMPC_AIMED
+/** Coordinates of the nearest target of row k inside its limits; 1 if a limit moved it. */
+static int target_of_row(koopmpc_state *s, int k, const koopmpc_real *e, koopmpc_real *alpha) {
+  const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
+#if KOOPMPC_BOUNDS
+  return koopmpc_target_within(s, row, e, s->target_low + k * KOOPMPC_NL, s->target_high + k * KOOPMPC_NL, alpha);
+#else
+  return koopmpc_target(s, row, e, alpha);
+#endif
 }
 #endif
 
@@ -63,7 +76,7 @@ static void aim(koopmpc_state *s, const koopmpc_rows *reference) {
 #if KOOPMPC_CHECKED_LIMITS /* checked when the disturbance is known */
         if (!repeated) koopmpc_nearest(row, 0, nearest);
 #else
-        if (!repeated && (moved = koopmpc_target(s, row, 0, alpha))) {
+        if ((KOOPMPC_BOUNDS || !repeated) && (moved = target_of_row(s, k, 0, alpha))) {
           koopmpc_nearest(row, 0, nearest);
           for (int i = 0; i < KOOPMPC_NA; i++) alpha[i] -= nearest[i];
         }
@@ -83,9 +96,10 @@ static void aim(koopmpc_state *s, const koopmpc_rows *reference) {
 }
 
 /** Whether entries first ... last - 1 of the plan are within their limits; NaN is not. */
-static int within(const koopmpc_real *t, int first, int last) {
+static int within(const koopmpc_state *s, int first, int last) {
+  const koopmpc_real *t = s->t, *low = KOOPMPC_PLAN_LOW(s), *high = KOOPMPC_PLAN_HIGH(s);
   int broken = 0;
-  for (int i = first; i < last; i++) broken |= !(t[i] >= koopmpc_low[i]) | !(t[i] <= koopmpc_high[i]);
+  for (int i = first; i < last; i++) broken |= !(t[i] >= low[i]) | !(t[i] <= high[i]);
   return !broken;
 }
 
@@ -114,17 +128,30 @@ static const koopmpc_qp problem = {MOVES,           ROWS,         KOOPMPC_QP_SOF
                                    koopmpc_scaling, 0,            koopmpc_sense,   koopmpc_linear,
                                    koopmpc_rho};
 
+/** The limits of row i of the QP. */
+#if KOOPMPC_BOUNDS
+static koopmpc_real row_limit(const koopmpc_real *plan, const koopmpc_real *opened, int i) {
+  const int at = koopmpc_source[i], change = KOOPMPC_CHANGES && at >= MOVES && at < 2 * MOVES;
+  return (change ? opened[at - MOVES] : plan[at]) * koopmpc_scale[i];
+}
+static koopmpc_real row_low(const koopmpc_state *s, int i) { return row_limit(s->low, s->opened_low, i); }
+static koopmpc_real row_high(const koopmpc_state *s, int i) { return row_limit(s->high, s->opened_high, i); }
+#else
+static koopmpc_real row_low(const koopmpc_state *s, int i) { return (void)s, koopmpc_qp_low[i]; }
+static koopmpc_real row_high(const koopmpc_state *s, int i) { return (void)s, koopmpc_qp_high[i]; }
+#endif
+
 /** Set the limits of a solve: distances from the plan. A rate limit widens if it excludes the input limits. */
 static koopmpc_real set_limits(const koopmpc_state *s, koopmpc_qp_memory *qp, int hard_alone) {
   koopmpc_real conflict = 0;
   for (int i = 0; i < ROWS; i++) {
     const koopmpc_real moved = s->t[koopmpc_source[i]] * koopmpc_scale[i];
-    koopmpc_real low = koopmpc_qp_low[i], high = koopmpc_qp_high[i];
+    koopmpc_real low = row_low(s, i), high = row_high(s, i);
     const int which = koopmpc_rate_input[i];
     if (which >= 0) { /* the first change of an input, hard: the input limit has precedence */
       const koopmpc_real last = s->known[KOOPMPC_U_PREV + which];
-      const koopmpc_real highest = (koopmpc_input_high[which] - last) * koopmpc_scale[i];
-      const koopmpc_real lowest = (koopmpc_input_low[which] - last) * koopmpc_scale[i];
+      const koopmpc_real highest = (KOOPMPC_BOX_HIGH(s)[which] - last) * koopmpc_scale[i];
+      const koopmpc_real lowest = (KOOPMPC_BOX_LOW(s)[which] - last) * koopmpc_scale[i];
       koopmpc_real past = 0;
       if (highest < low) past += low - highest, low = highest;
       if (lowest > high) past += lowest - high, high = lowest;
@@ -250,6 +277,11 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   s->resumes = 0;
   for (int i = 0; i < ROWS; i++) /* the last answer, shifted by one step */
     push[i] = s->warm && koopmpc_shift[i] < ROWS ? s->dual[koopmpc_shift[i]] : 0;
+#if KOOPMPC_BOUNDS
+  const koopmpc_real opened = koopmpc_open_rates(s);
+#else
+  const koopmpc_real opened = 0;
+#endif
   if (!resume && s->unmet && contradictory(s, qp)) return KOOPMPC_INFEASIBLE;
   conflict = set_limits(s, qp, 0);
   if (!resume && s->far) {
@@ -275,15 +307,15 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   }
 #endif
   if (!good) return status;
-  report->slack = conflict;
+  report->slack = conflict > opened ? conflict : opened;
   for (int i = 0; i < ROWS; i++) {
     const koopmpc_real dual = qp->dual[i];
     if (koopmpc_sense[i] && (dual < 0 || dual > 0) && koopmpc_abs(dual) >= (1 - (koopmpc_real)1e-9) * koopmpc_linear[i]) {
       const koopmpc_real unit = koopmpc_unit[i] * koopmpc_scale[i];
       const koopmpc_real value = koopmpc_dot(koopmpc_M + i * MOVES, qp->primal, MOVES) / koopmpc_scaling[i] / unit +
                                  s->t[koopmpc_source[i]];
-      const koopmpc_real over = value - koopmpc_qp_high[i] / koopmpc_scale[i];
-      const koopmpc_real under = koopmpc_qp_low[i] / koopmpc_scale[i] - value;
+      const koopmpc_real over = value - row_high(s, i) / koopmpc_scale[i];
+      const koopmpc_real under = row_low(s, i) / koopmpc_scale[i] - value;
       const koopmpc_real past = over > under ? over : under;
       if (past > koopmpc_allowance[i] && past > report->slack) report->slack = past;
     }
@@ -306,7 +338,7 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
     return;
   }
 #if KOOPMPC_CHECKED > 0
-  if (!within(s->t, PLANNED, KOOPMPC_NT)) { /* the disturbance moves a target outside its limits: take the nearest one inside */
+  if (!within(s, PLANNED, KOOPMPC_NT)) { /* the disturbance moves a target outside its limits: take the nearest one inside */
     koopmpc_real e[KOOPMPC_NZ], alpha[KOOPMPC_NA], nearest[KOOPMPC_NA];
     koopmpc_fill(e, 0, KOOPMPC_NZ);
     koopmpc_add(e, koopmpc_disturbance, KOOPMPC_NZ, s->known + KOOPMPC_PREVIEW, KOOPMPC_DRIVEN);
@@ -314,9 +346,9 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
       const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
       int repeated = k > 0;
       for (int i = 0; i < KOOPMPC_NR && repeated; i++) repeated = row[i] == row[i - KOOPMPC_NR];
-      if (!repeated) {
+      if (KOOPMPC_BOUNDS || !repeated) {
         koopmpc_nearest(row, e, nearest);
-        koopmpc_target(s, row, e, alpha);
+        target_of_row(s, k, e, alpha);
         for (int i = 0; i < KOOPMPC_NA; i++) alpha[i] -= nearest[i];
       }
       koopmpc_add(s->t, koopmpc_from_target + k * KOOPMPC_NA * PLANNED, PLANNED, alpha, KOOPMPC_NA);
@@ -324,7 +356,7 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
     changed = 1;
   }
 #endif
-  if (changed && within(s->t, 0, PLANNED)) {
+  if (changed && within(s, 0, PLANNED)) {
     unconstrained(s, u, report);
     return;
   }
@@ -339,8 +371,19 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
       return;
     }
     koopmpc_add(s->t, koopmpc_deviation, MOVES, qp.primal, MOVES);
+#if KOOPMPC_BOUNDS
+    koopmpc_real low[KOOPMPC_NU], high[KOOPMPC_NU];
+    for (int i = 0; i < MOVES; i++) s->t[i] = koopmpc_clip(s->t[i], s->box_low[i], s->box_high[i]);
+    for (int i = 0; i < KOOPMPC_NU; i++) {
+      low[i] = KOOPMPC_CHANGES && koopmpc_hard[i] ? s->rate_low[i] : -KOOPMPC_HUGE;
+      high[i] = KOOPMPC_CHANGES && koopmpc_hard[i] ? s->rate_high[i] : KOOPMPC_HUGE;
+    }
+    if (KOOPMPC_HARD_RATED)
+      koopmpc_admit_within(s->t, low, high, s->known + KOOPMPC_U_PREV, s->box_low, s->box_high);
+#else
     for (int i = 0; i < MOVES; i++) s->t[i] = koopmpc_clip(s->t[i], koopmpc_low[i], koopmpc_high[i]);
     if (KOOPMPC_HARD_RATED) koopmpc_admit(s->t, koopmpc_hard_rate_low, koopmpc_hard_rate_high, s->known + KOOPMPC_U_PREV);
+#endif
     keep(s, u, report, report->slack > 0 ? KOOPMPC_SOFTENED : KOOPMPC_OPTIMAL);
   }
 #else
@@ -363,7 +406,7 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
   koopmpc_take(s, y, applied, w);
   report->refused = s->refused;
   evaluate(s);
-  if (within(s->t, 0, KOOPMPC_NT))
+  if (within(s, 0, KOOPMPC_NT))
     unconstrained(s, u, report);
   else
     limited(s, applied, u, report);

@@ -1,6 +1,7 @@
 /** @file koopmpc_receding.c @brief The start of a plan, and the fallback of a failed step. */
 #include <math.h>
 
+#include "koopmpc_bounds.h"
 #include "koopmpc_limits.h"
 #include "koopmpc_observer.h"
 #include "koopmpc_receding.h"
@@ -249,13 +250,17 @@ void koopmpc_fail(koopmpc_state *s, const koopmpc_real *free_input, const koopmp
     if (free_input) chosen = free_input;
   }
   koopmpc_copy(u, chosen, KOOPMPC_NU);
-  koopmpc_admit(u, KOOPMPC_RATED ? koopmpc_rate_low : 0, koopmpc_rate_high, before);
+  koopmpc_admit_within(u, KOOPMPC_RATED ? KOOPMPC_RATES_LOW(s) : 0, KOOPMPC_RATES_HIGH(s), before, KOOPMPC_BOX_LOW(s),
+                       KOOPMPC_BOX_HIGH(s));
   koopmpc_copy(s->given, u, KOOPMPC_NU);
 }
 
 void koopmpc_start(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *u_prev) {
   const koopmpc_state empty = {0};
   *s = empty;
+#if KOOPMPC_BOUNDS
+  koopmpc_reset_bounds(s);
+#endif
   for (int i = 0; i < KOOPMPC_NU; i++)
     s->given[i] = u_prev ? u_prev[i] : koopmpc_clip(0, koopmpc_input_low[i], koopmpc_input_high[i]);
   for (int k = 0; k <= KOOPMPC_LATENCY; k++) koopmpc_copy(s->sent + k * KOOPMPC_NU, s->given, KOOPMPC_NU);

@@ -11,6 +11,11 @@ void koopmpc_nearest(const koopmpc_real *r, const koopmpc_real *e, koopmpc_real 
 }
 
 int koopmpc_target(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha) {
+  return koopmpc_target_within(s, r, e, koopmpc_target_low, koopmpc_target_high, alpha);
+}
+
+int koopmpc_target_within(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *e, const koopmpc_real *least,
+                          const koopmpc_real *most, koopmpc_real *alpha) {
   koopmpc_real low[KOOPMPC_NL], high[KOOPMPC_NL], value[KOOPMPC_NL];
   int outside = 0;
   koopmpc_nearest(r, e, alpha);
@@ -21,8 +26,8 @@ int koopmpc_target(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *
   for (int i = 0; i < KOOPMPC_NL; i++) {
     const koopmpc_real pushed = low[i];
     const koopmpc_real reach = KOOPMPC_ROUNDING * (koopmpc_abs(value[i]) + koopmpc_target_size[i]);
-    low[i] = koopmpc_target_low[i] - pushed;
-    high[i] = koopmpc_target_high[i] - pushed;
+    low[i] = least[i] - pushed;
+    high[i] = most[i] - pushed;
     outside |= value[i] < low[i] - reach || value[i] > high[i] + reach;
   }
   if (!outside) return 0;

@@ -10,6 +10,44 @@ from koopmpc.control.program import LinearProgram
 from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.solvers.daqp import DAQPSetup
 from koopmpc.estimate.observer import EstimatorProgram
+from koopmpc.values import Value
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BoundsProgram(Value):
+    """How rows of limits in time become the limits of a plan.
+
+    Attributes
+    ----------
+    first, count
+        (moves, nu) the first step of what holds the value of a move, and for how many steps it does.
+    start
+        (moves,) the first step of each move.
+    held, tied
+        Which moves keep the value of the one before; which of them have no limits of their own, one after the other.
+    margin
+        (N, outputs) by how much each stage moves the limits of outputs inwards.
+    values
+        What the limits of targets count from.
+    checked
+        The limits of targets that a plan is tested by.
+    hard, allowance
+        Which rates are hard, and by how much one may give way before that is reported.
+    outputs
+        Which of the states and observables have a limit, or may get one.
+    """
+
+    first: Int[np.ndarray, "moves nu"]
+    count: Int[np.ndarray, "moves nu"]
+    start: Int[np.ndarray, " moves"]
+    held: Bool[np.ndarray, "moves nu"]
+    tied: Bool[np.ndarray, " all_moves"]
+    margin: Float[np.ndarray, "N outputs"]
+    values: Float[np.ndarray, " nl"]
+    checked: Int[np.ndarray, " nc"]
+    hard: Bool[np.ndarray, " nu"]
+    allowance: Float[np.ndarray, " nu"]
+    outputs: Bool[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,6 +70,8 @@ class CondensedProgram(LinearProgram):
         Whether u_{−1} is part of what the plan starts from.
     hard_rates
         Hard limits of the changes of inputs, ±inf where one has none; None without.
+    bounds
+        How limits in time move the plan's; None where none do.
     M, low, high
         The plan's matrix, and the limits of t.
     offset, from_reference, from_target, from_given
@@ -67,3 +107,4 @@ class CondensedProgram(LinearProgram):
     deviation: Float[np.ndarray, "moves nw"]
     solver: DAQPSetup
     estimator: EstimatorProgram
+    bounds: BoundsProgram | None = None

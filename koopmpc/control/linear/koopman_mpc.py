@@ -13,7 +13,7 @@ from scipy.linalg.blas import dasum
 from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
 from koopmpc.control.base import MPCBase
-from koopmpc.control.cost import Cost, lifted_tracking
+from koopmpc.control.cost import Cost, add_held, lifted_tracking
 from koopmpc.control.horizon import Coordinates
 from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
@@ -21,7 +21,7 @@ from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.linear.condensed_program import CondensedProgram
 from koopmpc.control.linear.moving import MovingMap
 from koopmpc.control.linear.plan import plan_map, planned_states
-from koopmpc.control.linear.windows import LimitWindows, limit_windows
+from koopmpc.control.linear.windows import LimitWindows, describe_bounds, limit_windows
 from koopmpc.control.move import Fallback, Move, Plan, Status, alone, busy
 from koopmpc.control.program import linear_parts, no_export, publish_estimator, reference_table
 from koopmpc.control.solvers import FINISHER, exact_turn, order_solvers
@@ -225,13 +225,6 @@ class KoopmanMPC(MPCBase):
         plan, track = self._map, self._map.track
         if plan.ball is not None:
             raise no_export(self, "it adds tangent cuts of a terminal ellipsoid; use a polytope, or no terminal set")
-        if track.shift is not None:
-            raise no_export(self, "its cost has a price, which its C does not know", "one without a price")
-        if self.limits.in_time:
-            raise DataError(
-                "the controller's limits have rows in time, and C code keeps one set of limits; make it with "
-                "limits.at(step)"
-            )
         rows = reference_table(reference, len(track.Q))
         estimator = publish_estimator(
             self._initial.observer,
@@ -249,7 +242,7 @@ class KoopmanMPC(MPCBase):
             **linear_parts(self.predictor, plan.targets),
             inputs=track.inputs,
             rates=track.rates,
-            given=track.given,
+            given=add_held(track.given, track.shift),
             reference=rows,
             gain=plan.matrix[: plan.moves, : self.predictor.nz],
             settings=setup.settings,
@@ -272,6 +265,7 @@ class KoopmanMPC(MPCBase):
             deviation=plan.deviation,
             solver=setup,
             estimator=estimator,
+            bounds=describe_bounds(plan) if self.limits.in_time or self.limits.rows else None,
         )
 
     @property
@@ -431,6 +425,20 @@ class KoopmanMPC(MPCBase):
         model = self.predictor
         return limit_windows(self._map, limits, model.states, model.inputs, self._latency, at_call=at_call)
 
+    def read_limits(self, limits: Limits) -> Limits:
+        """Return the limits of a call with arrays in place of names.
+
+        Raises
+        ------
+        DataError
+            They differ from the controller's own in more than bounds.
+        """
+        return check_bounds_alone(limits, self.limits, self.predictor.states, self.predictor.inputs)
+
+    def check_limits(self, limits: Limits) -> None:
+        """Raise where limits of a call cross, have no row in the plan, or too few rows."""
+        self._make_windows(limits, at_call=True)
+
     def _move_limits(self, limits: Limits | None, moving: MovingMap | None) -> None:
         """Put the limits of this step into the plan, and let targets that they move be found again."""
         window = self._rows_of_limits
@@ -453,8 +461,7 @@ class KoopmanMPC(MPCBase):
     def _change_window(self, limits: Limits | None) -> LimitWindows | None:
         """Return the windows of the limits of a call, or of the controller's own, where the last call had others."""
         if limits is not None and limits is not self._called_with:
-            own = check_bounds_alone(limits, self.limits, self.predictor.states, self.predictor.inputs)
-            self._at_call, self._called_with = self._make_windows(own, at_call=True), limits
+            self._at_call, self._called_with = self._make_windows(self.read_limits(limits), at_call=True), limits
         window = self._rows_of_limits if limits is None else self._at_call
         if window is not self._window:
             self._window, self._aimed = window, self._aimed and not self._map.aims_inside

@@ -12,6 +12,7 @@ from koopmpc.checks import HUGE
 from koopmpc.control.in_time.bounds import refuse_crossed_rows
 from koopmpc.control.in_time.preview import require_movable, require_preview
 from koopmpc.control.limits import Interval, Limits, preview_margin
+from koopmpc.control.linear.condensed_program import BoundsProgram
 from koopmpc.control.linear.moving import MovingMap
 from koopmpc.control.linear.plan import PlanMap
 from koopmpc.control.target import ROUNDING
@@ -294,6 +295,25 @@ def limit_windows(
         plan_pages=pages[0],
         moving_pages=pages[1],
         single_pages=pages[2],
+    )
+
+
+def describe_bounds(plan: PlanMap) -> BoundsProgram:
+    """Return how rows of limits become the limits of this plan."""
+    track, nu = plan.track, len(plan.track.inputs.low)
+    first, count = _find_holds(plan, nu)
+    return BoundsProgram(
+        first=first,
+        count=count,
+        start=np.cumsum([0, *plan.blocks[:-1]]),
+        held=plan.held,
+        tied=plan.tied,
+        margin=preview_margin(track.margin, sum(plan.blocks)),
+        values=plan.targets.values,
+        checked=np.flatnonzero(plan.checked),
+        hard=np.isinf(track.rate_softness.linear),
+        allowance=track.rate_softness.allowance,
+        outputs=track.movable.outputs,
     )
 
 

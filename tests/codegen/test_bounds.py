@@ -1,0 +1,100 @@
+"""Limits in time and prices in C: rows of bounds as arguments give what Python gives, step by step."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from scipy.signal import StateSpace
+
+import koopmpc as km
+
+A, B = np.array([[1.0, 0.2], [-0.1, 0.9]]), np.array([[0.02, 0.01], [0.2, -0.1]])
+MODEL = km.LinearPredictor.from_state_space(StateSpace(A, B, np.eye(2), np.zeros((2, 2)), dt=0.2), inputs=("a", "b"))
+COST = km.Cost(Q=[1, 0.5], R=0.05)
+ROWS = np.random.default_rng(0).uniform(0.3, 1.2, (40, 2))
+slow = pytest.mark.slow
+
+
+def compile_mpc(limits, N=6, cost=COST, **options):
+    mpc = km.KoopmanMPC(MODEL, cost, limits, N, **options)
+    fast = km.compiled(mpc)
+    if fast is mpc:
+        pytest.skip("no C compiler")
+    return mpc, fast
+
+
+def require_parity(mpc, fast, steps=40, calls=None):
+    rng, x = np.random.default_rng(1), np.array([1.0, -0.5])
+    mpc.reset()
+    fast.reset()
+    seen = set()
+    for k in range(steps):
+        reference = np.array([1.2 * np.sin(k / 6), 0.2])
+        limits = calls(k) if calls else None
+        y = np.array([np.nan, 0.0]) if k % 13 == 7 else x
+        one, other = mpc(y, reference, limits=limits), fast(y, reference, limits=limits)
+        np.testing.assert_allclose(other.u, one.u, atol=1e-6)
+        assert (other.status, other.fallback) == (one.status, one.fallback)
+        assert other.slack == pytest.approx(one.slack, abs=1e-6)
+        seen.add(one.status.name)
+        x = A @ x + B @ one.u + rng.normal(0, 0.02, 2)
+    return seen
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        pytest.param({"latency": 1}, marks=slow),
+        {"moves": {"a": (1, 1, 4), "b": (2, 4)}},
+        pytest.param({"estimator": km.LiftedDisturbance()}, marks=slow),
+    ],
+)
+@pytest.mark.parametrize(
+    "rates", [{}, {"du_max": [0.3, 0.4]}, pytest.param({"du_max": 0.3, "du_slack": (9, 9)}, marks=slow)]
+)
+def test_rows_of_bounds_in_c_give_what_python_gives(options, rates):
+    limits = km.Limits(u_min=-1, u_max=ROWS, x_min=-1.5, x_max=ROWS[::-1], margin=[[0.01, 0.02]], **rates)
+    assert {"OPTIMAL", "SOFTENED"} <= require_parity(*compile_mpc(limits, **options))
+
+
+def test_rows_at_a_call_hold_for_that_call():
+    limits = km.Limits(u_min=-1, u_max=1, rows=("x_max",))
+    mpc, fast = compile_mpc(limits)
+    at_call = limits.with_bounds(u_max=ROWS, x_max=[0.4, 0.3])
+    require_parity(mpc, fast, calls=lambda k: None if k % 3 == 0 else at_call)
+    with pytest.raises(km.errors.DataError, match="without a limit there"):
+        fast([0, 0], [0, 0], limits=limits.with_bounds(du_max=0.1))
+
+
+def test_constant_rows_give_the_same_inputs_as_the_constant_limits():
+    plain, rows = (compile_mpc(km.Limits(u_min=-1, u_max=end, x_max=0.8))[1] for end in (0.7, np.full((3, 2), 0.7)))
+    x = np.array([1.0, -0.5])
+    for _ in range(15):
+        u = plain(x, [1, 0]).u
+        np.testing.assert_allclose(rows(x, [1, 0]).u, u, atol=1e-12)
+        x = A @ x + B @ u
+
+
+def test_copies_go_on_at_the_same_row():
+    _, fast = compile_mpc(km.Limits(u_min=-1, u_max=ROWS))
+    for _ in range(5):
+        fast([1.0, -0.5], [1, 0])
+    twins = copy.copy(fast), pickle.loads(pickle.dumps(fast))
+    u = fast([0.8, -0.5], [1, 0]).u
+    for twin in twins:
+        np.testing.assert_array_equal(twin([0.8, -0.5], [1, 0]).u, u)
+
+
+def test_code_without_rows_refuses_limits_of_a_call():
+    _, fast = compile_mpc(km.Limits(u_min=-1, u_max=1))
+    with pytest.raises(km.errors.DataError, match="keeps its own"):
+        fast([0, 0], [0, 0], limits=km.Limits(u_min=-1, u_max=0.5))
+
+
+@pytest.mark.parametrize("target", ["equilibrium", "zero", [[0.1, 0.0], [0.2, 0.1]]])
+def test_prices_in_c_give_what_python_gives(target):
+    price = np.random.default_rng(2).uniform(-0.2, 0.2, (9, 2))
+    cost = km.Cost(Q=[1, 0.5], R=0.05, price=price, u_target=target)
+    require_parity(*compile_mpc(km.Limits(u_min=-1, u_max=1), cost=cost), steps=20)
