@@ -293,7 +293,7 @@ class Compiled:
         """Set the limits of this step: those of the call, or the controller's own."""
         if limits is not None and self._bounds is None:
             raise DataError(
-                "limits were passed, and this C code keeps its own; compile a KoopmanMPC or a LinearMPC whose limits have"
+                "limits were passed, and this C code keeps its own; compile a KoopmanMPC or LinearMPC whose limits have"
                 ' rows in time, or Limits(rows=("u_max",))'
             )
         if limits is not None:

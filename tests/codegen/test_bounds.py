@@ -2,6 +2,8 @@
 
 import copy
 import pickle
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -57,6 +59,15 @@ def require_parity(mpc, fast, steps=40, calls=None):
 def test_rows_of_bounds_in_c_give_what_python_gives(options, rates):
     limits = km.Limits(u_min=-1, u_max=ROWS, x_min=-1.5, x_max=ROWS[::-1], margin=[[0.01, 0.02]], **rates)
     assert {"OPTIMAL", "SOFTENED"} <= require_parity(*compile_mpc(limits, **options))
+
+
+@pytest.mark.parametrize("limits", [{"x_max": ROWS, "du_max": 0.3}, {}])
+def test_the_c_of_bounds_has_no_warning(limits, tmp_path):
+    compiler = shutil.which("gcc") or pytest.skip("gcc is not here")
+    mpc = km.KoopmanMPC(MODEL, COST, km.Limits(u_min=-1, u_max=ROWS, **limits), 4, estimator=km.LiftedDisturbance())
+    folder = km.export(mpc, tmp_path / "c")
+    done = subprocess.run(["make", "-s", "strict", f"CC={compiler}"], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_rows_at_a_call_hold_for_that_call():

@@ -4,6 +4,7 @@
 #include "koopmpc_plan.h"
 #include "koopmpc_qp.h"
 #include "koopmpc_receding.h"
+#include "koopmpc_solver.h"
 #include "koopmpc_targets.h"
 
 #if KOOPMPC_BOUNDS
@@ -56,9 +57,9 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
     s->low[FIRST + j] = bound(&b->x_low, row, OUT, j % OUT1) + koopmpc_inwards[j];
     s->high[FIRST + j] = bound(&b->x_high, row, OUT, j % OUT1) - koopmpc_inwards[j];
   }
-  for (int i = 0; i < KOOPMPC_CHECKED; i++) {
-    s->low[KOOPMPC_PLANNED + i] = s->low[KOOPMPC_PLANNED + KOOPMPC_CHECKED + i] = -KOOPMPC_HUGE;
-    s->high[KOOPMPC_PLANNED + i] = s->high[KOOPMPC_PLANNED + KOOPMPC_CHECKED + i] = KOOPMPC_HUGE;
+  for (int i = KOOPMPC_PLANNED; i < KOOPMPC_PLANNED + 2 * KOOPMPC_CHECKED; i++) {
+    s->low[i] = -KOOPMPC_HUGE;
+    s->high[i] = KOOPMPC_HUGE;
   }
   for (int k = 0; k <= KOOPMPC_N && KOOPMPC_AIMED; k++)
     for (int i = 0; i < NU + OUT; i++) { /* limits of the target of this row */
@@ -110,6 +111,8 @@ koopmpc_real koopmpc_open_rates(koopmpc_state *s) {
     }
     if (widest > (koopmpc_real)1e-5 * koopmpc_rate_allowance[i] && widest > conflict) conflict = widest;
   }
+#else
+  (void)s;
 #endif
   return conflict;
 }
