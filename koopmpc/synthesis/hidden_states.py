@@ -34,6 +34,8 @@ def judge_hidden_states(
     horizon: int,
     bilinear: bool,
     rival: float = np.inf,
+    *,
+    short: int | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[LeaderboardRow, FreeRun]]:
     """Return the best models with a hidden state, one of each kind, and how they run over stretches that no fit saw.
@@ -53,6 +55,8 @@ def judge_hidden_states(
         Least error of other models on unseen rows; what errs by far more is not judged.
     bilinear
         Try polynomial ones, which are bilinear predictors.
+    short
+        Steps of the short forecasts that judge; `horizon` by default, whose errors the leaderboard shows.
     progress
         Called with what is done and how many there are.
     """
@@ -95,14 +99,14 @@ def judge_hidden_states(
     results: list[tuple[LeaderboardRow, FreeRun]] = []
     for structure in found:
         try:
-            results.append(_judge(structure, measured, first, horizon, searched))
+            results.append(_judge(structure, measured, first, horizon, short or horizon, searched))
         except KoopmpcError:
             continue
     return results
 
 
 def _judge(
-    structure: HiddenStructure, measured: Episodes, first: int, horizon: int, searched: float
+    structure: HiddenStructure, measured: Episodes, first: int, horizon: int, short: int, searched: float
 ) -> tuple[LeaderboardRow, FreeRun]:
     """Return the line of the leaderboard and the free runs of a structure."""
     begun, models = perf_counter(), list[AnyPredictor]()
@@ -115,7 +119,7 @@ def _judge(
         return models[-1]
 
     start = max(first, structure.delays)
-    run = judge_free_run(fit, data, data, start, horizon, relift=structure.is_nonlinear)
+    run = judge_free_run(fit, data, data, start, short, relift=structure.is_nonlinear)
     run = replace(run, calm=run.calm and bool(run.errors.max() < LOST))
     errors, whole = _errors_ahead(models, data, start, horizon), models[-1]
     radius = float(np.abs(sorted_eigen(whole.A)[0][0]))

@@ -17,7 +17,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import FitWarning
 from koopmpc.identify.moments.read import ReadOptions
-from koopmpc.identify.records.structure import Structure
+from koopmpc.identify.records.structure import Structure, choose_horizon
 from koopmpc.lifting.base import Lifting
 from koopmpc.parallel import Progress, StageProgress, map_tasks
 from koopmpc.predict.base import replace_report
@@ -228,7 +228,9 @@ def select(
         told = report_stage(progress, "sparse polynomials")
         given += propose_structures(measured[1], None if delays is None else past, bilinear, told)
     first = max(one.delays for one in given)
+    first = max(one.delays for one in given)
     ahead, short = usual_horizon(held, first) if horizon is None else (checks.count(horizon, "horizon"), ())
+    nearer = max(ahead, choose_horizon(measured[1])) if record and horizon is None else ahead
     data = make_folds(held, ahead + first, folds, draw)
     rough = make_folds(measured[1], ahead + first, folds, draw).episodes if record else data.episodes
     trials = [
@@ -246,9 +248,9 @@ def select(
     if record:
         told = report_stage(progress, "hidden states")
         rival = min((one.structure.error for one in given if one.structure is not None), default=np.inf)
-        ran = judge_hidden_states(measured[1], first, ahead, both, rival, told)
+        ran = judge_hidden_states(measured[1], first, ahead, both, rival, short=nearer, progress=told)
         told = report_stage(progress, "free runs")
-        rows, chosen, found = judge_finalists(rows, held, measured[1], first, ahead, told, ran)
+        rows, chosen, found = judge_finalists(rows, held, measured[1], first, nearer, told, ran)
         if held is not measured[1] and (rows[chosen].rough or rows[chosen].structure is not None):
             notes = (*notes, ROUGH)
     else:
@@ -277,7 +279,7 @@ def select(
         smoothed = row.structure is None and not row.rough
         model = fit_candidate(row.candidate, source if smoothed else measured[0], row.ridge, read)
         if isinstance(row.structure, Structure):
-            model, refined[place] = refine_structure(row.structure, model, measured[1], first, ahead)
+            model, refined[place] = refine_structure(row.structure, model, measured[1], first, nearer)
         if lead and model.report is not None:
             report = replace(model.report, input_lead=lead, changes=(*model.report.changes, LATE))
             model = replace_report(model, report)

@@ -44,10 +44,11 @@ def test_a_design_from_data_alone_costs_at_most_a_twentieth_more_than_the_optimu
 @pytest.mark.parametrize("task", ["one record of a drive", "one record of a tank"])
 def test_a_design_from_one_record_of_one_sensor_under_pi_controls_what_nobody_measured(task, record_property):
     """Two of three states, or one of two, are hidden; a model with a past or a hidden state stands for them."""
-    table = measure([task], ["designed", "dmdc"], seeds=(0,), workers=1)
+    table = measure([task], ["designed", "bilinear-mpc", "dmdc"], seeds=(0,), workers=1)
     record_property("closed loops", text(table))
-    designed, dmdc = (table[task][name] for name in ("designed", "dmdc"))
-    assert designed.ratio <= 1.2, text(table)
+    designed, hidden, dmdc = (table[task][name] for name in ("designed", "bilinear-mpc", "dmdc"))
+    assert designed.ratio <= 1.05, text(table)
+    assert hidden.ratio <= (1.05 if task.endswith("drive") else 2.5), text(table)  # the model has a hidden state
     assert designed.ratio <= 1.02 * dmdc.ratio, text(table)
 
 

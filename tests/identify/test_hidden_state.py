@@ -1,5 +1,7 @@
 """Models with a hidden state: exact derivatives, exact conversion, exact data, rails of sensors, refinement."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -165,6 +167,25 @@ def test_readings_correct_the_state_and_missing_ones_are_bridged(tanks):
     hidden = embedding.shift(np.array([1.2, *z]), U[past], np.array([np.nan]))[1:]
     assert np.isfinite(hidden).all()
     assert low[1, 0] == 1.2
+
+
+def test_readings_move_the_state_by_what_forecasts_best(tanks):
+    """Without a gain a wrong state is never corrected, and ten times the gain follows the noise."""
+    _, model = tanks
+    (fresh,) = saturating_record(np.random.default_rng(5), noise=0.02)
+    past, errors = model.embedding.steps, []
+    for factor in (0.0, 1.0, 10.0):
+        embedding = replace(model.embedding, gain=factor * model.embedding.gain)
+        step, gaps = model.step_map(), []
+        point = model.start(fresh.X[past], km.Episode(X=fresh.X[: past + 1], U=fresh.U[:past])).copy()
+        point[1:] += 0.5
+        for k in range(past, len(fresh) - 20):
+            point = embedding.shift(point, fresh.U[k], fresh.X[k + 1])
+            if k % 10 == 0 and k < past + 300:
+                gaps.append(step.rollout(point, fresh.U[k + 1 : k + 20])[:, 0] - fresh.X[k + 1 : k + 21, 0])
+        errors.append(np.sqrt(np.mean(np.square(gaps))))
+    assert errors[1] < errors[0]
+    assert errors[1] < 0.7 * errors[2]
 
 
 def test_exact_data_are_met_from_coefficients_ten_percent_off():

@@ -90,7 +90,7 @@ class HiddenStructure(Value):
         how = f"fitted to forecasts of {self.horizon} steps" if self.horizon else "by a subspace method"
         return (
             f"a hidden state of order {self.order} with {kind}, which begins with {self.delays} past rows, {how}; on "
-            f"unseen rows, in free run and {HORIZON} steps ahead, it errs by {self.error:.3g} spreads"
+            f"unseen rows, in free run and in forecasts, it errs by {self.error:.3g} spreads"
         )
 
 
@@ -203,14 +203,16 @@ def cut_sets(
     return found
 
 
-def measure_hidden(model: HiddenModel, data: Episodes, units: SignalUnits, delays: int) -> Float[np.ndarray, " blocks"]:
-    """Return errors on four parts of the last quarters, in spreads: geometric means of free run and forecasts."""
+def measure_hidden(
+    model: HiddenModel, data: Episodes, units: SignalUnits, delays: int, ahead: int = HORIZON
+) -> Float[np.ndarray, " blocks"]:
+    """Return errors on four parts of the last quarters, in spreads: of free runs and forecasts, geometric means."""
     free: list[np.ndarray] = []
     short: list[np.ndarray] = []
     for e in data:
         one, spans = data.with_episodes([e]), [(round((1 - UNSEEN) * len(e)), len(e))]
         ((a, b),) = spans
-        for horizon, gaps in ((b - max(a, delays), free), (HORIZON, short)):
+        for horizon, gaps in ((b - max(a, delays), free), (ahead, short)):
             if b - max(a, delays) < max(horizon, 2):
                 continue
             part = join_segments(cut_segments(one, units, delays, horizon, horizon, spans))

@@ -20,7 +20,7 @@ from koopmpc.identify.records.forward import (
     solve_nested,
 )
 from koopmpc.identify.records.free_run import Models, Pieces, embed_rows, is_calm, run_freely
-from koopmpc.identify.records.structure import EXACT, HORIZON, Structure, fit_structure
+from koopmpc.identify.records.structure import EXACT, Structure, choose_horizon, fit_structure
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 DELAYS = (0, 1, 2, 3, 4, 6, 8, 12)  # numbers of past rows that are tried
@@ -49,7 +49,7 @@ def narx(
     Terms are products of ζ's entries, and inputs times such products, in standard units; so neither units nor origins
     change the model. For each number of delays and each degree, forward orthogonal least squares orders the terms. The
     record is cut into four stretches. Without each of them the terms are chosen and fitted; on it the model is judged
-    by forecasts of 20 steps and by its free run, from the record's first rows and the inputs alone. The least error
+    by short forecasts and by its free run, from the record's first rows and the inputs alone. The least error
     decides on delays, degree and number of terms, and of all within one standard error the fewest terms are taken. A
     model whose free run leaves three times the range of the data is taken only where every model's does, and one
     without an input only where the data have none. All rows then fit the coefficients.
@@ -139,7 +139,7 @@ def search_structures(
     delays: Sequence[int] = DELAYS,
     degrees: Sequence[int] = DEGREES,
     terms: int = SIZES[-1],
-    horizon: int = HORIZON,
+    horizon: int | None = None,
     ask: Ask | None = None,
 ) -> list[Structure]:
     """Return structures of all delays, degrees and sizes with their errors in free run; the calm ones if there are any.
@@ -150,12 +150,14 @@ def search_structures(
         The records.
     delays, degrees, terms
         As in `narx`.
+    horizon
+        Steps of the short forecasts; `choose_horizon` says what it is by default.
     ask
         Called before each pair of delays and degree.
     """
     if episodes.nw:
         raise DataError("the records hold measured disturbances, which narx does not know; pass them as inputs")
-    pieces = Pieces.of(episodes)
+    pieces, horizon = Pieces.of(episodes), choose_horizon(episodes) if horizon is None else horizon
     nx, nu = pieces.nx, pieces.nu
     longest = max(map(len, pieces.U))
     room = [d for d in delays if 4 * FOLDS * (d + 1) <= longest]

@@ -36,7 +36,7 @@ from koopmpc.identify.records.hidden_structure import (
 from koopmpc.identify.records.narx import Ask, check_list, source_episodes
 from koopmpc.identify.records.neurons.candidates import draw_neurons, take_neurons
 from koopmpc.identify.records.neurons.contained import ContainedError, contain
-from koopmpc.identify.records.structure import HORIZON
+from koopmpc.identify.records.structure import HORIZON, choose_horizon
 from koopmpc.identify.records.subspace import build_realisation, compute_block_moments
 from koopmpc.identify.records.unseen import UNSEEN
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -89,7 +89,7 @@ def neural_state_space(
         Records of one plant: outputs as states.
     order, neurons, degree
         Order of z, number of neurons and total degree of the polynomials; several of each are tried. Of all models
-        within one standard error of the best, in free run and in forecasts of 20 steps on the last quarter of each
+        within one standard error of the best, in free run and in short forecasts on the last quarter of each
         record, the one with the fewest coefficients is taken.
     rails
         As in `polynomial_state_space`.
@@ -149,7 +149,7 @@ def search_neural(
     DataError
         The records are too short for all of them.
     """
-    data = thin_records(episodes, ROWS, PIECE)
+    data, ahead = thin_records(episodes, ROWS, PIECE), choose_horizon(episodes)
     delays, horizon = choose_window(data)
     found: list[HiddenStructure] = []
     reasons: list[KoopmpcError] = []
@@ -160,7 +160,7 @@ def search_neural(
         plan = HiddenStructure(order, degree, delays, horizon, rails, np.ones(1), False, 0, start=start)
         try:
             for model, units in fit_chain(data, plan, neurons, quick=quick):
-                errors = measure_hidden(model, data, units, delays)
+                errors = measure_hidden(model, data, units, delays, ahead)
                 calm = is_calm_anywhere(model, data, units, delays)
                 size, count = model.E.size + model.neurons.size, len(model.neurons)
                 found.append(replace(plan, errors=errors, calm=calm, parameters=size, neurons=count))

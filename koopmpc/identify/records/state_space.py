@@ -30,6 +30,7 @@ from koopmpc.identify.records.hidden_structure import (
 )
 from koopmpc.identify.records.narx import Ask, check_list, source_episodes
 from koopmpc.identify.records.neural import fit_neural
+from koopmpc.identify.records.structure import choose_horizon
 from koopmpc.identify.records.subspace import build_realisation, compute_block_moments
 from koopmpc.identify.records.unseen import UNSEEN
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -75,7 +76,7 @@ def polynomial_state_space(
         Records of one plant: outputs as states.
     order, degree, delays, horizon
         Order of z, total degree, past rows of ζ, and steps of a segment; several of each are tried. Of all models
-        within one standard error of the best, in free run and in forecasts of 20 steps on the last quarter of each
+        within one standard error of the best, in free run and in short forecasts on the last quarter of each
         record, the one with the fewest coefficients is taken.
     rails
         (2, ny) or (2,), the least and the largest reading of the sensors: y = min(max(C z + c, low), high). Where a
@@ -140,7 +141,7 @@ def search_hidden(
     DataError
         The records are too short for all of them.
     """
-    data = thin_records(episodes)
+    data, ahead = thin_records(episodes), choose_horizon(episodes)
     plans = [(n, d, min(horizons)) for n in sorted(orders) for d in delays]
     count, done, least = len(plans) + FINALISTS * (len(horizons) - 1), 0, np.inf
     found: list[HiddenStructure] = []
@@ -159,7 +160,7 @@ def search_hidden(
         for model, units in chain:
             degree = model.terms.shape[1]
             if degree in degrees:
-                errors = measure_hidden(model, data, units, past)
+                errors = measure_hidden(model, data, units, past, ahead)
                 calm = is_calm_hidden(model, data, units, past)
                 found.append(HiddenStructure(model.order, degree, past, horizon, rails, errors, calm, model.E.size))
 

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
+from koopmpc.data.pace import find_pace
 from koopmpc.data.source import Source, source_of
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
@@ -28,9 +29,21 @@ from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.values import Value
 
-HORIZON = 20  # steps of the short forecasts, which count as much as the free run
+HORIZON = 20  # steps of the short forecasts, at least, which count as much as the free run
+LONGEST = 200  # steps of these, at most
+_SHARE = 4  # they reach over this share of the rows that the outputs remember
+_FORECASTS = 16  # that many of them fit into a record, at least
 EXACT = 1e-6  # smaller errors, in spreads, are alike: they are due to rounding
 _SOFT = 1e-9  # ridge of the observables' own rows, which are almost dependent
+
+
+def choose_horizon(episodes: Episodes) -> int:
+    """Return the steps of the short forecasts: a quarter of the rows that the outputs remember, from 20 to 200.
+
+    20 steps of a drive at 1 kHz are 20 ms, in which no two models differ.
+    """
+    room = max(map(len, episodes)) // _FORECASTS
+    return max(HORIZON, min(find_pace(episodes) // _SHARE, LONGEST, room))
 
 
 @dataclass(frozen=True, eq=False)

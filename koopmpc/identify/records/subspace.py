@@ -13,7 +13,7 @@ from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.records.narx import check_list, is_worse, source_episodes
-from koopmpc.identify.records.structure import EXACT, HORIZON
+from koopmpc.identify.records.structure import EXACT, choose_horizon
 from koopmpc.identify.records.unseen import cut_quarter, measure_forecasts
 from koopmpc.identify.regression import Regression, build_regression, compute_scale_factor
 from koopmpc.identify.solve import column_norms, solve
@@ -58,7 +58,7 @@ def subspace(
         Order of the hidden state, or several to try.
     delays
         Number p of past rows, or several to try. Of several orders and numbers the smallest order within one standard
-        error of the least error is taken: in free run and in forecasts of 20 steps on the last quarter of each record,
+        error of the least error is taken: in free run and in short forecasts on the last quarter of each record,
         which a first fit does not see. All rows then fit the model.
     **options
         ``weights``, ``workers``, ``scheduler`` and ``progress`` of the last fit, as in `km.moments.second_moments`.
@@ -251,13 +251,13 @@ def choose_sizes(
     DataError
         The records are too short.
     """
-    learned, spans = cut_quarter(episodes)
+    (learned, spans), horizon = cut_quarter(episodes), choose_horizon(episodes)
     tried: list[tuple[int, int, Float[np.ndarray, " blocks"]]] = []
     for delays in pasts:
         try:
             total = compute_block_moments(learned, delays)
             found = {order: build_realisation(total, order) for order in orders}
-            tried += [(m, delays, measure_forecasts(one, episodes, spans, HORIZON)) for m, one in found.items()]
+            tried += [(m, delays, measure_forecasts(one, episodes, spans, horizon)) for m, one in found.items()]
         except KoopmpcError:  # too short for so many past rows
             continue
     if not tried:
