@@ -17,7 +17,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import FitWarning
 from koopmpc.identify.moments.read import ReadOptions
-from koopmpc.identify.records.structure import Structure, choose_horizon
+from koopmpc.identify.records.structure import Structure, find_forecast_horizon
 from koopmpc.lifting.base import Lifting
 from koopmpc.parallel import Progress, StageProgress, map_tasks
 from koopmpc.predict.base import replace_report
@@ -230,7 +230,7 @@ def select(
     first = max(one.delays for one in given)
     first = max(one.delays for one in given)
     ahead, short = usual_horizon(held, first) if horizon is None else (checks.count(horizon, "horizon"), ())
-    nearer = max(ahead, choose_horizon(measured[1])) if record and horizon is None else ahead
+    nearer = max(ahead, find_forecast_horizon(measured[1])) if record and horizon is None else ahead
     data = make_folds(held, ahead + first, folds, draw)
     rough = make_folds(measured[1], ahead + first, folds, draw).episodes if record else data.episodes
     trials = [

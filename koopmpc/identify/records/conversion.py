@@ -24,7 +24,8 @@ from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 _OBSERVED = 0.999  # an observer's spectral radius is below this
 _RATIOS = tuple(10.0**power for power in range(-6, 5))  # variances of process noise beside that of the sensors
-_FOLLOWED, _FORECAST = 40, 20  # steps in which readings correct the state, and forecasts behind them that judge
+_FOLLOWED = 40  # steps in which readings correct the state
+_FORECAST = 20  # steps of the forecasts behind them, which judge
 _SEGMENTS = 200  # of the records that judge, about
 _ALIKE = 1.05  # squared errors within this factor are alike
 _FAR = 1e3  # a state stays within this many spreads

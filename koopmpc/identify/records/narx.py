@@ -20,7 +20,7 @@ from koopmpc.identify.records.forward import (
     solve_nested,
 )
 from koopmpc.identify.records.free_run import Models, Pieces, embed_rows, is_calm, run_freely
-from koopmpc.identify.records.structure import EXACT, Structure, choose_horizon, fit_structure
+from koopmpc.identify.records.structure import EXACT, Structure, find_forecast_horizon, fit_structure
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 DELAYS = (0, 1, 2, 3, 4, 6, 8, 12)  # numbers of past rows that are tried
@@ -151,13 +151,13 @@ def search_structures(
     delays, degrees, terms
         As in `narx`.
     horizon
-        Steps of the short forecasts; `choose_horizon` says what it is by default.
+        Steps of the short forecasts; `find_forecast_horizon` says what it is by default.
     ask
         Called before each pair of delays and degree.
     """
     if episodes.nw:
         raise DataError("the records hold measured disturbances, which narx does not know; pass them as inputs")
-    pieces, horizon = Pieces.of(episodes), choose_horizon(episodes) if horizon is None else horizon
+    pieces, horizon = Pieces.of(episodes), find_forecast_horizon(episodes) if horizon is None else horizon
     nx, nu = pieces.nx, pieces.nu
     longest = max(map(len, pieces.U))
     room = [d for d in delays if 4 * FOLDS * (d + 1) <= longest]

@@ -36,7 +36,7 @@ from koopmpc.identify.records.hidden_structure import (
 from koopmpc.identify.records.narx import Ask, check_list, source_episodes
 from koopmpc.identify.records.neurons.candidates import draw_neurons, take_neurons
 from koopmpc.identify.records.neurons.contained import ContainedError, contain
-from koopmpc.identify.records.structure import HORIZON, choose_horizon
+from koopmpc.identify.records.structure import HORIZON, find_forecast_horizon
 from koopmpc.identify.records.subspace import build_realisation, compute_block_moments
 from koopmpc.identify.records.unseen import UNSEEN
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -149,7 +149,7 @@ def search_neural(
     DataError
         The records are too short for all of them.
     """
-    data, ahead = thin_records(episodes, ROWS, PIECE), choose_horizon(episodes)
+    data, ahead = thin_records(episodes, ROWS, PIECE), find_forecast_horizon(episodes)
     delays, horizon = choose_window(data)
     found: list[HiddenStructure] = []
     reasons: list[KoopmpcError] = []

@@ -30,7 +30,7 @@ from koopmpc.identify.records.hidden_structure import (
 )
 from koopmpc.identify.records.narx import Ask, check_list, source_episodes
 from koopmpc.identify.records.neural import fit_neural
-from koopmpc.identify.records.structure import choose_horizon
+from koopmpc.identify.records.structure import find_forecast_horizon
 from koopmpc.identify.records.subspace import build_realisation, compute_block_moments
 from koopmpc.identify.records.unseen import UNSEEN
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -141,7 +141,7 @@ def search_hidden(
     DataError
         The records are too short for all of them.
     """
-    data, ahead = thin_records(episodes), choose_horizon(episodes)
+    data, ahead = thin_records(episodes), find_forecast_horizon(episodes)
     plans = [(n, d, min(horizons)) for n in sorted(orders) for d in delays]
     count, done, least = len(plans) + FINALISTS * (len(horizons) - 1), 0, np.inf
     found: list[HiddenStructure] = []

@@ -37,7 +37,7 @@ EXACT = 1e-6  # smaller errors, in spreads, are alike: they are due to rounding
 _SOFT = 1e-9  # ridge of the observables' own rows, which are almost dependent
 
 
-def choose_horizon(episodes: Episodes) -> int:
+def find_forecast_horizon(episodes: Episodes) -> int:
     """Return the steps of the short forecasts: a quarter of the rows that the outputs remember, from 20 to 200.
 
     20 steps of a drive at 1 kHz are 20 ms, in which no two models differ.

@@ -13,7 +13,7 @@ from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.records.narx import check_list, is_worse, source_episodes
-from koopmpc.identify.records.structure import EXACT, choose_horizon
+from koopmpc.identify.records.structure import EXACT, find_forecast_horizon
 from koopmpc.identify.records.unseen import cut_quarter, measure_forecasts
 from koopmpc.identify.regression import Regression, build_regression, compute_scale_factor
 from koopmpc.identify.solve import column_norms, solve
@@ -251,7 +251,7 @@ def choose_sizes(
     DataError
         The records are too short.
     """
-    (learned, spans), horizon = cut_quarter(episodes), choose_horizon(episodes)
+    (learned, spans), horizon = cut_quarter(episodes), find_forecast_horizon(episodes)
     tried: list[tuple[int, int, Float[np.ndarray, " blocks"]]] = []
     for delays in pasts:
         try:
