@@ -111,7 +111,7 @@ class Cost(Value):
     tail: int | None = None
     price: "Bound" = None
     beyond: Literal["rest", "motion"] | None = None
-    stage: StageCost | None = None
+    stage: "StageCost | None" = None
 
     def __post_init__(self) -> None:
         if isinstance(self.Q_N, WeighsEnd):

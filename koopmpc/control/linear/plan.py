@@ -1,7 +1,7 @@
 """The plan of a horizon: the unconstrained one as a matrix, its limits, and the QP where it meets one."""
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -88,6 +88,7 @@ class PlanMap(Viewing):
     """
 
     _VIEWS = ("met", "met_low", "met_high", "low", "high")
+    layout: Any = None  # where rows of limits stand in a table, once there are some
 
     def __init__(
         self,

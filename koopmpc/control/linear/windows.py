@@ -70,6 +70,32 @@ class _Columns(NamedTuple):
     width: int
 
 
+class WindowLayout(NamedTuple):
+    """Where the limits of a plan stand in a table of rows of limits; it is that of every table of this plan.
+
+    Attributes
+    ----------
+    used
+        The lengths of blocks, and which inputs are held so long; an input box holds at each step, too.
+    width
+        W of the table.
+    raw, tight
+        Where targets stand, and the tightest limits of targets.
+    moves, outputs
+        Where the limits of all moves stand; which entries of a plan are outputs.
+    entries
+        Those of the plan, of its map of a reference that moves, and of that of a single row.
+    """
+
+    used: dict[int, Bool[np.ndarray, " nu"]]
+    width: int
+    raw: _Columns
+    tight: _Columns
+    moves: Int[np.ndarray, " moves"]
+    outputs: slice
+    entries: tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " n"]]
+
+
 @dataclass(frozen=True, eq=False)
 class LimitWindows:
     """The limits of each step of a run, taken from one table with a row for each step.
@@ -226,10 +252,10 @@ def limit_windows(
         Interval(every.low[:, kept], every.high[:, kept]),
         [n for n, k in zip(names, kept, strict=True) if k],
     )
-    start, length = _find_holds(plan, nu)
-    blocks = {b: _sweep(box, b) for b in sorted({1, *length.ravel().tolist()})}
+    layout = plan.layout = plan.layout or _lay_out(plan)
+    blocks = {b: _sweep(box, b) for b in layout.used}
     for b, swept in blocks.items():
-        used = np.ones(nu, np.bool_) if b == 1 else (length == b).any(axis=0)
+        used = layout.used[b]
         _require_inputs(plan, swept, inputs, used, f" within a block of {b} held steps" if b > 1 else "")
     refuse_crossed_rows(*change, "rate", inputs)
     most = track.margin.max(axis=0, initial=0.0)
@@ -245,56 +271,72 @@ def limit_windows(
     free = Interval(np.full((count, 1), -HUGE), np.full((count, 1), HUGE))
     parts = [box, *([] if track.rates is None else [change]), outputs, raw, test, tightest, free]
     parts += [swept for b, swept in blocks.items() if b > 1]
-    widths = [part.low.shape[1] for part in parts]
-    starts = np.cumsum([0, *widths]).tolist()
-    at = iter(starts)
-    u_at, du_at = next(at), next(at) if track.rates is not None else 0
-    out_at, raw_at, test_at, tight_at, free_at = (next(at) for _ in range(5))
-    block_at = {b: next(at) for b in blocks if b > 1} | {1: u_at}
-    table = np.hstack([np.hstack([part[i] for part in parts]) for i in (0, 1)])
-    W = starts[-1]
-
-    first = np.cumsum([0, *plan.blocks[:-1]])
-    columns = np.vectorize(block_at.__getitem__, otypes=[np.intp])(length)
-    moves = (start * 2 * W + columns + np.arange(nu)).ravel()
-    places: list[Int[np.ndarray, " n"]] = [np.where(plan.tied, free_at, moves)]
-    if track.rates is not None:
-        changes = (first[:, None] * 2 * W + du_at + np.arange(nu)).ravel()
-        changes[plan.held.ravel()] = free_at
-        places.append(changes)
-    places += [(k + 1) * 2 * W + out_at + np.arange(outputs.low.shape[1]) for k in range(N)]
-    mine = np.concatenate(places).astype(np.intp)
-    low_places, high_places = [mine], [mine + W]
-    if len(plan.low) > plan.planned:
-        checked = tight_at + np.flatnonzero(plan.checked[limited])
-        low_places += [checked, np.full(len(checked), free_at)]
-        high_places += [np.full(len(checked), W + free_at), W + checked]
-    tests = (np.arange(N + 1)[:, None] * 2 * W + test_at + np.arange(len(reach))).ravel() if plan.aimed else mine[:0]
-    tight = tight_at + np.arange(len(reach)) if plan.aimed else mine[:0]
+    table = np.concatenate([part[i] for i in (0, 1) for part in parts], axis=1)
     margin = preview_margin(track.margin, N).ravel() if track.margin.any() else None
+    W, raw_at = layout.width, layout.raw.first
     planned = table[:, :raw_at], table[:, W : W + raw_at]
     table = np.clip(table, -HUGE, HUGE)
-    pages = [
-        _Pages(table, places.astype(np.intp), latency, steps - 1, slice(len(mine) - N * len(shown), len(mine)), margin)
-        for places in (
-            np.concatenate([*low_places, *high_places]),
-            np.concatenate([mine, tests, mine + W, tests + W]),
-            np.concatenate([mine, tight, mine + W, tight + W]),
-        )
-    ]
+    pages = [_Pages(table, entries, latency, steps - 1, layout.outputs, margin) for entries in layout.entries]
     return LimitWindows(
         plan=plan,
         last=steps - 1,
         latency=latency,
         table=table,
         endless=not all(np.isfinite(part).all() for part in planned),
-        targets=_Columns(raw_at, raw.low.shape[1]),
-        swept=_Columns(tight_at, len(reach)),
+        targets=layout.raw,
+        swept=layout.tight,
         hard=None if track.hard_rates is None else np.isinf(track.rate_softness.linear),
-        moves=moves,
+        moves=layout.moves,
         plan_pages=pages[0],
         moving_pages=pages[1],
         single_pages=pages[2],
+    )
+
+
+def _lay_out(plan: PlanMap) -> WindowLayout:
+    """Return where the limits of a plan stand in a table of rows of limits."""
+    track, N, nu = plan.track, sum(plan.blocks), len(plan.track.inputs.low)
+    start, length = _find_holds(plan, nu)
+    used = {b: (length == b).any(axis=0) | (b == 1) for b in sorted({1, *length.ravel().tolist()})}
+    outs, limited, rated = len(track.outputs.low), int(plan.limited_targets.sum()), track.rates is not None
+    widths = [nu, *([nu] if rated else []), outs, nu + outs, limited, limited, 1, *([nu] * (len(used) - 1))]
+    starts = np.cumsum([0, *widths]).tolist()
+    at = iter(starts)
+    u_at, du_at = next(at), next(at) if rated else 0
+    out_at, raw_at, test_at, tight_at, free_at = (next(at) for _ in range(5))
+    block_at = {b: next(at) for b in used if b > 1} | {1: u_at}
+    W = starts[-1]
+
+    first = np.cumsum([0, *plan.blocks[:-1]])
+    columns = np.vectorize(block_at.__getitem__, otypes=[np.intp])(length)
+    moves = (start * 2 * W + columns + np.arange(nu)).ravel()
+    places: list[Int[np.ndarray, " n"]] = [np.where(plan.tied, free_at, moves)]
+    if rated:
+        changes = (first[:, None] * 2 * W + du_at + np.arange(nu)).ravel()
+        changes[plan.held.ravel()] = free_at
+        places.append(changes)
+    places += [(k + 1) * 2 * W + out_at + np.arange(outs) for k in range(N)]
+    mine = np.concatenate(places).astype(np.intp)
+    low_places, high_places = [mine], [mine + W]
+    if len(plan.low) > plan.planned:
+        checked = tight_at + np.flatnonzero(plan.checked[plan.limited_targets])
+        low_places += [checked, np.full(len(checked), free_at)]
+        high_places += [np.full(len(checked), W + free_at), W + checked]
+    tests = (np.arange(N + 1)[:, None] * 2 * W + test_at + np.arange(limited)).ravel() if plan.aimed else mine[:0]
+    tight = tight_at + np.arange(limited) if plan.aimed else mine[:0]
+    entries = (
+        np.concatenate([*low_places, *high_places]).astype(np.intp),
+        np.concatenate([mine, tests, mine + W, tests + W]).astype(np.intp),
+        np.concatenate([mine, tight, mine + W, tight + W]).astype(np.intp),
+    )
+    return WindowLayout(
+        used=used,
+        width=W,
+        raw=_Columns(raw_at, nu + outs),
+        tight=_Columns(tight_at, limited),
+        moves=moves,
+        outputs=slice(len(mine) - N * outs, len(mine)),
+        entries=entries,
     )
 
 
