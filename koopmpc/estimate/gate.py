@@ -15,7 +15,8 @@ from koopmpc.values import Viewing
 # innovations the bound is about ten standard deviations: where the running quantile rests it is above 1.64.
 BEYOND = 5.0
 BRIDGED = 5  # refused readings in sequence for which a prediction stands in; the next one is used
-FEW = 10  # no reading is refused before so many innovations of a run have come
+FEW = 10  # the bound counts once so many innovations of a run have come; before,
+ABSURD = 1e4  # a reading is refused if it is off by this many times all that its output has shown
 RISE = 1.4  # an innovation above the running quantile multiplies it by this,
 FALL = RISE ** (-1 / 9)  # and one below it by this: nine of ten are below where the quantile rests
 WIDEN = 4.0  # while all readings are used, the quantile follows the last innovation by at most this factor a step,
@@ -33,7 +34,8 @@ def gate_function(ny: int) -> ca.Function:
     quantile of |yᵢ − ŷᵢ|, and Sᵢ the largest step of this output that was used. ρ is the largest predicted step of all
     outputs, each in units of its S, and fades by 0.8 a step: in a transient a model may err by as much as the outputs
     move. After five refused readings in sequence the gate opens, and all readings are used until one is inside the
-    bound. Entries that are NaN, or not predicted, are not judged.
+    bound. Before the tenth reading only one is refused that is off by 1e4 times all that its output has shown, |last| +
+    max(q, S); the bound counts from there. Entries that are NaN, or not predicted, are not judged.
 
     The memory is q, S, the predicted steps, the last used values, and a count: below 10 the gate is open, and 10 less
     the count are the least number of readings until it may close; from 10 on the refused ones are added.
@@ -48,8 +50,11 @@ def gate_function(ny: int) -> ca.Function:
     least = ca.fmax(LEAST * largest, ca.if_else(came, ROUNDING * ca.fabs(predicted), 0))
     inside = error <= BEYOND * ca.fmax(quantile, least) + share * size
     judged, good, closed = ca.mmax(came), ca.mmin(inside), count >= FEW
+    shown = ca.fmax(quantile, size) + ca.fabs(last)
+    far = ca.mmax(ca.logic_and(shown > 0, error > ABSURD * shown))
+    absurd = ca.logic_and(ca.logic_and(judged, count > 1), ca.logic_and(ca.logic_not(closed), far))
     wild = ca.logic_and(ca.logic_and(judged, closed), ca.logic_not(good))
-    refused = ca.logic_and(wild, count < FEW + BRIDGED)
+    refused = ca.logic_or(ca.logic_and(wild, count < FEW + BRIDGED), absurd)
     opened = ca.logic_and(wild, count >= FEW + BRIDGED)
     used = ca.if_else(refused, predicted, y)
     learned = ca.logic_and(came, ca.logic_not(refused))
@@ -57,7 +62,7 @@ def gate_function(ny: int) -> ca.Function:
     tracks = quantile * ca.if_else(error > quantile, RISE, FALL)
     step = ca.if_else(ca.logic_and(ca.logic_and(learned, inside), count > 0), ca.fabs(y - last), 0)
     waited = ca.if_else(count < FEW - 1, count + 1, ca.if_else(good, FEW, FEW - 1))
-    counted = ca.if_else(refused, count + 1, ca.if_else(opened, FEW - 1, ca.if_else(closed, FEW, waited)))
+    counted = ca.if_else(refused, ca.fmax(count, FEW) + 1, ca.if_else(opened, FEW - 1, ca.if_else(closed, FEW, waited)))
     after = ca.vertcat(
         ca.if_else(learned, ca.if_else(ca.logic_and(closed, good), tracks, follows), quantile),
         ca.fmax(largest, step),

@@ -5,7 +5,7 @@
 A plant has 1 to 4 states and a spectral radius up to 1.3, a controller any of its options: limits of inputs, of their
 changes and of states, hard or soft, weights of changes, blocked moves, latency, previews of the reference and of a
 measured disturbance, an estimator, a model that is wrong by a few percent, and either solver. With --bilinear the
-same loops are those of BilinearMPC, which plans on the same models.
+same loops are those of BilinearMPC, which plans on the same models; with --wild readings are missing or far off.
 """
 
 import argparse
@@ -86,9 +86,18 @@ def lifted(rng, A, B, nz, given):
     return km.LinearPredictor(whole, np.vstack([B, below]), C, lifting, 0.1, *names, **given)
 
 
-def loop(seed, solver=None, large=False, bilinear=False, build=None):
-    """Run the loop of a seed, with the controller that `build` makes of its parts, and return its Outcome."""
-    rng = np.random.default_rng(seed)
+def nonlinear(model, cost, limits, horizon, *, solver, moves=None, **options):
+    """Return a NonlinearMPC of a linear model, which has no solver and no blocks to choose."""
+    return km.NonlinearMPC(model.step_map(), cost, limits, horizon, **options)
+
+
+def loop(seed, solver=None, large=False, bilinear=False, build=None, wild=False):
+    """Run the loop of a seed, with the controller that `build` makes of its parts, and return its Outcome.
+
+    With `wild` one reading in twenty is missing or far off, at times five in a row, and half of the loops have an
+    estimator.
+    """
+    rng, spoil = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     nx, nu, N = int(rng.integers(1, 5)), int(rng.integers(1, 3)), int(rng.integers(1, 31))
     if large:
         nx, nu, N = 4, 2, 50
@@ -116,6 +125,8 @@ def loop(seed, solver=None, large=False, bilinear=False, build=None):
         options["moves"] = int(rng.integers(1, N + 1))
     if rng.random() < 0.25:
         options["estimator"] = km.LiftedDisturbance(rng.uniform(0.1, 1.0))
+    if wild and spoil.random() < 0.5:
+        options["estimator"] = km.LiftedDisturbance()
     chosen = "osqp" if rng.random() < 0.75 else "daqp"
     options["solver"] = solver or chosen
     moving, preview = rng.random() < 0.3, rng.random() < 0.5
@@ -134,12 +145,17 @@ def loop(seed, solver=None, large=False, bilinear=False, build=None):
         mpc = build(model, km.Cost(**weights), limits, N, **options)
         path = goal * np.cos(0.2 * np.arange(STEPS + N + 3))[:, None] if moving else np.tile(goal, (STEPS + N + 3, 1))
         box, pending = limits.inputs(nu), [np.clip(np.zeros(nu), *limits.inputs(nu))] * options.get("latency", 0)
-        most = FAR * (1 + np.abs(x).max())
+        most, burst = FAR * (1 + np.abs(x).max()), 0
         for k in range(STEPS):
             reference = path[k : k + mpc.horizon + 1] if preview else path[k]
             w = None if not nw else W[k : k + mpc.horizon] if preview else W[k]
+            y = x + noise * noises[k]
+            if wild:
+                burst = max(burst - 1, int(spoil.choice([1, 5])) if spoil.random() < 0.05 else 0)
+                if burst:
+                    y[spoil.integers(nx)] = spoil.choice([np.nan, 50.0, -1e6, 1e29])
             start = time.thread_time()
-            move = mpc(x + noise * noises[k], reference, w=w)
+            move = mpc(y, reference, w=w)
             outcome.seconds.append(time.thread_time() - start)
             outcome.statuses.append(move.status.name)
             outcome.solvers.append(getattr(move, "solver", ""))
@@ -179,12 +195,13 @@ def table(outcomes):
     return lines
 
 
-def outcomes_of(seeds, processes=1, solver=None, large=False, bilinear=False):
+def outcomes_of(seeds, processes=1, solver=None, large=False, bilinear=False, build=None, wild=False):
     """Run the loops of some seeds."""
+    asked = solver, large, bilinear, build, wild
     if processes == 1:
-        return [loop(seed, solver, large, bilinear) for seed in seeds]
+        return [loop(seed, *asked) for seed in seeds]
     with ProcessPoolExecutor(processes) as pool:
-        return list(pool.map(loop, seeds, repeat(solver), repeat(large), repeat(bilinear), chunksize=20))
+        return list(pool.map(loop, seeds, *map(repeat, asked), chunksize=20))
 
 
 if __name__ == "__main__":
@@ -197,9 +214,12 @@ if __name__ == "__main__":
     parser.add_argument(
         "--bilinear", action="store_true", help="BilinearMPC, interpreted: a loop ends before compiling"
     )
+    parser.add_argument("--nonlinear", action="store_true", help="NonlinearMPC on the map of the model")
+    parser.add_argument("--wild", action="store_true", help="readings that are missing or far off, more estimators")
     given = parser.parse_args()
     if given.bilinear:
         koopmpc.plants.routines.find_compiler = lambda: None
     seeds = range(given.first, given.first + given.count)
-    found = outcomes_of(seeds, given.processes, given.solver, given.large, given.bilinear)
+    build = nonlinear if given.nonlinear else None
+    found = outcomes_of(seeds, given.processes, given.solver, given.large, given.bilinear, build, given.wild)
     sys.stdout.write("\n".join(table(found)) + "\n")

@@ -162,3 +162,16 @@ def test_what_is_no_number_in_one_place_is_as_if_nothing_were_told(kind, value):
     np.testing.assert_allclose(failed.u, again.u, atol=1e-9)
     for mpc in (told, other):  # the next step goes on
         assert mpc(x, [0.1, 0.0]).fallback is km.control.Fallback.NONE
+
+
+@pytest.mark.parametrize("solver", ["daqp", "osqp"])
+def test_a_reading_whose_forecast_leaves_all_numbers_is_no_exception(solver):
+    A, B = np.array([[1.3, 0.3], [0.0, 0.9]]), np.array([[0.0], [0.5]])
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("p", "q"), ("u",))
+    mpc = km.KoopmanMPC(model, km.Cost(1.0, 0.1), km.Limits(-1, 1, x_max=[1.0, 2.0]), 15, solver=solver)
+    twin = km.compiled(mpc)
+    for y in ([1e29, 1e29], [9e29, 9e29], [0.1, 0.2]):
+        move, other = mpc(y, [0, 0]), twin(y, [0, 0])
+        assert np.abs(move.u).max() <= 1
+        assert solver == "osqp" or (move.status, move.fallback) == (other.status, other.fallback)
+    assert move.status in (km.Status.OPTIMAL, km.Status.UNCONSTRAINED)

@@ -158,6 +158,32 @@ def test_a_wild_first_reading_does_not_let_the_true_ones_be_refused():
     assert np.abs(x).max() < 0.5
 
 
+@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("length", [1, 5])
+def test_absurd_readings_are_refused_from_the_third_on(kind, length):
+    """Five in a row at most: the next one is used, as from the tenth reading on."""
+    controller, rng = built(kind), np.random.default_rng(0)
+    controller.reset()
+    x, refused = np.array([0.4, 0.1]), []
+    for k in range(70):
+        wild = burst(1e7, length, 3)[k - 3] if 3 <= k < 3 + length else 0
+        move = controller(x + NOISE * rng.normal(size=2) + wild, [0.0, 0.0])
+        refused.append(move.refused)
+        x = TRUE(x, move.u)
+    assert np.flatnonzero(refused)[:length].tolist() == list(range(3, 3 + length))
+    assert (np.abs(x) < [0.05, 0.2]).all()
+
+
+def test_what_moves_a_plant_from_rest_is_no_absurd_reading_for_long():
+    mpc, x, refused = km.KoopmanMPC(model("linear"), WHOLE, LIMITS, 20, estimator=LEARNS), np.zeros(2), 0
+    for k in range(150):
+        move = mpc(x, [0.0, 0.0])
+        refused += move.refused
+        x = TRUE(x, move.u) + (np.array([0.0, 1.0]) if k == 4 else 0)
+    assert refused <= BRIDGED
+    assert np.abs(x).max() < 0.02
+
+
 def test_the_run_of_a_loop_holds_which_readings_were_refused():
     class Wild(km.faults.Fault):
         def start(self, wiring, rng):

@@ -326,10 +326,14 @@ class StepSolver:
         solver = self._solvers[i]
         if solver is None:
             solver = self._solvers[i] = self._turns[i].solver(self.qp, self._turns[i].settings)
-        if limits is None:
-            solver.shift(moved)
-        else:
-            solver.set_bounds(limits.low - moved, limits.high - moved)
+        try:
+            if limits is None:
+                solver.shift(moved)
+            else:
+                solver.set_bounds(limits.low - moved, limits.high - moved)
+        except DataError:  # a wild reading moves limits beyond 1e30, where they end in C too
+            low, high = (self.qp.low, self.qp.high) if limits is None else (limits.low, limits.high)
+            solver.set_bounds(*(np.clip(end - moved, -INFINITY, INFINITY) for end in (low, high)))
         left = None
         if deadline is not None:
             left = deadline - perf_counter()
