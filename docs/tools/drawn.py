@@ -46,6 +46,8 @@ def inputs_of(picture: str) -> list[str]:
         return [f"koopmpc/papers/{PAPERS[folder.partition('/')[2]]}"]
     if name.startswith("real_"):
         return ["tests/real/pictures.py:draw"]
+    if name == "calibration":
+        return ["docs/tools/pictures.py:calibration", "tests/closed_loop/calibration.json"]
     return [f"docs/tools/pictures.py:{name}"]
 
 

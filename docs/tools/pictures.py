@@ -1,5 +1,6 @@
 """The pictures of the site, drawn by the library: `python docs/tools/pictures.py [NAME…]` writes docs/pictures/."""
 
+import json
 import re
 import sys
 from collections.abc import Callable, Iterable
@@ -397,6 +398,25 @@ def next_design() -> Any:
     return km.plot.run(_run_page("how/next_experiment.md")["run"], width="two columns")
 
 
+def calibration() -> Any:
+    """What designs promise and what happens on their plants: costs over the median of fresh loops, by task and seed."""
+    table = json.loads((DOCS.parent / "tests" / "closed_loop" / "calibration.json").read_text())
+    made, axes = make_figure(1, 1, width="two columns", height=3.4)
+    axis, most = axes[0, 0], 100.0
+    for place, key in enumerate(sorted(table)):
+        row = table[key]
+        low, high, costs = (np.array(row[name]) / row["median"] for name in ("low", "high", "cost"))
+        axis.fill_between([place - 0.35, place + 0.35], low, min(high, most), color="#56b4e9", alpha=0.5, linewidth=0)
+        shown = np.clip(np.where(np.isfinite(costs), costs, most), 1 / most, most)
+        inside = (costs >= low) & (costs <= high)
+        across = place + np.linspace(-0.25, 0.25, len(costs))
+        axis.plot(across[inside], shown[inside], ".", markersize=3, color="#000000")
+        axis.plot(across[~inside], shown[~inside], ".", markersize=4, color="#d55e00")
+    axis.set(yscale="log", ylim=(1 / most, most), ylabel="cost over the median promised", xlim=(-0.6, len(table) - 0.4))
+    axis.set_xticks(range(len(table)), sorted(table), rotation=90, fontsize=5)
+    return made
+
+
 def _run_page(page: str) -> dict[str, Any]:
     """Run all blocks of a page in a folder of its own, and return the names that they leave."""
     names: dict[str, Any] = {"__name__": "page"}
@@ -446,6 +466,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         from_pid,
         next_experiment,
         next_design,
+        calibration,
         cart_pole,
     )
 }
