@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import numbers
 from koopmpc.codegen.abreast import ControllersAbreast
-from koopmpc.codegen.sources import Language, write_one_source, write_plant_functions
+from koopmpc.codegen.functions import Language
+from koopmpc.codegen.sources import write_one_source, write_plant_functions
 from koopmpc.codegen.tables import Precision, make_tables, read_program
 from koopmpc.control.limits import Limits
 from koopmpc.control.linear.condensed_program import CondensedProgram

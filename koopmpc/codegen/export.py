@@ -11,8 +11,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.codegen.functions import Language
 from koopmpc.codegen.sources import (
-    Language,
     count_constants,
     count_flops,
     count_iteration_flops,

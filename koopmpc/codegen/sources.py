@@ -2,17 +2,15 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib.resources import files
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from koopmpc.codegen.tables import Tables
+from koopmpc.codegen.functions import Language, count_function_flops, write_functions
+from koopmpc.codegen.tables import CFunction, Tables
 from koopmpc.control.program import trace_graph
 from koopmpc.errors import DataError
-from koopmpc.plants.graph import Graph
 
 _OWN = ("koopmpc.h", "koopmpc_common.h", "koopmpc_common.c")
 _RECEDING = ("koopmpc_receding.h", "koopmpc_receding.c", "koopmpc_bounds.h")
@@ -22,121 +20,6 @@ _STAGED = (*_STAGES, "koopmpc_rest.c", "koopmpc_rows.c", "koopmpc_finish.c")
 _SOLVER = ("daqp.c", "auxiliary.c", "factorization.c", "constants.h", "types.h", "auxiliary.h", "daqp.h")
 _SOLVER_FILES = (*_SOLVER, "factorization.h", "LICENSE")
 _CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"  # for the step times of a whole run
-_WIDTH = 118
-
-# Each operation of `plants.graph` as C; {0} and {1} are its operands. Names of math.h go through KOOPMPC_FN, which
-# takes the float version in single precision.
-_UNARY = {
-    "assign": "{0}",
-    "neg": "-{0}",
-    "sq": "{0} * {0}",
-    "twice": "{0} + {0}",
-    "inv": "1 / {0}",
-    "not": "(koopmpc_real)({0} == 0)",
-    "sign": "(koopmpc_real)(({0} > 0) - ({0} < 0))",
-}
-_BINARY = {
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
-    "div": "{0} / {1}",
-    "lt": "(koopmpc_real)({0} < {1})",
-    "le": "(koopmpc_real)({0} <= {1})",
-    "eq": "(koopmpc_real)({0} == {1})",
-    "ne": "(koopmpc_real)({0} != {1})",
-    "and": "(koopmpc_real)({0} != 0 && {1} != 0)",
-    "or": "(koopmpc_real)({0} != 0 || {1} != 0)",
-    "if_else_zero": "{0} != 0 ? {1} : 0",
-    "pow": "KOOPMPC_FN(pow)({0}, {1})",
-    "constpow": "KOOPMPC_FN(pow)({0}, {1})",
-}
-_HYPERBOLIC = ("sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
-_MATH = ("sqrt", "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "erf")
-_WHOLE = ("fabs", "floor", "ceil")
-_MATH_OF_TWO = ("hypot", "atan2", "fmin", "fmax", "fmod", "copysign")
-EXPRESSIONS = (
-    _UNARY
-    | _BINARY
-    | {name: f"KOOPMPC_FN({name})({{0}})" for name in (*_MATH, *_WHOLE, *_HYPERBOLIC)}
-    | {name: f"KOOPMPC_FN({name})({{0}}, {{1}})" for name in _MATH_OF_TWO}
-)
-_FLOPS = {"assign": 0, "neg": 0}  # of one operation where it is not 1; a function of math.h counts 20
-_CALL = 20
-
-
-@dataclass(frozen=True)
-class Language:
-    """How numbers are written: in double or in single precision."""
-
-    single: bool = False
-
-    def number(self, value: float) -> str:
-        """Return a literal that reads back as this number; numbers beyond ±1e30 become ±1e30."""
-        value = float(np.clip(value, -1e30, 1e30))
-        if self.single:
-            short = f"{float(np.float32(value)):.9g}"
-            return short + ("F" if any(mark in short for mark in ".en") else ".0F")
-        return repr(value)
-
-    def array(self, name: str, values: np.ndarray) -> str:
-        """Return the definition of a constant array, of integers or of numbers as `values` are.
-
-        An empty array becomes one zero: C has no array of length 0.
-        """
-        flat = np.asarray(values).ravel()
-        if flat.dtype.kind in "iu":
-            kind, words = "int", [str(int(value)) for value in flat] or ["0"]
-        else:
-            kind, words = "koopmpc_real", [self.number(value) for value in flat] or [self.number(0.0)]
-        lines = [f"static const {kind} {name}[{len(words)}] = {{"]
-        line = " "
-        for word in words:
-            if len(line) + len(word) + 2 > _WIDTH:
-                lines.append(line)
-                line = " "
-            line += f" {word},"
-        return "\n".join([*lines, line, "};"])
-
-    def arrays(self, table: Mapping[str, np.ndarray]) -> str:
-        """Return the definitions of all arrays."""
-        return "\n".join(self.array(f"koopmpc_{name}", values) for name, values in table.items()) + "\n"
-
-
-class Function(NamedTuple):
-    """A C function, and its number of floating-point operations."""
-
-    text: str
-    flops: int
-
-
-def write_function(graph: Graph, name: str, arguments: Mapping[str, int], result: str, language: Language) -> Function:
-    """Return ``void name(const real *argument, …, real *result)``, each register written once."""
-    places: list[str] = [f"{argument}[{i}]" for argument, size in arguments.items() for i in range(size)]
-    registers: dict[int, str] = {}
-    results: list[str] = []
-    lines: list[str] = []
-    flops = 0
-    for count, (step, (target, first, second)) in enumerate(zip(graph.steps, graph.places.tolist(), strict=True)):
-        if step == "output":
-            results.append(f"  {result}[{target}] = {registers[first]};")
-            continue
-        if step == "input":
-            registers[target] = places[first]
-            continue
-        if step == "constant":
-            value = float(graph.constants[first])
-            text = language.number(value)
-            registers[target] = f"({text})" if text.startswith("-") else text
-            continue
-        a, b = registers[first], registers.get(second, "")
-        lines.append(f"  const koopmpc_real v{count} = {EXPRESSIONS[step].format(a, b)};")
-        registers[target] = f"v{count}"
-        flops += _FLOPS.get(step, _CALL if "KOOPMPC_FN" in EXPRESSIONS[step] else 1)
-    # The result may be an argument's own array: all reads come before the writes.
-    heads = [f"const koopmpc_real *{argument}" for argument in arguments]
-    unused = [f"  (void){argument};" for argument in arguments if not any(f"{argument}[" in s for s in lines + results)]
-    body = "\n".join([*unused, *lines, *results])
-    return Function(f"void {name}({', '.join(heads)}, koopmpc_real *{result}) {{\n{body}\n}}\n", flops)
 
 
 def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
@@ -169,11 +52,7 @@ def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
     header = "koopmpc_stages.h" if tables.is_staged else "koopmpc.h"
     result["koopmpc_model.c"] = (
         "/** @file koopmpc_model.c @brief The model, written from CasADi's graph. */\n#include <math.h>\n\n"
-        f'#include "{header}"\n\n'
-        + "\n".join(
-            write_function(each.graph, name, each.arguments, each.result, language).text
-            for name, each in tables.functions.items()
-        )
+        f'#include "{header}"\n\n' + write_functions(tables.functions, language)
     )
     return result
 
@@ -213,10 +92,11 @@ def write_plant_functions(F: ca.Function, h: ca.Function, language: Language) ->
     """
     nx, nu = F.size1_in(0), F.size1_in(1)
     step, look = trace_graph(F, "the plant"), trace_graph(h, "what the plant measures")
-    return (
-        write_function(step, "plant_step", {"x": nx, "u": nu}, "next", language).text
-        + write_function(look, "plant_measure", {"x": nx}, "y", language).text
-    )
+    functions = {
+        "plant_step": CFunction(step, {"x": nx, "u": nu}, "next"),
+        "plant_measure": CFunction(look, {"x": nx}, "y"),
+    }
+    return write_functions(functions, language)
 
 
 def rename_symbols(texts: dict[str, str], name: str) -> dict[str, str]:
@@ -256,10 +136,7 @@ def read_shipped(folder: str, name: str) -> str:
 def count_flops(tables: Tables) -> int:
     """Return a bound of the floating-point operations of a step in which no limit is active and the reference rests."""
     sizes = tables.sizes
-    cost = {
-        name: write_function(each.graph, name, each.arguments, each.result, Language()).flops
-        for name, each in tables.functions.items()
-    }
+    cost = {name: count_function_flops(each.graph) for name, each in tables.functions.items()}
     nz = sizes["NZ"]
     if tables.is_lqr:
         return cost["koopmpc_lift"] + 2 * sizes["NU"] * (nz + sizes["NW"] + sizes["NR"] + 2 * sizes["NU"])

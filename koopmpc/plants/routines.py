@@ -25,7 +25,10 @@ from koopmpc.values import fingerprint
 Kernel = Callable[[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]], None]
 
 # Without fused multiply-adds and -march the machine code gives the interpreter's numbers on all machines of a kind.
-_FLAGS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+_FLAGS = ("-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+# The time of a compiler grows faster than a function that CasADi wrote. 366 kB took 5 s by -O3, 1.7 s by -O1, 0.4 s by
+# -O0, and ran 6.9, 6.4 and 11.6 µs. 1.3 MB took above 100 s by -O3, 19 s by -O1, 1.3 s by -O0.
+_LEVELS = ((100_000, "-O3"), (500_000, "-O1"))  # text of at most so many characters is compiled by this level
 _PROBE = 30.0  # a compiler has this long for a program of one line [s]
 _STEPS_A_THREAD = 50_000  # least steps for one thread: they take about 5 ms, and starting a thread takes 0.1 ms
 _LOOP = """
@@ -143,7 +146,8 @@ def compile_kernel(F: ca.Function, command: list[str], cache: Path | None) -> Ke
     OSError, subprocess.SubprocessError
         The compiler fails or its output does not load.
     """
-    rollouts = load_library(_generate_rollouts(F), command, cache).koopmpc_rollouts
+    text = _generate_rollouts(F)
+    rollouts = load_library(text, command, cache, choose_level(text)).koopmpc_rollouts
     rollouts.argtypes = [ctypes.c_longlong, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p]
     rollouts.restype = None
 
@@ -166,7 +170,12 @@ def compile_kernel(F: ca.Function, command: list[str], cache: Path | None) -> Ke
     return run
 
 
-def load_library(text: str, command: list[str], cache: Path | None) -> ctypes.CDLL:
+def choose_level(text: str) -> str:
+    """Return the level of optimisation for C that CasADi wrote, so that a compiler takes seconds and not minutes."""
+    return next((level for most, level in _LEVELS if len(text) <= most), "-O0")
+
+
+def load_library(text: str, command: list[str], cache: Path | None, level: str = "-O3") -> ctypes.CDLL:
     """Return the machine code of this C, loaded from `cache` or compiled into it; without a cache no file remains.
 
     The flags in the environment variable KOOPMPC_CFLAGS follow the library's own flags. The name of a cached file
@@ -177,7 +186,7 @@ def load_library(text: str, command: list[str], cache: Path | None) -> ctypes.CD
     OSError, subprocess.SubprocessError
         The compiler fails or its output does not load.
     """
-    command = [*command, *_FLAGS, *shlex.split(os.environ.get("KOOPMPC_CFLAGS", ""))]
+    command = [*command, level, *_FLAGS, *shlex.split(os.environ.get("KOOPMPC_CFLAGS", ""))]
     if cache is None:
         with tempfile.TemporaryDirectory() as folder:  # loaded code stays valid when its file is gone
             return ctypes.CDLL(str(_compile(text, command, Path(folder) / "step.so")))
@@ -274,7 +283,8 @@ def _bind_machine_code(
     if command is None:
         return None
     try:
-        code = load_library(_generate_code(function) + _CALL % function.name(), command, find_private_cache())
+        text = _generate_code(function) + _CALL % function.name()
+        code = load_library(text, command, find_private_cache(), choose_level(text))
     except (OSError, RuntimeError, subprocess.SubprocessError):
         return None
     call = code.koopmpc_call
