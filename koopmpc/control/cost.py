@@ -82,6 +82,10 @@ class Cost(Value):
     stage
         ℓ(x, u), a number, as a function of CasADi's symbols: ``lambda x, u: x[1] * u[0]``. For BilinearMPC, which
         convexifies it, and NonlinearMPC; V is of Q and R alone. `metrics` counts it from x_0 and u_0 on.
+    Q_rows, R_rows
+        Weights in time, (T, nr) and (T, nu), or by name a value a step: row k is the diagonal that weighs x_k, or u_k,
+        of a run in place of that of Q or R; the last row is held. Q and R stay the weights of V, of set points and of
+        sizes. For BilinearMPC and NonlinearMPC.
     beyond
         What a reference does after the rows that a step is given. "rest": the last row stays. "motion", the default of
         BilinearMPC and NonlinearMPC without Q_N, tail and given u_target: it goes on by the linear recurrence that all
@@ -112,6 +116,8 @@ class Cost(Value):
     price: "Bound" = None
     beyond: Literal["rest", "motion"] | None = None
     stage: "StageCost | None" = None
+    Q_rows: "Bound" = None
+    R_rows: "Bound" = None
 
     def __post_init__(self) -> None:
         if isinstance(self.Q_N, WeighsEnd):
@@ -146,6 +152,9 @@ class Cost(Value):
             if not all(np.isfinite(np.asarray(value)).all() for value in bounds.list_bound(price)):
                 raise DataError("price holds an infinite number; pass what a unit of an input costs in a step")
             object.__setattr__(self, "price", price)
+        for name in ("Q_rows", "R_rows"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, self._check_rows(name))
         if not (callable(cast("object", self.stage)) or isinstance(self.stage, Graph | None)):
             raise DataError(f"stage is {self.stage!r}; pass a function of x and u, such as lambda x, u: x[0] * u[0]")
         if self.beyond not in ("rest", "motion", None):
@@ -162,6 +171,21 @@ class Cost(Value):
         """Whether the end of a plan follows a reference that goes on as it moved."""
         return self.beyond != "rest" and self.Q_N is None and self.tail is None
 
+    def _check_rows(self, name: str) -> Any:
+        """Return rows of weights, checked."""
+        rows = bounds.check_bound(getattr(self, name), name)
+        values = [np.asarray(value) for value in bounds.list_bound(rows)]
+        if not all((np.isfinite(value) & (value >= 0)).all() for value in values):
+            raise DataError(f"{name} holds a number below 0 or no finite one; pass weights of 0 or above")
+        if not isinstance(rows, Mapping) and np.ndim(rows) != 2:
+            raise ShapeError(f"{name} has shape {np.shape(rows)}; pass rows (steps, n), or by name a value a step")
+        if self.price is not None and name == "R_rows":
+            raise DataError("a price is paid back by R, which R_rows moves in time; pass one of the two")
+        base = getattr(self, name[0])
+        if not isinstance(base, Mapping) and np.ndim(base) == 2 and (base != np.diag(np.diagonal(base))).any():
+            raise DataError(f"{name} are diagonals, and {name[0]} is a full matrix; pass a diagonal one")
+        return rows
+
     def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Cost":
         """Return the cost with arrays in place of weights by name, and a graph in place of the function `stage`.
 
@@ -176,6 +200,10 @@ class Cost(Value):
         priced: dict[str, Any] = {}
         if isinstance(self.price, Mapping):
             priced["price"] = bounds.order_bound(self.price, "price", inputs, 0.0)
+        if isinstance(self.R_rows, Mapping):
+            priced["R_rows"] = bounds.order_bound(self.R_rows, "R_rows", inputs, 0.0)
+        if isinstance(self.Q_rows, Mapping):
+            priced["Q_rows"] = bounds.order_bound(self.Q_rows, "Q_rows", self.of.bind(tuple(states)).names, 0.0)
         if callable(self.stage):
             priced["stage"] = trace_stage(self.stage, len(states), len(inputs))
         if not fields:
@@ -215,6 +243,23 @@ class Cost(Value):
     def price_rows(self, nu: int, first: int, count: int) -> Float[np.ndarray, "count nu"]:
         """Return the prices of the inputs of `count` steps from `first` on; the last row is held."""
         return bounds.hold_rows(cast("ArrayLike | None", self.price), "price", nu, first, count, 0.0)
+
+    @property
+    def weighs_in_time(self) -> bool:
+        """Whether Q or R have rows in time."""
+        return self.Q_rows is not None or self.R_rows is not None
+
+    def weight_rows(
+        self, nr: int, nu: int, first: int, count: int
+    ) -> tuple[Float[np.ndarray, "count nr"], Float[np.ndarray, "count nu"]]:
+        """Return the diagonals that weigh x_k, and u_k, of `count` steps from `first` on; the last rows are held."""
+        Q, R = self.matrices(nr, nu)
+        tables = []
+        for name, weight in (("Q_rows", Q), ("R_rows", R)):
+            rows = getattr(self, name)
+            rows = weight.diagonal() if rows is None else rows
+            tables.append(bounds.hold_rows(rows, name, len(weight), first, count, 0.0))
+        return tables[0], tables[1]
 
     def find_shift(self, nu: int) -> Float[np.ndarray, "T nu"] | None:
         """Return −½ R⁻¹ p, by which a price moves the inputs that cost nothing, a row a step; None without a price.
@@ -441,13 +486,18 @@ def _refuse_steps(cost: Cost, limits: Limits) -> None:
 
 
 def refuse_stage(cost: Cost, who: str) -> None:
-    """Raise where the cost has a stage of its own.
+    """Raise where the cost has a stage of its own, or weights in time.
 
     Raises
     ------
     DataError
-        It has one.
+        It has one of the two.
     """
+    if cost.weighs_in_time:
+        raise DataError(
+            f"the cost has rows of weights in time, which {who} does not know; take a BilinearMPC or a NonlinearMPC, or"
+            " leave Q_rows and R_rows out"
+        )
     if cost.stage is not None:
         raise DataError(
             f"the cost has a stage of its own, which {who} does not know; take a BilinearMPC or a NonlinearMPC, or"
@@ -477,6 +527,7 @@ def _tracking(
     if nu == 0:
         raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
     nx = len(states)
+    cost.weight_rows(nr, nu, 0, 1)  # checks their sizes
     (Q, R), R_delta, rows = cost.matrices(nr, nu), cost.rate(nu), cost.given_inputs(nu)
     base = limits.base
     sizes = Sizes.of(cost.of.bind(states), Q, R, base, states, ranges)

@@ -204,6 +204,12 @@ def cost_terms(
     )
     if run.cost is not None and run.cost.price is not None:
         moved = moved + np.einsum("ki,ki->k", run.cost.price_rows(nu, 0, len(run.U)), run.U)
+    if run.cost is not None and run.cost.weighs_in_time:
+        weights = run.cost.weight_rows(nr, nu, 0, len(error))
+        stage, moved = (
+            np.einsum("ki,ki->k", rows**2, diagonal[: len(rows)])
+            for rows, diagonal in zip((error, run.U - run.u_reference), weights, strict=True)
+        )
     if run.cost is not None and run.cost.stage is not None:
         moved = moved + evaluate_stage(run.cost.stage, _states(run)[:-1], run.U)
     return stage, moved, changed

@@ -52,6 +52,7 @@ _COPIED = (
     "_age",
     "_given",
     "_limit_step",
+    "_weight_row",
     "_planned",
     "_warm",
     "_moved",
@@ -179,6 +180,8 @@ class BilinearMPC(StagedMPC):
             raise no_export(self, "its limits have rows in time, and its C keeps one set", "one with limits.at(step)")
         if outputs.shift is not None:
             raise no_export(self, "its cost has a price, which its C does not know", "one without a price")
+        if problem.timed:
+            raise no_export(self, "its weights move in time, and its C keeps one set", "one without Q_rows and R_rows")
         if problem.stage is not None:
             raise no_export(self, "its cost has a stage of its own, which its C does not know", "one without a stage")
         if self._levels is not None:
@@ -284,6 +287,9 @@ class BilinearMPC(StagedMPC):
     def _limit(self, limits: StageLimits | None) -> None:
         low, high = self._base_limits if limits is None else limits.stages
         self._iteration.low[:], self._iteration.high[:] = low, high
+
+    def _weigh(self, Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N m"]) -> None:
+        self._iteration.set_weights(Q, R)
 
     def _schedule(self, W: Float[np.ndarray, "N nw"]) -> None:
         self._iteration.W[:] = W

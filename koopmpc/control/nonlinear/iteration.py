@@ -101,7 +101,7 @@ class RealTimeIteration:
         self._softness = Softness(*(np.concatenate(pair) for pair in prices))
         self._sizes, self._input_sizes = problem.sizes, problem.input_sizes
         sweeps, simulate, linearise = RiccatiSweeps(nx, nu, N), simulation(problem), linearisation(problem)
-        own = problem.stage is not None  # then R changes from program to program
+        own = problem.stage is not None or problem.timed  # then R changes from program to program
         free = solve_unconstrained(sweeps, None if own else R)
         interior = interior_step(sweeps, None if own else R, self._sides, ng) if len(self._sides.row) else None
         self._limits = Interval(*(np.concatenate([problem.inputs[i], problem.box[i]]) for i in (0, 1)))
@@ -135,12 +135,16 @@ class RealTimeIteration:
         self._F, self._c, self._x0 = F, zeros((N, nx)), zeros(nx)
         self._now, state = _views([(N, nx), (N, nu), (N, ns), (N, ns), (N, nsoft), (N, nsoft)])
         self._next, after = _views([each.shape for each in state])
-        plan = [self.X, self.U, self._R, self._U_r, *self._terminal, self.theta]
+        rated = problem.with_rates
+        self._weights = [zeros((N, nr)), zeros((N, 0 if rated else nu))] if problem.timed else []
+        plan = [self.X, self.U, self._R, self._U_r, *self._terminal, self.theta, *self._weights]
         self._base_R, self._R_k = R.reshape(nu, N, nu).transpose(1, 0, 2).copy(), zeros((N, nu, nu))
         self._R_k[:] = self._base_R
         self._A, self._stages = A, Stages(A, B, Q, self._R_k, self._G, problem.free)
         self._quadratic, self._gradients = (Q, self._R_k), (q, r)
-        self._own_stage = ConvexStage(problem, self.X, self.U, compiles=compiles_model) if own else None
+        self._own_stage = (
+            ConvexStage(problem, self.X, self.U, compiles=compiles_model) if problem.stage is not None else None
+        )
         self._ahead, self._trial = (zeros((N, nx)), zeros((N, nu))), zeros((N, nx))
         self._simulate = Routine(simulate, [*self._ahead, self.theta], [self._trial], compiles=compiles_model)
         self._linearise = Routine(linearise, plan, [A, B, F, Q, q, r, self._g, self._G], compiles=compiles_model)
@@ -148,7 +152,8 @@ class RealTimeIteration:
         stages = [A, B, self._c, Q, q, r, self._x0, *([self._R_k] if own else [])]
         self.without_limits = zeros(nu)  # the first input of the last program, had it no limits
         self._dX, self._dU, self._t, self._lam, self._eps, self._nu = state
-        parts, self._cost = [self.X, self.U, self._R, self._U_r, *self._terminal], zeros(1)
+        parts = [self.X, self.U, self._R, self._U_r, *self._terminal, *self._weights]
+        self._cost = zeros(1)
         self._weigh = Routine(cost, parts, [self._cost], compiles=False)
         self._free = Routine(free, stages, [self._dX, self._dU, curvature])
         self._d, self._measures, self._curvature = zeros((N, ns)), zeros(2), curvature
@@ -184,9 +189,9 @@ class RealTimeIteration:
             for place, value in zip(self._terminal, (targets.M.T, targets.L.T, targets.m), strict=True):
                 place[:] = value
         self._linearise.call()
+        (Q, R), (q, r) = self._quadratic, self._gradients
+        R[:] = self._base_R
         if self._own_stage is not None:
-            (Q, R), (q, r) = self._quadratic, self._gradients
-            R[:] = self._base_R
             self._own_stage.add(Q, q, R, r)
         if self._ends:  # a terminal set limits the last stage alone
             self._g[:-1, -self._ends :], self._G[:-1, :, -self._ends :] = 0.0, 0.0
@@ -288,6 +293,12 @@ class RealTimeIteration:
         if not self._scheduled:
             return self.theta
         return np.concatenate([self.theta[: len(self.theta) - self.W.size], self.W[k]])
+
+    def set_weights(self, Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N m"]) -> None:
+        """Set the diagonals of all stages, where weights move in time."""
+        self._weights[0][:], self._weights[1][:] = Q, R
+        for k in range(len(R) if R.shape[1] else 0):
+            self._base_R[k] = np.diag(R[k])
 
     def set_theta(self, theta: Float[np.ndarray, " nt"]) -> None:
         """Set the θ of a model; the w of all stages stay."""

@@ -142,6 +142,9 @@ class NonlinearMPC(StagedMPC):
         nu = self.nu
         self._shooting.set_limits(Interval(low[:, :nu], high[:, :nu]), Interval(low[:, nu:], high[:, nu:]))
 
+    def _weigh(self, Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N m"]) -> None:
+        self._shooting.weights = Q, R
+
     def _schedule(self, W: Float[np.ndarray, "N nw"]) -> None:
         self._W[:] = W
 

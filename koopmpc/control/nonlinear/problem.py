@@ -220,6 +220,8 @@ class StagedProblem(NamedTuple):
         How many of `limited`, the last ones, are those of a terminal set, and limit the last stage alone.
     stage
         (s_k, v_k) → ℓ of the cost; None where it has no stage of its own.
+    timed
+        Whether weights move in time: each stage then has diagonals of its own in place of Q, and of R without rates.
     """
 
     F: ca.Function
@@ -243,6 +245,7 @@ class StagedProblem(NamedTuple):
     own: bool = False
     scheduled: int = 0
     stage: ca.Function | None = None
+    timed: bool = False
 
     def stage_theta(self, theta: ca.MX, k: int) -> ca.MX:
         """Return the θ of stage k out of [θ; w_0; …; w_{N−1}], all of them where w multiplies no state."""
@@ -297,6 +300,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks)
         scale=o.sizes.scale,
         scheduled=model.scheduled,
         stage=_stage_function(o.cost, model, nx, with_rates=False),
+        timed=o.cost.weighs_in_time,
     )
     wanted = o.limits.terminal
     if not o.with_rates and len(blocks) == N and not moves.own:

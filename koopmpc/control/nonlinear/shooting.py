@@ -129,9 +129,12 @@ class Shooting:
         ahead = F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U, schedule) + ca.vertcat(e, ca.MX(nx - moved, N))
         gaps = W[nu : nu + nx, :] - ahead / ca.DM(p.sizes)
         end = M @ p.tracked(X[:, N - 1]) + L @ X[:, N - 1] - m
-        f = _weigh(U - u_r, p.R) + ca.sumsqr(end)
+        Q_d, R_d = ca.MX.sym("Q_d", nr * p.timed, N), ca.MX.sym("R_d", nu * (p.timed and not p.with_rates), N)
+        self.weights = np.tile(p.Q.diagonal(), (N, int(p.timed))), np.tile(p.R.diagonal(), (N, int(R_d.numel() > 0)))
+        f = (ca.dot(U - u_r, R_d * (U - u_r)) if R_d.numel() else _weigh(U - u_r, p.R)) + ca.sumsqr(end)
         if N > 1:
-            f += _weigh(p.tracked.map(N - 1)(X[:, : N - 1]) - r[:, : N - 1], p.Q)
+            missed = p.tracked.map(N - 1)(X[:, : N - 1]) - r[:, : N - 1]
+            f += ca.dot(missed, Q_d[:, : N - 1] * missed) if p.timed else _weigh(missed, p.Q)
         if p.stage is not None:
             f += ca.sum2(p.stage.map(N)(ca.horzcat(x0, X[:, : N - 1]), U))
         path, low, high = ca.MX(0, N), np.zeros(0), np.zeros(0)
@@ -175,7 +178,7 @@ class Shooting:
         lbx[held] = ubx[held] = 0.0
         lbx, ubx = lbx / self._sizes, ubx / self._sizes
         self._bounds = {"lbx": lbx.ravel(), "ubx": ubx.ravel(), "lbg": lbg, "ubg": ubg}
-        parameters = ca.veccat(x0, r, u_r, e, M, L, m, schedule)
+        parameters = ca.veccat(x0, r, u_r, e, M, L, m, schedule, Q_d, R_d)
         nlp = {"x": ca.vec(W), "p": parameters, "f": f / p.scale, "g": ca.vertcat(*g)}
         given: dict[str, Any] = {"expand": smooth, "error_on_fail": False, "print_time": False}
         self._start_is_number: ca.Function | None = None
@@ -244,6 +247,7 @@ class Shooting:
             self._bounds[end][:nu] = value / self._sizes[:nu]
         p = [x0, t.R.ravel(), t.U.ravel(), e.ravel(), t.M.ravel("F"), t.L.ravel("F"), t.m]
         p += [] if schedule is None else [schedule.ravel()]
+        p += [rows.ravel() for rows in self.weights]
         begin = {"x0": start.v, "lam_x0": start.bounds, "lam_g0": start.constraints}
         U, X, slacks = np.split(start.v.reshape(self._shape) * self._sizes, self._split, axis=1)
         failed = NLPSolution(U, X, slacks, np.inf, Status.FAILED, 0, start, start)

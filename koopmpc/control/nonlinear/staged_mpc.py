@@ -68,6 +68,8 @@ class StagedMPC(MPCBase):
     _called_with: Limits | None
     _goes_on: bool  # whether a reference that moves goes on beyond its rows
     _levels: LevelSearch | None
+    _last_root: Float[np.ndarray, "nu nu"] | None = None  # root of the weight of u_{N−1}, where it moves in time
+    _weight_row = 0  # calls since reset, as far as weights move in time
     _timed: bool  # whether the controller's own limits move in time
     _warm: bool  # whether the next step starts from the plan of the last one
 
@@ -127,7 +129,7 @@ class StagedMPC(MPCBase):
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
-        self._limit_step, inputs = 0, self._outputs.inputs
+        self._limit_step, self._weight_row, inputs = 0, 0, self._outputs.inputs
         if self._timed:
             low, high = self.limits.input_rows(self.nu, 0, 1)
             self._box = Interval(np.maximum(low, inputs.low), np.minimum(high, inputs.high))
@@ -235,6 +237,8 @@ class StagedMPC(MPCBase):
         x, u_prev = initial.z, initial.u_prev if initial.u_prev.size else self._given
         s, first, conflict = self._first_stage(x, u_prev)
         target = checks.numbers(reference, "reference")
+        if self.cost.weighs_in_time:
+            self._pass_weights()
         known = np.abs(x).max() < HUGE and (not self._disturbed or self._disturb())
         if not (known and self._aim(target)):
             return self._lose(applied, Status.BAD_MEASUREMENT, 0, start)
@@ -266,6 +270,19 @@ class StagedMPC(MPCBase):
         deadline: float,
     ) -> StagePlan:
         """Return the plan from s on, with v_0 inside `first`."""
+
+    def _pass_weights(self) -> None:
+        """Pass the weights of the stages of this step, and go on to the next row."""
+        first, o = self._weight_row + self._latency, self._outputs
+        Q, R = self.cost.weight_rows(len(o.Q), self.nu, first, self._N + 1)
+        self._weight_row += 1
+        if self._with_rates and self.cost.R_rows is not None:
+            self._last_root, self._moved = np.diag(np.sqrt(R[-2])), True
+        self._weigh(*((np.hstack([Q[1:], R[:-1]]), R[:-1, :0]) if self._with_rates else (Q[1:], R[:-1])))
+
+    @abstractmethod
+    def _weigh(self, Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N m"]) -> None:
+        """Take over the diagonals that weigh the tracked outputs of s_1 … s_N, and v_0 … v_{N−1} without rates."""
 
     def _disturb(self) -> bool:
         """Write down e_k = E w_k + d; return whether it is finite."""
@@ -352,7 +369,8 @@ class StagedMPC(MPCBase):
         M_s, L_s, m_s = np.zeros((ns + nr + nu, nr + nu)), np.zeros((ns + nr + nu, ns)), np.zeros(ns + nr + nu)
         last = slice(nx, nx + nu)
         M_s[:n, :nr], L_s[:n, :nx], L_s[:n, last], m_s[:n] = M, L, V, m
-        L_s[n : n + nu, last], m_s[n : n + nu] = self._outputs.R_root, self._outputs.R_root @ U[-1]
+        root = self._outputs.R_root if self._last_root is None else self._last_root
+        L_s[n : n + nu, last], m_s[n : n + nu] = root, root @ U[-1]
         return StageTargets(np.hstack([R, U]), np.zeros_like(U), M_s, L_s, m_s)
 
     def _first_stage(

@@ -81,10 +81,11 @@ def linearisation(problem: StagedProblem) -> ca.Function:
     if problem.F.is_a("SXFunction"):
         dynamics = dynamics.expand("dynamics", {"cse": True})
     s, r = ca.SX.sym("x", nx), ca.SX.sym("r", nr)
+    d = ca.SX.sym("d", nr * problem.timed)
     of, g = problem.tracked(s), problem.limited(s)
     J = ca.jacobian(of, s)
-    weighted = J.T @ ca.DM(problem.Q)
-    stage = ca.Function("stage", [s, r], [ca.densify(weighted @ J), ca.densify(weighted @ (of - r))], {"cse": True})
+    weighted = J.T @ (ca.diag(d) if problem.timed else ca.DM(problem.Q))
+    stage = ca.Function("stage", [s, r, d], [ca.densify(weighted @ J), ca.densify(weighted @ (of - r))], {"cse": True})
     limited = ca.Function("limits", [s], [ca.densify(g), ca.densify(ca.jacobian(g, s))], {"cse": True})
     M, L, m = (ca.SX.sym("goal", nx + nr, columns) for columns in (nr, nx, 1))
     E = M @ J + L
@@ -101,13 +102,22 @@ def linearisation(problem: StagedProblem) -> ca.Function:
         *(each[1] if free else ca.MX(ca.DM(nx, nu)) for each, free in zip(stages, problem.free, strict=True))
     )
     F = ca.horzcat(*(stage[2] for stage in stages))
+    Q_d, R_d = _weight_symbols(problem)
     Q, q = end(X[:, N], *goal)
     if N > 1:
-        Q_k, q_k = stage.map(N - 1)(X[:, 1:N], R[:, : N - 1])
+        Q_k, q_k = stage.map(N - 1)(X[:, 1:N], R[:, : N - 1], Q_d[:, : N - 1])
         Q, q = ca.horzcat(Q_k, Q), ca.horzcat(q_k, q)
     g_k, G = limited.map(N)(X[:, 1:]) if ng else (ca.MX(0, N), ca.MX(0, N * nx))
-    found = [A, ca.densify(B), F, Q, q, ca.DM(problem.R) @ (U - U_r), g_k, G]
-    return ca.Function("linearisation", [X, U, R, U_r, *goal, every], found)
+    r = R_d * (U - U_r) if R_d.numel() else ca.DM(problem.R) @ (U - U_r)
+    found = [A, ca.densify(B), F, Q, q, r, g_k, G]
+    return ca.Function("linearisation", [X, U, R, U_r, *goal, every, *([Q_d, R_d] if problem.timed else [])], found)
+
+
+def _weight_symbols(problem: StagedProblem) -> tuple[ca.MX, ca.MX]:
+    """Return the diagonals of all stages that weigh tracked outputs, and inputs without rates; none where none move."""
+    N, nr, nu = len(problem.free), len(problem.Q), len(problem.R)
+    timed = problem.timed
+    return ca.MX.sym("Q_d", nr * timed, N), ca.MX.sym("R_d", nu * (timed and not problem.with_rates), N)
 
 
 def list_hard_outputs(softness: Softness, inputs: int) -> Int[np.ndarray, " n"]:
@@ -124,8 +134,10 @@ def plan_cost(problem: StagedProblem) -> ca.Function:
     M, L, m = (ca.MX.sym("terminal", nx + nr, columns) for columns in (nr, nx, 1))
     of, moved = problem.tracked.map(N)(X[:, 1:]), U - U_r
     missed = (of - R)[:, : N - 1]
-    cost = ca.sumsqr(M @ of[:, N - 1] + L @ X[:, N] - m) + ca.dot(moved, ca.DM(problem.R) @ moved)
-    cost += ca.dot(missed, ca.DM(problem.Q) @ missed)
+    Q_d, R_d = _weight_symbols(problem)
+    cost = ca.sumsqr(M @ of[:, N - 1] + L @ X[:, N] - m)
+    cost += ca.dot(moved, R_d * moved if R_d.numel() else ca.DM(problem.R) @ moved)
+    cost += ca.dot(missed, Q_d[:, : N - 1] * missed if problem.timed else ca.DM(problem.Q) @ missed)
     if len(problem.box.low):
         soft = np.isfinite(problem.softness.linear)
         linear, quadratic = (ca.DM(np.where(soft, weight, 0.0)) for weight in problem.softness[:2])
@@ -141,7 +153,7 @@ def plan_cost(problem: StagedProblem) -> ca.Function:
         cost += ca.dot(linear, ca.sum2(over)) + ca.dot(quadratic, ca.sum2(over**2))
     if problem.stage is not None:
         cost += ca.sum2(problem.stage.map(N)(X[:, :N], U))
-    return ca.Function("plan_cost", [X, U, R, U_r, M, L, m], [cost])
+    return ca.Function("plan_cost", [X, U, R, U_r, M, L, m, *([Q_d, R_d] if problem.timed else [])], [cost])
 
 
 def simulation(problem: StagedProblem) -> ca.Function:

@@ -1,0 +1,98 @@
+"""Weights in time: constant rows are constant weights, moving ones give the plan of a solver that knows nothing of
+stages, metrics count them, and laws that do not know them refuse them."""
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+from scipy.optimize import lsq_linear
+from scipy.signal import StateSpace
+
+import koopmpc as km
+
+A, B = np.array([[1.0, 0.2], [-0.1, 0.9]]), np.array([[0.02], [0.2]])
+MODEL = km.LinearPredictor.from_state_space(StateSpace(A, B, np.eye(2), np.zeros((2, 1)), dt=0.2))
+LIMITS, END, N = km.Limits(u_min=-1, u_max=1), np.diag([3.0, 1.0]), 5
+Q_ROWS = np.random.default_rng(0).uniform(0, 4, (12, 2))
+R_ROWS = np.random.default_rng(1).uniform(0.05, 2, (12, 1))
+KINDS = [km.BilinearMPC, km.NonlinearMPC]
+slow = pytest.mark.slow
+
+
+def make(kind, **cost):
+    return kind(MODEL, km.Cost(**{"Q": [1, 0.5], "R": 0.2, "Q_N": END, "u_target": "zero"} | cost), LIMITS, N)
+
+
+def row(table, k):
+    return table[min(k, len(table) - 1)]
+
+
+def find_best(x, k, R_delta, last):
+    """Return the inputs of least cost at step k, by least squares in all inputs at once."""
+    forced = np.vstack([np.linalg.matrix_power(A, i + 1) for i in range(N)]) @ x
+    response = np.zeros((2 * N, N))
+    for i in range(N):
+        for j in range(i + 1):
+            response[2 * i : 2 * i + 2, j] = (np.linalg.matrix_power(A, i - j) @ B)[:, 0]
+    states = [np.diag(np.sqrt(row(Q_ROWS, k + i + 1))) for i in range(N - 1)]
+    weigh = block_diag(*states, np.sqrt(END))
+    inputs = np.diag([float(np.sqrt(row(R_ROWS, k + i)[0])) for i in range(N)])
+    change = np.sqrt(R_delta) * (np.eye(N) - np.eye(N, k=-1))
+    rows = np.vstack([weigh @ response, inputs, change])
+    right = np.concatenate([-weigh @ forced, np.zeros(N), np.sqrt(R_delta) * last * np.eye(N)[0]])
+    return lsq_linear(rows, right, (-1, 1), tol=1e-14).x
+
+
+@pytest.mark.parametrize(
+    ("kind", "R_delta"),
+    [(KINDS[0], 0.0), (KINDS[0], 0.3), (KINDS[1], 0.0), pytest.param(KINDS[1], 0.3, marks=slow)],
+)
+def test_the_plan_of_each_step_is_that_of_least_squares(kind, R_delta):
+    mpc = make(kind, Q_rows=Q_ROWS, R_rows=R_ROWS, R_delta=R_delta or None)
+    for _ in range(2):  # a reset begins at the first row
+        x, last = np.array([2.0, 0.5]), 0.0
+        mpc.reset()
+        for k in range(9):
+            u = mpc(x, [0, 0]).u
+            np.testing.assert_allclose(mpc.plan().U[:, 0], find_best(x, k, R_delta, last), atol=2e-5)
+            x, last = A @ x + B @ u, float(u[0])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_constant_rows_are_the_constant_weights(kind):
+    plain, rows = make(kind), make(kind, Q_rows=[[1, 0.5]] * 3, R_rows=[[0.2]])
+    x = np.array([2.0, 0.5])
+    for _ in range(6):
+        u = plain(x, [0.3, 0]).u
+        np.testing.assert_allclose(rows(x, [0.3, 0]).u, u, atol=1e-9)
+        x = A @ x + B @ u
+
+
+def test_metrics_count_the_rows_and_names_are_resolved():
+    names = {"Q_rows": {"x0": Q_ROWS[:, 0]}, "R_rows": {"u0": R_ROWS[:, 0]}}
+    mpc = make(km.BilinearMPC, **names)
+    run = km.simulate(MODEL.step_map(), mpc, x0=[1.0, 0.0], reference=[0, 0], steps=6, cost=mpc.cost)
+    expected = sum(Q_ROWS[k, 0] * run.X[k, 0] ** 2 for k in range(1, 7))
+    expected += sum(R_ROWS[k, 0] * run.U[k, 0] ** 2 for k in range(6))
+    assert km.metrics(run).cost == pytest.approx(expected)
+
+
+REFUSED = {
+    "below 0": {"Q_rows": [[-1, 0]]},
+    "pass rows": {"R_rows": [0.1, 0.2]},
+    "one of the two": {"R_rows": [[0.1]], "price": [0.1]},
+    "a full matrix": {"Q": [[1, 0.2], [0.2, 1]], "Q_rows": [[1, 1]]},
+    "pass rows of 2": {"Q_rows": [[1, 1, 1]]},
+}
+
+
+@pytest.mark.parametrize("said", REFUSED)
+def test_rows_that_cannot_be_are_refused(said):
+    with pytest.raises((km.errors.DataError, km.errors.ShapeError), match=said):
+        make(km.BilinearMPC, **REFUSED[said])
+
+
+def test_laws_that_do_not_know_rows_refuse_them():
+    for kind in (km.KoopmanMPC, km.LQR):
+        with pytest.raises(km.errors.DataError, match="rows of weights in time"):
+            kind(MODEL, km.Cost(Q=1, R=1, Q_rows=[[1, 1]]))
+    assert "weights move in time" in make(km.BilinearMPC, Q_rows=[[1, 1]]).program().obstacle
