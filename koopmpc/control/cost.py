@@ -173,12 +173,12 @@ class Cost(Value):
 
     def _check_rows(self, name: str) -> Any:
         """Return rows of weights, checked."""
-        rows = bounds.check_bound(getattr(self, name), name)
+        rows: Any = bounds.check_bound(getattr(self, name), name)
         values = [np.asarray(value) for value in bounds.list_bound(rows)]
         if not all((np.isfinite(value) & (value >= 0)).all() for value in values):
             raise DataError(f"{name} holds a number below 0 or no finite one; pass weights of 0 or above")
-        if not isinstance(rows, Mapping) and np.ndim(rows) != 2:
-            raise ShapeError(f"{name} has shape {np.shape(rows)}; pass rows (steps, n), or by name a value a step")
+        if not bounds.is_rows(rows):
+            raise ShapeError(f"{name} is {rows!r}; pass rows (steps, n), or by name a value a step")
         if self.price is not None and name == "R_rows":
             raise DataError("a price is paid back by R, which R_rows moves in time; pass one of the two")
         base = getattr(self, name[0])
@@ -254,11 +254,11 @@ class Cost(Value):
     ) -> tuple[Float[np.ndarray, "count nr"], Float[np.ndarray, "count nu"]]:
         """Return the diagonals that weigh x_k, and u_k, of `count` steps from `first` on; the last rows are held."""
         Q, R = self.matrices(nr, nu)
-        tables = []
+        tables: list[Float[np.ndarray, "count n"]] = []
         for name, weight in (("Q_rows", Q), ("R_rows", R)):
             rows = getattr(self, name)
             rows = weight.diagonal() if rows is None else rows
-            tables.append(bounds.hold_rows(rows, name, len(weight), first, count, 0.0))
+            tables.append(bounds.hold_rows(cast("ArrayLike", rows), name, len(weight), first, count, 0.0))
         return tables[0], tables[1]
 
     def find_shift(self, nu: int) -> Float[np.ndarray, "T nu"] | None:
@@ -527,7 +527,8 @@ def _tracking(
     if nu == 0:
         raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
     nx = len(states)
-    cost.weight_rows(nr, nu, 0, 1)  # checks their sizes
+    if cost.Q_rows is not None or cost.R_rows is not None:
+        cost.weight_rows(nr, nu, 0, 1)  # checks their sizes
     (Q, R), R_delta, rows = cost.matrices(nr, nu), cost.rate(nu), cost.given_inputs(nu)
     base = limits.base
     sizes = Sizes.of(cost.of.bind(states), Q, R, base, states, ranges)

@@ -237,7 +237,7 @@ class StagedMPC(MPCBase):
         x, u_prev = initial.z, initial.u_prev if initial.u_prev.size else self._given
         s, first, conflict = self._first_stage(x, u_prev)
         target = checks.numbers(reference, "reference")
-        if self.cost.weighs_in_time:
+        if self._problem.timed:
             self._pass_weights()
         known = np.abs(x).max() < HUGE and (not self._disturbed or self._disturb())
         if not (known and self._aim(target)):
