@@ -373,6 +373,21 @@ def own_blocks() -> Any:
     return _run_of("how/own_blocks.md")
 
 
+def speed() -> Any:
+    """Time of a step and memory over the horizon, of several methods, as measured."""
+    found = json.loads((DOCS.parent / "tests/speed/figures/growth.json").read_text())
+    drawing, axes = make_figure(1, 2, width="two columns", height=2.6)
+    for i, (method, rows) in enumerate(found.items()):
+        horizons = [int(N) for N in rows]
+        axes[0, 0].loglog(horizons, [1e3 * row["next"] for row in rows.values()], **line_style(i), label=method)
+        axes[0, 1].loglog(horizons, [row["MB"] for row in rows.values()], **line_style(i))
+    axes[0, 0].axhline(10, **LIMIT, label="asked at N 500")
+    for axis, label in zip(axes[0], ("CPU time of a step [ms]", "memory [MB]"), strict=True):
+        axis.set(xlabel="horizon N", ylabel=label)
+    draw_legend(drawing, axes[0, :1], 3)
+    return drawing
+
+
 def next_experiment() -> Any:
     """The first plan and the last one of the page on the next experiment, with their logs."""
     plans = _run_page("how/next_experiment.md")["plans"]
@@ -459,6 +474,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         measured_disturbances,
         on_off,
         own_blocks,
+        speed,
         unequal_rates,
         priorities,
         periodic,

@@ -1,5 +1,6 @@
 """Steps of controllers: references that rest and move, limits, and quadratic programs."""
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -88,6 +89,58 @@ def limited() -> Callable[[], float]:
     return measure
 
 
+def pmsm() -> Any:
+    """Return a permanent-magnet drive in the rotor's frame, by Runge-Kutta steps of 0.1 ms: id, iq, ω and ud, uq."""
+    R, L, flux, pairs, J, friction, dt = 0.5, 2e-3, 0.1, 4, 1e-3, 1e-4, 1e-4
+    x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
+    turn = pairs * x[2]
+    change = ca.vertcat(
+        (-R * x[0] + turn * L * x[1] + u[0]) / L,
+        (-R * x[1] - turn * L * x[0] - turn * flux + u[1]) / L,
+        (1.5 * pairs * flux * x[1] - friction * x[2]) / J,
+    )
+    f = ca.Function("f", [x, u], [change])
+    k2 = f(x + dt / 2 * change, u)
+    k3 = f(x + dt / 2 * k2, u)
+    k4 = f(x + dt * k3, u)
+    step = ca.Function("F", [x, u], [x + dt / 6 * (change + 2 * k2 + 2 * k3 + k4)])
+    return km.StepMap(step, dt, states=("id", "iq", "omega"), inputs=("ud", "uq"))
+
+
+def whole_loop(kind: str, share: float, compiled: bool) -> Callable[[], Callable[[], float]]:
+    """Return a measurement of the CPU time of a step of a closed loop that a share of the steps keeps."""
+
+    def prepare() -> Callable[[], float]:
+        if kind == "quadrotor":
+            problem = km.load_problem("planar_quadrotor")
+            plant, case = km.discretize(problem.dynamics, problem.dt), next(iter(problem.cases.values()))
+            mpc: Any = km.BilinearMPC(plant, problem.cost, problem.limits, 50)
+            x, rows = np.asarray(case.x0), [np.asarray(case.reference)] * case.steps
+        else:
+            plant, N, steps, k = pmsm(), 20, 1000, np.arange(1021)
+            limits = km.Limits(-150, 150, x_min=[-30, -30, -1000], x_max=[30, 30, 1000])
+            mpc, x = km.BilinearMPC(plant, km.Cost([1, 1, 0.1], [1e-3, 1e-3]), limits, N), np.zeros(3)
+            speed = 50 + 0.1 * k if kind == "ramp" else np.where(k // 200 % 2, 100.0, 50.0)
+            rows = [np.array([0.0, 0.0, speed[i]]) for i in range(steps)]
+            if kind == "ramp":
+                rows = [np.stack([0 * speed[i : i + N + 1]] * 2 + [speed[i : i + N + 1]], axis=1) for i in range(steps)]
+        controller: Any = km.compiled(mpc) if compiled else mpc
+
+        def measure() -> float:
+            controller.reset()
+            state, spent = x, np.zeros(len(rows))
+            for i, row in enumerate(rows):
+                start = time.thread_time()
+                move = controller(state, row)
+                spent[i] = time.thread_time() - start
+                state = plant(state, move.u)
+            return float(np.quantile(spent[1:], share))
+
+        return measure
+
+    return prepare
+
+
 NAMES = {
     "rows": "N+1 rows of preview",
     "row": "one new row",
@@ -95,6 +148,11 @@ NAMES = {
     "u_target rows": "rows of `u_target` and of preview",
     "limits": "limits in time",
     "limits rows": "limits in time and rows of preview",
+}
+LOOPS = {
+    "pmsm": "electric drive at 10 kHz, set points",
+    "ramp": "the same, rows of a ramp",
+    "quadrotor": "planar quadrotor, N 50",
 }
 FIGURES = {
     "resting": Figure("step, nothing active, 12 observables, N 40", moving("rest", 40), goal="not slower"),
@@ -110,5 +168,14 @@ FIGURES = {
         )
         for N in (40, 100)
         for kind in ("rows", "row")
+    },
+    **{
+        f"{kind} {name}": Figure(
+            f"`BilinearMPC`, {text}, {'in C' if compiled else 'Python'}, {'p99' if share > 0.9 else 'median'}",
+            whole_loop(kind, share, compiled),
+            goal=goal,
+        )
+        for kind, text in LOOPS.items()
+        for name, share, compiled, goal in (("C", 0.99, True, "≤ 100 µs"), ("Python", 0.5, False, "≤ 1 ms"))
     },
 }
