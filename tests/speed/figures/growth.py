@@ -9,16 +9,19 @@ import resource
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
-import osqp
-import scipy.sparse as sp
+import osqp as osqp_library
+import scipy.sparse as scipy_sparse
 
 import koopmpc as km
 
+osqp: Any = osqp_library  # neither has types
+sp: Any = scipy_sparse
 HORIZONS = (50, 100, 200, 500)
 METHODS = {
     "daqp": "condensed, DAQP",
@@ -34,6 +37,11 @@ B = np.array([[0.0], [0.05], [0.1], [0.1]])
 NAMES = tuple("abcd")
 
 
+def take_step(mpc: Any, reference: Any, x: Any) -> Any:
+    """Return the input of a step."""
+    return mpc(x, reference).u
+
+
 def make_step(method: str, N: int) -> Any:
     """Return a function x → u of one step."""
     cost = km.Cost(np.ones(4), 0.1)
@@ -43,14 +51,14 @@ def make_step(method: str, N: int) -> Any:
     if method in ("daqp", "osqp"):
         model = km.LinearPredictor(A, B, np.eye(4), km.State(), 0.1, NAMES, ("u",))
         mpc: Any = km.KoopmanMPC(model, cost, limits, N, solver=method)
-        return lambda x: mpc(x, zero).u
+        return partial(take_step, mpc, zero)
     if method.startswith("riccati"):
         x, u = ca.SX.sym("x", 4), ca.SX.sym("u", 1)
         plant = km.StepMap(ca.Function("F", [x, u], [ca.DM(A) @ x + ca.DM(B) @ u]), 0.1, states=NAMES, inputs=("u",))
         mpc = km.BilinearMPC(plant, cost, limits, N)
         if method == "riccati in C":
             mpc = km.compiled(mpc)
-        return lambda x: mpc(x, zero).u
+        return partial(take_step, mpc, zero)
     one = sp.identity(N)
     P = sp.block_diag([0.2 * one, 2 * sp.identity(4 * N)]).tocsc()
     model = sp.hstack([sp.kron(one, -B), sp.identity(4 * N) - sp.kron(sp.eye(N, k=-1), A)])
@@ -73,7 +81,8 @@ def make_step(method: str, N: int) -> Any:
 def measure(method: str, N: int) -> dict[str, float]:
     """Return times [s], memory [MB], and how many rows of the first plan are at a limit."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    step, x, spent = make_step(method, N), np.array([0.05 * N, 0.0, 0.0, 0.0]), []
+    step, x = make_step(method, N), np.array([0.05 * N, 0.0, 0.0, 0.0])
+    spent: list[float] = []
     for _ in range(STEPS):
         start = time.process_time()
         u = step(x)
