@@ -93,7 +93,6 @@ REFUSED = {
     "raised IndexError|raised RuntimeError": lambda x, u: x[7],
     "expected one number": lambda x, u: x,
     "the symbol p": lambda x, u: x[0] * ca.SX.sym("p"),
-    "pass a function of x and u": 3.0,
 }
 
 

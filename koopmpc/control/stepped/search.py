@@ -181,10 +181,10 @@ class LevelSearch:
         self, at: Float[np.ndarray, "moves leveled"], nearest: Int[np.ndarray, "moves leveled"], box: LevelBox
     ) -> tuple[int, int] | None:
         """Return the move and the input to branch on: the first between two levels, or with an open dwell time."""
-        between = np.argwhere(np.abs(at - nearest) > NEAR)
-        if len(between):
-            k, i = between[0]
-            return int(k), int(i)
+        between = np.abs(at - nearest) > NEAR
+        if between.any():
+            k, i = divmod(int(between.argmax()), between.shape[1])
+            return k, i
         if self.held.tighten(LevelBox(nearest.copy(), nearest.copy()), self._blocks):
             return None
         open_moves = np.argwhere((box.low != box.high) & (self.held.levels.dwell.max(axis=1) > 1))
@@ -228,6 +228,7 @@ class LevelSolver(StepSolver):
         self._rows_of = row[search.find_places()]
         self._flat = self._rows_of.ravel()
         self._of_levels, self._factor = qp.A[self._flat], qp.scale[self._flat]
+        self._is_least_distance = bool((np.eye(len(qp.q)) == qp.P).all()) and not qp.q.any()
         self._soft_rows = np.flatnonzero(np.isfinite(qp.softness.linear))
 
     def reset(self) -> None:
@@ -267,7 +268,7 @@ class LevelSolver(StepSolver):
     def _cost(self, v: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> float:
         """Return the cost of a solution above that of the plan without limits, soft limits that give way included."""
         qp, rows = self.qp, self._soft_rows
-        cost = 0.5 * float(v @ qp.P @ v) + float(qp.q @ v)
+        cost = 0.5 * float(v @ v) if self._is_least_distance else 0.5 * float(v @ qp.P @ v) + float(qp.q @ v)
         if len(rows):
             value = qp.A[rows] @ v
             slack = np.maximum(np.maximum(value - high[rows], low[rows] - value), 0.0)
