@@ -57,7 +57,14 @@ from koopmpc.synthesis.cross_validation import (
     smooth_data,
     take_sample,
 )
-from koopmpc.synthesis.designed import Design, DesignRow, Evidence, ExpectedLoop, choose_row
+from koopmpc.synthesis.designed import (
+    Design,
+    DesignRow,
+    Evidence,
+    ExpectedLoop,
+    choose_estimator,
+    choose_row,
+)
 from koopmpc.synthesis.feedback import remove_feedback, require_episodes
 from koopmpc.synthesis.fresh.abreast import speed_up
 from koopmpc.synthesis.fresh.coverage import check_coverage, keep_limits
@@ -284,8 +291,8 @@ def design(
         doubts = [*left.values(), *doubts]
         for sentence in doubts:
             warnings.warn(sentence, FitWarning, stacklevel=2)
-        rows, outcomes = _judge_rounds(test, _list_first_round(results, floor), pool, progress)
-    unstable = is_unstable(test.surrogates, asked)
+        unstable = is_unstable(test.surrogates, asked)
+        rows, outcomes = _judge_rounds(test, _list_first_round(results, floor), unstable, pool, progress)
     best, linear = choose_row(rows, unstable=unstable), choose_row(rows, "linear", unstable=unstable)
     assert best is not None, "the last round is never empty"
 
@@ -528,7 +535,7 @@ Judged = tuple[Sequence[Recipe], Sequence[Outcome]]  # the recipes of a round, a
 
 
 def _judge_rounds(
-    test: LoopTest, screened: Sequence[Recipe], pool: Workers, progress: StageProgress | None
+    test: LoopTest, screened: Sequence[Recipe], unstable: bool, pool: Workers, progress: StageProgress | None
 ) -> tuple[tuple[DesignRow, ...], list[Outcome]]:
     """Return the leaderboard and the outcome of each row.
 
@@ -563,7 +570,7 @@ def _judge_rounds(
     outcomes = pool.map(run, jobs, report_stage(progress, "closed loops of the best"), size=Job.size)
     if bilinear:
         tried_ones = average_ratios(rate_runs(outcomes[: len(estimators)]), test.weights)
-        best = estimators[int(np.argmin(tried_ones))]
+        best = estimators[choose_estimator(tried_ones.tolist(), unstable=unstable)]
         tried_ends = average_ratios(
             rate_runs([outcomes[0], *outcomes[len(estimators) : len(estimators) + len(ends) - 1]]), test.weights
         )

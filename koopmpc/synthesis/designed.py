@@ -440,6 +440,15 @@ def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: 
     return min(estimating, key=lambda i: (rows[i].score, i), default=place)
 
 
+def choose_estimator(scores: Sequence[float], *, unstable: bool) -> int:
+    """Return the place of the estimator that other models of the kind get; the first score is that without one.
+
+    One that costs at most 2 % more than none is taken, for it leaves no offset; none of those on an unstable plant.
+    """
+    place, some = int(np.argmin(scores)), 1 + int(np.argmin(scores[1:]))
+    return some if not unstable and scores[some] <= (1 + WORTH) * scores[place] else place
+
+
 def load_controller(path: str | Path) -> Any:
     """Return the controller that `save`, of a controller or of a Design, wrote. It begins as after `reset`.
 

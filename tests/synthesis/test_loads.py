@@ -7,6 +7,7 @@ import pytest
 import koopmpc as km
 from koopmpc.synthesis.asked import check_task, find_poor_logs
 from koopmpc.synthesis.candidates import Candidate, Recipe
+from koopmpc.synthesis.designed import choose_estimator
 from koopmpc.synthesis.surrogates import fit_surrogate
 from tests.closed_loop.more_tasks import ALL
 from tests.closed_loop.optimum import held, optimum
@@ -37,6 +38,18 @@ def test_a_stand_in_with_another_gain_has_a_constant_load_where_inputs_are_at_th
     for gain in (0.8, 1.2):
         load = one.plant(gain)([0.3, 0.1], U.mean(axis=0)) - one.plant()([0.3, 0.1], U.mean(axis=0))
         np.testing.assert_allclose(load, (gain - 1) * U.std() * B, atol=1e-6)
+
+
+def test_an_estimator_that_costs_two_percent_more_is_taken_unless_the_plant_is_unstable():
+    for scores, place in (
+        ([1.0, 1.015, 1.4], 1),
+        ([1.0, 1.03, 1.019], 2),
+        ([1.0, 1.03, 1.04], 0),
+        ([1.2, 1.1, 1.0], 2),
+    ):
+        assert choose_estimator(scores, unstable=False) == place
+    assert choose_estimator([1.0, 1.015, 1.4], unstable=True) == 0
+    assert choose_estimator([1.2, 1.1, 1.0], unstable=True) == 2
 
 
 @pytest.mark.slow
