@@ -31,6 +31,7 @@ from koopmpc.control.program import StepProgram
 from koopmpc.disk import path_of, writing
 from koopmpc.errors import DataError
 from koopmpc.estimate.kalman import FilterProgram
+from koopmpc.guarantees.step_effort import IterationBound, ObservedIterations
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.routines import find_compiler
 from koopmpc.plants.step_map import StepMap
@@ -56,6 +57,7 @@ def export(
     reference: ArrayLike | None = None,
     steps: int = 200,
     fmu: int | None = None,
+    iterations: IterationBound | ObservedIterations | None = None,
 ) -> Path:
     """Write the controller as C99 into a folder: sources, Makefile, CMakeLists.txt, an example and a README.
 
@@ -86,6 +88,9 @@ def export(
         2 or 3: also write ``name.fmu``, the controller as a co-simulation unit of this version of the FMI standard,
         with its source and machine code for this platform. Inputs y, reference (one row, held over the horizon) and w;
         outputs u, status, fallback and iterations; a step is one sample.
+    iterations
+        The most iterations of a step, of `km.guarantees.bound_iterations` or `observe_iterations`, for the README and
+        `koopmpc_sizes.h`, which say whether it is proved.
 
     Raises
     ------
@@ -104,6 +109,8 @@ def export(
         raise DataError(f"fmu is {fmu!r}; pass 2 or 3, the version of the FMI standard")
     program = read_program(controller, reference)
     tables = make_tables(program, single=single)
+    if iterations is not None:
+        _state_iterations(tables, iterations, single=single)
     coarse = float(np.finfo(np.float32).eps) * tables.conditioning
     if single and coarse > _DIGITS:
         warnings.warn(
@@ -126,6 +133,26 @@ def export(
     if fmu is not None:
         write_unit(tables, own, root / f"{name}.fmu", name, 2 if fmu == 2 else 3)
     return root
+
+
+def _state_iterations(tables: Tables, figure: IterationBound | ObservedIterations, *, single: bool) -> None:
+    """Put the most iterations of a step among the sizes of the C, and what it is into its header and its README.
+
+    Raises
+    ------
+    DataError
+        A bound is proved for another precision, or for cold steps alone while steps of this C start warm.
+    """
+    proved = isinstance(figure, IterationBound)
+    if proved and single:
+        raise DataError('the bound is one of exact arithmetic, which single precision leaves; export "double"')
+    if proved and not tables.sizes.get("COLD_START", 0):
+        raise DataError(
+            "the bound is for steps that start cold, and steps of this controller start warm; make it with "
+            'settings={"cold_start": True}'
+        )
+    tables.sizes |= {"MOST_ITERATIONS": figure.most, "ITERATIONS_PROVED": int(proved)}
+    tables.notes.append(f"Iterations of the QP solver: {figure}.")
 
 
 def _write(path: Path, text: str) -> None:

@@ -392,6 +392,7 @@ def _add_condensed(tables: Tables, program: CondensedProgram) -> None:
         "QP_MIXED": int(any_soft and not soft.all()),
         "STEEP": int(solver.metric is not None),
         "FEW": FEW,
+        "COLD_START": int(solver.settings["cold_start"]),
     }
     _add_limits(tables, hard_rate=program.hard_rates)
     tables.limits["move_of"] = np.asarray(program.move_of, dtype=np.intc)

@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from koopmpc.guarantees.certify import certify as certify
     from koopmpc.guarantees.invariant_set import InvariantPolytope as InvariantPolytope
     from koopmpc.guarantees.invariant_set import find_invariant_set as find_invariant_set
+    from koopmpc.guarantees.step_effort import IterationBound as IterationBound
     from koopmpc.guarantees.step_effort import ObservedIterations as ObservedIterations
+    from koopmpc.guarantees.step_effort import bound_iterations as bound_iterations
     from koopmpc.guarantees.step_effort import observe_iterations as observe_iterations
     from koopmpc.guarantees.terminal_set import find_terminal_set as find_terminal_set
 else:

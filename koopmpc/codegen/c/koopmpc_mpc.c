@@ -274,6 +274,9 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   const int resume = s->warm && s->resumes;
   koopmpc_status status;
   int good = 0, active = 0;
+#if KOOPMPC_COLD_START
+  s->far = s->unmet = 0;
+#endif
   s->resumes = 0;
   for (int i = 0; i < ROWS; i++) /* the last answer, shifted by one step */
     push[i] = s->warm && koopmpc_shift[i] < ROWS ? s->dual[koopmpc_shift[i]] : 0;
@@ -321,7 +324,7 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
     }
   }
   koopmpc_copy(s->dual, qp->dual, ROWS);
-  s->warm = 1;
+  s->warm = !KOOPMPC_COLD_START;
   return KOOPMPC_OPTIMAL;
 }
 #endif

@@ -45,6 +45,8 @@ _CURVED = 1e-8  # least curvature of a price by its slope, per unit of a row: DA
 FEW = 20  # active rows up to which the next solve goes on from them
 _MANY = 16  # iterations of a solve that tell how long one takes
 
+_COLD = "cold_start"  # the one setting of ours
+
 # DAQP's exit flags
 _OPTIMAL = 1
 _INFEASIBLE = -1
@@ -111,7 +113,8 @@ class DAQP(QPSolver):
     qp
         The problem.
     settings
-        DAQP's own settings, for example ``{"iter_limit": 200}``; they override `DEFAULTS`.
+        DAQP's own settings, for example ``{"iter_limit": 200}``; they override `DEFAULTS`. With ``"cold_start": True``
+        every solve starts from no active rows.
 
     Raises
     ------
@@ -125,10 +128,10 @@ class DAQP(QPSolver):
     @staticmethod
     def setting_names() -> frozenset[str]:
         """Return the names of DAQP's settings."""
-        return frozenset(_model({}).settings)
+        return frozenset([*_model({}).settings, _COLD])
 
     def _setup(self) -> None:
-        self._model = _model(self._settings)
+        self._model, self._cold = _model(self._settings), bool(self._settings.get(_COLD, False))
         known = self._model.settings
         self._time_limit = self._allowed = known["time_limit"]
         self._most = self._few = known["iter_limit"]
@@ -176,7 +179,7 @@ class DAQP(QPSolver):
             self._linear,
             self._curved,
             self._metric() if len(self._rows) and self._steep() else None,
-            dict(self._model.settings),
+            {**self._model.settings, _COLD: self._cold},
         )
 
     def update(self, qp: QP) -> None:
@@ -207,6 +210,8 @@ class DAQP(QPSolver):
     def _solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None) -> QPSolution:
         """Solve from the rows that y pushes to."""
         self.resumes = False
+        if self._cold:
+            y, self._far, self._unmet = np.zeros_like(y), False, False
         if self._far:
             return self._approach(v, y, self._time_limit if time_limit is None else time_limit)
         if self._unmet and self._contradictory(time_limit):
@@ -232,7 +237,7 @@ class DAQP(QPSolver):
             x, multipliers, flag, more = self._run(max(limit - (perf_counter() - start), 1e-6) if limit else limit)
             iterations += more
         good = (flag == _OPTIMAL and self._exact) or (flag > 0 and self._accurate(x, multipliers))
-        self.resumes = good and int(np.count_nonzero(multipliers)) <= FEW
+        self.resumes = good and not self._cold and int(np.count_nonzero(multipliers)) <= FEW
         if not good and flag != _TIME_LIMIT:
             steep = self._steep()
             if flag == _INFEASIBLE and self._mixed and not steep and self._contradictory(time_limit):
@@ -428,7 +433,7 @@ def _model(settings: Mapping[str, Any]) -> Any:
     """Return an empty DAQP model with checked settings."""
     import daqp
 
-    model = daqp.Model()
+    model, settings = daqp.Model(), {name: value for name, value in settings.items() if name != _COLD}
     known = model.settings
     for name, value in settings.items():
         if name not in known:
