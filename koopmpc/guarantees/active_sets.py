@@ -29,8 +29,8 @@ _STILL = 1e-12  # entry of a direction below which a multiplier does not move
 _LONGEST = 1000  # iterations of one way
 _HARD = 1e20  # a linear price from here is that of a hard row
 
-Affine = Float[np.ndarray, "k p1"]  # rows of [θ; 1]
-Row = Float[np.ndarray, " p1"]
+AffineRows = Float[np.ndarray, "k p1"]  # rows of [θ; 1]
+AffineRow = Float[np.ndarray, " p1"]
 
 
 class ParametricQP(NamedTuple):
@@ -41,8 +41,8 @@ class ParametricQP(NamedTuple):
     """
 
     A: Float[np.ndarray, "m n"]
-    low: Affine
-    high: Affine
+    low: AffineRows
+    high: AffineRows
     limited: Bool[np.ndarray, " m2"]
     linear: Float[np.ndarray, " m"]
     rho: Float[np.ndarray, " m"]
@@ -60,9 +60,9 @@ class Way(NamedTuple):
 class _Part:
     """Rows g of g θ₁ ≤ 0, samples in it, and one point of its inside."""
 
-    region: Affine
+    region: AffineRows
     points: Float[np.ndarray, "s p1"]
-    inside: Row
+    inside: AffineRow
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +76,8 @@ class _Node:
     W: tuple[int, ...]
     side: tuple[float, ...]
     free: frozenset[int]
-    multipliers: Affine
-    sigma: Row
+    multipliers: AffineRows
+    sigma: AffineRow
     c: Float[np.ndarray, " k"]
     iterations: int = 0
     switched: frozenset[int] = frozenset()
@@ -164,9 +164,9 @@ class _Search:
 
     def find_blocks(
         self, node: _Node, direction: Float[np.ndarray, " k"], singular: bool
-    ) -> list[tuple[int, float, Row]]:
+    ) -> list[tuple[int, float, AffineRow]]:
         """Return places whose multiplier meets the end of its range, that end, and the length of the step to it."""
-        blocks: list[tuple[int, float, Row]] = []
+        blocks: list[tuple[int, float, AffineRow]] = []
         for i, (row, d) in enumerate(zip(node.W, direction, strict=True)):
             price = float(self.problem.linear[row])
             if d < -_STILL:
@@ -192,7 +192,7 @@ class _Search:
         i: int,
         target: float,
         direction: Float[np.ndarray, " k"],
-        length: Row,
+        length: AffineRow,
         singular: bool,
     ) -> _Node:
         """Return the node after a step that the multiplier of place i ends: its row leaves, or its slack switches."""
@@ -213,7 +213,7 @@ class _Search:
             switched=frozenset(),
         )
 
-    def add(self, node: _Node, part: _Part, end: Affine) -> tuple[list[_Node], list[Way]]:
+    def add(self, node: _Node, part: _Part, end: AffineRows) -> tuple[list[_Node], list[Way]]:
         """Return the nodes after a full step, one for each row that may be broken most, and the end if none is."""
         A, m = self.problem.A, len(self.problem.A)
         W, side = list(node.W), np.array(node.side)
@@ -230,7 +230,7 @@ class _Search:
         rest = self.cut(part, list(broken[rows]))
         return nodes, [] if rest is None else [Way(node.iterations, rest.inside[:-1], infeasible=False)]
 
-    def put(self, node: _Node, part: _Part, end: Affine, row: int, side: float, violation: Row) -> _Node:
+    def put(self, node: _Node, part: _Part, end: AffineRows, row: int, side: float, violation: AffineRow) -> _Node:
         """Return the node with one more row, which is broken by `violation`.
 
         DAQP gives a hard row that multiplier, and a soft one zero.
@@ -259,7 +259,7 @@ class _Search:
             switched=frozenset(),
         )
 
-    def cut(self, part: _Part, rows: Sequence[Row]) -> _Part | None:
+    def cut(self, part: _Part, rows: Sequence[AffineRow]) -> _Part | None:
         """Return the part in which rows g θ₁ ≤ 0 hold, too; None where it is empty or thin."""
         if not len(rows):
             return part
@@ -280,10 +280,10 @@ class _Search:
         inside = self.find_point(region)
         return None if inside is None else _Part(region, points, inside)
 
-    def find_point(self, region: Affine) -> Row | None:
+    def find_point(self, region: AffineRows) -> AffineRow | None:
         """Return a point of the box that is THIN inside all rows; None where there is none."""
         p = region.shape[1] - 1
-        box = np.eye(p)
+        box: Float[np.ndarray, "p p"] = np.eye(p)
         A = np.concatenate([box, region[:, :-1]])
         high = np.concatenate([np.ones(p), -region[:, -1] - THIN])
         low = np.concatenate([-np.ones(p), np.full(len(region), -np.inf)])

@@ -1,6 +1,7 @@
 """The most solver iterations of a step: proved by `bound_iterations`, or observed by `observe_iterations`."""
 
 from dataclasses import dataclass
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -17,7 +18,7 @@ from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.validate.binomial import bound_failure_rate
 from koopmpc.values import Value
 
-_NO_LIMIT = 1e20  # a limit from here is none
+_NO_LIMIT = 1e20  # there is no limit from here on
 _ZERO_ROW = 3.2e-6  # DAQP leaves shorter rows as they are
 
 
@@ -65,9 +66,9 @@ def bound_iterations(
     """Return the largest number of DAQP's iterations of any cold step from boxes of states and references.
 
     All ways of the solver through the box are followed: each compares multipliers and violations that are affine in
-    state, reference and last input. The bound is exact but for parts of the box thinner than 1e-7 of it, where rounding
-    decides. A controller with ``settings={"cold_start": True}``, and its C, starts every step cold, so that the bound
-    is one of all its steps.
+    state, reference and last input. Parts of the box thinner than 1e-7 of it are left out, where rounding decides. A
+    controller with ``settings={"cold_start": True}``, and its C, starts every step cold: then the bound is one of all
+    its steps.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ def bound_iterations(
     (5, True)
     """
     checks.kind(controller, "controller", KoopmanMPC, "a KoopmanMPC or a LinearMPC")
-    model, program = controller.predictor, controller.program()
+    model, program = controller.predictor, cast("CondensedProgram", controller.program())
     if program.M.shape[1] > model.nz + model.nu * program.with_rates or program.latency or model.embedding is not None:
         raise DataError(
             "the bound is for controllers without an estimator, delays, measured disturbances and latency; use "
@@ -117,7 +118,7 @@ def bound_iterations(
     x_low, x_high = _read_box(states, "states", Z.shape[1])
     r_low, r_high = _read_box(references, "references", program.targets.from_reference.shape[1])
     nu = model.nu if program.with_rates else 0
-    u_low, u_high = _read_box(last_inputs or tuple(program.inputs), "last_inputs", model.nu)
+    u_low, u_high = _read_box(last_inputs or (program.inputs.low, program.inputs.high), "last_inputs", model.nu)
     low, high = np.concatenate([x_low, u_low[:nu], r_low]), np.concatenate([x_high, u_high[:nu], r_high])
     if not np.isfinite(low).all() or not np.isfinite(high).all():
         raise DataError("the box is not finite; pass last_inputs=(low, high), since the inputs have no limits")
@@ -151,7 +152,7 @@ def bound_iterations(
         controller.reset(u_prev=u_prev if nu else None)
         attained = controller(x, r).iterations == most
         controller.reset()
-    cold = bool(program.settings.get("cold_start", False))
+    cold = bool(program.solver.settings["cold_start"])
     return IterationBound(most, len(ways), x, r, u_prev, attained, cold)
 
 

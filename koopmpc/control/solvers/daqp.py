@@ -45,7 +45,7 @@ _CURVED = 1e-8  # least curvature of a price by its slope, per unit of a row: DA
 FEW = 20  # active rows up to which the next solve goes on from them
 _MANY = 16  # iterations of a solve that tell how long one takes
 
-_COLD = "cold_start"  # the one setting of ours
+_COLD = "cold_start"  # our own setting
 
 # DAQP's exit flags
 _OPTIMAL = 1
