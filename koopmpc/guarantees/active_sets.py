@@ -282,11 +282,11 @@ class _Search:
 
     def find_point(self, region: AffineRows) -> AffineRow | None:
         """Return a point of the box that is THIN inside all rows; None where there is none."""
-        p = region.shape[1] - 1
-        box: Float[np.ndarray, "p p"] = np.eye(p)
+        p = int(region.shape[1]) - 1
+        box, zero = np.eye(p), np.zeros(p, dtype=np.float64)
         A = np.concatenate([box, region[:, :-1]])
         high = np.concatenate([np.ones(p), -region[:, -1] - THIN])
         low = np.concatenate([-np.ones(p), np.full(len(region), -np.inf)])
-        solver = DAQP(QP(box, np.zeros(p), A, low, high))
-        found = solver.solve(np.zeros(p), np.zeros(len(A)))
+        solver = DAQP(QP(box, zero, A, low, high))
+        found = solver.solve(zero, np.zeros(len(A)))
         return np.append(found.v, 1.0) if found.status is Status.OPTIMAL else None
