@@ -96,6 +96,16 @@ def test_its_parts_are_those_of_their_own_functions(data) -> None:
     assert km.trust(model, held_out, HORIZON) == report  # the same seed, the same report
 
 
+def test_a_bilinear_model_is_judged_by_the_forecast_that_its_controller_makes(data) -> None:
+    """Lifted afresh at each step, as BilinearMPC plans and as design compares; a linear model is lifted once."""
+    train, held_out = data
+    for model, afresh in ((km.bilinear_edmd(train, LIFTING), True), (km.edmd(train, LIFTING), False)):
+        report = km.trust(model, held_out, HORIZON)
+        assert report.score == km.score(model, held_out, HORIZON, relift=afresh)
+        assert report.score != km.score(model, held_out, HORIZON, relift=not afresh)
+        assert report.band.relift is afresh
+
+
 def test_steps_end_where_a_band_leaves_its_share_of_the_range(data) -> None:
     report = km.trust(km.edmd(data[0], km.State()), swings(60, 5, theta=2.0), 40)
     assert 0 < report.steps < 40
