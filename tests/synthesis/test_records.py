@@ -18,6 +18,7 @@ from koopmpc.synthesis.records import (
 )
 from tests.identify.test_hidden_state import saturating_record
 from tests.identify.test_neural import friction_record
+from tests.validate.logs.test_timing import record
 
 
 def oscillator(rows=420, noise=0.01, late=False, gain=None, seed=0):
@@ -94,6 +95,13 @@ def test_inputs_move_up_only_where_the_log_is_late_and_open():
     assert is_fed_back(fed_back)
     assert not is_late(fed_back)
     assert not is_fed_back(oscillator(late=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["P", "PI"])
+def test_inputs_of_noisy_records_under_feedback_are_never_moved_up(kind):
+    """Of 20 dB, in time; most have a set point that hides the feedback from `is_fed_back`."""
+    assert not any(is_late(record(seed, feedback=kind)) for seed in range(20))
 
 
 def test_inputs_that_are_advanced_twice_are_those_advanced_by_two():
