@@ -5,7 +5,14 @@
 Half of the controllers are a BilinearMPC of a learned or given oscillator, half a KoopmanMPC of a random linear plant, with
 hard and soft limits, estimators, latency and blocked moves. Both run DAQP to its tolerance from the same start: both are
 told the same readings, references and inputs that acted. One reading in thirty is missing, and one in sixty is 50, 1e6 or 1e29.
-A difference is another status or fallback, or inputs that differ by more than 1e-6 of their range.
+A difference is another status or fallback, or inputs that differ by more than 1e-6 of their range. Both loops end where the plant
+is lost. TIME_LIMIT and OSQP do not come up.
+
+The differences known, all of BilinearMPC, and their causes:
+- u is apart by 1e-6 to 3e-6: interior points stop at μ = 1e-9, and the cost is flat there. A later input of a plan, which a
+  fallback takes, was apart by 5e-4.
+- Another status at a reading of 50 or more without an estimator: no plan from there is near the data of the model, and
+  rounding decides which of several starts ends first.
 """
 
 import argparse
@@ -36,6 +43,7 @@ class Difference:
     python: str
     c: str
     apart: float  # share of the inputs' range
+    wild: bool  # whether the reading was beyond twenty, where no plan is near any data
 
 
 def make_bilinear(rng):
@@ -85,12 +93,7 @@ def compare(seed: int, episodes: int) -> tuple[collections.Counter[str], list[Di
     controller, plant, width = (make_linear if seed % 2 else make_bilinear)(rng)
     twin = km.compiled(controller)
     assert type(twin).__name__ == "Compiled"
-    nx, seen, differences = (
-        len(controller.model_states) if hasattr(controller, "model_states") else None,
-        collections.Counter(),
-        [],
-    )
-    nx = 2 if nx is None and not seed % 2 else controller.predictor.nx
+    nx, seen, differences = controller.predictor.nx if seed % 2 else 2, collections.Counter(), []
     for episode in range(episodes):
         controller.reset()
         twin.reset()
@@ -107,11 +110,13 @@ def compare(seed: int, episodes: int) -> tuple[collections.Counter[str], list[Di
             seen[a.status.name] += 1
             if (a.status, a.fallback) != (b.status, b.fallback) or not apart <= CLOSE:
                 said = [f"{move.status.name}/{move.fallback.name} {move.iterations}" for move in (a, b)]
-                differences.append(Difference(seed, type(controller).__name__, episode, step, *said, apart))
+                differences.append(
+                    Difference(seed, type(controller).__name__, episode, step, *said, apart, bool(np.abs(y).max() > 20))
+                )
                 break
             u = a.u
             x = np.asarray(plant(x, u))
-            if not np.abs(x).max() < 20:
+            if not np.abs(x).max() < (20 if seed % 2 else 3):  # the plant is lost, or its model of no use
                 break
     return seen, differences
 

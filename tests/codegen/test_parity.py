@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.codegen.parity_fuzz import compare
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
 BOX = {"u_min": -25.0, "u_max": 25.0}
@@ -180,6 +181,18 @@ def test_a_closed_loop_costs_the_same(pendulum):
     costs = [km.metrics(run).cost for run in runs]
     assert abs(costs[1] / costs[0] - 1) < 1e-6
     assert list(runs[0].status) == list(runs[1].status)
+
+
+@pytest.mark.slow
+def test_random_controllers_answer_alike():
+    """Differences and their causes stand in tests/codegen/parity_fuzz.py."""
+    steps, differences = 0, []
+    for seed in range(24):
+        seen, found = compare(seed, 6)
+        steps, differences = steps + sum(seen.values()), differences + found
+    assert not [one for one in differences if one.kind == "KoopmanMPC"]
+    assert not [one for one in differences if not one.wild and one.python.split()[0] != one.c.split()[0]]
+    assert sum(one.wild or one.apart > 1e-5 for one in differences) <= 1e-3 * steps
 
 
 @pytest.mark.parametrize(("growth", "horizon", "more"), [(1.4, 40, {}), (1.4, 60, {"du_max": 0.3})])

@@ -211,9 +211,10 @@ class RealTimeIteration:
             if found is None:
                 return StageStep(self._dX, self._dU, nothing, Status.FAILED, 0)
             return self._deviate(free, self._dX.copy(), self._dU.copy(), found, 0)
-        if ((free >= self.low) & (free <= self.high)).all() and np.isfinite(self._dX).all():
+        known = bool(np.abs(self._dX).max() < HUGE and np.abs(self._dU).max() < HUGE)  # as in C; False for NaN
+        if known and ((free >= self.low) & (free <= self.high)).all():
             return StageStep(self._dX, self._dU, nothing, Status.UNCONSTRAINED, 0)
-        if self._interior is None or not np.isfinite(free).all():
+        if self._interior is None or not (known and np.isfinite(free).all()):
             return StageStep(self._dX, self._dU, nothing, Status.FAILED, 0)
         return self._solve_limited(y, free, deadline)
 
