@@ -285,7 +285,7 @@ class BilinearMPC(StagedMPC):
         self._iteration.set_theta(self._map.theta)
 
     def _limit(self, limits: StageLimits | None) -> None:
-        low, high = self._base_limits if limits is None else limits.stages
+        low, high = self._problem.stage_limits if limits is None else limits.stages
         self._iteration.low[:], self._iteration.high[:] = low, high
 
     def _weigh(self, Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N m"]) -> None:

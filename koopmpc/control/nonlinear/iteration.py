@@ -104,11 +104,7 @@ class RealTimeIteration:
         own = problem.stage is not None or problem.timed  # then R changes from program to program
         free = solve_unconstrained(sweeps, None if own else R)
         interior = interior_step(sweeps, None if own else R, self._sides, ng) if len(self._sides.row) else None
-        self._limits = Interval(*(np.concatenate([problem.inputs[i], problem.box[i]]) for i in (0, 1)))
-        self.low, self.high = (np.tile(end, (N, 1)) for end in self._limits)
-        margin = problem.margin
-        self.low[:, self.low.shape[1] - margin.shape[1] :] += margin
-        self.high[:, self.high.shape[1] - margin.shape[1] :] -= margin
+        self.low, self.high = problem.stage_limits
         self._free_stages, self._ends, self._limited = problem.free, problem.ends, problem.limited
         ns, nsoft = len(self._sides.row), self._sides.soft
         zeros = np.zeros

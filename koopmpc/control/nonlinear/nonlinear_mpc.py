@@ -138,7 +138,7 @@ class NonlinearMPC(StagedMPC):
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
 
     def _limit(self, limits: StageLimits | None) -> None:
-        low, high = self._base_limits if limits is None else limits.stages
+        low, high = self._problem.stage_limits if limits is None else limits.stages
         nu = self.nu
         self._shooting.set_limits(Interval(low[:, :nu], high[:, :nu]), Interval(low[:, nu:], high[:, nu:]))
 

@@ -255,6 +255,15 @@ class StagedProblem(NamedTuple):
         return ca.vertcat(theta[:n], theta[n + k * s : n + (k + 1) * s])
 
     @property
+    def stage_limits(self) -> Interval:
+        """Limits (N, nu + ng) of [v_k; limited(s_{k+1})] of all stages, margins taken off."""
+        low, high = (np.tile(np.concatenate([self.inputs[i], self.box[i]]), (len(self.free), 1)) for i in (0, 1))
+        first = low.shape[1] - self.margin.shape[1]
+        low[:, first:] += self.margin
+        high[:, first:] -= self.margin
+        return Interval(low, high)
+
+    @property
     def theta_size(self) -> int:
         """Entries of [θ; w_0; …; w_{N−1}]."""
         return self.F.size1_in(2) + self.scheduled * (len(self.free) - 1)

@@ -203,19 +203,9 @@ class StagedMPC(MPCBase):
             self._box = outputs.inputs
             self._limit(None)
             return
-        found = find_stage_limits(own, outputs, problem, first + self._latency, self._base_limits)
+        found = find_stage_limits(own, outputs, problem, first + self._latency, problem.stage_limits)
         self._box = found.inputs
         self._limit(found)
-
-    @property
-    def _base_limits(self) -> Interval:
-        """The limits of all stages as the controller was made."""
-        problem, N = self._problem, self._N
-        low, high = (np.tile(np.concatenate([problem.inputs[i], problem.box[i]]), (N, 1)) for i in (0, 1))
-        count = problem.margin.shape[1]
-        low[:, low.shape[1] - count :] += problem.margin
-        high[:, high.shape[1] - count :] -= problem.margin
-        return Interval(low, high)
 
     @abstractmethod
     def _limit(self, limits: StageLimits | None) -> None:
