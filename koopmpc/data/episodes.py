@@ -34,7 +34,8 @@ class Origin:
     X
         (K, nx) states in these rows.
     at
-        (T+1,) index into them for each row of the episode; after resampling, of the row at or before it.
+        (T+1,) index into them for each row of the episode; after resampling, of the row at or before it, or of the wild
+        reading in it.
     resampled
         Whether a row of the episode lies between two rows of the table.
     """

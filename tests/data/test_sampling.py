@@ -269,3 +269,20 @@ def test_a_column_is_doubted_once_where_it_is_constant_or_repeats_an_earlier_one
         warnings.simplefilter("error", ColumnWarning)
         with pytest.warns(km.FitWarning, match="gap"):
             km.load_episodes(tmp_path / "log.csv", states=["x", "y", "c"], inputs=["u"])  # told, not guessed
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_single_wild_reading_stays_in_one_row_of_the_grid(seed):
+    rng = np.random.default_rng(seed)
+    time, X = np.arange(60) + rng.uniform(-0.2, 0.2, 60), np.cumsum(rng.standard_normal(60))
+    k = int(rng.integers(5, 55))
+    wild, left_out = X.copy(), np.delete(np.arange(60), k)
+    wild[k] = 999.0
+    (part,) = on_grid(signals(time, X=wild), 1.0)
+    without = np.interp(part.time, time[left_out], X[left_out])
+    differ = np.flatnonzero(np.abs(part.X[:, 0] - without) > 1e-9)
+    assert part.X[differ, 0].tolist() == [999.0]
+    assert abs(part.time[differ[0]] - time[k]) <= 0.5 + 1e-9
+    (coarse,) = on_grid(signals(time, X=wild), 7.3)
+    assert np.isin(coarse.X[:, 0], [999.0]).sum() <= (np.abs(coarse.time - time[k]) < 1.4).sum()
+    assert np.abs(coarse.X[coarse.X[:, 0] != 999.0]).max() <= np.abs(X).max()

@@ -12,6 +12,8 @@ from koopmpc.errors import DataError, FitWarning
 
 _JITTER = 0.02  # share of dt by which a step may differ
 _GAP = 1.5  # a step longer than 1.5 dt is a gap
+_FEW = 10  # rows from which on single wild readings are looked for
+_WILD = 8.0  # they are so many times the usual distance from the line between their neighbours
 
 
 class UnevenSamplingError(DataError):
@@ -135,11 +137,30 @@ def _on_grid(part: Signals, dt: float, where: str) -> Signals:
     grid = t[0] + dt * np.arange(count)
     before = np.asarray(np.searchsorted(t, grid + 1e-9 * dt, side="right"), dtype=np.intp)
     held = np.clip(before - 1, 0, len(t) - 1)
-    states = np.empty((count, part.X.shape[1]))
+    states, read = np.empty((count, part.X.shape[1])), held.copy()
     for i in range(part.X.shape[1]):
-        states[:, i] = np.interp(grid, t, part.X[:, i])
-    origin = Origin(where, part.states, part.rows, part.X, held, resampled=True) if part.states else None
+        wild = _single_readings(t, part.X[:, i])
+        states[:, i] = np.interp(grid, t[~wild], part.X[~wild, i])
+        k = np.flatnonzero(wild)
+        at = np.searchsorted(grid[:-1] + 0.5 * dt, t[k])  # the nearest row
+        kept = (t[k - 1] < grid[at]) & (grid[at] < t[k + 1])  # of many readings between rows, most are in none
+        states[at[kept], i], read[at[kept]] = part.X[k[kept], i], k[kept]
+    origin = Origin(where, part.states, part.rows, part.X, read, resampled=True) if part.states else None
     return Signals(grid, states, part.U[held], part.W[held], part.rows[held], part.states, origin)
+
+
+def _single_readings(t: Float[np.ndarray, " m"], x: Float[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+    """Return which readings are far from the line between their neighbours, which would leak into rows of a grid."""
+    wild = np.zeros(len(x), dtype=bool)
+    if len(x) < _FEW:
+        return wild
+    line = x[:-2] + (x[2:] - x[:-2]) * (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
+    off = np.abs(x[1:-1] - line)
+    low, high = np.quantile(x, [0.05, 0.95])
+    far = (off > 0.5 * (high - low)) & (off > _WILD * np.median(off)) & (high > low)
+    beside = np.maximum(np.append(off[1:], 0.0), np.insert(off[:-1], 0, 0.0))
+    wild[1:-1] = far & (off > 1.5 * beside)
+    return wild
 
 
 def episodes_from(parts: list[Signals], dt: float, where: str) -> list[Episode]:
