@@ -190,7 +190,7 @@ def test_a_state_far_from_the_expected_one_begins_anew_and_the_last_plan_goes_on
 @pytest.mark.parametrize("ahead", [True, False])
 def test_what_a_plan_costs_is_the_cost_of_its_states_and_inputs(R_delta, latency, u_target, ahead):
     """Row k of the reference, and of given inputs, belongs to step k from now; the last of both is held."""
-    cost = km.Cost(Q=[10, 1], R=0.1, R_delta=R_delta, u_target=u_target)
+    cost = km.Cost(Q=[10, 1], R=0.1, R_delta=R_delta, u_target=u_target, beyond="rest")
     mpc = made(cost, km.Limits(-5, 5), latency=latency)
     rows = np.array([[0.1 * k, 0.0] for k in range(N + 1 + latency)]) if ahead else np.tile([0.2, 0.0], (9, 1))
     mpc.reset(u_prev=[0.4])
