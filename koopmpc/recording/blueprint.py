@@ -28,7 +28,7 @@ LIMIT: Color = (232, 84, 84)
 REFERENCE: Color = (165, 170, 180)
 _PREDICTION: Color = (250, 250, 250)
 _MEASURED: Color = (120, 126, 138)
-_STEP_TIME = "Time of a step, 10^y s: -6 is 1 µs, -3 is 1 ms"
+_STEP_TIME = "Time of a step, logarithm to base 10 of seconds: -6 is 1 µs, -3 is 1 ms"
 _FASTEST = -6.2
 _TICKS = 5.0, 8.0  # as many as have numbers, in a low plot and in a high one
 _LINKED = 50.0  # length of a run whose plots are moved together [s]
@@ -283,7 +283,7 @@ def blueprint(
     bounds = readable([v for _, v in input_limits(about)], _TICKS[roomy])
     shown.append(plot("plots/u", inputs, {"/control/u": [], "/control/limits": []}, bounds))
     slowest = rrb.ScalarAxis(range=[_FASTEST, max(float(np.log10(about.dt)), -2.0) + 0.4])
-    time = {"/solver/time_ms": [_alone(_lines(["time of a step [10^y s]"], color(2), 1.5), LOG_TIME)]}
+    time = {"/solver/time_ms": [_alone(_lines(["log10 of the time of a step in s"], color(2), 1.5), LOG_TIME)]}
     time["/solver/deadline_ms"] = [_alone(_lines(["sample time, its deadline"], LIMIT, 1.0), LOG_TIME)]
     shown.append(plot("solver/log", _STEP_TIME, time, slowest))
     status = rrb.StateTimelineView(origin="solver/status", name="How each step ended")

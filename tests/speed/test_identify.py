@@ -225,3 +225,32 @@ def test_edmd_over_a_plain_gram_that_lifts_each_row_once(benchmark, observables:
         f"edmd / plain Gram (≤ {limit:g})": round(float(np.median([a / b for a, b in pairs])), 2),
     }
     told(benchmark)
+
+
+def test_rows_a_second_from_parquet_files(benchmark, tmp_path: Path) -> None:
+    """34 observables of three states, from files, beside the lifting and the Gram matrix of rows in memory."""
+    rng, parts = np.random.default_rng(0), 4
+    for i in range(parts):
+        episodes = [km.Episode(X=rng.uniform(-1, 1, (10_001, 3)), U=rng.uniform(-1, 1, (10_000, 1))) for _ in range(25)]
+        km.Episodes(episodes, 0.1).save(tmp_path / f"{i}.parquet")
+    lifting = km.State() + km.Constant() + km.Gaussian(rng.uniform(-1, 1, (30, 3)), 1.0)
+    files, bound = km.data.Files(sorted(tmp_path.glob("*.parquet"))), lifting.bind(("x0", "x1", "x2"))
+    pairs: list[tuple[float, float]] = []
+
+    def both() -> None:
+        start = time.process_time()
+        count = km.moments.second_moments(files, lifting, route="gram", workers=1).samples
+        ours, start = count / (time.process_time() - start), time.process_time()
+        for one in episodes:
+            Z = bound(one.X)
+            D = np.hstack([Z[:-1], one.U, Z[1:]])
+            D.T @ D
+        pairs.append((ours, sum(map(len, episodes)) / (time.process_time() - start)))
+
+    benchmark.pedantic(both, rounds=3, warmup_rounds=1)
+    ours, plain = np.median(pairs, axis=0)
+    benchmark.extra_info |= {
+        "from files [rows/s]": round(float(ours)),
+        "numpy, in memory [rows/s]": round(float(plain)),
+    }
+    told(benchmark)
