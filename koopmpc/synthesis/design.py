@@ -4,10 +4,9 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
@@ -15,7 +14,6 @@ from koopmpc.codegen.compiled import Compiled
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.linear.koopman_mpc import KoopmanMPC
-from koopmpc.data.angles import find_angles
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, FitWarning
@@ -27,12 +25,8 @@ from koopmpc.parallel import StageProgress, Workers
 from koopmpc.synthesis.asked import (
     DesignTask,
     check_task,
-    find_outside_data,
-    find_outside_limits,
-    find_poor_logs,
     find_stray_episodes,
     find_unweighted_limits,
-    limit_margins,
 )
 from koopmpc.synthesis.candidates import (
     Candidate,
@@ -46,14 +40,11 @@ from koopmpc.synthesis.candidates import (
 )
 from koopmpc.synthesis.cross_validation import (
     LEAST,
-    Folds,
     Trial,
     Tried,
     cross_validate,
-    drop_fold,
     make_folds,
     replace_glitches,
-    select_fold,
     smooth_data,
     take_sample,
 )
@@ -67,6 +58,7 @@ from koopmpc.synthesis.designed import (
 )
 from koopmpc.synthesis.feedback import remove_feedback, require_episodes
 from koopmpc.synthesis.fresh.abreast import speed_up
+from koopmpc.synthesis.fresh.conditions import FOLDS, prepare_test
 from koopmpc.synthesis.fresh.coverage import check_coverage, keep_limits
 from koopmpc.synthesis.fresh.drawn import LoopPool
 from koopmpc.synthesis.fresh.horizon import choose_horizon
@@ -81,7 +73,6 @@ from koopmpc.synthesis.fresh.loops import (
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap
 from koopmpc.synthesis.fresh.promise import CoveragePromise
 from koopmpc.synthesis.judging import (
-    Condition,
     Job,
     LoopTest,
     Outcome,
@@ -93,18 +84,12 @@ from koopmpc.synthesis.judging import (
 )
 from koopmpc.synthesis.select import LONGER, RIDGES, report_stage
 from koopmpc.synthesis.surrogates import (
-    Surrogate,
     choose_surrogates,
-    explain_unreachable,
-    find_ignored_states,
-    fit_surrogate,
     is_unstable,
 )
 from koopmpc.text import to_percent
 from koopmpc.validate.memory import find_hidden_state
 
-FOLDS = 3  # folds of the data; models are fitted to two of them
-OFF = 0.2  # in half of the final runs the inputs act by this share more or less
 _FIRST_ROUND = 5  # models of each kind that the first round judges by closed loop
 _LINEAR = 2  # linear models of the first round that are tried with estimators and both terminal costs
 _BILINEAR = 3  # bilinear models of the first round that are tried with an estimator or with weights
@@ -114,8 +99,6 @@ MANY = 600  # fresh loops of a controller in machine code
 FEW = 60  # fresh loops of one in Python
 WORRY = 0.05  # a bound of lost loops above this is advice
 _KEPT = 6000  # steps of the data that a saved design keeps, to compare new logs with
-_STRETCHES = 4  # runs start at this many places of a long reference
-_TURNS = 0.9 * 2 * np.pi  # [rad] an angle whose range in the data is larger makes whole turns
 
 
 def design(
@@ -287,7 +270,7 @@ def design(
         )
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
         pair = choose_surrogates(results, floor, hidden=hidden)
-        test, doubts, holds = _prepare_test(folds, asked, pair, tighten and wished is None, noise, pool)
+        test, doubts, holds = prepare_test(folds, asked, pair, tighten and wished is None, noise, pool)
         doubts = [*left.values(), *doubts]
         for sentence in doubts:
             warnings.warn(sentence, FitWarning, stacklevel=2)
@@ -421,96 +404,6 @@ def _list_models(
         return replace(one, lifting=sum([*first[1:], one.lifting], first[0])).bind(held.states, held.inputs)
 
     return [complete(one) for one in models]
-
-
-def _prepare_test(
-    folds: Folds,
-    asked: DesignTask,
-    pair: Sequence[Recipe],
-    tighten: bool,
-    noise: Float[np.ndarray, " nx"],
-    pool: Workers,
-) -> tuple[LoopTest, list[str], bool]:
-    """Return the conditions of all closed loops, doubts about the task, and whether the goal can be held.
-
-    For each fold and each family there is a surrogate that is fitted to the two other folds. A model that does not know
-    fold k is tested on two surrogates, which do not know fold k + 1 and fold k + 2.
-    """
-    data = folds.episodes
-    wanted: list[Condition] = []
-    for gain, families in ((1.0, (0, 1)), (1.0 + OFF, (1,)), (1.0 - OFF, (0,))):
-        for k in range(FOLDS):
-            for family in families:
-                number, j = 2 * ((k + 1 + family) % FOLDS) + family, len(wanted)
-                row = asked.late * (j % _STRETCHES) // (_STRETCHES - 1)
-                start = asked.starts[j % len(asked.starts)]
-                wanted.append(Condition(k, number, gain, start, row, np.zeros((0, data.nu))))
-    mine = [[j for j, one in enumerate(wanted) if one.surrogate == number] for number in range(FOLDS * len(pair))]
-    tasks = [
-        _StandIn(recipe, i, tuple((wanted[j].gain, wanted[j].first) for j in mine[i * len(pair) + family]))
-        for i in range(FOLDS)
-        for family, recipe in enumerate(pair)
-    ]
-    surrogates: list[Surrogate] = []
-    conditions = list(wanted)
-    for places, (one, inputs) in zip(mine, pool.map(partial(_fit_task, folds, asked, noise), tasks), strict=True):
-        surrogates.append(one)
-        for j, rows in zip(places, inputs, strict=True):
-            conditions[j] = replace(wanted[j], u_reference=rows)
-    X = np.concatenate([episode.X for episode in data])
-    turning = [i for i in find_angles(data.states, X) if asked.high[i] - asked.low[i] > _TURNS]
-    ignored = find_ignored_states(surrogates[0], X)
-    turning = sorted({*asked.angles, *turning} - {*ignored})
-    free = sorted({*turning, *ignored})
-    of = asked.cost.of.bind(data.states)
-    tracked = [int(i) for i in of.state_indices] if isinstance(of, State) else []
-    low, high = asked.hull(free, tracked)
-    room = limit_margins(asked, data) if tighten else None
-    test = LoopTest(
-        asked,
-        data,
-        folds.fold,
-        tuple(surrogates),
-        tuple(conditions),
-        low,
-        high,
-        room,
-        noise,
-        tuple(ignored),
-        tuple(turning),
-    )
-    unreachable = explain_unreachable(surrogates[0], asked)
-    holds = not asked.moves and not unreachable
-    return (
-        test,
-        [
-            *unreachable,
-            *find_outside_limits(asked, data),
-            *find_outside_data(asked, data, tracked, free),
-            *find_poor_logs(asked, data, tracked),
-        ],
-        holds,
-    )
-
-
-class _StandIn(NamedTuple):
-    """A task: fit the surrogate of a recipe without a fold, for runs with (gain, first row of the reference)."""
-
-    recipe: Recipe
-    out: int
-    runs: tuple[tuple[float, int], ...]
-
-
-def _fit_task(
-    folds: Folds, asked: DesignTask, noise: Float[np.ndarray, " nx"], task: _StandIn
-) -> tuple[Surrogate, list[Float[np.ndarray, "T nu"]]]:
-    """Return the surrogate and the `Condition.u_reference` of each run on it."""
-    data, fold = folds.episodes, folds.fold
-    one = fit_surrogate(task.recipe, drop_fold(data, fold, task.out), select_fold(data, fold, task.out), noise)
-    cost, limits = asked.cost, asked.limits
-    rows = [(gain, asked.reference[first : first + asked.steps]) for gain, first in task.runs]
-    inputs = [one.find_reference_inputs(cost, limits, part, gain) for gain, part in rows]
-    return one, inputs
 
 
 def _list_first_round(results: Sequence[Tried], floor: float) -> list[Recipe]:
