@@ -11,7 +11,13 @@ from jaxtyping import Float
 from koopmpc.data.angles import find_angles
 from koopmpc.lifting.state import State
 from koopmpc.parallel import Workers
-from koopmpc.synthesis.asked import DesignTask, find_outside_data, find_outside_limits, limit_margins
+from koopmpc.synthesis.asked import (
+    DesignTask,
+    find_outside_data,
+    find_outside_limits,
+    find_poor_logs,
+    limit_margins,
+)
 from koopmpc.synthesis.candidates import Recipe
 from koopmpc.synthesis.cross_validation import Folds, drop_fold, select_fold
 from koopmpc.synthesis.judging import Condition, LoopTest
