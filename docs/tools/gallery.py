@@ -20,7 +20,7 @@ import koopmpc as km
 from koopmpc.bench.controllers import Prepared, is_learned
 from koopmpc.bench.measured import find_baseline, find_best_learned, read_standings
 from koopmpc.bench.problem import shipped
-from koopmpc.bench.single import run_closed_loop
+from koopmpc.bench.single import find_time_unit, run_closed_loop
 from koopmpc.bench.store import RunRow
 from koopmpc.page import Page
 from koopmpc.recording.video import export_video
@@ -56,7 +56,7 @@ def page(path: Path, *, pictures: bool = True) -> Page:
     if rows:
         made.table(("parameter", "value", "meaning"), rows)
     x, u = problem.equilibrium
-    second = "h" if "Time in hours" in source else "s"
+    second = find_time_unit(problem)
     made.text(
         f"""Sampled every {problem.dt:g} {second} by {type(problem.integrator).__name__}. Linear controllers linearise
         at x = {_vector(x)}, u = {_vector(u)}. Limits: {limits(problem, problem.limits)}."""

@@ -1,5 +1,7 @@
 """One run of a sweep: a controller on a case, its figures, and its log; and the same run again from that log."""
 
+import re
+import sys
 import time
 import traceback
 from collections.abc import Iterator, Sequence
@@ -12,7 +14,7 @@ import numpy as np
 
 from koopmpc import disk
 from koopmpc.bench.controllers import Prepared, is_learned
-from koopmpc.bench.problem import Case, load_problem
+from koopmpc.bench.problem import Case, Problem, load_problem
 from koopmpc.bench.store import RunRow, reached
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.codegen.compiled import compiled as built
@@ -36,6 +38,7 @@ from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder
 from koopmpc.recording.writer import record
 
+_TIME_UNITS = {"milliseconds": "ms", "minutes": "min", "hours": "h", "days": "d"}
 FAULTS: dict[str, Fault] = {
     "nan-sensor": NaNSensor(probability=0.1),
     "frozen-sensor": FrozenSensor(begin=10, end=15),
@@ -207,6 +210,13 @@ def _cold(controller: Controller, run: Run) -> tuple[float, float]:
     return float(p50), float(p99)
 
 
+def find_time_unit(problem: Problem) -> str:
+    """Return the unit of dt: s, unless the docstring of the file that holds the dynamics says "Time in hours"."""
+    module = sys.modules.get(type(problem.dynamics).__module__)
+    words = re.search(r"\bTime in (\w+)", getattr(module, "__doc__", None) or "")
+    return _TIME_UNITS.get(words[1], "s") if words else "s"
+
+
 def _metadata(parts: Prepared, row: RunRow, injected: Sequence[Fault]) -> dict[str, Any]:
     problem, training = parts.problem, parts.problem.training
     known: dict[str, Any] = {
@@ -219,6 +229,8 @@ def _metadata(parts: Prepared, row: RunRow, injected: Sequence[Fault]) -> dict[s
         "training": {"episodes": training.episodes, "steps": training.steps, "seed": training.seed + row.seed},
     }
     sweep = {name: getattr(row, name) for name in ("start", "seed", "noise", "wrong") if getattr(row, name)}
+    unit = find_time_unit(problem)
+    known |= {"time unit": unit} if unit != "s" else {}
     known |= {"file": problem.file} if problem.file else {}
     known |= {"sweep": sweep} if sweep else {}
     return known | ({"fault": row.fault, "faults": [str(broken) for broken in injected]} if injected else {})

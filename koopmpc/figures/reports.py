@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.figures.series import draw_limits
-from koopmpc.figures.style import REFERENCE, draw_legend, fit_label, line_style, make_figure, styled
+from koopmpc.figures.style import REFERENCE, draw_legend, fit_label, label_time, line_style, make_figure, styled
 from koopmpc.loop.run import Run
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ def draw_trajectories(runs: Mapping[str, Run]) -> "Figure":
             panel.plot(first.time, first.reference[:, j], label="reference", **REFERENCE)
         _add_near_limits(panel, first, "states", j)
     _add_near_limits(axes[-1, 0], first, "inputs", 0)
-    axes[-1, 0].set_xlabel("time [s]")
+    axes[-1, 0].set_xlabel(label_time(first.metadata))
     axes[-1, 0].set_ylabel(**fit_label(first.inputs[0], 1.0))
     draw_legend(drawing, axes[:, 0], 4)
     return drawing

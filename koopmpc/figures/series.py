@@ -21,6 +21,7 @@ from koopmpc.figures.style import (
     draw_legend,
     fit_label,
     follow_truth,
+    label_time,
     limit_axis,
     line_style,
     make_figure,
@@ -128,7 +129,7 @@ def run(run: Run, *, states: StateChoice | None = None, width: Width = "one colu
         draw_limits(panel, run, "inputs", j)
         panel.set_ylabel(**fit_label(run.inputs[j], _INPUT_HEIGHT))
     _draw_statuses(axes[-1], run)
-    axes[-1].set(xlabel="time [s]", xlim=(0, t[-1]))
+    axes[-1].set(xlabel=label_time(run.metadata), xlim=(0, t[-1]))
     draw_legend(drawing, axes[:-1], 3)
     return drawing
 
@@ -283,7 +284,7 @@ def runs(tasks: Mapping[str, Mapping[str, Run]]) -> "Figure":
     states, inputs = all_runs[0].states, all_runs[0].inputs
     if any((run.states, run.inputs) != (states, inputs) for run in all_runs):
         raise DataError("the runs have different states or inputs; draw one plant a figure")
-    drawing, grid = _arrange_columns([*states, *inputs], list(tasks), 0.95)
+    drawing, grid = _arrange_columns([*states, *inputs], list(tasks), 0.95, label_time(all_runs[0].metadata))
     names = list(dict.fromkeys(name for task in tasks.values() for name in task))
     for column, task in zip(grid.T, tasks.values(), strict=True):
         _draw_task(column, task, names)
@@ -341,7 +342,7 @@ def reconstruction(
     states = checks.texts(states, "states")
     if not cases:
         raise DataError("there is no case to draw; pass at least one")
-    drawing, grid = _arrange_columns([*states, "relative error"], list(cases), 0.92)
+    drawing, grid = _arrange_columns([*states, "relative error"], list(cases), 0.92, "time [s]")
     names = list(dict.fromkeys(name for _, curves in cases.values() for name in curves))
     for column, (title, (true_states, reconstructions)) in zip(grid.T, cases.items(), strict=True):
         truth = checks.array(true_states, f"the truth of {title!r}", (None, len(states)))
@@ -392,8 +393,10 @@ def _draw_relative_errors(
     panel.yaxis.set_minor_locator(NullLocator())
 
 
-def _arrange_columns(labels: Sequence[str], titles: Sequence[str], height: float) -> "tuple[Figure, np.ndarray]":
-    """Return a figure with a column of panels for each title, a row for each label, and a common time axis."""
+def _arrange_columns(
+    labels: Sequence[str], titles: Sequence[str], height: float, time: str
+) -> "tuple[Figure, np.ndarray]":
+    """Return a figure with a column of panels for each title, a row for each label, and the label of its time axis."""
     width: Width = "two columns" if len(titles) > 1 else "one column"
     drawing, grid = make_figure(len(labels), len(titles), width=width, height=0.8 + height * len(labels), sharex="col")
     for panel, title in zip(grid[0], titles, strict=True):
@@ -401,6 +404,6 @@ def _arrange_columns(labels: Sequence[str], titles: Sequence[str], height: float
     for panel, label in zip(grid[:, 0], labels, strict=True):
         panel.set_ylabel(**fit_label(label, height))
     for panel in grid[-1]:
-        panel.set_xlabel("time [s]")
+        panel.set_xlabel(time)
     drawing.align_ylabels(list(grid[:, 0]))
     return drawing, grid

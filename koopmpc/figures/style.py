@@ -6,7 +6,7 @@ state. matplotlib is imported only when a figure is drawn.
 """
 
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import BytesIO, StringIO
 from os import PathLike
@@ -129,6 +129,11 @@ def line_style(i: int, points: int = 0) -> dict[str, Any]:
         every = max(1, points // 8)
         look |= {"marker": _MARKERS[i % len(_MARKERS)], "markevery": (i * every // 3 % every, every)}
     return look
+
+
+def label_time(metadata: Mapping[str, Any]) -> str:
+    """Return the label of a run's time axis; a run of a problem says the unit of its time if it is not the second."""
+    return f"time [{metadata.get('time unit', 's')}]"
 
 
 def fit_label(name: str, height: float, size: float = 8.0) -> dict[str, Any]:

@@ -13,7 +13,9 @@ import pytest
 import koopmpc as km
 from koopmpc.bench.controllers import CONTROLLERS, Prepared, controller_names
 from koopmpc.bench.measured import BASELINE, describe_best, find_best_learned, read_standings
+from koopmpc.bench.single import run_closed_loop
 from koopmpc.bench.store import ORACLE, RunRow
+from koopmpc.figures.reports import draw_trajectories
 from koopmpc.loop.metrics import Metrics
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "tools"))
@@ -199,3 +201,14 @@ def test_what_is_said_of_the_best_learned_controller_is_what_a_run_gives(name: s
     rows = km.sweep([replace(problem, scene=lambda x, u: [])], [best, baseline], folder=tmp_path)
     assert [row.failure for row in rows if row.failure] == []
     assert compute_standings(rows, [problem])[name][best].ratio == pytest.approx(said[best].ratio, rel=0.05)
+
+
+@pytest.mark.parametrize(("name", "label"), [("cstr", "time [h]"), ("pendulum", "time [s]")])
+def test_pictures_of_runs_label_time_in_the_unit_of_their_problem(name, label, tmp_path):
+    prepared = few(FILES[name])
+    case, one = next(iter(prepared.problem.cases.items()))
+    run = run_closed_loop(prepared, RunRow(name, case, "lqr", x0=tuple(one.x0)), plans=False).take_first(STEPS)
+    km.record(run, tmp_path / "run.rrd")
+    for each in (run, km.load_run(tmp_path / "run.rrd")):
+        pictures = km.plot.run(each), km.plot.runs({case: {"lqr": each}}), draw_trajectories({"lqr": each})
+        assert [picture.axes[-1].get_xlabel() for picture in pictures] == [label] * 3
