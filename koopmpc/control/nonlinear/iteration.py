@@ -185,9 +185,9 @@ class RealTimeIteration:
             for place, value in zip(self._terminal, (targets.M.T, targets.L.T, targets.m), strict=True):
                 place[:] = value
         self._linearise.call()
-        (Q, R), (q, r) = self._quadratic, self._gradients
-        R[:] = self._base_R
         if self._own_stage is not None:
+            (Q, R), (q, r) = self._quadratic, self._gradients
+            R[:] = self._base_R
             self._own_stage.add(Q, q, R, r)
         if self._ends:  # a terminal set limits the last stage alone
             self._g[:-1, -self._ends :], self._G[:-1, :, -self._ends :] = 0.0, 0.0
@@ -294,8 +294,9 @@ class RealTimeIteration:
     def set_weights(self, Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N m"]) -> None:
         """Set the diagonals of all stages, where weights move in time."""
         self._weights[0][:], self._weights[1][:] = Q, R
-        for k in range(len(R) if R.shape[1] else 0):
-            self._base_R[k] = np.diag(R[k])
+        if R.size:
+            np.einsum("kii->ki", self._base_R)[:] = R  # a view of the diagonals
+        self._R_k[:] = self._base_R
 
     def set_theta(self, theta: Float[np.ndarray, " nt"]) -> None:
         """Set the θ of a model; the w of all stages stay."""

@@ -69,7 +69,7 @@ class StagedMPC(MPCBase):
     _goes_on: bool  # whether a reference that moves goes on beyond its rows
     _levels: LevelSearch | None
     _last_root: Float[np.ndarray, "nu nu"] | None = None  # root of the weight of u_{N−1}, where it moves in time
-    _weight_row = 0  # calls since reset, as far as weights move in time
+    _steps: int  # since reset: the row of limits and of weights in time
     _timed: bool  # whether the controller's own limits move in time
     _warm: bool  # whether the next step starts from the plan of the last one
 
@@ -90,7 +90,7 @@ class StagedMPC(MPCBase):
         self._map = given = learned_map(model)
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
         o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, in_time=True)
-        self._outputs, self._box, self._limit_step, self._called_with = o, o.inputs, 0, None
+        self._outputs, self._box, self._steps, self._called_with = o, o.inputs, 0, None
         self._timed = o.limits.in_time
         refuse_priority(o.limits, f"a {type(self).__name__}")
         super().__init__(
@@ -129,7 +129,7 @@ class StagedMPC(MPCBase):
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
-        self._limit_step, self._weight_row, inputs = 0, 0, self._outputs.inputs
+        self._steps, inputs = 0, self._outputs.inputs
         if self._timed:
             low, high = self.limits.input_rows(self.nu, 0, 1)
             self._box = Interval(np.maximum(low, inputs.low), np.minimum(high, inputs.high))
@@ -183,15 +183,14 @@ class StagedMPC(MPCBase):
         if limits is not None or self._timed or self._box is not self._outputs.inputs:
             self._move_limits(limits)
         move = self._step(y, reference, applied, w, start)
-        if self._timed:  # a call that was refused counts as no step
-            self._limit_step += 1
+        self._steps += 1  # a call that was refused counts as no step
         move.refused = self._initial.refused
         watch = self._watch
         return move if watch is None else self._judge_step(watch, move, applied, start)
 
     def _move_limits(self, limits: Limits | None) -> None:
         """Set the limits of this step: those of the call, or the controller's own."""
-        outputs, problem, own, first = self._outputs, self._problem, self.limits, self._limit_step
+        outputs, problem, own, first = self._outputs, self._problem, self.limits, self._steps
         if limits is not None:
             if limits is not self._called_with:
                 model = self._map.model
@@ -262,10 +261,9 @@ class StagedMPC(MPCBase):
         """Return the plan from s on, with v_0 inside `first`."""
 
     def _pass_weights(self) -> None:
-        """Pass the weights of the stages of this step, and go on to the next row."""
-        first, o = self._weight_row + self._latency, self._outputs
+        """Pass the weights of the stages of this step."""
+        first, o = self._steps + self._latency, self._outputs
         Q, R = self.cost.weight_rows(len(o.Q), self.nu, first, self._N + 1)
-        self._weight_row += 1
         if self._with_rates and self.cost.R_rows is not None:
             self._last_root, self._moved = np.diag(np.sqrt(R[-2])), True
         self._weigh(*((np.hstack([Q[1:], R[:-1]]), R[:-1, :0]) if self._with_rates else (Q[1:], R[:-1])))
