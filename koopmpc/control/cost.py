@@ -181,9 +181,10 @@ class Cost(Value):
             raise ShapeError(f"{name} is {rows!r}; pass rows (steps, n), or by name a value a step")
         if self.price is not None and name == "R_rows":
             raise DataError("a price is paid back by R, which R_rows moves in time; pass one of the two")
-        base = getattr(self, name[0])
-        if not isinstance(base, Mapping) and np.ndim(base) == 2 and (base != np.diag(np.diagonal(base))).any():
-            raise DataError(f"{name} are diagonals, and {name[0]} is a full matrix; pass a diagonal one")
+        for weight in ("Q", "R"):  # the steps have diagonals of both
+            base = getattr(self, weight)
+            if not isinstance(base, Mapping) and np.ndim(base) == 2 and (base != np.diag(np.diagonal(base))).any():
+                raise DataError(f"{name} are diagonals, and {weight} is a full matrix; pass a diagonal one")
         return rows
 
     def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Cost":
@@ -527,7 +528,7 @@ def _tracking(
     if nu == 0:
         raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
     nx = len(states)
-    if cost.Q_rows is not None or cost.R_rows is not None:
+    if cost.weighs_in_time:
         cost.weight_rows(nr, nu, 0, 1)  # checks their sizes
     (Q, R), R_delta, rows = cost.matrices(nr, nu), cost.rate(nu), cost.given_inputs(nu)
     base = limits.base

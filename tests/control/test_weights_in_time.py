@@ -57,6 +57,14 @@ def test_the_plan_of_each_step_is_that_of_least_squares(kind, R_delta):
             x, last = A @ x + B @ u, float(u[0])
 
 
+def test_a_call_that_is_refused_counts_as_no_step():
+    mpc, x = make(km.BilinearMPC, Q_rows=Q_ROWS, R_rows=R_ROWS), np.array([2.0, 0.5])
+    with pytest.raises(km.errors.ShapeError):
+        mpc(x, [0, 0, 0])
+    mpc(x, [0, 0])
+    np.testing.assert_allclose(mpc.plan().U[:, 0], find_best(x, 0, 0.0, 0.0), atol=2e-5)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_constant_rows_are_the_constant_weights(kind):
     plain, rows = make(kind), make(kind, Q_rows=[[1, 0.5]] * 3, R_rows=[[0.2]])
@@ -80,7 +88,9 @@ REFUSED = {
     "below 0": {"Q_rows": [[-1, 0]]},
     "pass rows": {"R_rows": [0.1, 0.2]},
     "one of the two": {"R_rows": [[0.1]], "price": [0.1]},
-    "a full matrix": {"Q": [[1, 0.2], [0.2, 1]], "Q_rows": [[1, 1]]},
+    "Q_rows are diagonals, and Q is a full matrix": {"Q": [[1, 0.2], [0.2, 1]], "Q_rows": [[1, 1]]},
+    "R_rows are diagonals, and Q is a full matrix": {"Q": [[1, 0.2], [0.2, 1]], "R_rows": [[0.1]]},
+    "Q_rows are diagonals, and R is a full matrix": {"R": [[1, 0.2], [0.2, 1]], "Q_rows": [[1, 1]]},
     "pass rows of 2": {"Q_rows": [[1, 1, 1]]},
 }
 

@@ -309,7 +309,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks)
         scale=o.sizes.scale,
         scheduled=model.scheduled,
         stage=_stage_function(o.cost, model, nx, with_rates=False),
-        timed=o.cost.Q_rows is not None or o.cost.R_rows is not None,
+        timed=o.cost.weighs_in_time,
     )
     wanted = o.limits.terminal
     if not o.with_rates and len(blocks) == N and not moves.own:
