@@ -117,7 +117,7 @@ def write_functions(functions: Mapping[str, CFunction], language: Language) -> s
         if name in plans:
             texts.append(_write_table(plans[name], kind, each, name, language))
         else:
-            texts.append(write_function(each.graph, name, each.arguments, each.result, language))
+            texts.append(write_function(each, name, language))
     return "\n".join(texts)
 
 
@@ -130,8 +130,9 @@ def _write_head(each: CFunction, name: str) -> str:
     return f"void {name}({', '.join(heads)}, koopmpc_real *{each.result})"
 
 
-def write_function(graph: Graph, name: str, arguments: Mapping[str, int], result: str, language: Language) -> str:
+def write_function(each: CFunction, name: str, language: Language) -> str:
     """Return ``void name(const real *argument, …, real *result)``, each register written once."""
+    graph, arguments, result = each
     places: list[str] = [f"{argument}[{i}]" for argument, size in arguments.items() for i in range(size)]
     registers: dict[int, str] = {}
     results: list[str] = []
@@ -154,7 +155,7 @@ def write_function(graph: Graph, name: str, arguments: Mapping[str, int], result
     # The result may be an argument's own array: all reads come before the writes.
     unused = [f"  (void){argument};" for argument in arguments if not any(f"{argument}[" in s for s in lines + results)]
     body = "\n".join([*unused, *lines, *results])
-    return f"{_write_head(CFunction(graph, arguments, result), name)} {{\n{body}\n}}\n"
+    return f"{_write_head(each, name)} {{\n{body}\n}}\n"
 
 
 class RunPlan(NamedTuple):

@@ -500,6 +500,7 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         "TAIL": p.tail.steps,
         "BEYOND": p.beyond,
         "RESTS": motion.RESTS,
+        "MOST_TERMS": max(motion.ORDERS) + 1,
     }
     arguments = {
         "map": {"x": nx, "u": nu},
@@ -547,6 +548,7 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         "cost_quadratic": np.where(soft, softness.quadratic, 0.0),
         "sizes": p.stage_sizes,
         "input_sizes": p.input_sizes,
+        "orders": np.array(motion.ORDERS, dtype=np.intc),
     }
     tables.plan |= {
         "rest_weight": p.rest.weight,

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.codegen.functions import EXPRESSIONS, Language, write_function
+from koopmpc.codegen.tables import CFunction
 from koopmpc.plants.graph import OPERATIONS, Graph
 from koopmpc.plants.routines import load_library
 from tests.faults.damage import room_for
@@ -159,7 +160,8 @@ def test_every_operation_of_a_graph_is_the_same_in_c():
         names.append(name)
     graph = Graph.trace(ca.Function("all", [a, b], [ca.vertcat(*results)]))
     text = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
-    code = load_library(text + write_function(graph, "all_of_them", {"a": 1, "b": 1}, "y", Language()), ["cc"], None)
+    function = CFunction(graph, {"a": 1, "b": 1}, "y")
+    code = load_library(text + write_function(function, "all_of_them", Language()), ["cc"], None)
     rows = np.random.default_rng(0).normal(size=(50, 2)) * 2
     expected = graph.evaluate(rows)
     import ctypes

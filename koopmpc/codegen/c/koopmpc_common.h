@@ -60,7 +60,7 @@ void koopmpc_nearest(const koopmpc_real *r, const koopmpc_real *e, koopmpc_real 
 /** Coordinates of the nearest target inside the limits; 1 if a limit moved it. */
 int koopmpc_target(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *e, koopmpc_real *alpha);
 
-/** The same inside the limits `low` and `high` of KOOPMPC_NL values. */
+/** The same inside the limits `least` and `most` of KOOPMPC_NL values. */
 int koopmpc_target_within(koopmpc_state *s, const koopmpc_real *r, const koopmpc_real *e, const koopmpc_real *least,
                           const koopmpc_real *most, koopmpc_real *alpha);
 

@@ -9,8 +9,9 @@
 #include "koopmpc_stages.h"
 
 #if KOOPMPC_BEYOND
-/* rows beyond the preview, rows of the preview, terms of a recurrence, rows of the end's cost, tracked outputs, [x; u] */
-enum { FURTHER = KOOPMPC_BEYOND, ROWS = STEPS + 1, MOST_TERMS = 7, GOAL = KOOPMPC_GOAL, RN = KOOPMPC_NR, LEAST = NX + NV };
+/* rows beyond the preview, rows of the preview, terms of a recurrence; rows of the end's cost, tracked outputs, [x; u] */
+enum { FURTHER = KOOPMPC_BEYOND, ROWS = STEPS + 1, MOST_TERMS = KOOPMPC_MOST_TERMS };
+enum { GOAL = KOOPMPC_GOAL, RN = KOOPMPC_NR, LEAST = NX + NV };
 
 /** Whether r_k = sum c_i r_{k-n+i} has a root beyond 1 + GROWS, by the Schur-Cohn recursion. */
 static int grows(const koopmpc_real *c, int n) {
@@ -41,7 +42,6 @@ static int stands(const koopmpc_state *s, int j) {
 
 /** Write column `j` of the rows beyond the preview, and whether it drifts; 0 if it obeys no linear recurrence. */
 static int extend(koopmpc_state *s, int j, int *drifts) {
-  static const int orders[] = {2, 3, 4, 6};
   koopmpc_real z[ROWS], past[ROWS * MOST_TERMS], inverse[MOST_TERMS * ROWS], c[MOST_TERMS];
   koopmpc_real low = s->reference[j], high = low, spread;
   const koopmpc_real end = s->reference[STEPS * RN + j];
@@ -57,8 +57,8 @@ static int extend(koopmpc_state *s, int j, int *drifts) {
     return 1;
   }
   for (int k = 0; k < ROWS; k++) z[k] = (s->reference[k * RN + j] - end) / spread;
-  for (unsigned which = 0; which < sizeof orders / sizeof orders[0]; which++) {
-    const int order = orders[which], terms = order + 1, rows = ROWS - order;
+  for (unsigned which = 0; which < sizeof koopmpc_orders / sizeof koopmpc_orders[0]; which++) {
+    const int order = koopmpc_orders[which], terms = order + 1, rows = ROWS - order;
     koopmpc_real most = 0, sum = 0, last[MOST_TERMS];
     int drifting;
     if (rows < order + 2) return 0;

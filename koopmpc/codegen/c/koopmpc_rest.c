@@ -20,7 +20,7 @@ enum {
   LIMITS = NV + BOX,
   MOST_ROWS = LEFT > NX + LIMITS ? LEFT : NX + LIMITS,
   NEWTON = 20,
-  WIDEST = SIZE > 7 ? SIZE : 7 /* the recurrence of a reference has 7 terms */
+  WIDEST = SIZE > KOOPMPC_MOST_TERMS ? SIZE : KOOPMPC_MOST_TERMS /* the recurrence of a reference has so many */
 };
 #define RANK ((koopmpc_real)KOOPMPC_RANK)
 #define CLOSE ((koopmpc_real)1e-2)
