@@ -42,14 +42,11 @@ def trace_stage(stage: StageCost, nx: int, nu: int) -> Graph:
         ) from error
     if value.shape != (1, 1):
         raise ShapeError(f"stage(x, u) has shape {value.shape}, expected one number")
-    free = [str(symbol) for symbol in ca.symvar(value) if not any(ca.is_equal(symbol, own) for own in _list(x, u))]
+    own = ca.vertcat(x, u)
+    free = [str(symbol) for symbol in ca.symvar(value) if not ca.depends_on(symbol, own)]
     if free:
         raise DataError(f"stage(x, u) holds the symbol {free[0]}, which is neither of its arguments; pass a number")
-    return Graph.trace(ca.Function("stage", [ca.vertcat(x, u)], [ca.densify(value)]))
-
-
-def _list(*columns: ca.SX) -> list[ca.SX]:
-    return [column[i] for column in columns for i in range(column.numel())]
+    return Graph.trace(ca.Function("stage", [own], [ca.densify(value)]))
 
 
 def evaluate_stage(

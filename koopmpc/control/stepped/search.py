@@ -67,8 +67,8 @@ class LevelSearch:
     index
         The levels of the last plan, move by move.
     gap
-        (J − bound) / J of the last plan, J its cost above that of the least cost that is known to be possible; 0 where
-        it is the best.
+        (J − bound) / J of the last plan, both counted from the least cost that is known to be possible; 0 where it is
+        the best.
     nodes
         Programs of the last search.
     """

@@ -1,4 +1,4 @@
-"""Figure: a row of docs/speed.md. A file of figures imports koopmpc and numpy alone, so that an old commit can run it."""
+"""Figure: a row of docs/speed.md. A file of figures imports no test, so that an old commit can run it."""
 
 import time
 from collections.abc import Callable

@@ -79,7 +79,7 @@ def make_step(method: str, N: int) -> Any:
 
 
 def measure(method: str, N: int) -> dict[str, float]:
-    """Return times [s], memory [MB], and how many rows of the first plan are at a limit."""
+    """Return times [s] and memory [MB]."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     step, x = make_step(method, N), np.array([0.05 * N, 0.0, 0.0, 0.0])
     spent: list[float] = []
