@@ -554,7 +554,7 @@ class Compiled:
         return self.__copy__()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuild, (self.original, self.precision, self._memory, self._step)
+        return _rebuild, (self.original, self.precision, self._memory, self._step, self._at_call)
 
 
 def _run_arguments(
@@ -576,11 +576,15 @@ def _run_arguments(
 
 
 def _rebuild(
-    controller: Controller, precision: Precision, memory: Float[np.ndarray, " n"], step: int = 0
+    controller: Controller,
+    precision: Precision,
+    memory: Float[np.ndarray, " n"],
+    step: int = 0,
+    at_call: Limits | None = None,
 ) -> Controller:
     """Return the controller of a pickle, compiled here, in the state of the pickled one."""
     result = compiled(controller, precision=precision)
     if isinstance(result, Compiled) and result._memory.shape == memory.shape:
-        result._memory[:], result._step = memory, step
+        result._memory[:], result._step, result._at_call = memory, step, at_call
         result._aim(np.zeros((0, result._nr)))  # the address of the table is another one here
     return result

@@ -98,6 +98,17 @@ def test_copies_go_on_at_the_same_row():
         np.testing.assert_array_equal(twin([0.8, -0.5], [1, 0]).u, u)
 
 
+def test_copies_forget_the_limits_of_a_call_as_the_original_does():
+    limits = km.Limits(u_min=-1, u_max=1, rows=("x_max",))
+    _, fast = compile_mpc(limits)
+    fast([1.0, -0.5], [0, 0], limits=limits.with_bounds(u_max=0.2))
+    twins = copy.copy(fast), pickle.loads(pickle.dumps(fast))
+    u = fast([1.0, -0.5], [1, 0]).u
+    assert u.max() > 0.2
+    for twin in twins:
+        np.testing.assert_array_equal(twin([1.0, -0.5], [1, 0]).u, u)
+
+
 def test_code_without_rows_refuses_limits_of_a_call():
     _, fast = compile_mpc(km.Limits(u_min=-1, u_max=1))
     with pytest.raises(km.errors.DataError, match="keeps its own"):
