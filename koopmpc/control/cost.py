@@ -84,8 +84,8 @@ class Cost(Value):
         convexifies it, and NonlinearMPC; V is of Q and R alone. `metrics` counts it from x_0 and u_0 on.
     Q_rows, R_rows
         Weights in time, (T, nr) and (T, nu), or by name a value a step: row k is the diagonal that weighs x_k, or u_k,
-        of a run in place of that of Q or R; the last row is held. Q and R, both diagonal then, stay the weights of V, of
-        set points and of sizes. For BilinearMPC and NonlinearMPC.
+        of a run in place of that of Q or R; the last row is held. Q and R, both diagonal then, stay the weights of V,
+        of set points and of sizes. For BilinearMPC and NonlinearMPC.
     beyond
         What a reference does after the rows that a step is given. "rest": the last row stays. "motion", the default of
         BilinearMPC and NonlinearMPC without Q_N, tail and given u_target: it goes on by the linear recurrence that all
