@@ -371,7 +371,7 @@ class Compiled:
         """
         if self._targets is None or self._last_rows:
             kept, step = self._memory.copy(), self._step
-            self(self._y, self._reference[: self._count])
+            self(self._y, self._reference[: self._count], limits=self._at_call)
             self._memory[:], self._step = kept, step
 
     def _pass_extras(self, applied: ArrayLike | None, w: ArrayLike | None) -> None:
@@ -554,7 +554,8 @@ class Compiled:
         return self.__copy__()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuild, (self.original, self.precision, self._memory, self._step, self._at_call)
+        limits = None if self._at_call is None else self._called_with
+        return _rebuild, (self.original, self.precision, self._memory, self._step, limits)
 
 
 def _run_arguments(
@@ -585,6 +586,7 @@ def _rebuild(
     """Return the controller of a pickle, compiled here, in the state of the pickled one."""
     result = compiled(controller, precision=precision)
     if isinstance(result, Compiled) and result._memory.shape == memory.shape:
-        result._memory[:], result._step, result._at_call = memory, step, at_call
+        result._memory[:], result._step = memory, step
+        result._at_call = result._called_with = at_call
         result._aim(np.zeros((0, result._nr)))  # the address of the table is another one here
     return result

@@ -101,7 +101,11 @@ def test_copies_go_on_at_the_same_row():
 def test_copies_forget_the_limits_of_a_call_as_the_original_does():
     limits = km.Limits(u_min=-1, u_max=1, rows=("x_max",))
     _, fast = compile_mpc(limits)
-    fast([1.0, -0.5], [0, 0], limits=limits.with_bounds(u_max=0.2))
+    at_call = limits.with_bounds(u_max=0.2)
+    held = fast([1.0, -0.5], [0, 0], limits=at_call).u
+    twin, same = pickle.loads(pickle.dumps((fast, at_call)))
+    np.testing.assert_allclose(twin([1.0, -0.5], [0, 0], limits=same).u, held, atol=1e-9)
+    fast.rehearse()
     twins = copy.copy(fast), pickle.loads(pickle.dumps(fast))
     u = fast([1.0, -0.5], [1, 0]).u
     assert u.max() > 0.2
