@@ -13,6 +13,7 @@ import pytest
 import koopmpc as km
 from koopmpc.codegen.tables import Tables, read_program
 from tests.compiler import find_compiler
+from tests.synthesis.test_abreast import make
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
 BOX = {"u_min": -8.0, "u_max": 8.0}
@@ -174,6 +175,18 @@ def test_a_loop_that_learns_what_the_model_lacks_is_that_of_python_to_rounding(s
         assert a.status is b.status
         np.testing.assert_allclose(b.u, a.u, rtol=0, atol=1e-8)
         x = np.add(plant(x, a.u), [0.0, 0.02])  # a load that the model does not know
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_delays_and_a_disturbance_without_an_equilibrium_are_answered_as_in_python(seed):
+    """Readings that no constant load explains: Gauss–Newton leads to an equilibrium at some steps, and at others to none."""
+    controller = make(bilinear=True, delays=1)[1]
+    machine, readings = km.compiled(controller), 0.3 * np.random.default_rng(seed).normal(size=(30, 2))
+    controller.reset(readings[0])
+    for y in readings:
+        slow, fast = controller(y, [0.3, 0.0]), machine(y, [0.3, 0.0])
+        assert (slow.status, slow.fallback) == (fast.status, fast.fallback)
+        np.testing.assert_allclose(slow.u, fast.u, rtol=0, atol=1e-6)
 
 
 def test_a_constant_of_the_c_code_has_one_meaning(swung):

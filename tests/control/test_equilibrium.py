@@ -297,6 +297,17 @@ def test_a_row_whose_equilibrium_is_not_found_is_aimed_at_itself_until_it_is_loo
         np.testing.assert_allclose(targets(row).equilibrium.x, row, atol=1e-5)
 
 
+def test_a_disturbance_that_allows_no_equilibrium_leaves_the_target_of_the_row() -> None:
+    """A position and a speed: where the position is pushed by more than the speed may make up for, nothing rests."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    cart = km.StepMap(ca.Function("F", [x, u], [ca.vertcat(x[0] + 0.2 * x[1], 0.9 * x[1] + 0.3 * u)]), 0.2)
+    read = state_tracking(cart.states, cart.inputs, COST, km.Limits(-1, 1, x_max=[np.inf, 0.4]))
+    targets, row = TerminalTargets(learned_map(cart), COST, read, 1000), np.array([0.3, 0.0])
+    slow = targets.find_disturbed(row, np.array([-0.07, 0.0]), None)
+    np.testing.assert_allclose(slow.equilibrium.x, [0.3, 0.35], atol=1e-6)
+    assert targets.find_disturbed(row, np.array([-0.09, 0.0]), slow) is targets(row)
+
+
 @pytest.mark.parametrize(
     ("row", "active"),
     [

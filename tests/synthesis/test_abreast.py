@@ -47,7 +47,7 @@ def make(*, bilinear=False, delays=0, moves=False):
 
 CASES = [
     {},
-    pytest.param({"bilinear": True, "moves": True}, marks=pytest.mark.slow),
+    pytest.param({"bilinear": True, "delays": 1, "moves": True}, marks=pytest.mark.slow),
     pytest.param({"delays": 2}, marks=pytest.mark.slow),
 ]
 

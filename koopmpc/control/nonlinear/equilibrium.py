@@ -1,6 +1,8 @@
 """The equilibrium x = F(x, u) + e that holds a reference, or comes nearest to it, and what the end of a horizon costs.
 
 Near a guess it is found by Gauss–Newton steps that hold the active limits; from afar, or where these fail, by ipopt.
+Where steps fail under a disturbance, the equilibrium without it stays, as in C: ipopt went on to equilibria thousands
+of sizes away, to which no loop should be led.
 """
 
 from collections.abc import Sequence
@@ -546,12 +548,13 @@ class TerminalTargets:
     ) -> TerminalTarget:
         """Return the target of a row where x⁺ = F(x, u) + e, mostly by one step from that of the last control step.
 
-        The error that this leaves is of the square of the change of e, and gone once e rests.
+        The error that this leaves is of the square of the change of e, and gone once e rests. Where no Gauss–Newton
+        steps lead to an equilibrium, the target of the row stays.
         """
         target = self(row)
         begin = (target if last is None else last).equilibrium
         each = self.equilibria
-        found = each.follow(begin, row, e) or each.near(begin, row, e, CLOSE) or each.find(row, e, begin)
+        found = each.follow(begin, row, e) or each.near(begin, row, e, CLOSE)
         if found is None or self.is_missed(row):
             return target
         u, m = found.u * self._hold, target.m
