@@ -72,6 +72,13 @@ def test_plans_on_a_nonlinear_plant_are_the_best_of_all_sequences(kind):
         assert planned == pytest.approx(least, rel=1e-9 if kind is km.NonlinearMPC else 0.02)
 
 
+def test_a_search_that_fixes_all_inputs_prints_nothing(capfd):
+    mpc = km.NonlinearMPC(MODEL, km.Cost(**COST), km.Limits(levels=[[-1, 0, 1]], dwell=[2]), 5, moves=(1, 2, 2))
+    for x in ([1.5, 0.3], [1.4, 0.1], [1.2, -0.2]):
+        assert mpc(x, [0.2, 0]).status is km.Status.OPTIMAL
+    assert capfd.readouterr() == ("", "")
+
+
 def drive(mpc, seed, steps=30):
     """Return the inputs of a loop in which measurements and solvers fail now and then."""
     rng, x, U = np.random.default_rng(seed), np.array([1.0, 0.0]), []

@@ -112,7 +112,8 @@ class NonlinearMPC(StagedMPC):
         if solver not in OPTIONS:
             raise DataError(f'solver is {solver!r}; pass "ipopt", "fatrop" or "sqpmethod"')
         self._starts = checks.count(starts, "starts")
-        self._options = solver, dict(settings or {}), time_limit is not None
+        fixes = {} if self._levels is None else {"inputs_check": False}  # it warns of nodes that fix all inputs
+        self._options = solver, {**fixes, **(settings or {})}, time_limit is not None
         self._own = {"solver": solver, "starts": self._starts, "settings": dict(settings or {})}
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
         self._e, self._W = np.zeros((self._N, self._map.nx)), np.zeros((self._N, self._map.scheduled))
