@@ -22,10 +22,12 @@ def format_markdown_table(headings: Sequence[str], rows: Iterable[Sequence[objec
 
 
 def to_percent(share: float) -> str:
-    """Return 0.123 as "12 %"."""
+    """Return 0.123 as "12 %", and 0.996 as "99.6 %": what is not all is never said to be."""
     value = 100 * float(share)
     if not value <= 1000:
         return "> 1000 %"
+    if 99.5 <= value < 100 - 1e-9:
+        return f"{int(10 * value) / 10:g} %"
     return f"{value:.0f} %" if value >= 10 or value == round(value) else f"{value:.2g} %"
 
 

@@ -146,7 +146,7 @@ def certify(
         K_w=best.K_w,
         decay=best.decay,
         ball=best.ball,
-        error=best.bound,
+        error=best.bound if given else replace(best.bound, confidence=float(confidence)),  # whichever was chosen
         low=deviation.x + best.scale * (low - deviation.x),
         high=deviation.x + best.scale * (high - deviation.x),
         v_max=room.inputs,

@@ -56,7 +56,7 @@ class ErrorBound(Value):
         Independent episodes, and pairs, behind a scenario bound; 0 for the others.
     share, confidence
         Of a scenario bound: it holds on all pairs of at least 1 − share of episodes drawn like the calibration
-        episodes, with this confidence. 0 and 1 for the others.
+        episodes, with this confidence; of a Certificate, whichever of its bounds was chosen. 0 and 1 for the others.
     held_out, broken
         Pairs that were not used, and how many of them broke the bound.
     """

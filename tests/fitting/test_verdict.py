@@ -91,13 +91,42 @@ def test_the_goal_file_asks_for_coverage_and_a_certificate_and_the_report_answer
     assert promise.verified_on == 60
     text = " ".join(made.page.read_text().split())
     assert "90 % of" in text
-    assert "ertificate" in text
+    assert "No certificate: the data have too few independent episodes" in text
     saved, _ = load(made)
     assert saved.evidence.promise == promise
     for wrong in ("coverage = 1.5", "certify = 3"):
         (tmp_path / "goal.toml").write_text(GOAL.replace("horizon = 15", wrong))
         with pytest.raises(km.errors.DataError, match=wrong.partition(" ")[0]):
             read_goal(tmp_path / "goal.toml", logs())
+
+
+def test_fit_with_a_goal_writes_a_certificate_and_its_page_where_logs_suffice(tmp_path, monkeypatch):
+    """A fifth of 200 episodes is held out; from the edge of the region V falls on the plant, and limits are kept."""
+    monkeypatch.chdir(tmp_path)
+    logs(200, 8).save(tmp_path / "logs.npz")
+    (tmp_path / "goal.toml").write_text(GOAL.replace("horizon = 15", "horizon = 4\ncertify = true"))
+    result = CliRunner().invoke(app, ["fit", "logs.npz", "--goal", "goal.toml", "--linear"])
+    assert result.exit_code == 0
+    assert "certificate.md states it" in " ".join(result.stdout.split())
+    (page,) = tmp_path.rglob("certificate.md")
+    certificate = km.guarantees.load_certificate(page.with_name("certificate.npz"))
+    assert page.read_text() == certificate.page()
+    assert certificate.estimated
+    assert not certificate.is_proof
+    assert "certificate.md states it" in " ".join(page.with_name("report.html").read_text().split())
+    X = certificate.sample(50)
+    value = certificate.value(X)
+    for x, v in zip(X, value, strict=True):
+        u = certificate.feedback(x)
+        ahead = A @ x + B @ u
+        assert np.abs(u).max() <= 2
+        assert abs(ahead[1]) <= 0.8
+        assert certificate.value(ahead) <= max(certificate.decay * v, certificate.ball) * (1 + 1e-9)
+
+
+def test_a_promise_of_nearly_all_loops_is_not_said_to_be_one_of_all(made):
+    promise = replace(made.design.promise, coverage=0.996, found=True, failures=0)
+    assert "at least 99.6 % of runs" in str(promise)
 
 
 def test_options_of_a_goal_need_one(tmp_path, monkeypatch):

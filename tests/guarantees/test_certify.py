@@ -233,6 +233,7 @@ def test_a_certificate_and_its_controller_are_saved(tanks, tmp_path):
 
 def test_the_page_states_what_is_not_claimed(tanks):
     page = tanks[-1].page()
+    assert "with the confidence 95 %" in page  # of the bound that was chosen, whichever of the boxes it is of
     for words in (
         "## Theorem",
         "(x_s, u_s) is an equilibrium of the plant",
