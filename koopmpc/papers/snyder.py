@@ -277,7 +277,7 @@ def judge_text(
             "control on the lifted model is future work",
             holds=max(lifted) < GOOD,
             why=f"done here, by LQR and by MPC with input limits: Fourier 1 takes {max(lifted):.4f} times the cost of "
-            "nonlinear MPC at most; all costs stand below",
+            "nonlinear MPC at most",
         ),
     ]
 

@@ -254,6 +254,15 @@ def test_verdicts_of_the_text_follow_the_numbers(fits):
     assert verdict("EDMD finds the leading Koopman eigenfunctions") is Verdict.IN_PART
 
 
+def test_reasons_of_the_text_end_with_what_they_say_and_point_to_no_other_table(fits):
+    names = ("DMD, feedback data", "DMDc, feedback data", "EDMDc, exciting data")
+    predicted = {"pendulum": {name: Prediction(name, 0.0, 0.0, 1.0, "–") for name in names}}
+    ratios = {"a task": {"LQR, linearisation": 1.05, "LQR, Fourier 1": 1.0, ORACLE: 1.0}}
+    reasons = {claim.says: claim.why for claim in judge_text(fits, 3e-5, predicted, ratios)}
+    assert reasons["control on the lifted model is future work"].endswith("times the cost of nonlinear MPC at most")
+    assert not [why for why in reasons.values() if "below" in why or why.endswith(":")]
+
+
 def test_the_parts_of_the_report_hold_their_tables_and_pictures(settings, fits, tmp_path, monkeypatch):
     saved = []
     for module in (report, theory):
