@@ -1,7 +1,7 @@
 """The leaderboard of `select`: a row a candidate, the choice among them, and the Selection that holds both."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rich.console import RenderableType
@@ -150,23 +150,43 @@ class Selection(Value):
         """The row of `linear`."""
         return self.leaderboard[self.chosen_linear]
 
+    def _find_twins(self) -> tuple[list[int], list[int]]:
+        """Return the rows to print, and for each row its place among them.
+
+        Rows of one lifting with the same figures, of another name or ridge, are printed as one.
+        """
+        kept: list[int] = []
+        leads: list[int] = []
+        for i, row in enumerate(self.leaderboard):
+            twin = next((place for place, k in enumerate(kept) if _is_twin(row, self.leaderboard[k])), len(kept))
+            if twin == len(kept):
+                kept.append(i)
+            elif i == self.chosen or (i == self.chosen_linear and kept[twin] != self.chosen):
+                kept[twin] = i
+            leads.append(twin)
+        return kept, leads
+
     def __str__(self) -> str:
         """Return the choice, and the first rows of the leaderboard with those chosen and the plain linear model."""
         horizon, best, linear = self.horizon, self.best, self.best_linear
         parts: list[RenderableType] = [_sentence("chosen", best)]
         if self.chosen != self.chosen_linear:
             parts.append(_sentence("best linear", linear))
-        plain = [i for i, row in enumerate(self.leaderboard) if row.title == PLAIN]
-        ran = [i for i, row in enumerate(self.leaderboard) if not np.isnan(row.free)]
+        ran = [row for row in self.leaderboard if not np.isnan(row.free)]
         steps = [f"{n} step{'s' * (n > 1)}" for n in (1, max(horizon // 2, 1), horizon)]
         headings = ["model", "observ-\nables", *(f"error\n{n}" for n in steps), "worst\nfold"]
         headings += [*["free\nrun"] * bool(ran), "spectral\nradius", "ridge", "time\n[s]"]
+        kept, leads = self._find_twins()
         rows: list[list[str]] = []
-        for row in self.leaderboard:
-            errors = [f"{error:.2g}" for error in (row.first, row.middle, row.last, row.worst)]
-            errors += [("" if np.isnan(row.free) else f"{row.free:.2g}")] * bool(ran)
+        extra: list[int] = []
+        for place, i in enumerate(kept):
+            row, twins = self.leaderboard[i], leads.count(place) - 1
+            *errors, radius = _list_figures(row)
+            title = row.title + f"; {twins} more alike" * bool(twins)
             ridge = f"{row.ridge:.0e}" if row.ridge else "0"
-            rows.append([row.title, str(row.nz), *errors, f"{row.radius:.4g}", ridge, f"{row.seconds:.1f}"])
+            rows.append([title, str(row.nz), *(errors if ran else errors[:-1]), radius, ridge, f"{row.seconds:.1f}"])
+            if row.title == PLAIN or not np.isnan(row.free):
+                extra.append(place)
         legend = (
             f"Errors are root-mean-squares over the states, each relative to its standard deviation, {horizon} steps = "
             f"{horizon * self.predictor.dt:.3g} s: the median over {self.folds} folds at each number of steps ahead, "
@@ -179,11 +199,24 @@ class Selection(Value):
                 "and the inputs alone, and count as much as short forecasts; inf leaves three times the data's range"
             )
         legend += "." if self.chosen == self.chosen_linear else "; l marks the best linear model."
-        table, hidden = build_leaderboard(headings, rows, self.chosen, self.chosen_linear, [*plain, *ran])
+        table, hidden = build_leaderboard(headings, rows, leads[self.chosen], leads[self.chosen_linear], extra)
         if hidden:
             legend += f" The leaderboard has {hidden} more models."
         parts += ["", table, "", legend]
         return "\n".join([render_text(*parts), *([""] if self.notes else []), *self.notes])
+
+
+def _list_figures(row: LeaderboardRow) -> list[str]:
+    """Return the errors and the spectral radius as printed; nothing for a free run that was not made."""
+    errors = [f"{error:.2g}" for error in (row.first, row.middle, row.last, row.worst)]
+    return [*errors, "" if np.isnan(row.free) else f"{row.free:.2g}", f"{row.radius:.4g}"]
+
+
+def _is_twin(one: LeaderboardRow, other: LeaderboardRow) -> bool:
+    """Return whether both are the same model in print, but for its name and ridge."""
+    if (one.nz, _list_figures(one)) != (other.nz, _list_figures(other)):
+        return False
+    return replace(one.candidate, name="") == replace(other.candidate, name="")
 
 
 def _sentence(role: str, row: LeaderboardRow) -> str:

@@ -439,6 +439,16 @@ def test_the_table_shows_the_choice_the_plain_model_and_fits_a_terminal():
     assert max(map(len, lines)) <= 120
 
 
+def test_the_table_shows_a_model_that_was_tried_twice_once():
+    found = km.select(
+        episodes_of(bilinear, count=8), candidates=[PLAIN, PLAIN, SQUARES], horizon=5, folds=2, delays=[0]
+    )
+    shown = [line for line in str(found).splitlines()[4:] if "linear: " in line]
+    assert len(found.leaderboard) == 6
+    assert len(shown) == 4
+    assert sum("; 1 more alike" in line for line in shown) == 2
+
+
 def test_a_bilinear_model_with_a_hundredth_of_the_error_is_worth_its_step():
     """x⁺ = A x + B u + 0.002 u N x: a linear model errs by less than 1 % of the spread, a bilinear one by rounding."""
 
