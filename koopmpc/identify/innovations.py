@@ -22,13 +22,15 @@ from koopmpc.interrupts import raise_swallowed
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.predict.spectrum import check_same_names
 
-NOT_IDENTIFIABLE = "not identifiable from these logs"
+RESTS = "follows from the readings alone, for the set point rests and no test signal is added"
+_NOT_IDENTIFIABLE = "not identifiable from these logs"
 _SPAN = 200  # steps of a segment, where the episodes have them
 _SETTLES = 5  # one step of so many of a segment is not judged: there the first gains still act
 _LEAST = 20  # steps of a segment, at least
 _EXACT = 1e-12  # share of the largest variance below which a direction's is not trusted
 _UNKNOWN = 0.1  # standard error of a coefficient, in spreads of its state for a spread of its regressor
 _PAST = 4  # rows from which a controller would find its input
+_EACH = 2  # rows for each coefficient of that, at least
 _FEEDBACK = 1e-4  # share of an input's spread that is left where the readings say it all
 _ROUNDS = 2  # fits, the second with the covariance of the innovations of the first
 
@@ -46,8 +48,9 @@ class InnovationsError(MultiStepError):
 
     def evaluate(self, theta: Float[np.ndarray, "nx n"], data: Segments) -> float:
         """Return the mean squared weighted error after the steps in which the filter settles; inf on overflow."""
-        errors = self.find_errors(theta, data)
-        return float(np.mean((errors @ self.root.T) ** 2)) if np.isfinite(errors).all() else np.inf
+        with np.errstate(over="ignore", invalid="ignore"):
+            value = float(np.mean((self.find_errors(theta, data) @ self.root.T) ** 2))
+        return value if np.isfinite(value) else np.inf
 
     def find_errors(self, theta: Float[np.ndarray, "nx n"], data: Segments) -> Float[np.ndarray, "steps m nx"]:
         """Return y_k − x̂_k of each segment after the steps in which the filter settles."""
@@ -119,8 +122,8 @@ def prediction_error(
     Raises
     ------
     DataError
-        The model has past rows or measured disturbances, C does not pick the states, no episode has 20 steps; the
-        loop does not excite the plant enough to separate the coefficients.
+        The model has past rows or measured disturbances, C does not pick the states, the last quarter of no episode
+        has 20 steps; the loop does not excite the plant enough to separate the coefficients.
     ShapeError
         The episodes have other states or inputs.
 
@@ -223,31 +226,41 @@ def _whiten(errors: Float[np.ndarray, "steps m nx"]) -> Float[np.ndarray, "nx nx
     return vectors.T / np.sqrt(np.maximum(values, max(values[-1] * _EXACT, np.finfo(float).tiny)))[:, None]
 
 
+def measure_feedback(episodes: Episodes) -> Float[np.ndarray, " nu"]:
+    """Return the share of each input that readings explain, beyond what past inputs do: it is fed back.
+
+    States also explain an input of an open loop that is held for some rows, for they followed it; its next move they do
+    not know. 0 where there are too few rows to tell.
+    """
+    _, alone, both = _explain_inputs(episodes)
+    return 1 - np.divide(both, alone, out=np.ones(len(alone)), where=alone > 0) ** 2
+
+
 def _check_set_point(episodes: Episodes) -> None:
     """Raise DataError where an input is a function of past readings and inputs: nothing but noise moves the loop."""
+    for name, size, alone, both in zip(episodes.inputs, *_explain_inputs(episodes), strict=True):
+        if both < _FEEDBACK * size < alone:
+            raise DataError(f"{_NOT_IDENTIFIABLE}: {name} {RESTS}; move the set point, or add a test signal")
+
+
+def _explain_inputs(episodes: Episodes) -> tuple[Float[np.ndarray, " nu"], ...]:
+    """Return the spread of the inputs, what past inputs leave of it, and what these and the readings leave."""
     long = [e for e in episodes if len(e) > 4 * _PAST]
-    if not long:
-        return
+    columns = (_PAST - 1) * episodes.nu + _PAST * episodes.nx
+    if sum(len(e) - _PAST for e in long) <= _EACH * columns:  # as many coefficients explain any input
+        return (np.zeros(episodes.nu),) * 3
     past = np.concatenate([np.hstack([e.U[_PAST - i : len(e) - i] for i in range(1, _PAST)]) for e in long])
     seen = np.concatenate([np.hstack([e.X[_PAST - i : len(e) - i] for i in range(_PAST)]) for e in long])
     now = np.concatenate([e.U[_PAST:] for e in long])
-    spread = np.asarray(now.std(axis=0), dtype=np.float64)
-    rest = [_find_rest(regressors, now) for regressors in (past, np.hstack([past, seen]))]
-    for name, alone, both in zip(episodes.inputs, rest[0], rest[1], strict=True):
-        size = spread[episodes.inputs.index(name)]
-        if both < _FEEDBACK * size < alone:
-            raise DataError(
-                f"{NOT_IDENTIFIABLE}: {name} follows from the readings alone, for the set point rests and no "
-                "test signal is added; move the set point, or add a test signal"
-            )
+    return now.std(axis=0), _find_rest(past, now), _find_rest(np.hstack([past, seen]), now)
 
 
 def _find_rest(regressors: Float[np.ndarray, "M n"], targets: Float[np.ndarray, "M nu"]) -> Float[np.ndarray, " nu"]:
-    """Return the standard deviation of the targets that a linear function of the regressors leaves."""
+    """Return the standard deviation of the noise beside a linear function of the regressors."""
     P = np.hstack([regressors, np.ones((len(regressors), 1))])
     P = P / np.maximum(np.abs(P).max(axis=0), np.finfo(float).tiny)
     rest = np.asarray(targets - P @ np.linalg.lstsq(P, targets, rcond=1e-12)[0], dtype=np.float64)
-    return np.asarray(rest.std(axis=0), dtype=np.float64)
+    return np.sqrt((rest**2).sum(axis=0) / (len(P) - P.shape[1]))
 
 
 def _check_excitation(
@@ -266,6 +279,6 @@ def _check_excitation(
     worst = float(np.max(spread * phi.std(axis=0) / np.maximum(points.std(axis=0), np.finfo(float).tiny)[:, None]))
     if worst > _UNKNOWN:
         raise DataError(
-            f"{NOT_IDENTIFIABLE}: a coefficient is known to {worst:.2g} spreads of its state, at most "
+            f"{_NOT_IDENTIFIABLE}: a coefficient is known to {worst:.2g} spreads of its state, at most "
             f"{_UNKNOWN} expected; move the set point, add a test signal to u, or pass fewer observables"
         )

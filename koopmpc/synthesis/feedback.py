@@ -12,7 +12,7 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.innovations import NOT_IDENTIFIABLE, filter_states, fit_with_gain
+from koopmpc.identify.innovations import RESTS, filter_states, fit_with_gain, measure_feedback
 from koopmpc.identify.instruments import check_instruments, instrumental_edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Standardized
@@ -22,7 +22,7 @@ from koopmpc.text import to_percent
 from koopmpc.validate.scoring import score
 from koopmpc.validate.sufficiency import feedback_share
 
-FEEDBACK = 0.05  # logs hold feedback where the states explain at least this share of an input
+FEEDBACK = 0.05  # logs hold feedback where the states explain this share of an input, and of what its past leaves
 _LAGS = 40  # rows of the set point that the projection sees: a loop should settle within them
 _EACH = 4  # rows of data for each lag, at least
 _FOLDS = 4  # parts of the rows,
@@ -123,6 +123,8 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
     total, plain = sum(map(len, episodes)), State() + Constant()
     if not episodes.nu or (signals is None and not _LEAST <= total <= _MOST):
         return kept
+    if signals is None and measure_feedback(episodes).max() < FEEDBACK:
+        return kept
     share = float(feedback_share(episodes, plain)[: episodes.nu].max())
     if share < FEEDBACK:
         if signals is None:
@@ -130,7 +132,6 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
         said = f"the logs hold no feedback, for the states explain {to_percent(share)} of the inputs"
         return replace(kept, sentence=f"instruments are not used: {said}")
     ways: list[_Way] = [_Filter()]
-    width = 1
     if signals is not None:
         width = signals[0].shape[1]
         lags = min(_LAGS, max(total // (_EACH * width * 4), 2), min(len(e) for e in episodes) // 2)
@@ -143,7 +144,7 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
             with hide_fit_warnings():
                 made, noise = way.apply(episodes, pieces)
                 ratio = _compare_unseen(episodes, pieces, way)
-        except DataError as problem:
+        except (KoopmpcError, np.linalg.LinAlgError) as problem:
             reason = str(problem)
             continue
         if ratio <= _GAIN:
@@ -155,7 +156,7 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
     if found:
         return min(found, key=lambda one: one[0])[1]
     if signals is None:
-        return replace(kept, sentence=reason if reason.startswith(NOT_IDENTIFIABLE) else "")
+        return replace(kept, sentence=reason if RESTS in reason else "")
     return replace(kept, sentence=f"instruments are not used: {reason}")
 
 
@@ -240,7 +241,7 @@ def _compare_unseen(episodes: Episodes, pieces: _Pieces, way: _Way) -> float:
                 [score(edmd(data, lifting, ridge=_RIDGE), judged, ahead).rmse for data in (changed, rest)]
                 for lifting in (State() + Constant(), _bend(rest))
             ]
-        except KoopmpcError:
+        except (KoopmpcError, np.linalg.LinAlgError):
             return 1.0
         logs.append([float(np.mean(np.log(np.maximum(a, 1e-300) / np.maximum(b, 1e-300)))) for a, b in both])
     mean = np.exp(np.mean(logs, axis=0)) if logs else np.ones(2)

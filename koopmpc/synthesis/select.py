@@ -228,7 +228,6 @@ def select(
         told = report_stage(progress, "sparse polynomials")
         given += propose_structures(measured[1], None if delays is None else past, bilinear, told)
     first = max(one.delays for one in given)
-    first = max(one.delays for one in given)
     ahead, short = usual_horizon(held, first) if horizon is None else (checks.count(horizon, "horizon"), ())
     nearer = max(ahead, find_forecast_horizon(measured[1])) if record and horizon is None else ahead
     data = make_folds(held, ahead + first, folds, draw)

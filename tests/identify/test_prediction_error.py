@@ -97,6 +97,12 @@ def test_logs_that_identify_nothing_are_refused():
         fit(resting)
 
 
+def test_too_few_rows_do_not_make_an_input_follow_from_the_readings():
+    rng = np.random.default_rng(0)
+    data = km.Episodes([km.Episode(X=rng.standard_normal((81, 4)), U=rng.standard_normal((80, 20)))], dt=0.1)
+    km.identify.prediction_error(km.edmd(data, km.State()), data, iterations=2)
+
+
 def test_models_that_it_does_not_know_are_refused():
     data, _ = run_loop(np.random.default_rng(6), 200, sensor=0.1)
     with pytest.raises(DataError, match="has past rows"):

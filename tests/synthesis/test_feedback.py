@@ -49,6 +49,19 @@ def test_open_loops_need_no_instruments():
     assert remove_feedback(data, None).episodes is data
 
 
+@pytest.mark.parametrize("noise", [0.1, 0.3])
+def test_inputs_that_are_held_in_an_open_loop_are_no_feedback(noise):
+    """States explain them, for they followed them; noisy logs of them stay, and nobody is told to move a set point."""
+    slow = km.LinearPredictor(np.diag([0.8, 0.6]), np.full((2, 1), 0.2), np.eye(2), km.State(), 0.1, ["x", "v"], ["u"])
+    clean = km.collect(slow.step_map(), [0, 0], km.Noise(-1, 1, hold=6), episodes=4, steps=320)
+    rng = np.random.default_rng(0)
+    data = clean.with_episodes([km.Episode(X=e.X + noise * rng.standard_normal(e.X.shape), U=e.U) for e in clean])
+    assert km.validate.feedback_share(data, km.State() + km.Constant())[0] > 0.1
+    found = remove_feedback(data, None)
+    assert found.episodes is data
+    assert not found.sentence
+
+
 def test_without_noise_the_projection_changes_nothing_that_matters():
     data, r = run_loop(np.random.default_rng(3), 2000)
     projected, noise = project_on_instruments(data, r, 60)
@@ -112,7 +125,7 @@ def test_logs_of_a_nonlinear_loop_stay_where_its_curvature_could_be_taken_for_no
     plant, rng, logs = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05), np.random.default_rng(0), []
     for _ in range(4):
         x, X, U = np.array([rng.uniform(-1, 1), 0.0]), [], []
-        for k in range(120):
+        for k in range(400):  # a quarter of a fold must hold the steps of a filter
             goal = rng.uniform(-2, 2) if k % 25 == 0 else goal
             X.append(x + noise * rng.standard_normal(2))
             U.append([8 * (goal - X[-1][0]) - 3 * X[-1][1]])
