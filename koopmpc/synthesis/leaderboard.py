@@ -213,7 +213,7 @@ def _list_figures(row: LeaderboardRow) -> list[str]:
 
 
 def _is_twin(one: LeaderboardRow, other: LeaderboardRow) -> bool:
-    """Return whether both are the same model in print, but for its name and ridge."""
+    """Return whether both are the same model in print, apart from its name and ridge."""
     if (one.nz, _list_figures(one)) != (other.nz, _list_figures(other)):
         return False
     return replace(one.candidate, name="") == replace(other.candidate, name="")
