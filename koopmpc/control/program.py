@@ -261,11 +261,11 @@ class Published:
 def no_export(
     controller: object,
     why: str = "koopmpc has no C code for its law",
-    instead: str = "a BilinearMPC, a LinearMPC or an LQR",
+    instead: str = "a KoopmanMPC, a BilinearMPC, a LinearMPC or an LQR",
 ) -> DataError:
     """Return the error that says why no C code can be generated for a controller."""
     name = type(controller).__name__
-    return DataError(f"a {name} cannot be exported: {why}; export a KoopmanMPC, {instead}")
+    return DataError(f"a {name} cannot be exported: {why}; export {instead}")
 
 
 def publish_estimator(

@@ -122,7 +122,7 @@ class Adaptive(Published):
 
     def build_program(self, reference: ArrayLike | None) -> Program:
         """Raise the DataError that says why no C code can be generated."""
-        raise no_export(self, "its model changes while it runs; export the controller inside it")
+        raise no_export(self, "its model changes while it runs", "the controller inside it")
 
     def _clear(self) -> None:
         self._memory.clear()

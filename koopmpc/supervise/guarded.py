@@ -84,7 +84,7 @@ class Guarded(Published):
 
     def build_program(self, reference: ArrayLike | None) -> Program:
         """Raise the DataError that says why no C code can be generated."""
-        raise no_export(self, "it holds two controllers; export each of them")
+        raise no_export(self, "it holds two controllers", "each of them")
 
     def _forget(self) -> None:
         self.handed_over, self._in_sequence = False, 0

@@ -152,7 +152,7 @@ class Station(Published):
 
     def build_program(self, reference: ArrayLike | None) -> Program:
         """Raise the DataError that says why no C code can be generated."""
-        raise no_export(self, "it holds several controllers; export each of them")
+        raise no_export(self, "it holds several controllers", "each of them")
 
     @property
     def predictor(self) -> Any:

@@ -1,5 +1,6 @@
 """A `Program` says all of a controller: interpreted by a plain loop it gives the same inputs, as the C made of it does."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -158,6 +159,9 @@ def test_each_kind_without_c_code_says_why_and_export_raises_that_sentence(model
         "its model changes while it runs": km.supervise.Adaptive(km.KoopmanMPC(model, COST, limits, 5), online),
         "it holds two controllers": km.supervise.Guarded(watched, feedback),
         "it holds several controllers": km.supervise.Station(watched, feedback),
+        "levels.*; export one without": km.KoopmanMPC(model, COST, km.Limits(levels=[[-8, 0, 8]]), 5),
+        "stage of its own": km.BilinearMPC(bilinear, replace(CIRCLE, stage=lambda x, u: x[0] ** 2), limits, 5),
+        "price.*; export one without": km.BilinearMPC(bilinear, replace(CIRCLE, price=[0.1]), limits, 5),
         "koopmpc has no C code for its law": km.control.EigenfunctionLQR(
             energy, km.Cost(Q=1, R=1, of=energy), dt=0.05, B=[[0], [1]], eigenvalue=0.0
         ),
@@ -169,4 +173,7 @@ def test_each_kind_without_c_code_says_why_and_export_raises_that_sentence(model
         with pytest.raises(km.errors.DataError, match=sentence) as error:
             km.export(controller, tmp_path / "c")
         assert str(error.value) == obstacle
+        assert str(error.value).count("export ") <= 1  # one remedy
+        assert f"export a {type(controller).__name__}" not in str(error.value)  # which was refused
+        assert "C code cannot be generated" not in str(error.value)  # it begins with that
         assert not (tmp_path / "c").exists()

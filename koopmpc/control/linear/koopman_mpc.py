@@ -224,7 +224,9 @@ class KoopmanMPC(MPCBase):
             raise no_export(self, "its C weighs soft limits, and knows no priority", "one without a priority")
         plan, track = self._map, self._map.track
         if plan.ball is not None:
-            raise no_export(self, "it adds tangent cuts of a terminal ellipsoid; use a polytope, or no terminal set")
+            raise no_export(
+                self, "it adds tangent cuts of a terminal ellipsoid", "one with a polytope, or without a terminal set"
+            )
         rows = reference_table(reference, len(track.Q))
         estimator = publish_estimator(
             self._initial.observer,

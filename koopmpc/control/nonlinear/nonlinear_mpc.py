@@ -125,8 +125,8 @@ class NonlinearMPC(StagedMPC):
         """Raise the DataError that says why no C code can be generated."""
         raise no_export(
             self,
-            "it uses ipopt or a CasADi solver; C code cannot be generated for these",
-            "a BilinearMPC of the same model",
+            "it uses ipopt or a CasADi solver",
+            "a KoopmanMPC, or a BilinearMPC of the same model",
         )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "NonlinearMPC":
