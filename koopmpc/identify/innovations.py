@@ -276,7 +276,9 @@ def _check_excitation(
     spread = spread.reshape(nx, -1)[:, :count]
     points = data.states[:-1].reshape(-1, nx)
     phi = error.find_features(points, data.inputs[1:].reshape(len(points), -1))[0]
-    worst = float(np.max(spread * phi.std(axis=0) / np.maximum(points.std(axis=0), np.finfo(float).tiny)[:, None]))
+    size = np.asarray(points.std(axis=0), dtype=np.float64)
+    known = spread * np.asarray(phi.std(axis=0), dtype=np.float64) / np.where(size > 0, size, np.inf)[:, None]
+    worst = float(np.max(known))
     if worst > _UNKNOWN:
         raise DataError(
             f"{_NOT_IDENTIFIABLE}: a coefficient is known to {worst:.2g} spreads of its state, at most "

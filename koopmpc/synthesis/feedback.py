@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.smoother import Mender
 from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.innovations import RESTS, filter_states, fit_with_gain, measure_feedback
@@ -28,10 +29,11 @@ _EACH = 4  # rows of data for each lag, at least
 _FOLDS = 4  # parts of the rows,
 _JUDGED = 2  # of which so many are left out in turn
 _AHEAD = 20  # steps of the forecasts that judge
-_SHORTEST = 40  # rows of an episode in which a filter settles
+_SHORTEST = 60  # rows of an episode in which a filter settles
 _ITERATIONS = 12  # Levenberg-Marquardt steps of a filter's fit
 _LEAST = 200  # rows of logs without instruments, from which on their noise is looked for,
-_MOST = 20_000  # and up to which
+_MOST = 20_000  # and up to which,
+_WORK = 200_000  # with rows times states squared at most, above which a filter takes too long
 _PLATES = 20  # thin plates of the model that tells noise from curvature
 _RIDGE = 1e-8  # of the models that judge
 _GAIN = 0.98  # the error on unseen rows must fall to this share
@@ -131,25 +133,26 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
             return kept
         said = f"the logs hold no feedback, for the states explain {to_percent(share)} of the inputs"
         return replace(kept, sentence=f"instruments are not used: {said}")
-    ways: list[_Way] = [_Filter()]
+    ways: list[_Way] = [_Filter()] if total * episodes.nx**2 <= _WORK else []
     if signals is not None:
         width = signals[0].shape[1]
         lags = min(_LAGS, max(total // (_EACH * width * 4), 2), min(len(e) for e in episodes) // 2)
         ways.append(_Projection(lags))
-    pieces = list(zip(episodes, [None] * len(episodes) if signals is None else signals, strict=True))
+    sound, replaced = _mend(episodes)
+    pieces = list(zip(sound, [None] * len(episodes) if signals is None else signals, strict=True))
     found: list[tuple[float, FeedbackData]] = []
     reason = ""
     for way in ways:
         try:
             with hide_fit_warnings():
-                made, noise = way.apply(episodes, pieces)
-                ratio = _compare_unseen(episodes, pieces, way)
+                made, noise = way.apply(sound, pieces)
+                ratio = _compare_unseen(sound, pieces, way)
         except (KoopmpcError, np.linalg.LinAlgError) as problem:
             reason = str(problem)
             continue
         if ratio <= _GAIN:
             said = f"the error of a linear model falls to {to_percent(ratio)} of that of least squares"
-            said = f"{way.describe()}, since the logs hold feedback and noise: on unseen rows {said}"
+            said = f"{way.describe()}, since the logs hold feedback and noise: on unseen rows {said}{replaced}"
             found.append((ratio, FeedbackData(made, noise, said)))
         else:
             reason = f"on unseen rows the error is {to_percent(ratio)} of that of least squares"
@@ -158,6 +161,16 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
     if signals is None:
         return replace(kept, sentence=reason if RESTS in reason else "")
     return replace(kept, sentence=f"instruments are not used: {reason}")
+
+
+def _mend(episodes: Episodes) -> tuple[Episodes, str]:
+    """Return the episodes without wild readings, which a filter would spread, and the end of a sentence."""
+    try:
+        mender = Mender.of(episodes)
+    except DataError:
+        return episodes, ""
+    count = len(mender.glitches(episodes))
+    return (mender(episodes), f"; {count} wild readings were replaced") if count else (episodes, "")
 
 
 _Pieces = Sequence[tuple[Episode, Float[np.ndarray, "rows nr"] | None]]
@@ -218,7 +231,10 @@ def require_episodes(data: object) -> Episodes:
 def _compare_unseen(episodes: Episodes, pieces: _Pieces, way: _Way) -> float:
     """Return the error of forecasts by a linear model of the changed rows over that of least squares, on unseen rows.
 
-    1 where a model with thin plates loses by the change.
+    Raises
+    ------
+    DataError
+        The logs are too short, or a model with thin plates loses by the change.
     """
     block = max(min(len(e) for e in episodes) // _FOLDS, way.settles + _AHEAD)
     parts = [
@@ -232,20 +248,21 @@ def _compare_unseen(episodes: Episodes, pieces: _Pieces, way: _Way) -> float:
         seen = [one for i, one in enumerate(parts) if i % _FOLDS != fold]
         out = [e for i, (e, _) in enumerate(parts) if i % _FOLDS == fold]
         if not seen:
-            return 1.0
+            raise DataError("the logs are too short to be judged on unseen rows")
         rest, judged = episodes.with_episodes([e for e, _ in seen]), episodes.with_episodes(out)
         ahead = min(_AHEAD, min(map(len, out)))
-        try:
-            changed, _ = way.apply(episodes, seen)
-            both = [
-                [score(edmd(data, lifting, ridge=_RIDGE), judged, ahead).rmse for data in (changed, rest)]
-                for lifting in (State() + Constant(), _bend(rest))
-            ]
-        except (KoopmpcError, np.linalg.LinAlgError):
-            return 1.0
+        changed, _ = way.apply(episodes, seen)
+        both = [
+            [score(edmd(data, lifting, ridge=_RIDGE), judged, ahead).rmse for data in (changed, rest)]
+            for lifting in (State() + Constant(), _bend(rest))
+        ]
         logs.append([float(np.mean(np.log(np.maximum(a, 1e-300) / np.maximum(b, 1e-300)))) for a, b in both])
-    mean = np.exp(np.mean(logs, axis=0)) if logs else np.ones(2)
-    return float(mean[0]) if np.isfinite(mean).all() and mean[1] <= 1 else 1.0
+    if not logs:
+        raise DataError("the logs are too short to be judged on unseen rows")
+    mean = np.exp(np.mean(logs, axis=0))
+    if not np.isfinite(mean).all() or mean[1] > 1:
+        raise DataError("a model with thin plates loses by it on unseen rows")
+    return float(mean[0])
 
 
 def _bend(episodes: Episodes) -> Lifting:

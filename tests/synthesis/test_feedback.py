@@ -133,3 +133,12 @@ def test_logs_of_a_nonlinear_loop_stay_where_its_curvature_could_be_taken_for_no
         logs.append(km.Episode(X=np.array([*X, x]), U=np.array(U)))
     data = km.Episodes(logs, 0.05, plant.states, plant.inputs)
     assert remove_feedback(data, None).episodes is data
+
+
+def test_wild_readings_are_replaced_before_a_filter_spreads_them():
+    data, _ = run_loop(np.random.default_rng(1), 800, sensor=0.2)
+    X = data[0].X.copy()
+    X[300, 0] = 99.0
+    found = remove_feedback(km.Episodes([km.Episode(X=X, U=data[0].U)], 0.1), None)
+    assert found.sentence.endswith("1 wild readings were replaced")
+    assert np.linalg.norm(fit_plain(found.episodes) - TRUTH) < 0.03
