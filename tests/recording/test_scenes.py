@@ -1,5 +1,6 @@
 """Scenes: in the plane shapes become lines that cover what they stand for, y down; in space lines, balls and boxes, z up."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -14,6 +15,7 @@ import koopmpc as km
 from koopmpc.figures.animation import project
 from koopmpc.recording.scenes import Extent, Names, draw, draw_ahead, stages
 from koopmpc.recording.video import export_video
+from tests.recording.runs import make_run
 
 coordinate = st.floats(-10, 10)
 
@@ -236,3 +238,18 @@ def test_a_scene_that_cannot_be_drawn_in_space_is_told(
 
     with pytest.raises(km.errors.DataError, match=message):
         recorded(tmp_path / "run.rrd", Bad())
+
+
+def test_the_scene_of_a_reference_that_stays_is_asked_for_once(tmp_path):
+    asked = []
+
+    def scene(x, u):
+        asked.append(x)
+        return [km.scene.Disk("a", (float(x[0]), 0.0), 0.1)]
+
+    run = make_run(T=12)
+    still = replace(
+        run, reference=np.ones_like(run.reference), u_reference=np.zeros_like(run.U), plans=None, scene=scene
+    )
+    km.record(still, tmp_path / "still.rrd")
+    assert len(asked) == len(run.X) + 1
