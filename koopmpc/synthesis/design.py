@@ -82,7 +82,7 @@ from koopmpc.synthesis.judging import (
     measure_errors,
     rate_runs,
 )
-from koopmpc.synthesis.select import LONGER, RIDGES, report_stage
+from koopmpc.synthesis.select import RIDGES, extend_past, report_stage
 from koopmpc.synthesis.surrogates import (
     choose_surrogates,
     is_unstable,
@@ -168,7 +168,7 @@ def design(
     candidates
         Models to try, as in `select`.
     delays
-        Past steps to try in an embedding; by default 0, 1 and 2, and 4 where the data show a hidden state.
+        Past steps to try in an embedding; by default 0, 1 and 2, and 4 where the data show a hidden state (see `select`).
     bilinear
         Try bilinear models too; the surrogates are then bilinear.
     tighten
@@ -249,7 +249,7 @@ def design(
     memory = find_hidden_state(measured) if max(past) else None
     hidden = memory is not None and memory.shows_hidden_state
     if hidden and delays is None:
-        past = [*past, *LONGER]
+        past = extend_past(past, held, measured)
     models = _list_models(held, asked, candidates, past, bilinear, draw)
     first = max(one.delays for one in models)
     room = int(np.median([len(episode) for episode in held])) - first

@@ -13,12 +13,15 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.angles import count_wraps
+from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import FitWarning
+from koopmpc.errors import FitWarning, hide_fit_warnings
+from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.records.structure import Structure, find_forecast_horizon
 from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.state import Constant, State
 from koopmpc.parallel import Progress, StageProgress, map_tasks
 from koopmpc.predict.base import replace_report
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -54,9 +57,11 @@ from koopmpc.synthesis.records import (
     refine_structure,
 )
 from koopmpc.validate.memory import find_hidden_state
-from koopmpc.validate.scoring import AnyPredictor
+from koopmpc.validate.scoring import AnyPredictor, score
 
 ENOUGH = 1e-2  # error of a forecast, as a share of the states' spread, below which a controller gains nothing
+_NEAR = 10  # steps of the forecasts that say whether more of the past is worth a trial
+_GAINS = 0.9  # it is, where two past steps lower the error of one to this share
 LONGER = (4,)  # further past steps that are tried where a hidden state shows
 RIDGES = tuple(10.0**power for power in range(-9, -2))
 LATE = (
@@ -65,6 +70,26 @@ LATE = (
 )
 
 ROUGH = "the chosen model learns from the rows as they were measured: smoothed ones forecast unseen rows no better"
+
+
+def extend_past(past: Sequence[int], learned: Episodes, measured: Episodes) -> list[int]:
+    """Return the past steps to try where a hidden state shows: more if two of them forecast better than one.
+
+    Linear models of the `learned` rows forecast `measured` rows of every fourth episode, which they did not see: of
+    smoothed rows a model would know from the past what only the future told. With fewer episodes more are tried.
+    """
+    unseen = [i for i, e in enumerate(measured) if i % 4 == 0 and len(e) > 3 * max(past)]
+    seen = learned.with_episodes([e for i, e in enumerate(learned) if i % 4])
+    if len(unseen) < 2 or not len(seen):
+        return [*past, *LONGER]
+    ahead = min(_NEAR, min(len(measured[i]) for i in unseen) - 2)
+    errors: list[float] = []
+    with hide_fit_warnings():
+        for steps in (1, 2):
+            model = edmd(seen, State() + Constant(), embedding=Delay(steps))
+            same = measured.with_episodes([measured[i].cut(2 - steps, len(measured[i])) for i in unseen])
+            errors.append(float(np.mean(score(model, same, ahead).rmse)))
+    return [*past, *LONGER] if errors[1] < _GAINS * errors[0] else list(past)
 
 
 def select(
@@ -130,8 +155,8 @@ def select(
         ridge ε² on deviations of unit norm. With less, a state and its past, which are almost functions of each other,
         get large weights of opposite signs, which cancel on the training data alone.
     delays
-        Past steps to try in an embedding; by default 0, 1 and 2, also 4 where the data show a hidden state, and of
-        records up to 12.
+        Past steps to try in an embedding; by default 0, 1 and 2, also 4 where the data show a hidden state and two past
+        steps forecast better than one, and of records up to 12.
     bilinear
         Try z⁺ = A z + B u + E w + Σ uᵢ Nᵢ z + Σ wⱼ Sⱼ z too, where there are inputs.
     relift
@@ -217,7 +242,7 @@ def select(
     memory = find_hidden_state(measured[1]) if max(past) and not record else None
     hidden = memory is not None and memory.shows_hidden_state
     if hidden:
-        past = past if delays is not None else [*past, *LONGER]
+        past = past if delays is not None else extend_past(past, held, measured[1])
         notes = (*notes, f"{memory}; models with delays are tried, and need not halve the error")
     given = (
         propose_candidates(held, past, both, draw)

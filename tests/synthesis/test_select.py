@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import koopmpc as km
 from koopmpc.data.angles import find_angles
@@ -485,3 +486,25 @@ def test_of_centres_at_one_place_one_is_kept():
     coarse = data.with_episodes([km.Episode(X=steps + jitter, U=data[0].U)])
     tried = [one for one in propose_candidates(coarse, (0,), False, rng) if "gaussian" in one.name]
     assert {one.name for one in tried} == {f"gaussian {len(np.unique(steps))}"}
+
+
+def test_more_of_the_past_is_tried_where_two_rows_of_it_forecast_better_than_one():
+    """One hidden speed needs one past row, though noise and smoothing make more look better; three hidden states do not."""
+    rng, found = np.random.default_rng(0), []
+    springs = np.array([[0.0, 1.0, 0.0, 0.0], [-2.0, -0.1, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], [1.0, 0.0, -1.0, -0.1]])
+    for F in (springs[:2, :2], springs):
+        n = len(F)
+        G = np.zeros((n, 1))
+        G[-1] = 1.0
+        AB = expm(0.3 * np.block([[F, G], [np.zeros((1, n + 1))]]))
+        logs = []
+        for _ in range(12):
+            x, U = rng.uniform(-1, 1, n), rng.uniform(-1, 1, (40, 1))
+            X = [x]
+            for u in U:
+                X.append(AB[:n, :n] @ X[-1] + AB[:n, n:] @ u)
+            logs.append(km.Episode(X=np.array(X)[:, :1] + 1e-3 * rng.standard_normal((41, 1)), U=U))
+        data = km.Episodes(logs, dt=0.3)
+        chosen = km.select(data, candidates=[km.State() + km.Constant()], horizon=10, bilinear=False)
+        found.append(max(row.delays for row in chosen.leaderboard))
+    assert found == [2, 4]
