@@ -52,6 +52,16 @@ def test_the_tube_of_a_design_is_that_of_the_linear_loop_under_its_riccati_feedb
     assert tube[0] == pytest.approx(error)
 
 
+class MarginAlone(float):
+    """A controller of which the pool asks nothing but its margin."""
+
+    dt, nu, horizon = 0.1, 1, 1
+
+    def reset(self, x0=None, u_prev=None): ...
+
+    def __call__(self, y, reference, applied=None, w=None): ...
+
+
 class DrawnPool(LoopPool):
     """Loops that need a margin of their own, drawn at random, on a share of which no margin helps."""
 
@@ -72,7 +82,7 @@ def promise(seed, coverage=0.9, loops=60, hopeless=0.0, room=10.0):
     tube = np.array([[0.0, 0.05], [0.0, 0.1]])
     return promise_coverage(
         DrawnPool(task, hopeless),
-        lambda limits: 0.0 if limits.margin is None else float(np.max(limits.margin)),
+        lambda limits: MarginAlone(0.0 if limits.margin is None else np.max(limits.margin)),
         tube,
         np.full(2, room),
         coverage,
@@ -108,7 +118,13 @@ def test_where_none_is_needed_there_is_no_margin():
     task = make_task()[-1]
     pool = DrawnPool(task, 0.0)
     found, limits = promise_coverage(
-        pool, lambda limits: 100.0, np.full((2, 2), 0.1), np.full(2, 1.0), 0.95, 40, np.random.default_rng(0)
+        pool,
+        lambda limits: MarginAlone(100.0),
+        np.full((2, 2), 0.1),
+        np.full(2, 1.0),
+        0.95,
+        40,
+        np.random.default_rng(0),
     )
     assert (found.shape, found.failures, limits.margin) == ("none", 0, None)
     assert found.holds
