@@ -127,7 +127,8 @@ class Adaptive(Published):
     def _clear(self) -> None:
         self._memory.clear()
         self._recent.clear()
-        self._changed_at = 0  # pairs learned before the first of those that a model in use did not predict
+        self._changed_at = 0  # pairs learned before those that led to the model in use
+        self._alarm: int | None = None  # pairs learned before those that the model in use does not suffice for
         self._before: tuple[np.ndarray, np.ndarray, np.ndarray, bool] | None = None
         self._misfits: deque[float] = deque(maxlen=self._memory.maxlen)
         self._off = self._steps = 0
@@ -150,8 +151,8 @@ class Adaptive(Published):
     def find_drift(self, data: Episodes) -> DriftReport:
         """Name what has changed since the data of the design, as `km.validate.find_drift` does.
 
-        New logs are the last 500 pairs that were learned from, from the first that the model in use did not predict
-        as well as its own data.
+        New logs are the last 500 pairs that were learned from, from the first that the model in use does not predict
+        as well as its own data. Where it suffices, they begin with the pairs that led to it, or with the run.
 
         Parameters
         ----------
@@ -163,7 +164,8 @@ class Adaptive(Published):
         DataError
             Nothing was learned in this run yet, or the data have other signals.
         """
-        new = list(self._recent)[max(len(self._recent) - (self.learned - self._changed_at), 0) :]
+        before = self._changed_at if self._alarm is None else self._alarm
+        new = list(self._recent)[max(len(self._recent) - (self.learned - before), 0) :]
         if not new:
             raise DataError("nothing was learned in this run yet; call the controller first")
         ends = [i + 1 for i, (one, then) in enumerate(pairwise(new)) if one.x_next is not then.x]
@@ -247,10 +249,11 @@ class Adaptive(Published):
         """Put a new model on trial where the one in use does not suffice, end a trial, or go back to an earlier one."""
         pairs, used = list(self._memory), self.predictor
         if self._suffices(used, pairs):
-            self._on_trial = None
+            self._on_trial = self._alarm = None
             return
+        if self._alarm is None:
+            self._alarm = self.learned - len(pairs)
         if self._on_trial is None:
-            self._changed_at = self._changed_at or max(self.learned - len(pairs), 0)
             try:
                 self._on_trial = self.online.predictor(), self.learned
             except KoopmpcError:  # too little was learned for a fit
@@ -291,6 +294,8 @@ class Adaptive(Published):
         except KoopmpcError:
             self.controller.update(used)
             return False
+        assert self._alarm is not None, "only called where the model in use does not suffice"
+        self._changed_at = self._alarm
         return True
 
 

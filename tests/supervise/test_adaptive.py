@@ -254,9 +254,8 @@ def test_a_fit_of_the_last_steps_does_not_replace_a_model_that_plans_better(reme
     assert learning.refused + learning.renewed > 0  # models were on trial
 
 
-@pytest.mark.parametrize("share", [1.0, 0.6])
-def test_it_names_what_changed_since_the_design(share):
-    """The gain of the input falls after 150 steps, or does not."""
+def run_with_drift(share, change, pushed=range(0), steps=450):
+    """Return the data of a design, and a learning controller after a run with a gain that changes once."""
     A, B, rng = np.array([[0.9, 0.1], [-0.1, 0.8]]), np.array([[0.0], [0.2]]), np.random.default_rng(0)
     plant = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ["x", "v"], ["F"]).step_map()
     old = km.collect(plant, [0, 0], km.Noise(-2, 2, hold=3), episodes=4, steps=150)
@@ -268,11 +267,18 @@ def test_it_names_what_changed_since_the_design(share):
     with pytest.raises(km.errors.DataError, match="nothing was learned"):
         learning.find_drift(old)
     x, goal = np.zeros(2), np.zeros(2)
-    for k in range(450):
+    for k in range(steps):
         if k % 15 == 0:
             goal = np.array([rng.uniform(-0.6, 0.6), 0.0])
         u = learning(x + 1e-3 * rng.standard_normal(2), goal).u
-        x = A @ x + B @ u * (share if k >= 150 else 1.0)
+        x = A @ x + B @ u * (share if k >= change else 1.0) + np.array([0.0, 0.1 * (k in pushed)])
+    return old, learning
+
+
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_it_names_what_changed_since_the_design(share):
+    """The gain of the input falls after 150 steps, or does not."""
+    old, learning = run_with_drift(share, 150)
     report = learning.find_drift(old)
     if share == 1:
         assert report.verdict == "unchanged"
@@ -281,3 +287,13 @@ def test_it_names_what_changed_since_the_design(share):
         assert learning.renewed >= 1
         assert report.changes[0].share == pytest.approx(share - 1, abs=0.08)
         assert "the gain of F" in [change.name for change in report.changes]
+
+
+def test_an_alarm_that_passed_does_not_blur_what_changed_later():
+    """Something pushes for 8 steps; the gain falls 180 steps later, and pairs before that are not of the change."""
+    pushed = range(60, 68)
+    _, learning = run_with_drift(0.6, 250, pushed, steps=100)
+    assert (learning.refused, learning.renewed) == (1, 0)  # a false alarm
+    old, learning = run_with_drift(0.6, 250, pushed)
+    assert learning.renewed >= 1
+    assert learning.find_drift(old).changes[0].share == pytest.approx(-0.4, abs=0.08)
