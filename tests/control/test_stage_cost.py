@@ -65,13 +65,13 @@ def test_an_economic_stage_is_planned_to_its_optimum(kind, x):
 
 
 def test_a_stage_that_is_not_convex_is_said_and_still_planned_with():
-    cost = {"Q": [1, 0.1], "R": 0.1, "u_target": "zero"}
-    convex = km.BilinearMPC(MODEL, km.Cost(**cost, stage=quadratic), LIMITS, 6)
-    bent = km.BilinearMPC(MODEL, km.Cost(**cost, stage=lambda x, u: -0.05 * x[0] ** 2 + 0.1 * u[0]), LIMITS, 6)
-    for mpc in (convex, bent):
-        assert mpc([1.0, 0.0], [0, 0]).status is km.Status.OPTIMAL or mpc.plan() is not None
-    assert convex.stage_is_convex
-    assert not bent.stage_is_convex
+    cost, x = {"Q": [1, 0.1], "R": 0.1, "u_target": "zero"}, [1.0, 0.0]
+    bent = km.Cost(**cost, stage=lambda x, u: -0.05 * x[0] ** 2 + 0.1 * u[0])
+    for own, convex in ((km.Cost(**cost, stage=quadratic), True), (bent, False)):
+        mpc, other = km.BilinearMPC(MODEL, own, LIMITS, 6), km.NonlinearMPC(MODEL, own, LIMITS, 6)
+        assert [each(x, [0, 0]).status for each in (mpc, other)] == [km.Status.OPTIMAL] * 2
+        np.testing.assert_allclose(mpc.plan().U, other.plan().U, atol=2e-4)
+        assert mpc.stage_is_convex is convex
     assert km.BilinearMPC(MODEL, km.Cost(**cost), LIMITS, 6).stage_is_convex
 
 
