@@ -494,16 +494,15 @@ def refuse_stage(cost: Cost, who: str) -> None:
     DataError
         It has one of the two.
     """
-    if cost.weighs_in_time:
-        raise DataError(
-            f"the cost has rows of weights in time, which {who} does not know; take a BilinearMPC or a NonlinearMPC, or"
-            " leave Q_rows and R_rows out"
-        )
-    if cost.stage is not None:
-        raise DataError(
-            f"the cost has a stage of its own, which {who} does not know; take a BilinearMPC or a NonlinearMPC, or"
-            " leave stage out"
-        )
+    for name, what, there in (
+        ("Q_rows and R_rows", "rows of weights in time", cost.weighs_in_time),
+        ("stage", "a stage of its own", cost.stage is not None),
+    ):
+        if there:
+            raise DataError(
+                f"the cost has {what}, which {who} does not know; take a BilinearMPC or a NonlinearMPC, or leave {name}"
+                " out"
+            )
 
 
 def _tracking(

@@ -322,17 +322,11 @@ class BilinearMPC(StagedMPC):
         if self._problem.ends and status in GOOD:
             status, more = self._meet_end(status, s, u_prev, deadline)
             iterations += more
-        if self._on_levels is not None and status in GOOD and not self._rests_on_levels():
+        if self._on_levels is not None and status in GOOD and not self._rests_on_levels(iteration.X, iteration.U):
             status, more = self._on_levels.improve(iteration, s, self._targets, deadline)
             iterations += more
         free = iteration.without_limits + (u_prev if self._with_rates else 0.0)
         return StagePlan(iteration.X, iteration.U, status, iterations, iteration.slack, free)
-
-    def _rests_on_levels(self) -> bool:
-        """Return whether the plan without levels is on them."""
-        assert self._levels is not None, "only asked where inputs have levels"
-        _, U = self._trajectory(self._iteration.X, self._iteration.U)
-        return self._levels.accepts(U[self._problem.free].ravel())
 
     def _meet_limits(
         self, status: Status, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], deadline: float

@@ -165,7 +165,7 @@ class NonlinearMPC(StagedMPC):
         iterations = sum(found.iterations for found in solved)
         good = [found for found in solved if found.status is Status.OPTIMAL]
         found = min(good, key=lambda each: each.cost) if good else solved[0]
-        if good and self._levels is not None and not self._rests_on_levels(found, s):
+        if good and self._levels is not None and not self._rests_on_levels(np.vstack([s, found.X]), found.U):
             found, more = self._search_levels(found, s, first, deadline)
             iterations += more
             good = good if found.status is Status.OPTIMAL else []
@@ -173,12 +173,6 @@ class NonlinearMPC(StagedMPC):
         slack = float(found.slacks[found.slacks > self._shooting.allowance].max(initial=0.0))
         status = Status.SOFTENED if good and slack else found.status
         return StagePlan(np.vstack([s, found.X]), found.U, status, iterations, slack)
-
-    def _rests_on_levels(self, found: NLPSolution, s: Float[np.ndarray, " ns"]) -> bool:
-        """Return whether the plan without levels is on them."""
-        assert self._levels is not None, "only asked where inputs have levels"
-        _, U = self._trajectory(np.vstack([s, found.X]), found.U)
-        return self._levels.accepts(U[self._problem.free].ravel())
 
     def _search_levels(
         self, relaxed: NLPSolution, s: Float[np.ndarray, " ns"], first: Interval, deadline: float

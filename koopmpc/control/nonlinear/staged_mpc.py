@@ -399,6 +399,11 @@ class StagedMPC(MPCBase):
             V = S[0, nx : nx + self.nu] + np.cumsum(V * self._problem.free[:, None], axis=0)
         return S[:, :nx], np.minimum(np.maximum(V, low), high)
 
+    def _rests_on_levels(self, S: Float[np.ndarray, "N1 ns"], V: Float[np.ndarray, "N nu"]) -> bool:
+        """Return whether a plan that was found without levels is on them."""
+        assert self._levels is not None, "only asked where inputs have levels"
+        return self._levels.accepts(self._trajectory(S, V)[1][self._problem.free].ravel())
+
     def _lose(
         self,
         applied: ArrayLike | None,
