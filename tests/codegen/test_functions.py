@@ -14,10 +14,10 @@ from koopmpc.codegen import functions
 from koopmpc.codegen.functions import EXPRESSIONS, Language, plan_runs, write_functions
 from koopmpc.codegen.tables import CFunction
 from koopmpc.plants.graph import OPERATIONS, Graph
-from koopmpc.plants.routines import find_compiler, load_library
+from koopmpc.plants.routines import load_library
+from tests.compiler import find_compiler, needs_compiler
 
 HEAD = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 
 
 def run_in_c(graph: Graph, rows: np.ndarray) -> np.ndarray:

@@ -8,10 +8,10 @@ import pytest
 
 import koopmpc as km
 from tests.commands import koopmpc
-from tests.compiler import find_compiler
+from tests.compiler import find_compiler, needs_compiler
 
 fmpy = pytest.importorskip("fmpy", reason="the extra fmu is not installed")
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+pytestmark = needs_compiler
 
 COST, LIMITS = km.Cost(Q=[10, 1], R=0.1), km.Limits(-12, 12)
 

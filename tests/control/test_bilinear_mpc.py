@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import shutil
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
@@ -13,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
+from tests.compiler import needs_compiler
 from tests.tiers import slow
 
 PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}
@@ -103,7 +103,7 @@ def test_every_turn_of_the_angle_counts_the_same() -> None:
     assert np.allclose(mpc([0.6 + 2 * np.pi, -0.2], [0, 1, 0]).u, u, atol=1e-8)
 
 
-@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler here")
+@needs_compiler
 def test_machine_code_and_interpreter_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     limits = km.Limits(-0.8, 0.5, x_max=[np.inf, 0.15])
     fast = km.BilinearMPC(pendulum(), CIRCLE, limits, 20)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.estimate.gate import BEYOND, BRIDGED, FEW, LEAST, ReadingGate
+from tests.compiler import needs_compiler
 from tests.estimate.pendulums import PROBLEM, truth
 from tests.estimate.plants import linear
 
@@ -263,11 +264,12 @@ def test_a_missing_entry_is_neither_judged_nor_refused():
         x = TRUE(x, move.u)
 
 
+@needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
 def test_machine_code_refuses_the_same_readings(kind):
-    if km.compiled(controller := built(kind)) is controller:
-        pytest.skip("no C compiler")
-    code, wild = km.compiled(controller), np.zeros((18, 2))
+    controller, wild = built(kind), np.zeros((18, 2))
+    code = km.compiled(controller)
+    assert code is not controller
     wild[[0, 1, 6, 12, 13, 14, 15, 16]] = burst(50.0, 8, 5)
     steps = WILD + 40
     expected, got = loop(controller, 1, wild, steps=steps), loop(code, 1, wild, steps=steps)

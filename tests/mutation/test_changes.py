@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import koopmpc as km
-from tests.compiler import find_compiler
+from tests.compiler import find_compiler, needs_compiler
 from tests.mutation.c_changes import c_mutants
 from tests.mutation.changes import mutants
 from tests.mutation.draw import drawn_of, list_changes, read_sources, room_of
@@ -125,12 +125,12 @@ def controllers():
     yield km.LQR(km.edmd(data, problem.lifting), problem.cost)
 
 
+@needs_compiler
 @pytest.mark.slow
 def test_changed_c_compiles(tmp_path: Path) -> None:
     """One of forty changes of each file, in a program that is compiled from it."""
     compiler = find_compiler()
-    if compiler is None:
-        pytest.skip("no C compiler")
+    assert compiler is not None
     tried = Counter()
     for number, controller in enumerate(controllers()):
         folder = tmp_path / str(number)

@@ -13,9 +13,9 @@ import koopmpc as km
 from koopmpc.plants import routines, step_map
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Routine
+from tests.compiler import needs_compiler
 from tests.example_plants import CartPole, Pendulum
 
-needs_compiler = pytest.mark.skipif(routines.find_compiler() is None, reason="no C compiler here")
 MAPS = {
     "euler": km.discretize(CartPole(), 0.02, km.Euler()),
     "rk4": km.discretize(CartPole(), 0.02),
@@ -240,7 +240,7 @@ def results(routine_of) -> tuple[np.ndarray, np.ndarray, bool]:
     return X, sums, routine.compiled
 
 
-@pytest.mark.skipif(routines.find_compiler() is None, reason="no C compiler here")
+@needs_compiler
 def test_machine_code_is_the_interpreter_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     fast = results(Routine)
     monkeypatch.setattr(routines, "find_compiler", lambda: None)

@@ -8,7 +8,6 @@ import pytest
 
 import koopmpc as km
 from koopmpc.codegen.compiled import Compiled
-from koopmpc.plants.routines import find_compiler
 from koopmpc.synthesis.asked import check_task
 from koopmpc.synthesis.candidates import Candidate, Recipe
 from koopmpc.synthesis.fresh.abreast import speed_up
@@ -17,11 +16,11 @@ from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool
 from koopmpc.synthesis.fresh.loops import run_fresh_loops
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap
 from koopmpc.synthesis.surrogates import fit_surrogate
+from tests.compiler import needs_compiler
 from tests.synthesis.test_select import episodes_of
 
 LIMITS = km.Limits(u_min=-1, u_max=1, x_max=[np.inf, 0.4])
 LIFTING = km.State() + km.Constant()
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
 
 
 def bent(x, u):
