@@ -152,7 +152,7 @@ def _state_iterations(tables: Tables, figure: IterationBound | ObservedIteration
             'settings={"cold_start": True}'
         )
     tables.sizes |= {"MOST_ITERATIONS": figure.most, "ITERATIONS_PROVED": int(proved)}
-    tables.notes.append(f"Iterations of the QP solver: {figure}.")
+    tables.effort = f"Iterations of the QP solver: {figure}."
 
 
 def _write(path: Path, text: str) -> None:
@@ -310,7 +310,7 @@ def _write_readme(tables: Tables, measured: tuple[int, int, int] | None, precisi
         ]
     rows.append(("rounding of the lifted state, amplified to a share of an input's span", f"{tables.conditioning:.2g}"))
     table = "\n".join(f"| {what} | {value} |" for what, value in rows)
-    notes = "".join(f"- {note}\n" for note in tables.notes)
+    notes = "".join(f"- {note}\n" for note in filter(None, [*tables.notes, tables.effort]))
     solver = (
         "`daqp/` holds sources of DAQP 0.11.0 by Daniel Arnström, unchanged, under the MIT licence in `daqp/LICENSE`.\n"
     )

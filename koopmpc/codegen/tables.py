@@ -91,6 +91,7 @@ class Tables:
     """The numbers of a controller's C code: `sizes` are integers, `settings` those of the QP solver, the others arrays.
 
     `conditioning` is the change of the plan, as a share of an input's span, per relative rounding of the lifted state.
+    `effort` says what is known of the iterations of a step.
     """
 
     program: StepProgram
@@ -105,6 +106,7 @@ class Tables:
     reals: dict[str, float] = field(default_factory=dict)
     conditioning: float = 0.0
     notes: list[str] = field(default_factory=list)
+    effort: str = ""
 
     def define(self, reals: Mapping[str, float]) -> None:
         """Add constants of the C code, each under a name that nothing else has: the later one would be used by both."""

@@ -1,5 +1,7 @@
 """The most iterations of a step: the bound is attained and never exceeded, and what is observed has its probability."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -100,7 +102,8 @@ def test_no_step_of_many_controllers_takes_more_than_the_bound():
 
 def test_the_c_code_states_the_bound_and_keeps_it(tmp_path):
     limits = km.Limits(u_min=-1, u_max=1, x_max=[2.0, 0.6])
-    warm, cold = (make_mpc(limits, horizon=2, settings={"cold_start": start}) for start in (False, True))
+    warm = make_mpc(replace(limits, rows=("x_max",)), horizon=2, settings={"cold_start": False})
+    cold = make_mpc(limits, horizon=2, settings={"cold_start": True})
     bound, box = km.guarantees.bound_iterations(cold, (-3, 3), (0, 0)), ((-3, 3), (0, 0))
     seen = km.guarantees.observe_iterations(warm, *box, samples=20)
     for mpc, figure, words in ((cold, bound, "proved: no step"), (warm, seen, "observed, not proved")):
@@ -108,6 +111,7 @@ def test_the_c_code_states_the_bound_and_keeps_it(tmp_path):
         header = (tmp_path / words[:3] / "koopmpc_sizes.h").read_text()
         assert f"#define KOOPMPC_MOST_ITERATIONS {figure.most}\n" in header
         assert words in header
+        assert "koopmpc_set_bounds" not in header  # a note of the README alone
         assert words in (tmp_path / words[:3] / "README.md").read_text()
     with pytest.raises(km.errors.DataError, match="start warm"):
         km.export(warm, tmp_path / "c", iterations=km.guarantees.bound_iterations(warm, *box))
