@@ -14,6 +14,8 @@ import pytest
 
 import koopmpc as km
 from koopmpc.cli.console import find_program
+from koopmpc.loop.run import About
+from koopmpc.recording.description import table_figures, to_markdown
 from tests.bench.tiny import write
 from tests.commands import koopmpc
 
@@ -47,6 +49,21 @@ def test_run_takes_a_path_and_leaves_a_log_a_run_and_the_table(call, tmp_path):
     assert (view, log) == ("view", f"logs{os.sep}{folder.name}{os.sep}tiny-near-koopman-mpc.rrd")
     shown = subprocess.run([*program, "inspect", log], capture_output=True, text=True, cwd=tmp_path)
     assert shown.stdout.startswith("tiny near koopman-mpc")  # what is printed can be called as it stands
+
+
+def test_a_plant_whose_time_is_in_hours_settles_in_hours(call, tmp_path):
+    path = write(tmp_path, **{"More lines that nobody lists.": "Time in hours."})
+    result = call("run", f"{path}:near", "-c", "lqr")
+    assert result.exit_code == 0, result.output
+    log = folders(tmp_path)[0] / "tiny-near-lqr.rrd"
+    run = km.load_run(log)
+    settles = km.metrics(run).settling_time
+    assert f" {settles:.2f} h " in result.stdout
+    page = to_markdown(About(**run.about()))
+    assert "**Sampling time** 0.1 h" in page
+    figures = table_figures(km.metrics(run), run, 1)
+    assert figures["settling time"] == f"{settles:.3g} h"
+    assert "effort [(m/s)² h]" in figures
 
 
 def test_a_program_on_the_path_is_called_by_its_name(call, tmp_path, monkeypatch):

@@ -46,10 +46,10 @@ def results_table(rows: Sequence[RunRow]) -> RenderableType:
     return Group(*(case_table(list(group)) for _, group in cases), explain_results(rows))
 
 
-def case_table(rows: Sequence[RunRow]) -> RenderableType:
-    """Return the table of the runs of one case, and the one under faults where there are such runs."""
+def case_table(rows: Sequence[RunRow], unit: str = "s") -> RenderableType:
+    """Return the table of the runs of one case, and the one under faults; `unit` is that of the plant's time."""
     title = f"{rows[0].problem}:{rows[0].case}"
-    table = _case(title, [row for row in rows if row.fault is None])
+    table = _case(title, [row for row in rows if row.fault is None], unit)
     broken = any(row.fault is not None for row in rows)
     return Group(table, _under_faults(f"{title} under faults", rows)) if broken else table
 
@@ -80,7 +80,7 @@ def _find_better(rows: Sequence[RunRow]) -> str | None:
     return None
 
 
-def _case(title: str, rows: list[RunRow]) -> Table:
+def _case(title: str, rows: list[RunRow], unit: str) -> Table:
     lines = build_plain_table(title, (), padding=(0, 0, 0, 1))
     lines.add_column("controller", no_wrap=True)
     measured = [row.metrics for row in rows if row.metrics is not None]
@@ -93,7 +93,7 @@ def _case(title: str, rows: list[RunRow]) -> Table:
         if row.metrics is None:
             lines.add_row(row.controller, "raised", style="red")
         else:
-            cells = _run_cells(row, row.metrics, oracle, violated)
+            cells = _run_cells(row, row.metrics, oracle, violated, unit)
             lines.add_row(row.controller, *cells, style="red" if row.failure else None)
     learned = max((row.training_time for row in rows), default=0.0)
     if learned:
@@ -102,7 +102,7 @@ def _case(title: str, rows: list[RunRow]) -> Table:
     return lines
 
 
-def _run_cells(row: RunRow, figures: Metrics, oracle: float, violated: bool) -> Iterator[str]:
+def _run_cells(row: RunRow, figures: Metrics, oracle: float, violated: bool, unit: str) -> Iterator[str]:
     """Yield the cells of a run after the controller's name."""
     yield f"{figures.cost:.1f}" if figures.cost < 1e5 else f"{figures.cost:.2g}"
     ratio = figures.cost / oracle if oracle > 0 else np.nan
@@ -110,7 +110,7 @@ def _run_cells(row: RunRow, figures: Metrics, oracle: float, violated: bool) -> 
     if not row.reached:
         yield "does not reach"
     else:
-        yield f"{figures.settling_time:.2f} s" if np.isfinite(figures.settling_time) else "within 5 %"
+        yield f"{figures.settling_time:.2f} {unit}" if np.isfinite(figures.settling_time) else "within 5 %"
     yield f"{np.abs(figures.final_error).max():.1g}"
     if violated:
         yield f"{figures.violation:.2g}"

@@ -189,6 +189,7 @@ def _sweep(
     """Sweep with a progress bar, print the tables, and exit with 1 where a run did not end as it should."""
     from koopmpc.bench.controllers import controller_names
     from koopmpc.bench.report import build_summary_table, case_table, explain_results, write_report
+    from koopmpc.bench.single import find_time_unit
     from koopmpc.bench.store import row_to_view
     from koopmpc.bench.sweep import sweep
 
@@ -197,11 +198,12 @@ def _sweep(
     ENDING.folder = folder
     single = asked.get("starts", 1) == asked.get("seeds", 1) == 1
     single &= all(share == 0 for name in ("noise", "wrong") for share in asked.get(name, ()))
+    units = {problem.name: find_time_unit(problem) for problem in problems}
     with bar("", rate=True) as progress:
 
         def show_case(runs: "list[RunRow]") -> None:
             if single:
-                progress.print(case_table(runs))
+                progress.print(case_table(runs, units[runs[0].problem]))
 
         rows = sweep(problems, controllers, folder=folder, progress=progress, on_case=show_case, **asked)
     console().print(explain_results(rows) if single else build_summary_table(rows))

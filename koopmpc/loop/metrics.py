@@ -90,9 +90,12 @@ class Metrics(Value):
         """Return a line a figure."""
         return "\n".join(f"{name:<25} {value}" for name, value in self.figures().items())
 
-    def figures(self, tracked: Sequence[str] | None = None) -> dict[str, str]:
-        """Return each figure in words by its name; those of a tracked output in a line of its own, if named."""
-        settles = f"{self.settling_time:.3g} s" if np.isfinite(self.settling_time) else "does not settle"
+    def figures(self, tracked: Sequence[str] | None = None, unit: str = "s") -> dict[str, str]:
+        """Return each figure in words by its name; those of a tracked output in a line of its own, if named.
+
+        `unit` is that of the plant's time.
+        """
+        settles = f"{self.settling_time:.3g} {unit}" if np.isfinite(self.settling_time) else "does not settle"
         times = (self.solve_time_p50, self.solve_time_p99, self.solve_time_max)
         missed = np.isnan(self.final_error).any() or np.isnan(self.tracking_rmse).any()
         cost = "unknown, a state was not measured" if missed else "none was given"

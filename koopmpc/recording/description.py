@@ -128,7 +128,7 @@ def to_markdown(about: About) -> str:
     if "title" in about.metadata:
         lines += [str(about.metadata["title"]), ""]
     lines += [f"**States** {', '.join(about.states)}  ", f"**Inputs** {', '.join(about.inputs)}  "]
-    lines += [f"**Sampling time** {about.dt:g} s", ""]
+    lines += [f"**Sampling time** {about.dt:g} {_time_unit(about)}", ""]
     if about.cost is not None:
         lines += [_table("cost", _fields(about.cost, about)), ""]
     if about.limits is not None:
@@ -145,11 +145,15 @@ def metrics_to_markdown(metrics: Metrics, about: About, nr: int) -> str:
 
 def table_figures(metrics: Metrics, about: About, nr: int) -> dict[str, str]:
     """Return the metrics in words by their names, with the unit of the effort and the statuses in words."""
-    figures = metrics.figures(about.name_references(nr))
+    figures = metrics.figures(about.name_references(nr), _time_unit(about))
     statuses = [f"{n} {STATUS_WORDS.get(Status[name], name)}" for name, n in metrics.status.items()]
     fallbacks = [f"{n} {name.lower().replace('_', ' ')}" for name, n in metrics.fallback.items() if name != "NONE"]
     figures |= {"status": ", ".join(statuses), "fallback": ", ".join(fallbacks) or "none"}
     return {_with_unit(name, about): value for name, value in figures.items()}
+
+
+def _time_unit(about: About) -> str:
+    return str(about.metadata.get("time unit", "s"))
 
 
 def _with_unit(name: str, about: About) -> str:
@@ -159,7 +163,7 @@ def _with_unit(name: str, about: About) -> str:
         for found in (re.findall(r"\[(.*?)\]", each) for each in about.inputs)
         if found
     }
-    return f"effort [{units.pop()}² s]" if name == "effort" and len(units) == 1 else name
+    return f"effort [{units.pop()}² {_time_unit(about)}]" if name == "effort" and len(units) == 1 else name
 
 
 def _table(heading: str, values: Mapping[str, Any]) -> str:
