@@ -135,6 +135,9 @@ def bound_by_scenario(
     Campi and Garatti (SIAM J. Optim. 19, 2008) speak of a convex program with d unknowns and one constraint for each
     of n independent episodes. A new episode breaks its optimum with probability at most ε, with confidence 1 − β. Here
     Σ_{i<d} C(n, i) εⁱ (1 − ε)ⁿ⁻ⁱ = β. None where there are too few episodes.
+
+    The argument takes the shape, the sizes and the least values of the constants as given. Here they come from these
+    pairs or from all, so that ε is not strict.
     """
     episodes = len(np.unique(pairs.episode))
     if episodes < _FEW:

@@ -27,7 +27,8 @@ def most_failures(loops: int, coverage: float) -> int:
     """Return how many of these loops may fail so that one more loop keeps its limits with a probability of `coverage`.
 
     (k + 1) / (n + 1) ≤ 1 − coverage (Angelopoulos, Bates, Fisch, Lei & Schuster, "Conformal risk control", ICLR 2024).
-    Negative for fewer than ⌈1/α⌉ − 1 loops.
+    Negative for fewer than ⌈1/α⌉ − 1 loops. This holds for one family of margins of which a wider one never fails where
+    a narrower one does not. `promise_coverage` tries two families and takes the cheaper: its second loops count alone.
     """
     return int(np.floor((1 - coverage) * (loops + 1) + 1e-9)) - 1
 
