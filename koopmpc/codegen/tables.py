@@ -518,11 +518,8 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         tables.functions[f"koopmpc_{name}"] = CFunction(graph, arguments[name], result)
     _add_limits(tables, hard_rate=p.hard_rates, change=p.v_limits)
     tables.limits["move_of"] = np.arange(N, dtype=np.intc)
-    rows, inwards = (N if p.margin.any() else 1), p.margin.shape[1]
-    low, high = (np.tile(np.concatenate([p.v_limits[i], p.box[i]]), (rows, 1)) for i in (0, 1))
-    if p.margin.any():
-        low[:, low.shape[1] - inwards :] += p.margin
-        high[:, high.shape[1] - inwards :] -= p.margin
+    same = all((end == end[0]).all() for end in p.stage_limits)
+    low, high = (end[:1] if same else end for end in p.stage_limits)  # the last row is that of all stages after it
     tables.sizes["BOX_ROWS"] = len(low)
     soft = np.isfinite(softness.linear)
     hard = list_hard_outputs(softness, nu * p.with_rates)

@@ -510,10 +510,7 @@ class Interpreter:
         self.c, self.A0 = np.zeros((N, ns)), None
         rows, low, high, linear, quadratic = [], [], [], [], []
         M, L, m = self.end
-        box = [np.tile(end, (N, 1)) for end in p.box]
-        inwards = p.margin.shape[1]
-        box[0][:, box[0].shape[1] - inwards :] += p.margin
-        box[1][:, box[1].shape[1] - inwards :] -= p.margin
+        box = [end[:, nu:] for end in p.stage_limits]
         for k in range(N):
             out = evaluate(p.functions["slopes"], self.S[k], self.V[k])
             A, B = out[: ns * ns].reshape(ns, ns), out[ns * ns : ns * (ns + nu)].reshape(ns, nu)
@@ -603,10 +600,8 @@ class Interpreter:
             v = self.V[k] - self.U_r[k]
             total += v @ p.R @ v
             if len(p.box.low):
-                value, inwards = evaluate(p.functions["limited"], state)[: len(p.box.low)], p.margin.shape[1]
-                low, high = p.box.low.copy(), p.box.high.copy()
-                low[len(low) - inwards :] += p.margin[k]
-                high[len(high) - inwards :] -= p.margin[k]
+                value = evaluate(p.functions["limited"], state)[: len(p.box.low)]
+                low, high = (end[k, len(v) :] for end in p.stage_limits)
                 over = np.maximum(np.maximum(low - value, value - high), 0)
                 soft = np.isfinite(p.softness.linear)
                 total += p.softness.linear[soft] @ over[soft] + p.softness.quadratic[soft] @ over[soft] ** 2

@@ -230,7 +230,7 @@ class BilinearMPC(StagedMPC):
             R_root=outputs.R_root,
             v_limits=problem.inputs,
             box=problem.box,
-            margin=problem.margin,
+            stage_limits=problem.stage_limits,
             softness=problem.softness,
             sides=list_sides(problem),
             stage_sizes=problem.sizes,

@@ -49,9 +49,9 @@ class StagedProgram(StepProgram):
         Weights of the tracked outputs, of v, and of v in a stage without an input.
     Q_root, R_root
         S with SᵀS = Q and R of the cost.
-    v_limits, box, margin, softness
-        Limits of v and of the limited outputs, by how much each stage moves the last of these inwards, and what it
-        costs to break them.
+    v_limits, box, stage_limits, softness
+        Limits of v and of the limited outputs, those of both in each stage with margins taken off, and what it costs to
+        break them.
     sides
         The finite ends of all limits, for interior points.
     stage_sizes, input_sizes
@@ -95,7 +95,7 @@ class StagedProgram(StepProgram):
     R_root: Float[np.ndarray, "nu nu"]
     v_limits: Interval
     box: Interval
-    margin: Float[np.ndarray, "N margin"]
+    stage_limits: Interval
     softness: Softness
     sides: Sides
     stage_sizes: Float[np.ndarray, " ns"]
