@@ -6,15 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
-
-class _Arguments(ctypes.Structure):
-    """The arguments of a step of many controllers, as in c/door.c."""
-
-    _fields_ = (
-        *((name, ctypes.c_long) for name in ("count", "size", "stride")),
-        *((name, ctypes.c_int) for name in ("first", "measured")),
-        *((name, ctypes.c_void_p) for name in ("which", "states", "Y", "rows", "W", "U", "reports")),
-    )
+from koopmpc.codegen.door import AbreastStep, point_to
 
 
 class ControllersAbreast:
@@ -55,10 +47,9 @@ class ControllersAbreast:
         self._states = np.zeros((len(rows), words))
         for e, state in enumerate(self._states):
             start = None if x0 is None else np.ascontiguousarray(x0[e])
-            place = ctypes.c_void_p(state.ctypes.data)
-            code.koopmpc_init(place, None if start is None else ctypes.c_void_p(start.ctypes.data), None)
+            code.koopmpc_init(point_to(state), point_to(start), None)
             if targets is not None:
-                code.koopmpc_use_targets(place, ctypes.c_void_p(targets.ctypes.data), len(targets))
+                code.koopmpc_use_targets(point_to(state), point_to(targets), len(targets))
 
     def step(self, k: int, Y: Float[np.ndarray, "E ny"], which: Int[np.ndarray, " n"]) -> Float[np.ndarray, "E nu"]:
         """Return the inputs after step k of the controllers `which`; rows of the others are those of before."""
@@ -66,7 +57,7 @@ class ControllersAbreast:
         assert Y.shape == (len(self.U), self._ny), "a row of measurements for each controller"
         rows = self._rows
         assert k + 1 <= rows.shape[1], "the reference has a row for this step"
-        arguments = _Arguments(
+        arguments = AbreastStep(
             len(places),
             self._states.strides[0],
             rows.shape[1] * rows.shape[2],

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import numbers
 from koopmpc.codegen.abreast import ControllersAbreast
+from koopmpc.codegen.door import BoundRows, Frame, Rows, SingleFrame, gather_run, point_to
 from koopmpc.codegen.functions import Language
 from koopmpc.codegen.sources import write_one_source, write_plant_functions
 from koopmpc.codegen.tables import Precision, make_tables, read_program
@@ -130,63 +131,6 @@ class ManyRuns(NamedTuple):
     slack: Float[np.ndarray, "E T"]
 
 
-def _address(array: np.ndarray | None) -> ctypes.c_void_p | None:
-    """Return the address of an array's first number, for C; None, C's null pointer, for None."""
-    return None if array is None else ctypes.c_void_p(array.ctypes.data)
-
-
-# ctypes is fastest with one pointer as argument: a call passes one structure. c/door.c defines the same structures.
-class _Rows(ctypes.Structure):
-    """Rows of a preview: their address and their number."""
-
-    _fields_ = (("values", ctypes.c_void_p), ("count", ctypes.c_int))
-
-
-_FIELDS = (
-    ("state", ctypes.c_void_p),
-    ("y", ctypes.c_void_p),
-    ("reference", _Rows),
-    ("applied", ctypes.c_void_p),
-    ("w", _Rows),
-    ("u", ctypes.c_void_p),
-    ("status", ctypes.c_int),
-    ("fallback", ctypes.c_int),
-    ("iterations", ctypes.c_int),
-)
-
-
-class _Frame(ctypes.Structure):
-    """The arguments and results of a call, as in C."""
-
-    _fields_ = (*_FIELDS, ("slack", ctypes.c_double), ("refused", ctypes.c_int))
-
-
-class _SingleFrame(ctypes.Structure):
-    """A `_Frame` in single precision."""
-
-    _fields_ = (*_FIELDS, ("slack", ctypes.c_float), ("refused", ctypes.c_int))
-
-
-_BOUNDS = ("u_low", "u_high", "du_low", "du_high", "x_low", "x_high")
-
-
-class _Bounds(ctypes.Structure):
-    """Rows of limits, as in C."""
-
-    _fields_ = tuple((name, _Rows) for name in _BOUNDS)
-
-
-class _Whole(ctypes.Structure):
-    """The arguments and results of a whole run, as in C."""
-
-    _fields_ = (
-        ("steps", ctypes.c_long),
-        *((name, ctypes.c_int) for name in ("nx", "ny", "preview", "measured")),
-        *((name, ctypes.c_void_p) for name in ("step", "measure", "rows", "W", "X", "Y", "U")),
-        *((name, ctypes.c_void_p) for name in ("slack", "times", "reports")),
-    )
-
-
 class TargetTable:
     """The targets of the reference rows that a BilinearMPC in machine code meets, found in Python; copies share it."""
 
@@ -244,10 +188,10 @@ class Compiled:
         self._y, self._u, self._applied = (np.zeros(n, kind) for n in (self._ny, self.nu, self.nu))
         self._reference = np.zeros((rows, self._nr), kind)
         self._w = np.zeros((rows, max(1, self._nw)), kind)
-        frame = self._frame = _SingleFrame() if single else _Frame()
+        frame = self._frame = SingleFrame() if single else Frame()
         frame.state, frame.y, frame.u = (a.ctypes.data for a in (self._memory, self._y, self._u))
-        frame.reference = _Rows(self._reference.ctypes.data, 1)
-        frame.w = _Rows(self._w.ctypes.data, 0)
+        frame.reference = Rows(self._reference.ctypes.data, 1)
+        frame.w = Rows(self._w.ctypes.data, 0)
         self._applied_address = self._applied.ctypes.data
         self._pointer = ctypes.c_void_p(ctypes.addressof(frame))
         self._call = self._code.koopmpc_call
@@ -268,7 +212,7 @@ class Compiled:
             None if value is None else np.ascontiguousarray(checks.array(value, name, (size,)), kind)
             for value, name, size in ((x0, "x0", self._sizes["NX"]), (u_prev, "u_prev", self.nu))
         )
-        self._code.koopmpc_init(_address(self._memory), _address(start), _address(last))
+        self._code.koopmpc_init(point_to(self._memory), point_to(start), point_to(last))
         self._aim(np.zeros((0, self._nr)))
 
     def _aim(self, rows: Float[np.ndarray, "..."]) -> None:
@@ -276,7 +220,7 @@ class Compiled:
         if self._targets is not None:
             self._last_rows = rows.tobytes()
             self._table = self._targets.of(rows).astype(self._y.dtype)
-            self._code.koopmpc_use_targets(_address(self._memory), _address(self._table), len(self._table))
+            self._code.koopmpc_use_targets(point_to(self._memory), point_to(self._table), len(self._table))
 
     def _pass_bounds(self, limits: Limits, first: int) -> None:
         """Pass the limits from step `first` on to the C code."""
@@ -287,8 +231,8 @@ class Compiled:
         boxes = limits.input_rows(self.nu, first, count), limits.rate_rows(self.nu, first, count)
         ends = [*(end for box in boxes for end in box), *(end[:, bounds.outputs] for end in outputs)]
         arrays = [np.ascontiguousarray(np.clip(end, -checks.HUGE, checks.HUGE), kind) for end in ends]
-        rows = _Bounds(*(_Rows(each.ctypes.data, count) for each in arrays))
-        self._code.koopmpc_bound(_address(self._memory), ctypes.c_void_p(ctypes.addressof(rows)))
+        rows = BoundRows(*(Rows(each.ctypes.data, count) for each in arrays))
+        self._code.koopmpc_bound(point_to(self._memory), ctypes.c_void_p(ctypes.addressof(rows)))
 
     def _move_limits(self, limits: Limits | None) -> None:
         """Set the limits of this step: those of the call, or the controller's own."""
@@ -402,13 +346,13 @@ class Compiled:
 
     def plan(self) -> Plan | None:
         """Return the plan of the last call; None where it had none."""
-        sizes, memory, model = self._sizes, _address(self._memory), self.model
+        sizes, memory, model = self._sizes, point_to(self._memory), self.model
         U = np.zeros((sizes["N"], self.nu), self._y.dtype)
-        if not self._code.koopmpc_plan(memory, _address(U)):
+        if not self._code.koopmpc_plan(memory, point_to(U)):
             return None
         if sizes["IS_STAGED"]:
             X = np.zeros((sizes["N"] + 1, sizes["NX"]), self._y.dtype)
-            self._code.koopmpc_plan_states(memory, _address(X))
+            self._code.koopmpc_plan_states(memory, point_to(X))
             return Plan(X.astype(np.float64), U.astype(np.float64))
         if self._states is None:
             assert isinstance(model, LinearPredictor), "it plans by one matrix"
@@ -450,7 +394,7 @@ class Compiled:
         rows, W = np.ascontiguousarray(rows), None if W is None else np.ascontiguousarray(W)
         slack, times, reports = np.zeros(len(U)), np.zeros(len(U)), np.zeros((len(U), 4), dtype=np.intc)
         arrays = {"rows": rows, "X": X, "Y": Y, "U": U, "slack": slack, "times": times, "reports": reports}
-        whole = _run_arguments(code, len(U), arrays, W, preview=preview)
+        whole = gather_run(code, len(U), arrays, W, preview=preview)
         self._code.koopmpc_run(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)))
         status, fallback, iterations = reports.T.tolist()[:3]
         return {
@@ -519,7 +463,7 @@ class Compiled:
         X[:, 0] = starts
         slack, reports = np.zeros((E, T)), np.zeros((E, T, 4), dtype=np.intc)
         arrays = {"rows": rows, "X": X, "Y": np.empty((T + 1, self._ny)), "U": U, "slack": slack, "reports": reports}
-        whole = _run_arguments(code, T, arrays, None, preview=True)
+        whole = gather_run(code, T, arrays, None, preview=True)
         self._code.koopmpc_runs(self._pointer, ctypes.c_void_p(ctypes.addressof(whole)), ctypes.c_long(E))
         return ManyRuns(X, U, reports[..., 0], reports[..., 1], slack)
 
@@ -556,24 +500,6 @@ class Compiled:
     def __reduce__(self) -> tuple[Any, ...]:
         limits = None if self._at_call is None else self._called_with
         return _rebuild, (self.original, self.precision, self._memory, self._step, limits)
-
-
-def _run_arguments(
-    code: ctypes.CDLL,
-    steps: int,
-    arrays: dict[str, np.ndarray],
-    W: Float[np.ndarray, "wrows nw"] | None,
-    *,
-    preview: bool,
-) -> _Whole:
-    """Return the arguments of a whole run; the structure keeps no reference to the arrays."""
-    whole = _Whole(steps, arrays["X"].shape[-1], arrays["Y"].shape[-1], preview, W is not None)
-    for name, routine in (("step", code.plant_step), ("measure", code.plant_measure)):
-        setattr(whole, name, ctypes.cast(routine, ctypes.c_void_p))
-    for name, array in ({"W": W} | arrays if W is not None else arrays).items():
-        assert array.flags.c_contiguous, "machine code reads contiguous arrays"
-        setattr(whole, name, array.ctypes.data)
-    return whole
 
 
 def _rebuild(
