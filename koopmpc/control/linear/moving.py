@@ -1,17 +1,34 @@
 """MovingMap: the plan of a reference that moves, by one product; GivenShares: the part of a given u_target in it."""
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.lib.stride_tricks import sliding_window_view
 
 from koopmpc.checks import HUGE
-from koopmpc.control.target import ROUNDING
+from koopmpc.control.limits import Interval
+from koopmpc.control.target import ROUNDING, Targets
 from koopmpc.values import Viewing
 
 _TABLE = 2**20  # entries of a table of GivenShares: 8 MB
 _LARGEST = 2**23  # entries of a MovingMap: 64 MB
+
+
+class PlanParts(NamedTuple):
+    """The unconstrained plan v = F [z; u_{−1}; g] + f + F_r r, and what limits it.
+
+    `box` holds the limits of v. There are no `targets` where none enters the plan. `limited` says which of their
+    limited values have limits, or may get some in time, and `drive` is what [z; u_{−1}; g] adds to these.
+    """
+
+    fixed: Float[np.ndarray, "nv n"]
+    offset: Float[np.ndarray, " nv"]
+    from_reference: Float[np.ndarray, "nv nR"]
+    box: Interval
+    targets: Targets | None
+    limited: Bool[np.ndarray, " nl"]
+    drive: Float[np.ndarray, "nk n"]
 
 
 class MovingMap(Viewing):
@@ -34,21 +51,18 @@ class MovingMap(Viewing):
 
     _VIEWS = ("met", "met_low", "met_high", "low", "high", "start", "flat", "rows", "plan", "planned", "tests")
 
-    def __init__(self, plan: Any, nr: int, *, held: bool) -> None:
-        maps, targets, n = plan.maps, plan.targets, plan.planned
-        fixed, shares = plan.matrix[:n, :-1], maps.from_reference
+    def __init__(self, parts: PlanParts, nr: int, *, held: bool) -> None:
+        fixed, shares, targets, limited = parts.fixed, parts.from_reference, parts.targets, parts.limited
+        n = len(fixed)
         if held:
             shares = shares.reshape(n, -1, nr).sum(axis=1)
         steps = shares.shape[1] // nr
-        matrix = np.column_stack([fixed, plan.offset, shares])
-        low, high = [plan.limits[:n]], [plan.limits[len(plan.limits) // 2 :][:n]]
+        matrix = np.column_stack([fixed, parts.offset, shares])
+        low, high = [parts.box.low], [parts.box.high]
         self.from_row = np.zeros((nr, 0))  # K, transposed, where it is not part of M
         self.drive: Float[np.ndarray, "nt n"] | None = None  # what a known disturbance adds to K r
-        if plan.aimed:
-            limited = plan.limited_targets
-            K, drive = targets.rows[limited] @ targets.from_reference, np.zeros((int(limited.sum()), fixed.shape[1]))
-            if plan.checked.any():
-                drive = plan.matrix[n : n + len(K), :-1]
+        if targets is not None:
+            K, drive = targets.rows[limited] @ targets.from_reference, parts.drive
             shift, reach = targets.rows[limited] @ targets.offset, ROUNDING * targets.size[limited]
             if held:
                 matrix, shift = np.vstack([matrix, np.column_stack([drive, shift, K])]), 0.0 * shift
@@ -86,10 +100,11 @@ class MovingMap(Viewing):
         return self.t
 
     @staticmethod
-    def of(plan: Any, nr: int) -> "tuple[MovingMap | None, MovingMap]":
+    def of(parts: PlanParts, nr: int) -> "tuple[MovingMap | None, MovingMap]":
         """Return the maps of a preview and of a row that is held; None for one that would be too large."""
-        entries = plan.planned * (plan.matrix.shape[1] + plan.maps.from_reference.shape[1])
-        return MovingMap(plan, nr, held=False) if entries <= _LARGEST else None, MovingMap(plan, nr, held=True)
+        (n, start), reads = parts.fixed.shape, parts.from_reference.shape[1]
+        large = n * (start + 1 + reads) > _LARGEST
+        return None if large else MovingMap(parts, nr, held=False), MovingMap(parts, nr, held=True)
 
 
 class GivenShares:

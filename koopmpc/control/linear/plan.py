@@ -1,7 +1,7 @@
 """The plan of a horizon: the unconstrained one as a matrix, its limits, and the QP where it meets one."""
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,7 +12,8 @@ from koopmpc.control.cost import LiftedTracking, add_held
 from koopmpc.control.horizon import Condensed, Coordinates, Horizon, build_stages, condense, horizon_of
 from koopmpc.control.limits import Interval, Softness, preview_margin
 from koopmpc.control.linear.blocking import tie_moves
-from koopmpc.control.linear.moving import GivenShares, MovingMap
+from koopmpc.control.linear.layout import WindowLayout
+from koopmpc.control.linear.moving import GivenShares, MovingMap, PlanParts
 from koopmpc.control.riccati import recursion
 from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.stepped.blocks import MoveBlocks
@@ -88,7 +89,7 @@ class PlanMap(Viewing):
     """
 
     _VIEWS = ("met", "met_low", "met_high", "low", "high")
-    layout: Any = None  # where rows of limits stand in a table, once there are some
+    layout: WindowLayout | None = None  # where rows of limits stand in a table, once there are some
 
     def __init__(
         self,
@@ -150,8 +151,18 @@ class PlanMap(Viewing):
                 self.given = given
             else:
                 self.offset = self.offset + given.at(0)
-        self.moving, self.single = MovingMap.of(self, len(track.tracked))
         self._see()
+        fixed, count = self.matrix[:, :-1], int(self.limited_targets.sum())
+        parts = PlanParts(
+            fixed=fixed[:nv],
+            offset=self.offset,
+            from_reference=self.maps.from_reference,
+            box=Interval(self.low[:nv], self.high[:nv]),
+            targets=targets if self.aimed else None,
+            limited=self.limited_targets,
+            drive=fixed[nv : nv + count] if len(fixed) > nv else np.zeros((count, fixed.shape[1])),
+        )
+        self.moving, self.single = MovingMap.of(parts, len(track.tracked))
 
     def restore_limits(self) -> None:
         """Set the limits that hold where none move in time."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,6 +12,7 @@ from koopmpc.control.in_time.bounds import refuse_crossed_rows
 from koopmpc.control.in_time.preview import require_movable, require_preview
 from koopmpc.control.limits import Interval, Limits, preview_margin
 from koopmpc.control.linear.condensed_program import BoundsProgram
+from koopmpc.control.linear.layout import TableColumns, WindowLayout
 from koopmpc.control.linear.moving import MovingMap
 from koopmpc.control.linear.plan import PlanMap
 from koopmpc.control.target import ROUNDING
@@ -63,39 +63,6 @@ class _Pages:
         return self.rows[k]
 
 
-class _Columns(NamedTuple):
-    """Where the columns of a kind stand in the table: `first` … `first` + `width` − 1."""
-
-    first: int
-    width: int
-
-
-class WindowLayout(NamedTuple):
-    """Where the limits of a plan stand in a table of rows of limits; it is that of every table of this plan.
-
-    Attributes
-    ----------
-    used
-        The lengths of blocks, and which inputs are held so long; an input box holds at each step, too.
-    width
-        W of the table.
-    raw, tight
-        Where targets stand, and the tightest limits of targets.
-    moves, outputs
-        Where the limits of all moves stand; which entries of a plan are outputs.
-    entries
-        Those of the plan, of its map of a reference that moves, and of that of a single row.
-    """
-
-    used: dict[int, Bool[np.ndarray, " nu"]]
-    width: int
-    raw: _Columns
-    tight: _Columns
-    moves: Int[np.ndarray, " moves"]
-    outputs: slice
-    entries: tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " n"]]
-
-
 @dataclass(frozen=True, eq=False)
 class LimitWindows:
     """The limits of each step of a run, taken from one table with a row for each step.
@@ -124,8 +91,8 @@ class LimitWindows:
     latency: int
     table: Float[np.ndarray, "rows W2"]
     endless: bool
-    targets: _Columns
-    swept: _Columns
+    targets: TableColumns
+    swept: TableColumns
     hard: Bool[np.ndarray, " nu"] | None
     moves: Int[np.ndarray, " moves"]
     plan_pages: _Pages
@@ -332,8 +299,8 @@ def _lay_out(plan: PlanMap) -> WindowLayout:
     return WindowLayout(
         used=used,
         width=W,
-        raw=_Columns(raw_at, nu + outs),
-        tight=_Columns(tight_at, limited),
+        raw=TableColumns(raw_at, nu + outs),
+        tight=TableColumns(tight_at, limited),
         moves=moves,
         outputs=slice(len(mine) - N * outs, len(mine)),
         entries=entries,
