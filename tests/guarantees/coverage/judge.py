@@ -8,7 +8,7 @@ import numpy as np
 
 import koopmpc as km
 from koopmpc.loop.metrics import violation_shares
-from koopmpc.synthesis.fresh.coverage import get_model
+from koopmpc.synthesis.candidates import get_model
 from tests.guarantees.coverage.optimum import find_optimum
 from tests.guarantees.coverage.plants import CoverageTask
 
