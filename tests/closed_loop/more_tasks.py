@@ -1,7 +1,7 @@
 """Twelve more tasks, each made after a cause for which a design once failed on a plant that nobody had tuned for."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ SMALL = 0.02  # noise that the operators put on top of the PI loop, as a share o
 
 @dataclass(frozen=True)
 class LoggedTask(Task):
-    """A task whose training data are logs of a working PI loop with a few changes of its set point."""
+    """A task whose training data may be logs of a working PI loop with a few changes of its set point."""
 
     logged: Callable[["LoggedTask", int], km.Episodes] | None = None
     gains: tuple[float, float] = PI
@@ -74,6 +74,28 @@ def _sine(amplitude: float, period: float, steps: int, column: int) -> np.ndarra
     rows[:, column] = amplitude * np.sin(2 * np.pi * np.arange(steps + 1) / period)
     return rows
 
+
+_TWO_HIDDEN = LoggedTask(
+    name="two hidden",  # of mass and drive the position alone is measured
+    truth=more_plants.LaggedSpring(),
+    dt=0.1,
+    around=([0.0, 0.0, 0.0], [0.0]),
+    training=km.Training(
+        x0=km.Uniform([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]),
+        excitation=km.Noise(-2.5, 2.5, hold=4),
+        episodes=50,
+        steps=60,
+    ),
+    Q=[10.0],
+    R=[0.1],
+    limits=km.Limits(u_min=-2.5, u_max=2.5),
+    horizon=20,
+    tracked=["x [m]"],
+    reference=np.array([0.7]),
+    starts=[[-0.5, 0.0, 0.0]],
+    steps=120,
+    noise=1e-3,
+)
 
 _MORE = (
     Task(
@@ -241,46 +263,13 @@ _MORE = (
         starts=[[0.3, 0.3], [0.8, 0.4]],
         steps=80,
     ),
-    Task(
-        name="two hidden",  # of mass and drive the position alone is measured
-        truth=more_plants.LaggedSpring(),
-        dt=0.1,
-        around=([0.0, 0.0, 0.0], [0.0]),
-        training=km.Training(
-            x0=km.Uniform([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]),
-            excitation=km.Noise(-2.5, 2.5, hold=4),
-            episodes=50,
-            steps=60,
-        ),
-        Q=[10.0],
-        R=[0.1],
-        limits=km.Limits(u_min=-2.5, u_max=2.5),
-        horizon=20,
-        tracked=["x [m]"],
-        reference=np.array([0.7]),
-        starts=[[-0.5, 0.0, 0.0]],
-        steps=120,
-        noise=1e-3,
-    ),
-    LoggedTask(
-        name="one record of a drive",  # speed and drive are hidden; there is one record of a working PI loop
-        truth=more_plants.LaggedSpring(),
-        dt=0.1,
-        around=([0.0, 0.0, 0.0], [0.0]),
-        training=km.Training(
-            x0=km.Uniform([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]), excitation=km.Noise(-2.5, 2.5), episodes=1, steps=2000
-        ),
+    _TWO_HIDDEN,
+    replace(
+        _TWO_HIDDEN,
+        name="one record of a drive",  # of the same plant there is one record of a working PI loop
+        training=replace(_TWO_HIDDEN.training, excitation=km.Noise(-2.5, 2.5), episodes=1, steps=2000),
         logged=_record_under_pi,
         gains=(0.1, 0.04),
-        Q=[10.0],
-        R=[0.1],
-        limits=km.Limits(u_min=-2.5, u_max=2.5),
-        horizon=20,
-        tracked=["x [m]"],
-        reference=np.array([0.7]),
-        starts=[[-0.5, 0.0, 0.0]],
-        steps=120,
-        noise=1e-3,
     ),
     LoggedTask(
         name="one record of a tank",  # the upper level is hidden; there is one record of a working PI loop
