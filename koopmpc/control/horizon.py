@@ -168,7 +168,7 @@ def input_target(h: Horizon, targets: Targets) -> Float[np.ndarray, "nu nf"]:
 def _weights(
     h: Horizon, powers: Sequence[tuple[Float[np.ndarray, "nz nz"], Float[np.ndarray, "nz nu"]]]
 ) -> tuple[Float[np.ndarray, "nx nx"], Float[np.ndarray, "nx nu"] | None, Float[np.ndarray, "nu nu"]]:
-    """Return Q, M and R of a block on ξ and its input; M is None where it is zero."""
+    """Return Q, M and R of a block on ξ and its input; M = None stands for zero."""
     nz, nu = h.B.shape
     CQC = h.C.T @ h.Q @ h.C
     Q, M, R = CQC.copy(), np.zeros((nz, nu)), len(powers) * h.R

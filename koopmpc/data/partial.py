@@ -17,8 +17,8 @@ from koopmpc.values import Value, freeze
 class PartialEpisodes(Value):
     """Runs x_0 … x_T under u_0 … u_{T−1}, in which NaN in X means: not measured in this row.
 
-    They are no Episodes, so that nothing takes a missing number for one. Fits of one step take `complete_pairs()`;
-    `km.identify.unequal_rates` fits to the measured cells alone. Nothing is interpolated.
+    The class is not Episodes, so that code cannot take a missing number for a measured one. Fits of one step take
+    `complete_pairs()`; `km.identify.unequal_rates` fits to the measured cells alone. Nothing is interpolated.
 
     Parameters
     ----------

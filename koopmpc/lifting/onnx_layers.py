@@ -74,7 +74,7 @@ def _replace(graph: bytes) -> bytes:
 
 
 def _rewrite(node: Node, sizes: dict[str, int]) -> list[Node] | None:
-    """Return nodes that compute the same of one row; None where the node stays."""
+    """Return nodes that give the same result on one row; None where the node stays."""
     operation, told = node.operation, node.attributes
     if operation not in ("Dropout", "Flatten", "Softmax", "BatchNormalization", "LayerNormalization"):
         return None

@@ -161,7 +161,7 @@ class StepRows(Value):
     def __post_init__(self) -> None:
         for name in ("X", "Y", "U", "reference", "u_reference"):
             if not isinstance(getattr(self, name), np.ndarray):
-                raise DataError(f"{name} is no array; a Run is what simulate or load_run returns")
+                raise DataError(f"{name} is not an array; a Run is what simulate or load_run returns")
         if not self.u_reference.size:
             object.__setattr__(self, "u_reference", np.zeros(self.U.shape))
         for column in MOVE_COLUMNS:
@@ -291,7 +291,7 @@ class About(Value):
 
 
 def check_judges(cost: object, limits: object) -> None:
-    """Raise where what a run is judged by is no Cost, or no Limits; None is left out.
+    """Raise unless cost and limits are of the classes Cost and Limits, or None.
 
     Raises
     ------

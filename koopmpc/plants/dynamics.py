@@ -16,7 +16,7 @@ from koopmpc.scene import Scene, Shape
 from koopmpc.values import Named
 
 _Symbol = Any  # ca.SX of equations, ca.MX of foreign code
-_Pair = tuple[ca.SX, ca.SX]  # what checkers are told of x and u: both kinds have the same operations
+_Pair = tuple[ca.SX, ca.SX]  # the type of x and u for checkers: both kinds have the same operations
 
 
 class Dynamics(Named, ABC):

@@ -237,7 +237,7 @@ def test_the_page_states_what_is_not_claimed(tanks):
     for words in (
         "## Theorem",
         "(x_s, u_s) is an equilibrium of the plant",
-        "That is no proof for the rest",
+        "That does not prove it for the rest",
         "## What is",
     ):
         assert words in page

@@ -53,8 +53,8 @@ class LimitRows(NamedTuple):
 class SizedLimits(NamedTuple):
     """Limits in the sizes of a model: of its inputs, of their changes, and of the limited outputs [x; y] in `rows`.
 
-    Without limits of changes `rates` is None. `hard_rates` are the rate limits that are hard, with ±inf in place
-    of the others; None where none is.
+    `rates` exist only with limits of changes. `hard_rates` are the rate limits that are hard, with ±inf in place
+    of the others; None if there are none.
     """
 
     inputs: Interval
