@@ -171,7 +171,7 @@ def take_textbook(name: str) -> CoverageTask:
 
 
 def list_tasks() -> dict[str, Callable[[], CoverageTask]]:
-    """Return all eighty, by name."""
+    """Return all 88, by name."""
     tasks: dict[str, Callable[[], CoverageTask]] = {}
     for k, name in enumerate(TEXTBOOK):  # in turn, so that a measurement that ends early has some of both
         tasks |= {f"random {seed}": partial(draw_task, seed) for seed in range(3 * k, 3 * k + 3)}
