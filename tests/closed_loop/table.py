@@ -9,7 +9,7 @@ from tests.closed_loop.controllers import YARDSTICKS
 from tests.closed_loop.judge import LOST, Row, Table, rounded
 
 HERE = Path(__file__).parent
-STORED = HERE / "table.json"  # of the last commit
+STORED = HERE / "table.json"  # each row as it was last measured
 FIRST = HERE / "first_edition.json"  # of the first edition's defaults
 WORSE = 1.05  # a default that costs more than this beyond the stored table fails
 ALLOWED = 0.01  # and so does one that violates limits by this share of the range more

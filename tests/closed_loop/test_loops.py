@@ -18,7 +18,7 @@ RUNS = [(name, start) for name, task in TASKS.items() for start in range(len(tas
 
 @pytest.mark.loops
 @pytest.mark.parametrize("task", TASKS)
-def test_no_default_loses_five_percent_against_the_last_commit(task, record_property):
+def test_no_default_loses_five_percent_against_the_stored_table(task, record_property):
     table = measure([task], list(CONTROLLERS), workers=1)
     record_property("closed loops", text(table, stored()))
     lost = losses(table, stored())
