@@ -168,7 +168,8 @@ def design(
     candidates
         Models to try, as in `select`.
     delays
-        Past steps to try in an embedding; by default 0, 1 and 2, and 4 where the data show a hidden state (see `select`).
+        Past steps to try in an embedding; by default 0, 1 and 2, and 4 where the data show a hidden state,
+        see `select`.
     bilinear
         Try bilinear models too; the surrogates are then bilinear.
     tighten
