@@ -234,12 +234,12 @@ class Watch(Viewing):
             self.fits = self._matches_prediction(start, before, acted)
         self._first, self._fast = False, psi is None and not start.W.size  # the second step is as all after it
         if psi is not None:
-            self._keep_step(start, u)
+            self._keep_step(start)
         elif start.W.size:
             self._extra = self._pushed @ start.W[0]
         return self.inside and self.fits
 
-    def _keep_step(self, start: InitialCondition, u: Float[np.ndarray, " nu"]) -> None:
+    def _keep_step(self, start: InitialCondition) -> None:
         """Keep what predicts the next state by a nonlinear model."""
         model, drive = self._model, start.drive.size > 0
         w = start.W[0] if start.W.size else np.zeros(0)

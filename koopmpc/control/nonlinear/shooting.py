@@ -12,6 +12,7 @@ from koopmpc.control.limits import SOFTENED, Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.ranges import find_undefined_operation
+from koopmpc.control.nonlinear.stagewise import weight_symbols
 from koopmpc.errors import DataError
 from koopmpc.interrupts import raise_swallowed
 
@@ -129,7 +130,7 @@ class Shooting:
         ahead = F.map(N)(ca.horzcat(x0, X[:, : N - 1]), U, schedule) + ca.vertcat(e, ca.MX(nx - moved, N))
         gaps = W[nu : nu + nx, :] - ahead / ca.DM(p.sizes)
         end = M @ p.tracked(X[:, N - 1]) + L @ X[:, N - 1] - m
-        Q_d, R_d = ca.MX.sym("Q_d", nr * p.timed, N), ca.MX.sym("R_d", nu * (p.timed and not p.with_rates), N)
+        Q_d, R_d = weight_symbols(p)
         self.weights = np.tile(p.Q.diagonal(), (N, int(p.timed))), np.tile(p.R.diagonal(), (N, int(R_d.numel() > 0)))
         f = (ca.dot(U - u_r, R_d * (U - u_r)) if R_d.numel() else _weigh(U - u_r, p.R)) + ca.sumsqr(end)
         if N > 1:

@@ -102,7 +102,7 @@ def linearisation(problem: StagedProblem) -> ca.Function:
         *(each[1] if free else ca.MX(ca.DM(nx, nu)) for each, free in zip(stages, problem.free, strict=True))
     )
     F = ca.horzcat(*(stage[2] for stage in stages))
-    Q_d, R_d = _weight_symbols(problem)
+    Q_d, R_d = weight_symbols(problem)
     Q, q = end(X[:, N], *goal)
     if N > 1:
         Q_k, q_k = stage.map(N - 1)(X[:, 1:N], R[:, : N - 1], Q_d[:, : N - 1])
@@ -113,7 +113,7 @@ def linearisation(problem: StagedProblem) -> ca.Function:
     return ca.Function("linearisation", [X, U, R, U_r, *goal, every, *([Q_d, R_d] if problem.timed else [])], found)
 
 
-def _weight_symbols(problem: StagedProblem) -> tuple[ca.MX, ca.MX]:
+def weight_symbols(problem: StagedProblem) -> tuple[ca.MX, ca.MX]:
     """Return the diagonals of all stages that weigh tracked outputs, and inputs without rates; none where none move."""
     N, nr, nu = len(problem.free), len(problem.Q), len(problem.R)
     timed = problem.timed
@@ -134,7 +134,7 @@ def plan_cost(problem: StagedProblem) -> ca.Function:
     M, L, m = (ca.MX.sym("terminal", nx + nr, columns) for columns in (nr, nx, 1))
     of, moved = problem.tracked.map(N)(X[:, 1:]), U - U_r
     missed = (of - R)[:, : N - 1]
-    Q_d, R_d = _weight_symbols(problem)
+    Q_d, R_d = weight_symbols(problem)
     cost = ca.sumsqr(M @ of[:, N - 1] + L @ X[:, N] - m)
     cost += ca.dot(moved, R_d * moved if R_d.numel() else ca.DM(problem.R) @ moved)
     cost += ca.dot(missed, Q_d[:, : N - 1] * missed if problem.timed else ca.DM(problem.Q) @ missed)

@@ -121,7 +121,7 @@ class BallSolver(StepSolver):
             y = plan[self.ball.rows] + self.ball.D @ found.v
             if np.linalg.norm(y) <= 1 + MET:
                 return found, gave_way
-            self._add_cut(y, found, np.multiply(plan[self._rows], self.qp.scale))
+            self._add_cut(y, found)
         return self._cut(plan, room, deadline, found, bounds)
 
     def _cut(
@@ -167,7 +167,7 @@ class BallSolver(StepSolver):
                 return found, max(conflict, slack, self._gave_way(found, moved, limits))
             if past < NEAR:  # the solver meets a row to its own tolerance, which is that of w
                 tighter += past
-            if not self._add_cut(y, found, moved):
+            if not self._add_cut(y, found):
                 break
         if found.status is Status.OPTIMAL:
             found = replace(found, status=Status.MAX_ITERATIONS)
@@ -175,7 +175,7 @@ class BallSolver(StepSolver):
         self._forget_cuts()
         return found, conflict
 
-    def _add_cut(self, y: Float[np.ndarray, " p"], found: QPSolution, moved: Float[np.ndarray, " m"]) -> bool:
+    def _add_cut(self, y: Float[np.ndarray, " p"], found: QPSolution) -> bool:
         """Add the half space that cuts y off; return False where there is no room for another one."""
         free = np.flatnonzero(~self._used)
         if not len(free):
