@@ -6,7 +6,15 @@ import sys
 
 import pytest
 
+from koopmpc.data.files import formats
 from tests.docs.page import DOCS
+
+
+@pytest.fixture(autouse=True)
+def formats_of_pages(monkeypatch):
+    """Forget the formats that the blocks of a page register: other tests of the process would meet them."""
+    formats.list_suffixes()  # the library's own are registered now
+    monkeypatch.setattr(formats, "_FORMATS", dict(formats._FORMATS))
 
 
 @pytest.fixture(scope="session")
