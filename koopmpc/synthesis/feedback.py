@@ -1,4 +1,14 @@
-"""Logs of closed loops before a choice of models: noise is projected out by the set points where unseen rows gain."""
+"""Logs of closed loops before a choice of models: noise is projected out by the set points where unseen rows gain.
+
+Four tests find feedback in logs, for four questions:
+
+- `feedback_share`: how much of u_k is a function of ψ(x_k), so that A and B cannot be separated? Also that of an
+  input which is held until the states have followed it.
+- `measure_feedback`: what do readings tell of u_k beyond past inputs, so that their noise comes back by the input?
+- `validate.logs.alignment.find_feedback`: is the law near enough to exact to be a fault of the log? Both at once.
+- `records.is_fed_back`: does u_{k+1} hold y_{k+1}, if input columns may be a row late? Past outputs and moves only, on
+  unseen rows, by least absolute deviations, so that moves of a set point do not hide it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -135,6 +135,23 @@ def test_logs_of_a_nonlinear_loop_stay_where_its_curvature_could_be_taken_for_no
     assert remove_feedback(data, None).episodes is data
 
 
+def test_logs_of_a_bent_plant_stay_though_a_linear_model_would_gain_by_a_filter(monkeypatch):
+    """x₁ moves by |x₂|: a filter of a linear model takes this for noise, and a model that could have learned it loses."""
+    rng, logs = np.random.default_rng(0), []
+    for _ in range(4):
+        x, X, U = np.array([rng.uniform(-1, 1), 0.0]), [], []
+        for k in range(400):
+            goal = rng.uniform(-1, 1) if k % 25 == 0 else goal
+            X.append(x + 0.05 * rng.standard_normal(2))
+            U.append([0.1 * (goal - X[-1][0]) - 0.8 * X[-1][1]])
+            x = np.array([0.9 * x[0] + 0.2 * abs(x[1]), 0.7 * x[1] + 0.3 * U[-1][0]])
+        logs.append(km.Episode(X=np.array([*X, x]), U=np.array(U)))
+    data = km.Episodes(logs, 0.05)
+    assert remove_feedback(data, None).episodes is data
+    monkeypatch.setattr("koopmpc.synthesis.feedback._bend", lambda _: km.State() + km.Constant())
+    assert "as a filter sees them" in remove_feedback(data, None).sentence
+
+
 def test_wild_readings_are_replaced_before_a_filter_spreads_them():
     data, _ = run_loop(np.random.default_rng(1), 800, sensor=0.2)
     X = data[0].X.copy()
