@@ -24,10 +24,11 @@ from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Recipe
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap, choose_starts_to_record
 from koopmpc.synthesis.fresh.promise import CoveragePromise
-from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_share, bound_value, cost_interval
+from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_value, cost_interval
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.terminal import build_leaderboard, label_lines, render_text
 from koopmpc.text import to_percent
+from koopmpc.validate.binomial import bound_failure_rate
 from koopmpc.validate.logs.summary import LogSummary
 from koopmpc.values import Value
 
@@ -130,7 +131,7 @@ class ExpectedLoop(Value):
     def lost_bound(self) -> float:
         """Exact upper bound, at 95 %, of the probability that a loop like the fresh ones is lost."""
         cost = self._judged_runs(self.cost, self.cost_off, "cost")
-        return bound_share(int(np.sum(~np.isfinite(cost))), len(cost))
+        return bound_failure_rate(int(np.sum(~np.isfinite(cost))), len(cost))
 
     @property
     def loops(self) -> dict[str, int]:

@@ -6,17 +6,15 @@ from functools import cache
 
 import numpy as np
 import pytest
-import scipy.stats
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.synthesis.designed import ExpectedLoop, choose_row
 from koopmpc.synthesis.fresh.drawn import draw_starts
 from koopmpc.synthesis.fresh.horizon import choose_horizon
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box, probe_range
-from koopmpc.synthesis.fresh.verdict import bound_share, bound_value, cost_interval
+from koopmpc.synthesis.fresh.verdict import bound_value, cost_interval
 from koopmpc.synthesis.judging import measure_errors
+from koopmpc.validate import bound_failure_rate
 from tests.closed_loop.controllers import Parts
 from tests.closed_loop.judge import judged, kept_promises, promised
 from tests.closed_loop.more_tasks import MORE
@@ -36,20 +34,6 @@ def rows_of(plant, count=30):
 @cache
 def fresh():
     return designed(data(count=15), loops=24)
-
-
-def test_no_failure_in_59_loops_is_below_five_percent_and_in_299_below_one():
-    assert bound_share(0, 59) < 0.05 < bound_share(0, 58)
-    assert bound_share(0, 299) < 0.01 < bound_share(0, 298)
-    assert bound_share(7, 7) == 1.0
-
-
-@given(loops=st.integers(1, 400), share=st.floats(0, 1))
-@settings(max_examples=60)
-def test_at_the_bound_so_few_failures_have_a_probability_of_five_percent(loops, share):
-    failures = int(share * (loops - 1))
-    bound = bound_share(failures, loops)
-    assert scipy.stats.binom.cdf(failures, loops, bound) == pytest.approx(0.05, rel=1e-6)
 
 
 def test_one_more_of_exchangeable_values_keeps_the_bound_and_the_interval_as_often_as_said():
@@ -115,7 +99,7 @@ def test_the_fresh_loops_of_a_design_are_counted_by_kind_and_give_its_bounds():
     assert counts["neighbours"] + counts["models"] == 24
     assert min(counts.pop("neighbours"), counts.pop("models")) > 0
     assert counts == {"choice": 6, "choice, inputs 20 % off": 6, "corners": 4}
-    assert expected.lost_bound == bound_share(0, 24)
+    assert expected.lost_bound == bound_failure_rate(0, 24)
     low, high = expected.cost_interval
     assert low <= np.median(expected.fresh.cost) <= high
     assert expected.violation_bound <= expected.fresh.violation.max()

@@ -1,10 +1,9 @@
-"""FreshLoops: loops of a designed controller from starts that took no part in its choice, and exact bounds of them."""
+"""FreshLoops: loops of a designed controller from starts that took no part in its choice, and bounds of them."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import betaincinv
 
 from koopmpc.values import Value
 
@@ -48,16 +47,6 @@ class FreshLoops(Value):
     def counts(self) -> dict[str, int]:
         """Number of loops of each kind."""
         return {kind: self.kinds.count(kind) for kind in sorted(set(self.kinds))} | {"corners": len(self.corner_cost)}
-
-
-def bound_share(failures: int, loops: int, sure: float = SURE) -> float:
-    """Return the exact one-sided upper bound of a probability: no failure in 59 loops is below 5 %, in 299 below 1 %.
-
-    Clopper & Pearson, "The use of confidence or fiducial limits", Biometrika 26, 1934.
-    """
-    if failures >= loops:
-        return 1.0
-    return float(betaincinv(failures + 1, loops - failures, sure))
 
 
 def bound_value(values: Float[np.ndarray, " n"], sure: float = SURE) -> float:
