@@ -12,7 +12,7 @@ from koopmpc.errors import DataError
 from koopmpc.loop.metrics import stack_limited
 from koopmpc.synthesis.designed import Evidence
 from koopmpc.synthesis.fresh.abreast import speed_up
-from koopmpc.synthesis.fresh.drawn import KEPT, LoopPool, LoopResult
+from koopmpc.synthesis.fresh.drawn import KEPT, SHIFT, LoopPool, LoopResult
 from koopmpc.text import to_percent
 from koopmpc.validate.binomial import bound_failure_rate, count_runs_needed
 
@@ -55,7 +55,7 @@ class RateVerdict:
 
     def list_sentences(self) -> list[str]:
         """Return what was found, on what, and what that is worth."""
-        starts = "a start of the logs moved by up to 5 % of its range"
+        starts = f"a start of the design moved by up to {to_percent(SHIFT)} of the data's range"
         return [
             f"{self.broken} of {self.loops} fresh loops broke a limit by more than {to_percent(KEPT)} of its range and "
             f"{self.lost} were lost: with {to_percent(CONFIDENCE)} confidence at most "
