@@ -62,7 +62,7 @@ from koopmpc.validate.scoring import AnyPredictor, score
 ENOUGH = 1e-2  # error of a forecast, as a share of the states' spread, below which a controller gains nothing
 _NEAR = 10  # steps of the forecasts that say whether more of the past is worth a trial
 _GAINS = 0.9  # it is, where two past steps lower the error of one to this share
-LONGER = (4,)  # further past steps that are tried where a hidden state shows
+_LONGER = (4,)  # then these are tried too
 RIDGES = tuple(10.0**power for power in range(-9, -2))
 LATE = (
     "the inputs were moved up by one row: the log's row k holds the outputs after its inputs have acted; "
@@ -81,7 +81,7 @@ def extend_past(past: Sequence[int], learned: Episodes, measured: Episodes) -> l
     unseen = [i for i, e in enumerate(measured) if i % 4 == 0 and len(e) > 3 * max(past)]
     seen = learned.with_episodes([e for i, e in enumerate(learned) if i % 4])
     if len(unseen) < 2 or not len(seen):
-        return [*past, *LONGER]
+        return [*past, *_LONGER]
     ahead = min(_NEAR, min(len(measured[i]) for i in unseen) - 2)
     errors: list[float] = []
     with hide_fit_warnings():
@@ -89,7 +89,7 @@ def extend_past(past: Sequence[int], learned: Episodes, measured: Episodes) -> l
             model = edmd(seen, State() + Constant(), embedding=Delay(steps))
             same = measured.with_episodes([measured[i].cut(2 - steps, len(measured[i])) for i in unseen])
             errors.append(float(np.mean(score(model, same, ahead).rmse)))
-    return [*past, *LONGER] if errors[1] < _GAINS * errors[0] else list(past)
+    return [*past, *_LONGER] if errors[1] < _GAINS * errors[0] else list(past)
 
 
 def select(
