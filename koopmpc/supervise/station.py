@@ -13,7 +13,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
 from koopmpc.control.function import as_controller
 from koopmpc.control.kinds import ControllerKind, register_controller
-from koopmpc.control.limits import Limits, clip_input
+from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
 from koopmpc.control.program import Program, Published, SavedController, no_export
 from koopmpc.control.stepped.levels import HeldLevels
@@ -178,7 +178,7 @@ class Station(Published):
         zero = np.clip(np.zeros(self.nu), *self.inputs)
         self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
         if self._held is not None:
-            self._last = self._last if u_prev is not None else self._held.round(zero, None, None)
+            self._last = self._last if u_prev is not None else self._held.round(zero)
             self._held.reset(self._last)
         self.mode: Mode = self._first_mode
         self._hand = self._first_hand
@@ -219,8 +219,8 @@ class Station(Published):
             self._approaching, u = not np.array_equal(near, u), near
         u = clip_input(u, self.inputs, self.rates, last)
         if self._held is not None:
-            ends = (None, None) if self.rates is None else (last + self.rates.low, last + self.rates.high)
-            u = self._held.round(u, *ends)
+            reach = None if self.rates is None else Interval(last + self.rates.low, last + self.rates.high)
+            u = self._held.round(u, reach)
         self._last = u
         status = move.status if np.array_equal(u, move.u) else Status.SATURATED
         fallback = Fallback.OTHER_CONTROLLER if actor == "standby" else move.fallback

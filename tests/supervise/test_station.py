@@ -266,3 +266,12 @@ def test_a_plain_function_and_a_pid_run_in_a_sweep(tmp_path):
         del km.bench.CONTROLLERS["half"]
     assert [(row.controller, row.failure) for row in rows] == [("half", None), ("pid", None)]
     assert abs(rows[1].metrics.final_error[0]) < 0.2
+
+
+def test_hand_values_move_over_levels_no_faster_than_the_rate():
+    limits = km.Limits(levels=[[0, 1, 2, 3]], du_max=1.0)
+    mpc = km.KoopmanMPC(TANK, COST, limits, 5)
+    station = km.supervise.Station(mpc, limits=limits, mode="manual", hand=[2.7])
+    station.reset()
+    U = [float(station([0.0], [0.0]).u[0]) for _ in range(4)]
+    np.testing.assert_array_equal(U, [1.0, 2.0, 3.0, 3.0])
