@@ -39,6 +39,7 @@ from koopmpc.synthesis.cross_validation import (
     Trial,
     check_ridges,
     cross_validate,
+    cut_blocks,
     make_folds,
     replace_glitches,
     smooth_data,
@@ -63,6 +64,7 @@ ENOUGH = 1e-2  # error of a forecast, as a share of the states' spread, below wh
 _NEAR = 10  # steps of the forecasts that say whether more of the past is worth a trial
 _GAINS = 0.9  # it is, where two past steps lower the error of one to this share
 _LONGER = (4,)  # then these are tried too
+_EPISODES = 8  # of which a quarter is forecast
 RIDGES = tuple(10.0**power for power in range(-9, -2))
 LATE = (
     "the inputs were moved up by one row: the log's row k holds the outputs after its inputs have acted; "
@@ -76,12 +78,19 @@ def extend_past(past: Sequence[int], learned: Episodes, measured: Episodes) -> l
     """Return the past steps to try where a hidden state shows: more if two of them forecast better than one.
 
     Linear models of the `learned` rows forecast `measured` rows of every fourth episode, which they did not see: of
-    smoothed rows a model would know from the past what only the future told. With fewer episodes more are tried.
+    smoothed rows a model would know from the past what only the future told. Fewer than eight episodes are cut into
+    blocks; where these are too short, more past steps are tried.
     """
+    if len(measured) < _EPISODES:
+        share = -(-_EPISODES // len(measured))
+        learned, measured = (
+            each.with_episodes([block for e in each for block in cut_blocks(e, max(len(e) // share, 1))])
+            for each in (learned, measured)
+        )
     unseen = [i for i, e in enumerate(measured) if i % 4 == 0 and len(e) > 3 * max(past)]
-    seen = learned.with_episodes([e for i, e in enumerate(learned) if i % 4])
-    if len(unseen) < 2 or not len(seen):
+    if len(unseen) < 2:
         return [*past, *_LONGER]
+    seen = learned.with_episodes([e for i, e in enumerate(learned) if i % 4])
     ahead = min(_NEAR, min(len(measured[i]) for i in unseen) - 2)
     errors: list[float] = []
     with hide_fit_warnings():

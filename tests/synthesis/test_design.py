@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
+from scipy.signal import dlsim
 
 import koopmpc as km
 from koopmpc.synthesis.candidates import Candidate, Recipe
@@ -436,3 +437,15 @@ def test_a_single_wrong_measurement_is_replaced_and_its_episode_kept():
     assert any("x1 = " in note and "row 10 of episode 11" in note for note in found.notes)
     assert not any("is left out" in sentence for sentence in found.advice)
     assert found.best.recipe.candidate == designed(data(12)).best.recipe.candidate
+
+
+def test_one_record_of_a_sensor_tries_as_much_of_the_past_as_many_episodes():
+    rng = np.random.default_rng(0)
+    spring = ([[0.98, 0.28], [-0.14, 0.87]], [[0.043], [0.28]], [[1.0, 0.0]], [[0.0]], 0.3)
+    U = np.repeat(rng.uniform(-1, 1, (100, 1)), 6, axis=0)
+    Y = dlsim(spring, np.vstack([U, U[-1:]]))[1] + 0.02 * rng.standard_normal((601, 1))
+    record = km.Episodes([km.Episode(X=Y, U=U)], dt=0.3)
+    limits = km.Limits(u_min=-1, u_max=1)
+    found = designed(record, km.Cost(Q=1.0, R=0.1), limits, reference=[0.0], delays=None)
+    assert any(sentence.startswith("a hidden state shows") for sentence in found.advice)
+    assert {row.recipe.candidate.delays for row in found.leaderboard} == {0, 1, 2}
