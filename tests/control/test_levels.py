@@ -8,6 +8,7 @@ import pytest
 
 import koopmpc as km
 import koopmpc.control.stepped.search
+import koopmpc.control.stepped.sequences
 
 OFF = 1e-9  # an input is on its level to this
 
@@ -116,6 +117,34 @@ def test_plans_of_twenty_binaries_are_the_best_of_all_sequences(seed):
     compare_with_enumeration(np.random.default_rng([2, seed]), 2, 10)
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_quadratic_programs_and_sequences_find_the_same_plans(seed, monkeypatch):
+    rng = np.random.default_rng([4, seed])
+    nu = int(rng.integers(1, 3))
+    limits = {"levels": [[0, 1, 2], [0, 1]][:nu], "x_max": rng.uniform(0.3, 2, 3)}
+    if seed % 3 == 0:
+        limits["dwell"] = [2, 3][:nu]
+    if seed % 4 == 1:
+        limits["du_max"] = [1, 1][:nu]
+    if seed % 4 == 2:
+        limits |= {"slack": None, "x_max": rng.uniform(3, 6, 3)}
+    moves = [None, 4, {"u0": (1, 1, 2, 2)}][seed % 3]
+    model, cost, limits = draw_model(rng, nu), km.Cost(Q=1.0, R=0.05, R_delta=0.02), km.Limits(**limits)
+    by_sequences, by_programs = (km.KoopmanMPC(model, cost, limits, 6, moves=moves) for _ in range(2))
+    monkeypatch.setattr(by_programs._qps, "_sequences", None)
+    assert by_sequences._qps._sequences is not None
+    x, statuses = rng.standard_normal(3), set()
+    for _ in range(12):
+        one, other = (mpc(x, np.ones(3)) for mpc in (by_sequences, by_programs))
+        assert (one.status, one.gap) == (other.status, 0)
+        statuses.add(one.status)
+        if one.status in (km.Status.OPTIMAL, km.Status.SOFTENED):
+            np.testing.assert_array_equal(by_sequences.plan().U, by_programs.plan().U)
+            assert one.slack == pytest.approx(other.slack, rel=1e-6, abs=1e-9)
+        x = model.A @ x + model.B @ one.u + 0.3 * rng.standard_normal(3)
+    assert statuses & {km.Status.OPTIMAL, km.Status.SOFTENED}
+
+
 TANK = km.LinearPredictor([[0.9]], [[0.2]], np.eye(1), km.State().bind(("level",)), 1.0, ("level",), ("pump",))
 COST = km.Cost(Q=1.0, R=0.0, R_delta=0.01)
 
@@ -222,7 +251,8 @@ def test_the_gap_of_a_search_that_is_cut_off_bounds_what_its_plan_misses(monkeyp
         best, cut = (km.KoopmanMPC(model, cost, limits, 9) for _ in range(2))
         x, r, costs = 2 * rng.standard_normal(3), np.zeros(3), []
         for mpc in (free, best, cut):
-            monkeypatch.setattr(koopmpc.control.stepped.search, "NODES", 14 if mpc is cut else 200_000)
+            monkeypatch.setattr(koopmpc.control.stepped.search, "NODES", 36 if mpc is cut else 200_000)
+            monkeypatch.setattr(koopmpc.control.stepped.sequences, "WIDTH", 2 if mpc is cut else 128)
             mpc.reset(u_prev=[-1.0])
             move = mpc(x, r)
             if move.fallback is km.control.Fallback.NONE:

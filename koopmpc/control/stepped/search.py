@@ -18,9 +18,10 @@ from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolution, SolverTurn, StepQP, StepSolver
 from koopmpc.control.stepped.levels import NEAR, HeldLevels, LevelBox, leveled_moves
+from koopmpc.control.stepped.sequences import EQUAL, SequenceSearch
 
-_EQUAL = 1e-9  # a node is worse than the best plan unless it is better by more than this share
 NODES = 200_000  # nodes of one search, at most
+_NAME = "sequences"  # of the solver, where no quadratic program is solved
 
 
 class Relaxed(NamedTuple):
@@ -74,7 +75,7 @@ class LevelSearch:
     """
 
     def __init__(self, held: HeldLevels, blocks: Sequence[int], nu: int) -> None:
-        self.held, self._blocks, self._nu = held, blocks, nu
+        self.held, self.blocks, self._nu = held, blocks, nu
         self.index = np.zeros((leveled_moves(held.levels, blocks), len(held.levels.which)), np.intp)
         self._known, self.gap, self.nodes = False, 0.0, 0
         self.repeats = False  # whether the next search is of the same step as the last one
@@ -85,12 +86,12 @@ class LevelSearch:
 
     def accepts(self, t: Float[np.ndarray, " nt"]) -> bool:
         """Return whether a plan without levels is on them; its moves are then put on them to the bit."""
-        moves = len(self._blocks) * self._nu
+        moves = len(self.blocks) * self._nu
         U = t[:moves].reshape(-1, self._nu)
         at = self.held.levels.indices(U[: len(self.index)])
         nearest = np.rint(at).astype(np.intp)
         if (np.abs(at - nearest) > NEAR).any() or not self.held.tighten(
-            LevelBox(nearest.copy(), nearest.copy()), self._blocks
+            LevelBox(nearest.copy(), nearest.copy()), self.blocks
         ):
             return False
         self.index, self._known, self.gap = nearest, True, 0.0
@@ -105,7 +106,7 @@ class LevelSearch:
 
     def place_steps(self, U: Float[np.ndarray, "N nu"]) -> None:
         """Put the inputs of all steps on the levels found, to the bit."""
-        blocks = self._blocks[: len(self.index)]
+        blocks = self.blocks[: len(self.index)]
         values = self.held.levels.values(np.repeat(self.index, blocks, axis=0))
         U[: len(values), self.held.levels.which] = values
 
@@ -129,17 +130,16 @@ class LevelSearch:
         self.nodes, self.gap = 0, 0.0
         best: Any = None
         cost, iterations, unproven = np.inf, 0, np.inf
-        stack = [_Node(least, root, start)]
-        if self._known:
-            last = self.index if self.repeats else np.vstack([self.index[1:], self.index[-1:]])
-            last = np.clip(last, root.low, root.high)
+        stack, guess = [_Node(least, root, start)], self.guess()
+        if guess is not None:
+            last = np.clip(guess, root.low, root.high)
             stack.append(_Node(least, LevelBox(last.copy(), last.copy()), start))
         ended = Status.INFEASIBLE
         while stack:
             node = stack.pop()
-            if node.bound >= cost - _EQUAL * abs(cost):
+            if node.bound >= cost - EQUAL * abs(cost):
                 continue
-            if not self.held.tighten(node.box, self._blocks):
+            if not self.held.tighten(node.box, self.blocks):
                 continue
             left = None if deadline is None else deadline - perf_counter()
             if (left is not None and left <= 0) or self.nodes >= NODES:
@@ -157,7 +157,7 @@ class LevelSearch:
                 if found.status is not Status.INFEASIBLE:
                     unproven, ended = min(unproven, node.bound), Status.FAILED
                 continue
-            if found.cost >= cost - _EQUAL * abs(cost):
+            if found.cost >= cost - EQUAL * abs(cost):
                 continue
             nearest = np.clip(np.rint(found.at), node.box.low, node.box.high).astype(np.intp)
             place = self._choose(found.at, nearest, node.box)
@@ -169,9 +169,36 @@ class LevelSearch:
         self._known = best is not None
         if best is None:
             return LevelsFound(None, ended, iterations)
-        if worst < cost - _EQUAL * abs(cost):
-            self.gap = float(min(max((cost - max(worst, least)) / max(cost - least, 1e-300), 0.0), 1.0))
+        self._measure_gap(cost, worst, least)
         return LevelsFound(best, Status.OPTIMAL, iterations)
+
+    def find_sequence(
+        self,
+        sequences: SequenceSearch,
+        start: Float[np.ndarray, "moves leveled"],
+        limits: Interval,
+        root: LevelBox,
+        deadline: float | None,
+    ) -> LevelsFound:
+        """Search the sequences of levels inside `root`; the answer is the point v of the best one."""
+        self.gap = 0.0
+        found = sequences.find(start, limits, root, self.guess(), deadline, NODES)
+        self.nodes, self._known = found.nodes, found.levels is not None
+        if found.levels is None:
+            return LevelsFound(None, found.status, found.nodes)
+        self.index = found.levels
+        self._measure_gap(found.cost, found.bound, 0.0)
+        return LevelsFound(found.v, Status.OPTIMAL, found.nodes)
+
+    def guess(self) -> Int[np.ndarray, "moves leveled"] | None:
+        """Return the levels of the last plan, moved on by a step; None where there is none."""
+        if not self._known:
+            return None
+        return self.index if self.repeats else np.vstack([self.index[1:], self.index[-1:]])
+
+    def _measure_gap(self, cost: float, bound: float, least: float) -> None:
+        if bound < cost - EQUAL * abs(cost):
+            self.gap = float(min(max((cost - max(bound, least)) / max(cost - least, 1e-300), 0.0), 1.0))
 
     def find_places(self) -> Int[np.ndarray, "moves leveled"]:
         """Return where the moves on levels stand in a plan, move by move."""
@@ -185,7 +212,7 @@ class LevelSearch:
         if between.any():
             k, i = divmod(int(between.argmax()), between.shape[1])
             return k, i
-        if self.held.tighten(LevelBox(nearest.copy(), nearest.copy()), self._blocks):
+        if self.held.tighten(LevelBox(nearest.copy(), nearest.copy()), self.blocks):
             return None
         open_moves = np.argwhere((box.low != box.high) & (self.held.levels.dwell.max(axis=1) > 1))
         k, i = open_moves[0]
@@ -230,6 +257,9 @@ class LevelSolver(StepSolver):
         self._of_levels, self._factor = qp.A[self._flat], qp.scale[self._flat]
         self._is_least_distance = bool((np.eye(len(qp.q)) == qp.P).all()) and not qp.q.any()
         self._soft_rows = np.flatnonzero(np.isfinite(qp.softness.linear))
+        shape = search.index.shape
+        sequences = SequenceSearch(qp, self._rows_of, self._factor.reshape(shape), search.held, search.blocks)
+        self._sequences = sequences if sequences.applies else None
 
     def reset(self) -> None:
         """Forget all earlier solves, so that a run repeats to the bit."""
@@ -251,6 +281,12 @@ class LevelSolver(StepSolver):
             if (root.low > root.high).any():
                 return QPSolution(cold[0].copy(), cold[1].copy(), Status.INFEASIBLE, 0, self.first.name), True
 
+        at = (at_start / factor - levels.first) / levels.spacing
+        if self._sequences is not None:
+            found = search.find_sequence(self._sequences, at, Interval(low, high), root, deadline)
+            v = cold[0] if found.answer is None else found.answer
+            return QPSolution(v.copy(), self._push(v, low, high), found.status, found.iterations, _NAME), True
+
         def relax(box: LevelBox, answer: tuple[np.ndarray, np.ndarray], left: float | None) -> Relaxed:
             least, most = low.copy(), high.copy()
             least[self._rows_of] = factor * levels.values(box.low) - at_start
@@ -264,6 +300,15 @@ class LevelSolver(StepSolver):
         found = search.find(relax, root, cold, deadline)
         v, y = cold if found.answer is None else found.answer
         return QPSolution(v.copy(), y.copy(), found.status, found.iterations, self.first.name), True
+
+    def _push(
+        self, v: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]
+    ) -> Float[np.ndarray, " m"]:
+        """Return multipliers of the soft limits that give way at v, zero for all others."""
+        y, rows = np.zeros(len(low)), self._soft_rows
+        value = self.qp.A[rows] @ v
+        y[rows] = ((value > high[rows]).astype(float) - (value < low[rows])) * self.qp.softness.linear[rows]
+        return y
 
     def _cost(self, v: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> float:
         """Return the cost of a solution above that of the plan without limits, soft limits that give way included."""
