@@ -88,7 +88,7 @@ class Value:
 
 
 class Named:
-    """Base of classes with named states and inputs, which count them."""
+    """Base of classes with named states, inputs and measured disturbances, which count them."""
 
     @property
     def nx(self) -> int:
@@ -99,6 +99,11 @@ class Named:
     def nu(self) -> int:
         """Number of inputs."""
         return len(cast("Any", self).inputs)
+
+    @property
+    def nw(self) -> int:
+        """Number of measured disturbances."""
+        return len(getattr(cast("Any", self), "disturbances", ()))
 
 
 def freeze(value: object, **fields: object) -> None:

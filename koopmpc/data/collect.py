@@ -57,8 +57,9 @@ def collect(
     episodes: int,
     steps: int,
     rng: np.random.Generator | int = 0,
+    measured: OpenLoop | ArrayLike | None = None,
 ) -> Episodes:
-    """Run x_{k+1} = F(x_k, u_k) from x0 under the excitation, and return the episodes as measured.
+    """Run x_{k+1} = F(x_k, u_k, w_k) from x0 under the excitation, and return the episodes as measured.
 
     Parameters
     ----------
@@ -72,11 +73,14 @@ def collect(
         Number of episodes, and steps of each: X is (steps+1, ny), or less where the plant itself ends an episode.
     rng
         Generator or seed; the same seed gives the same data, whichever way the plant is run.
+    measured
+        w of a step map with measured disturbances: (nw,), (steps, nw) or (E, steps, nw), or an excitation without
+        feedback. Its values stand in W of the episodes.
 
     Raises
     ------
     ShapeError
-        x0 or the excitation does not fit the plant.
+        x0, the excitation or the measured disturbances do not fit the plant.
     DataError
         A state became NaN or infinite, or the plant lacks a method.
 
@@ -95,6 +99,7 @@ def collect(
     nu = len(plant.inputs)
     starts = None if x0 is None else _starts(x0, len(plant.states), count, source)
     streams = source.spawn(count)
+    W = _measured_rows(plant, measured, length, streams)
     if isinstance(excitation, Excitation) and excitation.nu != nu:
         raise ShapeError(
             f"the excitation gives {excitation.nu} inputs, the plant takes {nu} ({', '.join(plant.inputs)}); "
@@ -108,11 +113,40 @@ def collect(
         elif starts is None:
             raise DataError("a step map has no state of its own to begin in; pass x0, such as km.Uniform(low, high)")
         else:
-            X, U = _batch(plant, starts, excitation, length, streams)
+            X, U = _batch(plant, starts, excitation, length, streams, W)
             Y = _measure_rows(plant, X)
             _finite(Y)
-            runs = [Episode(X=y, U=u) for y, u in zip(Y, U, strict=True)]
-    return Episodes(runs, plant.dt, plant.outputs, plant.inputs)
+            runs = [Episode(X=y, U=u, W=w) for y, u, w in zip(Y, U, W, strict=True)]
+    return Episodes(runs, plant.dt, plant.outputs, plant.inputs, getattr(plant, "disturbances", ()))
+
+
+def _measured_rows(
+    plant: StepMap | Plant, measured: OpenLoop | ArrayLike | None, steps: int, streams: list[np.random.Generator]
+) -> Float[np.ndarray, "E T nw"]:
+    """Return the measured disturbances of all episodes; (E, T, 0) for a plant without."""
+    nw, count = getattr(plant, "nw", 0), len(streams)
+    if not isinstance(plant, StepMap) or not nw:
+        if measured is not None or nw:
+            raise DataError("measured goes with a StepMap F(x, u, w); any other plant makes its own disturbances")
+        return np.zeros((count, steps, 0))
+    names = ", ".join(plant.disturbances)
+    if measured is None:
+        raise DataError(f"the plant has measured disturbances ({names}); pass measured=, such as km.Noise(low, high)")
+    if isinstance(measured, OpenLoop):
+        W = np.stack([measured.sequence(steps, plant.dt, own.spawn(1)[0]) for own in streams])
+    else:
+        W = checks.array(measured, "measured")
+        W = (
+            np.broadcast_to(W, (count, steps, W.shape[-1]))
+            if W.ndim in (1, 2) and W.shape[:-1] in ((), (steps,))
+            else W
+        )
+    if W.shape != (count, steps, nw):
+        raise ShapeError(
+            f"measured has shape {W.shape}, expected ({nw},), ({steps}, {nw}) or ({count}, {steps}, {nw}): "
+            f"a column for {names}"
+        )
+    return W
 
 
 def _drive(
@@ -137,11 +171,12 @@ def _batch(
     excitation: Excitation | InputFunction,
     steps: int,
     streams: list[np.random.Generator],
+    W: Float[np.ndarray, "E T nw"],
 ) -> tuple[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]]:
     """Run all episodes at once; an excitation that depends on y is called step by step."""
     if isinstance(excitation, OpenLoop):
         U = np.stack([excitation.sequence(steps, plant.dt, own) for own in streams])
-        return plant.rollouts(starts, U), U
+        return plant.rollouts(starts, U, W), U
     policies = [_start(excitation, e, steps, plant.dt, plant.nu, own) for e, own in enumerate(streams)]
     X = np.empty((len(starts), steps + 1, plant.nx))
     moves = np.empty((len(starts), steps, plant.nu))
@@ -151,7 +186,7 @@ def _batch(
         _finite(Y, step=k)
         for e, policy in enumerate(policies):
             moves[e, k] = policy(k, Y[e, 0])
-        X[:, k + 1] = plant.rollouts(X[:, k], moves[:, k : k + 1])[:, 1]
+        X[:, k + 1] = plant.rollouts(X[:, k], moves[:, k : k + 1], W[:, k : k + 1])[:, 1]
     return X, moves
 
 

@@ -5,7 +5,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, field, fields
 from math import isfinite
 from typing import Any
 
@@ -60,7 +60,7 @@ def simulate(
     angles: Sequence[int] = (),
     metadata: Mapping[str, Any] | None = None,
 ) -> Run:
-    """Run u_k = controller(y_k, r_k … r_{k+N}), x_{k+1} = F(x_k, u_k) + d_k, y_k = h(x_k) + n_k for `steps` steps.
+    """Run u_k = controller(y_k, r_k … r_{k+N}), x_{k+1} = F(x_k, u_k, w_k) + d_k, y_k = h(x_k) + n_k for `steps` steps.
 
     Parameters
     ----------
@@ -89,9 +89,10 @@ def simulate(
         n_k, (ny,) standard deviations of white noise, (steps+1, ny) values, or a function of (k, rng).
     measured
         w_k, (nw,) or (steps, nw): disturbances that the controller is told as `w`, rows k … k+horizon−1, the last
-        one repeated; with ``preview=False`` it gets row k alone, to hold over its horizon. They do not move the
-        plant: pass their effect as `disturbance`, for example ``disturbance=W @ E.T``. The metadata keep them under
-        "measured".
+        one repeated; with ``preview=False`` it gets row k alone, to hold over its horizon. A plant that has measured
+        disturbances of its own needs them, and a controller whose model has none is then not told. Any other plant is
+        not moved by them: pass their effect as `disturbance`, for example ``disturbance=W @ E.T``. The metadata keep
+        them under "measured".
     faults
         What breaks, see `km.faults`. A signal passes through them in order, y_k after its noise. Run.Y is what the
         controller got. Run.U is what the plant got, which the controller is told at the next step. The metadata
@@ -206,10 +207,14 @@ class _Wiring:
     rng: np.random.Generator
     noise: _Draw | None = None
     faults: Injections | None = None
+    moves_plant: bool = field(init=False)  # whether w_k moves the plant
+    tells: bool = field(init=False)  # whether the controller gets w_k
 
     def __post_init__(self) -> None:
         if self.disturbance is not None and not isinstance(self.plant, StepMap | SimulatedPlant):
             raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
+        self.moves_plant = _check_measured(self.plant, self.measured)
+        self.tells = self.measured is not None and not (self.moves_plant and _knows_no_disturbance(self.controller))
         self.reference.setflags(write=False)  # the Run keeps these rows, so a controller must not write into them
 
     @property
@@ -250,7 +255,7 @@ class _Wiring:
         try:
             if failing is not None:
                 failing.solver_fails = True
-            if W is None:
+            if W is None or not self.tells:
                 return controller(y, ahead, applied)
             return controller(y, ahead, applied, w=W[k : k + max(N, 1)] if self.preview else W[k])
         except ValueError as error:
@@ -267,7 +272,7 @@ class _Wiring:
         push = None if self.disturbance is None else self.disturbance(k, self.rng)
         if isinstance(plant, StepMap):
             x = rows.X[k + 1]
-            plant.advance(rows.X[k], u, x)
+            plant.advance(rows.X[k], u, x, self.measured[k] if self.measured is not None and self.moves_plant else None)
             if push is not None:
                 x += push
             y = x.copy() if rows.X is rows.Y else plant.measure(x)
@@ -316,7 +321,7 @@ def _run_at_once(wiring: _Wiring, rows: LoopRows) -> bool:
     """Let a compiled controller make the whole run; return False where it cannot, or the loop needs Python."""
     make_run = getattr(wiring.controller, "whole_run", None)
     plant, plain = wiring.plant, wiring.noise is None and wiring.faults is None and wiring.disturbance is None
-    if make_run is None or not plain or not isinstance(plant, StepMap):
+    if make_run is None or not plain or not isinstance(plant, StepMap) or wiring.moves_plant:
         return False
     rows.at_once = make_run(plant, wiring.reference, wiring.measured, rows.X, rows.Y, rows.U, preview=wiring.preview)
     return rows.at_once is not None
@@ -376,6 +381,24 @@ def _tracked_rows(
                 f"{', '.join(names)}; pass a column for each{fewer}"
             )
     return rows
+
+
+def _check_measured(plant: StepMap | Plant, measured: Float[np.ndarray, "rows nw"] | None) -> bool:
+    """Return whether the plant has measured disturbances, after a check that the rows are those."""
+    if not isinstance(plant, StepMap) or not plant.disturbances:
+        return False
+    nw, names = len(plant.disturbances), ", ".join(plant.disturbances)
+    if measured is None:
+        raise DataError(f"the plant has measured disturbances ({names}); pass measured=, a row a step")
+    if measured.shape[1] != nw:
+        raise ShapeError(f"measured has {measured.shape[1]} columns, the plant {nw} disturbances: {names}")
+    return True
+
+
+def _knows_no_disturbance(controller: Controller) -> bool:
+    """Return whether the controller has a model, and that has no measured disturbances."""
+    model = predictor_of(controller) or getattr(controller, "step_map", None)
+    return model is not None and getattr(model, "nw", 0) == 0
 
 
 def predictor_of(controller: object) -> Predictor | None:

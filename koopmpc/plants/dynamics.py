@@ -22,7 +22,8 @@ _Pair = tuple[ca.SX, ca.SX]  # the type of x and u for checkers: both kinds have
 class Dynamics(Named, ABC):
     """A plant ẋ = f(x, u), y = h(x): a frozen dataclass whose fields are the parameters, with units.
 
-    `states` and `inputs` name the rows of x and u, unit included: ``("theta [rad]", "omega [rad/s]")``.
+    `states` and `inputs` name the rows of x and u, unit included: ``("theta [rad]", "omega [rad/s]")``. `disturbances`
+    names what is measured and cannot be set, such as the weather: its values follow the inputs in the u of `rhs`.
 
     Examples
     --------
@@ -39,10 +40,11 @@ class Dynamics(Named, ABC):
 
     states: ClassVar[tuple[str, ...]]
     inputs: ClassVar[tuple[str, ...]]
+    disturbances: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
-        """ẋ = f(x, u): (nx, 1) from x (nx, 1) and u (nu, 1)."""
+        """ẋ = f(x, u): (nx, 1) from x (nx, 1) and u (nu + nw, 1), the inputs and then the measured disturbances."""
 
     def measure(self, x: ca.SX) -> ca.SX:
         """Return y = h(x): (ny, 1) from x (nx, 1); the whole state unless overridden."""
@@ -61,7 +63,7 @@ def find_scene(dynamics: Dynamics) -> Scene | None:
 
 @raise_swallowed()
 def build_right_side(dynamics: Dynamics) -> ca.Function:
-    """Return f of ẋ = f(x, u) as a CasADi function of x (nx) and u (nu).
+    """Return f of ẋ = f(x, u) as a CasADi function of x (nx) and u (nu), measured disturbances last.
 
     Raises
     ------
@@ -72,9 +74,19 @@ def build_right_side(dynamics: Dynamics) -> ca.Function:
     """
     checks.members(dynamics, "dynamics", ("states", "inputs", "rhs"), "pass one of your subclass of km.Dynamics")
     _check_names(dynamics)
-    x, u = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
+    x, u = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu + dynamics.nw)
     value = _check_expression(dynamics.rhs(x, u), f"{type(dynamics).__name__}.rhs", ca.vertcat(x, u), dynamics.nx)
     return ca.Function("f", [x, u], [value], ["x", "u"], ["dx"])
+
+
+@raise_swallowed()
+def split_inputs(F: ca.Function, nu: int, nw: int) -> ca.Function:
+    """Return F(x, u, w) of F(x, [u; w]); F itself without disturbances."""
+    if not nw:
+        return F
+    x, u, w = ca.MX.sym("x", F.size1_in(0)), ca.MX.sym("u", nu), ca.MX.sym("w", nw)
+    split = ca.Function("F", [x, u, w], [F(x, ca.vertcat(u, w))], ["x", "u", "w"], ["x_next"])
+    return split.expand("F") if F.is_a("SXFunction") else split
 
 
 @raise_swallowed()
@@ -108,7 +120,7 @@ def _check_expression(value: object, name: str, known: ca.SX, rows: int | None =
 
 def _check_names(dynamics: Dynamics) -> None:
     """Check that states and inputs are tuples of names, and that there is a state."""
-    for field in ("states", "inputs"):
+    for field in ("states", "inputs", "disturbances"):
         names = cast("object", getattr(dynamics, field, None))
         if not isinstance(names, tuple) or not all(isinstance(n, str) for n in cast("tuple[object]", names)):
             raise DataError(f"{type(dynamics).__name__}.{field} is {names!r}; pass a tuple of names: ('theta [rad]',)")

@@ -126,6 +126,10 @@ class SimulatedPlant:
         checks.members(
             step_map, "the step map", ("dt", "nx", "measure"), "discretize dynamics; pass a Plant without a wrapper"
         )
+        if getattr(step_map, "nw", 0):
+            raise DataError(
+                "the map has measured disturbances: pass it to simulate or collect as it is, with measured="
+            )
         self.step_map, self.dt, self.scene = step_map, step_map.dt, step_map.scene
         self.states, self.inputs, self.outputs = step_map.states, step_map.inputs, step_map.outputs
         self._x: Float[np.ndarray, " nx"] | None = None

@@ -1,4 +1,4 @@
-"""The discrete-time plant x⁺ = F(x, u), y = h(x), immutable: one step, and many episodes at once."""
+"""The discrete-time plant x⁺ = F(x, u, w), y = h(x), immutable: one step, and many episodes at once."""
 
 import subprocess
 import warnings
@@ -16,7 +16,15 @@ from koopmpc import checks
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants import routines
-from koopmpc.plants.dynamics import RK4, Dynamics, Integrator, build_output, build_right_side, find_scene
+from koopmpc.plants.dynamics import (
+    RK4,
+    Dynamics,
+    Integrator,
+    build_output,
+    build_right_side,
+    find_scene,
+    split_inputs,
+)
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Buffered, make_dense
 from koopmpc.scene import Scene
@@ -30,21 +38,23 @@ _CHUNK = 4096  # episodes that run at once, so that their columns stay in the ca
 
 @dataclass(frozen=True, eq=False)
 class Affine(Value):
-    """x⁺ ≈ A x + B u + c: A (nx, nx), B (nx, nu), c (nx,)."""
+    """x⁺ ≈ A x + B u + E w + c: A (nx, nx), B (nx, nu), c (nx,), E (nx, nw)."""
 
     A: Float[np.ndarray, "nx nx"]
     B: Float[np.ndarray, "nx nu"]
     c: Float[np.ndarray, " nx"]
+    E: Float[np.ndarray, "nx nw"]
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class StepMap(Named):
-    """x⁺ = F(x, u), y = h(x), one sample of dt [s].
+    """x⁺ = F(x, u), or F(x, u, w) with measured disturbances w, and y = h(x), one sample of dt [s].
 
     Parameters
     ----------
     F
-        CasADi function of x (nx) and u (nu, may be 0) that returns x⁺ (nx). An F made of SX runs in batches.
+        CasADi function of x (nx) and u (nu, may be 0) that returns x⁺ (nx). An F made of SX runs in batches. A third
+        argument w (nw) holds measured disturbances, such as the weather; calls without w take it as zero.
     dt
         Sample time [s].
     h
@@ -53,6 +63,8 @@ class StepMap(Named):
         Names with units; by default x0, x1, …; u0, …; and the states' names or y0, ….
     scene
         scene(x, u) → shapes, for the animation in the logs; pickling leaves it out.
+    disturbances
+        Names of w with units; by default w0, w1, ….
 
     Raises
     ------
@@ -69,6 +81,7 @@ class StepMap(Named):
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     scene: Scene | None = field(default=None, compare=False)
+    disturbances: tuple[str, ...] = ()
 
     @raise_swallowed()
     def __init__(
@@ -80,6 +93,7 @@ class StepMap(Named):
         inputs: Sequence[str] | None = None,
         outputs: Sequence[str] | None = None,
         scene: Scene | None = None,
+        disturbances: Sequence[str] | None = None,
     ) -> None:
         _check_signature(F, "F", 2)
         nx, nu = F.size1_in(0), F.size1_in(1)
@@ -101,6 +115,7 @@ class StepMap(Named):
             inputs=checks.names(inputs, "inputs", "u", nu),
             outputs=checks.names(outputs, "outputs", "y", h.size1_out(0)),
             scene=scene,
+            disturbances=checks.names(disturbances, "disturbances", "w", F.size1_in(2) if F.n_in() > 2 else 0),
         )
 
     @property
@@ -108,23 +123,31 @@ class StepMap(Named):
         """Number of outputs."""
         return len(self.outputs)
 
-    def __call__(self, x: ArrayLike, u: ArrayLike) -> Float[np.ndarray, " nx"]:
-        """x⁺ = F(x, u): (nx,) from x (nx,) and u (nu,).
+    def __call__(self, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None) -> Float[np.ndarray, " nx"]:
+        """x⁺ = F(x, u, w): (nx,) from x (nx,), u (nu,) and w (nw,), which is zero by default.
 
         NaN passes through. If an implicit method finds no x⁺, the result is NaN and a RuntimeWarning says so.
         """
         x, u = _as_vector(x, "x", len(self.states)), _as_vector(u, "u", len(self.inputs))
         x_next = np.empty(self.nx)
-        self.advance(x, u, x_next)
+        self.advance(x, u, x_next, None if w is None else _as_vector(w, "w", len(self.disturbances)))
         return x_next
 
     def advance(
-        self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"], x_next: Float[np.ndarray, " nx"]
+        self,
+        x: Float[np.ndarray, " nx"],
+        u: Float[np.ndarray, " nu"],
+        x_next: Float[np.ndarray, " nx"],
+        w: Float[np.ndarray, " nw"] | None = None,
     ) -> None:
-        """Write F(x, u) into `x_next`; unlike a call, this does not check the arguments."""
+        """Write F(x, u, w) into `x_next`; unlike a call, this does not check the arguments."""
         step = self._step
-        x_place, u_place = step.arguments
-        x_place[:], u_place[:] = x, u
+        x_place, v_place = step.arguments
+        x_place[:] = x
+        if self.disturbances:
+            v_place[: len(u)], v_place[len(u) :] = u, 0.0 if w is None else w
+        else:
+            v_place[:] = u
         try:
             step.evaluate()
         except RuntimeError as error:
@@ -132,6 +155,14 @@ class StepMap(Named):
             x_next[:] = np.nan
         else:
             x_next[:] = step.results[0]
+
+    def at(self, w: ArrayLike) -> "StepMap":
+        """Return the map x⁺ = F(x, u, w) of constant measured disturbances w (nw,), which takes x and u alone."""
+        values = checks.array(w, "w", (self.nw,))
+        x, u = ca.MX.sym("x", self.nx), ca.MX.sym("u", self.nu)
+        F = ca.Function("F", [x, u], [self.F(x, u, *((ca.DM(values),) if self.nw else ()))], ["x", "u"], ["x_next"])
+        F = F.expand("F") if self.F.is_a("SXFunction") else F
+        return StepMap(F, self.dt, self.h, self.states, self.inputs, self.outputs, self.scene)
 
     def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
         """Return y = h(x): (ny,) from x (nx,)."""
@@ -142,35 +173,64 @@ class StepMap(Named):
         output.evaluate()
         return output.results[0].copy()
 
-    def rollout(self, x0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "steps nx"]:
-        """x_{k+1} = F(x_k, u_k): X (T+1, nx) from x0 (nx,) and U (T, nu), equal to T single calls to the bit."""
+    def rollout(self, x0: ArrayLike, U: ArrayLike, W: ArrayLike | None = None) -> Float[np.ndarray, "steps nx"]:
+        """x_{k+1} = F(x_k, u_k, w_k): X (T+1, nx) from x0 (nx,), U (T, nu) and W (T, nw), to the bit as single calls.
+
+        Without W the measured disturbances are zero.
+        """
         start = checks.array(x0, "x0", (self.nx,))
-        moves = checks.array(U, "U", (None, self.nu))
+        moves = self._drive(checks.array(U, "U", (None, self.nu)), W)
         X = np.empty((len(moves) + 1, self.nx))
         X[0] = start
         _roll_out(self._step, X, moves)
         return X
 
-    def rollouts(self, X0: ArrayLike, U: ArrayLike) -> Float[np.ndarray, "episodes steps nx"]:
-        """x_{k+1} = F(x_k, u_k) for E episodes at once: X (E, T+1, nx) from X0 (E, nx) and U (E, T, nu)."""
+    def rollouts(
+        self, X0: ArrayLike, U: ArrayLike, W: ArrayLike | None = None
+    ) -> Float[np.ndarray, "episodes steps nx"]:
+        """x_{k+1} = F(x_k, u_k, w_k) for E episodes at once: X (E, T+1, nx) from X0 (E, nx), U (E, T, nu).
+
+        W (E, T, nw) are the measured disturbances, zero by default.
+        """
         starts = checks.array(X0, "X0", (None, self.nx))
-        moves = checks.array(U, "U", (len(starts), None, self.nu))
+        moves = self._drive(checks.array(U, "U", (len(starts), None, self.nu)), W)
         X = np.empty((len(starts), moves.shape[1] + 1, self.nx))
         X[:, 0] = starts
         self._batch.fill(X, moves)
         return X
 
-    def linearize(self, x: ArrayLike, u: ArrayLike) -> Affine:
-        """x⁺ ≈ A x + B u + c about (x*, u*): A = ∂F/∂x, B = ∂F/∂u exactly, c = F(x*, u*) − A x* − B u*."""
+    def _drive(self, U: Float[np.ndarray, "... nu"], W: ArrayLike | None) -> Float[np.ndarray, "... nv"]:
+        """Return rows [u w]."""
+        shape = (*U.shape[:-1], self.nw)
+        rows = np.zeros(shape) if W is None else checks.array(W, "W", shape)
+        return np.concatenate([U, rows], axis=-1) if self.nw else U
+
+    def linearize(self, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None) -> Affine:
+        """x⁺ ≈ A x + B u + E w + c about (x*, u*, w*): A, B, E = ∂F/∂x, ∂F/∂u, ∂F/∂w exactly; w* is zero by default.
+
+        c = F(x*, u*, w*) − A x* − B u* − E w*.
+        """
         x, u = checks.array(x, "x", (self.nx,)), checks.vector(u, "u", self.nu)
-        x_next, columns_A, columns_B = self._jacobians(x, u)
+        w = np.zeros(self.nw) if w is None else checks.array(w, "w", (self.nw,))
+        x_next, columns_A, columns_B = self._jacobians(x, np.concatenate([u, w]) if self.nw else u)
         A = np.ascontiguousarray(columns_A.reshape(self.nx, self.nx).T)
-        B = np.ascontiguousarray(columns_B.reshape(self.nu, self.nx).T)
-        return Affine(A, B, x_next - A @ x - B @ u)
+        B, E = np.split(columns_B.reshape(self.nu + self.nw, self.nx).T, [self.nu], axis=1)
+        B, E = np.ascontiguousarray(B), np.ascontiguousarray(E)
+        return Affine(A, B, x_next - A @ x - B @ u - E @ w, E)
+
+    @cached_property
+    @raise_swallowed()
+    def _joint_map(self) -> ca.Function:
+        """F as a function of x and [u; w]; F itself without disturbances."""
+        if not self.nw:
+            return self.F
+        x, v = ca.MX.sym("x", self.nx), ca.MX.sym("v", self.nu + self.nw)
+        F = ca.Function("F", [x, v], [self.F(x, v[: self.nu], v[self.nu :])], ["x", "v"], ["x_next"])
+        return F.expand("F", {"cse": True}) if self.F.is_a("SXFunction") else F
 
     @cached_property
     def _step(self) -> Buffered:
-        return Buffered(self.F)
+        return Buffered(self._joint_map)
 
     @cached_property
     def _batch(self) -> "_Batch":
@@ -191,10 +251,10 @@ class StepMap(Named):
     @cached_property
     @raise_swallowed()
     def _jacobians(self) -> Buffered:
-        x, u = ca.MX.sym("x", self.nx), ca.MX.sym("u", self.nu)
-        x_next = self.F(x, u)
-        A, B = ca.densify(ca.jacobian(x_next, x)), ca.densify(ca.jacobian(x_next, u))
-        together = ca.Function("linearize", [x, u], [x_next, A, B])
+        x, v = ca.MX.sym("x", self.nx), ca.MX.sym("v", self.nu + self.nw)
+        x_next = self._joint_map(x, v)
+        A, B = ca.densify(ca.jacobian(x_next, x)), ca.densify(ca.jacobian(x_next, v))
+        together = ca.Function("linearize", [x, v], [x_next, A, B])
         return Buffered(together.expand("linearize", {"cse": True}) if self.F.is_a("SXFunction") else together)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -203,7 +263,7 @@ class StepMap(Named):
 
 @raise_swallowed()
 def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) -> StepMap:  # noqa: B008
-    """Return x⁺ = F(x, u) of ẋ = f(x, u) over one sample with constant u.
+    """Return x⁺ = F(x, u, w) of ẋ = f(x, u, w) over one sample with constant u and w.
 
     Parameters
     ----------
@@ -233,9 +293,10 @@ def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) ->
     """
     checks.positive(dt, "dt", "s")
     checks.members(integrator, "the integrator", ("step",), "pass one of km.plants, as km.plants.RK4()")
-    F = integrator.step(build_right_side(dynamics), dt)
+    F = split_inputs(integrator.step(build_right_side(dynamics), dt), dynamics.nu, dynamics.nw)
     h, outputs = build_output(dynamics)
-    return StepMap(F, dt, h, dynamics.states, dynamics.inputs, outputs, find_scene(dynamics))
+    names = dynamics.states, dynamics.inputs, outputs
+    return StepMap(F, dt, h, *names, find_scene(dynamics), dynamics.disturbances)
 
 
 def _as_vector(value: ArrayLike, name: str, length: int) -> Float[np.ndarray, " n"]:
@@ -251,12 +312,14 @@ def _as_vector(value: ArrayLike, name: str, length: int) -> Float[np.ndarray, " 
 def _check_signature(function: ca.Function, name: str, arguments: int) -> None:
     checks.members(function, name, ("n_in", "n_out"), "pass a casadi Function")
     wanted = "(x, u)" if arguments == 2 else "(x)"
-    if function.n_in() != arguments or function.n_out() != 1:
+    given = function.n_in()
+    if given not in {arguments, 3 if arguments == 2 else 1} or function.n_out() != 1:
+        with_w = " or F(x, u, w)" if arguments == 2 else ""
         raise ShapeError(
-            f"{name} has {function.n_in()} arguments and {function.n_out()} results, "
-            f"expected {name}{wanted} with one result"
+            f"{name} has {given} arguments and {function.n_out()} results, "
+            f"expected {name}{wanted} with one result{with_w}"
         )
-    sizes = [function.size2_in(i) for i in range(arguments) if function.size1_in(i)] + [function.size2_out(0)]
+    sizes = [function.size2_in(i) for i in range(given) if function.size1_in(i)] + [function.size2_out(0)]
     if any(columns != 1 for columns in sizes):
         raise ShapeError(f"{name} is {function}, expected columns: {name}{wanted} with one column each")
 

@@ -129,11 +129,11 @@ class LinearPredictor(Predictor):
         return X
 
     def step_map(self) -> StepMap:
-        """Return the re-lifted map x⁺ = C (A ψ(x) + B u) as a StepMap, for simulation and nonlinear MPC; w is 0.
+        """Return the re-lifted map x⁺ = C (A ψ(x) + B u + E w) as a StepMap, for simulation and nonlinear MPC.
 
-        With an embedding it is a map of ζ: ζ⁺ = [C (A ψ(ζ) + B u), u, ζ without its oldest step].
+        With an embedding it is a map of ζ: ζ⁺ = [C (A ψ(ζ) + B u + E w), u, ζ without its oldest step].
         """
-        return _build_step_map(self, ())
+        return _build_step_map(self, self.E, self.disturbances)
 
     @cached_property
     def modes(self) -> Complex[np.ndarray, "nx nz"]:
@@ -192,18 +192,20 @@ class LinearPredictor(Predictor):
         return build_system(self.A, self.B, self.C, self.dt)
 
     @classmethod
-    def local(cls, step_map: StepMap, x: ArrayLike, u: ArrayLike) -> "LinearPredictor":
-        """Return the linearisation x⁺ = A x + B u + c at (x, u) as a predictor on State() + Constant().
+    def local(cls, step_map: StepMap, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None) -> "LinearPredictor":
+        """Return the linearisation x⁺ = A x + B u + E w + c at (x, u, w) as a predictor on State() + Constant().
 
-        Exact Jacobians of `step_map`; c = F(x, u) − A x − B u, so (x, u) need not be an equilibrium.
+        Exact Jacobians of `step_map`; c = F(x, u, w) − A x − B u − E w, so (x, u) need not be an equilibrium.
         """
-        affine = step_map.linearize(x, u)
+        affine = step_map.linearize(x, u, w)
         nx, nu = affine.B.shape
         A = np.eye(nx + 1)
         A[:nx, :nx], A[:nx, nx] = affine.A, affine.c
         B = np.vstack([affine.B, np.zeros((1, nu))])
         C = np.eye(nx, nx + 1)
-        return cls(A, B, C, State() + Constant(), step_map.dt, step_map.states, step_map.inputs)
+        E = np.vstack([affine.E, np.zeros((1, step_map.nw))])
+        names = step_map.dt, step_map.states, step_map.inputs
+        return cls(A, B, C, State() + Constant(), *names, E=E, disturbances=step_map.disturbances)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -321,11 +323,11 @@ class BilinearPredictor(Predictor):
         return X
 
     def step_map(self) -> StepMap:
-        """Return the re-lifted map x⁺ = C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)) as a StepMap; with an embedding, of ζ.
+        """Return the re-lifted map x⁺ = C (A ψ(x) + B u + E w + Σ uᵢ Nᵢ ψ(x) + Σ wⱼ Sⱼ ψ(x)) as a StepMap.
 
-        Measured disturbances are zero in it; `at` makes a model of other constant ones.
+        With an embedding it is a map of ζ, whose past w does not move.
         """
-        return _build_step_map(self, self.N)
+        return _build_step_map(self, self.E, self.disturbances, self.N, self.S)
 
 
 def relift_rollout(
@@ -335,18 +337,7 @@ def relift_rollout(
     W: Float[np.ndarray, "T nw"],
 ) -> Float[np.ndarray, "T1 n"]:
     """Return the states, or points under an embedding, of forecasts that are lifted afresh at every step."""
-    if not predictor.nw:
-        return predictor.step_map().rollout(x0, U)
-    points = np.empty((len(U) + 1, len(x0)))
-    points[0] = x0
-    for k, (u, w) in enumerate(zip(U, W, strict=True)):
-        z = predictor.lifting(points[k])
-        z_next = predictor.A @ z + predictor.B @ u + predictor.E @ w
-        if isinstance(predictor, BilinearPredictor):
-            z_next += u @ (predictor.N @ z) + w @ (predictor.S @ z)
-        x, embedding = predictor.C @ z_next, predictor.embedding
-        points[k + 1] = x if embedding is None else embedding.shift(points[k], u, embedding.clip(x))
-    return points
+    return predictor.step_map().rollout(x0, U, W if predictor.nw else None)
 
 
 def load_model(path: str | Path) -> LinearPredictor | BilinearPredictor:
@@ -419,13 +410,23 @@ def _check_scale(scale: ArrayLike, nz: int) -> Float[np.ndarray, "nz nz"]:
 
 
 @raise_swallowed()
-def _build_step_map(predictor: Predictor, N: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray) -> StepMap:
-    """Return x⁺ = C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)) as a StepMap of x, or of ζ under an embedding."""
-    x, u = ca.SX.sym("x", len(predictor.point_names)), ca.SX.sym("u", predictor.nu)
+def _build_step_map(
+    predictor: Predictor,
+    E: Float[np.ndarray, "nz nw"],
+    disturbances: tuple[str, ...],
+    N: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray = (),
+    S: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray = (),
+) -> StepMap:
+    """Return x⁺ = C (A ψ(x) + B u + E w + Σ uᵢ Nᵢ ψ(x) + Σ wⱼ Sⱼ ψ(x)) as a StepMap of x, or of ζ."""
+    x, u, w = (ca.SX.sym(*each) for each in (("x", len(predictor.point_names)), ("u", predictor.nu), ("w", E.shape[1])))
     C, z = predictor.C, predictor.lifting.symbolic(x)
     x_next = ca.DM(C @ predictor.A) @ z + ca.DM(C @ predictor.B) @ u
-    for i, Ni in enumerate(N):
-        x_next += u[i] * (ca.DM(C @ Ni) @ z)
+    for factor, products in ((u, N), (w, S)):
+        for i, each in enumerate(products):
+            x_next += factor[i] * (ca.DM(C @ each) @ z)
+    if disturbances:
+        x_next += ca.DM(C @ E) @ w
     point_next = x_next if predictor.embedding is None else predictor.embedding.symbolic(x, u, x_next)
-    F = ca.Function("F", [x, u], [ca.densify(point_next)], ["x", "u"], ["x_next"], {"cse": True})
-    return StepMap(F, predictor.dt, states=predictor.point_names, inputs=predictor.inputs)
+    arguments, names = ([x, u, w], ["x", "u", "w"]) if disturbances else ([x, u], ["x", "u"])
+    F = ca.Function("F", arguments, [ca.densify(point_next)], names, ["x_next"], {"cse": True})
+    return StepMap(F, predictor.dt, states=predictor.point_names, inputs=predictor.inputs, disturbances=disturbances)

@@ -34,7 +34,7 @@ class LearnedMap:
 
     Of a predictor F is C (A ψ(x) + B u + Σ uᵢ Nᵢ ψ(x)), lifted afresh each step, and θ holds C A, C B and C Nᵢ. Under
     an embedding x is the point ζ of the plant's state and its past, the state first; F also shifts the past, which
-    neither w nor d moves. A StepMap has no θ.
+    neither w nor d moves. The θ of a StepMap is its w.
 
     Attributes
     ----------
@@ -151,10 +151,11 @@ def learned_map(model: ModelOrMap) -> LearnedMap:
     checks.kind(model, "model", kinds, "fit one with bilinear_edmd or edmd, or pass a StepMap")
     ny = len(model.states)
     if isinstance(model, StepMap):
-        x, u, none = ca.MX.sym("x", ny), ca.MX.sym("u", model.nu), ca.MX.sym("theta", 0)
-        F = ca.Function("F", [x, u, none], [ca.densify(model.F(x, u))])
+        nw = model.nw
+        x, u, w = ca.MX.sym("x", ny), ca.MX.sym("u", model.nu), ca.MX.sym("theta", nw)
+        F = ca.Function("F", [x, u, w], [ca.densify(model.F(x, u, w) if nw else model.F(x, u))])
         F = F.expand("F") if model.F.is_a("SXFunction") else F
-        return LearnedMap(model, F, np.zeros(0), np.zeros((ny, 0)), ny, ny, model.nu, 0, None)
+        return LearnedMap(model, F, np.zeros(nw), np.zeros((ny, nw)), ny, ny, model.nu, nw, None, nw)
     nu, nz = model.nu, model.nz
     nx = ny if model.embedding is None else len(model.embedding.names)
     x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
