@@ -279,12 +279,19 @@ class Episodes(Named, Value):
             X_next=np.concatenate([episode.X[1:] for episode in self.episodes]),
         )
 
-    def driven(self) -> "Episodes":
-        """Return these episodes with the measured disturbances appended to the inputs: both drive the plant."""
+    def driven(self, *, products: bool = False) -> "Episodes":
+        """Return these episodes with the measured disturbances appended to the inputs: both drive the plant.
+
+        With `products` the signals uᵢ wⱼ follow, i first.
+        """
         if not self.nw:
             return self
-        joined = [Episode(X=e.X, U=np.hstack([e.U, e.W])) for e in self.episodes]
-        return Episodes(joined, self.dt, self.states, self.inputs + self.disturbances)
+        joined: list[Episode] = []
+        for e in self.episodes:
+            crossed = [(e.U[:, i : i + 1] * e.W) for i in range(self.nu)] if products else []
+            joined.append(Episode(X=e.X, U=np.hstack([e.U, e.W, *crossed])))
+        names = tuple(f"{u} * {w}" for u in self.inputs for w in self.disturbances) if products else ()
+        return Episodes(joined, self.dt, self.states, (*self.inputs, *self.disturbances, *names))
 
     def split(self, fraction: float, rng: np.random.Generator | int = 0) -> "tuple[Episodes, Episodes]":
         """Return (train, held_out): whole episodes drawn at random, of which `fraction` trains.

@@ -90,11 +90,13 @@ class Source(Named, ABC):
         """Number of measured disturbances."""
         return len(self.disturbances)
 
-    def driven(self) -> "Source":
-        """Return a source with the measured disturbances appended to the inputs: both drive the plant."""
+    def driven(self, *, products: bool = False) -> "Source":
+        """Return a source with the measured disturbances appended to the inputs, as `Episodes.driven` does."""
         if not self.nw:
             return self
-        return Changed(self, Episodes.driven, self.states, self.inputs + self.disturbances)
+        names = tuple(f"{u} * {w}" for u in self.inputs for w in self.disturbances) if products else ()
+        change = partial(Episodes.driven, products=products)
+        return Changed(self, change, self.states, (*self.inputs, *self.disturbances, *names))
 
 
 class Held(Source):

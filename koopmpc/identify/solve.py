@@ -237,13 +237,13 @@ def choose_ridge(
 
 
 def centre_products(
-    rows: RegressionRows, nu: int, which: Int[np.ndarray, " np"]
+    rows: RegressionRows, nu: int, which: Int[np.ndarray, " np"], crossed: Sequence[tuple[int, int, int]] = ()
 ) -> tuple[RegressionRows, Float[np.ndarray, "n n"]]:
     """Return the rows with products (u − ū)(ψ − ψ̄) in place of u ψ, and the matrix that turns their K into that of u ψ.
 
-    Both span the same models. A ridge on the products of deviations gives the same model for any origin of the data,
-    while far from the origin u ψ is nearly dependent: u ψ ≈ ū ψ + ψ̄ u. Without a constant column the rows stay the
-    same.
+    `crossed` names further columns of products, each with the two columns of its factors. Both span the same models. A
+    ridge on the products of deviations gives the same model for any origin of the data, while far from the origin u ψ
+    is nearly dependent: u ψ ≈ ū ψ + ψ̄ u. Without a constant column the rows stay the same.
     """
     back = np.eye(rows.P.shape[1])
     if rows.constant is None:
@@ -255,6 +255,9 @@ def centre_products(
         back[which, products] = -mean[first + i]
         back[first + i, products] = -mean[which]
         back[rows.constant, products] = mean[first + i] * mean[which]
+    for product, left, right in crossed:
+        back[left, product], back[right, product] = -mean[right], -mean[left]
+        back[rows.constant, product] = mean[left] * mean[right]
     return replace(rows, P=rows.P @ back), back
 
 

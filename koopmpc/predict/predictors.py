@@ -210,11 +210,11 @@ class LinearPredictor(Predictor):
 
 @dataclass(frozen=True, eq=False, init=False)
 class BilinearPredictor(Predictor):
-    """A lifted bilinear predictor z⁺ = A z + B u + E w + Σ uᵢ Nᵢ z + Σ wⱼ Sⱼ z, x ≈ C z, z₀ = ψ(x₀).
+    """A lifted bilinear predictor z⁺ = A z + (B + Σ wⱼ Mⱼ) u + E w + Σ uᵢ Nᵢ z + Σ wⱼ Sⱼ z, x ≈ C z, z₀ = ψ(x₀).
 
     The effect of an input may depend on the state, as for a force that turns with the body on which it acts. A linear
-    predictor has one B for all states. Measured disturbances w act alike: with S they are scheduling signals of a
-    linear parameter-varying model.
+    predictor has one B for all states. Measured disturbances w act alike: with S and M they are scheduling signals of
+    a linear parameter-varying model, A(w) and B(w).
 
     Attributes
     ----------
@@ -224,6 +224,8 @@ class BilinearPredictor(Predictor):
         (nu, nz, nz), one matrix for each input.
     E, S, disturbances, nw
         (nz, nw) and (nw, nz, nz), the effects of the measured disturbances w, their names, and how many there are.
+    M
+        (nw, nz, nu), how w changes B.
 
     Raises
     ------
@@ -239,6 +241,7 @@ class BilinearPredictor(Predictor):
     N: Float[np.ndarray, "nu nz nz"]
     E: Float[np.ndarray, "nz nw"]
     S: Float[np.ndarray, "nw nz nz"]
+    M: Float[np.ndarray, "nw nz nu"]
     disturbances: tuple[str, ...]
     nw: int = field(init=False)
 
@@ -258,6 +261,7 @@ class BilinearPredictor(Predictor):
         E: ArrayLike | None = None,
         S: ArrayLike | None = None,
         disturbances: Sequence[str] | None = None,
+        M: ArrayLike | None = None,
     ) -> None:
         _store_fields(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
         nz = self.nz
@@ -267,15 +271,17 @@ class BilinearPredictor(Predictor):
         if len(names) != nw:
             raise ShapeError(f"disturbances has {len(names)} names and E {nw} columns; give one name each")
         schedule = np.zeros((nw, nz, nz)) if S is None else checks.bounded(S, "S", (nw, nz, nz))
-        freeze(self, N=checks.bounded(N, "N", (len(inputs), nz, nz)), E=drift, S=schedule, disturbances=names, nw=nw)
+        nu = len(inputs)
+        steer = np.zeros((nw, nz, nu)) if M is None else checks.bounded(M, "M", (nw, nz, nu))
+        freeze(self, N=checks.bounded(N, "N", (nu, nz, nz)), E=drift, S=schedule, M=steer, disturbances=names, nw=nw)
 
     @property
     def is_scheduled(self) -> bool:
-        """Whether a measured disturbance multiplies the state."""
-        return bool(self.S.any())
+        """Whether a measured disturbance multiplies the state or an input."""
+        return bool(self.S.any() or self.M.any())
 
     def at(self, w: ArrayLike) -> "BilinearPredictor":
-        """Return the model without measured disturbances for constant ones, w: A + Σ wⱼ Sⱼ in place of A.
+        """Return the model without measured disturbances for constant ones, w: A + Σ wⱼ Sⱼ for A, B + Σ wⱼ Mⱼ for B.
 
         The part E w is added to it, and needs a `Constant` among the observables.
 
@@ -291,12 +297,12 @@ class BilinearPredictor(Predictor):
         if constant is not None:
             A[:, constant] += push
         about = (self.C, self.lifting, self.dt, self.states, self.inputs, self.report, self.embedding, self.scale)
-        return BilinearPredictor(A, self.B, self.N, *about)
+        return BilinearPredictor(A, self.B + np.tensordot(values, self.M, 1), self.N, *about)
 
     def rollout(
         self, x0: ArrayLike, U: ArrayLike, W: ArrayLike | None = None, *, history: Episode | None = None
     ) -> Float[np.ndarray, "steps nx"]:
-        """Return x_k ≈ C z_k of z_{k+1} = (A + Σ uᵢ Nᵢ + Σ wⱼ Sⱼ) z_k + B u_k + E w_k, z_0 = ψ(x0), lifted once.
+        """Return x_k ≈ C z_k of z_{k+1} = (A + Σ uᵢ Nᵢ + Σ wⱼ Sⱼ) z_k + (B + Σ wⱼ Mⱼ) u_k + E w_k, z_0 = ψ(x0).
 
         Parameters
         ----------
@@ -317,17 +323,17 @@ class BilinearPredictor(Predictor):
         for k, u in enumerate(inputs):
             Z[k + 1] = self.A @ Z[k] + self.B @ u + u @ (self.N @ Z[k])
             if self.nw:
-                Z[k + 1] += self.E @ rows[k] + rows[k] @ (self.S @ Z[k])
+                Z[k + 1] += self.E @ rows[k] + rows[k] @ (self.S @ Z[k] + self.M @ u)
         X = self._clip(Z @ self.C.T)
         X[0] = start[: self.nx]
         return X
 
     def step_map(self) -> StepMap:
-        """Return the re-lifted map x⁺ = C (A ψ(x) + B u + E w + Σ uᵢ Nᵢ ψ(x) + Σ wⱼ Sⱼ ψ(x)) as a StepMap.
+        """Return the re-lifted map x⁺ = C ((A + Σ uᵢ Nᵢ + Σ wⱼ Sⱼ) ψ(x) + (B + Σ wⱼ Mⱼ) u + E w) as a StepMap.
 
         With an embedding it is a map of ζ, whose past w does not move.
         """
-        return _build_step_map(self, self.E, self.disturbances, self.N, self.S)
+        return _build_step_map(self, self.E, self.disturbances, self.N, self.S, self.M)
 
 
 def relift_rollout(
@@ -416,14 +422,15 @@ def _build_step_map(
     disturbances: tuple[str, ...],
     N: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray = (),
     S: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray = (),
+    M: Sequence[Float[np.ndarray, "nz nu"]] | np.ndarray = (),
 ) -> StepMap:
-    """Return x⁺ = C (A ψ(x) + B u + E w + Σ uᵢ Nᵢ ψ(x) + Σ wⱼ Sⱼ ψ(x)) as a StepMap of x, or of ζ."""
+    """Return x⁺ = C ((A + Σ uᵢ Nᵢ + Σ wⱼ Sⱼ) ψ(x) + (B + Σ wⱼ Mⱼ) u + E w) as a StepMap of x, or of ζ."""
     x, u, w = (ca.SX.sym(*each) for each in (("x", len(predictor.point_names)), ("u", predictor.nu), ("w", E.shape[1])))
     C, z = predictor.C, predictor.lifting.symbolic(x)
     x_next = ca.DM(C @ predictor.A) @ z + ca.DM(C @ predictor.B) @ u
-    for factor, products in ((u, N), (w, S)):
+    for factor, products, of in ((u, N, z), (w, S, z), (w, M, u)):
         for i, each in enumerate(products):
-            x_next += factor[i] * (ca.DM(C @ each) @ z)
+            x_next += factor[i] * (ca.DM(C @ each) @ of)
     if disturbances:
         x_next += ca.DM(C @ E) @ w
     point_next = x_next if predictor.embedding is None else predictor.embedding.symbolic(x, u, x_next)

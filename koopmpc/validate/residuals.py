@@ -63,7 +63,8 @@ def compute_moments(
         check_same_names(model, episodes)
         lifting, embedding, bilinear = model.lifting, model.embedding, isinstance(model, BilinearPredictor)
         driven = model.nw > 0
-    rows = episodes.driven() if driven else episodes
+    crossed = not isinstance(model, Lifting) and isinstance(model, BilinearPredictor) and bool(model.M.any())
+    rows = episodes.driven(products=crossed) if driven else episodes
     return second_moments(rows, lifting, embedding=embedding, route="qr", bilinear=bilinear)
 
 
@@ -150,8 +151,10 @@ def _step_matrix(predictor: AnyPredictor, total: Moments) -> Float[np.ndarray, "
         return np.vstack([A, predictor.B.T, predictor.E.T])
     products = total.products
     constant = np.setdiff1d(np.arange(total.nz), products)  # u times the Constant is u: add it to the inputs
-    every = np.concatenate([predictor.N, predictor.S])
-    B = np.hstack([predictor.B, predictor.E]).T + every[:, :, constant].sum(axis=2)
+    crossed = len(total.inputs) - predictor.nu - predictor.nw  # the products of u and w multiply no observable
+    every = np.concatenate([predictor.N, predictor.S, np.zeros((crossed, total.nz, total.nz))])
+    M = predictor.M.transpose(2, 0, 1).reshape(-1, total.nz)[:crossed]
+    B = np.vstack([predictor.B.T, predictor.E.T, M]) + every[:, :, constant].sum(axis=2)
     N = every[:, :, products].transpose(0, 2, 1).reshape(-1, total.nz)
     return np.vstack([A, B, N])
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -177,6 +178,9 @@ def compare_forecasts(
     width = nx if relift else nz
     M = np.ascontiguousarray(np.swapaxes(M, 1, 2)).reshape(len(models), nz, -1)  # one product a step gives A z and N z
     for X, V, rows in _split_blocks(points, starts, horizon, first.nw, len(models)):
+        if any(map(_multiplies_inputs, models)):
+            U, W = V[:, : first.nu], V[:, first.nu :]
+            V = np.hstack([V, *(w[:, None] * U for w in W.T)])
         point = np.repeat(X[rows][None], len(models), axis=0)
         z = np.repeat(first.lifting(X[rows])[None], len(models), axis=0)
         truth = np.empty((horizon, len(rows), nx))
@@ -206,11 +210,17 @@ def compare_forecasts(
 def _transpose_matrices(
     model: AnyPredictor,
 ) -> tuple[Float[np.ndarray, "products nz nz"], Float[np.ndarray, "nv nz"], Float[np.ndarray, "nz nx"]]:
-    """Return [Aᵀ, N₁ᵀ …, S₁ᵀ …], [B E]ᵀ and Cᵀ."""
+    """Return [Aᵀ, N₁ᵀ …, S₁ᵀ …], [B E M₁ …]ᵀ and Cᵀ; M where w multiplies inputs."""
     A = model.A.T[None]
     if isinstance(model, BilinearPredictor):
         A = np.concatenate([A, model.N.transpose(0, 2, 1), model.S.transpose(0, 2, 1)])
-    return A, np.hstack([model.B, model.E]).T, model.C.T
+    crossed = model.M if _multiplies_inputs(model) else ()
+    return A, np.hstack([model.B, model.E, *crossed]).T, model.C.T
+
+
+def _multiplies_inputs(model: AnyPredictor) -> TypeGuard[BilinearPredictor]:
+    """Return whether measured disturbances multiply inputs of the model."""
+    return isinstance(model, BilinearPredictor) and bool(model.M.any())
 
 
 _Slice = tuple[Episode, Int[np.ndarray, "_"]]  # an episode and its starts in this block

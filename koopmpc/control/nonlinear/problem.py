@@ -170,6 +170,9 @@ def learned_map(model: ModelOrMap) -> LearnedMap:
         for j in range(scheduled):
             theta.append(ca.SX.sym(f"CS{j}", ny, nz))
             A = A + w[j] * theta[-1]
+        for j in range(scheduled):
+            theta.append(ca.SX.sym(f"CM{j}", ny, nu))
+            B = B + w[j] * theta[-1]
         theta.append(w)
     x_next = A @ z + B @ u
     if model.embedding is not None:
@@ -182,7 +185,7 @@ def learned_map(model: ModelOrMap) -> LearnedMap:
 def _theta(model: LinearPredictor | BilinearPredictor) -> Float[np.ndarray, " nt"]:
     parts = [model.A, model.B, *(model.N if isinstance(model, BilinearPredictor) else ())]
     schedule = isinstance(model, BilinearPredictor) and model.is_scheduled
-    parts += list(model.S) if isinstance(model, BilinearPredictor) and schedule else []
+    parts += [*model.S, *model.M] if isinstance(model, BilinearPredictor) and schedule else []
     theta = np.concatenate([(model.C @ part).ravel("F") for part in parts])
     return np.concatenate([theta, np.zeros(model.nw)]) if schedule else theta
 

@@ -1,4 +1,4 @@
-"""Bilinear extended dynamic mode decomposition: z⁺ = A z + B u + E w + Σ uᵢ Nᵢ z + Σ wⱼ Sⱼ z on z = ψ(x)."""
+"""Bilinear extended dynamic mode decomposition: z⁺ = A z + (B + Σ wⱼ Mⱼ) u + E w + Σ uᵢ Nᵢ z + Σ wⱼ Sⱼ z, z = ψ(x)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -38,6 +38,7 @@ def bilinear_edmd(
     rank: Rank = None,
     products: Sequence[str] | None = None,
     difference: bool = False,
+    scheduled_inputs: bool = False,
     **options: Unpack[ReadOptions],
 ) -> BilinearPredictor:
     """Fit ψ(x⁺) = A ψ(x) + B u + E w + Σ uᵢ Nᵢ ψ(x) + Σ wⱼ Sⱼ ψ(x) by least squares on M snapshot pairs.
@@ -67,14 +68,16 @@ def bilinear_edmd(
         Regress ψ(x⁺) − ψ(x) and add I to A. Without a ridge and on independent columns the model is the same. With a
         ridge, or a cut of singular values, the model is drawn towards z⁺ = z instead of z⁺ = 0. For a short dt this is
         closer to the plant.
+    scheduled_inputs
+        Also fit Σ wⱼ Mⱼ u: measured disturbances change what inputs do, as the cold does to a heat pump.
     **options
         ``weights``, ``workers``, ``scheduler`` and ``progress``, as in `km.moments.second_moments`.
 
     Raises
     ------
     DataError
-        The data have no inputs, ridge is negative, products and a rank are both given, or an observable is not
-        finite on the data.
+        The data have no inputs, ridge is negative, products and a rank are both given, an observable is not finite on
+        the data, or scheduled_inputs go with a rank or with data without W.
     ObservableError
         The lifting does not hold one of the products.
 
@@ -104,16 +107,26 @@ def bilinear_edmd(
     ridge = check_ridge(ridge)
     if rank is not None and products is not None:
         raise DataError("a rank mixes all observables, so inputs cannot multiply some of them; pass one of the two")
+    if scheduled_inputs and (rank is not None or not source.nw):
+        raise DataError(
+            "scheduled_inputs multiply inputs by measured disturbances, without a rank: give each Episode its W, and "
+            "leave rank out"
+        )
     delays = embedding if embedding is None or not source.nw else embedding.match(source.states, source.inputs)
-    total = second_moments(source.driven(), lifting, bilinear=True, embedding=delays, **options)
+    signals = source.driven(products=scheduled_inputs)
+    total = second_moments(signals, lifting, bilinear=True, embedding=delays, **options)
     regression = build_regression(total, "bilinear_edmd", disturbances=source.disturbances)
     assert regression.C is not None, "an extended regression has its C"
-    bound, nz, nu = regression.lifting, total.nz, source.nu + source.nw
+    bound, nz, own, nu = regression.lifting, total.nz, source.nu, source.nu + source.nw
+    nm = len(total.inputs) - nu
+    crossed = [(nz + own * j + i, nz + nm + i, nz + nm + own + j) for j in range(source.nw) for i in range(own)][:nm]
     which = total.products if products is None else _find_products(total, products)
-    rows = _keep_products(regression.rows, total, which)
-    names = tuple(f"{u} * {bound.names[int(i)]}" for u in total.inputs for i in which)
+    rows = _keep_products(regression.rows, total, which, source)
+    names = tuple(f"{u} * {bound.names[int(i)]}" for u in total.inputs[:nu] for i in which)
     regular = ridge != 0 or rank is not None
-    sentences, condition = find_doubts(rows, bound.names, (*total.inputs, *names), regular=regular)
+    multiplied = [f"{u} * {w}" for w in source.disturbances for u in source.inputs][:nm]
+    columns = (*multiplied, *total.inputs[:nu], *names)
+    sentences, condition = find_doubts(rows, bound.names, columns, regular=regular)
     P, C, basis, state_residual, words = rows.P, regression.C, np.eye(nz), regression.state_residual, ""
     if rank is not None:
         basis, words = leading_directions(rows, nz, rank, sentences)
@@ -124,17 +137,17 @@ def bilinear_edmd(
     start = np.eye(P.shape[1], r) @ basis.T * difference  # K of the model z⁺ = z, or zero
     constant = rows.constant if rank is None else None
     change = RegressionRows(P, rows.T[:, :nz] - P @ start, rows.rest[:nz], rows.samples, constant)
-    shifted, back = centre_products(change, nu, which)
+    shifted, back = centre_products(change, nu, which, crossed)
     solution = solve(shifted, ridge=ridge)
     K = (back @ solution.K + start) @ basis
     N = np.zeros((nu, r, r))
-    N[:, :, which] = K[r + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
+    first = r + nm
+    N[:, :, which] = K[first + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
     regression = replace(regression, rows=replace(rows, P=P, constant=constant))
     solved = describe_solve(regression.rows, ridge, solution.ridge)
-    own = source.nu
     result = FitResult(
         A=K[:r].T,
-        B=K[r : r + own].T,
+        B=K[first : first + own].T,
         C=C,
         lifting=bound,
         residual=regression.rows.residual(regression.x_next, K @ C.T),
@@ -157,8 +170,9 @@ def bilinear_edmd(
         build_report(regression, result),
         regression.embedding,
         compute_scale_factor(P[:, :r], rows.samples),
-        E=K[r + own : r + nu].T if source.nw else None,
+        E=K[first + own : first + nu].T if source.nw else None,
         S=N[own:] if source.nw else None,
+        M=K[r:first].reshape(source.nw, own, r).transpose(0, 2, 1) if nm else None,
         disturbances=source.disturbances if source.nw else None,
     )
 
@@ -174,12 +188,20 @@ def _find_products(total: Moments, products: Sequence[str]) -> Int[np.ndarray, "
     return np.intersect1d([place[name] for name in products], total.products).astype(np.intp)
 
 
-def _keep_products(rows: RegressionRows, total: Moments, which: Int[np.ndarray, " np"]) -> RegressionRows:
-    """Return the rows with only those products u⊗ψ(x) whose observables are in `which`."""
-    first = total.nz + len(total.inputs)
+def _keep_products(
+    rows: RegressionRows, total: Moments, which: Int[np.ndarray, " np"], source: Source
+) -> RegressionRows:
+    """Return the rows [ψ u⊗w u w u⊗ψ w⊗ψ] with only those observables in `which` in the last two.
+
+    The products of u and w, where there are some, stand w first.
+    """
+    nz, own, nw = total.nz, source.nu, source.nw
+    nu, first = own + nw, nz + len(total.inputs)
     block = np.flatnonzero(np.isin(total.products, which))
-    columns = [first + i * len(total.products) + block for i in range(len(total.inputs))]
-    return replace(rows, P=rows.P[:, np.concatenate([np.arange(first), *columns])])
+    crossed = [nz + nu + nw * i + j for j in range(nw) for i in range(own)][: first - nz - nu]
+    columns = [first + i * len(total.products) + block for i in range(nu)]
+    order = [np.arange(nz), np.array(crossed, dtype=np.intp), nz + np.arange(nu), *columns]
+    return replace(rows, P=rows.P[:, np.concatenate(order)])
 
 
 def _project_rows(
