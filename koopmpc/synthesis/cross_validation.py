@@ -17,9 +17,11 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, join_sets
 from koopmpc.data.smoother import Glitch, Mender, Smoother
 from koopmpc.data.source import Changed, EpisodesMap, Held, Source
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments, space_evenly
+from koopmpc.identify.records.hidden_structure import HiddenStructure
+from koopmpc.identify.records.state_space import fit_hidden
 from koopmpc.identify.records.structure import Structure, solve_structure
 from koopmpc.identify.regression import Regression, build_regression
 from koopmpc.identify.solve import centre_products, solve_path
@@ -350,6 +352,8 @@ def cross_validate(trial: Trial) -> Tried:
     The moments of each fold are read once. The moments of all data except a fold are the sum over the other folds. A
     further ridge costs neither a pass over the data nor a decomposition.
     """
+    if isinstance(trial.candidate.structure, HiddenStructure):
+        return _cross_validate_hidden(trial, trial.candidate.structure)
     start = perf_counter()
     count = max(trial.fold) + 1
     folds = [select_fold(trial.episodes, trial.fold, i) for i in range(count)]
@@ -368,6 +372,22 @@ def cross_validate(trial: Trial) -> Tried:
         misfit=_misfit(trial.candidate, total),
         seconds=perf_counter() - start,
     )
+
+
+def _cross_validate_hidden(trial: Trial, structure: HiddenStructure) -> Tried:
+    """Cross-validate a model with a hidden state, whose fit sees rows and no moments, and needs no ridge."""
+    start, count, sizes = perf_counter(), max(trial.fold) + 1, _sizes(trial.episodes)
+    errors = np.full((1, count, trial.horizon), np.inf)
+    with hide_fit_warnings():
+        whole = fit_hidden(structure, trial.episodes, quick=True)
+        for i in range(count):
+            try:
+                model = fit_hidden(structure, drop_fold(trial.episodes, trial.fold, i), quick=True)
+            except KoopmpcError:  # what is left is too short
+                continue
+            errors[:, i] = _errors(trial, [model], select_fold(trial.episodes, trial.fold, i), sizes)
+    inputs = trial.episodes.nu + trial.episodes.nw
+    return Tried(trial.candidate, (0.0,), errors, inputs, whole.A[None], np.inf, perf_counter() - start)
 
 
 def leave_one_out(parts: Sequence[Moments]) -> list[Moments]:

@@ -22,6 +22,7 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Present
 from koopmpc.lifting.state import State
 from koopmpc.parallel import StageProgress, Workers
+from koopmpc.predict.hidden_state import HiddenState
 from koopmpc.synthesis.asked import (
     DesignTask,
     check_task,
@@ -72,6 +73,7 @@ from koopmpc.synthesis.fresh.loops import (
 )
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap
 from koopmpc.synthesis.fresh.promise import CoveragePromise
+from koopmpc.synthesis.hidden_states import propose_hidden_states
 from koopmpc.synthesis.judging import (
     Job,
     LoopTest,
@@ -82,6 +84,7 @@ from koopmpc.synthesis.judging import (
     measure_errors,
     rate_runs,
 )
+from koopmpc.synthesis.records import is_record
 from koopmpc.synthesis.select import RIDGES, extend_past, report_stage
 from koopmpc.synthesis.surrogates import (
     choose_surrogates,
@@ -169,7 +172,7 @@ def design(
         Models to try, as in `select`.
     delays
         Past steps to try in an embedding; by default 0, 1 and 2, and 4 where the data show a hidden state,
-        see `select`.
+        see `select`. Of records that show one, models with a hidden state are tried too.
     bilinear
         Try bilinear models too; the surrogates are then bilinear.
     tighten
@@ -252,6 +255,8 @@ def design(
     if hidden and delays is None:
         past = extend_past(past, held, measured)
     models = _list_models(held, asked, candidates, past, bilinear, draw)
+    if hidden and delays is None and candidates is None and is_record(held) and _tracks_states(asked):
+        models += propose_hidden_states(measured, bilinear, report_stage(progress, "hidden states"))
     first = max(one.delays for one in models)
     room = int(np.median([len(episode) for episode in held])) - first
     forecast = min(ahead, max(room, 1))
@@ -264,7 +269,10 @@ def design(
             f"{len(held)} episodes give {folds.number} folds, and a design needs {FOLDS}: one to judge on and two to "
             f"learn from; pass more episodes of {forecast + first} steps or more, or a shorter horizon"
         )
-    trials = [Trial(one, folds.episodes, folds.fold, forecast, first, RIDGES, relift=True) for one in models]
+    trials = [
+        Trial(one, folds.episodes, folds.fold, forecast, first, RIDGES if one.structure is None else (0.0,), True)
+        for one in models
+    ]
     with Workers(workers, scheduler) as pool:
         results = pool.map(
             cross_validate, trials, report_stage(progress, "models"), size=lambda trial: trial.candidate.size
@@ -316,7 +324,8 @@ def design(
         recipe = replace(rows[plain].recipe, estimator=None)
         model = recipe.fit(source, workers=workers, scheduler=scheduler)
         standby = recipe.controller(model, asked.cost, test.limits(outcomes[plain].band), ahead)
-    embedding = test.surrogates[0].model.embedding
+    pasts = [one.model.embedding for one in test.surrogates]  # rows are compared by what was measured
+    embedding = next((past for past in pasts if not isinstance(past, HiddenState)), pasts[0])
     neighbours = NeighbourMap.of(test.episodes, embedding, test.surrogates[0].noise, test.ignored, test.turning)
     drawn_from = LoopPool(asked, test.surrogates, neighbours, test.low, test.high)
     promise: CoveragePromise | None = None
@@ -384,6 +393,11 @@ def _confirm_first(
     return None, None
 
 
+def _tracks_states(asked: DesignTask) -> bool:
+    """Return whether cost and limits are of states alone, which models with a hidden state have as outputs."""
+    return all(of is None or isinstance(of, State) for of in (asked.cost.of, asked.limits.of))
+
+
 def _list_models(
     held: Episodes,
     asked: DesignTask,
@@ -410,14 +424,16 @@ def _list_models(
 def _list_first_round(results: Sequence[Tried], floor: float) -> list[Recipe]:
     """Return the recipes of the first round: the five best models of each kind, and plain linear ones with Q_N = Q.
 
-    Plain linear models are also tried with the smallest ridge, as in a textbook fit.
+    Models with a hidden state are few, and all of them are judged. Plain linear models are also tried with the smallest
+    ridge, as in a textbook fit.
     """
     places = [tried.best(floor) for tried in results]
     worst = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
     ranked = sorted(range(len(results)), key=lambda i: (worst[i], i))
     found: list[Recipe] = []
     for bilinear in (False, True):
-        best = [i for i in ranked if results[i].candidate.bilinear == bilinear][:_FIRST_ROUND]
+        same = [i for i in ranked if results[i].candidate.bilinear == bilinear]
+        best = same[:_FIRST_ROUND] + [i for i in same[_FIRST_ROUND:] if results[i].candidate.structure is not None]
         found += [Recipe(results[i].candidate, results[i].ridges[places[i]]) for i in best]
     for one, place in zip(results, places, strict=True):
         if one.candidate.name == "x, 1" and not one.candidate.bilinear:
@@ -469,7 +485,8 @@ def _judge_rounds(
             rate_runs([outcomes[0], *outcomes[len(estimators) : len(estimators) + len(ends) - 1]]), test.weights
         )
         end = ends[int(np.argmin(tried_ends))] if tried_ends.min() < (1 - GAINED) * tried_ends[0] else {}
-        third.append(replace(bilinear[0], estimator=best, weighted=True, **end))
+        if bilinear[0].candidate.structure is None:  # fits of hidden states know no weights
+            third.append(replace(bilinear[0], estimator=best, weighted=True, **end))
         third += [replace(one, estimator=best, **end) for one in bilinear[1:]]
         if end and best is not None:
             third.append(replace(bilinear[0], estimator=best, **end))

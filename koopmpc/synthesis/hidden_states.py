@@ -8,14 +8,15 @@ from jaxtyping import Float
 
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError, hide_fit_warnings
-from koopmpc.identify.records.hidden_structure import HiddenStructure, choose_hidden, find_rails, thin_records
+from koopmpc.identify.records.hidden_structure import HiddenStructure, choose_hidden, find_rails
 from koopmpc.identify.records.narx import FOLDS
-from koopmpc.identify.records.neural import PIECE, ROWS, search_neural
+from koopmpc.identify.records.neural import search_neural
 from koopmpc.identify.records.state_space import fit_hidden, search_hidden
 from koopmpc.identify.records.subspace import choose_sizes
 from koopmpc.parallel import Progress
 from koopmpc.predict.base import sorted_eigen
 from koopmpc.predict.predictors import BilinearPredictor
+from koopmpc.synthesis.candidates import Candidate
 from koopmpc.synthesis.leaderboard import LeaderboardRow
 from koopmpc.synthesis.records import FreeRun, cut_pieces, forecast_rows, judge_free_run
 from koopmpc.validate.scoring import AnyPredictor
@@ -38,12 +39,13 @@ def judge_hidden_states(
     short: int | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[LeaderboardRow, FreeRun]]:
-    """Return the best models with a hidden state, one of each kind, and how they run over stretches that no fit saw.
+    """Return the best models with a hidden state of each kind, and how they run over stretches that no fit saw.
 
     The kinds are the subspace model, the linear and the polynomial one of least simulation error, and where a sensor
-    rests at its least or largest reading, the polynomial one with these rails; and for one or two sensors the one with
-    neurons, with the rails if the best one before has them. With neurons only what is calm and errs by a tenth less
-    than all others is judged. Where records are too short for a kind, it is left out.
+    rests at its least or largest reading, the polynomial one with these rails; and for one or two sensors those with
+    neurons, with the rails if the best one before has them. With neurons the best of each order is judged, if it is
+    calm and errs by a tenth less than all others. Where records are too short for a kind, it is left out; so is a model
+    that on the first stretches errs by half more than the best one before.
 
     Parameters
     ----------
@@ -61,7 +63,26 @@ def judge_hidden_states(
         Called with what is done and how many there are.
     """
     begun = perf_counter()
+    found = search_hidden_states(measured, bilinear, rival, progress)
+    searched = (perf_counter() - begun) / max(len(found), 1)
+    results: list[tuple[LeaderboardRow, FreeRun]] = []
+    for structure in found:
+        best = min((run for _, run in results if run.calm), key=lambda run: run.error, default=None)
+        try:
+            result = _judge(structure, measured, first, horizon, short or horizon, searched, best)
+        except KoopmpcError:
+            continue
+        if result is not None:
+            results.append(result)
+    return results
+
+
+def search_hidden_states(
+    measured: Episodes, bilinear: bool, rival: float = np.inf, progress: Progress | None = None
+) -> list[HiddenStructure]:
+    """Return the best structure of each kind, as `judge_hidden_states` lists them; of those that err far more, none."""
     found: list[HiddenStructure] = []
+    neural: list[HiddenStructure] = []
     try:
         (order,), (delays,), errors = choose_sizes(measured)
         found.append(HiddenStructure(order, 1, delays, 0, None, errors, True, order * (order + 1 + measured.nu)))
@@ -92,37 +113,29 @@ def judge_hidden_states(
             tried = []
         best = min([rival, *(one.error for one in found if one.calm)])
         calm = [one for one in tried if one.calm and one.error < PAYS * best]
-        found += [choose_hidden(calm)] if calm else []
-    least = min((one.error for one in found), default=np.inf)
-    found = [one for one in found if one.error < FAR * min(least, rival)]
-    searched = (perf_counter() - begun) / max(len(found), 1)
-    results: list[tuple[LeaderboardRow, FreeRun]] = []
-    for structure in found:
+        orders = sorted({one.order for one in calm})
+        neural = [choose_hidden([one for one in calm if one.order == order]) for order in orders]
+        neural.sort(key=lambda one: one.parameters)  # the others race against the smallest
+    least = min([rival, *(one.error for one in (*found, *neural))])
+    return [*(one for one in found if one.error < FAR * least), *neural]
+
+
+def propose_hidden_states(episodes: Episodes, bilinear: bool, progress: Progress | None = None) -> list[Candidate]:
+    """Return candidates with a hidden state, the best of each kind; none where the records are too short."""
+    found: list[Candidate] = []
+    for structure in search_hidden_states(episodes, bilinear, progress=progress):
         try:
-            results.append(_judge(structure, measured, first, horizon, short or horizon, searched))
+            with hide_fit_warnings():
+                model = fit_hidden(structure, episodes, quick=True)
         except KoopmpcError:
             continue
-    return results
+        name = _name_structure(structure)
+        found.append(Candidate(name, model.lifting, model.embedding, isinstance(model, BilinearPredictor), structure))
+    return found
 
 
-def _judge(
-    structure: HiddenStructure, measured: Episodes, first: int, horizon: int, short: int, searched: float
-) -> tuple[LeaderboardRow, FreeRun]:
-    """Return the line of the leaderboard and the free runs of a structure."""
-    begun, models = perf_counter(), list[AnyPredictor]()
-    size = (ROWS, PIECE) if structure.neurons else ()
-    data = measured if len(measured) > 1 else thin_records(measured, *size)
-
-    def fit(episodes: Episodes) -> AnyPredictor:
-        with hide_fit_warnings():
-            models.append(fit_hidden(structure, episodes, quick=True))
-        return models[-1]
-
-    start = max(first, structure.delays)
-    run = judge_free_run(fit, data, data, start, short, relift=structure.is_nonlinear)
-    run = replace(run, calm=run.calm and bool(run.errors.max() < LOST))
-    errors, whole = _errors_ahead(models, data, start, horizon), models[-1]
-    radius = float(np.abs(sorted_eigen(whole.A)[0][0]))
+def _name_structure(structure: HiddenStructure) -> str:
+    """Return the name of a candidate."""
     rails = "" if structure.rails is None else ", saturating sensor"
     how = "simulation error" if structure.horizon else "subspace"
     name = f"hidden state of order {structure.order}"
@@ -130,8 +143,35 @@ def _judge(
         name += f", {structure.neurons} neuron{'s' * (structure.neurons != 1)}"
     else:
         name += f", degree {structure.degree}" if structure.is_nonlinear else f", {how}"
+    return name + rails
+
+
+def _judge(
+    structure: HiddenStructure,
+    measured: Episodes,
+    first: int,
+    horizon: int,
+    short: int,
+    searched: float,
+    rival: FreeRun | None,
+) -> tuple[LeaderboardRow, FreeRun] | None:
+    """Return the line of the leaderboard and the free runs of a structure; None where a rival does much better."""
+    begun, models = perf_counter(), list[AnyPredictor]()
+
+    def fit(episodes: Episodes) -> AnyPredictor:
+        with hide_fit_warnings():
+            models.append(fit_hidden(structure, episodes, quick=True))
+        return models[-1]
+
+    start = max(first, structure.delays)
+    run = judge_free_run(fit, measured, measured, start, short, relift=structure.is_nonlinear, rival=rival)
+    if len(models) <= FOLDS:
+        return None
+    run = replace(run, calm=run.calm and bool(run.errors.max() < LOST))
+    errors, whole = _errors_ahead(models, measured, start, horizon), models[-1]
+    radius = float(np.abs(sorted_eigen(whole.A)[0][0]))
     row = LeaderboardRow(
-        name=name + rails,
+        name=_name_structure(structure),
         bilinear=isinstance(whole, BilinearPredictor),
         nz=whole.nz,
         size=structure.parameters,

@@ -7,6 +7,7 @@ from operator import methodcaller
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Changed, Held, Source
@@ -41,6 +42,8 @@ _ITERATIONS = 12  # Levenberg-Marquardt steps of a refinement
 _GAIN = 0.98  # keep a refinement if it lowers the error on unseen rows to less than this share
 _PAYS = 0.9  # take a hidden state if it lowers the error on unseen rows to less than this share
 _LOST = 1e3  # a free run counts as this many spreads at most
+_BEHIND = 1.5  # a model that errs by this many times a rival's error on the first quarters is not fitted to others
+_LONGEST = 4000  # rows of a free run that judges finalists, at most; the search for terms cuts shorter pieces
 
 
 def is_record(episodes: Episodes) -> bool:
@@ -164,7 +167,7 @@ class FreeRun(Value):
     @property
     def error(self) -> float:
         """Geometric mean of the errors of the blocks."""
-        return float(np.exp(np.log(np.maximum(self.errors, EXACT)).mean()))
+        return _mean(self.errors)
 
 
 def judge_free_run(
@@ -175,8 +178,11 @@ def judge_free_run(
     horizon: int,
     *,
     relift: bool,
+    rival: FreeRun | None = None,
 ) -> FreeRun:
     """Return how a fit does on each quarter of the records when it learns from the others.
+
+    Where it errs by far more than a `rival` on the first quarters, it is not fitted to the others, and has lost there.
 
     Parameters
     ----------
@@ -190,6 +196,8 @@ def judge_free_run(
         Steps of the short forecasts.
     relift
         Lift the forecasts at every step.
+    rival
+        How another model did on the same stretches.
     """
     seen, truth = cut_pieces(learned), cut_pieces(measured)
     scale = np.concatenate([episode.X for episode in truth]).std(axis=0)
@@ -200,7 +208,14 @@ def judge_free_run(
         kept = [e.cut(a, b) for e, (low, high) in zip(seen, spans, strict=True) for a, b in ((0, low), (high, len(e)))]
         model = fit(truth.with_episodes([e for e in kept if len(e) > first]))
         errors += _stretch_errors(model, truth, spans, scale, first, horizon, relift=relift)
+        if rival is not None and _mean(errors) > _BEHIND * _mean(rival.errors[: len(errors)]):
+            return FreeRun(np.array(errors + [_LOST] * (len(rival.errors) - len(errors))), False)
     return FreeRun(np.array(errors), _is_calm(fit(seen), truth, first, relift))
+
+
+def _mean(errors: ArrayLike) -> float:
+    """Return the geometric mean of errors."""
+    return float(np.exp(np.log(np.maximum(errors, EXACT)).mean()))
 
 
 def _stretch_errors(
@@ -295,10 +310,10 @@ def _root_mean_square(gaps: Float[np.ndarray, "*rows nx"]) -> float:
 
 
 def cut_pieces(episodes: Episodes) -> Episodes:
-    """Return the records in pieces of at most 1500 rows, of very long data evenly spread ones."""
+    """Return the records in pieces of at most 4000 rows, of very long data evenly spread ones."""
     pieces: list[Episode] = []
     for e in episodes:
-        count = -(-len(e) // PIECE)
+        count = -(-len(e) // _LONGEST)
         pieces += [e.cut(len(e) * i // count, len(e) * (i + 1) // count) for i in range(count)]
     return episodes.with_episodes(pieces[:: -(-sum(map(len, pieces)) // ROWS)])
 
@@ -363,8 +378,12 @@ def judge_finalists(
         if progress is not None:
             progress(done, len(places))
         row = rows[place]
-        if isinstance(row.structure, Structure):  # the search for its terms ran it freely
-            runs[place] = FreeRun(row.structure.errors, row.structure.calm)
+        if isinstance(row.structure, Structure):
+            if max(map(len, measured)) <= PIECE:  # the search for its terms ran it freely on the same pieces
+                runs[place] = FreeRun(row.structure.errors, row.structure.calm)
+            else:
+                again = partial(fit_structure, row.structure)
+                runs[place] = judge_free_run(again, measured, measured, first, horizon, relift=row.bilinear)
             continue
         fit = partial(_fit_quietly, row.candidate, row.ridge)
         run = judge_free_run(fit, learned, measured, first, horizon, relift=row.bilinear)

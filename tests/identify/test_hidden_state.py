@@ -272,7 +272,7 @@ def test_refinement_of_a_hidden_state_is_never_worse_on_held_out_rows():
     assert after <= before
 
 
-def test_bilinear_mpc_controls_a_hidden_state(tanks):
+def test_bilinear_mpc_controls_a_hidden_state_and_is_refused_by_export(tanks, tmp_path):
     _, model = tanks
     mpc = km.BilinearMPC(model, km.Cost(Q=1.0, R=1e-3), km.Limits(u_min=0.0, u_max=1.2), 20)
     x, u = np.array([0.5, 0.5]), np.array([0.5])
@@ -280,7 +280,9 @@ def test_bilinear_mpc_controls_a_hidden_state(tanks):
         u = mpc([min(x[1], 1.2)], [0.9]).u
         x = x + np.array([0.3 * u[0] - 0.2 * x[0] - 0.1 * x[0] ** 2, 0.25 * x[0] - 0.2 * x[1]])
     assert abs(x[1] - 0.9) < 0.02
-    assert "hidden state" in mpc.program([0.9]).obstacle
+    with pytest.raises(DataError, match=r"hidden state with nonlinear dynamics.*subspace"):
+        km.export(mpc, tmp_path / "c")
+    assert not (tmp_path / "c").exists()
 
 
 def test_wrong_rails_and_short_records_are_refused_in_a_sentence():

@@ -5,6 +5,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.errors import DataError
+from tests.compiler import needs_compiler
 
 
 def linear_plant(rng, order, ny=1, nu=1):
@@ -108,6 +109,25 @@ def test_controllers_files_and_c_take_the_model(tmp_path):
     for _ in range(80):
         x = A @ x + B @ mpc(C @ x, [0.3]).u
     assert abs(C @ x - 0.3) < 0.01
+
+
+@needs_compiler
+@pytest.mark.parametrize("estimator", [None, km.LiftedDisturbance()], ids=["plain", "offset-free"])
+def test_c_of_a_controller_on_a_hidden_state_gives_the_inputs_of_python(estimator):
+    rng = np.random.default_rng(6)
+    A, B, C = linear_plant(rng, 2)
+    model = km.identify.subspace(record_of((A, B, C), rng, noise=0.01), 2, delays=4)
+    limits = km.Limits(u_min=-0.5, u_max=0.5)
+    mpc = km.KoopmanMPC(model, km.Cost(Q=1.0, R=1e-2), limits, 15, estimator=estimator)
+    machine = km.compiled(mpc)
+    x, worst, bound = np.zeros(2), 0.0, 0
+    for k in range(200):
+        y, goal = C @ x + 0.01 * rng.standard_normal(1), [np.sign(np.sin(0.1 * k))]
+        u, same = mpc(y, goal).u, machine(y, goal).u
+        worst, bound = max(worst, float(np.abs(u - same).max())), bound + bool(np.abs(u[0]) > 0.499)
+        x = A @ x + B @ u + 0.05
+    assert worst < 1e-9
+    assert 0 < bound < 200  # with the limit and without
 
 
 def test_what_cannot_be_fitted_is_refused_in_a_sentence():

@@ -449,3 +449,37 @@ def test_one_record_of_a_sensor_tries_as_much_of_the_past_as_many_episodes():
     found = designed(record, km.Cost(Q=1.0, R=0.1), limits, reference=[0.0], delays=None)
     assert any(sentence.startswith("a hidden state shows") for sentence in found.advice)
     assert {row.recipe.candidate.delays for row in found.leaderboard} == {0, 1, 2}
+
+
+def hidden_record(rows=600, seed=0):
+    """Return one record of a tank's level; the valve that feeds it lags, and its position is hidden."""
+    rng = np.random.default_rng(seed)
+    u, Y = np.repeat(rng.uniform(0, 1, rows // 6), 6), np.empty(rows + 1)
+    valve, level = 0.5, 0.5
+    for k in range(rows + 1):
+        Y[k] = level + 3e-3 * rng.standard_normal()
+        if k < rows:
+            valve, level = lagged(valve, level, u[k])
+    return km.Episodes([km.Episode(X=Y[:, None], U=u[:, None])], 0.1, ["level"], ["valve"])
+
+
+def lagged(valve, level, u):
+    return 0.85 * valve + 0.15 * u, 0.9 * level + 0.3 * valve**2
+
+
+HELD_LEVEL = (km.Cost(Q=10.0, R=0.01, u_target="equilibrium"), km.Limits(u_min=0, u_max=1))
+
+
+@pytest.mark.slow
+def test_models_with_a_hidden_state_are_judged_in_the_loops_of_one_record():
+    cost, limits = HELD_LEVEL
+    found = designed(
+        hidden_record(), cost, limits, horizon=15, delays=None, candidates=None, bilinear=True, reference=[1.2]
+    )
+    hidden = [row for row in found.leaderboard if "hidden state" in row.title]
+    assert hidden
+    assert min(row.score for row in hidden) < 1.1  # beside the best of all
+    valve, level = 0.2, 0.1
+    for _ in range(80):
+        valve, level = lagged(valve, level, float(found.controller([level], [1.2]).u[0]))
+    assert level == pytest.approx(1.2, abs=0.03)

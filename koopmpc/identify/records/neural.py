@@ -192,8 +192,8 @@ def fit_neural(
 ) -> LinearPredictor | BilinearPredictor:
     """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows.
 
-    With `quick` a third of the segments and half of the steps are taken, and nothing is polished. Where that is not
-    calm, the last one before it that is: before the polish, with fewer neurons, or without any.
+    With `quick` a third of the segments is taken. Where that is not calm, the last one before it that is: before the
+    polish, with fewer neurons, or without any.
 
     Raises
     ------
@@ -204,8 +204,7 @@ def fit_neural(
     counts = [q for q in NEURONS if q < s.neurons] + [s.neurons]
     chain = list(fit_chain(data, s, counts, quick=quick, plain=True))
     units, models = chain[-1][1], [model for model, _ in reversed(chain)]
-    if not quick:
-        models.insert(0, _polish(models[0], data, units, s))
+    models.insert(0, _polish(models[0], data, units, s, quick))
     for one in models:
         if is_calm_anywhere(one, data, units, s.delays):
             return from_standard(one, units, episodes, s.delays, report_fit(structure, one, units, data))
@@ -217,10 +216,13 @@ def fit_neural(
     )
 
 
-def _polish(model: HiddenModel, data: Episodes, units: SignalUnits, structure: HiddenStructure) -> HiddenModel:
+def _polish(
+    model: HiddenModel, data: Episodes, units: SignalUnits, structure: HiddenStructure, quick: bool
+) -> HiddenModel:
     """Return the model after some steps on all rows."""
     basis = smooth_basis(units.ny, data.nu, structure.delays)
-    whole = _project(_cut(data, units, structure, structure.horizon, [(0, len(e)) for e in data]), basis)
+    most = QUICK_STEPS if quick else STEPS
+    whole = _project(_cut(data, units, structure, structure.horizon, [(0, len(e)) for e in data], most), basis)
     small = _change_past(model, basis.T)
     error = ContainedError(SimulationError(small))
     theta, _ = minimise(error, small.parameters, whole, whole, _POLISH, converged=_CONVERGED)
@@ -258,9 +260,9 @@ def fit_chain(
     most = QUICK_STEPS if quick else STEPS
     sets = [tuple(_project(_cut(data, units, s, h, part, most), basis) for part in spans) for h in steps]
     learned = data.with_episodes([e.cut(0, a) for e, a in zip(data, ends, strict=True) if a > 0])
-    model, noise = _start(learned, units, s, basis, sets[0], quick)
+    model, noise = _start(learned, units, s, basis, sets[0])
     if s.degree > 1:
-        model = _fit(model.raise_degree(s.degree), noise, sets[0], quick)
+        model = _fit(model.raise_degree(s.degree), noise, sets[0])
     if plain:
         yield _change_past(model, basis), units
     rng = np.random.default_rng(s.start)
@@ -268,7 +270,7 @@ def fit_chain(
         drawn = draw_neurons(model, sets[0][0][0], rng)
         model = model.add_neurons(take_neurons(model, sets[0][0], drawn, count - before, noise))
         for part in sets:
-            model = _fit(model, noise, part, quick)
+            model = _fit(model, noise, part)
         yield _change_past(model, basis), units
 
 
@@ -283,13 +285,12 @@ def _cut(
     return cut_sets(data, units, structure.delays, horizon, spans, max(HORIZON, horizon // LONGER), most)
 
 
-def _fit(model: HiddenModel, noise: float, part: tuple[Sets, ...], quick: bool) -> HiddenModel:
+def _fit(model: HiddenModel, noise: float, part: tuple[Sets, ...]) -> HiddenModel:
     """Return the model that Levenberg-Marquardt finds, whose linear part does not grow; unseen segments stop it."""
     fitted, judged = part
-    iterations, patience = (_ITERATIONS // 2, _PATIENCE // 2) if quick else (_ITERATIONS, _PATIENCE)
     theta, _ = minimise(
-        ContainedError(SimulationError(model, noise)), model.parameters, fitted, judged, iterations,
-        patience=patience, converged=_CONVERGED,
+        ContainedError(SimulationError(model, noise)), model.parameters, fitted, judged, _ITERATIONS,
+        patience=_PATIENCE, converged=_CONVERGED,
     )  # fmt: skip
     return contain(model.with_parameters(theta))
 
@@ -300,7 +301,6 @@ def _start(
     structure: HiddenStructure,
     basis: Float[np.ndarray, "k nzeta"],
     part: tuple[Sets, ...],
-    quick: bool,
 ) -> tuple[HiddenModel, float]:
     """Return the linear model to begin with, and the noise of a row: of two starts the one that forecasts better."""
     order, delays = structure.order, structure.delays
@@ -319,7 +319,7 @@ def _start(
         if len(fitted) == 0:
             noise = min(noise, np.sqrt(error.evaluate(small.parameters, [_first_step(part[0][-1])])))
         if np.isfinite(error.evaluate(small.parameters, part[0])):
-            small = _fit(small, float(noise), part, quick)
+            small = _fit(small, float(noise), part)
             fitted.append((error.evaluate(small.parameters, part[1]), small))
     if not fitted:
         raise DataError(f"no linear model of order {order} has a forecast that stays finite; pass another order")
