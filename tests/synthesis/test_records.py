@@ -15,6 +15,7 @@ from koopmpc.synthesis.records import (
     is_late,
     is_record,
     judge_finalists,
+    judge_free_run,
 )
 from tests.identify.test_hidden_state import saturating_record
 from tests.identify.test_neural import friction_record
@@ -155,6 +156,21 @@ def test_a_model_that_leaves_the_range_is_taken_only_where_all_do():
     assert choose_by_free_run([wild, wild], [3, 2]) == 1
     near = FreeRun(np.array([0.52, 0.57]), True)
     assert choose_by_free_run([calm, near], [9, 1]) == 1
+
+
+def test_a_model_far_behind_a_rival_is_not_fitted_without_each_quarter():
+    data, fits = oscillator(rows=240), list[km.Episodes]()
+
+    def fit(episodes, past):
+        fits.append(episodes)
+        return km.edmd(episodes, km.State() + km.Constant(), embedding=past, ridge=1e-9)
+
+    rival = judge_free_run(lambda e: fit(e, km.Delay(2)), data, data, 2, 10, relift=False)
+    assert (len(fits), rival.calm) == (5, True)
+    lost = judge_free_run(lambda e: fit(e, None), data, data, 2, 10, relift=False, rival=rival)
+    assert len(fits) == 6
+    assert not lost.calm
+    assert lost.errors.shape == rival.errors.shape
 
 
 @pytest.mark.slow
