@@ -122,6 +122,20 @@ def test_ten_thousand_loops_stay_feasible_and_their_cost_falls():
     assert (lost, rises) == (0, 0)
 
 
+def has_optimum(problem):
+    """Return whether Clarabel solves a program, False if it is infeasible."""
+    import cvxpy as cp
+
+    for digits in (11, 9, 8, 7):
+        tolerance = 10.0**-digits
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of an inaccurate answer, which is not taken
+            problem.solve(solver=cp.CLARABEL, tol_gap_abs=tolerance, tol_gap_rel=tolerance, tol_feas=tolerance)
+        if problem.status in ("optimal", "infeasible"):
+            return problem.status == "optimal"
+    raise AssertionError(problem.status)
+
+
 def solve_cone_program(model, cost, box, x0, N, Q_N, W):
     """Return the inputs and the states of a plan that ends in {xᵀW x ≤ 1}, by Clarabel, None where there is none."""
     import cvxpy as cp
@@ -133,14 +147,7 @@ def solve_cone_program(model, cost, box, x0, N, Q_N, W):
     keeps = [X[0] == x0, box["u_min"] <= U, box["u_max"] >= U, cp.norm(root @ X[N]) <= 1]
     keeps += [X[1:] == X[:-1] @ model.A.T + U @ model.B.T, X[1:] <= np.tile(box["x_max"], (N, 1))]
     problem = cp.Problem(cp.Minimize(spent), keeps)
-    for digits in (11, 9, 8):
-        tolerance = 10.0**-digits
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of an inaccurate answer, which is not taken
-            problem.solve(solver=cp.CLARABEL, tol_gap_abs=tolerance, tol_gap_rel=tolerance, tol_feas=tolerance)
-        if problem.status in ("optimal", "infeasible"):
-            return (U.value, X.value) if problem.status == "optimal" else None
-    raise AssertionError(problem.status)
+    return (U.value, X.value) if has_optimum(problem) else None
 
 
 def compare_with_cone_program(seeds):
@@ -186,6 +193,67 @@ def test_five_hundred_ellipsoids_are_those_of_a_cone_program():
     agreed, active, _ = compare_with_cone_program(range(1000, 1500))
     assert agreed >= 250
     assert active >= 80
+
+
+def solve_priced_program(model, cost, box, prices, x0, N, Q_N, W):
+    """Return the inputs of a plan whose soft limits and whose ellipsoid {xᵀW x ≤ 1} have a price, by Clarabel."""
+    import cvxpy as cp
+
+    X, U = cp.Variable((N + 1, model.nx)), cp.Variable((N, model.nu))
+    over, past = cp.Variable((N, model.nx), nonneg=True), cp.Variable(nonneg=True)
+    root, end = np.linalg.cholesky(W).T, np.linalg.cholesky(Q_N).T
+    spent = cp.sum_squares(X[1:N] @ np.diag(np.sqrt(cost.Q))) + cp.sum_squares(end @ X[N])
+    spent += cp.sum_squares(U @ np.diag(np.sqrt(cost.R)))
+    spent += prices[0] * cp.sum(over) + prices[1] * cp.sum_squares(over) + prices[2] * past + prices[3] * past**2
+    keeps = [X[0] == x0, box["u_min"] <= U, box["u_max"] >= U, cp.norm(root @ X[N]) <= 1 + past]
+    keeps += [X[1:] == X[:-1] @ model.A.T + U @ model.B.T, X[1:] <= np.tile(box["x_max"], (N, 1)) + over]
+    problem = cp.Problem(cp.Minimize(spent), keeps)
+    assert has_optimum(problem)
+    return U.value, float(past.value)
+
+
+def compare_with_priced_program(seeds):
+    """Return how many plans agreed with Clarabel's, of these those that leave the ellipsoid, and break limits, too."""
+    left = broken = 0
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        model = draw_model(rng, n=int(rng.integers(1, 5)))
+        n, nu, N = model.nx, model.nu, int(rng.integers(2, 7))
+        root = rng.normal(size=(n, n)) + 0.3 * np.eye(n)
+        W = root.T @ root * 10 ** rng.uniform(0, 2) + 1e-2 * np.eye(n)
+        Q_N = np.diag(rng.uniform(0.1, 1, n))
+        cost = km.Cost(Q=rng.uniform(0.1, 2, n), R=rng.uniform(0.05, 1, nu), Q_N=Q_N)
+        prices = rng.uniform([1, 0.1, 1, 0.1], [10, 3, 10, 3])
+        box = {"u_min": -1.0, "u_max": 1.0, "x_max": rng.uniform(0.5, 2, n)}
+        end = km.guarantees.TerminalSet(np.zeros(n), of=km.State(), W=W)
+        limits = km.Limits(**box, slack=tuple(prices[:2]), terminal=end, terminal_slack=tuple(prices[2:]))
+        mpc = km.KoopmanMPC(model, cost, limits, horizon=N)
+        x = rng.normal(size=n) * rng.uniform(0.5, 2)
+        for _ in range(3):  # the second and the third step begin at the active rows of the one before
+            move = mpc(x, np.zeros(n))
+            U, past = solve_priced_program(model, cost, box, prices, x, N, Q_N, W)
+            plan = mpc.plan()
+            assert move.status in (km.Status.OPTIMAL, km.Status.UNCONSTRAINED, km.Status.SOFTENED), (seed, move.status)
+            assert np.abs(plan.U - U).max() < 2e-4, (seed, plan.U - U)
+            gauge = float(end.measure(plan.X[-1])) - 1
+            assert abs(max(gauge, 0) - past) < 1e-4, seed
+            left += past > 1e-4
+            broken += past > 1e-4 and (plan.X[1:] > box["x_max"] + 1e-4).any()
+            x = model.A @ x + model.B @ move.u
+    return left, broken
+
+
+def test_a_soft_ellipsoid_and_soft_limits_weigh_as_in_a_cone_program():
+    left, broken = compare_with_priced_program(range(24))
+    assert left >= 3
+    assert broken >= 1
+
+
+@pytest.mark.slow
+def test_three_hundred_soft_ellipsoids_are_those_of_a_cone_program():
+    left, broken = compare_with_priced_program(range(100, 400))
+    assert left >= 40
+    assert broken >= 20
 
 
 def test_a_soft_set_gives_way_where_a_hard_one_is_infeasible_and_agrees_with_it_elsewhere():

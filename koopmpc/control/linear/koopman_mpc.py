@@ -595,9 +595,8 @@ class KoopmanMPC(MPCBase):
             if (v >= plan.low[:n]).all() and (v <= plan.high[:n]).all():
                 return self._return_free_plan(t, applied, start)
         if plan.ball is not None and isinstance(self._qps, BallSolver) and self._qps.contains(v):
-            others = np.ones(n, dtype=np.bool_)
-            others[plan.ball.rows] = False
-            if (v >= plan.low[:n])[others].all() and (v <= plan.high[:n])[others].all():
+            n = plan.ball.rows.start
+            if (v[:n] >= plan.low[:n]).all() and (v[:n] <= plan.high[:n]).all():
                 return self._return_free_plan(t, applied, start)
         return self._solve_qp(t, applied, start)
 

@@ -326,14 +326,10 @@ class StepSolver:
         solver = self._solvers[i]
         if solver is None:
             solver = self._solvers[i] = self._turns[i].solver(self.qp, self._turns[i].settings)
-        try:
-            if limits is None:
-                solver.shift(moved)
-            else:
-                solver.set_bounds(limits.low - moved, limits.high - moved)
-        except DataError:  # a wild reading moves limits beyond 1e30, where they end in C too
-            low, high = (self.qp.low, self.qp.high) if limits is None else (limits.low, limits.high)
-            solver.set_bounds(*(np.clip(end - moved, -INFINITY, INFINITY) for end in (low, high)))
+        if limits is None and moved.dot(moved) < _BELOW_ROUNDING:
+            solver.shift(moved)
+        else:
+            solver.set_bounds(*self._find_room(moved, limits))
         left = None
         if deadline is not None:
             left = deadline - perf_counter()
@@ -351,6 +347,11 @@ class StepSolver:
             return found, found.status is Status.OPTIMAL or found.status is Status.INFEASIBLE
         solved = found.status is Status.OPTIMAL
         return found, solved and (not self._soft or bool(np.all(np.abs(found.y) <= self.qp.softness.linear)))
+
+    def _find_room(self, moved: Float[np.ndarray, " m"], limits: Interval | None) -> Interval:
+        """Return the limits less `moved`; those that a wild reading moves beyond 1e30 end there, as in C."""
+        low, high = (self.qp.low, self.qp.high) if limits is None else limits
+        return Interval(np.minimum(low - moved, INFINITY), np.maximum(high - moved, -INFINITY))
 
     def _gave_way(self, found: QPSolution, moved: Float[np.ndarray, " m"], limits: Interval | None) -> float:
         """Return the largest violation of a soft row above its allowance, in the unit of its limit."""

@@ -1,11 +1,12 @@
-"""A terminal ellipsoid by tangent cuts: a plan that leaves it is cut off by a half space that holds all of it."""
+"""A terminal ellipsoid: the step's QP on its active rows, or tangent cuts until the plan ends in the ellipsoid."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.linalg import cholesky, solve_triangular
 
 from koopmpc.control.limits import SOFTENED, Interval, Softness
@@ -13,12 +14,14 @@ from koopmpc.control.move import Status
 from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.base import QP, QPSolution, SolverTurn, StepQP, StepSolver
 from koopmpc.control.solvers.daqp import DAQP
+from koopmpc.control.terminal.faces import FaceQP, Faces, Price
 
 MET = 1e-8  # the ellipsoid is met if the norm exceeds 1 by at most this much
+_MET_SQUARE = (1 + MET) ** 2
 NEAR = 1e-6  # from here on the half spaces move inwards by what the solver's tolerance leaves
 MOST = 40  # cuts of a step; beyond that the step ends with MAX_ITERATIONS
-_BOUNDED = 1e-9  # a singular value below this share of the largest moves nothing
-_NEWTON = 60  # steps of the secular equation, at most
+_ALONE = 20  # passes in which one soft cut follows the plan, before others join it
+_TRIES = 6  # sets of active rows that are tried before the next cut
 
 
 @dataclass(frozen=True)
@@ -43,12 +46,25 @@ def make_ball(softness: Softness, D: Float[np.ndarray, "nv nw"], unit: float, fi
     return Ball(rows, D[rows], linear / (2 * unit), quadratic / (2 * unit), 1 / np.sqrt(len(D) - first))
 
 
+class StepLimits(NamedTuple):
+    """The limits of a step, None for those of the QP, by how much the plan moves them, what is left for A w.
+
+    `conflict` is how far a hard rate had to give way.
+    """
+
+    moved: Float[np.ndarray, " m"]
+    limits: Interval | None
+    left: Interval
+    conflict: float
+
+
 class BallSolver(StepSolver):
     """The QP of a step whose plan also has to end in a ball; see `StepSolver`.
 
-    Where the solution of the QP leaves the ball, half spaces aᵀy ≤ 1 join it until ‖y‖ ≤ 1 + 1e-8. Each is tangent to
-    the ball at the point where it would meet the solution with the same active rows, or else at y/‖y‖. Those that are
-    active at the end are the first ones of the next step.
+    The active rows of the last step, shifted, are tried first, else those of the QP's solution where that leaves the
+    ball. On these rows the problem is a scalar equation; see `Face`. Its answer is the optimum where it keeps all
+    other rows and all multipliers have the right sign. Where no set of rows gives it, half spaces aᵀy ≤ 1 join the
+    QP, each tangent to the ball, until ‖y‖ ≤ 1 + 1e-8 or the active rows give the optimum.
     """
 
     def __init__(self, qp: StepQP, turns: Sequence[SolverTurn], ball: Ball) -> None:
@@ -56,48 +72,49 @@ class BallSolver(StepSolver):
         self._set_ball(ball)
 
     def _set_ball(self, ball: Ball) -> None:
-        """Set up the QP with room for cuts."""
-        self.ball, qp, n = ball, self.qp, MOST
+        """Make this the ball; the QP with room for cuts is set up when it is needed."""
+        self.ball, qp = ball, self.qp
+        root = cholesky(qp.P, lower=True)
+        back = solve_triangular(root, np.eye(len(root)), lower=True).T  # w = back q with ‖q‖² = wᵀP w
+        price = Price(ball.linear, ball.quadratic)
+        self._faces = Faces(FaceQP(qp.A @ back, ball.D @ back, back, qp.softness, price))
         self._size = float(np.sqrt((ball.D**2).sum(axis=1).max(initial=0.0))) or 1.0  # of a row aᵀD
-        free = np.full(n, np.inf)
-        s = self._size
-        soft = Softness(
-            np.concatenate([qp.softness.linear, np.full(n, ball.linear * s)]),
-            np.concatenate([qp.softness.quadratic, np.full(n, ball.quadratic * s**2)]),
-            np.concatenate([qp.softness.allowance, np.full(n, SOFTENED)]),
-        )
-        whole = QP(
-            qp.P,
-            qp.q,
-            np.vstack([qp.A, np.zeros((n, qp.A.shape[1]))]),
-            np.concatenate([qp.low, -free]),
-            np.concatenate([qp.high, free]),
-            soft,
-        )
-        self._cutter: DAQP = FINISHER(whole)
-        self._root = cholesky(qp.P, lower=True)
-        self._forget_cuts()
+        self._cutter: DAQP | None = None
+        self._multiplier = 0.0
 
-    def _forget_cuts(self) -> None:
-        self._cuts = np.zeros((MOST, len(self.ball.D)))
-        self._used = np.zeros(MOST, dtype=np.bool_)
-        self._pushes: Float[np.ndarray, " n"] = np.zeros(MOST)
+    def _set_up_cutter(self) -> DAQP:
+        """Return the QP with room for cuts, all of them free."""
+        qp, ball, n, s = self.qp, self.ball, MOST, self._size
+        if self._cutter is None:
+            soft = Softness(
+                np.concatenate([qp.softness.linear, np.full(n, ball.linear * s)]),
+                np.concatenate([qp.softness.quadratic, np.full(n, ball.quadratic * s**2)]),
+                np.concatenate([qp.softness.allowance, np.full(n, SOFTENED)]),
+            )
+            A, free = np.vstack([qp.A, np.zeros((n, qp.A.shape[1]))]), np.full(n, np.inf)
+            low, high = np.concatenate([qp.low, -free]), np.concatenate([qp.high, free])
+            self._cutter = FINISHER(QP(qp.P, qp.q, A, low, high, soft))
+        return self._cutter
 
     def change(self, qp: StepQP, ball: Ball) -> None:
-        """Go on with new matrices of the same size; the warm start is kept, and no cut."""
+        """Go on with new matrices of the same size; the warm start is kept."""
         self.update(qp)
         self._set_ball(ball)
 
+    def cool(self) -> None:
+        """Forget the last answer."""
+        super().cool()
+        self._multiplier = 0.0
+
     def rest(self) -> None:
-        """Forget the last answer and its cuts."""
+        """Forget the last answer; see `StepSolver`."""
         super().rest()
-        self._used[:] = False
-        self._pushes = np.zeros(MOST)
+        self._multiplier = 0.0
 
     def reset(self) -> None:
         """Forget all earlier solves, so that a run repeats to the bit."""
         super().reset()
-        self._cutter.reset()
+        self._cutter = None
 
     def contains(self, plan: Float[np.ndarray, " nv"]) -> bool:
         """Return whether a plan ends in the ball."""
@@ -112,116 +129,120 @@ class BallSolver(StepSolver):
         bounds: Interval | None = None,
     ) -> tuple[QPSolution, float]:
         """Return the least deviation w from the plan that ends in the ball; see `StepSolver.solve`."""
-        if self._used.any():
-            found, gave_way = QPSolution(np.zeros(len(self.qp.q)), np.zeros(len(self.qp.A)), Status.OPTIMAL, 0, ""), 0.0
+        y_0, known = plan[self.ball.rows], None
+        if self._multiplier > 0 and self._last is not None:
+            known = self._find_limits(plan, room, bounds)
+            face, _ = self._try_faces(np.append(self._last.y, 0.0)[self.qp.shift_dual], y_0, known.left)
+            if face is not None:
+                return self._accept(face, y_0, known)
+        found, gave_way = super().solve(plan, room, deadline, bounds)
+        self._multiplier, y = 0.0, y_0 + self.ball.D.dot(found.v)
+        if found.status is not Status.OPTIMAL or y.dot(y) <= _MET_SQUARE:
+            return found, gave_way
+        known = known or self._find_limits(plan, room, bounds)
+        face, touch = self._try_faces(found.y, y_0, known.left)
+        if face is None:
+            face = self._cut(found, y if touch is None else touch, y_0, known.left, deadline)
         else:
-            found, gave_way = super().solve(plan, room, deadline, bounds)
-            if found.status is not Status.OPTIMAL:
-                return found, gave_way
-            y = plan[self.ball.rows] + self.ball.D @ found.v
-            if np.linalg.norm(y) <= 1 + MET:
-                return found, gave_way
-            self._add_cut(y, found)
-        return self._cut(plan, room, deadline, found, bounds)
+            face.iterations += found.iterations
+        if face.status is Status.OPTIMAL:
+            return self._accept(face, y_0, known)
+        self.cool()
+        return face, known.conflict
+
+    def _find_limits(
+        self, plan: Float[np.ndarray, " nv"], room: Interval | None, bounds: Interval | None
+    ) -> StepLimits:
+        """Return what limits w in this step; see `StepSolver.solve`."""
+        qp, limits, conflict = self.qp, bounds, 0.0
+        if room is not None:
+            limits, conflict = self._widen_rates(room, bounds or Interval(qp.low, qp.high))
+        moved = np.multiply(plan[self._rows], qp.scale)
+        return StepLimits(moved, limits, self._find_room(moved, limits), conflict)
+
+    def _accept(self, found: QPSolution, y_0: Float[np.ndarray, " p"], known: StepLimits) -> tuple[QPSolution, float]:
+        """Keep an answer, and return it with how far a soft limit or the ball gave way."""
+        self._last, past = found, 0.0
+        if self.ball.linear < np.inf:
+            past = float(np.linalg.norm(y_0 + self.ball.D @ found.v)) - 1
+        slack = past if past > SOFTENED else 0.0
+        gave_way = self._gave_way(found, known.moved, known.limits) if self._soft else 0.0
+        return found, max(known.conflict, slack, gave_way)
+
+    def _try_faces(
+        self,
+        rows: Float[np.ndarray, " m"],
+        y_0: Float[np.ndarray, " p"],
+        left: Interval,
+    ) -> tuple[QPSolution | None, Float[np.ndarray, " p"] | None]:
+        """Return the optimum if one of a few sets of active rows has it, and where the first set meets the ball.
+
+        The first set is that to which the multipliers `rows` push.
+        """
+        sides, touch, tried, hard = self._faces.find_sides(rows), None, set[bytes](), self.ball.linear == np.inf
+        for i in range(_TRIES):
+            found = self._faces.solve(sides, y_0, left, self._multiplier)
+            if found is None:
+                break
+            if touch is None:
+                touch = found.y
+            if hard and found.y.dot(found.y) > _MET_SQUARE:  # these rows leave no way into the ball
+                break
+            if found.sides is None:
+                end = y_0 + self.ball.D.dot(found.w)
+                if hard and end.dot(end) > _MET_SQUARE:
+                    break
+                self._multiplier = found.multiplier
+                return QPSolution(found.w, found.rows, Status.OPTIMAL, i + 1, FINISHER.name), found.y
+            tried.add(sides.tobytes())
+            sides = found.sides
+            if sides.tobytes() in tried:
+                break
+        return None, touch
 
     def _cut(
         self,
-        plan: Float[np.ndarray, " nv"],
-        room: Interval | None,
-        deadline: float | None,
         found: QPSolution,
-        bounds: Interval | None,
-    ) -> tuple[QPSolution, float]:
-        """Solve with the cuts, and add one after the other, until the plan ends in the ball."""
-        qp, ball, solver, m = self.qp, self.ball, self._cutter, len(self.qp.A)
-        moved, limits, conflict = np.multiply(plan[self._rows], qp.scale), bounds, 0.0
-        if room is not None:
-            limits, conflict = self._widen_rates(room, bounds or Interval(qp.low, qp.high))
-        low, high = (qp.low, qp.high) if limits is None else limits
-        y_0, iterations, last = plan[ball.rows], found.iterations, self._last
-        v, rows, tighter = found.v, found.y, 0.0
-        if self._used.any() and last is not None:
-            v, rows = np.append(last.v, 0.0)[qp.shift_primal], np.append(last.y, 0.0)[qp.shift_dual]
-        for _ in range(MOST):
-            left = None if deadline is None else deadline - perf_counter()
-            if left is not None and left <= 0:
-                found = replace(found, status=Status.TIME_LIMIT, iterations=iterations)
-                break
-            ends = np.where(self._used, (1 - tighter - self._cuts @ y_0) / self._size, np.inf)
-            solver.set_bounds(
-                np.concatenate([low - moved, np.full(MOST, -np.inf)]), np.concatenate([high - moved, ends])
-            )
-            whole = solver.solve(v, np.concatenate([rows, self._pushes]), left)
+        y: Float[np.ndarray, " p"],
+        y_0: Float[np.ndarray, " p"],
+        left: Interval,
+        deadline: float | None,
+    ) -> QPSolution:
+        """Add one cut after the other, the first at y/‖y‖, until the plan ends in the ball.
+
+        Of a soft ball several cuts would each take their price, so that one follows the plan; only where it finds no
+        rest others join it.
+        """
+        ball, m, solver, soft = self.ball, len(self.qp.A), self._set_up_cutter(), self.ball.linear < np.inf
+        cuts, pushes, tighter, iterations = np.zeros((MOST, len(ball.D))), np.zeros(MOST), 0.0, found.iterations
+        ends, free, v, rows = np.full(MOST, np.inf), np.full(MOST, np.inf), found.v, found.y
+        for step in range(MOST):
+            limit = None if deadline is None else deadline - perf_counter()
+            if limit is not None and limit <= 0:
+                return replace(found, status=Status.TIME_LIMIT, iterations=iterations)
+            i = max(step - _ALONE, 0) if soft else step
+            cuts[i] = y / np.linalg.norm(y)
+            solver.exchange_row(m + i, cuts[i] @ ball.D / self._size)
+            ends[: i + 1] = (1 - tighter - cuts[: i + 1] @ y_0) / self._size
+            solver.set_bounds(np.concatenate([left.low, -free]), np.concatenate([left.high, ends]))
+            whole = solver.solve(v, np.concatenate([rows, pushes]), limit)
             iterations += whole.iterations
-            v, rows, self._pushes = whole.v, whole.y[:m], whole.y[m:].copy()
+            v, rows, pushes = whole.v, whole.y[:m], whole.y[m:].copy()
             found = QPSolution(v, rows, whole.status, iterations, whole.solver)
             if whole.status is not Status.OPTIMAL:
-                break
+                return found
             y = y_0 + ball.D @ v
             past = float(np.linalg.norm(y)) - 1
-            given = float((self._cuts[self._used] @ y).max(initial=-np.inf)) - 1  # what soft cuts gave way
-            if past <= MET or (np.isfinite(ball.linear) and given >= past - MET):
-                self._last = found
-                self._used &= self._pushes > 0
-                slack = past if past > SOFTENED else 0.0
-                return found, max(conflict, slack, self._gave_way(found, moved, limits))
-            if past < NEAR:  # the solver meets a row to its own tolerance, which is that of w
+            given = float((cuts[: i + 1] @ y).max()) - 1  # what soft cuts gave way
+            if past <= MET or (soft and given >= past - MET):
+                self._multiplier = float(pushes.sum()) / self._size
+                return found
+            face, touch = self._try_faces(rows, y_0, left)
+            if face is not None:
+                face.iterations += iterations
+                return face
+            if past < NEAR and not soft:  # the solver meets a row to its own tolerance, which is that of w
                 tighter += past
-            if not self._add_cut(y, found):
-                break
-        if found.status is Status.OPTIMAL:
-            found = replace(found, status=Status.MAX_ITERATIONS)
-        self._last = None
-        self._forget_cuts()
-        return found, conflict
-
-    def _add_cut(self, y: Float[np.ndarray, " p"], found: QPSolution) -> bool:
-        """Add the half space that cuts y off; return False where there is no room for another one."""
-        free = np.flatnonzero(~self._used)
-        if not len(free):
-            free = np.flatnonzero(self._pushes <= 0)
-            if not len(free):
-                return False
-        normal = self._touch(y, found)
-        if normal is None or normal @ y <= 1 + MET:
-            normal = y / np.linalg.norm(y)
-        i = int(free[0])
-        self._cuts[i], self._used[i], self._pushes[i] = normal, True, 0.0
-        self._cutter.exchange_row(len(self.qp.A) + i, normal @ self.ball.D / self._size)
-        return True
-
-    def _touch(self, y: Float[np.ndarray, " p"], found: QPSolution) -> Float[np.ndarray, " p"] | None:
-        """Return the point of the ball where the QP has its solution if its active rows stay as they are, or None.
-
-        On the active rows w = w_p + Z q, and y = b + M q. In the left singular vectors of M the solution is
-        ŷ_i = b̂_i / (1 + λ s_i²), where λ solves ‖y‖ = 1.
-        """
-        active: Bool[np.ndarray, " m"] = found.y != 0
-        back = solve_triangular(self._root, np.eye(len(self._root)), lower=True).T  # w = back q with ‖q‖² = wᵀP w
-        D, q = self.ball.D @ back, self._root.T @ found.v
-        if active.any():
-            rows = (self.qp.A[active] @ back).T
-            basis, R = np.linalg.qr(rows)
-            if len(R) < rows.shape[1] or np.abs(np.diag(R)).min() < _BOUNDED * np.abs(R).max():
-                return None
-            fixed = basis @ (basis.T @ q)
-            M = D - (D @ basis) @ basis.T
-        else:
-            fixed, M = np.zeros_like(q), D
-        b = y + D @ (fixed - q)  # where w is as near to the plan as the active rows let it be
-        left, s, _ = np.linalg.svd(M, full_matrices=True)
-        squares = np.zeros(len(b))
-        squares[: len(s)] = np.where(s > _BOUNDED * max(float(s[0]), 1e-300), s**2, 0.0)
-        parts = left.T @ b
-        if np.linalg.norm(parts[squares == 0]) >= 1:
-            return None
-        lam = 0.0
-        for _ in range(_NEWTON):  # 1/‖y‖ is nearly linear in λ: Newton's method from the left never oversteps
-            shrunk = parts / (1 + lam * squares)
-            size = float(np.linalg.norm(shrunk))
-            if size <= 1 + 1e-14:
-                break
-            slope = float((shrunk**2 * squares / (1 + lam * squares)).sum()) / size**3
-            lam += (1 - 1 / size) / slope
-        point = left @ (parts / (1 + lam * squares))
-        return point / np.linalg.norm(point)
+            elif touch is not None and touch @ y > (1 + MET) * np.linalg.norm(touch):
+                y = touch
+        return replace(found, status=Status.MAX_ITERATIONS)
