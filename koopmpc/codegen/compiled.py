@@ -197,7 +197,7 @@ class Compiled:
         self._call = self._code.koopmpc_call
         self._y_shape, self._row_shape, self._row = (self._ny,), (self._nr,), self._reference[0]
         self._count, self._has_extras, self._is_double = 1, False, not single
-        self._solver = "" if self._targets is not None else "daqp"
+        self._solver = "" if self._targets is not None else "sequences" if sizes["LEVELED"] else "daqp"
         if self._targets is not None:
             self._aim(np.zeros((0, self._nr)))
 
@@ -303,6 +303,7 @@ class Compiled:
                 frame.slack,
                 self._solver if frame.iterations else "",
                 refused=bool(frame.refused),
+                gap=frame.gap,
             )
         finally:
             self._token.append(held)
@@ -383,6 +384,7 @@ class Compiled:
         """
         misfit = (
             self._timed  # each step has limits of its own
+            or self._sizes["LEVELED"]  # each step has a gap
             or rows.shape[1] != self._nr
             or Y.shape[1] != self._ny
             or (W is not None and W.shape[1] != self._nw)

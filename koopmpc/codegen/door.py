@@ -34,13 +34,13 @@ _FIELDS = (
 class Frame(ctypes.Structure):
     """The arguments and results of a call, as in C."""
 
-    _fields_ = (*_FIELDS, ("slack", ctypes.c_double), ("refused", ctypes.c_int))
+    _fields_ = (*_FIELDS, ("slack", ctypes.c_double), ("refused", ctypes.c_int), ("gap", ctypes.c_double))
 
 
 class SingleFrame(ctypes.Structure):
     """A `Frame` in single precision."""
 
-    _fields_ = (*_FIELDS, ("slack", ctypes.c_float), ("refused", ctypes.c_int))
+    _fields_ = (*_FIELDS, ("slack", ctypes.c_float), ("refused", ctypes.c_int), ("gap", ctypes.c_float))
 
 
 _BOUNDS = ("u_low", "u_high", "du_low", "du_high", "x_low", "x_high")

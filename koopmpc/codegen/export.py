@@ -303,10 +303,13 @@ def _write_readme(tables: Tables, measured: tuple[int, int, int] | None, precisi
         ]
     rows.append(("floating-point operations of a step without active limits, at most", str(count_flops(tables))))
     if not tables.is_lqr:
-        limit = MOST if tables.is_staged else int(tables.settings["iter_limit"])
+        limit, what = MOST if tables.is_staged else int(tables.settings["iter_limit"]), "iteration"
+        if sizes["LEVELED"]:
+            limit, what = sizes["NODES"], "node"
+        of = "of the search over levels" if sizes["LEVELED"] else "of the QP solver in one solve"
         rows += [
-            ("iterations of the QP solver in one solve, at most", str(limit)),
-            ("floating-point operations of one iteration, at most", str(count_iteration_flops(tables))),
+            (f"{what}s {of}, at most", str(limit)),
+            (f"floating-point operations of one {what}, at most", str(count_iteration_flops(tables))),
         ]
     rows.append(("rounding of the lifted state, amplified to a share of an input's span", f"{tables.conditioning:.2g}"))
     table = "\n".join(f"| {what} | {value} |" for what, value in rows)

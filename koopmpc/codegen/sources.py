@@ -13,7 +13,7 @@ from koopmpc.control.program import trace_graph
 from koopmpc.errors import DataError
 
 _OWN = ("koopmpc.h", "koopmpc_common.h", "koopmpc_common.c")
-_RECEDING = ("koopmpc_receding.h", "koopmpc_receding.c", "koopmpc_bounds.h")
+_RECEDING = ("koopmpc_receding.h", "koopmpc_receding.c", "koopmpc_bounds.h", "koopmpc_levels.h")
 _QP = ("koopmpc_qp.h", "koopmpc_qp.c", "koopmpc_daqp.c")
 _STAGES = ("koopmpc_stages.h", "koopmpc_stages.c", "koopmpc_staged.c")
 _STAGED = (*_STAGES, "koopmpc_rest.c", "koopmpc_rows.c", "koopmpc_finish.c")
@@ -31,6 +31,7 @@ def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
     else:
         law = ("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")
         law = (*law, *(["koopmpc_bounds.c"] if tables.sizes["BOUNDS"] else ()))
+        law = (*law, *(["koopmpc_levels.c"] if tables.sizes["LEVELED"] else ()))
         own = (*_OWN, *_QP, "koopmpc_target.c", *law)
     result = {name: read_shipped("c", name) for name in own}
     result["koopmpc_sizes.h"] = _write_sizes(tables, single=single)
@@ -158,9 +159,11 @@ def count_flops(tables: Tables) -> int:
 
 
 def count_iteration_flops(tables: Tables) -> int:
-    """Return a bound of the floating-point operations of one iteration of the QP solver."""
+    """Return a bound of the floating-point operations of one iteration of the QP solver, or of one node of a search."""
     if tables.is_staged:
         return _count_sweeps(tables, 2) + 100 * tables.sizes["N"] * (tables.sizes["SIDES"] + 1)
+    if tables.sizes["LEVELED"]:
+        return 2 * tables.sizes["FREE_MOVES"] * (tables.sizes["SEARCH_ROWS"] + 4)
     n, m = tables.sizes["MOVES"], tables.sizes["QP_M"]
     rank = n + tables.sizes["QP_SOFT"] + 1
     return 2 * n * m + 4 * n * rank + 4 * rank * rank

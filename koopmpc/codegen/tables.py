@@ -20,6 +20,8 @@ from koopmpc.control.nonlinear.stagewise import list_hard_outputs
 from koopmpc.control.program import LinearProgram, Published, StepProgram, no_export
 from koopmpc.control.riccati import SETTLED as RESTED
 from koopmpc.control.solvers.daqp import FEW
+from koopmpc.control.stepped.search import NODES
+from koopmpc.control.stepped.sequences import LevelsProgram
 from koopmpc.control.target import ROUNDING
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import EXACT, DisturbanceProgram
@@ -75,6 +77,13 @@ _TABLE_NOTE = (
 _BOUNDS_NOTE = (
     "Limits that move in time are arguments: call `koopmpc_set_bounds` before a step, with rows from that step on. "
     "Until then, and after `koopmpc_init`, the widest bounds of the controller hold."
+)
+
+
+_LEVELS_NOTE = (
+    "A step searches sequences of levels, and looks at no more than `most_nodes` of the state; `koopmpc_init` sets it "
+    "to KOOPMPC_NODES. If the search ends there, the status is KOOPMPC_TIME_LIMIT, and `gap` bounds by which share of "
+    "its cost a better plan could be cheaper."
 )
 
 
@@ -150,7 +159,7 @@ def make_tables(program: StepProgram, *, single: bool) -> Tables:
     DataError
         A setting of the solver has no counterpart in C, or C code for this kind of Program is not known.
     """
-    sizes = {"IS_LQR": 0, "IS_STAGED": 0, "BOUNDS": 0, "NU": program.model.nu, "NR": program.nr}
+    sizes = {"IS_LQR": 0, "IS_STAGED": 0, "BOUNDS": 0, "LEVELED": 0, "NU": program.model.nu, "NR": program.nr}
     embedding = None if isinstance(program.model, StepMap) else program.model.embedding
     steps, inputs_too = (0, 0) if embedding is None else (embedding.steps, int(embedding.inputs))
     sizes |= {"DELAYS": steps, "DELAYED_INPUTS": inputs_too, "NZETA": program.lifting.n, "NZ": program.lifting.m}
@@ -392,7 +401,7 @@ def _add_condensed(tables: Tables, program: CondensedProgram) -> None:
         "CONSTANT": -1 if constant is None else constant,
         "NS": model.nz,
         "QP_MIXED": int(any_soft and not soft.all()),
-        "STEEP": int(solver.metric is not None),
+        "STEEP": int(solver.metric is not None and program.levels is None),
         "FEW": FEW,
         "COLD_START": int(solver.settings["cold_start"]),
     }
@@ -428,11 +437,45 @@ def _add_condensed(tables: Tables, program: CondensedProgram) -> None:
     }
     if program.bounds is not None:
         _add_bounds(tables, program.bounds, rated=program.rates is not None)
-    if solver.metric is not None:
+    if program.levels is not None:
+        _add_levels(tables, program.levels)
+    elif solver.metric is not None:
         values, V = np.linalg.eigh(solver.metric)
         tables.plan |= {"lambda": np.maximum(values, 0.0), "V": V, "MV": solver.M @ V}
     _add_estimator(tables, program)
     _add_memory(tables, moves, m, int(soft.sum()))
+
+
+def _add_levels(tables: Tables, program: LevelsProgram) -> None:
+    """Write the levels of the inputs, and the search for the best sequence of them."""
+    levels, soft = program.levels, np.isfinite(program.linear)
+    tables.sizes |= {
+        "LEVELED": 1,
+        "FREE_MOVES": len(program.free),
+        "SEARCH_ROWS": len(program.rows),
+        "NODES": NODES,
+    }
+    whole = {
+        "level_count": levels.count,
+        "dwell": levels.dwell,
+        "block": program.blocks,
+        "free_move": program.free,
+        "free_steps": program.steps,
+        "group": program.group,
+        "row_start": program.first,
+        "search_row": program.rows,
+        "row_soft": soft,
+    }
+    tables.plan |= {name: values.astype(np.intc).ravel() for name, values in whole.items()}
+    tables.plan |= {
+        "level_first": levels.first,
+        "level_spacing": levels.spacing,
+        "move_of_s": program.L,
+        "row_of": program.T,
+        "row_linear": np.where(soft, program.linear, 0.0),
+        "row_quadratic": program.quadratic,
+    }
+    tables.notes.append(_LEVELS_NOTE)
 
 
 def _add_bounds(tables: Tables, bounds: BoundsProgram, *, rated: bool) -> None:

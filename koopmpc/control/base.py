@@ -290,6 +290,7 @@ class MPCBase(Published):
         self._given = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
         if self._held is not None:
             if u_prev is None:
+                self._held.reset(zero)  # no dwell time of an earlier run counts
                 self._given = self._held.round(zero)
             self._held.reset(self._given)
         self._initial.reset(x0, self._given)

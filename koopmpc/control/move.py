@@ -65,7 +65,7 @@ class Move:
     slack
         How far the plan breaks the soft limit, or the rate, that gives way most, in its own unit; 0 but for SOFTENED.
     solver
-        Name of the QP solver that answered, "osqp" or "daqp"; if none did, of the last one that was asked.
+        Name of the solver that answered, "osqp", "daqp", or "sequences" of levels; if none did, of the last one asked.
     known
         Whether the step is like the data of the model: state and input inside their region, the measurement as
         predicted. None without a monitor.

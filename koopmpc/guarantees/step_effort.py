@@ -112,6 +112,8 @@ def bound_iterations(
             "the bound is for controllers without an estimator, delays, measured disturbances and latency; use "
             "km.guarantees.observe_iterations"
         )
+    if program.levels is not None:
+        raise DataError("the bound is of quadratic programs; with inputs on levels a step searches sequences")
     if controller.solver != "daqp" or not np.array_equal(program.solver.H, np.eye(len(program.solver.H))):
         raise DataError('the bound is for solver="daqp"; pass it to the controller')
     Z, z0 = _lift_affine(model)

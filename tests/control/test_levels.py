@@ -276,6 +276,15 @@ def test_levels_of_the_first_steps_alone_leave_later_ones_between():
     assert ((U[2:] > 0.01) & (U[2:] < 0.99)).any()
 
 
+def test_no_dwell_time_of_an_earlier_run_counts_after_a_reset():
+    mpc = km.KoopmanMPC(TANK, COST, km.Limits(levels=[[0, 1]], dwell=[4]), 5)
+    first = mpc([0.0], [2.0]).u
+    assert first == 1
+    mpc.reset()
+    mpc.solver_fails = True
+    assert mpc([np.nan], [2.0]).u == 0  # held from zero, not from the pump that ran
+
+
 def test_levels_by_name_are_those_by_order():
     by_name = km.Limits(levels={"pump": [0, 1]}, dwell={"pump": (3, 2)})
     by_order = km.Limits(levels=[[0, 1]], dwell=[(3, 2)])
@@ -360,16 +369,14 @@ def test_levels_that_cannot_be_are_refused(said):
         km.KoopmanMPC(TANK, COST, km.Limits(**REFUSED[said]), 5)
 
 
-def test_laws_that_do_not_search_refuse_levels(tmp_path):
+def test_laws_that_do_not_search_refuse_levels():
     limits = km.Limits(levels=[[0, 1]])
     plant = km.discretize(km.load_problem("pendulum").dynamics, 0.05)
     data = km.collect(plant, [0, 0], km.Noise(-1, 1), episodes=2, steps=30)
-    mpc = km.KoopmanMPC(TANK, COST, limits, 5)
     refused = (
         (lambda: km.LQR(TANK, COST, limits), "an LQR does not keep"),
         (lambda: km.control.PID(1.0, dt=1.0, limits=limits), "a PID does not keep"),
         (lambda: km.design(data, km.Cost(Q=1, R=1), limits, horizon=3, reference=[0, 0]), "a design does not keep"),
-        (lambda: km.export(mpc, tmp_path), "cannot be exported"),
         (lambda: km.KoopmanMPC(TANK, COST, limits, 5, solver="osqp"), 'need "daqp"'),
     )
     for act, said in refused:

@@ -27,7 +27,7 @@ typedef enum {
   KOOPMPC_SOFTENED = 2,        /**< solved, and a soft limit or a rate gave way by more than its tolerance */
   KOOPMPC_SATURATED = 3,       /**< a feedback law was clipped to the input limits */
   KOOPMPC_MAX_ITERATIONS = 4,  /**< the solver met its bound of iterations */
-  KOOPMPC_TIME_LIMIT = 5,      /**< never returned here: C has no clock */
+  KOOPMPC_TIME_LIMIT = 5,      /**< solved, but a search over levels met its bound of nodes: see `gap` */
   KOOPMPC_INFEASIBLE = 6,      /**< no plan meets the hard limits */
   KOOPMPC_BAD_MEASUREMENT = 7, /**< NaN, inf or beyond 1e30 in y, the reference or w */
   KOOPMPC_FAILED = 8           /**< the solver gave no usable answer */
@@ -51,9 +51,10 @@ typedef struct {
 typedef struct {
   koopmpc_status status;
   koopmpc_fallback fallback;
-  int iterations;     /**< iterations of the QP solver */
+  int iterations;     /**< iterations of the QP solver, or nodes of a search over levels */
   koopmpc_real slack; /**< the largest violation of a soft limit, in its unit; 0 unless SOFTENED */
   int refused;        /**< 1 if y was too far from its prediction, which stood in */
+  koopmpc_real gap;   /**< the share of its cost by which a better plan on levels may be cheaper; 0 for the best */
 } koopmpc_report;
 
 #if KOOPMPC_BOUNDS
@@ -176,6 +177,12 @@ typedef struct {
   koopmpc_real box_low[KOOPMPC_MOVES], box_high[KOOPMPC_MOVES], rate_low[KOOPMPC_NU], rate_high[KOOPMPC_NU];
   koopmpc_real opened_low[KOOPMPC_MOVES], opened_high[KOOPMPC_MOVES];
   koopmpc_real target_low[(KOOPMPC_N + 1) * KOOPMPC_NL], target_high[(KOOPMPC_N + 1) * KOOPMPC_NL];
+#endif
+#if KOOPMPC_LEVELED
+  int level[KOOPMPC_NU], level_steps[KOOPMPC_NU]; /**< level of each input, and for how many steps it has held it */
+  int level_begins;                               /**< whether no input has acted yet: the first change is free */
+  int plan_levels[KOOPMPC_MOVES], has_levels;     /**< levels of the last plan */
+  int most_nodes; /**< nodes of a search, at most; koopmpc_init sets KOOPMPC_NODES, and it may be changed after */
 #endif
   int far;        /**< whether the last solution took proximal points */
   int resumes;    /**< whether the next solve continues from the active rows of this one */

@@ -83,7 +83,7 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
     report->status = status;
     report->fallback = fallback;
     report->iterations = 0;
-    report->slack = 0;
+    report->slack = report->gap = 0;
     report->refused = refused;
   }
 }

@@ -8,6 +8,7 @@
 #include <math.h>
 
 #include "koopmpc_bounds.h"
+#include "koopmpc_levels.h"
 #include "koopmpc_limits.h"
 #include "koopmpc_plan.h"
 #include "koopmpc_qp.h"
@@ -117,6 +118,13 @@ static void keep(koopmpc_state *s, koopmpc_real *u, koopmpc_report *report, koop
   report->status = status;
 }
 
+/** Whether a plan that meets all limits is on levels, where its inputs have some. */
+#if KOOPMPC_LEVELED
+static int rests(koopmpc_state *s) { return koopmpc_accept_levels(s); }
+#else
+static int rests(const koopmpc_state *s) { return (void)s, 1; }
+#endif
+
 static void unconstrained(koopmpc_state *s, koopmpc_real *u, koopmpc_report *report) {
   s->warm = 0;
   keep(s, u, report, KOOPMPC_UNCONSTRAINED);
@@ -169,6 +177,19 @@ static koopmpc_real set_limits(const koopmpc_state *s, koopmpc_qp_memory *qp, in
   return conflict;
 }
 
+#if KOOPMPC_LEVELED
+/** Put the plan on the best sequence of levels; writes how far a limit gave way. */
+static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_report *report) {
+#if KOOPMPC_BOUNDS
+  const koopmpc_real opened = koopmpc_open_rates(s);
+#else
+  const koopmpc_real opened = 0;
+#endif
+  const koopmpc_real conflict = set_limits(s, qp, 0);
+  report->slack = conflict > opened ? conflict : opened;
+  return koopmpc_search_levels(s, qp->low, qp->high, report);
+}
+#else
 /** Whether the hard rows alone have no point in common. */
 static int contradictory(koopmpc_state *s, koopmpc_qp_memory *qp) {
   int good;
@@ -328,6 +349,7 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   return KOOPMPC_OPTIMAL;
 }
 #endif
+#endif
 
 /** A step in which the plan or its target breaks a limit, or something is not finite. */
 static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real *u, koopmpc_report *report) {
@@ -359,7 +381,7 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
     changed = 1;
   }
 #endif
-  if (changed && within(s, 0, PLANNED)) {
+  if (changed && within(s, 0, PLANNED) && rests(s)) {
     unconstrained(s, u, report);
     return;
   }
@@ -373,6 +395,10 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
       koopmpc_fail(s, free_input, applied, u, report, status);
       return;
     }
+#if KOOPMPC_LEVELED
+    keep(s, u, report, report->gap > 0 ? KOOPMPC_TIME_LIMIT : report->slack > 0 ? KOOPMPC_SOFTENED : KOOPMPC_OPTIMAL);
+    return;
+#else
     koopmpc_add(s->t, koopmpc_deviation, MOVES, qp.primal, MOVES);
 #if KOOPMPC_BOUNDS
     koopmpc_real low[KOOPMPC_NU], high[KOOPMPC_NU];
@@ -388,6 +414,7 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
     if (KOOPMPC_HARD_RATED) koopmpc_admit(s->t, koopmpc_hard_rate_low, koopmpc_hard_rate_high, s->known + KOOPMPC_U_PREV);
 #endif
     keep(s, u, report, report->slack > 0 ? KOOPMPC_SOFTENED : KOOPMPC_OPTIMAL);
+#endif
   }
 #else
   koopmpc_fail(s, s->t, applied, u, report, KOOPMPC_FAILED);
@@ -404,12 +431,15 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
   if (!report) report = &own;
   report->fallback = KOOPMPC_NONE;
   report->iterations = 0;
-  report->slack = 0;
+  report->slack = report->gap = 0;
   aim(s, reference);
   koopmpc_take(s, y, applied, w);
   report->refused = s->refused;
+#if KOOPMPC_LEVELED
+  koopmpc_count_levels(s, applied && !KOOPMPC_LATENCY && koopmpc_usable(applied, KOOPMPC_NU) ? applied : s->given);
+#endif
   evaluate(s);
-  if (within(s, 0, KOOPMPC_NT))
+  if (within(s, 0, KOOPMPC_NT) && rests(s))
     unconstrained(s, u, report);
   else
     limited(s, applied, u, report);

@@ -2,6 +2,7 @@
 #include <math.h>
 
 #include "koopmpc_bounds.h"
+#include "koopmpc_levels.h"
 #include "koopmpc_limits.h"
 #include "koopmpc_observer.h"
 #include "koopmpc_receding.h"
@@ -252,6 +253,9 @@ void koopmpc_fail(koopmpc_state *s, const koopmpc_real *free_input, const koopmp
   koopmpc_copy(u, chosen, KOOPMPC_NU);
   koopmpc_admit_within(u, KOOPMPC_RATED ? KOOPMPC_RATES_LOW(s) : 0, KOOPMPC_RATES_HIGH(s), before, KOOPMPC_BOX_LOW(s),
                        KOOPMPC_BOX_HIGH(s));
+#if KOOPMPC_LEVELED
+  koopmpc_round_levels(s, u, before);
+#endif
   koopmpc_copy(s->given, u, KOOPMPC_NU);
 }
 
@@ -263,6 +267,11 @@ void koopmpc_start(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real 
 #endif
   for (int i = 0; i < KOOPMPC_NU; i++)
     s->given[i] = u_prev ? u_prev[i] : koopmpc_clip(0, koopmpc_input_low[i], koopmpc_input_high[i]);
+#if KOOPMPC_LEVELED
+  koopmpc_start_levels(s, s->given);
+  if (!u_prev) koopmpc_round_levels(s, s->given, s->given);
+  koopmpc_start_levels(s, s->given);
+#endif
   for (int k = 0; k <= KOOPMPC_LATENCY; k++) koopmpc_copy(s->sent + k * KOOPMPC_NU, s->given, KOOPMPC_NU);
 #if KOOPMPC_ESTIMATOR == 2
   {

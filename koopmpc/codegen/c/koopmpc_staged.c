@@ -514,7 +514,7 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
   if (!report) report = &own;
   report->fallback = KOOPMPC_NONE;
   report->iterations = 0;
-  report->slack = 0;
+  report->slack = report->gap = 0;
   koopmpc_take(s, y, applied, w);
   report->refused = s->refused;
   koopmpc_copy(u_prev, s->given, NV);

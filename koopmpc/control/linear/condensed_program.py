@@ -9,6 +9,7 @@ from koopmpc.control.limits import Interval
 from koopmpc.control.program import LinearProgram
 from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.solvers.daqp import DAQPSetup
+from koopmpc.control.stepped.sequences import LevelsProgram
 from koopmpc.estimate.observer import EstimatorProgram
 from koopmpc.values import Value
 
@@ -72,6 +73,8 @@ class CondensedProgram(LinearProgram):
         Hard limits of the changes of inputs, ±inf where one has none; None without.
     bounds
         How limits in time move the plan's; None where none do.
+    levels
+        The search for the best sequence of levels; None where no input is on levels.
     M, low, high
         The plan's matrix, and the limits of t.
     offset, from_reference, from_target, from_given
@@ -108,3 +111,4 @@ class CondensedProgram(LinearProgram):
     solver: DAQPSetup
     estimator: EstimatorProgram
     bounds: BoundsProgram | None = None
+    levels: LevelsProgram | None = None

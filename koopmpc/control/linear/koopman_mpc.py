@@ -216,9 +216,12 @@ class KoopmanMPC(MPCBase):
 
     def build_program(self, reference: ArrayLike | None) -> CondensedProgram:
         """Return the data of a step."""
-        if self._held is not None:
+        levels = self._qps.describe() if isinstance(self._qps, LevelSolver) else None
+        if self._held is not None and levels is None:
             raise no_export(
-                self, "its inputs are on levels, and the search over them has no C code", "one without levels"
+                self,
+                "only some of its inputs or steps are on levels, and this search has no C code",
+                "one whose inputs are all on levels in all steps",
             )
         if self.limits.priority is not None:
             raise no_export(self, "its C weighs soft limits, and knows no priority", "one without a priority")
@@ -268,6 +271,7 @@ class KoopmanMPC(MPCBase):
             solver=setup,
             estimator=estimator,
             bounds=describe_bounds(plan) if self.limits.in_time or self.limits.rows else None,
+            levels=levels,
         )
 
     @property

@@ -18,7 +18,7 @@ from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolution, SolverTurn, StepQP, StepSolver
 from koopmpc.control.stepped.levels import NEAR, HeldLevels, LevelBox, leveled_moves
-from koopmpc.control.stepped.sequences import EQUAL, SequenceSearch
+from koopmpc.control.stepped.sequences import EQUAL, LevelsProgram, SequenceSearch
 
 NODES = 200_000  # nodes of one search, at most
 _NAME = "sequences"  # of the solver, where no quadratic program is solved
@@ -75,7 +75,7 @@ class LevelSearch:
     """
 
     def __init__(self, held: HeldLevels, blocks: Sequence[int], nu: int) -> None:
-        self.held, self.blocks, self._nu = held, blocks, nu
+        self.held, self.blocks, self.nu = held, blocks, nu
         self.index = np.zeros((leveled_moves(held.levels, blocks), len(held.levels.which)), np.intp)
         self._known, self.gap, self.nodes = False, 0.0, 0
         self.repeats = False  # whether the next search is of the same step as the last one
@@ -86,8 +86,8 @@ class LevelSearch:
 
     def accepts(self, t: Float[np.ndarray, " nt"]) -> bool:
         """Return whether a plan without levels is on them; its moves are then put on them to the bit."""
-        moves = len(self.blocks) * self._nu
-        U = t[:moves].reshape(-1, self._nu)
+        moves = len(self.blocks) * self.nu
+        U = t[:moves].reshape(-1, self.nu)
         at = self.held.levels.indices(U[: len(self.index)])
         nearest = np.rint(at).astype(np.intp)
         if (np.abs(at - nearest) > NEAR).any() or not self.held.tighten(
@@ -100,7 +100,7 @@ class LevelSearch:
 
     def place(self, U: Float[np.ndarray, "..."]) -> float:
         """Put the moves of a plan on the levels found, to the bit; return the gap."""
-        rows = U.reshape(-1, self._nu)
+        rows = U.reshape(-1, self.nu)
         rows[: len(self.index), self.held.levels.which] = self.held.levels.values(self.index)
         return self.gap
 
@@ -202,7 +202,7 @@ class LevelSearch:
 
     def find_places(self) -> Int[np.ndarray, "moves leveled"]:
         """Return where the moves on levels stand in a plan, move by move."""
-        return np.arange(len(self.index))[:, None] * self._nu + self.held.levels.which
+        return np.arange(len(self.index))[:, None] * self.nu + self.held.levels.which
 
     def _choose(
         self, at: Float[np.ndarray, "moves leveled"], nearest: Int[np.ndarray, "moves leveled"], box: LevelBox
@@ -260,6 +260,12 @@ class LevelSolver(StepSolver):
         shape = search.index.shape
         sequences = SequenceSearch(qp, self._rows_of, self._factor.reshape(shape), search.held, search.blocks)
         self._sequences = sequences if sequences.applies else None
+
+    def describe(self) -> LevelsProgram | None:
+        """Return the search over sequences as data; None unless all inputs are on levels in all steps."""
+        search = self.search
+        every = search.index.shape == (len(search.blocks), search.nu)
+        return None if self._sequences is None or not every else self._sequences.describe()
 
     def reset(self) -> None:
         """Forget all earlier solves, so that a run repeats to the bit."""

@@ -10,6 +10,7 @@ Electronics 29(12), 2014: the sphere decoder.
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from time import perf_counter
 from typing import NamedTuple
 
@@ -20,7 +21,8 @@ from scipy.linalg import solve_triangular
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import StepQP
-from koopmpc.control.stepped.levels import HeldLevels, LevelBox
+from koopmpc.control.stepped.levels import HeldLevels, InputLevels, LevelBox
+from koopmpc.values import Value
 
 WIDTH = 128  # beginnings that go on at once
 EQUAL = 1e-9  # a sequence is worse than the best one unless it is better by more than this share
@@ -38,6 +40,41 @@ class SequenceFound(NamedTuple):
     bound: float
     status: Status
     nodes: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LevelsProgram(Value):
+    """The search of a step: ½ ‖s‖² + Σ (linear ε + quadratic ε²) → min, where moves and rows are at + L s and T s.
+
+    Attributes
+    ----------
+    levels
+        The levels of the inputs.
+    blocks
+        (moves,) steps of each move.
+    free, group
+        (n,) the moves that are free, and for each move and input, one after the other, the free one that it repeats.
+    steps
+        (n,) for how many steps a free move is held.
+    L, T
+        (n, n) lower triangular, in levels; (m, n), in the unit of the rows.
+    rows, first
+        (m,) the rows of the step's program besides its moves; (n + 1,) where those begin that depend on a move last.
+    linear, quadratic
+        (m,) prices of the soft rows, inf for a hard one.
+    """
+
+    levels: InputLevels
+    blocks: Int[np.ndarray, " moves"]
+    free: Int[np.ndarray, " n"]
+    group: Int[np.ndarray, " all_moves"]
+    steps: Int[np.ndarray, " n"]
+    L: Float[np.ndarray, "n n"]
+    T: Float[np.ndarray, "m n"]
+    rows: Int[np.ndarray, " m"]
+    first: Int[np.ndarray, " n1"]
+    linear: Float[np.ndarray, " m"]
+    quadratic: Float[np.ndarray, " m"]
 
 
 class _Begun(NamedTuple):
@@ -106,7 +143,7 @@ class SequenceSearch:
         order = np.argsort(last, kind="stable")
         self._others, self._last = others[order], last[order]
         self._free, self._count = free, np.bincount(last, minlength=len(free)).tolist()
-        self._inverse = np.linalg.inv(L)
+        self._L, self._inverse = L, np.linalg.inv(L)
         self._from_s = solve_triangular(factor_of_v, Q, lower=True, trans="T")
         self._T = T[order]
         # the rows in the order in which a sequence meets them: each move, then those that depend on it last
@@ -127,6 +164,22 @@ class SequenceSearch:
         self._input = (free % leveled).tolist()
         lengths = np.repeat(np.asarray(blocks)[: self._shape[0]], leveled)
         self._length = np.bincount(self._group, weights=lengths).astype(np.intp).tolist()
+
+    def describe(self) -> LevelsProgram:
+        """Return the search as data."""
+        return LevelsProgram(
+            levels=self._held.levels,
+            blocks=np.array(self._blocks),
+            free=self._free,
+            group=self._group,
+            steps=np.array(self._length),
+            L=self._L,
+            T=self._T,
+            rows=self._others,
+            first=np.cumsum([0, *self._count]),
+            linear=np.where(self._is_soft, self._linear, np.inf),
+            quadratic=self._quadratic,
+        )
 
     def _find_groups(self, tied: Bool[np.ndarray, "moves leveled"]) -> Int[np.ndarray, " all_moves"]:
         """Return the number of the free move that each move repeats."""
