@@ -208,7 +208,7 @@ class Cost(Value):
         if callable(self.stage):
             priced["stage"] = trace_stage(self.stage, len(states), len(inputs))
         if not fields:
-            return replace(self, **priced) if priced else self
+            return (replace(self, **priced) if priced else self)._drop_constant_rows()
         known = {"Q": self.of.bind(tuple(states)).names if "Q" in fields else ()}
         omitted = {"Q": 0.0, "R": None, "R_delta": 0.0}
         return replace(
@@ -218,7 +218,18 @@ class Cost(Value):
                 for name, value in fields.items()
             },
             **priced,
-        )
+        )._drop_constant_rows()
+
+    def _drop_constant_rows(self) -> "Cost":
+        """Return the cost without rows that are all the diagonal of their weight, so that plans are alike to the bit."""
+        dropped: dict[str, None] = {}
+        for name, given in (("Q_rows", self.Q), ("R_rows", self.R)):
+            rows, weight = getattr(self, name), np.asarray(given, dtype=np.float64)
+            if rows is not None:
+                diagonal = weight.diagonal() if weight.ndim == 2 else weight
+                same = diagonal.size in (1, np.shape(rows)[-1]) and bool((np.asarray(rows) == diagonal).all())
+                dropped |= {name: None} if same else {}
+        return replace(self, **dropped) if dropped else self
 
     def matrices(self, nr: int, nu: int) -> tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]]:
         """Return Q (nr, nr) and R (nu, nu) for `nr` tracked outputs and `nu` inputs."""
