@@ -208,7 +208,7 @@ class Cost(Value):
         if callable(self.stage):
             priced["stage"] = trace_stage(self.stage, len(states), len(inputs))
         if not fields:
-            return (replace(self, **priced) if priced else self)._drop_constant_rows()
+            return replace(self, **priced) if priced else self
         known = {"Q": self.of.bind(tuple(states)).names if "Q" in fields else ()}
         omitted = {"Q": 0.0, "R": None, "R_delta": 0.0}
         return replace(
@@ -218,18 +218,7 @@ class Cost(Value):
                 for name, value in fields.items()
             },
             **priced,
-        )._drop_constant_rows()
-
-    def _drop_constant_rows(self) -> "Cost":
-        """Return the cost without rows that are all the diagonal of their weight, so that plans are alike to the bit."""
-        dropped: dict[str, None] = {}
-        for name, given in (("Q_rows", self.Q), ("R_rows", self.R)):
-            rows, weight = getattr(self, name), np.asarray(given, dtype=np.float64)
-            if rows is not None:
-                diagonal = weight.diagonal() if weight.ndim == 2 else weight
-                same = diagonal.size in (1, np.shape(rows)[-1]) and bool((np.asarray(rows) == diagonal).all())
-                dropped |= {name: None} if same else {}
-        return replace(self, **dropped) if dropped else self
+        )
 
     def matrices(self, nr: int, nu: int) -> tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]]:
         """Return Q (nr, nr) and R (nu, nu) for `nr` tracked outputs and `nu` inputs."""
@@ -605,5 +594,17 @@ def check_cost_and_limits(
     elif not isinstance(limits, Limits):
         raise DataError(f"limits is a {type(limits).__name__}; pass Limits, or None for none")
     if callable(cost.stage) or any(isinstance(v, Mapping) for v in (*vars(cost).values(), *vars(limits).values())):
-        return cost.resolve(states, inputs), limits.resolve(states, inputs)
-    return cost, limits
+        cost, limits = cost.resolve(states, inputs), limits.resolve(states, inputs)
+    return _drop_constant_rows(cost), limits
+
+
+def _drop_constant_rows(cost: Cost) -> Cost:
+    """Return the cost without rows that are all the diagonal of their weight, so that plans are alike to the bit."""
+    dropped: dict[str, None] = {}
+    for name, given in (("Q_rows", cost.Q), ("R_rows", cost.R)):
+        rows, weight = getattr(cost, name), np.asarray(given, dtype=np.float64)
+        if rows is not None:
+            diagonal = weight.diagonal() if weight.ndim == 2 else weight
+            same = diagonal.size in (1, np.shape(rows)[-1]) and bool((np.asarray(rows) == diagonal).all())
+            dropped |= {name: None} if same else {}
+    return replace(cost, **dropped) if dropped else cost

@@ -40,6 +40,28 @@ def test_plans_on_a_linear_plant_are_those_of_koopman_mpc(kind, rate, moves):
     assert len(used) > 1
 
 
+def test_rows_of_limits_leave_the_levels_that_koopman_mpc_takes():
+    limits = km.Limits(levels=[[-1, 0, 1]], u_max=np.array([[1.0]] * 3 + [[0.2]] * 4 + [[1.0]] * 9), x_min=[-3, -0.4])
+    mpcs = [each(MODEL, km.Cost(**COST), limits, 4) for each in (km.KoopmanMPC, km.NonlinearMPC)]
+    x = np.array([-1.5, 0.3])
+    for _ in range(8):
+        one, _ = (mpc(x, [0, 0]) for mpc in mpcs)
+        np.testing.assert_array_equal(mpcs[1].plan().U, mpcs[0].plan().U)
+        x = A @ x + B @ one.u
+
+
+@pytest.mark.parametrize("more", [{}, {"dwell": [2]}, {"du_max": 1}])
+def test_sequences_cost_no_more_than_what_branch_and_bound_finds(more, monkeypatch):
+    x, costs = np.array([-0.8, 0.5]), []
+    for searched in (True, False):
+        mpc = km.NonlinearMPC(make_swing(), km.Cost(**COST), km.Limits(levels=[[-1, 0, 1]], **more), 5)
+        if not searched:
+            monkeypatch.setattr(mpc, "_rollouts", None)
+        assert mpc(x, [0, 0]).status in (km.Status.OPTIMAL, km.Status.SOFTENED)
+        costs.append(cost_of(x, mpc.plan().U[:, 0]))
+    assert costs[0] <= costs[1] * (1 + 1e-9)
+
+
 def swing(x, u):
     return ca.vertcat(x[0] + 0.2 * x[1], x[1] + 0.2 * (-ca.sin(2 * x[0]) - 0.2 * x[1] + u[0] * (1 + 0.3 * x[0])))
 

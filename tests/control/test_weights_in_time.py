@@ -104,5 +104,5 @@ def test_rows_that_cannot_be_are_refused(said):
 def test_laws_that_do_not_know_rows_refuse_them():
     for kind in (km.KoopmanMPC, km.LQR):
         with pytest.raises(km.errors.DataError, match="rows of weights in time"):
-            kind(MODEL, km.Cost(Q=1, R=1, Q_rows=[[1, 1]]))
-    assert "weights move in time" in make(km.BilinearMPC, Q_rows=[[1, 1]]).program().obstacle
+            kind(MODEL, km.Cost(Q=1, R=1, Q_rows=[[1, 2]]))
+    assert "weights move in time" in make(km.BilinearMPC, Q_rows=[[1, 2]]).program().obstacle

@@ -14,6 +14,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.move import Status
+from koopmpc.control.nonlinear.level_rollouts import LevelRollouts, StageData
 from koopmpc.control.nonlinear.problem import ModelOrMap
 from koopmpc.control.nonlinear.rows import StageLimits
 from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolution, NLPSolver, Shooting, Start
@@ -91,6 +92,8 @@ class NonlinearMPC(StagedMPC):
     'OPTIMAL'
     """
 
+    _limits_now: StageLimits | None = None  # of this step, where they differ from those of the stages
+
     @raise_swallowed()  # CasADi swallows a Ctrl-C while it builds expressions
     def __init__(
         self,
@@ -115,7 +118,7 @@ class NonlinearMPC(StagedMPC):
         fixes = {} if self._levels is None else {"inputs_check": False}  # it warns of nodes that fix all inputs
         self._options = solver, {**fixes, **(settings or {})}, time_limit is not None
         self._own = {"solver": solver, "starts": self._starts, "settings": dict(settings or {})}
-        self._shooting = Shooting(self._problem, self._map.theta, *self._options)
+        self._set_up()
         self._e, self._W = np.zeros((self._N, self._map.nx)), np.zeros((self._N, self._map.scheduled))
 
     def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
@@ -136,9 +139,18 @@ class NonlinearMPC(StagedMPC):
     def update(self, model: ModelOrMap) -> None:
         """Go on with another predictor of the same lifting, as `BilinearMPC.update`; the solver is built again."""
         super().update(model)
+        self._set_up()
+
+    def _set_up(self) -> None:
+        """Build the nonlinear program, and the search over sequences where all inputs are on levels in all steps."""
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
+        self._rollouts: LevelRollouts | None = None
+        levels, p = self._levels, self._problem
+        if levels is not None and levels.index.shape == (len(self._blocks), self.nu) and not p.own:
+            self._rollouts = LevelRollouts(p, self._map.theta, levels.held, self._blocks)
 
     def _limit(self, limits: StageLimits | None) -> None:
+        self._limits_now = limits
         low, high = self._problem.stage_limits if limits is None else limits.stages
         nu = self.nu
         self._shooting.set_limits(Interval(low[:, :nu], high[:, :nu]), Interval(low[:, nu:], high[:, nu:]))
@@ -177,9 +189,10 @@ class NonlinearMPC(StagedMPC):
     def _search_levels(
         self, relaxed: NLPSolution, s: Float[np.ndarray, " ns"], first: Interval, deadline: float
     ) -> tuple[NLPSolution, int]:
-        """Return the best plan on levels that branch and bound over nonlinear programs finds, and all iterations.
+        """Return the best plan on levels, and all iterations.
 
-        A node is a local optimum, so that a plan is the best one as far as these are.
+        Where all inputs are on levels and sequences are few, it is the best of all. Otherwise branch and bound over
+        nonlinear programs finds it; a node is a local optimum, so that a plan is the best one as far as these are.
         """
         search, shooting, N = self._levels, self._shooting, self._N
         assert search is not None, "only asked where inputs have levels"
@@ -207,8 +220,15 @@ class NonlinearMPC(StagedMPC):
             _, U = self._trajectory(np.vstack([s, found.X]), found.U)
             return Relaxed(status, found.cost, levels.indices(U[starts[:count]]), found.iterations, found)
 
-        end = None if np.isinf(deadline) else deadline
-        found = search.find(relax, root, relaxed, end, relaxed.cost)
+        end, found = None if np.isinf(deadline) else deadline, None
+        if self._rollouts is not None:
+            limits = self._problem.stage_limits if self._limits_now is None else self._limits_now.stages
+            stages = StageData(self._targets, self._e, self._W, shooting.weights, limits, first)
+            best = self._rollouts.find(s, stages, root, search.guess())
+            if best is not None:
+                found = search.find(relax, LevelBox(best, best.copy()), relaxed, end, relaxed.cost)
+        if found is None or (found.answer is None and found.status is not Status.TIME_LIMIT):
+            found = search.find(relax, root, relaxed, end, relaxed.cost)
         unlimited = np.full((N, self.nu), np.inf)
         shooting.set_moves(*((-unlimited, unlimited) if rated else (low, high)))
         if found.answer is None:

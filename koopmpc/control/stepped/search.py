@@ -131,7 +131,7 @@ class LevelSearch:
         best: Any = None
         cost, iterations, unproven = np.inf, 0, np.inf
         stack, guess = [_Node(least, root, start)], self.guess()
-        if guess is not None:
+        if guess is not None and (root.low != root.high).any():
             last = np.clip(guess, root.low, root.high)
             stack.append(_Node(least, LevelBox(last.copy(), last.copy()), start))
         ended = Status.INFEASIBLE
