@@ -23,7 +23,7 @@ _OUTSIDE = 1e-6  # share of a limit's size by which a hard limit may be missed
 
 
 class StageData(NamedTuple):
-    """What the stages of a step are: targets, e, w, diagonals of weights in time, limits of [v; limited], and of v_0."""
+    """The stages of a step: targets, e, w, diagonals of weights in time, limits of [v; limited] and of v_0."""
 
     targets: StageTargets
     e: Float[np.ndarray, "N n"]
@@ -118,7 +118,7 @@ class LevelRollouts:
         low, high = (end[k] for end in stages.limits)
         first = stages.first if k == 0 else Interval(low[:nu], high[:nu])
         reach = _OUTSIDE * p.input_sizes
-        broken = ((V < first.low - reach) | (first.high + reach < V)).any(axis=1)
+        broken = ((first.low - reach > V) | (first.high + reach < V)).any(axis=1)
         if len(p.box.low):
             values, (linear, quadratic, allowance) = _evaluate(p.limited, after), p.softness
             past = np.maximum(np.maximum(values - high[nu:], low[nu:] - values), 0.0)
