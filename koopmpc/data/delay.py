@@ -98,7 +98,7 @@ class Delay(Value):
         """Names of the entries of ζ."""
         states, inputs = self._names
         past = (inputs if self.inputs else ()) + states
-        return states + tuple(_name_past(name, i) for i in range(1, self.steps + 1) for name in past)
+        return states + tuple(name_past(name, i) for i in range(1, self.steps + 1) for name in past)
 
     @property
     def _names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -231,7 +231,7 @@ class Delay(Value):
         return np.hstack([X[d:], windows.transpose(0, 2, 1).reshape(len(windows), -1)])
 
 
-def _name_past(name: str, steps: int) -> str:
+def name_past(name: str, steps: int) -> str:
     """Return ``"theta[k-1] [rad]"`` for ``"theta [rad]"``."""
     stem, bracket, unit = name.partition(" [")
     return f"{stem}[k-{steps}]{bracket}{unit}"

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.data.delay import Delay
+from koopmpc.data.delay import Delay, name_past
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError, ShapeError
@@ -354,7 +354,8 @@ def feedback_share(
     """Return for each input the share R², 0 … 1, of its energy that a linear function of ψ(x) explains.
 
     At 1 the input was a feedback u = K ψ(x), and the data cannot separate A from B. If ψ contains a Constant, the
-    energy is that around the mean.
+    energy is that around the mean; if ψ contains past inputs, only what they leave open counts, for a smooth input is
+    no feedback.
 
     Parameters
     ----------
@@ -377,13 +378,25 @@ def explain_inputs(total: Moments) -> Float[np.ndarray, " nu"]:
     """Return the result of `feedback_share` from moments, in the order of their inputs."""
     P, _, cut = both_sides(total)
     nz, nu = total.nz, len(total.inputs)
-    index = total.lifting.constant_index
-    constant = [] if index is None else [index]
+    names, constant = total.lifting.names, total.lifting.constant_index
+    always = [] if constant is None else [constant]
+    past = _name_past_inputs(total)
+    known = [*always, *(i for i, name in enumerate(names) if name in past)]
     U = P[:, nz : nz + nu]
-    variation = _residual_norms(U, P[:, constant], cut)
+    moves = _residual_norms(U, P[:, always], cut) > cut * column_norms(U)
+    variation = _residual_norms(U, P[:, known], cut)
     unexplained = _residual_norms(U, P[:, :nz], cut)
     varies = variation > cut * column_norms(U)
-    return 1.0 - np.divide(unexplained**2, variation**2, out=np.zeros(nu), where=varies)
+    rest = np.divide(unexplained**2, variation**2, out=1.0 * moves, where=varies)
+    return 1.0 - rest
+
+
+def _name_past_inputs(total: Moments) -> set[str]:
+    """Return the names that past inputs have among the entries of ζ."""
+    past = total.embedding
+    if past is None or not past.inputs:
+        return set()
+    return {name_past(name, i) for i in range(1, past.steps + 1) for name in total.inputs}
 
 
 def _residual_norms(

@@ -71,3 +71,19 @@ def test_feedback_is_the_share_of_u_that_the_observables_explain() -> None:
     assert cubed[4] == pytest.approx(1, abs=1e-6)
     raw = share(data, km.State())  # without a Constant the mean is energy that x lacks
     assert raw[0] == pytest.approx(var / (var + 9), abs=0.01)
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.5])
+def test_a_smooth_input_is_no_feedback_where_the_model_holds_past_inputs(gain: float) -> None:
+    """u_k = .98 u_{k−1} + e_k is known from its past; only under feedback do outputs tell what the past leaves open."""
+    rng = np.random.default_rng(4)
+    Y, U, slow = np.zeros((2001, 1)), np.zeros((2000, 1)), 0.0
+    for k in range(2000):
+        slow = 0.98 * slow + 0.1 * rng.standard_normal()
+        U[k] = slow - gain * Y[k]
+        Y[k + 1] = 0.7 * Y[k] + U[k] + 0.2 * rng.standard_normal()
+    data, psi = km.Episodes([km.Episode(X=Y, U=U)], 0.1), km.State() + km.Constant()
+    share = float(km.validate.feedback_share(data, psi, embedding=km.Delay(2))[0])
+    assert share > 0.5 if gain else share < 0.1
+    wave = km.Episodes([km.Episode(X=Y, U=np.sin(0.3 * np.arange(2000.0))[:, None])], 0.1)
+    assert km.validate.feedback_share(wave, psi, embedding=km.Delay(2))[0] < 0.1  # its past says all of it
