@@ -126,7 +126,7 @@ class Ensemble(Value):
             x = rows.reshape(members, loops, -1) @ self.theta[:members]
             if isinstance(E, np.ndarray):
                 x = x + self._widen(rows).reshape(members, loops, 1) * E
-        x = np.clip(np.nan_to_num(x, nan=_HUGE), -_HUGE * self.scale, _HUGE * self.scale)
+        x = np.fmax(np.fmin(x, _HUGE * self.scale), -_HUGE * self.scale)  # what is not a number is huge
         return x if self.embedding is None else self.embedding.shift(points, U, x)
 
     def simulate(
@@ -151,7 +151,7 @@ class Ensemble(Value):
     def _widen(self, rows: Float[np.ndarray, "M p"]) -> Float[np.ndarray, " M"]:
         """Return by how much residuals grow at these rows: the root of their leverage over its mean, at least 1."""
         leverage = np.sum(((rows / self.size) @ self._root) ** 2, axis=1)
-        return np.sqrt(np.clip(np.nan_to_num(leverage, nan=_FARTHEST), 1.0, _FARTHEST))
+        return np.sqrt(np.fmax(np.fmin(leverage, _FARTHEST), 1.0))
 
     @cached_property
     def _root(self) -> Float[np.ndarray, "p p"]:

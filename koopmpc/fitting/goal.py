@@ -168,7 +168,7 @@ def design_data(
     except DataError as refusal:
         if plan is None:
             raise
-        few = join_sets([part.load() for part in Files(find_logs(data), **reading).parts()])
+        few = _load_few(data, reading, pushed)
         further(few, read_goal(goal, few), refusal=refusal)
         raise
     missed = tuple(name for name in pushed if name in split.seen.states)
@@ -198,7 +198,7 @@ def design_data(
                 rng=draw,
             )
     except DataError as refusal:
-        further(split.fitted, asked, refusal=refusal)
+        further(_join_rows(split), asked, refusal=refusal)
         raise
     tell(str(designed))
     certified = ""
@@ -206,7 +206,7 @@ def design_data(
         unseen = split.held_out if split.learned is None else None
         certified = describe_certificate(designed, asked.reference, unseen, place)
         tell(certified)
-    planned = further(split.fitted, asked, designed)
+    planned = further(_join_rows(split), asked, designed)
     file = place / "controller.npz"
     summary = _summarise_logs(split, designed, about, Path(goal).read_text(), planned, draw)
     designed.save(file, logs=replace(summary, certified=certified))
@@ -214,6 +214,25 @@ def design_data(
     saved = load_value(file, SavedDesign)
     page = write_design_report(saved, rebuild_controller(saved, file), place / "report.html", file.as_posix())
     return DesignedData(designed, asked, file, page, usage, planned)
+
+
+def _load_few(data: Data, reading: Mapping[str, Any], pushed: Sequence[str]) -> Episodes:
+    """Return logs that are too few to learn from; columns that the goal pushes are inputs, whatever their names."""
+    files = find_logs(data)
+    with collect_notes([]):
+        few = join_sets([part.load() for part in Files(files, **reading).parts()])
+        missed = [name for name in pushed if name in few.states]
+        if not missed or "inputs" in reading:
+            return few
+        told: dict[str, Any] = {**reading, "inputs": (*few.inputs, *missed)}
+        return join_sets([part.load() for part in Files(files, **told).parts()])
+
+
+def _join_rows(split: DividedData) -> Episodes | Source:
+    """Return all rows in memory, the held-out ones too: what was recorded need not be recorded again."""
+    if split.learned is not None or not isinstance(split.fitted, Episodes):
+        return split.fitted
+    return split.fitted.with_episodes([*split.fitted, *split.held_out])
 
 
 _FORECASTS = 3  # held-out stretches whose forecasts a report may draw

@@ -25,7 +25,8 @@ _BLOCKS = 8  # parts of the old data that are compared with the others
 _INSIDE = 0.995  # share of the old rows whose leverage counts as inside the data
 _FEWEST = 40  # rows inside the old data that a comparison needs
 _NUDGE = 1e-3  # relative step of the differences
-_PART = 0.5  # a name must explain this share of what changed
+_PART = 0.5  # a name should explain this share of what changed
+_TOO_LITTLE = 1 / 3  # one that explains less than this is not named: the regression itself may not hold there
 
 TOLERANCE = 1.5  # errors may be this many times those of a model on its own data before it counts as changed
 CHANCE = 1e-4  # or so large that chance makes them so in this share of cases
@@ -125,7 +126,8 @@ def find_drift(old: Episodes, new: Episodes) -> DriftReport:
     Returns
     -------
     report
-        "cannot say" where new rows are outside of the old data, or do not excite what could have changed.
+        "cannot say" where new rows are outside of the old data, or do not excite what could have changed, or where no
+        single change explains a third of the difference.
 
     Raises
     ------
@@ -365,6 +367,13 @@ def _judge(law: _Law, found: _Measured, null: Sequence[_Measured], rows: int, in
         return DriftReport("unchanged", (), missed, rows, inside, (first, *said))
     scaled = found.gain / inflate**2
     best = max(changed, key=lambda i: float(scaled[i]))
+    part = float(found.gain[best] / max(found.whole, 1e-300))
+    if part < _TOO_LITTLE:
+        first = (
+            "the new logs differ from the law of the old data, and no single change explains a third of it: more than "
+            "one thing changed, or the law is not well known where the new rows lie"
+        )
+        return DriftReport("cannot say", (), missed, rows, inside, (first, *said))
     single = law.log.data.nu + law.log.data.nx  # gains stand first among the candidates
     share = np.where(np.arange(len(names)) < single, ALIKE_GAIN, ALIKE)
     near = [i for i in changed if scaled[i] >= scaled[best] - max(_CLOSE, float(share[i] * scaled[best]))]
@@ -376,8 +385,6 @@ def _judge(law: _Law, found: _Measured, null: Sequence[_Measured], rows: int, in
         for i in near
     )
     first = str(chosen[0]) if len(chosen) == 1 else " or ".join(map(str, chosen)) + ": these cannot be told apart"
-    if found.gain[best] < _PART * found.whole:
-        said.append(
-            f"it explains {to_percent(float(found.gain[best] / found.whole))} of what changed: more than one thing did"
-        )
+    if part < _PART:
+        said.append(f"it explains {to_percent(part)} of what changed: more than one thing did")
     return DriftReport("changed", chosen, missed, rows, inside, (first, *said))

@@ -10,8 +10,8 @@ from koopmpc.fitting.goal import design_data
 from tests.fitting.mass import GOAL, NAMES, A, B, logs
 
 
-def few():
-    rng, x = np.random.default_rng(3), np.array([0.0, 0.0])
+def few(seed=3):
+    rng, x = np.random.default_rng(seed), np.array([0.0, 0.0])
     X, U = [x], 0.3 * np.repeat(rng.uniform(-1, 1, (6, 1)), 4, axis=0)
     for u in U:
         x = A @ x + B @ u
@@ -29,6 +29,30 @@ def test_a_refused_design_comes_with_a_plan_that_stays_inside_the_limits(tmp_pat
     head, table = lines[0].split(","), np.array([line.split(",") for line in lines[1:]], dtype=float)
     assert table[:, head.index("high speed [m/s]")].max() <= 0.8
     assert np.abs(table[:, head.index("force [N/kg]")]).max() <= 2.0
+
+
+def test_the_next_plan_knows_all_logs_also_those_that_are_held_out(tmp_path):
+    (tmp_path / "goal.toml").write_text(GOAL)
+    first, second = few(3)[0], few(4)[0]
+    shares = []
+    for name, episodes in {"few": [first], "more": [first, second, *logs(2, 60)]}.items():
+        logs().with_episodes(episodes).save(tmp_path / f"{name}.npz")
+        with pytest.raises(km.KoopmpcError, match="the next experiment is planned in"):
+            design_data(tmp_path / f"{name}.npz", tmp_path / "goal.toml", tmp_path, plan=tmp_path / f"{name}.csv")
+        words = (tmp_path / f"{name}.csv").read_text().split("errors by ")[1]
+        shares.append(float(words.split(" %")[0]))
+    assert shares[1] < 0.5 * shares[0]
+
+
+def test_the_goal_says_which_columns_are_inputs_of_logs_that_are_too_few(tmp_path):
+    for i, e in enumerate(few()):
+        rows = [f"{0.1 * k:.1f},{x[0]:.6f},{x[1]:.6f},{u:.6f}" for k, (x, u) in enumerate(zip(e.X, e.U[:, 0], strict=False))]
+        (tmp_path / f"log{i}.csv").write_text("\n".join(["time [s],position [m],speed [m/s],F [N]", *rows]))
+    (tmp_path / "goal.toml").write_text(GOAL.replace("force [N/kg]", "F [N]"))
+    with pytest.raises(km.KoopmpcError, match="the next experiment is planned in"):
+        design_data(tmp_path / "log0.csv", tmp_path / "goal.toml", tmp_path, plan=tmp_path / "plan.csv")
+    lines = [line for line in (tmp_path / "plan.csv").read_text().splitlines() if not line.startswith("#")]
+    assert "F [N]" in lines[0].split(",")
 
 
 @pytest.mark.slow
