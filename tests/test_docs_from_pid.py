@@ -34,3 +34,28 @@ def test_the_way_from_a_pid_leads_to_a_better_loop_without_a_bump(tmp_path):
     usual = np.abs(np.diff(switched.U[10:k, 0])).max()
     assert abs(switched.U[k, 0] - switched.U[k - 1, 0]) < max(3 * usual, 0.3)
     assert (tmp_path / "c_code" / "Makefile").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::koopmpc.errors.FitWarning")
+def test_one_sensor_is_enough_for_a_better_loop_that_the_stand_ins_do_not_call_lost(tmp_path):
+    """The log of one level in closed loop: a design failed on it, and then called half of its loops lost."""
+    names, _ = run("how/from_pid.md", tmp_path)
+    twin, logs = names["twin"], names["logs"]
+    one = km.Episodes([km.Episode(X=e.X[:, 1:], U=e.U) for e in logs], logs.dt, logs.states[1:], logs.inputs)
+    limits = km.Limits(u_min=0, u_max=8, x_max=[20])
+    cost = km.Cost(Q=1.0, R=0.1, R_delta=0.5)
+    design = km.design(one, cost, limits, horizon=25, reference=[10.0], bilinear=False)
+    assert "1 delay" in design.best.title
+    assert dict(design.expected.loops)["neighbours"] > 100
+    assert np.isinf(design.expected.fresh.cost).mean() < 0.01
+    wanted, rng = names["steps"][:, 0], np.random.default_rng(0)
+    x, lower = np.array([2.56, 4.0]), []
+    for k in range(149):
+        move = design.controller(x[1:] + 0.05 * rng.standard_normal(1), wanted[k : k + 1])
+        x = twin(x, move.u)
+        lower.append(float(x[1]))
+    error = np.sqrt(np.mean((lower - wanted[:149]) ** 2))
+    old = names["runs"]["PID as it is"].X[:, 1]
+    assert error < 0.9 * np.sqrt(np.mean((old - wanted) ** 2))
+    assert max(lower[10:80]) - 12 < 0.3 * (old[10:80].max() - 12)

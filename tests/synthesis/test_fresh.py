@@ -72,6 +72,27 @@ def test_nearest_rows_of_a_bent_plant_miss_less_the_more_rows_there_are():
     assert missed[1] < 2e-3
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_nearest_rows_forecast_no_worse_than_a_map_fitted_to_all_rows(noise):
+    """Few rows of noisy past values tell no slope; of clean ones they tell it better than all rows together."""
+    quiet = episodes_of(bent, count=20, steps=40, keep=1)
+    rng = np.random.default_rng(3)
+    logs = quiet.with_episodes([km.Episode(X=e.X + noise * rng.standard_normal(e.X.shape), U=e.U) for e in quiet])
+    past = km.Delay(2).bind(logs.states, logs.inputs)
+    one = NeighbourMap.of(logs, past, np.full(1, noise))
+    unseen = past(episodes_of(bent, count=8, steps=40, seed=9, keep=1))
+    errors = []
+    for ridge in (one.ridge, 1e9):
+        plant = replace(one, ridge=ridge).draw(np.random.default_rng(0))
+        for e in unseen:
+            z = e.X[0]
+            for u in e.U[:15]:
+                z = plant(z, u)
+            errors.append((z[0] - e.X[15, 0]) ** 2)
+    local, affine = np.sqrt(np.mean(np.reshape(errors, (2, -1)), axis=1))
+    assert local < (1.02 if noise else 0.8) * affine
+
+
 def test_a_draw_is_kept_for_a_loop_and_two_draws_differ():
     one, other = (rows_of(bent, 10).draw(np.random.default_rng(seed)) for seed in (0, 1))
     x, u = np.array([0.9, -0.9]), np.array([0.5])

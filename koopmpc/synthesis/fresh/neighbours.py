@@ -1,7 +1,7 @@
 """NeighbourMap: a stand-in of the plant by the nearest rows of the data, a bootstrap of them for each loop."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,9 +17,14 @@ from koopmpc.synthesis.asked import DesignTask
 from koopmpc.values import Value
 
 MOST = 6000  # rows that are kept
-NEAR = 3  # neighbours for each coefficient of the local slope
+NEAR = 3  # neighbours for each coefficient say whether a row is inside the data
 LEAST = 12  # neighbours at least
-RIDGE = 1e-4  # of the local slope, as a share of its largest squared direction
+# neighbours for each coefficient of the local slope, and its ridge, as a share of its largest squared direction
+SLOPES = tuple((near, ridge) for near in (NEAR, 20) for ridge in (1e-4, 1e-2, 1.0))
+AHEAD = 10  # steps of the forecasts that choose among them
+BEGUN = 400  # of these forecasts, about
+GROUPS = 8  # of episodes; each is forecast by the rows of the others
+ALIKE = 1.05  # the first of them is taken whose error is at most this many times the least one
 KNOWN = 0.99  # share of the data's own rows that is inside the data
 ROOM = 1.5  # a row is outside if its neighbours are this many times as far as those of KNOWN
 PROBES = 256  # points of the goal's range that are looked up in the data
@@ -32,8 +37,9 @@ class NeighbourMap(Value):
 
     States that nothing depends on are left out of v, and of angles that make whole turns v holds sine and cosine. The
     affine part is fitted to all rows; the local slope corrects what it misses, by least squares with tricube
-    weights (Cleveland & Devlin, "Locally weighted regression", J. Am. Stat. Assoc. 83, 1988). Where no rows are near,
-    the slope of the nearest ones goes on.
+    weights (Cleveland & Devlin, "Locally weighted regression", J. Am. Stat. Assoc. 83, 1988). How local it is, and its
+    ridge, are chosen by forecasts of unseen episodes: in logs that hold noise, or were made in closed loop, a few rows
+    tell no slope. Where no rows are near, the slope of the nearest ones goes on.
 
     Attributes
     ----------
@@ -59,6 +65,8 @@ class NeighbourMap(Value):
         Names of the state without its past, and of the inputs.
     dt
         Sampling time [s].
+    local, ridge
+        Neighbours for each coefficient of the local slope, and its ridge.
     """
 
     rows: Float[np.ndarray, "M n"]
@@ -75,6 +83,8 @@ class NeighbourMap(Value):
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     dt: float
+    local: int = SLOPES[0][0]
+    ridge: float = SLOPES[0][1]
 
     @classmethod
     def of(
@@ -96,7 +106,7 @@ class NeighbourMap(Value):
         scale = np.where(spread > GRID * (np.abs(V).max(axis=0) + 1e-300), spread, 1.0)
         apart = -(-len(V) // MOST)
         mean = np.concatenate([np.hstack([e.U, e.W]) for e in points]).mean(axis=0)
-        return cls(
+        found = cls(
             rows=np.ascontiguousarray((V / scale)[::apart]),
             steps=np.ascontiguousarray(steps[::apart]),
             points=np.concatenate([e.X[:-1, : data.nx] for e in points])[::apart],
@@ -112,6 +122,8 @@ class NeighbourMap(Value):
             inputs=data.inputs,
             dt=data.dt,
         )
+        local, ridge = _choose_slope(found, points)
+        return replace(found, local=local, ridge=ridge)
 
     @cached_property
     def tree(self) -> KDTree:
@@ -120,8 +132,13 @@ class NeighbourMap(Value):
 
     @property
     def near(self) -> int:
-        """Number k of neighbours."""
+        """Number k of neighbours that say whether a row is inside the data."""
         return min(max(NEAR * (self.rows.shape[1] + 1), LEAST), len(self.rows))
+
+    @property
+    def looked_up(self) -> int:
+        """Number of neighbours of which those in a bootstrap give the local slope."""
+        return min(2 * max(self.local * (self.rows.shape[1] + 1), LEAST), len(self.rows))
 
     @cached_property
     def reach(self) -> float:
@@ -134,9 +151,12 @@ class NeighbourMap(Value):
         """Return ζ after a rest at x0."""
         return x0 if self.embedding is None else self.embedding.repeat(x0, self.middle)
 
-    def scale_rows(self, Z: Float[np.ndarray, "T nzeta"], U: Float[np.ndarray, "T nu"]) -> Float[np.ndarray, "T n"]:
-        """Return v of each row over its spread."""
-        return _regress(Z, U, np.tile(self.w, (len(Z), 1)), self.ignored, self.turning) / self.scale
+    def scale_rows(
+        self, Z: Float[np.ndarray, "T nzeta"], U: Float[np.ndarray, "T nu"], W: Float[np.ndarray, "T nw"] | None = None
+    ) -> Float[np.ndarray, "T n"]:
+        """Return v of each row over its spread; without W measured disturbances are as on average."""
+        W = np.tile(self.w, (len(Z), 1)) if W is None else W
+        return _regress(Z, U, W, self.ignored, self.turning) / self.scale
 
     def find_outside(self, Z: Float[np.ndarray, "T nzeta"], U: Float[np.ndarray, "T nu"]) -> Bool[np.ndarray, " T"]:
         """Return which rows [ζ; u] have no data around them."""
@@ -180,6 +200,33 @@ class NeighbourMap(Value):
         return NeighbourPlants(self, counts.reshape(-1, number))
 
 
+def _choose_slope(map_: NeighbourMap, episodes: Episodes) -> tuple[int, float]:
+    """Return the neighbours for each coefficient and the ridge of the local slope that forecast best."""
+    number = len(map_.triangles)
+    group = np.arange(number) % GROUPS
+    counts = np.array([group != out for out in range(min(GROUPS, number))], dtype=np.float64)
+    ahead = min(AHEAD, min(len(e) for e in episodes))
+    apart = -(-sum(len(e) for e in episodes) // BEGUN)
+    at = [(i, k) for i, e in enumerate(episodes) for k in range(0, len(e) - ahead + 1, apart)]
+    if number < 2 or (counts @ np.bincount(map_.episode, minlength=number)).min() < map_.near:
+        return SLOPES[0]
+    which = np.array([group[i] for i, _ in at])
+    begun: Float[np.ndarray, "n nzeta"] = np.array([episodes[i].X[k] for i, k in at])
+    U = np.array([episodes[i].U[k : k + ahead] for i, k in at])
+    W = np.array([episodes[i].W[k : k + ahead] for i, k in at])
+    after: Float[np.ndarray, "n nzeta"] = np.array([episodes[i].X[k + ahead] for i, k in at])
+    spread = np.maximum(np.concatenate([e.X for e in episodes]).std(axis=0), 1e-300)
+    errors: list[float] = []
+    for local, ridge in SLOPES:
+        plants, Z = NeighbourPlants(replace(map_, local=local, ridge=ridge), counts), begun
+        for k in range(ahead):
+            Z = plants.step(Z, U[:, k], which, W[:, k])
+        missed: Float[np.ndarray, "n nzeta"] = (Z - after) / spread
+        error = float(np.sqrt(np.mean(missed**2)))
+        errors.append(error if np.isfinite(error) else np.inf)
+    return next(slope for slope, error in zip(SLOPES, errors, strict=True) if error <= ALIKE * min(errors))
+
+
 def _regress(
     Z: Float[np.ndarray, "T nzeta"],
     U: Float[np.ndarray, "T nu"],
@@ -205,7 +252,11 @@ class NeighbourPlants:
         self._affine: Float[np.ndarray, "E n nzeta"] = np.array(fits, dtype=np.float64).reshape(len(counts), n, -1)
 
     def step(
-        self, Z: Float[np.ndarray, "n nzeta"], U: Float[np.ndarray, "n nu"], which: Int[np.ndarray, " n"]
+        self,
+        Z: Float[np.ndarray, "n nzeta"],
+        U: Float[np.ndarray, "n nu"],
+        which: Int[np.ndarray, " n"],
+        W: Float[np.ndarray, "n nw"] | None = None,
     ) -> Float[np.ndarray, "n nzeta"]:
         """Return ζ⁺ of the plants `which`; NaN where ζ or u is not finite."""
         one, Z_next = self._map, np.full(Z.shape, np.nan)
@@ -213,8 +264,8 @@ class NeighbourPlants:
         if not good.any():
             return Z_next
         Z, U, which = Z[good], U[good], which[good]
-        V = one.scale_rows(Z, U)
-        found = one.tree.query(V, min(2 * one.near, len(one.rows)))
+        V = one.scale_rows(Z, U, None if W is None else W[good])
+        found = one.tree.query(V, one.looked_up)
         distance, places = (np.reshape(part, (len(V), -1)) for part in found)
         affine, near = self._affine[which], one.rows[places]
         width = 1.0001 * np.maximum(distance[:, -1:], 1e-12)
@@ -226,7 +277,7 @@ class NeighbourPlants:
         D = near - center[:, None]
         weighed = (D * share[..., None]).swapaxes(1, 2)
         S = weighed @ D
-        tilt = RIDGE * np.einsum("eii->ei", S).max(axis=1) + 1e-300
+        tilt = one.ridge * np.einsum("eii->ei", S).max(axis=1) + 1e-300
         S = np.where((total > 0)[:, None, None], S + tilt[:, None, None] * np.eye(S.shape[1]), np.eye(S.shape[1]))
         slope = np.asarray(np.linalg.solve(S, weighed @ (missed - mean[:, None])), dtype=np.float64)
         change = np.einsum("ei,eij->ej", V, affine[:, :-1]) + affine[:, -1]
