@@ -25,6 +25,7 @@ from koopmpc.control.stepped.sequences import LevelsProgram
 from koopmpc.control.target import ROUNDING
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import EXACT, DisturbanceProgram
+from koopmpc.estimate.gate import BRIDGED
 from koopmpc.estimate.kalman import FilterProgram
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
@@ -233,6 +234,7 @@ def _add_settings(tables: Tables, *, single: bool) -> None:
 def _add_gate(tables: Tables, gate: Graph | None, ny: int) -> None:
     """Write which readings are refused."""
     tables.sizes["GATE"] = 0 if gate is None else gate.m - 2
+    tables.sizes["BRIDGED"] = BRIDGED
     if gate is not None:
         arguments = {"y": ny, "predicted": ny, "memory": gate.m - 2}
         tables.functions["koopmpc_gate"] = CFunction(gate, arguments, "result")

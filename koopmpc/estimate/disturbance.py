@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
-from koopmpc.estimate.gate import gate_graph
+from koopmpc.estimate.gate import BRIDGED, gate_graph
 from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
 from koopmpc.estimate.periodic import PeriodicObserver, find_harmonics
 from koopmpc.interrupts import raise_swallowed
@@ -181,6 +181,7 @@ class DisturbanceObserver(Viewing, Measured):
         self._memory, self._C = np.zeros(self._rule.numel_in(2)), np.zeros(self.ny * own.nz)
         self._predicted, self._still = np.zeros(own.nz), np.zeros(own.nz)
         self._stood_in = False  # whether a prediction stood in for a part of the last reading
+        self._bridged = 0  # missed readings in sequence that the prediction has bridged
         self._see()
         self._take(model)
 
@@ -206,7 +207,7 @@ class DisturbanceObserver(Viewing, Measured):
         """Forget the last state, all misfits, d and the past; x0 will come as the first measurement."""
         super().reset(x0)
         self._memory[:] = 0.0
-        self._stood_in = False
+        self._stood_in, self._bridged = False, 0
 
     def program(self) -> DisturbanceProgram:
         """Return the data with which z and d are found."""
@@ -234,6 +235,10 @@ class DisturbanceObserver(Viewing, Measured):
                 beyond = bool(self._rails.is_beyond(y, expected).any())
                 expected = self._rails.clip(expected)
         stands_in = gate.judge(y, expected)
+        if gate.lost:
+            self._memory[:] = 0.0
+            if self._history is not None:
+                self._history.reset()
         if stands_in:
             y = expected
         self._x[:] = y if self._history is None else self._history.take(y, u)
@@ -241,8 +246,16 @@ class DisturbanceObserver(Viewing, Measured):
         self._flags[0], self._flags[1] = learns, gate.opened
         self._stood_in = stands_in
         self._evaluate()
+        foreseen = bool(self._seen[0]) and self._bridged < BRIDGED
         self._memory[:] = self._after
-        return bool(self._seen[0])
+        if self._seen[0]:
+            self._bridged = 0
+            return True
+        if foreseen:  # the next reading is judged all the same
+            self.z[:] = self._predicted + self.d
+            self._seen[0], self._stood_in = 1.0, True
+            self._bridged += 1
+        return False
 
 
 @raise_swallowed()

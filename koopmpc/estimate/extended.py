@@ -193,6 +193,9 @@ class ExtendedObserver:
         useful = came if self._embedding is None else came & ~self._embedding.is_beyond(y, predicted)
         shown = np.where(useful | ~came, y, predicted)
         refused = self._gate.judge(shown, predicted)
+        if self._gate.lost and useful.all():
+            self._start, self.d[:] = None, 0.0
+            return self._begin(y, u)
         s = np.concatenate([z, self.d[:ny]])
         if useful.any() and not refused:
             s, P = self._correct(s, P, H[useful], self._R[np.ix_(useful, useful)], (y - predicted)[useful])

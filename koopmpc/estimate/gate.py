@@ -14,9 +14,10 @@ from koopmpc.values import Viewing
 # A reading is refused if an innovation exceeds this many times the running 0.9 quantile of its size. Of Gaussian
 # innovations the bound is about ten standard deviations: where the running quantile rests it is above 1.64.
 BEYOND = 5.0
-BRIDGED = 5  # refused readings in sequence for which a prediction stands in; the next one is used
+BRIDGED = 5  # refused readings in sequence for which a prediction stands in; the next one is used, an absurd one
+LONG = 10  # only after so many
 FEW = 10  # the bound counts once so many innovations of a run have come; before,
-ABSURD = 1e4  # a reading is refused if it is off by this many times all that its output has shown
+ABSURD = 1e4  # a reading, or a prediction, is absurd if off by this many times all that its output has shown
 RISE = 1.4  # an innovation above the running quantile multiplies it by this,
 FALL = RISE ** (-1 / 9)  # and one below it by this: nine of ten are below where the quantile rests
 WIDEN = 4.0  # while all readings are used, the quantile follows the last innovation by at most this factor a step,
@@ -28,21 +29,26 @@ FADING = 0.8  # what a predicted step allows fades by this factor a step
 
 @cache
 def gate_function(ny: int) -> ca.Function:
-    """Return (y, prediction, memory) → [whether y is refused; whether the gate has opened; the new memory].
+    """Return (y, prediction, memory) → [whether y is refused; 1 if the gate has opened, 2 if all is lost; the memory].
 
     y is refused if |yᵢ − ŷᵢ| > 5 max(qᵢ, 0.01 Sᵢ, 1e-9 |ŷᵢ|) + ρ Sᵢ for any of its entries. qᵢ is the running 0.9
     quantile of |yᵢ − ŷᵢ|, and Sᵢ the largest step of this output that was used. ρ is the largest predicted step of all
     outputs, each in units of its S, and fades by 0.8 a step: in a transient a model may err by as much as the outputs
     move. After five refused readings in sequence the gate opens, and all readings are used until one is inside the
     bound. Before the tenth reading only one is refused that is off by 1e4 times all that its output has shown, |last| +
-    max(q, S); the bound counts from there. Entries that are NaN, or not predicted, are not judged.
+    max(q, S); the bound counts from there. Such a reading opens the gate after ten refused ones only. Without a
+    prediction it is refused if it is so far from the last one that was used. Entries that are NaN are not judged.
+
+    Among the first readings, and while the gate is open, a wild one may be used. Where a prediction is then off by more
+    than 1e4 (S + |y|), the estimate is lost: the observer starts again from y.
 
     The memory is q, S, the predicted steps, the last used values, and a count: below 10 the gate is open, and 10 less
     the count are the least number of readings until it may close; from 10 on the refused ones are added.
     """
     y, predicted, memory = (ca.SX.sym(name, n) for name, n in (("y", ny), ("predicted", ny), ("memory", 4 * ny + 1)))
     quantile, largest, ahead, last, count = ca.vertsplit(memory, [0, ny, 2 * ny, 3 * ny, 4 * ny, 4 * ny + 1])
-    came = ca.logic_and(ca.fabs(y) < HUGE, ca.fabs(predicted) < HUGE)  # False for NaN
+    known, foreseen = ca.fabs(y) < HUGE, ca.fabs(predicted) < HUGE  # False for NaN
+    came = ca.logic_and(known, foreseen)
     error = ca.if_else(came, ca.fabs(y - predicted), 0)
     ahead_new = ca.fmax(ca.if_else(ca.logic_and(came, count > 0), ca.fabs(predicted - last), 0), FADING * ahead)
     size = ca.fmax(largest, ahead_new)
@@ -51,11 +57,15 @@ def gate_function(ny: int) -> ca.Function:
     inside = error <= BEYOND * ca.fmax(quantile, least) + share * size
     judged, good, closed = ca.mmax(came), ca.mmin(inside), count >= FEW
     shown = ca.fmax(quantile, size) + ca.fabs(last)
-    far = ca.mmax(ca.logic_and(shown > 0, error > ABSURD * shown))
-    absurd = ca.logic_and(ca.logic_and(judged, count > 1), ca.logic_and(ca.logic_not(closed), far))
+    jump = ca.if_else(foreseen, error, ca.if_else(known, ca.fabs(y - last), 0))
+    far = ca.logic_and(ca.mmax(ca.logic_and(shown > 0, jump > ABSURD * shown)), count > 1)
+    astray = ca.logic_and(error > ABSURD * (largest + ca.fabs(y)), ca.logic_or(largest > 0, count <= 2))
+    lost = ca.logic_and(ca.mmax(astray), ca.logic_not(far))
+    absurd = ca.logic_and(far, ca.logic_not(ca.logic_and(judged, closed)))
     wild = ca.logic_and(ca.logic_and(judged, closed), ca.logic_not(good))
-    refused = ca.logic_or(ca.logic_and(wild, count < FEW + BRIDGED), absurd)
-    opened = ca.logic_and(wild, count >= FEW + BRIDGED)
+    patient = count < FEW + ca.if_else(far, LONG, BRIDGED)
+    refused = ca.logic_and(ca.logic_and(ca.logic_or(wild, absurd), patient), ca.logic_not(lost))
+    opened = ca.logic_and(wild, ca.logic_not(refused))
     used = ca.if_else(refused, predicted, y)
     learned = ca.logic_and(came, ca.logic_not(refused))
     follows = ca.if_else(quantile > 0, ca.fmin(ca.fmax(error, NARROW * quantile), WIDEN * quantile), error)
@@ -68,9 +78,12 @@ def gate_function(ny: int) -> ca.Function:
         ca.fmax(largest, step),
         ahead_new,
         ca.if_else(ca.fabs(used) < HUGE, used, last),
-        ca.if_else(judged, counted, count),
+        ca.if_else(ca.logic_or(judged, refused), counted, count),
     )
-    return ca.Function("gate", [y, predicted, memory], [ca.densify(ca.vertcat(refused, opened, after))], {"cse": True})
+    none = ca.SX(ny, 1)
+    anew = ca.vertcat(none, largest, none, ca.if_else(known, y, last), ca.fmin(count, 1) + 1)
+    result = ca.vertcat(refused, ca.if_else(lost, 2, opened), ca.if_else(lost, anew, after))
+    return ca.Function("gate", [y, predicted, memory], [ca.densify(result)], {"cse": True})
 
 
 def gate_graph(ny: int) -> Graph:
@@ -87,6 +100,8 @@ class ReadingGate(Viewing):
         Whether the last reading was refused.
     opened
         Whether the last reading is used though it is beyond the bound, after refused ones.
+    lost
+        Whether the last prediction was absurd, so that the observer starts again from the reading.
 
     Parameters
     ----------
@@ -111,7 +126,7 @@ class ReadingGate(Viewing):
     def reset(self) -> None:
         """Forget all readings."""
         self._memory[:] = 0.0
-        self.refused, self.opened = False, False
+        self.refused = self.opened = self.lost = False
 
     def judge(self, y: Float[np.ndarray, " ny"], predicted: Float[np.ndarray, " ny"]) -> bool:
         """Return whether y is refused; a NaN in `predicted` says that this entry was not predicted."""
@@ -119,5 +134,5 @@ class ReadingGate(Viewing):
         self._y[:], self._predicted[:] = y, predicted
         self._evaluate()
         self._memory[:] = after[2:]
-        self.refused, self.opened = bool(after[0]), bool(after[1])
+        self.refused, self.opened, self.lost = bool(after[0]), after[1] == 1, after[1] == 2
         return self.refused

@@ -178,6 +178,7 @@ class KalmanFilter(Viewing):
         start = np.zeros(system.predictor.nx) if start is None else start
         self._s[:] = 0.0
         self._s[: len(system.kept)] = system.predictor.lift(system.predictor.rest_point(start))[system.kept]
+        self._start = self._s.copy()
         self._inputs.clear()
         self._started = False
         self._missed = 0
@@ -197,7 +198,7 @@ class KalmanFilter(Viewing):
             refused = self._gate.judge(y, self._clip(self._expected))
             silent = self._rails is not None and self._is_silent(y, self._expected).any()
             if (
-                not refused and not silent and self._found.dot(self._found) < HUGE**2
+                not (refused or silent or self._gate.lost) and self._found.dot(self._found) < HUGE**2
             ):  # False for NaN: some of y is missing
                 self._s[:] = self._s_new
                 self._missed = 0
@@ -215,6 +216,8 @@ class KalmanFilter(Viewing):
         first = len(self._inputs) < self._delay  # y is older than the start
         if not first and (self._delay or not self._started):
             self._gate.judge(y, self._clip(system.M @ self._s + system.h))
+        if self._gate.lost:
+            self._s[:] = self._start
         useful = came & ~self._is_silent(y, system.M @ self._s + system.h)
         if not first and useful.any() and not self._gate.refused:
             self._s += self._gain(useful) @ (y[useful] - system.M[useful] @ self._s - system.h[useful])

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
-from koopmpc.estimate.gate import ReadingGate, gate_graph
+from koopmpc.estimate.gate import BRIDGED, ReadingGate, gate_graph
 from koopmpc.lifting.base import Lifting, buffer_lifting
 from koopmpc.plants.graph import Graph
 from koopmpc.predict.predictors import LinearPredictor
@@ -210,6 +210,8 @@ class Measured:
         self.ny = model.ny
         self._gate = ReadingGate(model.ny) if self._remembers or model.embedding is not None else None
         self._nothing, self._known_z = np.full(model.ny, np.nan), False
+        self._nothing_z = np.full(model.nz, np.nan)
+        self._from, self._bridged = np.zeros(model.nz), 0  # what the next prediction starts from; missed readings since
         self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.lift = None if model.lifting is None else buffer_lifting(model.lifting)
@@ -220,7 +222,7 @@ class Measured:
         self.d[:] = 0.0
         if self._gate is not None:
             self._gate.reset()
-        self._known_z = False
+        self._known_z, self._bridged = False, 0
         if self._history is not None:
             self._history.reset()
 
@@ -240,28 +242,40 @@ class Measured:
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y as it is; where it is lifted, a bad entry makes all of z NaN, which shows in every plan."""
+        expected = self._nothing_z
         if self._history is not None and self._gate is not None:
-            y = self._history.take(self._check_reading(self._gate, y, u, w), u)
+            if self._known_z:
+                expected = self._model.advance(self._from, u, w, self.d)
+            y = self._history.take(self._check_reading(self._gate, y, expected), u)
         if self.lift is None:
             self.z = y
-            return True
-        self.lift.arguments[0][:] = y
-        self.lift.evaluate()
-        self.z = self.lift.results[0]
+        else:
+            self.lift.arguments[0][:] = y
+            self.lift.evaluate()
+            self.z = self.lift.results[0]
+        if self._gate is not None:
+            self._follow(expected)
         return True
 
+    def _follow(self, expected: Float[np.ndarray, " nz"]) -> None:
+        """Have the next prediction start from z, or for some missed readings from its prediction."""
+        known = bool(np.isfinite(self.z).all())
+        bridges = not known and self._known_z and self._bridged < BRIDGED
+        self._from[:] = expected if bridges else self.z
+        self._bridged = self._bridged + 1 if bridges else 0
+        self._known_z = known or bridges
+
     def _check_reading(
-        self, gate: ReadingGate, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
+        self, gate: ReadingGate, y: Float[np.ndarray, " ny"], z: Float[np.ndarray, " nz"]
     ) -> Float[np.ndarray, " ny"]:
-        """Return y, or its prediction where y is refused."""
-        predicted = self._nothing
-        if self._known_z:
-            z = self._model.advance(self.z, u, w, self.d)
-            predicted = z[: self.ny] if self._to_y is None else self._to_y.dot(z)
-            if self._model.embedding is not None:
-                predicted = self._model.embedding.clip(predicted)
-        self._known_z = True
-        return predicted if gate.judge(y, predicted) else y
+        """Return y, or what this z shows where y is refused."""
+        predicted = z[: self.ny] if self._to_y is None else self._to_y.dot(z)
+        if self._model.embedding is not None:
+            predicted = self._model.embedding.clip(predicted)
+        refused = gate.judge(y, predicted)
+        if gate.lost and self._history is not None:
+            self._history.reset()
+        return predicted if refused else y
 
 
 def start_observer(estimator: Estimator | None, model: LinearPredictor | StateModel, horizon: int) -> StateObserver:

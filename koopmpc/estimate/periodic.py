@@ -11,6 +11,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError
+from koopmpc.estimate.gate import BRIDGED
 from koopmpc.estimate.observer import EstimatorProgram, Measured
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -75,7 +76,7 @@ class PeriodicObserver(Measured):
         n = 1 + 2 * len(self._turns)
         self._theta, self._P = np.zeros((n, self._model.nz)), np.eye(n)
         self._k, self._last = 0, np.full(self._model.nz, np.nan)
-        self._stood_in = False
+        self._stood_in, self._bridged = False, 0
 
     def program(self) -> EstimatorProgram:
         """Raise the DataError that says why no C code can be generated.
@@ -103,6 +104,10 @@ class PeriodicObserver(Measured):
             after = predicted + phi @ self._theta
             expected = after[: self.ny] if self._to_y is None else self._to_y.dot(after)
         stands_in = gate.judge(y, expected)
+        if gate.lost:
+            self._theta[:], self._P, predicted = 0.0, np.eye(len(self._P)), np.full(self._model.nz, np.nan)
+            if self._history is not None:
+                self._history.reset()
         if stands_in:
             y = expected
         point = y if self._history is None else self._history.take(y, u)
@@ -117,6 +122,11 @@ class PeriodicObserver(Measured):
             self._learn(phi, e)
         self._stood_in = stands_in
         self._last, self.z = z, z
+        if np.isfinite(z).all():
+            self._bridged = 0
+        elif self._bridged < BRIDGED:  # the next reading is judged all the same
+            self._last, self._stood_in = predicted + phi @ self._theta, True
+            self._bridged += 1
         self._k += 1
         self.d[:] = self._theta[0]
         return True

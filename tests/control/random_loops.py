@@ -87,8 +87,8 @@ def lifted(rng, A, B, nz, given):
 
 
 def nonlinear(model, cost, limits, horizon, *, solver, moves=None, **options):
-    """Return a NonlinearMPC of a linear model, which has no solver and no blocks to choose."""
-    return km.NonlinearMPC(model.step_map(), cost, limits, horizon, **options)
+    """Return a NonlinearMPC of a linear model, which has no solver to choose."""
+    return km.NonlinearMPC(model, cost, limits, horizon, **options)
 
 
 def loop(seed, solver=None, large=False, bilinear=False, build=None, wild=False):

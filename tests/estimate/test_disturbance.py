@@ -25,7 +25,8 @@ def test_d_moves_to_the_mean_of_the_misfits_by_the_share_that_was_constant(gain,
     model = predictor(rng)
     observer = km.LiftedDisturbance(gain).start(model, 20)
     X, U = rng.normal(size=(12, 2)), rng.normal(size=(12, 1))
-    X[:, 1] = 1e5 + 0.1 * X[:, 1]  # a state whose misfits hardly vary, in a unit of its own
+    X[:, 0] += 5.0
+    X[:, 1] = 1e3 + 0.1 * X[:, 1]  # a state whose misfits hardly vary, in a unit of its own
     d, E = np.zeros(4), []
     for k in range(12):
         assert observer.observe(X[k], U[k - 1], NO_W)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.estimate.gate import BEYOND, BRIDGED, FEW, LEAST, ReadingGate
+from koopmpc.estimate.gate import BEYOND, BRIDGED, FEW, LEAST, LONG, ReadingGate
 from tests.compiler import needs_compiler
 from tests.estimate.pendulums import PROBLEM, truth
 from tests.estimate.plants import linear
@@ -62,7 +62,7 @@ def built(kind):
     return KINDS[kind]()
 
 
-def loop(controller, seed, wild=None, plant=TRUE, steps=STEPS):
+def loop(controller, seed, wild=None, plant=TRUE, steps=STEPS, at=WILD):
     """A run from a random start; `wild` (steps, 2) is added to the readings from step 45 on. Return X, U, d, refused."""
     rng = np.random.default_rng(seed)
     x, reference, noise = rng.uniform(-0.6, 0.6, 2), [rng.uniform(-0.5, 0.5), 0], NOISE * rng.normal(size=(steps, 2))
@@ -71,8 +71,8 @@ def loop(controller, seed, wild=None, plant=TRUE, steps=STEPS):
     observer = getattr(controller, "observer", None)
     for k in range(steps):
         y = x + noise[k]
-        if wild is not None and 0 <= k - WILD < len(wild):
-            y = y + wild[k - WILD]
+        if wild is not None and 0 <= k - at < len(wild):
+            y = y + wild[k - at]
         move = controller(y, reference)
         x = plant(x, move.u)
         X.append(x)
@@ -173,6 +173,59 @@ def test_absurd_readings_are_refused_from_the_third_on(kind, length):
         x = TRUE(x, move.u)
     assert np.flatnonzero(refused)[:length].tolist() == list(range(3, 3 + length))
     assert (np.abs(x) < [0.05, 0.2]).all()
+
+
+PERIODIC, EXTENDED = "KoopmanMPC, period", "BilinearMPC, extended filter"
+MORE = KINDS | {
+    PERIODIC: lambda: km.KoopmanMPC(
+        model("linear"), WHOLE, LIMITS, 20, estimator=km.LiftedDisturbance(period=20 * PROBLEM.dt)
+    ),
+    EXTENDED: lambda: km.BilinearMPC(model("bilinear"), WHOLE, LIMITS, 20, estimator=km.ExtendedKalman()),
+}
+
+
+def plant_for(kind):
+    return km.discretize(PROBLEM.dynamics, PROBLEM.dt) if kind in ("LQR, delays", EXTENDED) else TRUE
+
+
+@pytest.mark.parametrize("kind", MORE)
+def test_an_absurd_reading_among_the_first_does_not_stay_in_the_estimate(kind):
+    """Nothing has been shown yet by which it could be refused: it is used, and the next reading shows what it was."""
+    controller, plant = MORE[kind](), plant_for(kind)
+    X = loop(controller, 1, plant=plant, steps=110)[0]
+    for at in range(3):
+        for size in (1e6, 1e29):
+            for missed in (False, True):
+                wild = burst(size, 2, 2)
+                wild[0] = np.nan if missed else wild[0]
+                X_w = loop(controller, 1, wild if missed else wild[:1], plant, 110, at)[0]
+                away = np.abs(X_w - X) / np.ptp(X, axis=0)
+                assert (away[at + 15 :] <= 0.4).all(), (at, size, missed)
+                assert (away[-20:] <= 0.05).all(), (at, size, missed)
+
+
+@pytest.mark.parametrize("kind", MORE)
+@pytest.mark.parametrize("missed", [1, BRIDGED])
+def test_a_wild_reading_after_missed_ones_is_refused(kind, missed):
+    controller, plant = MORE[kind](), plant_for(kind)
+    X, _, _, refused = loop(controller, 1, plant=plant)
+    assert not refused.any()
+    wild = np.vstack([np.full((missed, 2), np.nan), burst(50.0, 1, 2)])
+    X_w, _, _, refused_w = loop(controller, 1, wild, plant)
+    assert np.flatnonzero(refused_w).tolist() == [WILD + missed]
+    assert (np.abs(X_w - X)[WILD + missed + 12 :] <= 0.06 * np.ptp(X, axis=0)).all()
+
+
+@pytest.mark.parametrize("kind", MORE)
+def test_ten_absurd_readings_are_refused_and_one_that_is_used_does_not_stay_in_the_estimate(kind):
+    controller, plant = MORE[kind](), plant_for(kind)
+    X = loop(controller, 1, plant=plant, steps=110)[0]
+    for count, most, left in ((LONG, 0.2, 0.1), (LONG + 2, 1.0, 0.25)):
+        X_w, _, _, refused = loop(controller, 1, burst(1e29, count, 2), plant, 110)
+        assert np.flatnonzero(refused)[:LONG].tolist() == list(range(WILD, WILD + LONG))
+        away = np.abs(X_w - X) / np.ptp(X, axis=0)
+        assert (away <= most).all()
+        assert (away[-20:] <= left).all()
 
 
 def test_what_moves_a_plant_from_rest_is_no_absurd_reading_for_long():
@@ -276,6 +329,12 @@ def test_machine_code_refuses_the_same_readings(kind):
     assert expected[3].sum() == got[3].sum() == 8
     np.testing.assert_array_equal(got[3], expected[3])
     np.testing.assert_allclose(got[1], expected[1], atol=5e-4 if "Bilinear" in kind else 1e-6)
+    wild[[1, 2, 14]] = np.nan
+    wild[[3, 15]] = burst(1e7, 2, 6)
+    for at in (0, 1, WILD):
+        expected, got = loop(controller, 2, wild, at=at), loop(code, 2, wild, at=at)
+        np.testing.assert_array_equal(got[3], expected[3])
+        np.testing.assert_allclose(got[1], expected[1], atol=5e-4 if "Bilinear" in kind else 1e-6)
 
 
 @pytest.mark.parametrize("count", [pytest.param(1000, marks=pytest.mark.slow), 30])

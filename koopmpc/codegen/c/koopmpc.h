@@ -78,8 +78,8 @@ typedef struct {
   int seen; /**< whether zeta holds a past; only for models with delays */
   int row;  /**< row of given input targets */
 #if KOOPMPC_GATE
-  koopmpc_real gate[KOOPMPC_GATE], w[KOOPMPC_NW1];
-  int has_z;
+  koopmpc_real gate[KOOPMPC_GATE], w[KOOPMPC_NW1], from[KOOPMPC_NZ];
+  int has_z, bridged;
 #endif
 } koopmpc_state;
 
@@ -98,10 +98,9 @@ typedef struct {
   koopmpc_real z[KOOPMPC_NZ], d[KOOPMPC_NZ];
   koopmpc_real scratch[2 * KOOPMPC_NS + 2];
 #if KOOPMPC_ESTIMATOR == 1
-  koopmpc_real last_z[KOOPMPC_NZ];
   koopmpc_real newest[KOOPMPC_NZ + 2 * KOOPMPC_NX], means[KOOPMPC_NZ + 2 * KOOPMPC_NX];
   koopmpc_real sizes[KOOPMPC_NX], weights[KOOPMPC_NX], fresh, change;
-  int learned, has_last, stood_in;
+  int learned, stood_in;
 #elif KOOPMPC_ESTIMATOR == 2
   koopmpc_real s[KOOPMPC_NS];
   koopmpc_real queue[(KOOPMPC_DELAY_Y + 1) * (KOOPMPC_NU + KOOPMPC_NW1)];
@@ -110,7 +109,8 @@ typedef struct {
 #endif
 #if KOOPMPC_GATE
   koopmpc_real gate[KOOPMPC_GATE]; /**< memory of the test of readings */
-  int has_z;
+  koopmpc_real from[KOOPMPC_NZ];   /**< what the next reading is predicted from */
+  int has_z, bridged;
 #endif
 #if KOOPMPC_IS_STAGED
   koopmpc_real S[(KOOPMPC_N + 1) * KOOPMPC_POINT], V[KOOPMPC_MOVES];         /**< the plan: states, inputs of stages */

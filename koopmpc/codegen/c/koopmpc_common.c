@@ -59,8 +59,15 @@ int koopmpc_refuse(koopmpc_real *memory, const koopmpc_real *y, const koopmpc_re
   koopmpc_real result[KOOPMPC_GATE + 2];
   koopmpc_gate(y, predicted, memory, result);
   koopmpc_copy(memory, result + 2, KOOPMPC_GATE);
-  *opened = result[1] > 0;
+  *opened = (int)result[1];
   return result[0] > 0;
+}
+
+int koopmpc_bridge(koopmpc_real *from, int has, int *bridged, const koopmpc_real *z, const koopmpc_real *expected) {
+  const int known = koopmpc_usable(z, KOOPMPC_NZ), bridges = !known && has && *bridged < KOOPMPC_BRIDGED;
+  koopmpc_copy(from, bridges ? expected : z, KOOPMPC_NZ);
+  *bridged = bridges ? *bridged + 1 : 0;
+  return known || bridges;
 }
 #endif
 

@@ -52,6 +52,9 @@ void koopmpc_gate(const koopmpc_real *y, const koopmpc_real *predicted, const ko
 
 /** Whether y is too far from its prediction to be used; NaN in `predicted` is no prediction. */
 int koopmpc_refuse(koopmpc_real *memory, const koopmpc_real *y, const koopmpc_real *predicted, int *opened);
+
+/** from <- z, from which the next reading is predicted; for some missed readings its prediction. Return whether it is. */
+int koopmpc_bridge(koopmpc_real *from, int has, int *bridged, const koopmpc_real *z, const koopmpc_real *expected);
 #endif
 
 /** Coordinates of the target nearest to r, without limits; disturbances add e to z, NULL for none. */

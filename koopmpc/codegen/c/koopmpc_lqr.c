@@ -49,23 +49,26 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
   if (s->row + 1 < KOOPMPC_GIVEN) s->row++;
   if (applied && koopmpc_usable(applied, KOOPMPC_NU)) koopmpc_copy(s->last, applied, KOOPMPC_NU);
 #if KOOPMPC_GATE
-  koopmpc_real next[KOOPMPC_NZ], expected[KOOPMPC_NY];
+  koopmpc_real next[KOOPMPC_NZ] = {0}, expected[KOOPMPC_NY];
   int opened;
   koopmpc_fill(expected, s->has_z ? 0 : (koopmpc_real)NAN, KOOPMPC_NY);
   if (s->has_z) {
     koopmpc_fill(next, 0, KOOPMPC_NZ);
-    koopmpc_add(next, koopmpc_A, KOOPMPC_NZ, s->z, KOOPMPC_NZ);
+    koopmpc_add(next, koopmpc_A, KOOPMPC_NZ, s->from, KOOPMPC_NZ);
     koopmpc_add(next, koopmpc_B, KOOPMPC_NZ, s->last, KOOPMPC_NU);
     if (KOOPMPC_NW) koopmpc_add(next, koopmpc_E, KOOPMPC_NZ, s->w, KOOPMPC_NW);
     koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, next, KOOPMPC_NZ);
   }
-  s->has_z = 1;
   refused = koopmpc_refuse(s->gate, y, expected, &opened);
+  if (opened == 2) s->seen = 0; /* the estimate is lost */
   if (refused) y = expected;
   for (int i = 0; i < KOOPMPC_NW; i++) /* one that is not finite keeps its last value */
     if (!w || koopmpc_abs(w->values[i]) < KOOPMPC_HUGE) s->w[i] = w ? w->values[i] : 0;
 #endif
   koopmpc_observe(s->zeta, &s->seen, s->z, y, s->last);
+#if KOOPMPC_GATE
+  s->has_z = koopmpc_bridge(s->from, s->has_z, &s->bridged, s->z, next);
+#endif
   koopmpc_add(free_input, koopmpc_gain, KOOPMPC_NU, s->z, KOOPMPC_NZ);
   if (KOOPMPC_WITH_RATES) koopmpc_add(free_input, koopmpc_gain_rate, KOOPMPC_NU, s->last, KOOPMPC_NU);
   if (good && koopmpc_usable(free_input, KOOPMPC_NU)) {

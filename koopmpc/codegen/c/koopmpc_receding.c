@@ -38,7 +38,7 @@ static void learn(koopmpc_state *s, koopmpc_real *misfit) {
   if (!koopmpc_usable(misfit, NZ)) return;
   for (int i = 0; i < NX; i++) states[i] = step[i] = believed[i] = 0;
   koopmpc_add(states, koopmpc_C, NX, misfit, NZ);
-  for (int i = 0; i < NZ; i++) s->scratch[i] = s->z[i] - s->last_z[i];
+  for (int i = 0; i < NZ; i++) s->scratch[i] = s->z[i] - s->from[i];
   koopmpc_add(step, koopmpc_C, NX, s->scratch, NZ);
   koopmpc_add(believed, koopmpc_C, NX, s->d, NZ);
   for (int i = 0; i < NX; i++) {
@@ -71,30 +71,42 @@ static void learn(koopmpc_state *s, koopmpc_real *misfit) {
   for (int i = 0; i < NZ; i++) s->d[i] += share < exact || exact > KOOPMPC_EXACT ? exact * (misfit[i] - s->d[i]) : share * (s->means[i] - s->d[i]);
 }
 
+/** Forget the past and all that was learned: the estimate is lost. */
+static void forget_estimate(koopmpc_state *s) {
+  koopmpc_fill(s->d, 0, KOOPMPC_NZ);
+  koopmpc_fill(s->newest, 0, KOOPMPC_NZ + 2 * KOOPMPC_NX);
+  koopmpc_fill(s->means, 0, KOOPMPC_NZ + 2 * KOOPMPC_NX);
+  koopmpc_fill(s->sizes, 0, KOOPMPC_NX);
+  koopmpc_fill(s->weights, 0, KOOPMPC_NX);
+  s->fresh = s->change = 0;
+  s->learned = s->seen = 0;
+}
+
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
   koopmpc_real misfit[KOOPMPC_NZ], expected[KOOPMPC_NY];
-  int opened, learns = s->has_last && !s->stood_in;
-  koopmpc_fill(expected, s->has_last ? 0 : (koopmpc_real)NAN, KOOPMPC_NY);
-  if (s->has_last) {
-    advance(misfit, s->last_z, u, s->w, 0);
+  int opened, learns = s->has_z && !s->stood_in;
+  koopmpc_fill(expected, s->has_z ? 0 : (koopmpc_real)NAN, KOOPMPC_NY);
+  if (s->has_z) {
+    advance(misfit, s->from, u, s->w, 0);
     for (int i = 0; i < KOOPMPC_NZ; i++) s->scratch[i] = misfit[i] + s->d[i];
     koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, s->scratch, KOOPMPC_NZ);
   }
   s->refused = s->stood_in = koopmpc_refuse(s->gate, y, expected, &opened);
+  if (opened == 2) forget_estimate(s);
   koopmpc_observe(s->zeta, &s->seen, s->z, s->refused ? expected : y, u);
-  if (!koopmpc_usable(s->z, KOOPMPC_NZ)) {
-    s->has_last = 0;
+  if (!koopmpc_usable(s->z, KOOPMPC_NZ)) { /* the next reading is judged all the same */
+    s->has_z = koopmpc_bridge(s->from, s->has_z, &s->bridged, s->z, s->scratch);
+    s->stood_in = 1;
     return 0;
   }
-  if (opened) { /* what the readings show now is new: the means begin anew */
+  if (opened == 1) { /* what the readings show now is new: the means begin anew */
     s->learned = 0;
     s->fresh = 1;
-  } else if (learns && !s->refused) {
+  } else if (!opened && learns && !s->refused) {
     for (int i = 0; i < KOOPMPC_NZ; i++) misfit[i] = s->z[i] - misfit[i];
     learn(s, misfit);
   }
-  koopmpc_copy(s->last_z, s->z, KOOPMPC_NZ);
-  s->has_last = 1;
+  s->has_z = koopmpc_bridge(s->from, 1, &s->bridged, s->z, s->z);
   return 1;
 }
 
@@ -137,6 +149,13 @@ static void correct(koopmpc_state *s, const koopmpc_real *y) {
     for (int j = 0; j < KOOPMPC_NS; j++) s->s[j] += koopmpc_filter_PM[came[i] * KOOPMPC_NS + j] * x[i];
 }
 
+/** s <- that of the start. */
+static void forget_estimate(koopmpc_state *s) {
+  koopmpc_lift(s->zeta, s->z);
+  koopmpc_fill(s->s, 0, KOOPMPC_NS);
+  for (int i = 0; i < KOOPMPC_KEPT; i++) s->s[i] = s->z[koopmpc_kept[i]];
+}
+
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
   koopmpc_real *now = s->scratch + KOOPMPC_NS, largest = 0, expected[KOOPMPC_NY];
   int any = 0, opened;
@@ -156,6 +175,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
     for (int i = 0; i < KOOPMPC_NY; i++)
       expected[i] = koopmpc_filter_h[i] + koopmpc_dot(koopmpc_filter_M + i * KOOPMPC_NS, s->s, KOOPMPC_NS);
     s->refused = koopmpc_refuse(s->gate, y, expected, &opened);
+    if (opened == 2) forget_estimate(s);
     if (any && !s->refused) correct(s, y);
   }
   s->missed = any ? 0 : s->missed + 1;
@@ -177,18 +197,21 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
 
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
 #if KOOPMPC_GATE
-  koopmpc_real next[KOOPMPC_NZ], expected[KOOPMPC_NY];
+  koopmpc_real next[KOOPMPC_NZ] = {0}, expected[KOOPMPC_NY];
   int opened;
   koopmpc_fill(expected, s->has_z ? 0 : (koopmpc_real)NAN, KOOPMPC_NY);
   if (s->has_z) {
-    advance(next, s->z, u, s->w, 0);
+    advance(next, s->from, u, s->w, 0);
     koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, next, KOOPMPC_NZ);
   }
-  s->has_z = 1;
   s->refused = koopmpc_refuse(s->gate, y, expected, &opened);
+  if (opened == 2) s->seen = 0; /* the estimate is lost */
   if (s->refused) y = expected;
 #endif
   koopmpc_observe(s->zeta, &s->seen, s->z, y, u);
+#if KOOPMPC_GATE
+  s->has_z = koopmpc_bridge(s->from, s->has_z, &s->bridged, s->z, next);
+#endif
   return 1;
 }
 
@@ -282,8 +305,7 @@ void koopmpc_start(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real 
       const int place = (i - KOOPMPC_NX) % PAST - KOOPMPC_NU * KOOPMPC_DELAYED_INPUTS;
       s->zeta[i] = place < 0 ? 0 : start[place];
     }
-    koopmpc_lift(s->zeta, s->z);
-    for (int i = 0; i < KOOPMPC_KEPT; i++) s->s[i] = s->z[koopmpc_kept[i]];
+    forget_estimate(s);
   }
 #else
   (void)x0;
