@@ -275,6 +275,7 @@ class Measured:
         refused = gate.judge(y, predicted)
         if gate.lost and self._history is not None:
             self._history.reset()
+            self._known_z = False
         return predicted if refused else y
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 import koopmpc as km
 
+BRIDGED = 5  # missed readings in sequence through which predictions go on
 FINE = {"primal_tol": 1e-12, "dual_tol": 1e-13, "iter_limit": 10_000}
 HUGE = 1e30
 UNARY = {
@@ -101,15 +102,20 @@ class Estimate:
         self.zeta, self.ny = None, len(program.model.states)
         self.z, self.d = np.zeros(program.lifting.m), np.zeros(program.lifting.m)
         self.kind = type(self.rule).__name__
-        self.last, self.newest, self.mean, self.sizes, self.learned = None, None, 0.0, np.zeros(self.ny), 0
+        self.last, self.bridged = None, 0
+        self.forget()
         self.missed, self.queue = 0, None
         self.gate = program.gate if self.rule is None else self.rule.gate
         self.memory = None if self.gate is None else np.zeros(self.gate.m - 2)
-        self.refused, self.opened, self.fresh, self.first = False, False, 0.0, True
+        self.refused, self.opened, self.lost, self.stood_in = False, False, False, False
         if self.kind == "FilterProgram":
             zeta = np.zeros(program.lifting.n)
             self.s = np.concatenate([evaluate(program.lifting, zeta)[self.rule.kept], np.zeros(len(self.rule.F))])
-            self.s = self.s[: len(self.rule.F)]
+            self.start = self.s = self.s[: len(self.rule.F)]
+
+    def forget(self):
+        self.newest, self.mean, self.sizes, self.learned, self.fresh = None, 0.0, np.zeros(self.ny), 0, 0.0
+        self.d, self.zeta = np.zeros(self.program.lifting.m), None
 
     def point(self, x, u):
         if self.embedding is None:
@@ -128,33 +134,35 @@ class Estimate:
     def judge(self, y, expected):
         """Whether y is refused; NaN in `expected` is no prediction."""
         refused, opened, *memory = evaluate(self.gate, y, expected, self.memory)
-        self.memory, self.refused, self.opened = np.array(memory), bool(refused), bool(opened)
+        self.memory, self.refused, self.opened, self.lost = np.array(memory), bool(refused), opened == 1, opened == 2
         return self.refused
 
     def take(self, y, u, w):
         if self.kind == "FilterProgram":
             return self.filtered(y, u, w)
-        stood_in = self.refused
+        ahead = None
         if self.gate is not None:
-            known = self.last if self.kind == "DisturbanceProgram" else self.z
             expected = np.full(self.ny, np.nan)
-            if not self.first and known is not None and np.isfinite(known).all():
-                z = self.advance(known, u, w, self.d)
-                expected = z[: self.ny] if type(self.program).__name__ == "StagedProgram" else self.program.model.C @ z
+            if self.last is not None:
+                ahead = self.advance(self.last, u, w, self.d)
+                staged = type(self.program).__name__ == "StagedProgram"
+                expected = ahead[: self.ny] if staged else self.program.model.C @ ahead
             y = expected if self.judge(y, expected) else y
-        self.first = False
+            if self.lost:
+                self.forget()
+                self.last = ahead = None
         zeta = self.point(y, u)
         z = evaluate(self.program.lifting, zeta) if np.isfinite(zeta).all() else np.full(self.program.lifting.m, np.nan)
-        if self.kind == "DisturbanceProgram" and np.isfinite(z).all():
+        known = bool(np.isfinite(z).all())
+        if self.kind == "DisturbanceProgram" and known:
             if self.opened:
                 self.learned, self.fresh = 0, 1.0
-            elif self.last is not None and not (self.refused or stood_in):
+            elif self.last is not None and not (self.refused or self.stood_in):
                 self.learn(np.where(self.rule.known, 0.0, z - self.advance(self.last, u, w, 0.0)), z - self.last)
-            self.last = z
-        elif self.kind == "DisturbanceProgram":
-            self.last = None
-        self.z = z
-        return bool(np.isfinite(z).all())
+        bridges = not known and ahead is not None and self.bridged < BRIDGED
+        self.bridged, self.stood_in = self.bridged + 1 if bridges else 0, self.refused or bridges
+        self.last, self.z = z if known else ahead if bridges else None, z
+        return known
 
     def learn(self, misfit, step):
         C, gain = self.rule.C, max(self.rule.gain, self.fresh)
@@ -191,6 +199,7 @@ class Estimate:
         due = len(self.queue) >= rule.delay
         if due:
             self.judge(y, rule.M @ self.s + rule.h)
+            self.s = self.start if self.lost else self.s
         if due and came.any() and not self.refused:
             M = rule.M[came]
             S = M @ rule.P @ M.T + rule.R[np.ix_(came, came)]

@@ -2,7 +2,9 @@
 
 import ast
 import hashlib
+import json
 import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -165,3 +167,17 @@ def test_other_seeds_draw_from_every_room_and_every_kind_of_change() -> None:
     assert max(rooms.values()) - min(rooms.values()) <= 1
     assert len({mutant.operator for mutant in drawn}) >= 10
     assert not any("daqp/" in name for name in read_sources(4))
+
+
+@pytest.mark.parametrize(
+    "text", ["import nothing_of_this_name", "def test_it():\n    assert False", "def test_it():\n    pass"]
+)
+def test_a_change_that_breaks_an_import_is_noticed_as_one_that_fails_a_test(tmp_path: Path, text: str):
+    path = tmp_path / "test_it.py"
+    path.write_text(text)
+    asked = json.dumps([[str(path)], 60, 1e9]) + "\n"
+    command = [sys.executable, "-m", "tests.mutation.warm"]
+    code, failed = json.loads(
+        subprocess.run(command, input=asked, stdout=subprocess.PIPE, text=True, check=True).stdout
+    )
+    assert (code > 0, bool(failed)) == ((False, False) if "pass" in text else (True, True))

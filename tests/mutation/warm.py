@@ -34,6 +34,11 @@ class Watch:
             self.failed = report.nodeid
 
     @pytest.hookimpl
+    def pytest_collectreport(self, report):
+        if report.failed:  # a change that breaks an import is noticed too
+            self.failed = report.nodeid
+
+    @pytest.hookimpl
     def pytest_runtest_teardown(self, item):
         if sum(os.times()[:4]) > self._enough:
             item.session.shouldstop = "enough"

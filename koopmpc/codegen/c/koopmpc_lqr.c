@@ -60,7 +60,7 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
     koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, next, KOOPMPC_NZ);
   }
   refused = koopmpc_refuse(s->gate, y, expected, &opened);
-  if (opened == 2) s->seen = 0; /* the estimate is lost */
+  if (opened == 2) s->seen = s->has_z = 0; /* the estimate is lost */
   if (refused) y = expected;
   for (int i = 0; i < KOOPMPC_NW; i++) /* one that is not finite keeps its last value */
     if (!w || koopmpc_abs(w->values[i]) < KOOPMPC_HUGE) s->w[i] = w ? w->values[i] : 0;

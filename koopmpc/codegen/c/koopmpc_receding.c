@@ -79,7 +79,7 @@ static void forget_estimate(koopmpc_state *s) {
   koopmpc_fill(s->sizes, 0, KOOPMPC_NX);
   koopmpc_fill(s->weights, 0, KOOPMPC_NX);
   s->fresh = s->change = 0;
-  s->learned = s->seen = 0;
+  s->learned = s->seen = s->has_z = 0;
 }
 
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
@@ -205,7 +205,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
     koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, next, KOOPMPC_NZ);
   }
   s->refused = koopmpc_refuse(s->gate, y, expected, &opened);
-  if (opened == 2) s->seen = 0; /* the estimate is lost */
+  if (opened == 2) s->seen = s->has_z = 0; /* the estimate is lost */
   if (s->refused) y = expected;
 #endif
   koopmpc_observe(s->zeta, &s->seen, s->z, y, u);

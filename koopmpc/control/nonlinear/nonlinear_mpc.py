@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits
@@ -29,6 +30,7 @@ from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator
 from koopmpc.interrupts import raise_swallowed
 
+Guess = tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]]  # states and inputs
 _HOLD = 5  # steps for which a random guess holds an input
 _WIDE = 1.0  # the range of random inputs where they have no limit
 
@@ -168,14 +170,20 @@ class NonlinearMPC(StagedMPC):
         first: Interval,
         deadline: float,
     ) -> StagePlan:
-        starts = [self._next] if self._warm else self._guesses(s[: self._map.nx], u_prev)
+        x = s[: self._map.nx]
+        starts = [self._next] if self._warm else self._guesses(x, u_prev)
         solved: list[NLPSolution] = []
         for start in starts:
             solved.append(self._shooting.solve(s, self._targets, self._e, start, first, deadline, self._W))
             if perf_counter() > deadline:
                 break
-        iterations = sum(found.iterations for found in solved)
         good = [found for found in solved if found.status is Status.OPTIMAL]
+        if not good and perf_counter() < deadline:  # once more from where inputs at rest lead, which leaves no gaps
+            U = np.tile(np.clip(np.zeros(self.nu), *self._outputs.inputs), (self._N, 1))
+            guesses = self._stage_guesses(self._roll_out(x, U), u_prev)
+            solved += [self._shooting.solve(s, self._targets, self._e, g, first, deadline, self._W) for g in guesses]
+            good = [found for found in solved if found.status is Status.OPTIMAL]
+        iterations = sum(found.iterations for found in solved)
         found = min(good, key=lambda each: each.cost) if good else solved[0]
         if good and self._levels is not None and not self._rests_on_levels(np.vstack([s, found.X]), found.U):
             found, more = self._search_levels(found, s, first, deadline)
@@ -239,16 +247,22 @@ class NonlinearMPC(StagedMPC):
         """Return the guesses of a first step: rest at x_0, then where random held inputs lead."""
         N, inputs = self._N, self._outputs.inputs
         rest = np.clip(np.zeros(self.nu), *inputs)
-        guesses = [(np.tile(x, (N + 1, 1)), np.tile(rest, (N, 1)))]
+        guesses: list[Guess] = [(np.tile(x, (N + 1, 1)), np.tile(rest, (N, 1)))]
         rng = np.random.default_rng(0)
         low, high = np.maximum(inputs.low, rest - _WIDE), np.minimum(inputs.high, rest + _WIDE)
         for _ in range(self._starts - 1):
             U = np.repeat(rng.uniform(low, high, (-(-N // _HOLD), self.nu)), _HOLD, axis=0)[:N]
-            X = [x]
-            for u, e, w in zip(U, self._e, self._initial.W, strict=True):
-                X.append(self._map.step(X[-1], u, w) + e)
-            if np.isfinite(X).all():
-                guesses.append((np.array(X), U))
+            guesses += self._roll_out(x, U)
+        return self._stage_guesses(guesses, u_prev)
+
+    def _roll_out(self, x: Float[np.ndarray, " nx"], U: Float[np.ndarray, "N nu"]) -> list[Guess]:
+        """Return the states to which U leads, and U; nothing where they overflow."""
+        X = [x]
+        for u, e, w in zip(U, self._e, self._initial.W, strict=True):
+            X.append(self._map.step(X[-1], u, w) + e)
+        return [(np.array(X), U)] if np.abs(X).max() < HUGE else []  # False for NaN
+
+    def _stage_guesses(self, guesses: list[Guess], u_prev: Float[np.ndarray, " nu"]) -> list[Start]:
         stages = [self._stages(X, U, u_prev) for X, U in guesses]
         return [self._shooting.at(S[1:], V) for S, V in stages]
 
