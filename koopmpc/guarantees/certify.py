@@ -86,7 +86,7 @@ def certify(
     confidence
         Of a scenario bound, which is used without `error` and `lipschitz`.
     rng
-        Which episodes calibrate the bound, and which check it.
+        Which half of the episodes sets the box and the sizes, and which of the others make the bound or check it.
 
     Returns
     -------
@@ -183,8 +183,11 @@ class _Search:
         self.model, self.asked = model, asked
         self.pairs = _read_pairs(model, asked.data)
         sampled = len(asked.given) != 2
-        self.room, self.low, self.high = _find_room(model, self.pairs, asked.limits, asked.region, sampled=sampled)
-        inside = self.pairs.within(self.low, self.high)
+        self.sizing = self.pairs
+        if not asked.given:  # a scenario bound takes box, sizes and shape as given: they are of other episodes
+            self.sizing, self.bounding = split_pairs(self.pairs, np.random.default_rng(asked.seed), share=0.5)
+        self.room, self.low, self.high = _find_room(model, self.sizing, asked.limits, asked.region, sampled=sampled)
+        inside = self.sizing.within(self.low, self.high)
         if not asked.given and len(inside.phi) < _LEAST_PAIRS:
             raise DataError(
                 f"{len(inside.phi)} pairs of the data lie in the box, {_LEAST_PAIRS} are needed; collect more there"
@@ -200,17 +203,19 @@ class _Search:
         if len(given) == 2:
             n, m = len(model.kept), len(model.u)
             return ErrorBound("given", given[0], given[1], 0.0, np.eye(n), np.full(n, 1.0), np.full(m, 1.0))
-        near = self.pairs.within(model.x + scale * (self.low - model.x), model.x + scale * (self.high - model.x))
-        if len(near.phi) < _LEAST_PAIRS:
+        low, high = model.x + scale * (self.low - model.x), model.x + scale * (self.high - model.x)
+        sizing = self.sizing.within(low, high)
+        if len(sizing.phi) < _LEAST_PAIRS:
             return None
         if given:
-            return bound_by_lipschitz(given[0], near, self.phi_size, self.v_size)
-        calibration, held_out = split_pairs(near, np.random.default_rng(asked.seed))
+            return bound_by_lipschitz(given[0], sizing, self.phi_size, self.v_size)
+        calibration, held_out = split_pairs(self.bounding.within(low, high), np.random.default_rng(asked.seed))
         return bound_by_scenario(
             calibration,
-            shape_of(calibration, self.phi_size),
+            shape_of(sizing, self.phi_size),
             self.phi_size,
             self.v_size,
+            sizing=sizing,
             constant=asked.estimated or self.slope is not None,
             confidence=asked.level,
             held_out=held_out,

@@ -96,12 +96,12 @@ class ErrorBound(Value):
         return replace(self, c_x=factor * self.c_x, c_u=factor * self.c_u, c_0=factor * self.c_0)
 
 
-def split_pairs(pairs: ErrorPairs, rng: np.random.Generator) -> tuple[ErrorPairs, ErrorPairs]:
-    """Return the pairs of two thirds of the episodes, which calibrate a bound, and those of the others."""
+def split_pairs(pairs: ErrorPairs, rng: np.random.Generator, *, share: float = 2 / 3) -> tuple[ErrorPairs, ErrorPairs]:
+    """Return the pairs of this share of the episodes, and those of the others."""
     names = np.unique(pairs.episode)
-    chosen = rng.permutation(names)[: max(1, (2 * len(names)) // 3)]
-    calibrates = np.isin(pairs.episode, chosen)
-    return pairs.of(calibrates), pairs.of(~calibrates)
+    chosen = rng.permutation(names)[: max(1, int(share * len(names)))]
+    is_first = np.isin(pairs.episode, chosen)
+    return pairs.of(is_first), pairs.of(~is_first)
 
 
 def shape_of(pairs: ErrorPairs, phi_size: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
@@ -126,6 +126,7 @@ def bound_by_scenario(
     phi_size: Float[np.ndarray, " n"],
     v_size: Float[np.ndarray, " m"],
     *,
+    sizing: ErrorPairs,
     constant: bool,
     confidence: float,
     held_out: ErrorPairs,
@@ -136,21 +137,22 @@ def bound_by_scenario(
     of n independent episodes. A new episode breaks its optimum with probability at most ε, with confidence 1 − β. Here
     Σ_{i<d} C(n, i) εⁱ (1 − ε)ⁿ⁻ⁱ = β. None where there are too few episodes.
 
-    The argument takes the shape, the sizes and the least values of the constants as given. Here they come from these
-    pairs or from all, so that ε is not strict.
+    The argument takes the shape, the sizes, the weights and the least values of the constants as given. They come from
+    the `sizing` pairs, which have to be of other episodes.
     """
     episodes = len(np.unique(pairs.episode))
     if episodes < _FEW:
         return None
     bound = ErrorBound("scenario", 0.0, 0.0, 0.0, shape, phi_size, v_size)
+    size, phi, v = bound.norms(sizing)
+    means = [max(float(column.mean()), 1e-12) for column in (phi, v, *([np.ones(len(phi))] if constant else []))]
+    # samples rarely have φ or v near 0 alone: each constant is at least half the usual error per unit of both
+    usual = 0.5 * float(np.median(size / np.maximum(phi + v, 1e-300)))
     size, phi, v = bound.norms(pairs)
     columns = [phi, v, *([np.ones(len(phi))] if constant else [])]
-    means = [max(float(column.mean()), 1e-12) for column in columns]
     unit = max(float(size.max()), 1e-12)
     rows = np.stack(columns, axis=1)
-    # samples rarely have φ or v near 0 alone: each constant is at least half the usual error per unit of both
-    usual = 0.5 * float(np.median(size / np.maximum(phi + v, 1e-300))) / unit
-    bounds = [(0.0 if i == 2 else usual, None) for i in range(len(columns))]
+    bounds = [(0.0 if i == 2 else usual / unit, None) for i in range(len(columns))]
     from scipy.optimize import linprog  # slow to import
 
     found = linprog(means, A_ub=-rows, b_ub=-size / unit, bounds=bounds, method="highs")

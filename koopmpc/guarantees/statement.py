@@ -80,8 +80,8 @@ def _describe_bound(c: Certificate) -> str:
         f" scenario argument says of them: they hold on all pairs of at least {to_percent(1 - error.share)} of episodes"
         f" that are drawn like these, with the confidence {to_percent(error.confidence)}. That does not prove it for"
         " the rest. The model must not have been fitted to these episodes, and they must be independent."
-        " The box, the sizes, the shape of the error and the least values of the constants come from the data too; the"
-        " argument takes them as given, so that the share is not strict."
+        " The box, the sizes, the shape of the error and the least values of the constants come from other episodes, a"
+        " half of all."
     )
 
 

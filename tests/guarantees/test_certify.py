@@ -175,20 +175,36 @@ def test_the_area_is_a_fair_share_on_more_plants(name):
 
 
 def test_a_scenario_bound_is_broken_as_rarely_as_it_promises():
-    from koopmpc.guarantees.error_bounds import ErrorPairs, bound_by_scenario
+    from koopmpc.guarantees.error_bounds import ErrorPairs, bound_by_scenario, shape_of
 
     rng, missed = np.random.default_rng(0), []
     for _ in range(60):
         phi, v = rng.normal(size=(4000, 2)), rng.normal(size=(4000, 1))
         r = rng.normal(size=(4000, 2)) * (np.linalg.norm(phi, axis=1) + np.linalg.norm(v, axis=1))[:, None]
         pairs = ErrorPairs(phi, v, r, phi, v, np.arange(4000.0))
-        first, rest = pairs.of(np.arange(4000) < 150), pairs.of(np.arange(4000) >= 150)
+        sizing, first, rest = (pairs.of((np.arange(4000) // 150).clip(0, 2) == k) for k in range(3))
         bound = bound_by_scenario(
-            first, np.eye(2), np.ones(2), np.ones(1), constant=False, confidence=0.9, held_out=rest
+            first,
+            shape_of(sizing, np.ones(2)),
+            np.ones(2),
+            np.ones(1),
+            sizing=sizing,
+            constant=False,
+            confidence=0.9,
+            held_out=rest,
         )
         missed.append(bound.broken / bound.held_out > bound.share)
         assert (bound.measure(first) <= 1e-12).all()
     assert np.mean(missed) <= 0.1 + 3 * np.sqrt(0.1 * 0.9 / 60)
+
+
+def test_the_episodes_that_set_box_and_sizes_are_not_those_of_the_bound(tanks):
+    _, model, data, limits, x, u, certificate = tanks
+    error = certificate.error
+    assert error.pairs + error.held_out <= sum(len(episode.U) for episode in data.episodes) / 2 + 1
+    other = km.certify(model, data, limits, x=x, u=u, rng=1)  # another half
+    assert (other.low != certificate.low).any()
+    assert (other.error.phi_size != error.phi_size).all()
 
 
 @pytest.mark.slow
