@@ -52,7 +52,7 @@ class InitialCondition(Viewing):
         Whether u_{−1} is needed, and whether the observer finds d.
     """
 
-    _VIEWS = ("z", "u_prev", "drive", "W", "periodic", "d")
+    _VIEWS = ("known", "z", "u_prev", "drive", "W", "periodic", "d")
 
     def __init__(
         self,
@@ -72,8 +72,9 @@ class InitialCondition(Viewing):
         self._shape = (observer.ny,)
         self._np = model.nz if hasattr(observer, "forecast") else 0  # entries of a periodic disturbance
         drives = N * (model.nw + self._np)
-        self.known = np.zeros(model.nz + model.nu * with_rates + drives + model.nz * estimated + 1)
-        self.known[-1] = 1.0
+        self._count = model.nz + model.nu * with_rates + drives + model.nz * estimated + 1
+        self.buffer = np.zeros(self._count)  # known, and what a plan keeps behind it
+        self.buffer[-1] = 1.0
         self.refused = False  # whether the observer refused the last y
         self._ahead = np.zeros((latency + 1, model.nw))
         self._sent: deque[Float[np.ndarray, " nu"]] = deque(maxlen=latency + 1)
@@ -83,12 +84,20 @@ class InitialCondition(Viewing):
         """Make the views; see `Viewing`."""
         nz, nu, nw, N = self._sizes
         first = nz + nu * self._with_rates
+        self.known = self.buffer[: self._count]
         self.z = self.known[:nz]
         self.u_prev = self.known[nz:first]
         self.drive = self.known[first:-1]
         whole = nw + self._np
         ahead = self.drive[: N * whole].reshape(N, whole)
         self.W, self.periodic, self.d = ahead[:, :nw], ahead[:, nw:], self.drive[N * whole :]
+
+    def extend(self, size: int) -> Float[np.ndarray, " n"]:
+        """Return `buffer` with room for `size` numbers, which begin with `known`."""
+        if len(self.buffer) != size:
+            self.buffer = np.concatenate([self.known, np.zeros(size - self._count)])
+            self._see()
+        return self.buffer
 
     def reset(self, x0: ArrayLike | None, last: Float[np.ndarray, " nu"]) -> None:
         """Start at x0, where it is known, with the input `last` acting until the first one arrives."""

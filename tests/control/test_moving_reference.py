@@ -1,5 +1,7 @@
 """A reference that moves enters the plan by one product with it, or part by part: both give the same inputs."""
 
+import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -100,3 +102,23 @@ def test_a_plan_on_the_way_is_the_one_that_is_computed_afresh(seed, cost, rows, 
         if fresh.plan() is not None:
             np.testing.assert_allclose(mpc.plan().U, fresh.plan().U, rtol=0, atol=1e-9 * size)
         last, x = move.u, A @ x + B @ (last if latency else move.u)
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
+@pytest.mark.parametrize("rows", [1, N + 1])
+def test_steps_of_a_copy_and_of_its_original_do_not_meet(duplicate, rows):
+    """Both read where a step starts and its reference from one array: each needs one of its own."""
+    signal = 0.2 * np.sin(0.3 * np.arange(N + 8))[:, None] * [1.0, 0.0]
+    references = [signal[k] if rows == 1 else signal[k : k + rows] for k in range(6)]
+    alone, mpc = (km.KoopmanMPC(linear(A, B), COSTS["no target"], LIMITS["wide"], N) for _ in range(2))
+    for k in range(3):
+        alone([0.1, 0.0], references[k])
+        mpc([0.1, 0.0], references[k])
+    twin = duplicate(mpc)
+    for k in range(3, 6):
+        expected = alone([0.1 * k, 0.0], references[k])
+        mpc([-5.0, 3.0], references[k - 3])
+        move = twin([0.1 * k, 0.0], references[k])
+        np.testing.assert_array_equal(move.u, expected.u)
+        mpc([7.0, 1.0], references[k - 2])
+        np.testing.assert_array_equal(twin.plan().X, alone.plan().X)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-from scipy.linalg.blas import dasum
+from scipy.linalg.blas import idamax
 
 from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
@@ -176,6 +176,7 @@ class KoopmanMPC(MPCBase):
         self._map = plan_map(
             predictor, track, self._moves, coordinates, disturbed=disturbed, periodic=self._initial.periodic.size > 0
         )
+        self._share_start()
         self._hold_limits()
         self._options = {"solver": self._solver, "settings": settings}
         self._levels: LevelSearch | None = None
@@ -200,10 +201,18 @@ class KoopmanMPC(MPCBase):
         self._reference_key: bytes | None = None
         self._given_row = 0  # the row of a given u_target that belongs to this step
         self._read: MovingMap | None = self._map.moving  # the map that holds the reference of the last call
+        self._peak, self._near = 0.0, False  # largest |r| of that reference; whether no limit moves its targets
         self._aimed = False  # whether the plan's last column is that of the reference
         self._going = False  # whether a step was made since reset: the first one repeats to the bit in every run
         self._rows = np.zeros((self._N + 1, len(track.tracked)))
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # the states of a plan, once somebody asks for one
+
+    def _share_start(self) -> None:
+        """Let the maps of a moving reference read where a step starts from where it is written."""
+        maps = [part for part in (self._map.moving, self._map.single) if part is not None]
+        buffer = self._initial.extend(max(part.matrix.shape[1] for part in maps))
+        for part in maps:
+            part.share(buffer)
 
     def _priorities(self) -> Int[np.ndarray, " nv"]:
         """Return the priority of each entry of a plan."""
@@ -322,6 +331,7 @@ class KoopmanMPC(MPCBase):
             disturbed=self._disturbed,
             periodic=self._initial.periodic.size > 0,
         )
+        self._share_start()
         self._read = self._map.moving
         self.predictor, self._states = predictor, None
         if isinstance(self._qps, BallSolver) and self._map.ball is not None:
@@ -379,7 +389,7 @@ class KoopmanMPC(MPCBase):
             target = numbers(reference, "reference")
             key, moving = target.tobytes(), None
             if key != self._reference_key:
-                moving = self._take_reference(target)
+                moving = self._take_reference(target, key)
                 self._reference_key, self._aimed = key, False
             if self._window is not None or limits is not None:
                 self._move_limits(limits, moving)
@@ -393,8 +403,11 @@ class KoopmanMPC(MPCBase):
             if self._window is not None:
                 self._step += 1
             plan, t = self._map, self._spare
-            if moving is None:
-                plan.matrix.dot(origin.known, t)
+            if moving is None or self._near:
+                if moving is None:
+                    plan.matrix.dot(origin.known, t)
+                else:
+                    moving.rows_of_plan.dot(moving.known, t)
                 if plan.given is not None:
                     self._add_given(t)
                 _at_least(t, plan.low, plan.met_low)
@@ -403,7 +416,7 @@ class KoopmanMPC(MPCBase):
                 ask = self._solve_limited if 0 in plan.met else self._return_free_plan
                 move = ask(t, applied, start)
             else:
-                whole = moving.multiply(origin.known)
+                whole = moving.multiply()
                 if plan.given is not None:
                     self._add_given(whole)
                 _at_least(whole, moving.low, moving.met_low)
@@ -457,6 +470,8 @@ class KoopmanMPC(MPCBase):
             k = window.last
         self._row = k
         if moving is not None:
+            self._near = self._peak <= window.reaches[k]
+        if moving is not None and not self._near:
             (window.single_pages if moving is plan.single else window.moving_pages).turn(moving, k)
             return
         pages = window.plan_pages
@@ -502,25 +517,28 @@ class KoopmanMPC(MPCBase):
         rows = self._rows if self._read is None else self._read.rows
         return rows if len(rows) > self._N else np.repeat(rows, self._N + 1, axis=0)
 
-    def _take_reference(self, reference: Float[np.ndarray, "..."]) -> MovingMap | None:
+    def _take_reference(self, reference: Float[np.ndarray, "..."], key: bytes) -> MovingMap | None:
         """Keep the rows of the reference that the plan reads; return the map that reads them.
 
-        The first step after `reset` gets None, as does a row that is not finite.
+        The first step after `reset` gets None, as does a row that is not finite. `key` holds the bytes of the rows.
         """
         plan, shape = self._map, reference.shape
-        if shape == plan.single.shape[1:]:
+        if shape == plan.row_shape:
             self._read = read = plan.single
-            read.flat[:] = reference
+            read.raw[:] = key
         else:
             self._read = read = plan.moving
-            R = self._rows if read is None else read.rows
-            if shape == R.shape and not self._latency:
-                R[:] = reference
+            if shape == plan.rows_shape and read is not None and not self._latency:
+                read.raw[:] = key
             else:
+                R = self._rows if read is None else read.rows
                 R[:] = checks.reference_rows(reference, self._N, R.shape[1], self._latency)
         if read is None:
             return None
-        return read if dasum(read.flat) < HUGE and self._going else None
+        flat = read.flat
+        self._peak = peak = abs(flat[idamax(flat)])  # what is NaN gives a plan of NaN, which meets no limit
+        self._near = peak <= read.reach
+        return read if peak < HUGE and self._going else None
 
     def _add_given(self, t: Float[np.ndarray, " nt"]) -> None:
         """Add the share of the rows of a given u_target that belong to this step, and go on to the next one."""

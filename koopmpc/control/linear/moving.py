@@ -36,20 +36,27 @@ class MovingMap(Viewing):
 
     One product serves a reference that moves, and a small one its targets. Where low ≤ t ≤ high, the plan is the
     optimum, and no limit moves a target. For one row that is held over the horizon, M has one r, and K is part of it.
+    Where no |r| is above `reach`, no limit can move a target, and the plan alone is computed.
 
     Attributes
     ----------
-    known
-        What M is multiplied by, with the views `start`, `rows`, and `flat`, the rows one after the other.
+    buffer, known
+        What M is multiplied by, at the begin of an array that others use too: the part before the rows is theirs. The
+        rows have the views `rows`, `flat`, one after the other, and `raw`, their bytes.
     t, planned
         The product and the values of targets, and of these the plan.
     shape
         That of `rows`.
     met
         A byte for each limit, as in `PlanMap`.
+    rows_of_plan
+        The rows of M that are the plan's.
     """
 
-    _VIEWS = ("met", "met_low", "met_high", "low", "high", "start", "flat", "rows", "plan", "planned", "tests")
+    _VIEWS = (
+        *("met", "met_low", "met_high", "low", "high", "known", "start", "flat", "raw", "rows", "plan"),
+        *("planned", "tests", "rows_of_plan"),
+    )
 
     def __init__(self, parts: PlanParts, nr: int, *, held: bool) -> None:
         fixed, shares, targets, limited = parts.fixed, parts.from_reference, parts.targets, parts.limited
@@ -61,6 +68,7 @@ class MovingMap(Viewing):
         low, high = [parts.box.low], [parts.box.high]
         self.from_row = np.zeros((nr, 0))  # K, transposed, where it is not part of M
         self.drive: Float[np.ndarray, "nt n"] | None = None  # what a known disturbance adds to K r
+        self.reach = HUGE  # least |r| for which a limit may move a target
         if targets is not None:
             K, drive = targets.rows[limited] @ targets.from_reference, parts.drive
             shift, reach = targets.rows[limited] @ targets.offset, ROUNDING * targets.size[limited]
@@ -69,10 +77,12 @@ class MovingMap(Viewing):
             else:
                 self.from_row = np.ascontiguousarray(K.T)
                 self.drive = np.column_stack([drive, 0.0 * shift]) if drive.any() else None
-            low.append(np.tile(np.maximum(targets.low[limited] - reach, -HUGE) - shift, steps))
-            high.append(np.tile(np.minimum(targets.high[limited] + reach, HUGE) - shift, steps))
+            ends = np.maximum(targets.low[limited] - reach, -HUGE), np.minimum(targets.high[limited] + reach, HUGE)
+            self.reach = float(find_reach(K, *(end - targets.rows[limited] @ targets.offset for end in ends)))
+            low.append(np.tile(ends[0] - shift, steps))
+            high.append(np.tile(ends[1] - shift, steps))
         self.matrix, self.limits = np.ascontiguousarray(matrix), np.concatenate([*low, *high])
-        self.t, self.known = np.zeros(len(self.limits) // 2), np.zeros(matrix.shape[1])
+        self.t, self.buffer = np.zeros(len(self.limits) // 2), np.zeros(matrix.shape[1])
         self._first, self.shape, self._n = fixed.shape[1] + 1, (steps, nr), n
         self._see()
 
@@ -84,19 +94,25 @@ class MovingMap(Viewing):
         self.met = bytearray(2 * count)
         met = np.frombuffer(self.met, dtype=np.bool_)
         self.met_low, self.met_high = met[:count], met[count:]
-        self.start = self.known[:first]
-        self.flat = self.known[first:]
+        self.known = self.buffer[: self.matrix.shape[1]]
+        self.start, self.flat = self.known[:first], self.known[first:]
+        self.raw = self.flat.data.cast("B")
+        self.rows_of_plan = self.matrix[: self._n]
         self.rows, self.planned = self.flat.reshape(self.shape), self.t[: self._n]
         self.plan, self.tests = self.t[:rows], self.t[rows:].reshape(self.shape[0], -1)
 
-    def multiply(self, start: Float[np.ndarray, " n"]) -> Float[np.ndarray, " nt"]:
-        """Return t of a step that starts at [z; u_{−1}; g; 1]."""
-        self.start[:] = start
+    def share(self, buffer: Float[np.ndarray, " n"]) -> None:
+        """Take the known part of a step from where it is written."""
+        self.buffer = buffer
+        self._see()
+
+    def multiply(self) -> Float[np.ndarray, " nt"]:
+        """Return t of a step."""
         self.matrix.dot(self.known, self.plan)
         if self.tests.size:
             self.rows.dot(self.from_row, self.tests)
             if self.drive is not None:
-                self.tests += self.drive.dot(start)
+                self.tests += self.drive.dot(self.start)
         return self.t
 
     @staticmethod
@@ -105,6 +121,16 @@ class MovingMap(Viewing):
         (n, start), reads = parts.fixed.shape, parts.from_reference.shape[1]
         large = n * (start + 1 + reads) > _LARGEST
         return None if large else MovingMap(parts, nr, held=False), MovingMap(parts, nr, held=True)
+
+
+def find_reach(
+    K: Float[np.ndarray, "nl nr"], low: Float[np.ndarray, "*T nl"], high: Float[np.ndarray, "*T nl"]
+) -> Float[np.ndarray, "*T"]:
+    """Return the largest a for which low ≤ K r ≤ high wherever no |r_i| is above a; below 0 where there is none."""
+    room, size = np.minimum(high, -low), np.abs(K).sum(axis=1)
+    moved = size > 0
+    reach = np.where(moved, room / np.where(moved, size, 1.0), np.where(room >= 0, HUGE, -1.0))
+    return np.minimum(reach.min(axis=-1, initial=HUGE), HUGE)
 
 
 class GivenShares:

@@ -13,7 +13,7 @@ from koopmpc.control.in_time.preview import require_movable, require_preview
 from koopmpc.control.limits import Interval, Limits, preview_margin
 from koopmpc.control.linear.condensed_program import BoundsProgram
 from koopmpc.control.linear.layout import TableColumns, WindowLayout
-from koopmpc.control.linear.moving import MovingMap
+from koopmpc.control.linear.moving import MovingMap, find_reach
 from koopmpc.control.linear.plan import PlanMap
 from koopmpc.control.target import ROUNDING
 from koopmpc.errors import DataError
@@ -80,6 +80,8 @@ class LimitWindows:
         Where targets stand in the table, and the tightest limits of targets.
     hard
         Which rates are hard; None where none is.
+    reaches
+        For each step the largest |r| of a preview for which no limit moves a target.
     moves
         Where the limits of all moves stand, those that an input keeps included.
     plan_pages, moving_pages, single_pages
@@ -94,6 +96,7 @@ class LimitWindows:
     targets: TableColumns
     swept: TableColumns
     hard: Bool[np.ndarray, " nu"] | None
+    reaches: list[float]
     moves: Int[np.ndarray, " moves"]
     plan_pages: _Pages
     moving_pages: _Pages
@@ -243,6 +246,10 @@ def limit_windows(
     W, raw_at = layout.width, layout.raw.first
     planned = table[:, :raw_at], table[:, W : W + raw_at]
     table = np.clip(table, -HUGE, HUGE)
+    reaches = [plan.single.reach] * steps  # where nothing aims at a target, or a disturbance moves it
+    if plan.aims_inside:
+        first = [part[latency : latency + steps] - shift for part in tightest]
+        reaches = find_reach(targets.rows[limited] @ targets.from_reference, *first).tolist()
     pages = [_Pages(table, entries, latency, steps - 1, layout.outputs, margin) for entries in layout.entries]
     return LimitWindows(
         plan=plan,
@@ -253,6 +260,7 @@ def limit_windows(
         targets=layout.raw,
         swept=layout.tight,
         hard=None if track.hard_rates is None else np.isinf(track.rate_softness.linear),
+        reaches=reaches,
         moves=layout.moves,
         plan_pages=pages[0],
         moving_pages=pages[1],
