@@ -196,6 +196,7 @@ class Compiled:
         self._pointer = ctypes.c_void_p(ctypes.addressof(frame))
         self._call = self._code.koopmpc_call
         self._y_shape, self._row_shape, self._row = (self._ny,), (self._nr,), self._reference[0]
+        self._rows_shape = self._reference.shape
         self._count, self._has_extras, self._is_double = 1, False, not single
         self._solver = "" if self._targets is not None else "sequences" if sizes["LEVELED"] else "daqp"
         if self._targets is not None:
@@ -279,6 +280,9 @@ class Compiled:
             if target.shape == self._row_shape:
                 self._row[:] = target
                 count = 1
+            elif target.shape == self._rows_shape:  # not by a method, for it costs a tenth of the step
+                self._reference[:] = target
+                count = len(target)
             else:
                 count = self._copy_rows(target, self._reference, self._nr, "reference")
             if count != self._count:  # writing a field takes as long as the C step

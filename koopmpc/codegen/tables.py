@@ -407,6 +407,7 @@ def _add_condensed(tables: Tables, program: CondensedProgram) -> None:
         "FEW": FEW,
         "COLD_START": int(solver.settings["cold_start"]),
     }
+    tables.define({"UNPUSHED": program.unpushed})
     _add_limits(tables, hard_rate=program.hard_rates)
     tables.limits["move_of"] = np.asarray(program.move_of, dtype=np.intc)
     M, scaling = _normalise(solver.M)
@@ -418,6 +419,7 @@ def _add_condensed(tables: Tables, program: CondensedProgram) -> None:
         "high": program.high,
         "offset": program.offset,
         "from_reference": stack(program.from_reference),
+        "from_held": stack(program.from_reference.reshape(len(program.offset), -1, program.nr).sum(axis=1)),
         "from_target": stack(program.from_target) if program.aimed else np.zeros(0),
         "from_given": np.zeros(0) if program.given is None else stack(program.from_given),
         "checked": targets.rows[program.checked] if checked else np.zeros(0),

@@ -50,6 +50,8 @@ class InitialCondition(Viewing):
         Steps of the plan; L ≥ 0.
     with_rates, estimated
         Whether u_{−1} is needed, and whether the observer finds d.
+    room
+        Numbers that a plan keeps behind `known`, in the array `buffer` that holds both.
     """
 
     _VIEWS = ("known", "z", "u_prev", "drive", "W", "periodic", "d")
@@ -63,6 +65,7 @@ class InitialCondition(Viewing):
         *,
         with_rates: bool,
         estimated: bool,
+        room: int = 0,
     ) -> None:
         self._model, self.observer, self._latency = state_model(model), observer, latency
         self._sizes = model.nz, model.nu, model.nw, N
@@ -73,8 +76,8 @@ class InitialCondition(Viewing):
         self._np = model.nz if hasattr(observer, "forecast") else 0  # entries of a periodic disturbance
         drives = N * (model.nw + self._np)
         self._count = model.nz + model.nu * with_rates + drives + model.nz * estimated + 1
-        self.buffer = np.zeros(self._count)  # known, and what a plan keeps behind it
-        self.buffer[-1] = 1.0
+        self.buffer = np.zeros(self._count + room)
+        self.buffer[self._count - 1] = 1.0
         self.refused = False  # whether the observer refused the last y
         self._ahead = np.zeros((latency + 1, model.nw))
         self._sent: deque[Float[np.ndarray, " nu"]] = deque(maxlen=latency + 1)
@@ -91,13 +94,6 @@ class InitialCondition(Viewing):
         whole = nw + self._np
         ahead = self.drive[: N * whole].reshape(N, whole)
         self.W, self.periodic, self.d = ahead[:, :nw], ahead[:, nw:], self.drive[N * whole :]
-
-    def extend(self, size: int) -> Float[np.ndarray, " n"]:
-        """Return `buffer` with room for `size` numbers, which begin with `known`."""
-        if len(self.buffer) != size:
-            self.buffer = np.concatenate([self.known, np.zeros(size - self._count)])
-            self._see()
-        return self.buffer
 
     def reset(self, x0: ArrayLike | None, last: Float[np.ndarray, " nu"]) -> None:
         """Start at x0, where it is known, with the input `last` acting until the first one arrives."""
@@ -256,7 +252,13 @@ class MPCBase(Published):
         self._allowed = np.inf if time_limit is None else checks.positive(time_limit, "time_limit", "s")
         self._estimator = estimator
         self._initial = InitialCondition(
-            model, observer, N, self._latency, with_rates=self._with_rates, estimated=estimator is not None
+            model,
+            observer,
+            N,
+            self._latency,
+            with_rates=self._with_rates,
+            estimated=estimator is not None,
+            room=0 if stagewise else (N + 1) * len(tracking.Q),
         )
         levels = self.limits.base.input_levels(self.nu)
         self._held = None if levels is None else HeldLevels(levels)

@@ -35,6 +35,8 @@ CONTROLLERS = {
     "inputs": Asked(mpc(BOX), ("UNCONSTRAINED", "OPTIMAL", "BAD_MEASUREMENT")),
     "lqr": Asked(lambda model: km.LQR(model, COST, km.Limits(**BOX, du_max=20.0)), ("SATURATED", "BAD_MEASUREMENT")),
     "soft": Asked(mpc(BOX | {"x_min": [-0.5, -1.0], "x_max": [0.5, 1.0]}), ("SOFTENED",), preview=20),
+    "small rows": Asked(mpc(BOX | {"x_max": [0.5, 9.0]}), ("UNCONSTRAINED", "OPTIMAL", "SOFTENED"), preview=6),
+    "one row": Asked(mpc(BOX), ("UNCONSTRAINED", "OPTIMAL"), preview=1),
     "hard": Asked(mpc(BOX | {"x_min": [-0.6, -1.0], "x_max": [0.6, 1.0], "slack": None}, 8), ("OPTIMAL", "INFEASIBLE")),
     "rates": Asked(
         mpc(

@@ -43,14 +43,18 @@ static int target_of_row(koopmpc_state *s, int k, const koopmpc_real *e, koopmpc
 /** Write the reference's part of the plan: all NaN if a row is not finite. */
 static void aim(koopmpc_state *s, const koopmpc_rows *reference) {
   const int moves_on = s->row + 1 < KOOPMPC_GIVEN;
-  int good = 1, same = s->aimed;
+  int good = 1, same = s->aimed, held = 1; /* held: all rows are the same */
+  koopmpc_real peak = 0;
   for (int k = 0; k <= KOOPMPC_N; k++) {
     const koopmpc_real *row = koopmpc_row(reference, k + KOOPMPC_LATENCY, KOOPMPC_NR);
     koopmpc_real *mine = s->reference + k * KOOPMPC_NR;
     for (int i = 0; i < KOOPMPC_NR; i++) {
+      const koopmpc_real size = koopmpc_abs(row[i]);
       same &= mine[i] == row[i];
       mine[i] = row[i];
-      good &= koopmpc_abs(row[i]) < KOOPMPC_HUGE;
+      held &= row[i] == s->reference[i];
+      good &= size < KOOPMPC_HUGE;
+      peak = size > peak ? size : peak;
     }
   }
   if (!same) {
@@ -59,7 +63,10 @@ static void aim(koopmpc_state *s, const koopmpc_rows *reference) {
       koopmpc_fill(s->column, (koopmpc_real)NAN, KOOPMPC_NT);
     } else {
       koopmpc_copy(s->column, koopmpc_offset, PLANNED);
-      koopmpc_add(s->column, koopmpc_from_reference, PLANNED, s->reference, (KOOPMPC_N + 1) * KOOPMPC_NR);
+      if (held)
+        koopmpc_add(s->column, koopmpc_from_held, PLANNED, s->reference, KOOPMPC_NR);
+      else
+        koopmpc_add(s->column, koopmpc_from_reference, PLANNED, s->reference, (KOOPMPC_N + 1) * KOOPMPC_NR);
 #if KOOPMPC_GIVEN
       for (int k = 0; k <= KOOPMPC_N; k++)
         koopmpc_add(s->column, koopmpc_from_given + k * KOOPMPC_NU * PLANNED, PLANNED, given_row(s, k), KOOPMPC_NU);
@@ -70,7 +77,9 @@ static void aim(koopmpc_state *s, const koopmpc_rows *reference) {
       koopmpc_real alpha[KOOPMPC_NA];
       int moved = 0; /* whether a limit moves the target of this row, which the column holds as if there were none */
 #endif
-      for (int k = 0; k <= KOOPMPC_N; k++) {
+      /* no limit moves a target of rows as small as this */
+      const int rows = !KOOPMPC_CHECKED_LIMITS && !KOOPMPC_BOUNDS && peak <= KOOPMPC_UNPUSHED ? 0 : KOOPMPC_N + 1;
+      for (int k = 0; k < rows; k++) {
         const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
         int repeated = k > 0;
         for (int i = 0; i < KOOPMPC_NR && repeated; i++) repeated = row[i] == row[i - KOOPMPC_NR];

@@ -79,8 +79,8 @@ class CondensedProgram(LinearProgram):
         The plan's matrix, and the limits of t.
     offset, from_reference, from_target, from_given
         The parts of m(r).
-    aimed
-        Whether a target enters the plan.
+    aimed, unpushed
+        Whether a target enters the plan; largest |r| of a preview for which no limit moves its targets.
     checked, disturbance
         The limits of the targets that g may break; (nz, ng) what g adds to z⁺ at the end of the horizon.
     qp, deviation
@@ -104,6 +104,7 @@ class CondensedProgram(LinearProgram):
     from_target: Float[np.ndarray, "planned target"]
     from_given: Float[np.ndarray, "planned inputs"]
     aimed: bool
+    unpushed: float
     checked: Bool[np.ndarray, " checked"]
     disturbance: Float[np.ndarray, "nz ng"]
     qp: StepQP

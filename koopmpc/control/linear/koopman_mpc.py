@@ -174,9 +174,14 @@ class KoopmanMPC(MPCBase):
         self.predictor, self._disturbed = predictor, disturbed
         coordinates = self._wanted or turns[0].solver.coordinates
         self._map = plan_map(
-            predictor, track, self._moves, coordinates, disturbed=disturbed, periodic=self._initial.periodic.size > 0
+            predictor,
+            track,
+            self._moves,
+            coordinates,
+            self._initial.buffer,
+            disturbed=disturbed,
+            periodic=self._initial.periodic.size > 0,
         )
-        self._share_start()
         self._hold_limits()
         self._options = {"solver": self._solver, "settings": settings}
         self._levels: LevelSearch | None = None
@@ -206,13 +211,6 @@ class KoopmanMPC(MPCBase):
         self._going = False  # whether a step was made since reset: the first one repeats to the bit in every run
         self._rows = np.zeros((self._N + 1, len(track.tracked)))
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # the states of a plan, once somebody asks for one
-
-    def _share_start(self) -> None:
-        """Let the maps of a moving reference read where a step starts from where it is written."""
-        maps = [part for part in (self._map.moving, self._map.single) if part is not None]
-        buffer = self._initial.extend(max(part.matrix.shape[1] for part in maps))
-        for part in maps:
-            part.share(buffer)
 
     def _priorities(self) -> Int[np.ndarray, " nv"]:
         """Return the priority of each entry of a plan."""
@@ -273,6 +271,7 @@ class KoopmanMPC(MPCBase):
             from_target=plan.maps.from_target,
             from_given=plan.maps.from_given,
             aimed=bool(plan.aimed and plan.targets.Z.shape[1]),
+            unpushed=plan.single.reach,
             checked=plan.checked,
             disturbance=plan.disturbance,
             qp=plan.qp,
@@ -328,10 +327,10 @@ class KoopmanMPC(MPCBase):
             track,
             self._moves,
             coordinates,
+            self._initial.buffer,
             disturbed=self._disturbed,
             periodic=self._initial.periodic.size > 0,
         )
-        self._share_start()
         self._read = self._map.moving
         self.predictor, self._states = predictor, None
         if isinstance(self._qps, BallSolver) and self._map.ball is not None:

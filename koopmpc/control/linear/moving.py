@@ -19,7 +19,8 @@ class PlanParts(NamedTuple):
     """The unconstrained plan v = F [z; u_{−1}; g] + f + F_r r, and what limits it.
 
     `box` holds the limits of v. There are no `targets` where none enters the plan. `limited` says which of their
-    limited values have limits, or may get some in time, and `drive` is what [z; u_{−1}; g] adds to these.
+    limited values have limits, or may get some in time, and `drive` is what [z; u_{−1}; g] adds to these. `buffer`
+    begins with [z; u_{−1}; g; 1] of a step, and has room for a reference.
     """
 
     fixed: Float[np.ndarray, "nv n"]
@@ -29,6 +30,7 @@ class PlanParts(NamedTuple):
     targets: Targets | None
     limited: Bool[np.ndarray, " nl"]
     drive: Float[np.ndarray, "nk n"]
+    buffer: Float[np.ndarray, " n"]
 
 
 class MovingMap(Viewing):
@@ -78,11 +80,12 @@ class MovingMap(Viewing):
                 self.from_row = np.ascontiguousarray(K.T)
                 self.drive = np.column_stack([drive, 0.0 * shift]) if drive.any() else None
             ends = np.maximum(targets.low[limited] - reach, -HUGE), np.minimum(targets.high[limited] + reach, HUGE)
-            self.reach = float(find_reach(K, *(end - targets.rows[limited] @ targets.offset for end in ends)))
+            pushed = targets.rows[limited] @ targets.offset
+            self.reach = float(find_reach(K, *(np.atleast_2d(end - pushed) for end in ends))[0])
             low.append(np.tile(ends[0] - shift, steps))
             high.append(np.tile(ends[1] - shift, steps))
         self.matrix, self.limits = np.ascontiguousarray(matrix), np.concatenate([*low, *high])
-        self.t, self.buffer = np.zeros(len(self.limits) // 2), np.zeros(matrix.shape[1])
+        self.t, self.buffer = np.zeros(len(self.limits) // 2), parts.buffer
         self._first, self.shape, self._n = fixed.shape[1] + 1, (steps, nr), n
         self._see()
 
@@ -100,11 +103,6 @@ class MovingMap(Viewing):
         self.rows_of_plan = self.matrix[: self._n]
         self.rows, self.planned = self.flat.reshape(self.shape), self.t[: self._n]
         self.plan, self.tests = self.t[:rows], self.t[rows:].reshape(self.shape[0], -1)
-
-    def share(self, buffer: Float[np.ndarray, " n"]) -> None:
-        """Take the known part of a step from where it is written."""
-        self.buffer = buffer
-        self._see()
 
     def multiply(self) -> Float[np.ndarray, " nt"]:
         """Return t of a step."""
@@ -124,8 +122,8 @@ class MovingMap(Viewing):
 
 
 def find_reach(
-    K: Float[np.ndarray, "nl nr"], low: Float[np.ndarray, "*T nl"], high: Float[np.ndarray, "*T nl"]
-) -> Float[np.ndarray, "*T"]:
+    K: Float[np.ndarray, "nl nr"], low: Float[np.ndarray, "T nl"], high: Float[np.ndarray, "T nl"]
+) -> Float[np.ndarray, " T"]:
     """Return the largest a for which low ≤ K r ≤ high wherever no |r_i| is above a; below 0 where there is none."""
     room, size = np.minimum(high, -low), np.abs(K).sum(axis=1)
     moved = size > 0

@@ -99,6 +99,7 @@ class PlanMap(Viewing):
         maps: Condensed,
         end: EndRows | None,
         held: Bool[np.ndarray, "moves nu"],
+        buffer: Float[np.ndarray, " n"],
     ) -> None:
         self.track, self.targets = track, targets
         self.moves, self.blocks = len(maps.hessian), horizon.blocks
@@ -160,6 +161,7 @@ class PlanMap(Viewing):
             box=Interval(self.low[:nv], self.high[:nv]),
             targets=targets if self.aimed else None,
             limited=self.limited_targets,
+            buffer=buffer,
             drive=fixed[nv : nv + count] if len(fixed) > nv else np.zeros((count, fixed.shape[1])),
         )
         nr = len(track.tracked)
@@ -192,6 +194,7 @@ def plan_map(
     track: LiftedTracking,
     moves: MoveBlocks,
     coordinates: Coordinates,
+    buffer: Float[np.ndarray, " n"],
     *,
     disturbed: bool,
     periodic: bool = False,
@@ -210,7 +213,7 @@ def plan_map(
     if moves.own:
         maps = tie_moves(maps, moves.held)
     scaled = _scale_deviation(maps, track.inputs, len(moves.lengths))
-    return PlanMap(track, targets, horizon, scaled, rows, moves.held)
+    return PlanMap(track, targets, horizon, scaled, rows, moves.held, buffer)
 
 
 def _fold_targets(maps: Condensed, targets: Targets) -> Condensed:
