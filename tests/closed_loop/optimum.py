@@ -3,12 +3,14 @@
 Multiple shooting with Ipopt, written apart from the library's controllers: of koopmpc it uses the plant's step map.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 
 import casadi as ca
 import numpy as np
 
+import koopmpc as km
 from tests.closed_loop.more_tasks import ALL
 from tests.closed_loop.tasks import Task, UTarget
 
@@ -92,36 +94,55 @@ def optimum(name: str, start: int, u_target: UTarget | None = None) -> Optimum:
     The sum is the one of `km.metrics`: Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k − u_r‖²_R.
     """
     task = ALL[name].but(u_target)
-    plant, T = task.plant, task.steps
-    Q, R, tracked = weights(task)
-    size, u_size = sizes(task)
-    low, high, u_low, u_high = boxes(task)
-    rows, u_ref = task.rows[1:].T, held(name, u_target).T
+    x0, u_ref = np.array(task.starts[start]), held(name, u_target)
+    best = find_best(
+        task.plant, x0, weights(task), (task.rows[1:], u_ref), boxes(task), sizes(task), _starts(task, x0, u_ref)
+    )
+    if best is None:
+        raise RuntimeError(f"{name}: no start of the optimal-control problem converged; is the task feasible?")
+    return best
+
+
+def find_best(
+    plant: km.StepMap,
+    x0: np.ndarray,
+    weights: tuple[np.ndarray, np.ndarray, list[int]],
+    references: tuple[np.ndarray, np.ndarray],
+    boxes: tuple[np.ndarray, ...],
+    sizes: tuple[np.ndarray, np.ndarray],
+    guesses: Iterable[tuple[np.ndarray, np.ndarray]],
+    settings: dict = QUIET,
+) -> Optimum | None:
+    """Return the best way from x0 that Ipopt finds from the guesses (X, U), None where none converges.
+
+    `references` are (T, nr) rows of the tracked states and (T, nu) inputs from which the cost counts.
+    """
+    (Q, R, tracked), (rows, u_ref), (size, u_size), (low, high, u_low, u_high) = weights, references, sizes, boxes
+    T = len(u_ref)
     X, U = ca.MX.sym("X", plant.nx, T), ca.MX.sym("U", plant.nu, T)
-    x0 = np.array(task.starts[start])
     before = ca.horzcat(ca.DM(x0), X[:, :-1] * size)  # in the plant's units
     defects = (plant.F.map(T)(before, U * u_size) - X * size) / size
-    error, moved = (X * size)[tracked, :] - rows, U * u_size - u_ref
+    error, moved = (X * size)[tracked, :] - rows.T, U * u_size - u_ref.T
     cost = ca.sum1(ca.sum2(error * (Q @ error))) + ca.sum1(ca.sum2(moved * (R @ moved)))
     variables = ca.vertcat(ca.vec(X), ca.vec(U))
-    solver = ca.nlpsol("optimum", "ipopt", {"x": variables, "f": cost, "g": ca.vec(defects)}, QUIET)
+    solver = ca.nlpsol("optimum", "ipopt", {"x": variables, "f": cost, "g": ca.vec(defects)}, settings)
     bounds = {
         "lbx": np.concatenate([np.tile(low / size, T), np.tile(u_low / u_size, T)]),
         "ubx": np.concatenate([np.tile(high / size, T), np.tile(u_high / u_size, T)]),
     }
     best, found = None, []
-    for X0, U0 in _starts(task, x0, u_ref.T):
-        guess = np.concatenate([(X0 / size).ravel(), (U0 / u_size).ravel()])
-        result = solver(x0=guess, lbg=0, ubg=0, **bounds)
+    for X0, U0 in guesses:
+        result = solver(x0=np.concatenate([(X0 / size).ravel(), (U0 / u_size).ravel()]), lbg=0, ubg=0, **bounds)
         if not solver.stats()["success"]:
             continue
         found.append(float(result["f"]))
         if best is None or found[-1] < best[0]:
             best = found[-1], result["x"].full().ravel()
     if best is None:
-        raise RuntimeError(f"{name}: no start of the optimal-control problem converged; is the task feasible?")
-    X = np.vstack([x0, best[1][: T * plant.nx].reshape(T, -1) * size])
-    return Optimum(X, best[1][T * plant.nx :].reshape(T, -1) * u_size, best[0], tuple(sorted(found)))
+        return None
+    states, inputs = np.split(best[1], [T * plant.nx])
+    X = np.vstack([x0, states.reshape(T, -1) * size])
+    return Optimum(X, inputs.reshape(T, -1) * u_size, best[0], tuple(sorted(found)))
 
 
 def _starts(task: Task, x0: np.ndarray, u_ref: np.ndarray):

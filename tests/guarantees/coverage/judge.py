@@ -9,7 +9,7 @@ import numpy as np
 import koopmpc as km
 from koopmpc.loop.metrics import violation_shares
 from koopmpc.synthesis.candidates import get_model
-from tests.guarantees.coverage.optimum import find_optimum
+from tests.guarantees.coverage.optimum import find_optimum, is_touched
 from tests.guarantees.coverage.plants import CoverageTask
 
 COVERAGE = 0.95
@@ -112,7 +112,7 @@ def judge(task: CoverageTask) -> Row:
             best = find_optimum(task, moved, *(() if run is None else (run.X[1:], run.U)))
             if best is None:
                 continue
-            touches = touches or best.touches
+            touches = touches or is_touched(task, best)
             if max(cost, plain_cost) < LOST * best.cost:
                 ratios.append((cost / plain_cost, cost / best.cost, plain_cost / best.cost))
     means = np.exp(np.mean(np.log(ratios), axis=0)) if ratios else np.full(3, np.inf)

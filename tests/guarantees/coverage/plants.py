@@ -134,7 +134,7 @@ def _limit(task: CoverageTask, rng: np.random.Generator, *, touching: bool) -> C
         return None
     for i in rng.permutation(2):
         for side in rng.permutation([1.0, -1.0]):
-            most = max(float((side * way.X[:, i]).max()) for way in ways if way is not None)
+            most = max(float((side * way.X[1:, i]).max()) for way in ways if way is not None)
             least = max(side * task.reference[i], float((side * task.starts[:, i]).max()))
             if touching and most - least < 0.06:
                 continue
