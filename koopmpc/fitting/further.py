@@ -68,7 +68,7 @@ def plan_further(
     Parameters
     ----------
     data, cost, limits, reference, design, episodes, rng
-        As for `next_experiment`.
+        As for `next_experiment`. Where no plan is safe by the model of the design, one of its own is fitted.
     file
         The .csv to write; the picture stands beside it, as .png.
     horizon
@@ -83,19 +83,24 @@ def plan_further(
     LogError
         It cannot be written.
     """
-    try:
-        plan = next_experiment(
-            data,
-            cost,
-            limits,
-            reference=reference,
-            design=design,
-            steps=min(_HORIZONS * horizon, _LONGEST) if steps is None else steps,
-            episodes=episodes,
-            rng=rng,
-        )
-    except KoopmpcError as reason:  # it must not cost the design
-        return FurtherData(None, str(reason))
+    plan, sentence = None, ""
+    for known in (design, None) if design is not None else (None,):  # a design of few logs may have a poor model
+        try:
+            plan = next_experiment(
+                data,
+                cost,
+                limits,
+                reference=reference,
+                design=known,
+                steps=min(_HORIZONS * horizon, _LONGEST) if steps is None else steps,
+                episodes=episodes,
+                rng=rng,
+            )
+            break
+        except KoopmpcError as reason:  # it must not cost the design
+            sentence = str(reason)
+    if plan is None:
+        return FurtherData(None, sentence)
     if not plan.is_worth_it:
         return FurtherData(plan, plan.verdict)
     plan.save(file)
