@@ -1,7 +1,7 @@
 """Feedback without a plan: LQR, u = −K ψ(x) + feedforward in limits, EigenfunctionLQR; the gains `lqr`, `dlqr`."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, TypeVar
@@ -14,12 +14,20 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import HUGE
-from koopmpc.control.cost import Cost, lifted_tracking
+from koopmpc.control.cost import Cost, check_cost_and_limits, lifted_tracking
 from koopmpc.control.horizon import horizon_of
+from koopmpc.control.in_time.bounds import refuse_crossed_rows
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits, clip_input, refuse_levels
 from koopmpc.control.move import Fallback, Move, Status, Token, alone
-from koopmpc.control.program import LinearProgram, Published, SavedController, linear_parts, reference_table
+from koopmpc.control.program import (
+    LinearProgram,
+    Published,
+    SavedController,
+    linear_parts,
+    no_export,
+    reference_table,
+)
 from koopmpc.control.riccati import Gain
 from koopmpc.control.solvers.daqp import DAQPSetup, daqp_settings
 from koopmpc.control.target import Targets, Units, targets_of
@@ -50,6 +58,8 @@ class FeedbackLaw(Published):
     """
 
     horizon = 0  # no preview
+    _rows: tuple[Interval, Interval] | None = None  # limits of the inputs and of their changes, a row a step
+    _step = 0  # row of the next call
 
     def __init__(self, dt: float, nx: int, inputs: Interval, rates: Interval | None) -> None:
         self.dt, self.nu, self._nx, self.inputs, self.rates = dt, len(inputs.low), nx, inputs, rates
@@ -73,8 +83,34 @@ class FeedbackLaw(Published):
             x0 or u_prev is of another length, or holds what is no finite number; pass None where it is not known.
         """
         checks.start(x0, self._nx)
+        self._step = 0
+        self._take_row()
         zero = np.clip(np.zeros(self.nu), *self.inputs)
         self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
+
+    def follow_rows(self, limits: Limits | None, names: Sequence[str] = ()) -> None:
+        """Clip the input of each step to its row of these limits, where they have rows; the last one is held.
+
+        Raises
+        ------
+        DataError
+            Limits cross in a row.
+        """
+        if limits is not None and limits.in_time:
+            count = max(limits.count_rows().values())
+            box, change = limits.input_rows(self.nu, 0, count), limits.rate_rows(self.nu, 0, count)
+            refuse_crossed_rows(*box, "input", names)
+            refuse_crossed_rows(*change, "rate", names)
+            self._rows = box, change
+            FeedbackLaw.reset(self)
+
+    def _take_row(self) -> None:
+        """Take the limits of the next step."""
+        if self._rows is not None:
+            box, change = self._rows
+            k = min(self._step, len(box.low) - 1)
+            self.inputs = Interval(box.low[k], box.high[k])
+            self.rates = None if self.rates is None else Interval(change.low[k], change.high[k])
 
     def take_applied(self, applied: ArrayLike | None) -> None:
         """Take the input that the plant really got for the last one, where it can be used."""
@@ -84,7 +120,9 @@ class FeedbackLaw(Published):
                 self._last = got
 
     def limit_input(self, free: Float[np.ndarray, " nu"] | None, start: float) -> Move:
-        """Return the input inside its limits; None, where nothing is known, is answered by the last one."""
+        """Return the input inside the limits of its step; None, where nothing is known, is answered by the last one."""
+        self._take_row()
+        self._step += 1
         if free is None:
             self._last = clip_input(self._last, self.inputs, self.rates, self._last)
             return Move.hold(self._last.copy(), Status.BAD_MEASUREMENT, perf_counter() - start)
@@ -154,7 +192,8 @@ class LQR(FeedbackLaw):
     the disturbance w held: the gain K and the feedforward are where the Riccati difference equation rests. It does not
     look ahead: of several reference rows, or rows of w, the first counts and the others change nothing. Where r is
     an equilibrium and u_r holds it, u = u_r − K (ψ(x) − z_r). With R_delta it acts on [ψ(x); u_{k−1}]. The input is
-    clipped to the limits of its change, soft or hard, and to its own (status SATURATED); other limits are not seen.
+    clipped to the limits of its change, soft or hard, and to its own (status SATURATED), in time to those of its step;
+    other limits are not seen.
 
     One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
 
@@ -188,9 +227,10 @@ class LQR(FeedbackLaw):
     def __init__(self, predictor: LinearPredictor, cost: Cost, limits: Limits | None = None) -> None:
         advice = "fit one with edmd, or linearise with LinearPredictor.local; from_state_space takes matrices"
         checks.kind(predictor, "predictor", LinearPredictor, advice)
-        track = lifted_tracking(predictor, cost, limits)
+        cost, known = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
+        track = lifted_tracking(predictor, cost, known.base)
         refuse_levels(limits, "an LQR")
-        self.predictor, self.cost, self.limits = predictor, track.cost, None if limits is None else track.limits
+        self.predictor, self.cost, self.limits = predictor, track.cost, None if limits is None else known
         units, C = Units.of(predictor, track), track.tracked
         h = horizon_of(predictor, track, (1,), disturbed=False).in_units(units)
         rest = tail_of(tail_stage(h.A, h.B, h.E, h.C, h.Q, h.R, h.R_delta), None)
@@ -206,6 +246,7 @@ class LQR(FeedbackLaw):
         self._feedforward = np.zeros(predictor.nu)
         self._row = 0  # of a given u_target, for the next call
         super().__init__(predictor.dt, predictor.nx, track.inputs, track.rates)
+        self.follow_rows(self.limits, predictor.inputs)
 
     def as_data(self) -> SavedController:
         """Return what the controller was made of."""
@@ -219,6 +260,8 @@ class LQR(FeedbackLaw):
 
     def build_program(self, reference: ArrayLike | None) -> FeedbackProgram:
         """Return the data of a step."""
+        if self._rows is not None:
+            raise no_export(self, "its limits have rows in time, and its C keeps one set", "one with limits.at(step)")
         return feedback_program(
             self,
             self.predictor,

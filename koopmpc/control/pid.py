@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import HUGE
-from koopmpc.control.cost import Cost, lifted_tracking
+from koopmpc.control.cost import Cost, check_cost_and_limits, lifted_tracking
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Limits, refuse_levels
 from koopmpc.control.lqr import FeedbackLaw
@@ -110,7 +110,9 @@ class PID(FeedbackLaw):
         self.outputs = _indices(outputs, "outputs", nu)
         self.references = _indices(references, "references", nu)
         self.limits = limits or Limits()
-        super().__init__(checks.positive(dt, "dt", "s"), 0, self.limits.inputs(nu), self.limits.rates(nu))
+        widest = self.limits.base
+        super().__init__(checks.positive(dt, "dt", "s"), 0, widest.inputs(nu), widest.rates(nu))
+        self.follow_rows(limits)
         with np.errstate(divide="ignore", invalid="ignore"):
             tenth = np.where(self.kp != 0, 0.1 * self.kd / np.where(self.kp != 0, self.kp, 1.0), self.dt)
             share = self.dt * self.ki / np.where(self.kp != 0, self.kp, 1.0)
@@ -155,7 +157,8 @@ class PID(FeedbackLaw):
             SIMC has no rule: unequal numbers, tracked outputs that are not states, an unstable or integrating model,
             a response that overshoots or does not move.
         """
-        track = lifted_tracking(model, cost, limits)
+        cost, known = check_cost_and_limits(cost, limits, model.states, model.inputs)
+        track = lifted_tracking(model, cost, known.base)
         weighed = np.flatnonzero(np.diag(track.Q) > 0)
         if len(weighed) != model.nu:
             raise DataError(
@@ -177,7 +180,7 @@ class PID(FeedbackLaw):
             dt=model.dt,
             outputs=[measured[i] for i in place],
             references=[int(weighed[i]) for i in place],
-            limits=track.limits,
+            limits=known,
             bias=bias,
         )
 

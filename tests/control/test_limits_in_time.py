@@ -4,6 +4,7 @@ import copy
 
 import numpy as np
 import pytest
+from scipy.signal import StateSpace
 
 import koopmpc as km
 from koopmpc.errors import DataError, ShapeError
@@ -244,9 +245,30 @@ def test_bad_rows_are_refused_in_sentences_that_name_row_and_step():
     low[4:], high[4:] = 0.0, 0.5
     with pytest.raises(DataError, match="within a block of 7 held steps"):
         km.KoopmanMPC(model, COST, km.Limits(u_min=low, u_max=high), N, moves=(1, 7))
-    with pytest.raises(DataError, match="does not know"):
-        km.LQR(model, COST, km.Limits(u_min=-1, u_max=falling + 3))
+    with pytest.raises(DataError, match="cross for"):
+        km.LQR(model, COST, km.Limits(u_min=-1, u_max=falling - 3))
     assert mpc([0.1, 0], [0, 0]).status.value < 4  # a refused call leaves the controller as it was
+
+
+@pytest.mark.parametrize("rates", [{}, {"du_max": np.linspace(0.1, 0.3, 5)[:, None]}])
+def test_laws_without_a_plan_clip_each_input_to_the_row_of_its_step(rates):
+    high = np.array([[0.6], [0.5], [0.4], [0.1], [0.3], [0.7]])
+    limits = km.Limits(u_min=-1, u_max=high, **rates)
+    model = km.LinearPredictor.from_state_space(StateSpace([[1.0]], [[0.1]], [[1.0]], [[0.0]], dt=0.1))
+    cost = km.Cost(Q=1, R=0.01)
+    for law in (km.LQR(model, cost, limits), km.control.PID(9.0, dt=0.1, limits=limits)):
+        free = km.LQR(model, cost) if isinstance(law, km.LQR) else km.control.PID(9.0, dt=0.1)
+        for _ in range(2):  # a reset begins at the first row
+            law.reset()
+            last = 0.0
+            for k in range(9):
+                change = float(rates["du_max"][min(k, 4), 0]) if rates else np.inf
+                wished = float(free([0.0], [1.0]).u[0])
+                u = float(law([0.0], [1.0]).u[0])
+                assert u == min(np.clip(wished, last - change, last + change), high[min(k, 5), 0])
+                last = u
+    with pytest.raises(DataError, match="rows in time"):
+        km.compiled(km.LQR(model, cost, limits))
 
 
 def test_limits_by_name_may_have_a_value_a_step():
