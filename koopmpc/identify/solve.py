@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -259,6 +259,71 @@ def centre_products(
         back[left, product], back[right, product] = -mean[right], -mean[left]
         back[rows.constant, product] = mean[left] * mean[right]
     return replace(rows, P=rows.P @ back), back
+
+
+class BilinearParts(NamedTuple):
+    """The matrices of z⁺ = A z + (B + Σ wⱼ Mⱼ) u + E w + Σ uᵢ Nᵢ z + Σ wⱼ Sⱼ z."""
+
+    A: Float[np.ndarray, "nz nz"]
+    B: Float[np.ndarray, "nz nu"]
+    N: Float[np.ndarray, "nu nz nz"]
+    E: Float[np.ndarray, "nz nw"]
+    S: Float[np.ndarray, "nw nz nz"]
+    M: Float[np.ndarray, "nw nz nu"]
+
+
+@dataclass(frozen=True)
+class BilinearColumns:
+    """The columns [ψ w⊗u u w u⊗ψ w⊗ψ] of a bilinear regression, w⊗u only where it is `crossed`."""
+
+    nz: int
+    nu: int
+    nw: int
+    crossed: bool
+
+    @property
+    def first(self) -> int:
+        """The column of u."""
+        return self.nz + self.nu * self.nw * self.crossed
+
+    def arrange(
+        self, rows: RegressionRows, products: Int[np.ndarray, " np"], which: Int[np.ndarray, " nk"]
+    ) -> RegressionRows:
+        """Return these columns of rows [ψ u w u⊗w u⊗ψ w⊗ψ …], with only the `products` in `which` in the last two."""
+        nz, nu, nw = self.nz, self.nu, self.nw
+        crossed = [nz + nu + nw + nw * i + j for j in range(nw) for i in range(nu)] if self.crossed else []
+        first = nz + nu + nw + len(crossed)
+        block = np.flatnonzero(np.isin(products, which))
+        order = [np.arange(nz), np.array(crossed, dtype=np.intp), nz + np.arange(nu + nw)]
+        order += [first + i * len(products) + block for i in range(nu + nw)]
+        return replace(rows, P=rows.P[:, np.concatenate(order)])
+
+    def name(
+        self, signals: tuple[str, ...], observables: tuple[str, ...], which: Int[np.ndarray, " nk"]
+    ) -> tuple[str, ...]:
+        """Return the names of all columns behind ψ; u and w are the first of the signals."""
+        drives = signals[: self.nu + self.nw]
+        inputs, disturbances = drives[: self.nu], drives[self.nu :]
+        crossed = [f"{u} * {w}" for w in disturbances for u in inputs] if self.crossed else []
+        return (*crossed, *drives, *(f"{u} * {observables[int(i)]}" for u in drives for i in which))
+
+    def centre(
+        self, rows: RegressionRows, which: Int[np.ndarray, " nk"]
+    ) -> tuple[RegressionRows, Float[np.ndarray, "n n"]]:
+        """Return the rows with products of deviations, and the matrix that turns their K, see `centre_products`."""
+        nz, nu, first = self.nz, self.nu, self.first
+        crossed = [(nz + nu * j + i, first + i, first + nu + j) for j in range(self.nw) for i in range(nu)]
+        return centre_products(rows, nu + self.nw, which, crossed if self.crossed else ())
+
+    def split(self, K: Float[np.ndarray, "n nz"], which: Int[np.ndarray, " nk"]) -> BilinearParts:
+        """Return the matrices of the coefficients K."""
+        nz, nu, nw, first = self.nz, self.nu, self.nw, self.first
+        last = first + nu + nw
+        N, M = np.zeros((nu + nw, nz, nz)), np.zeros((nw, nz, nu))
+        N[:, :, which] = K[last:].reshape(nu + nw, -1, nz).transpose(0, 2, 1)
+        if self.crossed:
+            M = K[nz:first].reshape(nw, nu, nz).transpose(0, 2, 1)
+        return BilinearParts(K[:nz].T, K[first : first + nu].T, N[:nu], K[first + nu : last].T, N[nu:], M)
 
 
 def scaled_rank(rows: RegressionRows, P: Float[np.ndarray, "m n"]) -> tuple[int, float]:

@@ -117,7 +117,10 @@ def fit_candidate(candidate: Candidate, data: Episodes | Source, ridge: float, r
             return fit_hidden(candidate.structure, source_episodes(source_of(data)))
         return fit_structure(candidate.structure, data, **read)
     if candidate.bilinear:
-        return bilinear_edmd(data, psi, embedding=embedding, ridge=ridge, difference=True, **read)
+        scheduled = source_of(data).nw > 0
+        return bilinear_edmd(
+            data, psi, embedding=embedding, ridge=ridge, difference=True, scheduled_inputs=scheduled, **read
+        )
     model = edmd(data, psi, embedding=embedding, ridge=ridge, towards=candidate.towards, **read)
     return relift_model(model) if candidate.relifted else model
 

@@ -24,7 +24,7 @@ from koopmpc.identify.records.hidden_structure import HiddenStructure
 from koopmpc.identify.records.state_space import fit_hidden
 from koopmpc.identify.records.structure import Structure, solve_structure
 from koopmpc.identify.regression import Regression, build_regression
-from koopmpc.identify.solve import centre_products, solve_path
+from koopmpc.identify.solve import BilinearColumns, solve_path
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.text import with_unit
@@ -369,7 +369,7 @@ def cross_validate(trial: Trial) -> Tried:
         errors=errors,
         inputs=trial.episodes.nu + trial.episodes.nw,
         A=np.array([model.A for model in fit_ridges(trial.candidate, total, trial.episodes, trial.ridges)]),
-        misfit=_misfit(trial.candidate, total),
+        misfit=_misfit(trial.candidate, total, trial.episodes.nw),
         seconds=perf_counter() - start,
     )
 
@@ -405,52 +405,67 @@ def fit_ridges(candidate: Candidate, total: Moments, like: Episodes, ridges: tup
     """Return the predictor of each ridge on these moments, without the checks that a report would need."""
     if isinstance(candidate.structure, Structure):  # fitted without a ridge
         return [solve_structure(candidate.structure, total)] * len(ridges)
-    task, nz, nu, nw, which = build_regression(total, "select"), total.nz, like.nu, like.nw, total.products
+    nz, nu, nw, which = total.nz, like.nu, like.nw, total.products
+    task = _build_task(candidate, total, nw)
     C = task.C
     assert C is not None, "an extended regression has its C"
+    names, past = like.disturbances, candidate.embedding
+    common = (C, candidate.lifting, like.dt, like.states, like.inputs)
     models: list[AnyPredictor] = []
-    for K in _solutions(candidate, task, ridges, which):
-        A, B, E = K[:nz].T, K[nz : nz + nu].T, K[nz + nu : nz + nu + nw].T
-        names, past = like.disturbances, candidate.embedding
-        common = (C, candidate.lifting, like.dt, like.states, like.inputs)
+    for K in _solutions(candidate, task, ridges, which, nw):
         if candidate.bilinear:
-            N = np.zeros((nu + nw, nz, nz))
-            N[:, :, which] = K[nz + nu + nw :].reshape(nu + nw, -1, nz).transpose(0, 2, 1)
-            models.append(BilinearPredictor(A, B, N[:nu], *common, E=E, S=N[nu:], disturbances=names, embedding=past))
+            A, B, N, E, S, M = BilinearColumns(nz, nu, nw, crossed=nw > 0).split(K, which)
+            models.append(BilinearPredictor(A, B, N, *common, E=E, S=S, M=M, disturbances=names, embedding=past))
         else:
+            A, B, E = K[:nz].T, K[nz : nz + nu].T, K[nz + nu : nz + nu + nw].T
             models.append(LinearPredictor(A, B, *common, E=E, disturbances=names, embedding=past))
     return models
 
 
-def _misfit(candidate: Candidate, total: Moments) -> float:
+def _misfit(candidate: Candidate, total: Moments, nw: int) -> float:
     if isinstance(candidate.structure, Structure):
         return np.inf  # it is fitted without a ridge, and takes no part in the choice of the least one
-    task = build_regression(total, "select")
+    task = _build_task(candidate, total, nw)
     rows, where = task.rows, task.x_next
-    (K,) = _solutions(candidate, task, (LEAST,), total.products)
+    (K,) = _solutions(candidate, task, (LEAST,), total.products, nw)
     energy = (np.sum(rows.subtract_means().T[:, where] ** 2, axis=0) + rows.rest[where]) / rows.samples
     return float(np.mean(rows.residual(where, task.decode(K)) ** 2 / np.where(energy > 0, energy, 1.0)))
 
 
+def _build_task(candidate: Candidate, total: Moments, nw: int) -> Regression:
+    """Return the regression of these moments; of a bilinear candidate with its columns in their order."""
+    task = build_regression(total, "select")
+    if not candidate.bilinear:
+        return task
+    return replace(task, rows=_list_columns(task, nw).arrange(task.rows, total.products, total.products))
+
+
+def _list_columns(task: Regression, nw: int) -> BilinearColumns:
+    """Return the columns of a bilinear candidate, whose signals are u, w and u⊗w."""
+    return BilinearColumns(task.lifting.nz, (len(task.inputs) - nw) // (1 + nw), nw, crossed=nw > 0)
+
+
 def _solutions(
-    candidate: Candidate, task: Regression, ridges: Sequence[float], which: Int[np.ndarray, " np"]
+    candidate: Candidate, task: Regression, ridges: Sequence[float], which: Int[np.ndarray, " np"], nw: int
 ) -> list[Float[np.ndarray, "n nz"]]:
     """Return K of each ridge. The ridge of a bilinear model pulls it towards z⁺ = z, as in the final fit."""
-    P, nz = task.rows.P, task.lifting.nz
+    nz = task.lifting.nz
     if not candidate.bilinear:
         light = task.affine_columns if candidate.towards == "affine" else ()
         return [solution.K for solution in solve_path(task.rows.keep_targets(nz), ridges, light=light)]
+    P, rows = task.rows.P, task.rows
     start = np.eye(P.shape[1], nz)
-    rows = replace(task.rows, T=task.rows.T[:, :nz] - P @ start, rest=task.rows.rest[:nz])
-    shifted, back = centre_products(rows, len(task.inputs), which)
+    change = replace(rows, T=rows.T[:, :nz] - P @ start, rest=rows.rest[:nz])
+    shifted, back = _list_columns(task, nw).centre(change, which)
     return [back @ solution.K + start for solution in solve_path(shifted, ridges)]
 
 
 def _moments(candidate: Candidate, episodes: Episodes) -> Moments:
     """Return moments as triangular factors, whatever their condition, so that all folds are solved in the same way."""
+    sparse = isinstance(candidate.structure, Structure)
     products = candidate.structure.has_products if isinstance(candidate.structure, Structure) else candidate.bilinear
     return second_moments(
-        episodes.driven(),
+        episodes.driven(products=candidate.bilinear and not sparse),
         candidate.lifting,
         embedding=candidate.embedding,
         route="qr",

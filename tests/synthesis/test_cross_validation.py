@@ -37,6 +37,7 @@ def forecast(model: km.BilinearPredictor | km.LinearPredictor, e: km.Episode, k:
         z_next = model.A @ z + model.B @ u + model.E @ w
         if isinstance(model, km.BilinearPredictor):
             z_next += sum(v * (N @ z) for v, N in zip([*u, *w], [*model.N, *model.S], strict=True))
+            z_next += sum(v * (M @ u) for v, M in zip(w, model.M, strict=True))
         rows.append(model.C @ z_next)
         if relift:
             point = rows[-1] if model.embedding is None else model.embedding.shift(point, u, rows[-1])
@@ -58,7 +59,10 @@ def test_a_score_is_that_of_a_fit_and_a_forecast_for_each_fold_ridge_and_start(n
     )
     spread = np.concatenate([e.X for e in data]).std(axis=0)
     for f in range(3):
-        rest = reduce(Moments.__add__, [read(select_fold(data.driven(), FOLD, other)) for other in {0, 1, 2} - {f}])
+        rest = reduce(
+            Moments.__add__,
+            [read(select_fold(data.driven(products=bilinear), FOLD, other)) for other in {0, 1, 2} - {f}],
+        )
         for i, ridge in enumerate(RIDGES):
             (model,) = fit_ridges(candidate, rest, data, (ridge,))
             gaps = [

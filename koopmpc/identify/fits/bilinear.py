@@ -16,9 +16,9 @@ from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.regression import FitResult, build_regression, build_report, compute_scale_factor
 from koopmpc.identify.solve import (
+    BilinearColumns,
     RegressionRows,
     Ridge,
-    centre_products,
     check_ridge,
     describe_solve,
     find_doubts,
@@ -117,16 +117,14 @@ def bilinear_edmd(
     total = second_moments(signals, lifting, bilinear=True, embedding=delays, **options)
     regression = build_regression(total, "bilinear_edmd", disturbances=source.disturbances)
     assert regression.C is not None, "an extended regression has its C"
-    bound, nz, own, nu = regression.lifting, total.nz, source.nu, source.nu + source.nw
-    nm = len(total.inputs) - nu
-    crossed = [(nz + own * j + i, nz + nm + i, nz + nm + own + j) for j in range(source.nw) for i in range(own)][:nm]
+    bound, nz, nu = regression.lifting, total.nz, source.nu + source.nw
+    columns = BilinearColumns(nz, source.nu, source.nw, crossed=scheduled_inputs)
     which = total.products if products is None else _find_products(total, products)
-    rows = _keep_products(regression.rows, total, which, source)
-    names = tuple(f"{u} * {bound.names[int(i)]}" for u in total.inputs[:nu] for i in which)
+    rows = columns.arrange(regression.rows, total.products, which)
     regular = ridge != 0 or rank is not None
-    multiplied = [f"{u} * {w}" for w in source.disturbances for u in source.inputs][:nm]
-    columns = (*multiplied, *total.inputs[:nu], *names)
-    sentences, condition = find_doubts(rows, bound.names, columns, regular=regular)
+    sentences, condition = find_doubts(
+        rows, bound.names, columns.name(total.inputs, bound.names, which), regular=regular
+    )
     P, C, basis, state_residual, words = rows.P, regression.C, np.eye(nz), regression.state_residual, ""
     if rank is not None:
         basis, words = leading_directions(rows, nz, rank, sentences)
@@ -134,20 +132,19 @@ def bilinear_edmd(
         state_residual = np.hypot(state_residual, truncation_loss(rows.P[:, :nz], basis, regression.C, rows.samples))
         which = np.arange(len(basis.T))
     r = len(basis.T)
+    columns = replace(columns, nz=r)
     start = np.eye(P.shape[1], r) @ basis.T * difference  # K of the model z⁺ = z, or zero
     constant = rows.constant if rank is None else None
     change = RegressionRows(P, rows.T[:, :nz] - P @ start, rows.rest[:nz], rows.samples, constant)
-    shifted, back = centre_products(change, nu, which, crossed)
+    shifted, back = columns.centre(change, which)
     solution = solve(shifted, ridge=ridge)
     K = (back @ solution.K + start) @ basis
-    N = np.zeros((nu, r, r))
-    first = r + nm
-    N[:, :, which] = K[first + nu :].reshape(nu, -1, r).transpose(0, 2, 1)
+    parts = columns.split(K, which)
     regression = replace(regression, rows=replace(rows, P=P, constant=constant))
     solved = describe_solve(regression.rows, ridge, solution.ridge)
     result = FitResult(
-        A=K[:r].T,
-        B=K[first : first + own].T,
+        A=parts.A,
+        B=parts.B,
         C=C,
         lifting=bound,
         residual=regression.rows.residual(regression.x_next, K @ C.T),
@@ -161,7 +158,7 @@ def bilinear_edmd(
     return BilinearPredictor(
         result.A,
         result.B,
-        N[:own],
+        parts.N,
         C,
         bound,
         regression.dt,
@@ -170,10 +167,10 @@ def bilinear_edmd(
         build_report(regression, result),
         regression.embedding,
         compute_scale_factor(P[:, :r], rows.samples),
-        E=K[first + own : first + nu].T if source.nw else None,
-        S=N[own:] if source.nw else None,
-        M=K[r:first].reshape(source.nw, own, r).transpose(0, 2, 1) if nm else None,
-        disturbances=source.disturbances if source.nw else None,
+        parts.E,
+        parts.S,
+        source.disturbances,
+        parts.M,
     )
 
 
@@ -186,22 +183,6 @@ def _find_products(total: Moments, products: Sequence[str]) -> Int[np.ndarray, "
                 f"products names {name!r}, which the lifting lacks; it holds {', '.join(total.lifting.names)}"
             )
     return np.intersect1d([place[name] for name in products], total.products).astype(np.intp)
-
-
-def _keep_products(
-    rows: RegressionRows, total: Moments, which: Int[np.ndarray, " np"], source: Source
-) -> RegressionRows:
-    """Return the rows [ψ u⊗w u w u⊗ψ w⊗ψ] with only those observables in `which` in the last two.
-
-    The products of u and w, where there are some, stand w first.
-    """
-    nz, own, nw = total.nz, source.nu, source.nw
-    nu, first = own + nw, nz + len(total.inputs)
-    block = np.flatnonzero(np.isin(total.products, which))
-    crossed = [nz + nu + nw * i + j for j in range(nw) for i in range(own)][: first - nz - nu]
-    columns = [first + i * len(total.products) + block for i in range(nu)]
-    order = [np.arange(nz), np.array(crossed, dtype=np.intp), nz + np.arange(nu), *columns]
-    return replace(rows, P=rows.P[:, np.concatenate(order)])
 
 
 def _project_rows(
