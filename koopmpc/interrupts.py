@@ -7,6 +7,7 @@ for a failed evaluation: ipopt then reports a failure, CVODES no next state, fat
 that comes while an object is deleted.
 """
 
+import io
 import os
 import signal
 import socket
@@ -160,6 +161,7 @@ class Ending:
             os._exit(INTERRUPTED)  # unloading all modules would take most of a second
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        sys.stderr = io.StringIO()  # CasADi warns of the exception, which would be a second line
         raise KeyboardInterrupt
 
     def _watch(self, ends: socket.socket) -> None:

@@ -308,3 +308,23 @@ def test_what_was_kept_is_said_and_half_files_go(tmp_path: Path) -> None:
         (folder / name).write_text("x")
     assert clean_folder(folder) == f"kept in {folder}: 2 finished runs, results.parquet"
     assert not list(folder.glob(".*"))
+
+
+SOLVING = """
+import os, signal, threading
+from koopmpc.interrupts import ENDING
+import casadi as ca
+with ENDING:
+    x = ca.MX.sym("x", 40)
+    f = ca.Function("f", [x], [ca.sumsqr(x**2 - 1) + ca.sumsqr(ca.sin(x[1:] * x[:-1]))])
+    quiet = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+    solver = ca.nlpsol("solver", "ipopt", {"x": x, "f": f(x)}, quiet)
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+    while True:
+        solver(x0=[3.0] * 40)
+"""
+
+
+def test_what_casadi_warns_of_an_interrupt_is_no_second_line():
+    done = subprocess.run([sys.executable, "-c", SOLVING], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "interrupted; nothing was written\n")
