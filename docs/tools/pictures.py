@@ -277,6 +277,39 @@ def guarantees() -> Any:
     return km.plot.certificate(certified, data, runs)
 
 
+def terminal_sets() -> Any:
+    """Plans of the page's cart that end in its polytope, beside the ellipsoid of the same feedback."""
+    names: dict[str, Any] = {"__name__": "page"}
+    source = re.findall(r"```python\n(.*?)```", (DOCS / "why/guarantees.md").read_text(), re.DOTALL)[1]
+    names |= {"km": km, "np": np}
+    exec(compile(source, "guarantees.md", "exec"), names)
+    mpc, model, cost, box = (names[name] for name in ("mpc", "model", "cost", "box"))
+    inner = km.guarantees.find_terminal_set(model, cost, km.Limits(**box), [0.0, 0.0], kind="ellipsoid")
+    made, axes = make_figure(1, 1, width="one column", height=3.2)
+    panel = axes[0][0]
+    x, v = np.meshgrid(np.linspace(-1.2, 1.6, 561), np.linspace(-1.5, 0.8, 461))
+    points = np.stack([x, v], axis=-1).reshape(-1, 2)
+    for i, (found, label) in enumerate(((names["end"], "polytope"), (inner, "ellipsoid"))):
+        color = line_style(i)["color"]
+        gauge = found.measure(points).reshape(x.shape)
+        panel.contour(x, v, gauge, levels=[1.0], colors=[color], linewidths=1.4)
+        panel.contourf(x, v, gauge, levels=[0.0, 1.0], colors=[color], alpha=0.15)
+        panel.plot([], [], color=color, label=label)
+    for x0 in ([-1.0, 0.0], [1.0, 0.0], [-0.9, -0.4], [0.9, 0.4], [-0.6, 0.5], [0.6, -0.5]):
+        mpc.reset()
+        mpc(x0, [0.0, 0.0])
+        X = mpc.plan().X
+        panel.plot(*X.T, color="black", linewidth=0.9)
+        panel.plot(*X[0], "o", color="black", markersize=3)
+        panel.plot(*X[-1], "s", color="black", markersize=3.5)
+    panel.axvline(1.0, **LIMIT)
+    panel.axhline(0.5, **LIMIT, label="limits")
+    panel.plot([], [], color="black", marker="s", markersize=3.5, linewidth=0.9, label="plans and their ends")
+    panel.set(xlabel="position", ylabel="speed")
+    draw_legend(made, [panel], 2)
+    return made
+
+
 def manual_automatic() -> Any:
     """The run of the page on manual and automatic control."""
     return _run_of("how/manual_automatic.md")
@@ -468,6 +501,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         choosing_by_closed_loop,
         what_trust_means,
         guarantees,
+        terminal_sets,
         limits_in_time,
         prices,
         stage_cost,
