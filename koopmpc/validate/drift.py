@@ -16,7 +16,7 @@ from koopmpc.validate.logs.log import Log, solve_weights
 from koopmpc.values import Value
 
 SURE = 5.0  # a change must be this many times its spread among parts of the old data
-LEAST = 0.08  # smaller changes than this share are not named
+LEAST = 0.1  # smaller changes than this share are not named
 ASKED = 0.2  # where a change of this share would not be seen, nobody can say
 ALIKE = 0.1  # coefficients that explain this share less than the best explanation cannot be told from it
 ALIKE_GAIN = 0.25  # gains of inputs and sensors may explain this share less: they are the commoner cause
@@ -113,8 +113,8 @@ def find_drift(old: Episodes, new: Episodes) -> DriftReport:
     A regression x⁺ = Θᵀφ(x, u) + e of the old data predicts the new rows inside them. Each candidate, the gain of an
     input, the gain of a sensor, or a coefficient of a state's law, moves these predictions in a direction of its own.
     Its size a is fitted by generalised least squares, with the uncertainty of Θ, and a constant load in each new
-    episode free. The same is done for parts of the old data against the others: a change is named if it is at least 8 %
-    and five times its spread there. On unchanged plants that is rarely so, even where the regression misfits.
+    episode free. The same is done for parts of the old data against the others: a change is named if it is at least
+    10 % and five times its spread there. On unchanged plants that is rarely so, even where the regression misfits.
 
     Parameters
     ----------

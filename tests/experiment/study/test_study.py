@@ -1,0 +1,57 @@
+"""The stored rows: bands hold as often as they say, changes are named, and a plant that is measured again gives its row."""
+
+import numpy as np
+import pytest
+
+from tests.experiment.study.drift import judge_drift
+from tests.experiment.study.halves import TASKS, choose_rows
+from tests.experiment.study.plants import draw_task
+from tests.experiment.study.safety import run_experiments
+from tests.experiment.study.table import count_safety, load_rows
+
+SAFETY, DRIFT, HALVES = (load_rows(study) for study in ("safety", "drift", "halves"))
+
+
+@pytest.mark.parametrize("level", sorted({row.level for row in SAFETY.values()}))
+def test_bands_of_planned_experiments_hold_as_often_as_they_say(level):
+    held = [one for row in SAFETY.values() if row.level == level for one in row.held]
+    assert len(held) >= 50
+    assert np.mean(held) >= level
+
+
+def test_no_planned_experiment_breaks_a_limit_where_its_band_holds():
+    found = count_safety(SAFETY.values())
+    assert found["broken where the band holds"] == 0
+    row = next(row for row in SAFETY.values() if row.held)
+    worse = [0.02, *row.broken[1:]]
+    assert (
+        count_safety([type(row)(**{**vars(row), "broken": worse, "held": [True] * len(worse)})])["broken at all"] == 1
+    )
+
+
+def test_drift_of_nonlinear_plants_is_named_and_its_absence_is_not():
+    rows = list(DRIFT.values())
+    assert len(rows) >= 100
+    assert not any("changed" in {row.unchanged, row.quiet, row.far} for row in rows)
+    assert np.mean([row.right for row in rows]) >= 0.9
+
+
+def test_half_of_the_rows_teach_more_where_they_are_planned():
+    assert set(HALVES) <= set(TASKS)
+    ratios = [row.planned / row.half for row in HALVES.values()]
+    assert np.exp(np.mean(np.log(ratios))) < 1
+
+
+def test_rows_are_chosen_where_random_steps_have_not_converged():
+    assert choose_rows({10: 3.0, 20: 1.3, 40: 1.2, 80: 1.05}, 1.0) == 40
+    assert choose_rows({10: 3.0, 20: 1.6, 40: 1.01}, 1.0) == 20
+
+
+@pytest.mark.slow
+def test_a_plant_that_is_measured_again_gives_its_row():
+    number = next(iter(DRIFT))
+    assert judge_drift(int(number)) == DRIFT[number]
+    row = SAFETY["3"]
+    again = run_experiments(draw_task(3), 3, row.level)
+    assert (again.held, again.kinds) == (row.held, row.kinds)
+    assert again.reached == pytest.approx(row.reached, rel=1e-3)
