@@ -184,7 +184,7 @@ def worst_moments(run: Run) -> tuple[Moment, ...]:
     masks = {
         "fallback": np.array([each is not Fallback.NONE for each in run.fallback]),
         "unknown state": run.known == 0,
-        "later than dt": run.solve_time > run.dt,
+        "later than dt": run.solve_time > run.dt_seconds,
     }
     for name, mask in masks.items():
         begins = np.flatnonzero(mask & ~np.concatenate([[False], mask[:-1]]))

@@ -31,7 +31,7 @@ from koopmpc.loop.faults import (
 )
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.realtime import in_real_time
-from koopmpc.loop.run import MOVE_COLUMNS, Run, columns_of_moves
+from koopmpc.loop.run import MOVE_COLUMNS, SECONDS, Run, columns_of_moves
 from koopmpc.loop.simulate import StepObserver, predictor_of, simulate
 from koopmpc.plants.step_map import StepMap
 from koopmpc.recording.reader import load_run
@@ -172,7 +172,9 @@ def run_closed_loop(
             noise=noise,
             faults=(*case.faults, *injected),
             rng=row.start,
-            observers=observers if not paced else (*observers, in_real_time(plant.dt)),
+            observers=observers
+            if not paced
+            else (*observers, in_real_time(plant.dt * SECONDS[find_time_unit(problem)])),
             plans=plans,
             **about,
         )

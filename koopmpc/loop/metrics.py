@@ -171,7 +171,7 @@ def metrics(run: Run) -> Metrics:
         solve_time_p50=float(p50),
         solve_time_p99=float(p99),
         solve_time_max=float(run.solve_time.max()),
-        late=int((run.solve_time > run.dt).sum()),
+        late=int((run.solve_time > run.dt_seconds).sum()),
         status=dict(Counter(s.name for s in run.status)),
         fallback=dict(Counter(f.name for f in run.fallback)),
         unknown=int((run.known == 0).sum()) if (run.known >= 0).any() else None,

@@ -46,7 +46,9 @@ def test_the_next_plan_knows_all_logs_also_those_that_are_held_out(tmp_path):
 
 def test_the_goal_says_which_columns_are_inputs_of_logs_that_are_too_few(tmp_path):
     for i, e in enumerate(few()):
-        rows = [f"{0.1 * k:.1f},{x[0]:.6f},{x[1]:.6f},{u:.6f}" for k, (x, u) in enumerate(zip(e.X, e.U[:, 0], strict=False))]
+        rows = [
+            f"{0.1 * k:.1f},{x[0]:.6f},{x[1]:.6f},{u:.6f}" for k, (x, u) in enumerate(zip(e.X, e.U[:, 0], strict=False))
+        ]
         (tmp_path / f"log{i}.csv").write_text("\n".join(["time [s],position [m],speed [m/s],F [N]", *rows]))
     (tmp_path / "goal.toml").write_text(GOAL.replace("force [N/kg]", "F [N]"))
     with pytest.raises(km.KoopmpcError, match="the next experiment is planned in"):

@@ -231,6 +231,8 @@ def test_the_steps_of_each_solver_are_counted():
 def test_a_step_that_takes_exactly_the_sampling_time_is_not_late():
     run = replace(random_run(np.random.default_rng(0), T=4, dt=0.1), solve_time=np.array([0.1, 0.05, 0.1, 0.2]))
     assert km.metrics(run).late == 1
+    assert km.metrics(replace(run, metadata={"time unit": "h"})).late == 0  # a tenth of an hour
+    assert km.metrics(replace(run, metadata={"time unit": "ms"})).late == 4
 
 
 def test_references_bear_the_names_of_what_is_tracked_where_these_are_known():
