@@ -1,6 +1,7 @@
 """km.identify.eigenfunctions: conserved quantities and eigenpairs from data, the effect of inputs, validation, bad input."""
 
 import os
+import re
 from dataclasses import dataclass
 
 import casadi as ca
@@ -60,6 +61,16 @@ def test_one_trajectory_holds_its_energy_with_exact_ratios_and_no_other_observab
     assert H.eigenvalue == 0
     assert H.error < exact
     assert H.nu == 0
+
+
+def test_what_is_printed_are_the_coefficients_and_the_eigenvalue(one):
+    (H,) = km.identify.eigenfunctions(one, QUARTIC)
+    label, text = str(H).split(" = ", 1)
+    formula, rate, error = text.split(", ")
+    terms = [re.fullmatch(r"\((.+)\) (.+)", term) for term in formula.split(" + ")]
+    assert label == H.label
+    assert {term[2]: float(term[1]) for term in terms} == pytest.approx(named(H), rel=1e-3)
+    assert (rate, float(error.removeprefix("error "))) == ("λ = 0 1/s", pytest.approx(H.error, rel=0.1))
 
 
 def test_the_null_space_is_that_of_differences_of_the_library_by_numpy(one):
