@@ -134,24 +134,38 @@ class ManyRuns(NamedTuple):
 class TargetTable:
     """The targets of the reference rows that a BilinearMPC in machine code meets, found in Python; copies share it."""
 
-    def __init__(self, find: Callable[[np.ndarray], np.ndarray]) -> None:
-        self._find, self._lock = find, Lock()
+    def __init__(self, find: Callable[[np.ndarray], np.ndarray], kind: type[np.floating]) -> None:
+        self._find, self._kind, self._lock = find, kind, Lock()
         self._known: set[bytes] = set()
-        self._table = np.zeros((0, 1))
+        self._room = self._table = np.zeros((0, 1), kind)
 
     def of(self, reference: Float[np.ndarray, "..."]) -> Float[np.ndarray, "found size"]:
-        """Return the table with the rows of this reference in it."""
+        """Return the table with the rows of this reference in it: the same array while no row is new."""
         with self._lock:
-            rows = np.atleast_2d(reference)
+            rows = np.ascontiguousarray(np.atleast_2d(reference))
+            keys, width = rows.tobytes(), rows.shape[1] * rows.itemsize
+            if self._known.issuperset([keys[i : i + width] for i in range(0, len(keys), width)]):
+                return self._table
             rows = rows[np.abs(rows).max(axis=1, initial=0.0) < checks.HUGE]
             if len(self._known) + len(rows) > _ROWS:
-                self._known, self._table = set(), np.zeros((0, 1))
+                self._known, self._table = set(), np.zeros((0, 1), self._kind)
             new = [row for row in rows if row.tobytes() not in self._known]
             if new:
-                found = self._find(np.array(new))
-                self._table = np.vstack([self._table, found]) if len(self._table) else found
+                self._append(self._find(np.array(new)))
                 self._known |= {row.tobytes() for row in new}
             return self._table
+
+    def _append(self, found: Float[np.ndarray, "new size"]) -> None:
+        """Add rows. A table that was returned before keeps its rows, for C may still read it."""
+        first = len(self._table)
+        last = first + len(found)
+        if first == 0 or last > len(self._room):
+            room = np.zeros((2 * last, found.shape[1]), self._kind)
+            if first:
+                room[:first] = self._table
+            self._room = room
+        self._room[first:last] = found
+        self._table = self._room[:last]
 
 
 class Compiled:
@@ -171,13 +185,15 @@ class Compiled:
         self._timed = self._bounds is not None and self.limits is not None and self.limits.in_time
         self._step, self._at_call = 0, None
         find = getattr(controller, "find_targets", None) if isinstance(program, StagedProgram) else None
-        self._targets = None if find is None else TargetTable(find)
+        self._targets = None if find is None else TargetTable(find, np.float32 if precision == "float" else np.float64)
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # takes a linear plan and its start to the states
         self._ny, self._nr, self._nw = sizes["NY"], sizes["NR"], sizes["NW"]
         self._memory = np.zeros(-(-int(self._code.koopmpc_state_size()) // 8))
         self._plants: dict[int, tuple[StepMap, ctypes.CDLL]] = {}
         self._connect()
         self.reset()
+
+    _table: Float[np.ndarray, "found size"] | None = None  # the targets that C reads
 
     def _connect(self) -> None:
         """Make the arrays and the frame that a call passes."""
@@ -217,10 +233,16 @@ class Compiled:
         self._aim(np.zeros((0, self._nr)))
 
     def _aim(self, rows: Float[np.ndarray, "..."]) -> None:
-        """Pass the targets of these rows to the C code of a BilinearMPC; other kinds have none."""
+        """Pass the targets of these rows to the C code of a BilinearMPC; other kinds have none.
+
+        Without rows they are passed in any case: a start, or another memory, holds none.
+        """
         if self._targets is not None:
             self._last_rows = rows.tobytes()
-            self._table = self._targets.of(rows).astype(self._y.dtype)
+            table = self._targets.of(rows)
+            if table is self._table and len(rows):
+                return
+            self._table = table
             self._code.koopmpc_use_targets(point_to(self._memory), point_to(self._table), len(self._table))
 
     def _pass_bounds(self, limits: Limits, first: int) -> None:

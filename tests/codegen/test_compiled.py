@@ -135,3 +135,14 @@ def test_a_rehearsal_changes_nothing(fast, pendulum, kind):
     assert np.array_equal(one.plan().U, twin.plan().U)
     assert np.array_equal(answers(one, states()), answers(twin, states()))
     assert len(first) == 5
+
+
+def test_copies_that_meet_other_rows_keep_the_targets_of_their_own(pendulum):
+    """Copies share a table of targets, which grows while they step."""
+    first, reference = km.BilinearMPC(pendulum[0], COST, LIMITS, 8), np.zeros((9, 2))
+    loops = [(km.compiled(first), first)]
+    loops.append((copy.copy(loops[0][0]), copy.copy(first)))
+    for k in range(12):
+        for sign, (fast, slow) in zip((1.0, -1.0), loops, strict=True):
+            reference[:, 0] = 0.02 * sign * (k + np.arange(9))
+            np.testing.assert_allclose(fast([0.1, 0.0], reference).u, slow([0.1, 0.0], reference).u, atol=1e-4)
