@@ -43,9 +43,9 @@ def judge_hidden_states(
 
     The kinds are the subspace model, the linear and the polynomial one of least simulation error, and where a sensor
     rests at its least or largest reading, the polynomial one with these rails; and for one or two sensors those with
-    neurons, with the rails if the best one before has them. With neurons the best of each order is judged, if it is
-    calm and errs by a tenth less than all others. Where records are too short for a kind, it is left out; so is a model
-    that on the first stretches errs by half more than the best one before.
+    neurons, with the rails if the best one before has them. With neurons the best one and the smallest of other orders
+    are judged, if they are calm and err by a tenth less than all others. Where records are too short for a kind, it is
+    left out; so is a model that on the first stretches errs by half more than the best one before.
 
     Parameters
     ----------
@@ -114,8 +114,10 @@ def search_hidden_states(
         best = min([rival, *(one.error for one in found if one.calm)])
         calm = [one for one in tried if one.calm and one.error < PAYS * best]
         orders = sorted({one.order for one in calm})
-        neural = [choose_hidden([one for one in calm if one.order == order]) for order in orders]
-        neural.sort(key=lambda one: one.parameters)  # the others race against the smallest
+        each = [choose_hidden([one for one in calm if one.order == order]) for order in orders]
+        each.sort(key=lambda one: one.parameters)
+        best_one = min(each, key=lambda one: one.error, default=None)
+        neural = [one for one in each if one is each[0] or one is best_one]  # the best one races against the smallest
     least = min([rival, *(one.error for one in (*found, *neural))])
     return [*(one for one in found if one.error < FAR * least), *neural]
 
