@@ -81,7 +81,7 @@ def gate_function(ny: int) -> ca.Function:
         ca.if_else(ca.logic_or(judged, refused), counted, count),
     )
     none = ca.SX(ny, 1)
-    anew = ca.vertcat(none, largest, none, ca.if_else(known, y, last), ca.fmin(count, 1) + 1)
+    anew = ca.vertcat(none, largest, none, ca.if_else(known, y, last), ca.fmin(count, 2) + 1)
     result = ca.vertcat(refused, ca.if_else(lost, 2, opened), ca.if_else(lost, anew, after))
     return ca.Function("gate", [y, predicted, memory], [ca.densify(result)], {"cse": True})
 

@@ -228,6 +228,14 @@ def test_ten_absurd_readings_are_refused_and_one_that_is_used_does_not_stay_in_t
         assert (away[-20:] <= left).all()
 
 
+def test_a_reading_that_stays_at_zero_against_every_prediction_is_no_lost_estimate_for_long():
+    gate, lost = ReadingGate(2), 0
+    for _ in range(50):
+        gate.judge(np.array([0.01, 0.0]), np.array([0.01, 1e-3]))
+        lost += gate.lost
+    assert lost <= 3
+
+
 def test_what_moves_a_plant_from_rest_is_no_absurd_reading_for_long():
     mpc, x, refused = km.KoopmanMPC(model("linear"), WHOLE, LIMITS, 20, estimator=LEARNS), np.zeros(2), 0
     for k in range(150):
