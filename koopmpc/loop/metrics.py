@@ -13,7 +13,7 @@ from koopmpc.control.cost import Cost, Sizes
 from koopmpc.control.limits import SOFTENED, Interval, Limits
 from koopmpc.control.stepped.levels import NEAR
 from koopmpc.errors import ShapeError
-from koopmpc.loop.run import Run, bind_outputs
+from koopmpc.loop.run import SECONDS, Run, bind_outputs
 from koopmpc.text import format_duration
 from koopmpc.values import Value
 
@@ -171,7 +171,7 @@ def metrics(run: Run) -> Metrics:
         solve_time_p50=float(p50),
         solve_time_p99=float(p99),
         solve_time_max=float(run.solve_time.max()),
-        late=int((run.solve_time > run.dt_seconds).sum()),
+        late=int((run.solve_time > run.dt * SECONDS.get(run.metadata.get("time unit", "s"), 1.0)).sum()),
         status=dict(Counter(s.name for s in run.status)),
         fallback=dict(Counter(f.name for f in run.fallback)),
         unknown=int((run.known == 0).sum()) if (run.known >= 0).any() else None,

@@ -24,7 +24,7 @@ from koopmpc.predict.base import Predictor
 from koopmpc.scene import Scene
 from koopmpc.values import Value
 
-SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}  # in each unit of time
+SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}  # in a unit of `metadata["time unit"]`
 
 
 @dataclass(slots=True)
@@ -411,11 +411,6 @@ class Run(About, StepRows):
     def time(self) -> Float[np.ndarray, " T1"]:
         """Time of every state [s], or in the unit that `metadata["time unit"]` names."""
         return np.arange(len(self.X)) * self.dt
-
-    @property
-    def dt_seconds(self) -> float:
-        """Sampling time [s], whatever the unit of time is."""
-        return self.dt * SECONDS.get(str(self.metadata.get("time unit", "s")), 1.0)
 
 
 class LoopRows:
