@@ -74,8 +74,10 @@ class PeriodicObserver(Measured):
         """Forget the last state, the harmonics and the phase; x0 will come as the first measurement."""
         super().reset(x0)
         n = 1 + 2 * len(self._turns)
-        self._theta, self._P = np.zeros((n, self._model.nz)), np.eye(n)
-        self._k, self._last = 0, np.full(self._model.nz, np.nan)
+        self._theta: Float[np.ndarray, "n nz"] = np.zeros((n, self._model.nz))
+        self._P: Float[np.ndarray, "n n"] = np.eye(n)
+        self._last: Float[np.ndarray, " nz"] = np.full(self._model.nz, np.nan)
+        self._k: int = 0
         self._stood_in, self._bridged = False, 0
 
     def program(self) -> EstimatorProgram:
