@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.errors import ShapeError
 from tests.control.models import linear
 
 A, B = np.array([[1.0, 0.1], [0.15, 0.98]]), np.array([[0.005], [0.1]])
@@ -65,6 +66,18 @@ def test_a_moving_reference_that_is_not_finite_ends_in_bad_measurement():
         assert mpc([0, 0], rows).status is km.Status.BAD_MEASUREMENT
         rows[3, 0] = 0.0
         assert mpc([0, 0], rows).status is km.Status.UNCONSTRAINED
+
+
+@pytest.mark.parametrize("kind", ["one row", "rows"])
+def test_a_reference_that_is_refused_leaves_the_last_one_as_it_was(kind):
+    mpc, fresh = (km.KoopmanMPC(linear(A, B), COSTS["no target"], LIMITS["wide"], N) for _ in range(2))
+    last = preview(kind, 3)[: N + 1] if kind == "rows" else preview(kind, 3)
+    mpc([0, 0], preview("one row", 1))
+    mpc([0, 0], last)
+    for refused in (np.zeros(3), np.zeros((4, 3))):
+        with pytest.raises(ShapeError, match="reference has shape"):
+            mpc([0, 0], refused)
+        np.testing.assert_allclose(mpc([0, 0], last).u, fresh([0, 0], last).u, rtol=0, atol=1e-12)
 
 
 @settings(max_examples=12, deadline=None)

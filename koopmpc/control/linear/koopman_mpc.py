@@ -388,6 +388,7 @@ class KoopmanMPC(MPCBase):
             target = numbers(reference, "reference")
             key, moving = target.tobytes(), None
             if key != self._reference_key:
+                self._reference_key = None  # one that is refused leaves no rows of the last one
                 moving = self._take_reference(target, key)
                 self._reference_key, self._aimed = key, False
             if self._window is not None or limits is not None:
