@@ -69,6 +69,18 @@ def test_a_moving_reference_that_is_not_finite_ends_in_bad_measurement():
 
 
 @pytest.mark.parametrize("kind", ["one row", "rows"])
+def test_a_reference_that_stays_not_finite_ends_in_bad_measurement_under_limits_in_time(kind):
+    limits = km.Limits(-2 - np.arange(30.0)[:, None] / 9, 2 + np.arange(30.0)[:, None] / 9)
+    good, bad = preview(kind, 0), np.array(preview(kind, 0))
+    bad[..., 0] = np.nan
+    mpc, alone = (km.KoopmanMPC(linear(A, B), COSTS["equilibria as targets"], limits, N) for _ in range(2))
+    for reference in (bad, bad, good, bad, bad, bad, good):
+        move, other = mpc([0.1, 0], reference), alone([0.1, 0], good)
+        assert move.status is (km.Status.BAD_MEASUREMENT if reference is bad else other.status)
+    np.testing.assert_allclose(move.u, other.u, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["one row", "rows"])
 def test_a_reference_that_is_refused_leaves_the_last_one_as_it_was(kind):
     mpc, fresh = (km.KoopmanMPC(linear(A, B), COSTS["no target"], LIMITS["wide"], N) for _ in range(2))
     last = preview(kind, 3)[: N + 1] if kind == "rows" else preview(kind, 3)

@@ -557,6 +557,7 @@ class KoopmanMPC(MPCBase):
         column, self._aimed = plan.matrix[:, -1], True
         if not (np.abs(R) < HUGE).all():
             column[:] = np.nan
+            self._pushed = True  # no steps are known in which limits in time would leave it as it is
             return
         v = maps.from_reference.dot(R.reshape(-1))
         v += plan.offset
