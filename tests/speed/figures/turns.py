@@ -19,7 +19,7 @@ PAGE = HERE.parents[2] / "docs" / "speed.md"
 TABLE = "<!-- table -->\n\n", "\n\n<!-- end -->"
 EACH = 6  # turns of a process: where its memory lies alone can move a time by 3 %
 PAIRS = 24  # turns of a figure: the median's 95 % interval needs some 20
-HEAD = ("figure", "before", "now", "now / before, 95 %", "divided by", "asked")
+HEAD = ("figure", "before", "now", "now / before, 95 %", "compared with", "goal", "commit")
 
 
 def find_files() -> list[Path]:
@@ -89,6 +89,18 @@ def interval(values: list[float]) -> tuple[float, float, float]:
     return middle, ordered[max(0, n // 2 - reach)], ordered[min(n - 1, (n - 1) // 2 + reach)]
 
 
+def read_commit(tree: Path) -> str:
+    """Return the commit of a tree, with a + where files were changed since."""
+    commit, changed = (
+        subprocess.run(["git", *command], cwd=tree, capture_output=True, text=True, check=True).stdout.strip()
+        for command in (
+            ("rev-parse", "--short=7", "HEAD"),
+            ("status", "--porcelain", "--untracked-files=no", "koopmpc"),
+        )
+    )
+    return commit + "+" * bool(changed)
+
+
 def measure(name: str, before: Path | None, pairs: int) -> dict[str, Any]:
     """Return what was measured of a figure."""
     trees = {"now": HERE.parents[2]} | ({} if before is None else {"before": before})
@@ -100,7 +112,7 @@ def measure(name: str, before: Path | None, pairs: int) -> dict[str, Any]:
                 rows[side].append(sides[side].ask())
         for process in sides.values():
             process.close()
-    found: dict[str, Any] = {"pairs": pairs}
+    found: dict[str, Any] = {"commit": read_commit(trees["now"]), "pairs": pairs}
     for side, values in rows.items():
         found[side] = interval([row[0] for row in values])[0]
         if len(values[0]) > 1:
@@ -130,6 +142,7 @@ def format_row(figure: Any, found: dict[str, Any]) -> str:
         if relative and figure.yardstick
         else "",
         figure.goal,
+        f"`{found['commit']}`",
     )
     return "| " + " | ".join(cells) + " |"
 
