@@ -40,13 +40,16 @@ def gate_function(ny: int) -> ca.Function:
     prediction it is refused if it is so far from the last one that was used. Entries that are NaN are not judged.
 
     Among the first readings, and while the gate is open, a wild one may be used. Where a prediction is then off by more
-    than 1e4 (S + |y|), the estimate is lost: the observer starts again from y.
+    than 1e4 (S + |y|), the estimate is lost: the observer starts again from y. A plant that does not move, whatever is
+    predicted, looks alike: after the first readings this is done once, and again when an absurd reading was used.
 
-    The memory is q, S, the predicted steps, the last used values, and a count: below 10 the gate is open, and 10 less
-    the count are the least number of readings until it may close; from 10 on the refused ones are added.
+    The memory is q, S, the predicted steps, the last used values, a count, and whether the observer has started again
+    since. Below a count of 10 the gate is open, and 10 less the count are the least number of readings until it may
+    close; from 10 on the refused ones are added.
     """
-    y, predicted, memory = (ca.SX.sym(name, n) for name, n in (("y", ny), ("predicted", ny), ("memory", 4 * ny + 1)))
-    quantile, largest, ahead, last, count = ca.vertsplit(memory, [0, ny, 2 * ny, 3 * ny, 4 * ny, 4 * ny + 1])
+    y, predicted, memory = (ca.SX.sym(name, n) for name, n in (("y", ny), ("predicted", ny), ("memory", 4 * ny + 2)))
+    ends = [0, ny, 2 * ny, 3 * ny, 4 * ny, 4 * ny + 1, 4 * ny + 2]
+    quantile, largest, ahead, last, count, restarted = ca.vertsplit(memory, ends)
     known, foreseen = ca.fabs(y) < HUGE, ca.fabs(predicted) < HUGE  # False for NaN
     came = ca.logic_and(known, foreseen)
     error = ca.if_else(came, ca.fabs(y - predicted), 0)
@@ -59,7 +62,8 @@ def gate_function(ny: int) -> ca.Function:
     shown = ca.fmax(quantile, size) + ca.fabs(last)
     jump = ca.if_else(foreseen, error, ca.if_else(known, ca.fabs(y - last), 0))
     far = ca.logic_and(ca.mmax(ca.logic_and(shown > 0, jump > ABSURD * shown)), count > 1)
-    astray = ca.logic_and(error > ABSURD * (largest + ca.fabs(y)), ca.logic_or(largest > 0, count <= 2))
+    may_restart = ca.logic_or(count <= 2, ca.logic_and(largest > 0, ca.logic_not(restarted)))
+    astray = ca.logic_and(error > ABSURD * (largest + ca.fabs(y)), may_restart)
     lost = ca.logic_and(ca.mmax(astray), ca.logic_not(far))
     absurd = ca.logic_and(far, ca.logic_not(ca.logic_and(judged, closed)))
     wild = ca.logic_and(ca.logic_and(judged, closed), ca.logic_not(good))
@@ -79,9 +83,10 @@ def gate_function(ny: int) -> ca.Function:
         ahead_new,
         ca.if_else(ca.fabs(used) < HUGE, used, last),
         ca.if_else(ca.logic_or(judged, refused), counted, count),
+        ca.logic_and(restarted, ca.logic_or(ca.logic_not(far), refused)),
     )
     none = ca.SX(ny, 1)
-    anew = ca.vertcat(none, largest, none, ca.if_else(known, y, last), ca.fmin(count, 2) + 1)
+    anew = ca.vertcat(none, largest, none, ca.if_else(known, y, last), ca.fmin(count, 2) + 1, count > 2)
     result = ca.vertcat(refused, ca.if_else(lost, 2, opened), ca.if_else(lost, anew, after))
     return ca.Function("gate", [y, predicted, memory], [ca.densify(result)], {"cse": True})
 

@@ -236,6 +236,17 @@ def test_a_reading_that_stays_at_zero_against_every_prediction_is_no_lost_estima
     assert lost <= 3
 
 
+@pytest.mark.parametrize("estimator", [LEARNS, km.LiftedKalman(("x0", "x1"))])
+@pytest.mark.parametrize("noise", [1e-17, 1e-6])
+def test_what_keeps_a_plant_at_rest_is_learned(estimator, noise):
+    """A stuck valve: all that is shown is rounding, and each prediction is off by far more."""
+    model, rng, u = linear([[1, 0.1], [0, 0.9]], [[0], [0.1]]), np.random.default_rng(0), np.zeros(1)
+    mpc = km.KoopmanMPC(model, km.Cost(1, 0.1), km.Limits(-1, 1), 20, estimator=estimator)
+    for _ in range(60):
+        u = mpc(noise * rng.normal(size=2), [1.0, 0]).u
+    np.testing.assert_allclose(mpc.observer.d, -model.B @ u, atol=1e-3)
+
+
 def test_what_moves_a_plant_from_rest_is_no_absurd_reading_for_long():
     mpc, x, refused = km.KoopmanMPC(model("linear"), WHOLE, LIMITS, 20, estimator=LEARNS), np.zeros(2), 0
     for k in range(150):
