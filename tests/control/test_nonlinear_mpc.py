@@ -104,6 +104,26 @@ def test_a_held_reference_is_its_rows_repeated():
         np.testing.assert_array_equal(mpc([0.2, 0.1], rows).u, first)
 
 
+@dataclass(frozen=True)
+class Escape(km.Dynamics):
+    states, inputs = ("x",), ("u",)
+
+    def rhs(self, x, u):
+        return ca.vertcat(x[0] ** 2 + u[0])
+
+
+@pytest.mark.parametrize("integrator", [km.RK4(), km.ImplicitMidpoint(), km.Collocation(), km.CVODES()])
+def test_a_plant_that_escapes_within_the_horizon_fails_a_step_and_raises_nothing(integrator):
+    mpc = km.NonlinearMPC(km.discretize(Escape(), 0.2, integrator), km.Cost(1, 0.1), km.Limits(-1, 1), 10)
+    good = mpc([0.2], [0.0])
+    assert good.status is km.Status.OPTIMAL
+    for x in (50.0, 1e6, 1e29):
+        move = mpc([x], [0.0])
+        assert move.status in (km.Status.FAILED, km.Status.INFEASIBLE)
+        assert np.abs(move.u) <= 1
+    np.testing.assert_allclose(mpc([0.2], [0.0]).u, good.u, atol=1e-4)
+
+
 def test_every_end_has_a_status_and_a_safe_input():
     short = km.NonlinearMPC(step_map(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5), 6, settings={"ipopt.max_iter": 1})
     move = short([2.0, 1.0], [0, 0])
