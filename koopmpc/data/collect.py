@@ -136,17 +136,12 @@ def _measured_rows(
         W = np.stack([measured.sequence(steps, plant.dt, own.spawn(1)[0]) for own in streams])
     else:
         W = checks.array(measured, "measured")
-        W = (
-            np.broadcast_to(W, (count, steps, W.shape[-1]))
-            if W.ndim in (1, 2) and W.shape[:-1] in ((), (steps,))
-            else W
-        )
-    if W.shape != (count, steps, nw):
+    if W.shape not in ((nw,), (steps, nw), (count, steps, nw)):
         raise ShapeError(
             f"measured has shape {W.shape}, expected ({nw},), ({steps}, {nw}) or ({count}, {steps}, {nw}): "
             f"a column for {names}"
         )
-    return W
+    return np.broadcast_to(W, (count, steps, nw))
 
 
 def _drive(

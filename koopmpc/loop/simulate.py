@@ -214,7 +214,7 @@ class _Wiring:
         if self.disturbance is not None and not isinstance(self.plant, StepMap | SimulatedPlant):
             raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
         self.moves_plant = _check_measured(self.plant, self.measured)
-        self.tells = self.measured is not None and not (self.moves_plant and _knows_no_disturbance(self.controller))
+        self.tells = self.measured is not None and not (self.moves_plant and count_disturbances(self.controller) == 0)
         self.reference.setflags(write=False)  # the Run keeps these rows, so a controller must not write into them
 
     @property
@@ -395,10 +395,12 @@ def _check_measured(plant: StepMap | Plant, measured: Float[np.ndarray, "rows nw
     return True
 
 
-def _knows_no_disturbance(controller: Controller) -> bool:
-    """Return whether the controller has a model, and that has no measured disturbances."""
+def count_disturbances(controller: object) -> int | None:
+    """Return how many measured disturbances the model of a controller has; None where it has no model."""
+    if hasattr(controller, "nw"):  # a station knows those of its parts
+        return controller.nw
     model = predictor_of(controller) or getattr(controller, "step_map", None)
-    return model is not None and getattr(model, "nw", 0) == 0
+    return None if model is None else getattr(model, "nw", 0)
 
 
 def predictor_of(controller: object) -> Predictor | None:

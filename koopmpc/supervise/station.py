@@ -18,6 +18,7 @@ from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
 from koopmpc.control.program import Program, Published, SavedController, no_export
 from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.errors import DataError
+from koopmpc.loop.simulate import count_disturbances
 
 Mode = Literal["manual", "automatic", "standby"]
 _BUMP = 0.01  # after a switch u moves by this share of its range a step, unless the controller takes over exactly
@@ -30,7 +31,8 @@ class Station(Published):
     begins to act that has `take_over(y, reference, u)`, as `PID` has, it starts from the applied input to the digit.
     Others have no state that could be set to give that input; u then moves towards theirs by at most `bump` a step
     until it is reached. The standby also acts after `patience` steps in sequence at which the primary controller fell
-    back or did not know the step, until it has been well for as many. `Move.actor` says who acted.
+    back or did not know the step, until it has been well for as many. `Move.actor` says who acted. Where one of the two
+    knows measured disturbances w, the other is told them only if its model has some too.
 
     Parameters
     ----------
@@ -155,6 +157,12 @@ class Station(Published):
         raise no_export(self, "it holds several controllers", "each of them")
 
     @property
+    def nw(self) -> int | None:
+        """Measured disturbances that its controllers know; None where none of them has a model."""
+        counts = [count_disturbances(part) for part in (self.controller, self.standby) if part is not None]
+        return max((count for count in counts if count is not None), default=None)
+
+    @property
     def predictor(self) -> Any:
         """The model of the primary controller; None where it has none."""
         return getattr(self.controller, "predictor", None)
@@ -206,10 +214,10 @@ class Station(Published):
         last = self._last
         if self._held is not None:
             self._held.take(last)
-        first = self.controller(measured, _rows_of(rows, self.controller), last, w)
+        first = self.controller(measured, _rows_of(rows, self.controller), last, self._select_w(self.controller, w))
         second = None
         if self.standby is not None:
-            second = self.standby(measured, _rows_of(rows, self.standby), last, w)
+            second = self.standby(measured, _rows_of(rows, self.standby), last, self._select_w(self.standby, w))
         actor = self._choose(first)
         begins, self.actor = actor != self.actor and self.actor != "", actor
         move = self._ask(actor, begins, first, second, measured, rows, w)
@@ -266,8 +274,12 @@ class Station(Published):
             if take_over is not None:
                 own = _rows_of(rows, acting)
                 take_over(y, own, self._last)
-                return acting(y, own, self._last, w)
+                return acting(y, own, self._last, self._select_w(acting, w))
         return move
+
+    def _select_w(self, part: Controller, w: ArrayLike | None) -> ArrayLike | None:
+        """Return w for this controller: None if its model has no w and that of the other one has."""
+        return None if w is not None and count_disturbances(part) == 0 and self.nw else w
 
     def _ramp_rows(self, y: Float[np.ndarray, " ny"], rows: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Return the reference rows with set points that move by at most `ramp` a second."""

@@ -84,6 +84,14 @@ def test_rows_of_limits_leave_some_levels_in_c_as_in_python():
         assert other.u[0] <= limits.u_max[min(k, 5), 0]
 
 
+def test_a_step_without_a_plan_has_no_slack_in_c_as_in_python():
+    """The last input was far outside its limits, so that its change must be large, and no plan meets x ≤ 1."""
+    mpc = km.KoopmanMPC(TANK, COST, km.Limits(levels=[[0, 1, 2]], du_max=1, x_max=1, slack=None), 4)
+    fast = km.compiled(mpc)
+    one, other = (each([9.0], [0.0], [7.0]) for each in (mpc, fast))
+    assert (one.status, one.slack) == (other.status, other.slack) == (km.Status.INFEASIBLE, 0.0)
+
+
 def test_a_search_that_meets_its_bound_in_c_says_what_its_plan_may_miss(monkeypatch):
     rng, gaps = np.random.default_rng(3), []
     for _ in range(6):

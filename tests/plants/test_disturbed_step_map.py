@@ -125,6 +125,17 @@ def test_the_plan_under_w_is_the_optimum_of_the_equations(plant):
         np.testing.assert_allclose(mpc.plan().U[:, 0], wanted, atol=2e-4)
 
 
+@pytest.mark.parametrize("kind", [km.NonlinearMPC, km.BilinearMPC])
+def test_a_plan_of_one_step_knows_the_one_disturbance(kind):
+    """x⁺ = 0.9 x + u (1 + w) and no limits: the cost (0.9 x + u (1 + w))² + 0.1 u² is least in closed form."""
+    x, u, w = (ca.SX.sym(name) for name in "xuw")
+    plant = km.StepMap(ca.Function("F", [x, u, w], [0.9 * x + u * (1 + w)]), 0.1)
+    mpc = kind(plant, km.Cost(Q=1.0, R=0.1, tail=0, u_target="zero"), None, 1)
+    for w_now in (0.0, 0.5, -0.4):
+        gain = 1 + w_now
+        assert mpc([0.7], [0.0], w=[w_now]).u == pytest.approx(-gain * 0.63 / (gain**2 + 0.1), rel=1e-6)
+
+
 @pytest.mark.parametrize("estimator", [km.LiftedDisturbance(), km.ExtendedKalman()], ids=["d", "ekf"])
 def test_estimators_of_the_equations_predict_with_w(plant, estimator):
     """On the plant itself nothing is left to estimate, so the run is that without an estimator."""
@@ -165,7 +176,7 @@ def test_what_does_not_fit_is_named(plant):
     excite = km.Noise(-1, 1)
     with pytest.raises(DataError, match="pass measured="):
         km.collect(plant, [0, 0], excite, episodes=1, steps=3)
-    with pytest.raises(ShapeError, match="a column for outside"):
-        km.collect(plant, [0, 0], excite, episodes=1, steps=3, measured=[1.0])
+    with pytest.raises(ShapeError, match=r"shape \(3,\), expected \(2,\), .* a column for outside"):
+        km.collect(plant, [0, 0], excite, episodes=1, steps=3, measured=[1.0, 2.0, 3.0])
     with pytest.raises(DataError, match="goes with a StepMap"):
         km.collect(plant.at([0, 0]), [0, 0], excite, episodes=1, steps=3, measured=[1.0])

@@ -275,3 +275,22 @@ def test_hand_values_move_over_levels_no_faster_than_the_rate():
     station.reset()
     U = [float(station([0.0], [0.0]).u[0]) for _ in range(4)]
     np.testing.assert_array_equal(U, [1.0, 2.0, 3.0, 3.0])
+
+
+def test_only_controllers_whose_model_has_w_are_told_it():
+    """Whichever of the two has it: a run acts as that controller does alone while it is well."""
+    steps, W = 6, np.sin(np.arange(6.0))[:, None]
+    told = km.LinearPredictor(
+        TANK.A, TANK.B, TANK.C, TANK.lifting, 0.1, TANK.states, TANK.inputs, E=[[0.3]], disturbances=["w"]
+    )
+    plant = told.step_map()
+    knows, blind = (km.KoopmanMPC(model, COST, BOX, 5) for model in (told, TANK))
+    task = {"x0": [0.0], "reference": [0.5], "steps": steps, "measured": W}
+    for first, second, mode in ((knows, blind, "automatic"), (blind, knows, "standby")):
+        station = km.supervise.Station(first, second, limits=BOX, mode=mode)
+        assert station.nw == 1
+        np.testing.assert_array_equal(km.simulate(plant, station, **task).U, km.simulate(plant, knows, **task).U)
+    assert km.supervise.Station(blind).nw == 0
+    assert km.supervise.Station(km.control.PID(kp=1.0, dt=0.1)).nw is None
+    with pytest.raises(km.errors.DataError, match="w was passed"):
+        km.supervise.Station(blind, limits=BOX)([0.0], [0.5], w=[1.0])

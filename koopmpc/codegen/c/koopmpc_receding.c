@@ -264,6 +264,7 @@ void koopmpc_fail(koopmpc_state *s, const koopmpc_real *free_input, const koopmp
   s->warm = 0;
   koopmpc_copy(before, applied && koopmpc_usable(applied, KOOPMPC_NU) ? applied : s->given, KOOPMPC_NU);
   report->status = status;
+  report->slack = 0;
   if (s->has_kept && s->age + 1 < KOOPMPC_N) {
     s->age++;
     chosen = s->kept + KOOPMPC_NU * koopmpc_move_of[s->age];

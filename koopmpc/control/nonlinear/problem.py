@@ -256,7 +256,7 @@ class StagedProblem(NamedTuple):
         if not self.scheduled:
             return theta
         n, s = self.F.size1_in(2) - self.scheduled, self.scheduled
-        return ca.vertcat(theta[:n], theta[n + k * s : n + (k + 1) * s])
+        return ca.vertcat(theta[:n, 0], theta[n + k * s : n + (k + 1) * s, 0])
 
     @property
     def stage_limits(self) -> Interval:
