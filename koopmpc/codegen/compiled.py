@@ -27,6 +27,7 @@ from koopmpc.control.linear.plan import planned_states
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, alone, busy
 from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.program import StepProgram
+from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.plants.routines import find_compiler, find_private_cache, load_library
 from koopmpc.plants.step_map import StepMap
@@ -224,7 +225,8 @@ class Compiled:
         kind, self._step, self._at_call = self._y.dtype, 0, None
         if u_prev is None and self._timed and self.limits is not None:
             box = self.limits.input_rows(self.nu, self._sizes["LATENCY"], 1)
-            u_prev = np.clip(np.zeros(self.nu), box.low[0], box.high[0])
+            zero, levels = np.clip(np.zeros(self.nu), box.low[0], box.high[0]), self.limits.base.input_levels(self.nu)
+            u_prev = zero if levels is None else HeldLevels(levels).round(zero)
         start, last = (
             None if value is None else np.ascontiguousarray(checks.array(value, name, (size,)), kind)
             for value, name, size in ((x0, "x0", self._sizes["NX"]), (u_prev, "u_prev", self.nu))

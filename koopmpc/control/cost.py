@@ -595,16 +595,25 @@ def check_cost_and_limits(
         raise DataError(f"limits is a {type(limits).__name__}; pass Limits, or None for none")
     if callable(cost.stage) or any(isinstance(v, Mapping) for v in (*vars(cost).values(), *vars(limits).values())):
         cost, limits = cost.resolve(states, inputs), limits.resolve(states, inputs)
-    return _drop_constant_rows(cost), limits
+    return _drop_constant_rows(cost, states, inputs), limits
 
 
-def _drop_constant_rows(cost: Cost) -> Cost:
-    """Return the cost without rows that are all the diagonal of their weight, so that plans are alike to the bit."""
+def _drop_constant_rows(cost: Cost, states: Sequence[str], inputs: Sequence[str]) -> Cost:
+    """Return the cost without rows that are all the diagonal of their weight, so that plans are alike to the bit.
+
+    Raises
+    ------
+    ShapeError
+        Such rows are not as long as what is tracked, or the inputs.
+    """
     dropped: dict[str, None] = {}
     for name, given in (("Q_rows", cost.Q), ("R_rows", cost.R)):
         rows, weight = getattr(cost, name), np.asarray(given, dtype=np.float64)
         if rows is not None:
             diagonal = weight.diagonal() if weight.ndim == 2 else weight
             same = diagonal.size in (1, np.shape(rows)[-1]) and bool((np.asarray(rows) == diagonal).all())
-            dropped |= {name: None} if same else {}
+            if same:
+                size = len(inputs) if name == "R_rows" else len(cost.of.bind(tuple(states)).names)
+                bounds.hold_rows(cast("ArrayLike", rows), name, size, 0, 1, 0.0)
+                dropped[name] = None
     return replace(cost, **dropped) if dropped else cost

@@ -397,8 +397,9 @@ def _check_measured(plant: StepMap | Plant, measured: Float[np.ndarray, "rows nw
 
 def count_disturbances(controller: object) -> int | None:
     """Return how many measured disturbances the model of a controller has; None where it has no model."""
-    if hasattr(controller, "nw"):  # a station knows those of its parts
-        return controller.nw
+    count: int | None = getattr(controller, "nw", None)  # a station knows those of its parts
+    if count is not None:
+        return count
     model = predictor_of(controller) or getattr(controller, "step_map", None)
     return None if model is None else getattr(model, "nw", 0)
 

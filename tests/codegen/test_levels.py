@@ -84,6 +84,15 @@ def test_rows_of_limits_leave_some_levels_in_c_as_in_python():
         assert other.u[0] <= limits.u_max[min(k, 5), 0]
 
 
+def test_a_run_with_rows_starts_on_a_level_in_c_as_in_python():
+    """Zero, where a run starts, is between two levels, and a change of more than 0.5 breaks the rate."""
+    limits = km.Limits(levels=[[-0.1, 0.4]], du_max=0.5, u_max=np.full((3, 1), 1.0))
+    mpc = km.KoopmanMPC(TANK, COST, limits, 3)
+    for each in (mpc, km.compiled(mpc)):
+        move = each([0.0], [1.0])
+        assert (move.u, move.status, move.slack) == (0.4, km.Status.OPTIMAL, 0.0)
+
+
 def test_a_step_without_a_plan_has_no_slack_in_c_as_in_python():
     """The last input was far outside its limits, so that its change must be large, and no plan meets x ≤ 1."""
     mpc = km.KoopmanMPC(TANK, COST, km.Limits(levels=[[0, 1, 2]], du_max=1, x_max=1, slack=None), 4)

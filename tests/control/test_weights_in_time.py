@@ -92,6 +92,8 @@ REFUSED = {
     "R_rows are diagonals, and Q is a full matrix": {"Q": [[1, 0.2], [0.2, 1]], "R_rows": [[0.1]]},
     "Q_rows are diagonals, and R is a full matrix": {"R": [[1, 0.2], [0.2, 1]], "Q_rows": [[1, 1]]},
     "pass rows of 2": {"Q_rows": [[1, 1, 1]]},
+    r"Q_rows has shape \(1, 3\)": {"Q": 1, "Q_rows": [[1, 1, 1]]},
+    r"R_rows has shape \(1, 2\)": {"R": 0.1, "R_rows": [[0.1, 0.1]]},
 }
 
 
