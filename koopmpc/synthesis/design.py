@@ -256,10 +256,10 @@ def design(
         past = extend_past(past, held, measured)
     models = _list_models(held, asked, candidates, past, bilinear, draw)
     if hidden and delays is None and candidates is None and is_record(held) and _tracks_states(asked):
-        models += propose_hidden_states(measured, bilinear, report_stage(progress, "hidden states"))
+        proposed = propose_hidden_states(measured, bilinear, report_stage(progress, "hidden states"))
+        models += [one for one in proposed if _has_folds(held, ahead, one.delays)]
     first = max(one.delays for one in models)
-    room = int(np.median([len(episode) for episode in held])) - first
-    forecast = min(ahead, max(room, 1))
+    forecast = _fit_forecast(held, ahead, first)
     short: list[str] = []
     if forecast < ahead:
         short = [f"models were judged {forecast} steps ahead, not {ahead}, for episodes are no longer"]
@@ -396,6 +396,20 @@ def _confirm_first(
 def _tracks_states(asked: DesignTask) -> bool:
     """Return whether cost and limits are of states alone, which models with a hidden state have as outputs."""
     return all(of is None or isinstance(of, State) for of in (asked.cost.of, asked.limits.of))
+
+
+def _fit_forecast(episodes: Episodes, ahead: int, past: int) -> int:
+    """Return how far models are judged: as far as a controller plans, or as half of the episodes allow."""
+    return min(ahead, max(int(np.median([len(episode) for episode in episodes])) - past, 1))
+
+
+def _has_folds(episodes: Episodes, ahead: int, past: int) -> bool:
+    """Return whether episodes give as many folds as a design needs, with so many past rows."""
+    needed = _fit_forecast(episodes, ahead, past) + past
+    try:
+        return make_folds(episodes, needed, FOLDS, np.random.default_rng(0)).number == FOLDS
+    except DataError:
+        return False
 
 
 def _list_models(

@@ -27,6 +27,7 @@ PAYS = 0.9  # neurons are judged if they lower the error on unseen rows to less 
 _NEURAL_ORDERS = (2, 3, 4)  # orders of hidden states with neurons
 _SENSORS = 2  # neurons are tried on records of at most so many sensors: with more of them little is hidden
 _ORDERS = (1, 2, 3, 4)  # orders of hidden states that simulation error is tried on
+_PROPOSED = 2  # candidates with a hidden state that a design fits to each fold and judges in its loops, at most
 
 
 def judge_hidden_states(
@@ -36,6 +37,7 @@ def judge_hidden_states(
     bilinear: bool,
     rival: float = np.inf,
     *,
+    ran: FreeRun | None = None,
     short: int | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[LeaderboardRow, FreeRun]]:
@@ -45,7 +47,7 @@ def judge_hidden_states(
     rests at its least or largest reading, the polynomial one with these rails; and for one or two sensors those with
     neurons, with the rails if the best one before has them. With neurons the best one and the smallest of other orders
     are judged, if they are calm and err by a tenth less than all others. Where records are too short for a kind, it is
-    left out; so is a model that on the first stretches errs by half more than the best one before.
+    left out; so is a model that on the first stretches errs by half more than the best calm one so far.
 
     Parameters
     ----------
@@ -57,6 +59,8 @@ def judge_hidden_states(
         Least error of other models on unseen rows; what errs by far more is not judged.
     bilinear
         Try polynomial ones, which are bilinear predictors.
+    ran
+        How the best of the other models ran over the same stretches.
     short
         Steps of the short forecasts that judge; `horizon` by default, whose errors the leaderboard shows.
     progress
@@ -67,7 +71,8 @@ def judge_hidden_states(
     searched = (perf_counter() - begun) / max(len(found), 1)
     results: list[tuple[LeaderboardRow, FreeRun]] = []
     for structure in found:
-        best = min((run for _, run in results if run.calm), key=lambda run: run.error, default=None)
+        others = [run for run in (ran, *(run for _, run in results)) if run is not None and run.calm]
+        best = min(others, key=lambda run: run.error, default=None)
         try:
             result = _judge(structure, measured, first, horizon, short or horizon, searched, best)
         except KoopmpcError:
@@ -123,9 +128,10 @@ def search_hidden_states(
 
 
 def propose_hidden_states(episodes: Episodes, bilinear: bool, progress: Progress | None = None) -> list[Candidate]:
-    """Return candidates with a hidden state, the best of each kind; none where the records are too short."""
+    """Return the two best candidates with a hidden state; none where the records are too short."""
     found: list[Candidate] = []
-    for structure in search_hidden_states(episodes, bilinear, progress=progress):
+    structures = search_hidden_states(episodes, bilinear, progress=progress)
+    for structure in sorted(structures, key=lambda one: (not one.calm, one.error))[:_PROPOSED]:
         try:
             with hide_fit_warnings():
                 model = fit_hidden(structure, episodes, quick=True)

@@ -213,6 +213,14 @@ def judge_free_run(
     return FreeRun(np.array(errors), _is_calm(fit(seen), truth, first, relift))
 
 
+def run_structure(structure: Structure, measured: Episodes, first: int, horizon: int) -> FreeRun:
+    """Return how a sparse polynomial does on each quarter of the records; the arguments are as in `judge_free_run`."""
+    if max(map(len, measured)) <= PIECE:  # the search for its terms ran it freely on the same pieces
+        return FreeRun(structure.errors, structure.calm)
+    fit = partial(fit_structure, structure)
+    return judge_free_run(fit, measured, measured, first, horizon, relift=structure.is_nonlinear)
+
+
 def _mean(errors: ArrayLike) -> float:
     """Return the geometric mean of errors."""
     return float(np.exp(np.log(np.maximum(errors, EXACT)).mean()))
@@ -379,11 +387,7 @@ def judge_finalists(
             progress(done, len(places))
         row = rows[place]
         if isinstance(row.structure, Structure):
-            if max(map(len, measured)) <= PIECE:  # the search for its terms ran it freely on the same pieces
-                runs[place] = FreeRun(row.structure.errors, row.structure.calm)
-            else:
-                again = partial(fit_structure, row.structure)
-                runs[place] = judge_free_run(again, measured, measured, first, horizon, relift=row.bilinear)
+            runs[place] = run_structure(row.structure, measured, first, horizon)
             continue
         fit = partial(_fit_quietly, row.candidate, row.ridge)
         run = judge_free_run(fit, learned, measured, first, horizon, relift=row.bilinear)

@@ -56,6 +56,7 @@ from koopmpc.synthesis.records import (
     judge_finalists,
     propose_structures,
     refine_structure,
+    run_structure,
 )
 from koopmpc.validate.memory import find_hidden_state
 from koopmpc.validate.scoring import AnyPredictor, score
@@ -280,8 +281,11 @@ def select(
     alike = ENOUGH if relift else EXACT
     if record:
         told = report_stage(progress, "hidden states")
-        rival = min((one.structure.error for one in given if one.structure is not None), default=np.inf)
-        ran = judge_hidden_states(measured[1], first, ahead, both, rival, short=nearer, progress=told)
+        sparse = [one.structure for one in given if isinstance(one.structure, Structure)]
+        rival = min((one.error for one in sparse), default=np.inf)
+        runs = [run_structure(one, measured[1], first, nearer) for one in sparse]
+        best = min((run for run in runs if run.calm), key=lambda run: run.error, default=None)
+        ran = judge_hidden_states(measured[1], first, ahead, both, rival, ran=best, short=nearer, progress=told)
         told = report_stage(progress, "free runs")
         rows, chosen, found = judge_finalists(rows, held, measured[1], first, nearer, told, ran)
         if held is not measured[1] and (rows[chosen].rough or rows[chosen].structure is not None):

@@ -451,6 +451,23 @@ def test_one_record_of_a_sensor_tries_as_much_of_the_past_as_many_episodes():
     assert {row.recipe.candidate.delays for row in found.leaderboard} == {0, 1, 2}
 
 
+@pytest.mark.slow
+def test_a_hidden_state_with_a_past_that_leaves_too_few_folds_is_left_out(monkeypatch):
+    asked = list[km.Episodes]()
+
+    def propose(episodes, bilinear, progress):
+        del bilinear, progress
+        asked.append(episodes)
+        found = [Candidate(f"past {i}", km.State() + km.Constant(), km.Delay(i), False) for i in (4, 100)]
+        return [one.bind(episodes.states, episodes.inputs) for one in found]
+
+    monkeypatch.setattr("koopmpc.synthesis.design.propose_hidden_states", propose)
+    cost, limits = HELD_LEVEL
+    found = designed(hidden_record(), cost, limits, horizon=15, delays=None, candidates=None, reference=[1.2])
+    assert len(asked) == 1
+    assert "past 100" not in {row.recipe.candidate.name for row in found.leaderboard}
+
+
 def hidden_record(rows=600, seed=0):
     """Return one record of a tank's level; the valve that feeds it lags, and its position is hidden."""
     rng = np.random.default_rng(seed)

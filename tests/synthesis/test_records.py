@@ -8,6 +8,7 @@ import pytest
 import koopmpc as km
 from koopmpc.errors import DataError
 from koopmpc.synthesis.candidates import relift_model
+from koopmpc.synthesis.hidden_states import judge_hidden_states
 from koopmpc.synthesis.records import (
     FreeRun,
     choose_by_free_run,
@@ -171,6 +172,19 @@ def test_a_model_far_behind_a_rival_is_not_fitted_without_each_quarter():
     assert len(fits) == 6
     assert not lost.calm
     assert lost.errors.shape == rival.errors.shape
+
+
+def test_hidden_states_far_behind_the_best_calm_polynomial_are_left_out():
+    data = oscillator(rows=240)
+
+    def names(errors, calm):
+        ran = FreeRun(np.full(8, errors), calm)
+        return [row.name for row, _ in judge_hidden_states(data, 2, 10, False, ran=ran)]
+
+    both = ["hidden state of order 2, subspace", "hidden state of order 2, simulation error"]
+    assert names(0.2, calm=True) == both
+    assert names(1e-4, calm=False) == both
+    assert names(1e-4, calm=True) == []
 
 
 @pytest.mark.slow
