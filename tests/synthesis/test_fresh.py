@@ -11,7 +11,7 @@ import koopmpc as km
 from koopmpc.synthesis.designed import ExpectedLoop, choose_row
 from koopmpc.synthesis.fresh.drawn import draw_starts
 from koopmpc.synthesis.fresh.horizon import choose_horizon
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box, probe_range
+from koopmpc.synthesis.fresh.neighbours import MOST, NeighbourMap, goal_box, probe_range
 from koopmpc.synthesis.fresh.verdict import bound_value, cost_interval
 from koopmpc.synthesis.judging import measure_errors
 from koopmpc.validate import bound_failure_rate
@@ -91,6 +91,24 @@ def test_nearest_rows_forecast_no_worse_than_a_map_fitted_to_all_rows(noise):
             errors.append((z[0] - e.X[15, 0]) ** 2)
     local, affine = np.sqrt(np.mean(np.reshape(errors, (2, -1)), axis=1))
     assert local < (1.02 if noise else 0.8) * affine
+
+
+def test_one_short_episode_does_not_choose_the_slope_of_nearest_rows():
+    """Over one step small noise hides what a few rows get wrong; over ten it shows."""
+    rng, quiet = np.random.default_rng(0), episodes_of(bent, count=12, steps=60, keep=1)
+    logs = quiet.with_episodes([km.Episode(X=e.X + 0.02 * rng.standard_normal(e.X.shape), U=e.U) for e in quiet])
+    past = km.Delay(2).bind(logs.states, logs.inputs)
+    one, more = (
+        NeighbourMap.of(each, past, np.zeros(1)) for each in (logs, logs.with_episodes([*logs, logs[0].cut(0, 3)]))
+    )
+    assert (more.local, more.ridge) == (one.local, one.ridge)
+
+
+def test_a_last_episode_of_which_no_row_is_kept_costs_nothing():
+    long = episodes_of(bent, count=4, steps=MOST // 2 + 1)
+    one = NeighbourMap.of(long.with_episodes([*long, long[0].cut(0, 1)]), None, np.zeros(2))
+    assert one.episode.max() == 3
+    assert np.isfinite(one.draw(np.random.default_rng(0))([0.1, 0.1], [0.2])).all()
 
 
 def test_a_draw_is_kept_for_a_loop_and_two_draws_differ():

@@ -14,6 +14,7 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.scene import Scene
 from koopmpc.synthesis.asked import DesignTask
+from koopmpc.synthesis.cross_validation import usual_horizon
 from koopmpc.values import Value
 
 MOST = 6000  # rows that are kept
@@ -22,7 +23,7 @@ LEAST = 12  # neighbours at least
 # neighbours for each coefficient of the local slope, and its ridge, as a share of its largest squared direction
 SLOPES = tuple((near, ridge) for near in (NEAR, 20) for ridge in (1e-4, 1e-2, 1.0))
 AHEAD = 10  # steps of the forecasts that choose among them
-BEGUN = 400  # of these forecasts, about
+BEGUN = 400  # of these forecasts, at most
 GROUPS = 8  # of episodes; each is forecast by the rows of the others
 ALIKE = 1.05  # the first of them is taken whose error is at most this many times the least one
 KNOWN = 0.99  # share of the data's own rows that is inside the data
@@ -202,12 +203,13 @@ class NeighbourMap(Value):
 
 def _choose_slope(map_: NeighbourMap, episodes: Episodes) -> tuple[int, float]:
     """Return the neighbours for each coefficient and the ridge of the local slope that forecast best."""
-    number = len(map_.triangles)
+    number = len(map_.triangles)  # a last episode may have no row that is kept
     group = np.arange(number) % GROUPS
     counts = np.array([group != out for out in range(min(GROUPS, number))], dtype=np.float64)
-    ahead = min(AHEAD, min(len(e) for e in episodes))
+    ahead = min(AHEAD, usual_horizon(episodes)[0])
     apart = -(-sum(len(e) for e in episodes) // BEGUN)
-    at = [(i, k) for i, e in enumerate(episodes) for k in range(0, len(e) - ahead + 1, apart)]
+    at = [(i, k) for i, e in enumerate(list(episodes)[:number]) for k in range(0, len(e) - ahead + 1, apart)]
+    at = at[:: max(-(-len(at) // BEGUN), 1)]
     if number < 2 or (counts @ np.bincount(map_.episode, minlength=number)).min() < map_.near:
         return SLOPES[0]
     which = np.array([group[i] for i, _ in at])
