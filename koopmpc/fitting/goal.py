@@ -26,7 +26,7 @@ from koopmpc.fitting.fit import Say, describe_data, ignore_text
 from koopmpc.fitting.further import FurtherData, plan_further
 from koopmpc.fitting.repair import IN_MEMORY, Data, DividedData, collect_notes, find_logs, read_logs
 from koopmpc.fitting.report import write_design_report
-from koopmpc.fitting.set_points import take_set_points
+from koopmpc.fitting.set_points import drop_set_points, take_set_points
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
 from koopmpc.parallel import StageProgress
@@ -168,7 +168,7 @@ def design_data(
     except DataError as refusal:
         if plan is None:
             raise
-        few = _load_few(data, reading, pushed)
+        few = drop_set_points(_load_few(data, reading, pushed), set_points)
         further(few, read_goal(goal, few), refusal=refusal)
         raise
     missed = tuple(name for name in pushed if name in split.seen.states)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.files.columns import drop_unit
 from koopmpc.errors import DataError
 from koopmpc.fitting.repair import DividedData
 
@@ -21,7 +22,7 @@ def take_set_points(
     split
         Data that were read with the set points among the measured disturbances.
     names
-        Names of the set points; with none nothing is taken out.
+        Names of the set points, with or without units; with none nothing is taken out.
 
     Raises
     ------
@@ -32,20 +33,34 @@ def take_set_points(
         return split, None
     if not isinstance(split.fitted, Episodes):
         raise DataError("--set-point goes with logs that fit into memory; pass fewer logs")
-    missing = [name for name in names if name not in split.fitted.disturbances]
-    if missing:
-        raise DataError(f"the logs lack the column {missing[0]}; --set-point names columns of a table")
-    taken = [split.fitted.disturbances.index(name) for name in names]
+    taken = _find_places(split.fitted, names)
     signals = [e.W[:, taken] for e in split.fitted]
+    fitted, seen, held_out = (drop_set_points(each, names) for each in (split.fitted, split.seen, split.held_out))
+    return replace(split, fitted=fitted, seen=seen, held_out=held_out, learned=None), signals
 
-    def drop(episodes: Episodes) -> Episodes:
-        kept = [i for i, name in enumerate(episodes.disturbances) if name not in names]
-        left = [Episode(X=e.X, U=e.U, W=e.W[:, kept]) for e in episodes]
-        return Episodes(
-            left, episodes.dt, episodes.states, episodes.inputs, tuple(episodes.disturbances[i] for i in kept)
-        )
 
-    return (
-        replace(split, fitted=drop(split.fitted), seen=drop(split.seen), held_out=drop(split.held_out), learned=None),
-        signals,
-    )
+def drop_set_points(episodes: Episodes, names: Sequence[str]) -> Episodes:
+    """Return the episodes without these measured disturbances.
+
+    Raises
+    ------
+    DataError
+        A set point is not in the logs.
+    """
+    taken = _find_places(episodes, names)
+    kept = [i for i in range(len(episodes.disturbances)) if i not in taken]
+    left = [Episode(X=e.X, U=e.U, W=e.W[:, kept]) for e in episodes]
+    names_left = tuple(episodes.disturbances[i] for i in kept)
+    return Episodes(left, episodes.dt, episodes.states, episodes.inputs, names_left)
+
+
+def _find_places(episodes: Episodes, names: Sequence[str]) -> list[int]:
+    """Return the places of set points among the measured disturbances, whose units the names may leave out."""
+    known = list(episodes.disturbances)
+    stems = [drop_unit(name) for name in known]
+    places: list[int] = []
+    for name in names:
+        if name not in known and stems.count(name.strip().lower()) != 1:
+            raise DataError(f"the logs lack the column {name}; --set-point names columns of a table")
+        places.append(known.index(name) if name in known else stems.index(name.strip().lower()))
+    return places

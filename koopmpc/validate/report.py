@@ -366,9 +366,12 @@ def _check_fit(report: TrustReport) -> Iterator[tuple[str, str]]:
         says = f"errors on held-out episodes are {ratio:.3g} times those on the training episodes"
         yield says, "collect more data, take fewer observables or a larger ridge"
     if report.unseen is not None and report.unseen > _UNSEEN:
-        regions = "; ".join(str(region) for region in report.coverage.empty[:_MOST_NAMES])
+        regions = "; ".join(region.where for region in report.coverage.empty[:_MOST_NAMES])
         says = f"{to_percent(report.unseen)} of the held-out samples lie where there are no training data"
-        yield says + (f": {regions}" if regions else ""), "collect data there, or keep the controller away from there"
+        yield (
+            says + (f", such as {regions}" if regions else ""),
+            "collect data there, or keep the controller away from there",
+        )
 
 
 def _check_inputs(report: TrustReport) -> Iterator[tuple[str, str]]:

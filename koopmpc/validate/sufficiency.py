@@ -51,11 +51,16 @@ class Region(Value):
 
     def __str__(self) -> str:
         """Return e.g. ``"theta in [1.2, 2.1] rad with omega > 3 rad/s was never visited"``."""
+        return f"{self.where} was never visited"
+
+    @property
+    def where(self) -> str:
+        """Its two intervals, e.g. ``"theta in [1.2, 2.1] rad with omega > 3 rad/s"``."""
         ends = zip(self.names, self.low.tolist(), self.high.tolist(), strict=True)
         parts = [
             with_unit(name, _format_interval(low, high)) for name, low, high in ends if np.isfinite([low, high]).any()
         ]
-        return f"{' with '.join(parts)} was never visited"
+        return " with ".join(parts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,10 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 from koopmpc.cli.app import app
+from koopmpc.fitting import further
 from koopmpc.fitting.goal import design_data
+from koopmpc.fitting.repair import IN_MEMORY, read_logs
+from koopmpc.fitting.set_points import take_set_points
 from tests.fitting.mass import GOAL, NAMES, A, B, logs
 
 
@@ -95,6 +98,37 @@ def write_closed_loop(path, runs=6, steps=150):
 
 
 PLAIN = GOAL.replace(" [m]", "").replace(" [m/s]", "").replace(" [N/kg]", "")
+
+
+def test_set_points_may_leave_out_their_unit(tmp_path):
+    write_closed_loop(tmp_path / "loop.csv")
+    text = (tmp_path / "loop.csv").read_text()
+    (tmp_path / "loop.csv").write_text(text.replace("goal", "goal [m]", 1))
+    reading = {"disturbances": ["goal"]}
+    split = read_logs(tmp_path / "loop.csv", None, np.random.default_rng(0), IN_MEMORY, reading, "record more")
+    left, signals = take_set_points(split, ["goal"])
+    assert left.fitted.disturbances == left.held_out.disturbances == ()
+    assert signals is not None
+    assert {abs(one) for signal in signals for one in signal.ravel()} == {0.4}
+    with pytest.raises(km.KoopmpcError, match="lack the column wish"):
+        take_set_points(split, ["wish"])
+
+
+def test_set_points_push_nothing_in_a_plan_from_few_logs(tmp_path, monkeypatch):
+    write_closed_loop(tmp_path / "loop.csv", runs=1, steps=30)
+    (tmp_path / "goal.toml").write_text(PLAIN)
+    known = []
+
+    def plan(data, *args, **more):
+        known.append(data)
+        return further.FurtherData(None, "no safe plan exists")
+
+    monkeypatch.setattr("koopmpc.fitting.goal.plan_further", plan)
+    with pytest.raises(km.KoopmpcError, match="too few"):
+        design_data(
+            tmp_path / "loop.csv", tmp_path / "goal.toml", tmp_path, plan=tmp_path / "plan.csv", set_points=["goal"]
+        )
+    assert (known[0].states, known[0].disturbances) == (("position", "speed"), ())
 
 
 @pytest.mark.slow

@@ -63,6 +63,7 @@ def test_narrow_data_are_found_out(data) -> None:
     assert "collect data where the model will be used" in text
     assert "of the held-out samples lie where there are no training data" in text
     assert "was never visited" in text
+    assert any("no training data, such as" in one.says and "visited" not in one.says for one in report.findings)
     assert report.unseen is not None
     assert report.unseen > 0.5
 
