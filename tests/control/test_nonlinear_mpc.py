@@ -124,6 +124,16 @@ def test_a_plant_that_escapes_within_the_horizon_fails_a_step_and_raises_nothing
     np.testing.assert_allclose(mpc([0.2], [0.0]).u, good.u, atol=1e-4)
 
 
+def test_an_estimate_from_which_no_next_state_is_found_ends_no_loop():
+    plant, estimator = km.discretize(Escape(), 0.2, km.Collocation()), km.LiftedDisturbance()
+    mpc = km.NonlinearMPC(plant, km.Cost(1, 0.1), km.Limits(-1, 1), 5, estimator=estimator)
+    for x in (0.1, 0.1, 50.0, 0.1, np.nan, 0.2):
+        move = mpc([x], [0.0])
+        assert np.abs(move.u) <= 1
+        if x == 50.0:
+            assert move.status is km.Status.FAILED
+
+
 def test_every_end_has_a_status_and_a_safe_input():
     short = km.NonlinearMPC(step_map(A, B), km.Cost(1, 0.1), km.Limits(-0.5, 0.5), 6, settings={"ipopt.max_iter": 1})
     move = short([2.0, 1.0], [0, 0])

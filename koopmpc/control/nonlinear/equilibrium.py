@@ -241,7 +241,10 @@ class Equilibria:
         low, high = self._low / sizes, self._high / sizes
         for _ in range(_NEWTON):
             x, u = np.split(s * size, [nx])
-            at = self.linearise(x, u)
+            try:
+                at = self.linearise(x, u)
+            except RuntimeError:  # an implicit step does not converge, or CVODES gives up
+                return None
             limited[nu:, :nx] = at.G * size[:nx] / sizes[nu:, None]
             values = np.concatenate([u, at.g]) / sizes
             held = np.flatnonzero(active)

@@ -258,12 +258,8 @@ class NonlinearMPC(StagedMPC):
     def _roll_out(self, x: Float[np.ndarray, " nx"], U: Float[np.ndarray, "N nu"]) -> list[Guess]:
         """Return the states to which U leads, and U; nothing where they overflow, or a step has no solution."""
         X = [x]
-        with raise_swallowed():
-            try:
-                for u, e, w in zip(U, self._e, self._initial.W, strict=True):
-                    X.append(self._map.step(X[-1], u, w) + e)
-            except RuntimeError:  # an implicit step does not converge, or CVODES gives up
-                return []
+        for u, e, w in zip(U, self._e, self._initial.W, strict=True):
+            X.append(self._map.step(X[-1], u, w) + e)
         return [(np.array(X), U)] if np.abs(X).max() < HUGE else []  # False for NaN
 
     def _stage_guesses(self, guesses: list[Guess], u_prev: Float[np.ndarray, " nu"]) -> list[Start]:

@@ -109,8 +109,11 @@ class LearnedMap:
     def step(
         self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"] | None = None
     ) -> Float[np.ndarray, " nx"]:
-        """Return F(x, u, θ), with the products of w where it has some."""
-        return self._buffer(x, u, self.theta if w is None or not self.scheduled else self.schedule(w))[0]
+        """Return F(x, u, θ), with the products of w where it has some; NaN where a step has no solution."""
+        try:
+            return self._buffer(x, u, self.theta if w is None or not self.scheduled else self.schedule(w))[0]
+        except RuntimeError:  # an implicit step does not converge, or CVODES gives up
+            return np.full(len(x), np.nan)
 
     def slope(
         self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
