@@ -51,7 +51,7 @@ class Smoother(Value):
     the measurements, found by expectation–maximisation (Shumway & Stoffer 1982). The products are taken
     at the smoothed states; what they do not describe is part of V, and where V is large the measurements are kept.
     Where not all states are measured, the past stands in for them: of d = 0, 1, 2 the smallest is taken whose
-    prediction errors are within 5 % of the least. Measured disturbances count as inputs.
+    prediction errors are within 5 % of the least. Measured disturbances, and their products with inputs, act as inputs.
 
     A smoother is for data that were recorded. It looks ahead in time, so no controller can use it.
 
@@ -118,7 +118,7 @@ class Smoother(Value):
         DataError
             More than 30 states; episodes of fewer than 6 steps, or fewer than 10 steps for each regressor.
         """
-        data = episodes_of(episodes).driven()
+        data = episodes_of(episodes).driven(products=True)
         both = np.concatenate([np.hstack([episode.X[:-1], episode.U]) for episode in data])
         mean, scale = both.mean(axis=0), both.std(axis=0)
         scale = np.where(scale > 1e-12 * np.abs(mean), scale, 1.0)
@@ -182,7 +182,7 @@ class Smoother(Value):
         DataError
             The data have other numbers of states and inputs.
         """
-        nx, driven = len(self.noise), data.driven()
+        nx, driven = len(self.noise), data.driven(products=True)
         if (driven.nx, driven.nx + driven.nu) != (nx, len(self.mean)):
             raise DataError(
                 f"the smoother is of {nx} states and {len(self.mean) - nx} inputs, the data have {driven.nx} and "
@@ -336,7 +336,7 @@ class Mender(Value):
         DataError
             As `Smoother.of`.
         """
-        data = episodes_of(episodes).driven()
+        data = episodes_of(episodes).driven(products=True)
         both = np.concatenate([np.hstack([episode.X[:-1], episode.U]) for episode in data])
         low, middle, high = np.quantile(both, [0.05, 0.5, 0.95], axis=0)
         scale, whole = (high - low) / 3.29, both.std(axis=0)  # normal data have their standard deviation

@@ -227,3 +227,22 @@ def test_a_controller_of_noisy_logs_knows_that_the_plant_is_unstable() -> None:
     options: Any = {"horizon": 20, "bilinear": False, "delays": [0], "candidates": [km.State() + km.Constant()]}
     assert price(km.select(data, **options).linear) < 1.05 * best
     assert price(km.select(data, smooth=False, **options).linear) > 100 * best
+
+
+def test_what_products_of_inputs_and_disturbances_do_is_no_noise():
+    """x⁺ = 0.8 x + 0.3 u (1 + 0.5 w) with sensor noise of 0.01: the smoother finds that noise, and takes it out."""
+    rng, clean = np.random.default_rng(2), []
+    for _ in range(8):
+        U, W, X = rng.uniform(-1, 1, (40, 1)), rng.normal(size=(40, 2)), [rng.normal(size=1)]
+        for u, w in zip(U, W, strict=True):
+            X.append(0.8 * X[-1] + 0.3 * u * (1 + 0.5 * w[0]))
+        clean.append(km.Episode(X=np.array(X), U=U, W=W))
+    data = km.Episodes(clean, 0.1)
+    noisy = data.with_episodes([e.with_states(e.X + rng.normal(0, 0.01, e.X.shape)) for e in data])
+    smoother = km.data.Smoother.of(noisy)
+    assert smoother.noise[0] == pytest.approx(0.01, rel=0.3)
+    errors = [
+        np.std(np.concatenate([a.X - b.X for a, b in zip(each, data, strict=True)]))
+        for each in (smoother(noisy), noisy)
+    ]
+    assert errors[0] < 0.9 * errors[1]
