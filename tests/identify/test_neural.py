@@ -140,3 +140,9 @@ def test_dry_friction_is_found_and_the_model_is_used_as_any_other(tmp_path):
     again = from_standard(to_standard(model, units), units, data, model.embedding.steps, model.report)
     for name in ("A", "B", "N", "C"):
         assert np.allclose(getattr(model, name), getattr(again, name), rtol=1e-9, atol=1e-9)
+
+
+def test_an_output_that_never_moves_is_refused_in_a_sentence():
+    data = km.Episodes([km.Episode(X=np.ones((201, 1)), U=np.random.default_rng(0).uniform(-1, 1, (200, 1)))], 0.1)
+    with pytest.raises(DataError, match="no output moves"):
+        km.identify.neural_state_space(data, order=2, neurons=1)

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc.errors import DataError
 from koopmpc.identify.records.hidden import (
     HiddenModel,
     RecordSegments,
@@ -21,6 +22,8 @@ _SOFT = 1e-6  # weight of the diagonal where the best candidates are sought
 def draw_neurons(model: HiddenModel, data: RecordSegments, rng: np.random.Generator) -> Float[np.ndarray, "count n1"]:
     """Return candidates that bend along the outputs, their differences and random directions, where z has been."""
     z = _visit(model, data)
+    if not len(z):
+        raise DataError("no output moves, so there is nothing to learn; pass a record whose inputs move its outputs")
     n, A = model.order, model.E[:, 1 : 1 + model.order]
     found: list[np.ndarray] = []
 
