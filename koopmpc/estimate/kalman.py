@@ -193,13 +193,12 @@ class KalmanFilter(Viewing):
             self._uw[: len(u)] = u
             if len(w):
                 self._uw[len(u) :] = w
-            self._y[:] = y
+            whole = y.dot(y) < HUGE**2  # False for NaN, which would make NaN of every prediction
+            self._y[:] = y if whole else 0.0
             self._omega.dot(self._known, self._found)
             refused = self._gate.judge(y, self._clip(self._expected))
             silent = self._rails is not None and self._is_silent(y, self._expected).any()
-            if (
-                not (refused or silent or self._gate.lost) and self._found.dot(self._found) < HUGE**2
-            ):  # False for NaN: some of y is missing
+            if whole and not (refused or silent or self._gate.lost) and self._found.dot(self._found) < HUGE**2:
                 self._s[:] = self._s_new
                 self._missed = 0
                 return True

@@ -247,6 +247,12 @@ def test_what_keeps_a_plant_at_rest_is_learned(estimator, noise):
     np.testing.assert_allclose(mpc.observer.d, -model.B @ u, atol=1e-3)
 
 
+@pytest.mark.parametrize("kind", ["KoopmanMPC, filter", EXTENDED])
+def test_a_wild_entry_beside_a_missing_one_is_refused(kind):
+    refused = loop(MORE[kind](), 1, np.array([[np.nan, 50.0]]), plant_for(kind))[3]
+    assert np.flatnonzero(refused).tolist() == [WILD]
+
+
 def test_what_moves_a_plant_from_rest_is_no_absurd_reading_for_long():
     mpc, x, refused = km.KoopmanMPC(model("linear"), WHOLE, LIMITS, 20, estimator=LEARNS), np.zeros(2), 0
     for k in range(150):
