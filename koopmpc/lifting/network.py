@@ -115,7 +115,7 @@ def _read_network(path: Path) -> Graph:
             builder.bind_dim(name, 1)
         network = cast("ca.Function", builder.create("network", {"symbolic": True})).expand()
     except (RuntimeError, NotImplementedError, ValueError) as error:  # ValueError: names that are not UTF-8
-        reason = str(error).strip().splitlines()[-1].rpartition(": ")[2]
+        reason = (str(error).strip().splitlines() or ["the file is damaged"])[-1].rpartition(": ")[2]
         raise LogError(
             f"{path.name} cannot be read as a network: {reason}; export it for inference, with its weights inside, of "
             "layers such as Gemm, MatMul, Add, Tanh, Relu and Sigmoid"

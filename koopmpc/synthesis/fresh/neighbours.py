@@ -136,11 +136,6 @@ class NeighbourMap(Value):
         """Number k of neighbours that say whether a row is inside the data."""
         return min(max(NEAR * (self.rows.shape[1] + 1), LEAST), len(self.rows))
 
-    @property
-    def looked_up(self) -> int:
-        """Number of neighbours of which those in a bootstrap give the local slope."""
-        return min(2 * max(self.local * (self.rows.shape[1] + 1), LEAST), len(self.rows))
-
     @cached_property
     def reach(self) -> float:
         """Distance to the k-th neighbour beyond which a row is outside the data."""
@@ -248,6 +243,7 @@ class NeighbourPlants:
     def __init__(self, map_: NeighbourMap, counts: Float[np.ndarray, "E P"]) -> None:
         self._map, self._counts = map_, counts
         n = map_.rows.shape[1] + 1
+        self._looked_up = min(2 * max(map_.local * n, LEAST), len(map_.rows))  # those in a bootstrap give the slope
         triangles = map_.triangles
         tables = [(np.sqrt(one)[:, None, None] * triangles).reshape(-1, triangles.shape[1]) for one in counts]
         fits: list[Any] = [np.linalg.lstsq(table[:, :n], table[:, n:], rcond=1e-10)[0] for table in tables]
@@ -267,7 +263,7 @@ class NeighbourPlants:
             return Z_next
         Z, U, which = Z[good], U[good], which[good]
         V = one.scale_rows(Z, U, None if W is None else W[good])
-        found = one.tree.query(V, one.looked_up)
+        found = one.tree.query(V, self._looked_up)
         distance, places = (np.reshape(part, (len(V), -1)) for part in found)
         affine, near = self._affine[which], one.rows[places]
         width = 1.0001 * np.maximum(distance[:, -1:], 1e-12)
