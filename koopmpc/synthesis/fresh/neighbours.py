@@ -214,8 +214,9 @@ def _choose_slope(map_: NeighbourMap, episodes: Episodes) -> tuple[int, float]:
     after: Float[np.ndarray, "n nzeta"] = np.array([episodes[i].X[k + ahead] for i, k in at])
     spread = np.maximum(np.concatenate([e.X for e in episodes]).std(axis=0), 1e-300)
     errors: list[float] = []
-    for local, ridge in SLOPES:
-        plants, Z = NeighbourPlants(replace(map_, local=local, ridge=ridge), counts), begun
+    plants = NeighbourPlants(map_, counts)
+    for slope in SLOPES:
+        plants.slope, Z = slope, begun
         for k in range(ahead):
             Z = plants.step(Z, U[:, k], which, W[:, k])
         missed: Float[np.ndarray, "n nzeta"] = (Z - after) / spread
@@ -243,7 +244,7 @@ class NeighbourPlants:
     def __init__(self, map_: NeighbourMap, counts: Float[np.ndarray, "E P"]) -> None:
         self._map, self._counts = map_, counts
         n = map_.rows.shape[1] + 1
-        self._looked_up = min(2 * max(map_.local * n, LEAST), len(map_.rows))  # those in a bootstrap give the slope
+        self.slope = map_.local, map_.ridge
         triangles = map_.triangles
         tables = [(np.sqrt(one)[:, None, None] * triangles).reshape(-1, triangles.shape[1]) for one in counts]
         fits: list[Any] = [np.linalg.lstsq(table[:, :n], table[:, n:], rcond=1e-10)[0] for table in tables]
@@ -263,7 +264,8 @@ class NeighbourPlants:
             return Z_next
         Z, U, which = Z[good], U[good], which[good]
         V = one.scale_rows(Z, U, None if W is None else W[good])
-        found = one.tree.query(V, self._looked_up)
+        local, ridge = self.slope
+        found = one.tree.query(V, min(2 * max(local * (V.shape[1] + 1), LEAST), len(one.rows)))  # a bootstrap has fewer
         distance, places = (np.reshape(part, (len(V), -1)) for part in found)
         affine, near = self._affine[which], one.rows[places]
         width = 1.0001 * np.maximum(distance[:, -1:], 1e-12)
@@ -275,7 +277,7 @@ class NeighbourPlants:
         D = near - center[:, None]
         weighed = (D * share[..., None]).swapaxes(1, 2)
         S = weighed @ D
-        tilt = one.ridge * np.einsum("eii->ei", S).max(axis=1) + 1e-300
+        tilt = ridge * np.einsum("eii->ei", S).max(axis=1) + 1e-300
         S = np.where((total > 0)[:, None, None], S + tilt[:, None, None] * np.eye(S.shape[1]), np.eye(S.shape[1]))
         slope = np.asarray(np.linalg.solve(S, weighed @ (missed - mean[:, None])), dtype=np.float64)
         change = np.einsum("ei,eij->ej", V, affine[:, :-1]) + affine[:, -1]
