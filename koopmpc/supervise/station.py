@@ -31,8 +31,8 @@ class Station(Published):
     begins to act that has `take_over(y, reference, u)`, as `PID` has, it starts from the applied input to the digit.
     Others have no state that could be set to give that input; u then moves towards theirs by at most `bump` a step
     until it is reached. The standby also acts after `patience` steps in sequence at which the primary controller fell
-    back or did not know the step, until it has been well for as many. `Move.actor` says who acted. Where one of the two
-    knows measured disturbances w, the other is told them only if its model has some too.
+    back or did not know the step, until it has been well for as many. `Move.actor` says who acted. Measured
+    disturbances w go to both controllers; where the model of one has none, to the other alone.
 
     Parameters
     ----------
