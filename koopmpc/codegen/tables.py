@@ -20,8 +20,9 @@ from koopmpc.control.nonlinear.stagewise import list_hard_outputs
 from koopmpc.control.program import LinearProgram, Published, StepProgram, no_export
 from koopmpc.control.riccati import SETTLED as RESTED
 from koopmpc.control.solvers.daqp import FEW
+from koopmpc.control.stepped.levels import FREE, NEAR
 from koopmpc.control.stepped.search import NODES
-from koopmpc.control.stepped.sequences import LevelsProgram
+from koopmpc.control.stepped.sequences import EQUAL, LevelsProgram
 from koopmpc.control.target import ROUNDING
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import EXACT, DisturbanceProgram
@@ -176,7 +177,7 @@ def make_tables(program: StepProgram, *, single: bool) -> Tables:
         case FeedbackProgram():
             _add_feedback(tables, program)
         case CondensedProgram():
-            _add_condensed(tables, program)
+            _add_condensed(tables, program, single=single)
         case StagedProgram():
             _add_staged(tables, program, single=single)
         case _:
@@ -379,7 +380,7 @@ def _add_feedback(tables: Tables, program: FeedbackProgram) -> None:
     _add_memory(tables, 1, 0, 0)
 
 
-def _add_condensed(tables: Tables, program: CondensedProgram) -> None:
+def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool) -> None:
     """Write a plan by one matrix, and its condensed QP."""
     _add_linear(tables, program)
     model, qp, solver, targets = program.model, program.qp, program.solver, program.targets
@@ -442,7 +443,7 @@ def _add_condensed(tables: Tables, program: CondensedProgram) -> None:
     if program.bounds is not None:
         _add_bounds(tables, program.bounds, rated=program.rates is not None)
     if program.levels is not None:
-        _add_levels(tables, program.levels)
+        _add_levels(tables, program.levels, single=single)
     elif solver.metric is not None:
         values, V = np.linalg.eigh(solver.metric)
         tables.plan |= {"lambda": np.maximum(values, 0.0), "V": V, "MV": solver.M @ V}
@@ -450,7 +451,7 @@ def _add_condensed(tables: Tables, program: CondensedProgram) -> None:
     _add_memory(tables, moves, m, int(soft.sum()))
 
 
-def _add_levels(tables: Tables, program: LevelsProgram) -> None:
+def _add_levels(tables: Tables, program: LevelsProgram, *, single: bool) -> None:
     """Write the levels of the inputs, and the search for the best sequence of them."""
     levels, soft = program.levels, np.isfinite(program.linear)
     tables.sizes |= {
@@ -458,7 +459,9 @@ def _add_levels(tables: Tables, program: LevelsProgram) -> None:
         "FREE_MOVES": len(program.free),
         "SEARCH_ROWS": len(program.rows),
         "NODES": NODES,
+        "FREE": FREE,
     }
+    tables.define({"NEAR_LEVEL": 1e-4 if single else NEAR, "BETTER": 1 - (1e-6 if single else EQUAL)})
     whole = {
         "level_count": levels.count,
         "dwell": levels.dwell,

@@ -84,6 +84,15 @@ def test_rows_of_limits_leave_some_levels_in_c_as_in_python():
         assert other.u[0] <= limits.u_max[min(k, 5), 0]
 
 
+def test_single_precision_leaves_out_no_level_on_its_limit():
+    """Rounded to single precision, such a limit is up to 4e-6 of the spacing below its level."""
+    row = -3.0 + 0.15 * np.arange(40)
+    for highest in (33, 34, 38):
+        mpc = km.KoopmanMPC(TANK, COST, km.Limits(levels=[row], u_max=[[row[highest]], [row[-1]]]), 3)
+        for each in (mpc, km.compiled(mpc, precision="float")):
+            assert each([0.0], [50.0]).u == pytest.approx(row[highest], rel=1e-5)
+
+
 def test_a_run_with_rows_starts_on_a_level_in_c_as_in_python():
     """Zero, where a run starts, is between two levels, and a change of more than 0.5 breaks the rate."""
     limits = km.Limits(levels=[[-0.1, 0.4]], du_max=0.5, u_max=np.full((3, 1), 1.0))

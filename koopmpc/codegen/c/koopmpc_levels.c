@@ -15,10 +15,12 @@
 
 #if KOOPMPC_LEVELED
 enum { NU = KOOPMPC_NU, COUNT = KOOPMPC_FREE_MOVES, OTHERS = KOOPMPC_SEARCH_ROWS, OTHERS1 = OTHERS > 0 ? OTHERS : 1 };
-enum { FREE_TO_CHANGE = 1000000000, BLOCKS = KOOPMPC_MOVES / NU };
+enum { BLOCKS = KOOPMPC_MOVES / NU };
 
-static const koopmpc_real NEAR_LEVEL = (koopmpc_real)1e-6; /* of the spacing: an input this near is on its level */
-static const koopmpc_real BETTER = 1 - (koopmpc_real)1e-9; /* a sequence is better if it costs less than this share */
+/*
+ * Numbers that Python has, too: KOOPMPC_NEAR_LEVEL of the spacing from a level, an input is on it. A sequence is better
+ * if it costs less than the share KOOPMPC_BETTER. An input that has held its level for KOOPMPC_FREE steps may change.
+ */
 
 /** A search at work: the sequence begun, its costs, and the levels that are still to be tried below and above. */
 typedef struct {
@@ -45,8 +47,8 @@ static int dwell_of(int level, int i) { return koopmpc_dwell[2 * i + (level != 0
 /** The lowest and highest level of input i inside (low, high). */
 static void levels_inside(koopmpc_real low, koopmpc_real high, int i, int *least, int *most) {
   const koopmpc_real last = (koopmpc_real)koopmpc_level_count[i];
-  const koopmpc_real from = KOOPMPC_FN(ceil)(koopmpc_clip(place_of(low, i), -1, last) - NEAR_LEVEL);
-  const koopmpc_real to = KOOPMPC_FN(floor)(koopmpc_clip(place_of(high, i), -1, last) + NEAR_LEVEL);
+  const koopmpc_real from = KOOPMPC_FN(ceil)(koopmpc_clip(place_of(low, i), -1, last) - KOOPMPC_NEAR_LEVEL);
+  const koopmpc_real to = KOOPMPC_FN(floor)(koopmpc_clip(place_of(high, i), -1, last) + KOOPMPC_NEAR_LEVEL);
   *least = from > 0 ? (int)from : 0;
   *most = to < last - 1 ? (int)to : koopmpc_level_count[i] - 1;
 }
@@ -54,7 +56,7 @@ static void levels_inside(koopmpc_real low, koopmpc_real high, int i, int *least
 void koopmpc_start_levels(koopmpc_state *s, const koopmpc_real *u) {
   for (int i = 0; i < NU; i++) {
     s->level[i] = nearest_level(u[i], i);
-    s->level_steps[i] = FREE_TO_CHANGE;
+    s->level_steps[i] = KOOPMPC_FREE;
   }
   s->level_begins = 1;
   s->most_nodes = KOOPMPC_NODES;
@@ -63,7 +65,7 @@ void koopmpc_start_levels(koopmpc_state *s, const koopmpc_real *u) {
 void koopmpc_count_levels(koopmpc_state *s, const koopmpc_real *u) {
   for (int i = 0; i < NU; i++) {
     const int level = nearest_level(u[i], i), changed = level != s->level[i] && !s->level_begins;
-    s->level_steps[i] = changed ? 1 : s->level_steps[i] < FREE_TO_CHANGE ? s->level_steps[i] + 1 : FREE_TO_CHANGE;
+    s->level_steps[i] = changed ? 1 : s->level_steps[i] < KOOPMPC_FREE ? s->level_steps[i] + 1 : KOOPMPC_FREE;
     s->level[i] = level;
   }
   s->level_begins = 0;
@@ -73,8 +75,8 @@ void koopmpc_round_levels(const koopmpc_state *s, koopmpc_real *u, const koopmpc
   for (int i = 0; i < NU; i++) {
     int level = nearest_level(u[i], i), least, most;
 #if KOOPMPC_RATED
-    const koopmpc_real from = KOOPMPC_FN(ceil)(place_of(before[i] + KOOPMPC_RATES_LOW(s)[i], i) - NEAR_LEVEL);
-    const koopmpc_real to = KOOPMPC_FN(floor)(place_of(before[i] + KOOPMPC_RATES_HIGH(s)[i], i) + NEAR_LEVEL);
+    const koopmpc_real from = KOOPMPC_FN(ceil)(place_of(before[i] + KOOPMPC_RATES_LOW(s)[i], i) - KOOPMPC_NEAR_LEVEL);
+    const koopmpc_real to = KOOPMPC_FN(floor)(place_of(before[i] + KOOPMPC_RATES_HIGH(s)[i], i) + KOOPMPC_NEAR_LEVEL);
     if (from <= to && from < (koopmpc_real)koopmpc_level_count[i] && to >= 0)
       level = (int)koopmpc_clip((koopmpc_real)level, from, to);
 #else
@@ -114,7 +116,7 @@ int koopmpc_accept_levels(koopmpc_state *s) {
   for (int at = 0; at < KOOPMPC_MOVES; at++) {
     const koopmpc_real place = place_of(s->t[at], at % NU);
     levels[at] = (int)KOOPMPC_FN(rint)(place);
-    if (!(koopmpc_abs(place - (koopmpc_real)levels[at]) <= NEAR_LEVEL)) return 0;
+    if (!(koopmpc_abs(place - (koopmpc_real)levels[at]) <= KOOPMPC_NEAR_LEVEL)) return 0;
   }
   if (!keeps_dwell(s, levels)) return 0;
   for (int at = 0; at < KOOPMPC_MOVES; at++) s->plan_levels[at] = levels[at];
@@ -201,7 +203,7 @@ static koopmpc_real look(const koopmpc_state *s, search *now, int *nodes) {
     const int i = koopmpc_free_move[j] % NU, *level = now->level + j * NU, *steps = now->steps + j * NU;
     int next, *to = now->level + (j + 1) * NU, *held = now->steps + (j + 1) * NU;
     koopmpc_real cost = next_cost(now, j, &next), paid;
-    if (next < now->least[j] || (now->has && cost >= now->best * BETTER)) {
+    if (next < now->least[j] || (now->has && cost >= now->best * KOOPMPC_BETTER)) {
       j--;
       continue;
     }
@@ -224,7 +226,7 @@ static koopmpc_real look(const koopmpc_state *s, search *now, int *nodes) {
     paid = price(now, now->s, j);
     if (paid < 0) continue;
     cost += paid;
-    if (now->has && cost >= now->best * BETTER) continue;
+    if (now->has && cost >= now->best * KOOPMPC_BETTER) continue;
     if (j + 1 == COUNT) {
       now->best = cost;
       now->has = 1;
@@ -282,7 +284,7 @@ koopmpc_status koopmpc_search_levels(koopmpc_state *s, const koopmpc_real *low, 
   report->iterations += nodes;
   s->has_levels = now.has;
   if (!now.has) return bound < KOOPMPC_HUGE ? KOOPMPC_MAX_ITERATIONS : KOOPMPC_INFEASIBLE;
-  if (bound < now.best * BETTER) {
+  if (bound < now.best * KOOPMPC_BETTER) {
     const koopmpc_real least = bound > 0 ? bound : 0;
     report->gap = (now.best - least) / now.best;
   }
