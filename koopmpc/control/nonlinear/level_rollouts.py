@@ -6,6 +6,7 @@ are left.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -75,13 +76,12 @@ class LevelRollouts:
         p, held, nu, k = self._problem, self._held, len(self._problem.R), 0
         S, cost = s[None], np.zeros(1)
         taken, level, steps = np.zeros((1, 0, nu), np.intp), held.index[None], held.steps[None]
-        dwell, inputs = held.levels.dwell, np.arange(nu)
         for move, length in enumerate(self._blocks):
             ranges = [range(low, high + 1) for low, high in zip(box.low[move], box.high[move], strict=True)]
-            each = np.array(list(itertools.product(*ranges)), np.intp).reshape(-1, nu)
-            if len(S) * len(each) > MOST:
+            if len(S) * math.prod(map(len, ranges)) > MOST:
                 break
-            bound = steps < dwell[inputs, (level != 0).astype(np.intp)]
+            each = np.array(list(itertools.product(*ranges)), np.intp)
+            bound = steps < held.levels.least(level)
             at, which = np.nonzero(~(bound[:, None] & (each[None] != level[:, None])).any(axis=-1))
             S, cost, chosen = S[at], cost[at], each[which]
             steps = np.where(chosen != level[at], 0, steps[at]) + length

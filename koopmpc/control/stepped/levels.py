@@ -67,7 +67,7 @@ class InputLevels(Value):
         least, most = np.ceil(low - NEAR), np.floor(high + NEAR)
         return LevelBox(np.maximum(least, 0).astype(np.intp), np.minimum(most, self.count - 1).astype(np.intp))
 
-    def least(self, index: Int[np.ndarray, " leveled"]) -> Int[np.ndarray, " leveled"]:
+    def least(self, index: Int[np.ndarray, "*rows leveled"]) -> Int[np.ndarray, "*rows leveled"]:
         """Return for how many steps each input has to hold the level of this index."""
         return np.where(index == 0, self.dwell[:, 0], self.dwell[:, 1])
 
