@@ -194,8 +194,6 @@ class Compiled:
         self._connect()
         self.reset()
 
-    _table: Float[np.ndarray, "found size"] | None = None  # the targets that C reads
-
     def _connect(self) -> None:
         """Make the arrays and the frame that a call passes."""
         self._token, self._inside = [0], 0
@@ -242,9 +240,9 @@ class Compiled:
         if self._targets is not None:
             self._last_rows = rows.tobytes()
             table = self._targets.of(rows)
-            if table is self._table and len(rows):
+            if len(rows) and table is self._table:
                 return
-            self._table = table
+            self._table = table  # which C reads
             self._code.koopmpc_use_targets(point_to(self._memory), point_to(self._table), len(self._table))
 
     def _pass_bounds(self, limits: Limits, first: int) -> None:

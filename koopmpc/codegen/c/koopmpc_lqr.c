@@ -53,7 +53,6 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
   int opened;
   koopmpc_fill(expected, s->has_z ? 0 : (koopmpc_real)NAN, KOOPMPC_NY);
   if (s->has_z) {
-    koopmpc_fill(next, 0, KOOPMPC_NZ);
     koopmpc_add(next, koopmpc_A, KOOPMPC_NZ, s->from, KOOPMPC_NZ);
     koopmpc_add(next, koopmpc_B, KOOPMPC_NZ, s->last, KOOPMPC_NU);
     if (KOOPMPC_NW) koopmpc_add(next, koopmpc_E, KOOPMPC_NZ, s->w, KOOPMPC_NW);

@@ -94,8 +94,6 @@ class NonlinearMPC(StagedMPC):
     'OPTIMAL'
     """
 
-    _limits_now: StageLimits | None = None  # of this step, where they differ from those of the stages
-
     @raise_swallowed()  # CasADi swallows a Ctrl-C while it builds expressions
     def __init__(
         self,
@@ -148,13 +146,13 @@ class NonlinearMPC(StagedMPC):
         self._shooting = Shooting(self._problem, self._map.theta, *self._options)
         self._rollouts: LevelRollouts | None = None
         levels, p = self._levels, self._problem
+        self._stage_limits = p.stage_limits  # of this step
         if levels is not None and levels.index.shape == (len(self._blocks), self.nu) and not p.own:
             self._rollouts = LevelRollouts(p, self._map.theta, levels.held, self._blocks)
 
     def _limit(self, limits: StageLimits | None) -> None:
-        self._limits_now = limits
-        low, high = self._problem.stage_limits if limits is None else limits.stages
-        nu = self.nu
+        self._stage_limits = self._problem.stage_limits if limits is None else limits.stages
+        (low, high), nu = self._stage_limits, self.nu
         self._shooting.set_limits(Interval(low[:, :nu], high[:, :nu]), Interval(low[:, nu:], high[:, nu:]))
 
     def _weigh(self, Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N m"]) -> None:
@@ -230,8 +228,7 @@ class NonlinearMPC(StagedMPC):
 
         end, found = None if np.isinf(deadline) else deadline, None
         if self._rollouts is not None:
-            limits = self._problem.stage_limits if self._limits_now is None else self._limits_now.stages
-            stages = StageData(self._targets, self._e, self._W, shooting.weights, limits, first)
+            stages = StageData(self._targets, self._e, self._W, shooting.weights, self._stage_limits, first)
             best = self._rollouts.find(s, stages, root, search.guess())
             if best is not None:
                 found = search.find(relax, LevelBox(best, best.copy()), relaxed, end, relaxed.cost)
