@@ -68,6 +68,11 @@ _BELOW_ROUNDING = 1e26  # up to this ‖by‖², 1e30 less an entry of `by` stil
 _AFTER = 5e-5  # what a step still has to do after its solve [s]
 
 
+def move_limits(limits: Interval, by: Float[np.ndarray, " m"]) -> Interval:
+    """Return limits less `by`; those that a wild reading moves beyond 1e30 end there, as in C."""
+    return Interval(np.minimum(limits.low - by, INFINITY), np.maximum(limits.high - by, -INFINITY))
+
+
 class QPSolver(ABC):
     """A QP set up once in a solver with its own `settings`: limits move from solve to solve, P, q and A now and then.
 
@@ -127,21 +132,21 @@ class QPSolver(ABC):
         self._in_order_array = np.frombuffer(self._in_order, bool)
 
     def shift(self, by: Float[np.ndarray, " m"]) -> None:
-        """Set the limits to those of the QP less `by`; the old ones stay where that is refused.
+        """Set the limits to those of the QP less `by`, as `move_limits` does; the old ones stay where that is refused.
 
         Raises
         ------
         ShapeError
             `by` has the wrong length.
         DataError
-            It holds NaN, or moves a limit beyond 1e30.
+            It holds NaN.
         """
         if by.shape != self.low.shape:
             raise ShapeError(f"the limits move by shape {by.shape}, the QP has {len(self.low)} rows")
         if by.dot(by) < _BELOW_ROUNDING:
             np.subtract(self._own, by, out=self._now)
         else:
-            self.set_bounds(self._qp.low - by, self._qp.high - by)
+            self.set_bounds(*move_limits(Interval(self._qp.low, self._qp.high), by))
 
     def set_bounds(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
         """Set new limits, ±inf where there is none; the old ones stay where they are refused.
@@ -286,16 +291,23 @@ class StepSolver:
         bounds
             Limits of this step in place of those of the QP.
         """
-        qp, moved, limits, conflict = self.qp, self._moved, bounds, 0.0
-        np.multiply(plan[self._rows], qp.scale, out=moved)
-        if room is not None:
-            limits, conflict = self._widen_rates(room, Interval(qp.low, qp.high) if bounds is None else bounds)
+        moved, limits, conflict = self._limit(plan, room, bounds)
         found, answers = self._ask_all(moved, limits, deadline)
         if not answers or found.status is not Status.OPTIMAL:
             self._last = None
             return found, conflict
         self._last = found
         return found, max(conflict, self._gave_way(found, moved, limits)) if self._soft else conflict
+
+    def _limit(
+        self, plan: Float[np.ndarray, " nv"], room: Interval | None, bounds: Interval | None
+    ) -> tuple[Float[np.ndarray, " m"], Interval | None, float]:
+        """Return how far the plan moves the limits, these, None for the QP's own, and how far hard rates give way."""
+        qp = self.qp
+        moved = np.multiply(plan[self._rows], qp.scale, out=self._moved)
+        if room is None:
+            return moved, bounds, 0.0
+        return moved, *self._widen_rates(room, bounds or Interval(qp.low, qp.high))
 
     def _ask_all(
         self, moved: Float[np.ndarray, " m"], limits: Interval | None, deadline: float | None
@@ -326,10 +338,10 @@ class StepSolver:
         solver = self._solvers[i]
         if solver is None:
             solver = self._solvers[i] = self._turns[i].solver(self.qp, self._turns[i].settings)
-        if limits is None and moved.dot(moved) < _BELOW_ROUNDING:
+        if limits is None:
             solver.shift(moved)
         else:
-            solver.set_bounds(*self._find_room(moved, limits))
+            solver.set_bounds(*move_limits(limits, moved))
         left = None
         if deadline is not None:
             left = deadline - perf_counter()
@@ -347,11 +359,6 @@ class StepSolver:
             return found, found.status is Status.OPTIMAL or found.status is Status.INFEASIBLE
         solved = found.status is Status.OPTIMAL
         return found, solved and (not self._soft or bool(np.all(np.abs(found.y) <= self.qp.softness.linear)))
-
-    def _find_room(self, moved: Float[np.ndarray, " m"], limits: Interval | None) -> Interval:
-        """Return the limits less `moved`; those that a wild reading moves beyond 1e30 end there, as in C."""
-        low, high = (self.qp.low, self.qp.high) if limits is None else limits
-        return Interval(np.minimum(low - moved, INFINITY), np.maximum(high - moved, -INFINITY))
 
     def _gave_way(self, found: QPSolution, moved: Float[np.ndarray, " m"], limits: Interval | None) -> float:
         """Return the largest violation of a soft row above its allowance, in the unit of its limit."""

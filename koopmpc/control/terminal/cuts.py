@@ -12,7 +12,7 @@ from scipy.linalg import cholesky, solve_triangular
 from koopmpc.control.limits import SOFTENED, Interval, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.solvers import FINISHER
-from koopmpc.control.solvers.base import QP, QPSolution, SolverTurn, StepQP, StepSolver
+from koopmpc.control.solvers.base import QP, QPSolution, SolverTurn, StepQP, StepSolver, move_limits
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.terminal.faces import FaceQP, Faces, Price
 
@@ -154,11 +154,9 @@ class BallSolver(StepSolver):
         self, plan: Float[np.ndarray, " nv"], room: Interval | None, bounds: Interval | None
     ) -> StepLimits:
         """Return what limits w in this step; see `StepSolver.solve`."""
-        qp, limits, conflict = self.qp, bounds, 0.0
-        if room is not None:
-            limits, conflict = self._widen_rates(room, bounds or Interval(qp.low, qp.high))
-        moved = np.multiply(plan[self._rows], qp.scale)
-        return StepLimits(moved, limits, self._find_room(moved, limits), conflict)
+        moved, limits, conflict = self._limit(plan, room, bounds)
+        left = move_limits(limits or Interval(self.qp.low, self.qp.high), moved)
+        return StepLimits(moved, limits, left, conflict)
 
     def _accept(self, found: QPSolution, y_0: Float[np.ndarray, " p"], known: StepLimits) -> tuple[QPSolution, float]:
         """Keep an answer, and return it with how far a soft limit or the ball gave way."""
