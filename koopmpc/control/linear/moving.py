@@ -20,7 +20,8 @@ class PlanParts(NamedTuple):
 
     `box` holds the limits of v. There are no `targets` where none enters the plan. `limited` says which of their
     limited values have limits, or may get some in time, and `drive` is what [z; u_{−1}; g] adds to these. `buffer`
-    begins with [z; u_{−1}; g; 1] of a step, and has room for a reference.
+    begins with [z; u_{−1}; g; 1] of a step, and has room for a reference. A plan is `driven` where a
+    known disturbance moves targets, too.
     """
 
     fixed: Float[np.ndarray, "nv n"]
@@ -30,6 +31,7 @@ class PlanParts(NamedTuple):
     targets: Targets | None
     limited: Bool[np.ndarray, " nl"]
     drive: Float[np.ndarray, "nk n"]
+    driven: bool
     buffer: Float[np.ndarray, " n"]
 
 
@@ -73,17 +75,18 @@ class MovingMap(Viewing):
         self.reach = HUGE  # least |r| for which a limit may move a target
         if targets is not None:
             K, drive = targets.rows[limited] @ targets.from_reference, parts.drive
-            shift, reach = targets.rows[limited] @ targets.offset, ROUNDING * targets.size[limited]
+            shift, rounding = targets.rows[limited] @ targets.offset, ROUNDING * targets.size[limited]
+            low_end = np.maximum(targets.low[limited] - rounding, -HUGE)
+            high_end = np.minimum(targets.high[limited] + rounding, HUGE)
+            found = find_reach(K, (low_end - shift)[None], (high_end - shift)[None])
+            self.reach = -1.0 if parts.driven else float(found[0])
             if held:
                 matrix, shift = np.vstack([matrix, np.column_stack([drive, shift, K])]), 0.0 * shift
             else:
                 self.from_row = np.ascontiguousarray(K.T)
                 self.drive = np.column_stack([drive, 0.0 * shift]) if drive.any() else None
-            ends = np.maximum(targets.low[limited] - reach, -HUGE), np.minimum(targets.high[limited] + reach, HUGE)
-            pushed = targets.rows[limited] @ targets.offset
-            self.reach = float(find_reach(K, *(np.atleast_2d(end - pushed) for end in ends))[0])
-            low.append(np.tile(ends[0] - shift, steps))
-            high.append(np.tile(ends[1] - shift, steps))
+            low.append(np.tile(low_end - shift, steps))
+            high.append(np.tile(high_end - shift, steps))
         self.matrix, self.limits = np.ascontiguousarray(matrix), np.concatenate([*low, *high])
         self.t, self.buffer = np.zeros(len(self.limits) // 2), parts.buffer
         self._first, self.shape, self._n = fixed.shape[1] + 1, (steps, nr), n

@@ -163,14 +163,11 @@ class PlanMap(Viewing):
             limited=self.limited_targets,
             buffer=buffer,
             drive=fixed[nv : nv + count] if len(fixed) > nv else np.zeros((count, fixed.shape[1])),
+            driven=driven,
         )
         nr = len(track.tracked)
         self.moving, self.single = MovingMap.of(parts, nr)
         self.row_shape, self.rows_shape = (nr,), (horizon.N + 1, nr)
-        if driven and self.aimed:  # a disturbance moves targets too
-            for part in (self.moving, self.single):
-                if part is not None:
-                    part.reach = -1.0
 
     def restore_limits(self) -> None:
         """Set the limits that hold where none move in time."""
