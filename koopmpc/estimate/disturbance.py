@@ -181,7 +181,6 @@ class DisturbanceObserver(Viewing, Measured):
         self._memory, self._C = np.zeros(self._rule.numel_in(2)), np.zeros(self.ny * own.nz)
         self._predicted, self._still = np.zeros(own.nz), np.zeros(own.nz)
         self._stood_in = False  # whether a prediction stood in for a part of the last reading
-        self._bridged = 0  # missed readings in sequence that the prediction has bridged
         self._see()
         self._take(model)
 
@@ -207,7 +206,7 @@ class DisturbanceObserver(Viewing, Measured):
         """Forget the last state, all misfits, d and the past; x0 will come as the first measurement."""
         super().reset(x0)
         self._memory[:] = 0.0
-        self._stood_in, self._bridged = False, 0
+        self._stood_in = False
 
     def program(self) -> DisturbanceProgram:
         """Return the data with which z and d are found."""

@@ -76,9 +76,9 @@ class PeriodicObserver(Measured):
         n = 1 + 2 * len(self._turns)
         self._theta: Float[np.ndarray, "n nz"] = np.zeros((n, self._model.nz))
         self._P: Float[np.ndarray, "n n"] = np.eye(n)
-        self._last: Float[np.ndarray, " nz"] = np.full(self._model.nz, np.nan)
+        self._last: Float[np.ndarray, " nz"] = self._nothing_z
         self._k: int = 0
-        self._stood_in, self._bridged = False, 0
+        self._stood_in = False
 
     def program(self) -> EstimatorProgram:
         """Raise the DataError that says why no C code can be generated.
@@ -97,7 +97,7 @@ class PeriodicObserver(Measured):
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y, and learn from the misfit of the step that led here."""
-        gate, predicted = self._gate, np.full(self._model.nz, np.nan)
+        gate, predicted = self._gate, self._nothing_z
         assert gate is not None, "it remembers readings"
         phi = make_regressor(self._turns, self._k - 1)
         expected = self._nothing
@@ -107,7 +107,7 @@ class PeriodicObserver(Measured):
             expected = after[: self.ny] if self._to_y is None else self._to_y.dot(after)
         stands_in = gate.judge(y, expected)
         if gate.lost:
-            self._theta[:], self._P, predicted = 0.0, np.eye(len(self._P)), np.full(self._model.nz, np.nan)
+            self._theta[:], self._P, predicted = 0.0, np.eye(len(self._P)), self._nothing_z
             if self._history is not None:
                 self._history.reset()
         if stands_in:
