@@ -136,18 +136,36 @@ def has_optimum(problem):
     raise AssertionError(problem.status)
 
 
-def solve_cone_program(model, cost, box, x0, N, Q_N, W):
-    """Return the inputs and the states of a plan that ends in {xᵀW x ≤ 1}, by Clarabel, None where there is none."""
+def draw_ellipsoid(rng, sizes, horizons, stretch, least):
+    """Return a model, a cost with an end of its own, a horizon and an ellipsoid; the last two say how thin this is."""
+    model = draw_model(rng, n=int(rng.integers(*sizes)))
+    n, N = model.nx, int(rng.integers(*horizons))
+    root = rng.normal(size=(n, n)) + 0.3 * np.eye(n)
+    W = root.T @ root * 10 ** rng.uniform(0, stretch) + least * np.eye(n)
+    Q_N = np.diag(rng.uniform(0.1, 1, n))
+    cost = km.Cost(Q=rng.uniform(0.1, 2, n), R=rng.uniform(0.05, 1, model.nu), Q_N=Q_N)
+    return model, cost, N, km.guarantees.TerminalSet(np.zeros(n), of=km.State(), W=W)
+
+
+def solve_cone_program(mpc, x0, prices=None):
+    """Return a plan's inputs and how far it ends outside its ellipsoid, by Clarabel; None where there is no plan.
+
+    The `prices` are those of leaving the limits of states and the ellipsoid; without them both are hard.
+    """
     import cvxpy as cp
 
+    model, cost, limits, N = mpc.predictor, mpc.cost, mpc.limits, mpc.horizon
     X, U = cp.Variable((N + 1, model.nx)), cp.Variable((N, model.nu))
-    root, end = np.linalg.cholesky(W).T, np.linalg.cholesky(Q_N).T
-    tracked = cp.sum_squares(X[1:N] @ np.diag(np.sqrt(cost.Q))) if N > 1 else 0
-    spent = tracked + cp.sum_squares(U @ np.diag(np.sqrt(cost.R))) + cp.sum_squares(end @ X[N])
-    keeps = [X[0] == x0, box["u_min"] <= U, box["u_max"] >= U, cp.norm(root @ X[N]) <= 1]
-    keeps += [X[1:] == X[:-1] @ model.A.T + U @ model.B.T, X[1:] <= np.tile(box["x_max"], (N, 1))]
-    problem = cp.Problem(cp.Minimize(spent), keeps)
-    return (U.value, X.value) if has_optimum(problem) else None
+    root, end = np.linalg.cholesky(limits.terminal.W).T, np.linalg.cholesky(cost.Q_N).T
+    spent = cp.sum_squares(X[1:N] @ np.diag(np.sqrt(cost.Q))) + cp.sum_squares(end @ X[N])
+    spent += cp.sum_squares(U @ np.diag(np.sqrt(cost.R)))
+    over, past = np.zeros((N, model.nx)), cp.Constant(0)
+    if prices is not None:
+        over, past = cp.Variable((N, model.nx), nonneg=True), cp.Variable(nonneg=True)
+        spent += prices[0] * cp.sum(over) + prices[1] * cp.sum_squares(over) + prices[2] * past + prices[3] * past**2
+    keeps = [X[0] == x0, limits.u_min <= U, limits.u_max >= U, cp.norm(root @ X[N]) <= 1 + past]
+    keeps += [X[1:] == X[:-1] @ model.A.T + U @ model.B.T, X[1:] <= np.tile(limits.x_max, (N, 1)) + over]
+    return (U.value, float(past.value)) if has_optimum(cp.Problem(cp.Minimize(spent), keeps)) else None
 
 
 def compare_with_cone_program(seeds):
@@ -155,18 +173,12 @@ def compare_with_cone_program(seeds):
     agreed = active = infeasible = 0
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        model = draw_model(rng, n=int(rng.integers(2, 6)))
-        n, nu, N = model.nx, model.nu, int(rng.integers(2, 9))
-        root = rng.normal(size=(n, n)) + 0.3 * np.eye(n)
-        W = root.T @ root * 10 ** rng.uniform(0, 4) + 1e-3 * np.eye(n)
-        Q_N = np.diag(rng.uniform(0.1, 1, n))
-        cost = km.Cost(Q=rng.uniform(0.1, 2, n), R=rng.uniform(0.05, 1, nu), Q_N=Q_N)
-        box = {"u_min": -1.0, "u_max": 1.0, "x_max": rng.uniform(1, 3, n)}
-        end = km.guarantees.TerminalSet(np.zeros(n), of=km.State(), W=W)
-        limits = km.Limits(**box, slack=None, terminal=end, terminal_slack=None)
+        model, cost, N, end = draw_ellipsoid(rng, (2, 6), (2, 9), stretch=4, least=1e-3)
+        n = model.nx
+        limits = km.Limits(-1, 1, x_max=rng.uniform(1, 3, n), slack=None, terminal=end, terminal_slack=None)
         mpc = km.KoopmanMPC(model, cost, limits, horizon=N)
         x0 = rng.normal(size=n) * rng.uniform(0.2, 1.5)
-        move, oracle = mpc(x0, np.zeros(n)), solve_cone_program(model, cost, box, x0, N, Q_N, W)
+        move, oracle = mpc(x0, np.zeros(n)), solve_cone_program(mpc, x0)
         if oracle is None:
             assert move.status is km.Status.INFEASIBLE, (seed, move.status)
             infeasible += 1
@@ -195,50 +207,27 @@ def test_five_hundred_ellipsoids_are_those_of_a_cone_program():
     assert active >= 80
 
 
-def solve_priced_program(model, cost, box, prices, x0, N, Q_N, W):
-    """Return the inputs of a plan whose soft limits and whose ellipsoid {xᵀW x ≤ 1} have a price, by Clarabel."""
-    import cvxpy as cp
-
-    X, U = cp.Variable((N + 1, model.nx)), cp.Variable((N, model.nu))
-    over, past = cp.Variable((N, model.nx), nonneg=True), cp.Variable(nonneg=True)
-    root, end = np.linalg.cholesky(W).T, np.linalg.cholesky(Q_N).T
-    spent = cp.sum_squares(X[1:N] @ np.diag(np.sqrt(cost.Q))) + cp.sum_squares(end @ X[N])
-    spent += cp.sum_squares(U @ np.diag(np.sqrt(cost.R)))
-    spent += prices[0] * cp.sum(over) + prices[1] * cp.sum_squares(over) + prices[2] * past + prices[3] * past**2
-    keeps = [X[0] == x0, box["u_min"] <= U, box["u_max"] >= U, cp.norm(root @ X[N]) <= 1 + past]
-    keeps += [X[1:] == X[:-1] @ model.A.T + U @ model.B.T, X[1:] <= np.tile(box["x_max"], (N, 1)) + over]
-    problem = cp.Problem(cp.Minimize(spent), keeps)
-    assert has_optimum(problem)
-    return U.value, float(past.value)
-
-
 def compare_with_priced_program(seeds):
     """Return how many plans agreed with Clarabel's, of these those that leave the ellipsoid, and break limits, too."""
     left = broken = 0
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        model = draw_model(rng, n=int(rng.integers(1, 5)))
-        n, nu, N = model.nx, model.nu, int(rng.integers(2, 7))
-        root = rng.normal(size=(n, n)) + 0.3 * np.eye(n)
-        W = root.T @ root * 10 ** rng.uniform(0, 2) + 1e-2 * np.eye(n)
-        Q_N = np.diag(rng.uniform(0.1, 1, n))
-        cost = km.Cost(Q=rng.uniform(0.1, 2, n), R=rng.uniform(0.05, 1, nu), Q_N=Q_N)
-        prices = rng.uniform([1, 0.1, 1, 0.1], [10, 3, 10, 3])
-        box = {"u_min": -1.0, "u_max": 1.0, "x_max": rng.uniform(0.5, 2, n)}
-        end = km.guarantees.TerminalSet(np.zeros(n), of=km.State(), W=W)
-        limits = km.Limits(**box, slack=tuple(prices[:2]), terminal=end, terminal_slack=tuple(prices[2:]))
+        model, cost, N, end = draw_ellipsoid(rng, (1, 5), (2, 7), stretch=2, least=1e-2)
+        n, prices = model.nx, rng.uniform([1, 0.1, 1, 0.1], [10, 3, 10, 3])
+        x_max, slack, terminal_slack = rng.uniform(0.5, 2, n), tuple(prices[:2]), tuple(prices[2:])
+        limits = km.Limits(-1, 1, x_max=x_max, slack=slack, terminal=end, terminal_slack=terminal_slack)
         mpc = km.KoopmanMPC(model, cost, limits, horizon=N)
         x = rng.normal(size=n) * rng.uniform(0.5, 2)
         for _ in range(3):  # the second and the third step begin at the active rows of the one before
             move = mpc(x, np.zeros(n))
-            U, past = solve_priced_program(model, cost, box, prices, x, N, Q_N, W)
+            U, past = solve_cone_program(mpc, x, prices)
             plan = mpc.plan()
             assert move.status in (km.Status.OPTIMAL, km.Status.UNCONSTRAINED, km.Status.SOFTENED), (seed, move.status)
             assert np.abs(plan.U - U).max() < 2e-4, (seed, plan.U - U)
             gauge = float(end.measure(plan.X[-1])) - 1
             assert abs(max(gauge, 0) - past) < 1e-4, seed
             left += past > 1e-4
-            broken += past > 1e-4 and (plan.X[1:] > box["x_max"] + 1e-4).any()
+            broken += past > 1e-4 and (plan.X[1:] > x_max + 1e-4).any()
             x = model.A @ x + model.B @ move.u
     return left, broken
 
