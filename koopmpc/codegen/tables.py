@@ -7,23 +7,19 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.codegen import tolerances
 from koopmpc.control.limits import Interval
 from koopmpc.control.linear.condensed_program import BoundsProgram, CondensedProgram
 from koopmpc.control.lqr import FeedbackProgram
 from koopmpc.control.nonlinear import motion
-from koopmpc.control.nonlinear.bilinear_mpc import SETTLED
-from koopmpc.control.nonlinear.equilibrium import PSEUDO, RANK
-from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
-from koopmpc.control.nonlinear.iteration import DIGITS, ENOUGH, MOST, PRECISE, STUCK
+from koopmpc.control.nonlinear.iteration import MOST
 from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.nonlinear.stagewise import list_hard_outputs
 from koopmpc.control.program import LinearProgram, Published, StepProgram, no_export
-from koopmpc.control.riccati import SETTLED as RESTED
 from koopmpc.control.solvers.daqp import FEW
-from koopmpc.control.stepped.levels import FREE, NEAR
+from koopmpc.control.stepped.levels import FREE
 from koopmpc.control.stepped.search import NODES
-from koopmpc.control.stepped.sequences import EQUAL, LevelsProgram
-from koopmpc.control.target import ROUNDING
+from koopmpc.control.stepped.sequences import LevelsProgram
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import EXACT, DisturbanceProgram
 from koopmpc.estimate.gate import BRIDGED
@@ -36,38 +32,6 @@ Precision = Literal["double", "float"]
 
 _ZERO_ROW = 1e-11  # DAQP leaves a row as it is if its squared length is below this
 
-# DAQP's tolerances in single precision: its own are below the rounding of a float.
-_SINGLE = {
-    "primal_tol": 1e-5, "dual_tol": 1e-6, "zero_tol": 1e-6, "pivot_tol": 1e-4,
-    "progress_tol": 1e-7, "sing_tol": 1e-6, "refactor_tol": 1e-5,
-}  # fmt: skip
-_OTHERS = ("cycle_tol", "iter_limit", "eps_prox", "eta_prox", "rho_soft", "rel_subopt", "abs_subopt", "w_soft")
-_C_SETTINGS = (*_SINGLE, "fval_bound", *_OTHERS)
-
-# Tolerances of a StagedProgram: as in Python, and in single precision, whose rounding is 5e8 times as coarse.
-_TOLERANCES = {
-    "PRECISE": (PRECISE, 1e-6),
-    "ENOUGH": (ENOUGH, 1e-4),
-    "DIGITS": (DIGITS, 1e-6),
-    "STUCK": (STUCK, 1e-6),
-    "SETTLED": (SETTLED, 1e-4),
-    "REACH": (1e-9, 1e-5),
-    "RANK": (RANK, 1e-6),
-    "HELD": (HELD, 1e-4),
-    "TURN": (1e-15, 1e-7),
-    "SMALL": (1e-7, 1e-4),
-    "RESTED": (RESTED, 1e-5),
-    "PSEUDO": (PSEUDO, 1e-5),
-    "FITS": (motion.FITS, 1e-4),
-    "GROWS": (motion.GROWS, 1e-3),
-    "DRIFTS": (motion.DRIFTS, 1e-4),
-    "FOLLOWS": (motion.FOLLOWS, 1e-2),
-    "STILL": (motion.STILL, 1e-5),
-    "TERMS": (motion.TERMS, 1e-5),
-    "FLAT": (motion.ROUNDING, 1e-6),
-    "BURSTS": (motion.BURSTS, 1e3),
-    "SEEN": (motion.SEEN, 1e-3),
-}
 _TABLE_NOTE = (
     "`koopmpc_table.h` holds the equilibria of the reference rows that `export` was given, and what the end of the "
     "horizon costs there. Any other row may come at run time: the step that meets it finds its equilibrium from that "
@@ -217,19 +181,12 @@ def _add_settings(tables: Tables, *, single: bool) -> None:
         raise DataError(
             'a time_limit cannot be exported, C has no clock; bound the iterations: settings={"iter_limit": 100}'
         )
-    settings = {name: float(value) for name, value in known.items() if name in _C_SETTINGS}
+    settings = {name: float(value) for name, value in known.items() if name in tolerances.SETTINGS}
     if single:
-        settings |= {name: max(settings[name], least) for name, least in _SINGLE.items()}
+        settings |= {name: max(settings[name], least) for name, least in tolerances.SINGLE.items()}
     tables.settings = settings
-    tables.define(
-        {
-            "PRIMAL_TOL": settings["primal_tol"],
-            "ZERO_TOL": settings["zero_tol"],
-            "WIDER": 1e-5 if single else 1e-8,
-            "ACCURACY": 5e-3 if single else 1e-6,
-            "ROUNDING": 1e-6 if single else ROUNDING,
-        }
-    )
+    tables.define({"PRIMAL_TOL": settings["primal_tol"], "ZERO_TOL": settings["zero_tol"]})
+    tables.define({name: values[single] for name, values in tolerances.OF_ALL.items()})
 
 
 def _add_gate(tables: Tables, gate: Graph | None, ny: int) -> None:
@@ -461,7 +418,7 @@ def _add_levels(tables: Tables, program: LevelsProgram, *, single: bool) -> None
         "NODES": NODES,
         "FREE": FREE,
     }
-    tables.define({"NEAR_LEVEL": 1e-4 if single else NEAR, "BETTER": 1 - (1e-6 if single else EQUAL)})
+    tables.define({name: values[single] for name, values in tolerances.OF_LEVELS.items()})
     whole = {
         "level_count": levels.count,
         "dwell": levels.dwell,
@@ -611,7 +568,8 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         "tail_D": p.tail.R_delta,
         "tail_end": p.tail.end,
     }
-    tables.define({"TAIL_SCALE": p.tail.scale} | {name: values[single] for name, values in _TOLERANCES.items()})
+    tables.define({"TAIL_SCALE": p.tail.scale})
+    tables.define({name: values[single] for name, values in tolerances.OF_STAGES.items()})
     _add_finish(tables, p, low, high)
     _add_estimator(tables, p)
     tables.targets = {"table": p.table}

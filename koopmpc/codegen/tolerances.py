@@ -1,0 +1,45 @@
+"""The tolerances of C code: as in Python, and in single precision, whose rounding is 5e8 times as coarse."""
+
+from koopmpc.control.nonlinear import motion
+from koopmpc.control.nonlinear.bilinear_mpc import SETTLED
+from koopmpc.control.nonlinear.equilibrium import PSEUDO, RANK
+from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
+from koopmpc.control.nonlinear.iteration import DIGITS, ENOUGH, PRECISE, STUCK
+from koopmpc.control.riccati import SETTLED as RESTED
+from koopmpc.control.stepped.levels import NEAR
+from koopmpc.control.stepped.sequences import EQUAL
+from koopmpc.control.target import ROUNDING
+
+# DAQP's tolerances in single precision: its own are below the rounding of a float.
+SINGLE = {
+    "primal_tol": 1e-5, "dual_tol": 1e-6, "zero_tol": 1e-6, "pivot_tol": 1e-4,
+    "progress_tol": 1e-7, "sing_tol": 1e-6, "refactor_tol": 1e-5,
+}  # fmt: skip
+_OTHERS = ("cycle_tol", "iter_limit", "eps_prox", "eta_prox", "rho_soft", "rel_subopt", "abs_subopt", "w_soft")
+SETTINGS = (*SINGLE, "fval_bound", *_OTHERS)
+
+OF_ALL = {"WIDER": (1e-8, 1e-5), "ACCURACY": (1e-6, 5e-3), "ROUNDING": (ROUNDING, 1e-6)}
+OF_LEVELS = {"NEAR_LEVEL": (NEAR, 1e-4), "BETTER": (1 - EQUAL, 1 - 1e-6)}
+OF_STAGES = {
+    "PRECISE": (PRECISE, 1e-6),
+    "ENOUGH": (ENOUGH, 1e-4),
+    "DIGITS": (DIGITS, 1e-6),
+    "STUCK": (STUCK, 1e-6),
+    "SETTLED": (SETTLED, 1e-4),
+    "REACH": (1e-9, 1e-5),
+    "RANK": (RANK, 1e-6),
+    "HELD": (HELD, 1e-4),
+    "TURN": (1e-15, 1e-7),
+    "SMALL": (1e-7, 1e-4),
+    "RESTED": (RESTED, 1e-5),
+    "PSEUDO": (PSEUDO, 1e-5),
+    "FITS": (motion.FITS, 1e-4),
+    "GROWS": (motion.GROWS, 1e-3),
+    "DRIFTS": (motion.DRIFTS, 1e-4),
+    "FOLLOWS": (motion.FOLLOWS, 1e-2),
+    "STILL": (motion.STILL, 1e-5),
+    "TERMS": (motion.TERMS, 1e-5),
+    "FLAT": (motion.ROUNDING, 1e-6),
+    "BURSTS": (motion.BURSTS, 1e3),
+    "SEEN": (motion.SEEN, 1e-3),
+}
