@@ -89,8 +89,10 @@ def write_plant_functions(F: ca.Function, h: ca.Function, language: Language) ->
     Raises
     ------
     DataError
-        The equations cannot be written in C.
+        The equations cannot be written in C, or F takes measured disturbances.
     """
+    if F.n_in() > 2:
+        raise DataError("the plant has measured disturbances, and its C would take u alone; pass plant.at(w)")
     nx, nu = F.size1_in(0), F.size1_in(1)
     step, look = trace_graph(F, "the plant"), trace_graph(h, "what the plant measures")
     functions = {

@@ -96,6 +96,8 @@ class StepMap(Named):
         disturbances: Sequence[str] | None = None,
     ) -> None:
         _check_signature(F, "F", 2)
+        if F.n_in() > 2 and not F.size1_in(2):
+            F = _hold(F, np.zeros(0))
         nx, nu = F.size1_in(0), F.size1_in(1)
         if F.size1_out(0) != nx:
             raise ShapeError(f"F returns {F.size1_out(0)} rows, expected {nx}, one a state")
@@ -159,9 +161,7 @@ class StepMap(Named):
     def at(self, w: ArrayLike) -> "StepMap":
         """Return the map x⁺ = F(x, u, w) of constant measured disturbances w (nw,), which takes x and u alone."""
         values = checks.array(w, "w", (self.nw,))
-        x, u = ca.MX.sym("x", self.nx), ca.MX.sym("u", self.nu)
-        F = ca.Function("F", [x, u], [self.F(x, u, *((ca.DM(values),) if self.nw else ()))], ["x", "u"], ["x_next"])
-        F = F.expand("F") if self.F.is_a("SXFunction") else F
+        F = _hold(self.F, values) if self.nw else self.F
         return StepMap(F, self.dt, self.h, self.states, self.inputs, self.outputs, self.scene)
 
     def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
@@ -297,6 +297,14 @@ def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) ->
     h, outputs = build_output(dynamics)
     names = dynamics.states, dynamics.inputs, outputs
     return StepMap(F, dt, h, *names, find_scene(dynamics), dynamics.disturbances)
+
+
+@raise_swallowed()
+def _hold(F: ca.Function, w: Float[np.ndarray, " nw"]) -> ca.Function:
+    """Return F(x, u) of F(x, u, w) for constant w."""
+    x, u = ca.MX.sym("x", F.size1_in(0)), ca.MX.sym("u", F.size1_in(1))
+    held = ca.Function("F", [x, u], [F(x, u, ca.DM(w))], ["x", "u"], ["x_next"])
+    return held.expand("F") if F.is_a("SXFunction") else held
 
 
 def _as_vector(value: ArrayLike, name: str, length: int) -> Float[np.ndarray, " n"]:

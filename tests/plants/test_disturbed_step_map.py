@@ -43,6 +43,22 @@ def test_a_step_follows_w_and_is_that_of_the_equations(plant):
     assert (twin(x, u, w) == plant(x, u, w)).all()
 
 
+def test_a_w_without_entries_is_no_w():
+    x, u, w = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("w", 0)
+    plant = km.StepMap(ca.Function("F", [x, u, w], [0.9 * x + u]), 0.1)
+    assert plant.nw == 0
+    assert plant([1.0], [0.5]) == plant.at([])([1.0], [0.5]) == plant.rollout([1.0], [[0.5]])[1] == 1.4
+    km.NonlinearMPC(plant, km.Cost(Q=1.0, R=0.1), None, 3)([1.0], [0.0])
+
+
+def test_c_code_of_a_plant_with_w_is_refused_in_a_sentence(plant, tmp_path):
+    calm = plant.at([0.0, 1.0])
+    mpc = km.LinearMPC(calm, [0, 0], [0], COST, LIMITS, 5)
+    km.export(mpc, tmp_path / "calm", plant=calm)
+    with pytest.raises(DataError, match=r"measured disturbances, and its C would take u alone; pass plant\.at\(w\)"):
+        km.export(mpc, tmp_path / "windy", plant=plant)
+
+
 def test_batches_are_single_calls_to_the_bit(plant):
     rng = np.random.default_rng(0)
     X0, U, W = rng.normal(size=(80, 2)), rng.normal(size=(80, 12, 1)), rng.normal(size=(80, 12, 2))
