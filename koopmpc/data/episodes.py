@@ -247,11 +247,6 @@ class Episodes(Named, Value):
         if repeated:
             raise DataError(f"two states or inputs are named {repeated[0]!r}; rename one")
 
-    @property
-    def nw(self) -> int:
-        """Number of measured disturbances."""
-        return len(self.disturbances)
-
     def __len__(self) -> int:
         """Return the number of episodes."""
         return len(self.episodes)

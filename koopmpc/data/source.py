@@ -85,11 +85,6 @@ class Source(Named, ABC):
             Where a part begins inside an episode, it begins this many rows earlier: an embedding needs them.
         """
 
-    @property
-    def nw(self) -> int:
-        """Number of measured disturbances."""
-        return len(self.disturbances)
-
     def driven(self, *, products: bool = False) -> "Source":
         """Return a source with the measured disturbances appended to the inputs, as `Episodes.driven` does."""
         if not self.nw:
