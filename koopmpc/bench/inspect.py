@@ -17,8 +17,8 @@ from koopmpc import checks
 from koopmpc.bench.store import RunRow, load_rows, reached
 from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import DataError, KoopmpcError, LogError
-from koopmpc.loop.metrics import Metrics, beyond, metrics
-from koopmpc.loop.run import SECONDS, Run
+from koopmpc.loop.metrics import Metrics, beyond, find_late, metrics
+from koopmpc.loop.run import Run
 from koopmpc.recording.model import ModelLog, load_model_log
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.writer import record
@@ -184,7 +184,7 @@ def worst_moments(run: Run) -> tuple[Moment, ...]:
     masks = {
         "fallback": np.array([each is not Fallback.NONE for each in run.fallback]),
         "unknown state": run.known == 0,
-        "later than dt": run.solve_time > run.dt * SECONDS.get(run.metadata.get("time unit", "s"), 1.0),
+        "later than dt": find_late(run),
     }
     for name, mask in masks.items():
         begins = np.flatnonzero(mask & ~np.concatenate([[False], mask[:-1]]))

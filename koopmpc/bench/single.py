@@ -161,6 +161,8 @@ def run_closed_loop(
     noise = np.hypot(own, row.noise * parts.spread) if row.noise else case.noise
     scene = problem.scene or getattr(plant, "scene", None)
 
+    pace = (in_real_time(plant.dt * SECONDS[find_time_unit(problem)]),) if paced else ()
+
     def simulate_with(*observers: StepObserver) -> Run:
         run = simulate(
             plant,
@@ -172,9 +174,7 @@ def run_closed_loop(
             noise=noise,
             faults=(*case.faults, *injected),
             rng=row.start,
-            observers=observers
-            if not paced
-            else (*observers, in_real_time(plant.dt * SECONDS[find_time_unit(problem)])),
+            observers=(*observers, *pace),
             plans=plans,
             **about,
         )

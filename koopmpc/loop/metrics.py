@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from koopmpc import checks
 from koopmpc.control.bounds.stage_cost import evaluate_stage
@@ -171,7 +171,7 @@ def metrics(run: Run) -> Metrics:
         solve_time_p50=float(p50),
         solve_time_p99=float(p99),
         solve_time_max=float(run.solve_time.max()),
-        late=int((run.solve_time > run.dt * SECONDS.get(run.metadata.get("time unit", "s"), 1.0)).sum()),
+        late=int(find_late(run).sum()),
         status=dict(Counter(s.name for s in run.status)),
         fallback=dict(Counter(f.name for f in run.fallback)),
         unknown=int((run.known == 0).sum()) if (run.known >= 0).any() else None,
@@ -181,6 +181,11 @@ def metrics(run: Run) -> Metrics:
 
 
 @np.errstate(invalid="ignore", over="ignore")
+def find_late(run: Run) -> Bool[np.ndarray, " T"]:
+    """Return which steps took longer than dt, whose unit the metadata may name."""
+    return run.solve_time > run.dt * SECONDS.get(run.metadata.get("time unit", "s"), 1.0)
+
+
 def running_cost(run: Run) -> Float[np.ndarray, " T1"]:
     """Return the cost so far at every state, from 0 to the cost that `metrics` gives; NaN where there is no Cost."""
     if run.cost is None:
