@@ -277,16 +277,15 @@ class Episodes(Named, Value):
     def driven(self, *, products: bool = False) -> "Episodes":
         """Return these episodes with the measured disturbances appended to the inputs: both drive the plant.
 
-        With `products` the signals uᵢ wⱼ follow, i first.
+        With `products` the signals wⱼ uᵢ follow, all u times the first w first.
         """
         if not self.nw:
             return self
         joined: list[Episode] = []
         for e in self.episodes:
-            crossed = [(e.U[:, i : i + 1] * e.W) for i in range(self.nu)] if products else []
+            crossed = [w[:, None] * e.U for w in e.W.T] if products else []
             joined.append(Episode(X=e.X, U=np.hstack([e.U, e.W, *crossed])))
-        names = tuple(f"{u} * {w}" for u in self.inputs for w in self.disturbances) if products else ()
-        return Episodes(joined, self.dt, self.states, (*self.inputs, *self.disturbances, *names))
+        return Episodes(joined, self.dt, self.states, name_drives(self.inputs, self.disturbances, products=products))
 
     def split(self, fraction: float, rng: np.random.Generator | int = 0) -> "tuple[Episodes, Episodes]":
         """Return (train, held_out): whole episodes drawn at random, of which `fraction` trains.
@@ -466,6 +465,12 @@ class PlantSignature:
                     f"{place} names the {what} {_quote(theirs)}, {self.place} {_quote(mine)}; "
                     "rename them, or leave it out"
                 )
+
+
+def name_drives(inputs: tuple[str, ...], disturbances: tuple[str, ...], *, products: bool) -> tuple[str, ...]:
+    """Return the names of the signals of `Episodes.driven`."""
+    crossed = tuple(f"{u} * {w}" for w in disturbances for u in inputs) if products else ()
+    return (*inputs, *disturbances, *crossed)
 
 
 def join_sets(sets: Sequence[Episodes]) -> Episodes:

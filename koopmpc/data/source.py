@@ -7,7 +7,7 @@ from functools import partial
 from itertools import chain
 from typing import cast
 
-from koopmpc.data.episodes import Episodes, PlantSignature, explain_wrong_data, join_sets
+from koopmpc.data.episodes import Episodes, PlantSignature, explain_wrong_data, join_sets, name_drives
 from koopmpc.errors import DataError
 from koopmpc.values import Named
 
@@ -89,9 +89,8 @@ class Source(Named, ABC):
         """Return a source with the measured disturbances appended to the inputs, as `Episodes.driven` does."""
         if not self.nw:
             return self
-        names = tuple(f"{u} * {w}" for u in self.inputs for w in self.disturbances) if products else ()
         change = partial(Episodes.driven, products=products)
-        return Changed(self, change, self.states, (*self.inputs, *self.disturbances, *names))
+        return Changed(self, change, self.states, name_drives(self.inputs, self.disturbances, products=products))
 
 
 class Held(Source):

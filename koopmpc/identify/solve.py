@@ -289,22 +289,18 @@ class BilinearColumns:
     def arrange(
         self, rows: RegressionRows, products: Int[np.ndarray, " np"], which: Int[np.ndarray, " nk"]
     ) -> RegressionRows:
-        """Return these columns of rows [ψ u w u⊗w u⊗ψ w⊗ψ …], with only the `products` in `which` in the last two."""
-        nz, nu, nw = self.nz, self.nu, self.nw
-        crossed = [nz + nu + nw + nw * i + j for j in range(nw) for i in range(nu)] if self.crossed else []
-        first = nz + nu + nw + len(crossed)
-        block = np.flatnonzero(np.isin(products, which))
-        order = [np.arange(nz), np.array(crossed, dtype=np.intp), nz + np.arange(nu + nw)]
-        order += [first + i * len(products) + block for i in range(nu + nw)]
+        """Return these columns of rows [ψ u w w⊗u u⊗ψ w⊗ψ …], with only the `products` in `which` in the last two."""
+        nz, drives = self.nz, self.nu + self.nw
+        end, block = self.first + drives, np.flatnonzero(np.isin(products, which))
+        order = [np.arange(nz), np.arange(nz + drives, end), np.arange(nz, nz + drives)]
+        order += [end + i * len(products) + block for i in range(drives)]
         return replace(rows, P=rows.P[:, np.concatenate(order)])
 
     def name(
         self, signals: tuple[str, ...], observables: tuple[str, ...], which: Int[np.ndarray, " nk"]
     ) -> tuple[str, ...]:
-        """Return the names of all columns behind ψ; u and w are the first of the signals."""
-        drives = signals[: self.nu + self.nw]
-        inputs, disturbances = drives[: self.nu], drives[self.nu :]
-        crossed = [f"{u} * {w}" for w in disturbances for u in inputs] if self.crossed else []
+        """Return the names of all columns behind ψ, of the signals u, w and w⊗u."""
+        drives, crossed = signals[: self.nu + self.nw], signals[self.nu + self.nw :]
         return (*crossed, *drives, *(f"{u} * {observables[int(i)]}" for u in drives for i in which))
 
     def centre(

@@ -278,7 +278,12 @@ class BilinearPredictor(Predictor):
     @property
     def is_scheduled(self) -> bool:
         """Whether a measured disturbance multiplies the state or an input."""
-        return bool(self.S.any() or self.M.any())
+        return bool(self.S.any()) or self.multiplies_inputs
+
+    @property
+    def multiplies_inputs(self) -> bool:
+        """Whether a measured disturbance multiplies an input."""
+        return bool(self.M.any())
 
     def at(self, w: ArrayLike) -> "BilinearPredictor":
         """Return the model without measured disturbances for constant ones, w: A + Σ wⱼ Sⱼ for A, B + Σ wⱼ Mⱼ for B.

@@ -441,7 +441,7 @@ def _build_task(candidate: Candidate, total: Moments, nw: int) -> Regression:
 
 
 def _list_columns(task: Regression, nw: int) -> BilinearColumns:
-    """Return the columns of a bilinear candidate, whose signals are u, w and u⊗w."""
+    """Return the columns of a bilinear candidate, whose signals are u, w and w⊗u."""
     return BilinearColumns(task.lifting.nz, (len(task.inputs) - nw) // (1 + nw), nw, crossed=nw > 0)
 
 

@@ -57,13 +57,12 @@ def compute_moments(
     """
     source_of(episodes)
     if isinstance(model, Lifting):
-        lifting, driven = model, not bilinear
+        lifting, driven, crossed = model, not bilinear, False
     else:
         checks.kind(model, "model", (LinearPredictor, BilinearPredictor), "pass a model, or a lifting")
         check_same_names(model, episodes)
         lifting, embedding, bilinear = model.lifting, model.embedding, isinstance(model, BilinearPredictor)
-        driven = model.nw > 0
-    crossed = not isinstance(model, Lifting) and isinstance(model, BilinearPredictor) and bool(model.M.any())
+        driven, crossed = model.nw > 0, isinstance(model, BilinearPredictor) and model.multiplies_inputs
     rows = episodes.driven(products=crossed) if driven else episodes
     return second_moments(rows, lifting, embedding=embedding, route="qr", bilinear=bilinear)
 
@@ -153,7 +152,7 @@ def _step_matrix(predictor: AnyPredictor, total: Moments) -> Float[np.ndarray, "
     constant = np.setdiff1d(np.arange(total.nz), products)  # u times the Constant is u: add it to the inputs
     crossed = len(total.inputs) - predictor.nu - predictor.nw  # the products of u and w multiply no observable
     every = np.concatenate([predictor.N, predictor.S, np.zeros((crossed, total.nz, total.nz))])
-    M = predictor.M.transpose(2, 0, 1).reshape(-1, total.nz)[:crossed]
+    M = predictor.M.transpose(0, 2, 1).reshape(-1, total.nz)[:crossed]
     B = np.vstack([predictor.B.T, predictor.E.T, M]) + every[:, :, constant].sum(axis=2)
     N = every[:, :, products].transpose(0, 2, 1).reshape(-1, total.nz)
     return np.vstack([A, B, N])

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeGuard
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -172,13 +171,14 @@ def compare_forecasts(
     """
     first = models[0]
     nx, nz, past = first.nx, first.nz, first.embedding
-    M, G, C = (np.array(parts) for parts in zip(*map(_transpose_matrices, models), strict=True))
+    crossed = any(isinstance(model, BilinearPredictor) and model.multiplies_inputs for model in models)
+    M, G, C = (np.array(parts) for parts in zip(*(_transpose_matrices(each, crossed) for each in models), strict=True))
     if relift:
         M, G = M @ C[:, None], G @ C
     width = nx if relift else nz
     M = np.ascontiguousarray(np.swapaxes(M, 1, 2)).reshape(len(models), nz, -1)  # one product a step gives A z and N z
     for X, V, rows in _split_blocks(points, starts, horizon, first.nw, len(models)):
-        if any(map(_multiplies_inputs, models)):
+        if crossed:
             U, W = V[:, : first.nu], V[:, first.nu :]
             V = np.hstack([V, *(w[:, None] * U for w in W.T)])
         point = np.repeat(X[rows][None], len(models), axis=0)
@@ -208,19 +208,14 @@ def compare_forecasts(
 
 
 def _transpose_matrices(
-    model: AnyPredictor,
+    model: AnyPredictor, crossed: bool
 ) -> tuple[Float[np.ndarray, "products nz nz"], Float[np.ndarray, "nv nz"], Float[np.ndarray, "nz nx"]]:
-    """Return [Aᵀ, N₁ᵀ …, S₁ᵀ …], [B E M₁ …]ᵀ and Cᵀ; M where w multiplies inputs."""
-    A = model.A.T[None]
+    """Return [Aᵀ, N₁ᵀ …, S₁ᵀ …], [B E]ᵀ or the `crossed` [B E M₁ …]ᵀ, and Cᵀ."""
+    A, B = model.A.T[None], [model.B, model.E]
     if isinstance(model, BilinearPredictor):
         A = np.concatenate([A, model.N.transpose(0, 2, 1), model.S.transpose(0, 2, 1)])
-    crossed = model.M if _multiplies_inputs(model) else ()
-    return A, np.hstack([model.B, model.E, *crossed]).T, model.C.T
-
-
-def _multiplies_inputs(model: AnyPredictor) -> TypeGuard[BilinearPredictor]:
-    """Return whether measured disturbances multiply inputs of the model."""
-    return isinstance(model, BilinearPredictor) and bool(model.M.any())
+        B += [*model.M] if crossed else []
+    return A, np.hstack(B).T, model.C.T
 
 
 _Slice = tuple[Episode, Int[np.ndarray, "_"]]  # an episode and its starts in this block

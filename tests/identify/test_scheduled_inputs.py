@@ -6,6 +6,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.validate.scoring import compare_forecasts, forecast_errors
 
 M = np.array([[[0.0, 0.3], [0.0, 0.0]], [[0.0, 0.0], [-0.02, 0.0]]])
 
@@ -49,6 +50,18 @@ def test_scores_files_and_models_of_constant_w_know_the_products(logs, plant, tm
     plain = km.bilinear_edmd(logs, km.State() + km.Constant())
     assert not plain.M.any()
     assert km.score(plain, logs, 5).rmse.max() > 0.02
+
+
+@pytest.mark.parametrize("relift", [False, True])
+def test_models_with_and_without_the_products_are_compared_at_once(logs, relift):
+    lifting = km.State() + km.Constant()
+    models = [km.bilinear_edmd(logs, lifting, scheduled_inputs=each) for each in (True, False)]
+    starts = [np.arange(0, 30, 7)] * len(logs)
+    ((gaps, _),) = compare_forecasts(models, logs, starts, 6, relift=relift)
+    for model, together in zip(models, gaps, strict=True):
+        ((alone, _),) = forecast_errors(model, logs, starts, 6, relift=relift)
+        np.testing.assert_allclose(together, alone, atol=1e-12)
+    assert np.abs(gaps[0]).max() < 1e-9 < 1e-3 < np.abs(gaps[1]).max()
 
 
 def test_a_loop_of_the_learned_model_is_that_of_the_equations(logs, plant):
