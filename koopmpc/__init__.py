@@ -144,6 +144,7 @@ else:
             ),
             "controllers": (
                 "control.lqr",
+                "control.eigenfunction_lqr",
                 "control.linear.koopman_mpc",
                 "control.nonlinear.bilinear_mpc",
                 "control.nonlinear.nonlinear_mpc",

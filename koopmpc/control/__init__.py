@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.control.eigenfunction_lqr import EigenfunctionLQR as EigenfunctionLQR
     from koopmpc.control.kinds import BenchEntry as BenchEntry
     from koopmpc.control.kinds import ControllerKind as ControllerKind
     from koopmpc.control.kinds import list_kinds as list_kinds
     from koopmpc.control.kinds import register_controller as register_controller
     from koopmpc.control.linear.condensed_program import CondensedProgram as CondensedProgram
-    from koopmpc.control.lqr import EigenfunctionLQR as EigenfunctionLQR
     from koopmpc.control.lqr import FeedbackProgram as FeedbackProgram
     from koopmpc.control.move import Controller as Controller
     from koopmpc.control.move import Fallback as Fallback

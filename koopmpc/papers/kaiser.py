@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 
 from koopmpc.control.cost import Cost
-from koopmpc.control.lqr import EigenfunctionLQR
+from koopmpc.control.eigenfunction_lqr import EigenfunctionLQR
 from koopmpc.data.collect import collect
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.errors import hide_fit_warnings
