@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.checks import HUGE
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import bind_interpreter
 from koopmpc.values import Viewing
@@ -28,6 +29,7 @@ FADING = 0.8  # what a predicted step allows fades by this factor a step
 
 
 @cache
+@raise_swallowed()
 def gate_function(ny: int) -> ca.Function:
     """Return (y, prediction, memory) → [whether y is refused; 1 if the gate has opened, 2 if all is lost; the memory].
 
