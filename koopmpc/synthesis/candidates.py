@@ -85,6 +85,11 @@ class Candidate(Value):
         return 0 if self.embedding is None else self.embedding.steps
 
     @property
+    def has_hidden_state(self) -> bool:
+        """Whether the model has a state that no past row holds."""
+        return isinstance(self.structure, HiddenStructure)
+
+    @property
     def kind(self) -> str:
         """Return "linear" or "bilinear"."""
         return "bilinear" if self.bilinear else "linear"

@@ -22,7 +22,6 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Present
 from koopmpc.lifting.state import State
 from koopmpc.parallel import StageProgress, Workers
-from koopmpc.predict.hidden_state import HiddenState
 from koopmpc.synthesis.asked import (
     DesignTask,
     check_task,
@@ -324,8 +323,7 @@ def design(
         recipe = replace(rows[plain].recipe, estimator=None)
         model = recipe.fit(source, workers=workers, scheduler=scheduler)
         standby = recipe.controller(model, asked.cost, test.limits(outcomes[plain].band), ahead)
-    pasts = [one.model.embedding for one in test.surrogates]  # rows are compared by what was measured
-    embedding = next((past for past in pasts if not isinstance(past, HiddenState)), pasts[0])
+    embedding = test.surrogates[0].model.embedding
     neighbours = NeighbourMap.of(test.episodes, embedding, test.surrogates[0].noise, test.ignored, test.turning)
     drawn_from = LoopPool(asked, test.surrogates, neighbours, test.low, test.high)
     promise: CoveragePromise | None = None
@@ -447,7 +445,7 @@ def _list_first_round(results: Sequence[Tried], floor: float) -> list[Recipe]:
     found: list[Recipe] = []
     for bilinear in (False, True):
         same = [i for i in ranked if results[i].candidate.bilinear == bilinear]
-        best = same[:_FIRST_ROUND] + [i for i in same[_FIRST_ROUND:] if results[i].candidate.structure is not None]
+        best = same[:_FIRST_ROUND] + [i for i in same[_FIRST_ROUND:] if results[i].candidate.has_hidden_state]
         found += [Recipe(results[i].candidate, results[i].ridges[places[i]]) for i in best]
     for one, place in zip(results, places, strict=True):
         if one.candidate.name == "x, 1" and not one.candidate.bilinear:
@@ -499,7 +497,7 @@ def _judge_rounds(
             rate_runs([outcomes[0], *outcomes[len(estimators) : len(estimators) + len(ends) - 1]]), test.weights
         )
         end = ends[int(np.argmin(tried_ends))] if tried_ends.min() < (1 - GAINED) * tried_ends[0] else {}
-        if bilinear[0].candidate.structure is None:  # fits of hidden states know no weights
+        if not bilinear[0].candidate.has_hidden_state:  # fits of hidden states know no weights
             third.append(replace(bilinear[0], estimator=best, weighted=True, **end))
         third += [replace(one, estimator=best, **end) for one in bilinear[1:]]
         if end and best is not None:

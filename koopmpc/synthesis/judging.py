@@ -267,7 +267,7 @@ def _judge_models(test: LoopTest, recipe: Recipe, models: _Models, conditions: S
         mine = [j for j, place in enumerate(conditions) if test.conditions[place].fold == k]
         if not mine:
             continue
-        if isinstance(controller, BilinearMPC) and recipe.candidate.structure is None:
+        if isinstance(controller, BilinearMPC) and not recipe.candidate.has_hidden_state:
             controller.update(model)  # its functions are those of the lifting, whatever the model
         else:
             controller = recipe.controller(model, asked.cost, limits, asked.horizon, brief=True)

@@ -141,9 +141,10 @@ def choose_surrogates(results: Sequence[Tried], floor: float, hidden: bool = Fal
     happens if a part of the state is not measured, or if the data show a `hidden` state and its error is less. The
     second family extrapolates differently, so closed loops show errors that only one of the models has. If the error
     of the best of another family is more than three times as large, the second best of the same family is taken, or
-    the best itself. Models with a hidden state are left out: at the start of a loop nobody knows their state.
+    the best itself. Where there are others, models with a hidden state are left out: at the start of a loop nobody
+    knows their state.
     """
-    results = [one for one in results if one.candidate.structure is None] or results
+    results = [one for one in results if not one.candidate.has_hidden_state] or results
     places = [tried.best(floor) for tried in results]
     error = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
     ranked = sorted(range(len(results)), key=lambda i: (error[i], i))

@@ -13,9 +13,13 @@ from scipy.optimize import lsq_linear
 from scipy.signal import dlsim
 
 import koopmpc as km
+from koopmpc.identify.records.hidden_structure import HiddenStructure
+from koopmpc.identify.records.structure import Structure
 from koopmpc.synthesis.candidates import Candidate, Recipe
+from koopmpc.synthesis.cross_validation import Tried
 from koopmpc.synthesis.designed import choose_row
 from koopmpc.synthesis.judging import LOST, Outcome, average_ratios, rate_runs
+from koopmpc.synthesis.surrogates import choose_surrogates
 from tests.synthesis.test_select import PLAIN, SQUARES, episodes_of, noisy
 
 A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])  # a mass with friction; its position is free
@@ -466,6 +470,20 @@ def test_a_hidden_state_with_a_past_that_leaves_too_few_folds_is_left_out(monkey
     found = designed(hidden_record(), cost, limits, horizon=15, delays=None, candidates=None, reference=[1.2])
     assert len(asked) == 1
     assert "past 100" not in {row.recipe.candidate.name for row in found.leaderboard}
+
+
+def test_no_model_with_a_hidden_state_stands_in_for_the_plant_where_there_is_another():
+    sizes = {"errors": np.ones(8), "calm": True}
+    hidden = HiddenStructure(order=2, degree=1, delays=4, horizon=0, rails=None, parameters=8, **sizes)
+    sparse = Structure(4, 1, (np.zeros((0, 1), int),), np.zeros(2), np.ones(2), **sizes)
+
+    def tried(name, structure, error):
+        one = Candidate(name, PLAIN, km.Delay(4), False, structure)
+        return Tried(one, (0.0,), np.full((1, 3, 5), error), 1, np.eye(1)[None], np.inf, 0.0)
+
+    known = [tried("hidden", hidden, 0.1), tried("sparse", sparse, 0.2), tried("plain", None, 0.3)]
+    assert [one.candidate.name for one in choose_surrogates(known, 0.0, hidden=True)] == ["sparse", "plain"]
+    assert [one.candidate.name for one in choose_surrogates(known[:1], 0.0, hidden=True)] == ["hidden", "hidden"]
 
 
 def hidden_record(rows=600, seed=0):
