@@ -1,6 +1,6 @@
 """Long measured records: late input columns, sparse polynomial candidates, and the judgement of models by free runs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import methodcaller
@@ -356,6 +356,7 @@ def judge_finalists(
     measured: Episodes,
     first: int,
     horizon: int,
+    sparse: Mapping[str, FreeRun],
     progress: Progress | None = None,
     ran: Sequence[tuple[LeaderboardRow, FreeRun]] = (),
 ) -> tuple[tuple[LeaderboardRow, ...], int, dict[str, int]]:
@@ -372,6 +373,8 @@ def judge_finalists(
         The leaderboard.
     learned, measured, first, horizon
         As in `judge_free_run`.
+    sparse
+        How the sparse polynomial of each kind ran.
     progress
         Called after each model.
     ran
@@ -387,7 +390,7 @@ def judge_finalists(
             progress(done, len(places))
         row = rows[place]
         if isinstance(row.structure, Structure):
-            runs[place] = run_structure(row.structure, measured, first, horizon)
+            runs[place] = sparse[row.kind]
             continue
         fit = partial(_fit_quietly, row.candidate, row.ridge)
         run = judge_free_run(fit, learned, measured, first, horizon, relift=row.bilinear)

@@ -281,13 +281,13 @@ def select(
     alike = ENOUGH if relift else EXACT
     if record:
         told = report_stage(progress, "hidden states")
-        sparse = [one.structure for one in given if isinstance(one.structure, Structure)]
-        rival = min((one.error for one in sparse), default=np.inf)
-        runs = [run_structure(one, measured[1], first, nearer) for one in sparse]
-        best = min((run for run in runs if run.calm), key=lambda run: run.error, default=None)
+        sparse = {one.kind: one.structure for one in given if isinstance(one.structure, Structure)}
+        rival = min((one.error for one in sparse.values()), default=np.inf)
+        runs = {kind: run_structure(one, measured[1], first, nearer) for kind, one in sparse.items()}
+        best = min((run for run in runs.values() if run.calm), key=lambda run: run.error, default=None)
         ran = judge_hidden_states(measured[1], first, ahead, both, rival, ran=best, short=nearer, progress=told)
         told = report_stage(progress, "free runs")
-        rows, chosen, found = judge_finalists(rows, held, measured[1], first, nearer, told, ran)
+        rows, chosen, found = judge_finalists(rows, held, measured[1], first, nearer, runs, told, ran)
         if held is not measured[1] and (rows[chosen].rough or rows[chosen].structure is not None):
             notes = (*notes, ROUGH)
     else:

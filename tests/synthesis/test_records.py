@@ -138,15 +138,15 @@ def test_smoothed_rows_are_learned_from_only_where_unseen_rows_gain():
     measured, clean = oscillator(noise=0.3), oscillator(noise=0.0)
     options = {"horizon": 10, "delays": [2], "smooth": False, "bilinear": False}
     rows = km.select(measured, candidates=[km.State() + km.Constant()], **options).leaderboard
-    (kept, *_), _, _ = judge_finalists(rows, clean, measured, 2, 10)
+    (kept, *_), _, _ = judge_finalists(rows, clean, measured, 2, 10, {})
     assert not kept.rough  # the best smoother that there can be
     blurred = clean[0].X.copy()
     for _ in range(60):  # a smoother that takes the motion for noise
         blurred[1:-1] = (blurred[:-2] + 2 * blurred[1:-1] + blurred[2:]) / 4
     wrong = clean.with_episodes([km.Episode(X=blurred, U=clean[0].U)])
-    (raw, *_), _, _ = judge_finalists(rows, wrong, clean, 2, 10)
+    (raw, *_), _, _ = judge_finalists(rows, wrong, clean, 2, 10, {})
     assert raw.rough
-    (same, *_), _, _ = judge_finalists(rows, clean, clean, 2, 10)
+    (same, *_), _, _ = judge_finalists(rows, clean, clean, 2, 10, {})
     assert not same.rough
     assert raw.free == same.free
 
