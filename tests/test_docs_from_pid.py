@@ -1,9 +1,13 @@
 """docs/how/from_pid.md: its blocks print what it shows, and the predictive controller is better than the PID by far."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.synthesis.fresh.drawn import LoopPool
+from koopmpc.synthesis.fresh.loops import run_fresh_loops
 from tests.docs.page import DOCS, alike, run
 
 
@@ -39,7 +43,7 @@ def test_the_way_from_a_pid_leads_to_a_better_loop_without_a_bump(tmp_path):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::koopmpc.errors.FitWarning")
 def test_one_sensor_is_enough_for_a_better_loop_that_the_stand_ins_do_not_call_lost(tmp_path):
-    """The log of one level in closed loop: a design failed on it, and then called half of its loops lost."""
+    """The log of one level in closed loop: a design failed on it, and then called about a fifth of its loops lost."""
     names, _ = run("how/from_pid.md", tmp_path)
     twin, logs = names["twin"], names["logs"]
     one = km.Episodes([km.Episode(X=e.X[:, 1:], U=e.U) for e in logs], logs.dt, logs.states[1:], logs.inputs)
@@ -48,7 +52,12 @@ def test_one_sensor_is_enough_for_a_better_loop_that_the_stand_ins_do_not_call_l
     design = km.design(one, cost, limits, horizon=25, reference=[10.0], bilinear=False)
     assert "1 delay" in design.best.title
     assert dict(design.expected.loops)["neighbours"] > 100
-    assert np.isinf(design.expected.fresh.cost).mean() < 0.01
+    assert np.isfinite(design.expected.fresh.cost).all()
+    known = design.evidence
+    before = replace(known.neighbours, local=3, ridge=1e-4)  # what a slope was of, whatever the log
+    pool = LoopPool(known.asked, known.surrogates, before, known.low, known.high)
+    fresh = run_fresh_loops(pool, km.compiled(design.controller), 600, np.random.default_rng(0))
+    assert np.isinf(fresh.cost).mean() > 0.15
     wanted, rng = names["steps"][:, 0], np.random.default_rng(0)
     x, lower = np.array([2.56, 4.0]), [4.0]
     for k in range(149):
