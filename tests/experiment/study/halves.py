@@ -95,10 +95,15 @@ def choose_fit(task: Task, data: km.Episodes) -> partial[km.LinearPredictor]:
     return partial(km.edmd, lifting=km.State() + km.Constant(), embedding=embedding, ridge=RIDGE)
 
 
+def make_cost(task: Task) -> km.Cost:
+    """Return the cost of a task; inputs that it gives are left to the equilibrium."""
+    return km.Cost(Q=task.Q, R=task.R, of=task.of, u_target="zero" if task.u_target == "zero" else "equilibrium")
+
+
 def find_cost(name: str, data: km.Episodes) -> float:
     """Return the geometric mean over the starts of the cost over the optimum, at most ten each."""
     task = ALL[name]
-    cost = km.Cost(Q=task.Q, R=task.R, of=task.of, u_target="zero" if task.u_target == "zero" else "equilibrium")
+    cost = make_cost(task)
     logs: list[float] = []
     try:
         model = choose_fit(task, data)(data)
@@ -159,7 +164,7 @@ def add_plans(name: str, seed: int, rows: int) -> tuple[km.Episodes, int, int]:
     rng = np.random.default_rng([37, seed])
     first = rows // 4
     logs, left = list(take_rows(whole, first)), rows // 2 - first
-    cost = km.Cost(Q=task.Q, R=task.R, of=task.of, u_target="zero" if task.u_target == "zero" else "equilibrium")
+    cost = make_cost(task)
     seen = [task.plant.states.index(one) for one in task.plant.outputs]
     x0 = task.training.x0
     steps, least, made, refused = min(task.training.steps, left), max(rows // 10, 8), 0, 0
