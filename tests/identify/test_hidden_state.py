@@ -188,21 +188,30 @@ def test_readings_move_the_state_by_what_forecasts_best(tanks):
     assert errors[1] < 0.7 * errors[2]
 
 
+def error_from_ten_percent_off(seed):
+    """The largest error of the first 50 Markov parameters; hidden states are unique only up to their basis."""
+    rng = np.random.default_rng(seed)
+    plant = linear_plant(rng, 2)
+    data = record_of(plant, rng, steps=300)
+    true = km.identify.subspace(data, 2, delays=4)
+    units = SignalUnits.of(data, None)
+    found = to_standard(true, units)
+    theta = found.parameters * rng.uniform(0.9, 1.1, found.parameters.size)
+    start = from_standard(found.with_parameters(theta), units, data, 4, true.report)
+    refined = km.identify.refine(start, data, horizon=20, iterations=100)
+    return np.abs(model_markov(refined) - markov(*plant)).max()
+
+
 def test_exact_data_are_met_from_coefficients_ten_percent_off():
-    """Free run and the first 50 Markov parameters; hidden states are unique only up to their basis."""
-    elsewhere = 0
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        plant = linear_plant(rng, 2)
-        data = record_of(plant, rng, steps=300)
-        true = km.identify.subspace(data, 2, delays=4)
-        units = SignalUnits.of(data, None)
-        found = to_standard(true, units)
-        theta = found.parameters * rng.uniform(0.9, 1.1, found.parameters.size)
-        start = from_standard(found.with_parameters(theta), units, data, 4, true.report)
-        refined = km.identify.refine(start, data, horizon=20, iterations=100)
-        elsewhere += not np.abs(model_markov(refined) - markov(*plant)).max() < 1e-6
-    assert elsewhere == 0
+    assert np.max([error_from_ten_percent_off(seed) for seed in range(5)]) < 1e-6
+
+
+@pytest.mark.slow
+def test_of_100_fits_of_exact_data_98_end_within_a_millionth_and_none_elsewhere():
+    """The numbers of docs/real.md."""
+    errors = np.array([error_from_ten_percent_off(seed) for seed in range(100)])
+    assert (errors < 1e-6).sum() >= 98
+    assert errors.max() < 1e-4
 
 
 @pytest.mark.parametrize("start", ["subspace", "ten percent off"])
