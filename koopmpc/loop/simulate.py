@@ -207,14 +207,15 @@ class _Wiring:
     rng: np.random.Generator
     noise: _Draw | None = None
     faults: Injections | None = None
-    moves_plant: bool = field(init=False)  # whether w_k moves the plant
-    tells: bool = field(init=False)  # whether the controller gets w_k
+    driving: Float[np.ndarray, "wrows nw"] | None = field(init=False)  # the rows of w that move the plant
+    told: Float[np.ndarray, "wrows nw"] | None = field(init=False)  # those that the controller gets
 
     def __post_init__(self) -> None:
         if self.disturbance is not None and not isinstance(self.plant, StepMap | SimulatedPlant):
             raise DataError("a disturbance is added to the next state: pass a StepMap or a SimulatedPlant")
-        self.moves_plant = _check_measured(self.plant, self.measured)
-        self.tells = self.measured is not None and not (self.moves_plant and count_disturbances(self.controller) == 0)
+        self.driving = _check_measured(self.plant, self.measured)
+        blind = self.driving is not None and count_disturbances(self.controller) == 0
+        self.told = None if blind else self.measured
         self.reference.setflags(write=False)  # the Run keeps these rows, so a controller must not write into them
 
     @property
@@ -248,14 +249,14 @@ class _Wiring:
 
     def ask(self, k: int, y: Float[np.ndarray, " ny"], applied: Float[np.ndarray, " nu"] | None) -> Move:
         """Return the move of the controller at step k."""
-        controller, rows, W, N = self.controller, self.reference, self.measured, self.controller.horizon
+        controller, rows, W, N = self.controller, self.reference, self.told, self.controller.horizon
         ahead = rows[k : k + N + 1] if self.preview else np.broadcast_to(rows[k], (N + 1, rows.shape[1]))
         fails = self.faults is not None and self.faults.solver_fails(k)
         failing = controller if fails and isinstance(controller, Fallible) else None
         try:
             if failing is not None:
                 failing.solver_fails = True
-            if W is None or not self.tells:
+            if W is None:
                 return controller(y, ahead, applied)
             return controller(y, ahead, applied, w=W[k : k + max(N, 1)] if self.preview else W[k])
         except ValueError as error:
@@ -272,7 +273,7 @@ class _Wiring:
         push = None if self.disturbance is None else self.disturbance(k, self.rng)
         if isinstance(plant, StepMap):
             x = rows.X[k + 1]
-            plant.advance(rows.X[k], u, x, self.measured[k] if self.measured is not None and self.moves_plant else None)
+            plant.advance(rows.X[k], u, x, None if self.driving is None else self.driving[k])
             if push is not None:
                 x += push
             y = x.copy() if rows.X is rows.Y else plant.measure(x)
@@ -321,7 +322,7 @@ def _run_at_once(wiring: _Wiring, rows: LoopRows) -> bool:
     """Let a compiled controller make the whole run; return False where it cannot, or the loop needs Python."""
     make_run = getattr(wiring.controller, "whole_run", None)
     plant, plain = wiring.plant, wiring.noise is None and wiring.faults is None and wiring.disturbance is None
-    if make_run is None or not plain or not isinstance(plant, StepMap) or wiring.moves_plant:
+    if make_run is None or not plain or not isinstance(plant, StepMap) or wiring.driving is not None:
         return False
     rows.at_once = make_run(plant, wiring.reference, wiring.measured, rows.X, rows.Y, rows.U, preview=wiring.preview)
     return rows.at_once is not None
@@ -383,16 +384,18 @@ def _tracked_rows(
     return rows
 
 
-def _check_measured(plant: StepMap | Plant, measured: Float[np.ndarray, "rows nw"] | None) -> bool:
-    """Return whether the plant has measured disturbances, after a check that the rows are those."""
+def _check_measured(
+    plant: StepMap | Plant, measured: Float[np.ndarray, "rows nw"] | None
+) -> Float[np.ndarray, "rows nw"] | None:
+    """Return the rows of w that move the plant, after a check that they fit; None where it has no w."""
     if not isinstance(plant, StepMap) or not plant.disturbances:
-        return False
+        return None
     nw, names = len(plant.disturbances), ", ".join(plant.disturbances)
     if measured is None:
         raise DataError(f"the plant has measured disturbances ({names}); pass measured=, a row a step")
     if measured.shape[1] != nw:
         raise ShapeError(f"measured has {measured.shape[1]} columns, the plant {nw} disturbances: {names}")
-    return True
+    return measured
 
 
 def count_disturbances(controller: object) -> int | None:
