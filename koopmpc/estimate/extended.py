@@ -178,7 +178,7 @@ class ExtendedObserver:
         False says that the estimate cannot be used: readings have been missing for too long, or it has run away.
         """
         if not self._begun:
-            return self._begin(y, u)
+            return bool(np.isfinite(y).all()) and self._begin(y, u, np.ones(self.ny, dtype=np.bool_))
         n, ny = self._model.nz, self.ny
         F = np.eye(n + ny)
         slope = getattr(self._model, "slope", None) if getattr(self._model, "scheduled", 0) else None
@@ -193,9 +193,9 @@ class ExtendedObserver:
         useful = came if self._embedding is None else came & ~self._embedding.is_beyond(y, predicted)
         shown = np.where(useful | ~came, y, predicted)
         refused = self._gate.judge(shown, predicted)
-        if self._gate.lost and useful.all():
-            self._start, self.d[:] = None, 0.0
-            return self._begin(y, u)
+        if self._gate.lost:
+            self.d[:] = 0.0
+            return self._begin(y, u, useful)
         s = np.concatenate([z, self.d[:ny]])
         if useful.any() and not refused:
             s, P = self._correct(s, P, H[useful], self._R[np.ix_(useful, useful)], (y - predicted)[useful])
@@ -205,19 +205,19 @@ class ExtendedObserver:
         self.d[:ny] = s[n:] if self._disturbed else 0.0
         return self._missed <= PATIENCE and bool(np.abs(s).max() < HUGE)
 
-    def _begin(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"]) -> bool:
-        n, ny, embedding = self._model.nz, self.ny, self._embedding
-        if not np.isfinite(y).all():
-            return False
+    def _begin(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], useful: Bool[np.ndarray, " ny"]) -> bool:
+        """Start at x0, or from these entries of y; of a lost estimate the others are 0, or x0's if this is z."""
+        n, embedding, entries, spread = self._model.nz, self._embedding, np.flatnonzero(useful), np.ones(self._model.nz)
         if embedding is not None:
-            self.z[:] = embedding.repeat(y, u)
+            self.z[:] = embedding.repeat(np.where(useful, y, 0.0), u)
             spread = embedding.spread(self._size, np.zeros(self._model.nu))
-        elif self._start is not None and len(self._start) == n:
-            self.z[:], spread = self._start, np.ones(n)
         else:
-            self.z[:ny], spread = y, np.ones(n)
+            known = self._start is not None and len(self._start) == n
+            self.z[:] = self._start if known else 0.0
+            if self._begun or not known:
+                self.z[entries] = y[entries]
         self._P = scipy.linalg.block_diag(np.diag(0.1 * spread**2), self._drift)
-        self._P[:ny, :ny] = self._R
+        self._P[np.ix_(entries, entries)] = self._R[np.ix_(entries, entries)]
         self._begun = True
         return True
 

@@ -253,6 +253,19 @@ def test_a_wild_entry_beside_a_missing_one_is_refused(kind):
     assert np.flatnonzero(refused).tolist() == [WILD]
 
 
+@pytest.mark.parametrize("kind", ["KoopmanMPC, filter", EXTENDED])
+@pytest.mark.parametrize("missing", [0, 1])
+def test_an_estimate_that_is_lost_while_an_entry_is_missing_comes_back(kind, missing):
+    controller, plant, wild = MORE[kind](), plant_for(kind), np.zeros((1 + BRIDGED, 2))
+    X = loop(controller, 1, plant=plant, steps=110)[0]
+    wild[1:, missing] = np.nan
+    for at in range(3):
+        for wild[0] in (1e6, 1e29):
+            away = np.abs(loop(controller, 1, wild, plant, 110, at)[0] - X) / np.ptp(X, axis=0)
+            assert (away[at + 15 :] <= 0.4).all(), at
+            assert (away[-20:] <= 0.05).all(), at
+
+
 def test_what_moves_a_plant_from_rest_is_no_absurd_reading_for_long():
     mpc, x, refused = km.KoopmanMPC(model("linear"), WHOLE, LIMITS, 20, estimator=LEARNS), np.zeros(2), 0
     for k in range(150):
