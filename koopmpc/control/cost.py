@@ -413,7 +413,7 @@ def lifted_tracking(
     """
     cost, limits = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
     if not in_time:
-        _refuse_steps(cost, limits)
+        refuse_steps(cost, limits)
     refuse_stage(cost, "a controller on a linear model")
     if cost.beyond == "motion":
         raise DataError(
@@ -444,7 +444,7 @@ def state_tracking(
     """
     cost, limits = check_cost_and_limits(cost, limits, states, inputs)
     if not in_time:
-        _refuse_steps(cost, limits)
+        refuse_steps(cost, limits)
     nx, nu = len(states), len(inputs)
     point = ca.SX.sym("x", nx if size is None else size)
     x, of = point[:nx], cost.of.bind(states)
@@ -472,8 +472,14 @@ def add_held(
     return first[np.minimum(steps, len(first) - 1)] + second[np.minimum(steps, len(second) - 1)]
 
 
-def _refuse_steps(cost: Cost, limits: Limits) -> None:
-    """Raise where limits have rows in time or inputs a price, for a law or a search that knows neither."""
+def refuse_steps(cost: Cost, limits: Limits) -> None:
+    """Raise where limits have rows in time or inputs a price, for a law or a search that knows neither.
+
+    Raises
+    ------
+    DataError
+        There is one of the two.
+    """
     if limits.in_time:
         end = next(iter(limits.count_rows()))
         raise DataError(

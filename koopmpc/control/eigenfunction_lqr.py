@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.checks import HUGE
-from koopmpc.control.cost import Cost
+from koopmpc.control.cost import Cost, check_cost_and_limits, refuse_stage, refuse_steps
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.limits import Limits, refuse_levels
 from koopmpc.control.lqr import FeedbackLaw
@@ -61,7 +61,7 @@ class EigenfunctionLQR(FeedbackLaw):
     ------
     DataError
         The eigenfunction is complex, or its eigenvalue or the effect of the input is not known; the cost is of other
-        outputs, has an R_delta, or a u_target in numbers.
+        outputs, has an R_delta, a u_target in numbers, a price, a stage or rows of weights; limits have rows in time.
     ShapeError
         B does not have a row for each state.
     DefinitenessError
@@ -107,6 +107,9 @@ class EigenfunctionLQR(FeedbackLaw):
         x, aim = ca.SX.sym("x", len(eigenfunction.bound_states)), ca.SX.sym("phi_r")
         self._beta = ca.Function("beta", [x], [ca.densify(self._effect(x, B))])
         nu = int(self._beta.size2_out(0))
+        self.cost, sized = check_cost_and_limits(cost, limits, eigenfunction.bound_states, [f"u{i}" for i in range(nu)])
+        refuse_steps(self.cost, sized)
+        refuse_stage(self.cost, "an EigenfunctionLQR")
         weights = cost.matrices(1, nu)
         self._Q = float(weights[0][0, 0])
         self._R_inverse = np.linalg.inv(checks.weight(weights[1], "R", nu, definite=True))
@@ -114,7 +117,6 @@ class EigenfunctionLQR(FeedbackLaw):
         both = ca.densify(ca.vertcat(eigenfunction.symbolic(kept), self.law(kept, aim)))
         self._read = Buffered(ca.Function("u", [x, aim], [both], {"cse": True}))
         refuse_levels(limits, "an EigenfunctionLQR")
-        sized = Limits() if limits is None else limits
         super().__init__(checks.positive(dt, "dt", "s"), x.numel(), sized.inputs(nu), sized.rates(nu))
 
     @raise_swallowed()
