@@ -59,7 +59,7 @@ class LiftedDisturbance(Value):
     period
         Of a disturbance that repeats itself, a shaft or the day [s]. Then d_k is a constant and harmonics of this
         period, found in the misfits by recursive least squares over the last three periods, and plans know how d goes
-        on. `km.estimate.find_period` finds a period in logs. In a KoopmanMPC or LinearMPC.
+        on. `km.estimate.find_period` finds a period in logs.
     harmonics
         How many harmonics of the period, at most; those faster than two samples are left out.
 
@@ -110,13 +110,9 @@ class LiftedDisturbance(Value):
         Raises
         ------
         DataError
-            The period is shorter than two samples; or the controller plans in the state, and there is a period.
+            The period is shorter than two samples.
         """
         if self.period is not None:
-            if not isinstance(model, LinearPredictor):
-                raise DataError(
-                    "a LiftedDisturbance with a period is for a KoopmanMPC or a LinearMPC; leave out period"
-                )
             return PeriodicObserver(model, find_harmonics(self.period, model.dt, self.harmonics))
         if self.gain is not None:
             return DisturbanceObserver(model, self.gain, 0.0)

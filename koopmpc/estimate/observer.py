@@ -22,6 +22,11 @@ class StateModel(Protocol):
     """The model z⁺ = F(z, u) + E w + d of a controller: a lifted linear one, or a map whose z is the state itself."""
 
     @property
+    def dt(self) -> float:
+        """Sampling time [s]."""
+        ...
+
+    @property
     def ny(self) -> int:
         """Number of the plant's states; y has as many entries where all of them are measured."""
         ...
@@ -66,7 +71,7 @@ class LiftedModel:
     """z⁺ = A z + B u + E w + d of a linear predictor, z = ψ(ζ): a `StateModel`."""
 
     def __init__(self, predictor: LinearPredictor) -> None:
-        self._predictor = predictor
+        self._predictor, self.dt = predictor, predictor.dt
         self.ny, self.nz, self.nu, self.nw = predictor.nx, predictor.nz, predictor.nu, predictor.nw
         self.lifting, self.embedding = predictor.lifting, predictor.embedding
 

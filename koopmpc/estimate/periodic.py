@@ -12,7 +12,7 @@ from koopmpc.checks import HUGE
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError
 from koopmpc.estimate.gate import BRIDGED
-from koopmpc.estimate.observer import EstimatorProgram, Measured
+from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
 from koopmpc.predict.predictors import LinearPredictor
 
 PERIODS = 3.0  # harmonics are learned over the last so many periods
@@ -47,25 +47,29 @@ class PeriodicObserver(Measured):
     """The observer of a `LiftedDisturbance` with a period: z = ψ(x) afresh, d_k = Θ [1; cos k θ_j; sin k θ_j].
 
     Recursive least squares of the misfits e = z − A z₋ − B u − E w with forgetting finds Θ. It starts as if one row of
-    zeros had been seen, so that the first rows are not believed too much.
+    zeros had been seen, so that the first rows are not believed too much. The Constant and the past of a state have no
+    disturbances.
 
     Parameters
     ----------
     model
-        The predictor.
+        The predictor, or a model whose z is the state.
     turns
         Angles by which the harmonics turn in a step [rad].
     """
 
     _remembers = True
 
-    def __init__(self, model: LinearPredictor, turns: Float[np.ndarray, " h"]) -> None:
+    def __init__(self, model: LinearPredictor | StateModel, turns: Float[np.ndarray, " h"]) -> None:
         super().__init__(model)
         self._turns = turns
         unknown = np.ones(self._model.nz)
-        constant = model.lifting.constant_index
-        if constant is not None:
-            unknown[constant] = 0.0
+        if isinstance(model, LinearPredictor):
+            constant = model.lifting.constant_index
+            if constant is not None:
+                unknown[constant] = 0.0
+        else:
+            unknown[self.ny :] = 0.0
         self._unknown, self._none = unknown, np.zeros(self._model.nz)
         self._forget = float(np.exp(-1 / max(PERIODS * 2 * np.pi / turns[0], SHORTEST)))
         self.reset()

@@ -1,5 +1,7 @@
 """Periodic disturbances: forecasts of exact harmonics, loops on them, periods found in logs, and errors."""
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,11 @@ import koopmpc as km
 DT, PERIOD = 0.5, 7.3
 A, B = np.array([[0.9, 0.1], [-0.1, 0.8]]), np.array([[0.0], [0.3]])
 MODEL = km.LinearPredictor(A, B, np.eye(2), km.State().bind(("a", "b")), DT, ("a", "b"), ("u",))
+
+
+@pytest.fixture(autouse=True)
+def interpret(monkeypatch):
+    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)  # a loop is shorter than its compilation
 
 
 def push(k):
@@ -28,10 +35,10 @@ def run(mpc, steps, r=(0.0, 0.0), latency=0):
     return np.array(X), np.array(U), moves
 
 
-def controller(latency=0, **estimator):
+def controller(latency=0, kind=km.KoopmanMPC, horizon=12, **estimator):
     cost = km.Cost(Q=[0, 1], R=1e-6, u_target="zero")
     told = km.LiftedDisturbance(**estimator)
-    return km.KoopmanMPC(MODEL, cost, km.Limits(u_min=-5, u_max=5), 12, estimator=told, latency=latency)
+    return kind(MODEL, cost, km.Limits(u_min=-5, u_max=5), horizon, estimator=told, latency=latency)
 
 
 @pytest.mark.parametrize("latency", [0, 2])
@@ -49,6 +56,36 @@ def test_a_loop_with_the_period_has_no_error_where_one_without_has():
     knowing, plain = (run(controller(**kind), 300)[0][200:, 1] for kind in ({"period": PERIOD}, {}))
     assert np.abs(knowing).max() < 1e-4
     assert np.abs(plain).max() > 1e-2
+
+
+@pytest.mark.parametrize("kind", [km.BilinearMPC, pytest.param(km.NonlinearMPC, marks=pytest.mark.slow)])
+def test_controllers_that_plan_in_the_state_know_the_period_too(kind):
+    """The loop has no error, the next state is the planned one, and a copy and a reset run repeat the inputs."""
+    mpc = controller(kind=kind, horizon=5, period=PERIOD)
+    X, U, moves = run(mpc, 240)
+    assert {move.status.name for move in moves[100:]} <= {"OPTIMAL", "UNCONSTRAINED"}
+    assert np.abs(X[200:, 1]).max() < 1e-4
+    other = copy.deepcopy(mpc)
+    after = other(X[-1], np.zeros(2)).u
+    np.testing.assert_array_equal(mpc(X[-1], np.zeros(2)).u, after)
+    np.testing.assert_allclose(mpc.plan().X[1], A @ X[-1] + B @ after + push(240), atol=1e-5)
+    mpc.reset()
+    np.testing.assert_array_equal(run(mpc, 20)[1], U[:20])
+
+
+def test_the_target_of_a_plan_is_that_of_the_constant_part():
+    """At an exact model's rest a long plan of BilinearMPC is KoopmanMPC's, though the disturbance goes on to move."""
+    plans = []
+    for kind in (km.KoopmanMPC, km.BilinearMPC):
+        cost = km.Cost(Q=[1, 1], R=0.1, Q_N=[1, 1])
+        mpc = kind(MODEL, cost, km.Limits(u_min=-5, u_max=5), 12, estimator=km.LiftedDisturbance(period=PERIOD))
+        x = np.zeros(2)
+        for k in range(60):
+            mpc(x, np.array([0.3, 0.1]), applied=[0.1])
+            x = A @ x + B @ [0.1] + push(k)
+        plans.append(mpc.plan())
+    np.testing.assert_allclose(plans[1].U, plans[0].U, atol=1e-6)
+    np.testing.assert_allclose(plans[1].X, plans[0].X, atol=1e-6)
 
 
 def test_without_a_disturbance_nothing_changes():
@@ -116,12 +153,9 @@ def test_bad_periods_are_refused_in_a_sentence(tmp_path):
         km.LiftedDisturbance(period=-1.0)
     with pytest.raises(km.errors.DataError, match="leave out gain"):
         km.LiftedDisturbance(gain=0.5, period=3.0)
-    with pytest.raises(km.errors.DataError, match="for a KoopmanMPC or a LinearMPC"):
-        km.BilinearMPC(
-            MODEL.step_map(), km.Cost(Q=1, R=1), km.Limits(), 5, estimator=km.LiftedDisturbance(period=PERIOD)
-        )
-    with pytest.raises(km.errors.DataError, match="period"):
-        km.export(controller(period=PERIOD), tmp_path)
+    for kind in (km.KoopmanMPC, km.BilinearMPC):
+        with pytest.raises(km.errors.DataError, match="period"):
+            km.export(controller(kind=kind, period=PERIOD), tmp_path)
 
 
 def kalman(**more):

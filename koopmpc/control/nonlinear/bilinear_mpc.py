@@ -51,6 +51,7 @@ _COPIED = (
     "_kept",
     "_age",
     "_given",
+    "_rest",
     "_steps",
     "_planned",
     "_warm",

@@ -78,6 +78,11 @@ class LearnedMap:
         object.__setattr__(self, "center", center)
         object.__setattr__(self, "spread", spread)
 
+    @property
+    def dt(self) -> float:
+        """Sampling time of the model [s]."""
+        return self.model.dt
+
     def replace_model(self, model: ModelOrMap) -> "LearnedMap":
         """Return the map of another predictor with the same lifting.
 

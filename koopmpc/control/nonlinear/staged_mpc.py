@@ -61,7 +61,8 @@ class Preview(NamedTuple):
 class StagedMPC(MPCBase):
     """An MPC on x⁺ = F(x, u) + E w + d, whose solver works stage by stage; parameters as in `BilinearMPC`."""
 
-    _e: Float[np.ndarray, "N nx"]  # e_k = E w_k + d of the step
+    _e: Float[np.ndarray, "N nx"]  # e_k = E w_k + d_k of the step
+    _rest: Float[np.ndarray, " nx"]  # the last e_k without what is periodic in it, which holds at the target
     _targets: StageTargets  # of the step
     _box: Interval  # limits of the inputs of the step, one for all stages or a row each
     _at_call: Limits
@@ -112,7 +113,7 @@ class StagedMPC(MPCBase):
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
         self._goes_on = self.cost.moves_on and o.given is None
         self._disturbed = estimator is not None or given.nw > 0
-        self._scheduled_for = np.zeros(given.nw)
+        self._scheduled_for, self._rest = np.zeros(given.nw), np.zeros(given.nx)
         if self._timed:
             check_rows(self.limits, o, self._problem, None)
 
@@ -143,6 +144,7 @@ class StagedMPC(MPCBase):
             self._scheduled_for = np.zeros(self._map.nw)
             self._terminal.begin_with(self._map)
         self._e[:] = 0.0
+        self._rest = np.zeros(self._map.nx)
 
     @alone
     def update(self, model: ModelOrMap) -> None:
@@ -273,15 +275,16 @@ class StagedMPC(MPCBase):
         """Take over the diagonals that weigh the tracked outputs of s_1 … s_N, and v_0 … v_{N−1} without rates."""
 
     def _disturb(self) -> bool:
-        """Write down e_k = E w_k + d; return whether it is finite."""
+        """Write down e_k = E w_k + d_k; return whether it is finite."""
         initial = self._initial
         e = initial.W @ self._map.E.T
         if initial.d.size:
             e = e + initial.d
-        if not np.abs(e).max() < HUGE:
+        ahead = e + initial.periodic if initial.periodic.size else e
+        if not np.abs(ahead).max() < HUGE:
             return False
-        self._moved = self._moved or bool((e[-1] != self._e[-1]).any())
-        self._e[:] = e
+        self._moved = self._moved or bool((e[-1] != self._rest).any())
+        self._e[:], self._rest = ahead, e[-1].copy()
         if self._map.scheduled:
             if not np.abs(initial.W).max() < HUGE:
                 return False
@@ -317,8 +320,8 @@ class StagedMPC(MPCBase):
             )
             self._reference = key
         R, U, slopes, held, end, beyond = self._preview
-        if self._disturbed:  # the last disturbance of the preview stays
-            e = self._e[-1]
+        if self._disturbed:  # the last disturbance of the preview stays, but for what is periodic in it
+            e = self._rest
             end = self._target = self._terminal.find_disturbed(R[-1], e, self._target)
             U = np.clip(U + slopes @ e, *self._outputs.inputs)
             U[held] = end.u
