@@ -101,6 +101,10 @@ class ExcitationController(FunctionController):
         self._k = 0
         self._policy = self._excitation.start(_LONGEST, self.dt, np.random.default_rng(0))
 
+    def skip(self) -> None:
+        """Pass over a step that was not run: time goes on, and the excitation with it."""
+        self._k += 1
+
     def _follow(self, y: Float[np.ndarray, " ny"], reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nu"]:
         del reference
         k, self._k = self._k, self._k + 1

@@ -204,7 +204,7 @@ class ExperimentPlan(Excitation):
 
         def policy(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " nu"]:
             if k == 0:
-                controller.reset(y.copy())
+                controller.reset(y.copy() if np.isfinite(y).all() else None)
             return np.asarray(controller(y, rows[[min(k + i, last) for i in ahead]]).u, dtype=np.float64)
 
         return policy
@@ -213,16 +213,17 @@ class ExperimentPlan(Excitation):
         U, X, K = self.U[0], self.X[0], self.K
         limit, last = InputLimiter(self.box, self.rates), len(self.U[0]) - 1
         deviation = np.zeros(K.shape[1])
+        off = np.zeros(X.shape[1])
         moved = np.zeros(self.nu)  # by how much the last input differed from the planned one
 
         def policy(k: int, y: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " nu"]:
-            nonlocal deviation, moved
+            nonlocal deviation, moved, off
             at = min(k, last)
             if not K.any():
                 return limit(U[at])
             if y.shape != X[0].shape:
                 raise ShapeError(f"the plan is for {X.shape[1]} measured states, the plant gives {len(y)}")
-            off = y - X[min(k, last + 1)]
+            off = np.where(np.isfinite(y), y - X[min(k, last + 1)], off)  # what is not measured stays where it was
             deviation = off if self.embedding is None else self.embedding.shift(deviation, moved, off)
             u = limit(U[at] - K @ deviation)
             moved = u - U[at]

@@ -27,7 +27,15 @@ _FINALISTS = 12  # so many candidates, those of the largest gain first, run on a
 
 
 class UnsafePlanError(DataError):
-    """No candidate is safe from a start."""
+    """No candidate is safe from a start; `worst` says which state would leave its limits where."""
+
+    def __init__(self, worst: str) -> None:
+        """Say what would help."""
+        self.worst = worst
+        super().__init__(
+            f"no safe plan exists, nor a shorter one: {worst}; start further inside, widen the limits, or record logs "
+            "that stay near a start first, so that the bands become narrow"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +249,7 @@ class Planner:
                     None,
                 )
             worst = self._explain(points[:, some, : self.data.nx], half)
-        raise UnsafePlanError(_say_unsafe(worst))
+        raise UnsafePlanError(worst)
 
     def _choose_set_points(
         self, start: Float[np.ndarray, " n"], standing: Any, information: Float[np.ndarray, "q q"]
@@ -264,7 +272,7 @@ class Planner:
                 one = SafeCandidate(U[:, 0, 0], X[:, 0, 0], half[:, 0], features, name, rows[: self.steps + 1])
                 best = value, one
         if best is None:
-            raise UnsafePlanError(_say_unsafe(worst))
+            raise UnsafePlanError(worst)
         return best[1]
 
     def _run_alone(
@@ -329,13 +337,6 @@ class Planner:
         end = high[i] if X[k + 1, calm, i] + half[k + 1, calm, i] > high[i] else low[i]
         reach = with_unit(self.data.states[i], f"= {X[k + 1, calm, i]:.4g} ± {half[k + 1, calm, i]:.4g}")
         return f"in the calmest plan at step {k + 1} the band {reach} crosses the limit {end:.4g}"
-
-
-def _say_unsafe(worst: str) -> str:
-    return (
-        f"no safe plan exists: {worst}; plan fewer steps, start further inside, widen the limits, or record logs that "
-        "stay near a start first, so that the bands become narrow"
-    )
 
 
 def _name_terms(model: LinearPredictor | BilinearPredictor) -> tuple[str, ...]:

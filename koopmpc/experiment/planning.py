@@ -20,7 +20,7 @@ from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.experiment.ensemble import Ensemble, Fit, calibrate_bands, fit_ensemble
 from koopmpc.experiment.plan import ExperimentPlan
-from koopmpc.experiment.planner import Planner
+from koopmpc.experiment.planner import Planner, UnsafePlanError
 from koopmpc.experiment.standing import check_standing
 from koopmpc.experiment.visits import Visits, visit_loop, weigh_visits
 from koopmpc.identify.fits.bilinear import bilinear_edmd
@@ -46,6 +46,7 @@ _DEGREES = ((2, 8), (3, 4))  # degrees of products, and the entries of a point u
 _RIDGE = 1e-8  # weight of these fits, on columns of unit size
 _ALIKE = 1.1  # a model with this many times the least error is as good
 _NEAR = 2.0  # a rival may have this many times the least error
+_SHORTEST = 8  # steps of the shortest plan that is tried where no longer one is safe
 _RIVALS = 2  # models of other structures that say where the structure is in doubt
 
 
@@ -94,7 +95,8 @@ def next_experiment(
     starts
         (nx,) or (n, nx) states from which the episodes begin, in turn; by default first states of the data.
     steps, episodes
-        Steps of an episode, and number of episodes.
+        Steps of an episode, and number of episodes. Where no plan of so many steps is safe, half of them are tried,
+        then a quarter, down to eight; a note says so.
     level
         Probability with which a whole episode stays inside its band.
     rng
@@ -171,9 +173,22 @@ def next_experiment(
     visits = simulate_visits(ensemble, model, held, asked, design, draw)
     if controller is not None:
         notes = (*notes, *check_standing(controller, held))
-    return Planner(asked, held, ensemble, visits, reach, steps, draw, free=starts is None).plan(
-        episodes, level, model, controller, notes
-    )
+    planner = Planner(asked, held, ensemble, visits, reach, steps, draw, free=starts is None)
+    try:
+        return planner.plan(episodes, level, model, controller, notes)
+    except UnsafePlanError as unsafe:
+        longest, refusal = steps, unsafe
+    while planner.steps > max(2 * past, _SHORTEST):  # a band grows with the steps
+        with hide_fit_warnings():
+            steps = max(planner.steps // 2, past + 1, _SHORTEST)
+            reach = calibrate_bands(model, held, ensemble, steps, level, draw, rivals)
+        planner = replace(planner, reach=reach, steps=steps)
+        note = f"no plan of {longest} steps is safe, so this one has {steps}: {refusal.worst}"
+        try:
+            return planner.plan(episodes, level, model, controller, (*notes, note))
+        except UnsafePlanError:
+            continue
+    raise refusal
 
 
 def choose_starts(asked: DesignTask, data: Episodes, count: int) -> Float[np.ndarray, "n nx"]:

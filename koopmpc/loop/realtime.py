@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.function import as_controller
+from koopmpc.control.function import ExcitationController, as_controller
 from koopmpc.control.move import Controller, Move, Status
 from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, KoopmpcError
@@ -303,6 +303,8 @@ class _Loop:
     def _skip(self, k: int) -> None:
         """Count and record a step whose time has passed: nothing was measured, and the plant kept its input."""
         self.paced.skipped += 1
+        if isinstance(self.controller, ExcitationController):
+            self.controller.skip()
         if self.recorder is not None:
             move = Move.hold(self.kept, Status.TIME_LIMIT)
             self.recorder(

@@ -26,6 +26,8 @@ class Experiments:
         The largest deviation of readings from the plan, in half-widths of its band.
     kinds, gains
         What each episode was, and the expected gain of each plan.
+    lengths
+        Steps of each plan, fewer than asked where none of so many was safe.
     ended
         Why there were no more plans.
     """
@@ -37,6 +39,7 @@ class Experiments:
     reached: list[float] = field(default_factory=list)
     kinds: list[str] = field(default_factory=list)
     gains: list[float] = field(default_factory=list)
+    lengths: list[int] = field(default_factory=list)
     ended: str = ""
     seconds: float = 0.0
 
@@ -75,7 +78,7 @@ def run_experiments(
                 plan.choose_episode(i),
                 x0=plan.starts[i] + task.noise * rng.standard_normal(task.plant.nx),  # a start is a reading, too
                 reference=task.reference,
-                steps=steps,
+                steps=plan.steps,
                 noise=task.noise,
                 rng=rng,
             )
@@ -89,5 +92,6 @@ def run_experiments(
         found.broken.extend(float(one[np.isfinite(one)].max(initial=-1.0)) for one in over)
         found.kinds.extend(plan.kinds)
         found.gains.append(plan.gain)
+        found.lengths.append(plan.steps)
         logs = logs.with_episodes([*logs, *new])
     return Experiments(**{**vars(found), "ended": ended, "seconds": time.process_time() - began})
