@@ -237,6 +237,7 @@ def design(
         ahead, sentence = choose_horizon(held, cost, limits, reference)
         notes = (*notes, sentence)
     asked = check_task(held, cost, limits, ahead, reference, starts, angles)
+    unweighted = find_unweighted_limits(asked, held)
     left = find_stray_episodes(held, asked)
     if left:
         held = held.with_episodes([episode for k, episode in enumerate(held) if k not in left])
@@ -363,7 +364,7 @@ def design(
             *blind,
             *_give_advice(rows, best, linear, expected),
             *test.limits(outcomes[best].band).capped,
-            *find_unweighted_limits(asked, held),
+            *unweighted,
         ),
         notes=(*notes, *short, *folds.notes, *turned, *remembered),
         standby=standby,
