@@ -361,3 +361,27 @@ def test_an_equilibrium_that_was_not_found_is_looked_for_again_after_a_reset(mon
     assert Equilibria.find is find
     controller.reset()
     assert np.array_equal(controller([0.3, 0.0], [0.0, 0.0]).u, fresh([0.3, 0.0], [0.0, 0.0]).u)
+
+
+@pytest.mark.parametrize(("target", "most"), [("zero", 1), ("equilibrium", 2)])
+def test_a_preview_is_searched_by_ipopt_only_where_nothing_close_is_known(monkeypatch, target, most):
+    """Rows before the last need no equilibrium where no input is asked for; others go on from the one before."""
+    A, B = np.array([[0.9, 0.2], [0.0, 0.7]]), np.array([[0.0], [0.3]])
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("x0", "x1"), ("u",))
+    limits = km.Limits(-5, 5, x_max=[2.0, 2.0])
+    controller = km.BilinearMPC(model, km.Cost(Q=[1.0, 1.0], R=0.1, u_target=target), limits, 20)
+    rows = 0.5 * np.cos(0.2 * np.arange(21))[:, None] * [1.0, 0.0]  # through zero
+    find, asked = Equilibria.find, []
+
+    def count(self, *arguments, **options):
+        asked.append(arguments)
+        return find(self, *arguments, **options)
+
+    monkeypatch.setattr(Equilibria, "find", count)
+    controller([0.3, 0.0], rows)
+    assert 1 <= len(asked) <= most
+    terminal = controller._terminal
+    for row in rows[::5]:  # as exact as if each had been sought from afar
+        kept, sought = terminal(row).equilibrium, terminal.equilibria.find(row)
+        assert np.allclose(kept.x, sought.x, atol=1e-6)
+        assert np.allclose(kept.u, sought.u, atol=1e-6)

@@ -71,6 +71,13 @@ class TerminalTarget(NamedTuple):
     slope: Float[np.ndarray, "nu nx"]
 
 
+class ReferenceInput(NamedTuple):
+    """The reference input of a row, and by how much a constant disturbance moves it; see `TerminalTarget`."""
+
+    u: Float[np.ndarray, " nu"]
+    slope: Float[np.ndarray, "nu nx"]
+
+
 class Linearisation(NamedTuple):
     """F(x, u), its Jacobians A and B, of(x) and its Jacobian J, the limited outputs g and their Jacobian G."""
 
@@ -461,6 +468,8 @@ class TerminalTargets:
             if not self.equilibria.of_state:
                 raise ShapeError("Q_N weighs x_N − r_N, but the reference is not of the state; leave Q_N out")
         self._known: dict[bytes, TerminalTarget] = {}
+        self._inputs: dict[bytes, ReferenceInput] = {}
+        self._found: dict[bytes, Equilibrium | None] = {}  # None where there is none
         self._missed: set[bytes] = set()  # reference rows whose equilibrium was not found
         self._last: tuple[Float[np.ndarray, " nr"], Equilibrium] | None = None  # the row found last, and where
 
@@ -483,7 +492,8 @@ class TerminalTargets:
     def forget_missed(self) -> None:
         """Look again for the equilibria that were not found."""
         for key in self._missed:
-            del self._known[key]
+            for kept in (self._known, self._inputs, self._found):
+                kept.pop(key, None)
         self._missed.clear()
 
     def update(self, model: LearnedMap) -> None:
@@ -491,7 +501,7 @@ class TerminalTargets:
         self.equilibria.update(model)
         self.forget_missed()
         self._last = None
-        last, self._known = list(self._known.items())[-1:], {}
+        last, self._known, self._inputs, self._found = list(self._known.items())[-1:], {}, {}, {}
         for key, target in last:
             row = np.frombuffer(key)
             found = self.equilibria.near(target.equilibrium, row, np.zeros(model.nx))
@@ -501,29 +511,58 @@ class TerminalTargets:
     def begin_with(self, model: LearnedMap) -> None:
         """Forget all targets, and find those of this θ."""
         self.equilibria.update(model)
-        self._known, self._last = {}, None
+        self._known, self._inputs, self._found, self._last = {}, {}, {}, None
         self._missed.clear()
 
     def __call__(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
         """Return the target of a row, kept for the next time, or until `forget_missed` where none was found."""
         key = row.tobytes()
         if key not in self._known:
-            if len(self._known) > _MOST:
-                self._known.clear()
-                self._missed.clear()
-            found = self._beside(row) or self._polish(self.equilibria.find(row), row)
-            self._last = None if found is None else (row.copy(), found)
-            if found is None:
-                self._missed.add(key)
+            found = self._find(key, row)
             self._known[key] = self._target_without_equilibrium(row) if found is None else self._target(row, found)
         return self._known[key]
+
+    def find_input(self, row: Float[np.ndarray, " nr"]) -> ReferenceInput:
+        """Return the reference input of a row before the last one, whose terminal cost nothing asks for.
+
+        A reference of the state that asks for no input needs no equilibrium at all.
+        """
+        key, nu = row.tobytes(), self.equilibria.model.nu
+        if self.equilibria.of_state and not self._hold:
+            return ReferenceInput(np.zeros(nu), np.zeros((nu, self.equilibria.model.nx)))
+        if key in self._known:
+            return ReferenceInput(self._known[key].u, self._known[key].slope)
+        if key not in self._inputs:
+            found = self._find(key, row)
+            if found is None:
+                target = self._target_without_equilibrium(row)
+                self._inputs[key] = ReferenceInput(target.u, target.slope)
+            else:
+                slope = self.equilibria.slope(self.equilibria.linearise(found.x, found.u))
+                self._inputs[key] = ReferenceInput(found.u * self._hold, slope * self._hold)
+        return self._inputs[key]
+
+    def _find(self, key: bytes, row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
+        """Return the equilibrium of a row, kept for the next time."""
+        if key in self._found:
+            return self._found[key]
+        if len(self._found) > _MOST:
+            for kept in (self._known, self._inputs, self._found, self._missed):
+                kept.clear()
+        found = self._beside(row) or self._polish(self.equilibria.find(row), row)
+        self._last = None if found is None else (row.copy(), found)
+        if found is None:
+            self._missed.add(key)
+        self._found[key] = found
+        return found
 
     def _beside(self, row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
         """Return the equilibrium of a row close to the last one, from where that was; None where it is not close."""
         if self._last is None:
             return None
         weight, (last, begin) = self._outputs.Q_root, self._last
-        sizes = [float(np.linalg.norm(weight @ each)) for each in (row - last, row, last)]
+        own = self.equilibria.size[: len(row)] if self.equilibria.of_state else np.zeros_like(row)
+        sizes = [float(np.linalg.norm(weight @ each)) for each in (row - last, row, last, own)]
         if sizes[0] > _BESIDE * max(sizes[1:]):
             return None
         return self.equilibria.near(begin, row, np.zeros(self.equilibria.model.nx))

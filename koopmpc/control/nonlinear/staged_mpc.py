@@ -309,7 +309,8 @@ class StagedMPC(MPCBase):
             self._reference = None
             if not np.isfinite(R).all():
                 return False
-            *targets, end = (self._terminal(row) for row in R)
+            targets = [self._terminal.find_input(row) for row in R[:-1]]
+            end = self._terminal(R[-1])
             self._preview = Preview(
                 R,
                 np.array([target.u for target in targets]),
