@@ -106,8 +106,10 @@ class DaskPool(Generic[Task, Result]):
         self._futures: dict[QueuedTask[Task], Any] = {}
 
     def count_workers(self) -> int:
-        """Return the number of the cluster's threads, or 1 while it has none."""
-        return max(sum(self._client.nthreads().values()), 1)
+        """Return the number of the cluster's threads, or 1 while it has none, or nobody answers: wait says so."""
+        with suppress(OSError):
+            return max(sum(self._client.nthreads().values()), 1)
+        return 1
 
     def submit(self, job: QueuedTask[Task]) -> None:
         """Send the job to the scheduler."""
@@ -133,19 +135,25 @@ class DaskPool(Generic[Task, Result]):
             except KilledWorker as error:
                 raise KoopmpcError(died(str(job), "Dask gave it up")) from error
             except (FutureCancelledError, CommClosedError) as error:
-                raise KoopmpcError(
-                    f"{job}: the Dask scheduler at {self._address} has ended; start another one, and run again"
-                ) from error
+                raise self._tell_end(job) from error
             except TimeoutError:
                 if future.done():
                     return future.result()  # it came just now, or the function itself raised a TimeoutError
-                if self._client.nthreads():
+                try:
+                    threads = self._client.nthreads()
+                except OSError as error:  # nobody answers: it has just ended, and the future does not know yet
+                    raise self._tell_end(job) from error
+                if threads:
                     seen = time.monotonic()
                 elif time.monotonic() > seen + _PATIENCE:
                     raise KoopmpcError(
                         f"{job}: the cluster has had no worker for {_PATIENCE:g} s; start some with "
                         "`dask worker ADDRESS`"
                     ) from None
+
+    def _tell_end(self, job: QueuedTask[Task]) -> KoopmpcError:
+        """Return the error for a scheduler that has ended before the job was done."""
+        return KoopmpcError(f"{job}: the Dask scheduler at {self._address} has ended; start another one, and run again")
 
     def abandon(self) -> None:
         """Cancel the jobs that are under way."""

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 import koopmpc as km
+from koopmpc.cluster import DaskPool, QueuedTask
 from koopmpc.parallel import Workers, is_orphan, map_tasks
 from tests import tasks
 from tests.cluster import scheduler_process, two_workers
@@ -375,6 +376,30 @@ def test_a_worker_knows_that_its_parent_was_killed(tmp_path: Path) -> None:
         """
     run_script(tmp_path / "parent.py", text).communicate(timeout=60)
     wait_until((tmp_path / "told").exists)
+
+
+class SilentClient:
+    """What a client of Dask is just after its scheduler was killed: no answer, and futures that do not know it yet."""
+
+    def nthreads(self) -> dict[str, int]:
+        raise OSError("Timed out trying to connect")
+
+    def submit(self, *_: object, **__: object) -> "SilentClient":
+        return self
+
+    def result(self, timeout: float) -> None:
+        raise TimeoutError
+
+    def done(self) -> bool:
+        return False
+
+
+def test_a_scheduler_that_answers_no_question_is_told() -> None:
+    pool, job = DaskPool[str, str](str, SilentClient(), "tcp://127.0.0.1:1"), QueuedTask(0, "a")
+    assert pool.count_workers() == 1
+    pool.submit(job)
+    with pytest.raises(km.KoopmpcError, match=r"task 0.*: the Dask scheduler at tcp://127.0.0.1:1 has ended"):
+        pool.wait(job)
 
 
 def test_a_scheduler_that_dies_is_told(tmp_path: Path) -> None:
