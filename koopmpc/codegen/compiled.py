@@ -182,7 +182,7 @@ class Compiled:
         self.dt, self.nu, self.horizon = program.dt, sizes["NU"], sizes["HORIZON"]
         self.cost, self.limits = getattr(controller, "cost", None), getattr(controller, "limits", None)
         self.model = program.model
-        self._bounds = program.bounds if isinstance(program, CondensedProgram) else None
+        self._bounds = program.bounds if isinstance(program, CondensedProgram | StagedProgram) else None
         self._timed = self._bounds is not None and self.limits is not None and self.limits.in_time
         self._step, self._at_call = 0, None
         find = getattr(controller, "find_targets", None) if isinstance(program, StagedProgram) else None
@@ -261,8 +261,8 @@ class Compiled:
         """Set the limits of this step: those of the call, or the controller's own."""
         if limits is not None and self._bounds is None:
             raise DataError(
-                "limits were passed, and this C code keeps its own; compile a KoopmanMPC or LinearMPC whose limits have"
-                ' rows in time, or Limits(rows=("u_max",))'
+                "limits were passed, and this C code keeps its own; compile one whose limits have rows in time,"
+                ' or Limits(rows=("u_max",))'
             )
         if limits is not None:
             if limits is not self._at_call:

@@ -28,6 +28,7 @@ def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
     if tables.is_staged:
         own = (*_OWN, *_RECEDING, *_STAGED, *(["koopmpc_motion.c"] if tables.sizes["BEYOND"] else ()))
         own = (*own, *(_QP if tables.sizes["FINISH_ROWS"] else ()))
+        own = (*own, *(["koopmpc_stage_bounds.c"] if tables.sizes["BOUNDS"] else ()))
     else:
         law = ("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")
         law = (*law, *(["koopmpc_bounds.c"] if tables.sizes["BOUNDS"] else ()))

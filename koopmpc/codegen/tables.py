@@ -568,6 +568,11 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         "tail_D": p.tail.R_delta,
         "tail_end": p.tail.end,
     }
+    if p.bounds is not None:
+        bounds = p.bounds
+        tables.sizes |= {"BOUNDS": 1, "OUTPUTS": bounds.margin.shape[1], "CHANGES": 0}
+        tables.plan |= {"inwards": bounds.margin, "far_inputs": bounds.far_inputs, "far_outputs": bounds.far_outputs}
+        tables.notes.append(_BOUNDS_NOTE)
     tables.define({"TAIL_SCALE": p.tail.scale})
     tables.define({name: values[single] for name, values in tolerances.OF_STAGES.items()})
     _add_finish(tables, p, low, high)

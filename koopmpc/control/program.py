@@ -170,9 +170,9 @@ def _describe_model(model: Any) -> str:
 def _describe_limits(limits: Any, states: Sequence[str], inputs: Sequence[str]) -> str:
     if limits is None:
         return ""
-    parts: list[str] = []
+    widest, parts = limits.base, list[str]()
     for low, high, names in (("u_min", "u_max", inputs), ("x_min", "x_max", states)):
-        ends = [getattr(limits, end) for end in (low, high)]
+        ends = [getattr(widest, end) for end in (low, high)]
         if all(end is None for end in ends):
             continue
         count = len(names) or max(np.size(end) for end in ends if end is not None)
@@ -184,10 +184,12 @@ def _describe_limits(limits: Any, states: Sequence[str], inputs: Sequence[str]) 
             if np.isfinite(lows[i]) or np.isfinite(highs[i]):
                 name = strip_unit(names[i]) if names else f"{low[0]}{i}"
                 parts.append(f"{lows[i]:.4g} ≤ {name} ≤ {highs[i]:.4g}")
-    rates = limits.du_max is not None or limits.du_min is not None
-    return ", ".join(
-        [*parts, *(["limited rates"] if rates else []), *([] if limits.of is None else ["limited outputs"])]
-    )
+    more = {
+        "limited rates": limits.du_max is not None or limits.du_min is not None,
+        "limited outputs": limits.of is not None,
+        "rows in time": limits.in_time,
+    }
+    return ", ".join([*parts, *(name for name, given in more.items() if given)])
 
 
 class Published:

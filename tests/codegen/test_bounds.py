@@ -4,6 +4,7 @@ import copy
 import pickle
 import subprocess
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.signal import StateSpace
@@ -17,6 +18,8 @@ A, B = np.array([[1.0, 0.2], [-0.1, 0.9]]), np.array([[0.02, 0.01], [0.2, -0.1]]
 MODEL = km.LinearPredictor.from_state_space(StateSpace(A, B, np.eye(2), np.zeros((2, 2)), dt=0.2), inputs=("a", "b"))
 COST = km.Cost(Q=[1, 0.5], R=0.05)
 ROWS = np.random.default_rng(0).uniform(0.3, 1.2, (40, 2))
+WAVES = 0.75 + 0.35 * np.cos(np.arange(40)[:, None] / [3, 2] + [0, 2])
+FLAT = 1e-4  # where interior points end, rounding of y moves u by as much: the cost is flat there
 slow = pytest.mark.slow
 
 
@@ -27,7 +30,17 @@ def compile_mpc(limits, N=6, cost=COST, **options):
     return mpc, fast
 
 
-def require_parity(mpc, fast, steps=40, calls=None):
+def compile_bilinear(limits, N=6, **options):
+    """A BilinearMPC of equations in which an input multiplies a state."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
+    plant = km.StepMap(ca.Function("F", [x, u], [A @ x + B @ u + 0.1 * u[0] * ca.vertcat(0, x[0])]), 0.2)
+    mpc = km.BilinearMPC(plant, km.Cost(Q=[1, 0.5], R=0.3, **options.pop("cost", {})), limits, N, **options)
+    fast = km.compiled(mpc)
+    assert fast is not mpc
+    return mpc, fast
+
+
+def require_parity(mpc, fast, steps=40, calls=None, within=1e-6):
     rng, x = np.random.default_rng(1), np.array([1.0, -0.5])
     mpc.reset()
     fast.reset()
@@ -37,9 +50,9 @@ def require_parity(mpc, fast, steps=40, calls=None):
         limits = calls(k) if calls else None
         y = np.array([np.nan, 0.0]) if k % 13 == 7 else x
         one, other = mpc(y, reference, limits=limits), fast(y, reference, limits=limits)
-        np.testing.assert_allclose(other.u, one.u, atol=1e-6)
+        np.testing.assert_allclose(other.u, one.u, atol=within)
         assert (other.status, other.fallback) == (one.status, one.fallback)
-        assert other.slack == pytest.approx(one.slack, abs=1e-6)
+        assert other.slack == pytest.approx(one.slack, abs=within)
         seen.add(one.status.name)
         x = A @ x + B @ one.u + rng.normal(0, 0.02, 2)
     return seen
@@ -62,10 +75,51 @@ def test_rows_of_bounds_in_c_give_what_python_gives(options, rates):
     assert {"OPTIMAL", "SOFTENED"} <= require_parity(*compile_mpc(limits, **options))
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"estimator": km.LiftedDisturbance()},
+        pytest.param({}, marks=slow),
+        pytest.param({"cost": {"R_delta": 0.1}, "latency": 1, "estimator": km.LiftedDisturbance()}, marks=slow),
+    ],
+)
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"slack": None, "du_max": 0.4},
+        pytest.param({}, marks=slow),
+        pytest.param({"du_max": 0.3, "du_slack": (9, 9)}, marks=slow),
+    ],
+)
+def test_rows_of_bounds_in_the_c_of_a_bilinear_mpc_give_what_python_gives(options, more):
+    low = np.where(np.arange(40)[:, None] % 9 == 4, -np.inf, -1.1)  # rows without a limit
+    bounds = {"u_min": -1, "u_max": WAVES, "x_min": low * [1, 1], "x_max": WAVES[::-1] + 0.1}
+    limits = km.Limits(**{"slack": (20.0, 5.0), **bounds, **more}, margin=[[0.01, 0.02]])
+    seen = require_parity(*compile_bilinear(limits, **options), within=FLAT)
+    assert {"OPTIMAL", "SOFTENED" if more.get("slack", 1) else "INFEASIBLE"} <= seen
+
+
+def test_limits_of_a_call_reach_the_c_of_a_bilinear_mpc():
+    limits = km.Limits(u_min=-1, u_max=1, x_max=2, rows=("u_max",))
+    mpc, fast = compile_bilinear(limits)
+    at_call = limits.with_bounds(u_max=ROWS, x_max=[0.4, 0.3])
+    require_parity(mpc, fast, calls=lambda k: None if k % 3 == 0 else at_call, within=FLAT)
+    with pytest.raises(km.errors.DataError, match="lower limit at step 0"):
+        fast([0, 0], [0, 0], limits=limits.with_bounds(x_min=-1))
+
+
 @pytest.mark.parametrize("limits", [{"x_max": ROWS, "du_max": 0.3}, {}])
 def test_the_c_of_bounds_has_no_warning(limits, tmp_path):
     mpc = km.KoopmanMPC(MODEL, COST, km.Limits(u_min=-1, u_max=ROWS, **limits), 4, estimator=km.LiftedDisturbance())
-    folder = km.export(mpc, tmp_path / "c")
+    require_strict(mpc, tmp_path / "c")
+
+
+def test_the_c_of_bounds_of_a_bilinear_mpc_has_no_warning(tmp_path):
+    require_strict(compile_bilinear(km.Limits(-1, ROWS, x_max=1, du_max=0.3))[0], tmp_path / "c")
+
+
+def require_strict(mpc, path):
+    folder = km.export(mpc, path)
     compiler = f"CC={' '.join(find_compiler() or ())}"
     done = subprocess.run(["make", "-s", "strict", compiler], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -343,3 +343,9 @@ def test_random_loops_with_rows_levels_prices_and_failures_keep_every_limit():
             solved += move.fallback is km.control.Fallback.NONE
             x = np.clip(A @ x + model.B @ move.u + 0.02 * rng.normal(size=nx), -1e4, 1e4)
     assert solved > 1000
+
+
+def test_a_controller_in_words_says_its_widest_limits_and_that_they_move():
+    mpc = km.KoopmanMPC(linear(A, B), COST, km.Limits(u_min=-1, u_max=[[0.5, 0.6], [0.7, 0.2]]), N)
+    assert "u0 ≤ 0.7" in repr(mpc)
+    assert "rows in time" in repr(mpc)

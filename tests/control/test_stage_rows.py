@@ -98,4 +98,15 @@ def test_what_the_stages_do_not_have_is_refused():
     mpc = km.BilinearMPC(model, cost(), km.Limits(-1, 1), N)
     with pytest.raises(DataError, match="upper limit at step 0"):
         mpc([0, 0], [0, 0], limits=mpc.limits.with_bounds(x_max=1.0))
-    assert "rows in time" in km.BilinearMPC(model, cost(), km.Limits(-1, rows), N).program().obstacle
+
+
+def test_a_plan_pays_for_breaking_the_row_of_its_step():
+    mpc = km.BilinearMPC(
+        linear(A, B), cost(), km.Limits(-1, 1, x_max=[[0.9, 9]] * 3 + [[0.1, 9]], slack=(50.0, 5.0)), N
+    )
+    mpc.reset([0.6, -0.4])
+    mpc([0.6, -0.4], [0.4, 0.0])
+    x = mpc.plan().X
+    without = mpc._iteration.cost() - sum(50 * past + 5 * past**2 for past in np.maximum(x[3:, 0] - 0.1, 0.0))
+    weighed = sum((each - [0.4, 0.0]) ** 2 @ [2, 0.5] for each in x[1:])
+    assert without == pytest.approx(weighed + sum(u**2 @ [0.1, 0.2] for u in mpc.plan().U), rel=1e-6)

@@ -140,7 +140,8 @@ def test_a_plan_costs_the_sum_of_its_stages_and_what_breaks_soft_limits(kind):
                 over = max(low + margin - g[i], g[i] - (high - margin), 0.0)
                 if np.isfinite(problem.softness.linear[i]):
                     total += problem.softness.linear[i] * over + problem.softness.quadratic[i] * over**2
-        said = plan_cost(problem)(plan.X.T, plan.U.T, *plan.targets)
+        ends = (end.T for end in problem.stage_limits)
+        said = plan_cost(problem)(plan.X.T, plan.U.T, *plan.targets, *ends)
         assert float(said) == pytest.approx(total, rel=1e-12)
 
 

@@ -137,6 +137,10 @@ typedef struct {
   koopmpc_real barrier[KOOPMPC_N * (KOOPMPC_NU + KOOPMPC_LIMITED)], push[KOOPMPC_N * (KOOPMPC_NU + KOOPMPC_LIMITED)];
   koopmpc_real reach[KOOPMPC_N * (KOOPMPC_NU + KOOPMPC_LIMITED)];
   koopmpc_real first_low[KOOPMPC_NU], first_high[KOOPMPC_NU]; /**< limits of the first change of the inputs */
+#if KOOPMPC_BOUNDS
+  koopmpc_real low[KOOPMPC_N * (KOOPMPC_NU + KOOPMPC_LIMITED)], high[KOOPMPC_N * (KOOPMPC_NU + KOOPMPC_LIMITED)];
+  koopmpc_real box_low[KOOPMPC_MOVES], box_high[KOOPMPC_MOVES]; /**< limits of the stages, and of their inputs */
+#endif
   koopmpc_real without_limits[KOOPMPC_NU], defects[KOOPMPC_POINT], length, slack, best_slack;
   koopmpc_real e[KOOPMPC_PUSHES]; /**< E w + d of the stages */
 #if KOOPMPC_FINISH_ROWS

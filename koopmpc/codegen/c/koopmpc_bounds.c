@@ -23,10 +23,6 @@ void koopmpc_reset_bounds(koopmpc_state *s) {
   }
 }
 
-static koopmpc_real bound(const koopmpc_rows *rows, int k, int width, int i) {
-  return koopmpc_clip(koopmpc_row(rows, k, width)[i], -KOOPMPC_HUGE, KOOPMPC_HUGE);
-}
-
 void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
   enum { NU = KOOPMPC_NU, OUT = KOOPMPC_OUTPUTS, OUT1 = OUT > 0 ? OUT : 1, FIRST = KOOPMPC_MOVES * (1 + KOOPMPC_CHANGES) };
   for (int at = 0; at < KOOPMPC_MOVES; at++) { /* the tightest limits of the steps in which a move is held */
@@ -34,7 +30,7 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
     koopmpc_real low = -KOOPMPC_HUGE, high = KOOPMPC_HUGE;
     for (int k = 0; k < koopmpc_hold_count[at]; k++) {
       const int row = KOOPMPC_LATENCY + koopmpc_hold_first[at] + k;
-      const koopmpc_real below = bound(&b->u_low, row, NU, i), above = bound(&b->u_high, row, NU, i);
+      const koopmpc_real below = koopmpc_bound_of(&b->u_low, row, NU, i), above = koopmpc_bound_of(&b->u_high, row, NU, i);
       low = below > low ? below : low;
       high = above < high ? above : high;
     }
@@ -44,18 +40,18 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
     s->high[at] = koopmpc_tied[at] ? KOOPMPC_HUGE : high;
     if (KOOPMPC_CHANGES) {
       const int row = KOOPMPC_LATENCY + koopmpc_move_start[at / NU];
-      s->low[KOOPMPC_MOVES + at] = koopmpc_held[at] ? -KOOPMPC_HUGE : bound(&b->du_low, row, NU, i);
-      s->high[KOOPMPC_MOVES + at] = koopmpc_held[at] ? KOOPMPC_HUGE : bound(&b->du_high, row, NU, i);
+      s->low[KOOPMPC_MOVES + at] = koopmpc_held[at] ? -KOOPMPC_HUGE : koopmpc_bound_of(&b->du_low, row, NU, i);
+      s->high[KOOPMPC_MOVES + at] = koopmpc_held[at] ? KOOPMPC_HUGE : koopmpc_bound_of(&b->du_high, row, NU, i);
     }
   }
   for (int i = 0; i < NU && KOOPMPC_CHANGES; i++) {
-    s->rate_low[i] = bound(&b->du_low, KOOPMPC_LATENCY, NU, i);
-    s->rate_high[i] = bound(&b->du_high, KOOPMPC_LATENCY, NU, i);
+    s->rate_low[i] = koopmpc_bound_of(&b->du_low, KOOPMPC_LATENCY, NU, i);
+    s->rate_high[i] = koopmpc_bound_of(&b->du_high, KOOPMPC_LATENCY, NU, i);
   }
   for (int j = 0; j < KOOPMPC_N * OUT; j++) {
     const int row = KOOPMPC_LATENCY + j / OUT1 + 1;
-    s->low[FIRST + j] = bound(&b->x_low, row, OUT, j % OUT1) + koopmpc_inwards[j];
-    s->high[FIRST + j] = bound(&b->x_high, row, OUT, j % OUT1) - koopmpc_inwards[j];
+    s->low[FIRST + j] = koopmpc_bound_of(&b->x_low, row, OUT, j % OUT1) + koopmpc_inwards[j];
+    s->high[FIRST + j] = koopmpc_bound_of(&b->x_high, row, OUT, j % OUT1) - koopmpc_inwards[j];
   }
   for (int i = KOOPMPC_PLANNED; i < KOOPMPC_PLANNED + 2 * KOOPMPC_CHECKED; i++) {
     s->low[i] = -KOOPMPC_HUGE;
@@ -64,8 +60,8 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
   for (int k = 0; k <= KOOPMPC_N && KOOPMPC_AIMED; k++)
     for (int i = 0; i < NU + OUT; i++) { /* limits of the target of this row */
       const int row = KOOPMPC_LATENCY + k;
-      const koopmpc_real below = i < NU ? bound(&b->u_low, row, NU, i) : bound(&b->x_low, row, OUT, i - NU);
-      const koopmpc_real above = i < NU ? bound(&b->u_high, row, NU, i) : bound(&b->x_high, row, OUT, i - NU);
+      const koopmpc_real below = i < NU ? koopmpc_bound_of(&b->u_low, row, NU, i) : koopmpc_bound_of(&b->x_low, row, OUT, i - NU);
+      const koopmpc_real above = i < NU ? koopmpc_bound_of(&b->u_high, row, NU, i) : koopmpc_bound_of(&b->x_high, row, OUT, i - NU);
       s->target_low[k * KOOPMPC_NL + i] = below - koopmpc_target_values[i];
       s->target_high[k * KOOPMPC_NL + i] = above - koopmpc_target_values[i];
     }

@@ -7,6 +7,7 @@
  */
 #include <math.h>
 
+#include "koopmpc_bounds.h"
 #include "koopmpc_limits.h"
 #include "koopmpc_observer.h"
 #include "koopmpc_plan.h"
@@ -36,14 +37,15 @@ static void enter(koopmpc_state *s, const koopmpc_real *X, const koopmpc_real *U
   }
   for (int k = 0; k < STEPS; k++)
     for (int i = 0; i < NV; i++) {
+      const koopmpc_real least = KOOPMPC_STAGE_BOX_LOW(s, k)[i], most = KOOPMPC_STAGE_BOX_HIGH(s, k)[i];
 #if KOOPMPC_WITH_RATES
-      const koopmpc_real u = koopmpc_clip(U[koopmpc_held_from[k] * NV + i], koopmpc_input_low[i], koopmpc_input_high[i]);
+      const koopmpc_real u = koopmpc_clip(U[koopmpc_held_from[k] * NV + i], least, most);
       koopmpc_real *before = s->S + k * NS + NX;
       if (k == 0) before[i] = u_prev[i];
       before[NS + i] = u;
       s->V[k * NV + i] = u - before[i];
 #else
-      s->V[k * NV + i] = koopmpc_clip(U[k * NV + i], koopmpc_input_low[i], koopmpc_input_high[i]);
+      s->V[k * NV + i] = koopmpc_clip(U[k * NV + i], least, most);
 #endif
     }
   for (int k = 0; k <= STEPS; k++)
@@ -60,11 +62,12 @@ static void trajectory(const koopmpc_state *s, koopmpc_real *X, koopmpc_real *U)
     koopmpc_real u = s->S[NX + i];
     for (int k = 0; k < STEPS; k++) {
       if (koopmpc_free[k]) u += s->V[k * NV + i];
-      U[k * NV + i] = koopmpc_clip(u, koopmpc_input_low[i], koopmpc_input_high[i]);
+      U[k * NV + i] = koopmpc_clip(u, KOOPMPC_STAGE_BOX_LOW(s, k)[i], KOOPMPC_STAGE_BOX_HIGH(s, k)[i]);
     }
 #else
     for (int k = 0; k < STEPS; k++)
-      U[k * NV + i] = koopmpc_clip(s->V[k * NV + i], koopmpc_input_low[i], koopmpc_input_high[i]);
+      U[k * NV + i] =
+          koopmpc_clip(s->V[k * NV + i], KOOPMPC_STAGE_BOX_LOW(s, k)[i], KOOPMPC_STAGE_BOX_HIGH(s, k)[i]);
 #endif
   }
 }
@@ -457,7 +460,7 @@ static int first_stage(koopmpc_state *s, const koopmpc_real *u_prev, koopmpc_rea
   koopmpc_copy(stage + NX, u_prev, NV);
   for (int i = 0; i < NV; i++) {
     const koopmpc_real low = koopmpc_change_low[i], high = koopmpc_change_high[i];
-    const koopmpc_real most = koopmpc_input_high[i] - u_prev[i], least = koopmpc_input_low[i] - u_prev[i];
+    const koopmpc_real most = KOOPMPC_BOX_HIGH(s)[i] - u_prev[i], least = KOOPMPC_BOX_LOW(s)[i] - u_prev[i];
     const koopmpc_real reach = KOOPMPC_REACH * (koopmpc_abs(u_prev[i]) + koopmpc_input_sizes[i]);
     s->first_low[i] = low < most ? low : most;
     s->first_high[i] = high > least ? high : least;
@@ -537,7 +540,8 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
   report->slack = s->slack;
   trajectory(s, s->draftX, s->kept);
   if (KOOPMPC_HARD_RATED) {
-    koopmpc_admit(s->kept, koopmpc_hard_rate_low, koopmpc_hard_rate_high, u_prev);
+    koopmpc_admit_within(s->kept, koopmpc_hard_rate_low, koopmpc_hard_rate_high, u_prev, KOOPMPC_BOX_LOW(s),
+                         KOOPMPC_BOX_HIGH(s));
     for (int i = 0; i < NV && conflict; i++) {
       const koopmpc_real change = s->kept[i] - u_prev[i];
       const koopmpc_real over = change - koopmpc_hard_rate_high[i], under = koopmpc_hard_rate_low[i] - change;

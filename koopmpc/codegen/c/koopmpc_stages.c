@@ -8,6 +8,7 @@
  */
 #include <math.h>
 
+#include "koopmpc_bounds.h"
 #include "koopmpc_plan.h"
 #include "koopmpc_solver.h"
 #include "koopmpc_stages.h"
@@ -21,14 +22,18 @@ static koopmpc_real quantity(const koopmpc_state *s, int k, int i) {
   return i < NV ? s->V[k * NV + i] : s->g[k * NG + i - NV];
 }
 
+/** The row of the limits of stage k: where limits do not move, the last one is that of all stages after it. */
+enum { LIMIT_ROWS = KOOPMPC_BOUNDS ? STEPS : KOOPMPC_BOX_ROWS };
+static int limit_row(int k) { return (k < LIMIT_ROWS ? k : LIMIT_ROWS - 1) * NQ; }
+
 koopmpc_real koopmpc_low_of(const koopmpc_state *s, int k, int i) {
   if (KOOPMPC_WITH_RATES && k == 0 && i < NV) return s->first_low[i];
-  return koopmpc_low[(k < KOOPMPC_BOX_ROWS ? k : KOOPMPC_BOX_ROWS - 1) * NQ + i];
+  return KOOPMPC_PLAN_LOW(s)[limit_row(k) + i];
 }
 
 koopmpc_real koopmpc_high_of(const koopmpc_state *s, int k, int i) {
   if (KOOPMPC_WITH_RATES && k == 0 && i < NV) return s->first_high[i];
-  return koopmpc_high[(k < KOOPMPC_BOX_ROWS ? k : KOOPMPC_BOX_ROWS - 1) * NQ + i];
+  return KOOPMPC_PLAN_HIGH(s)[limit_row(k) + i];
 }
 
 /** Derivatives at the plan: A, B, c = F - X along it, Q, q, r (Gauss-Newton in the tracked outputs), limits g and G. */

@@ -19,7 +19,7 @@ from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.level_stages import StageLevels
 from koopmpc.control.nonlinear.motion import BEYOND
 from koopmpc.control.nonlinear.problem import ModelOrMap
-from koopmpc.control.nonlinear.rows import StageLimits
+from koopmpc.control.nonlinear.rows import StageLimits, describe_stage_bounds
 from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
 from koopmpc.control.nonlinear.staged_program import StagedProgram, find_targets, first_gain, trace_functions
 from koopmpc.control.nonlinear.stagewise import list_sides, weights
@@ -176,8 +176,6 @@ class BilinearMPC(StagedMPC):
     def build_program(self, reference: ArrayLike | None) -> StagedProgram:
         """Return the data of a step."""
         problem, outputs, model = self._problem, self._outputs, self._map
-        if self.limits.in_time:
-            raise no_export(self, "its limits have rows in time, and its C keeps one set", "one with limits.at(step)")
         if outputs.shift is not None:
             raise no_export(self, "its cost has a price, which its C does not know", "one without a price")
         if problem.timed:
@@ -244,6 +242,7 @@ class BilinearMPC(StagedMPC):
             rest=terminal.equilibria.program(),
             tail=terminal.program(),
             estimator=estimator,
+            bounds=describe_stage_bounds(outputs, problem) if self.limits.in_time or self.limits.rows else None,
         )
 
     def __reduce__(self) -> tuple[Callable[..., "BilinearMPC"], tuple[Any, ...], dict[str, Any]]:

@@ -148,7 +148,7 @@ class RealTimeIteration:
         stages = [A, B, self._c, Q, q, r, self._x0, *([self._R_k] if own else [])]
         self.without_limits = zeros(nu)  # the first input of the last program, had it no limits
         self._dX, self._dU, self._t, self._lam, self._eps, self._nu = state
-        parts = [self.X, self.U, self._R, self._U_r, *self._terminal, *self._weights]
+        parts = [self.X, self.U, self._R, self._U_r, *self._terminal, self.low, self.high, *self._weights]
         self._cost = zeros(1)
         self._weigh = Routine(cost, parts, [self._cost], compiles=False)
         self._free = Routine(free, stages, [self._dX, self._dU, curvature])

@@ -1,9 +1,10 @@
 """Limits in time for the stages of BilinearMPC and NonlinearMPC: rows of u, x and y in place of the constructor's."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from koopmpc.control.cost import StateTracking
 from koopmpc.control.in_time.bounds import refuse_crossed_rows
@@ -11,8 +12,29 @@ from koopmpc.control.in_time.preview import require_preview
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.nonlinear.problem import StagedProblem
 from koopmpc.errors import DataError
+from koopmpc.values import Value
 
 _FAR = 1e3  # a row without a limit is this many sizes beyond the widest one, where it limits nothing
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StageBounds(Value):
+    """How rows of limits in time become the limits of the stages, in the C code.
+
+    Attributes
+    ----------
+    outputs
+        Which of the states and observables have a limit.
+    margin
+        (N, outputs) by how much each stage moves the limits of these inwards.
+    far_inputs, far_outputs
+        How far beyond the widest limit a row without one is.
+    """
+
+    outputs: Bool[np.ndarray, " n"]
+    margin: Float[np.ndarray, "N outputs"]
+    far_inputs: Float[np.ndarray, " nu"]
+    far_outputs: Float[np.ndarray, " outputs"]
 
 
 class StageLimits(NamedTuple):
@@ -73,20 +95,18 @@ def find_stage_limits(
     limits: Limits, outputs: StateTracking, problem: StagedProblem, first: int, base: Interval
 ) -> StageLimits:
     """Return the limits of a plan whose first input acts in step `first`; `base` are the stages' own (N, n)."""
-    N, nu, kept = len(problem.free), len(outputs.inputs.low), outputs.movable.outputs
-    nx = len(outputs.sizes.states)
+    N, nu, how = len(problem.free), len(outputs.inputs.low), describe_stage_bounds(outputs, problem)
+    nx, kept = len(outputs.sizes.states), how.outputs
     inputs = limits.input_rows(nu, first, N)
     every = limits.output_rows(nx, len(kept) - nx, first + 1, N)
     low, high = base.low.copy(), base.high.copy()
     column = nu * problem.with_rates
-    low[:, column : column + nu] = _reach(inputs.low, low[:, column : column + nu], outputs.sizes.inputs, -1.0)
-    high[:, column : column + nu] = _reach(inputs.high, high[:, column : column + nu], outputs.sizes.inputs, 1.0)
+    low[:, column : column + nu] = _reach(inputs.low, low[:, column : column + nu], -how.far_inputs)
+    high[:, column : column + nu] = _reach(inputs.high, high[:, column : column + nu], how.far_inputs)
     count = int(kept.sum())
     if count:
-        margin = problem.margin if problem.margin.shape[1] == count else np.zeros((N, count))
-        size = outputs.sizes.rows[kept]
-        low[:, -count:] = _reach(every.low[:, kept] + margin, low[:, -count:], size, -1.0)
-        high[:, -count:] = _reach(every.high[:, kept] - margin, high[:, -count:], size, 1.0)
+        low[:, -count:] = _reach(every.low[:, kept] + how.margin, low[:, -count:], -how.far_outputs)
+        high[:, -count:] = _reach(every.high[:, kept] - how.margin, high[:, -count:], how.far_outputs)
     own = Interval(
         np.where(np.isfinite(inputs.low), inputs.low, outputs.inputs.low),
         np.where(np.isfinite(inputs.high), inputs.high, outputs.inputs.high),
@@ -94,8 +114,20 @@ def find_stage_limits(
     return StageLimits(own, Interval(low, high))
 
 
+def describe_stage_bounds(outputs: StateTracking, problem: StagedProblem) -> StageBounds:
+    """Return how rows of limits become those of the stages."""
+    kept, N = outputs.movable.outputs, len(problem.free)
+    count = int(kept.sum())
+    return StageBounds(
+        outputs=kept,
+        margin=problem.margin if problem.margin.shape[1] == count else np.zeros((N, count)),
+        far_inputs=_FAR * outputs.sizes.inputs,
+        far_outputs=_FAR * outputs.sizes.rows[kept],
+    )
+
+
 def _reach(
-    rows: Float[np.ndarray, "N n"], base: Float[np.ndarray, "N n"], size: Float[np.ndarray, " n"], sign: float
+    rows: Float[np.ndarray, "N n"], base: Float[np.ndarray, "N n"], far: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "N n"]:
-    """Return the rows, far beyond the base where they have no limit and it has."""
-    return np.where(np.isfinite(rows), rows, base + sign * _FAR * size)
+    """Return the rows, `far` beyond the base where they have no limit."""
+    return np.where(np.isfinite(rows), rows, base + far)

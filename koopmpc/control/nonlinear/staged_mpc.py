@@ -132,7 +132,7 @@ class StagedMPC(MPCBase):
         """Forget all earlier steps; rates count from `u_prev`, which is held if the first step fails."""
         self._steps, inputs = 0, self._outputs.inputs
         if self._timed:
-            low, high = self.limits.input_rows(self.nu, 0, 1)
+            low, high = self.limits.input_rows(self.nu, self._latency, 1)
             self._box = Interval(np.maximum(low, inputs.low), np.minimum(high, inputs.high))
         super().reset(x0, u_prev)
         if self._levels is not None:
@@ -190,14 +190,28 @@ class StagedMPC(MPCBase):
         watch = self._watch
         return move if watch is None else self._judge_step(watch, move, applied, start)
 
+    def read_limits(self, limits: Limits) -> Limits:
+        """Return the limits of a call with arrays in place of names.
+
+        Raises
+        ------
+        DataError
+            They differ from the controller's own in more than bounds.
+        """
+        model = self._map.model
+        return check_bounds_alone(limits, self.limits, tuple(model.states), tuple(model.inputs))
+
+    def check_limits(self, limits: Limits) -> None:
+        """Raise where limits of a call cross, have no row in the stages, or too few rows."""
+        check_rows(limits, self._outputs, self._problem, self._N + self._latency)
+
     def _move_limits(self, limits: Limits | None) -> None:
         """Set the limits of this step: those of the call, or the controller's own."""
         outputs, problem, own, first = self._outputs, self._problem, self.limits, self._steps
         if limits is not None:
             if limits is not self._called_with:
-                model = self._map.model
-                own = check_bounds_alone(limits, self.limits, tuple(model.states), tuple(model.inputs))
-                check_rows(own, outputs, problem, self._N + self._latency)
+                own = self.read_limits(limits)
+                self.check_limits(own)
                 self._called_with, self._at_call = limits, own
             own, first = self._at_call, 0
         elif not self._timed:

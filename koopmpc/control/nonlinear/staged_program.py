@@ -12,6 +12,7 @@ from koopmpc.control.cost import StateTracking
 from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.nonlinear.equilibrium import RestProgram, TailProgram, TerminalTargets
 from koopmpc.control.nonlinear.problem import LearnedMap, ModelOrMap, StagedProblem
+from koopmpc.control.nonlinear.rows import StageBounds
 from koopmpc.control.nonlinear.stagewise import Sides
 from koopmpc.control.program import StepProgram, trace_graph
 from koopmpc.errors import DataError
@@ -71,6 +72,8 @@ class StagedProgram(StepProgram):
         How the target of another row or of a disturbance is found, and what the end of the horizon costs there.
     estimator
         How x and d follow from y.
+    bounds
+        How limits in time move those of the stages; None where none do.
     """
 
     model: ModelOrMap
@@ -108,6 +111,7 @@ class StagedProgram(StepProgram):
     rest: RestProgram
     tail: TailProgram
     estimator: EstimatorProgram
+    bounds: StageBounds | None = None
 
 
 def find_targets(

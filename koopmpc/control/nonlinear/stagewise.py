@@ -127,11 +127,15 @@ def list_hard_outputs(softness: Softness, inputs: int) -> Int[np.ndarray, " n"]:
 
 
 def plan_cost(problem: StagedProblem) -> ca.Function:
-    """Return (X, U, R, U_r, M, L, m) → the cost of a plan, with what it pays for breaking soft limits."""
+    """Return (X, U, R, U_r, M, L, m, low, high) → the cost of a plan, with what it pays for breaking soft limits.
+
+    The limits are those of [u_k; g(x_{k+1})], stage beside stage.
+    """
     nx, nu, nr, N = problem.nx, len(problem.R), len(problem.Q), len(problem.free)
     X, U = ca.MX.sym("X", nx, N + 1), ca.MX.sym("U", nu, N)
     R, U_r = ca.MX.sym("R", nr, N), ca.MX.sym("U_r", nu, N)
     M, L, m = (ca.MX.sym("terminal", nx + nr, columns) for columns in (nr, nx, 1))
+    low, high = (ca.MX.sym("end", nu + len(problem.box.low), N) for _ in range(2))
     of, moved = problem.tracked.map(N)(X[:, 1:]), U - U_r
     missed = (of - R)[:, : N - 1]
     Q_d, R_d = weight_symbols(problem)
@@ -142,10 +146,7 @@ def plan_cost(problem: StagedProblem) -> ca.Function:
         soft = np.isfinite(problem.softness.linear)
         linear, quadratic = (ca.DM(np.where(soft, weight, 0.0)) for weight in problem.softness[:2])
         g = problem.limited.map(N)(X[:, 1:])
-        inwards = np.zeros((N, len(soft)))
-        inwards[:, len(soft) - problem.margin.shape[1] :] = problem.margin
-        low, high = (ca.DM((end + sign * inwards).T) for end, sign in zip(problem.box, (1, -1), strict=True))
-        over = ca.fmax(ca.fmax(low - g, g - high), 0)
+        over = ca.fmax(ca.fmax(low[nu:, :] - g, g - high[nu:, :]), 0)
         if problem.ends:  # a terminal set limits the last stage alone
             counts = np.ones((len(soft), N))
             counts[-problem.ends :, :-1] = 0.0
@@ -153,7 +154,8 @@ def plan_cost(problem: StagedProblem) -> ca.Function:
         cost += ca.dot(linear, ca.sum2(over)) + ca.dot(quadratic, ca.sum2(over**2))
     if problem.stage is not None:
         cost += ca.sum2(problem.stage.map(N)(X[:, :N], U))
-    return ca.Function("plan_cost", [X, U, R, U_r, M, L, m, *([Q_d, R_d] if problem.timed else [])], [cost])
+    arguments = [X, U, R, U_r, M, L, m, low, high, *([Q_d, R_d] if problem.timed else [])]
+    return ca.Function("plan_cost", arguments, [cost])
 
 
 def simulation(problem: StagedProblem) -> ca.Function:
