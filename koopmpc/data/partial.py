@@ -15,7 +15,7 @@ from koopmpc.values import Value, freeze
 
 @dataclass(frozen=True, eq=False, init=False)
 class PartialEpisodes(Value):
-    """Runs x_0 … x_T under u_0 … u_{T−1}, in which NaN in X means: not measured in this row.
+    """Runs x_0 … x_T under u_0 … u_{T−1} and w_0 … w_{T−1}, in which NaN in X means: not measured in this row.
 
     The class is not Episodes, so that code cannot take a missing number for a measured one. Fits of one step take
     `complete_pairs()`; `km.identify.unequal_rates` fits to the measured cells alone. Nothing is interpolated.
@@ -26,17 +26,19 @@ class PartialEpisodes(Value):
         Of each run (T+1, nx), NaN where a state was not measured.
     U
         Of each run (T, nu), complete.
+    W
+        Of each run (T, nw) measured disturbances, complete; none by default.
     dt
         Sampling time of the rows [s].
-    states, inputs
-        Names, x1 … and u1 … by default.
+    states, inputs, disturbances
+        Names, x0 …, u0 … and w0 … by default.
 
     Raises
     ------
     ShapeError
-        X has not one row more than U; the runs have other numbers of states or inputs.
+        X has not one row more than U and W; the runs have other numbers of states, inputs or disturbances.
     DataError
-        There is no run; a state was never measured; U has NaN, or X inf.
+        There is no run; a state was never measured; U or W has NaN, or X inf.
 
     Examples
     --------
@@ -49,34 +51,45 @@ class PartialEpisodes(Value):
 
     X: tuple[Float[np.ndarray, "T1 nx"], ...]
     U: tuple[Float[np.ndarray, "T nu"], ...]
+    W: tuple[Float[np.ndarray, "T nw"], ...]
     dt: float
     states: tuple[str, ...]
     inputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
 
     def __init__(
         self,
         *,
         X: Sequence[ArrayLike],
         U: Sequence[ArrayLike],
+        W: Sequence[ArrayLike] | None = None,
         dt: float,
         states: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
+        disturbances: Sequence[str] | None = None,
     ) -> None:
-        for given, name in ((X, "X"), (U, "U")):
+        for given, name in ((X, "X"), (U, "U"), (U if W is None else W, "W")):
             checks.kind(given, name, (tuple, list, np.ndarray), "pass one array for every run")
         runs = [checks.array(each, f"X of run {i}", (None, None), finite=False) for i, each in enumerate(X)]
         moves = [checks.array(each, f"U of run {i}", (None, None)) for i, each in enumerate(U)]
-        if not runs or len(runs) != len(moves):
-            raise DataError(f"X has {len(runs)} runs and U {len(moves)}; pass one array of each for every run")
-        for i, (x, u) in enumerate(zip(runs, moves, strict=True)):
-            if len(x) != len(u) + 1 or x.shape[1] != runs[0].shape[1] or u.shape[1] != moves[0].shape[1]:
+        if W is None:
+            driven = [np.zeros((len(u), 0)) for u in moves]
+        else:
+            driven = [checks.array(each, f"W of run {i}", (None, None)) for i, each in enumerate(W)]
+        if not runs or not len(runs) == len(moves) == len(driven):
+            counts = f"X has {len(runs)} runs, U {len(moves)} and W {len(driven)}"
+            raise DataError(f"{counts}; pass one array of each for every run")
+        widths = runs[0].shape[1], moves[0].shape[1], driven[0].shape[1]
+        for i, (x, u, w) in enumerate(zip(runs, moves, driven, strict=True)):
+            if not len(x) == len(u) + 1 == len(w) + 1 or (x.shape[1], u.shape[1], w.shape[1]) != widths:
                 raise ShapeError(
-                    f"run {i} has X {x.shape} and U {u.shape}; X has one row more than U, and all runs the same columns"
+                    f"run {i} has X {x.shape}, U {u.shape} and W {w.shape}; X has one row more than U and W, and all"
+                    " runs the same columns"
                 )
             infinite = np.argwhere(np.isinf(x))
             if len(infinite):
                 raise DataError(f"X of run {i} is inf in row {infinite[0, 0]}; pass NaN where nothing was measured")
-        nx, nu = runs[0].shape[1], moves[0].shape[1]
+        nx, nu, nw = widths
         names = checks.names(states, "states", "x", nx), checks.names(inputs, "inputs", "u", nu)
         counts = sum((np.isfinite(x).sum(axis=0) for x in runs), np.zeros(nx, dtype=np.intp))
         if (counts == 0).any():
@@ -85,9 +98,11 @@ class PartialEpisodes(Value):
             self,
             X=tuple(runs),
             U=tuple(moves),
+            W=tuple(driven),
             dt=checks.positive(dt, "dt", "s"),
             states=names[0],
             inputs=names[1],
+            disturbances=checks.names(disturbances, "disturbances", "w", nw),
         )
 
     def count_measured(self) -> np.ndarray:
@@ -118,16 +133,16 @@ class PartialEpisodes(Value):
         """
         least = checks.count(least, "least")
         found: list[Episode] = []
-        for x, u in zip(self.X, self.U, strict=True):
+        for x, u, w in zip(self.X, self.U, self.W, strict=True):
             whole = np.atleast_1d(np.isfinite(x).all(axis=1))
             edges = np.flatnonzero(np.diff(np.concatenate([[False], whole, [False]]).astype(int)))
             for first, last in zip(edges[::2], edges[1::2], strict=True):
                 if last - first > 1:
-                    found.append(Episode(X=x[first:last], U=u[first : last - 1]))
+                    found.append(Episode(X=x[first:last], U=u[first : last - 1], W=w[first : last - 1]))
         pairs, every = sum(map(len, found)), sum(map(len, self.U))
         if pairs < least:
             raise DataError(
                 f"{pairs} of {every} pairs of rows are complete, and {least} are needed; fit to the measured cells"
                 " with km.identify.unequal_rates"
             )
-        return Episodes(found, self.dt, states=self.states, inputs=self.inputs)
+        return Episodes(found, self.dt, self.states, self.inputs, self.disturbances)

@@ -95,9 +95,79 @@ def test_complete_pairs_are_those_of_complete_rows_and_fit_one_step():
         some.complete_pairs(898)
 
 
+def draw_driven(seed, *, bilinear, nw=1):
+    """The matrices of a random plant with measured disturbances, and its runs with a state of every tenth row."""
+    rng = np.random.default_rng(seed)
+    n, nu = int(rng.integers(2, 4)), int(rng.integers(1, 3))
+    A = rng.standard_normal((n, n))
+    A *= rng.uniform(0.5, 0.9) / np.abs(np.linalg.eigvals(A)).max()
+    B, E = rng.standard_normal((n, nu)), rng.standard_normal((n, nw))
+    N, S = 0.08 * rng.standard_normal((nu, n, n)), 0.08 * rng.standard_normal((nw, n, n))
+    M = 0.3 * rng.standard_normal((nw, n, nu))
+    X, U, W = [], [], []
+    for _ in range(3):
+        u, w, x = rng.standard_normal((300, nu)), rng.standard_normal((300, nw)), [rng.standard_normal(n)]
+        for a, b in zip(u, w, strict=True):
+            products = np.einsum("i,ijk,k->j", a, N, x[-1]) + np.einsum("i,ijk,k->j", b, S, x[-1])
+            products = products + np.einsum("i,ijk,k->j", b, M, a)
+            x.append(A @ x[-1] + B @ a + E @ b + bilinear * products)
+        rows = np.array(x)
+        rows[(np.arange(301) + 3) % 10 > 0, -1] = np.nan
+        X.append(rows)
+        U.append(u)
+        W.append(w)
+    names = {"disturbances": [f"weather {j}" for j in range(nw)]}
+    return (A, B, E, N, S, M), km.data.PartialEpisodes(X=X, U=U, W=W, dt=0.1, **names)
+
+
+SEEDS = [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(10, 20))]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_an_exact_plant_with_measured_disturbances_is_recovered(seed):
+    (A, B, E, *_), data = draw_driven(seed, bilinear=False, nw=2)
+    model = km.identify.unequal_rates(data, km.State())
+    for found, true in ((model.A, A), (model.B, B), (model.E, E)):
+        np.testing.assert_allclose(found, true, atol=1e-6)
+    assert model.disturbances == ("weather 0", "weather 1")
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_an_exact_bilinear_plant_is_recovered_with_all_its_products(seed):
+    true, data = draw_driven(seed, bilinear=True)
+    model = km.identify.unequal_rates(data, km.State(), bilinear=True, scheduled_inputs=True)
+    for found, matrix in zip((model.A, model.B, model.E, model.N, model.S, model.M), true, strict=True):
+        np.testing.assert_allclose(found, matrix, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [5, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4))])
+def test_a_model_with_delays_forecasts_a_plant_whose_state_is_hidden(seed):
+    """Two outputs of three states, one in every fifth row: past rows hold what is hidden."""
+    rng = np.random.default_rng(seed)
+    A, B, C = rng.standard_normal((3, 3)), rng.standard_normal((3, 1)), rng.standard_normal((2, 3))
+    A *= 0.8 / np.abs(np.linalg.eigvals(A)).max()
+    Y, U = [], []
+    for _ in range(3):
+        u, x = rng.standard_normal((100, 1)), [rng.standard_normal(3)]
+        for v in u:
+            x.append(A @ x[-1] + B @ v)
+        Y.append(np.array(x) @ C.T)
+        U.append(u)
+    rows = [y.copy() for y in Y[:2]]
+    for y in rows:
+        y[np.arange(101) % 5 > 0, 1] = np.nan
+    data = km.data.PartialEpisodes(X=rows, U=U[:2], dt=0.1)
+    model = km.identify.unequal_rates(data, km.State(), embedding=km.Delay(2))
+    forecast = model.rollout(Y[2][2], U[2][2:], history=km.Episode(X=Y[2][:3], U=U[2][:2]))
+    np.testing.assert_allclose(forecast, Y[2][2:], atol=1e-4 * Y[2].std())
+
+
 X, U = [[0.0, 1.0], [np.nan, 1.0], [2.0, 1.0]], [[1.0], [1.0]]
 REFUSED = {
-    "X has 1 runs and U 2": {"X": [X], "U": [U, U]},
+    "X has 1 runs, U 2 and W 2": {"X": [X], "U": [U, U]},
+    "X has 1 runs, U 1 and W 2": {"X": [X], "U": [U], "W": [U, U]},
+    "W of run 0": {"X": [X], "U": [U], "W": [[[np.nan], [1.0]]]},
+    r"W \(1, 1\)": {"X": [X], "U": [U], "W": [U[:1]]},
     "one row more than U": {"X": [X], "U": [U[:1]]},
     "is inf in row 1": {"X": [[[0.0], [np.inf], [1.0]]], "U": [U]},
     "x1 was never measured": {"X": [[[0.0, np.nan]] * 3], "U": [U]},
@@ -119,6 +189,15 @@ def test_fits_say_what_they_cannot_take():
         km.identify.unequal_rates(data, km.State(), horizon=5)
     with pytest.raises(km.errors.DataError, match="lacks a state"):
         km.identify.unequal_rates(data, km.State(["x0"]))
+    with pytest.raises(km.errors.DataError, match="pass W, and bilinear=True"):
+        km.identify.unequal_rates(data, km.State(), bilinear=True, scheduled_inputs=True)
+    with pytest.raises(km.errors.DataError, match="the embedding has rails"):
+        km.identify.unequal_rates(data, km.State(), embedding=km.Delay(1, rails=[[0, 0], [1, 1]]))
+    with pytest.raises(km.errors.DataError, match="a segment has 2 steps, and the embedding keeps 2"):
+        km.identify.unequal_rates(data, km.State(), embedding=km.Delay(2))
+    still = km.data.PartialEpisodes(X=[X], U=[np.zeros((2, 0))], dt=0.1)
+    with pytest.raises(km.errors.DataError, match="no inputs, so nothing multiplies"):
+        km.identify.unequal_rates(still, km.State(), bilinear=True)
 
 
 @pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
