@@ -14,7 +14,7 @@ from koopmpc.identify.solve import BilinearColumns
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import Lifting
 
-Column = TypeVar("Column", np.ndarray, ca.SX)
+_Column = TypeVar("_Column", np.ndarray, ca.SX)
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class ModelColumns:
         object.__setattr__(self, "of_states", np.concatenate([k + np.arange(self.nx) for k in first]))
 
     @property
-    def multiplied(self) -> Int[np.ndarray, " np"]:
+    def factors(self) -> Int[np.ndarray, " np"]:
         """The observables that u and w multiply: all but the Constant."""
         every = np.arange(self.lifting.nz) if self.bilinear else np.zeros(0, dtype=np.intp)
         return every if self.lifting.constant_index is None else every[every != self.lifting.constant_index]
@@ -62,10 +62,11 @@ class ModelColumns:
         """The order of the columns."""
         return BilinearColumns(self.lifting.nz, self.nu, self.nw, crossed=self.crossed)
 
-    def arrange(self, psi: list[Column], u: list[Column], w: list[Column]) -> list[Column]:
+    def arrange(self, psi: list[_Column], u: list[_Column], w: list[_Column]) -> list[_Column]:
         """Return the columns of φ."""
         crossed = [wj * ui for wj in w for ui in u] if self.crossed else []
-        products = [each * psi[i] for each in (*u, *w) for i in self.multiplied]
+        factors: list[int] = self.factors.tolist()
+        products = [each * psi[i] for each in (*u, *w) for i in factors]
         return [*psi, *crossed, *u, *w, *products]
 
     def evaluate(
@@ -95,7 +96,7 @@ class Cells:
     W: Float[np.ndarray, "steps m nw"]
 
 
-class Slopes(NamedTuple):
+class CellSlopes(NamedTuple):
     """Gauss-Newton of Θ and of the starts of all segments; the starts are eliminated segment by segment."""
 
     gradient: Float[np.ndarray, " p"]
@@ -173,7 +174,7 @@ class MeasuredError:
 
     def derivatives(
         self, theta: Float[np.ndarray, "nx nphi"], starts: Float[np.ndarray, "m ns"], cells: Cells
-    ) -> Slopes:
+    ) -> CellSlopes:
         """Return half the gradient of `evaluate`, and the Gauss-Newton matrices."""
         (nx, count), (m, ns), past = self.shape, starts.shape, self.columns.past
         p = nx * count
@@ -198,10 +199,10 @@ class MeasuredError:
             own += np.einsum("mij,mik->mjk", Sw, Sw)
             cross += np.einsum("mij,mip->mjp", Sw, Dw)
         cut = 1.0 / cells.measured.sum()
-        return Slopes(cut * gradient, cut * matrix, cut * of_starts, cut * own, cut * cross)
+        return CellSlopes(cut * gradient, cut * matrix, cut * of_starts, cut * own, cut * cross)
 
 
-def cut_segments(
+def cut_cells(
     data: PartialEpisodes, bridged: Episodes, horizon: int, past: int
 ) -> tuple[Cells, Float[np.ndarray, "m ns"]]:
     """Return the segments of all runs, one after the other, and where they start on the bridged rows."""

@@ -13,7 +13,7 @@ from koopmpc.data.partial import PartialEpisodes
 from koopmpc.errors import DataError
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.measured_cells import Cells, MeasuredError, ModelColumns, cut_segments
+from koopmpc.identify.measured_cells import Cells, MeasuredError, ModelColumns, cut_cells
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -183,7 +183,7 @@ def _build_model(
     places = np.argmax(model.C, axis=1)
     K = np.zeros((found.theta.shape[1], model.nz))
     K[:, places] = found.theta.T
-    parts = columns.parts.split(K, columns.multiplied)
+    parts = columns.parts.split(K, columns.factors)
     A, B, E = model.A.copy(), model.B.copy(), model.E.copy()
     A[places], B[places], E[places] = parts.A[places], parts.B[places], parts.E[places]
     report = model.report
@@ -205,10 +205,11 @@ def _fit_from(
     """Return where the minimisation ends that starts at one-step least squares on the bridged rows."""
     columns = error.columns
     points = bridged if columns.embedding is None else columns.embedding(bridged)
-    Z, U, W = (np.concatenate([part(e) for e in points]) for part in (lambda e: e.X[:-1], lambda e: e.U, lambda e: e.W))
+    Z, U = np.concatenate([e.X[:-1] for e in points]), np.concatenate([e.U for e in points])
+    W = np.concatenate([e.W for e in points])
     after = np.concatenate([e.X[1:, : columns.nx] for e in points])
     theta, steps = np.asarray(np.linalg.lstsq(columns.evaluate(Z, U, W), after, rcond=None)[0]).T, 0
-    cells, starts = cut_segments(data, bridged, lengths[-1], columns.past)
+    cells, starts = cut_cells(data, bridged, lengths[-1], columns.past)
     unknowns = theta.size + starts.size
     if cells.measured.sum() < unknowns:
         raise DataError(
@@ -217,7 +218,7 @@ def _fit_from(
         )
     value = np.inf
     for length in lengths:
-        cells, starts = cut_segments(data, bridged, length, columns.past)
+        cells, starts = cut_cells(data, bridged, length, columns.past)
         theta, starts, value, taken = _minimise(error, theta, starts, cells, iterations)
         steps += taken
     X = error.simulate(theta, starts, cells)

@@ -192,7 +192,7 @@ def test_fits_say_what_they_cannot_take():
     with pytest.raises(km.errors.DataError, match="pass W, and bilinear=True"):
         km.identify.unequal_rates(data, km.State(), bilinear=True, scheduled_inputs=True)
     with pytest.raises(km.errors.DataError, match="the embedding has rails"):
-        km.identify.unequal_rates(data, km.State(), embedding=km.Delay(1, rails=[[0, 0], [1, 1]]))
+        km.identify.unequal_rates(data, km.State(), embedding=km.Delay(1, rails=np.array([[0.0, 0.0], [1.0, 1.0]])))
     with pytest.raises(km.errors.DataError, match="a segment has 2 steps, and the embedding keeps 2"):
         km.identify.unequal_rates(data, km.State(), embedding=km.Delay(2))
     still = km.data.PartialEpisodes(X=[X], U=[np.zeros((2, 0))], dt=0.1)
