@@ -209,6 +209,7 @@ class Compiled:
         frame.w = Rows(self._w.ctypes.data, 0)
         self._applied_address = self._applied.ctypes.data
         self._pointer = ctypes.c_void_p(ctypes.addressof(frame))
+        self._reference_pointer = ctypes.byref(frame.reference)
         self._call = self._code.koopmpc_call
         self._y_shape, self._row_shape, self._row = (self._ny,), (self._nr,), self._reference[0]
         self._rows_shape = self._reference.shape
@@ -244,6 +245,17 @@ class Compiled:
                 return
             self._table = table  # which C reads
             self._code.koopmpc_use_targets(point_to(self._memory), point_to(self._table), len(self._table))
+
+    def _aim_next(self, rows: Float[np.ndarray, "..."]) -> None:
+        """Let C find the targets of the rows in the frame, or Python, where C has none to start at.
+
+        C starts at the nearest row that it knows. Python searches where that leads to no equilibrium, or to limits.
+        """
+        if len(self._table):
+            self._last_rows = rows.tobytes()
+            if not self._code.koopmpc_find_targets(point_to(self._memory), self._reference_pointer):
+                return
+        self._aim(rows)
 
     def _pass_bounds(self, limits: Limits, first: int) -> None:
         """Pass the limits from step `first` on to the C code."""
@@ -310,7 +322,7 @@ class Compiled:
             if count != self._count:  # writing a field takes as long as the C step
                 frame.reference.count = self._count = count
             if self._targets is not None and target.tobytes() != self._last_rows:
-                self._aim(target)
+                self._aim_next(target)
             if applied is not None or w is not None or self._has_extras:
                 self._pass_extras(applied, w)
             if limits is not None or self._timed or self._at_call is not None:

@@ -60,3 +60,19 @@ def test_c_moves_the_end_as_python_does(name, plant):
             x = plant(x, a.u) + rng.normal(0.0, [2.0, 0.01])
     assert max(off) < 1e-6
     assert max(miss for kind, miss in moved if kind == "sine") > 0.05
+
+
+@pytest.mark.parametrize("held", ["equilibrium", "zero"])
+def test_a_set_point_met_for_the_first_time_is_held_as_in_python(held, plant):
+    """Near ones, far ones, and such that no torque inside the limits holds."""
+    cost = km.Cost(Q=[1e-5, 0.1], R=0.1, u_target=held)
+    mpc = km.BilinearMPC(plant, cost, km.Limits(**BOX), N)
+    twin = km.compiled(mpc)
+    rng, off, x = np.random.default_rng(1), [], np.array([50.0, 0.1])
+    for k in range(60):
+        angle = 20.0 * k if k % 4 else rng.uniform(-3000, 3000)
+        a, b = mpc(x, [angle, 0.0]), twin(x, [angle, 0.0])
+        assert (a.status, a.fallback) == (b.status, b.fallback)
+        off.append(float(np.abs(a.u - b.u).max()))
+        x = x + [0.05, 0.01] * rng.normal(size=2)
+    assert max(off) < 1e-6

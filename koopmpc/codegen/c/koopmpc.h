@@ -261,6 +261,14 @@ int koopmpc_plan_states(const koopmpc_state *s, koopmpc_real *X);
  */
 void koopmpc_use_targets(koopmpc_state *s, const koopmpc_real *targets, int count);
 
+/**
+ * Find the targets of reference rows before the step that meets them, which does the same otherwise.
+ * @param s         the state
+ * @param reference as in koopmpc_step
+ * @return number of rows that the table lacks, and for which no equilibrium inside all limits was found
+ */
+int koopmpc_find_targets(koopmpc_state *s, const koopmpc_rows *reference);
+
 /** next = F(x, u), the model; x is the state, or the state and its past. */
 void koopmpc_map(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *next);
 #endif

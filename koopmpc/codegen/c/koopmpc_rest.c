@@ -32,50 +32,56 @@ static koopmpc_real largest_of(const koopmpc_real *a, int n) {
   return most;
 }
 
+/** Turn two columns of n numbers. */
+static void turn(koopmpc_real *left, koopmpc_real *right, koopmpc_real cosine, koopmpc_real sine, int n) {
+  for (int i = 0; i < n; i++) {
+    const koopmpc_real a = left[i], b = right[i];
+    left[i] = cosine * a - sine * b;
+    right[i] = sine * a + cosine * b;
+  }
+}
+
 int koopmpc_inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_real *result, koopmpc_real *null) {
-  koopmpc_real V[WIDEST * WIDEST], size[WIDEST], largest = 0;
+  koopmpc_real V[WIDEST * WIDEST], size[WIDEST], largest = 0, nothing = 0;
   int count = 0;
+  for (int j = 0; j < n; j++) /* columns one after the other, so that a compiler vectorises what runs along them */
+    for (int i = 0; i < m; i++) result[j * m + i] = E[i * n + j];
+  koopmpc_copy(E, result, m * n);
   for (int i = 0; i < n * n; i++) V[i] = i % (n + 1) == 0 ? 1 : 0;
+  for (int j = 0; j < n; j++) {
+    size[j] = koopmpc_dot(E + j * m, E + j * m, m);
+    nothing += 16 * KOOPMPC_TURN * KOOPMPC_TURN * size[j];
+  }
   for (int sweep = 0, turned = 1; sweep < 40 && turned; sweep++) {
     turned = 0;
     for (int p = 0; p < n; p++)
       for (int q = p + 1; q < n; q++) {
-        koopmpc_real a = 0, b = 0, c = 0, zeta, t, cosine, sine;
-        for (int i = 0; i < m; i++) {
-          a += E[i * n + p] * E[i * n + p];
-          b += E[i * n + q] * E[i * n + q];
-          c += E[i * n + p] * E[i * n + q];
-        }
-        if (!(koopmpc_abs(c) > KOOPMPC_TURN * KOOPMPC_SQRT(a * b)) || !(koopmpc_abs(c) > 0)) continue;
+        koopmpc_real *left = E + p * m, *right = E + q * m, zeta, t, cosine, sine;
+        const koopmpc_real c = koopmpc_dot(left, right, m);
+        if (!(size[p] > nothing && size[q] > nothing)) continue; /* a column of rounding would turn on and on */
+        if (!(koopmpc_abs(c) > 0) || !(koopmpc_abs(c) > KOOPMPC_TURN * KOOPMPC_SQRT(size[p] * size[q]))) continue;
         turned = 1;
-        zeta = (b - a) / (2 * c);
+        zeta = (size[q] - size[p]) / (2 * c);
         t = (zeta < 0 ? -1 : 1) / (koopmpc_abs(zeta) + KOOPMPC_SQRT(1 + zeta * zeta));
         cosine = 1 / KOOPMPC_SQRT(1 + t * t);
         sine = cosine * t;
-        for (int i = 0; i < m; i++) {
-          const koopmpc_real left = E[i * n + p], right = E[i * n + q];
-          E[i * n + p] = cosine * left - sine * right;
-          E[i * n + q] = sine * left + cosine * right;
-        }
-        for (int i = 0; i < n; i++) {
-          const koopmpc_real left = V[i * n + p], right = V[i * n + q];
-          V[i * n + p] = cosine * left - sine * right;
-          V[i * n + q] = sine * left + cosine * right;
-        }
+        turn(left, right, cosine, sine, m);
+        turn(V + p * n, V + q * n, cosine, sine, n);
+        size[p] = koopmpc_dot(left, left, m);
+        size[q] = koopmpc_dot(right, right, m);
       }
   }
-  for (int j = 0; j < n; j++) {
-    size[j] = 0;
-    for (int i = 0; i < m; i++) size[j] += E[i * n + j] * E[i * n + j];
+  for (int j = 0; j < n; j++)
     if (size[j] > largest) largest = size[j];
-  }
   koopmpc_fill(result, 0, n * m);
   for (int j = 0; j < n; j++) {
     if (size[j] > rank * rank * largest && size[j] > 0) {
-      for (int i = 0; i < n; i++)
-        for (int k = 0; k < m; k++) result[i * m + k] += V[i * n + j] * E[k * n + j] / size[j];
+      for (int i = 0; i < n; i++) {
+        const koopmpc_real share = V[j * n + i] / size[j];
+        for (int k = 0; k < m; k++) result[i * m + k] += share * E[j * m + k];
+      }
     } else {
-      for (int i = 0; i < n && null; i++) null[i * n + count] = V[i * n + j];
+      for (int i = 0; i < n && null; i++) null[i * n + count] = V[j * n + i];
       count++;
     }
   }

@@ -259,7 +259,7 @@ static int add_tail(koopmpc_real *target) {
   koopmpc_copy(copied, seen, NX * NX);
   (void)koopmpc_inverse(copied, NX, NX, KOOPMPC_PSEUDO, inverse, 0);
   koopmpc_copy(copied, seen, NX * NX);
-  blind = koopmpc_inverse(copied, NX, NX, KOOPMPC_TURN * NX, copied, 0);
+  blind = koopmpc_inverse(copied, NX, NX, KOOPMPC_TURN * NX, seen, 0);
   for (int i = 0; i < NX; i++)
     for (int j = 0; j < NX; j++) mean += P[i * TAILED + j] * inverse[i * NX + j];
   mean /= (koopmpc_real)(blind < NX ? NX - blind : 1);

@@ -502,6 +502,22 @@ void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *
   s->target_count = KOOPMPC_TARGETS;
 }
 
+int koopmpc_find_targets(koopmpc_state *s, const koopmpc_rows *reference) {
+  int missed = 0;
+  for (int k = KOOPMPC_HOLDS ? 0 : STEPS; k <= STEPS; k++) {
+    const koopmpc_real *row = koopmpc_row(reference, k + KOOPMPC_LATENCY, KOOPMPC_NR), *target;
+    const koopmpc_real *known = s->targets + s->target_count * KOOPMPC_TARGET;
+    int free = 1;
+    if (!koopmpc_usable(row, KOOPMPC_NR)) continue;
+    target = target_of(s, row, k == STEPS);
+    if (target >= s->targets && target < known) continue;
+    for (int i = 0; i < NV + KOOPMPC_BOX && target; i++)
+      free &= !(target[TARGET_ACTIVE + i] < 0 || target[TARGET_ACTIVE + i] > 0);
+    missed += !(target && free && target[target == s->made_end ? TARGET_FOUND : TARGET_M] > 0);
+  }
+  return missed;
+}
+
 void koopmpc_use_targets(koopmpc_state *s, const koopmpc_real *targets, int count) {
   s->targets = targets;
   s->target_count = count;

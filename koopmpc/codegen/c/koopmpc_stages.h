@@ -75,7 +75,8 @@ koopmpc_real koopmpc_cost(const koopmpc_state *s);
 
 /**
  * The pseudo-inverse (n, m) of E (m, n), and a basis of its null space in the columns of `null` (n, n), by one-sided
- * Jacobi rotations of E's columns: E V = B has orthogonal columns. E is overwritten; returns the null space's size.
+ * Jacobi rotations of E's columns: E V = B has orthogonal columns. E is overwritten, and may not be `result`; returns the
+ * null space's size.
  */
 int koopmpc_inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_real *result, koopmpc_real *null);
 
