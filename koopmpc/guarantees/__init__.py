@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.control.terminal.sets import TerminalFeedback as TerminalFeedback
     from koopmpc.control.terminal.sets import TerminalSet as TerminalSet
     from koopmpc.guarantees.certificate import Certificate as Certificate
     from koopmpc.guarantees.certificate import CertifiedFeedback as CertifiedFeedback

@@ -16,7 +16,7 @@ from koopmpc.control.limits import Interval, Limits, refuse_levels
 from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import Program, SavedController, no_export
-from koopmpc.control.terminal.sets import TerminalSet
+from koopmpc.control.terminal.sets import TerminalFeedback, TerminalSet
 from koopmpc.errors import CertificateError, DataError
 from koopmpc.guarantees.deviation import DeviationModel
 from koopmpc.guarantees.error_bounds import ErrorBound
@@ -141,9 +141,10 @@ class Certificate(Value):
         return float(1 - fallen.mean())
 
     def terminal_set(self) -> TerminalSet:
-        """Return {V ≤ 1} as `Limits(terminal=…)` takes it."""
-        kept = tuple(int(i) for i in self.deviation.kept)
-        return TerminalSet(self.deviation.z, of=self.deviation.lifting, W=np.linalg.inv(self.P), kept=kept)
+        """Return {V ≤ 1} with its feedback, as `Limits(terminal=…)` takes it."""
+        deviation = self.deviation
+        kept, feedback = tuple(int(i) for i in deviation.kept), TerminalFeedback(deviation.u, self.K, self.K_w)
+        return TerminalSet(deviation.z, of=deviation.lifting, W=np.linalg.inv(self.P), kept=kept, feedback=feedback)
 
     def weigh_end(self, cost: Cost) -> Float[np.ndarray, "n n"]:
         """Return s P⁻¹ for which s V falls by at least the stage cost in every step, as `Cost(Q_N=…)` takes it.

@@ -12,7 +12,7 @@ from koopmpc.control.cost import Cost, LiftedTracking, lifted_tracking
 from koopmpc.control.limits import Limits
 from koopmpc.control.riccati import Stage, find_gain, one_step, stationary
 from koopmpc.control.target import targets_of
-from koopmpc.control.terminal.sets import TerminalSet
+from koopmpc.control.terminal.sets import TerminalFeedback, TerminalSet
 from koopmpc.errors import CertificateError, DataError
 from koopmpc.guarantees.invariant_set import find_invariant_set
 from koopmpc.predict.predictors import LinearPredictor
@@ -36,6 +36,7 @@ class TailLoop(NamedTuple):
     center: Float[np.ndarray, " n"]
     kept: Int[np.ndarray, " nk"]
     with_input: bool
+    u: Float[np.ndarray, " nu"]
 
 
 def find_terminal_set(
@@ -106,13 +107,14 @@ def find_terminal_set(
     loop = build_tail_loop(predictor, cost, limits, reference)
     kept = tuple(int(i) for i in loop.kept)
     of = predictor.lifting if predictor.embedding is None and predictor.lifting.nz == predictor.nz else None
+    law = TerminalFeedback(loop.u, -loop.K)
     if kind == "ellipsoid":
         if error is not None:
             raise DataError("an ellipsoid is not tightened by errors; take kind='polytope', or leave error out")
         # max H_i ξ over ξᵀP ξ ≤ α is √(α H_i P⁻¹ H_iᵀ)
         reach = np.einsum("ij,ij->i", loop.H, np.linalg.solve(loop.P, loop.H.T).T)
         level = float((loop.h**2 / np.maximum(reach, 1e-300)).min())
-        return TerminalSet(loop.center, of=of, W=loop.P / level, with_input=loop.with_input, kept=kept)
+        return TerminalSet(loop.center, of=of, W=loop.P / level, with_input=loop.with_input, kept=kept, feedback=law)
     n = len(loop.center)
     if n > MOST_COORDINATES:
         raise CertificateError(
@@ -124,7 +126,7 @@ def find_terminal_set(
         sizes = checks.vector(error, "error", predictor.nz)[loop.kept]
         grown = np.concatenate([sizes, np.zeros(n - len(sizes))])
     found = find_invariant_set(loop.transition, loop.H, loop.h, error=grown, most_steps=most_steps)
-    return TerminalSet(loop.center, of=of, H=found.H, h=found.h, with_input=loop.with_input, kept=kept)
+    return TerminalSet(loop.center, of=of, H=found.H, h=found.h, with_input=loop.with_input, kept=kept, feedback=law)
 
 
 def build_tail_loop(predictor: LinearPredictor, cost: Cost, limits: Limits, reference: ArrayLike) -> TailLoop:
@@ -167,7 +169,7 @@ def build_tail_loop(predictor: LinearPredictor, cost: Cost, limits: Limits, refe
         )
     H, h = _list_limits(track, K, kept, z_r, u_r, len(transition))
     center = np.concatenate([z_r[kept], u_r]) if len(transition) > nk else z_r[kept]
-    return TailLoop(transition, K, P, H, h, center, kept, len(transition) > nk)
+    return TailLoop(transition, K, P, H, h, center, kept, len(transition) > nk, u_r)
 
 
 def _list_limits(

@@ -82,6 +82,10 @@ class BilinearMPC(StagedMPC):
     are Riccati recursions, and where that ends early DAQP, on the condensed program. Where changes of the inputs
     count, or moves are blocked, the changes are the inputs of the program, and the last input is part of its state.
 
+    If a hard terminal set knows its feedback, as a Certificate does, a plan is accepted that keeps the limits on the
+    model and costs no more than the accepted plan of the last step, moved on and prolonged by this feedback. Otherwise
+    that plan is followed.
+
     One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
 
     Parameters
@@ -258,6 +262,7 @@ class BilinearMPC(StagedMPC):
         held = {name: getattr(self, name) for name in _COPIED}
         iteration = self._iteration
         held["levels"] = self._levels
+        held["ahead"] = None if self._keeper is None else self._keeper.ahead
         held["plan"] = iteration.X.copy(), iteration.U.copy(), iteration.e.copy()
         return build, (self.model, self.cost, self.limits, self._N), held
 
@@ -266,6 +271,9 @@ class BilinearMPC(StagedMPC):
         iteration = self._iteration
         iteration.X[:], iteration.U[:], iteration.e[:] = held.pop("plan")
         levels: LevelSearch | None = held.pop("levels")
+        ahead = held.pop("ahead")
+        if self._keeper is not None:
+            self._keeper.ahead = ahead
         if levels is not None:
             self._levels, self._held = levels, levels.held
             self._on_levels = StageLevels(levels, self._problem)
@@ -458,6 +466,9 @@ class BilinearMPC(StagedMPC):
     ) -> None:
         """Make these states and inputs the plan."""
         self._iteration.X[:], self._iteration.U[:] = self._stages(X, U, u_prev)
+
+    def _go_on_from(self, S: Float[np.ndarray, "N1 ns"], V: Float[np.ndarray, "N nu"]) -> None:
+        self._iteration.X[:], self._iteration.U[:] = S, V
 
     def _shift(self, u_prev: Float[np.ndarray, " nu"]) -> None:
         """Make the plan of the last step the start of this one; its last stage is one step of the model."""

@@ -43,6 +43,8 @@ class NonlinearMPC(StagedMPC):
     included. Without a Q_N the terminal weight is the Riccati solution of the linearisation at the equilibrium that
     holds the last reference row. It finds a local optimum, as every method of its kind.
 
+    With a hard terminal set that knows its feedback it keeps accepted plans as BilinearMPC does.
+
     One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
 
     Parameters
@@ -191,6 +193,9 @@ class NonlinearMPC(StagedMPC):
         slack = float(found.slacks[found.slacks > self._shooting.allowance].max(initial=0.0))
         status = Status.SOFTENED if good and slack else found.status
         return StagePlan(np.vstack([s, found.X]), found.U, status, iterations, slack)
+
+    def _go_on_from(self, S: Float[np.ndarray, "N1 ns"], V: Float[np.ndarray, "N nu"]) -> None:
+        self._next = self._shooting.at(np.vstack([S[2:], S[-1:]]), np.vstack([V[1:], V[-1:]]))
 
     def _search_levels(
         self, relaxed: NLPSolution, s: Float[np.ndarray, " ns"], first: Interval, deadline: float

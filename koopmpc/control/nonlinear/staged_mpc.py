@@ -14,13 +14,15 @@ from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, data_ranges, state_tracking
 from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation, refuse_priority
-from koopmpc.control.move import Move, Plan, Status, alone
+from koopmpc.control.move import Fallback, Move, Plan, Status, alone
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.motion import BEYOND, Course, can_drift, extend_rows, shift_target
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.control.nonlinear.rows import StageLimits, check_rows, find_stage_limits
 from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.stepped.search import LevelSearch
+from koopmpc.control.terminal.kept_plan import JudgedPlan, PlanKeeper, choose_plan
+from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set
 from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator, start_observer
@@ -110,12 +112,22 @@ class StagedMPC(MPCBase):
         )
         self._problem = staged_problem(given, o, self._moves)
         self._levels = None if self._held is None else LevelSearch(self._held, self._blocks, self.nu)
+        self._keeper = None if o.limits.terminal is None else self._make_keeper(o.limits.terminal)
         self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
         self._goes_on = self.cost.moves_on and o.given is None
         self._disturbed = estimator is not None or given.nw > 0
         self._scheduled_for, self._rest = np.zeros(given.nw), np.zeros(given.nx)
         if self._timed:
             check_rows(self.limits, o, self._problem, None)
+
+    def _make_keeper(self, given: TerminalSet | HasTerminalSet) -> PlanKeeper | None:
+        """Return what keeps the accepted plan; None where the set is soft or has no feedback, or moves are not free."""
+        end, problem = read_terminal_set(given), self._problem
+        if end.feedback is None or self._outputs.limits.terminal_slack is not None or self._levels is not None:
+            return None
+        return (
+            PlanKeeper(problem, self._map, end) if problem.free.all() and not (problem.own or problem.timed) else None
+        )
 
     @property
     def model(self) -> ModelOrMap:
@@ -137,6 +149,8 @@ class StagedMPC(MPCBase):
         super().reset(x0, u_prev)
         if self._levels is not None:
             self._levels.reset()
+        if self._keeper is not None:
+            self._keeper.keep(None)
         self._warm, self._moved, self._row = False, False, 0
         self._forget_targets()
         self._terminal.forget_missed()
@@ -248,8 +262,10 @@ class StagedMPC(MPCBase):
         if not (known and self._aim(target)):
             return self._lose(applied, Status.BAD_MEASUREMENT, 0, start)
         found = self._solve(s, u_prev, first, start + self._allowed)
-        status = Status.FAILED if self.solver_fails else found.status
-        if status not in GOOD:
+        status, kept = Status.FAILED if self.solver_fails else found.status, False
+        if self._keeper is not None:
+            found, status, kept = self._choose(self._keeper, found._replace(status=status), s, u_prev, first)
+        if status not in GOOD and not kept:
             return self._lose(applied, status, found.iterations, start, found.free)
         self._warm = True
         self._X, self._U = self._trajectory(found.S, found.V)
@@ -264,7 +280,45 @@ class StagedMPC(MPCBase):
         move = self._move(u.copy(), Status.SOFTENED if conflict else status, found.iterations, start, slack)
         if self._levels is not None and self._levels.gap:
             move.status, move.gap = Status.TIME_LIMIT, self._levels.gap
+        if kept and status not in GOOD:
+            move.fallback = Fallback.SHIFTED_PLAN
         return move
+
+    def _choose(
+        self,
+        keeper: PlanKeeper,
+        found: StagePlan,
+        s: Float[np.ndarray, " ns"],
+        u_prev: Float[np.ndarray, " nu"],
+        first: Interval,
+    ) -> tuple[StagePlan, Status, bool]:
+        """Return the plan to follow: the one found, or the accepted one of the last step where that costs less.
+
+        The last entry says whether it is the accepted one. Then an INFEASIBLE program has a plan, after all, and counts
+        as not solved to its tolerance.
+        """
+
+        def judge(U: Float[np.ndarray, "n nu"] | None) -> JudgedPlan | None:
+            way = None if U is None else keeper.roll_out(self._map, s[: self._map.nx], U, self._box, self._e, W)
+            return None if way is None else keeper.judge(*self._stages(*way, u_prev), way[1], first, self._targets)
+
+        W, status = self._initial.W, found.status
+        kept = judge(keeper.ahead)
+        chosen = choose_plan(judge(self._trajectory(found.S, found.V)[1]) if status in GOOD else None, kept)
+        if chosen is None:
+            keeper.skip()
+            return found, status, False
+        keeper.keep(chosen.U)
+        if chosen is kept:
+            self._go_on_from(chosen.S, chosen.V)
+            status = Status.MAX_ITERATIONS if status is Status.INFEASIBLE else status
+        if status in GOOD:
+            status = Status.SOFTENED if chosen.slack else Status.OPTIMAL if status is Status.SOFTENED else status
+        return StagePlan(chosen.S, chosen.V, status, found.iterations, chosen.slack), status, chosen is kept
+
+    @abstractmethod
+    def _go_on_from(self, S: Float[np.ndarray, "N1 ns"], V: Float[np.ndarray, "N nu"]) -> None:
+        """Make this the plan from which the next step starts."""
 
     @abstractmethod
     def _solve(
@@ -432,5 +486,7 @@ class StagedMPC(MPCBase):
     ) -> Move:
         """Return the move that replaces a failed step; the next step starts cold, unless this one ran out of time."""
         self._warm = status is Status.TIME_LIMIT
+        if self._keeper is not None and status is Status.BAD_MEASUREMENT:
+            self._keeper.skip()
         known = free is not None and bool((np.abs(free) < HUGE).all())
         return self._fail(free if known else None, applied, status, iterations, start)

@@ -20,6 +20,33 @@ _ADVICE = "make one with km.guarantees.find_terminal_set, or pass a Certificate"
 
 
 @dataclass(frozen=True, eq=False)
+class TerminalFeedback(Value):
+    """u = u_c + (I − K_w (I ⊗ δ))⁻¹ K δ with δ = ξ − c, under which a terminal set is not left.
+
+    Attributes
+    ----------
+    u
+        (nu,) the input u_c at the center.
+    K
+        (nu, n) gain.
+    K_w
+        (nu, nu n) of a feedback that is a quotient; None for a linear one.
+    """
+
+    u: ArrayLike
+    K: ArrayLike
+    K_w: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        u, K = checks.array(self.u, "u", (None,)), checks.array(self.K, "K", (None, None))
+        K = checks.array(K, "K", (len(u), K.shape[1]))
+        object.__setattr__(self, "u", u)
+        object.__setattr__(self, "K", K)
+        if self.K_w is not None:
+            object.__setattr__(self, "K_w", checks.array(self.K_w, "K_w", (len(u), K.size)))
+
+
+@dataclass(frozen=True, eq=False)
 class TerminalSet(Value):
     """{ξ: H (ξ − c) ≤ h}, or {ξ: (ξ − c)ᵀW(ξ − c) ≤ 1}, of observables ξ at the end of a plan.
 
@@ -37,11 +64,16 @@ class TerminalSet(Value):
         Whether the last input u_{N−1} stands behind the observables in ξ.
     kept
         (k,) which of the observables ξ holds; None for all. A Constant cannot be one of them.
+    feedback
+        The feedback that keeps ξ in the set, and the limits; None where it is not known. BilinearMPC and NonlinearMPC
+        with the set hard then keep the plan that they accepted until they find a better one.
 
     Raises
     ------
     DataError
         Neither or both of H and W are given; h is not above zero; W is not positive definite.
+    ShapeError
+        The feedback has another number of coordinates.
 
     Examples
     --------
@@ -58,6 +90,7 @@ class TerminalSet(Value):
     W: ArrayLike | None = None
     with_input: bool = False
     kept: tuple[int, ...] | None = None
+    feedback: TerminalFeedback | None = None
 
     def __post_init__(self) -> None:
         center = checks.array(self.center, "center", (None,))
@@ -65,6 +98,9 @@ class TerminalSet(Value):
         object.__setattr__(self, "center", center)
         if self.of is not None:
             checks.kind(self.of, "of", Lifting, "for example km.State()")
+        if self.feedback is not None:
+            checks.kind(self.feedback, "feedback", TerminalFeedback, "km.guarantees.TerminalFeedback(u, K)")
+            _require_size(np.shape(self.feedback.K)[1], n, "feedback of the terminal set")
         if (self.H is None) == (self.W is None) or (self.H is None) != (self.h is None):
             raise DataError("a terminal set is a polytope, H and h, or an ellipsoid, W; pass one of the two")
         if self.W is not None:
@@ -170,19 +206,43 @@ def terminal_function(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> 
     ShapeError
         The set has another number of coordinates.
     """
+    x, u, away = _trace_deviation(wanted, states, nu)
+    value = ca.mtimes(ca.DM(wanted.rows), away)
+    return ca.Function("terminal", [x, u], [ca.densify(ca.sumsqr(value) if wanted.is_ellipsoid else value)])
+
+
+def terminal_feedback(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> ca.Function:
+    """Return (x, u_{k−1}) → u of the feedback of a terminal set.
+
+    Raises
+    ------
+    ShapeError
+        The set has another number of coordinates, or its feedback of inputs.
+    """
+    law = wanted.feedback
+    assert law is not None, "only asked where the set has a feedback"
+    x, u, away = _trace_deviation(wanted, states, nu)
+    _require_size(len(np.asarray(law.u)), nu, "feedback of the terminal set")
+    v = ca.mtimes(ca.DM(law.K), away)
+    if law.K_w is not None:
+        v = ca.solve(ca.SX.eye(nu) - ca.mtimes(ca.DM(law.K_w), ca.kron(ca.SX.eye(nu), away)), v)
+    return ca.Function("feedback", [x, u], [ca.densify(ca.DM(law.u) + v)])
+
+
+def _trace_deviation(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Return x, u_{k−1} and ξ − c."""
     x, u = ca.SX.sym("x", len(states)), ca.SX.sym("u", nu)
     xi = x if wanted.of is None else wanted.of.bind(states).symbolic(x)
     xi = xi if wanted.kept is None else xi[list(wanted.kept), 0]
     xi = ca.vertcat(xi, u) if wanted.with_input else xi
     center = np.asarray(wanted.center)
     _require_size(len(center), xi.size1())
-    value = ca.mtimes(ca.DM(wanted.rows), xi - ca.DM(center))
-    return ca.Function("terminal", [x, u], [ca.densify(ca.sumsqr(value) if wanted.is_ellipsoid else value)])
+    return x, u, xi - ca.DM(center)
 
 
-def _require_size(had: int, wanted: int) -> None:
+def _require_size(had: int, wanted: int, what: str = "terminal set") -> None:
     if had != wanted:
         raise ShapeError(
-            f"the terminal set has {had} coordinates, the model {wanted}; make the set of this model, or name its"
+            f"the {what} has {had} coordinates, the model {wanted}; make the set of this model, or name its"
             " observables with of="
         )
