@@ -88,10 +88,11 @@ def test_many_loops_stay_feasible_and_their_cost_falls(kind):
 
 
 @pytest.mark.parametrize("kind", [km.BilinearMPC, km.NonlinearMPC])
-def test_a_solver_that_fails_is_replaced_by_the_kept_plan_to_the_end(kind, task):
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_a_solver_that_fails_is_replaced_by_the_kept_plan_to_the_end(kind, horizon, task):
     model, box, end, _ = task
     limits = km.Limits(**box, slack=None, terminal=end, terminal_slack=None)
-    mpc = kind(model, km.Cost(Q=1, R=1, Q_N=end), limits, 3)
+    mpc = kind(model, km.Cost(Q=1, R=1, Q_N=end), limits, horizon)
     x = 0.9 * end.sample(1)[0]
     assert mpc(x, np.zeros(model.nx)).fallback.name == "NONE"
     plan, mpc.solver_fails = mpc.plan(), True

@@ -299,7 +299,7 @@ class StagedMPC(MPCBase):
         """
 
         def judge(U: Float[np.ndarray, "n nu"] | None) -> JudgedPlan | None:
-            way = None if U is None else keeper.roll_out(self._map, s[: self._map.nx], U, self._box, self._e, W)
+            way = None if U is None else keeper.roll_out(self._map, s[: self._map.nx], U, u_prev, self._box, self._e, W)
             return None if way is None else keeper.judge(*self._stages(*way, u_prev), way[1], first, self._targets)
 
         W, status = self._initial.W, found.status

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
@@ -50,6 +51,9 @@ class PlanKeeper:
         The hard terminal set, which has a feedback.
     """
 
+    _feedback: ca.Function
+    _outputs: ca.Function
+    _cost: ca.Function
     ahead: Float[np.ndarray, "n nu"] | None  # inputs of the accepted plan from the next step on
 
     def __init__(self, problem: StagedProblem, model: LearnedMap, end: TerminalSet) -> None:
@@ -77,16 +81,19 @@ class PlanKeeper:
         model: LearnedMap,
         x: Float[np.ndarray, " nx"],
         U: Float[np.ndarray, "n nu"],
+        u_prev: Float[np.ndarray, " nu"],
         box: Interval,
         e: Float[np.ndarray, "N nx"],
         W: Float[np.ndarray, "N nw"],
     ) -> tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]] | None:
         """Return the N states to which U leads, and U with κ behind it; None where they overflow."""
-        states, inputs = [x], list(U)
+        states: list[np.ndarray] = [x]
+        inputs: list[np.ndarray] = list(U)
         for k in range(self._N):
             if k == len(inputs):
-                found = self._feedback(states[-1][: self._ny], inputs[-1] if k else np.zeros(U.shape[1]))
-                inputs.append(np.clip(np.array(found, dtype=np.float64).ravel(), *box))
+                before = inputs[-1] if k else u_prev
+                u: np.ndarray = np.array(self._feedback(states[-1][: self._ny], before), dtype=np.float64).ravel()
+                inputs.append(np.clip(u, *box))
             states.append(model.step(states[-1], inputs[k], W[k]) + e[k])
             if not np.abs(states[-1]).max() < HUGE:
                 return None

@@ -223,10 +223,10 @@ def terminal_feedback(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> 
     assert law is not None, "only asked where the set has a feedback"
     x, u, away = _trace_deviation(wanted, states, nu)
     _require_size(len(np.asarray(law.u)), nu, "feedback of the terminal set")
-    v = ca.mtimes(ca.DM(law.K), away)
+    v = ca.mtimes(ca.DM(np.asarray(law.K)), away)
     if law.K_w is not None:
-        v = ca.solve(ca.SX.eye(nu) - ca.mtimes(ca.DM(law.K_w), ca.kron(ca.SX.eye(nu), away)), v)
-    return ca.Function("feedback", [x, u], [ca.densify(ca.DM(law.u) + v)])
+        v = ca.solve(ca.SX.eye(nu) - ca.mtimes(ca.DM(np.asarray(law.K_w)), ca.kron(ca.SX.eye(nu), away)), v)
+    return ca.Function("feedback", [x, u], [ca.densify(ca.DM(np.asarray(law.u)) + v)])
 
 
 def _trace_deviation(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> tuple[ca.SX, ca.SX, ca.SX]:
