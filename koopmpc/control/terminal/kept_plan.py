@@ -61,7 +61,7 @@ class PlanKeeper:
         self._feedback = terminal_feedback(end, tuple(model.model.states), nu)
         self._ny, self._outputs, self._cost = model.ny, problem.limited.map(self._N), plan_cost(problem)
         low, high = problem.stage_limits
-        self._low, self._high = low[:, nu:], high[:, nu:]
+        self._low, self._high, self._stage_limits = low[:, nu:], high[:, nu:], (low.T, high.T)
         self._moves, self._move_sizes = problem.inputs, 1e-9 * problem.input_sizes
         self._hard = np.isinf(problem.softness.linear)
         self._allowance = problem.softness.allowance.copy()
@@ -118,7 +118,7 @@ class PlanKeeper:
         soft = past[:, ~self._hard]
         excess = max(float(over[:, self._hard].max(initial=0.0)), float(moved.max()))
         slack = float(soft[over[:, ~self._hard] > 1].max(initial=0.0))
-        parts = (S.T, V.T, targets.R.T, targets.U.T, targets.M, targets.L, targets.m)
+        parts = (S.T, V.T, targets.R.T, targets.U.T, targets.M, targets.L, targets.m, *self._stage_limits)
         return JudgedPlan(U, S, V, float(self._cost(*parts)), excess, slack)
 
 
