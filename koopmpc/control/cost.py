@@ -39,7 +39,7 @@ class WeighsEnd(Protocol):
 class Cost(Value):
     """Σ_{k=1}^{N−1} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{N−1} (‖u_k − u_r‖²_R + pᵀu_k + ‖u_k − u_{k−1}‖²_{R_delta}) + V(z_N).
 
-    A custom `stage` adds Σ_{k=0}^{N−1} ℓ(x_k, u_k).
+    A custom `stage` adds Σ_{k=0}^{N−1} ℓ(x_k, u_k), an `output_price` Σ_{k=1}^{N−1} qᵀ of(x_k).
 
     V is by default the cost-to-go of the same tracking problem over a tail of steps after the horizon, without limits
     and with an input of its own at each step: x_N and every later state are weighed by Q, inputs by R around u_r and
@@ -86,6 +86,10 @@ class Cost(Value):
         Weights in time, (T, nr) and (T, nu), or by name a value a step: row k is the diagonal that weighs x_k, or u_k,
         of a run in place of that of Q or R; the last row is held. Q and R, both diagonal then, stay the weights of V,
         of set points and of sizes. For BilinearMPC and NonlinearMPC.
+    output_price
+        q, what a unit of each tracked output costs in a step, (nr,) or by name; an omitted output is free. A priced
+        output needs a weight in Q. Where V is the tail, it counts q too, and so does ``tail=0`` at x_N; other ends do
+        not. For the controllers that know `price`.
     beyond
         What a reference does after the rows that a step is given. "rest": the last row stays. "motion", the default of
         BilinearMPC and NonlinearMPC without Q_N, tail and given u_target: it goes on by the linear recurrence that all
@@ -118,6 +122,7 @@ class Cost(Value):
     stage: "StageCost | None" = None
     Q_rows: "Bound" = None
     R_rows: "Bound" = None
+    output_price: ArrayLike | checks.ByName | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.Q_N, WeighsEnd):
@@ -152,6 +157,14 @@ class Cost(Value):
             if not all(np.isfinite(np.asarray(value)).all() for value in bounds.list_bound(price)):
                 raise DataError("price holds an infinite number; pass what a unit of an input costs in a step")
             object.__setattr__(self, "price", price)
+        if self.output_price is not None:
+            if isinstance(self.output_price, Mapping):
+                stored = checks.check_named(self.output_price, "output_price")
+            else:
+                stored = np.atleast_1d(checks.array(self.output_price, "output_price"))
+                if stored.ndim > 1:
+                    raise ShapeError(f"output_price has shape {stored.shape}; pass a number for each tracked output")
+            object.__setattr__(self, "output_price", stored)
         for name in ("Q_rows", "R_rows"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, self._check_rows(name))
@@ -181,6 +194,8 @@ class Cost(Value):
             raise ShapeError(f"{name} is {rows!r}; pass rows (steps, n), or by name a value a step")
         if self.price is not None and name == "R_rows":
             raise DataError("a price is paid back by R, which R_rows moves in time; pass one of the two")
+        if self.output_price is not None and name == "Q_rows":
+            raise DataError("an output_price is paid back by Q, which Q_rows moves in time; pass one of the two")
         for weight in ("Q", "R"):  # the steps have diagonals of both
             base = getattr(self, weight)
             if not isinstance(base, Mapping) and np.ndim(base) == 2 and (base != np.diag(np.diagonal(base))).any():
@@ -201,6 +216,9 @@ class Cost(Value):
         priced: dict[str, Any] = {}
         if isinstance(self.price, Mapping):
             priced["price"] = bounds.order_bound(self.price, "price", inputs, 0.0)
+        if isinstance(self.output_price, Mapping):
+            names = self.of.bind(tuple(states)).names
+            priced["output_price"] = checks.order_by_name(self.output_price, "output_price", names, 0.0)
         if isinstance(self.R_rows, Mapping):
             priced["R_rows"] = bounds.order_bound(self.R_rows, "R_rows", inputs, 0.0)
         if isinstance(self.Q_rows, Mapping):
@@ -261,6 +279,32 @@ class Cost(Value):
             rows = weight.diagonal() if rows is None else rows
             tables.append(bounds.hold_rows(cast("ArrayLike", rows), name, len(weight), first, count, 0.0))
         return tables[0], tables[1]
+
+    def find_pull(self, nr: int) -> Float[np.ndarray, " nr"] | None:
+        """Return −½ Q⁻¹ q, by which an output price moves the rows that cost nothing; None without one.
+
+        ‖y − r‖²_Q + qᵀy = ‖y − r + ½ Q⁻¹ q‖²_Q + const.
+
+        Raises
+        ------
+        DataError
+            Q does not weigh a priced output.
+        ShapeError
+            There is not one number for each tracked output.
+        """
+        if self.output_price is None:
+            return None
+        q = checks.array(cast("ArrayLike", self.output_price), "output_price", (nr,))
+        Q = checks.weight(self.Q, "Q", nr)
+        pull = -0.5 * np.linalg.pinv(Q, hermitian=True) @ q
+        missed = np.abs(2.0 * Q @ pull + q)
+        if (missed > 1e-9 * np.abs(q).max()).any():
+            i = int(missed.argmax())
+            raise DataError(
+                f"tracked output {i} has the price {q[i]:g} and no weight in Q, so its plan may have no end; give it a"
+                " Q above zero, or pass the price as a stage= to a BilinearMPC"
+            )
+        return pull
 
     def find_shift(self, nu: int) -> Float[np.ndarray, "T nu"] | None:
         """Return −½ R⁻¹ p, by which a price moves the inputs that cost nothing, a row a step; None without a price.
@@ -364,7 +408,7 @@ class Tracking(Generic[Read]):
     u_target that is given as numbers, None for one by name. `Q_root` and `R_root` are S with SᵀS = Q and R. `sizes` are
     those of states, inputs, limits and cost. Where limits have rows, all these are of their widest values, and
     `movable` says which inputs, rates and outputs [x; of(x)] have a limit, or may get one. `shift` is what a price adds
-    to u_r.
+    to u_r, `pull` what an output price adds to the reference.
     """
 
     cost: Cost
@@ -388,6 +432,7 @@ class Tracking(Generic[Read]):
     sizes: Sizes
     movable: Movable
     shift: Float[np.ndarray, "prices nu"] | None
+    pull: Float[np.ndarray, " nr"] | None
 
 
 LiftedTracking: TypeAlias = Tracking[np.ndarray]
@@ -486,7 +531,7 @@ def refuse_steps(cost: Cost, limits: Limits) -> None:
             f"{end} has a row for each step, which this controller or search does not know; pass limits.at(step), or "
             "take a KoopmanMPC, a LinearMPC, a BilinearMPC or a NonlinearMPC"
         )
-    if cost.price is not None:
+    if cost.price is not None or cost.output_price is not None:
         raise DataError(
             "the cost has a price, which this controller or search does not know; take a KoopmanMPC, a BilinearMPC or "
             "a NonlinearMPC, or leave the price out"
@@ -572,6 +617,7 @@ def _tracking(
         sizes=sizes,
         movable=base.movable(nx, len(sizes.rows) - nx, nu),
         shift=cost.find_shift(nu),
+        pull=cost.find_pull(nr),
     )
 
 

@@ -199,7 +199,7 @@ def running_cost(run: Run) -> Float[np.ndarray, " T1"]:
 def cost_terms(
     run: Run, error: Float[np.ndarray, "T1 nr"]
 ) -> tuple[Float[np.ndarray, " T1"], Float[np.ndarray, " T"], Float[np.ndarray, " T0"]]:
-    """Return ‖error_k‖²_Q, ‖u_k − u_reference_k‖²_R + pᵀu_k + ℓ(x_k, u_k), ‖u_k − u_{k−1}‖²_{R_delta}.
+    """Return ‖error_k‖²_Q + qᵀy_k, ‖u_k − u_reference_k‖²_R + pᵀu_k + ℓ(x_k, u_k), ‖u_k − u_{k−1}‖²_{R_delta}.
 
     By default Q = I and R = 0.
     """
@@ -212,6 +212,8 @@ def cost_terms(
     )
     if run.cost is not None and run.cost.price is not None:
         moved = moved + np.einsum("ki,ki->k", run.cost.price_rows(nu, 0, len(run.U)), run.U)
+    if run.cost is not None and run.cost.output_price is not None:
+        stage = stage + run.cost.of.bind(tuple(run.states))(_states(run)) @ np.asarray(run.cost.output_price)
     if run.cost is not None and run.cost.weighs_in_time:
         weights = run.cost.weight_rows(nr, nu, 0, len(error))
         stage, moved = (

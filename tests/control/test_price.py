@@ -1,5 +1,7 @@
 """Prices of inputs: CVXPY's plan, the shift of a target that they are, tariffs that move along, and metrics."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ LIMITS = km.Limits(u_min=-0.4, u_max=0.6, x_max=[0.7, np.inf], slack=None)
 TARIFF = np.column_stack([0.3 * np.sign(np.sin(np.arange(40) / 3)), np.linspace(-0.2, 0.4, 40)])
 
 
-def cheapest(model, x, rows, price, u_r, limits):
+def cheapest(model, x, rows, price, u_r, limits, q=(0.0, 0.0)):
     """The inputs of least cost, as a program in CVXPY without a tail."""
     import cvxpy as cp
 
@@ -24,6 +26,7 @@ def cheapest(model, x, rows, price, u_r, limits):
     for k in range(N):
         held += [X[k + 1] == model.A @ X[k] + model.B @ U[k], U[k] >= -0.4, U[k] <= 0.6, X[k + 1][0] <= 0.7]
         cost += cp.quad_form(U[k] - u_r[k], R) + price[k] @ U[k]
+        cost += np.array(q) @ X[k + 1]
         cost += 2.0 * cp.square(X[k + 1][0] - rows[k + 1][0]) + 0.1 * cp.square(X[k + 1][1] - rows[k + 1][1])
     cp.Problem(cp.Minimize(cost), held).solve(cp.CLARABEL)
     return U.value
@@ -47,6 +50,60 @@ def test_the_plan_is_the_cheapest_and_a_tariff_moves_along(kind, u_target):
         np.testing.assert_allclose(mpc.plan().U, wanted, atol=2e-4)
         x = A @ x + B @ move.u
     assert km.Status.OPTIMAL in statuses
+
+
+@pytest.mark.parametrize("kind", [km.KoopmanMPC, km.BilinearMPC, km.NonlinearMPC])
+def test_the_plan_is_the_cheapest_where_outputs_have_prices_too(kind):
+    model, q = linear(A, B), np.array([0.3, -0.05])
+    cost = km.Cost(Q=[2.0, 0.1], R=R, tail=0, u_target="zero", price=TARIFF, output_price=q)
+    mpc, x = kind(model, cost, LIMITS, N), np.array([0.3, -0.2])
+    rows = np.tile([0.4, 0.0], (N + 1, 1))
+    rows[N // 2 :] = [0.9, 0.1]
+    for k in range(3):
+        move = mpc(x, rows)
+        wanted = cheapest(model, x, rows, TARIFF[k : k + N], [np.zeros(2)] * N, LIMITS, q)
+        np.testing.assert_allclose(mpc.plan().U, wanted, atol=2e-4)
+        x = A @ x + B @ move.u
+
+
+@pytest.mark.parametrize("end", [{}, {"Q_N": np.eye(2)}])
+@pytest.mark.parametrize("estimator", [None, km.LiftedDisturbance()])
+def test_an_output_price_is_a_shift_of_the_reference_but_for_the_input_target(end, estimator):
+    """‖y − r‖²_Q + qᵀy = ‖y − r + ½ Q⁻¹ q‖²_Q + const, also in the tail; an end of one's own counts no price."""
+    model, q = linear(A, B), np.array([0.3, -0.05])
+    pull = -0.5 * q / np.array([2.0, 0.1])
+    cost = km.Cost(Q=[2.0, 0.1], R=R, u_target="zero", **end)
+    priced = km.KoopmanMPC(model, replace(cost, output_price=q), LIMITS, N, estimator=estimator)
+    shifted = km.KoopmanMPC(model, cost, LIMITS, N, estimator=estimator)
+    x, statuses = np.array([0.3, -0.2]), set()
+    for k in range(6):
+        rows = np.tile([0.2 + 0.1 * k, 0.0], (N + 1, 1))
+        moved = rows + pull
+        if end:
+            moved[N] = rows[N]
+        a, b = priced(x, rows), shifted(x, moved)
+        np.testing.assert_allclose(a.u, b.u, atol=1e-9)
+        statuses.add(a.status)
+        x = A @ x + B @ a.u
+    assert len(statuses) == 2
+
+
+def test_metrics_and_files_know_the_price_of_an_output(tmp_path):
+    model = linear(A, B)
+    cost = km.Cost(Q=[2.0, 0.1], R=R, u_target="zero", output_price={"x0": 0.3})
+    mpc = km.KoopmanMPC(model, cost, LIMITS, N)
+    run = km.simulate(model.step_map(), mpc, x0=[0.3, -0.2], reference=[0.3, 0], steps=20, cost=cost, limits=LIMITS)
+    by_hand = sum(
+        2.0 * (x[0] - 0.3) ** 2 + 0.1 * x[1] ** 2 + u @ R @ u + 0.3 * x[0]
+        for x, u in zip(run.X[1:], run.U, strict=True)
+    )
+    assert km.metrics(run).cost == pytest.approx(by_hand)
+    km.record(run, tmp_path / "run.rrd")
+    assert km.load_run(tmp_path / "run.rrd").cost == run.cost
+    mpc.save(tmp_path / "mpc.npz")
+    other = km.load_controller(tmp_path / "mpc.npz")
+    mpc.reset()
+    np.testing.assert_array_equal(other([0.3, -0.2], [0.3, 0]).u, mpc([0.3, -0.2], [0.3, 0]).u)
 
 
 def test_a_price_is_a_shift_of_the_target_to_the_bit_also_in_the_tail():
@@ -95,5 +152,17 @@ def test_prices_by_name_and_what_is_refused():
         km.LQR(model, km.Cost(Q=[1, 1], R=R, price=[0, 1]))
     with pytest.raises(DataError, match="infinite"):
         km.Cost(Q=1, R=R, price=[np.inf, 0])
+    for wrong, said in (
+        ({"output_price": [1, 0], "Q": [0, 1]}, "no weight in Q"),
+        ({"output_price": [1, 0, 0]}, "output_price has shape"),
+        ({"output_price": [[1, 0]]}, "a number for each tracked output"),
+        ({"output_price": {"x7": 1}}, "x7"),
+    ):
+        with pytest.raises((DataError, km.errors.ShapeError), match=said):
+            km.KoopmanMPC(model, km.Cost(**{"Q": [1, 1], "R": R, **wrong}), LIMITS, N)
+    with pytest.raises(DataError, match="paid back by Q"):
+        km.Cost(Q=1, R=R, Q_rows=[[1, 1]], output_price=[1, 0])
+    with pytest.raises(DataError, match="does not know"):
+        km.LQR(model, km.Cost(Q=[1, 1], R=R, output_price=[0, 1]))
     obstacle = km.BilinearMPC(model, km.Cost(Q=[1, 1], R=R, price=[0, 1]), LIMITS, N).program().obstacle
     assert "price" in obstacle

@@ -209,6 +209,10 @@ def plan_map(
     maps = condense(own, law, end, aims, units, "riccati" if moves.own else coordinates, rows)
     if moves.own:
         maps = tie_moves(maps, moves.held)
+    if track.pull is not None:  # an end of one's own does not count the price
+        counted = horizon.N + (track.cost.Q_N is None)
+        pulled = np.concatenate([np.tile(track.pull, counted), np.zeros((horizon.N + 1 - counted) * len(track.pull))])
+        maps = replace(maps, offset=maps.offset + maps.from_reference @ pulled)
     scaled = _scale_deviation(maps, track.inputs, len(moves.lengths))
     return PlanMap(track, targets, horizon, scaled, rows, moves.held, buffer)
 

@@ -180,7 +180,7 @@ class BilinearMPC(StagedMPC):
     def build_program(self, reference: ArrayLike | None) -> StagedProgram:
         """Return the data of a step."""
         problem, outputs, model = self._problem, self._outputs, self._map
-        if outputs.shift is not None:
+        if outputs.shift is not None or outputs.pull is not None:
             raise no_export(self, "its cost has a price, which its C does not know", "one without a price")
         if problem.timed:
             raise no_export(self, "its weights move in time, and its C keeps one set", "one without Q_rows and R_rows")

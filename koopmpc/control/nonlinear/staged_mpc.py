@@ -395,7 +395,7 @@ class StagedMPC(MPCBase):
             U = np.clip(U + slopes @ e, *self._outputs.inputs)
             U[held] = end.u
         self._moved = False
-        rows, shift = self._outputs.given, self._outputs.shift
+        rows, shift, pull = self._outputs.given, self._outputs.shift, self._outputs.pull
         ahead = np.arange(self._N + 1) + self._row + self._latency
         if rows is not None:  # row k of a given u_target counts at the k-th step
             given = rows[np.minimum(ahead, len(rows) - 1)]
@@ -408,7 +408,8 @@ class StagedMPC(MPCBase):
         if self.cost.Q_N is None and (trajectory or self.cost.tail == 0):
             M, nr = np.zeros_like(end.M), len(R[-1])
             M[:nr] = self._outputs.Q_root
-            end = end._replace(M=M, L=np.zeros_like(end.L), V=np.zeros_like(end.V), m=M @ R[-1])
+            last = R[-1] if pull is None else R[-1] + pull
+            end = end._replace(M=M, L=np.zeros_like(end.L), V=np.zeros_like(end.V), m=M @ last)
         if len(beyond.rows):
             point, equilibria, outputs = end.equilibrium, self._terminal.equilibria, self._outputs
             at, rows = equilibria.linearise(point.x, point.u), np.vstack([R[-1], beyond.rows])
@@ -416,8 +417,9 @@ class StagedMPC(MPCBase):
             if not beyond.drifts or can_drift(at, followed, outputs.Q_root, R):
                 held = followed[nx:] if self.cost.u_target == "equilibrium" else None
                 end = shift_target(end, at, (outputs.Q, outputs.R), equilibria.size, rows, held)
+        R = R[1:] if pull is None else R[1:] + pull
         rated = self._with_rates
-        self._targets = self._add_last_input(R[1:], U, end) if rated else StageTargets(R[1:], U, end.M, end.L, end.m)
+        self._targets = self._add_last_input(R, U, end) if rated else StageTargets(R, U, end.M, end.L, end.m)
         return True
 
     def _add_last_input(
