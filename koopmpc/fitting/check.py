@@ -26,7 +26,7 @@ from koopmpc.parallel import StageProgress
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign, read_controller, rebuild_controller
 from koopmpc.synthesis.fresh.loops import goal_box
-from koopmpc.synthesis.judging import run_on_surrogate
+from koopmpc.synthesis.judging import read_reference, run_on_surrogate
 from koopmpc.terminal import build_table, render_text
 from koopmpc.text import format_duration, to_percent
 
@@ -310,9 +310,11 @@ class _TestBench:
     def __init__(self, evidence: Evidence, controller: AnyMPC) -> None:
         self._evidence, self._controller, self.times = evidence, controller, list[float]()
         asked = evidence.asked
-        self._reference = asked.reference[: asked.steps + 1]
+        self._steps = asked.steps
+        self._reference = read_reference(asked, 0, asked.steps + 1 + controller.horizon)
         if evidence.goal_can_be_held:
-            self._reference = np.repeat(self._reference[:1], LONGER * asked.steps + 1, axis=0)
+            self._steps *= LONGER
+            self._reference = np.repeat(self._reference[:1], self._steps + 1, axis=0)
         self._plants: dict[tuple[int, float], tuple[StepMap, Float[np.ndarray, "T nu"]]] = {}
 
     def run(self, kind: RunKind, first: Float[np.ndarray, " n"], seed: int) -> _Outcome:
@@ -320,7 +322,9 @@ class _TestBench:
         evidence, asked, place = self._evidence, self._evidence.asked, seed % len(self._evidence.surrogates)
         surrogate, key = evidence.surrogates[place], (place, kind.gain)
         if key not in self._plants:
-            inputs = surrogate.find_reference_inputs(asked.cost, asked.limits, self._reference[:-1], kind.gain)
+            inputs = surrogate.find_reference_inputs(
+                asked.cost, asked.limits, self._reference[: self._steps], kind.gain
+            )
             self._plants[key] = surrogate.plant(kind.gain), inputs
         plant, inputs = self._plants[key]
         watch = _StepWatch(self.times, asked.limits.inputs(self._controller.nu))
@@ -359,7 +363,9 @@ class _TestBench:
             return [], []
         asked, u_reference = evidence.asked, self._plants[0, 1.0][1] if (0, 1.0) in self._plants else None
         if u_reference is None:
-            u_reference = evidence.surrogates[0].find_reference_inputs(asked.cost, asked.limits, self._reference[:-1])
+            u_reference = evidence.surrogates[0].find_reference_inputs(
+                asked.cost, asked.limits, self._reference[: self._steps]
+            )
         low, high = goal_box(asked)
         starts = low + (high - low) * rng.uniform(size=(runs, len(low)))
         bad_inside, bad_outside, unknown = 0, 0, 0.0

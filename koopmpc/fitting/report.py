@@ -19,7 +19,7 @@ from koopmpc.loop.run import Run
 from koopmpc.page import HtmlPage
 from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign
 from koopmpc.synthesis.fresh.neighbours import choose_starts_to_record, probe_range
-from koopmpc.synthesis.judging import run_on_surrogate
+from koopmpc.synthesis.judging import read_reference, run_on_surrogate
 from koopmpc.text import shorten_observable, to_percent, with_unit
 from koopmpc.validate.logs.summary import LogExcerpt, LogSummary
 
@@ -263,7 +263,7 @@ def run_shown_loops(evidence: Evidence, controller: AnyMPC) -> dict[str, list[Ru
     """
     asked, starts = evidence.asked, evidence.expected.starts
     starts = starts if len(starts) else asked.starts
-    rows = asked.reference[: asked.steps + 1]
+    rows = read_reference(asked, 0, asked.steps + 1 + controller.horizon)
     inputs = np.zeros((asked.steps, controller.nu))  # only the cost needs them, and no loop here is judged by it
     count = len(evidence.surrogates)
 

@@ -72,7 +72,8 @@ def simulate(
         (nx,) initial state; None: the plant chooses its own initial state.
     reference
         (nr,) held throughout, or (steps+1, nr): row k belongs to x_k. The controller gets rows k … k+horizon, the
-        last one repeated; with ``preview=False`` it gets row k repeated over its horizon.
+        last one repeated; with ``preview=False`` it gets row k repeated over its horizon. Of (steps+1+horizon, nr) the
+        last rows are seen ahead, in place of that last one, and never reached.
     steps
         Number of steps T. If the plant ends the episode earlier, as a `GymPlant` may, the run ends there with a
         UserWarning, and the reason is in the metadata under "ended".
@@ -416,10 +417,12 @@ def predictor_of(controller: object) -> Predictor | None:
 def rows_ahead(
     values: ArrayLike, name: str, columns: str, count: int, horizon: int, counted: str
 ) -> Float[np.ndarray, "T n"]:
-    """Return `count` rows of a signal that is previewed, and after them `horizon` copies of the last one."""
+    """Return `count` rows of a signal that is previewed, and `horizon` rows after them: given ones, or the last one."""
     rows = np.atleast_1d(checks.array(values, name))
     if rows.ndim == 1:
         rows = np.broadcast_to(rows, (count, len(rows)))
+    if rows.ndim == 2 and len(rows) == count + horizon:
+        return rows.copy()
     if rows.ndim != 2 or len(rows) != count:
         expected = f"({columns},) or ({counted}, {columns}) = ({count}, {columns})"
         raise ShapeError(f"{name} has shape {rows.shape}, expected {expected}")

@@ -20,6 +20,7 @@ from koopmpc.text import with_unit
 from koopmpc.values import Value
 
 RUN = 3  # length of a run in horizons
+MOVING = 120  # steps of a run with a moving reference, at least: three short horizons show the way there, no tracking
 STARTS = 12  # default number of starts: one for each condition of a design
 _FEW = 4  # if at least this many first states are inside the limits, only those are used
 ROOM = 0.5  # a run may leave the data by this share of their range
@@ -43,7 +44,7 @@ class DesignTask(Value):
         (m, nx) first states of all episodes, or only those inside the limits if there are enough; random starts are
         drawn from them.
     steps
-        Length of a run: three horizons, or the steps of the reference.
+        Length of a run: three horizons, and at least 120 steps where the reference moves; or all its steps.
     angles
         Indices of states whose errors wrap.
     low, high
@@ -135,6 +136,8 @@ def check_task(
     steps = RUN * horizon
     if len(rows) == 1:
         rows = np.repeat(rows, steps + 1, axis=0)
+    if (rows != rows[0]).any():
+        steps = max(steps, MOVING)
     X = np.concatenate([episode.X for episode in data])
     low, high = X.min(axis=0), X.max(axis=0)
     firsts = _first_states(data, limits)

@@ -160,7 +160,8 @@ def design(
         Horizon of the controllers in steps. None: half of the time in which a linear loop on the data settles, 8 to 40
         steps; the notes say which. A given one is kept.
     reference
-        (nr,) of the tracked outputs, or rows (T+1, nr), of which the runs take stretches of three horizons.
+        (nr,) of the tracked outputs, or rows (T+1, nr), of which the runs take stretches of three horizons, and of at
+        least 120 steps where they move.
     starts
         (nx,) or (n, nx) states from which runs begin; by default first states of up to twelve episodes, inside the
         limits.
@@ -335,13 +336,13 @@ def design(
             model = get_model(controller)
             controller = watch_data(recipe, model, recipe.controller(model, asked.cost, limits, ahead), measured)
     held_inputs = next(one.u_reference for one in test.conditions if one.gain == 1.0)
+    wide = find_blind_range(test.episodes, asked, neighbours) if few else []
     fresh, blind = None, find_blind_reference(test.episodes, asked, neighbours, held_inputs)
     if few:
         fast = speed_up(controller)
         count = MANY if loops is None and isinstance(fast, Compiled) else few
         fresh = run_fresh_loops(drawn_from, fast, count, draw)
-        blind = [*describe_outside(test.episodes, asked, fresh), *blind]
-        blind += find_blind_range(test.episodes, asked, neighbours)
+        blind = [*describe_outside(test.episodes, asked, fresh), *blind, *wide]
         blind += compare_longer_horizon(drawn_from, rows[best].recipe, controller, draw)
     controller.reset()
     remembered = [] if not hidden else [f"{memory}; models with delays were tried"]

@@ -317,12 +317,17 @@ def _run_condition(test: LoopTest, one: Condition, controller: Designed, seed: i
         controller,
         one.x0,
         box=(test.low, test.high),
-        reference=asked.reference[one.first : one.first + asked.steps + 1],
+        reference=read_reference(asked, one.first, asked.steps + 1 + controller.horizon),
         u_reference=one.u_reference,
         rng=seed,
     )
     cost = np.inf if run is None else metrics(run).cost
     return (run, cost) if np.isfinite(cost) else (None, np.inf)
+
+
+def read_reference(asked: DesignTask, first: int, count: int) -> Float[np.ndarray, "count nr"]:
+    """Return so many rows of the reference from row `first` on, the last one repeated behind its end."""
+    return asked.reference[np.minimum(first + np.arange(count), len(asked.reference) - 1)]
 
 
 def run_on_surrogate(
@@ -333,7 +338,7 @@ def run_on_surrogate(
     x0: Float[np.ndarray, " nx"],
     *,
     box: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
-    reference: Float[np.ndarray, "T1 nr"],
+    reference: Float[np.ndarray, "rows nr"],
     u_reference: Float[np.ndarray, "T nu"],
     rng: int,
     noise: float = 1.0,
@@ -343,8 +348,8 @@ def run_on_surrogate(
 ) -> Run | None:
     """Return a closed loop on the plant of a surrogate, with the states without their past; None if it is lost.
 
-    The run is lost if a state leaves the box. It is judged by the cost and the limits of the task. `noise` is a factor
-    on the noise of the surrogate, and `acting` says how the inputs act, by default as in the data.
+    The run is lost if a state leaves the box. It is judged by the cost and the limits of the task. `reference` is as
+    `simulate` takes it, `noise` a factor on the noise of the surrogate, and `acting` says how the inputs act.
     """
     states = surrogate.states
     try:
@@ -353,7 +358,7 @@ def run_on_surrogate(
             controller,
             x0=surrogate.start(x0),
             reference=reference,
-            steps=len(reference) - 1,
+            steps=len(u_reference),
             noise=noise * surrogate.noise,
             measured=surrogate.w if len(surrogate.w) else None,
             limits=asked.limits,

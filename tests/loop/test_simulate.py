@@ -87,6 +87,17 @@ def test_the_controller_gets_the_references_ahead_and_what_was_applied(preview):
             assert applied is None
 
 
+def test_rows_behind_the_run_are_seen_ahead_and_never_reached():
+    reference = np.arange(18.0).reshape(9, 2)  # 5 steps, and 3 rows behind them
+    controller = Recorded()
+    run = km.simulate(step_map(A, B), controller, x0=[1, 2], reference=reference, steps=5)
+    np.testing.assert_array_equal(run.reference, reference[:6])
+    for k, (_, ahead, _) in enumerate(controller.calls):
+        np.testing.assert_array_equal(ahead, reference[k : k + 4])
+    with pytest.raises(km.errors.ShapeError, match="expected"):
+        km.simulate(step_map(A, B), controller, x0=[1, 2], reference=reference[:8], steps=5)
+
+
 def test_one_reference_is_held_throughout():
     one = km.simulate(step_map(A, B), mpc(), x0=[0.5, 0], reference=[0.2, 0], steps=8)
     many = km.simulate(step_map(A, B), mpc(), x0=[0.5, 0], reference=[[0.2, 0]] * 9, steps=8)

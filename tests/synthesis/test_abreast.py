@@ -34,7 +34,7 @@ def make(*, bilinear=False, delays=0, moves=False):
     embedding = km.Delay(delays) if delays else None
     candidate = Candidate("x, 1", LIFTING, embedding, bilinear).bind(data.states, data.inputs)
     recipe = Recipe(candidate, 1e-6, estimator=km.LiftedDisturbance())
-    rows = np.column_stack([0.3 * np.sin(np.arange(40) / 5), np.zeros(40)]) if moves else [0.3, 0.0]
+    rows = np.column_stack([0.3 * np.sin(np.arange(150) / 5), np.zeros(150)]) if moves else [0.3, 0.0]
     task = check_task(data, km.Cost(Q=[1, 0.1], R=0.1), LIMITS, 8, rows, None, ())
     noise = np.array([0.01, 0.02])
     halves = [data.with_episodes(list(data)[i::2]) for i in (0, 1)]
@@ -121,6 +121,18 @@ def test_a_late_input_and_a_gain_change_a_loop_and_its_seed_repeats_it():
     assert one.cost == again.cost
     assert abs(late.cost / one.cost - 1) > 1e-4
     assert abs(weak.cost / one.cost - 1) > 1e-4
+
+
+def test_a_stretch_of_a_reference_ends_with_the_rows_behind_it_in_view():
+    """A loop of 20 steps is the first part of one of 30: no controller sees the reference rest where it goes on."""
+    pool, controller = make(moves=True)
+    assert pool.asked.steps == 120  # and not three horizons of 8 steps
+    loop = DrawnLoop(np.array([0.2, 0.1]), 0, 1.0, 5, 7)
+    short, long = (
+        replace(pool, asked=replace(pool.asked, steps=steps)).run(controller, [loop])[0].run for steps in (20, 30)
+    )
+    assert (short.steps, long.steps) == (20, 30)
+    np.testing.assert_array_equal(short.U, long.U[:20])
 
 
 def test_the_verdict_starts_where_no_choice_did_and_corners_stand_apart():

@@ -72,17 +72,20 @@ def run_abreast(
     controller: Compiled,
     crowd: Crowd,
     step: CrowdStep,
-    reference: Float[np.ndarray, "E T1 nr"],
+    reference: Float[np.ndarray, "E rows nr"],
     u_reference: Float[np.ndarray, "E T nu"],
     box: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
 ) -> list[Run | None]:
-    """Return the same loops as `run_on_surrogate` one by one, with its draws; None for one that left the box."""
-    stand_in, (E, T1, _), N, nx = crowd.stand_in, reference.shape, controller.horizon, len(crowd.stand_in.states)
+    """Return the same loops as `run_on_surrogate` one by one, with its draws; None for one that left the box.
+
+    Of the T + 1 + N rows of each reference the last N are only seen ahead.
+    """
+    stand_in, N, nx = crowd.stand_in, controller.horizon, len(crowd.stand_in.states)
+    E, T1 = len(reference), u_reference.shape[1] + 1
     Z = np.array([stand_in.start(x0) for x0 in crowd.starts])
     noise = crowd.draw_noise(T1 - 1)
-    rows = np.concatenate([reference, np.repeat(reference[:, -1:], N, axis=1)], axis=1)
     W = np.tile(stand_in.w, (N + 1, 1)) if len(stand_in.w) else None
-    fleet = controller.start_abreast(rows, Z if Z.shape[1] == nx else None, W)
+    fleet = controller.start_abreast(reference, Z if Z.shape[1] == nx else None, W)
     X, U = np.full((E, T1, nx), np.nan), np.zeros((E, T1 - 1, controller.nu))
     reports = np.zeros((E, T1 - 1, 2), dtype=np.int64)
     X[:, 0] = Z[:, :nx]
@@ -103,7 +106,7 @@ def run_abreast(
             X=X[e],
             Y=Y[e],
             U=U[e],
-            reference=reference[e],
+            reference=reference[e, :T1],
             status=tuple([_STATUS[int(i)] for i in reports[e, :, 0]]),
             fallback=tuple([_FALLBACK[int(i)] for i in reports[e, :, 1]]),
             solve_time=nothing,

@@ -15,7 +15,7 @@ from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.fresh.abreast import Crowd, CrowdStep, run_abreast
 from koopmpc.synthesis.fresh.acting import Acting
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box
-from koopmpc.synthesis.judging import run_on_surrogate
+from koopmpc.synthesis.judging import read_reference, run_on_surrogate
 from koopmpc.synthesis.surrogates import Surrogate
 
 KEPT = 0.01  # a loop keeps its limits if it violates none by more than this share of its range
@@ -118,7 +118,7 @@ class LoopPool:
         asked, place, box = self.asked, loops[0].place, (self.low, self.high)
         near = self.neighbours if place < 0 else None
         stand_in: Surrogate | NeighbourMap = self.surrogates[max(place, 0)] if near is None else near
-        rows, held = zip(*(self._find_rows(loop, stretch) for loop in loops), strict=True)
+        rows, held = zip(*(self._find_rows(loop, stretch, controller.horizon) for loop in loops), strict=True)
         acting = Acting(stand_in.middle, np.array([one.gain for one in loops]), np.array([one.late for one in loops]))
         if isinstance(controller, Compiled):
             crowd = Crowd(stand_in, acting, np.array([loop.x0 for loop in loops]), [loop.seed for loop in loops])
@@ -142,17 +142,20 @@ class LoopPool:
             for i, loop in enumerate(loops)
         ]
 
-    def _find_rows(self, loop: DrawnLoop, stretch: int) -> tuple[Float[np.ndarray, "T1 nr"], Float[np.ndarray, "T nu"]]:
-        """Return the reference of a loop, and the inputs without cost."""
+    def _find_rows(
+        self, loop: DrawnLoop, stretch: int, ahead: int
+    ) -> tuple[Float[np.ndarray, "rows nr"], Float[np.ndarray, "T nu"]]:
+        """Return the reference of a loop, with so many rows that are only seen ahead, and the inputs without cost."""
         asked, place = self.asked, max(loop.place, 0)
         given = not isinstance(asked.cost.u_target, str)  # by numbers, which count from the start of a loop
         if place not in self._inputs:
             every = asked.reference[:-1] if asked.moves or given else asked.reference[:1]
             self._inputs[place] = self.surrogates[place].find_reference_inputs(asked.cost, asked.limits, every)
         steps = asked.steps * (1 if asked.moves else stretch)
-        at = np.minimum(loop.first + np.arange(steps + 1), len(asked.reference) - 1)
+        at = np.minimum(loop.first + np.arange(steps), len(asked.reference) - 1)
         held = self._inputs[place]
-        return asked.reference[at], held[np.minimum(at[:-1] - given * loop.first, len(held) - 1)]
+        rows = read_reference(asked, loop.first, steps + 1 + ahead)
+        return rows, held[np.minimum(at - given * loop.first, len(held) - 1)]
 
     def _find_model(self, place: int) -> StepMap:
         """Return a learned model as a plant; each is built once."""
