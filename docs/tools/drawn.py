@@ -18,6 +18,10 @@ from pathlib import Path
 DOCS = Path(__file__).parents[1]
 ROOT = DOCS.parent
 STAMPS = DOCS / "pictures" / "drawn.json"
+TABLES = {  # picture -> the stored rows that it shows
+    "calibration": "tests/closed_loop/calibration.json",
+    "coverage": "tests/guarantees/coverage/table.json",
+}
 PAPERS = {  # folder of docs/papers -> the module of koopmpc/papers that draws its pictures
     "brunton": "proctor.py",
     "dictionary": "kevrekidis.py",
@@ -46,8 +50,8 @@ def inputs_of(picture: str) -> list[str]:
         return [f"koopmpc/papers/{PAPERS[folder.partition('/')[2]]}"]
     if name.startswith("real_"):
         return ["tests/real/pictures.py:draw"]
-    if name == "calibration":
-        return ["docs/tools/pictures.py:calibration", "tests/closed_loop/calibration.json"]
+    if name in TABLES:
+        return [f"docs/tools/pictures.py:{name}", TABLES[name]]
     return [f"docs/tools/pictures.py:{name}"]
 
 

@@ -277,6 +277,59 @@ def guarantees() -> Any:
     return km.plot.certificate(certified, data, runs)
 
 
+def coverage() -> Any:
+    """Runs on true plants that kept their limits, and what the margin costs, a point for each stored plant."""
+    rows = json.loads((DOCS.parent / "tests" / "guarantees" / "coverage" / "table.json").read_text()).values()
+    made, axes = make_figure(1, 2, width="two columns", height=2.6)
+    kept, price = axes[0]
+    for i, (holds, label) in enumerate(((True, "with a promise"), (False, "without one"))):
+        shares = sorted(row["kept"] / row["runs"] for row in rows if row["holds"] is holds)
+        before = i * sum(row["holds"] for row in rows)
+        kept.plot(before + np.arange(len(shares)), shares, ".", color=line_style(i)["color"], label=label)
+        touched = sorted(row["over_plain"] for row in rows if row["touches"] is holds)
+        start = i * sum(row["touches"] for row in rows)
+        words = "optimum at a limit" if holds else "elsewhere"
+        price.plot(start + np.arange(len(touched)), touched, ".", color=line_style(i + 2)["color"], label=words)
+    kept.axhline(0.95, **REFERENCE, label="promised")
+    kept.set(xlabel="plants", ylabel="share of runs that keep limits", ylim=(0, 1.05))
+    price.axhline(1.1, **LIMIT, label="1.10")
+    price.set(xlabel="plants", ylabel="cost with margin over without")
+    draw_legend(made, [kept, price], 3)
+    return made
+
+
+def failure_rate() -> Any:
+    """The exact bound of the failure rate over the number of runs, for few failures."""
+    made, axes = make_figure(1, 1, width="one column", height=2.8)
+    panel, runs = axes[0, 0], np.unique(np.geomspace(10, 3000, 120).astype(int))
+    for failures in range(4):
+        bounds = [km.validate.bound_failure_rate(failures, int(n)) for n in runs]
+        panel.plot(runs, bounds, label=f"{failures} failure{'s' * (failures != 1)}", **line_style(failures))
+    panel.plot(59, km.validate.bound_failure_rate(0, 59), "o", color="black", markersize=4, label="59 runs, 5 %")
+    panel.set(xscale="log", yscale="log", xlabel="runs", ylabel="failure rate, at most")
+    draw_legend(made, [panel], 2)
+    return made
+
+
+def step_iterations() -> Any:
+    """Iterations of cold steps over the states of a double integrator, beside their proved bound."""
+    import scipy.signal
+
+    cart = scipy.signal.dlti([[1.0, 0.3], [0.0, 1.0]], [[0.0], [0.3]], np.eye(2), np.zeros((2, 1)), dt=0.3)
+    model, limits = km.LinearPredictor.from_state_space(cart), km.Limits(u_min=-1, u_max=1, x_max=[2.0, 0.6])
+    mpc = km.KoopmanMPC(model, km.Cost(Q=1, R=0.1), limits, 3, settings={"cold_start": True})
+    bound = km.guarantees.bound_iterations(mpc, (-3, 3), (0, 0))
+    line = np.linspace(-3, 3, 121)
+    counts = np.array([[mpc([x, v], [0.0, 0.0]).iterations for x in line] for v in line])
+    made, axes = make_figure(1, 1, width="one column", height=3.2)
+    levels = np.arange(-0.5, bound.most + 1.5)
+    drawn = axes[0, 0].contourf(line, line, counts, levels=levels, cmap="viridis")
+    made.colorbar(drawn, ax=axes[0, 0], ticks=range(bound.most + 1), label=f"iterations, proved: at most {bound.most}")
+    axes[0, 0].plot(*bound.x, "o", color="#d55e00", markersize=5)
+    axes[0, 0].set(xlabel="position", ylabel="speed")
+    return made
+
+
 def terminal_sets() -> Any:
     """Plans of the page's cart that end in its polytope, beside the ellipsoid of the same feedback."""
     names: dict[str, Any] = {"__name__": "page"}
@@ -501,6 +554,9 @@ PICTURES: dict[str, Callable[[], Any]] = {
         choosing_by_closed_loop,
         what_trust_means,
         guarantees,
+        coverage,
+        failure_rate,
+        step_iterations,
         terminal_sets,
         limits_in_time,
         prices,

@@ -28,6 +28,7 @@ def certificate(
     data: Episodes | None = None,
     runs: Sequence[Run] = (),
     axes: tuple[int | str, int | str] = (0, 1),
+    spread: Sequence[Certificate] = (),
 ) -> "Figure":
     """Draw the region {V ≤ 1} of a certificate, the box of its bound, its ball, data and closed loops.
 
@@ -41,11 +42,14 @@ def certificate(
         Closed loops whose paths are drawn.
     axes
         The two states, by index or by name.
+    spread
+        Certificates of the same set point from episodes drawn again with replacement (bootstrap). Their regions are
+        thin lines: how far they differ shows what the data leave open, and proves nothing.
 
     Raises
     ------
     DataError
-        The certificate has one state alone, or the two axes are the same.
+        The certificate has one state alone, the two axes are the same, or one of `spread` has another set point.
     """
     checks.kind(certified, "certified", Certificate, "make one with km.certify")
     names = certified.states
@@ -61,6 +65,14 @@ def certificate(
     x, y = (np.linspace(low[k] - pad[k], high[k] + pad[k], _GRID) for k in (i, j))
     X = np.tile(certified.deviation.x, (_GRID * _GRID, 1))
     X[:, i], X[:, j] = np.repeat(x, _GRID), np.tile(y, _GRID)
+    for k, other in enumerate(spread):
+        if len(other.deviation.x) != len(names) or np.abs(other.deviation.x - certified.deviation.x).max() > 1e-9:
+            raise DataError(
+                f"spread[{k}] is a certificate of another set point; certify resampled data at the same one"
+            )
+        panel.contour(x, y, other.value(X).reshape(_GRID, _GRID).T, levels=[1.0], colors=["black"], linewidths=0.5)
+    if len(spread):
+        panel.plot([], [], color="black", linewidth=0.5, label="of resampled data")
     V = certified.value(X).reshape(_GRID, _GRID).T
     look = line_style(0)
     panel.contourf(x, y, V, levels=[-np.inf, 1.0], colors=[look["color"]], alpha=0.18)

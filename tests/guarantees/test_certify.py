@@ -257,8 +257,9 @@ def test_the_page_states_what_is_not_claimed(tanks):
         "## What is",
     ):
         assert words in page
-    drawing = km.plot.certificate(tanks[-1], tanks[2])
+    drawing = km.plot.certificate(tanks[-1], tanks[2], spread=[tanks[-1]])
     assert drawing.axes[0].get_xlabel() == tanks[-1].states[0]
+    assert "of resampled data" in [text.get_text() for text in drawing.legends[0].get_texts()]
 
 
 def test_given_constants_are_a_proof_and_a_lipschitz_constant_may_be_refuted(tanks):

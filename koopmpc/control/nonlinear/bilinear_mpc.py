@@ -82,9 +82,8 @@ class BilinearMPC(StagedMPC):
     are Riccati recursions, and where that ends early DAQP, on the condensed program. Where changes of the inputs
     count, or moves are blocked, the changes are the inputs of the program, and the last input is part of its state.
 
-    If a hard terminal set knows its feedback, as a Certificate does, a plan is accepted that keeps the limits on the
-    model and costs no more than the accepted plan of the last step, moved on and prolonged by this feedback. Otherwise
-    that plan is followed.
+    If a hard terminal set knows its feedback, as a Certificate does, the accepted plan is moved on by a step and
+    prolonged by this feedback. A new plan replaces it that keeps the limits on the model and costs no more.
 
     One thread at a time may call it: a second one gets a ThreadError, and needs a copy of its own.
 
