@@ -15,7 +15,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost, check_cost_and_limits, lifted_tracking
 from koopmpc.control.horizon import horizon_of
-from koopmpc.control.in_time.bounds import refuse_crossed_rows
+from koopmpc.control.in_time.preview import InputRows
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits, clip_input, refuse_levels
 from koopmpc.control.move import Fallback, Move, Status, Token, alone
@@ -53,7 +53,7 @@ class FeedbackLaw(Published):
     """
 
     horizon = 0  # no preview
-    _rows: tuple[Interval, Interval] | None = None  # limits of the inputs and of their changes, a row a step
+    _rows: InputRows | None = None
     _step = 0  # row of the next call
 
     def __init__(self, dt: float, nx: int, inputs: Interval, rates: Interval | None) -> None:
@@ -92,20 +92,14 @@ class FeedbackLaw(Published):
             Limits cross in a row.
         """
         if limits is not None and limits.in_time:
-            count = max(limits.count_rows().values())
-            box, change = limits.input_rows(self.nu, 0, count), limits.rate_rows(self.nu, 0, count)
-            refuse_crossed_rows(*box, "input", names)
-            refuse_crossed_rows(*change, "rate", names)
-            self._rows = box, change
+            self._rows = InputRows(limits, self.nu, names)
             FeedbackLaw.reset(self)
 
     def _take_row(self) -> None:
         """Take the limits of the next step."""
         if self._rows is not None:
-            box, change = self._rows
-            k = min(self._step, len(box.low) - 1)
-            self.inputs = Interval(box.low[k], box.high[k])
-            self.rates = None if self.rates is None else Interval(change.low[k], change.high[k])
+            self.inputs, change = self._rows.at(self._step)
+            self.rates = None if self.rates is None else change
 
     def take_applied(self, applied: ArrayLike | None) -> None:
         """Take the input that the plant really got for the last one, where it can be used."""

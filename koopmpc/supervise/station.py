@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
 from koopmpc.control.function import as_controller
+from koopmpc.control.in_time.preview import InputRows
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
@@ -41,7 +42,8 @@ class Station(Published):
     standby
         A controller of the same plant, or a function u = f(y, r); None: the applied input is held.
     limits
-        Limits of the inputs and their changes, for whoever acts. Inputs with `levels` are rounded to an allowed one.
+        Limits of the inputs and their changes, for whoever acts; of those with rows in time the row of the step. Inputs
+        with `levels` are rounded to an allowed one.
     mode
         "manual", "automatic" or "standby" at every reset.
     hand
@@ -64,7 +66,8 @@ class Station(Published):
     Raises
     ------
     DataError
-        One is no controller; the two have another dt or number of inputs; an argument is none of those above.
+        One is no controller; the two have another dt or number of inputs; an argument is none of those above; limits
+        cross in a row.
 
     Examples
     --------
@@ -105,10 +108,12 @@ class Station(Published):
         if limits is not None:
             checks.kind(limits, "limits", Limits, "pass km.Limits(u_min=…, u_max=…)")
         self.limits = limits or Limits()
-        self.inputs, self.rates = self.limits.inputs(self.nu), self.limits.rates(self.nu)
+        base = self.limits.base
+        self.inputs, self.rates = base.inputs(self.nu), base.rates(self.nu)
+        self._rows = InputRows(self.limits, self.nu) if self.limits.in_time else None
         width = np.where(np.isfinite(self.inputs.high - self.inputs.low), self.inputs.high - self.inputs.low, np.inf)
         self.bump = _BUMP * width if bump is None else checks.vector(bump, "bump", self.nu, infinite=True)
-        levels = self.limits.input_levels(self.nu)
+        levels = base.input_levels(self.nu)
         self._held = None if levels is None else HeldLevels(levels)
         if levels is not None:  # an input on levels moves by a level or not at all
             self.bump = np.where(np.isin(np.arange(self.nu), levels.which), np.inf, self.bump)
@@ -183,7 +188,8 @@ class Station(Published):
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
         """Begin a run in the first mode, with the first hand value."""
-        zero = np.clip(np.zeros(self.nu), *self.inputs)
+        self._step = 0
+        zero = np.clip(np.zeros(self.nu), *self._present_limits()[0])
         self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
         if self._held is not None:
             self._last = self._last if u_prev is not None else self._held.round(zero)
@@ -196,6 +202,13 @@ class Station(Published):
         self.controller.reset(x0, u_prev)
         if self.standby is not None:
             self.standby.reset(x0, u_prev)
+
+    def _present_limits(self) -> tuple[Interval, Interval | None]:
+        """Return the limits of the inputs, and of their changes, in this step."""
+        if self._rows is None:
+            return self.inputs, self.rates
+        box, change = self._rows.at(self._step)
+        return box, None if self.rates is None else change
 
     def plan(self) -> Plan | None:
         """Return the plan behind the last move; None where it had none."""
@@ -225,10 +238,12 @@ class Station(Published):
         if self._approaching:
             near = np.clip(u, last - self.bump, last + self.bump)
             self._approaching, u = not np.array_equal(near, u), near
-        u = clip_input(u, self.inputs, self.rates, last)
+        box, rates = self._present_limits()
+        u = clip_input(u, box, rates, last)
         if self._held is not None:
-            reach = None if self.rates is None else Interval(last + self.rates.low, last + self.rates.high)
-            u = self._held.round(u, reach)
+            reach = None if rates is None else Interval(last + rates.low, last + rates.high)
+            u = self._held.round(u, reach, None if self._rows is None else box)
+        self._step += 1
         self._last = u
         status = move.status if np.array_equal(u, move.u) else Status.SATURATED
         fallback = Fallback.OTHER_CONTROLLER if actor == "standby" else move.fallback

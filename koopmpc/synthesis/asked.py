@@ -114,6 +114,11 @@ def check_task(
         A size does not fit, NaN, an angle that is no state.
     """
     cost, limits = check_cost_and_limits(cost, limits, data.states, data.inputs)
+    if limits.in_time:
+        raise DataError(
+            "the limits have rows in time, and a design judges by one set; pass limits.base, and the rows to its "
+            "controller: controller(y, reference, limits=controller.limits.with_bounds(u_max=rows))"
+        )
     refuse_levels(limits, "a design")
     refuse_stage(cost, "a design")
     refuse_priority(limits, "a design")

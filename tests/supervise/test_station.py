@@ -294,3 +294,22 @@ def test_only_controllers_whose_model_has_w_are_told_it():
     assert km.supervise.Station(km.control.PID(kp=1.0, dt=0.1)).nw is None
     with pytest.raises(km.errors.DataError, match="w was passed"):
         km.supervise.Station(blind, limits=BOX)([0.0], [0.5], w=[1.0])
+
+
+@pytest.mark.parametrize("mode", ["manual", "automatic", "standby"])
+def test_whoever_acts_keeps_the_row_of_the_step(mode):
+    rows = np.array([[0.6], [0.2], [-0.1], [0.5], [0.9]])
+    limits = km.Limits(u_min=-1.0, u_max=rows, du_max=0.3)
+    standby = km.control.PID(5.0, 1.0, dt=0.1, limits=BOX)
+    station = km.supervise.Station(km.LQR(TANK, COST, BOX), standby, limits=limits, mode=mode, hand=[1.0], bump=1.0)
+    _, U, _ = loop(station, 7, r=3.0)
+    expected = [0.3, 0.2, -0.1, 0.2, 0.5, 0.8, 0.9]  # the box wins over the rate, which bounds the way back
+    np.testing.assert_allclose(U, expected, atol=1e-12)
+    with pytest.raises(km.errors.DataError, match="cross for index 0 at step 1"):
+        km.supervise.Station(km.LQR(TANK, COST, BOX), limits=km.Limits(u_min=[[-1.0], [0.5]], u_max=[[1.0], [0.2]]))
+
+
+def test_a_station_with_levels_keeps_to_those_inside_its_row():
+    limits = km.Limits(levels={"u0": [0, 1]}, u_max=[[1.0], [0.5], [1.0]]).resolve((), ("u0",))
+    station = km.supervise.Station(km.control.PID(5.0, 1.0, dt=0.1), limits=limits, mode="manual", hand=[1.0])
+    assert [float(station([0.0], [0.0]).u[0]) for _ in range(3)] == [1.0, 0.0, 1.0]

@@ -518,3 +518,9 @@ def test_models_with_a_hidden_state_are_judged_in_the_loops_of_one_record():
     for _ in range(80):
         valve, level = lagged(valve, level, float(found.controller([level], [1.2]).u[0]))
     assert level == pytest.approx(1.2, abs=0.03)
+
+
+def test_limits_with_rows_in_time_are_refused_and_rows_go_to_the_controller():
+    data = km.Episodes([km.Episode(X=np.zeros((5, 1)), U=np.zeros((4, 1)))], dt=0.1)
+    with pytest.raises(km.errors.DataError, match=r"rows in time.*limits=controller\.limits\.with_bounds"):
+        km.design(data, km.Cost(Q=1.0, R=1.0), km.Limits(u_max=[[1.0], [2.0]]), reference=[0.0], horizon=2)

@@ -5,12 +5,35 @@ from dataclasses import fields
 
 import numpy as np
 
+from koopmpc.control.in_time.bounds import refuse_crossed_rows
 from koopmpc.control.limits import BOUNDS, Interval, Limits, Movable
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.values import same
 
 _FIXED = tuple(f.name for f in fields(Limits) if f.name not in (*BOUNDS, "rows", "capped"))  # stay as they were made
 _GROUPS = ("u", "du", "x")
+
+
+class InputRows:
+    """Limits of nu inputs and of their changes, a row a step; the last one is held.
+
+    Raises
+    ------
+    DataError
+        Limits cross in a row.
+    """
+
+    def __init__(self, limits: Limits, nu: int, names: Sequence[str] = ()) -> None:
+        count = max(limits.count_rows().values())
+        self._box, self._change = limits.input_rows(nu, 0, count), limits.rate_rows(nu, 0, count)
+        refuse_crossed_rows(*self._box, "input", names)
+        refuse_crossed_rows(*self._change, "rate", names)
+
+    def at(self, step: int) -> tuple[Interval, Interval]:
+        """Return the limits of the inputs, and of their changes, in this step."""
+        k = min(step, len(self._box.low) - 1)
+        box, change = (Interval(rows.low[k], rows.high[k]) for rows in (self._box, self._change))
+        return box, change
 
 
 def require_preview(limits: Limits, steps: int, who: str = "the plan") -> None:
