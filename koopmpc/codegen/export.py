@@ -221,7 +221,8 @@ def _model_map(program: StepProgram) -> ca.Function:
     model = program.model
     x, u = ca.SX.sym("x", program.lifting.n), ca.SX.sym("u", model.nu)
     if isinstance(program, StagedProgram):
-        x_next = program.functions["map"].symbolic(x, u)
+        measured = [ca.SX(program.E.shape[1], 1)] if program.scheduled else []  # w is zero
+        x_next = program.functions["map"].symbolic(x, u, *measured)
     else:
         assert isinstance(model, LinearPredictor), "all other models are linear"
         z = program.lifting.symbolic(x)

@@ -40,6 +40,13 @@ _TABLE_NOTE = (
 )
 
 
+_OF_MODEL = ("map", "stage_map", "slopes", "local")  # the functions that w enters where it multiplies x or u
+
+_SCHEDULE_NOTE = (
+    "Measured disturbances multiply the state or the inputs: the last row of their preview holds at the end of the "
+    "horizon, and each step at which it changes searches the equilibria of the reference again."
+)
+
 _BOUNDS_NOTE = (
     "Limits that move in time are arguments: call `koopmpc_set_bounds` before a step, with rows from that step on. "
     "Until then, and after `koopmpc_init`, the widest bounds of the controller hold."
@@ -125,7 +132,15 @@ def make_tables(program: StepProgram, *, single: bool) -> Tables:
     DataError
         A setting of the solver has no counterpart in C, or C code for this kind of Program is not known.
     """
-    sizes = {"IS_LQR": 0, "IS_STAGED": 0, "BOUNDS": 0, "LEVELED": 0, "NU": program.model.nu, "NR": program.nr}
+    sizes = {
+        "IS_LQR": 0,
+        "IS_STAGED": 0,
+        "BOUNDS": 0,
+        "LEVELED": 0,
+        "SCHEDULED": 0,
+        "NU": program.model.nu,
+        "NR": program.nr,
+    }
     embedding = None if isinstance(program.model, StepMap) else program.model.embedding
     steps, inputs_too = (0, 0) if embedding is None else (embedding.steps, int(embedding.inputs))
     sizes |= {"DELAYS": steps, "DELAYED_INPUTS": inputs_too, "NZETA": program.lifting.n, "NZ": program.lifting.m}
@@ -469,6 +484,7 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
     target = nr + nx + nu + (nu + box) + nu + nu * nx
     tables.sizes |= {
         "IS_STAGED": 1,
+        "SCHEDULED": int(p.scheduled),
         "NX": p.ny,
         "NY": p.ny,
         "NS": nx,
@@ -522,7 +538,8 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
     }
     for name, graph in p.functions.items():
         result = "next" if name.endswith("map") else "out"
-        tables.functions[f"koopmpc_{name}"] = CFunction(graph, arguments[name], result)
+        measured = {"w": p.E.shape[1]} if p.scheduled and name in _OF_MODEL else {}
+        tables.functions[f"koopmpc_{name}"] = CFunction(graph, arguments[name] | measured, result)
     _add_limits(tables, hard_rate=p.hard_rates, change=p.v_limits)
     tables.limits["move_of"] = np.arange(N, dtype=np.intc)
     same = all((end == end[0]).all() for end in p.stage_limits)
@@ -578,7 +595,7 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
     _add_finish(tables, p, low, high)
     _add_estimator(tables, p)
     tables.targets = {"table": p.table}
-    tables.notes.append(_TABLE_NOTE)
+    tables.notes += [_TABLE_NOTE, *([_SCHEDULE_NOTE] if p.scheduled else [])]
 
 
 def _add_finish(

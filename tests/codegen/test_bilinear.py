@@ -12,7 +12,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.codegen.tables import Tables, read_program
-from tests.compiler import find_compiler
+from tests.compiler import find_compiler, needs_compiler
 from tests.synthesis.test_abreast import make
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
@@ -325,3 +325,48 @@ def test_an_implicit_integrator_is_refused_with_what_would_do(tmp_path):
     controller = km.BilinearMPC(plant, COST, km.Limits(**BOX), 5)
     with pytest.raises(km.errors.DataError, match=r"implicit integrator .* discretize with RK4"):
         km.compiled(controller)
+
+
+def drive_scheduled(x, u, w):
+    """The input counts as w says, and not at all without it; w also moves the state, and multiplies it."""
+    return [0.95 * x[0] + 0.1 * x[1] + 0.05 * w[0], 0.9 * x[1] - 0.1 * x[0] + 0.2 * w[0] * u[0] + 0.1 * w[0] * x[0]]
+
+
+def learn_scheduled(rng):
+    episodes = []
+    for _ in range(8):
+        X, U, W = [rng.uniform(-1, 1, 2)], rng.uniform(-1, 1, (25, 1)), rng.uniform(-1, 1, (25, 1))
+        for u, w in zip(U, W, strict=True):
+            X.append(drive_scheduled(X[-1], u, w))
+        episodes.append(km.Episode(X=np.array(X), U=U, W=W))
+    return km.bilinear_edmd(km.Episodes(episodes, 0.1), km.State() + km.Constant(), scheduled_inputs=True)
+
+
+@needs_compiler
+@pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "more", [{}, pytest.param({"latency": 1, "estimator": km.LiftedDisturbance()}, marks=pytest.mark.slow)]
+)
+def test_measured_disturbances_that_multiply_state_and_inputs_count_in_c_as_in_python(given, more):
+    rng = np.random.default_rng(3)
+    x, u, w = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("w")
+    plant = km.StepMap(ca.Function("F", [x, u, w], [ca.vertcat(*drive_scheduled(x, u, w))]), 0.1)
+    model = plant if given else learn_scheduled(rng)
+    cost, limits = km.Cost(Q=[1, 0.1], R=0.01), km.Limits(-2, 2, x_max=[0.5, 2], slack=(20.0, 5.0))
+    mpc = km.BilinearMPC(model, cost, limits, 8, **more)
+    fast = km.compiled(mpc)
+    assert fast is not mpc
+    at, seen = np.array([0.4, 0.1]), set()
+    for k in range(60):
+        rows = 0.8 + 0.4 * np.sin((k + np.arange(9)) / 7)[:, None]
+        measured = [np.nan] if k == 40 else rows if k % 20 < 15 else rows[0]
+        a, b = (each(at, [0.3 + 0.2 * (k > 30), 0.0], w=measured) for each in (mpc, fast))
+        assert (a.status, a.fallback) == (b.status, b.fallback)
+        np.testing.assert_allclose(b.u, a.u, atol=2e-5)
+        seen.add(a.status.name)
+        at = np.array(drive_scheduled(at, a.u, rows[0])) + 0.01 * rng.normal(size=2)
+    assert {"UNCONSTRAINED", "OPTIMAL", "BAD_MEASUREMENT"} <= seen
+    again = km.compiled(mpc)  # of a controller that has seen w: the table of its C is that of w = 0 all the same
+    again.reset()
+    mpc.reset()
+    np.testing.assert_allclose(again(at, [0.3, 0.0], w=[0.7]).u, mpc(at, [0.3, 0.0], w=[0.7]).u, atol=1e-6)

@@ -20,6 +20,13 @@ typedef float koopmpc_real;
 typedef double koopmpc_real;
 #endif
 
+/** An argument that only models have in which measured disturbances multiply the state or the inputs. */
+#if KOOPMPC_SCHEDULED
+#define KOOPMPC_AND(w) , w
+#else
+#define KOOPMPC_AND(w)
+#endif
+
 /** How a step ended. The first four are regular; the others come with a fallback. */
 typedef enum {
   KOOPMPC_UNCONSTRAINED = 0,   /**< the unconstrained optimum meets every limit */
@@ -161,6 +168,10 @@ typedef struct {
   koopmpc_real made[KOOPMPC_MADE * KOOPMPC_MADE_SIZE]; /**< equilibria of rows that the table lacks */
   koopmpc_real made_end[KOOPMPC_TARGET];               /**< the target of the last row, if the table lacks it */
   int made_count, made_next, has_made_end;
+#if KOOPMPC_SCHEDULED
+  koopmpc_real aimed_w[KOOPMPC_NW1]; /**< the w for which targets were found; those of the table are for zero */
+  int has_old_end;                   /**< whether made_end is that of another w */
+#endif
   const koopmpc_real *targets; /**< the table of targets, see koopmpc_use_targets */
   int finishing;               /**< whether the active-set method finished the last program of this step */
   int target_count, found;     /**< number of its rows, and the row that was found last */
@@ -269,8 +280,8 @@ void koopmpc_use_targets(koopmpc_state *s, const koopmpc_real *targets, int coun
  */
 int koopmpc_find_targets(koopmpc_state *s, const koopmpc_rows *reference);
 
-/** next = F(x, u), the model; x is the state, or the state and its past. */
-void koopmpc_map(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *next);
+/** next = F(x, u), the model, or F(x, u, w) where w multiplies x or u; x is the state, or the state and its past. */
+void koopmpc_map(const koopmpc_real *x, const koopmpc_real *u KOOPMPC_AND(const koopmpc_real *w), koopmpc_real *next);
 #endif
 
 #ifdef __cplusplus

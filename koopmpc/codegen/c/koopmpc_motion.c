@@ -122,7 +122,7 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   if (!moves || !(end[TARGET_FOUND] > 0)) return;
   for (int j = 0; j < RN; j++)
     if (!extend(s, j, &drifts)) return;
-  koopmpc_local(end + TARGET_X, end + TARGET_U, at);
+  koopmpc_local(end + TARGET_X, end + TARGET_U KOOPMPC_AND(koopmpc_end_w(s)), at);
   koopmpc_factors(at, H, T);
   for (int i = 0; i < LEAST; i++) /* the equilibrium that comes nearest to a row, by its size */
     for (int j = 0; j < RN; j++) {

@@ -13,7 +13,7 @@
 static void advance(koopmpc_real *next, const koopmpc_real *z, const koopmpc_real *u, const koopmpc_real *w,
                     const koopmpc_real *d) {
 #if KOOPMPC_IS_STAGED
-  koopmpc_map(z, u, next);
+  koopmpc_map(z, u KOOPMPC_AND(w), next);
 #else
   koopmpc_fill(next, 0, KOOPMPC_NZ);
   koopmpc_add(next, koopmpc_A, KOOPMPC_NZ, z, KOOPMPC_NZ);

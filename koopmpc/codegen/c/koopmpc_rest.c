@@ -164,7 +164,7 @@ static int chord(koopmpc_state *k, koopmpc_real *x, koopmpc_real *u, const koopm
   koopmpc_real s[SIZE], at[KOOPMPC_LOCAL], left[LEFT], step[SIZE], missed[NX], close, far = 0;
   scaled(x, u, s);
   close = CLOSE * (1 + largest_of(s, SIZE));
-  koopmpc_local(x, u, at);
+  koopmpc_local(x, u KOOPMPC_AND(koopmpc_end_w(k)), at);
   for (int i = 0; i < SIZE; i++) far = koopmpc_abs(s[i] - k->chord_s[i]) > far ? koopmpc_abs(s[i] - k->chord_s[i]) : far;
   if (!k->has_chord || far > close) {
     koopmpc_factors(at, k->chord_H, k->chord_T);
@@ -194,9 +194,10 @@ static int chord(koopmpc_state *k, koopmpc_real *x, koopmpc_real *u, const koopm
 
 #endif
 
-int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *e,
-                 koopmpc_real enough) {
+int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *w,
+                 const koopmpc_real *e, koopmpc_real enough) {
   koopmpc_real s[SIZE], held_now[LIMITS];
+  (void)w;
   scaled(x, u, s);
   koopmpc_copy(held_now, active, LIMITS);
   for (int pass = 0; pass < NEWTON; pass++) {
@@ -207,7 +208,7 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
     int held[LIMITS], n = 0, count, release = -1, broken = -1;
     for (int i = 0; i < NX; i++) here[i] = s[i] * koopmpc_rest_size[i];
     for (int i = 0; i < NV; i++) input[i] = s[NX + i] * koopmpc_rest_size[NX + i];
-    koopmpc_local(here, input, at);
+    koopmpc_local(here, input KOOPMPC_AND(w), at);
     koopmpc_fill(rows, 0, LIMITS * SIZE);
     for (int i = 0; i < LIMITS; i++) {
       if (i < NV) {
@@ -291,7 +292,8 @@ void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_re
   koopmpc_copy(u, s->has_rest ? s->rest_u : target + TARGET_U, NV);
   koopmpc_copy(active, s->has_rest ? s->rest_active : target + TARGET_ACTIVE, LIMITS);
   for (int i = 0; i < LIMITS; i++) limited |= active[i] > 0 || active[i] < 0;
-  found = (!limited && chord(s, x, u, target, e)) || koopmpc_near(x, u, active, target, e, CLOSE);
+  found = (!limited && chord(s, x, u, target, e)) ||
+          koopmpc_near(x, u, active, target, koopmpc_end_w(s), e, CLOSE);
   if (!(target[TARGET_FOUND] > 0)) found = 0;
   if (!found) {
     koopmpc_copy(x, target + TARGET_X, NX);
@@ -307,7 +309,7 @@ void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_re
   if (!found) return;
   for (int i = 0; i < NV; i++) s->rest_input[i] = KOOPMPC_HOLDS ? u[i] : 0;
   if (!KOOPMPC_GIVEN_END) {
-    koopmpc_local(x, u, at);
+    koopmpc_local(x, u KOOPMPC_AND(koopmpc_end_w(s)), at);
     for (int i = 0; i < KOOPMPC_GOAL; i++)
       s->rest_goal[i] = koopmpc_dot(target + TARGET_M + i * KOOPMPC_NR, at + LOCAL_OF, KOOPMPC_NR) +
                         koopmpc_dot(target + TARGET_L + i * NX, x, NX) +

@@ -20,6 +20,13 @@ enum {
   RESTING = TAILED < 50 ? TAILED : 50 /* steps for which a gain that has settled must rest */
 };
 
+/** Whether a target is that of this row. */
+static int is_row(const koopmpc_real *target, const koopmpc_real *row) {
+  int same = 1;
+  for (int i = 0; i < ROW && same; i++) same = !(target[i] < row[i] || target[i] > row[i]);
+  return same;
+}
+
 /** The squared distance of two rows by the weights of the cost. */
 static koopmpc_real apart(const koopmpc_real *a, const koopmpc_real *b) {
   koopmpc_real sum = 0;
@@ -48,15 +55,16 @@ static const koopmpc_real *nearest(const koopmpc_state *s, const koopmpc_real *r
   return found;
 }
 
-/** Walk from an equilibrium to that of another row, in one go or in pieces; 0 if the way ends before. */
-static int walk(const koopmpc_real *from, const koopmpc_real *row, koopmpc_real *x, koopmpc_real *u,
-                koopmpc_real *active) {
-  koopmpc_real none[NX], there[ROW], done = 0, stride = 1;
+/** Walk from an equilibrium to that of another row, in one go or in pieces; w comes in with the row where it is `new`. */
+static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc_real *w, int new, koopmpc_real *x,
+                koopmpc_real *u, koopmpc_real *active) {
+  koopmpc_real none[NX], there[ROW], now[KOOPMPC_NW1], done = 0, stride = 1;
   koopmpc_fill(none, 0, NX);
   for (int tries = 0; tries < HALVINGS; tries++) {
     const koopmpc_real share = done + stride < 1 ? done + stride : 1;
     for (int i = 0; i < ROW; i++) there[i] = share < 1 ? from[i] + share * (row[i] - from[i]) : row[i];
-    if (koopmpc_near(x, u, active, there, none, KOOPMPC_HELD)) {
+    for (int i = 0; i < KOOPMPC_NW; i++) now[i] = new ? share * w[i] : w[i];
+    if (koopmpc_near(x, u, active, there, now, none, KOOPMPC_HELD)) {
       done = share;
       if (!(done < 1)) return 1;
       stride *= 2;
@@ -81,9 +89,21 @@ static void slope_of(const koopmpc_real *at, koopmpc_real *slope) {
 static const koopmpc_real *make(koopmpc_state *s, const koopmpc_real *row) {
   const koopmpc_real *from = nearest(s, row);
   koopmpc_real at[KOOPMPC_LOCAL], own[KOOPMPC_MADE_SIZE];
+  const koopmpc_real *w = koopmpc_end_w(s);
+  int found = 0;
   if (!from) return 0;
-  koopmpc_copy(own, from, TARGET_M);
-  own[TARGET_M] = (koopmpc_real)walk(from, row, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
+#if KOOPMPC_SCHEDULED
+  if (s->has_old_end && s->made_end[TARGET_FOUND] > 0 && is_row(s->made_end, row)) { /* from where it was for another w */
+    koopmpc_copy(own, s->made_end, TARGET_M);
+    found = walk(row, row, w, 0, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
+  }
+#endif
+  if (!found) {
+    const int new = s->made_count == 0 || from < s->made || from >= s->made + s->made_count * KOOPMPC_MADE_SIZE;
+    koopmpc_copy(own, from, TARGET_M);
+    found = walk(from, row, w, new, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
+  }
+  own[TARGET_M] = (koopmpc_real)found;
   koopmpc_copy(own, row, ROW);
   for (int i = 0; i < NV; i++) {
     if (!(own[TARGET_M] > 0)) own[TARGET_U + i] = koopmpc_clip(0, koopmpc_input_low[i], koopmpc_input_high[i]);
@@ -91,7 +111,7 @@ static const koopmpc_real *make(koopmpc_state *s, const koopmpc_real *row) {
   }
   koopmpc_fill(own + TARGET_SLOPE, 0, NV * NX);
   if (own[TARGET_M] > 0 && KOOPMPC_DISTURBED) {
-    koopmpc_local(own + TARGET_X, own + TARGET_U, at);
+    koopmpc_local(own + TARGET_X, own + TARGET_U KOOPMPC_AND(w), at);
     slope_of(at, own + TARGET_SLOPE);
   }
   koopmpc_copy(s->made + s->made_next * KOOPMPC_MADE_SIZE, own, KOOPMPC_MADE_SIZE);
@@ -214,14 +234,15 @@ static void root_of(const koopmpc_real *P, koopmpc_real *S) {
 }
 
 /** Write M, L, V and the goal of a target whose equilibrium is known; 0 if the recursion fails. */
-static int add_tail(koopmpc_real *target) {
+static int add_tail(koopmpc_real *target, const koopmpc_real *w) {
   koopmpc_real at[KOOPMPC_LOCAL], J[ROW * NX], QJ[ROW * NX], work[ROW * NX], back[NX * ROW], seen[NX * NX];
   koopmpc_real inverse[NX * NX], copied[NX * NX], P[TAILED * TAILED], S[TAILED * TAILED], mean = 0;
   koopmpc_real *M = target + TARGET_M, *L = target + TARGET_L, *V = target + TARGET_V;
   const koopmpc_real *size = koopmpc_rest_size, scale = KOOPMPC_SQRT((koopmpc_real)KOOPMPC_TAIL_SCALE);
   tail_step t;
   int blind;
-  koopmpc_local(target + TARGET_X, target + TARGET_U, at);
+  (void)w;
+  koopmpc_local(target + TARGET_X, target + TARGET_U KOOPMPC_AND(w), at);
   for (int i = 0; i < ROW; i++)
     for (int j = 0; j < NX; j++) J[i * NX + j] = at[LOCAL_J + i * NX + j] * size[j] / koopmpc_tail_rows[i];
   for (int i = 0; i < ROW; i++)
@@ -302,22 +323,16 @@ const koopmpc_real *koopmpc_find_row(koopmpc_state *s, const koopmpc_real *row, 
   koopmpc_real *target = s->made_end;
   for (int k = 0; k < s->made_count && !found; k++) {
     const koopmpc_real *each = s->made + k * KOOPMPC_MADE_SIZE;
-    int same = 1;
-    for (int i = 0; i < ROW && same; i++) same = !(each[i] < row[i] || each[i] > row[i]);
-    if (same) found = each;
+    if (is_row(each, row)) found = each;
   }
-  if (whole && s->has_made_end) { /* the end may outlive its row's place */
-    int same = 1;
-    for (int i = 0; i < ROW && same; i++) same = !(target[i] < row[i] || target[i] > row[i]);
-    if (same) return target;
-  }
+  if (whole && s->has_made_end && is_row(target, row)) return target; /* the end may outlive its row's place */
   if (!found) found = make(s, row);
   if (!found || !whole) return found;
   koopmpc_copy(target, found, TARGET_M);
   target[TARGET_FOUND] = found[TARGET_M];
   s->has_made_end = 1;
 #if KOOPMPC_STAGE_END == 1
-  if (found[TARGET_M] > 0 && add_tail(target)) {
+  if (found[TARGET_M] > 0 && add_tail(target, koopmpc_end_w(s))) {
     target[TARGET_FOUND] = found[TARGET_M];
     return target;
   }

@@ -74,7 +74,7 @@ static void trajectory(const koopmpc_state *s, koopmpc_real *X, koopmpc_real *U)
 
 /** One step of the model from a stage, with the disturbance of the plan. */
 static void follow(const koopmpc_state *s, int k, const koopmpc_real *x, const koopmpc_real *v, koopmpc_real *next) {
-  koopmpc_stage_map(x, v, next);
+  koopmpc_stage_map(x, v KOOPMPC_AND(koopmpc_w_of(s, k)), next);
   if (KOOPMPC_DISTURBED)
     for (int i = 0; i < NX; i++) next[i] += s->e[k * NX + i];
 }
@@ -189,7 +189,7 @@ static void shift(koopmpc_state *s, const koopmpc_real *u_prev) {
   trajectory(s, X, U);
   for (int i = 0; i < STEPS * NX; i++) X[i] = X[i + NX];
   for (int i = 0; i < (STEPS - 1) * NV; i++) U[i] = U[i + NV];
-  koopmpc_map(X + (STEPS - 1) * NX, U + (STEPS - 1) * NV, X + STEPS * NX);
+  koopmpc_map(X + (STEPS - 1) * NX, U + (STEPS - 1) * NV KOOPMPC_AND(koopmpc_w_of(s, STEPS - 1)), X + STEPS * NX);
   if (KOOPMPC_DISTURBED)
     for (int i = 0; i < NX; i++) X[STEPS * NX + i] += s->e[(STEPS - 1) * NX + i];
   enter(s, X, U, u_prev);
@@ -209,7 +209,7 @@ static int begin(koopmpc_state *s, int which, const koopmpc_real *x, const koopm
     }
   if (which == 2) {
     for (int k = 0; k < STEPS; k++) {
-      koopmpc_map(X + k * NX, U + k * NV, X + (k + 1) * NX);
+      koopmpc_map(X + k * NX, U + k * NV KOOPMPC_AND(koopmpc_w_of(s, k)), X + (k + 1) * NX);
       if (KOOPMPC_DISTURBED)
         for (int i = 0; i < NX; i++) X[(k + 1) * NX + i] += s->e[k * NX + i];
     }
@@ -315,6 +315,21 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
   return polished;
 }
 
+#if KOOPMPC_SCHEDULED
+static int differ(const koopmpc_real *a, const koopmpc_real *b, int n) {
+  int found = 0;
+  for (int i = 0; i < n; i++) found |= a[i] < b[i] || a[i] > b[i];
+  return found;
+}
+
+/** Have the targets found for another w, which holds at the end of the horizon. */
+static void aim_at(koopmpc_state *s, const koopmpc_real *w) {
+  koopmpc_copy(s->aimed_w, w, KOOPMPC_NW);
+  s->has_old_end = s->has_made_end || s->has_old_end;
+  s->made_count = s->made_next = s->has_made_end = s->has_rest = s->has_chord = s->aimed = 0;
+}
+#endif
+
 /** Store e_k = E w_k + d; returns whether it is finite. */
 static int disturb(koopmpc_state *s) {
 #if KOOPMPC_DISTURBED
@@ -329,10 +344,16 @@ static int disturb(koopmpc_state *s) {
     good = koopmpc_usable(e, NX);
     koopmpc_copy(s->draftX + k * NX, e, NX);
   }
+#if KOOPMPC_SCHEDULED
+  good = good && koopmpc_usable(koopmpc_w_of(s, 0), STEPS * KOOPMPC_NW);
+#endif
   if (!good) return 0;
   koopmpc_copy(last, s->e + (STEPS - 1) * NX, NX);
   koopmpc_copy(s->e, s->draftX, STEPS * NX);
   for (int i = 0; i < NX; i++) s->moved_on |= last[i] < s->e[(STEPS - 1) * NX + i] || last[i] > s->e[(STEPS - 1) * NX + i];
+#if KOOPMPC_SCHEDULED
+  if (differ(s->aimed_w, koopmpc_w_of(s, STEPS - 1), KOOPMPC_NW)) aim_at(s, koopmpc_w_of(s, STEPS - 1));
+#endif
 #else
   (void)s;
 #endif
@@ -341,7 +362,13 @@ static int disturb(koopmpc_state *s) {
 
 /** The target of a reference row, without its cost unless `whole`; the search starts at the last one found. */
 static const koopmpc_real *target_of(koopmpc_state *s, const koopmpc_real *row, int whole) {
-  for (int tried = 0; tried < s->target_count; tried++) {
+#if KOOPMPC_SCHEDULED
+  const koopmpc_real none[KOOPMPC_NW1] = {0};
+  const int table = differ(s->aimed_w, none, KOOPMPC_NW) ? 0 : s->target_count;
+#else
+  const int table = s->target_count;
+#endif
+  for (int tried = 0; tried < table; tried++) {
     const koopmpc_real *target = s->targets + s->found * KOOPMPC_TARGET;
     int same = 1;
     for (int i = 0; i < KOOPMPC_NR && same; i++) same = target[i] == row[i];

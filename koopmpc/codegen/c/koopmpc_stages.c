@@ -42,7 +42,7 @@ static void linearise(koopmpc_state *s) {
   for (int k = 0; k < STEPS; k++) {
     const koopmpc_real *next = s->S + (k + 1) * NS, *of = seen, *J = seen + NR;
     koopmpc_real *Q = s->Q + k * NS * NS, *q = s->q + k * NS;
-    koopmpc_slopes(s->S + k * NS, s->V + k * NV, dynamics);
+    koopmpc_slopes(s->S + k * NS, s->V + k * NV KOOPMPC_AND(koopmpc_w_of(s, k)), dynamics);
     koopmpc_copy(s->A + k * NS * NS, dynamics, NS * NS);
     if (koopmpc_free[k])
       koopmpc_copy(s->B + k * NS * NV, dynamics + NS * NS, NS * NV);

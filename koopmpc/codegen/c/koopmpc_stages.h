@@ -44,8 +44,23 @@ enum {
 };
 
 /** Slopes: A and B of a stage, row after row, and its next state. Stage map: the next state alone. */
-void koopmpc_slopes(const koopmpc_real *s, const koopmpc_real *v, koopmpc_real *out);
-void koopmpc_stage_map(const koopmpc_real *s, const koopmpc_real *v, koopmpc_real *next);
+void koopmpc_slopes(const koopmpc_real *s, const koopmpc_real *v KOOPMPC_AND(const koopmpc_real *w), koopmpc_real *out);
+void koopmpc_stage_map(const koopmpc_real *s, const koopmpc_real *v KOOPMPC_AND(const koopmpc_real *w),
+                       koopmpc_real *next);
+
+/** The measured disturbance of stage k. */
+static inline const koopmpc_real *koopmpc_w_of(const koopmpc_state *s, int k) {
+  return s->known + KOOPMPC_PREVIEW + k * KOOPMPC_NW;
+}
+
+/** The measured disturbance that holds at the end of the horizon, and for which targets are sought. */
+static inline const koopmpc_real *koopmpc_end_w(const koopmpc_state *s) {
+#if KOOPMPC_SCHEDULED
+  return s->aimed_w;
+#else
+  return koopmpc_w_of(s, STEPS - 1);
+#endif
+}
 
 /** Tracked outputs of a stage and their derivative, row after row; limited outputs and theirs. */
 void koopmpc_tracked(const koopmpc_real *s, koopmpc_real *out);
@@ -55,7 +70,7 @@ void koopmpc_limited(const koopmpc_real *s, koopmpc_real *out);
 void koopmpc_stage(const koopmpc_real *s, const koopmpc_real *r, koopmpc_real *out);
 
 /** F, A, B, of, J, g and G at (x, u), for the search of an equilibrium. */
-void koopmpc_local(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *out);
+void koopmpc_local(const koopmpc_real *x, const koopmpc_real *u KOOPMPC_AND(const koopmpc_real *w), koopmpc_real *out);
 
 /** The lower and the upper limit of entry i of [v_k; g(s_{k+1})]. */
 koopmpc_real koopmpc_low_of(const koopmpc_state *s, int k, int i);
@@ -81,10 +96,12 @@ koopmpc_real koopmpc_cost(const koopmpc_state *s);
 int koopmpc_inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_real *result, koopmpc_real *null);
 
 /**
- * Gauss-Newton steps to the equilibrium of a row and of a disturbance e: a violated limit is added, one with a wrong
+ * Gauss-Newton steps to the equilibrium of a row, of w where that multiplies x or u, and of a disturbance e: a violated
+ * limit is added, one with a wrong
  * sign released. The last step is at most a share `enough` of (x, u); 0, and nothing written, if they fail.
  */
-int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *e,
+int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *w,
+                 const koopmpc_real *e,
                  koopmpc_real enough);
 
 /** The factors of a Gauss-Newton step at `koopmpc_local` without active limits: H of F + e - x, T of the residuals. */

@@ -15,6 +15,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import SOFTENED, Interval, Limits
 from koopmpc.control.move import Status
+from koopmpc.control.nonlinear.equilibrium import TerminalTargets
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.level_stages import StageLevels
 from koopmpc.control.nonlinear.motion import BEYOND
@@ -173,8 +174,14 @@ class BilinearMPC(StagedMPC):
         return self._iteration.stage_is_convex
 
     def find_targets(self, reference: Float[np.ndarray, "rows nr"]) -> Float[np.ndarray, "found size"]:
-        """Return the `table` of the StagedProgram for these reference rows, each row once."""
-        return find_targets(self._terminal, self._map.nx, reference)
+        """Return the `table` of the StagedProgram for these reference rows, each row once.
+
+        Where measured disturbances multiply the state, it is that of w = 0.
+        """
+        terminal = self._terminal
+        if self._scheduled_for.any():
+            terminal = TerminalTargets(self._map, self.cost, self._outputs, 10 * self._N)
+        return find_targets(terminal, self._map.nx, reference)
 
     def build_program(self, reference: ArrayLike | None) -> StagedProgram:
         """Return the data of a step."""
@@ -188,12 +195,6 @@ class BilinearMPC(StagedMPC):
         if self._levels is not None:
             raise no_export(
                 self, "its inputs are on levels, and the search over them has no C code", "one without levels"
-            )
-        if problem.scheduled:
-            raise no_export(
-                self,
-                "measured disturbances multiply its state, which its C does not know",
-                "a BilinearMPC on model.at(w), for one constant w",
             )
         if problem.ends:
             raise no_export(self, "its C has no terminal set", "a LinearMPC or a KoopmanMPC with a terminal polytope")
@@ -219,6 +220,7 @@ class BilinearMPC(StagedMPC):
             ny=model.ny,
             ns=problem.nx,
             E=model.E,
+            scheduled=problem.scheduled > 0,
             with_rates=problem.with_rates,
             weighs_changes=outputs.R_delta is not None,
             soft_rates=problem.soft_rates,

@@ -31,15 +31,17 @@ class StagedProgram(StepProgram):
     Attributes
     ----------
     functions
-        Name → graph: "map" (x, u) → F; "stage_map" (s, v) → s⁺; "slopes" (s, v) → ∂s⁺/∂s, ∂s⁺/∂v by rows, s⁺;
-        "tracked" and "limited" s → value, Jacobian by rows; "stage" (s, r) → JᵀQJ, JᵀQ(of − r); "local"
-        (x, u) → F, ∂F/∂x, ∂F/∂u, of, ∂of/∂x, g, ∂g/∂x.
+        Name → graph. Those of the model take w too where it multiplies x or u. "map" (x, u) → F; "stage_map" (s, v) →
+        s⁺; "slopes" (s, v) → ∂s⁺/∂s, ∂s⁺/∂v by rows, s⁺; "tracked" and "limited" s → value, Jacobian by rows; "stage"
+        (s, r) → JᵀQJ, JᵀQ(of − r); "local" (x, u) → F, ∂F/∂x, ∂F/∂u, of, ∂of/∂x, g, ∂g/∂x.
     N, latency, iterations
         Steps of the plan, steps until its first input acts, linearisations a step.
     nx, ny, ns
         Entries of x, of the plant's state, and of s.
     E
         (nx, nw) gain of the measured disturbances.
+    scheduled
+        Whether they multiply x or u too.
     with_rates, weighs_changes, soft_rates
         Whether v is the change of u; whether the cost weighs it; the inputs whose changes have soft limits.
     free, held_from
@@ -85,6 +87,7 @@ class StagedProgram(StepProgram):
     ny: int
     ns: int
     E: Float[np.ndarray, "nx nw"]
+    scheduled: bool
     with_rates: bool
     weighs_changes: bool
     soft_rates: Int[np.ndarray, " soft"]
@@ -141,7 +144,9 @@ def trace_functions(problem: StagedProblem, outputs: StateTracking, model: Learn
     """
     nx, nu, ns = model.nx, model.nu, problem.nx
     s, v, x, u = (ca.SX.sym(name, n) for name, n in (("s", ns), ("v", nu), ("x", nx), ("u", nu)))
-    theta = ca.DM(model.theta)
+    w = ca.SX.sym("w", model.scheduled)
+    theta = ca.vertcat(ca.SX(ca.DM(model.theta[: len(model.theta) - model.scheduled])), w)
+    measured = [w] if model.scheduled else []
     if not model.F.is_a("SXFunction"):
         raise DataError(
             "the model's map holds an implicit integrator or a callback, which cannot be written in C; "
@@ -158,13 +163,13 @@ def trace_functions(problem: StagedProblem, outputs: StateTracking, model: Learn
     weighed = J.T @ ca.sparsify(ca.DM(problem.Q))
     of, g = ca.SX(outputs.tracked(x)), ca.SX(outputs.limited(x))
     functions = {
-        "map": ([x, u], [F]),
-        "stage_map": ([s, v], [F_s]),
-        "slopes": ([s, v], [slope(F_s, s), slope(F_s, v), F_s]),
+        "map": ([x, u, *measured], [F]),
+        "stage_map": ([s, v, *measured], [F_s]),
+        "slopes": ([s, v, *measured], [slope(F_s, s), slope(F_s, v), F_s]),
         "tracked": ([s], [tracked, slope(tracked, s)]),
         "limited": ([s], [limited, slope(limited, s)]),
         "stage": ([s, r], [ca.vec(ca.densify(weighed @ J)), ca.densify(weighed @ (tracked - r))]),
-        "local": ([x, u], [F, slope(F, x), slope(F, u), of, slope(of, x), g, slope(g, x)]),
+        "local": ([x, u, *measured], [F, slope(F, x), slope(F, u), of, slope(of, x), g, slope(g, x)]),
     }
     found: dict[str, Graph] = {}
     for name, (arguments, results) in functions.items():
