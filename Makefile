@@ -39,8 +39,10 @@ loops: $(VENV)/installed-dev
 real: $(VENV)/installed-dev
 	KOOPMPC_TESTS=bare $(PINNED) $(BIN)/python -m pytest -n 2 --benchmark-disable -m real tests/real
 
+# Benchmarks, then each row of docs/speed.md as it is here.
 speed: $(VENV)/installed-dev
 	KOOPMPC_TESTS=bare $(PINNED) $(BIN)/python -m pytest tests/speed -m speed --benchmark-columns=median,iqr,rounds --benchmark-sort=name
+	$(BIN)/python -m tests.speed.figures.turns --every
 
 # Closed loops with faults, damaged files, designs, kills and interrupts, for MINUTES; memory must stay flat.
 MINUTES ?= 10

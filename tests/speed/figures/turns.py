@@ -2,7 +2,7 @@
 
 A figure is measured in a process of its own. With `--before`, the tree of another commit, a second process measures the
 same figure there, and both are asked in turns. `python -m tests.speed.figures.turns` without a name writes docs/speed.md
-of what was measured before.
+of what was measured before, and `--every` prints all rows as they are here and now, and writes nothing.
 """
 
 import argparse
@@ -164,9 +164,15 @@ def main() -> None:
     parser.add_argument("--before", type=Path)
     parser.add_argument("--pairs", type=int, default=PAIRS)
     parser.add_argument("--answer")
+    parser.add_argument("--every", action="store_true")
     given = parser.parse_args()
     if given.answer:
         answer(given.answer)
+        return
+    if given.every:
+        for name, figure in load_figures().items():
+            sys.stdout.write(format_row(figure, measure(name, given.before, min(given.pairs, EACH))) + "\n")
+            sys.stdout.flush()
         return
     figures, measured = load_figures(), {path: read_measured(path) for path in find_files()}
     for name in given.names:
