@@ -268,6 +268,11 @@ class MPCBase(Published):
         MPCBase.reset(self)
 
     @property
+    def latency(self) -> int:
+        """Steps until an input that is computed now acts."""
+        return self._latency
+
+    @property
     def watch(self) -> StepWatch | None:
         """The monitor's answer on the last step; None without a monitor."""
         return self._watch

@@ -42,8 +42,8 @@ class Station(Published):
     standby
         A controller of the same plant, or a function u = f(y, r); None: the applied input is held.
     limits
-        Limits of the inputs and their changes, for whoever acts; of those with rows in time the row of the step. Inputs
-        with `levels` are rounded to an allowed one.
+        Limits of the inputs and their changes, for whoever acts; of those with rows in time the row of the step in
+        which an input acts, after the controller's latency. Inputs with `levels` are rounded to an allowed one.
     mode
         "manual", "automatic" or "standby" at every reset.
     hand
@@ -111,6 +111,7 @@ class Station(Published):
         base = self.limits.base
         self.inputs, self.rates = base.inputs(self.nu), base.rates(self.nu)
         self._rows = InputRows(self.limits, self.nu) if self.limits.in_time else None
+        self._latency = int(getattr(controller, "latency", 0))  # an input acts, and is limited, so many steps later
         width = np.where(np.isfinite(self.inputs.high - self.inputs.low), self.inputs.high - self.inputs.low, np.inf)
         self.bump = _BUMP * width if bump is None else checks.vector(bump, "bump", self.nu, infinite=True)
         levels = base.input_levels(self.nu)
@@ -207,7 +208,7 @@ class Station(Published):
         """Return the limits of the inputs, and of their changes, in this step."""
         if self._rows is None:
             return self.inputs, self.rates
-        box, change = self._rows.at(self._step)
+        box, change = self._rows.at(self._step + self._latency)
         return box, None if self.rates is None else change
 
     def plan(self) -> Plan | None:

@@ -137,10 +137,10 @@ def draw_controller(rng, kind, model, plant, found):
 
 def stand_by(rng, mpc, model, cost, limits, found):
     """Return the controller in a station with somebody who stands by, or alone."""
-    if limits.in_time or rng.random() < 0.4:
+    if rng.random() < 0.4:
         return mpc
     found.append("station")
-    nu = model.nu
+    nu, hand = model.nu, 3 * rng.normal(size=model.nu)
     plain = km.Limits(u_min=limits.u_min, u_max=limits.u_max)
     draw = rng.random()
     if draw < 0.4:
@@ -150,10 +150,10 @@ def stand_by(rng, mpc, model, cost, limits, found):
     else:
 
         def standby(y, r):
-            return np.full(nu, 0.1)
+            return -hand
 
     own = km.Limits(u_min=limits.u_min, u_max=limits.u_max, levels=limits.levels, dwell=limits.dwell)
-    return km.supervise.Station(mpc, standby, limits=own, hand=np.zeros(nu), patience=int(rng.integers(1, 4)))
+    return km.supervise.Station(mpc, standby, limits=own, hand=hand, patience=int(rng.integers(1, 4)))
 
 
 def loop(seed):

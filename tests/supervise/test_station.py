@@ -313,3 +313,14 @@ def test_a_station_with_levels_keeps_to_those_inside_its_row():
     limits = km.Limits(levels={"u0": [0, 1]}, u_max=[[1.0], [0.5], [1.0]]).resolve((), ("u0",))
     station = km.supervise.Station(km.control.PID(5.0, 1.0, dt=0.1), limits=limits, mode="manual", hand=[1.0])
     assert [float(station([0.0], [0.0]).u[0]) for _ in range(3)] == [1.0, 0.0, 1.0]
+
+
+def test_an_input_that_acts_later_keeps_the_row_of_the_step_in_which_it_acts():
+    u_max = np.full((10, 1), 2.0)
+    u_max[5:8] = 0.5
+    limits = km.Limits(u_min=-2.0, u_max=u_max)
+    model = km.LinearPredictor([[0.9]], [[1.0]], np.eye(1), km.State(), 0.1, ("x",), ("u",))
+    mpc = km.KoopmanMPC(model, km.Cost(Q=1, R=0.1), limits, 5, latency=2)
+    station = km.supervise.Station(mpc, limits=limits, mode="manual", hand=[3.0])
+    U = [station([0.0], [0.0]).u[0] for _ in range(8)]
+    np.testing.assert_array_equal(U, u_max[2:, 0])
