@@ -158,7 +158,8 @@ class HeatPump(km.Dynamics):
     """A house of two heat capacities, and a heat pump that the cold outside, which is measured, makes worse.
 
     The heat that a kW of the compressor makes is the regression of Staffell et al. on the lift from the outside air to
-    the floor's water, "A review of domestic heat pumps", Energy Environ. Sci. 5, 2012; the sizes are ours.
+    the floor's water, of 15 to 60 K, "A review of domestic heat pumps", Energy Environ. Sci. 5, 2012, with the figures
+    that PyPSA-Eur quotes of it (scripts/build_cop_profiles.py); the sizes are ours.
     """
 
     states = ("room [°C]", "floor [°C]")

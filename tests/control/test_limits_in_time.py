@@ -349,3 +349,14 @@ def test_a_controller_in_words_says_its_widest_limits_and_that_they_move():
     mpc = km.KoopmanMPC(linear(A, B), COST, km.Limits(u_min=-1, u_max=[[0.5, 0.6], [0.7, 0.2]]), N)
     assert "u0 ≤ 0.7" in repr(mpc)
     assert "rows in time" in repr(mpc)
+
+
+def test_a_page_of_limits_reads_the_rows_of_its_steps_alone():
+    limits = moving_limits(4, rates=0.5)
+    window = km.KoopmanMPC(linear(A, B), COST, limits, N)._rows_of_limits
+    assert np.shares_memory(window.table, window.table.reshape(-1))  # else each page copies the rows of the whole run
+    for pages in (window.plan_pages, window.moving_pages, window.single_pages):
+        for k in (0, 7, T):
+            low, high = pages.fill(k)
+            both = window.table.reshape(-1)[k * window.table.shape[1] + pages.entries]
+            np.testing.assert_array_equal(np.concatenate([low, high]), both)

@@ -18,7 +18,7 @@ from koopmpc.control.linear.plan import PlanMap
 from koopmpc.control.target import ROUNDING
 from koopmpc.errors import DataError
 
-_PAGE = 2**15  # entries of limits that are made at once: more cost a step more than 0.1 ms
+_PAGE = 2**14  # entries of limits that are made at once: more cost a step more than 0.1 ms
 _SHARE = 1e-5  # a rate that gives way by more of its allowance than this is reported
 
 
@@ -52,10 +52,9 @@ class _Pages:
     def fill(self, k: int) -> tuple[Float[np.ndarray, " nt"], Float[np.ndarray, " nt"]]:
         """Make the page that begins with step k, and return its first row."""
         steps = min(max(1, _PAGE // max(len(self.entries), 1)), self.last + 1 - k)
-        width, half = self.table.shape[1], len(self.entries) // 2
-        rows = (k + self.latency + np.arange(steps)) * width
-        page = self.table.reshape(-1)[rows[:, None] + self.entries]
-        low, high = page[:, :half].copy(), page[:, half:].copy()
+        half, span, (stride, _) = len(self.entries) // 2, int(self.entries.max(initial=0)) + 1, self.table.strides
+        ahead = np.ndarray((steps, span), np.float64, self.table, (k + self.latency) * stride, (stride, 8))
+        low, high = (np.ascontiguousarray(ahead[:, part]) for part in (self.entries[:half], self.entries[half:]))
         if self.margin is not None:
             low[:, self.outputs] += self.margin
             high[:, self.outputs] -= self.margin
@@ -245,7 +244,7 @@ def limit_windows(
     margin = preview_margin(track.margin, N).ravel() if track.margin.any() else None
     W, raw_at = layout.width, layout.raw.first
     planned = table[:, :raw_at], table[:, W : W + raw_at]
-    table = np.clip(table, -HUGE, HUGE)
+    table = np.ascontiguousarray(np.clip(table, -HUGE, HUGE))  # else each page would copy the limits of the whole run
     reaches = [plan.single.reach] * steps  # where nothing aims at a target, or a disturbance moves it
     if plan.aims_inside:
         first = [part[latency : latency + steps] - shift for part in tightest]
