@@ -52,6 +52,7 @@ class InnovationsError(MultiStepError):
             value = float(np.mean((self.find_errors(theta, data) @ self.root.T) ** 2))
         return value if np.isfinite(value) else np.inf
 
+    @raise_swallowed()
     def find_errors(self, theta: Float[np.ndarray, "nx n"], data: Segments) -> Float[np.ndarray, "steps m nx"]:
         """Return y_k − x̂_k of each segment after the steps in which the filter settles."""
         coefficients, gain = np.split(theta, [self.shape[1]], axis=1)
@@ -194,6 +195,7 @@ def fit_with_gain(
     return with_coefficients(model, places, theta[:, :-nx], sentence), gain
 
 
+@raise_swallowed()
 def filter_states(
     model: LinearPredictor | BilinearPredictor, gain: Float[np.ndarray, "nx nx"], episodes: Episodes
 ) -> Episodes:
@@ -263,6 +265,7 @@ def _find_rest(regressors: Float[np.ndarray, "M n"], targets: Float[np.ndarray, 
     return np.sqrt((rest**2).sum(axis=0) / (len(P) - P.shape[1]))
 
 
+@raise_swallowed()
 def _check_excitation(
     error: InnovationsError, theta: Float[np.ndarray, "nx n"], data: Segments, free: Int[np.ndarray, " f"], rows: int
 ) -> None:

@@ -11,6 +11,7 @@ DECAY = 0.2  # factor on the damping after a step that does
 LEAST_DAMPING = 1e-14  # damping does not fall below this
 TRIALS = 10  # dampings tried for one step
 CONVERGED = 1e-12  # stop where a step lowers the squared error by less than this share
+_ROUNDING = float(np.finfo(float).eps)  # smaller eigenvalues than this share of the largest are rounding error
 PATIENCE = 3  # stop after this many steps in a row that do not lower the error on the held-out rows
 
 D = TypeVar("D", contravariant=True)
@@ -71,11 +72,16 @@ def minimise(
         gradient, matrix = error.derivatives(theta, fitted)
         gradient, matrix = gradient[places], matrix[np.ix_(places, places)]
         scale = np.sqrt(np.where(matrix.diagonal() > 0, matrix.diagonal(), 1.0))
-        scaled, slope = matrix / np.outer(scale, scale), gradient / scale
-        lower = np.inf
+        sizes, directions = np.linalg.eigh(matrix / np.outer(scale, scale))  # once for all dampings
+        slope, lower = directions.T @ (gradient / scale), np.inf
         for _ in range(TRIALS):
             move = np.zeros(theta.size)
-            move[places] = np.linalg.lstsq(scaled + damping * np.eye(len(slope)), -slope, rcond=None)[0] / scale
+            damped = sizes + damping
+            steep = damped > _ROUNDING * len(sizes) * damped[-1]  # directions that are more than rounding error
+            along = np.divide(slope, damped, out=np.zeros(len(sizes)), where=steep)
+            if along @ (2 * slope - sizes * along) < converged * value:
+                break  # the quadratic model promises too little for another step
+            move[places] = -directions @ along / scale
             trial = theta + move.reshape(theta.shape)
             lower = error.evaluate(trial, fitted)
             if lower < value:

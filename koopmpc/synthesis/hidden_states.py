@@ -27,6 +27,7 @@ PAYS = 0.9  # neurons are judged if they lower the error on unseen rows to less 
 _NEURAL_ORDERS = (2, 3, 4)  # orders of hidden states with neurons
 _SENSORS = 2  # neurons are tried on records of at most so many sensors: with more of them little is hidden
 _ORDERS = (1, 2, 3, 4)  # orders of hidden states that simulation error is tried on
+_RAILED = 2  # that many of them are tried with the rails of a sensor too
 _PROPOSED = 2  # candidates with a hidden state that a design fits to each fold and judges in its loops, at most
 
 
@@ -43,8 +44,8 @@ def judge_hidden_states(
 ) -> list[tuple[LeaderboardRow, FreeRun]]:
     """Return the best models with a hidden state of each kind, and how they run over stretches that no fit saw.
 
-    The kinds are the subspace model, the linear and the polynomial one of least simulation error, and where a sensor
-    rests at its least or largest reading, the polynomial one with these rails; and for one or two sensors those with
+    The kinds are the subspace model, the linear and the polynomial one of least simulation error, the latter with rails
+    where a sensor rests at its least or largest reading and they gain; and for one or two sensors those with
     neurons, with the rails if the best one before has them. With neurons the best one and the smallest of other orders
     are judged, if they are calm and err by a tenth less than all others. Where records are too short for a kind, it is
     left out; so is a model that on the first stretches errs by half more than the best calm one so far.
@@ -99,15 +100,19 @@ def search_hidden_states(
         if progress is not None:
             progress(done, total)
 
+    orders, kinds = _ORDERS, dict[bool, list[HiddenStructure]]()
     for limits in (None,) if rails is None else (None, rails):
         try:
-            tried = search_hidden(measured, _ORDERS, rails=limits, ask=ask)
+            tried = search_hidden(measured, orders, rails=limits, ask=ask)
         except KoopmpcError:
             continue
+        ranked = dict.fromkeys(one.order for one in sorted(tried, key=lambda one: one.error))
+        orders = tuple(ranked)[:_RAILED]  # with rails only those that did best without
         for kind in (False, True) if bilinear else (False,):
             same = [one for one in tried if one.is_nonlinear is kind]
             if same and (kind or limits is None):
-                found.append(choose_hidden(same))
+                kinds.setdefault(kind, []).extend(same)
+    found += map(choose_hidden, kinds.values())
     if bilinear and measured.nx <= _SENSORS:
         try:
             saturates = bool(found) and min(found, key=lambda one: one.error).rails is not None

@@ -182,7 +182,8 @@ def judge_free_run(
 ) -> FreeRun:
     """Return how a fit does on each quarter of the records when it learns from the others.
 
-    Where it errs by far more than a `rival` on the first quarters, it is not fitted to the others, and has lost there.
+    Where it errs by far more than a `rival` on each of the first two quarters, it is not fitted to the others, and has
+    lost there. One quarter does not decide: without it the data may lack what only that quarter holds.
 
     Parameters
     ----------
@@ -208,9 +209,15 @@ def judge_free_run(
         kept = [e.cut(a, b) for e, (low, high) in zip(seen, spans, strict=True) for a, b in ((0, low), (high, len(e)))]
         model = fit(truth.with_episodes([e for e in kept if len(e) > first]))
         errors += _stretch_errors(model, truth, spans, scale, first, horizon, relift=relift)
-        if rival is not None and _mean(errors) > _BEHIND * _mean(rival.errors[: len(errors)]):
+        if rival is not None and fold and _is_behind(errors, rival.errors[: len(errors)], fold + 1):
             return FreeRun(np.array(errors + [_LOST] * (len(rival.errors) - len(errors))), False)
     return FreeRun(np.array(errors), _is_calm(fit(seen), truth, first, relift))
+
+
+def _is_behind(errors: Sequence[float], than: Float[np.ndarray, " blocks"], quarters: int) -> bool:
+    """Return whether errors are far larger on each of the quarters that they are from."""
+    own, others = (np.log(np.maximum(e, EXACT)).reshape(quarters, -1).mean(axis=1) for e in (errors, than))
+    return bool((own > others + np.log(_BEHIND)).all())
 
 
 def run_structure(structure: Structure, measured: Episodes, first: int, horizon: int) -> FreeRun:

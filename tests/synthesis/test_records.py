@@ -169,9 +169,16 @@ def test_a_model_far_behind_a_rival_is_not_fitted_without_each_quarter():
     rival = judge_free_run(lambda e: fit(e, km.Delay(2)), data, data, 2, 10, relift=False)
     assert (len(fits), rival.calm) == (5, True)
     lost = judge_free_run(lambda e: fit(e, None), data, data, 2, 10, relift=False, rival=rival)
-    assert len(fits) == 6
+    assert len(fits) == 7  # two quarters
     assert not lost.calm
     assert lost.errors.shape == rival.errors.shape
+    fits.clear()
+    once = judge_free_run(
+        lambda e: fit(e, km.Delay(2) if fits else None), data, data, 2, 10, relift=False, rival=rival
+    )  # one quarter does not decide
+    assert (len(fits), once.calm) == (5, True)
+    assert once.errors[0] > rival.errors[0]
+    np.testing.assert_allclose(once.errors[2:], rival.errors[2:])
 
 
 def test_hidden_states_far_behind_the_best_calm_polynomial_are_left_out():

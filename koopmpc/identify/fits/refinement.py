@@ -59,6 +59,7 @@ class MultiStepError:
         self.shape = model.nx, phi.numel()
         self._bound: dict[tuple[bool, int], tuple[list[np.ndarray], Callable[[], None], Any]] = {}
 
+    @raise_swallowed()
     def evaluate(self, theta: Float[np.ndarray, "nx nphi"], data: Segments) -> float:
         """Return the mean squared relative error over all segments and steps; inf where a forecast overflows."""
         total, point = 0.0, data.points
@@ -71,7 +72,6 @@ class MultiStepError:
                 point = x if self.embedding is None else self.embedding.shift(point, u, x)
         return total / data.states.size
 
-    @raise_swallowed()
     def find_features(self, *values: np.ndarray) -> list[np.ndarray]:
         """Return φ of every segment, (m, nphi), of points and inputs; with Θ also the slopes, (m, npoint, nx)."""
         slopes, (m, npoint), (nx, count) = len(values) > 2, values[0].shape, self.shape

@@ -244,23 +244,19 @@ def _list_states(
     model: HiddenModel, z: Float[np.ndarray, "m n"], inputs: Float[np.ndarray, "steps m nu"]
 ) -> Float[np.ndarray, "steps1 m n"]:
     """Return z_0, z_1, …, which stop at `_FAR` spreads."""
-    out = np.empty((len(inputs) + 1, *z.shape))
-    out[0] = z
+    features, out = FeatureTable(model), np.empty((len(inputs) + 1, z.shape[1], len(z)))
+    out[0] = z.T
     with np.errstate(over="ignore", invalid="ignore"):
         for k, u in enumerate(inputs):
-            np.minimum(np.maximum(read_features(model, out[k], u) @ model.E.T, -_FAR), _FAR, out=out[k + 1])
-    return out
+            np.minimum(np.maximum(model.E @ features.read(out[k], u.T), -_FAR), _FAR, out=out[k + 1])
+    return np.ascontiguousarray(out.swapaxes(1, 2))
 
 
 def bound_states(model: HiddenModel, data: RecordSegments, reach: float) -> HiddenModel:
     """Return the model with bounds at `reach` times the largest |z| that occurs on these stretches."""
     model = replace(model, bound=np.full(model.order, np.inf))
-    z = start_states(model, data.points)
-    largest = np.abs(z).max(axis=0)
-    for u in data.inputs:
-        z = np.clip(read_features(model, z, u) @ model.E.T, -_FAR, _FAR)
-        largest = np.maximum(largest, np.abs(z).max(axis=0))
-    return replace(model, bound=reach * largest)
+    z = _list_states(model, start_states(model, data.points), data.inputs)
+    return replace(model, bound=reach * np.abs(z).max(axis=(0, 1)))
 
 
 def join_segments(parts: Sequence[RecordSegments]) -> RecordSegments:
@@ -279,24 +275,48 @@ def read_features(
     model: HiddenModel, z: Float[np.ndarray, "m n"], u: Float[np.ndarray, "m nu"]
 ) -> Float[np.ndarray, "m nphi"]:
     """Return φ(z, u)."""
-    n, products = model.order, len(model.terms)
-    phi = np.empty((len(z), model.E.shape[1]))
-    signals = np.empty((len(z), 1 + n + u.shape[1]))
-    phi[:, 0] = signals[:, 0] = 1.0
-    signals[:, 1 : 1 + n], signals[:, 1 + n :] = z, u
-    phi[:, 1 : 1 + products] = signals[:, 1:] if is_plain(model) else evaluate_terms(model.terms, signals)
-    if (np.abs(z) > model.bound).any():
-        curved = np.flatnonzero(is_nonlinear(model.terms, n))
-        signals[:, 1 : 1 + n] = np.clip(z, -model.bound, model.bound)
-        phi[:, 1 + curved] = evaluate_terms(model.terms[curved], signals)
-    if model.V is not None:
-        phi[:, 1 + products :] = np.tanh(z @ model.V[:, :-1].T + model.V[:, -1])
-    return phi
+    return np.ascontiguousarray(FeatureTable(model).read(z.T, u.T).T)
 
 
-def is_plain(model: HiddenModel) -> bool:
-    """Return whether the products are z and u themselves, in this order."""
-    return model.terms.shape[1] == 1 and len(model.terms) == int(model.terms[-1, 0])
+class FeatureTable:
+    """φ of many states and inputs, a row for each feature. Each product is a shorter one times one more factor.
+
+    Parameters
+    ----------
+    model
+        Its terms, bounds and neurons; E, H and T play no part.
+    """
+
+    def __init__(self, model: HiddenModel) -> None:
+        self._model, self._limited = model, bool(np.isfinite(model.bound).any())
+        factors = [tuple(v for v in term if v) for term in model.terms.tolist()]
+        place = {(): 0} | {term: t for t, term in enumerate(factors, 1)}
+        self._blocks = [
+            (
+                np.array([place[term] for term in same], dtype=np.intp),
+                np.array([place[term[:-1]] for term in same], dtype=np.intp),
+                np.array([term[-1] for term in same], dtype=np.intp),
+            )
+            for size in range(1, max(map(len, factors), default=0) + 1)
+            if (same := [term for term in factors if len(term) == size])
+        ]
+        self._curved = 1 + np.flatnonzero(is_nonlinear(model.terms, model.order))
+
+    def read(self, z: Float[np.ndarray, "n m"], u: Float[np.ndarray, "nu m"]) -> Float[np.ndarray, "nphi m"]:
+        """Return φ(z, u), a column for each column of z and u."""
+        model, n = self._model, len(z)
+        phi = np.empty((model.E.shape[1], z.shape[1]))
+        signals = np.empty((1 + n + len(u), z.shape[1]))
+        phi[0] = signals[0] = 1.0
+        signals[1 : 1 + n], signals[1 + n :] = z, u
+        for i, (rows, shorter, last) in enumerate(self._blocks):
+            phi[rows] = signals[last] if i == 0 else phi[shorter] * signals[last]
+        if self._limited and len(self._curved) and (np.abs(z) > model.bound[:, None]).any():
+            signals[1 : 1 + n] = np.clip(z, -model.bound[:, None], model.bound[:, None])
+            phi[self._curved] = evaluate_terms(model.terms[self._curved - 1], signals.T).T
+        if model.V is not None:
+            phi[1 + len(model.terms) :] = np.tanh(model.V[:, :-1] @ z + model.V[:, -1:])
+        return phi
 
 
 def is_nonlinear(terms: Terms, order: int) -> Bool[np.ndarray, " nt"]:

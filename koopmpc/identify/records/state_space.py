@@ -17,6 +17,8 @@ from koopmpc.identify.records.hidden import (
     bound_states,
 )
 from koopmpc.identify.records.hidden_structure import (
+    ROWS,
+    STEPS,
     HiddenStructure,
     check_rails,
     choose_hidden,
@@ -43,6 +45,7 @@ REACH = 1.2  # products of z are constant beyond this many times the largest |z|
 GAINED = 0.95  # try a larger order only if the last one lowered the error to less than this share
 SEGMENTS = 5  # segments that fit into the records one behind the other, at least, of the longer kinds
 FINALISTS = 2  # orders that are fitted to longer segments too
+QUICK_STEPS = ROWS  # steps of all segments of one length in a search: each row is in one of them
 MOST = 300  # parameters of a model, at most
 EACH = 3  # rows for each parameter, at least
 _ITERATIONS = 25  # Levenberg-Marquardt steps for each degree
@@ -153,7 +156,7 @@ def search_hidden(
             ask(f"hidden states of order {order}", done, count)
         done += 1
         try:
-            chain = _fit_chain(data, order, max(degrees), past, horizon, rails)
+            chain = _fit_chain(data, order, max(degrees), past, horizon, rails, QUICK_STEPS)
         except KoopmpcError as error:
             reasons.append(error)
             return
@@ -188,7 +191,7 @@ def fit_hidden(
 ) -> LinearPredictor | BilinearPredictor:
     """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows.
 
-    `quick` is as in `fit_neural`; other kinds are fitted as fast in any case.
+    `quick` is as in `fit_neural`; polynomials learn from half of the segments then, as in the search for their sizes.
     """
     s = structure
     if s.neurons:
@@ -196,8 +199,9 @@ def fit_hidden(
     if not s.horizon:
         return build_realisation(compute_block_moments(episodes, s.delays), s.order)
     data = thin_records(episodes)
-    found, units = _fit_chain(data, s.order, s.degree, s.delays, s.horizon, s.rails)[-1]
-    whole = cut_sets(data, units, s.delays, s.horizon, [(0, len(e)) for e in data])
+    most = QUICK_STEPS if quick else STEPS
+    found, units = _fit_chain(data, s.order, s.degree, s.delays, s.horizon, s.rails, most)[-1]
+    whole = cut_sets(data, units, s.delays, s.horizon, [(0, len(e)) for e in data], steps_of_all=most)
     theta, _ = minimise(
         SimulationError(found), found.parameters, whole, whole, _POLISH, patience=_PATIENCE, converged=_CONVERGED
     )
@@ -210,13 +214,21 @@ def fit_hidden(
 
 
 def _fit_chain(
-    data: Episodes, order: int, degree: int, delays: int, horizon: int, rails: Float[np.ndarray, "2 ny"] | None
+    data: Episodes,
+    order: int,
+    degree: int,
+    delays: int,
+    horizon: int,
+    rails: Float[np.ndarray, "2 ny"] | None,
+    most: int,
 ) -> list[tuple[HiddenModel, SignalUnits]]:
-    """Return the models of degrees 1, 2, … that learn from the first three quarters of each record."""
+    """Return the models of degrees 1, 2, … that learn from about `most` steps of the first three quarters."""
     units = SignalUnits.of(data, rails)
     ends = [round((1 - UNSEEN) * len(e)) for e in data]
-    fitted = cut_sets(data, units, delays, horizon, [(0, a) for a in ends])
-    judged = cut_sets(data, units, delays, horizon, [(a, len(e)) for e, a in zip(data, ends, strict=True)])
+    unseen = [(a, len(e)) for e, a in zip(data, ends, strict=True)]
+    fitted, judged = (
+        cut_sets(data, units, delays, horizon, part, steps_of_all=most) for part in ([(0, a) for a in ends], unseen)
+    )
     learned = data.with_episodes([e.cut(0, a) for e, a in zip(data, ends, strict=True) if a > 0])
     start = build_realisation(compute_block_moments(learned, delays), order)
     model = normalise(to_standard(start, units), fitted[-1].points)
