@@ -512,6 +512,7 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
         "DISTURBED": int(p.disturbed),
         "PUSHES": N * nx if p.disturbed else 1,
         "GIVEN_MAP": int(isinstance(p.model, StepMap)),
+        "AFFINE": int(p.affine),
         "ITERATIONS": p.iterations,
         "HOLDS": int(p.holds),
         "GIVEN_END": int(p.end == "given"),

@@ -15,7 +15,7 @@
 #include "koopmpc_stages.h"
 #include "koopmpc_table.h"
 
-enum { EACH = 12, AGAIN = 10, ENDINGS = 20, PLAN_S = (STEPS + 1) * NS, PLAN_V = STEPS * NV };
+enum { EACH = 12, AGAIN = 10, ENDINGS = 20, SPENT = 300, PLAN_S = (STEPS + 1) * NS, PLAN_V = STEPS * NV };
 #define NEAR_OF ((koopmpc_real)0.2)      /* F may differ from its linearisation by this share of a change */
 #define SHORTEST ((koopmpc_real)0.001)   /* shortest length of a step */
 #define FOLLOWED ((koopmpc_real)0.02)    /* a plan follows the model if its defects are below this share of a range */
@@ -168,8 +168,10 @@ static int rests(const koopmpc_state *s, koopmpc_real settled) {
 static koopmpc_status improve(koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev, int most,
                               koopmpc_real settled, int *iterations) {
   koopmpc_status status = KOOPMPC_FAILED;
+  const int before = *iterations;
   for (int k = 0; k < most; k++) {
     int taken = 0;
+    if (k && *iterations - before >= SPENT) break;
     const koopmpc_status found = koopmpc_program(s, x, s->without_limits, &taken);
     *iterations += taken;
     if (!is_good(found)) return found;
@@ -178,7 +180,7 @@ static koopmpc_status improve(koopmpc_state *s, const koopmpc_real *x, const koo
     trajectory(s, s->draftX, s->draftU);
     enter(s, s->draftX, s->draftU, u_prev);
     status = s->slack > 0 ? KOOPMPC_SOFTENED : found;
-    if (k + 1 < most && rests(s, settled)) break;
+    if (k + 1 < most && ((KOOPMPC_AFFINE && s->length >= 1) || rests(s, settled))) break;
   }
   return status;
 }
@@ -279,10 +281,11 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
                                  int *iterations) {
   koopmpc_status status = KOOPMPC_FAILED, polished;
   koopmpc_real best = KOOPMPC_HUGE;
-  int best_kind = 3;
+  const int before = *iterations;
+  int best_kind = 3, done = 0;
   save(s);
   s->best_slack = 0;
-  for (int which = 0; which < 2 + KOOPMPC_GIVEN_MAP; which++) {
+  for (int which = 0; which < 2 + KOOPMPC_GIVEN_MAP && !done; which++) {
     koopmpc_status ended;
     koopmpc_real value = 0;
     int kind = 2;
@@ -304,9 +307,10 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
       status = ended;
       save(s);
     }
+    done = *iterations - before >= SPENT || (KOOPMPC_AFFINE && best_kind == 0);
   }
   restore(s);
-  if (!is_good(status)) return status;
+  if (!is_good(status) || done) return status;
   polished = improve(s, x, u_prev, KOOPMPC_ITERATIONS > AGAIN ? KOOPMPC_ITERATIONS : AGAIN, KOOPMPC_SETTLED, iterations);
   if (!is_good(polished)) {
     restore(s);

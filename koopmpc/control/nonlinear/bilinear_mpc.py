@@ -39,6 +39,7 @@ from koopmpc.predict.predictors import BilinearPredictor
 
 EACH = 12  # linearisations from each start of a first step, at most
 FIRST = 10  # further linearisations of the best of these plans, at most
+SPENT = 300  # after so many iterations of the solver no further start, and no further linearisation from one, begins
 FOLLOWED = 0.02  # a plan follows the model whose defects are below this share of the range of their state
 SETTLED = (
     1e-6  # a plan is a solution when no input and no state moves by more than this share of its size and the plan's
@@ -158,6 +159,7 @@ class BilinearMPC(StagedMPC):
         self._sqp_iterations = checks.count(sqp_iterations, "sqp_iterations")
         self._iteration = RealTimeIteration(self._problem, compiles_model=self._compiles_model)
         self._iteration.set_theta(self._map.theta)
+        self._affine = self._problem.is_affine
         self._e = self._iteration.e[:, : self._map.nx]
         self._X, self._U = self._iteration.X[:, : self._map.nx], np.zeros((self._N, self.nu))
         self._on_levels = None if self._levels is None else StageLevels(self._levels, self._problem)
@@ -214,6 +216,7 @@ class BilinearMPC(StagedMPC):
             settings=daqp_settings(),
             functions=trace_functions(problem, outputs, model),
             N=self._N,
+            affine=self._affine,
             latency=self._latency,
             iterations=self._sqp_iterations,
             nx=model.nx,
@@ -378,7 +381,8 @@ class BilinearMPC(StagedMPC):
     ) -> tuple[Status, int]:
         """Take the cheapest of the plans to which several starts lead; return how it ended, and all iterations.
 
-        Plans that follow the model come before those that do not yet.
+        Plans that follow the model come before those that do not yet. No further start begins after SPENT iterations
+        of the solver, or where the problem is affine and a plan was found: all starts lead to that one.
         """
         iteration, total, best = self._iteration, 0, (3, 0.0)
         status, kept = Status.FAILED, (iteration.X.copy(), iteration.U.copy(), 0.0)
@@ -393,10 +397,11 @@ class BilinearMPC(StagedMPC):
                 rank = (0, iteration.cost()) if followed else (1, max(gap, broken))
             if rank < best:
                 best, status, kept = rank, ended, (iteration.X.copy(), iteration.U.copy(), iteration.slack)
-            if perf_counter() > deadline:
+            if total >= SPENT or (self._affine and best[0] == 0) or perf_counter() > deadline:
                 break
         iteration.X[:], iteration.U[:], iteration.slack = kept
-        if status not in GOOD or perf_counter() > deadline:
+        done = total >= SPENT or (self._affine and best[0] == 0)
+        if status not in GOOD or done or perf_counter() > deadline:
             return status, total
         polished, iterations = self._improve(s, u_prev, max(FIRST, self._sqp_iterations), deadline)
         if polished not in GOOD:
@@ -444,7 +449,7 @@ class BilinearMPC(StagedMPC):
         if begin is not None:
             self._enter(*begin, u_prev)
         for k in range(most):
-            if k and perf_counter() > deadline:
+            if k and (total >= SPENT or perf_counter() > deadline):
                 break
             found = iteration.step(s, self._targets, deadline)
             total += found.iterations
@@ -455,7 +460,8 @@ class BilinearMPC(StagedMPC):
                 return (found.status if iteration.gap < NEAR else Status.FAILED), total
             self._enter(*self._trajectory(iteration.X, iteration.U), u_prev)
             status = Status.SOFTENED if iteration.slack else found.status
-            if k + 1 < most and iteration.rests(found, settled):
+            whole = self._affine and iteration.length == 1.0  # then the plan solves the problem itself
+            if k + 1 < most and (whole or iteration.rests(found, settled)):
                 break
         return status, total
 

@@ -38,7 +38,7 @@ from koopmpc.control.solvers.base import QP
 from koopmpc.errors import DefinitenessError
 from koopmpc.plants.routines import Routine
 
-MOST = 100  # interior-point steps, before an active-set method finishes the program
+MOST = 40  # interior-point steps, before an active-set method finishes the program
 STALLED = 5  # after this many steps without half the μ, one step only returns to the central path
 CENTRING = 0.3  # that step aims at this share of μ for every pair
 # Relative tolerances of distances (by spans), of μ (by the curvature along an input's span) and of residuals

@@ -276,6 +276,16 @@ class StagedProblem(NamedTuple):
         return Interval(low, high)
 
     @property
+    def is_affine(self) -> bool:
+        """Whether F, the tracked and the limited outputs are affine in (s, v), so that all starts lead to one plan."""
+        if self.stage is not None or not self.F.is_a("SXFunction"):
+            return False
+        both, theta = ca.SX.sym("sv", self.nx + self.F.size1_in(1)), ca.SX.sym("theta", self.F.size1_in(2))
+        s = both[: self.nx]
+        values = ca.vertcat(self.F(s, both[self.nx :], theta), self.tracked(s), self.limited(s))
+        return not any(ca.which_depends(values, both, 2, True))
+
+    @property
     def theta_size(self) -> int:
         """Entries of [θ; w_0; …; w_{N−1}]."""
         return self.F.size1_in(2) + self.scheduled * (len(self.free) - 1)

@@ -63,6 +63,8 @@ class StagedProgram(StepProgram):
         Whether the input target is that of the equilibrium.
     end
         Terminal cost: "given" by Q_N, "tail" for the cost of a tail, "stage" for Q itself.
+    affine
+        Whether the problem is affine in s and v, so that one linearisation solves it.
     beyond
         Rows for which a reference that moves goes on behind the plan; 0 where it rests.
     table
@@ -108,6 +110,7 @@ class StagedProgram(StepProgram):
     input_sizes: Float[np.ndarray, " nu"]
     holds: bool
     end: str
+    affine: bool
     beyond: int
     table: Float[np.ndarray, "found size"]
     disturbed: bool
