@@ -25,6 +25,7 @@ WIDEN = 4.0  # while all readings are used, the quantile follows the last innova
 NARROW = 0.7  # and downwards by this one
 LEAST = 0.01  # the quantile counts as at least this share of the largest step that the output has made
 ROUNDING = 1e-9  # and as this share of the prediction's size
+SUSPECTS = 2  # the first readings, and those after a reading that leaps, may be left behind so many times
 FADING = 0.8  # what a predicted step allows fades by this factor a step
 
 
@@ -45,13 +46,18 @@ def gate_function(ny: int) -> ca.Function:
     than 1e4 (S + |y|), the estimate is lost: the observer starts again from y. A plant that does not move, whatever is
     predicted, looks alike: after the first readings this is done once, and again when an absurd reading was used.
 
-    The memory is q, S, the predicted steps, the last used values, a count, and whether the observer has started again
-    since. Below a count of 10 the gate is open, and 10 less the count are the least number of readings until it may
-    close; from 10 on the refused ones are added.
+    Several wild ones in a row hide each other so. While the gate is open, an output may fall to less than 1e-4 of its
+    last used value, but not to zero. If its prediction is off by more than 1e4 times what it falls to, the readings
+    before were wild: the observer starts again from y, and S is forgotten. This is done twice, and twice again after a
+    reading off by 1e4 times all that its output had shown was used.
+
+    The memory is q, S, the predicted steps, the last used values, a count, whether the observer has started again
+    since, and how often it has left wild readings behind. Below a count of 10 the gate is open, and 10 less the count
+    are the least number of readings until it may close; from 10 on the refused ones are added.
     """
-    y, predicted, memory = (ca.SX.sym(name, n) for name, n in (("y", ny), ("predicted", ny), ("memory", 4 * ny + 2)))
-    ends = [0, ny, 2 * ny, 3 * ny, 4 * ny, 4 * ny + 1, 4 * ny + 2]
-    quantile, largest, ahead, last, count, restarted = ca.vertsplit(memory, ends)
+    y, predicted, memory = (ca.SX.sym(name, n) for name, n in (("y", ny), ("predicted", ny), ("memory", 4 * ny + 3)))
+    ends = [0, ny, 2 * ny, 3 * ny, 4 * ny, 4 * ny + 1, 4 * ny + 2, 4 * ny + 3]
+    quantile, largest, ahead, last, count, restarted, left = ca.vertsplit(memory, ends)
     known, foreseen = ca.fabs(y) < HUGE, ca.fabs(predicted) < HUGE  # False for NaN
     came = ca.logic_and(known, foreseen)
     error = ca.if_else(came, ca.fabs(y - predicted), 0)
@@ -63,10 +69,14 @@ def gate_function(ny: int) -> ca.Function:
     judged, good, closed = ca.mmax(came), ca.mmin(inside), count >= FEW
     shown = ca.fmax(quantile, size) + ca.fabs(last)
     jump = ca.if_else(foreseen, error, ca.if_else(known, ca.fabs(y - last), 0))
-    far = ca.logic_and(ca.mmax(ca.logic_and(shown > 0, jump > ABSURD * shown)), count > 1)
+    leapt = ca.mmax(ca.logic_and(shown > 0, jump > ABSURD * shown))
+    far = ca.logic_and(leapt, count > 1)
     may_restart = ca.logic_or(count <= 2, ca.logic_and(largest > 0, ca.logic_not(restarted)))
     astray = ca.logic_and(error > ABSURD * (largest + ca.fabs(y)), may_restart)
-    lost = ca.logic_and(ca.mmax(astray), ca.logic_not(far))
+    fell = ca.logic_and(ca.logic_and(known, y != 0), ca.fabs(last) > ABSURD * ca.fabs(y))
+    missed = ca.if_else(foreseen, error > ABSURD * ca.fabs(y), 1)
+    back = ca.logic_and(ca.mmax(ca.logic_and(fell, missed)), ca.logic_and(left < SUSPECTS, ca.logic_not(closed)))
+    lost = ca.logic_or(ca.logic_and(ca.mmax(astray), ca.logic_not(far)), back)
     absurd = ca.logic_and(far, ca.logic_not(ca.logic_and(judged, closed)))
     wild = ca.logic_and(ca.logic_and(judged, closed), ca.logic_not(good))
     patient = count < FEW + ca.if_else(far, LONG, BRIDGED)
@@ -86,9 +96,11 @@ def gate_function(ny: int) -> ca.Function:
         ca.if_else(ca.fabs(used) < HUGE, used, last),
         ca.if_else(ca.logic_or(judged, refused), counted, count),
         ca.logic_and(restarted, ca.logic_or(ca.logic_not(far), refused)),
+        ca.if_else(ca.logic_and(leapt, ca.logic_not(refused)), 0, left),
     )
     none = ca.SX(ny, 1)
-    anew = ca.vertcat(none, largest, none, ca.if_else(known, y, last), ca.fmin(count, 2) + 1, count > 2)
+    first = ca.vertcat(none, ca.if_else(back, none, largest), none, ca.if_else(known, y, last))
+    anew = ca.vertcat(first, ca.fmin(count, 2) + 1, ca.logic_and(count > 2, ca.logic_not(back)), left + back)
     result = ca.vertcat(refused, ca.if_else(lost, 2, opened), ca.if_else(lost, anew, after))
     return ca.Function("gate", [y, predicted, memory], [ca.densify(result)], {"cse": True})
 

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.control.nonlinear.iteration import RealTimeIteration
 from tests.compiler import needs_compiler
 from tests.tiers import slow
 
@@ -323,3 +324,34 @@ def test_plans_of_sixty_models_keep_their_hard_limits():
     solved, broken = count_broken_plans(range(60), twins=[18, 25, 51])
     assert solved > 1500
     assert broken == 0
+
+
+def test_an_affine_problem_is_solved_by_one_linearisation(monkeypatch):
+    """All starts lead to the plan of KoopmanMPC."""
+    A, B = np.array([[1.1, 0.1], [0.0, 1.05]]), np.array([[0.0], [0.1]])
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("x", "v"), ("u",))
+    cost, limits = km.Cost(Q=[1, 1], R=1e-3), km.Limits(-1, 1, x_max=[0.3, 0.1])
+    step, taken = RealTimeIteration.step, []
+
+    def count(self, *arguments, **options):
+        taken.append(1)
+        return step(self, *arguments, **options)
+
+    monkeypatch.setattr(RealTimeIteration, "step", count)
+    one, other = km.BilinearMPC(model, cost, limits, 15), km.KoopmanMPC(model, cost, limits, 15)
+    x = [0.2, 0.1]
+    np.testing.assert_allclose(one(x, [0, 0]).u, other(x, [0, 0]).u, atol=1e-6)
+    assert len(taken) == 1
+
+
+def test_a_step_that_has_spent_its_iterations_begins_no_further_start(monkeypatch):
+    plant = pendulum()
+    cost, limits = km.Cost(Q=[10, 10, 1], R=0.1, of=UPRIGHT), km.Limits(-2, 2)
+    statuses, iterations = [], []
+    for spent in (300, 1):
+        monkeypatch.setattr("koopmpc.control.nonlinear.bilinear_mpc.SPENT", spent)
+        move = km.BilinearMPC(plant, cost, limits, 20)([3.0, 0.0], [0, 1, 0])
+        statuses.append(move.status)
+        iterations.append(move.iterations)
+    assert iterations[1] < iterations[0]
+    assert statuses[1] in (km.Status.OPTIMAL, km.Status.UNCONSTRAINED, km.Status.SOFTENED)

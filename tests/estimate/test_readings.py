@@ -387,3 +387,25 @@ def test_no_loop_is_lost_to_wild_readings(count):
         X = loop(controller, seed, wild, plants[seed % len(plants)])[0]
         lost += not bool((np.abs(X) < [np.pi, 8.0]).all())
     assert lost == 0
+
+
+@pytest.mark.parametrize("kind", MORE)
+def test_wild_readings_in_a_row_from_the_second_on_are_left_behind(kind):
+    """They hide each other; the first true one that follows falls to a share of them that no plant falls to."""
+    controller, plant = MORE[kind](), plant_for(kind)
+    X = loop(controller, 1, plant=plant, steps=90)[0]
+    for at, size in ((0, 1e6), (1, 1e6), (1, 1e29)):
+        away = np.abs(loop(controller, 1, burst(size, 5, 2), plant, 90, at)[0] - X) / np.ptp(X, axis=0)
+        assert (away[-15:] <= (0.2 if kind == PERIODIC else 0.1)).all(), (at, size)  # harmonics fade over three periods
+
+
+def test_an_output_that_falls_beside_its_prediction_starts_the_estimate_again_twice_and_no_more():
+    gate, lost = ReadingGate(1), []
+    for y in (1.0, 1e-5, 1.0, 1e-5, 1.0, 1e-5, 1.0, 1e-5):
+        gate.judge(np.array([y]), np.array([1.0]))
+        lost.append(gate.lost)
+    assert sum(lost) == 2
+    gate = ReadingGate(1)
+    for y in (1.0, 1e-5, 1e-9):  # as predicted
+        gate.judge(np.array([y]), np.array([y]))
+        assert not gate.lost

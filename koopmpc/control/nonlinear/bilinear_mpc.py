@@ -159,7 +159,7 @@ class BilinearMPC(StagedMPC):
         self._sqp_iterations = checks.count(sqp_iterations, "sqp_iterations")
         self._iteration = RealTimeIteration(self._problem, compiles_model=self._compiles_model)
         self._iteration.set_theta(self._map.theta)
-        self._affine = self._problem.is_affine
+        self._affine = self._problem.affine
         self._e = self._iteration.e[:, : self._map.nx]
         self._X, self._U = self._iteration.X[:, : self._map.nx], np.zeros((self._N, self.nu))
         self._on_levels = None if self._levels is None else StageLevels(self._levels, self._problem)

@@ -7,6 +7,7 @@ of sizes away, to which no loop should be led.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Any, NamedTuple, cast
 
 import casadi as ca
@@ -447,6 +448,12 @@ class TerminalTargets:
     of(x_N) − of(x_r) that no small motion changes keeps its weight Q, times the mean size of P over JᵀQJ. With
     R_delta, P weighs [d; u_{N−1} − u_r].
 
+    Attributes
+    ----------
+    deadline, sought, late
+        After the deadline no search begins but the first of a step, which is `sought`; `late` says that a row was left
+        out, whose target is then that of a row without an equilibrium.
+
     Parameters
     ----------
     most
@@ -472,6 +479,7 @@ class TerminalTargets:
         self._found: dict[bytes, Equilibrium | None] = {}  # None where there is none
         self._missed: set[bytes] = set()  # reference rows whose equilibrium was not found
         self._last: tuple[Float[np.ndarray, " nr"], Equilibrium] | None = None  # the row found last, and where
+        self.deadline, self.sought, self.late = np.inf, False, False
 
     def program(self) -> TailProgram:
         """Return the data of the terminal cost."""
@@ -519,7 +527,10 @@ class TerminalTargets:
         key = row.tobytes()
         if key not in self._known:
             found = self._find(key, row)
-            self._known[key] = self._target_without_equilibrium(row) if found is None else self._target(row, found)
+            target = self._target_without_equilibrium(row) if found is None else self._target(row, found)
+            if key not in self._found:  # there was no time to search
+                return target
+            self._known[key] = target
         return self._known[key]
 
     def find_input(self, row: Float[np.ndarray, " nr"]) -> ReferenceInput:
@@ -536,16 +547,23 @@ class TerminalTargets:
             found = self._find(key, row)
             if found is None:
                 target = self._target_without_equilibrium(row)
-                self._inputs[key] = ReferenceInput(target.u, target.slope)
+                asked = ReferenceInput(target.u, target.slope)
             else:
                 slope = self.equilibria.slope(self.equilibria.linearise(found.x, found.u))
-                self._inputs[key] = ReferenceInput(found.u * self._hold, slope * self._hold)
+                asked = ReferenceInput(found.u * self._hold, slope * self._hold)
+            if key not in self._found:  # there was no time to search
+                return asked
+            self._inputs[key] = asked
         return self._inputs[key]
 
     def _find(self, key: bytes, row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
-        """Return the equilibrium of a row, kept for the next time."""
+        """Return the equilibrium of a row, kept for the next time, or None: there is none, or no time to search."""
         if key in self._found:
             return self._found[key]
+        if self.sought and perf_counter() > self.deadline:
+            self.late = True
+            return None
+        self.sought = True
         if len(self._found) > _MOST:
             for kept in (self._known, self._inputs, self._found, self._missed):
                 kept.clear()

@@ -234,6 +234,8 @@ class StagedProblem(NamedTuple):
         (s_k, v_k) → ℓ of the cost; None where it has no stage of its own.
     timed
         Whether weights move in time: each stage then has diagonals of its own in place of Q, and of R without rates.
+    affine
+        Whether F, the tracked and the limited outputs are affine in (s, v), so that all starts lead to one plan.
     """
 
     F: ca.Function
@@ -258,6 +260,7 @@ class StagedProblem(NamedTuple):
     scheduled: int = 0
     stage: ca.Function | None = None
     timed: bool = False
+    affine: bool = False
 
     def stage_theta(self, theta: ca.MX, k: int) -> ca.MX:
         """Return the θ of stage k out of [θ; w_0; …; w_{N−1}], all of them where w multiplies no state."""
@@ -274,16 +277,6 @@ class StagedProblem(NamedTuple):
         low[:, first:] += self.margin
         high[:, first:] -= self.margin
         return Interval(low, high)
-
-    @property
-    def is_affine(self) -> bool:
-        """Whether F, the tracked and the limited outputs are affine in (s, v), so that all starts lead to one plan."""
-        if self.stage is not None or not self.F.is_a("SXFunction"):
-            return False
-        both, theta = ca.SX.sym("sv", self.nx + self.F.size1_in(1)), ca.SX.sym("theta", self.F.size1_in(2))
-        s = both[: self.nx]
-        values = ca.vertcat(self.F(s, both[self.nx :], theta), self.tracked(s), self.limited(s))
-        return not any(ca.which_depends(values, both, 2, True))
 
     @property
     def theta_size(self) -> int:
@@ -334,6 +327,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks)
         timed=o.cost.weighs_in_time,
     )
     wanted = o.limits.terminal
+    plain = plain._replace(affine=wanted is None and _is_affine(plain))
     if not o.with_rates and len(blocks) == N and not moves.own:
         return plain if wanted is None else _add_end(plain, wanted, model, o)
     unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
@@ -366,6 +360,16 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks)
         stage=_stage_function(o.cost, model, ns, with_rates=True),
     )
     return rated if wanted is None else _add_end(rated, wanted, model, o)
+
+
+def _is_affine(problem: StagedProblem) -> bool:
+    """Return whether the map and the outputs of a problem without rates are affine; those with rates are so alike."""
+    if problem.stage is not None or not problem.F.is_a("SXFunction"):
+        return False
+    both = ca.SX.sym("sv", problem.nx + problem.F.size1_in(1))
+    s, v, theta = both[: problem.nx], both[problem.nx :], ca.SX.sym("theta", problem.F.size1_in(2))
+    values = ca.vertcat(problem.F(s, v, theta), problem.tracked(s), problem.limited(s))
+    return not any(ca.which_depends(values, both, 2, True))
 
 
 def _stage_function(cost: Cost, model: LearnedMap, ns: int, *, with_rates: bool) -> ca.Function | None:

@@ -258,6 +258,7 @@ class StagedMPC(MPCBase):
         target = checks.numbers(reference, "reference")
         if self._problem.timed:
             self._pass_weights()
+        self._terminal.deadline, self._terminal.sought, self._terminal.late = start + self._allowed, False, False
         known = np.abs(x).max() < HUGE and (not self._disturbed or self._disturb())
         if not (known and self._aim(target)):
             return self._lose(applied, Status.BAD_MEASUREMENT, 0, start)
@@ -387,7 +388,7 @@ class StagedMPC(MPCBase):
                 end,
                 extend_rows(R, BEYOND * (self._goes_on and not self._terminal.is_missed(R[-1]))),
             )
-            self._reference = key
+            self._reference = None if self._terminal.late else key  # the next step searches on
         R, U, slopes, held, end, beyond = self._preview
         if self._disturbed:  # the last disturbance of the preview stays, but for what is periodic in it
             e = self._rest
