@@ -153,10 +153,9 @@ class Cost(Value):
                 raise ShapeError(f"u_target has shape {rows.shape}, expected (nu,) or rows (k, nu), one a step")
             object.__setattr__(self, "u_target", rows)
         if self.price is not None:
-            price = bounds.check_bound(self.price, "price")
-            if not all(np.isfinite(np.asarray(value)).all() for value in bounds.list_bound(price)):
-                raise DataError("price holds an infinite number; pass what a unit of an input costs in a step")
-            object.__setattr__(self, "price", price)
+            for value in self.price.values() if isinstance(self.price, Mapping) else [self.price]:
+                checks.array(value, "price")  # finite, and named by its row where it is not
+            object.__setattr__(self, "price", bounds.check_bound(self.price, "price"))
         if self.output_price is not None:
             if isinstance(self.output_price, Mapping):
                 stored = checks.check_named(self.output_price, "output_price")

@@ -150,8 +150,9 @@ def test_prices_by_name_and_what_is_refused():
         km.KoopmanMPC(model, km.Cost(Q=[1, 1], R=[1, 0], price=[0, 1]), LIMITS, N)
     with pytest.raises(DataError, match="does not know"):
         km.LQR(model, km.Cost(Q=[1, 1], R=R, price=[0, 1]))
-    with pytest.raises(DataError, match="infinite"):
-        km.Cost(Q=1, R=R, price=[np.inf, 0])
+    for price in ([np.inf, 0], {"u0": [0, np.nan]}):
+        with pytest.raises(DataError, match="price holds 1 NaN or inf, the first at"):
+            km.Cost(Q=1, R=R, price=price)
     for wrong, said in (
         ({"output_price": [1, 0], "Q": [0, 1]}, "no weight in Q"),
         ({"output_price": [1, 0, 0]}, "output_price has shape"),
