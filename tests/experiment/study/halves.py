@@ -196,9 +196,9 @@ def add_plans(name: str, seed: int, rows: int) -> tuple[km.Episodes, int, int]:
             logs += take_rows(whole, left, skip=used)
             break
         begin[seen] = plan.starts[0]
-        new = km.collect(task.equations, begin, plan, episodes=1, steps=steps)[0]
+        new = km.collect(task.equations, begin, plan, episodes=1, steps=plan.steps)[0]
         logs.append(km.Episode(X=new.X + _spread(task) * rng.standard_normal(new.X.shape), U=new.U))
-        left, made = left - steps, made + 1
+        left, made = left - plan.steps, made + 1
     return whole.with_episodes(logs), made, refused
 
 
