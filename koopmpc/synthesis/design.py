@@ -78,6 +78,7 @@ from koopmpc.synthesis.judging import (
     LoopTest,
     Outcome,
     average_ratios,
+    is_alike,
     is_confirmed,
     judge_job,
     measure_errors,
@@ -465,16 +466,23 @@ def _judge_rounds(
 
     The first round judges all models with inputs as in the data. The second judges, in all conditions, the best
     bilinear model with every estimator, and the best linear model with every estimator and terminal cost. The third
-    judges the second linear model likewise, the next bilinear models with the best estimator, and the best bilinear
-    one with weights.
+    judges the second linear model likewise, and the smallest one that is as good as the best, the next bilinear models
+    with the best estimator, and the best bilinear one with weights.
     """
     run, every = partial(judge_job, test), range(len(test.conditions))
     first = pool.map(
         run, [Job(one, test.nominal) for one in screened], report_stage(progress, "closed loops"), size=Job.size
     )
-    score = average_ratios(rate_runs(first), test.weights[test.nominal])
-    ranked = [screened[i] for i in sorted(range(len(screened)), key=lambda i: (score[i], i))]
+    each, nominal = rate_runs(first), test.weights[test.nominal]
+    score = average_ratios(each, nominal)
+    error = measure_errors(each, score, nominal)
+    places = sorted(range(len(screened)), key=lambda i: (score[i], i))
+    ranked = [screened[i] for i in places]
     linear = [one for one in ranked if not one.candidate.bilinear][:_LINEAR]
+    near = [screened[i] for i in places if is_alike(score[i], score[places[0]], error[i])]
+    small = min((one for one in near if not one.candidate.bilinear), key=lambda one: one.candidate.size, default=None)
+    if small is not None and small not in linear:  # else no later round can choose the simplest of equals
+        linear.append(small)
     bilinear = [one for one in ranked if one.candidate.bilinear][:_BILINEAR]
     estimators = (None, *(LiftedDisturbance(gain=gain) for gain in _GAINS))
     cost = test.asked.cost

@@ -25,6 +25,7 @@ from koopmpc.synthesis.candidates import Designed, Recipe
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap, choose_starts_to_record
 from koopmpc.synthesis.fresh.promise import CoveragePromise
 from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_value, cost_interval
+from koopmpc.synthesis.judging import is_alike
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.terminal import build_leaderboard, label_lines, render_text
 from koopmpc.text import to_percent
@@ -32,8 +33,6 @@ from koopmpc.validate.binomial import bound_failure_rate
 from koopmpc.validate.logs.summary import LogSummary
 from koopmpc.values import Value
 
-ALIKE = 0.005  # scores that differ by this share are alike
-UNSURE = 0.03  # the largest standard error by which two scores are alike
 BREAKS = 0.01  # a larger violation, as a share of the range, is less safe
 WORTH = 0.02  # a controller with an estimator may cost this share more
 WORTH_UNSTABLE = 0.05  # on an unstable plant one without an estimator may cost this share more
@@ -418,7 +417,7 @@ def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: 
     if not places:
         return None
     best = min(rows[i].score for i in places)
-    near = [i for i in places if rows[i].score <= best * (1 + max(ALIKE, min(rows[i].error, UNSURE)))]
+    near = [i for i in places if is_alike(rows[i].score, best, rows[i].error)]
 
     def rank(i: int) -> tuple[object, ...]:
         row, one = rows[i], rows[i].recipe

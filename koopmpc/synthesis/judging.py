@@ -38,6 +38,8 @@ _WEIGHTED = 4  # a recipe with weights takes about this many times as long, sinc
 _NINETY = 1.645  # 90 % of normal errors lie within this many standard deviations
 _BAND = 5  # limits are tightened by errors up to this many steps ahead
 CONFIRMED = 1.25  # fitted to all data, a controller may cost this factor of its cost with two folds
+ALIKE = 0.005  # scores that differ by this share are alike
+UNSURE = 0.03  # the largest standard error by which two scores are alike
 LESS = 0.5  # weight of a run with inputs 20 % off; other runs have weight 1
 BROKEN = 1e-3  # a step violates a limit if it exceeds the limit by more than this share of its range
 
@@ -413,3 +415,8 @@ def measure_errors(
     share = weights / weights.sum()
     spread = ((apart - (apart @ share)[:, None]) ** 2) @ share
     return np.sqrt(spread * (share**2).sum())
+
+
+def is_alike(score: float, best: float, error: float) -> bool:
+    """Return whether a score is as good as the best one, by the standard error of their difference."""
+    return score <= best * (1 + max(ALIKE, min(error, UNSURE)))
