@@ -136,9 +136,9 @@ def refuse_crossed_rows(
     why: str = "",
 ) -> None:
     """Raise where a lower limit is above its upper one, and name the signal and the step; row 0 is step `first`."""
-    crossed = np.argwhere(low > high)
-    if len(crossed):
-        k, i = (int(v) for v in crossed[0])
+    crossed = low > high
+    if crossed.any():
+        k, i = (int(v) for v in np.argwhere(crossed)[0])
         signal = signals[i] if signals else f"index {i}"
         raise DataError(
             f"{name} limits cross for {signal} at step {first + k}: lower {low[k, i]:g} is above upper "

@@ -94,9 +94,9 @@ def require_movable(
     """
     for group, can_move, box in zip(_GROUPS, movable, boxes, strict=True):
         low, high = (np.isfinite(end) & ~can_move for end in box)
-        missing = np.argwhere(low | high)
-        if len(missing):
-            k, i = (int(v) for v in missing[0])
+        missing = low | high
+        if missing.any():
+            k, i = (int(v) for v in np.argwhere(missing)[0])
             names = outputs if group == "x" else inputs
             kind = "y" if group == "x" and i >= nx else group
             end = f"{kind}_{'min' if low[k, i] else 'max'}"

@@ -345,7 +345,8 @@ def _require_inputs(
     plan: PlanMap, box: Interval, inputs: Sequence[str], used: Bool[np.ndarray, " nu"], why: str
 ) -> None:
     """Raise where limits of inputs cross, or an input on levels has none between them, of the inputs in use."""
-    levels = plan.track.limits.base.input_levels(len(inputs))
+    limits = plan.track.limits
+    levels = None if limits.levels is None else limits.base.input_levels(len(inputs))
     low, high = np.where(used, box.low, -np.inf), np.where(used, box.high, np.inf)
     if levels is not None:
         inside = levels.inside(Interval(low, high))
