@@ -291,7 +291,7 @@ def coverage() -> Any:
         words = "optimum at a limit" if holds else "elsewhere"
         price.plot(start + np.arange(len(touched)), touched, ".", color=line_style(i + 2)["color"], label=words)
     kept.axhline(0.95, **REFERENCE, label="promised")
-    kept.set(xlabel="plants", ylabel="share of runs that keep limits", ylim=(0, 1.05))
+    kept.set(xlabel="plants", ylabel="share of runs that keep limits", ylim=(-0.05, 1.05))
     price.axhline(1.1, **LIMIT, label="1.10")
     price.set(xlabel="plants", ylabel="cost with margin over without")
     draw_legend(made, [kept, price], 3)

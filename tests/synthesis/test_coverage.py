@@ -153,4 +153,5 @@ def test_a_design_with_noise_promises_what_fresh_loops_keep():
     task = {"horizon": 10, "reference": [0.0, 0.0], "bilinear": False, "workers": 1}
     design = km.design(noisy, km.Cost(Q=[1, 0.1], R=0.01), limits, coverage=0.9, **task)
     assert design.promise.holds
+    assert f"for {design.promise.steps} steps" in str(design.promise)
     assert (design.expected.fresh.violation > 0.01).mean() <= 0.2

@@ -161,6 +161,7 @@ def promise_coverage(
         verified_on=loops,
         failures=_count_failures(fresh),
         found=found,
+        steps=pool.asked.steps,
     )
     return promise, chosen.limits
 

@@ -33,6 +33,8 @@ class CoveragePromise(Value):
         Loops that took no part in the choice, run with the margin fixed, and how many of them failed.
     found
         Whether some margin gives the wished share on the loops of the choice.
+    steps
+        Length of a loop; what happens later is not promised. 0 where an older file does not say it.
     """
 
     coverage: float
@@ -44,6 +46,7 @@ class CoveragePromise(Value):
     verified_on: int
     failures: int
     found: bool
+    steps: int = 0
 
     @property
     def holds(self) -> bool:
@@ -65,6 +68,7 @@ class CoveragePromise(Value):
     def __str__(self) -> str:
         """Return the promise, or why there is none."""
         share = to_percent(self.coverage)
+        length = f" for {self.steps} steps" if self.steps else ""
         how = "without a margin" if self.shape == "none" else f"with a {self.shape} margin of {self.scale:.3g} tubes"
         seen = (
             f"{self.failures} of {self.verified_on} loops that took no part in the choice failed, so that at most "
@@ -78,6 +82,6 @@ class CoveragePromise(Value):
         if self.is_refuted:
             return f"{share} of loops on stand-ins is not promised {how}: {seen}"
         return (
-            f"at least {share} of runs on stand-ins drawn like these keep their limits, {how}: {seen}. It says nothing "
-            "of the plant before `koopmpc check --on-plant` has seen enough of its runs"
+            f"at least {share} of runs on stand-ins drawn like these keep their limits{length}, {how}: {seen}. It says "
+            "nothing of the plant before `koopmpc check --on-plant` has seen enough of its runs"
         )
