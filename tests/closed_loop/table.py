@@ -10,6 +10,7 @@ from tests.closed_loop.judge import LOST, Row, Table, rounded
 
 HERE = Path(__file__).parent
 STORED = HERE / "table.json"  # each row as it was last measured
+DESIGNS = HERE / "designed.json"  # designs of the later tasks, seed 0
 FIRST = HERE / "first_edition.json"  # of the first edition's defaults
 WORSE = 1.05  # a default that costs more than this beyond the stored table fails
 ALLOWED = 0.01  # and so does one that violates limits by this share of the range more
@@ -39,6 +40,13 @@ def _ratio(row: Row | None) -> str:
     if row is None or row.ratio is None:
         return "-"
     return "failed" if row.failure else "lost" if row.ratio >= LOST else f"{row.ratio:.4g}"
+
+
+def show_cost(row: Row | None) -> str:
+    """Return the cost of a row as the pages have it, in brackets the violation from 0.05 % on."""
+    if row is None:
+        return "–"
+    return _ratio(row) + (f"&nbsp;({100 * row.violation:.1f}&nbsp;%)" if row.violation >= 5e-4 else "")
 
 
 def saved(table: Table, path: Path) -> None:

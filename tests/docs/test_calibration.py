@@ -3,7 +3,9 @@
 import numpy as np
 
 from tests.closed_loop.calibration import describe, stored, summarise
-from tests.closed_loop.more_tasks import ALL
+from tests.closed_loop.more_tasks import ALL, MORE
+from tests.closed_loop.table import DESIGNS, show_cost
+from tests.closed_loop.table import stored as stored_rows
 from tests.docs.page import DOCS
 
 
@@ -13,6 +15,16 @@ def test_the_page_of_the_judge_shows_the_stored_calibration():
     missing = [line for line in describe(table) if line not in page]
     assert not missing, "python -m tests.closed_loop.calibration prints them"
     assert any(f"{len(table)} designs" in line for line in page)
+
+
+def test_the_page_of_the_judge_shows_the_stored_designs_of_the_later_tasks():
+    page = (DOCS / "closed_loop.md").read_text(encoding="utf-8").splitlines()
+    rows = stored_rows(DESIGNS)
+    assert set(rows) <= set(MORE)
+    for task in MORE:
+        shown = [line for line in page if line.startswith(f"| `{task}` |")]
+        costs = [show_cost(rows.get(task, {}).get(name)) for name in ("designed", "guarded")]
+        assert [line.split(" | ")[-2:] for line in shown] == [[costs[0], costs[1] + " |"]], task
 
 
 def test_stored_promises_are_kept_as_often_as_asked():
