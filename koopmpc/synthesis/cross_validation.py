@@ -378,8 +378,12 @@ def _cross_validate_hidden(trial: Trial, structure: HiddenStructure) -> Tried:
     """Cross-validate a model with a hidden state, whose fit sees rows and no moments, and needs no ridge."""
     start, count, sizes = perf_counter(), max(trial.fold) + 1, _sizes(trial.episodes)
     errors = np.full((1, count, trial.horizon), np.inf)
+    A = np.eye(trial.candidate.lifting.nz)[None]
     with hide_fit_warnings():
-        whole = fit_hidden(structure, trial.episodes, quick=True)
+        try:
+            A = fit_hidden(structure, trial.episodes, quick=True).A[None]
+        except KoopmpcError:  # blocks are too short for its segments: no fold is judged, and it is not chosen
+            count = 0
         for i in range(count):
             try:
                 model = fit_hidden(structure, drop_fold(trial.episodes, trial.fold, i), quick=True)
@@ -387,7 +391,7 @@ def _cross_validate_hidden(trial: Trial, structure: HiddenStructure) -> Tried:
                 continue
             errors[:, i] = _errors(trial, [model], select_fold(trial.episodes, trial.fold, i), sizes)
     inputs = trial.episodes.nu + trial.episodes.nw
-    return Tried(trial.candidate, (0.0,), errors, inputs, whole.A[None], np.inf, perf_counter() - start)
+    return Tried(trial.candidate, (0.0,), errors, inputs, A, np.inf, perf_counter() - start)
 
 
 def leave_one_out(parts: Sequence[Moments]) -> list[Moments]:

@@ -360,7 +360,8 @@ def feedback_share(
 
     At 1 the input was a feedback u = K ψ(x), and the data cannot separate A from B. If ψ contains a Constant, the
     energy is that around the mean; if ψ contains past inputs, only what they leave open counts, for a smooth input is
-    no feedback.
+    no feedback. An input of few frequencies is near 1 in open loop too unless ψ contains two of its past rows for each
+    of them: it excites too little to separate A from B, see `persistency`.
 
     Parameters
     ----------

@@ -8,6 +8,8 @@ import pytest
 import koopmpc as km
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments
+from koopmpc.identify.records.hidden_structure import HiddenStructure
+from koopmpc.synthesis.candidates import Candidate
 from koopmpc.synthesis.cross_validation import Trial, cross_validate, fit_ridges, leave_one_out, select_fold
 
 RIDGES = (1e-7, 1e-4, 1e-2)
@@ -85,3 +87,14 @@ def test_shared_sums_are_those_of_the_other_parts(count):
         plain = second_moments(others, km.State() + km.Constant(), route="gram").sums
         assert rest.samples == sum(map(len, others))
         assert np.allclose(rest.sums.T @ rest.sums, plain, rtol=1e-12, atol=1e-12)
+
+
+def test_a_hidden_state_whose_blocks_are_too_short_is_not_chosen():
+    rng = np.random.default_rng(0)
+    blocks = [km.Episode(X=rng.normal(size=(6, 1)), U=rng.normal(size=(5, 1))) for _ in range(4)]
+    structure = HiddenStructure(1, 1, 8, 20, None, np.ones(8), True, 3)
+    candidate = Candidate("hidden", km.State() + km.Constant(), km.Delay(8), False, structure)
+    data = km.Episodes(blocks, 0.1, ["y"], ["u"])
+    result = cross_validate(Trial(candidate.bind(data.states, data.inputs), data, (0, 0, 1, 1), 2, 8, (0.0,)))
+    assert np.isinf(result.errors).all()
+    assert np.isfinite(result.A).all()

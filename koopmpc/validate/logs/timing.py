@@ -13,6 +13,8 @@ apart. Three tests look for feedback:
 2. The past p_k predicts an input only by K times its prediction of y_{k+1} (Sargan's test of p_k as instruments).
 3. A later input u_{k+2} seems to act on y_{k+1}.
 
+None of them sees every PI controller of white set points whose sensor is as noisy as the set point moves.
+
 References
 ----------
 Granger, "Investigating causal relations by econometric models", Econometrica 37, 1969. Sargan, "The estimation of
