@@ -22,6 +22,7 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Present
 from koopmpc.lifting.state import State
 from koopmpc.parallel import StageProgress, Workers
+from koopmpc.plants.routines import find_compiler
 from koopmpc.synthesis.asked import (
     DesignTask,
     check_task,
@@ -342,6 +343,12 @@ def design(
     if few:
         fast = speed_up(controller)
         count = MANY if loops is None and isinstance(fast, Compiled) else few
+        if loops is None and count == few and find_compiler() is None:
+            notes = (
+                *notes,
+                f"no C compiler was found ($CC, cc, gcc, clang), so {few} fresh loops ran in place of {MANY}: install "
+                f"one, or pass loops={MANY} and wait longer",
+            )
         fresh = run_fresh_loops(drawn_from, fast, count, draw)
         blind = [*describe_outside(test.episodes, asked, fresh), *blind, *wide]
         blind += compare_longer_horizon(drawn_from, rows[best].recipe, controller, draw)

@@ -538,3 +538,13 @@ def test_the_smallest_linear_model_that_is_as_good_as_the_best_is_judged_in_ever
     last = {row.recipe.candidate.size for row in found.leaderboard if row.off}
     assert len(last) == 3
     assert found.best.recipe.candidate.size == min(last)
+
+
+@pytest.mark.slow
+def test_without_a_compiler_a_design_says_that_fewer_loops_ran(monkeypatch):
+    monkeypatch.setattr("koopmpc.plants.routines.shutil.which", lambda _: None)
+    found = designed(data(), loops=None)
+    assert len(found.expected.fresh.cost) == 60
+    assert any(
+        "no C compiler was found" in note and "60 fresh loops ran in place of 600" in note for note in found.notes
+    )
