@@ -152,8 +152,7 @@ class Limits(Value):
                     object.__setattr__(self, end, bounds.check_bound(value, end))
             if not any(isinstance(getattr(self, end), Mapping) for end in (low, high)):
                 bounds.require_room(getattr(self, low), getattr(self, high), low, high, name)
-        unknown = [name for name in self.rows if name not in BOUNDS]
-        if isinstance(cast(object, self.rows), str) or unknown:
+        if not all(checks.among(name, BOUNDS) for name in checks.texts(self.rows, "rows")):
             raise DataError(f"rows is {self.rows!r}; pass a tuple of {', '.join(BOUNDS)}")
         object.__setattr__(self, "rows", tuple(self.rows))
         if (self.y_min is not None or self.y_max is not None) and self.of is None:

@@ -125,6 +125,7 @@ def check_instruments(episodes: Episodes, instruments: Sequence[ArrayLike]) -> l
     ShapeError
         There is not one array an episode, of one row a step.
     """
+    checks.members(instruments, "instruments", ("__len__", "__iter__"), "pass one array an episode")
     if len(instruments) != len(episodes):
         raise ShapeError(f"instruments has {len(instruments)} arrays for {len(episodes)} episodes; pass one an episode")
     found: list[np.ndarray] = []

@@ -210,6 +210,7 @@ def select(
     Breiman, Friedman, Olshen & Stone, "Classification and Regression Trees", 1984, section 3.4.3.
     """
     draw, used = checks.generator(rng), ""
+    checks.kind(smooth, "smooth", (bool, np.bool_), "pass True or False")
     if instruments is not None or (
         smooth and isinstance(episodes, Episodes) and not (candidates is None and is_record(episodes))
     ):

@@ -416,3 +416,16 @@ def test_a_function_is_told_how_to_become_a_plant():
 def test_a_problem_whose_name_is_too_long_for_a_file_is_unknown():
     with pytest.raises(km.errors.ProblemError, match="there is no problem"):
         km.load_problem("x" * 300)
+
+
+def test_things_of_another_kind_for_rows_solver_instruments_and_smooth_are_named(model):
+    data = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-8, 8), episodes=2, steps=20)
+    for bad in (model, ("u_min", 3), "u_min"):
+        with pytest.raises(km.errors.DataError, match="rows is"):
+            km.Limits(-1, 1, rows=bad)
+    with pytest.raises(km.errors.DataError, match="solver is"):
+        km.KoopmanMPC(model, PENDULUM.cost, PENDULUM.limits, 5, solver=km.State())
+    with pytest.raises(km.errors.DataError, match="instruments is a complex"):
+        km.identify.instrumental_edmd(data, km.State(), 1j)
+    with pytest.raises(km.errors.DataError, match="smooth is a list"):
+        km.select(data, candidates=[km.State()], smooth=[])

@@ -8,6 +8,7 @@ pyproject.toml names that package, and an import contract gives it its one door.
 from collections.abc import Mapping
 from typing import Any
 
+from koopmpc import checks
 from koopmpc.control.solvers.base import QPSolver, SolverTurn
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.solvers.osqp import OSQP
@@ -38,10 +39,10 @@ def order_solvers(solver: str, settings: Mapping[str, Any]) -> list[SolverTurn]:
         There is no such solver.
     """
     first = solver
-    if solver == "auto":
+    if checks.among(solver, ("auto",)):
         able = [name for name in (FIRST, *SOLVERS) if not settings or set(settings) <= SOLVERS[name].setting_names()]
         first = able[0] if able else FIRST
-    if first not in SOLVERS:
+    if not checks.among(first, SOLVERS):
         raise DataError(f"solver is {solver!r}; there are 'auto', {', '.join(map(repr, SOLVERS))}")
     kind = SOLVERS[first]
     turns = [SolverTurn(kind, {**kind.impatient, **settings})]
