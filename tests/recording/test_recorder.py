@@ -119,10 +119,12 @@ def test_a_viewer_that_is_up_gets_the_whole_run(tmp_path: Path) -> None:
     try:
         with km.Recorder(live=True, port=port, **about(run)) as recorder:
             feed(recorder, run)
-    finally:
         time.sleep(0.5)
         viewer.send_signal(signal.SIGINT)
-        viewer.wait(10)
+        viewer.wait(60)  # it writes its file before it ends
+    finally:
+        viewer.kill()
+        viewer.wait()
     assert km.load_run(tmp_path / "seen.rrd") == run
 
 
