@@ -229,7 +229,7 @@ def _add_forecasts(page: HtmlPage, logs: LogSummary | None) -> None:
     first = logs.forecasts[0]
     page.text(
         f"{logs.verdict}. The pictures show rows that the model did not learn from, its forecast from the first of "
-        "them under the inputs as applied, and a band: {first.band}."
+        f"them under the inputs as applied, and a band: {first.band}."
     )
     if logs.findings:
         page.items(logs.findings)

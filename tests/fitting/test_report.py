@@ -115,6 +115,7 @@ def test_the_page_of_a_design_is_one_file_with_every_section_and_the_wild_readin
     words = " ".join(" ".join(page.words).split())
     for part in ("0.2 to 1.5", "level = 99 m", "weight = 0.01", "koopmpc check", "95 % confidence"):
         assert part in words
+    assert not re.search(r"\{[a-z_.]+\}", words)
     assert page.tags.count("figure") >= 5
     assert made.page.parent.name not in [path.suffix for path in made.page.parent.glob("*.png")]
 
