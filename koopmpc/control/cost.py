@@ -88,8 +88,8 @@ class Cost(Value):
         of set points and of sizes. For BilinearMPC and NonlinearMPC.
     output_price
         q, what a unit of each tracked output costs in a step, (nr,) or by name; an omitted output is free. A priced
-        output needs a weight in Q. Where V is the tail, it counts q too, and so does ``tail=0`` at x_N; other ends do
-        not. For the controllers that know `price`.
+        output needs a weight in Q. The tail of linear controllers counts q too, and so does ``tail=0`` at x_N; other
+        ends do not. For the controllers that know `price`.
     beyond
         What a reference does after the rows that a step is given. "rest": the last row stays. "motion", the default of
         BilinearMPC and NonlinearMPC without Q_N, tail and given u_target: it goes on by the linear recurrence that all

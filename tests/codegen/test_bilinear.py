@@ -370,3 +370,16 @@ def test_measured_disturbances_that_multiply_state_and_inputs_count_in_c_as_in_p
     again.reset()
     mpc.reset()
     np.testing.assert_allclose(again(at, [0.3, 0.0], w=[0.7]).u, mpc(at, [0.3, 0.0], w=[0.7]).u, atol=1e-6)
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_new_rows_that_several_inputs_hold_are_aimed_at_by_the_same_in_c_as_in_python():
+    model = km.BilinearPredictor(
+        [[-0.9]], [[-1.3, -0.25]], [[[0.13]], [[0.34]]], np.eye(1), km.State(), 0.1, ["x"], ["u0", "u1"]
+    )
+    mpc = km.BilinearMPC(model, km.Cost(Q=1, R=0.5), km.Limits(-1, 1), 5)
+    fast = km.compiled(mpc)
+    for row in (0.0, 0.5, 0.55, -0.45, -0.58, 0.3):
+        for y in (0.1, 0.9 * row):
+            np.testing.assert_allclose(fast([y], [row]).u, mpc([y], [row]).u, atol=1e-9)

@@ -385,3 +385,18 @@ def test_a_preview_is_searched_by_ipopt_only_where_nothing_close_is_known(monkey
         kept, sought = terminal(row).equilibrium, terminal.equilibria.find(row)
         assert np.allclose(kept.x, sought.x, atol=1e-6)
         assert np.allclose(kept.u, sought.u, atol=1e-6)
+
+
+def test_of_the_inputs_that_hold_a_row_the_smallest_are_found_wherever_the_search_begins():
+    """x = −0.9 x − 1.3 u₀ − 0.25 u₁ + (0.13 u₀ + 0.34 u₁) x leaves one direction of u free."""
+    model = km.BilinearPredictor(
+        [[-0.9]], [[-1.3, -0.25]], [[[0.13]], [[0.34]]], np.eye(1), km.State(), 0.1, ["x"], ["u0", "u1"]
+    )
+    seen = state_tracking(model.states, model.inputs, km.Cost(Q=1, R=0.5), km.Limits(-1, 1))
+    for row in (np.array([0.55]), np.array([-0.58])):
+        fresh, moved = (TerminalTargets(learned_map(model), km.Cost(Q=1, R=0.5), seen, 50) for _ in range(2))
+        moved(row * 0.98)
+        slope = np.array([-1.3, -0.25]) + row * [0.13, 0.34]
+        smallest = slope * 1.9 * row / (slope @ slope)
+        assert fresh(row).u == pytest.approx(smallest, abs=1e-7)
+        assert moved(row).u == pytest.approx(smallest, abs=1e-7)

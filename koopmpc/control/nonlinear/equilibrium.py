@@ -375,6 +375,14 @@ class Equilibria:
         away = np.abs(x[: len(center)] - center) / np.maximum(spread, 1e-12 * (1 + np.abs(center)))
         return max(float(away.max()) - _FAR, 0.0)
 
+    def is_nearer(self, exact: Equilibrium, found: Equilibrium, row: Float[np.ndarray, " nr"]) -> bool:
+        """Return whether an equilibrium is close to another one, or a smaller one that holds the row as well."""
+        now, before = (np.concatenate([each.x, each.u]) / self.size for each in (exact, found))
+        if np.abs(now - before).max() <= CLOSE:
+            return True
+        smaller = float(now @ now) <= float(before @ before) and self._outside(exact.x) <= self._outside(found.x)
+        return smaller and self._measure_miss(exact.x, row) <= self._measure_miss(found.x, row)
+
     def _measure_miss(self, x: Float[np.ndarray, " nx"], row: Float[np.ndarray, " nr"]) -> float:
         """Return ‖of(x) − r‖²_Q by its size; what a good equilibrium may leave counts as that."""
         off = self.values(x, np.zeros(self.model.nu))[1] - row
@@ -586,12 +594,14 @@ class TerminalTargets:
         return self.equilibria.near(begin, row, np.zeros(self.equilibria.model.nx))
 
     def _polish(self, found: Equilibrium | None, row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
-        """Return an equilibrium of ipopt to rounding, by Gauss–Newton steps, as C finds it."""
+        """Return an equilibrium of ipopt to rounding, by Gauss–Newton steps, as C finds it.
+
+        Where several inputs hold a row, these steps go on to the smallest, and ipopt may have stopped far before.
+        """
         exact = None if found is None else self.equilibria.near(found, row, np.zeros(self.equilibria.model.nx))
         if found is None or exact is None:
             return found
-        away = np.concatenate([exact.x - found.x, exact.u - found.u]) / self.equilibria.size
-        return exact if np.abs(away).max() <= CLOSE else found
+        return exact if self.equilibria.is_nearer(exact, found, row) else found
 
     def _target_without_equilibrium(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
         """Return the target of a row whose equilibrium was not found: ‖of(x_N) − r‖²_Q, and inputs at zero."""
