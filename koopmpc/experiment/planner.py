@@ -37,6 +37,9 @@ class UnsafePlanError(DataError):
             "that stay near a start first, so that the bands become narrow"
         )
 
+    def __reduce__(self) -> tuple[type["UnsafePlanError"], tuple[str]]:
+        return UnsafePlanError, (self.worst,)
+
 
 @dataclass(frozen=True, eq=False)
 class Hold:

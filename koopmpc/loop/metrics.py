@@ -180,12 +180,12 @@ def metrics(run: Run) -> Metrics:
     )
 
 
-@np.errstate(invalid="ignore", over="ignore")
 def find_late(run: Run) -> Bool[np.ndarray, " T"]:
     """Return which steps took longer than dt, whose unit the metadata may name."""
     return run.solve_time > run.dt * SECONDS.get(run.metadata.get("time unit", "s"), 1.0)
 
 
+@np.errstate(invalid="ignore", over="ignore")
 def running_cost(run: Run) -> Float[np.ndarray, " T1"]:
     """Return the cost so far at every state, from 0 to the cost that `metrics` gives; NaN where there is no Cost."""
     if run.cost is None:

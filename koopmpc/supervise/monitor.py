@@ -1,6 +1,10 @@
 """Monitor: the region of a model's data and its errors there, to ask at each step whether the loop is inside both."""
 
+import ctypes
+import subprocess
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import cast
 
 import numpy as np
@@ -15,8 +19,9 @@ from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import StateModel
 from koopmpc.lifting.base import Lifting, buffer_lifting
+from koopmpc.plants.routines import find_compiler, find_private_cache, load_library
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.supervise.quick_look import FITS, INSIDE, QuickLook, load_look
+from koopmpc.supervise.quick_look import CODE, FITS, INSIDE, QuickLook
 from koopmpc.validate.scoring import embed_episodes, forecast_errors
 from koopmpc.values import Viewing
 
@@ -125,6 +130,21 @@ def make_monitor(given: object, model: object) -> Monitor:
 register_monitor(make_monitor)
 
 
+@cache
+def load_look() -> Callable[[ctypes.c_void_p], int] | None:
+    """Return the machine code, compiled once for each user; None without a compiler."""
+    try:
+        command = find_compiler()
+        if command is None:
+            return None
+        library = load_library(CODE, command, find_private_cache())
+    except (OSError, ValueError, subprocess.SubprocessError):  # ValueError: a quote without its end in the environment
+        return None
+    address = ctypes.cast(library.koopmpc_look, ctypes.c_void_p).value
+    # a call that keeps the interpreter's lock is faster; the loaded code stays in the process
+    return None if address is None else ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(address)
+
+
 class Watch(Viewing):
     """The monitor in one closed loop: whether the last step was `inside` the data, and whether the prediction `fits`.
 
@@ -141,7 +161,7 @@ class Watch(Viewing):
         Steps until an input acts; the prediction that is compared is that of the plan's start.
     """
 
-    _VIEWS = ("_halves", "_error", "_reach", "_quick", "_asked")
+    _VIEWS = ("_halves", "_error", "_reach", "_quick", "_code")
 
     def __init__(self, monitor: Monitor, model: LinearPredictor | StateModel, latency: int) -> None:
         self.monitor, self._latency = monitor, latency
@@ -169,7 +189,9 @@ class Watch(Viewing):
         halves = [np.split(self._rows[low : low + width], [nz, n]) for low in (0, width)]
         self._halves = [(*halves[new], *halves[1 - new][:2], self._matrices[new]) for new in (0, 1)]
         self._error, self._reach = self._found[:nx], self._found[nx:]
-        self._quick, self._asked = None, False  # it points into the arrays of one loop, which the next step shows
+        self._quick = None  # it points into the arrays of one loop, which the next step shows
+        plain = isinstance(self._model, LinearPredictor) and not self._model.nw
+        self._code = load_look() if plain else None  # here, for a compiler takes longer than a step
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Compare with the predictions of another model from now on; region and band stay."""
@@ -199,16 +221,6 @@ class Watch(Viewing):
         """Return W C [A B I] of the step before, the last block where d is estimated, and W C of the step now."""
         C = self.monitor.band @ model.C
         return np.hstack([C @ model.A, C @ model.B, C][: 2 + driven]), C
-
-    def _hasten(self, start: InitialCondition) -> None:
-        """Look by machine code from now on, where a compiler is there and nothing but u and d drives a linear model."""
-        self._asked, model = True, self._model
-        if not isinstance(model, LinearPredictor) or start.W.size:
-            return
-        parts = self._split_error(model, start.d.size > 0)
-        code = load_look()
-        if code is not None:
-            self._quick = QuickLook(code, self.monitor.leverage, *parts, start.z, start.d, self._last, self._begun)
 
     def reset(self) -> None:
         """Forget the step before: the first step of a run has no prediction to be compared with."""
@@ -250,10 +262,11 @@ class Watch(Viewing):
             if start.d.size != d.size:  # the first step of a loop with an estimator
                 self._lay_out(self._model, start.d.size)
                 z, now, d, before, acted, matrix = self._halves[self._new]
-            if not self._asked:
-                self._hasten(start)
-                if self._quick is not None:
-                    return self.look(start, u, applied)
+            model, code = self._model, self._code
+            if code is not None and isinstance(model, LinearPredictor):
+                error = self._split_error(model, start.d.size > 0)
+                self._quick = QuickLook(code, self.monitor.leverage, *error, start.z, start.d, self._last, self._begun)
+                return self.look(start, u, applied)
             z[:], d[:] = start.z, start.d
         else:
             psi.arguments[0][:] = start.z

@@ -1,19 +1,16 @@
 """QuickLook: what a Watch asks of a linear model at each step, as machine code, where a compiler is there."""
 
 import ctypes
-import subprocess
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.plants.routines import find_compiler, find_private_cache, load_library
-
 INSIDE = 1  # bit of the answer: state and input are inside the data
 FITS = 2  # bit of the answer: the prediction fits
-_CODE = """
+CODE = """
 typedef struct {
   long long nz, nu, nd, nx, *begun;
   const double *reach, *ahead, *back, *z, *d, *u;
@@ -66,28 +63,13 @@ class _Memory(ctypes.Structure):
     )
 
 
-@cache
-def load_look() -> Callable[[ctypes.c_void_p], int] | None:
-    """Return the machine code, compiled once for each user; None without a compiler."""
-    command = find_compiler()
-    if command is None:
-        return None
-    try:
-        library = load_library(_CODE, command, find_private_cache())
-    except (OSError, subprocess.SubprocessError):
-        return None
-    address = ctypes.cast(library.koopmpc_look, ctypes.c_void_p).value
-    # a call that keeps the interpreter's lock is faster; the loaded code stays in the process
-    return None if address is None else ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(address)
-
-
 class QuickLook:
     """‖L [z; u]‖² ≤ 1 and ‖P [z; u; d]_{k−1} − W C z_k‖² ≤ 1 with P = W C [A B I], in one call that copies the step.
 
     Parameters
     ----------
     code
-        The machine code, see `load_look`.
+        The machine code, see `load_look` of koopmpc.supervise.monitor.
     reach
         (n, n) L.
     ahead

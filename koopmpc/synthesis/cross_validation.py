@@ -206,9 +206,10 @@ def make_folds(episodes: Episodes, needed: int, folds: int, rng: np.random.Gener
                 "blocks, and a fold is one stretch of them; neighbouring blocks are alike, so errors may be too small"
             )
     if len(long) < 2:
+        given = "one episode" if len(episodes) == 1 else f"{len(episodes)} episodes, the longest"
         raise DataError(
-            f"of {len(episodes)} episodes {len(long)} have {needed} steps or more, and a choice needs 2: pass a "
-            "shorter horizon, or longer episodes"
+            f"the data have {given} of {max(map(len, episodes))} steps, and a choice needs two of {needed} steps or "
+            f"more, or one of {4 * needed}: pass a shorter horizon, or longer episodes"
         )
     count = min(folds, len(long))
     lengths = np.array([len(episode) for episode in long])

@@ -1,5 +1,6 @@
 """Plans of inputs and of set points under `realtime`: late steps, readings that are missing, a shorter plan."""
 
+import pickle
 import time
 from dataclasses import replace
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.experiment.planner import UnsafePlanError
 from tests.experiment.test_next_experiment import CART, COST, LIMITS, log_noisily
 from tests.fitting.mass import A, B
 
@@ -85,3 +87,9 @@ def test_a_shorter_plan_is_tried_where_none_of_the_asked_length_is_safe():
     assert (plan.low[:, 1:] >= [0.2, -0.3]).all()
     assert (plan.high[:, 1:] <= [0.8, 0.3]).all()
     assert f"no plan of 100 steps is safe, so this one has {plan.steps}" in str(plan)
+
+
+def test_a_refusal_comes_whole_out_of_a_worker():
+    refusal = UnsafePlanError("the band crosses the limit 1")
+    read = pickle.loads(pickle.dumps(refusal))
+    assert (str(read), read.worst) == (str(refusal), refusal.worst)

@@ -54,6 +54,9 @@ def test_the_cost_so_far_grows_by_the_cost_of_each_step_and_ends_at_that_of_the_
     none = running_cost(replace(make_run(), cost=None))
     assert none.shape == (21,)
     assert np.isnan(none).all()
+    with np.errstate(all="raise"):  # the cost of a loop that diverged overflows to inf in silence
+        far = replace(run, X=np.full_like(run.X, 7e153), cost=km.Cost([2.0, 1.0], 0.5), angles=())
+        assert np.isinf(running_cost(far)[-1])
 
 
 def test_each_run_is_a_curve_of_every_plot_and_a_column_of_the_table(logs: list[Path], tmp_path: Path) -> None:

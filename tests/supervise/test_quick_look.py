@@ -66,9 +66,18 @@ def test_machine_code_and_python_give_the_same_verdicts(data, monkeypatch, optio
     assert {all(pair) for pair in quick} == {True, False}
 
 
-def test_a_compiler_that_fails_leaves_the_watch_in_python(monkeypatch):
-    from koopmpc.supervise import quick_look
+def test_the_code_is_there_before_the_first_step(data, monkeypatch):
+    model = km.edmd(data, km.State() + km.Constant())
+    mpc = km.KoopmanMPC(model, km.Cost(Q=[10, 1], R=0.1), km.Limits(-1, 1), 8, monitor=data)
+    read = pickle.loads(pickle.dumps(mpc))
+    monkeypatch.setattr(monitor, "load_look", lambda: pytest.fail("a compiler would hold up a step"))
+    for one in (mpc, read):
+        one([0.5, 0.0], [0, 0])
+        assert one.watch._quick is not None
 
-    monkeypatch.setenv("CC", "false")
-    monkeypatch.setattr(quick_look, "find_private_cache", lambda: None)
-    assert quick_look.load_look.__wrapped__() is None
+
+@pytest.mark.parametrize("command", ["false", "cc '"])
+def test_a_compiler_that_fails_leaves_the_watch_in_python(monkeypatch, command):
+    monkeypatch.setenv("CC", command)
+    monkeypatch.setattr(monitor, "find_private_cache", lambda: None)
+    assert monitor.load_look.__wrapped__() is None
