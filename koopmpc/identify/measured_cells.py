@@ -97,7 +97,7 @@ class Cells:
 
 
 class CellSlopes(NamedTuple):
-    """Gauss-Newton of Θ and of the starts of all segments; the starts are eliminated segment by segment."""
+    """Gauss-Newton of Θ and of the starts of all segments, in spreads; the starts are eliminated segment by segment."""
 
     gradient: Float[np.ndarray, " p"]
     matrix: Float[np.ndarray, "p p"]
@@ -106,7 +106,7 @@ class CellSlopes(NamedTuple):
     cross: Float[np.ndarray, "m ns p"]
 
     def solve(self, damping: float) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "m ns"]]:
-        """Return the steps of Θ and of the starts."""
+        """Return the steps of Θ and of the starts, in spreads."""
         ns = self.starts.shape[1]
         own = np.diagonal(self.starts, axis1=1, axis2=2)
         inverse: np.ndarray = np.linalg.inv(
@@ -138,6 +138,7 @@ class MeasuredError:
             "slopes", [x, u, w, theta], [phi, ca.densify(ca.jacobian(theta @ phi, x))], {"cse": True}
         )
         self.columns, self.shape, self.size = columns, (columns.nx, int(phi.numel())), size
+        self.start_size: Float[np.ndarray, " ns"] = np.tile(size, columns.past + 1)
 
     @raise_swallowed()
     def _step(
@@ -180,7 +181,7 @@ class MeasuredError:
         p = nx * count
         gradient, matrix = np.zeros(p), np.zeros((p, p))
         of_starts, own, cross = np.zeros((m, ns)), np.zeros((m, ns, ns)), np.zeros((m, ns, p))
-        states, D, S = starts, np.zeros((m, ns, p)), np.tile(np.eye(ns), (m, 1, 1))
+        states, D, S = starts, np.zeros((m, ns, p)), np.tile(np.diag(self.start_size), (m, 1, 1))
         rows = np.arange(nx)
         for k in range(len(cells.X)):
             if k > past:

@@ -14,6 +14,7 @@ from koopmpc.errors import DataError
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.measured_cells import Cells, MeasuredError, ModelColumns, cut_cells
+from koopmpc.identify.solve import column_norms
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
@@ -131,7 +132,9 @@ def unequal_rates(
         )
     wanted = min(wanted, longest)
     if wanted <= past:
-        raise DataError(f"a segment has {wanted} steps, and the embedding keeps {past}; pass longer runs or a horizon")
+        raise DataError(
+            f"a segment has {wanted} steps, and the embedding keeps {past}; pass longer runs or a longer horizon"
+        )
     size = np.nanstd(np.concatenate(data.X), axis=0)
     error = MeasuredError(columns, np.where(size > 0, size, 1.0))
     lengths = sorted({max(wanted // 2, past + 1), wanted})
@@ -208,7 +211,10 @@ def _fit_from(
     Z, U = np.concatenate([e.X[:-1] for e in points]), np.concatenate([e.U for e in points])
     W = np.concatenate([e.W for e in points])
     after = np.concatenate([e.X[1:, : columns.nx] for e in points])
-    theta, steps = np.asarray(np.linalg.lstsq(columns.evaluate(Z, U, W), after, rcond=None)[0]).T, 0
+    phi = columns.evaluate(Z, U, W)
+    norms = column_norms(phi)
+    norms[norms == 0] = 1.0
+    theta, steps = (np.asarray(np.linalg.lstsq(phi / norms, after, rcond=None)[0]) / norms[:, None]).T, 0
     cells, starts = cut_cells(data, bridged, lengths[-1], columns.past)
     unknowns = theta.size + starts.size
     if cells.measured.sum() < unknowns:
@@ -241,7 +247,7 @@ def _minimise(
         slopes, lower = error.derivatives(theta, starts, cells), np.inf
         for _trial in range(_TRIALS):
             move, moved = slopes.solve(damping)
-            trial = theta + move.reshape(theta.shape), starts + moved
+            trial = theta + move.reshape(theta.shape), starts + moved * error.start_size
             lower = error.evaluate(*trial, cells)
             if lower < value:
                 (theta, starts), damping = trial, max(damping / 10, 1e-15)
