@@ -42,6 +42,7 @@ _ITERATIONS = 12  # Levenberg-Marquardt steps of a refinement
 _GAIN = 0.98  # keep a refinement if it lowers the error on unseen rows to less than this share
 _PAYS = 0.9  # take a hidden state if it lowers the error on unseen rows to less than this share
 _LOST = 1e3  # a free run counts as this many spreads at most
+_HALVES = 2  # errors of a quarter
 _BEHIND = 1.5  # a model that errs by this many times a rival's error on the first quarters is not fitted to others
 _LONGEST = 4000  # rows of a free run that judges finalists, at most; the search for terms cuts shorter pieces
 
@@ -209,14 +210,14 @@ def judge_free_run(
         kept = [e.cut(a, b) for e, (low, high) in zip(seen, spans, strict=True) for a, b in ((0, low), (high, len(e)))]
         model = fit(truth.with_episodes([e for e in kept if len(e) > first]))
         errors += _stretch_errors(model, truth, spans, scale, first, horizon, relift=relift)
-        if rival is not None and fold and _is_behind(errors, rival.errors[: len(errors)], fold + 1):
+        if rival is not None and len(errors) > _HALVES and _is_behind(errors, rival.errors[: len(errors)]):
             return FreeRun(np.array(errors + [_LOST] * (len(rival.errors) - len(errors))), False)
     return FreeRun(np.array(errors), _is_calm(fit(seen), truth, first, relift))
 
 
-def _is_behind(errors: Sequence[float], than: Float[np.ndarray, " blocks"], quarters: int) -> bool:
-    """Return whether errors are far larger on each of the quarters that they are from."""
-    own, others = (np.log(np.maximum(e, EXACT)).reshape(quarters, -1).mean(axis=1) for e in (errors, than))
+def _is_behind(errors: Sequence[float], than: Float[np.ndarray, " blocks"]) -> bool:
+    """Return whether errors are far larger on each of their quarters that have rows behind `first`."""
+    own, others = (np.log(np.maximum(e, EXACT)).reshape(-1, _HALVES).mean(axis=1) for e in (errors, than))
     return bool((own > others + np.log(_BEHIND)).all())
 
 
@@ -255,7 +256,7 @@ def _stretch_errors(
         starts = [*range(low, high - horizon + 1, horizon)]
         if starts:
             short.append(forecast_rows(model, truth.with_episodes([e]), starts, horizon, relift).transpose(1, 0, 2))
-    parts = [np.array_split(np.concatenate(gaps), 2) for gaps in (free, short) if gaps]
+    parts = [np.array_split(np.concatenate(gaps), _HALVES) for gaps in (free, short) if gaps]
     errors: list[float] = []
     for halves in zip(*parts, strict=True):
         sizes = [_root_mean_square(half / scale) for half in halves if len(half)]

@@ -181,6 +181,17 @@ def test_a_model_far_behind_a_rival_is_not_fitted_without_each_quarter():
     np.testing.assert_allclose(once.errors[2:], rival.errors[2:])
 
 
+def test_a_quarter_before_the_first_row_of_a_free_run_judges_no_model():
+    data = oscillator()
+
+    def fit(e):
+        return km.edmd(e, km.State() + km.Constant())
+
+    alone = judge_free_run(fit, data, data, 110, 10, relift=False)  # a quarter has 104 rows
+    beside = judge_free_run(fit, data, data, 110, 10, relift=False, rival=alone)
+    np.testing.assert_array_equal(beside.errors, alone.errors)
+
+
 def test_hidden_states_far_behind_the_best_calm_polynomial_are_left_out():
     data = oscillator(rows=240)
 
