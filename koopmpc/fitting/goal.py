@@ -3,6 +3,7 @@
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from inspect import Parameter, signature
@@ -164,7 +165,7 @@ def design_data(
         reading["disturbances"] = [*reading.get("disturbances", ()), *set_points]
     further = partial(plan_goal, file=plan, steps=plan_steps, episodes=plan_episodes, tell=tell)
     try:
-        split = read_logs(data, None, draw, memory, reading, _SHORT, ask=not pushed)
+        split = _read_for(goal, data, draw, memory, reading, ask=not pushed)
     except DataError as refusal:
         if plan is None:
             raise
@@ -174,7 +175,7 @@ def design_data(
     missed = tuple(name for name in pushed if name in split.seen.states)
     if missed and "inputs" not in reading:  # the goal knows inputs that no name in the logs shows
         reading["inputs"] = (*split.seen.inputs, *missed)
-        split = read_logs(data, None, draw, memory, reading, _SHORT)
+        split = _read_for(goal, data, draw, memory, reading)
     split, instruments = take_set_points(split, set_points)
     about = describe_data(split)
     tell(about)
@@ -216,6 +217,26 @@ def design_data(
     return DesignedData(designed, asked, file, page, usage, planned)
 
 
+def _read_for(
+    goal: str | PathLike[str],
+    data: Data,
+    rng: np.random.Generator,
+    memory: int,
+    reading: Mapping[str, Any],
+    *,
+    ask: bool = True,
+) -> DividedData:
+    """Read logs to judge a model over the horizon of a goal, or over the usual one where they are too short for it."""
+    wished = _load_toml(Path(goal)).get("horizon")
+    if not isinstance(wished, int) or wished < 1:  # none is given, or read_goal refuses it in a sentence
+        return read_logs(data, None, rng, memory, reading, _SHORT, ask=ask)
+    with suppress(DataError):
+        return read_logs(data, wished, rng, memory, reading, _SHORT, ask=ask)
+    split = read_logs(data, None, rng, memory, reading, _SHORT, ask=ask)
+    note = f"the logs are too short to judge a model over the {wished} steps of the goal"
+    return replace(split, notes=(*split.notes, note))
+
+
 def _load_few(data: Data, reading: Mapping[str, Any], pushed: Sequence[str]) -> Episodes:
     """Return logs that are too few to learn from; columns that the goal pushes are inputs, whatever their names."""
     files = find_logs(data)
@@ -248,7 +269,7 @@ def _summarise_logs(
 ) -> LogSummary:
     """Return what a report shows of the logs, with forecasts of rows that the chosen model did not learn from."""
     assert split.excerpt is not None, "divide_files makes it"
-    model, horizon = designed.controller.as_data().model, split.horizon
+    model, horizon = designed.controller.as_data().model, split.ahead
     assert model is not None, "every design has a model"
     forecasts, findings = list[Forecast](), list[str]()
     error = plain = np.zeros((0, model.nx))

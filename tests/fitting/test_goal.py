@@ -139,6 +139,23 @@ def test_a_goal_file_keeps_every_keyword_that_reads_the_logs_and_a_call_replaces
             load_reading(path)
 
 
+@pytest.mark.parametrize(("horizon", "ahead"), [(30, 30), (80, 20)])
+def test_a_model_is_judged_over_the_horizon_of_the_goal_where_the_logs_are_long_enough(
+    horizon, ahead, tmp_path, monkeypatch
+):
+    def stop(*_, **__):
+        raise km.KoopmpcError("read")
+
+    logs().save(tmp_path / "logs.npz")
+    (tmp_path / "goal.toml").write_text(GOAL.replace("horizon = 15", f"horizon = {horizon}"))
+    monkeypatch.setattr("koopmpc.fitting.goal.design", stop)
+    told = []
+    with pytest.raises(km.KoopmpcError, match="read"):
+        design_data(tmp_path / "logs.npz", tmp_path / "goal.toml", tmp_path, say=told.append)
+    assert f"horizon {ahead} steps" in told[0]
+    assert ("too short to judge a model over the 80 steps of the goal" in told[0]) == (horizon == 80)
+
+
 @pytest.mark.parametrize(
     ("median", "step"), [(2.002, 2.0), (0.0501, 0.05), (0.33333, 0.33333), (1.0, 1.0), (7.3e-4, 7.3e-4)]
 )
