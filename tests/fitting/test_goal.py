@@ -259,6 +259,28 @@ def test_a_controller_that_misses_its_goal_fails_the_check_with_the_reason(tmp_p
     assert str(done).startswith("THE GOAL IS NOT KEPT")
 
 
+def test_a_reference_that_no_input_holds_is_not_kept_where_every_run_ends_far_from_it(made, tmp_path, monkeypatch):
+    monkeypatch.setattr("koopmpc.fitting.check.kinds", lambda *_, **__: [RunKind("as in the data")])
+    saved = load_value(made.controller, SavedDesign)
+    asked = replace(saved.evidence.asked, reference=saved.evidence.asked.reference * [1, 0] + [0, 0.7])  # x and speed
+    evidence = replace(saved.evidence, asked=asked, goal_can_be_held=False)
+    save_value(replace(saved, evidence=evidence), tmp_path / "design.npz")
+    done = check_controller(tmp_path / "design.npz", tmp_path, runs=2, rate=0.5)
+    assert done.verdict == "not kept"
+    assert re.match("as in the data: every run ends .* or more off its reference, 5 % are allowed", done.reasons[0])
+    assert done.reasons[1].startswith("no input holds position = 0.5 m, speed = 0.7 m/s")
+
+
+def test_runs_with_weaker_inputs_that_end_off_the_reference_are_named_beside_the_verdict(made, tmp_path, monkeypatch):
+    both = [RunKind("as in the data"), RunKind("inputs gone", gain=0.0)]
+    monkeypatch.setattr("koopmpc.fitting.check.kinds", lambda *_, **__: both)
+    done = check_controller(made.controller, tmp_path, runs=2, rate=0.5)
+    (remark,) = done.remarks
+    assert remark.startswith("inputs gone: a run ends ")
+    assert not any("off its reference" in reason for reason in done.reasons)
+    assert "- inputs gone: a run ends" in str(done)
+
+
 def test_an_input_beyond_its_limits_under_a_fault_fails_the_check(made, tmp_path, monkeypatch):
     ours = MPCBase._fail
 
