@@ -35,6 +35,7 @@ from koopmpc.predict.base import load_value
 from koopmpc.synthesis.cross_validation import usual_horizon
 from koopmpc.synthesis.design import design
 from koopmpc.synthesis.designed import Design, SavedDesign, rebuild_controller
+from koopmpc.synthesis.surrogates import describe_rest
 from koopmpc.validate.bands import Forecast, forecast
 from koopmpc.validate.logs.summary import LogSummary
 from koopmpc.validate.report import trust
@@ -202,6 +203,9 @@ def design_data(
         further(_join_rows(split), asked, refusal=refusal)
         raise
     tell(str(designed))
+    evidence = designed.evidence
+    if evidence.goal_can_be_held:
+        tell(describe_rest(evidence.surrogates, evidence.asked))
     certified = ""
     if asked.certify:
         unseen = split.held_out if split.learned is None else None

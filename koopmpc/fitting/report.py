@@ -20,6 +20,7 @@ from koopmpc.page import HtmlPage
 from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign
 from koopmpc.synthesis.fresh.neighbours import choose_starts_to_record, probe_range
 from koopmpc.synthesis.judging import read_reference, run_on_surrogate
+from koopmpc.synthesis.surrogates import describe_rest
 from koopmpc.text import shorten_observable, to_percent, with_unit
 from koopmpc.validate.logs.summary import LogExcerpt, LogSummary
 
@@ -158,7 +159,10 @@ def _add_goal(page: HtmlPage, evidence: Evidence, controller: AnyMPC) -> None:
         f"A step takes {controller.dt:g} s, and the controller looks {controller.horizon} steps ahead, which is "
         f"{ahead:.4g} s. Limits of measured signals are soft: they give way where no input keeps them."
     )
-    if not evidence.goal_can_be_held and not asked.moves:
+    if evidence.goal_can_be_held:
+        rest = describe_rest(evidence.surrogates, asked)
+        page.text(f"{rest[0].upper()}{rest[1:]}.")
+    elif not asked.moves:
         page.verdict(
             "doubt", "No input inside the limits holds the reference.", "The advice below says what is in the way."
         )

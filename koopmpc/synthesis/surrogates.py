@@ -24,6 +24,7 @@ from koopmpc.values import Value
 SECOND = 3.0  # the error of the second surrogate may be this many times that of the best
 INVARIANT = 0.25  # the plant ignores a state that changes increments by less than this share; models err as much
 UNHELD = 0.02  # an equilibrium may miss the reference by this share of the data's range
+HEADROOM = 0.1  # an input rests near a limit if less than this share of its range is left
 GROWN = 2.0  # a plant is unstable if a deviation grows by this factor within a horizon
 _SAMPLE = 500  # number of states on which ignored states are searched
 _FAMILIES = ("monomials", "fourier", "gaussian", "thin plate", "random fourier")
@@ -282,3 +283,22 @@ def explain_unreachable(one: Surrogate, asked: DesignTask) -> list[str]:
         return []
     needs = "; ".join(ways) if ways else "what the limits of its observables forbid"
     return [f"no input inside the limits holds {format_outputs(row)}: it needs {needs}; {nearest}"]
+
+
+def describe_rest(surrogates: Sequence[Surrogate], asked: DesignTask) -> str:
+    """Return at which inputs a constant reference rests, in the median of surrogates, and which are near a limit."""
+    row, names = asked.reference[0], surrogates[0].inputs
+    rest = np.median([one.holding(asked.cost, asked.limits)(row).u for one in surrogates], axis=0)
+    values, near = list[str](), list[str]()
+    for name, value, low, high in zip(names, rest, *asked.limits.inputs(len(names)), strict=True):
+        size = high - low
+        if not np.isfinite(size):
+            values.append(with_unit(name, f"= {value:.3g}"))
+            continue
+        shown = value if abs(value) > 1e-3 * size else 0.0
+        values.append(f"{with_unit(name, f'= {shown:.3g}')} of {low:.4g} … {high:.4g}")
+        for side, left in (("above", high - value), ("below", value - low)):
+            if left < HEADROOM * size:
+                near.append(f"{side} for {name.partition(' [')[0]}")
+    room = f"; less than a tenth of the range is left {' and '.join(near)}: no headroom" if near else ""
+    return f"the reference rests at {', '.join(values)}{room}"

@@ -20,6 +20,7 @@ from koopmpc.fitting.goal import design_data, format_template, load_reading, rea
 from koopmpc.fitting.repair import read_logs, round_step
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign
+from koopmpc.synthesis.surrogates import describe_rest
 from tests.fitting.mass import GOAL, NAMES, A, B, logs
 
 
@@ -216,6 +217,25 @@ def test_the_page_shows_what_to_expect_and_the_goal(made):
         assert part in text
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "said"),
+    [
+        (-2.0, 2.0, "force = 0 N/kg of -2 … 2"),
+        (-2.0, 0.1, "force = 0 N/kg of -2 … 0.1; less than a tenth of the range is left above for force: no headroom"),
+        (-0.1, 2.0, "force = 0 N/kg of -0.1 … 2; less than a tenth of the range is left below for force: no headroom"),
+        (-np.inf, 2.0, "force = "),
+    ],
+)
+def test_a_design_says_at_which_inputs_its_reference_rests_and_how_far_from_their_limits(made, low, high, said):
+    evidence = made.design.evidence
+    asked = replace(evidence.asked, limits=replace(evidence.asked.limits, u_min=low, u_max=high))
+    rest = describe_rest(evidence.surrogates[:1], asked)
+    assert rest.startswith(f"the reference rests at {said}")
+    assert rest.endswith(said) or low == -np.inf
+    page = html.unescape(made.page.read_text())
+    assert "The reference rests at force = 0 N/kg of -2 … 2." in page
+
+
 def test_a_design_that_keeps_its_goal_passes_the_check_and_its_page_says_so(made, tmp_path):
     done = check_controller(made.controller, tmp_path, runs=4, rate=0.5)
     assert done.kept, str(done)
@@ -393,6 +413,7 @@ def test_the_commands_write_a_template_design_and_check(tmp_path, monkeypatch):
     Path("goal.toml").write_text(GOAL)
     result = call(app, ["fit", "logs.npz", "--goal", "goal.toml", "--linear"])
     assert result.exit_code == 0, result.output
+    assert "the reference rests at force = 0 N/kg of -2 … 2" in result.stdout
     file = result.stdout.split("controller: ")[1].split(", report")[0]
     checked = call(app, ["check", file, "--runs", "2", "--rate", "0.5"])
     assert checked.exit_code == 0, checked.output
