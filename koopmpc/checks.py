@@ -289,7 +289,7 @@ def _format_shape(shape: Sequence[int | None]) -> str:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return ``", did you mean 'pendulum'?"`` for the known name nearest to `name`; empty where none is near."""
-    close = get_close_matches(name, list(known), n=1, cutoff=0.5)
+    close = get_close_matches(name, list(known), n=1, cutoff=0.6)
     return f", did you mean {close[0]!r}?" if close else ""
 
 

@@ -273,6 +273,29 @@ def test_a_word_of_the_tables_is_explained_and_a_wrong_one_finds_its_neighbour(c
     assert missed.exit_code == 2
     assert "did you mean 'ratio'" in missed.stderr
     assert "offset-free: " in call("explain").stdout
+    far = call("explain", "nonsense")
+    assert far.exit_code == 2
+    assert "did you mean" not in far.stderr
+
+
+@pytest.mark.parametrize(
+    "word",
+    ["violation", "score", "stand-in", "surrogate", "corners", "fresh loops", "gain", "tail", "weighted", "known"],
+)
+def test_the_words_of_a_design_and_of_the_pages_are_explained(call, word):
+    assert call("explain", *word.split()).exit_code == 0
+
+
+def test_a_ridge_is_that_of_a_fit_and_a_lost_run_also_that_of_a_design(call):
+    assert "coefficients" in call("explain", "ridge").stdout
+    assert "left the data" in " ".join(call("explain", "lost").stdout.split())
+
+
+def test_check_looks_for_the_file_before_it_plans_its_loops(call):
+    missed = call("check", "missing.npz")
+    assert missed.exit_code == 2
+    assert not missed.stdout
+    assert "missing.npz does not exist" in missed.stderr
 
 
 def test_a_case_is_explained_with_what_controllers_are_not_told(call, tmp_path):

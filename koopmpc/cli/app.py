@@ -226,11 +226,13 @@ def check(
     Exit code 0: the goal is kept. 1: it is not. 3: the logs do not show whether it is.
     """
     from koopmpc.data.files.load import load_episodes
+    from koopmpc.disk import existing
     from koopmpc.fitting.changed import read_new_logs
     from koopmpc.fitting.check import check_controller
     from koopmpc.fitting.verdict import plan_verdict
 
     with friendly():
+        existing(controller, "pass what `koopmpc fit --goal` or the save of a design wrote")
         say(plan_verdict(rate))
         seen = None if on_plant is None else load_episodes(on_plant)
     with friendly(), folder_of(logs, "check") as folder, bar("runs") as progress:
@@ -394,7 +396,34 @@ TERMS: dict[str, str] = {
         "Steps at which a learned model was beyond its data: state and input lay where the data were not, or what came "
         "was not what the model had predicted. About 2 of 100 steps are so by chance. Asked for by --monitor."
     ),
-    "lost": "Only because of the fault the run did not reach its reference.",
+    "lost": (
+        "In a table of faults: only because of the fault the run did not reach its reference. In a design or a check: "
+        "the run left the data by more than half of its range, or a state became NaN or infinite."
+    ),
+    "violation": (
+        "How far a limit was broken, at most: in the unit of that limit, or as a share of its range where a % follows."
+    ),
+    "score": (
+        "The mean over closed loops on stand-ins of a controller's cost, with a price on violations, over that of the "
+        "best controller in the same loop: 1 is the best in every loop."
+    ),
+    "stand-in": (
+        "A model of the plant from the same logs that the controller's own model does not know; it takes the plant's "
+        "place in tests. Where the logs are blind, so is it."
+    ),
+    "surrogate": "Another word for a stand-in of the plant.",
+    "corners": "The ends of the range of starts in the goal, at which loops begin that the logs may never have shown.",
+    "fresh loops": (
+        "Closed loops from new random starts, run after the choice of the controller, which had no part in it."
+    ),
+    "gain": (
+        "How strongly an output answers an input; in a name such as offset-free (gain 0.1), how fast the controller "
+        "learns an unknown load."
+    ),
+    "tail": "Steps after the horizon whose cost, without limits, the plan counts, so that it looks beyond its end.",
+    "weighted": "The model is fitted again, with more weight on the states that its own closed loops visit.",
+    "known": "A step of a learned model inside its data; the opposite of unknown.",
+    "ridge": "A small penalty on the size of a model's coefficients in the fit; it keeps noise out of them.",
     "–": (
         "No number: without the fault the run does not reach its reference either, or there is no run to compare with."
     ),
