@@ -419,4 +419,4 @@ def measure_errors(
 
 def is_alike(score: float, best: float, error: float) -> bool:
     """Return whether a score is as good as the best one, by the standard error of their difference."""
-    return score <= best * (1 + max(ALIKE, min(error, UNSURE)))
+    return bool(score <= best * (1 + max(ALIKE, min(error, UNSURE))))
