@@ -116,7 +116,9 @@ def test_select_cuts_one_episode_into_blocks_says_so_and_its_model_controls():
 
 
 def test_select_refuses_one_episode_that_is_too_short():
-    with pytest.raises(km.errors.DataError, match=r"choice needs two of 10 steps or more, or one of 40: pass a shorter horizon"):
+    with pytest.raises(
+        km.errors.DataError, match=r"choice needs two of 10 steps or more, or one of 40: pass a shorter horizon"
+    ):
         km.select(episodes(1, 15), **FEW)
 
 
