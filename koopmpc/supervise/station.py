@@ -19,7 +19,7 @@ from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
 from koopmpc.control.program import Program, Published, SavedController, no_export
 from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.errors import DataError
-from koopmpc.loop.simulate import count_disturbances, predictor_of
+from koopmpc.loop.simulate import count_disturbances
 
 Mode = Literal["manual", "automatic", "standby"]
 _BUMP = 0.01  # after a switch u moves by this share of its range a step, unless the controller takes over exactly
@@ -200,9 +200,9 @@ class Station(Published):
         self.actor: str = ""
         self._ill, self._replaced, self._approaching = 0, False, False
         self._set_point: Float[np.ndarray, " nr"] | None = None
-        for part in (self.controller, self.standby):
-            if part is not None:
-                part.reset(_start_of(part, x0), u_prev)
+        self.controller.reset(x0, u_prev)
+        if self.standby is not None:
+            self.standby.reset(x0, u_prev)
 
     def _present_limits(self) -> tuple[Interval, Interval | None]:
         """Return the limits of the inputs, and of their changes, in this step."""
@@ -319,12 +319,6 @@ def _check_mode(mode: str) -> Mode:
     if mode not in get_args(Mode):
         raise DataError(f'mode is {mode!r}; pass "manual", "automatic" or "standby"')
     return cast("Mode", mode)
-
-
-def _start_of(part: Controller, x0: ArrayLike | None) -> ArrayLike | None:
-    """Return x0; None where the model of this controller has another number of states, as `simulate` does."""
-    known = getattr(predictor_of(part) or getattr(part, "step_map", None), "states", None)
-    return x0 if x0 is None or known is None or len(known) == np.size(x0) else None
 
 
 def _rows_of(rows: Float[np.ndarray, "..."], controller: Controller) -> Float[np.ndarray, "..."]:

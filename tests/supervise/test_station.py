@@ -324,22 +324,3 @@ def test_an_input_that_acts_later_keeps_the_row_of_the_step_in_which_it_acts():
     station = km.supervise.Station(mpc, limits=limits, mode="manual", hand=[3.0])
     U = [station([0.0], [0.0]).u[0] for _ in range(8)]
     np.testing.assert_array_equal(U, u_max[2:, 0])
-
-
-def test_a_plant_with_more_states_than_outputs_begins_as_with_the_mpc_alone():
-    A, B = np.array([[0.9, 0.1, 0.0], [0.0, 0.8, 0.1], [0.0, 0.0, 0.5]]), np.array([[0.0], [0.2], [0.5]])
-    plant = km.black_box(
-        lambda x, u: A @ x + B @ u,
-        dt=0.1,
-        states=["a", "b", "c"],
-        inputs=["u"],
-        measure=lambda x: x[:2],
-        outputs=["y", "v"],
-    )
-    data = km.collect(plant, km.Uniform([-1] * 3, [1] * 3), km.Noise(0, 1), episodes=5, steps=20, rng=0)
-    mpc = km.KoopmanMPC(km.edmd(data, km.State()), km.Cost(Q=[1, 1], R=0.1), km.Limits(u_min=-1, u_max=1), 10)
-
-    pid = km.control.PID(kp=1.0, ki=0.1, dt=0.1)
-    station = km.supervise.Station(pid, mpc, mode="standby")
-    how = {"x0": [1, 1, 1], "reference": [0, 0], "steps": 3}
-    np.testing.assert_allclose(km.simulate(plant, station, **how).U, km.simulate(plant, mpc, **how).U, atol=1e-9)
