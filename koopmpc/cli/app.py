@@ -232,7 +232,7 @@ def check(
     from koopmpc.fitting.verdict import plan_verdict
 
     with friendly():
-        existing(controller, "pass what `koopmpc fit --goal` or the save of a design wrote")
+        existing(controller, "pass the .npz of a saved Controller or Design")
         say(plan_verdict(rate))
         seen = None if on_plant is None else load_episodes(on_plant)
     with friendly(), folder_of(logs, "check") as folder, bar("runs") as progress:
