@@ -33,7 +33,7 @@ class UnsafePlanError(DataError):
         """Say what would help."""
         self.worst = worst
         super().__init__(
-            f"no safe plan exists, nor a shorter one: {worst}; start further inside, widen the limits, or record logs "
+            f"no safe plan exists: {worst}; plan fewer steps, start further inside, widen the limits, or record logs "
             "that stay near a start first, so that the bands become narrow"
         )
 

@@ -112,12 +112,23 @@ def _generate_code(function: ca.Function) -> str:
 
 
 def find_compiler() -> list[str] | None:
-    """Return the command of the first C compiler found among $CC, cc, gcc and clang, or None."""
-    for command in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
-        words = shlex.split(command)
+    """Return the command of the first C compiler found among $CC, cc, gcc and clang; None where $CC cannot be read."""
+    try:
+        own = _read_words("CC")
+    except OSError:
+        return None
+    for words in (own, ["cc"], ["gcc"], ["clang"]):
         if words and shutil.which(words[0]):
             return words
     return None
+
+
+def _read_words(variable: str) -> list[str]:
+    """Return the words of an environment variable; an OSError says that a quote has no end."""
+    try:
+        return shlex.split(os.environ.get(variable, ""))
+    except ValueError as error:
+        raise OSError(f"{variable} is {os.environ[variable]!r}, in which a quote has no end") from error
 
 
 def try_compiler(command: list[str]) -> str:
@@ -186,7 +197,7 @@ def load_library(text: str, command: list[str], cache: Path | None, level: str =
     OSError, subprocess.SubprocessError
         The compiler fails or its output does not load.
     """
-    command = [*command, level, *_FLAGS, *shlex.split(os.environ.get("KOOPMPC_CFLAGS", ""))]
+    command = [*command, level, *_FLAGS, *_read_words("KOOPMPC_CFLAGS")]
     if cache is None:
         with tempfile.TemporaryDirectory() as folder:  # loaded code stays valid when its file is gone
             return ctypes.CDLL(str(_compile(text, command, Path(folder) / "step.so")))

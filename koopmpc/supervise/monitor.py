@@ -138,7 +138,7 @@ def load_look() -> Callable[[ctypes.c_void_p], int] | None:
         if command is None:
             return None
         library = load_library(CODE, command, find_private_cache())
-    except (OSError, ValueError, subprocess.SubprocessError):  # ValueError: a quote without its end in the environment
+    except (OSError, subprocess.SubprocessError):
         return None
     address = ctypes.cast(library.koopmpc_look, ctypes.c_void_p).value
     # a call that keeps the interpreter's lock is faster; the loaded code stays in the process

@@ -264,3 +264,11 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         Routine(function(), [np.zeros(2), np.zeros((20, 3, 3))], [np.zeros((20, 3)), np.zeros(3)])
     with pytest.raises(AssertionError, match="reads contiguous arrays"):
         Routine(function(), [np.zeros(6)[::2], np.zeros((20, 3, 3))], [np.zeros((20, 3)), np.zeros(3)])
+
+
+def test_a_quote_without_an_end_names_no_compiler_and_fails_as_a_compiler_does(monkeypatch):
+    monkeypatch.setenv("CC", "'gcc")
+    assert routines.find_compiler() is None
+    monkeypatch.setenv("KOOPMPC_CFLAGS", '-O2 "')
+    with pytest.raises(OSError, match=r"KOOPMPC_CFLAGS is .* a quote has no end"):
+        routines.load_library("int f(void) { return 0; }", ["cc"], None)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.plants.routines import find_compiler
 from koopmpc.supervise import monitor
+from tests.compiler import needs_compiler
 
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+pytestmark = needs_compiler
 
 
 @pytest.fixture(scope="module")
