@@ -23,13 +23,15 @@ def _often():
 
 
 class Slow:
-    """A measurement during whose reading, inside the controller, other threads have their turn."""
+    """A measurement whose reading, inside the controller, lasts until another thread was told, at most a second."""
 
-    def __init__(self, y):
-        self._y = y
+    def __init__(self, y, seen, least):
+        self._y, self._seen, self._least = y, seen, least
 
     def __array__(self, dtype=None, copy=None):
-        time.sleep(1e-4)
+        before, end = self._seen["met"], time.monotonic() + 1.0
+        while self._seen["met"] == before < self._least and time.monotonic() < end:
+            time.sleep(1e-4)
         return self._y
 
 
@@ -44,7 +46,9 @@ def test_threads_that_meet_in_a_controller_are_told_and_nothing_breaks(controlle
         while seen["met"] < least and seen["steps"] < 100 * least and not failures:
             try:
                 y = rng.normal(size=2)
-                move = controller(Slow(y) if rng.random() < 0.05 else y, [0.0, 0.0])  # most turns end anywhere
+                move = controller(
+                    Slow(y, seen, least) if rng.random() < 0.05 else y, [0.0, 0.0]
+                )  # most turns end anywhere
                 seen["steps"] += 1
                 if not np.isfinite(move.u).all():
                     failures.append(move)
