@@ -25,7 +25,7 @@ from koopmpc.control.move import Controller, Move, Status
 from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.loop.run import Step
-from koopmpc.loop.simulate import CONTROLLER, HOW, checked_input, predictor_of, rows_ahead
+from koopmpc.loop.simulate import CONTROLLER, HOW, checked_input, rows_ahead, start_for
 from koopmpc.plants.plant import Plant, read_measurement, require_plant
 
 Late = Literal["skip", "hold"]
@@ -203,8 +203,7 @@ def realtime(
     x0 = None if x0 is None else checks.array(x0, "x0", (None,))
 
     y = read_measurement(plant.reset(x0, np.random.default_rng(0)), None, 0)
-    own = getattr(predictor_of(controller) or getattr(controller, "step_map", None), "states", None)
-    controller.reset(x0 if x0 is None or own is None or len(own) == len(x0) else None)
+    controller.reset(start_for(controller, x0))
     main = threading.current_thread() is threading.main_thread()
     dog = _Watchdog(plant, at_rest, patience, main=main)
     read, ahead = getattr(plant, "read", None), controller.horizon + 1

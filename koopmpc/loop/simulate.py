@@ -160,8 +160,7 @@ def simulate(
         sees_state=wiring.sees_state,
         plans=plans,
     )
-    known = getattr(model or getattr(controller, "step_map", None), "states", None)
-    controller.reset(x0 if known is None or len(known) == nx else None)  # a model of other states knows no such x0
+    controller.reset(start_for(controller, x0))
     metadata = {"controller": type(controller).__name__, **(metadata or {})}
     if wiring.measured is not None:
         metadata["measured"] = wiring.measured[:steps].tolist()
@@ -412,6 +411,21 @@ def predictor_of(controller: object) -> Predictor | None:
     """Return the predictor that a controller holds, None where it has none."""
     held = (getattr(controller, name, None) for name in ("predictor", "model"))
     return next((each for each in held if isinstance(each, Predictor)), None)
+
+
+def start_sizes(controller: object) -> frozenset[int]:
+    """Return the numbers of states of the models that a controller holds; none where it has no model."""
+    sizes: frozenset[int] | None = getattr(controller, "start_sizes", None)  # of several controllers in one
+    if sizes is not None:
+        return sizes
+    states = getattr(predictor_of(controller) or getattr(controller, "step_map", None), "states", None)
+    return frozenset() if states is None else frozenset({len(states)})
+
+
+def start_for(controller: object, x0: Float[np.ndarray, " nx"] | None) -> Float[np.ndarray, " nx"] | None:
+    """Return the start that a controller can know: None where x0 has other states than its model."""
+    sizes = start_sizes(controller)
+    return x0 if x0 is None or not sizes or len(x0) in sizes else None
 
 
 def rows_ahead(

@@ -15,6 +15,7 @@ from koopmpc.control.move import Controller, Fallback, Move, Plan
 from koopmpc.control.program import Program, Published, SavedController, no_export
 from koopmpc.control.watching import StepWatch
 from koopmpc.errors import DataError
+from koopmpc.supervise.parts import join_start_sizes, reset_parts
 
 
 class Guarded(Published):
@@ -96,10 +97,14 @@ class Guarded(Published):
         return getattr(self.controller, "predictor", getattr(self.controller, "model", None))
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Begin a run with the first controller."""
+        """Begin a run with the first controller; one whose model has other states than x0 begins without it."""
         self._forget()
-        self.controller.reset(x0, u_prev)
-        self.standby.reset(x0, u_prev)
+        reset_parts((self.controller, self.standby), x0, u_prev)
+
+    @property
+    def start_sizes(self) -> frozenset[int]:
+        """Numbers of states of its controllers' models; `reset` takes an x0 of one of these lengths."""
+        return join_start_sizes((self.controller, self.standby))
 
     def plan(self) -> Plan | None:
         """Return the plan behind the last move; None where it had none."""

@@ -20,6 +20,7 @@ from koopmpc.control.program import Program, Published, SavedController, no_expo
 from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.errors import DataError
 from koopmpc.loop.simulate import count_disturbances
+from koopmpc.supervise.parts import join_start_sizes, reset_parts
 
 Mode = Literal["manual", "automatic", "standby"]
 _BUMP = 0.01  # after a switch u moves by this share of its range a step, unless the controller takes over exactly
@@ -165,8 +166,17 @@ class Station(Published):
     @property
     def nw(self) -> int | None:
         """Measured disturbances that its controllers know; None where none of them has a model."""
-        counts = [count_disturbances(part) for part in (self.controller, self.standby) if part is not None]
+        counts = map(count_disturbances, self._parts)
         return max((count for count in counts if count is not None), default=None)
+
+    @property
+    def _parts(self) -> list[Controller]:
+        return [self.controller] if self.standby is None else [self.controller, self.standby]
+
+    @property
+    def start_sizes(self) -> frozenset[int]:
+        """Numbers of states of its controllers' models; `reset` takes an x0 of one of these lengths."""
+        return join_start_sizes(self._parts)
 
     @property
     def predictor(self) -> Any:
@@ -188,7 +198,15 @@ class Station(Published):
         self.mode = wanted
 
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:
-        """Begin a run in the first mode, with the first hand value."""
+        """Begin a run in the first mode, with the first hand value.
+
+        A controller whose model has another number of states than x0 begins without it.
+
+        Raises
+        ------
+        ShapeError, DataError
+            x0 is no vector of finite numbers, or has the states of no model in it; u_prev has other inputs.
+        """
         self._step = 0
         zero = np.clip(np.zeros(self.nu), *self._present_limits()[0])
         self._last = zero if u_prev is None else checks.array(u_prev, "u_prev", (self.nu,))
@@ -200,9 +218,7 @@ class Station(Published):
         self.actor: str = ""
         self._ill, self._replaced, self._approaching = 0, False, False
         self._set_point: Float[np.ndarray, " nr"] | None = None
-        self.controller.reset(x0, u_prev)
-        if self.standby is not None:
-            self.standby.reset(x0, u_prev)
+        reset_parts(self._parts, x0, u_prev)
 
     def _present_limits(self) -> tuple[Interval, Interval | None]:
         """Return the limits of the inputs, and of their changes, in this step."""

@@ -324,3 +324,45 @@ def test_an_input_that_acts_later_keeps_the_row_of_the_step_in_which_it_acts():
     station = km.supervise.Station(mpc, limits=limits, mode="manual", hand=[3.0])
     U = [station([0.0], [0.0]).u[0] for _ in range(8)]
     np.testing.assert_array_equal(U, u_max[2:, 0])
+
+
+A3, B3 = np.array([[0.9, 0.1, 0.0], [0.0, 0.8, 0.1], [0.0, 0.0, 0.5]]), np.array([[0.0], [0.2], [0.5]])
+TWO_OF_THREE = km.black_box(
+    lambda x, u: A3 @ x + B3 @ u,
+    dt=0.1,
+    states=["a", "b", "c"],
+    inputs=["u"],
+    measure=lambda x: x[:2],
+    outputs=["y", "v"],
+)
+
+
+def mpc_of(size, **options):
+    model = model_of(A3[:size, :size], B3[:size])
+    return km.KoopmanMPC(model, km.Cost(Q=np.ones(size), R=0.1), BOX, 10, **options)
+
+
+def test_a_station_begins_on_a_plant_of_more_states_than_its_models():
+    pid, how = km.control.PID(kp=1.0, ki=0.1, dt=0.1), {"x0": [1.0, 1.0, 1.0], "reference": [0.0, 0.0], "steps": 4}
+    alone = km.simulate(TWO_OF_THREE, mpc_of(2), **how).U
+    for parts, mode in (((pid, mpc_of(2)), "standby"), ((mpc_of(2), pid), "automatic"), ((mpc_of(2),), "automatic")):
+        station = km.supervise.Station(*parts, mode=mode)
+        np.testing.assert_allclose(km.simulate(TWO_OF_THREE, station, **how).U, alone, atol=1e-9)
+
+
+@pytest.mark.parametrize("make", [km.supervise.Station, km.supervise.Guarded])
+def test_each_of_two_controllers_begins_with_what_its_model_can_know(make):
+    rng, begun = np.random.default_rng(0), []
+    data = km.Episodes(
+        [km.Episode(X=rng.normal(size=(200, 2)), U=rng.normal(size=(199, 1)))], 0.1, ("x0", "x1"), ("u0",)
+    )
+    watched = mpc_of(2, monitor=data)
+    both = make(watched, mpc_of(3))
+    for part in (both.controller, both.standby):
+        part.reset = lambda x0, u_prev=None: begun.append(None if x0 is None else len(x0))
+    both.reset([1.0, 1.0, 1.0])
+    both.reset([1.0, 1.0])
+    both.reset()
+    assert begun == [None, 3, 2, None, None, None]
+    with pytest.raises(km.errors.ShapeError, match=r"x0 has shape \(4,\), expected \(2,\) or \(3,\)"):
+        both.reset([1.0] * 4)
