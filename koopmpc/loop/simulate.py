@@ -136,6 +136,7 @@ def simulate(
         controller = as_controller(controller, plant.dt, len(plant.inputs))
     controller = _require_match(plant, controller, angles)
     nx, nu, N, model = len(plant.states), controller.nu, controller.horizon, predictor_of(controller)
+    start = start_for(controller, x0)
     wiring = _Wiring(
         plant=plant,
         controller=controller,
@@ -160,7 +161,7 @@ def simulate(
         sees_state=wiring.sees_state,
         plans=plans,
     )
-    controller.reset(start_for(controller, x0))
+    controller.reset(start)
     metadata = {"controller": type(controller).__name__, **(metadata or {})}
     if wiring.measured is not None:
         metadata["measured"] = wiring.measured[:steps].tolist()
