@@ -4,7 +4,7 @@ import pickle
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -18,10 +18,11 @@ import numpy as np
 from koopmpc import checks, disk
 from koopmpc.bench.controllers import Prepared, controller_names, is_learned
 from koopmpc.bench.problem import Problem, load_problem
-from koopmpc.bench.single import FAULTS, row_of_run
+from koopmpc.bench.single import FAULTS, log_run, measure_run
 from koopmpc.bench.store import RESULTS, ROWS, Journal, RunRow, load_rows, next_batch, open_sweep, write_results
 from koopmpc.control.limits import Limits
 from koopmpc.errors import ProblemError
+from koopmpc.loop.run import Run
 from koopmpc.parallel import map_tasks
 from koopmpc.recording.viewer import find_viewer, why_none
 from koopmpc.values import fingerprint
@@ -32,6 +33,7 @@ _LARGEST = 50  # put at most this many runs into a batch
 _EACH = 100  # make each run a batch of its own if there are at most this many
 _FIRST = 5.0  # write results.parquet for the first time after this time [s]
 _SHARE = 100.0  # write results.parquet again after this many times the time that writing takes
+_HELD = 3.0  # let logs wait for the table of their case while its loops take less than this time [s]
 _DEATHS = 3  # a run fails if it would begin for this time after its workers died
 
 
@@ -112,7 +114,8 @@ def sweep(
     progress
         Called with (name of the run, runs done, runs in all).
     on_case
-        Called with all runs of a case when the last one is finished; cases come in their order.
+        Called with all runs of a case when the last one has ended; cases come in their order. In this process it does
+        not wait for the logs of loops that take less than three seconds: they are written afterwards.
 
     Returns
     -------
@@ -172,8 +175,14 @@ def sweep(
             learn = partial(_learn, grid, asked["controllers"])
             for _ in map_tasks(learn, list(reversed(models.values())), **where):
                 pass
-            batches = _batches(left, workers or 1, next_batch(folder))
-            for finished in map_tasks(partial(_do, grid), batches, **where):
+            held = alone and on_case is not None
+
+            def add_ended(row: RunRow) -> None:
+                done[row.key] = row
+                say(row.name)
+
+            batches = _batches(left, workers or 1, next_batch(folder), by_case=held)
+            for finished in map_tasks(partial(_do, grid, on_end=add_ended if held else None), batches, **where):
                 done |= {row.key: replace(row, log=row.log and folder / row.log.name) for row in finished}
                 say(finished[-1].name if len(done) < len(rows) else "done")
                 if (begin := time.monotonic()) >= due:
@@ -276,38 +285,75 @@ def _learn(grid: _Grid, controllers: Sequence[str], model: tuple[str, int]) -> N
         parts.save_models(controllers)
 
 
-def _batches(rows: Sequence[RunRow], workers: int, first: int) -> list[tuple[int, list[RunRow]]]:
+def _batches(rows: Sequence[RunRow], workers: int, first: int, *, by_case: bool) -> list[tuple[int, list[RunRow]]]:
     """Return the runs in batches, each with the number of its file, the least of which is `first`.
 
-    Sending one takes a tenth of a millisecond, about as long as a short run.
+    Sending one takes a tenth of a millisecond, about as long as a short run. With `by_case` a batch holds runs of one
+    case, as many as it may.
     """
     size = 1 if len(rows) <= _EACH else min(max(1, len(rows) // (_BATCHES * workers)), _LARGEST)
-    taken = iter(rows)
-    return list(enumerate(iter(lambda: list(islice(taken, size)), []), first))
+    groups = [iter(rows)]
+    if by_case:
+        size = _LARGEST
+        groups = [iter(list(group)) for _, group in groupby(rows, key=lambda row: (row.problem, row.case))]
+    return list(enumerate((batch for taken in groups for batch in _take(taken, size)), first))
 
 
-def _do(grid: _Grid, batch: tuple[int, list[RunRow]]) -> list[RunRow]:
+def _take(rows: Iterator[RunRow], size: int) -> Iterator[list[RunRow]]:
+    """Yield the rows, `size` at a time."""
+    return iter(lambda: list(islice(rows, size)), [])
+
+
+def _do(
+    grid: _Grid, batch: tuple[int, list[RunRow]], *, on_end: Callable[[RunRow], None] | None = None
+) -> list[RunRow]:
     """Do the runs of a batch one after the other; those that a worker which died had finished are not run again.
 
-    Their lines go to the file of the batch's number.
+    Their lines go to the file of the batch's number. With `on_end`, which is called with each run that has ended, logs
+    wait until the last loop has ended, or loops and logs have taken `_HELD`.
     """
     number, rows = batch
+    due = time.monotonic() + (0.0 if on_end is None else _HELD)
     with Journal(grid.folder / ROWS / f"{number:06d}.jsonl") as journal:
         finished = [journal.rows[row.key] for row in rows if row.key in journal.rows]
         left, done = [row for row in rows if row.key not in journal.rows], None
+        waiting: list[tuple[RunRow, Run | None]] = []
         for row in left:
             died = journal.turn(done, row)
-            if died + 1 >= _DEATHS:
-                done = replace(row, failure=f"its worker process died {died} times")
-            else:
-                sent = grid.problems[f"{row.problem}:{row.case}"]
-                parts = _prepare(grid.name, sent, row.seed, grid.folder, grid.monitor)
-                logged = row.start < grid.log_starts
-                how = {"live": grid.live, "paced": grid.paced, "compiled": grid.compiled}
-                done = row_of_run(parts, row, grid.folder, logged=logged, **how)
-            finished.append(done)
+            done = None
+            waiting.append(_measure(grid, row, died))
+            if on_end is not None:
+                on_end(waiting[-1][0])
+            if row is not left[-1] and time.monotonic() < due:
+                continue
+            for ended, run in waiting:
+                if done is not None:
+                    journal.turn(done, None)
+                done = _log(grid, ended, run)
+                finished.append(done)
+            waiting.clear()
         journal.turn(done, None)
     return finished
+
+
+def _measure(grid: _Grid, row: RunRow, died: int) -> tuple[RunRow, Run | None]:
+    """Return the row with its figures, and its run, None where it raised or its worker `died` too often."""
+    if died + 1 >= _DEATHS:
+        return replace(row, failure=f"its worker process died {died} times"), None
+    how = {"live": grid.live, "paced": grid.paced, "compiled": grid.compiled}
+    return measure_run(_parts_of(grid, row), row, grid.folder, logged=row.start < grid.log_starts, **how)
+
+
+def _log(grid: _Grid, row: RunRow, run: Run | None) -> RunRow:
+    """Return the row of a run that has ended, with its log where it has one."""
+    if run is None:
+        return row
+    return log_run(_parts_of(grid, row), row, run, grid.folder, logged=row.start < grid.log_starts)
+
+
+def _parts_of(grid: _Grid, row: RunRow) -> Prepared:
+    sent = grid.problems[f"{row.problem}:{row.case}"]
+    return _prepare(grid.name, sent, row.seed, grid.folder, grid.monitor)
 
 
 def _in_order(rows: Sequence[RunRow], done: dict[tuple[Any, ...], RunRow]) -> list[RunRow]:

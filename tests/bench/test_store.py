@@ -86,8 +86,8 @@ def test_what_is_finished_is_not_run_again(problem, whole, tmp_path, monkeypatch
 
     from koopmpc.bench import sweep as room
 
-    original = room.row_of_run
-    monkeypatch.setattr("koopmpc.bench.sweep.row_of_run", counted)
+    original = room.measure_run
+    monkeypatch.setattr("koopmpc.bench.sweep.measure_run", counted)
     with pytest.raises(KeyboardInterrupt):
         km.sweep([problem], TWO, folder=tmp_path, **GRID)
     assert pq.read_table(tmp_path / "results.parquet").num_rows <= 20 == len(km.bench.load_rows(tmp_path))

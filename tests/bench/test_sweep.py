@@ -128,6 +128,21 @@ def test_the_runs_of_a_case_are_shown_when_its_last_one_is_finished(tmp_path):
     assert shown[2:] == [(4, cases[0]), (4, cases[1])]
 
 
+@pytest.mark.parametrize(("held", "there"), [(60.0, [0, 2]), (0.0, [1, 3])])
+def test_the_table_of_a_case_waits_for_no_log_but_where_loops_are_slow(tmp_path, monkeypatch, held, there):
+    monkeypatch.setattr("koopmpc.bench.sweep._HELD", held)
+    problem, logs = km.load_problem(write(tmp_path)), []
+    rows = km.sweep(
+        [problem],
+        ["lqr", "koopman-mpc"],
+        folder=tmp_path / "logs",
+        on_case=lambda runs: logs.append(len(list((tmp_path / "logs").glob("*.rrd")))),
+    )
+    assert logs == there
+    assert all(row.failure is None and km.load_run(row.log).steps == problem.cases[row.case].steps for row in rows)
+    assert [row.log for row in km.bench.load_rows(tmp_path / "logs")] == [row.log for row in rows]
+
+
 def test_the_truth_may_be_another_plant(swept):
     problem, *_ = swept
     heavier = type(problem.dynamics)
