@@ -51,15 +51,16 @@ def page(path: Path, *, pictures: bool = True) -> Page:
     made.parts.append(f"*`koopmpc run {name}:{case} -c {best}`*")
     made.text("## The plant")
     made.code((type(problem.dynamics).__doc__ or "").strip())
-    made.text(f"States: {_listed(problem.dynamics.states)}. Inputs: {_listed(problem.dynamics.inputs)}.")
+    told = f" Measured disturbances: {_listed(problem.dynamics.disturbances)}." if problem.dynamics.nw else ""
+    made.text(f"States: {_listed(problem.dynamics.states)}. Inputs: {_listed(problem.dynamics.inputs)}.{told}")
     rows = parameters(problem.dynamics, source)
     if rows:
         made.table(("parameter", "value", "meaning"), rows)
-    x, u = problem.equilibrium
+    rest = ", ".join(f"{name} = {_vector(at)}" for name, at in zip("xuw", problem.equilibrium, strict=False))
     second = find_time_unit(problem)
     made.text(
         f"""Sampled every {problem.dt:g} {second} by {type(problem.integrator).__name__}. Linear controllers linearise
-        at x = {_vector(x)}, u = {_vector(u)}. Limits: {limits(problem, problem.limits)}."""
+        at {rest}. Limits: {limits(problem, problem.limits)}."""
     )
     training, cost, ahead = problem.training, problem.cost, problem.horizon
     lasts = training.episodes * training.steps * problem.dt

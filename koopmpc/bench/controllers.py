@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -121,7 +121,7 @@ class Prepared:
 
     @cached_property
     def local_model(self) -> LinearPredictor:
-        """The problem's equations, linearised at the equilibrium."""
+        """The problem's equations, linearised at the equilibrium: x⁺ ≈ A x + B u + E w + c."""
         return LinearPredictor.local(self.step_map, *self.problem.equilibrium)
 
     @cached_property
@@ -203,11 +203,18 @@ class Prepared:
         if problem.cost.u_target == "zero":
             return np.zeros((steps, plant.nu))
         seen = state_tracking(plant.states, plant.inputs, problem.cost, problem.limits_of(case))
-        equilibria = Equilibria(learned_map(plant), problem.cost, seen)
-        rows = np.broadcast_to(np.asarray(problem.cases[case].reference), (steps + 1, len(seen.Q)))
-        distinct, of = np.unique(rows[:steps], axis=0, return_inverse=True)
-        held = [equilibria.find(row) or equilibria.guess(row) for row in distinct]
-        return np.array([each.u for each in held])[of.ravel()]
+        rows = np.broadcast_to(np.asarray(problem.cases[case].reference), (steps + 1, len(seen.Q)))[:steps]
+        W = problem.measured_of(case) if plant.nw else None
+        W = np.empty((steps, 0)) if W is None else W
+
+        @cache
+        def search(*w: float) -> Equilibria:
+            return Equilibria(learned_map(plant.at(w) if w else plant), problem.cost, seen)
+
+        distinct, of = np.unique(np.hstack([W, rows]), axis=0, return_inverse=True)
+        held = [(search(*each[: plant.nw]), each[plant.nw :]) for each in distinct]
+        inputs = [(equilibria.find(row) or equilibria.guess(row)).u for equilibria, row in held]
+        return np.array(inputs)[of.ravel()]
 
     @cached_property
     def data(self) -> Episodes:
@@ -220,11 +227,12 @@ class Prepared:
             episodes=training.episodes,
             steps=training.steps,
             rng=training.seed + self.seed,
+            measured=training.measured,
         )
 
     @cached_property
     def model(self) -> LinearPredictor:
-        """z⁺ = A z + B u fitted to the data; `training_time` [s] is how long data and fit took."""
+        """z⁺ = A z + B u + E w fitted to the data; `training_time` [s] is how long data and fit took."""
         if (file := self._file("-linear.npz")) is not None:
             self.training_time = self._numbers.get("training_time", 0.0)
             return cast("LinearPredictor", load_model(file))
@@ -260,10 +268,11 @@ class Prepared:
 
     @cached_property
     def bilinear(self) -> BilinearPredictor:
-        """z⁺ = A z + B u + Σ uᵢ Nᵢ z fitted to the same data with the same lifting."""
+        """z⁺ = A z + B u + Σ uᵢ Nᵢ z, with every product of w, fitted to the same data with the same lifting."""
         if (file := self._file("-bilinear.npz")) is not None:
             return cast("BilinearPredictor", load_model(file))
-        return bilinear_edmd(self.data, self.problem.lifting, ridge=self.problem.ridge, difference=True)
+        own: dict[str, Any] = {"scheduled_inputs": True} if self.data.nw else {}  # w changes B, too
+        return bilinear_edmd(self.data, self.problem.lifting, ridge=self.problem.ridge, difference=True, **own)
 
     def load_design(self, limits: Limits) -> Any:
         """Return the designed controller for these limits that `save_models` wrote; None where it did not."""

@@ -20,7 +20,7 @@ from koopmpc.checks import nearest
 from koopmpc.control.cost import Cost, check_cost_and_limits
 from koopmpc.control.limits import Limits
 from koopmpc.data.collect import InputFunction, Uniform
-from koopmpc.data.excitation import Excitation
+from koopmpc.data.excitation import Excitation, OpenLoop
 from koopmpc.errors import DataError, KoopmpcError, ProblemError, ShapeError
 from koopmpc.lifting.base import Lifting
 from koopmpc.loop.faults import Fault
@@ -49,6 +49,9 @@ class Training:
         Number of episodes, and number of steps in each.
     seed
         Seed of the random numbers.
+    measured
+        w of a plant with measured disturbances: an excitation without feedback, (nw,), (steps, nw), or
+        (episodes, steps, nw).
 
     Raises
     ------
@@ -61,6 +64,7 @@ class Training:
     episodes: int
     steps: int
     seed: int = 0
+    measured: OpenLoop | ArrayLike | None = None
 
     def __post_init__(self) -> None:
         checks.count(self.episodes, "Training.episodes")
@@ -88,11 +92,14 @@ class Case:
         Standard deviations (ny,) of the white noise that controllers measure in this case; the data are without.
     faults
         What is broken in this case, for example ``[km.faults.ActuatorDelay(1)]``, an input that comes a step late.
+    measured
+        w of a plant with measured disturbances, (nw,) held throughout or (steps, nw): they move the plant, and
+        controllers get those of their horizon.
 
     Raises
     ------
     DataError, ShapeError
-        x0 or the reference holds NaN, x0 is no vector, or there is no step.
+        x0, the reference or w holds NaN, x0 is no vector, or there is no step.
     """
 
     x0: ArrayLike
@@ -102,11 +109,14 @@ class Case:
     plant: Dynamics | StepMap | Plant | None = None
     noise: ArrayLike | None = None
     faults: Sequence[Fault] = ()
+    measured: ArrayLike | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "x0", checks.array(self.x0, "Case.x0", (None,)))
         object.__setattr__(self, "reference", checks.array(self.reference, "Case.reference"))
         checks.count(self.steps, "Case.steps")
+        if self.measured is not None:
+            object.__setattr__(self, "measured", np.atleast_1d(checks.array(self.measured, "Case.measured")))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -120,7 +130,7 @@ class Problem:
     dt
         Sampling time [s].
     equilibrium
-        (x, u) where linear controllers linearise.
+        (x, u) where linear controllers linearise; (x, u, w) of a plant with measured disturbances.
     training
         Which data the Koopman model learns from.
     lifting, ridge
@@ -148,8 +158,8 @@ class Problem:
     Raises
     ------
     ShapeError, DataError
-        An initial state, a reference, the equilibrium, an angle, the cost or the limits do not fit; there is no case,
-        or the name of one cannot be that of a file.
+        An initial state, a reference, the equilibrium, an angle, the cost, the limits or the measured disturbances do
+        not fit; there is no case, or the name of one cannot be that of a file.
 
     Warns
     -----
@@ -159,7 +169,7 @@ class Problem:
 
     dynamics: Dynamics
     dt: float
-    equilibrium: tuple[ArrayLike, ArrayLike]
+    equilibrium: tuple[ArrayLike, ArrayLike] | tuple[ArrayLike, ArrayLike, ArrayLike]
     training: Training
     lifting: Lifting
     cost: Cost
@@ -178,13 +188,15 @@ class Problem:
 
     def __post_init__(self) -> None:
         checks.members(self.dynamics, "dynamics", ("nx", "nu", "states", "inputs"), "pass Dynamics of yours")
-        nx, nu = self.dynamics.nx, self.dynamics.nu
-        checks.kind(self.equilibrium, "equilibrium", (tuple, list), "pass (x, u) of a resting plant")
-        if len(self.equilibrium) != 2:
-            raise ShapeError(f"equilibrium has {len(self.equilibrium)} parts; pass (x, u) of a resting plant")
-        x, u = self.equilibrium
+        nx, nu, nw = self.dynamics.nx, self.dynamics.nu, self.dynamics.nw
+        parts = "(x, u, w)" if nw else "(x, u)"
+        checks.kind(self.equilibrium, "equilibrium", (tuple, list), f"pass {parts} of a resting plant")
+        if len(self.equilibrium) != (3 if nw else 2):
+            raise ShapeError(f"equilibrium has {len(self.equilibrium)} parts; pass {parts} of a resting plant")
+        x, u, *w = self.equilibrium
         point = checks.array(x, "equilibrium x", (nx,)), checks.vector(u, "equilibrium u", nu)
-        object.__setattr__(self, "equilibrium", point)
+        rest = point + tuple(checks.vector(each, "equilibrium w", nw) for each in w)
+        object.__setattr__(self, "equilibrium", rest)
         object.__setattr__(self, "dt", checks.positive(self.dt, "dt", "s"))
         checks.count(self.horizon, "horizon")
         if self.ridge < 0:
@@ -214,14 +226,19 @@ class Problem:
                 )
             if case.limits is not None:
                 _fits(case.limits, self.dynamics, f"case {name!r}: limits")
+            _check_measured(case.measured, self.dynamics, case.steps, f"case {name!r}")
+        if bool(nw) == (self.training.measured is None):  # `collect` checks the shape
+            _check_measured(self.training.measured, self.dynamics, self.training.steps, "training")
         wrong = [i for i in self.angles if not 0 <= i < nx]
         if wrong:
             raise DataError(f"angles holds {wrong[0]}; pass indices of states, 0 to {nx - 1}")
-        self._check_rest(*point)
+        self._check_rest(*rest)
 
-    def _check_rest(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> None:
+    def _check_rest(
+        self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"] | None = None
+    ) -> None:
         """Warn where the plant does not rest at the equilibrium: a state moves by 1 % of 1 + |x| in one step."""
-        moved = discretize(self.dynamics, self.dt, Euler())(x, u) - x
+        moved = discretize(self.dynamics, self.dt, Euler())(x, u, w) - x
         if not (np.abs(moved) <= _REST * (1 + np.abs(x))).all():
             i = int(np.argmax(np.abs(moved) / (1 + np.abs(x))))
             warnings.warn(
@@ -256,6 +273,11 @@ class Problem:
         own = self.cases[case].limits
         return self.limits if own is None else own.resolve(self.dynamics.states, self.dynamics.inputs)
 
+    def measured_of(self, case: str) -> Float[np.ndarray, "T nw"] | None:
+        """Return the measured disturbances of a case, a row a step; None where the plant has none."""
+        own = self.cases[case]
+        return None if own.measured is None else np.broadcast_to(own.measured, (own.steps, self.dynamics.nw))
+
 
 def _fits(limits: Limits, dynamics: Dynamics, what: str) -> None:
     """Raise a ShapeError where limits have other sizes than the inputs, states and observables that they limit."""
@@ -266,6 +288,18 @@ def _fits(limits: Limits, dynamics: Dynamics, what: str) -> None:
         limits.find_rows(dynamics.nx, 0 if limits.of is None else limits.of.bind(dynamics.states).nz)
     except KoopmpcError as error:
         raise ShapeError(f"{what}: {error}") from error
+
+
+def _check_measured(measured: OpenLoop | ArrayLike | None, dynamics: Dynamics, steps: int, what: str) -> None:
+    """Raise where measured disturbances are missing, are not those of the plant, or have another shape."""
+    nw, names = dynamics.nw, ", ".join(dynamics.disturbances)
+    if nw and measured is None:
+        raise DataError(f"{what}: the plant has measured disturbances ({names}); pass measured=, a row a step")
+    if not nw and measured is not None:
+        raise DataError(f"{what}: measured is given, but the dynamics name no disturbances; name them, or leave it out")
+    if nw and np.shape(measured) not in ((nw,), (steps, nw)):
+        expected = f"({nw},) or (steps, nw) = ({steps}, {nw}): a column for {names}"
+        raise ShapeError(f"{what}: measured has shape {np.shape(measured)}, expected {expected}")
 
 
 class Entry(NamedTuple):

@@ -7,14 +7,16 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from koopmpc import disk
 from koopmpc.bench.controllers import Prepared, is_learned
-from koopmpc.bench.problem import Case, Problem, load_problem
+from koopmpc.bench.problem import Problem, load_problem
 from koopmpc.bench.store import RunRow, reached
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.codegen.compiled import compiled as built
@@ -32,7 +34,7 @@ from koopmpc.loop.faults import (
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.realtime import in_real_time
 from koopmpc.loop.run import MOVE_COLUMNS, SECONDS, Run, columns_of_moves
-from koopmpc.loop.simulate import StepObserver, predictor_of, simulate
+from koopmpc.loop.simulate import StepObserver, count_disturbances, predictor_of, simulate
 from koopmpc.plants.step_map import StepMap
 from koopmpc.recording.reader import load_run
 from koopmpc.recording.recorder import Recorder
@@ -166,7 +168,7 @@ def run_closed_loop(
     in_c = {"compiled": isinstance(controller, Compiled)} if compiled else {}
     monitored = {"monitor": True} if parts.monitor_data is not None else {}
     injected = () if row.fault is None else (FAULTS[row.fault],)
-    _warm_up(controller, parts, case)
+    _warm_up(controller, parts, row.case)
     about: dict[str, Any] = {
         "cost": problem.cost,
         "limits": problem.limits_of(row.case),
@@ -188,6 +190,7 @@ def run_closed_loop(
             steps=case.steps,
             u_reference=held,
             noise=noise,
+            measured=problem.measured_of(row.case),
             faults=(*case.faults, *injected),
             rng=row.start,
             observers=(*observers, *pace),
@@ -203,16 +206,25 @@ def run_closed_loop(
         return simulate_with(viewer)
 
 
-def _warm_up(controller: Controller, parts: Prepared, case: Case) -> None:
+def _warm_up(controller: Controller, parts: Prepared, name: str) -> None:
     """Call the controller twice and reset it, so that measured step times leave out the cost of first calls."""
+    case, told = parts.problem.cases[name], _tell(controller, parts.problem.measured_of(name), 0)
     y = parts.step_map.measure(case.x0)
     reference = np.atleast_1d(np.asarray(case.reference))
     row = reference if reference.ndim == 1 else reference[0]
     ahead = np.tile(row, (controller.horizon + 1, 1))
     controller.reset(case.x0)
     for _ in range(2):
-        controller(y, ahead)
+        controller(y, ahead, **told)
     controller.reset(case.x0)
+
+
+def _tell(controller: Controller, W: ArrayLike | None, k: int) -> dict[str, Any]:
+    """Return w of a call at step k, the last row of W repeated; nothing where the controller's model has none."""
+    if W is None or count_disturbances(controller) == 0:
+        return {}
+    rows = np.asarray(W)
+    return {"w": rows[np.minimum(np.arange(k, k + max(controller.horizon, 1)), len(rows) - 1)]}
 
 
 def _cold(controller: Controller, run: Run) -> tuple[float, float]:
@@ -221,8 +233,9 @@ def _cold(controller: Controller, run: Run) -> tuple[float, float]:
     controller.reset(run.X[0] if np.isfinite(run.X[0]).all() else None)
     for k in range(min(run.steps, _COLD_STEPS)):
         time.sleep(_SLEEP)
+        told = _tell(controller, run.metadata.get("measured"), k)
         begin = time.perf_counter()
-        controller(run.Y[k], run.reference[k : k + controller.horizon + 1], run.U[k - 1] if k else None)
+        controller(run.Y[k], run.reference[k : k + controller.horizon + 1], run.U[k - 1] if k else None, **told)
         times.append(time.perf_counter() - begin)
     p50, p99 = np.quantile(times, [0.5, 0.99])
     return float(p50), float(p99)
@@ -313,22 +326,24 @@ def _again(logged: Run, plant: StepMap | None, controller: Controller | None, lo
     if "faults" in logged.metadata:
         faults = ", ".join(logged.metadata["faults"])
         raise LogError(f"{log} is of a run with faults, {faults}: they cannot be made again from it")
-    X, U, moves = logged.X, logged.U, dict[str, Any]()
+    X, U, W, moves = logged.X, logged.U, logged.metadata.get("measured"), dict[str, Any]()
     if plant is not None:
         if np.isnan(X).any():
             raise LogError(f"{log} does not hold the states of its plant: pass the controller alone")
-        X = np.vstack([X[:1], *(plant(x, u)[None] for x, u in zip(X, U, strict=False))])
+        if plant.nw and W is None:
+            raise LogError(f"{log} does not hold what disturbed its plant: pass the controller alone")
+        w = W if plant.nw else repeat(None)
+        X = np.vstack([X[:1], *(plant(*each)[None] for each in zip(X, U, w, strict=False))])
     if controller is not None:
-        N, W = controller.horizon, logged.metadata.get("measured")
+        N = controller.horizon
         rows = np.vstack([logged.reference, np.repeat(logged.reference[-1:], N, axis=0)])
-        w = None if W is None else np.vstack([W, np.repeat(W[-1:], N, axis=0)])
         controller.reset(None if np.isnan(X[0]).any() else X[0])
         made = [
             controller(
                 logged.Y[k],
                 rows[k : k + N + 1],
                 U[k - 1] if k else None,
-                **({} if w is None else {"w": w[k : k + max(N, 1)]}),
+                **_tell(controller, W, k),
             )
             for k in range(logged.steps)
         ]

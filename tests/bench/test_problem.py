@@ -76,6 +76,42 @@ def test_every_form_of_a_reference_that_simulate_takes_fits(problem, reference):
     assert replace(problem, cases={"good": km.Case([1.0], reference, 3)}).cases.keys() == {"good"}
 
 
+@pytest.mark.parametrize(
+    ("change", "error", "text"),
+    [
+        ({"equilibrium": ([21.0, 25.0], [1.0])}, km.errors.ShapeError, r"has 2 parts; pass \(x, u, w\)"),
+        ({"equilibrium": ([21.0, 25.0], [1.0], [2.0, 3.0])}, km.errors.ShapeError, r"equilibrium w has shape \(2,\)"),
+        (
+            {"cases": {"bad": km.Case([20.0, 20.0], [21.0], 3)}},
+            km.errors.DataError,
+            r"case 'bad': the plant has measured disturbances \(outside \[°C\]\); pass measured=, a row a step",
+        ),
+        (
+            {"cases": {"bad": km.Case([20.0, 20.0], [21.0], 3, measured=[[1.0]] * 4)}},
+            km.errors.ShapeError,
+            r"case 'bad': measured has shape \(4, 1\), expected \(1,\) or \(steps, nw\) = \(3, 1\): a column for outside",
+        ),
+        (
+            {"training": km.Training([20.0, 20.0], km.Noise(0, 4), episodes=2, steps=3)},
+            km.errors.DataError,
+            r"training: the plant has measured disturbances",
+        ),
+    ],
+)
+def test_measured_disturbances_that_do_not_fit_are_refused(change, error, text):
+    with pytest.raises(error, match=text):
+        replace(km.load_problem("heat_pump"), **change)
+
+
+def test_a_plant_without_disturbances_refuses_their_values(problem):
+    with pytest.raises(km.errors.DataError, match=r"case 'bad': measured is given, but the dynamics name no dist"):
+        replace(problem, cases={"bad": km.Case([1.0], [0.0], 3, measured=[1.0])})
+    with pytest.raises(km.errors.DataError, match=r"training: measured is given, but the dynamics name no dist"):
+        replace(problem, training=replace(problem.training, measured=[1.0]))
+    with pytest.raises(km.errors.DataError, match=r"Case\.measured holds 1 NaN"):
+        km.Case([1.0], [0.0], 3, measured=[float("nan")])
+
+
 def test_a_case_needs_steps_and_numbers():
     with pytest.raises(km.errors.DataError, match=r"Case\.steps is 0; it must be at least 1"):
         km.Case([0.0], [0.0], 0)

@@ -85,7 +85,7 @@ def test_each_controller_runs_on_each_problem_and_keeps_its_hard_limits(path: Pa
             continue
         limits = problem.limits_of(name)
         low, high = limits.inputs(problem.dynamics.nu)
-        reference = np.asarray(case.reference)
+        reference, W = np.asarray(case.reference), problem.measured_of(name)
         all_of_them = ("lqr", "linear-mpc") if large else controller_names(problem.controllers)
         if not every and not large:
             all_of_them = [each for i, each in enumerate(all_of_them) if (i + sorted(FILES).index(path.stem)) % 3 == 0]
@@ -103,6 +103,7 @@ def test_each_controller_runs_on_each_problem_and_keeps_its_hard_limits(path: Pa
                 limits=limits,
                 noise=case.noise,
                 faults=case.faults,
+                measured=None if W is None else W[:STEPS],
             )
             assert np.isfinite(run.U).all(), (name, controller)
             assert np.array_equal(np.clip(run.U, low, high), run.U), (name, controller)
@@ -131,8 +132,8 @@ def test_each_problem_says_where_it_is_from_and_rests_where_it_says(path: Path):
     parts = few(path)
     problem = parts.problem
     assert problem.title.count(":") == 1
-    x, u = (np.asarray(part) for part in problem.equilibrium)
-    x_next = parts.step_map(x, u)
+    x, *driving = (np.asarray(part) for part in problem.equilibrium)
+    x_next = parts.step_map(x, *driving)
     np.testing.assert_allclose(x_next, x, atol=1e-3 * (1 + np.abs(x).max()))
 
 
@@ -146,6 +147,39 @@ def test_a_case_has_noise_and_broken_parts_of_its_own(tmp_path: Path):
     np.testing.assert_array_equal(plain.Y, plain.X)
     assert (run.Y != run.X).all()
     np.testing.assert_allclose(run.X[1], Prepared(problem).step_map(run.X[0], [0.0]))  # nothing has come through yet
+
+
+def test_a_problem_with_measured_disturbances_is_learned_told_recorded_and_replayed(tmp_path: Path):
+    problem = km.load_problem("heat_pump:front")
+    case = problem.cases["front"]
+    forecast = replace(case, steps=20, measured=np.repeat([[2.0], [-8.0]], 10, axis=0))
+    cases = {"front": forecast, "still": replace(case, steps=20, measured=[2.0])}
+    parts = Prepared(replace(problem, training=replace(problem.training, episodes=8), cases=cases))
+    assert parts.model.nw == parts.bilinear.nw == parts.local_model.nw == 1
+    assert parts.bilinear.is_scheduled
+    runs = {}
+    for name in cases:
+        row = RunRow("heat_pump", name, "linear-mpc", x0=tuple(case.x0))
+        runs[name] = run_closed_loop(parts, row, plans=False)
+    assert np.array_equal(runs["front"].metadata["measured"], forecast.measured)
+    assert runs["front"].U[8] > runs["still"].U[8] + 0.01  # the cold is known before it comes
+    km.record(runs["front"], tmp_path / "run.rrd")
+    mpc = parts.controller("linear-mpc", "front")
+    again = km.bench.replayed(tmp_path / "run.rrd", plant=parts.step_map, controller=mpc)
+    assert again.differences == ()
+
+
+def test_inputs_that_hold_a_reference_are_those_under_the_weather_of_each_step():
+    problem = km.load_problem("heat_pump:cold")
+    problem = replace(problem, cost=replace(problem.cost, u_target="equilibrium"))
+    weather = np.repeat([[-5.0], [10.0]], 3, axis=0)
+    case = replace(problem.cases["cold"], steps=6, measured=weather)
+    parts = Prepared(replace(problem, cases={"cold": case}))
+    held = parts.u_reference("cold")
+    for u, w in zip(held, weather, strict=True):
+        x = [21.0, 21.0 + 0.25 * (21.0 - w[0])]  # the floor warms the room as much as the walls lose
+        np.testing.assert_allclose(parts.step_map(x, u, w), x, atol=1e-6)
+    assert held[0, 0] > 2 * held[-1, 0]
 
 
 def _row(problem: km.Problem, case: str, controller: str, cost: float, share: float = 0.0) -> RunRow:

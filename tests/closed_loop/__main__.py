@@ -6,14 +6,14 @@ import time
 
 from tests.closed_loop.controllers import CONTROLLERS, DESIGNED
 from tests.closed_loop.judge import SEEDS, Table, measure
-from tests.closed_loop.more_tasks import ALL
+from tests.closed_loop.more_tasks import JUDGED
 from tests.closed_loop.table import FIRST, STORED, losses, saved, stored, text
 from tests.closed_loop.tasks import TASKS
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.closed_loop", description=__doc__)
-    parser.add_argument("--tasks", nargs="+", choices=ALL, default=list(TASKS))
+    parser.add_argument("--tasks", nargs="+", choices=JUDGED, default=list(TASKS))
     parser.add_argument("--controllers", nargs="+", choices=[*CONTROLLERS, *DESIGNED], default=list(CONTROLLERS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--quick", action="store_true", help="one training seed")
@@ -30,7 +30,7 @@ def main() -> int:
     def progress(number: int, of: int, table: Table) -> None:
         sys.stderr.write(f"{number} of {of} after {time.perf_counter() - start:.0f} s\n")
         if asked.write and asked.u_target is None:  # what is measured is kept, even if the rest never is
-            both = {task: kept.get(task, {}) | table.get(task, {}) for task in ALL if task in kept or task in table}
+            both = {task: kept.get(task, {}) | table.get(task, {}) for task in JUDGED if task in kept or task in table}
             saved(both, STORED)
 
     table = measure(asked.tasks, asked.controllers, seeds, asked.u_target, asked.workers, progress)

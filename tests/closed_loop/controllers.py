@@ -95,7 +95,8 @@ def _lqr(p: Parts) -> Any:
 
 
 def _linear_mpc(p: Parts) -> Any:
-    return km.LinearMPC(p.equations, *p.task.around, p.cost(), p.task.limits, p.task.horizon)
+    x, u, *w = p.task.around
+    return km.LinearMPC(p.equations, x, u, p.cost(), p.task.limits, p.task.horizon, w=w[0] if w else None)
 
 
 def _nonlinear_mpc(p: Parts) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 
 import koopmpc as km
 from tests.closed_loop.controllers import CONTROLLERS, DESIGNED, GIVEN, NotApplicableError, Parts
-from tests.closed_loop.more_tasks import ALL
+from tests.closed_loop.more_tasks import JUDGED
 from tests.closed_loop.optimum import boxes, held, optimum, weights
 from tests.closed_loop.tasks import Task, UTarget
 
@@ -110,6 +110,7 @@ def judged(parts: Parts, name: str, start: int, u_target: UTarget | None = None)
                 cost=km.Cost(Q=task.Q, R=task.R, of=task.of),
                 limits=task.limits,
                 u_reference=held(task.name, u_target),
+                measured=task.weather,
                 observers=(watch,),
             )
         ratio = km.metrics(run).cost / best.cost
@@ -195,7 +196,7 @@ def worst(rows: Iterable[Row]) -> Row:
 
 def one(task: str, seed: int, names: Sequence[str], u_target: UTarget | None = None) -> dict[str, Row]:
     """Return the rows of one task and training seed, each the worst of the task's starts."""
-    parts = Parts(ALL[task], seed, u_target)
+    parts = Parts(JUDGED[task], seed, u_target)
     starts = range(len(parts.task.starts))
     return {name: worst(judged(parts, name, start, u_target) for start in starts) for name in names}
 

@@ -151,33 +151,3 @@ class BlindFunnel(Funnel):
     def measure(self, x: ca.SX) -> ca.SX:
         """Return the lower level."""
         return x[1]
-
-
-@dataclass(frozen=True)
-class HeatPump(km.Dynamics):
-    """A house of two heat capacities, and a heat pump that the cold outside, which is measured, makes worse.
-
-    The heat that a kW of the compressor makes is the regression of Staffell et al. on the lift from the outside air to
-    the floor's water, of 15 to 60 K, "A review of domestic heat pumps", Energy Environ. Sci. 5, 2012, with the figures
-    that PyPSA-Eur quotes of it (scripts/build_cop_profiles.py); the sizes are ours.
-    """
-
-    states = ("room [°C]", "floor [°C]")
-    inputs = ("compressor [kW]",)
-    disturbances = ("outside [°C]",)
-
-    room: float = 2.0  # heat capacities of the room, and of the floor with its water [kWh/K]
-    floor: float = 8.0
-    inside: float = 1.0  # conductances from the floor to the room, and from the room to the outside [kW/K]
-    walls: float = 0.25
-    approach: float = 5.0  # the water is warmer than the floor by this [K]
-
-    def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
-        """ẋ = [heat of the room, heat of the floor] / capacity; time in hours."""
-        compressor, outside = u[0], u[1]
-        lift = x[1] + self.approach - outside
-        performance = 6.81 - 0.121 * lift + 0.000630 * lift**2
-        flow = self.inside * (x[1] - x[0])
-        return ca.vertcat(
-            (flow + self.walls * (outside - x[0])) / self.room, (performance * compressor - flow) / self.floor
-        )

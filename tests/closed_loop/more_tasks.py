@@ -1,4 +1,7 @@
-"""Twelve more tasks, each made after a cause for which a design once failed on a plant that nobody had tuned for."""
+"""Twelve more tasks, each made after a cause for which a design once failed on a plant that nobody had tuned for.
+
+A thirteenth has a measured disturbance.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -292,5 +295,27 @@ _MORE = (
     ),
 )
 
+_HEAT_PUMP = km.load_problem("heat_pump")
+
+_WEATHER = Task(
+    name="weather",  # a room is warm by day and cool at night; the temperature outside is measured and forecast
+    truth=_HEAT_PUMP.dynamics,
+    dt=_HEAT_PUMP.dt,
+    around=([21.0, 25.75], [1.2331], [2.0]),
+    training=_HEAT_PUMP.training,
+    Q=[1.0],
+    R=[0.02],
+    limits=_HEAT_PUMP.limits,
+    horizon=_HEAT_PUMP.horizon,
+    tracked=["room [°C]"],
+    reference=np.asarray(_HEAT_PUMP.cases["track"].reference)[:145],
+    starts=[[17.0, 18.0], [22.0, 27.0]],
+    steps=144,
+    u_target="zero",
+    noise=1e-3,
+    weather=_HEAT_PUMP.measured_of("track")[:144],
+)
+
 MORE = {task.name: task for task in _MORE}
 ALL = TASKS | MORE
+JUDGED = ALL | {_WEATHER.name: _WEATHER}

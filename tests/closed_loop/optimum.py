@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 import koopmpc as km
-from tests.closed_loop.more_tasks import ALL
+from tests.closed_loop.more_tasks import JUDGED
 from tests.closed_loop.tasks import Task, UTarget
 
 QUIET = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "ipopt.max_iter": 1500}
@@ -52,7 +52,7 @@ def held(name: str, u_target: UTarget | None = None) -> np.ndarray:
 
     They minimise ‖of(x) − r‖²_Q over the equilibria x = F(x, u) inside the limits.
     """
-    task = ALL[name].but(u_target)
+    task = JUDGED[name].but(u_target)
     plant = task.plant
     if task.u_target == "zero":
         return np.zeros((task.steps, plant.nu))
@@ -93,11 +93,10 @@ def optimum(name: str, start: int, u_target: UTarget | None = None) -> Optimum:
 
     The sum is the one of `km.metrics`: Σ_{k=1}^{T} ‖of(x_k) − r_k‖²_Q + Σ_{k=0}^{T−1} ‖u_k − u_r‖²_R.
     """
-    task = ALL[name].but(u_target)
+    task = JUDGED[name].but(u_target)
     x0, u_ref = np.array(task.starts[start]), held(name, u_target)
-    best = find_best(
-        task.plant, x0, weights(task), (task.rows[1:], u_ref), boxes(task), sizes(task), _starts(task, x0, u_ref)
-    )
+    given = weights(task), (task.rows[1:], u_ref), boxes(task), sizes(task), _starts(task, x0, u_ref)
+    best = find_best(task.plant, x0, *given, W=task.weather)
     if best is None:
         raise RuntimeError(f"{name}: no start of the optimal-control problem converged; is the task feasible?")
     return best
@@ -112,16 +111,19 @@ def find_best(
     sizes: tuple[np.ndarray, np.ndarray],
     guesses: Iterable[tuple[np.ndarray, np.ndarray]],
     settings: dict = QUIET,
+    W: np.ndarray | None = None,
 ) -> Optimum | None:
     """Return the best way from x0 that Ipopt finds from the guesses (X, U), None where none converges.
 
-    `references` are (T, nr) rows of the tracked states and (T, nu) inputs from which the cost counts.
+    `references` are (T, nr) rows of the tracked states and (T, nu) inputs from which the cost counts. W are the (T, nw)
+    measured disturbances of a plant that has some.
     """
     (Q, R, tracked), (rows, u_ref), (size, u_size), (low, high, u_low, u_high) = weights, references, sizes, boxes
     T = len(u_ref)
     X, U = ca.MX.sym("X", plant.nx, T), ca.MX.sym("U", plant.nu, T)
     before = ca.horzcat(ca.DM(x0), X[:, :-1] * size)  # in the plant's units
-    defects = (plant.F.map(T)(before, U * u_size) - X * size) / size
+    driven = plant.F.map(T)(before, U * u_size, *(() if W is None else (W.T,)))
+    defects = (driven - X * size) / size
     error, moved = (X * size)[tracked, :] - rows.T, U * u_size - u_ref.T
     cost = ca.sum1(ca.sum2(error * (Q @ error))) + ca.sum1(ca.sum2(moved * (R @ moved)))
     variables = ca.vertcat(ca.vec(X), ca.vec(U))

@@ -22,7 +22,7 @@ class Task:
         The plant that is driven, whose optimum is the measure; the one that the training data and the equations are
         of, None where it is the same.
     around
-        (x, u) at which LQR and LinearMPC linearise the model.
+        (x, u), or (x, u, w), at which LQR and LinearMPC linearise the model.
     training
         Its seed is replaced by that of the run.
     Q, R
@@ -35,12 +35,14 @@ class Task:
         Which inputs cost nothing: those that hold the reference, or zero.
     noise
         Standard deviation of the training data's measurement noise, as a share of the range of the initial states.
+    weather
+        (steps, nw) measured disturbances of the runs; None for a plant without.
     """
 
     name: str
     truth: km.Dynamics
     dt: float
-    around: tuple[list[float], list[float]]
+    around: tuple[list[float], ...]
     training: km.Training
     Q: list[float]
     R: list[float]
@@ -54,6 +56,7 @@ class Task:
     tracked: list[str] | None = None
     u_target: UTarget = "equilibrium"
     noise: float = 0.0
+    weather: np.ndarray | None = None
 
     @cached_property
     def plant(self) -> km.StepMap:
@@ -83,12 +86,13 @@ class Task:
     def data(self, seed: int) -> km.Episodes:
         """Return the training data of one seed."""
         t = self.training
-        clean = km.collect(self.equations, t.x0, t.excitation, episodes=t.episodes, steps=t.steps, rng=seed)
+        asked = {"episodes": t.episodes, "steps": t.steps, "measured": t.measured}
+        clean = km.collect(self.equations, t.x0, t.excitation, rng=seed, **asked)
         rng, names = np.random.default_rng(seed), self.plant.states
         seen = [names.index(name) for name in clean.states]
         spread = self.noise * (np.asarray(t.x0.high) - np.asarray(t.x0.low))[seen]
-        noisy = [km.Episode(X=e.X + spread * rng.standard_normal(e.X.shape), U=e.U) for e in clean]
-        return km.Episodes(noisy, clean.dt, clean.states, clean.inputs)
+        noisy = [km.Episode(X=e.X + spread * rng.standard_normal(e.X.shape), U=e.U, W=e.W) for e in clean]
+        return km.Episodes(noisy, clean.dt, clean.states, clean.inputs, clean.disturbances)
 
     def but(self, u_target: UTarget | None) -> "Task":
         """Return the task with another u_target; itself for None."""

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from tests.closed_loop.more_plants import HeatPump
 
 pytestmark = pytest.mark.slow
 
@@ -25,7 +24,7 @@ def make_weather(seed: int, steps: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def plant():
-    return km.discretize(HeatPump(), DT)
+    return km.discretize(km.load_problem("heat_pump").dynamics, DT)
 
 
 @pytest.fixture(scope="module")

@@ -673,6 +673,8 @@ class LinearMPC(KoopmanMPC):
         The plant, x⁺ = F(x, u).
     x, u
         (nx,) and (nu,), the point of the linearisation; it need not be an equilibrium.
+    w
+        (nw,) the measured disturbances there, zero by default.
     cost, limits
         What to minimise, within what, in the plant's own coordinates.
     horizon
@@ -712,16 +714,18 @@ class LinearMPC(KoopmanMPC):
         cost: Cost,
         limits: Limits | None = None,
         horizon: int = 20,
+        *,
+        w: ArrayLike | None = None,
         **options: Any,
     ) -> None:
         checks.kind(step_map, "step_map", StepMap, "discretize the dynamics, or use KoopmanMPC for a predictor")
-        super().__init__(LinearPredictor.local(step_map, x, u), cost, limits, horizon, **options)
+        super().__init__(LinearPredictor.local(step_map, x, u, w), cost, limits, horizon, **options)
 
 
 def _build_linear_mpc(parts: Any, limits: Limits) -> LinearMPC:
     problem = parts.problem
-    x, u = problem.equilibrium
-    return LinearMPC(parts.step_map, x, u, problem.cost, limits, problem.horizon)
+    x, u, *w = problem.equilibrium
+    return LinearMPC(parts.step_map, x, u, problem.cost, limits, problem.horizon, w=w[0] if w else None)
 
 
 def _build_mpc(parts: Any, limits: Limits, estimator: Estimator | None = None) -> KoopmanMPC:
