@@ -227,8 +227,8 @@ class Problem:
             if case.limits is not None:
                 _fits(case.limits, self.dynamics, f"case {name!r}: limits")
             _check_measured(case.measured, self.dynamics, case.steps, f"case {name!r}")
-        if bool(nw) == (self.training.measured is None):  # `collect` checks the shape
-            _check_measured(self.training.measured, self.dynamics, self.training.steps, "training")
+        told = None if self.training.measured is None else np.zeros(nw)  # `collect` checks the values
+        _check_measured(told, self.dynamics, self.training.steps, "training")
         wrong = [i for i in self.angles if not 0 <= i < nx]
         if wrong:
             raise DataError(f"angles holds {wrong[0]}; pass indices of states, 0 to {nx - 1}")
@@ -290,14 +290,16 @@ def _fits(limits: Limits, dynamics: Dynamics, what: str) -> None:
         raise ShapeError(f"{what}: {error}") from error
 
 
-def _check_measured(measured: OpenLoop | ArrayLike | None, dynamics: Dynamics, steps: int, what: str) -> None:
+def _check_measured(measured: ArrayLike | None, dynamics: Dynamics, steps: int, what: str) -> None:
     """Raise where measured disturbances are missing, are not those of the plant, or have another shape."""
     nw, names = dynamics.nw, ", ".join(dynamics.disturbances)
-    if nw and measured is None:
-        raise DataError(f"{what}: the plant has measured disturbances ({names}); pass measured=, a row a step")
-    if not nw and measured is not None:
+    if measured is None:
+        if nw:
+            raise DataError(f"{what}: the plant has measured disturbances ({names}); pass measured=, a row a step")
+        return
+    if not nw:
         raise DataError(f"{what}: measured is given, but the dynamics name no disturbances; name them, or leave it out")
-    if nw and np.shape(measured) not in ((nw,), (steps, nw)):
+    if np.shape(measured) not in ((nw,), (steps, nw)):
         expected = f"({nw},) or (steps, nw) = ({steps}, {nw}): a column for {names}"
         raise ShapeError(f"{what}: measured has shape {np.shape(measured)}, expected {expected}")
 

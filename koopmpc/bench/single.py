@@ -7,7 +7,6 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -332,8 +331,8 @@ def _again(logged: Run, plant: StepMap | None, controller: Controller | None, lo
             raise LogError(f"{log} does not hold the states of its plant: pass the controller alone")
         if plant.nw and W is None:
             raise LogError(f"{log} does not hold what disturbed its plant: pass the controller alone")
-        w = W if plant.nw else repeat(None)
-        X = np.vstack([X[:1], *(plant(*each)[None] for each in zip(X, U, w, strict=False))])
+        told = np.asarray(W if plant.nw else np.empty((len(U), 0)), dtype=np.float64)
+        X = np.vstack([X[:1], *(plant(x, u, w)[None] for x, u, w in zip(X, U, told, strict=False))])
     if controller is not None:
         N = controller.horizon
         rows = np.vstack([logged.reference, np.repeat(logged.reference[-1:], N, axis=0)])
