@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
@@ -21,9 +22,12 @@ from koopmpc.values import Value
 
 RUN = 3  # length of a run in horizons
 MOVING = 120  # steps of a run with a moving reference, at least: three short horizons show the way there, no tracking
+LONGEST = 120  # steps of a run that is as long as a loop takes to settle, at most
 STARTS = 12  # default number of starts: one for each condition of a design
 _FEW = 4  # if at least this many first states are inside the limits, only those are used
 ROOM = 0.5  # a run may leave the data by this share of their range
+SETTLED = 0.1  # a loop has settled where its error is below this share of its first error
+TRIED = 400  # steps of the trial loop
 FAR = 1.0  # an episode is left out if it leaves the box of the others by more than this many widths
 MOST = 0.9  # share of the episodes inside this box
 
@@ -44,7 +48,8 @@ class DesignTask(Value):
         (m, nx) first states of all episodes, or only those inside the limits if there are enough; random starts are
         drawn from them.
     steps
-        Length of a run: three horizons, and at least 120 steps where the reference moves; or all its steps.
+        Length of a run: three horizons, and as many steps as a linear loop on the data takes to settle from the
+        starts, at most 120; at least 120 where the reference moves; or all its steps.
     angles
         Indices of states whose errors wrap.
     low, high
@@ -138,11 +143,6 @@ def check_task(
     outside = [i for i in angles if not 0 <= i < nx]
     if outside:
         raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
-    steps = RUN * horizon
-    if len(rows) == 1:
-        rows = np.repeat(rows, steps + 1, axis=0)
-    if (rows != rows[0]).any():
-        steps = max(steps, MOVING)
     X = np.concatenate([episode.X for episode in data])
     low, high = X.min(axis=0), X.max(axis=0)
     firsts = _first_states(data, limits)
@@ -155,6 +155,11 @@ def check_task(
         )
         if not len(points):
             raise DataError("starts is empty; pass states (n, nx), or None for first states of the data's episodes")
+    steps = max(RUN * horizon, min(measure_settling(data, cost, limits, rows, points), LONGEST))
+    if len(rows) == 1:
+        rows = np.repeat(rows, steps + 1, axis=0)
+    if (rows != rows[0]).any():
+        steps = max(steps, MOVING)
     values, box = stack_limited(limits, X, states)
     sizes = box.high - box.low
     sizes = np.where(np.isfinite(sizes) & (sizes > 0), sizes, np.maximum(np.ptp(values, axis=0), 1e-300))
@@ -171,6 +176,63 @@ def check_task(
         high=high,
         limit_sizes=sizes,
     )
+
+
+def measure_settling(
+    data: Episodes, cost: Cost, limits: Limits, reference: ArrayLike, starts: Float[np.ndarray, "n nx"]
+) -> int:
+    """Return the steps in which an LQR with limited inputs settles from each of the starts, at most 400.
+
+    The loop is on the affine model of the data. The limits of the inputs bound how fast a motion can be stopped, and so
+    the time.
+    """
+    X = np.concatenate([e.X[:-1] for e in data])
+    U = np.concatenate([e.U for e in data])
+    after = np.concatenate([e.X[1:] for e in data])
+    size, u_size = np.maximum(X.std(axis=0), 1e-300), np.maximum(U.std(axis=0), 1e-300)
+    table = np.hstack([(X - X.mean(axis=0)) / size, (U - U.mean(axis=0)) / u_size])
+    moved: Float[np.ndarray, "M nx"] = (after - after.mean(axis=0)) / size
+    fitted: Float[np.ndarray, "nx n"] = np.asarray(np.linalg.lstsq(table, moved, rcond=1e-8)[0]).T
+    A, B = fitted[:, : data.nx], fitted[:, data.nx :]
+    of = cost.of.bind(data.states)
+    Q, R = cost.matrices(of.nz, data.nu)
+    weight, goal = np.eye(data.nx), X.mean(axis=0)
+    if isinstance(of, State):
+        places = list(of.state_indices)
+        weight = np.zeros((data.nx, data.nx))
+        weight[np.ix_(places, places)] = Q * np.outer(size[places], size[places])
+        goal[places] = np.atleast_2d(np.asarray(reference, dtype=np.float64))[-1]
+    weight += 1e-6 * np.trace(weight) * np.eye(data.nx) / data.nx
+    R = R * np.outer(u_size, u_size) + 1e-9 * np.eye(data.nu) * (1 + np.trace(R))
+    return _count_steps(A, B, weight, R, (starts - goal) / size, data, limits, u_size)
+
+
+def _count_steps(
+    A: Float[np.ndarray, "nx nx"],
+    B: Float[np.ndarray, "nx nu"],
+    Q: Float[np.ndarray, "nx nx"],
+    R: Float[np.ndarray, "nu nu"],
+    starts: Float[np.ndarray, "n nx"],
+    data: Episodes,
+    limits: Limits,
+    u_size: Float[np.ndarray, " nu"],
+) -> int:
+    """Return the steps until all loops stay below a tenth of their first error, at most 400."""
+    try:
+        P: Float[np.ndarray, "nx nx"] = np.asarray(scipy.linalg.solve_discrete_are(A, B, Q, R))
+    except (np.linalg.LinAlgError, ValueError):
+        return TRIED
+    K: Float[np.ndarray, "nu nx"] = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    low, high = limits.inputs(data.nu)
+    U = np.concatenate([e.U for e in data])
+    half = np.where(np.isfinite(high - low), high - low, np.ptp(U, axis=0)) / 2 / u_size
+    E, first, last = starts.T, np.sqrt(np.einsum("in,ij,jn->n", starts.T, Q, starts.T)), 1
+    with np.errstate(all="ignore"):
+        for k in range(1, TRIED + 1):
+            E = A @ E + B @ np.clip(-K @ E, -half[:, None], half[:, None])
+            if not (np.sqrt(np.einsum("in,ij,jn->n", E, Q, E)) <= SETTLED * first).all():
+                last = k + 1
+    return min(last, TRIED)
 
 
 def limit_margins(asked: DesignTask, data: Episodes) -> Float[np.ndarray, " nx"]:

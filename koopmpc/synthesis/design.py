@@ -22,8 +22,8 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Present
 from koopmpc.lifting.state import State
 from koopmpc.parallel import StageProgress, Workers
-from koopmpc.plants.routines import find_compiler
 from koopmpc.synthesis.asked import (
+    RUN,
     DesignTask,
     check_task,
     find_stray_episodes,
@@ -58,7 +58,7 @@ from koopmpc.synthesis.designed import (
     choose_row,
 )
 from koopmpc.synthesis.feedback import remove_feedback, require_episodes
-from koopmpc.synthesis.fresh.abreast import speed_up
+from koopmpc.synthesis.fresh.abreast import explain_python, speed_up
 from koopmpc.synthesis.fresh.conditions import FOLDS, prepare_test
 from koopmpc.synthesis.fresh.coverage import check_coverage, keep_limits
 from koopmpc.synthesis.fresh.drawn import LoopPool
@@ -136,15 +136,16 @@ def design(
        round, and the two surrogates of the plant.
     2. Surrogates: the bilinear model with the smallest error, and the best one from another family of observables, each
        fitted to every two folds. Their one-step errors give the noise of their measurements.
-    3. First round: each model, fitted to two folds, controls surrogates that know the third fold, for three horizons
-       from several starts, by BilinearMPC, KoopmanMPC, and plain KoopmanMPC with Q_N = Q.
+    3. First round: each model, fitted to two folds, controls surrogates that know the third fold from several starts,
+       by BilinearMPC, KoopmanMPC, and plain KoopmanMPC with Q_N = Q. A run takes three horizons, and as long as a
+       linear loop on the data takes to settle, at most 120 steps.
     4. Final round: the best models are tried with every estimator and terminal cost, and one is fitted with weights
        around the states that its loops visit. Some surrogates have inputs that act 20 % more or less, since a plant
        differs from its logs.
     5. Choice: the score of a run is its cost × (1 + 10 max(0, violation − 0.5 %)), divided by the best on the same
        surrogate and start. It is at most 20, and 20 if the run leaves the data by half of their range. A controller is
        judged by the geometric mean of its scores, in which runs with inputs 20 % off count half. Of all controllers
-       within 0.5 % of the best, the simplest is chosen and fitted to all data.
+       within 0.5 % of the best, whose worst run is within 3 %, the simplest is chosen and fitted to all data.
     6. Confirmation: if the fitted controller loses a run, or costs a quarter more on the surrogates than when fitted to
        two folds, the next best is chosen, and the notes say so.
     7. Fresh loops: the controller runs from starts that took no part in the choice, on nearest neighbours of the data
@@ -264,8 +265,14 @@ def design(
     first = max(one.delays for one in models)
     forecast = _fit_forecast(held, ahead, first)
     short: list[str] = []
+    longest = max(len(one) for one in held)
+    if asked.steps > max(longest, RUN * ahead):
+        short = [
+            f"loops take {asked.steps} steps, for so long a linear loop on the data settles; no episode is longer than "
+            f"{longest}, so what comes later rests on stand-ins that no log has followed so far"
+        ]
     if forecast < ahead:
-        short = [f"models were judged {forecast} steps ahead, not {ahead}, for episodes are no longer"]
+        short += [f"models were judged {forecast} steps ahead, not {ahead}, for episodes are no longer"]
     folds = make_folds(held, forecast + first, FOLDS, draw)
     if folds.number < FOLDS:
         raise DataError(
@@ -343,15 +350,12 @@ def design(
     if few:
         fast = speed_up(controller)
         count = MANY if loops is None and isinstance(fast, Compiled) else few
-        if loops is None and count == few and find_compiler() is None:
-            notes = (
-                *notes,
-                f"no C compiler was found ($CC, cc, gcc, clang), so {few} fresh loops ran in place of {MANY}: install "
-                f"one, or pass loops={MANY} and wait longer",
-            )
+        if loops is None and count == few:
+            why = explain_python(controller)
+            notes = (*notes, f"{few} fresh loops ran in place of {MANY}, for {why}; loops={MANY} takes longer")
         fresh = run_fresh_loops(drawn_from, fast, count, draw)
         blind = [*describe_outside(test.episodes, asked, fresh), *blind, *wide]
-        blind += compare_longer_horizon(drawn_from, rows[best].recipe, controller, draw)
+        blind += compare_longer_horizon(drawn_from, rows[best].recipe, controller, fast, draw)
     controller.reset()
     remembered = [] if not hidden else [f"{memory}; models with delays were tried"]
     if hidden and not rows[best].recipe.candidate.delays:

@@ -25,7 +25,7 @@ from koopmpc.synthesis.candidates import Designed, Recipe
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap, choose_starts_to_record
 from koopmpc.synthesis.fresh.promise import CoveragePromise
 from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_value, cost_interval
-from koopmpc.synthesis.judging import is_alike
+from koopmpc.synthesis.judging import UNSURE, is_alike
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.terminal import build_leaderboard, label_lines, render_text
 from koopmpc.text import to_percent
@@ -407,7 +407,8 @@ def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: 
     """Return the place of the safest, then simplest row that is as good as the best, of those judged in all conditions.
 
     A row is as good as the best if its score is within 0.5 % of it, or within the standard error of their difference
-    where that is larger, at most 3 %. Safer is a row with fewer lost runs, then one without a violation above 1 %.
+    where that is larger, at most 3 %, and its worst run is at most 3 % worse: where a plant differs from its logs, one
+    run shows it before the mean does. Safer is a row with fewer lost runs, then one without a violation above 1 %.
     Simpler is a row without weights, then one with a smaller model; a bilinear model counts twice its observables.
     A controller with an estimator may cost 2 % more than without one, since it corrects errors that surrogates and
     models share. On a plant that is `unstable` where it is used, one without an estimator may cost
@@ -416,8 +417,9 @@ def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: 
     places = [i for i, row in enumerate(rows) if row.off and kind in (None, row.recipe.candidate.kind)]
     if not places:
         return None
-    best = min(rows[i].score for i in places)
-    near = [i for i in places if is_alike(rows[i].score, best, rows[i].error)]
+    best = min((rows[i] for i in places), key=lambda row: (row.score, row.worst))
+    near = [i for i in places if is_alike(rows[i].score, best.score, rows[i].error)]
+    near = [i for i in near if rows[i].worst <= best.worst * (1 + UNSURE)]
 
     def rank(i: int) -> tuple[object, ...]:
         row, one = rows[i], rows[i].recipe

@@ -39,7 +39,7 @@ _NINETY = 1.645  # 90 % of normal errors lie within this many standard deviation
 _BAND = 5  # limits are tightened by errors up to this many steps ahead
 CONFIRMED = 1.25  # fitted to all data, a controller may cost this factor of its cost with two folds
 ALIKE = 0.005  # scores that differ by this share are alike
-UNSURE = 0.03  # the largest standard error by which two scores are alike
+UNSURE = 0.03  # the largest standard error by which two scores are alike, and share by which two worst runs are
 LESS = 0.5  # weight of a run with inputs 20 % off; other runs have weight 1
 BROKEN = 1e-3  # a step violates a limit if it exceeds the limit by more than this share of its range
 

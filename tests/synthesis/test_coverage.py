@@ -73,7 +73,7 @@ class DrawnPool(LoopPool):
         needs = np.where(rng.uniform(size=count) < self.hopeless, np.inf, rng.exponential(0.1, count))
         return [DrawnLoop(np.array([need, 0.0]), 0, 1.0, 0, 0) for need in needs]
 
-    def run(self, controller, loops, *, stretch=1):
+    def run(self, controller, loops):
         return [LoopResult(1.0 + controller, 0.05 if loop.x0[0] > controller else 0.0) for loop in loops]
 
 

@@ -18,6 +18,7 @@ from koopmpc.identify.records.structure import Structure
 from koopmpc.synthesis.candidates import Candidate, Recipe
 from koopmpc.synthesis.cross_validation import Tried
 from koopmpc.synthesis.designed import choose_row
+from koopmpc.synthesis.fresh.abreast import explain_python
 from koopmpc.synthesis.judging import LOST, Outcome, average_ratios, rate_runs
 from koopmpc.synthesis.surrogates import choose_surrogates
 from tests.synthesis.test_select import PLAIN, SQUARES, episodes_of, noisy
@@ -548,3 +549,10 @@ def test_without_a_compiler_a_design_says_that_fewer_loops_ran(monkeypatch):
     assert any(
         "no C compiler was found" in note and "60 fresh loops ran in place of 600" in note for note in found.notes
     )
+
+
+def test_loops_in_python_are_explained_by_the_controller_before_the_compiler(monkeypatch):
+    monkeypatch.setattr("koopmpc.plants.routines.shutil.which", lambda _: None)
+    assert "no C compiler was found" in explain_python(usual().controller)
+    nonlinear = km.NonlinearMPC(km.edmd(data(), PLAIN), COST, LIMITS, 3)
+    assert "has no C code" in explain_python(nonlinear)

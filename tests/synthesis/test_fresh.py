@@ -8,17 +8,20 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.synthesis.asked import check_task, measure_settling
+from koopmpc.synthesis.candidates import Candidate
 from koopmpc.synthesis.designed import ExpectedLoop, choose_row
 from koopmpc.synthesis.fresh.drawn import draw_starts
 from koopmpc.synthesis.fresh.horizon import choose_horizon
+from koopmpc.synthesis.fresh.loops import is_better
 from koopmpc.synthesis.fresh.neighbours import MOST, NeighbourMap, goal_box, probe_range
-from koopmpc.synthesis.fresh.verdict import bound_value, cost_interval
+from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_value, cost_interval
 from koopmpc.synthesis.judging import measure_errors
 from koopmpc.validate import bound_failure_rate
 from tests.closed_loop.controllers import Parts
 from tests.closed_loop.judge import judged, kept_promises, promised
 from tests.closed_loop.more_tasks import MORE
-from tests.synthesis.test_design import A, B, data, designed, usual
+from tests.synthesis.test_design import LIMITS, A, B, data, designed, usual
 from tests.synthesis.test_select import episodes_of
 
 
@@ -261,6 +264,20 @@ def test_rows_within_a_standard_error_are_alike_and_the_safer_one_is_taken():
     assert choose_row([risky, replace(worse, score=1.05, error=0.2)]) == 0
 
 
+def test_a_simpler_row_with_a_worse_run_is_not_as_good_though_its_mean_is():
+    """Measured on `leaks`: plain 1.005 with a run at 1.049, lifted 1.001 and 1.014; on that plant 1.112 and 1.028."""
+    best = usual().best
+    data = km.Episodes([km.Episode(X=np.zeros((3, 2)), U=np.zeros((2, 1)))], 0.1)
+    small, large = (
+        replace(best.recipe, candidate=Candidate("", one).bind(data.states, data.inputs))
+        for one in (km.State() + km.Constant(), km.State() + km.Constant() + km.Monomials(4))
+    )
+    lifted = replace(best, recipe=large, score=1.001, worst=1.014, off=True)
+    plain = replace(best, recipe=small, score=1.005, off=True)
+    assert choose_row([lifted, replace(plain, worst=1.049)]) == 0
+    assert choose_row([lifted, replace(plain, worst=1.03)]) == 1
+
+
 def test_on_an_unstable_plant_an_estimator_must_be_worth_five_percent():
     plain = replace(usual().best, score=1.03, recipe=replace(usual().best.recipe, estimator=None))
     free = replace(plain, score=1.0, recipe=replace(plain.recipe, estimator=km.LiftedDisturbance()))
@@ -290,6 +307,36 @@ def test_a_horizon_of_none_is_longer_where_inputs_are_weaker_and_is_told():
     assert any(f"the horizon is {found.controller.horizon} steps" in note for note in found.notes)
 
 
+def test_loops_last_until_a_linear_loop_settles_and_three_horizons_at_least():
+    cost, tight, wide = km.Cost(Q=[1.0, 0.1], R=0.1), km.Limits(u_min=-0.1, u_max=0.1), km.Limits(u_min=-5, u_max=5)
+    slow, fast = (check_task(data(), cost, limits, 3, [0.0, 0.0], None, ()).steps for limits in (tight, wide))
+    assert slow == measure_settling(data(), cost, tight, [0.0, 0.0], np.array([e.X[0] for e in data()])) > fast > 9
+    assert check_task(data(), cost, wide, 30, [0.0, 0.0], None, ()).steps == 90
+
+
+@pytest.mark.slow
+def test_a_design_says_where_its_loops_last_longer_than_every_episode():
+    found = designed(data(), horizon=3, limits=replace(LIMITS, u_min=-0.2, u_max=0.2))
+    assert found.expected.steps > 30
+    assert any(f"loops take {found.expected.steps} steps" in note for note in found.notes)
+
+
+def test_a_longer_horizon_is_better_where_it_alone_keeps_more_loops_than_chance_explains():
+    def loops(cost=1.0, broken=0, count=60):
+        over = np.where(np.arange(count) < broken, 0.1, 0.0)
+        nothing = np.zeros(0)
+        return FreshLoops(
+            np.full(count, cost), over, over, ("models",) * count, nothing, nothing, nothing, over[:, None]
+        )
+
+    assert is_better(loops(broken=20), loops(broken=25))
+    assert not is_better(loops(broken=20), loops(broken=24))
+    assert not is_better(loops(broken=25), loops(broken=20))
+    assert is_better(loops(cost=0.85), loops())
+    assert not is_better(loops(cost=0.95), loops())
+    assert is_better(loops(), loops(cost=np.inf))
+
+
 def test_the_chosen_horizon_does_not_change_with_the_units():
     cost, limits = km.Cost(Q=[1.0, 0.1], R=0.1), km.Limits(u_min=-1, u_max=1)
     usual_data = data(count=9, steps=60)
@@ -299,7 +346,7 @@ def test_the_chosen_horizon_does_not_change_with_the_units():
 
 
 @pytest.mark.slow
-def test_where_each_signal_is_inside_but_no_log_has_both_the_design_says_so_and_the_standby_holds():
+def test_where_each_signal_is_inside_but_no_log_has_both_the_design_says_so_and_holds():
     """A lifted model promised 0 of 60 lost and cost 1.43 and 2.54 times the optimum from two such starts."""
     parts = Parts(MORE["off the diagonal"], 0)
     with warnings.catch_warnings():
@@ -308,7 +355,7 @@ def test_where_each_signal_is_inside_but_no_log_has_both_the_design_says_so_and_
     assert any("of the goal's range" in sentence and "at the same time" in sentence for sentence in advice)
     for start in range(len(parts.task.starts)):
         alone, guarded = (judged(parts, name, start).ratio for name in ("designed", "guarded"))
-        assert guarded < 1.05 < alone
+        assert max(guarded, alone) < 1.05
 
 
 @pytest.mark.slow

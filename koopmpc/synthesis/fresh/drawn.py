@@ -93,17 +93,14 @@ class LoopPool:
             for i in range(count)
         ]
 
-    def run(self, controller: Any, loops: Sequence[DrawnLoop], *, stretch: int = 1) -> list[LoopResult]:
-        """Return what became of these loops, those of a controller in machine code side by side.
-
-        With a constant reference they take `stretch` times the steps of the task.
-        """
+    def run(self, controller: Any, loops: Sequence[DrawnLoop]) -> list[LoopResult]:
+        """Return what became of these loops, those of a controller in machine code side by side."""
         results: list[LoopResult] = [LoopResult(np.inf, np.inf)] * len(loops)
         for place in sorted({loop.place for loop in loops}):
             own = [i for i, loop in enumerate(loops) if loop.place == place]
             for first in range(0, len(own), ABREAST):
                 some = own[first : first + ABREAST]
-                for i, run in zip(some, self._run_place(controller, [loops[i] for i in some], stretch), strict=True):
+                for i, run in zip(some, self._run_place(controller, [loops[i] for i in some]), strict=True):
                     results[i] = self._judge(run)
         return results
 
@@ -113,12 +110,12 @@ class LoopPool:
         cost, over = metrics(run).cost, float(violation_shares(run, self.asked.limit_sizes)[1:].max(initial=0.0))
         return LoopResult(cost, over, run) if np.isfinite(cost) else LoopResult(np.inf, np.inf)
 
-    def _run_place(self, controller: Any, loops: Sequence[DrawnLoop], stretch: int) -> list[Run | None]:
+    def _run_place(self, controller: Any, loops: Sequence[DrawnLoop]) -> list[Run | None]:
         """Return the runs of loops that have one stand-in in common."""
         asked, place, box = self.asked, loops[0].place, (self.low, self.high)
         near = self.neighbours if place < 0 else None
         stand_in: Surrogate | NeighbourMap = self.surrogates[max(place, 0)] if near is None else near
-        rows, held = zip(*(self._find_rows(loop, stretch, controller.horizon) for loop in loops), strict=True)
+        rows, held = zip(*(self._find_rows(loop, controller.horizon) for loop in loops), strict=True)
         acting = Acting(stand_in.middle, np.array([one.gain for one in loops]), np.array([one.late for one in loops]))
         if isinstance(controller, Compiled):
             crowd = Crowd(stand_in, acting, np.array([loop.x0 for loop in loops]), [loop.seed for loop in loops])
@@ -142,19 +139,16 @@ class LoopPool:
             for i, loop in enumerate(loops)
         ]
 
-    def _find_rows(
-        self, loop: DrawnLoop, stretch: int, ahead: int
-    ) -> tuple[Float[np.ndarray, "rows nr"], Float[np.ndarray, "T nu"]]:
+    def _find_rows(self, loop: DrawnLoop, ahead: int) -> tuple[Float[np.ndarray, "rows nr"], Float[np.ndarray, "T nu"]]:
         """Return the reference of a loop, with so many rows that are only seen ahead, and the inputs without cost."""
         asked, place = self.asked, max(loop.place, 0)
         given = not isinstance(asked.cost.u_target, str)  # by numbers, which count from the start of a loop
         if place not in self._inputs:
             every = asked.reference[:-1] if asked.moves or given else asked.reference[:1]
             self._inputs[place] = self.surrogates[place].find_reference_inputs(asked.cost, asked.limits, every)
-        steps = asked.steps * (1 if asked.moves else stretch)
-        at = np.minimum(loop.first + np.arange(steps), len(asked.reference) - 1)
+        at = np.minimum(loop.first + np.arange(asked.steps), len(asked.reference) - 1)
         held = self._inputs[place]
-        rows = read_reference(asked, loop.first, steps + 1 + ahead)
+        rows = read_reference(asked, loop.first, asked.steps + 1 + ahead)
         return rows, held[np.minimum(at - given * loop.first, len(held) - 1)]
 
     def _find_model(self, place: int) -> StepMap:

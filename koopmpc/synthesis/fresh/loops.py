@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import bdtr
 
+from koopmpc.codegen.compiled import Compiled
 from koopmpc.data.angles import find_angles
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
@@ -14,6 +16,7 @@ from koopmpc.lifting.state import State
 from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Recipe, get_model
 from koopmpc.synthesis.designed import BREAKS
+from koopmpc.synthesis.fresh.abreast import speed_up
 from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box, probe_range
 from koopmpc.synthesis.fresh.verdict import FreshLoops
@@ -22,25 +25,22 @@ from koopmpc.text import to_percent
 from koopmpc.validate.scoring import AnyPredictor
 
 CORNERS = 8  # corners of the goal's range from which loops run, at most
-COMPARED = 12  # fresh loops in which two horizons are compared
+COMPARED = 60  # fresh loops in which two horizons are compared in machine code
+FEW = 12  # and in Python
+BETTER = 0.05  # share of the loops that one horizon alone must keep, and probability that this is chance
 MUCH = 0.9  # a horizon that costs this share of the given one is much better
 DRAWN = 400  # states outside the data that are kept for a picture, at most
 BLIND_RANGE = 0.3  # share of them outside the data above which a design says so
 BLIND = 0.05  # share of steps outside the data above which a design says where they are
 
 
-def run_fresh_loops(
-    pool: LoopPool, controller: Any, loops: int, rng: np.random.Generator, *, stretch: int = 1
-) -> FreshLoops:
-    """Return fresh loops, and loops from the corners of the goal's range, which are on nearest neighbours.
-
-    With a constant reference they take `stretch` times the steps of the task.
-    """
+def run_fresh_loops(pool: LoopPool, controller: Any, loops: int, rng: np.random.Generator) -> FreshLoops:
+    """Return fresh loops, and loops from the corners of the goal's range, which are on nearest neighbours."""
     asked, near = pool.asked, pool.neighbours
     assert near is not None, "a design has nearest rows"
     drawn = pool.draw(loops, rng)
     corners = [DrawnLoop(x0, -1, 1.0, 0, int(rng.integers(2**31))) for x0 in _list_corners(asked, rng)]
-    results = pool.run(controller, [*drawn, *corners], stretch=stretch)
+    results = pool.run(controller, [*drawn, *corners])
     share, away = np.zeros(len(results)), [np.zeros((0, len(asked.low)))]
     begun = 0
     for i, (result, loop) in enumerate(zip(results, [*drawn, *corners], strict=True)):
@@ -145,30 +145,64 @@ def watch_data(recipe: Recipe, model: AnyPredictor, controller: Designed, data: 
         return controller
 
 
-def compare_longer_horizon(pool: LoopPool, recipe: Recipe, controller: Designed, rng: np.random.Generator) -> list[str]:
+def compare_longer_horizon(
+    pool: LoopPool, recipe: Recipe, controller: Designed, fast: Any, rng: np.random.Generator
+) -> list[str]:
     """Return a sentence if a horizon twice as long is much better, or keeps limits that the given one breaks.
 
-    Both controllers run the same loops: from fresh starts, and from the corners of the goal's range.
+    All horizons run the same loops, from fresh starts and from the corners of the goal's range; `fast` is the
+    controller as `speed_up` returns it. Where twice as long is better, four times is tried, and told if better still.
     """
     N, seed = controller.horizon, int(rng.integers(2**31))
-    longer = recipe.controller(get_model(controller), controller.cost, controller.limits, 2 * N)
-    short, long = (
-        run_fresh_loops(pool, one, COMPARED, np.random.default_rng(seed), stretch=2) for one in (controller, longer)
+    count = COMPARED if isinstance(fast, Compiled) else FEW
+
+    def run(horizon: int) -> FreshLoops:
+        one = recipe.controller(get_model(controller), controller.cost, controller.limits, horizon)
+        return run_fresh_loops(pool, fast if horizon == N else speed_up(one), count, np.random.default_rng(seed))
+
+    given, twice = run(N), run(2 * N)
+    if not is_better(twice, given):
+        return []
+    lost, broken = ([count_loops(one) for one in (given, twice)] for count_loops in (_count_lost, _count_broken))
+    said = (
+        f"a horizon of {2 * N} steps in place of {N} costs {compare_costs(twice, given):.3g} times as much; of "
+        f"{len(given.cost) + len(given.corner_cost)} loops {broken[1]} violate limits by more than "
+        f"{to_percent(BREAKS)} of their range in place of {broken[0]}, and {lost[1]} are lost in place of {lost[0]}: "
+        "take it if a step has the time"
     )
-    costs = [np.concatenate([one.cost, one.corner_cost]) for one in (short, long)]
-    over = [np.concatenate([one.violation, one.corner_violation]) for one in (short, long)]
-    both = np.isfinite(costs[0]) & np.isfinite(costs[1])
+    if is_better(longer := run(4 * N), twice):
+        said += (
+            f"; {4 * N} steps cost {compare_costs(longer, given):.3g} times as much, {_count_broken(longer)} violate, "
+            f"and {_count_lost(longer)} are lost"
+        )
+    return [said]
+
+
+def is_better(longer: FreshLoops, shorter: FreshLoops) -> bool:
+    """Return whether of the same loops one controller's cost much less, fewer are lost, or more keep their limits.
+
+    Loops that one alone keeps decide on limits: a twentieth of all, and more than the toss of a coin explains in one
+    case of twenty.
+    """
+    over = [np.concatenate([one.violation, one.corner_violation]) > BREAKS for one in (longer, shorter)]
+    kept, broken = int(np.sum(over[1] & ~over[0])), int(np.sum(over[0] & ~over[1]))
+    keeps = kept - broken >= BETTER * len(over[0]) and bdtr(broken, kept + broken, 0.5) <= BETTER
+    return bool(keeps or compare_costs(longer, shorter) < MUCH or _count_lost(longer) < _count_lost(shorter))
+
+
+def compare_costs(one: FreshLoops, other: FreshLoops) -> float:
+    """Return the geometric mean of cost ratios of loops that neither lost; 1 where there are none."""
+    mine, others = (np.concatenate([each.cost, each.corner_cost]) for each in (one, other))
+    both = np.isfinite(mine) & np.isfinite(others)
     if not both.any():
-        return []
-    little = LITTLE * float(np.median(costs[0][both]))
-    change = float(np.exp(np.mean(np.log((costs[1][both] + little) / (costs[0][both] + little)))))
-    before, after = (int(np.sum(one > BREAKS)) for one in over)
-    lost = [int(np.sum(~np.isfinite(one))) for one in costs]
-    keeps = before > 1 and 2 * after <= before
-    if not (keeps or change < MUCH or lost[1] < lost[0]):
-        return []
-    return [
-        f"a horizon of {2 * N} steps in place of {N} costs {change:.3g} times as much; of {len(costs[0])} loops "
-        f"{after} violate limits by more than {to_percent(BREAKS)} of their range in place of {before}, and "
-        f"{lost[1]} are lost in place of {lost[0]}: take it if a step has the time"
-    ]
+        return 1.0
+    little = LITTLE * float(np.median(others[both]))
+    return float(np.exp(np.mean(np.log((mine[both] + little) / (others[both] + little)))))
+
+
+def _count_lost(one: FreshLoops) -> int:
+    return int(np.sum(~np.isfinite([*one.cost, *one.corner_cost])))
+
+
+def _count_broken(one: FreshLoops) -> int:
+    return int(np.sum(np.concatenate([one.violation, one.corner_violation]) > BREAKS))
