@@ -118,7 +118,7 @@ show(lambda: km.metrics([1, 2]))
     )
     assert lines == [
         """DataError u_target is 'rest'; pass "equilibrium", "zero", an input or rows of inputs""",
-        "DataError solver is 'simplex'; there are 'auto', 'osqp', 'daqp'",
+        "DataError solver is 'simplex'; there are 'auto', 'osqp', 'daqp', 'piqp'",
         "DataError horizon is 2.5; pass a whole number",
         'ShapeError slack is 5; pass (linear, quadratic), "auto", or None for hard limits',
         'DataError of is a str, expected a Lifting; for example km.Fourier(1, states="theta")',

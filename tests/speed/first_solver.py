@@ -13,7 +13,7 @@ import contextlib
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -79,6 +79,16 @@ def time_loop(family: str, title: str, controllers: dict[str, Any], calls: list[
         {name: float(each.max()) for name, each in times.items()},
         lost,
     )
+
+
+@dataclass(frozen=True)
+class LongTiming:
+    """One loop of long plans: N, nu and nz, states at their limit, first and mean later step [s], plans apart."""
+
+    size: tuple[int, int, int]
+    active: int
+    seconds: dict[str, tuple[float, float]]
+    apart: float
 
 
 class Recorded:
@@ -192,6 +202,46 @@ def saturated_timings(horizons: tuple[int, ...]) -> Iterator[Timing | None]:
         yield time_loop(f"saturated, {kind}, n {N * nu}", f"room {room}", made, calls)
 
 
+def long_timings(horizons: tuple[int, ...]) -> Iterator[LongTiming]:
+    """Time long plans with a hard limit of a state at each step, most of which act: DAQP, PIQP, and who names none."""
+    rng = np.random.default_rng(3)
+    for N, nu, nx in product(horizons, (1, 2), (4, 8, 12)):
+        A = np.diag(np.linspace(1.0, 0.6, nx)) + np.diag(0.1 * np.ones(nx - 1), 1)
+        names = tuple(f"x{i}" for i in range(nx)), tuple(f"u{i}" for i in range(nu))
+        B = 0.1 * rng.uniform(0.5, 1.0, (nx, nu)) * (np.arange(nx) > 0)[:, None]
+        model = km.LinearPredictor(A, B, np.eye(nx), km.State(), 0.1, *names)
+        end = np.where(np.arange(nx) == 1, 0.5, np.inf)
+        limits = km.Limits(-1, 1, x_min=-end, x_max=end, slack=None)
+        made = {
+            name: km.KoopmanMPC(model, km.Cost(np.ones(nx), 0.1 * np.ones(nu)), limits, N, solver=name)
+            for name in ("daqp", "piqp", "auto")
+        }
+        x, spent = np.where(np.arange(nx) == 0, 0.05 * N, 0.0), dict[str, list[float]]()
+        apart = 0.0
+        for _ in range(6):
+            moves = {}
+            for name, mpc in made.items():
+                start = time.thread_time()
+                moves[name] = mpc(x, np.zeros(nx))
+                spent.setdefault(name, []).append(time.thread_time() - start)
+            plans = [mpc.plan().U for mpc in made.values()]
+            apart = max(apart, max(float(np.abs(plan - plans[0]).max()) for plan in plans))
+            x = A @ x + B @ moves["daqp"].u
+        active = float((np.abs(made["daqp"].plan().X[1:, 1]) > 0.5 - 1e-6).sum())
+        yield LongTiming((N, nu, nx), int(active), {n: (s[0], float(np.mean(s[1:]))) for n, s in spent.items()}, apart)
+
+
+def print_long(timings: Iterable[LongTiming]) -> None:
+    """Print first and mean later steps [ms] of each solver."""
+    head = ("N, nu, nz", "states at their limit", "DAQP: first, next", "PIQP", "named by nobody", "plans apart")
+    sys.stdout.write("| " + " | ".join(head) + " |\n|" + " --- |" * len(head) + "\n")
+    for row in timings:
+        times = [f"{1e3 * first:.2g}, {1e3 * later:.2g} ms" for first, later in row.seconds.values()]
+        cells = [", ".join(map(str, row.size)), str(row.active), *times, f"{row.apart:.0e}"]
+        sys.stdout.write("| " + " | ".join(cells) + " |\n")
+        sys.stdout.flush()
+
+
 def print_table(timings: list[Timing]) -> None:
     """Print a row for each family: ratios OSQP over DAQP, the longest step, and how often the rule is right."""
     families: dict[str, list[Timing]] = defaultdict(list)
@@ -221,8 +271,11 @@ def main() -> None:
         "sizes": lambda: size_timings(tuple(given.horizons)),
         "saturated": lambda: saturated_timings(tuple(given.horizons)),
     }
-    parser.add_argument("--parts", nargs="*", default=tuple(sources), choices=tuple(sources))
+    parser.add_argument("--parts", nargs="*", default=tuple(sources), choices=(*sources, "long"))
     given = parser.parse_args()
+    if "long" in given.parts:
+        print_long(long_timings(tuple(given.horizons)))
+        return
     print_table([timing for part in given.parts for timing in sources[part]() if timing is not None])
 
 

@@ -24,7 +24,7 @@ from koopmpc.control.linear.plan import plan_map, planned_states
 from koopmpc.control.linear.windows import LimitWindows, describe_bounds, limit_windows
 from koopmpc.control.move import Fallback, Move, Plan, Status, alone, busy
 from koopmpc.control.program import linear_parts, no_export, publish_estimator, reference_table
-from koopmpc.control.solvers import FINISHER, exact_turn, order_solvers
+from koopmpc.control.solvers import FINISHER, add_sparse, exact_turn, needs_stages, order_solvers
 from koopmpc.control.solvers.base import StepSolver
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.stepped.blocks import Moves
@@ -82,8 +82,10 @@ class KoopmanMPC(MPCBase):
         allowed.
     solver
         The solver that is asked first: "daqp", an active-set method, exact to rounding; "osqp", an operator-splitting
-        method; or "auto", the one that was measured to be faster, which the attribute `solver` names. If OSQP has not
-        solved a QP in 100 iterations, or in the ``max_iter`` of `settings`, DAQP solves it.
+        method; "piqp", an interior-point method on the stages; or "auto", the one that was measured to be faster, which
+        the attribute `solver` names. If OSQP has not solved a QP in 100 iterations, or in the ``max_iter`` of
+        `settings`, DAQP solves it. In plans of 300 steps and more with hard limits alone, "auto" leaves to PIQP what
+        DAQP has not solved in 20 iterations: inputs then agree to 1e-6 of their range.
     settings
         The solver's own settings, for example ``{"eps_abs": 1e-9, "eps_rel": 1e-9}`` of OSQP. With "auto", the solver
         that has them is asked first.
@@ -181,6 +183,7 @@ class KoopmanMPC(MPCBase):
             self._initial.buffer,
             disturbed=disturbed,
             periodic=self._initial.periodic.size > 0,
+            staged=needs_stages(self._solver, self._N),
         )
         self._hold_limits()
         self._options = {"solver": self._solver, "settings": settings}
@@ -200,6 +203,10 @@ class KoopmanMPC(MPCBase):
                 )
             self._qps = PrioritySolver(self._map.qp, [exact_turn(turns), *turns[1:]], self._priorities())
         else:
+            if ball is None and solver == "auto" and not settings:
+                turns = add_sparse(turns, self._map.qp)
+                if turns[0].patience is not None:
+                    self._options["solver"] = solver  # one that is made again of its data has the same turns
             self._qps = StepSolver(self._map.qp, turns) if ball is None else BallSolver(self._map.qp, turns, ball)
         rows = len(self._map.matrix)
         self._plan, self._spare = np.zeros(rows), np.zeros(rows)
@@ -244,10 +251,11 @@ class KoopmanMPC(MPCBase):
             self._time_limit,
             'solver="daqp", settings={"iter_limit": 100}',
         )
-        if self._solver != FINISHER.name:
+        if self._solver != FINISHER.name or self._qps.first.patience is not None:
             saved = self.as_data()
             twin = KoopmanMPC.from_data(replace(saved, options={"solver": FINISHER.name}))
-            return replace(twin.build_program(rows), controller=type(self).__name__, notes=(_OTHER_SOLVER,))
+            notes = (_OTHER_SOLVER,) if self._solver == "osqp" else ()
+            return replace(twin.build_program(rows), controller=type(self).__name__, notes=notes)
         setup = cast("DAQP", self._qps.first).setup
         return CondensedProgram(
             controller=type(self).__name__,
@@ -330,6 +338,7 @@ class KoopmanMPC(MPCBase):
             self._initial.buffer,
             disturbed=self._disturbed,
             periodic=self._initial.periodic.size > 0,
+            staged=needs_stages(self._solver, self._N),
         )
         self._read = self._map.moving
         self.predictor, self._states = predictor, None

@@ -14,8 +14,9 @@ from koopmpc.control.limits import Interval, Softness, preview_margin
 from koopmpc.control.linear.blocking import tie_moves
 from koopmpc.control.linear.layout import WindowLayout
 from koopmpc.control.linear.moving import GivenShares, MovingMap, PlanParts
-from koopmpc.control.riccati import recursion
+from koopmpc.control.riccati import Law, Stage, recursion
 from koopmpc.control.solvers.base import StepQP
+from koopmpc.control.solvers.stages import QPStages
 from koopmpc.control.stepped.blocks import MoveBlocks
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
 from koopmpc.control.terminal.cuts import Ball, make_ball
@@ -100,6 +101,7 @@ class PlanMap(Viewing):
         end: EndRows | None,
         held: Bool[np.ndarray, "moves nu"],
         buffer: Float[np.ndarray, " n"],
+        stages: QPStages | None = None,
     ) -> None:
         self.track, self.targets = track, targets
         self.moves, self.blocks = len(maps.hessian), horizon.blocks
@@ -107,7 +109,7 @@ class PlanMap(Viewing):
         limits = _plan_limits(track, horizon, maps.deviation, end)
         if held.any():
             _drop_held(limits, held, track)
-        self.qp = _step_qp(maps, limits, 0 if track.rates is None else len(track.inputs.low))
+        self.qp = _step_qp(maps, limits, 0 if track.rates is None else len(track.inputs.low), stages)
         low, high, nv = limits.low, limits.high, len(limits.low)
         self.ball: Ball | None = None
         if end is not None and end.ball:
@@ -195,8 +197,12 @@ def plan_map(
     *,
     disturbed: bool,
     periodic: bool = False,
+    staged: bool = False,
 ) -> PlanMap:
-    """Return the plan of a predictor: its horizon, solved by the Riccati recursion, condensed, and limited."""
+    """Return the plan of a predictor: its horizon, solved by the Riccati recursion, condensed, and limited.
+
+    A `staged` one also keeps its QP as it was before, where each stage is one step.
+    """
     targets, units = targets_of(predictor, track), Units.of(predictor, track)
     aims, cost = units.targets(targets), units.cost(track.cost)
     horizon = horizon_of(predictor, track, moves.lengths, disturbed=disturbed, periodic=periodic)
@@ -214,7 +220,43 @@ def plan_map(
         pulled = np.concatenate([np.tile(track.pull, counted), np.zeros((horizon.N + 1 - counted) * len(track.pull))])
         maps = replace(maps, offset=maps.offset + maps.from_reference @ pulled)
     scaled = _scale_deviation(maps, track.inputs, len(moves.lengths))
-    return PlanMap(track, targets, horizon, scaled, rows, moves.held, buffer)
+    stages = None
+    plain = not moves.own and rows is None and len(horizon.blocks) == horizon.N
+    if staged and plain and maps.coordinates == "riccati":
+        columns = np.diagonal(scaled.deviation) / np.diagonal(maps.deviation)
+        stages = _keep_stages(own, parts[0], law, end.P, units, columns, units.scale / scaled.unit)
+    return PlanMap(track, targets, horizon, scaled, rows, moves.held, buffer, stages)
+
+
+def _keep_stages(
+    h: Horizon,
+    stage: Stage,
+    law: Law,
+    P: Float[np.ndarray, "nx nx"],
+    units: Units,
+    columns: Float[np.ndarray, " n"],
+    share: float,
+) -> QPStages:
+    """Return the QP of a horizon without blocks, in these units; `share` is the share of its cost in that of the QP."""
+    nz, nu = h.B.shape
+    M = np.zeros((h.size, nu)) if stage.M is None else stage.M
+    size = np.sqrt(float((law.L[0] ** 2).sum()) / nu)
+    inputs, none = np.diag(units.inputs), np.zeros((nu, h.size))
+    rows = [np.hstack([inputs, none, 0.0 * inputs])]
+    if h.bounded:
+        rows.append(np.hstack([inputs, none, -inputs]))
+    beside = np.zeros((len(h.G), nu))
+    rows.append(np.hstack([beside, units.limited[:, None] * h.G, np.zeros((len(h.G), h.size - nz)), beside]))
+    return QPStages(
+        A=stage.A,
+        B=stage.B,
+        W=share * np.block([[stage.Q, M], [M.T, stage.R]]),
+        P=share * P,
+        rows=np.vstack(rows),
+        groups=(nu, nu * h.bounded, len(h.G)),
+        factors=law.L.transpose(0, 2, 1) / (size * columns.reshape(h.N, nu, 1)),
+        K=law.K,
+    )
 
 
 def _fold_targets(maps: Condensed, targets: Targets) -> Condensed:
@@ -330,7 +372,7 @@ def _drop_held(limits: PlanLimits, held: Bool[np.ndarray, "moves nu"], track: Li
     limits.low[rows], limits.high[rows], limits.kept[rows] = -np.inf, np.inf, False
 
 
-def _step_qp(maps: Condensed, limits: PlanLimits, changes: int) -> StepQP:
+def _step_qp(maps: Condensed, limits: PlanLimits, changes: int, stages: QPStages | None) -> StepQP:
     """Return the QP of a condensed horizon under these limits, so many of each move's changes having some.
 
     Every row is measured by the norm of its row of D, so that the price of its violation is, too.
@@ -357,4 +399,5 @@ def _step_qp(maps: Condensed, limits: PlanLimits, changes: int) -> StepQP:
         shift_dual=row[limits.next[source]],
         rate_rows=row[hard],
         rate_inputs=hard - n,
+        stages=stages,
     )

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from koopmpc import checks
 from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.move import Status
+from koopmpc.control.solvers.stages import QPStages
 from koopmpc.errors import DataError, ShapeError
 
 INFINITY = 1e30  # OSQP and DAQP read a limit of this size as none
@@ -41,7 +42,8 @@ class StepQP(QP):
     It is the cost unit · wᵀH w, and the price of slacks, divided by 2 unit. The rows limit the entries `source` of the
     plan times `scale`: their limits move by that product. `shift_primal` and `shift_dual` tell where the next stage's
     entry stands; one past the end stands for zero. The `allowance` of a soft row is in the unit of its limit.
-    `rate_rows` limit the first change of the inputs `rate_inputs`, hard.
+    `rate_rows` limit the first change of the inputs `rate_inputs`, hard. `stages` are the same QP before it was
+    condensed, where each stage is one step and none has rows of its own.
     """
 
     softness: Softness = field(kw_only=True)
@@ -51,6 +53,7 @@ class StepQP(QP):
     shift_dual: Int[np.ndarray, " m"]
     rate_rows: Int[np.ndarray, " r"]
     rate_inputs: Int[np.ndarray, " r"]
+    stages: QPStages | None = None
 
 
 @dataclass(slots=True)
@@ -88,6 +91,8 @@ class QPSolver(ABC):
     """The coordinates of the condensed QP that suit it: in "riccati" the Hessian is the identity; see `condense`."""
     resumes = False
     """Whether `resume` can go on from the end of the last solve."""
+    patience: int | None = None
+    """Iterations after which it leaves the QP to the solver after it."""
 
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
         self._settings, self._stale = dict(settings or {}), False
@@ -205,11 +210,15 @@ class QPSolver(ABC):
 
 
 class SolverTurn(NamedTuple):
-    """A solver and its own settings; a `late` one is set up when it is first needed."""
+    """A solver and its own settings; a `late` one is set up when it is first needed.
+
+    One with `patience` gives up after so many iterations, and is asked first again once so few rows push.
+    """
 
     solver: type[QPSolver]
     settings: Mapping[str, Any]
     late: bool = False
+    patience: int | None = None
 
 
 class StepSolver:
@@ -233,6 +242,9 @@ class StepSolver:
         self._last: QPSolution | None = None
         self._hold(qp)
         self._solvers = [None if turn.late else turn.solver(qp, turn.settings) for turn in turns]
+        self._few = turns[0].patience
+        if self._few is not None:
+            self.first.patience = self._few
 
     @property
     def first(self) -> QPSolver:
@@ -297,6 +309,8 @@ class StepSolver:
             self._last = None
             return found, conflict
         self._last = found
+        if self._few is not None and self._turn and np.count_nonzero(found.y) <= self._few:
+            self._turn = 0
         return found, max(conflict, self._gave_way(found, moved, limits)) if self._soft else conflict
 
     def _limit(

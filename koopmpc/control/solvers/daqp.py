@@ -231,7 +231,9 @@ class DAQP(QPSolver):
         start = perf_counter() if limit else 0.0
         self._send(None if y is None else self._active(y))
         crowded = y is not None and self._soft and np.count_nonzero(y) > len(v)
-        x, multipliers, flag, iterations = self._run(limit, len(v) if crowded else None)
+        x, multipliers, flag, iterations = self._run(limit, len(v) if crowded else self.patience)
+        if self.patience is not None and flag == _ITERATIONS and not crowded:
+            return QPSolution(v.copy(), np.zeros_like(self.low), Status.MAX_ITERATIONS, iterations, self.name)
         if y is not None and crowded and flag == _ITERATIONS:
             self._send(self._active(np.where(self._sense == _SOFT, 0.0, y)))
             x, multipliers, flag, more = self._run(max(limit - (perf_counter() - start), 1e-6) if limit else limit)

@@ -8,13 +8,16 @@ pyproject.toml names that package, and an import contract gives it its one door.
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from koopmpc import checks
-from koopmpc.control.solvers.base import QPSolver, SolverTurn
+from koopmpc.control.solvers.base import QPSolver, SolverTurn, StepQP
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.solvers.osqp import OSQP
+from koopmpc.control.solvers.piqp import PIQP
 from koopmpc.errors import DataError
 
-SOLVERS: dict[str, type[QPSolver]] = {"osqp": OSQP, "daqp": DAQP}
+SOLVERS: dict[str, type[QPSolver]] = {"osqp": OSQP, "daqp": DAQP, "piqp": PIQP}
 
 FINISHER = DAQP  # solves to rounding what an inexact solver leaves, the targets of references, and the QPs of C code
 RESCUER = "osqp"  # answers where the finisher has none; it is set up when it is first asked
@@ -25,6 +28,14 @@ RESCUER = "osqp"  # answers where the finisher has none; it is set up when it is
 # alone, n ≥ 400 and more than two thirds of the planned inputs at a limit, by up to 2.8; with few of them at a limit
 # DAQP won the same sizes by up to 46. How many there will be is not known when a controller is built: one row for all.
 FIRST = "daqp"
+
+# Where a plan is long, its stages are small, and all its limits are hard, the first solver gets few iterations; then
+# the stages are solved as they are, sparse. The time of PIQP grows with N, that of DAQP with N³ where as many rows act.
+# `python -m tests.speed.first_solver --parts long` measures it; docs/research.md has the table.
+SPARSE = "piqp"
+LONG = 300  # steps from which on it is faster, first steps from nothing and later ones
+WIDE = 60  # and so many steps for each entry of a stage's state, of which its time is a power of 1.2 to 2
+PATIENCE = 20  # iterations that the first solver gets there
 
 
 def order_solvers(solver: str, settings: Mapping[str, Any]) -> list[SolverTurn]:
@@ -49,6 +60,21 @@ def order_solvers(solver: str, settings: Mapping[str, Any]) -> list[SolverTurn]:
     if not kind.exact:
         turns.append(SolverTurn(SOLVERS[FINISHER.name], {}))
     return [*turns, SolverTurn(SOLVERS[RESCUER], {}, late=True)]
+
+
+def needs_stages(solver: str, N: int) -> bool:
+    """Return whether a solver of a plan of N steps may need its stages."""
+    return solver == SPARSE or N >= LONG
+
+
+def add_sparse(turns: list[SolverTurn], qp: StepQP) -> list[SolverTurn]:
+    """Return the solvers of a step where none was named: for a long plan of small stages the sparse one is second."""
+    stages, hard = qp.stages, bool(np.isinf(qp.softness.linear).all())
+    if stages is None or max(LONG, WIDE * len(stages.A)) > stages.N or not hard:
+        return turns
+    first = turns[0]
+    sparse = SolverTurn(SOLVERS[SPARSE], {})
+    return [first._replace(patience=PATIENCE), sparse, first._replace(late=True), *turns[1:]]
 
 
 def exact_turn(turns: list[SolverTurn]) -> SolverTurn:

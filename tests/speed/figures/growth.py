@@ -25,7 +25,8 @@ sp: Any = scipy_sparse
 HORIZONS = (50, 100, 200, 500)
 METHODS = {
     "daqp": "condensed, DAQP",
-    "osqp": "condensed, OSQP",
+    "piqp": "stages, PIQP",
+    "auto": "no solver named",
     "riccati": "Riccati interior point",
     "riccati in C": "Riccati interior point, in C",
     "sparse": "OSQP alone, sparse",
@@ -48,7 +49,7 @@ def make_step(method: str, N: int) -> Any:
     end = np.array([np.inf, 0.5, np.inf, np.inf])
     limits = km.Limits(-1, 1, x_min=-end, x_max=end, slack=None)
     zero = np.zeros(4)
-    if method in ("daqp", "osqp"):
+    if method in ("daqp", "piqp", "auto"):
         model = km.LinearPredictor(A, B, np.eye(4), km.State(), 0.1, NAMES, ("u",))
         mpc: Any = km.KoopmanMPC(model, cost, limits, N, solver=method)
         return partial(take_step, mpc, zero)
