@@ -24,7 +24,7 @@ from koopmpc.control.linear.plan import plan_map, planned_states
 from koopmpc.control.linear.windows import LimitWindows, describe_bounds, limit_windows
 from koopmpc.control.move import Fallback, Move, Plan, Status, alone, busy
 from koopmpc.control.program import linear_parts, no_export, publish_estimator, reference_table
-from koopmpc.control.solvers import FINISHER, add_sparse, exact_turn, needs_stages, order_solvers
+from koopmpc.control.solvers import FINISHER, add_sparse, exact_turn, order, order_solvers
 from koopmpc.control.solvers.base import StepSolver
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.stepped.blocks import Moves
@@ -183,7 +183,7 @@ class KoopmanMPC(MPCBase):
             self._initial.buffer,
             disturbed=disturbed,
             periodic=self._initial.periodic.size > 0,
-            staged=needs_stages(self._solver, self._N),
+            staged=self._solver == order.SPARSE or self._N >= order.LONG,
         )
         self._hold_limits()
         self._options = {"solver": self._solver, "settings": settings}
@@ -338,7 +338,7 @@ class KoopmanMPC(MPCBase):
             self._initial.buffer,
             disturbed=self._disturbed,
             periodic=self._initial.periodic.size > 0,
-            staged=needs_stages(self._solver, self._N),
+            staged=self._solver == order.SPARSE or self._N >= order.LONG,
         )
         self._read = self._map.moving
         self.predictor, self._states = predictor, None

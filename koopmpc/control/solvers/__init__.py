@@ -4,5 +4,4 @@ from koopmpc.control.solvers.order import FINISHER as FINISHER
 from koopmpc.control.solvers.order import SOLVERS as SOLVERS
 from koopmpc.control.solvers.order import add_sparse as add_sparse
 from koopmpc.control.solvers.order import exact_turn as exact_turn
-from koopmpc.control.solvers.order import needs_stages as needs_stages
 from koopmpc.control.solvers.order import order_solvers as order_solvers

@@ -62,11 +62,6 @@ def order_solvers(solver: str, settings: Mapping[str, Any]) -> list[SolverTurn]:
     return [*turns, SolverTurn(SOLVERS[RESCUER], {}, late=True)]
 
 
-def needs_stages(solver: str, N: int) -> bool:
-    """Return whether a solver of a plan of N steps may need its stages."""
-    return solver == SPARSE or N >= LONG
-
-
 def add_sparse(turns: list[SolverTurn], qp: StepQP) -> list[SolverTurn]:
     """Return the solvers of a step where none was named: for a long plan of small stages the sparse one is second."""
     stages, hard = qp.stages, bool(np.isinf(qp.softness.linear).all())
