@@ -11,6 +11,7 @@ from rich.text import Text
 
 from koopmpc.cli import start, sweeps
 from koopmpc.cli.console import (
+    as_options,
     bar,
     console,
     folder_of,
@@ -142,7 +143,8 @@ def fit(
     }
 
     def say_line(text: str) -> None:
-        say(f"{text}\n")
+        notes = (as_options(line) if line.startswith("! ") else line for line in text.split("\n"))
+        say("\n".join([*notes, ""]))
 
     if goal_template:
         with friendly():

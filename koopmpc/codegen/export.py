@@ -312,7 +312,10 @@ def _write_readme(tables: Tables, measured: tuple[int, int, int] | None, precisi
             (f"{what}s {of}, at most", str(limit)),
             (f"floating-point operations of one {what}, at most", str(count_iteration_flops(tables))),
         ]
-    rows.append(("rounding of the lifted state, amplified to a share of an input's span", f"{tables.conditioning:.2g}"))
+    rounding = float(np.finfo(np.float32 if single else np.float64).eps) * tables.conditioning
+    rows.append(
+        (f"change of an input by rounding in {precision} precision, at most", f"{100 * rounding:.2g} % of its range")
+    )
     table = "\n".join(f"| {what} | {value} |" for what, value in rows)
     notes = "".join(f"- {note}\n" for note in filter(None, [*tables.notes, tables.effort]))
     solver = (

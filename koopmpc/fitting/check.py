@@ -120,6 +120,8 @@ class Checked:
         Time of the first step of a fresh controller, and the 99 % quantile of all others [s].
     dt
         Sampling time [s].
+    cost_steps
+        A cost is the sum over so many steps, the first of a run.
     page
         Path of the report.
     compared
@@ -139,6 +141,7 @@ class Checked:
     rate: RateVerdict | None = None
     plant: PlantVerdict | None = None
     remarks: tuple[str, ...] = ()
+    cost_steps: int = 0
 
     @property
     def verdict(self) -> str:
@@ -158,7 +161,8 @@ class Checked:
             aside = [*aside, f"new logs: {self.compared.sentence}"]
         verdicts = [each for each in (self.rate, self.plant) if each is not None]
         bound = ["", *(f"- {sentence}" for each in verdicts for sentence in each.list_sentences())]
-        return render_text(verdict, *reasons, *aside, "", build_table(_HEADINGS, rows), "", times, *bound)
+        table = build_table(("kind of run", *_list_headings(self.cost_steps)), rows)
+        return render_text(verdict, *reasons, *aside, "", table, "", _explain_cost(self), times, *bound)
 
 
 _VERDICTS = {
@@ -166,8 +170,20 @@ _VERDICTS = {
     "not kept": "THE GOAL IS NOT KEPT",
     "cannot say": "NOBODY CAN SAY WHETHER THE GOAL IS KEPT: the logs do not show it",
 }
-_NUMBERS = ("lost", "median\ncost", "worst\nviolation", "error\nat the end", "steps without\na good status")
-_HEADINGS = ("kind of run", *_NUMBERS)
+
+
+def _explain_cost(checked: Checked) -> str:
+    steps = checked.cost_steps
+    return (
+        f"A cost is the sum over the first {steps} steps ({format_duration(steps * checked.dt)}) of a run. That of the "
+        "design is over as many, from other starts and on other stand-ins. Of a run of your own, compare the first "
+        f"{steps} steps: km.metrics(run.take_first({steps})).cost."
+    )
+
+
+def _list_headings(steps: int) -> list[str]:
+    cost = f"median cost,\n{steps} steps"
+    return ["lost", cost, "worst\nviolation", "error\nat the end", "steps without\na good status"]
 
 
 def _row(one: Figures) -> list[str]:
@@ -280,7 +296,7 @@ def check_controller(
     page = Path(folder, "report.html")
     kept = not (reasons or doubts)
     said = tuple(reasons), tuple(broken), tuple(figures)
-    verdicts = tuple(doubts), compared, verdict, plant, tuple(_list_remarks(evidence, figures))
+    verdicts = tuple(doubts), compared, verdict, plant, tuple(_list_remarks(evidence, figures)), asked.steps
     result = Checked(kept, *said, cold, hot, controller.dt, page, *verdicts)
     _write_page(result, path, saved, controller)
     return result
@@ -494,7 +510,9 @@ def _write_page(result: Checked, path: str | Path, saved: SavedDesign, controlle
             f"{len(result.figures)} kinds of runs on {len(saved.evidence.surrogates)} models that were learned from "
             "its logs. An error that all of these models share does not show in these runs."
         )
-        page.table(["kind of run", *(heading.replace("\n", " ") for heading in _NUMBERS)], map(_row, result.figures))
+        headings = [heading.replace("\n", " ") for heading in _list_headings(result.cost_steps)]
+        page.table(["kind of run", *headings], map(_row, result.figures))
+        page.text(_explain_cost(result))
         if result.rate is not None:
             page.heading("How often it fails", 3)
             page.text(f"Said before the loops: {plan_verdict(result.rate.wished)}.")

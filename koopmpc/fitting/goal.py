@@ -349,6 +349,9 @@ def plan_goal(
     return further
 
 
+_EVENED = "  # nobody asked for it: steps of the logs are unequal; states are interpolated to so many s, inputs held"
+
+
 def write_template(
     data: Data, *, horizon: int | None = None, memory: int = IN_MEMORY, say: Say | None = None, **reading: Any
 ) -> str:
@@ -374,14 +377,18 @@ def write_template(
         raise DataError("\n".join([advice, *split.notes]))
     (ignore_text if say is None else say)(describe_data(split))
     both = split.seen.with_episodes([*split.seen, *split.held_out])
-    return format_template(both, horizon=horizon, reading=split.reading)
+    evened = "resample" in split.reading and reading.get("resample") is None
+    return format_template(both, horizon=horizon, reading=split.reading, evened=evened)
 
 
-def format_template(data: Episodes, *, horizon: int | None = None, reading: Mapping[str, Any] | None = None) -> str:
+def format_template(
+    data: Episodes, *, horizon: int | None = None, reading: Mapping[str, Any] | None = None, evened: bool = False
+) -> str:
     """Return the text of a goal file for these data: hold the medians of the last states, with inputs in their range.
 
     The weight of a state is 1 / (half its range)², so that errors as large as the data weigh alike; that of an input is
-    a tenth of this. `reading` holds the keywords of `load_episodes` that the logs are to be read with again.
+    a tenth of this. `reading` holds the keywords of `load_episodes` that the logs are to be read with again; with
+    `evened` a comment says that nobody asked for its ``resample``.
     """
     X = np.concatenate([episode.X for episode in data])
     U = np.concatenate([episode.U for episode in data])
@@ -403,7 +410,8 @@ def format_template(data: Episodes, *, horizon: int | None = None, reading: Mapp
     ]
     if reading:
         lines += ["", "[logs]  # how koopmpc fit reads them; an option such as --resample replaces the value here"]
-        lines += [f"{name} = {_format_toml(value)}" for name, value in reading.items()]
+        why = {"resample": _EVENED} if evened else {}
+        lines += [f"{name} = {_format_toml(value)}{why.get(name, '')}" for name, value in reading.items()]
     for i, name in enumerate(data.states):
         low, high = X[:, i].min(), X[:, i].max()
         unit = _find_unit(name)

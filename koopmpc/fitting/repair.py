@@ -15,6 +15,7 @@ from koopmpc.bench.store import RESULTS
 from koopmpc.data.angles import count_wraps
 from koopmpc.data.episodes import Episode, Episodes, join_sets
 from koopmpc.data.files.folder import Files
+from koopmpc.data.files.notes import ResampledWarning, name_files, name_resampled
 from koopmpc.data.files.sampling import UnevenSamplingError
 from koopmpc.data.files.tables import SAVED
 from koopmpc.data.pace import find_pace
@@ -66,9 +67,7 @@ def read_logs(
         except UnevenSamplingError as uneven:
             if "resample" in reading:
                 raise
-            dt = round_step(uneven.dt)
-            notes.append(f"{str(uneven).rpartition('; pass')[0]}; interpolated to {dt:g} s")
-            reading["resample"] = dt
+            reading["resample"] = round_step(uneven.dt)
             files = Files(logs, **reading)
             split = divide_files(files, horizon, rng, memory, short)
     how = [*shorten_notes(notes, files.files), *describe_guesses(files.files, reading)]
@@ -307,16 +306,21 @@ def collect_notes(notes: list[str]) -> Generator[None]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", FitWarning)
         yield
+    resampled: dict[str, ResampledWarning] = {}
     for one in caught:
-        if not issubclass(one.category, FitWarning):
+        if isinstance(one.message, ResampledWarning):
+            resampled.setdefault(one.message.file, one.message)
+        elif not issubclass(one.category, FitWarning):
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
         elif not issubclass(one.category, ColumnWarning) and str(one.message) not in notes:
             notes.append(str(one.message))
+    if resampled:
+        notes.insert(0, name_resampled(list(resampled.values())))
 
 
 def shorten_notes(notes: Iterable[str], files: Iterable[Path]) -> list[str]:
     """Return the notes: one line for a note that files share, and the first few of those that only one file has."""
-    known = {str(file) for file in files}
+    known = [str(file) for file in files]
     of: dict[str, list[str]] = {}
     for note in notes:
         file, _, text = note.partition(": ")
@@ -328,7 +332,7 @@ def shorten_notes(notes: Iterable[str], files: Iterable[Path]) -> list[str]:
     alone = 0
     for text, where in of.items():
         if len(where) > 1:
-            short.append(f"{where[0]} and {len(where) - 1} more files: {text}")
+            short.append(f"{name_files(where, known)}: {text}")
         elif where and alone < _SHOWN:
             short.append(f"{where[0]}: {text}")
         elif not where:

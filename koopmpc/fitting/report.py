@@ -388,7 +388,7 @@ def _list_promise(evidence: Evidence) -> list[str]:
         f"Of {number} loops after the choice, {lost} were lost: fewer than {to_percent(expected.lost_bound)} of loops "
         "like these are (95 % confidence).",
         f"In 95 % of them {_say_violated(expected.violation_bound)}.",
-        f"In 90 % of them the cost is between {low:.4g} and {high:.4g}.",
+        f"In 90 % of them the cost over {expected.steps} steps is between {low:.4g} and {high:.4g}.",
         f"With inputs that act 20 % more or less, {int(np.sum(~np.isfinite(expected.cost_off)))} of "
         f"{len(expected.cost_off)} loops were lost.",
         "These numbers are estimates, and no guarantee. All stand-ins are learned from the same logs, and an error "

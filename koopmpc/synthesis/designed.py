@@ -28,7 +28,7 @@ from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_value, cost_interv
 from koopmpc.synthesis.judging import UNSURE, is_alike
 from koopmpc.synthesis.surrogates import Surrogate
 from koopmpc.terminal import build_leaderboard, label_lines, render_text
-from koopmpc.text import to_percent
+from koopmpc.text import format_duration, to_percent
 from koopmpc.validate.binomial import bound_failure_rate
 from koopmpc.validate.logs.summary import LogSummary
 from koopmpc.values import Value
@@ -357,7 +357,16 @@ class Design:
         place = self.chosen_linear
         if place is not None and place != self.chosen:
             parts.append(f"best linear: {self.leaderboard[place].title}")
-        parts += ["", "expected", str(self.expected), ""]
+        steps = self.expected.steps
+        parts += [
+            "",
+            f"expected over {steps} steps ({format_duration(steps * self.controller.dt)})",
+            str(self.expected),
+            "",
+            f"A cost is the sum over a run of {steps} steps; koopmpc check sums over as many, from other starts. Of a "
+            f"run of your own, compare the first {steps} steps: km.metrics(run.take_first({steps})).cost.",
+            "",
+        ]
         rows: list[list[str]] = []
         titles = Counter(row.title for row in self.leaderboard)
         kept, leads = self._find_twins()

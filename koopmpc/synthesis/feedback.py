@@ -46,6 +46,7 @@ _MOST = 20_000  # and up to which,
 _WORK = 200_000  # with rows times states squared at most, above which a filter takes too long
 _PLATES = 20  # thin plates of the model that tells noise from curvature
 _RIDGE = 1e-8  # of the models that judge
+_UNUSED = "the set points are not used, and models are fitted by plain least squares"
 _GAIN = 0.98  # the error on unseen rows must fall to this share
 
 
@@ -142,7 +143,7 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
         if signals is None:
             return kept
         said = f"the logs hold no feedback, for the states explain {to_percent(share)} of the inputs"
-        return replace(kept, sentence=f"instruments are not used: {said}")
+        return replace(kept, sentence=f"{_UNUSED}: {said}")
     ways: list[_Way] = [_Filter()] if total * episodes.nx**2 <= _WORK else []
     if signals is not None:
         width = signals[0].shape[1]
@@ -170,7 +171,7 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
         return min(found, key=lambda one: one[0])[1]
     if signals is None:
         return replace(kept, sentence=reason if RESTS in reason else "")
-    return replace(kept, sentence=f"instruments are not used: {reason}")
+    return replace(kept, sentence=f"{_UNUSED}: {reason}")
 
 
 def _mend(episodes: Episodes) -> tuple[Episodes, str]:
@@ -225,7 +226,7 @@ class _Projection:
         tested = instrumental_edmd(logs, State() + Constant(), signals, lags=min(12, self.settles), level=0.01)
         assert tested.report is not None
         if "not found biased" in tested.report.route:
-            raise DataError("least squares is not found biased under this feedback")
+            raise DataError("no test finds that the feedback and the noise falsify it")
         return project_on_instruments(logs, signals, self.settles)
 
     def describe(self) -> str:
@@ -271,7 +272,7 @@ def _compare_unseen(episodes: Episodes, pieces: _Pieces, way: _Way) -> float:
         raise DataError("the logs are too short to be judged on unseen rows")
     mean = np.exp(np.mean(logs, axis=0))
     if not np.isfinite(mean).all() or mean[1] > 1:
-        raise DataError("a model with thin plates loses by it on unseen rows")
+        raise DataError("with the set points a nonlinear model forecasts unseen rows worse")
     return float(mean[0])
 
 

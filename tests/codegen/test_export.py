@@ -1,5 +1,6 @@
 """`km.export`: a folder that builds with every warning an error, runs clean, and closes the loop as Python does."""
 
+import re
 import shutil
 import subprocess
 
@@ -112,6 +113,8 @@ def test_the_folder_may_be_written_again_but_not_over_other_files(exported, tmp_
 def test_the_readme_states_sizes(exported):
     text = (exported[2] / "README.md").read_text()
     assert "RAM: one `koopmpc_state`" in text
+    (share,) = re.findall(r"change of an input by rounding in double precision, at most \| (\S+) % of its range", text)
+    assert 0 < float(share) < 1e-8
     assert "DAQP" in text
     assert "(a" not in (exported[2] / "koopmpc_sizes.h").read_text()
 

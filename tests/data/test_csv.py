@@ -97,7 +97,10 @@ def test_unequal_time_is_named_and_resampled(tmp_path: Path) -> None:
     ) as caught:
         km.load_episodes(file)
     assert caught.value.dt == pytest.approx(np.median(np.diff(t)), rel=1e-3)  # what to resample to
-    (episode,) = read = km.load_episodes(file, resample=0.05)
+    with pytest.warns(
+        km.FitWarning, match=r"log\.csv: sampling is unequal: .*the first at line 3, .*; interpolated to"
+    ):
+        (episode,) = read = km.load_episodes(file, resample=0.05)
     grid = t[0] + 0.05 * np.arange(len(episode.X))
     assert read.dt == 0.05
     assert grid[-1] <= t[-1] < grid[-1] + 0.05
@@ -292,3 +295,26 @@ def test_truth_values_with_one_missing_cut_an_episode(tmp_path: Path) -> None:
     with pytest.warns(km.FitWarning, match="1 gap .* cut 1 episode into 2; 1 of 5 rows are lost"):
         read = km.load_episodes(file)
     assert [episode.X[:, 0].tolist() for episode in read] == [[1, 0], [1, 0]]
+
+
+def test_what_several_files_share_is_one_sentence_that_names_them(tmp_path: Path) -> None:
+    t, files = np.arange(6) + np.array([0, 0, 0.1, 0, 0, 0]), []
+    for i in range(12):
+        rows = [f"{a:.2f},{i + k},{k},{3 * k % 5}" for k, a in enumerate(t)]
+        files.append(
+            text(tmp_path / f"run_{i:02d}.csv", "\n".join(["time [s],level,level setpoint,pump", *rows]) + "\n")
+        )
+    with pytest.warns(km.FitWarning) as caught:
+        km.load_episodes(*files, resample=1.0)
+    targets, unequal = (str(one.message) for one in caught)
+    assert targets == (
+        f"12 files ({files[0]} to run_11.csv): 'level setpoint' is a set point of a controller by its name, and left "
+        "out; pass inputs= or states= to use it"
+    )
+    assert unequal.startswith(
+        "sampling is unequal in 12 files, interpolated to 1 s; steps that differ by more than 2 %"
+    )
+    assert all(f"run_{i:02d}.csv (2 of 5, from line 4)" in unequal for i in range(12))
+    with pytest.warns(km.FitWarning) as caught, pytest.raises(km.errors.LogError):
+        km.load_episodes(files[0], files[1], tmp_path / "none.csv", resample=1.0)  # what was found is said all the same
+    assert len(caught) == 2

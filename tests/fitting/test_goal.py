@@ -19,8 +19,9 @@ from koopmpc.fitting.check import RunKind, check_controller
 from koopmpc.fitting.goal import design_data, format_template, load_reading, read_goal, write_template
 from koopmpc.fitting.repair import read_logs, round_step
 from koopmpc.predict.base import load_value, save_value
-from koopmpc.synthesis.designed import SavedDesign
+from koopmpc.synthesis.designed import SavedDesign, read_controller
 from koopmpc.synthesis.surrogates import describe_rest
+from koopmpc.text import format_duration
 from tests.fitting.mass import GOAL, NAMES, A, B, logs
 
 
@@ -178,10 +179,18 @@ def test_a_goal_file_keeps_the_step_that_an_uneven_clock_was_brought_to(tmp_path
         times = 0.1 * (np.arange(40) + rng.uniform(-0.1, 0.1, 40))
         rows = np.column_stack([times, episode.X[:-1], episode.U])
         np.savetxt(tmp_path / f"{i}.csv", rows, delimiter=",", header="time [s],x,v,force", comments="")
-    (tmp_path / "goal.toml").write_text(write_template(tmp_path))
-    step = load_reading(tmp_path / "goal.toml")["resample"]
-    assert step == pytest.approx(0.1, rel=0.05)
-    assert f"steps of {step:g} s" in (tmp_path / "goal.toml").read_text()
+    told: list[list[str]] = []
+    for reading in ({}, {"resample": 0.1}):
+        said: list[str] = []
+        text = write_template(tmp_path, say=said.append, **reading)
+        (tmp_path / "goal.toml").write_text(text)
+        step = load_reading(tmp_path / "goal.toml")["resample"]
+        assert step == pytest.approx(0.1, rel=0.05)
+        assert f"steps of {step:g} s" in text
+        assert ("# nobody asked for it: steps of the logs are unequal" in text) == (not reading)
+        told.append([line for line in said[0].splitlines() if "sampling is unequal in" in line])
+    assert len(told[0]) == len(told[1]) == 1  # the rows are named again where the goal file says how they are read
+    assert re.search(r"0\.csv \(\d+ of 39, from line \d+\)", told[1][0])
 
 
 def goal_of(text, tmp_path):
@@ -418,6 +427,14 @@ def test_the_commands_write_a_template_design_and_check(tmp_path, monkeypatch):
     checked = call(app, ["check", file, "--runs", "2", "--rate", "0.5"])
     assert checked.exit_code == 0, checked.output
     assert "the goal is kept" in checked.stdout
+    saved = read_controller(file)
+    assert isinstance(saved, SavedDesign)
+    steps = saved.evidence.expected.steps
+    told = [" ".join(text.split()) for text in (result.stdout, checked.stdout)]
+    assert f"expected over {steps} steps ({format_duration(0.1 * steps)})" in told[0]
+    for text in told:  # the run length stands beside each cost, and how to compare one's own run
+        assert f"compare the first {steps} steps: km.metrics(run.take_first({steps})).cost" in text
+    assert f"A cost is the sum over the first {steps} steps ({format_duration(0.1 * steps)}) of a run." in told[1]
     both = call(app, ["fit", "logs.npz", "--goal", "goal.toml", "--horizon", "9"])
     assert both.exit_code == 2
     assert "--horizon 9 is of no use with --goal; write horizon = 9 into goal.toml" in " ".join(both.stderr.split())

@@ -252,6 +252,7 @@ def test_what_is_printed_names_the_choice_and_says_that_figures_are_estimates():
     text = str(usual())
     assert text.startswith(f"chosen: {usual().best.title}")
     assert "no promise" in text
+    assert f"\nexpected over {usual().expected.steps} steps (" in text
     recipes = [row.recipe for row in usual().leaderboard]
     assert all(one != other for k, one in enumerate(recipes) for other in recipes[:k])  # judged twice, listed once
     names = [line.split("  ")[1].strip() for line in text.splitlines() if line.startswith(("   ", "→  ", "l  "))]

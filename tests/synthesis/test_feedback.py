@@ -32,7 +32,7 @@ def test_process_noise_alone_keeps_least_squares_with_its_variance():
         found = remove_feedback(data, r)
         assert found.episodes is data
         assert not found.noise.any()
-        assert found.sentence.startswith("instruments are not used")
+        assert found.sentence.startswith("the set points are not used, and models are fitted by plain least")
 
 
 def test_a_set_point_at_rest_identifies_nothing():

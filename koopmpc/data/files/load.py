@@ -1,5 +1,6 @@
 """load_episodes: the episodes of one file or of several, in any format that is registered."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
@@ -9,6 +10,7 @@ from koopmpc.data.episodes import Episodes, PlantSignature, join_sets
 from koopmpc.data.files.columns import TableSettings
 from koopmpc.data.files.formats import LogTable, find_format, read_log
 from koopmpc.data.files.frames import is_frame, read_frame
+from koopmpc.data.files.notes import join_warnings
 from koopmpc.data.files.recording import read_recording
 from koopmpc.data.files.tables import read_table
 from koopmpc.errors import DataError
@@ -73,12 +75,22 @@ def load_episodes(
     Warns
     -----
     FitWarning
-        There are gaps, columns that are constant or repeat another, or no column with the name of an input.
+        There are gaps, columns that are constant or repeat another, or no column with the name of an input; unequal
+        steps were interpolated. What is the same in several files is one warning, with their count and names.
     """
     settings = TableSettings(dt, states, inputs, disturbances, resample, columns)
     files = [log if is_frame(log) else disk.path_of(log) for log in (path, *more)]
-    sets = [_load_file(file, settings) for file in files]
     places = ["a DataFrame" if is_frame(log) else str(log) for log in files]
+    if len(files) == 1:
+        return _load_file(files[0], settings)
+    caught: list[warnings.WarningMessage] = []
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            sets = [_load_file(file, settings) for file in files]
+    finally:
+        said = [one.message for one in caught if isinstance(one.message, Warning)]
+        for joined in join_warnings(said, places):
+            warnings.warn(joined, stacklevel=2)
     plant = PlantSignature.of(sets[0], places[0])
     for place, episodes in zip(places, sets, strict=True):
         plant.check(episodes, place, tolerance=0.0)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from koopmpc.data.episodes import Episode, Origin
+from koopmpc.data.files.notes import ResampledWarning
 from koopmpc.errors import DataError, FitWarning
 
 _JITTER = 0.02  # share of dt by which a step may differ
@@ -102,6 +103,7 @@ def resample(parts: list[Signals], dt: float, where: str) -> list[Signals]:
         rows += len(part.X)
         kept += sum(len(piece.X) for piece in pieces)
         found += [_on_grid(piece, dt, where) for piece in pieces]
+    _warn_of_uneven(parts, dt, where)
     if gaps:
         why = "a gap is a step between complete rows of more than 1.5 times the usual one"
         _warn_of_gaps(where, gaps, len(parts), len(found), f"{rows - kept} of {rows} rows are lost; {why}")
@@ -113,6 +115,29 @@ def resample(parts: list[Signals], dt: float, where: str) -> list[Signals]:
             stacklevel=2,
         )
     return found
+
+
+def _warn_of_uneven(parts: list[Signals], dt: float, where: str) -> None:
+    """Warn if steps differ from the median one; gaps, and rows that are left out, have sentences of their own."""
+    whole = [part.at(np.asarray(np.isfinite(part.X).all(axis=1), dtype=np.bool_)) for part in parts]
+    steps = [np.diff(part.time) for part in whole if part.time is not None]
+    known = np.concatenate([np.zeros(0), *steps])
+    known = known[np.isfinite(known) & (known > 0)]
+    if not len(known):
+        return
+    usual, uneven, first = float(f"{np.median(known):.6g}"), 0, ("", 0.0)
+    for part, ahead in zip(whole, steps, strict=True):
+        off = np.flatnonzero((ahead > 0) & (ahead <= _GAP * usual) & (np.abs(ahead - usual) > _JITTER * usual))
+        if len(off) and not uneven:
+            k = int(off[0])
+            place = Origin(where, part.states, part.rows, part.X, part.rows, resampled=False).place(
+                int(part.rows[k + 1])
+            )
+            first = place.rpartition(", ")[2], float(f"{ahead[k]:.6g}")
+        uneven += len(off)
+    if uneven:
+        counts = uneven, len(known)
+        warnings.warn(ResampledWarning(where, counts, first, usual, dt), stacklevel=3)
 
 
 def _warn_of_gaps(where: str, gaps: list[int], before: int, after: int, rest: str) -> None:

@@ -88,8 +88,7 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
     found = find_roles(list(names), numeric, told, where, pick_driving(names, columns), clock)
     if found.targets:
         warnings.warn(
-            f"{where}: {', '.join(map(repr, found.targets))} is the set point of a controller by its name, and is left "
-            "out; pass inputs= or states= to use it",
+            f"{where}: {_say_set_points(found.targets)}",
             FitWarning,
             stacklevel=2,
         )
@@ -155,6 +154,13 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
         if str(error).startswith(where):
             raise
         raise DataError(f"{where}: {error}") from error
+
+
+def _say_set_points(names: Sequence[str]) -> str:
+    listed = " and ".join(filter(None, [", ".join(map(repr, names[:-1])), repr(names[-1])]))
+    if len(names) == 1:
+        return f"{listed} is a set point of a controller by its name, and left out; pass inputs= or states= to use it"
+    return f"{listed} are set points of a controller by their names, and left out; pass inputs= or states= to use them"
 
 
 def _rename_columns(table: LogTable, told: TableSettings, where: str) -> LogTable:
