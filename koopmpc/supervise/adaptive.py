@@ -72,6 +72,9 @@ class Adaptive(Published):
     ----------
     learned, skipped
         Number of pairs that were learned from, and that were not.
+    alarms
+        How often the model in use began to fail the test of `find_drift` for the size of residuals: its errors in the
+        memory exceed those on its own data by half, and by more than chance explains.
     renewed, returned, refused
         How often a new model came into use, an earlier one came back, and a new one was no better.
 
@@ -132,7 +135,7 @@ class Adaptive(Published):
         self._before: tuple[np.ndarray, np.ndarray, np.ndarray, bool] | None = None
         self._misfits: deque[float] = deque(maxlen=self._memory.maxlen)
         self._off = self._steps = 0
-        self.learned = self.skipped = self.renewed = self.returned = self.refused = 0
+        self.learned = self.skipped = self.alarms = self.renewed = self.returned = self.refused = 0
         self._good: deque[LinearPredictor] = deque(maxlen=_KEPT)
         self._on_trial: tuple[LinearPredictor, int] | None = None  # a new model, and the pairs learned before it
 
@@ -253,6 +256,7 @@ class Adaptive(Published):
             return
         if self._alarm is None:
             self._alarm = self.learned - len(pairs)
+            self.alarms += 1
         if self._on_trial is None:
             try:
                 self._on_trial = self.online.predictor(), self.learned

@@ -29,16 +29,18 @@ _PART = 0.5  # a name should explain this share of what changed
 _TOO_LITTLE = 1 / 3  # one that explains less than this is not named: the regression itself may not hold there
 
 TOLERANCE = 1.5  # errors may be this many times those of a model on its own data before it counts as changed
-CHANCE = 1e-4  # or so large that chance makes them so in this share of cases
+CHANCE = 1e-5  # or so large that chance makes them so in this share of cases
+PAIRED = 1.5  # sensor noise e_k = v_{k+1} − A v_k makes neighbours alike: n errors tell as much as n / 1.5 at least
 
 
 def exceeds_usual(errors: Float[np.ndarray, "n nx"], usual: Float[np.ndarray, " nx"]) -> bool:
     """Return whether errors of a model are larger than on its own data: by half, and by more than chance allows.
 
-    The test of a change that `Adaptive` makes while it runs: the mean square of n errors of a state over its usual one
-    is compared with χ²_n / n at a level of 1e-4.
+    The test of a change that `Adaptive` makes while it runs: the mean square of errors of a state over its usual one
+    is compared with χ²_m / m at a level of 1e-5. Noise of a sensor is in two errors in sequence, whose correlation is
+    down to −½, so that n errors count as m = n / 1.5: the variance of a mean square is that of 1 + 2 (½)² times white.
     """
-    n = max(len(errors), 1)
+    n = max(len(errors) / PAIRED, 1.0)
     with np.errstate(over="ignore", invalid="ignore"):
         found = np.asarray(np.sqrt((errors**2).mean(axis=0)), dtype=np.float64)
     bound = max(TOLERANCE, float(np.sqrt(chdtri(n, CHANCE) / n)))

@@ -10,11 +10,11 @@ A, B = np.array([[0.9, 0.1], [-0.1, 0.8]]), np.array([[0.0], [0.2]])
 TRUTH = np.hstack([A, B])
 
 
-def run_loop(rng, steps, *, sensor=0.0, process=0.0, moves=True, gain=(1.5, 0.15)):
+def run_loop(rng, steps, *, sensor=0.0, process=0.0, moves=True, gain=(1.5, 0.15), plant=(A, B)):
     """Return a record of a PI loop on the first state, and its set point."""
     held = -(-steps // 12)
     r = np.repeat(rng.choice([-1.0, 1.0], held), 12)[:steps, None] if moves else np.ones((steps, 1))
-    x, total = np.zeros(2), 0.0
+    (A, B), x, total = plant, np.zeros(2), 0.0
     X, U = np.empty((steps + 1, 2)), np.empty((steps, 1))
     for k in range(steps):
         X[k] = x + sensor * rng.standard_normal(2)

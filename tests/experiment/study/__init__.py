@@ -1,4 +1,4 @@
-"""How planned experiments fare on plants that nothing was set on: what bands and limits hold, and what half of the data teaches."""
+"""How planned experiments fare on plants that nothing was set on: what bands and limits hold, what half of the data teaches, and logs under feedback."""
 
 import os
 

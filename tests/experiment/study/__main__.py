@@ -1,4 +1,4 @@
-"""python -m tests.experiment.study safety|halves|drift: measure plants or tasks, print what they amount to, keep it with --write."""
+"""python -m tests.experiment.study STUDY: measure plants or tasks, print what they amount to, keep it with --write."""
 
 import argparse
 import sys
@@ -6,11 +6,14 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+from tests.experiment.study.alarms import judge_alarms
+from tests.experiment.study.bent import judge_bent
 from tests.experiment.study.drift import judge_drift
+from tests.experiment.study.feedback import judge_feedback
 from tests.experiment.study.halves import TASKS, judge_halves
 from tests.experiment.study.plants import draw_task
 from tests.experiment.study.safety import run_experiments
-from tests.experiment.study.table import count_drift, count_halves, count_safety, load_rows, save_rows
+from tests.experiment.study.table import COUNTS, load_rows, save_rows
 
 LEVELS = (0.9, 0.7)  # of plants in turn
 
@@ -20,15 +23,22 @@ def judge_safety(number: int) -> Any:
     return run_experiments(draw_task(number), number, LEVELS[number % len(LEVELS)])
 
 
-JUDGES: dict[str, Callable[[Any], Any]] = {"safety": judge_safety, "halves": judge_halves, "drift": judge_drift}
+JUDGES: dict[str, Callable[[Any], Any]] = {
+    "safety": judge_safety,
+    "halves": judge_halves,
+    "drift": judge_drift,
+    "alarms": judge_alarms,
+    "feedback": judge_feedback,
+    "bent": judge_bent,
+}
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.experiment.study", description=__doc__)
     parser.add_argument("study", choices=list(JUDGES))
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="of halves")
-    parser.add_argument("--first", type=int, default=0, help="number of the first plant, of safety and drift")
-    parser.add_argument("--count", type=int, default=10, help="number of plants, of safety and drift")
+    parser.add_argument("--first", type=int, default=0, help="number of the first plant, of all but halves")
+    parser.add_argument("--count", type=int, default=10, help="number of plants, of all but halves")
     parser.add_argument("--write", action="store_true", help="keep the rows")
     asked = parser.parse_args()
     numbers = range(asked.first, asked.first + asked.count)
@@ -40,8 +50,7 @@ def main() -> int:
         sys.stderr.write(f"{one}: {rows[str(one)]}\n")
         if asked.write:
             save_rows(asked.study, rows)
-    found = count_halves(rows) if asked.study == "halves" else None
-    found = found or (count_safety(rows.values()) if asked.study == "safety" else count_drift(rows.values()))
+    found = COUNTS[asked.study](rows)
     sys.stdout.write("".join(f"{name}: {value}\n" for name, value in found.items()))
     return 0
 

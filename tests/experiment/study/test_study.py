@@ -9,7 +9,7 @@ from tests.experiment.study.plants import draw_task
 from tests.experiment.study.safety import run_experiments
 from tests.experiment.study.table import count_safety, load_rows
 
-SAFETY, DRIFT, HALVES = (load_rows(study) for study in ("safety", "drift", "halves"))
+SAFETY, DRIFT, HALVES, ALARMS = (load_rows(study) for study in ("safety", "drift", "halves", "alarms"))
 
 
 @pytest.mark.parametrize("level", sorted({row.level for row in SAFETY.values()}))
@@ -33,6 +33,15 @@ def test_drift_of_nonlinear_plants_is_named_and_its_absence_is_not():
     rows = list(DRIFT.values())
     assert len(rows) >= 400
     assert not any("changed" in {row.unchanged, row.quiet, row.far} for row in rows)
+    assert np.mean([row.right for row in rows]) >= 0.9
+
+
+def test_adaptive_raises_no_alarm_without_a_change_and_names_the_gain_that_changed():
+    rows = list(ALARMS.values())
+    assert len(rows) >= 100
+    assert not any(row.false or row.renewed for row in rows)
+    assert all(row.unchanged == "unchanged" for row in rows)
+    assert np.mean([row.true > 0 for row in rows]) >= 0.9
     assert np.mean([row.right for row in rows]) >= 0.9
 
 
