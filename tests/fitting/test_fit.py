@@ -204,6 +204,11 @@ def test_the_verdict_on_a_record_looks_as_far_ahead_as_its_output_remembers(tmp_
     assert f"judged {split.ahead} steps = {0.01 * split.ahead:.3g} s ahead" in " ".join(split.notes)
     asked = read_logs(tmp_path / "slow.csv", 30, rng, 10**9, {})
     assert (asked.horizon, asked.ahead) == (30, 30)
+    np.savetxt(tmp_path / "short.csv", rows[:900], delimiter=",", header="time [s],u,y", comments="")
+    short = read_logs(tmp_path / "short.csv", None, rng, 10**9, {})  # too short for a band at any horizon
+    assert 20 < short.ahead <= 45 - 12
+    assert len(short.held_out) >= 4
+    assert "the outputs remember" in " ".join(short.notes)
 
 
 @pytest.mark.usefixtures("quick")

@@ -150,7 +150,7 @@ class Structure(Value):
         past = f"{self.delays} past row{'s' * (self.delays != 1)}"
         return (
             f"{self.size} terms of degree {self.degree} at most in {past}, by forward regression; on unseen rows, "
-            f"in free run and {HORIZON} steps ahead, it errs by {self.error:.3g} spreads"
+            f"in free run and in forecasts, it errs by {self.error:.3g} spreads"
         )
 
     @property

@@ -13,6 +13,8 @@ apart. Three tests look for feedback:
 2. The past p_k predicts an input only by K times its prediction of y_{k+1} (Sargan's test of p_k as instruments).
 3. A later input u_{k+2} seems to act on y_{k+1}.
 
+A feedback of one output that would drive it away, by the sign of the plant's gain, is none: no controller does that.
+
 None of them sees every PI controller of white set points whose sensor is as noisy as the set point moves.
 
 References
@@ -39,7 +41,7 @@ _LAGS = 8  # rows of states that the past holds at most
 _INPUT_LAGS = 24  # rows of inputs that the past holds at most
 _EACH = 12  # rows of the log for each column of the past
 _MOST_ROWS = 10_000  # read at most about this many rows
-_SURE = 5.5  # standard errors by which the coefficient of u_{k+1} must differ from zero
+_SURE = 7.0  # standard errors by which the coefficient of u_{k+1} must differ from zero
 _LATER = 0.5  # reject if u_{k+2} has more than this share of the t value of u_{k+1}
 _FRESH = 1e-3  # share of an input's variance that its past must leave open
 _BLOCKS = 8  # in all but one of this many parts of the log the coefficient must have the same sign
@@ -146,8 +148,9 @@ def measure_timing(log: Log) -> tuple[InputTiming, ...]:
             found.append(InputTiming(name, Timing.UNKNOWN, value, "its past predicts it, so no row shows its effect"))
             continue
         agree = signs[np.flatnonzero(moving).tolist().index(j), i] >= _BLOCKS - 1
-        limits = _USUAL if value**2 > _STRONG * (len(rows.same) + value**2) else _STRICT
-        if why := _explain_feedback(rows, j, limits if abs(value) > _WEAK else _USUAL):
+        strong = value**2 > _STRONG * (len(rows.same) + value**2)
+        limits = _USUAL if strong or abs(value) <= _WEAK else _STRICT
+        if not (strong and _amplifies(rows, j, value)) and (why := _explain_feedback(rows, j, limits)):
             found.append(InputTiming(name, Timing.UNKNOWN, value, why, feedback=True))
         elif abs(value) < _WEAK:
             found.append(InputTiming(name, Timing.NEXT_ROW, value, "its own row does not hold its effect"))
@@ -240,6 +243,29 @@ def _test_coefficients(
         agree += np.sign(np.linalg.pinv(part) @ other) == np.sign(b)
     floor = 1e-12 * np.abs(b)
     return b / np.maximum(errors, np.maximum(floor, 1e-300)), agree
+
+
+def _amplifies(rows: _Rows, j: int, t: float) -> bool:
+    """Return whether input j, were it a feedback, would drive the one output away: no controller does that.
+
+    y_{k+1} = Σ aᵢ y_{k−i} + Σ bᵢ u_{k−i} (+ b u_{k+1}) is fitted with and without the last term. The plant is stable,
+    its past inputs act, and its gain Σ bᵢ / (1 − Σ aᵢ) has the sign of the feedback that t shows, with and without.
+    """
+    if rows.after.shape[1] > 1:
+        return False
+    lags, own = rows.states.shape[1], slice(rows.states.shape[1] + j, None, rows.same.shape[1])
+    past = np.hstack([rows.states, rows.inputs])
+    alone, both = (float(np.sum(_leave_out(_find_basis(P), rows.after) ** 2)) for P in (rows.states, past))
+    more, free = rows.inputs.shape[1], len(past) - past.shape[1] - 1
+    if fdtrc(more, free, (alone - both) / more / max(both / free, 1e-300)) > _INSTRUMENTS:
+        return False
+    without = np.linalg.lstsq(past, rows.after, rcond=1e-9)[0][:, 0]
+    beside = np.linalg.lstsq(np.hstack([past, rows.same]), rows.after, rcond=1e-9)[0][: past.shape[1], 0]
+    for k in (without, beside):
+        poles = np.linalg.eigvals(np.vstack([k[:lags], np.eye(lags - 1, lags)]))
+        if not (np.abs(poles) < 1).all() or k[own].sum() * t <= 0:
+            return False
+    return True
 
 
 def _explain_feedback(rows: _Rows, j: int, limits: _Strictness) -> str:

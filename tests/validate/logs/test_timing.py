@@ -89,6 +89,16 @@ def test_a_late_input_column_is_named_and_the_true_one_is_not():
     assert sum(same_row(record(seed)) for seed in range(10)) == 0
 
 
+@pytest.mark.parametrize("seed", [1002, 1007, 1058, 1101])
+def test_what_looks_like_a_feedback_that_drives_the_output_away_is_a_late_column(seed):
+    assert same_row(record(seed, late=True))
+
+
+@pytest.mark.parametrize(("seed", "kind"), [(1055, "P"), (1082, "PI")])
+def test_an_effect_within_the_row_that_a_feedback_can_make_is_not_named(seed, kind):
+    assert not same_row(record(seed, feedback=kind))
+
+
 @pytest.mark.slow
 def test_counts_of_open_loop_records_at_20_db():
     assert sum(same_row(record(seed, late=True)) for seed in range(100)) >= 95
