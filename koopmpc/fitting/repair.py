@@ -346,7 +346,7 @@ def shorten_notes(notes: Iterable[str], files: Iterable[Path]) -> list[str]:
 IN_MEMORY = 150_000_000  # files up to this size [bytes] are read as a whole
 PAST = 2  # models look back at most this many steps
 _SHARE = 0.2  # hold out this share of the episodes
-_LEAST = 4  # blocks of a held-out end that are too few for a band
+_FEWEST = 4  # blocks of a held-out end that are too few for a band
 _ENOUGH = 12  # bands are finite with at least this many held-out episodes
 _JUDGED = 10_000  # a report is made of at most about this many steps
 
@@ -516,13 +516,13 @@ def _divide_records(
     """Hold out the last fifth of each record, in blocks, to judge; choice and last fit take the whole record.
 
     With `follow` the verdict looks as far ahead as the outputs remember, but `_ENOUGH` blocks are to remain, or
-    `_LEAST` of a record that is too short for `_ENOUGH` of the usual horizon, and so for a band.
+    `_FEWEST` of a record that is too short for `_ENOUGH` of the usual horizon, and so for a band.
     """
     past, verdict = max(delay, *DELAYS), None
     held = sum(min(len(e) - round((1 - _SHARE) * len(e)), _JUDGED) for e in records)
-    least = _ENOUGH if held // _ENOUGH - past >= ahead else _LEAST
+    least = _ENOUGH if held // _ENOUGH - past >= ahead else _FEWEST
     pace: int = find_pace(records) if follow else 0
-    longer = min(pace, int(held // least) - past)
+    longer = min(pace, held // least - past)
     if longer > ahead:
         verdict = longer
     shortest = (verdict or ahead) + past
