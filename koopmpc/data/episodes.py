@@ -1,6 +1,7 @@
 """Episodes: what a plant did, run by run, and the snapshots that a fit reads from them."""
 
 import csv
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -63,18 +64,26 @@ class Origin:
 
     def place(self, first: int, last: int | None = None) -> str:
         """Return file and lines of the rows with these numbers: lines as an editor shows them, else rows."""
-        numbers = [first] if last is None or last == first else [first, last]
-        unit = "row"
-        if self.file.endswith(".csv"):
-            unit, numbers = "line", [self._line(number) for number in numbers]
+        unit, numbers = find_lines(self.file, [first] if last is None or last == first else [first, last])
         return f"{self.file}, {unit}{'s' * (len(numbers) > 1)} {' to '.join(map(str, numbers))}"
 
-    def _line(self, number: int) -> int:
-        """Return the line of a row of a .csv file, below comments, the names of columns and empty lines."""
-        with Path(self.file).open(newline="", encoding="utf-8", errors="replace") as stream:
-            lines = csv.reader(stream)
-            rows = (lines.line_num for cells in lines if cells and not cells[0].startswith("#"))
-            return next(islice(rows, number, None))
+
+def find_lines(file: str, numbers: Sequence[int]) -> tuple[str, list[int]]:
+    """Return "line" and the lines of rows of a .csv file, as an editor shows them; of other files "row" and the rows.
+
+    Rows count from 1, below comments, the names of columns where there are any, and empty lines.
+    """
+    if not file.endswith(".csv") or not Path(file).is_file():
+        return "row", list(numbers)
+    with Path(file).open(newline="", encoding="utf-8", errors="replace") as stream:
+        lines = csv.reader(stream)
+        rows = ((lines.line_num, cells) for cells in lines if cells and not cells[0].startswith("#"))
+        first = next(rows, (0, list[str]()))
+        named = re.search(r"[^\W\d_]", re.sub(r"\b(nan|inf)\b|\de", "", " ".join(first[1]).lower())) is not None
+        at = [line for line, _ in islice(rows, max(numbers, default=0))]
+    at = at if named else [first[0], *at]
+    known = [at[number - 1] for number in numbers if 0 < number <= len(at)]
+    return ("line", known) if len(known) == len(numbers) else ("row", list(numbers))
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -164,7 +164,7 @@ class ExpectedLoop(Value):
             low, high = self.cost_interval
             number, lost = len(self.fresh.cost), int(np.sum(~np.isfinite(self.fresh.cost)))
             corners = self.fresh.corner_cost
-            kinds = ", ".join(f"{count} {kind}" for kind, count in self.loops.items())
+            kinds = ", ".join(f"{count} {_PLACES.get(kind, kind)}" for kind, count in self.loops.items())
             pairs += [
                 ("fresh loops", f"{lost} of {number} lost: below {to_percent(self.lost_bound)} at 95 %"),
                 ("cost in 90 %", f"{low:.4g} to {high:.4g}"),
@@ -398,6 +398,15 @@ class Design:
 
 def _list_figures(row: DesignRow) -> list[str]:
     return [f"{row.score:.3f}", f"{row.worst:.3f}", to_percent(row.violation), f"{row.lost} of {row.runs}"]
+
+
+_PLACES = {  # a kind of loops in `ExpectedLoop.loops`, as it is printed
+    "choice": "in the choice",
+    "choice, inputs 20 % off": "there with inputs 20 % off",
+    "models": "fresh on learned models",
+    "neighbours": "fresh on nearest rows of the logs",
+    "corners": "from corners of the goal's range",
+}
 
 
 def _format_spread(values: Float[np.ndarray, " runs"]) -> str:

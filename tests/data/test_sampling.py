@@ -254,7 +254,7 @@ def test_more_rows_than_memory_holds_are_refused_before_they_are_made(tmp_path, 
     for free, fits in ((1.01 * needed, True), (0.99 * needed, False), (None, True)):
         monkeypatch.setattr("koopmpc.disk.memory", lambda free=free: free)
         if fits:
-            with pytest.warns(km.FitWarning, match=r"1 gap \(after row 2\) cut 2 episodes into 3; 0 of 6 rows"):
+            with pytest.warns(km.FitWarning, match=r"1 gap \(after line 3\) cut 2 episodes into 3; 0 of 6 rows"):
                 assert len(km.load_episodes(tmp_path / "log.csv", resample=0.01)) == 3
         else:
             with pytest.raises(

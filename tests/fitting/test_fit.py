@@ -368,7 +368,7 @@ def test_what_files_have_in_common_is_said_once_and_no_column_of_one_file_is_jud
     found = fit_data(tmp_path, tmp_path / "out", horizon=10, bilinear=False, say=told.append)
     (gaps,) = [line for line in told[0].splitlines() if " gap" in line]
     every_other = ", ".join(f"{i:02d}.csv" for i in range(2, 24, 2))
-    assert gaps.startswith(f"! 12 files ({tmp_path / '00.csv'}, {every_other}): 1 gap (after row 10)")
+    assert gaps.startswith(f"! 12 files ({tmp_path / '00.csv'}, {every_other}): 1 gap (after line 11)")
     assert "throughout" not in told[0]  # load is constant in each file, and not over all of them
     assert "load" in found.selection.predictor.states
 

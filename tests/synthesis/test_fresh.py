@@ -146,6 +146,10 @@ def test_the_fresh_loops_of_a_design_are_counted_by_kind_and_give_its_bounds():
     assert low <= np.median(expected.fresh.cost) <= high
     assert expected.violation_bound <= expected.fresh.violation.max()
     assert "fresh loops" in str(expected)
+    told = " ".join(str(expected).split())
+    assert "6 in the choice, 6 there with inputs 20 % off, " in told
+    assert " fresh on learned models, " in told
+    assert "4 from corners of the goal's range" in told
 
 
 def test_fresh_loops_change_no_choice():

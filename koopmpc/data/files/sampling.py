@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from koopmpc.data.episodes import Episode, Origin
+from koopmpc.data.episodes import Episode, Origin, find_lines
 from koopmpc.data.files.notes import ResampledWarning
 from koopmpc.errors import DataError, FitWarning
 
@@ -130,10 +130,8 @@ def _warn_of_uneven(parts: list[Signals], dt: float, where: str) -> None:
         off = np.flatnonzero((ahead > 0) & (ahead <= _GAP * usual) & (np.abs(ahead - usual) > _JITTER * usual))
         if len(off) and not uneven:
             k = int(off[0])
-            place = Origin(where, part.states, part.rows, part.X, part.rows, resampled=False).place(
-                int(part.rows[k + 1])
-            )
-            first = place.rpartition(", ")[2], float(f"{ahead[k]:.6g}")
+            unit, (line,) = find_lines(where, [int(part.rows[k + 1])])
+            first = f"{unit} {line}", float(f"{ahead[k]:.6g}")
         uneven += len(off)
     if uneven:
         counts = uneven, len(known)
@@ -141,9 +139,10 @@ def _warn_of_uneven(parts: list[Signals], dt: float, where: str) -> None:
 
 
 def _warn_of_gaps(where: str, gaps: list[int], before: int, after: int, rest: str) -> None:
-    shown = ", ".join(str(row) for row in gaps[:3]) + (", …" if len(gaps) > 3 else "")
+    unit, lines = find_lines(where, gaps[:3])
+    shown = ", ".join(map(str, lines)) + (", …" if len(gaps) > 3 else "")
     count = f"{len(gaps)} gap{'s' * (len(gaps) != 1)}"
-    at = f" (after row {shown})" if gaps else ""
+    at = f" (after {unit} {shown})" if gaps else ""
     warnings.warn(
         f"{where}: {count}{at} cut {before} episode{'s' * (before != 1)} into {after}; {rest}", FitWarning, stacklevel=3
     )

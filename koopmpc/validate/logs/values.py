@@ -309,11 +309,15 @@ def find_outliers(log: Log) -> Iterator[LogFault]:
         if places and sum(p.last - p.first for p in places) < 0.05 * len(log.X):
             yield LogFault(
                 "spikes",
-                f"{name} leaves its path for single rows {len(places)} times: {list_places(places)}",
+                f"{name} leaves its path and returns, {_say_times(len(places))}: {list_places(places)}",
                 "leave these rows out",
                 (log.data.states[i],),
                 places,
             )
+
+
+def _say_times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
 
 
 def _find_loss_mark(log: Log, i: int, changes: np.ndarray) -> tuple[float, tuple[Place, ...]] | None:
