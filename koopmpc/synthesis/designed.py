@@ -425,7 +425,7 @@ def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: 
     """Return the place of the safest, then simplest row that is as good as the best, of those judged in all conditions.
 
     A row is as good as the best if its score is within 0.5 % of it, or within the standard error of their difference
-    where that is larger, at most 3 %, and its worst run is at most 3 % worse: where a plant differs from its logs, one
+    where that is larger, at most 3 %. Its worst run may be at most 3 % worse: where a plant differs from its logs, one
     run shows it before the mean does. Safer is a row with fewer lost runs, then one without a violation above 1 %.
     Simpler is a row without weights, then one with a smaller model; a bilinear model counts twice its observables.
     A controller with an estimator may cost 2 % more than without one, since it corrects errors that surrogates and

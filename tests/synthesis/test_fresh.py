@@ -13,7 +13,7 @@ from koopmpc.synthesis.candidates import Candidate
 from koopmpc.synthesis.designed import ExpectedLoop, choose_row
 from koopmpc.synthesis.fresh.drawn import draw_starts
 from koopmpc.synthesis.fresh.horizon import choose_horizon
-from koopmpc.synthesis.fresh.loops import is_better
+from koopmpc.synthesis.fresh.loops import helps_loops
 from koopmpc.synthesis.fresh.neighbours import MOST, NeighbourMap, goal_box, probe_range
 from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_value, cost_interval
 from koopmpc.synthesis.judging import measure_errors
@@ -333,12 +333,12 @@ def test_a_longer_horizon_is_better_where_it_alone_keeps_more_loops_than_chance_
             np.full(count, cost), over, over, ("models",) * count, nothing, nothing, nothing, over[:, None]
         )
 
-    assert is_better(loops(broken=20), loops(broken=25))
-    assert not is_better(loops(broken=20), loops(broken=24))
-    assert not is_better(loops(broken=25), loops(broken=20))
-    assert is_better(loops(cost=0.85), loops())
-    assert not is_better(loops(cost=0.95), loops())
-    assert is_better(loops(), loops(cost=np.inf))
+    assert helps_loops(loops(broken=20), loops(broken=25))
+    assert not helps_loops(loops(broken=20), loops(broken=24))
+    assert not helps_loops(loops(broken=25), loops(broken=20))
+    assert helps_loops(loops(cost=0.85), loops())
+    assert not helps_loops(loops(cost=0.95), loops())
+    assert helps_loops(loops(), loops(cost=np.inf))
 
 
 def test_the_chosen_horizon_does_not_change_with_the_units():

@@ -158,9 +158,9 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
 
 def _say_set_points(names: Sequence[str]) -> str:
     listed = " and ".join(filter(None, [", ".join(map(repr, names[:-1])), repr(names[-1])]))
-    if len(names) == 1:
-        return f"{listed} is a set point of a controller by its name, and left out; pass inputs= or states= to use it"
-    return f"{listed} are set points of a controller by their names, and left out; pass inputs= or states= to use them"
+    what, them = ("is a set point", "it") if len(names) == 1 else ("are set points", "them")
+    by = "by its name" if len(names) == 1 else "by their names"
+    return f"{listed} {what} of a controller {by}, and left out; name {them} among inputs or states to use {them}"
 
 
 def _rename_columns(table: LogTable, told: TableSettings, where: str) -> LogTable:

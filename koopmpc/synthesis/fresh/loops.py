@@ -161,7 +161,7 @@ def compare_longer_horizon(
         return run_fresh_loops(pool, fast if horizon == N else speed_up(one), count, np.random.default_rng(seed))
 
     given, twice = run(N), run(2 * N)
-    if not is_better(twice, given):
+    if not helps_loops(twice, given):
         return []
     lost, broken = ([count_loops(one) for one in (given, twice)] for count_loops in (_count_lost, _count_broken))
     said = (
@@ -170,7 +170,7 @@ def compare_longer_horizon(
         f"{to_percent(BREAKS)} of their range in place of {broken[0]}, and {lost[1]} are lost in place of {lost[0]}: "
         "take it if a step has the time"
     )
-    if is_better(longer := run(4 * N), twice):
+    if helps_loops(longer := run(4 * N), twice):
         said += (
             f"; {4 * N} steps cost {compare_costs(longer, given):.3g} times as much, {_count_broken(longer)} violate, "
             f"and {_count_lost(longer)} are lost"
@@ -178,7 +178,7 @@ def compare_longer_horizon(
     return [said]
 
 
-def is_better(longer: FreshLoops, shorter: FreshLoops) -> bool:
+def helps_loops(longer: FreshLoops, shorter: FreshLoops) -> bool:
     """Return whether of the same loops one controller's cost much less, fewer are lost, or more keep their limits.
 
     Loops that one alone keeps decide on limits: a twentieth of all, and more than the toss of a coin explains in one
