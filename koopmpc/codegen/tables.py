@@ -32,6 +32,7 @@ Precision = Literal["double", "float"]
 
 _ZERO_ROW = 1e-11  # DAQP leaves a row as it is if its squared length is below this
 
+_LONG = 2**13  # numbers in the reference's share of a plan from which on a step first asks for its first input alone
 _TABLE_NOTE = (
     "`koopmpc_table.h` holds the equilibria of the reference rows that `export` was given, and what the end of the "
     "horizon costs there. Any other row may come at run time: the step that meets it finds its equilibrium from that "
@@ -137,6 +138,7 @@ def make_tables(program: StepProgram, *, single: bool) -> Tables:
         "IS_STAGED": 0,
         "BOUNDS": 0,
         "LEVELED": 0,
+        "FIRST_ALONE": 0,
         "SCHEDULED": 0,
         "NU": program.model.nu,
         "NR": program.nr,
@@ -380,6 +382,10 @@ def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool) -
         "FEW": FEW,
         "COLD_START": int(solver.settings["cold_start"]),
     }
+    plain = program.given is None and program.bounds is None and program.levels is None
+    if plain and not program.disturbance.shape[1] and program.from_reference.size >= _LONG:
+        tables.sizes["FIRST_ALONE"] = 1
+        tables.plan["shares"] = np.abs(program.from_reference[:, program.nr :]).sum(axis=1)
     tables.define({"UNPUSHED": program.unpushed})
     _add_limits(tables, hard_rate=program.hard_rates)
     tables.limits["move_of"] = np.asarray(program.move_of, dtype=np.intc)

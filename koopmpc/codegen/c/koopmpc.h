@@ -97,6 +97,10 @@ typedef struct {
   koopmpc_real known[KOOPMPC_KNOWN + 1];   /**< [z; u_{-1}; w_0 ...; d], where the plan starts */
   koopmpc_real reference[(KOOPMPC_N + 1) * KOOPMPC_NR]; /**< rows of the last step */
   koopmpc_real kept[KOOPMPC_MOVES];        /**< inputs of the last good plan */
+#if KOOPMPC_FIRST_ALONE
+  koopmpc_real moved[(KOOPMPC_N + 1) * KOOPMPC_NR]; /**< rows less their first one, if `kept` still is without them */
+  int owes;
+#endif
   koopmpc_real given[KOOPMPC_NU];          /**< the last input returned */
   koopmpc_real sent[(KOOPMPC_LATENCY + 1) * KOOPMPC_NU]; /**< computed inputs that have not acted yet */
   koopmpc_real ahead[(KOOPMPC_LATENCY + 1) * KOOPMPC_NW1];

@@ -40,30 +40,39 @@ static int target_of_row(koopmpc_state *s, int k, const koopmpc_real *e, koopmpc
 }
 #endif
 
-/** Write the reference's part of the plan: all NaN if a row is not finite. */
-static void aim(koopmpc_state *s, const koopmpc_rows *reference) {
+/**
+ * Write the reference's part of the plan: all NaN if a row is not finite.
+ *
+ * Of a long preview write that of its first row alone, as if it were held, and return 1, and in `reach` the largest
+ * distance of a row from it: a step may need no more.
+ */
+static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *reach) {
   const int moves_on = s->row + 1 < KOOPMPC_GIVEN;
-  int good = 1, same = s->aimed, held = 1; /* held: all rows are the same */
+  int good = 1, same = 1, held = 1; /* held: all rows are the same */
+  int first_alone = 0;
   koopmpc_real peak = 0;
+  *reach = 0;
   for (int k = 0; k <= KOOPMPC_N; k++) {
     const koopmpc_real *row = koopmpc_row(reference, k + KOOPMPC_LATENCY, KOOPMPC_NR);
     koopmpc_real *mine = s->reference + k * KOOPMPC_NR;
     for (int i = 0; i < KOOPMPC_NR; i++) {
-      const koopmpc_real size = koopmpc_abs(row[i]);
+      const koopmpc_real size = koopmpc_abs(row[i]), far = koopmpc_abs(row[i] - s->reference[i]);
       same &= mine[i] == row[i];
       mine[i] = row[i];
       held &= row[i] == s->reference[i];
       good &= size < KOOPMPC_HUGE;
       peak = size > peak ? size : peak;
+      if (KOOPMPC_FIRST_ALONE && k > 0) *reach = far > *reach ? far : *reach;
     }
   }
-  if (!same) {
-    s->aimed = good && !moves_on;
+  if (!same || !s->aimed) {
+    first_alone = KOOPMPC_FIRST_ALONE && good && !held && !same && peak <= KOOPMPC_UNPUSHED;
+    s->aimed = good && !moves_on && !first_alone;
     if (!good) {
       koopmpc_fill(s->column, (koopmpc_real)NAN, KOOPMPC_NT);
     } else {
       koopmpc_copy(s->column, koopmpc_offset, PLANNED);
-      if (held)
+      if (held || first_alone)
         koopmpc_add(s->column, koopmpc_from_held, PLANNED, s->reference, KOOPMPC_NR);
       else
         koopmpc_add(s->column, koopmpc_from_reference, PLANNED, s->reference, (KOOPMPC_N + 1) * KOOPMPC_NR);
@@ -103,6 +112,7 @@ static void aim(koopmpc_state *s, const koopmpc_rows *reference) {
     }
   }
   if (moves_on) s->row++;
+  return first_alone;
 }
 
 /** Whether entries first ... last - 1 of the plan are within their limits; NaN is not. */
@@ -118,10 +128,37 @@ static void evaluate(koopmpc_state *s) {
   koopmpc_add(s->t, koopmpc_map, KOOPMPC_NT, s->known, KOOPMPC_KNOWN);
 }
 
+#if KOOPMPC_FIRST_ALONE
+void koopmpc_settle(const koopmpc_state *s, koopmpc_real *kept) {
+  for (int j = KOOPMPC_NR; j < (KOOPMPC_N + 1) * KOOPMPC_NR; j++)
+    for (int i = KOOPMPC_NU; i < MOVES; i++) kept[i] += s->moved[j] * koopmpc_from_reference[j * PLANNED + i];
+}
+
+/** Whether a plan for the first row meets all limits wherever the others are within `reach` of it; then its input. */
+static int certain(koopmpc_state *s, koopmpc_real reach) {
+  koopmpc_real first[KOOPMPC_NU];
+  int broken = 0;
+  for (int i = 0; i < PLANNED; i++) {
+    const koopmpc_real by = reach * koopmpc_shares[i];
+    broken |= !(s->t[i] - by >= koopmpc_low[i]) | !(s->t[i] + by <= koopmpc_high[i]);
+  }
+  koopmpc_copy(first, s->t, KOOPMPC_NU);
+  for (int j = KOOPMPC_NR; j < (KOOPMPC_N + 1) * KOOPMPC_NR && !broken; j++)
+    for (int i = 0; i < KOOPMPC_NU; i++)
+      first[i] += (s->reference[j] - s->reference[j % KOOPMPC_NR]) * koopmpc_from_reference[j * PLANNED + i];
+  for (int i = 0; i < KOOPMPC_NU; i++) broken |= !(first[i] >= koopmpc_low[i]) | !(first[i] <= koopmpc_high[i]);
+  if (!broken) koopmpc_copy(s->t, first, KOOPMPC_NU);
+  return !broken;
+}
+#endif
+
 static void keep(koopmpc_state *s, koopmpc_real *u, koopmpc_report *report, koopmpc_status status) {
   koopmpc_copy(s->kept, s->t, MOVES);
   koopmpc_copy(s->given, s->t, KOOPMPC_NU);
   koopmpc_copy(u, s->t, KOOPMPC_NU);
+#if KOOPMPC_FIRST_ALONE
+  s->owes = 0;
+#endif
   s->has_kept = s->planned = 1;
   s->age = 0;
   report->status = status;
@@ -437,17 +474,35 @@ void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *
 void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *reference, const koopmpc_real *applied,
                   const koopmpc_rows *w, koopmpc_real *u, koopmpc_report *report) {
   koopmpc_report own;
+  koopmpc_real reach;
+  int first_alone;
   if (!report) report = &own;
   report->fallback = KOOPMPC_NONE;
   report->iterations = 0;
   report->slack = report->gap = 0;
-  aim(s, reference);
+  first_alone = aim(s, reference, &reach);
   koopmpc_take(s, y, applied, w);
   report->refused = s->refused;
 #if KOOPMPC_LEVELED
   koopmpc_count_levels(s, applied && !KOOPMPC_LATENCY && koopmpc_usable(applied, KOOPMPC_NU) ? applied : s->given);
 #endif
   evaluate(s);
+#if KOOPMPC_FIRST_ALONE
+  if (first_alone && certain(s, reach)) {
+    unconstrained(s, u, report);
+    for (int j = 0; j < (KOOPMPC_N + 1) * KOOPMPC_NR; j++) s->moved[j] = s->reference[j] - s->reference[j % KOOPMPC_NR];
+    s->owes = 1;
+    return;
+  }
+  if (first_alone) { /* a limit may be met: the whole plan */
+    koopmpc_copy(s->column, koopmpc_offset, PLANNED);
+    koopmpc_add(s->column, koopmpc_from_reference, PLANNED, s->reference, (KOOPMPC_N + 1) * KOOPMPC_NR);
+    s->aimed = 1;
+    evaluate(s);
+  }
+#else
+  (void)first_alone;
+#endif
   if (within(s, 0, KOOPMPC_NT) && rests(s))
     unconstrained(s, u, report);
   else
@@ -455,8 +510,13 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
 }
 
 int koopmpc_plan(const koopmpc_state *s, koopmpc_real *U) {
+  koopmpc_real kept[MOVES];
   if (!s->planned) return 0;
+  koopmpc_copy(kept, s->kept, MOVES);
+#if KOOPMPC_FIRST_ALONE
+  if (s->owes) koopmpc_settle(s, kept);
+#endif
   for (int k = 0; k < KOOPMPC_N; k++)
-    koopmpc_copy(U + k * KOOPMPC_NU, s->kept + KOOPMPC_NU * koopmpc_move_of[k], KOOPMPC_NU);
+    koopmpc_copy(U + k * KOOPMPC_NU, kept + KOOPMPC_NU * koopmpc_move_of[k], KOOPMPC_NU);
   return 1;
 }

@@ -267,6 +267,10 @@ void koopmpc_fail(koopmpc_state *s, const koopmpc_real *free_input, const koopmp
   report->slack = 0;
   if (s->has_kept && s->age + 1 < KOOPMPC_N) {
     s->age++;
+#if KOOPMPC_FIRST_ALONE
+    if (s->owes) koopmpc_settle(s, s->kept);
+    s->owes = 0;
+#endif
     chosen = s->kept + KOOPMPC_NU * koopmpc_move_of[s->age];
     report->fallback = KOOPMPC_SHIFTED_PLAN;
   } else {

@@ -18,6 +18,11 @@ void koopmpc_start(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real 
 /** Write the start of the plan into `known`; z is NaN if y cannot be used. */
 void koopmpc_take(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *applied, const koopmpc_rows *w);
 
+#if KOOPMPC_FIRST_ALONE
+/** Write all inputs of a plan of which a step needed the first alone. */
+void koopmpc_settle(const koopmpc_state *s, koopmpc_real *kept);
+#endif
+
 /** Write the fallback of a failed step; `free_input` is the unconstrained optimum, NULL if it is not known. */
 void koopmpc_fail(koopmpc_state *s, const koopmpc_real *free_input, const koopmpc_real *applied, koopmpc_real *u,
                   koopmpc_report *report, koopmpc_status status);
