@@ -151,9 +151,13 @@ class ExperimentPlan(Excitation):
         share, duration = to_percent(max(self.gain, 0.0)), self.steps * self.episodes * self.dt
         if self.is_worth_it:
             return f"the experiment of {duration:g} s is expected to lower the variance of one-step errors by {share}"
+        left = self.before / (1 + self.before)  # what no experiment, however long, could exceed
+        end = "nothing is left that this model could learn where the controller works"
+        if left >= WORTH:
+            end = f"{to_percent(left)} is left to learn, so a longer one may be worth it; else stop here"
         return (
             f"another experiment is not worth its length: {duration:g} s are expected to lower the variance of "
-            f"one-step errors by {share}; nothing is left that this model could learn where the controller works"
+            f"one-step errors by {share}; {end}"
         )
 
     @property

@@ -96,10 +96,14 @@ def instrumental_edmd(
     strength = _measure_strength(regression.rows, explained)
     if strength < CHANCE:
         raise DataError(
-            f"not identifiable from these logs: the instruments move the regressors no more than chance would "
-            f"(F = {strength:.2g}, at least {CHANCE:.0f} expected); move the set point, or add a test signal to u"
+            "not identifiable from these logs: the instruments move the regressors no more than chance would (F of the "
+            f"first stage is {strength:.2g}, at least {CHANCE:.0f} expected); move the set point, or add a test signal "
+            "to u"
         )
-    weak = f"the instruments are weak (F = {strength:.2g}, {WEAK:.0f} expected); move the set point more, or log longer"
+    weak = (
+        f"the instruments are weak (F of the first stage is {strength:.2g}, {WEAK:.0f} expected); move the set point "
+        "more, or log longer"
+    )
     size = column_norms(explained)
     K = np.linalg.lstsq(explained / size, target)[0] / size[:, None]
     if level is not None:

@@ -231,8 +231,8 @@ def design(
     source = source_of(data)
     if source.nu == 0:
         raise DataError("the data have no inputs, so there is nothing to control; give each Episode its U")
-    held, notes = take_sample(source, checks.count(sample, "sample"))
-    notes = (*notes, used) if used else notes
+    held, sampled = take_sample(source, checks.count(sample, "sample"))
+    notes = (*sampled, used) if used else sampled
     if smooth:
         source, held, replaced = replace_glitches(source, held)
         notes = (*notes, *replaced)
@@ -247,8 +247,9 @@ def design(
         held = held.with_episodes([episode for k, episode in enumerate(held) if k not in left])
         asked = check_task(held, cost, limits, ahead, reference, starts, angles)
         source = source_of(held)
-        if notes:
-            notes = (f"chosen on and fitted to a sample of {len(held)} episodes, without those left out",)
+        if sampled:
+            said = f"chosen on and fitted to a sample of {len(held)} episodes, without those left out"
+            notes = (said, *notes[len(sampled) :])
     noise, measured = projected if projected.any() else np.zeros(held.nx), held
     if smooth:
         source, held, freed, noise = smooth_data(source, held)

@@ -80,6 +80,13 @@ def test_much_data_leave_nothing_to_learn():
     plan = km.next_experiment(much, COST, LIMITS, reference=[0, 0], steps=40)
     assert not plan.is_worth_it
     assert "another experiment is not worth its length" in str(plan)
+    assert "nothing is left" in plan.verdict
+
+
+def test_a_plan_that_is_only_too_short_asks_for_a_longer_one(logs):
+    plan = km.next_experiment(logs, COST, LIMITS, reference=[1, 0], steps=1)
+    assert not plan.is_worth_it
+    assert "is left to learn, so a longer one may be worth it" in plan.verdict
 
 
 def test_the_gain_is_that_of_the_information_matrix(logs):

@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
+import koopmpc as km
+from tests.experiment.study.bent import NOISES, draw_loop, judge_bent, record
 from tests.experiment.study.drift import judge_drift
 from tests.experiment.study.halves import TASKS, choose_rows
 from tests.experiment.study.plants import draw_task
 from tests.experiment.study.safety import run_experiments
 from tests.experiment.study.table import count_safety, load_rows
 
-SAFETY, DRIFT, HALVES, ALARMS = (load_rows(study) for study in ("safety", "drift", "halves", "alarms"))
+SAFETY, DRIFT, HALVES, ALARMS, BENT = (load_rows(study) for study in ("safety", "drift", "halves", "alarms", "bent"))
 
 
 @pytest.mark.parametrize("level", sorted({row.level for row in SAFETY.values()}))
@@ -70,3 +72,28 @@ def test_a_plant_that_is_measured_again_gives_its_row():
     again = run_experiments(draw_task(3), 3, row.level)
     assert (again.held, again.kinds) == (row.held, row.kinds)
     assert again.reached == pytest.approx(row.reached, rel=1e-3)
+
+
+def test_noise_is_taken_out_of_nonlinear_loops_only_where_it_matters_and_then_it_gains():
+    ratios = np.array([row.ratio for row in BENT.values()])
+    taken = np.array([row.taken for row in BENT.values()])
+    assert not any(any(row.taken) for row in BENT.values() if row.noise == min(NOISES))
+    assert taken.sum() >= 8
+    assert np.exp(np.mean(np.log(ratios[taken]))) < 1
+    assert ratios.max() <= 1.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [3, 7])
+def test_select_and_design_take_it_out_together(number):
+    bent, gain, spread = draw_loop(number)
+    noise = NOISES[number % len(NOISES)] * spread
+    data, r = record(bent, np.random.default_rng([355, number]), noise, gain)
+    plain = km.State() + km.Constant()
+    options = {"candidates": [plain, plain + km.Monomials(2)], "delays": (0,), "bilinear": False, "instruments": r}
+    cost, limits = km.Cost(Q=1 / spread**2, R=np.full(data.nu, 0.1)), km.Limits(u_min=-2, u_max=2)
+    chosen = km.select(data, **options)
+    designed = km.design(data, cost, limits, reference=0.2 * spread, horizon=8, loops=0, **options)
+    for notes in (chosen.notes, designed.notes):
+        assert any(note.startswith("models are of") for note in notes) == BENT[str(number)].taken[1]
+    assert judge_bent(number) == BENT[str(number)]
