@@ -19,12 +19,13 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
-_GAPS = 4  # a segment has this many measurements of the slowest sensor
+_GAPS = 4  # a segment has this many measurements of the slowest sensor for each of its unknown rows
 _SHORT = 20  # a segment has at least so many steps
 _CONVERGED = 1e-13  # stop where a step lowers the error by less than this share
 _EXACT = 1e-16  # at this mean squared error in spreads no other start is tried
 _LEAST = 1e-24  # stop at this mean squared error in spreads: rounding
 _DAMPING = 1e-3  # damping of the first step, as a share of the diagonal
+_RANK = 1e-8  # singular values of the simulated columns below this share of the largest are modes that nothing excites
 _TRIALS = 12  # times that the damping grows before the fit ends
 
 
@@ -46,7 +47,7 @@ def unequal_rates(
     bilinear: Literal[False] = False,
     scheduled_inputs: bool = False,
     horizon: int | None = None,
-    iterations: int = 60,
+    iterations: int = 100,
 ) -> LinearPredictor: ...
 @overload
 def unequal_rates(
@@ -57,7 +58,7 @@ def unequal_rates(
     bilinear: Literal[True],
     scheduled_inputs: bool = False,
     horizon: int | None = None,
-    iterations: int = 60,
+    iterations: int = 100,
 ) -> BilinearPredictor: ...
 def unequal_rates(
     data: PartialEpisodes,
@@ -67,7 +68,7 @@ def unequal_rates(
     bilinear: bool = False,
     scheduled_inputs: bool = False,
     horizon: int | None = None,
-    iterations: int = 60,
+    iterations: int = 100,
 ) -> LinearPredictor | BilinearPredictor:
     """Fit z⁺ = A z + B u + E w to runs whose sensors measured at rates of their own: residuals at measured cells alone.
 
@@ -75,8 +76,9 @@ def unequal_rates(
     measured, x̂_{k+1} = Θ [ψ(x̂_k); u_k; w_k] lifted afresh. Levenberg-Marquardt with exact derivatives; first states
     are eliminated segment by segment. It starts at least squares on rows whose gaps are bridged by straight lines, by
     held values, and by the mean, and takes the least error of the three; only the start depends on them. Segments
-    become longer in two steps. Rows of observables other than the states come from `edmd`, or `bilinear_edmd`, on the
-    states that the model itself simulates.
+    become longer in two steps. Where several Θ make the same rows, as with delays to spare, the smallest is taken:
+    others may hold unstable modes that nothing excited. Rows of observables other than the states come from `edmd`, or
+    `bilinear_edmd`, on the states that the model itself simulates.
 
     Parameters
     ----------
@@ -91,7 +93,7 @@ def unequal_rates(
     scheduled_inputs
         Of a bilinear model also Σ wⱼ Mⱼ u.
     horizon
-        Steps of a segment; by default four times the longest gap, at least 20.
+        Steps of a segment; by default four times the longest gap for each of its d + 1 unknown rows, at least 20.
     iterations
         Levenberg-Marquardt steps, at most.
 
@@ -125,7 +127,11 @@ def unequal_rates(
     iterations = checks.count(iterations, "iterations")
     columns = _find_columns(data, lifting, embedding, bilinear=bilinear, crossed=scheduled_inputs)
     longest, past = max(map(len, data.U)), columns.past
-    wanted = max(_GAPS * data.find_gap(), _SHORT) + past if horizon is None else checks.count(horizon, "horizon")
+    wanted = (
+        max(_GAPS * data.find_gap() * (past + 1), _SHORT) + past
+        if horizon is None
+        else checks.count(horizon, "horizon")
+    )
     if horizon is not None and horizon > longest:
         raise DataError(
             f"no run has the {horizon} steps of a segment; the longest has {longest}, pass a shorter horizon"
@@ -207,14 +213,8 @@ def _fit_from(
 ) -> _Found:
     """Return where the minimisation ends that starts at one-step least squares on the bridged rows."""
     columns = error.columns
-    points = bridged if columns.embedding is None else columns.embedding(bridged)
-    Z, U = np.concatenate([e.X[:-1] for e in points]), np.concatenate([e.U for e in points])
-    W = np.concatenate([e.W for e in points])
-    after = np.concatenate([e.X[1:, : columns.nx] for e in points])
-    phi = columns.evaluate(Z, U, W)
-    norms = column_norms(phi)
-    norms[norms == 0] = 1.0
-    theta, steps = (np.asarray(np.linalg.lstsq(phi / norms, after, rcond=None)[0]) / norms[:, None]).T, 0
+    phi, norms, after = _pairs(columns, bridged)
+    theta, steps = (np.asarray(np.linalg.lstsq(phi, after, rcond=None)[0]) / norms[:, None]).T, 0
     cells, starts = cut_cells(data, bridged, lengths[-1], columns.past)
     unknowns = theta.size + starts.size
     if cells.measured.sum() < unknowns:
@@ -229,7 +229,29 @@ def _fit_from(
         steps += taken
     X = error.simulate(theta, starts, cells)
     episodes = [Episode(X=X[:, i], U=cells.U[:, i], W=cells.W[:, i]) for i in range(X.shape[1])]
-    return _Found(value, steps, theta, Episodes(episodes, data.dt, data.states, data.inputs, data.disturbances))
+    simulated = Episodes(episodes, data.dt, data.states, data.inputs, data.disturbances)
+    least = _least_norm(columns, simulated)
+    if error.evaluate(least, starts, cells) <= max(value, _EXACT):
+        theta = least
+    return _Found(value, steps, theta, simulated)
+
+
+def _pairs(
+    columns: ModelColumns, rows: Episodes
+) -> tuple[Float[np.ndarray, "m nphi"], Float[np.ndarray, " nphi"], Float[np.ndarray, "m nx"]]:
+    """Return the columns of φ by their norms, these norms, and the states that follow."""
+    points = rows if columns.embedding is None else columns.embedding(rows)
+    Z, U = np.concatenate([e.X[:-1] for e in points]), np.concatenate([e.U for e in points])
+    phi = columns.evaluate(Z, U, np.concatenate([e.W for e in points]))
+    norms = column_norms(phi)
+    norms[norms == 0] = 1.0
+    return phi / norms, norms, np.concatenate([e.X[1:, : columns.nx] for e in points])
+
+
+def _least_norm(columns: ModelColumns, simulated: Episodes) -> Float[np.ndarray, "nx nphi"]:
+    """Return the smallest Θ that makes the simulated rows: it has no unstable modes that nothing excited."""
+    phi, norms, after = _pairs(columns, simulated)
+    return (np.asarray(np.linalg.lstsq(phi, after, rcond=_RANK)[0]) / norms[:, None]).T
 
 
 def _minimise(
