@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from koopmpc import checks
 from koopmpc.errors import DataError
@@ -89,17 +89,36 @@ def draw_blindness(
     panel.plot(*starts[unknown][:, [i, j]].T, "o", color=_BLIND, mec="black", label="starts outside the data")
     of = asked.cost.of.bind(names)
     tracked = list(of.state_indices) if isinstance(of, State) else []
+    missed = _find_missed_rows(asked, neighbours, tracked)
     if i in tracked and j in tracked:
-        panel.plot(*asked.reference[:, [tracked.index(i), tracked.index(j)]].T, "*k", markersize=6, label="reference")
+        aims = asked.reference[:, [tracked.index(i), tracked.index(j)]]
+        panel.plot(*aims[~missed].T, "*k", markersize=6, label="reference")
+        panel.plot(*aims[missed].T, "*", color=_BLIND, mec="black", markersize=8, label="reference outside the data")
     for k, X in enumerate(loops):
         panel.plot(X[:, i], X[:, j], color=line_style(0)["color"], linewidth=0.8, label="loops" if k == 0 else None)
     advised = choose_starts_to_record(asked, neighbours, checks.count(record, "record"))
     panel.plot(*advised[:, [i, j]].T, "D", mfc="none", mec="black", markersize=5, label="record from here")
     panel.set_xlabel(names[i].replace("$", r"\$"))
     panel.set_ylabel(**fit_label(names[j], 2.4))
-    panel.set_title(f"{to_percent(float(away.mean()))} of the goal's range has no data around it")
+    title = f"{to_percent(float(away.mean()))} of the goal's range has no data around it"
+    if missed.any():
+        title += ",\nand the reference lies outside the data: record episodes that rest near it"
+    panel.set_title(title)
     draw_legend(drawing, [panel], 2)
     return drawing
+
+
+def _find_missed_rows(asked: DesignTask, neighbours: NeighbourMap, tracked: Sequence[int]) -> Bool[np.ndarray, " T1"]:
+    """Return which rows of the reference have no data around them, or values outside the range of their signals."""
+    rows = asked.reference
+    if not tracked:
+        return np.zeros(len(rows), dtype=np.bool_)
+    room = 0.01 * (asked.high - asked.low)[list(tracked)]
+    low, high = asked.low[list(tracked)] - room, asked.high[list(tracked)] + room
+    missed: Bool[np.ndarray, " T1"] = np.asarray(((rows < low) | (rows > high)).any(axis=1))
+    if sorted(tracked) == list(range(len(asked.low))) and neighbours.embedding is None:
+        return missed | neighbours.find_outside_states(rows[:, np.argsort(tracked)])
+    return missed
 
 
 def _choose_axes(asked: DesignTask, neighbours: NeighbourMap, blind: np.ndarray) -> tuple[int, int]:

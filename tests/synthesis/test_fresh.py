@@ -11,11 +11,11 @@ import koopmpc as km
 from koopmpc.synthesis.asked import check_task, measure_settling
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.synthesis.designed import ExpectedLoop, choose_row
-from koopmpc.synthesis.fresh.drawn import draw_starts
+from koopmpc.synthesis.fresh.drawn import LoopResult, draw_starts
 from koopmpc.synthesis.fresh.horizon import choose_horizon
-from koopmpc.synthesis.fresh.loops import helps_loops
+from koopmpc.synthesis.fresh.loops import is_preferable
 from koopmpc.synthesis.fresh.neighbours import MOST, NeighbourMap, goal_box, probe_range
-from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_value, cost_interval
+from koopmpc.synthesis.fresh.verdict import bound_value, cost_interval
 from koopmpc.synthesis.judging import measure_errors
 from koopmpc.validate import bound_failure_rate
 from tests.closed_loop.controllers import Parts
@@ -222,6 +222,16 @@ def test_the_picture_of_blindness_shows_data_and_range_and_where_to_record(tmp_p
         km.plot.blindness(narrow(), axes=(1, 1))
 
 
+def test_the_picture_of_blindness_says_where_the_reference_is_outside():
+    asked, drawn = narrow().evidence.asked, []
+    for row in ([0.1, 0.1], [0.8, -0.8], [9.0, 9.0]):
+        evidence = replace(narrow().evidence, asked=replace(asked, reference=np.array([row])))
+        panel = km.plot.blindness(replace(narrow(), evidence=evidence)).axes[0]
+        shown = {line.get_label(): len(line.get_xdata()) for line in panel.get_lines()}
+        drawn.append((shown["reference outside the data"], "the reference lies outside" in panel.get_title()))
+    assert drawn == [(0, False), (1, True), (1, True)]
+
+
 def test_a_design_without_rows_of_its_data_has_no_picture():
     old = replace(narrow(), evidence=replace(narrow().evidence, neighbours=None))
     for ask in (km.plot.blindness, type(old).starts_to_record):
@@ -325,20 +335,18 @@ def test_a_design_says_where_its_loops_last_longer_than_every_episode():
     assert any(f"loops take {found.expected.steps} steps" in note for note in found.notes)
 
 
-def test_a_longer_horizon_is_better_where_it_alone_keeps_more_loops_than_chance_explains():
-    def loops(cost=1.0, broken=0, count=60):
-        over = np.where(np.arange(count) < broken, 0.1, 0.0)
-        nothing = np.zeros(0)
-        return FreshLoops(
-            np.full(count, cost), over, over, ("models",) * count, nothing, nothing, nothing, over[:, None]
-        )
+def test_one_controller_is_better_where_it_alone_keeps_more_loops_than_chance_explains_or_costs_less():
+    def loops(cost=1.0, broken=0, count=100):
+        return [LoopResult(cost, 0.1 if i < broken or not np.isfinite(cost) else 0.0) for i in range(count)]
 
-    assert helps_loops(loops(broken=20), loops(broken=25))
-    assert not helps_loops(loops(broken=20), loops(broken=24))
-    assert not helps_loops(loops(broken=25), loops(broken=20))
-    assert helps_loops(loops(cost=0.85), loops())
-    assert not helps_loops(loops(cost=0.95), loops())
-    assert helps_loops(loops(), loops(cost=np.inf))
+    assert is_preferable(loops(broken=20), loops(broken=25), 0.9)
+    assert not is_preferable(loops(broken=20), loops(broken=24), 0.9)
+    assert not is_preferable(loops(0.5, broken=25), loops(broken=20), 0.9)
+    assert is_preferable(loops(0.85), loops(), 0.9)
+    assert not is_preferable(loops(0.95), loops(), 0.9)
+    assert is_preferable(loops(), loops(np.inf), 0.9)
+    mixed = [LoopResult(cost, 0.0) for cost in [0.2, 4.0] * 50]
+    assert not is_preferable(mixed, loops(), 0.95)  # less on average, and not by three standard errors
 
 
 def test_the_chosen_horizon_does_not_change_with_the_units():

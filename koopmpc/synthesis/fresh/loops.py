@@ -1,5 +1,6 @@
 """run_fresh_loops: the loops of a chosen controller from fresh starts, and where they are outside the data."""
 
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
@@ -15,9 +16,8 @@ from koopmpc.lifting.base import strip_unit
 from koopmpc.lifting.state import State
 from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Recipe, get_model
-from koopmpc.synthesis.designed import BREAKS
 from koopmpc.synthesis.fresh.abreast import speed_up
-from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool
+from koopmpc.synthesis.fresh.drawn import KEPT, DrawnLoop, LoopPool, LoopResult
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box, probe_range
 from koopmpc.synthesis.fresh.verdict import FreshLoops
 from koopmpc.synthesis.judging import LITTLE
@@ -25,9 +25,10 @@ from koopmpc.text import to_percent
 from koopmpc.validate.scoring import AnyPredictor
 
 CORNERS = 8  # corners of the goal's range from which loops run, at most
-COMPARED = 60  # fresh loops in which two horizons are compared in machine code
+COMPARED = 60  # fresh loops in which horizons are compared in machine code
 FEW = 12  # and in Python
-BETTER = 0.05  # share of the loops that one horizon alone must keep, and probability that this is chance
+DIFFERENT = 0.02  # share of the loops by which one of two controllers must keep more
+CHANCE = 0.05  # and probability that this is chance
 MUCH = 0.9  # a horizon that costs this share of the given one is much better
 DRAWN = 400  # states outside the data that are kept for a picture, at most
 BLIND_RANGE = 0.3  # share of them outside the data above which a design says so
@@ -39,7 +40,7 @@ def run_fresh_loops(pool: LoopPool, controller: Any, loops: int, rng: np.random.
     asked, near = pool.asked, pool.neighbours
     assert near is not None, "a design has nearest rows"
     drawn = pool.draw(loops, rng)
-    corners = [DrawnLoop(x0, -1, 1.0, 0, int(rng.integers(2**31))) for x0 in _list_corners(asked, rng)]
+    corners = _draw_corners(asked, rng)
     results = pool.run(controller, [*drawn, *corners])
     share, away = np.zeros(len(results)), [np.zeros((0, len(asked.low)))]
     begun = 0
@@ -90,12 +91,14 @@ def find_blind_range(data: Episodes, asked: DesignTask, neighbours: NeighbourMap
     ]
 
 
-def _list_corners(asked: DesignTask, rng: np.random.Generator) -> Float[np.ndarray, "corners nx"]:
-    """Return corners of the goal's range, some of them where there are many."""
+def _draw_corners(asked: DesignTask, rng: np.random.Generator) -> list[DrawnLoop]:
+    """Return loops from corners of the goal's range, some of them where there are many."""
     low, high = goal_box(asked)
     if len(low) <= 3:
-        return np.array([np.where(way, high, low) for way in product((False, True), repeat=len(low))])
-    return np.where(rng.uniform(size=(CORNERS, len(low))) < 0.5, low, high)
+        corners = np.array([np.where(way, high, low) for way in product((False, True), repeat=len(low))])
+    else:
+        corners = np.where(rng.uniform(size=(CORNERS, len(low))) < 0.5, low, high)
+    return [DrawnLoop(x0, -1, 1.0, 0, int(rng.integers(2**31))) for x0 in corners]
 
 
 def describe_outside(data: Episodes, asked: DesignTask, fresh: FreshLoops) -> list[str]:
@@ -132,7 +135,7 @@ def find_blind_reference(
         return []
     return [
         "the reference lies outside the data, though each of its values is inside their range: no log has these values "
-        "at the same time; record episodes that rest near it"
+        "at the same time; record episodes that rest near it (km.plot.blindness draws it)"
     ]
 
 
@@ -153,56 +156,68 @@ def compare_longer_horizon(
     All horizons run the same loops, from fresh starts and from the corners of the goal's range; `fast` is the
     controller as `speed_up` returns it. Where twice as long is better, four times is tried, and told if better still.
     """
-    N, seed = controller.horizon, int(rng.integers(2**31))
-    count = COMPARED if isinstance(fast, Compiled) else FEW
+    N, drawn = controller.horizon, pool.draw(COMPARED if isinstance(fast, Compiled) else FEW, rng)
+    drawn += _draw_corners(pool.asked, rng)
 
-    def run(horizon: int) -> FreshLoops:
+    def run(horizon: int) -> list[LoopResult]:
         one = recipe.controller(get_model(controller), controller.cost, controller.limits, horizon)
-        return run_fresh_loops(pool, fast if horizon == N else speed_up(one), count, np.random.default_rng(seed))
+        return pool.run(fast if horizon == N else speed_up(one), drawn)
 
     given, twice = run(N), run(2 * N)
-    if not helps_loops(twice, given):
+    if not is_preferable(twice, given, MUCH):
         return []
     lost, broken = ([count_loops(one) for one in (given, twice)] for count_loops in (_count_lost, _count_broken))
     said = (
-        f"a horizon of {2 * N} steps in place of {N} costs {compare_costs(twice, given):.3g} times as much; of "
-        f"{len(given.cost) + len(given.corner_cost)} loops {broken[1]} violate limits by more than "
-        f"{to_percent(BREAKS)} of their range in place of {broken[0]}, and {lost[1]} are lost in place of {lost[0]}: "
-        "take it if a step has the time"
+        f"a horizon of {2 * N} steps in place of {N} costs {_compare_costs(twice, given)[0]:.3g} times as much; of "
+        f"{len(given)} loops {broken[1]} violate limits by more than {to_percent(KEPT)} of their range in place of "
+        f"{broken[0]}, and {lost[1]} are lost in place of {lost[0]}: take it if a step has the time"
     )
-    if helps_loops(longer := run(4 * N), twice):
+    if is_preferable(longer := run(4 * N), twice, MUCH):
         said += (
-            f"; {4 * N} steps cost {compare_costs(longer, given):.3g} times as much, {_count_broken(longer)} violate, "
-            f"and {_count_lost(longer)} are lost"
+            f"; {4 * N} steps cost {_compare_costs(longer, given)[0]:.3g} times as much, {_count_broken(longer)} "
+            f"violate, and {_count_lost(longer)} are lost"
         )
     return [said]
 
 
-def helps_loops(longer: FreshLoops, shorter: FreshLoops) -> bool:
-    """Return whether of the same loops one controller's cost much less, fewer are lost, or more keep their limits.
+def is_preferable(one: Sequence[LoopResult], other: Sequence[LoopResult], cheaper: float) -> bool:
+    """Return whether of the same loops one controller loses fewer or keeps more limits, or else costs less.
 
-    Loops that one alone keeps decide on limits: a twentieth of all, and more than the toss of a coin explains in one
-    case of twenty.
+    Loops that one of the two alone loses, or keeps, decide: a fiftieth of all, and more than the toss of a coin
+    explains in one case of twenty. A cost is less by a factor `cheaper` and by three standard errors.
     """
-    over = [np.concatenate([one.violation, one.corner_violation]) > BREAKS for one in (longer, shorter)]
-    kept, broken = int(np.sum(over[1] & ~over[0])), int(np.sum(over[0] & ~over[1]))
-    keeps = kept - broken >= BETTER * len(over[0]) and bdtr(broken, kept + broken, 0.5) <= BETTER
-    return bool(keeps or compare_costs(longer, shorter) < MUCH or _count_lost(longer) < _count_lost(shorter))
+    for fails in (_is_lost, _is_broken):
+        mine, others = (np.array([fails(result) for result in each]) for each in (one, other))
+        worse, better = int(np.sum(mine & ~others)), int(np.sum(others & ~mine))
+        few, many = sorted((worse, better))
+        if many - few >= DIFFERENT * len(mine) and bdtr(few, few + many, 0.5) <= CHANCE:
+            return better > worse
+    change, error = _compare_costs(one, other)
+    return change < cheaper and np.log(change) < -3 * error
 
 
-def compare_costs(one: FreshLoops, other: FreshLoops) -> float:
-    """Return the geometric mean of cost ratios of loops that neither lost; 1 where there are none."""
-    mine, others = (np.concatenate([each.cost, each.corner_cost]) for each in (one, other))
+def _compare_costs(one: Sequence[LoopResult], other: Sequence[LoopResult]) -> tuple[float, float]:
+    """Return the geometric mean of cost ratios of loops that neither lost, and the standard error of its logarithm."""
+    mine, others = (np.array([result.cost for result in each]) for each in (one, other))
     both = np.isfinite(mine) & np.isfinite(others)
     if not both.any():
-        return 1.0
+        return 1.0, 0.0
     little = LITTLE * float(np.median(others[both]))
-    return float(np.exp(np.mean(np.log((mine[both] + little) / (others[both] + little)))))
+    ratio = np.log((mine[both] + little) / (others[both] + little))
+    return float(np.exp(ratio.mean())), float(ratio.std() / np.sqrt(len(ratio)))
 
 
-def _count_lost(one: FreshLoops) -> int:
-    return int(np.sum(~np.isfinite([*one.cost, *one.corner_cost])))
+def _is_lost(result: LoopResult) -> bool:
+    return not np.isfinite(result.cost)
 
 
-def _count_broken(one: FreshLoops) -> int:
-    return int(np.sum(np.concatenate([one.violation, one.corner_violation]) > BREAKS))
+def _is_broken(result: LoopResult) -> bool:
+    return not result.keeps
+
+
+def _count_lost(results: Sequence[LoopResult]) -> int:
+    return sum(map(_is_lost, results))
+
+
+def _count_broken(results: Sequence[LoopResult]) -> int:
+    return sum(map(_is_broken, results))
