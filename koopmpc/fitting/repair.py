@@ -134,7 +134,7 @@ def audit_episodes(episodes: Episodes, *, cut: bool = True) -> Audited:
 
     With `cut` False the episodes are only a sample of the data, so that nothing can be left out.
     """
-    report = audit(episodes)
+    report = audit(_drop_repeats(episodes))
     rest, kinds, mended, out = episodes, set[str](), set[str](), set[str]()
     whole = Remainder.of(episodes)
     origins = whole.origins
@@ -166,6 +166,18 @@ def audit_episodes(episodes: Episodes, *, cut: bool = True) -> Audited:
     kept = [fault for fault in report.faults if fault.name not in out | mended | {*_REPAIRED}]
     doubtful = tuple(place for fault in kept for place in fault.places)
     return Audited(rest, tuple(notes), report.delay, origins, doubtful)
+
+
+def _drop_repeats(episodes: Episodes) -> Episodes:
+    """Return the episodes without columns that repeat another one: beside its copy no input seems to act on a state."""
+
+    def find_first(columns: Float[np.ndarray, "m n"]) -> list[int]:
+        return [i for i in range(columns.shape[1]) if not (columns[:, :i] == columns[:, [i]]).all(axis=0).any()]
+
+    X, V = (np.concatenate(rows) for rows in zip(*((e.X, np.hstack([e.U, e.W])) for e in episodes), strict=True))
+    nu, driven = episodes.nu, find_first(V)
+    states, inputs = find_first(X), [i for i in driven if i < nu]
+    return Repair(tuple(states), tuple(inputs), tuple(i - nu for i in driven if i >= nu), (), ("repeats",))(episodes)
 
 
 _NAMED = 3  # places of a fault that a note names

@@ -63,3 +63,31 @@ def test_single_wild_readings_always_go_and_leave_the_record_in_one_piece():
     assert max(float(e.X.max()) for e in rest) < 3.0
     assert len(rest) == 1
     assert any(note.startswith("spikes") and "replaced by the line" in note for note in notes)
+
+
+def test_a_column_that_repeats_another_hides_no_effect_of_an_input():
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, 600), np.zeros(601)
+    for k in range(600):
+        y[k + 1] = 0.9 * y[k] + 0.5 * u[k]
+    y += 0.01 * rng.standard_normal(601)
+    twice = km.Episodes([km.Episode(X=np.column_stack([y, y]), U=u[:, None])], 1.0, ["level", "copy"], ["valve"])
+    assert audit_episodes(twice).notes == audit_episodes(record(y, u)).notes
+    assert audit_episodes(twice).rest.nx == 2  # they are left out later, and that is said
+
+
+def test_a_coarse_sensor_whose_changes_are_mostly_zero_is_said_to_show_that():
+    y, u = tank(2000, quantum=0.05)
+    (note,) = [note for note in audit_episodes(record(y, u)).notes if note.startswith("quantised")]
+    assert "half of its changes from row to row are zero" in note
+
+
+def test_a_sensor_at_its_limit_is_no_held_sample_and_makes_no_input_a_feedback():
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, 600), np.zeros(601)
+    for k in range(600):
+        y[k + 1] = 0.9 * y[k] + 0.5 * u[k]
+    y = np.clip(y + 0.01 * rng.standard_normal(601), -0.5, 0.5)
+    notes = audit_episodes(record(y, u)).notes
+    assert any(note.startswith("sensor at its limit") for note in notes)
+    assert not any(note.startswith(("held samples", "rows twice")) or "feedback" in note for note in notes)

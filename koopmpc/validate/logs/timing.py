@@ -173,7 +173,7 @@ def find_same_row_inputs(timings: tuple[InputTiming, ...]) -> Iterator[LogFault]
                 "input in its own row",
                 f"a row of {name} explains the states of the same row beyond all earlier rows (t = {one.t:.3g}): "
                 f"{name} acts within its row, or its column is one row late",
-                "move its column one row up before a fit, or fit a model with feedthrough",
+                "move its column one row up before a fit; fits of records try that by themselves",
                 (one.input,),
             )
 
@@ -278,7 +278,7 @@ def _explain_feedback(rows: _Rows, j: int, limits: _Strictness) -> str:
     if joint < 1e-9 * float((u**2).sum()):
         return "the rows before determine it"
     if more > 0 and fdtrc(more, free, (alone - joint) / more / (joint / free)) < limits.significance:
-        return "past outputs predict it, so it is a feedback"
+        return "past outputs predict it, so it may be a feedback"
     nx, nu = rows.after.shape[1], rows.same.shape[1]
     if rows.repeated[j] < _REPEATED:
         short = _find_basis(rows.inputs[:, : nu * _SHORT])

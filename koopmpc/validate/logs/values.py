@@ -94,10 +94,11 @@ def find_coarse_sensors(log: Log) -> Iterator[LogFault]:
     """Find sensors whose resolution is coarse in comparison with a usual change."""
     for i, step in find_coarse_states(log).items():
         name, usual = strip_unit(log.data.states[i]), np.median(np.abs(log.changes[:, i]))
+        small = f"are below {usual:.3g}" if usual else "are zero"
         yield LogFault(
             "quantised",
-            f"{name} moves in steps of {step:.3g}, and half of its changes from row to row are below "
-            f"{usual:.3g}: its resolution hides what a model should learn",
+            f"{name} moves in steps of {step:.3g}, and half of its changes from row to row {small}: "
+            "its resolution hides what a model should learn",
             "log it with more digits, or sample more slowly; else let the model see more rows: embedding=km.Delay(2)",
             (log.data.states[i],),
         )
@@ -239,12 +240,12 @@ def find_held_samples(log: Log) -> Iterator[LogFault]:
         return
     places: list[Place] = []
     travels: list[float] = []
-    smooth = _find_smoothest_state(log, live)
+    smooth, limits = _find_smoothest_state(log, live), find_sensor_limits(log)
     for e, episode in enumerate(log.data):
         X, U = episode.X, episode.U
         same = (np.diff(X[:, live], axis=0) == 0).all(axis=1)
         for a, b in find_stretches(same):
-            if b >= len(U) or a == 0:
+            if b >= len(U) or a == 0 or all(X[a, i] in limits.get(i, ()) for i in live):  # sensors at their limits
                 continue
             contradiction = np.array_equal(U[b - 1], U[b]) or (np.ptp(U[a:b], axis=0) > 0).any()
             if contradiction or not episode.U.shape[1] or b - a == 1:
