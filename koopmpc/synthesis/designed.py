@@ -429,8 +429,9 @@ def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: 
     run shows it before the mean does. Safer is a row with fewer lost runs, then one without a violation above 1 %.
     Simpler is a row without weights, then one with a smaller model; a bilinear model counts twice its observables.
     A controller with an estimator may cost 2 % more than without one, since it corrects errors that surrogates and
-    models share. On a plant that is `unstable` where it is used, one without an estimator may cost
-    5 % more, for an estimator takes the model's error in a transient for a load.
+    models share. So may an estimator that finds its gain, over one with a small fixed gain, which corrects them late.
+    On a plant that is `unstable` where it is used, one without an estimator may cost 5 % more, for an estimator takes
+    the model's error in a transient for a load.
     """
     places = [i for i, row in enumerate(rows) if row.off and kind in (None, row.recipe.candidate.kind)]
     if not places:
@@ -452,12 +453,17 @@ def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: 
     if unstable:
         plain = [i for i in same if rows[i].recipe.estimator is None and rows[i].lost <= rows[place].lost]
         return next((i for i in plain if rows[i].score <= (1 + WORTH_UNSTABLE) * rows[place].score), place)
-    if rows[place].recipe.estimator is not None:
+    if rows[place].recipe.estimator is None:
+        estimating = [
+            i for i in same if rows[i].recipe.estimator is not None and rows[i].score <= (1 + WORTH) * rows[place].score
+        ]
+        place = min(estimating, key=lambda i: (rows[i].score, i), default=place)
+    estimator, row = rows[place].recipe.estimator, rows[place]
+    if estimator is None or estimator.gain is None:
         return place
-    estimating = [
-        i for i in same if rows[i].recipe.estimator is not None and rows[i].score <= (1 + WORTH) * rows[place].score
-    ]
-    return min(estimating, key=lambda i: (rows[i].score, i), default=place)
+    own = [i for i in same if rows[i].recipe.estimator == replace(estimator, gain=None) and rows[i].lost <= row.lost]
+    own = [i for i in own if rows[i].worst <= (1 + UNSURE) * row.worst]
+    return next((i for i in own if rows[i].score <= (1 + WORTH) * row.score), place)
 
 
 def choose_estimator(scores: Sequence[float], *, unstable: bool) -> int:
