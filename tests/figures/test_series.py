@@ -1,5 +1,7 @@
 """Forecasts beside the truth, errors by horizon, and closed loops: what is drawn is what was computed."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -166,3 +168,13 @@ def test_long_names_of_signals_end_beside_their_panel_and_a_dollar_is_a_letter()
     for axes in drawing.axes:
         box, panel = axes.yaxis.label.get_window_extent(), axes.get_window_extent()
         assert box.height <= 1.12 * panel.height, axes.get_ylabel()
+
+
+def test_names_beside_neighbouring_panels_of_a_run_do_not_touch():
+    names = {"states": ["jacket temperature [degC]", "level of the lower tank [cm]"]}
+    plant = km.black_box(lambda x, u: 0.9 * x + u, dt=0.1, inputs=["heater power [kW]", "pump voltage [V]"], **names)
+    loop = km.simulate(plant, lambda y, r: [0.0, 0.1], x0=[1, 1], reference=[0, 0], steps=8)
+    drawing = km.plot.run(loop)
+    drawing.canvas.draw()
+    boxes = [axes.yaxis.label.get_window_extent() for axes in drawing.axes[:4]]
+    assert all(above.y0 > below.y1 for above, below in pairwise(boxes))
