@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import numbers
 from koopmpc.codegen.abreast import ControllersAbreast
-from koopmpc.codegen.door import BoundRows, Frame, Rows, SingleFrame, gather_run, point_to
+from koopmpc.codegen.door import BoundPage, Frame, Rows, SingleFrame, gather_run, point_to
 from koopmpc.codegen.functions import Language
 from koopmpc.codegen.sources import write_one_source, write_plant_functions
 from koopmpc.codegen.tables import Precision, make_tables, read_program
@@ -37,6 +37,7 @@ _STATUS = list(Status)
 _FALLBACK = list(Fallback)
 _ROWS = 100_000  # reference rows whose targets a controller keeps
 _PLANTS = 8  # plants whose machine code a controller keeps
+_PAGE = 1024  # steps whose limits are made at once, which takes one of them 0.1 ms
 # head of the C file of a plant
 _PLANT_HEAD = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
 
@@ -211,6 +212,8 @@ class Compiled:
         self._pointer = ctypes.c_void_p(ctypes.addressof(frame))
         self._reference_pointer = ctypes.byref(frame.reference)
         self._call = self._code.koopmpc_call
+        self._page: BoundPage | None = None
+        self._passed: BoundPage | None = None  # the limits of the last call that had other ones than the last
         self._y_shape, self._row_shape, self._row = (self._ny,), (self._nr,), self._reference[0]
         self._rows_shape = self._reference.shape
         self._count, self._has_extras, self._is_double = 1, False, not single
@@ -231,6 +234,8 @@ class Compiled:
             for value, name, size in ((x0, "x0", self._sizes["NX"]), (u_prev, "u_prev", self.nu))
         )
         self._code.koopmpc_init(point_to(self._memory), point_to(start), point_to(last))
+        if self._timed and self._page is None:
+            self._turn_page()
         self._aim(np.zeros((0, self._nr)))
 
     def _aim(self, rows: Float[np.ndarray, "..."]) -> None:
@@ -257,17 +262,22 @@ class Compiled:
                 return
         self._aim(rows)
 
-    def _pass_bounds(self, limits: Limits, first: int) -> None:
-        """Pass the limits from step `first` on to the C code."""
-        bounds, sizes, kind = self._bounds, self._sizes, self._y.dtype
+    def _fill_bounds(self, limits: Limits, first: int, steps: int) -> BoundPage:
+        """Return the limits that C is passed in so many steps, from step `first` on."""
+        bounds, kind, ahead = self._bounds, self._y.dtype, self._sizes["HORIZON"] + 1
         assert bounds is not None, "only called where limits may move"
-        count, nx = sizes["HORIZON"] + 1, self.model.nx
+        count, nx = steps - 1 + ahead, self.model.nx
         outputs = limits.output_rows(nx, len(bounds.outputs) - nx, first, count)
         boxes = limits.input_rows(self.nu, first, count), limits.rate_rows(self.nu, first, count)
         ends = [*(end for box in boxes for end in box), *(end[:, bounds.outputs] for end in outputs)]
         arrays = [np.ascontiguousarray(np.clip(end, -checks.HUGE, checks.HUGE), kind) for end in ends]
-        rows = BoundRows(*(Rows(each.ctypes.data, count) for each in arrays))
-        self._code.koopmpc_bound(point_to(self._memory), ctypes.c_void_p(ctypes.addressof(rows)))
+        return BoundPage(first, arrays, ahead, steps)
+
+    def _turn_page(self) -> BoundPage:
+        """Return the limits of this step and of those after it."""
+        assert self.limits is not None, "they have rows"
+        page = self._page = self._fill_bounds(self.limits, self._step, _PAGE)
+        return page
 
     def _move_limits(self, limits: Limits | None) -> None:
         """Set the limits of this step: those of the call, or the controller's own."""
@@ -281,11 +291,12 @@ class Compiled:
                 original = cast("Any", self.original)
                 self._called_with = original.read_limits(limits)
                 original.check_limits(self._called_with)
+            if limits is not self._at_call or self._passed is None:
+                self._passed = self._fill_bounds(self._called_with, 0, 1)
             self._at_call = limits
-            self._pass_bounds(self._called_with, 0)
         elif self.limits is not None:
-            self._at_call = None
-            self._pass_bounds(self.limits, self._step)
+            self._at_call, self._passed = None, self._fill_bounds(self.limits, 0, 1)
+        self._frame.bounds = None if self._passed is None else self._passed.at(0)
 
     def __call__(
         self,
@@ -325,9 +336,16 @@ class Compiled:
                 self._aim_next(target)
             if applied is not None or w is not None or self._has_extras:
                 self._pass_extras(applied, w)
-            if limits is not None or self._timed or self._at_call is not None:
+            if limits is not None or (self._at_call is not None and not self._timed):
                 self._move_limits(limits)
                 self._step += 1
+            elif self._timed:
+                page, step, self._at_call = self._page, self._step, None
+                if page is None or not 0 <= step - page.first < _PAGE:
+                    page = self._turn_page()
+                frame.bounds, self._step = page.at(step), step + 1
+            elif self._passed is not None:  # C has the limits of the last call, which are its own again
+                frame.bounds = self._passed = None
             self._call(self._pointer)
             u = self._u.copy() if self._is_double else self._u.astype(np.float64)
             if not frame.status and not frame.refused:

@@ -31,25 +31,52 @@ _FIELDS = (
 )
 
 
+_LAST = ("bounds", ctypes.c_void_p)
+
+
 class Frame(ctypes.Structure):
     """The arguments and results of a call, as in C."""
 
-    _fields_ = (*_FIELDS, ("slack", ctypes.c_double), ("refused", ctypes.c_int), ("gap", ctypes.c_double))
+    _fields_ = (*_FIELDS, ("slack", ctypes.c_double), ("refused", ctypes.c_int), ("gap", ctypes.c_double), _LAST)
 
 
 class SingleFrame(ctypes.Structure):
     """A `Frame` in single precision."""
 
-    _fields_ = (*_FIELDS, ("slack", ctypes.c_float), ("refused", ctypes.c_int), ("gap", ctypes.c_float))
+    _fields_ = (*_FIELDS, ("slack", ctypes.c_float), ("refused", ctypes.c_int), ("gap", ctypes.c_float), _LAST)
 
 
 _BOUNDS = ("u_low", "u_high", "du_low", "du_high", "x_low", "x_high")
 
 
-class BoundRows(ctypes.Structure):
-    """Rows of limits, as in C."""
+_ROWS = np.dtype([("values", np.uintp), ("count", np.intc)], align=True)
+_BOUND_ROWS = np.dtype([(name, _ROWS) for name in _BOUNDS], align=True)  # as in C
 
-    _fields_ = tuple((name, Rows) for name in _BOUNDS)
+
+class BoundPage:
+    """The limits of consecutive steps as C reads them: a struct for each, all of which point into one table.
+
+    Parameters
+    ----------
+    first, steps
+        The first step, and for how many there are limits.
+    arrays
+        Rows of each part from step `first` on, in the order of the struct.
+    ahead
+        Rows that a step reads.
+    """
+
+    def __init__(self, first: int, arrays: list[np.ndarray], ahead: int, steps: int) -> None:
+        self.first, self.steps, self._arrays = first, steps, arrays  # C holds pointers only
+        self._table = np.zeros(steps, _BOUND_ROWS)
+        for name, array in zip(_BOUNDS, arrays, strict=True):
+            self._table[name]["values"] = array.ctypes.data + np.arange(steps) * array.strides[0]
+            self._table[name]["count"] = ahead
+        self._address, self._size = int(self._table.ctypes.data), _BOUND_ROWS.itemsize
+
+    def at(self, k: int) -> int:
+        """Return the address of the limits of step k."""
+        return self._address + (k - self.first) * self._size
 
 
 class WholeRun(ctypes.Structure):

@@ -420,6 +420,8 @@ def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool) -
     }
     if program.bounds is not None:
         _add_bounds(tables, program.bounds, rated=program.rates is not None)
+        tables.targets["target_gain"] = np.abs(targets.rows @ targets.from_reference).sum(axis=1)
+        tables.targets["target_shift"] = targets.rows @ targets.offset
     if program.levels is not None:
         _add_levels(tables, program.levels, single=single)
     elif solver.metric is not None:

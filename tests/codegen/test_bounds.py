@@ -179,3 +179,30 @@ def test_prices_in_c_give_what_python_gives(target):
     price = np.random.default_rng(2).uniform(-0.2, 0.2, (9, 2))
     cost = km.Cost(Q=[1, 0.5], R=0.05, price=price, u_target=target)
     require_parity(*compile_mpc(km.Limits(u_min=-1, u_max=1), cost=cost), steps=20)
+
+
+def test_pages_of_limits_are_turned_where_one_ends_and_where_a_run_begins_again(monkeypatch):
+    monkeypatch.setattr("koopmpc.codegen.compiled._PAGE", 7)
+    mpc, fast = compile_mpc(km.Limits(-ROWS, WAVES, x_max=[1.4, np.inf]))
+    for _ in range(2):
+        assert "UNCONSTRAINED" in require_parity(mpc, fast, 50)
+    one, other = mpc([0.1, 0.0], [0.0, 0.0]), pickle.loads(pickle.dumps(fast))([0.1, 0.0], [0.0, 0.0])
+    np.testing.assert_allclose(other.u, one.u, atol=1e-6)
+
+
+def test_the_same_limits_at_a_call_hold_as_long_as_they_are_passed_and_no_longer():
+    mpc, fast = compile_mpc(km.Limits(-1, 1, rows=("u_max",)))
+    narrow = mpc.limits.with_bounds(u_max=0.2)
+    assert "OPTIMAL" in require_parity(mpc, fast, 30, lambda k: narrow if k % 7 in (1, 2, 3) else None)
+
+
+def test_targets_that_limits_in_time_push_are_pushed_in_c_too():
+    """Small references need no look at their targets, large ones do: the border is that of the limits ahead."""
+    limits = km.Limits(-ROWS, WAVES, x_min=-WAVES, x_max=WAVES)
+    mpc, fast = compile_mpc(limits)
+    for size in (0.01, 0.1, 0.3, 1.0, 3.0):
+        mpc.reset()
+        fast.reset()
+        for k in range(12):
+            r = size * np.array([np.cos(k), np.sin(k)])
+            np.testing.assert_allclose(fast([0.1, 0.0], r).u, mpc([0.1, 0.0], r).u, atol=1e-6)

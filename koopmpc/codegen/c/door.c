@@ -12,13 +12,14 @@ typedef struct {
   koopmpc_rows w;
   koopmpc_real *u;
   koopmpc_report report;
+  const void *bounds; /* the limits of this step, where they have rows in time */
 } koopmpc_frame;
 DOOR void koopmpc_call(koopmpc_frame *f) {
+#if KOOPMPC_BOUNDS
+  if (f->bounds) koopmpc_set_bounds(f->state, (const koopmpc_bounds *)f->bounds);
+#endif
   koopmpc_step(f->state, f->y, &f->reference, f->applied, f->w.count ? &f->w : 0, f->u, &f->report);
 }
-#if KOOPMPC_BOUNDS
-DOOR void koopmpc_bound(koopmpc_state *s, const koopmpc_bounds *b) { koopmpc_set_bounds(s, b); }
-#endif
 DOOR long koopmpc_state_size(void) { return (long)sizeof(koopmpc_state); }
 
 /* A whole run: the controller and the plant step by step, with a clock around the controller. */

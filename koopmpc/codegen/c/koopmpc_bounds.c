@@ -21,6 +21,7 @@ void koopmpc_reset_bounds(koopmpc_state *s) {
     koopmpc_copy(s->target_low + k * KOOPMPC_NL, koopmpc_target_low, KOOPMPC_NL);
     koopmpc_copy(s->target_high + k * KOOPMPC_NL, koopmpc_target_high, KOOPMPC_NL);
   }
+  s->unpushed = KOOPMPC_UNPUSHED;
 }
 
 void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
@@ -65,6 +66,22 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
       s->target_low[k * KOOPMPC_NL + i] = below - koopmpc_target_values[i];
       s->target_high[k * KOOPMPC_NL + i] = above - koopmpc_target_values[i];
     }
+#if KOOPMPC_AIMED
+  s->unpushed = KOOPMPC_HUGE;
+  for (int i = 0; i < NU + OUT; i++) { /* the tightest limits of a target |r| times its gain away from its offset */
+    koopmpc_real below = -KOOPMPC_HUGE, above = KOOPMPC_HUGE, room;
+    for (int k = 0; k <= KOOPMPC_N; k++) {
+      const koopmpc_real low = s->target_low[k * KOOPMPC_NL + i], high = s->target_high[k * KOOPMPC_NL + i];
+      below = low > below ? low : below;
+      above = high < above ? high : above;
+    }
+    below = koopmpc_target_shift[i] - below;
+    above -= koopmpc_target_shift[i];
+    room = below < above ? below : above;
+    room = koopmpc_target_gain[i] > 0 ? room / koopmpc_target_gain[i] : room < 0 ? -1 : KOOPMPC_HUGE;
+    s->unpushed = room < s->unpushed ? room : s->unpushed;
+  }
+#endif
   for (int i = 0; i < KOOPMPC_CHECKED; i++) { /* the tightest of them, which a plan is tested by */
     const int at = koopmpc_checked_limit[i];
     koopmpc_real *low = s->low + KOOPMPC_PLANNED + i, *high = s->high + KOOPMPC_PLANNED + KOOPMPC_CHECKED + i;

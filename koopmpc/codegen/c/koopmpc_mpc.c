@@ -15,6 +15,11 @@
 #include "koopmpc_receding.h"
 #include "koopmpc_solver.h"
 
+#if KOOPMPC_BOUNDS
+#define UNPUSHED(s) (s)->unpushed
+#else
+#define UNPUSHED(s) KOOPMPC_UNPUSHED
+#endif
 #define MOVES KOOPMPC_MOVES
 #define PLANNED KOOPMPC_PLANNED
 #define ROWS KOOPMPC_QP_M
@@ -87,7 +92,7 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *re
       int moved = 0; /* whether a limit moves the target of this row, which the column holds as if there were none */
 #endif
       /* no limit moves a target of rows as small as this */
-      const int rows = !KOOPMPC_CHECKED_LIMITS && !KOOPMPC_BOUNDS && peak <= KOOPMPC_UNPUSHED ? 0 : KOOPMPC_N + 1;
+      const int rows = !KOOPMPC_CHECKED_LIMITS && peak <= UNPUSHED(s) ? 0 : KOOPMPC_N + 1;
       for (int k = 0; k < rows; k++) {
         const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
         int repeated = k > 0;

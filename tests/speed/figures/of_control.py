@@ -167,7 +167,7 @@ FIGURES = {
             f"{NAMES[kind]}, N {N}, in C", moving(kind, N, compiled=True), "resting", "≤ 1.5"
         )
         for N in (40, 100)
-        for kind in ("rows", "row")
+        for kind in NAMES
     },
     **{
         f"{kind} {name}": Figure(
