@@ -383,3 +383,24 @@ def test_new_rows_that_several_inputs_hold_are_aimed_at_by_the_same_in_c_as_in_p
     for row in (0.0, 0.5, 0.55, -0.45, -0.58, 0.3):
         for y in (0.1, 0.9 * row):
             np.testing.assert_allclose(fast([y], [row]).u, mpc([y], [row]).u, atol=1e-9)
+
+
+def test_targets_that_a_jump_of_w_moves_to_other_limits_are_those_of_python():
+    """Rows that no equilibrium holds, products u·w, limits active: whole Gauss–Newton steps swing from limit to limit."""
+    A, B = np.array([[0.28, -1.09], [0.76, 0.37]]), np.array([[0.58, 0.36], [0.29, 0.03]])
+    N = [[[0.16, -0.22], [-0.05, -0.14]], [[0.18, 0.01], [-0.09, -0.23]]]
+    P = [[[-0.11, 0.61], [0.19, 0.20]], [[-0.15, -0.49], [0.05, 0.03]]]
+    x, u, w = ca.SX.sym("x", 2), ca.SX.sym("u", 2), ca.SX.sym("w", 2)
+    f = A @ x + B @ u + np.array([[-0.08, 0.0], [-0.08, 0.39]]) @ w
+    for i in range(2):
+        f = f + u[i] * (ca.DM(N[i]) @ x) + w[i] * (ca.DM(P[i]) @ u)
+    plant = km.StepMap(ca.Function("F", [x, u, w], [f]), 0.1)
+    controller = km.BilinearMPC(plant, km.Cost(Q=[0.6, 0.1], R=[0.7, 0.7]), km.Limits(u_min=-1.1, u_max=1.0), 3)
+    fast, used = km.compiled(controller), []
+    for W in ([0, 0], [-0.75, 0.93], [0.75, -0.5], [0, 0], [-0.7, 0.9]):
+        for row in ([0.4, -0.6], [-0.5, 0.6]):
+            slow, quick = (one([-0.6, 0.1], row, w=W) for one in (controller, fast))
+            assert quick.status is slow.status
+            np.testing.assert_allclose(quick.u, slow.u, rtol=0, atol=1e-6)
+            used.append(slow.u)
+    np.testing.assert_allclose(used[-2], [-1.032, -0.871], atol=1e-3)  # not where no target was found, [-.099, -.027]

@@ -174,7 +174,9 @@ typedef struct {
   int made_count, made_next, has_made_end;
 #if KOOPMPC_SCHEDULED
   koopmpc_real aimed_w[KOOPMPC_NW1]; /**< the w for which targets were found; those of the table are for zero */
-  int has_old_end;                   /**< whether made_end is that of another w */
+  koopmpc_real last_end[KOOPMPC_MADE_SIZE]; /**< equilibrium of the last row of the last step */
+  koopmpc_real still[KOOPMPC_MADE_SIZE];    /**< of the last row that the table lacks, for w = 0 */
+  int has_last_end, has_still;
 #endif
   const koopmpc_real *targets; /**< the table of targets, see koopmpc_use_targets */
   int finishing;               /**< whether the active-set method finished the last program of this step */

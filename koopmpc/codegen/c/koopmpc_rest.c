@@ -19,11 +19,13 @@ enum {
   LEFT = ROWS_R + SIZE,
   LIMITS = NV + BOX,
   MOST_ROWS = LEFT > NX + LIMITS ? LEFT : NX + LIMITS,
-  NEWTON = 20,
+  NEWTON = 40,
   WIDEST = SIZE > KOOPMPC_MOST_TERMS ? SIZE : KOOPMPC_MOST_TERMS /* the recurrence of a reference has so many */
 };
 #define RANK ((koopmpc_real)KOOPMPC_RANK)
 #define CLOSE ((koopmpc_real)1e-2)
+#define BENT ((koopmpc_real)0.25) /* where the cost bends by this share beyond its Gauss-Newton part, steps are shorter */
+#define LEAST_LENGTH ((koopmpc_real)0.05)
 
 static koopmpc_real largest_of(const koopmpc_real *a, int n) {
   koopmpc_real most = 0;
@@ -194,18 +196,58 @@ static int chord(koopmpc_state *k, koopmpc_real *x, koopmpc_real *u, const koopm
 
 #endif
 
+/** The length of a Gauss-Newton step by Barzilai and Borwein (1988): below 1 where the cost bent more along the last one. */
+static koopmpc_real length_of(const koopmpc_real *taken, const koopmpc_real *last, const koopmpc_real *now) {
+  koopmpc_real bend = 0;
+  const koopmpc_real size = koopmpc_dot(taken, taken, SIZE);
+  for (int i = 0; i < SIZE; i++) bend += taken[i] * (last[i] - now[i]);
+  if (!(bend > (1 + BENT) * size)) return 1;
+  return size / bend > LEAST_LENGTH ? size / bend : LEAST_LENGTH;
+}
+
+/**
+ * The limit that a step breaks first, i + 1 if an upper and -i - 1 if a lower one, and the share of the step up to it; 0
+ * without one. Where values are outside already, the one that is farthest, and the whole step.
+ */
+static int find_hit(const koopmpc_real *value, const koopmpc_real *rows, const koopmpc_real *step,
+                    const koopmpc_real *held, koopmpc_real *length) {
+  koopmpc_real worst = 0, least = KOOPMPC_HUGE;
+  int first = 0, farthest = 0, outside = 0;
+  for (int i = 0; i < LIMITS; i++) {
+    const koopmpc_real moved = koopmpc_dot(rows + i * SIZE, step, SIZE);
+    const koopmpc_real high = koopmpc_rest_high[i] / koopmpc_rest_limit[i], low = koopmpc_rest_low[i] / koopmpc_rest_limit[i];
+    const koopmpc_real over = value[i] + moved - high, under = low - value[i] - moved;
+    const koopmpc_real rounding = KOOPMPC_REACH * (1 + koopmpc_abs(value[i]));
+    const koopmpc_real past = (over > under ? over : under) - rounding;
+    const koopmpc_real room = over > under ? high - value[i] : value[i] - low;
+    const koopmpc_real share = (room > 0 ? room : 0) / koopmpc_abs(moved);
+    if (held[i] > 0 || held[i] < 0 || !(past > 0)) continue;
+    outside |= room < -rounding;
+    if (past > worst) {
+      worst = past;
+      farthest = over > under ? i + 1 : -i - 1;
+    }
+    if (!(share < least)) continue;
+    least = share;
+    first = over > under ? i + 1 : -i - 1;
+  }
+  if (first && !outside) *length = least;
+  return outside ? farthest : first;
+}
+
 int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *w,
                  const koopmpc_real *e, koopmpc_real enough) {
-  koopmpc_real s[SIZE], held_now[LIMITS];
+  koopmpc_real s[SIZE], held_now[LIMITS], taken[SIZE], last[SIZE];
+  int going = 0; /* whether `taken` and `last` are those of the last step, with the same limits */
   (void)w;
   scaled(x, u, s);
   koopmpc_copy(held_now, active, LIMITS);
   for (int pass = 0; pass < NEWTON; pass++) {
     koopmpc_real at[KOOPMPC_LOCAL], E[MOST_ROWS * SIZE], kept[MOST_ROWS * SIZE], gain[SIZE * MOST_ROWS], null[SIZE * SIZE];
     koopmpc_real W[LEFT * SIZE], back[SIZE * LEFT], left[LEFT], missed[MOST_ROWS], step[SIZE], rows[LIMITS * SIZE];
-    koopmpc_real value[LIMITS], here[NX], input[NV], reach, pull[LEFT], turned[SIZE], worst = 0, least_pull = 0;
-    koopmpc_real most_pull = 0, off = 0;
-    int held[LIMITS], n = 0, count, release = -1, broken = -1;
+    koopmpc_real value[LIMITS], here[NX], input[NV], reach, pull[LEFT], turned[SIZE], least_pull = 0;
+    koopmpc_real most_pull = 0, off = 0, along[SIZE], whole[SIZE], length, close = enough;
+    int held[LIMITS], n = 0, count, release = -1;
     for (int i = 0; i < NX; i++) here[i] = s[i] * koopmpc_rest_size[i];
     for (int i = 0; i < NV; i++) input[i] = s[NX + i] * koopmpc_rest_size[NX + i];
     koopmpc_local(here, input KOOPMPC_AND(w), at);
@@ -235,10 +277,19 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
     for (int i = 0; i < SIZE; i++) step[i] = -koopmpc_dot(gain + i * (NX + n), missed, NX + n);
     least(W, null, count, back);
     for (int i = 0; i < LEFT; i++) pull[i] = left[i] - koopmpc_dot(W + i * SIZE, step, SIZE);
-    for (int i = 0; i < SIZE; i++) step[i] += koopmpc_dot(back + i * LEFT, pull, LEFT);
+    for (int i = 0; i < SIZE; i++) {
+      along[i] = koopmpc_dot(back + i * LEFT, pull, LEFT);
+      whole[i] = step[i] + along[i];
+    }
+    length = going ? length_of(taken, last, along) : 1;
+    going = 1;
+    for (int i = 0; i < SIZE; i++) {
+      taken[i] = length * along[i];
+      last[i] = along[i];
+      step[i] += taken[i];
+    }
     if (!koopmpc_usable(step, SIZE)) return 0;
     reach = 1 + largest_of(s, SIZE);
-    for (int i = 0; i < SIZE; i++) s[i] += step[i];
     for (int i = 0; i < LEFT; i++) pull[i] = left[i] - koopmpc_dot(W + i * SIZE, step, SIZE);
     for (int j = 0; j < SIZE; j++) {
       turned[j] = 0;
@@ -254,21 +305,21 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
         release = held[i];
       }
     }
-    for (int i = 0; i < LIMITS; i++) {
-      const koopmpc_real to = value[i] + koopmpc_dot(rows + i * SIZE, step, SIZE);
-      const koopmpc_real over = to - koopmpc_rest_high[i] / koopmpc_rest_limit[i];
-      const koopmpc_real under = koopmpc_rest_low[i] / koopmpc_rest_limit[i] - to;
-      const koopmpc_real past = (over > under ? over : under) - KOOPMPC_REACH * (1 + koopmpc_abs(value[i]));
-      if (!(held_now[i] > 0 || held_now[i] < 0) && past > worst) {
-        worst = past;
-        broken = over > under ? i : -2 - i;
-      }
-    }
     if (least_pull < -KOOPMPC_REACH * most_pull) {
       held_now[release] = 0;
-    } else if (worst > 0) {
-      held_now[broken >= 0 ? broken : -2 - broken] = broken >= 0 ? 1 : -1;
-    } else if (largest_of(step, SIZE) <= enough * reach) {
+      going = 0;
+    } else {
+      koopmpc_real share = 1;
+      const int hit = find_hit(value, rows, step, held_now, &share);
+      if (hit) {
+        held_now[hit > 0 ? hit - 1 : -1 - hit] = hit > 0 ? 1 : -1;
+        going = 0;
+        for (int i = 0; i < SIZE; i++) step[i] *= share;
+      }
+    }
+    for (int i = 0; i < SIZE; i++) s[i] += step[i];
+    if (length < 1 || length > 1) close = KOOPMPC_HELD; /* steps that swing leave more than their square */
+    if (going && largest_of(whole, SIZE) <= close * reach) {
       for (int i = 0; i < NX + n; i++) {
         const koopmpc_real still = koopmpc_abs(koopmpc_dot(kept + i * SIZE, step, SIZE) + missed[i]);
         if (still > off) off = still;

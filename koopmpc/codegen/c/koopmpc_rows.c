@@ -40,12 +40,17 @@ static koopmpc_real apart(const koopmpc_real *a, const koopmpc_real *b) {
 
 /** The known target whose row is nearest; one without an equilibrium only if all are. NULL without any. */
 static const koopmpc_real *nearest(const koopmpc_state *s, const koopmpc_real *row) {
-  const koopmpc_real *found = 0;
+  const koopmpc_real *found = 0, *others = s->made;
   koopmpc_real least = 0;
+  int count = s->made_count;
+#if KOOPMPC_SCHEDULED /* of w = 0 */
+  others = s->still;
+  count = s->has_still;
+#endif
   for (int good = 1; good >= 0 && !found; good--)
-    for (int i = 0; i < s->target_count + s->made_count; i++) {
+    for (int i = 0; i < s->target_count + count; i++) {
       const int made = i - s->target_count;
-      const koopmpc_real *each = made < 0 ? s->targets + i * KOOPMPC_TARGET : s->made + made * KOOPMPC_MADE_SIZE;
+      const koopmpc_real *each = made < 0 ? s->targets + i * KOOPMPC_TARGET : others + made * KOOPMPC_MADE_SIZE;
       const int known = each[made < 0 ? TARGET_FOUND : TARGET_M] > 0;
       const koopmpc_real far = apart(row, each);
       if (known != good || (found && !(far < least))) continue;
@@ -55,15 +60,15 @@ static const koopmpc_real *nearest(const koopmpc_state *s, const koopmpc_real *r
   return found;
 }
 
-/** Walk from an equilibrium to that of another row, in one go or in pieces; w comes in with the row where it is `new`. */
-static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc_real *w, int new, koopmpc_real *x,
+/** Walk from an equilibrium of w = 0 to that of another row, and of w, in one go or in pieces. */
+static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc_real *w, koopmpc_real *x,
                 koopmpc_real *u, koopmpc_real *active) {
   koopmpc_real none[NX], there[ROW], now[KOOPMPC_NW1], done = 0, stride = 1;
   koopmpc_fill(none, 0, NX);
   for (int tries = 0; tries < HALVINGS; tries++) {
     const koopmpc_real share = done + stride < 1 ? done + stride : 1;
     for (int i = 0; i < ROW; i++) there[i] = share < 1 ? from[i] + share * (row[i] - from[i]) : row[i];
-    for (int i = 0; i < KOOPMPC_NW; i++) now[i] = new ? share * w[i] : w[i];
+    for (int i = 0; i < KOOPMPC_NW; i++) now[i] = share * w[i];
     if (koopmpc_near(x, u, active, there, now, none, KOOPMPC_HELD)) {
       done = share;
       if (!(done < 1)) return 1;
@@ -85,24 +90,61 @@ static void slope_of(const koopmpc_real *at, koopmpc_real *slope) {
           KOOPMPC_HOLDS ? H[(NX + i) * NX + j] * koopmpc_rest_size[NX + i] / koopmpc_rest_size[j] : 0;
 }
 
+#if KOOPMPC_SCHEDULED
+static int is_limited(const koopmpc_real *active) {
+  int limited = 0;
+  for (int i = 0; i < KOOPMPC_NU + KOOPMPC_BOX; i++) limited |= active[i] < 0 || active[i] > 0;
+  return limited;
+}
+
+/** The equilibrium of a row for w = 0: of the table, or found from the nearest one; NULL without any. */
+static const koopmpc_real *still_of(koopmpc_state *s, const koopmpc_real *row) {
+  const koopmpc_real *from = nearest(s, row), none[KOOPMPC_NW1] = {0};
+  koopmpc_real own[KOOPMPC_MADE_SIZE];
+  if (!from || is_row(from, row)) return from;
+  koopmpc_copy(own, from, TARGET_M);
+  own[TARGET_M] = (koopmpc_real)walk(from, row, none, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
+  koopmpc_copy(own, row, ROW);
+  koopmpc_copy(s->still, own, KOOPMPC_MADE_SIZE);
+  s->has_still = 1;
+  return s->still;
+}
+
+int koopmpc_is_free(koopmpc_state *s, const koopmpc_real *row) {
+  const koopmpc_real *still = still_of(s, row);
+  return still && !is_limited(still + TARGET_ACTIVE) && still[still == s->still ? TARGET_M : TARGET_FOUND] > 0;
+}
+
+/** Move the equilibrium of a row with w: from that of the last step, or of w = 0. */
+static int move_on(koopmpc_state *s, const koopmpc_real *row, const koopmpc_real *w, koopmpc_real *own) {
+  koopmpc_real none[NX];
+  int moved = 0;
+  koopmpc_fill(none, 0, NX);
+  for (int i = 0; i < KOOPMPC_NW; i++) moved |= w[i] < 0 || w[i] > 0;
+  if (moved && s->has_last_end && is_row(s->last_end, row) && !is_limited(s->last_end + TARGET_ACTIVE)) {
+    koopmpc_copy(own, s->last_end, TARGET_M);
+    if (koopmpc_near(own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE, row, w, none, KOOPMPC_HELD) &&
+        !is_limited(own + TARGET_ACTIVE))
+      return 1;
+  }
+  koopmpc_copy(own, still_of(s, row), TARGET_M);
+  return walk(row, row, w, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
+}
+#endif
+
 /** Find the equilibrium of a row and keep it; NULL if there is no table to start from. */
 static const koopmpc_real *make(koopmpc_state *s, const koopmpc_real *row) {
   const koopmpc_real *from = nearest(s, row);
   koopmpc_real at[KOOPMPC_LOCAL], own[KOOPMPC_MADE_SIZE];
   const koopmpc_real *w = koopmpc_end_w(s);
-  int found = 0;
+  int found;
   if (!from) return 0;
 #if KOOPMPC_SCHEDULED
-  if (s->has_old_end && s->made_end[TARGET_FOUND] > 0 && is_row(s->made_end, row)) { /* from where it was for another w */
-    koopmpc_copy(own, s->made_end, TARGET_M);
-    found = walk(row, row, w, 0, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
-  }
+  found = move_on(s, row, w, own);
+#else
+  koopmpc_copy(own, from, TARGET_M);
+  found = walk(from, row, w, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
 #endif
-  if (!found) {
-    const int new = s->made_count == 0 || from < s->made || from >= s->made + s->made_count * KOOPMPC_MADE_SIZE;
-    koopmpc_copy(own, from, TARGET_M);
-    found = walk(from, row, w, new, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
-  }
   own[TARGET_M] = (koopmpc_real)found;
   koopmpc_copy(own, row, ROW);
   for (int i = 0; i < NV; i++) {

@@ -329,7 +329,6 @@ static int differ(const koopmpc_real *a, const koopmpc_real *b, int n) {
 /** Have the targets found for another w, which holds at the end of the horizon. */
 static void aim_at(koopmpc_state *s, const koopmpc_real *w) {
   koopmpc_copy(s->aimed_w, w, KOOPMPC_NW);
-  s->has_old_end = s->has_made_end || s->has_old_end;
   s->made_count = s->made_next = s->has_made_end = s->has_rest = s->has_chord = s->aimed = 0;
 }
 #endif
@@ -364,22 +363,27 @@ static int disturb(koopmpc_state *s) {
   return 1;
 }
 
-/** The target of a reference row, without its cost unless `whole`; the search starts at the last one found. */
-static const koopmpc_real *target_of(koopmpc_state *s, const koopmpc_real *row, int whole) {
-#if KOOPMPC_SCHEDULED
-  const koopmpc_real none[KOOPMPC_NW1] = {0};
-  const int table = differ(s->aimed_w, none, KOOPMPC_NW) ? 0 : s->target_count;
-#else
-  const int table = s->target_count;
-#endif
-  for (int tried = 0; tried < table; tried++) {
+/** The target of a reference row in the table, which is that of w = 0; NULL where it is not there. */
+static const koopmpc_real *find_in_table(koopmpc_state *s, const koopmpc_real *row) {
+  for (int tried = 0; tried < s->target_count; tried++) {
     const koopmpc_real *target = s->targets + s->found * KOOPMPC_TARGET;
     int same = 1;
     for (int i = 0; i < KOOPMPC_NR && same; i++) same = target[i] == row[i];
     if (same) return target;
     s->found = s->found + 1 < s->target_count ? s->found + 1 : 0;
   }
-  return koopmpc_find_row(s, row, whole);
+  return 0;
+}
+
+/** The target of a reference row, without its cost unless `whole`; the search starts at the last one found. */
+static const koopmpc_real *target_of(koopmpc_state *s, const koopmpc_real *row, int whole) {
+  const koopmpc_real *target = 0;
+#if KOOPMPC_SCHEDULED
+  const koopmpc_real none[KOOPMPC_NW1] = {0};
+  if (!differ(s->aimed_w, none, KOOPMPC_NW))
+#endif
+    target = find_in_table(s, row);
+  return target ? target : koopmpc_find_row(s, row, whole);
 }
 
 /** Find the targets of the stages where the reference or the disturbance moved; 0 where a row has none. */
@@ -415,6 +419,10 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference) {
     }
   }
   koopmpc_copy(own, end, KOOPMPC_TARGET);
+#if KOOPMPC_SCHEDULED
+  koopmpc_copy(s->last_end, own, TARGET_M);
+  s->has_last_end = own[TARGET_FOUND] > 0;
+#endif
 #if KOOPMPC_DISTURBED
   koopmpc_rest(s, own, s->e + (STEPS - 1) * NX);
   koopmpc_copy(own + TARGET_X, s->rest, NX);
@@ -533,18 +541,26 @@ void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *
   s->target_count = KOOPMPC_TARGETS;
 }
 
+/** Whether the target of a row is in the table, or was found without active limits; of a scheduled w, that of w = 0. */
+static int is_found(koopmpc_state *s, const koopmpc_real *row, int whole) {
+#if KOOPMPC_SCHEDULED
+  (void)whole;
+  return find_in_table(s, row) || koopmpc_is_free(s, row);
+#else
+  const koopmpc_real *target = target_of(s, row, whole), *known = s->targets + s->target_count * KOOPMPC_TARGET;
+  int free = 1;
+  if (target >= s->targets && target < known) return 1;
+  for (int i = 0; i < NV + KOOPMPC_BOX && target; i++)
+    free &= !(target[TARGET_ACTIVE + i] < 0 || target[TARGET_ACTIVE + i] > 0);
+  return target && free && target[target == s->made_end ? TARGET_FOUND : TARGET_M] > 0;
+#endif
+}
+
 int koopmpc_find_targets(koopmpc_state *s, const koopmpc_rows *reference) {
   int missed = 0;
   for (int k = KOOPMPC_HOLDS ? 0 : STEPS; k <= STEPS; k++) {
-    const koopmpc_real *row = koopmpc_row(reference, k + KOOPMPC_LATENCY, KOOPMPC_NR), *target;
-    const koopmpc_real *known = s->targets + s->target_count * KOOPMPC_TARGET;
-    int free = 1;
-    if (!koopmpc_usable(row, KOOPMPC_NR)) continue;
-    target = target_of(s, row, k == STEPS);
-    if (target >= s->targets && target < known) continue;
-    for (int i = 0; i < NV + KOOPMPC_BOX && target; i++)
-      free &= !(target[TARGET_ACTIVE + i] < 0 || target[TARGET_ACTIVE + i] > 0);
-    missed += !(target && free && target[target == s->made_end ? TARGET_FOUND : TARGET_M] > 0);
+    const koopmpc_real *row = koopmpc_row(reference, k + KOOPMPC_LATENCY, KOOPMPC_NR);
+    if (koopmpc_usable(row, KOOPMPC_NR)) missed += !is_found(s, row, k == STEPS);
   }
   return missed;
 }

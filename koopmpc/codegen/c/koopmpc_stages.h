@@ -113,6 +113,11 @@ void koopmpc_factors(const koopmpc_real *at, koopmpc_real *H, koopmpc_real *T);
  */
 const koopmpc_real *koopmpc_find_row(koopmpc_state *s, const koopmpc_real *row, int whole);
 
+#if KOOPMPC_SCHEDULED
+/** Whether the equilibrium of a row for w = 0 is known, or can be found from a known one, without active limits. */
+int koopmpc_is_free(koopmpc_state *s, const koopmpc_real *row);
+#endif
+
 /** Move the end's target to where a reference that goes on as it moved asks for it; one that rests moves nothing. */
 void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end);
 

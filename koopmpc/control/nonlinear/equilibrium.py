@@ -39,7 +39,10 @@ _QUIET = {
     "show_eval_warnings": False,
     "calc_lam_p": False,
 }
-_NEWTON = 20  # Gauss–Newton steps, at most
+_NEWTON = 40  # Gauss–Newton steps, at most
+_BENT = 0.25  # where the cost bends by more than this share beyond its Gauss–Newton part, steps are shorter
+_LEAST = 0.05  # shortest length of such a step, 1 being the longest
+_PIECES = 40  # pieces of the way from w = 0 to a measured disturbance, at most
 _AT = 1e-6  # share of a limit's size and value within which ipopt ends at a limit that is active
 _BESIDE = 0.3  # share of a reference row within which the next one is sought from its equilibrium
 _STARTS = 12  # guesses of an equilibrium where the reference is not of the state
@@ -240,13 +243,16 @@ class Equilibria:
         """Return the equilibrium by Gauss–Newton steps from `begin`, None where they do not lead to one.
 
         The limits that are active at `begin` are held. A limit that is broken is added, and one whose multiplier has
-        the wrong sign is released. The last step is at most `enough` of the size of (x, u).
+        the wrong sign is released. A step ends at the first limit that it would break. The last step is at most
+        `enough` of the size of (x, u). Where Gauss–Newton steps would swing, as far from a row that cannot be reached,
+        they are as short as Barzilai and Borwein's.
         """
         (nx, nu), size, sizes = (self.model.nx, self.model.nu), self.size, self._limit_size
         s, active = np.concatenate([begin.x, begin.u]) / size, begin.active.copy()
         limited = np.zeros((len(active), nx + nu))
         limited[:nu, nx:] = np.eye(nu)
         low, high = self._low / sizes, self._high / sizes
+        before: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]] | None = None  # steps, while limits stay
         for _ in range(_NEWTON):
             x, u = np.split(s * size, [nx])
             try:
@@ -262,21 +268,27 @@ class Equilibria:
             gain, free = _inverse(E)
             W = self._residuals(at)
             left = np.concatenate([self._weight @ (row - at.of), -self._small * s])
-            step = -gain @ missed
-            step += free @ np.linalg.lstsq(self._along(W, free), left - W @ step, rcond=None)[0]
+            back = -gain @ missed
+            along: Float[np.ndarray, " n"] = (
+                free @ np.linalg.lstsq(self._along(W, free), left - W @ back, rcond=None)[0]
+            )
+            length: float = 1.0 if before is None else _find_length(*before, along)
+            before = (length * along, along)
+            step = back + before[0]
             if not np.isfinite(step).all():
                 return None
-            reach = 1 + np.abs(s).max()
-            s = s + step
-            reached, tolerance = values + limited @ step, 1e-9 * (1 + np.abs(values))
+            reach, moved = 1 + np.abs(s).max(), limited @ step
             multipliers = active[held] * (gain.T @ (W.T @ (left - W @ step)))[nx:]  # positive where a limit holds
-            over = np.where(active == 0, np.maximum(reached - high, low - reached) - tolerance, -np.inf)
             if len(multipliers) and multipliers.min() < -1e-9 * np.abs(multipliers).max():
-                active[held[multipliers.argmin()]] = 0
-            elif over.size and over.max() > 0:
-                worst = int(over.argmax())
-                active[worst] = 1 if reached[worst] > high[worst] else -1
-            elif np.abs(step).max() <= enough * reach:
+                active[held[multipliers.argmin()]], before = 0, None
+            else:
+                hit, share = _find_hit(values, moved, low, high, active)
+                if hit:
+                    active[abs(hit) - 1], before = np.sign(hit), None
+                    step = share * step
+            s = s + step
+            last = enough if length == 1.0 else SETTLED  # Gauss–Newton steps that swing leave more than their square
+            if before is not None and np.abs(back + along).max() <= last * reach:
                 if np.abs(E @ step + missed).max() > SETTLED * reach:
                     return None
                 x, u = np.split(s * size, [nx])
@@ -450,6 +462,10 @@ class Equilibria:
 class TerminalTargets:
     """Reference row → TerminalTarget.
 
+    Where a measured disturbance multiplies the state, the equilibrium of a row is that of w = 0, moved with w: so two
+    programs find the same one, and not a local optimum each. Where the row was that of the last step, and no limit is
+    active, it is moved from there.
+
     The terminal cost is ‖d‖²_P, P that of the tail along the linearisation, or Q_N. The distance d is measured in
     the tracked outputs as far as they see it, d = J⁺(of(x_N) − of(x_r)) + (I − J⁺J)(x_N − x_r), J = ∂of/∂x: with
     sin θ and cos θ tracked it is the same at every turn of θ, and with of(x) = x it is x_N − x_r. The part of
@@ -487,6 +503,9 @@ class TerminalTargets:
         self._found: dict[bytes, Equilibrium | None] = {}  # None where there is none
         self._missed: set[bytes] = set()  # reference rows whose equilibrium was not found
         self._last: tuple[Float[np.ndarray, " nr"], Equilibrium] | None = None  # the row found last, and where
+        self._map, self._w = model, np.zeros(model.nw)
+        self._still: dict[bytes, Equilibrium | None] = {}  # `_found` of w = 0, while w is another one
+        self._end: tuple[bytes, Equilibrium] | None = None  # the last row of the last step, and its equilibrium
         self.deadline, self.sought, self.late = np.inf, False, False
 
     def program(self) -> TailProgram:
@@ -506,14 +525,27 @@ class TerminalTargets:
         return row.tobytes() in self._missed
 
     def forget_missed(self) -> None:
-        """Look again for the equilibria that were not found."""
+        """Look again for the equilibria that were not found, and begin no search at the last step."""
         for key in self._missed:
-            for kept in (self._known, self._inputs, self._found):
+            for kept in (self._known, self._inputs, self._found, self._still):
                 kept.pop(key, None)
         self._missed.clear()
+        self._end = None
+
+    def schedule(self, w: Float[np.ndarray, " nw"]) -> None:
+        """Go on with another w that multiplies the state."""
+        if not self._w.any():
+            self._still = self._found
+        self._w = w.copy()
+        self._known, self._inputs, self._found = {}, {}, {} if w.any() else self._still
+        self._missed = {key for key, found in self._found.items() if found is None}
+        self.equilibria.update(self._map.at(w))
 
     def update(self, model: LearnedMap) -> None:
         """Go on with another θ: the last target is searched again, from where it was."""
+        self._map, self._still = model, {}
+        if self._w.any():
+            model = model.at(self._w)
         self.equilibria.update(model)
         self.forget_missed()
         self._last = None
@@ -527,7 +559,8 @@ class TerminalTargets:
     def begin_with(self, model: LearnedMap) -> None:
         """Forget all targets, and find those of this θ."""
         self.equilibria.update(model)
-        self._known, self._inputs, self._found, self._last = {}, {}, {}, None
+        self._map, self._w, self._end = model, np.zeros(model.nw), None
+        self._known, self._inputs, self._found, self._still, self._last = {}, {}, {}, {}, None
         self._missed.clear()
 
     def __call__(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
@@ -572,15 +605,52 @@ class TerminalTargets:
             self.late = True
             return None
         self.sought = True
-        if len(self._found) > _MOST:
-            for kept in (self._known, self._inputs, self._found, self._missed):
+        if len(self._found) + len(self._still) > _MOST:
+            for kept in (self._known, self._inputs, self._found, self._still, self._missed):
                 kept.clear()
-        found = self._beside(row) or self._polish(self.equilibria.find(row), row)
-        self._last = None if found is None else (row.copy(), found)
+        found = self._search(row) if not self._w.any() else self._follow_w(key, row)
         if found is None:
             self._missed.add(key)
         self._found[key] = found
         return found
+
+    def _search(self, row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
+        found = self._beside(row) or self._polish(self.equilibria.find(row), row)
+        self._last = None if found is None else (row.copy(), found)
+        return found
+
+    def _follow_w(self, key: bytes, row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
+        """Return the equilibrium of a row under w, moved there from that of the last step, or of w = 0."""
+        equilibria, nothing = self.equilibria, np.zeros(self._map.nx)
+        if self._end is not None and self._end[0] == key and not self._end[1].active.any():
+            found = equilibria.near(self._end[1], row, nothing)
+            if found is not None and not found.active.any():
+                return found
+        if key not in self._still:
+            equilibria.update(self._map)
+            self._still[key] = self._search(row)
+        begin, done, stride = self._still[key] or equilibria.guess(row), 0.0, 1.0
+        try:
+            for _ in range(_PIECES):
+                share = min(done + stride, 1.0)
+                equilibria.update(self._map.at(share * self._w))
+                found = equilibria.near(begin, row, nothing)
+                if found is None:
+                    stride /= 2
+                    continue
+                begin, done, stride = found, share, 2 * stride
+                if done == 1:
+                    return found
+        finally:
+            equilibria.update(self._map.at(self._w))
+        return self._polish(equilibria.find(row), row)
+
+    def end_at(self, row: Float[np.ndarray, " nr"]) -> TerminalTarget:
+        """Return the target of the last row of a step, from which the search for the next w begins."""
+        target = self(row)
+        if self._map.scheduled:
+            self._end = None if self.is_missed(row) else (row.tobytes(), target.equilibrium)
+        return target
 
     def _beside(self, row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
         """Return the equilibrium of a row close to the last one, from where that was; None where it is not close."""
@@ -665,3 +735,42 @@ def _inverse(E: Float[np.ndarray, "m n"]) -> tuple[Float[np.ndarray, "n m"], Flo
     left, sigma, right = np.linalg.svd(E)
     rank = int((sigma > RANK * max(float(sigma[0]), 1e-300)).sum())
     return right[:rank].T @ (left[:, :rank].T / sigma[:rank, None]), right[rank:].T
+
+
+def _find_length(taken: Float[np.ndarray, " n"], last: Float[np.ndarray, " n"], now: Float[np.ndarray, " n"]) -> float:
+    """Return the length of a Gauss–Newton step: below 1 where the cost bent more than it knows along the last one.
+
+    From `last` to `now` the step has changed by as much as its slope along `taken` tells.
+
+    References
+    ----------
+    Barzilai & Borwein, "Two-point step size gradient methods", IMA J. Numer. Anal. 8, 1988.
+    """
+    bend, size = float(taken @ (last - now)), float(taken @ taken)
+    return max(size / bend, _LEAST) if bend > (1 + _BENT) * size else 1.0
+
+
+def _find_hit(
+    values: Float[np.ndarray, " nl"],
+    moved: Float[np.ndarray, " nl"],
+    low: Float[np.ndarray, " nl"],
+    high: Float[np.ndarray, " nl"],
+    active: Int[np.ndarray, " nl"],
+) -> tuple[int, float]:
+    """Return the limit that a step breaks first, i + 1 if it is an upper one, else −i − 1, and the share up to it.
+
+    (0, 1) where it breaks none. Where values are outside already, the one that is farthest, and the whole step.
+    """
+    over, under, rounding = values + moved - high, low - values - moved, 1e-9 * (1 + np.abs(values))
+    past = np.where(active == 0, np.maximum(over, under) - rounding, -np.inf)
+    broken = np.flatnonzero(past > 0)
+    if not len(broken):
+        return 0, 1.0
+    ends = np.where(over[broken] > under[broken], high[broken], low[broken])
+    room = np.where(over[broken] > under[broken], ends - values[broken], values[broken] - ends)
+    if (room < -rounding[broken]).any():
+        i, share = int(broken[past[broken].argmax()]), 1.0
+    else:
+        shares = np.maximum(room, 0.0) / np.abs(moved[broken])
+        i, share = int(broken[shares.argmin()]), float(shares.min())
+    return (i + 1 if over[i] > under[i] else -i - 1), share

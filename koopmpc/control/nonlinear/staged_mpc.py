@@ -170,7 +170,7 @@ class StagedMPC(MPCBase):
             The model is of another kind, has another lifting, dt, states, inputs or disturbances, or is a StepMap.
         """
         self._map = self._map.replace_model(model)
-        self._terminal.update(self._map.at(self._scheduled_for))
+        self._terminal.update(self._map)
         self._initial.update(self._map)
         if self._watch is not None:
             self._watch.update(self._map)
@@ -255,7 +255,7 @@ class StagedMPC(MPCBase):
         self._count_held(applied)
         x, u_prev = initial.z, initial.u_prev if initial.u_prev.size else self._given
         s, first, conflict = self._first_stage(x, u_prev)
-        target = checks.numbers(reference, "reference")
+        target = checks.numbers(reference, "reference") + 0.0  # -0.0 is no other row than 0.0
         if self._problem.timed:
             self._pass_weights()
         self._terminal.deadline, self._terminal.sought, self._terminal.late = start + self._allowed, False, False
@@ -360,7 +360,7 @@ class StagedMPC(MPCBase):
             self._schedule(initial.W)
             if (initial.W[-1] != self._scheduled_for).any():  # the last row of the preview holds at the target
                 self._scheduled_for = initial.W[-1].copy()
-                self._terminal.update(self._map.at(initial.W[-1]))
+                self._terminal.schedule(initial.W[-1])
                 self._forget_targets()
         return True
 
@@ -379,7 +379,7 @@ class StagedMPC(MPCBase):
             if not np.isfinite(R).all():
                 return False
             targets = [self._terminal.find_input(row) for row in R[:-1]]
-            end = self._terminal(R[-1])
+            end = self._terminal.end_at(R[-1])
             self._preview = Preview(
                 R,
                 np.array([target.u for target in targets]),
