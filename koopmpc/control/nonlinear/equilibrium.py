@@ -273,8 +273,8 @@ class Equilibria:
                 free @ np.linalg.lstsq(self._along(W, free), left - W @ back, rcond=None)[0]
             )
             length: float = 1.0 if before is None else _find_length(*before, along)
-            before = (length * along, along)
-            step = back + before[0]
+            taken: Float[np.ndarray, " n"] = length * along
+            before, step = (taken, along), back + taken
             if not np.isfinite(step).all():
                 return None
             reach, moved = 1 + np.abs(s).max(), limited @ step
