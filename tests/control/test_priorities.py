@@ -96,6 +96,8 @@ def test_saved_controllers_keep_their_priorities(tmp_path):
 REFUSED = {
     "priority names 'd'": {"priority": {"d": 1}},
     "one number for each of a, b, c": {"priority": [1, 2]},
+    "c has priority 2 and no limit": {"priority": {"c": 2}, "x_max": [1.0, 1.0, np.inf]},
+    "c has priority 1 and no limit": {"priority": [0, 2, 1], "x_max": [1.0, 1.0, np.inf]},
     "pass whole numbers": {"priority": [0.5, 0, 0]},
     "the limit of b is hard and has priority 2": {"priority": {"b": 2}, "slack": None},
     "levels and a priority": {"priority": {"b": 2}, "levels": [[-1, 1]]},
@@ -106,7 +108,7 @@ REFUSED = {
 def test_priorities_that_cannot_be_are_refused(said):
     model, cost, *_ = draw(0)
     with pytest.raises((km.errors.DataError, km.errors.ShapeError), match=said):
-        km.KoopmanMPC(model, cost, km.Limits(u_min=-1, u_max=1, x_max=1.0, **REFUSED[said]), 5)
+        km.KoopmanMPC(model, cost, km.Limits(u_min=-1, u_max=1, **({"x_max": 1.0} | REFUSED[said])), 5)
 
 
 def test_others_say_that_they_know_no_priority(tmp_path):

@@ -19,7 +19,8 @@ enum {
   LEFT = ROWS_R + SIZE,
   LIMITS = NV + BOX,
   MOST_ROWS = LEFT > NX + LIMITS ? LEFT : NX + LIMITS,
-  NEWTON = 40,
+  NEWTON = 20,
+  SHORTENED = 40,
   WIDEST = SIZE > KOOPMPC_MOST_TERMS ? SIZE : KOOPMPC_MOST_TERMS /* the recurrence of a reference has so many */
 };
 #define RANK ((koopmpc_real)KOOPMPC_RANK)
@@ -207,12 +208,12 @@ static koopmpc_real length_of(const koopmpc_real *taken, const koopmpc_real *las
 
 /**
  * The limit that a step breaks first, i + 1 if an upper and -i - 1 if a lower one, and the share of the step up to it; 0
- * without one. Where values are outside already, the one that is farthest, and the whole step.
+ * without one. If not `careful`, or where values are outside already, the one that is broken most, and the whole step.
  */
 static int find_hit(const koopmpc_real *value, const koopmpc_real *rows, const koopmpc_real *step,
-                    const koopmpc_real *held, koopmpc_real *length) {
+                    const koopmpc_real *held, int careful, koopmpc_real *length) {
   koopmpc_real worst = 0, least = KOOPMPC_HUGE;
-  int first = 0, farthest = 0, outside = 0;
+  int first = 0, farthest = 0, outside = !careful;
   for (int i = 0; i < LIMITS; i++) {
     const koopmpc_real moved = koopmpc_dot(rows + i * SIZE, step, SIZE);
     const koopmpc_real high = koopmpc_rest_high[i] / koopmpc_rest_limit[i], low = koopmpc_rest_low[i] / koopmpc_rest_limit[i];
@@ -236,13 +237,13 @@ static int find_hit(const koopmpc_real *value, const koopmpc_real *rows, const k
 }
 
 int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *w,
-                 const koopmpc_real *e, koopmpc_real enough) {
+                 const koopmpc_real *e, koopmpc_real enough, int careful) {
   koopmpc_real s[SIZE], held_now[LIMITS], taken[SIZE], last[SIZE];
   int going = 0; /* whether `taken` and `last` are those of the last step, with the same limits */
   (void)w;
   scaled(x, u, s);
   koopmpc_copy(held_now, active, LIMITS);
-  for (int pass = 0; pass < NEWTON; pass++) {
+  for (int pass = 0; pass < (careful ? SHORTENED : NEWTON); pass++) {
     koopmpc_real at[KOOPMPC_LOCAL], E[MOST_ROWS * SIZE], kept[MOST_ROWS * SIZE], gain[SIZE * MOST_ROWS], null[SIZE * SIZE];
     koopmpc_real W[LEFT * SIZE], back[SIZE * LEFT], left[LEFT], missed[MOST_ROWS], step[SIZE], rows[LIMITS * SIZE];
     koopmpc_real value[LIMITS], here[NX], input[NV], reach, pull[LEFT], turned[SIZE], least_pull = 0;
@@ -281,7 +282,7 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
       along[i] = koopmpc_dot(back + i * LEFT, pull, LEFT);
       whole[i] = step[i] + along[i];
     }
-    length = going ? length_of(taken, last, along) : 1;
+    length = careful && going ? length_of(taken, last, along) : 1;
     going = 1;
     for (int i = 0; i < SIZE; i++) {
       taken[i] = length * along[i];
@@ -310,7 +311,7 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
       going = 0;
     } else {
       koopmpc_real share = 1;
-      const int hit = find_hit(value, rows, step, held_now, &share);
+      const int hit = find_hit(value, rows, step, held_now, careful, &share);
       if (hit) {
         held_now[hit > 0 ? hit - 1 : -1 - hit] = hit > 0 ? 1 : -1;
         going = 0;
@@ -344,7 +345,7 @@ void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_re
   koopmpc_copy(active, s->has_rest ? s->rest_active : target + TARGET_ACTIVE, LIMITS);
   for (int i = 0; i < LIMITS; i++) limited |= active[i] > 0 || active[i] < 0;
   found = (!limited && chord(s, x, u, target, e)) ||
-          koopmpc_near(x, u, active, target, koopmpc_end_w(s), e, CLOSE);
+          koopmpc_near(x, u, active, target, koopmpc_end_w(s), e, CLOSE, 1);
   if (!(target[TARGET_FOUND] > 0)) found = 0;
   if (!found) {
     koopmpc_copy(x, target + TARGET_X, NX);

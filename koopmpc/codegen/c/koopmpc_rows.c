@@ -61,7 +61,7 @@ static const koopmpc_real *nearest(const koopmpc_state *s, const koopmpc_real *r
 }
 
 /** Walk from an equilibrium of w = 0 to that of another row, and of w, in one go or in pieces. */
-static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc_real *w, koopmpc_real *x,
+static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc_real *w, int careful, koopmpc_real *x,
                 koopmpc_real *u, koopmpc_real *active) {
   koopmpc_real none[NX], there[ROW], now[KOOPMPC_NW1], done = 0, stride = 1;
   koopmpc_fill(none, 0, NX);
@@ -69,7 +69,7 @@ static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc
     const koopmpc_real share = done + stride < 1 ? done + stride : 1;
     for (int i = 0; i < ROW; i++) there[i] = share < 1 ? from[i] + share * (row[i] - from[i]) : row[i];
     for (int i = 0; i < KOOPMPC_NW; i++) now[i] = share * w[i];
-    if (koopmpc_near(x, u, active, there, now, none, KOOPMPC_HELD)) {
+    if (koopmpc_near(x, u, active, there, now, none, KOOPMPC_HELD, careful)) {
       done = share;
       if (!(done < 1)) return 1;
       stride *= 2;
@@ -103,7 +103,7 @@ static const koopmpc_real *still_of(koopmpc_state *s, const koopmpc_real *row) {
   koopmpc_real own[KOOPMPC_MADE_SIZE];
   if (!from || is_row(from, row)) return from;
   koopmpc_copy(own, from, TARGET_M);
-  own[TARGET_M] = (koopmpc_real)walk(from, row, none, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
+  own[TARGET_M] = (koopmpc_real)walk(from, row, none, 0, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
   koopmpc_copy(own, row, ROW);
   koopmpc_copy(s->still, own, KOOPMPC_MADE_SIZE);
   s->has_still = 1;
@@ -111,8 +111,12 @@ static const koopmpc_real *still_of(koopmpc_state *s, const koopmpc_real *row) {
 }
 
 int koopmpc_is_free(koopmpc_state *s, const koopmpc_real *row) {
-  const koopmpc_real *still = still_of(s, row);
-  return still && !is_limited(still + TARGET_ACTIVE) && still[still == s->still ? TARGET_M : TARGET_FOUND] > 0;
+  const koopmpc_real *still = still_of(s, row), none[KOOPMPC_NW1] = {0}, nothing[ROW] = {0};
+  koopmpc_real at[KOOPMPC_LOCAL];
+  if (!still) return 0;
+  koopmpc_local(still + TARGET_X, still + TARGET_U KOOPMPC_AND(none), at);
+  if (!(apart(row, at + LOCAL_OF) <= KOOPMPC_HELD * apart(row, nothing))) return 0; /* several may come as near */
+  return !is_limited(still + TARGET_ACTIVE) && still[still == s->still ? TARGET_M : TARGET_FOUND] > 0;
 }
 
 /** Move the equilibrium of a row with w: from that of the last step, or of w = 0. */
@@ -123,12 +127,12 @@ static int move_on(koopmpc_state *s, const koopmpc_real *row, const koopmpc_real
   for (int i = 0; i < KOOPMPC_NW; i++) moved |= w[i] < 0 || w[i] > 0;
   if (moved && s->has_last_end && is_row(s->last_end, row) && !is_limited(s->last_end + TARGET_ACTIVE)) {
     koopmpc_copy(own, s->last_end, TARGET_M);
-    if (koopmpc_near(own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE, row, w, none, KOOPMPC_HELD) &&
+    if (koopmpc_near(own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE, row, w, none, KOOPMPC_HELD, 0) &&
         !is_limited(own + TARGET_ACTIVE))
       return 1;
   }
   koopmpc_copy(own, still_of(s, row), TARGET_M);
-  return walk(row, row, w, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
+  return walk(row, row, w, 1, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
 }
 #endif
 
@@ -143,7 +147,7 @@ static const koopmpc_real *make(koopmpc_state *s, const koopmpc_real *row) {
   found = move_on(s, row, w, own);
 #else
   koopmpc_copy(own, from, TARGET_M);
-  found = walk(from, row, w, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
+  found = walk(from, row, w, 0, own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE);
 #endif
   own[TARGET_M] = (koopmpc_real)found;
   koopmpc_copy(own, row, ROW);

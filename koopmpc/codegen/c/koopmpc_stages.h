@@ -97,12 +97,11 @@ int koopmpc_inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_re
 
 /**
  * Gauss-Newton steps to the equilibrium of a row, of w where that multiplies x or u, and of a disturbance e: a violated
- * limit is added, one with a wrong
- * sign released. The last step is at most a share `enough` of (x, u); 0, and nothing written, if they fail.
+ * limit is added, one with a wrong sign released. The last step is at most a share `enough` of (x, u); 0, and nothing
+ * written, if they fail. `careful` steps end at the first limit, and are shorter where they would swing.
  */
 int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *w,
-                 const koopmpc_real *e,
-                 koopmpc_real enough);
+                 const koopmpc_real *e, koopmpc_real enough, int careful);
 
 /** The factors of a Gauss-Newton step at `koopmpc_local` without active limits: H of F + e - x, T of the residuals. */
 void koopmpc_factors(const koopmpc_real *at, koopmpc_real *H, koopmpc_real *T);
@@ -114,7 +113,7 @@ void koopmpc_factors(const koopmpc_real *at, koopmpc_real *H, koopmpc_real *T);
 const koopmpc_real *koopmpc_find_row(koopmpc_state *s, const koopmpc_real *row, int whole);
 
 #if KOOPMPC_SCHEDULED
-/** Whether the equilibrium of a row for w = 0 is known, or can be found from a known one, without active limits. */
+/** Whether an equilibrium holds a row for w = 0 that is known, or found from a known one, without active limits. */
 int koopmpc_is_free(koopmpc_state *s, const koopmpc_real *row);
 #endif
 

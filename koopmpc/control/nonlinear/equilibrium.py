@@ -39,7 +39,7 @@ _QUIET = {
     "show_eval_warnings": False,
     "calc_lam_p": False,
 }
-_NEWTON = 40  # Gauss–Newton steps, at most
+_NEWTON, _SHORTENED = 20, 40  # Gauss–Newton steps, at most, whole ones and those that may be shorter
 _BENT = 0.25  # where the cost bends by more than this share beyond its Gauss–Newton part, steps are shorter
 _LEAST = 0.05  # shortest length of such a step, 1 being the longest
 _PIECES = 40  # pieces of the way from w = 0 to a measured disturbance, at most
@@ -239,13 +239,15 @@ class Equilibria:
         row: Float[np.ndarray, " nr"],
         e: Float[np.ndarray, " nx"],
         enough: float = SETTLED,
+        *,
+        careful: bool = False,
     ) -> Equilibrium | None:
         """Return the equilibrium by Gauss–Newton steps from `begin`, None where they do not lead to one.
 
         The limits that are active at `begin` are held. A limit that is broken is added, and one whose multiplier has
-        the wrong sign is released. A step ends at the first limit that it would break. The last step is at most
-        `enough` of the size of (x, u). Where Gauss–Newton steps would swing, as far from a row that cannot be reached,
-        they are as short as Barzilai and Borwein's.
+        the wrong sign is released. The last step is at most `enough` of the size of (x, u). `careful` steps end at the
+        first limit that they would break, and where they would swing, as far from a row that cannot be reached, they
+        are as short as Barzilai and Borwein's.
         """
         (nx, nu), size, sizes = (self.model.nx, self.model.nu), self.size, self._limit_size
         s, active = np.concatenate([begin.x, begin.u]) / size, begin.active.copy()
@@ -253,7 +255,7 @@ class Equilibria:
         limited[:nu, nx:] = np.eye(nu)
         low, high = self._low / sizes, self._high / sizes
         before: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]] | None = None  # steps, while limits stay
-        for _ in range(_NEWTON):
+        for _ in range(_SHORTENED if careful else _NEWTON):
             x, u = np.split(s * size, [nx])
             try:
                 at = self.linearise(x, u)
@@ -272,7 +274,7 @@ class Equilibria:
             along: Float[np.ndarray, " n"] = (
                 free @ np.linalg.lstsq(self._along(W, free), left - W @ back, rcond=None)[0]
             )
-            length: float = 1.0 if before is None else _find_length(*before, along)
+            length: float = 1.0 if before is None or not careful else _find_length(*before, along)
             taken: Float[np.ndarray, " n"] = length * along
             before, step = (taken, along), back + taken
             if not np.isfinite(step).all():
@@ -282,7 +284,7 @@ class Equilibria:
             if len(multipliers) and multipliers.min() < -1e-9 * np.abs(multipliers).max():
                 active[held[multipliers.argmin()]], before = 0, None
             else:
-                hit, share = _find_hit(values, moved, low, high, active)
+                hit, share = _find_hit(values, moved, Interval(low, high), active, careful=careful)
                 if hit:
                     active[abs(hit) - 1], before = np.sign(hit), None
                     step = share * step
@@ -634,7 +636,7 @@ class TerminalTargets:
             for _ in range(_PIECES):
                 share = min(done + stride, 1.0)
                 equilibria.update(self._map.at(share * self._w))
-                found = equilibria.near(begin, row, nothing)
+                found = equilibria.near(begin, row, nothing, careful=True)
                 if found is None:
                     stride /= 2
                     continue
@@ -694,7 +696,7 @@ class TerminalTargets:
         target = self(row)
         begin = (target if last is None else last).equilibrium
         each = self.equilibria
-        found = each.follow(begin, row, e) or each.near(begin, row, e, CLOSE)
+        found = each.follow(begin, row, e) or each.near(begin, row, e, CLOSE, careful=True)
         if found is None or self.is_missed(row):
             return target
         u, m = found.u * self._hold, target.m
@@ -753,14 +755,17 @@ def _find_length(taken: Float[np.ndarray, " n"], last: Float[np.ndarray, " n"], 
 def _find_hit(
     values: Float[np.ndarray, " nl"],
     moved: Float[np.ndarray, " nl"],
-    low: Float[np.ndarray, " nl"],
-    high: Float[np.ndarray, " nl"],
+    limits: Interval,
     active: Int[np.ndarray, " nl"],
+    *,
+    careful: bool,
 ) -> tuple[int, float]:
     """Return the limit that a step breaks first, i + 1 if it is an upper one, else −i − 1, and the share up to it.
 
-    (0, 1) where it breaks none. Where values are outside already, the one that is farthest, and the whole step.
+    (0, 1) where it breaks none. If not `careful`, or where values are outside already, the one that is broken most, and
+    the whole step.
     """
+    low, high = limits
     over, under, rounding = values + moved - high, low - values - moved, 1e-9 * (1 + np.abs(values))
     past = np.where(active == 0, np.maximum(over, under) - rounding, -np.inf)
     broken = np.flatnonzero(past > 0)
@@ -768,7 +773,7 @@ def _find_hit(
         return 0, 1.0
     ends = np.where(over[broken] > under[broken], high[broken], low[broken])
     room = np.where(over[broken] > under[broken], ends - values[broken], values[broken] - ends)
-    if (room < -rounding[broken]).any():
+    if not careful or (room < -rounding[broken]).any():
         i, share = int(broken[past[broken].argmax()]), 1.0
     else:
         shares = np.maximum(room, 0.0) / np.abs(moved[broken])

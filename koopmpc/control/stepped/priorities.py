@@ -20,12 +20,18 @@ _ROUNDING = 1e-3  # limits that are decided become wider by this share of the sl
 def find_priorities(
     given: Any, states: Sequence[str], outputs: Sequence[str], linear: Float[np.ndarray, " n"]
 ) -> Int[np.ndarray, " n"]:
-    """Return the priority of each limit of [x; of(x)], 0 where none is given; `linear` is its price, inf if hard.
+    """Return the priority of each limit of [x; of(x)], 0 where none is given.
+
+    Parameters
+    ----------
+    linear
+        Price of each limit, inf where it is hard, and 0 where there is none.
 
     Raises
     ------
     DataError
-        A name is unknown, or is that of a state and of an observable; a limit with a priority is hard.
+        A name is unknown, given twice, or is that of a state and of an observable; what has a priority has no limit, or
+        a hard one.
     ShapeError
         There is not one number for each state and observable.
     """
@@ -40,6 +46,12 @@ def find_priorities(
             )
     if (row != np.rint(row)).any():
         raise DataError(f"priority is {row.tolist()}; pass whole numbers, larger ones for limits that are kept longer")
+    nothing = np.flatnonzero((row != 0) & (linear == 0))
+    if nothing.size:
+        raise DataError(
+            f"{names[nothing[0]]} has priority {row[nothing[0]]:g} and no limit; limit it, declare that a step may with"
+            " Limits(rows=…), or leave its priority out"
+        )
     hard = np.flatnonzero((row != 0) & np.isinf(linear))
     if hard.size:
         raise DataError(
@@ -60,7 +72,7 @@ def spread_priorities(limits: Limits, states: Sequence[str], layout: tuple[int, 
     outputs = () if limits.of is None else limits.of.bind(tuple(states)).names
     rows = limits.base.find_rows(len(states), len(outputs))
     linear = np.zeros(len(states) + len(outputs))
-    linear[rows.kept] = rows.softness.linear
+    linear[rows.kept] = rows.softness.linear + rows.softness.quadratic  # a limit may be weighed by its square alone
     first, steps, length = layout
     priority = np.zeros(length, dtype=np.intp)
     own = find_priorities(limits.priority, states, outputs, linear)[rows.kept]
