@@ -39,7 +39,8 @@ _QUIET = {
     "show_eval_warnings": False,
     "calc_lam_p": False,
 }
-_NEWTON, _SHORTENED = 20, 40  # Gauss–Newton steps, at most, whole ones and those that may be shorter
+_NEWTON = 20  # whole Gauss–Newton steps, at most
+_SHORTENED = 40  # Gauss–Newton steps that may be shorter, at most
 _BENT = 0.25  # where the cost bends by more than this share beyond its Gauss–Newton part, steps are shorter
 _LEAST = 0.05  # shortest length of such a step, 1 being the longest
 _PIECES = 40  # pieces of the way from w = 0 to a measured disturbance, at most
