@@ -16,7 +16,7 @@ from koopmpc.control.nonlinear.iteration import MOST
 from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.nonlinear.stagewise import list_hard_outputs
 from koopmpc.control.program import LinearProgram, Published, StepProgram, no_export
-from koopmpc.control.solvers.daqp import FEW
+from koopmpc.control.solvers.daqp import FEW, MOVED
 from koopmpc.control.stepped.levels import FREE
 from koopmpc.control.stepped.search import NODES
 from koopmpc.control.stepped.sequences import LevelsProgram
@@ -380,6 +380,7 @@ def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool) -
         "QP_MIXED": int(any_soft and not soft.all()),
         "STEEP": int(solver.metric is not None and program.levels is None),
         "FEW": FEW,
+        "MOVED": MOVED,
         "COLD_START": int(solver.settings["cold_start"]),
     }
     plain = program.given is None and program.bounds is None and program.levels is None

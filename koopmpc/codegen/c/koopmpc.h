@@ -210,7 +210,7 @@ typedef struct {
   int resumes;    /**< whether the next solve continues from the active rows of this one */
   int unmet;      /**< whether the hard limits of the last solve contradicted each other */
 #endif
-  int aimed;      /**< whether the targets are those of `reference` */
+  int aimed;      /**< whether the targets are those of `reference`; 2 if its rows are the same */
   int row;        /**< row of given input targets */
   int warm;       /**< whether the next step starts from the last one */
   int has_kept, age, planned;

@@ -45,6 +45,8 @@ static int target_of_row(koopmpc_state *s, int k, const koopmpc_real *e, koopmpc
 }
 #endif
 
+enum { MOVING = 1, HELD }; /* whether the rows of the last reference were the same */
+
 /**
  * Write the reference's part of the plan: all NaN if a row is not finite.
  *
@@ -54,9 +56,11 @@ static int target_of_row(koopmpc_state *s, int k, const koopmpc_real *e, koopmpc
 static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *reach) {
   const int moves_on = s->row + 1 < KOOPMPC_GIVEN;
   int good = 1, same = 1, held = 1; /* held: all rows are the same */
-  int first_alone = 0;
+  int first_alone = 0, rests = s->aimed == HELD && reference->count == 1;
   koopmpc_real peak = 0;
   *reach = 0;
+  for (int i = 0; i < KOOPMPC_NR; i++) rests &= reference->values[i] == s->reference[i];
+  if (rests) return 0;
   for (int k = 0; k <= KOOPMPC_N; k++) {
     const koopmpc_real *row = koopmpc_row(reference, k + KOOPMPC_LATENCY, KOOPMPC_NR);
     koopmpc_real *mine = s->reference + k * KOOPMPC_NR;
@@ -72,7 +76,7 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *re
   }
   if (!same || !s->aimed) {
     first_alone = KOOPMPC_FIRST_ALONE && good && !held && !same && peak <= KOOPMPC_UNPUSHED;
-    s->aimed = good && !moves_on && !first_alone;
+    s->aimed = !good || moves_on || first_alone ? 0 : held ? HELD : MOVING;
     if (!good) {
       koopmpc_fill(s->column, (koopmpc_real)NAN, KOOPMPC_NT);
     } else {
@@ -206,7 +210,7 @@ static koopmpc_real set_limits(const koopmpc_state *s, koopmpc_qp_memory *qp, in
   for (int i = 0; i < ROWS; i++) {
     const koopmpc_real moved = s->t[koopmpc_source[i]] * koopmpc_scale[i];
     koopmpc_real low = row_low(s, i), high = row_high(s, i);
-    const int which = koopmpc_rate_input[i];
+    const int which = KOOPMPC_HARD_RATED ? koopmpc_rate_input[i] : -1;
     if (which >= 0) { /* the first change of an input, hard: the input limit has precedence */
       const koopmpc_real last = s->known[KOOPMPC_U_PREV + which];
       const koopmpc_real highest = (KOOPMPC_BOX_HIGH(s)[which] - last) * koopmpc_scale[i];
@@ -333,25 +337,42 @@ static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const ko
   for (int i = 0; i < ROWS; i++) {
     qp->dual[i] *= unit;
     active += qp->dual[i] < 0 || qp->dual[i] > 0;
+    qp->product[i] = koopmpc_dot(koopmpc_M + i * MOVES, qp->primal, MOVES) / koopmpc_scaling[i];
   }
   s->far = status == KOOPMPC_OPTIMAL && 2 * active > MOVES;
   return status;
 }
 #endif
 
+/** The multiplier of row i in the last answer, shifted by one step. */
+static koopmpc_real shifted(const koopmpc_state *s, int i) {
+  return s->warm && koopmpc_shift[i] < ROWS ? s->dual[koopmpc_shift[i]] : 0;
+}
+
+/** Whether few rows are active, or few change where a step moves them on; then DAQP goes on from those that it holds. */
+static int lasts(const koopmpc_state *s) {
+  int active = 0, changed = 0;
+  for (int i = 0; i < ROWS; i++) active += s->dual[i] < 0 || s->dual[i] > 0;
+  if (active <= KOOPMPC_FEW) return 1;
+  for (int i = 0; i < ROWS; i++) {
+    const koopmpc_real now = s->dual[i], next = shifted(s, i);
+    changed += (now > 0) != (next > 0) || (now < 0) != (next < 0);
+  }
+  return changed <= KOOPMPC_MOVED;
+}
+
 /** Find the least deviation from the plan inside the limits; writes how far a limit gave way. */
 static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_report *report) {
   koopmpc_real push[KOOPMPC_QP_M1], conflict;
   koopmpc_qp_end end;
-  const int resume = s->warm && s->resumes;
+  const int resume = s->warm && s->resumes && lasts(s);
   koopmpc_status status;
-  int good = 0, active = 0;
+  int good = 0;
 #if KOOPMPC_COLD_START
   s->far = s->unmet = 0;
 #endif
   s->resumes = 0;
-  for (int i = 0; i < ROWS; i++) /* the last answer, shifted by one step */
-    push[i] = s->warm && koopmpc_shift[i] < ROWS ? s->dual[koopmpc_shift[i]] : 0;
+  for (int i = 0; i < ROWS; i++) push[i] = resume ? 0 : shifted(s, i);
 #if KOOPMPC_BOUNDS
   const koopmpc_real opened = koopmpc_open_rates(s);
 #else
@@ -364,8 +385,7 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   } else {
     end = koopmpc_qp_attempt(&problem, qp, resume ? 0 : push, 0, resume, &good);
     report->iterations += end.iterations;
-    for (int i = 0; i < ROWS; i++) active += qp->dual[i] < 0 || qp->dual[i] > 0;
-    s->resumes = good && active <= KOOPMPC_FEW;
+    s->resumes = good;
     if (end.flag == -1 && KOOPMPC_QP_MIXED && !KOOPMPC_STEEP && contradictory(s, qp)) return KOOPMPC_INFEASIBLE;
     if (!good && !(end.flag == -1 && KOOPMPC_STEEP)) {
       (void)set_limits(s, qp, 0);
@@ -376,7 +396,6 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   }
 #if KOOPMPC_STEEP
   if (!good) {
-    if (resume) koopmpc_fill(push, 0, ROWS);
     status = approach(s, qp, push, &report->iterations);
     good = status == KOOPMPC_OPTIMAL;
   }
@@ -387,8 +406,7 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
     const koopmpc_real dual = qp->dual[i];
     if (koopmpc_sense[i] && (dual < 0 || dual > 0) && koopmpc_abs(dual) >= (1 - (koopmpc_real)1e-9) * koopmpc_linear[i]) {
       const koopmpc_real unit = koopmpc_unit[i] * koopmpc_scale[i];
-      const koopmpc_real value = koopmpc_dot(koopmpc_M + i * MOVES, qp->primal, MOVES) / koopmpc_scaling[i] / unit +
-                                 s->t[koopmpc_source[i]];
+      const koopmpc_real value = qp->product[i] / unit + s->t[koopmpc_source[i]];
       const koopmpc_real over = value - row_high(s, i) / koopmpc_scale[i];
       const koopmpc_real under = row_low(s, i) / koopmpc_scale[i] - value;
       const koopmpc_real past = over > under ? over : under;

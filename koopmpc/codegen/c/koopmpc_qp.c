@@ -58,7 +58,12 @@ koopmpc_qp_memory koopmpc_qp_on(const koopmpc_qp *qp, koopmpc_real *reals, int *
 /** Mark the rows from which to start, and rows with two equal limits; 0 if limits cross. */
 static int marked(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_real *push, int resume) {
   const int one = DAQP_ACTIVE | DAQP_IMMUTABLE | DAQP_AUTO_EQUALITY;
-  int result = 1;
+  int result = 1, narrow = 0, known = 0;
+  for (int i = 0; i < qp->m; i++) narrow |= !(mem->high[i] - mem->low[i] >= KOOPMPC_ZERO_TOL);
+  if (resume && !push && !narrow) {
+    for (int i = 0; i < qp->m; i++) known |= mem->sense[i];
+    if (!(known & DAQP_AUTO_EQUALITY)) return 1;
+  }
   for (int i = 0; i < qp->m; i++) {
     const koopmpc_real width = mem->high[i] - mem->low[i];
     int sense = resume ? mem->sense[i] : qp->sense[i];
@@ -185,6 +190,7 @@ static int accurate(const koopmpc_qp *problem, const koopmpc_qp_memory *qp) {
   for (int i = 0; i < m; i++) {
     const koopmpc_real over = qp->product[i] - qp->high[i], under = qp->low[i] - qp->product[i];
     const koopmpc_real outside = over > under ? over : under, push = koopmpc_abs(qp->dual[i]);
+    if (outside <= near && !(push > 0)) continue;
     if (!problem->sense[i]) {
       if (!(outside <= near)) return 0;
     } else {
@@ -202,10 +208,8 @@ static int accurate(const koopmpc_qp *problem, const koopmpc_qp_memory *qp) {
 koopmpc_qp_end koopmpc_qp_attempt(const koopmpc_qp *problem, koopmpc_qp_memory *qp, const koopmpc_real *push,
                                   koopmpc_real wider, int resume, int *good) {
   const koopmpc_qp_end end = koopmpc_qp_solve(problem, qp, push, wider, resume);
-  *good = end.flag == 1;
-  if (end.flag > 1) {
+  if (end.flag > 0)
     for (int i = 0; i < problem->m; i++) qp->product[i] /= problem->scaling[i]; /* DAQP's last product M u */
-    *good = accurate(problem, qp);
-  }
+  *good = end.flag == 1 || (end.flag > 1 && accurate(problem, qp));
   return end;
 }

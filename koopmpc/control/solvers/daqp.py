@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from koopmpc import checks
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
-from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver
+from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver, StepQP
 from koopmpc.errors import DataError
 from koopmpc.values import Value
 
@@ -43,6 +43,7 @@ _SLOW = 0.1  # share of what the step before missed above which the weight is ea
 _CURVED = 1e-8  # least curvature of a price by its slope, per unit of a row: DAQP divides by it, and with 1e-10 it errs
 
 FEW = 20  # active rows up to which the next solve goes on from them
+MOVED = 6  # of more rows too, if a shift by one step changes at most so many
 _MANY = 16  # iterations of a solve that tell how long one takes
 
 _COLD = "cold_start"  # our own setting
@@ -202,8 +203,9 @@ class DAQP(QPSolver):
     def resume(self, time_limit: float | None = None) -> QPSolution:
         """Solve from the rows that the last solve ended with, whose factors DAQP still holds.
 
-        That spares 6 µs where few rows are active. Where many are it takes up to a hundred times as many iterations as
-        to start from rows that have moved on by a step; therefore `resumes` is False after a solution of many rows.
+        That spares their factors: the cart-pole's step of N 50 with 25 active rows takes 7 µs in C instead of 17. Where
+        the rows of the next step are others, it takes up to a hundred times as many iterations as to start from rows
+        that have moved on by a step; therefore `resumes` is False where that move changes many rows.
         """
         return self._from(self._none, None, time_limit)
 
@@ -239,7 +241,7 @@ class DAQP(QPSolver):
             x, multipliers, flag, more = self._run(max(limit - (perf_counter() - start), 1e-6) if limit else limit)
             iterations += more
         good = (flag == _OPTIMAL and self._exact) or (flag > 0 and self._accurate(x, multipliers))
-        self.resumes = good and not self._cold and int(np.count_nonzero(multipliers)) <= FEW
+        self.resumes = good and not self._cold and self._lasts(multipliers)
         if not good and flag != _TIME_LIMIT:
             steep = self._steep()
             if flag == _INFEASIBLE and self._mixed and not steep and self._contradictory(time_limit):
@@ -262,6 +264,14 @@ class DAQP(QPSolver):
         if self._scaled:
             x, multipliers = self._columns * x, self._multipliers * multipliers
         return QPSolution(x, multipliers, status, iterations, self.name)
+
+    def _lasts(self, multipliers: Float[np.ndarray, " m"]) -> bool:
+        """Return whether few rows are active, or few change where a step moves them on."""
+        qp, few = self._qp, int(np.count_nonzero(multipliers)) <= FEW
+        if few or not isinstance(qp, StepQP):
+            return few
+        now = np.append(np.sign(multipliers), 0.0)
+        return int(np.count_nonzero(now[:-1] != now[qp.shift_dual])) <= MOVED
 
     def _contradictory(self, time_limit: float | None) -> bool:
         """Return whether the hard rows alone have no point in common.
