@@ -112,9 +112,13 @@ class ExcitationController(FunctionController):
 
 
 def as_controller(controller: Controller | Excitation | Callable[..., Any], dt: float, nu: int) -> Controller:
-    """Return a controller as it is; an excitation, or a plain function u = f(y, r), as a controller of this dt."""
+    """Return a controller as it is; an excitation, or a plain function u = f(y, r), as a controller of this dt.
+
+    An object that is called like a function may have a ``dt`` of its own, which then counts.
+    """
     if isinstance(controller, Excitation):
         return ExcitationController(controller, dt)
-    if callable(controller) and not any(hasattr(controller, name) for name in MEMBERS):
-        return FunctionController(controller, dt, nu)
+    if callable(controller) and not any(hasattr(controller, name) for name in MEMBERS if name != "dt"):
+        own = checks.positive(getattr(controller, "dt", dt), "dt of the controller", "s")
+        return FunctionController(controller, own, nu)
     return cast("Controller", controller)

@@ -231,9 +231,11 @@ def tracking_error(run: Run) -> Float[np.ndarray, "T1 nr"]:
     tracked = None if run.cost is None else bind_outputs(run.cost.of, run.states)
     outputs = X if tracked is None else tracked(X)
     if outputs.shape != run.reference.shape:
+        likely = run.outputs if set(run.outputs) <= set(run.states) else run.states
+        names = [name.partition(" [")[0] for name in likely[: run.reference.shape[1]]]
         raise ShapeError(
-            f"the reference has shape {run.reference.shape}, what it is for {outputs.shape}; keep the run's cost,"
-            " whose of= says what the reference is for"
+            f"the reference has shape {run.reference.shape}, and what it is compared with {outputs.shape}; pass "
+            f"simulate a cost that names the outputs of the reference: cost=km.Cost(Q=…, R=…, of=km.State({names}))"
         )
     error = outputs - run.reference
     names = run.states if tracked is None else tracked.names

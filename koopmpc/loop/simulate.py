@@ -34,7 +34,8 @@ _Draw = Callable[[int, np.random.Generator], Float[np.ndarray, " n"]]  # (k, rng
 CONTROLLER = ("dt", "nu", "horizon", "reset", "__call__")
 HOW = (
     "a Controller has dt [s], nu, horizon (0 if it reads no preview), reset(x0, u_prev), and is called as "
-    "controller(y, reference, applied) -> Move; make it a class, see km.control.Controller"
+    "controller(y, reference, applied) -> Move; make it a class, see km.control.Controller, or pass its law "
+    "as a function u = f(y, r)"
 )
 _MOVE = tuple(f.name for f in fields(Move) if f.default is MISSING)  # what a user's own move needs
 

@@ -120,7 +120,7 @@ MISTAKES = [
     ),
     (
         SHAPE,
-        "the reference has shape (13, 1), what it is for (13, 2)",
+        "the reference has shape (13, 1), and what it is compared with (13, 2); pass simulate a cost that names the outputs",
         lambda: km.metrics(random_run(np.random.default_rng(4), nr=1)),
     ),
 ]

@@ -366,3 +366,29 @@ def test_each_of_two_controllers_begins_with_what_its_model_can_know(make):
     assert begun == [None, 3, 2, None, None, None]
     with pytest.raises(km.errors.ShapeError, match=r"x0 has shape \(4,\), expected \(2,\) or \(3,\)"):
         both.reset([1.0] * 4)
+
+
+class OwnLaw:
+    """A law as users write it: an object with a step of its own that is called with y and r."""
+
+    dt = 0.1
+
+    def __init__(self):
+        self.sum = 0.0
+
+    def __call__(self, y, r):
+        self.sum += 0.1 * (r[0] - y[0])
+        return [1.5 * (r[0] - y[0]) + self.sum]
+
+
+def test_an_object_with_a_step_of_its_own_is_a_law_as_a_function_is():
+    plant = km.black_box(lambda x, u: 0.9 * x + 0.2 * u, dt=0.1, states=["x"], inputs=["u"])
+    own, law = OwnLaw(), OwnLaw()
+    runs = [km.simulate(plant, c, x0=[0], reference=[1.0], steps=20) for c in (own, lambda y, r: law(y, r))]
+    np.testing.assert_array_equal(runs[0].U, runs[1].U)
+    own.dt = 0.2
+    with pytest.raises(km.errors.DataError, match=r"the controller has dt = 0\.2 s, the plant 0\.1 s"):
+        km.simulate(plant, own, x0=[0], reference=[1.0], steps=2)
+    own.dt = "fast"
+    with pytest.raises(km.errors.DataError, match="dt of the controller"):
+        km.simulate(plant, own, x0=[0], reference=[1.0], steps=2)
