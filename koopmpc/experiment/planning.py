@@ -86,7 +86,8 @@ def next_experiment(
     reference
         (nr,) or rows of the outputs that the cost weighs; by default that of the design.
     model
-        The model that plans; by default that of the design, or the best of up to six that are fitted to the data.
+        The model that plans; by default that of the design, or the best of up to six that are fitted to the data. If
+        rows are few and a dictionary is known to suffice, plan with a model of it, and fit it to the new logs as well.
     design
         A design whose controller is simulated; by default a KoopmanMPC or a BilinearMPC on the model.
     controller

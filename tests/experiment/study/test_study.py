@@ -11,7 +11,9 @@ from tests.experiment.study.plants import draw_task
 from tests.experiment.study.safety import run_experiments
 from tests.experiment.study.table import count_safety, load_rows
 
-SAFETY, DRIFT, HALVES, ALARMS, BENT = (load_rows(study) for study in ("safety", "drift", "halves", "alarms", "bent"))
+SAFETY, DRIFT, HALVES, ALARMS, BENT, FEEDBACK = (
+    load_rows(study) for study in ("safety", "drift", "halves", "alarms", "bent", "feedback")
+)
 
 
 @pytest.mark.parametrize("level", sorted({row.level for row in SAFETY.values()}))
@@ -72,6 +74,18 @@ def test_a_plant_that_is_measured_again_gives_its_row():
     again = run_experiments(draw_task(3), 3, row.level)
     assert (again.held, again.kinds) == (row.held, row.kinds)
     assert again.reached == pytest.approx(row.reached, rel=1e-3)
+
+
+@pytest.mark.parametrize("way", [1, 2])
+def test_fits_under_feedback_lose_the_bias_of_least_squares_and_not_its_variance(way):
+    assert FEEDBACK
+    for row in FEEDBACK.values():
+        for steps, bias in row.bias.items():
+            assert bias[way] <= bias[0] / 5
+            assert bias[way] <= row.bound[steps][way]
+        assert row.bound["8000"][way] <= 1.2 * row.bound["500"][way] * (500 / 8000) ** 0.5
+        assert row.variance[way - 1] <= 1.1
+        assert row.refused[way - 1] == 20
 
 
 def test_noise_is_taken_out_of_nonlinear_loops_only_where_it_matters_and_then_it_gains():
