@@ -84,6 +84,8 @@ def _edmd(p: Parts) -> Any:
 
 def _dmdc(p: Parts) -> Any:
     """Plain DMDc, Q_N = Q."""
+    if p.task.weather is not None:
+        return p.plain(km.edmd(p.data, km.State()))  # the same fit, which knows W
     if p.task.measured:
         return p.plain(km.dmdc(p.data))
     return p.plain(km.edmd(p.data, km.State(), embedding=km.Delay(2)))

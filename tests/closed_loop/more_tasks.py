@@ -318,4 +318,5 @@ _WEATHER = Task(
 
 MORE = {task.name: task for task in _MORE}
 ALL = TASKS | MORE
-JUDGED = ALL | {_WEATHER.name: _WEATHER}
+TABLE = TASKS | {_WEATHER.name: _WEATHER}  # tasks of the stored table
+JUDGED = ALL | TABLE

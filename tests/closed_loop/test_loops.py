@@ -8,16 +8,17 @@ import pytest
 import koopmpc as km
 from tests.closed_loop.controllers import CONTROLLERS, GIVEN, YARDSTICKS
 from tests.closed_loop.judge import LOST, Row, measure, worst
+from tests.closed_loop.more_tasks import TABLE
 from tests.closed_loop.optimum import boxes, held, optimum
 from tests.closed_loop.table import losses, saved, stored, text
 from tests.closed_loop.tasks import TASKS, TEN
 
 NONE = km.control.move.Fallback.NONE
-RUNS = [(name, start) for name, task in TASKS.items() for start in range(len(task.starts))]
+RUNS = [(name, start) for name, task in TABLE.items() for start in range(len(task.starts))]
 
 
 @pytest.mark.loops
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", TABLE)
 def test_no_default_loses_five_percent_against_the_stored_table(task, record_property):
     table = measure([task], list(CONTROLLERS), workers=1)
     record_property("closed loops", text(table, stored()))
@@ -55,7 +56,7 @@ def test_a_design_from_one_record_of_one_sensor_under_pi_controls_what_nobody_me
 @pytest.mark.loops
 @pytest.mark.parametrize(("name", "start"), RUNS)
 def test_the_optimum_is_a_run_of_the_true_plant_whose_metrics_are_its_cost(name, start):
-    task, best = TASKS[name], optimum(name, start)
+    task, best = TABLE[name], optimum(name, start)
     nothing = np.zeros(task.steps)
     run = km.Run(
         X=best.X,
@@ -80,7 +81,8 @@ def test_the_optimum_is_a_run_of_the_true_plant_whose_metrics_are_its_cost(name,
     size = np.ptp(best.X, axis=0) + 1e-12
     assert (np.maximum(low - best.X[1:], best.X[1:] - high) <= 1e-6 * size).all()
     assert (np.maximum(u_low - best.U, best.U - u_high) <= 1e-6 * (u_high - u_low)).all()
-    after = np.array([task.plant(x, u) for x, u in zip(best.X[:-1], best.U, strict=True)])
+    W = np.zeros((task.steps, task.plant.nw)) if task.weather is None else task.weather
+    after = np.array([task.plant(*each) for each in zip(best.X[:-1], best.U, W, strict=True)])
     assert np.abs((after - best.X[1:]) / size).max() < 1e-6
     assert len(best.found) >= 4  # of five starts, and the least cost was found twice
     assert best.found[1] <= best.found[0] * (1 + 1e-6)
@@ -96,7 +98,7 @@ def test_inputs_that_hold_a_reference_keep_the_true_plant_where_it_is(name):
 
 
 @pytest.mark.loops
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", TABLE)
 def test_nothing_that_keeps_the_limits_beats_the_optimum(name):
     for row in stored().get(name, {}).values():
         if row.ratio is not None and row.violation < 1e-4:
@@ -129,6 +131,6 @@ def test_the_worst_row_has_the_worst_of_each_figure_and_all_statuses():
 
 @pytest.mark.loops
 def test_the_stored_table_has_every_task_and_every_controller():
-    assert set(stored()) == set(TASKS)
+    assert set(stored()) == set(TABLE)
     assert all(set(CONTROLLERS) == set(rows) for rows in stored().values())
     assert set(GIVEN) | set(YARDSTICKS) < set(CONTROLLERS)
