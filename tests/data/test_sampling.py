@@ -95,6 +95,7 @@ def test_what_resampling_cuts_and_leaves_out_is_told():
         "f: sampling is unequal: 2 of 5 steps differ from dt = 0.9 s by more than 2 %, the first at row 2, where it is "
         "1 s; interpolated to 1 s"
     ]
+    assert words(signals([0, 1, 2.2, 3.1, 4, 4.9]), dt=2.0) == []  # a wish, and no repair
     uneven = signals([0, 1, 2, 3.9, 5, 6])
     said_of_steps, said_of_gaps = words(uneven, signals(np.arange(4), first=7))
     assert "1 of 8 steps differ from dt = 1 s by more than 2 %, the first at row 5" in said_of_steps

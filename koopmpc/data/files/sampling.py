@@ -118,7 +118,10 @@ def resample(parts: list[Signals], dt: float, where: str) -> list[Signals]:
 
 
 def _warn_of_uneven(parts: list[Signals], dt: float, where: str) -> None:
-    """Warn if steps differ from the median one; gaps, and rows that are left out, have sentences of their own."""
+    """Warn if steps differ from the median one, unless another step is wanted than that of the log.
+
+    Gaps, and rows that are left out, have sentences of their own.
+    """
     whole = [part.at(np.asarray(np.isfinite(part.X).all(axis=1), dtype=np.bool_)) for part in parts]
     steps = [np.diff(part.time) for part in whole if part.time is not None]
     known = np.concatenate([np.zeros(0), *steps])
@@ -126,6 +129,8 @@ def _warn_of_uneven(parts: list[Signals], dt: float, where: str) -> None:
     if not len(known):
         return
     usual, uneven, first = float(f"{np.median(known):.6g}"), 0, ("", 0.0)
+    if not usual / _GAP <= dt <= _GAP * usual:
+        return
     for part, ahead in zip(whole, steps, strict=True):
         off = np.flatnonzero((ahead > 0) & (ahead <= _GAP * usual) & (np.abs(ahead - usual) > _JITTER * usual))
         if len(off) and not uneven:
