@@ -61,6 +61,7 @@ def anchors(page):
     return {re.sub(r"[^\w -]", "", (given or words).lower()).strip().replace(" ", "-") for words, given in titles}
 
 
+@pytest.mark.filterwarnings("ignore:.*sampling is unequal.*interpolated to:koopmpc.FitWarning")  # the page says so
 @pytest.mark.parametrize("page", HERE)
 def test_every_block_of_a_page_runs_and_prints_what_the_page_shows(page, tmp_path):
     for block in blocks(page):
