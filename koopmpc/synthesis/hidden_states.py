@@ -23,7 +23,8 @@ from koopmpc.validate.scoring import AnyPredictor
 
 FAR = 1.2  # a kind that errs by this many times the least error is left out
 LOST = 1.0  # a model that errs by more spreads than this on one stretch is not taken where another one is calm
-PAYS = 0.9  # neurons are judged if they lower the error on unseen rows to less than this share
+PAYS = 0.9  # neurons of several orders are judged if they lower the error on unseen rows to less than this share
+NEAR = 1.5  # else the best model with neurons is judged if it errs by less than this many times the least error
 _NEURAL_ORDERS = (2, 3, 4)  # orders of hidden states with neurons
 _SENSORS = 2  # neurons are tried on records of at most so many sensors: with more of them little is hidden
 _ORDERS = (1, 2, 3, 4)  # orders of hidden states that simulation error is tried on
@@ -47,8 +48,9 @@ def judge_hidden_states(
     The kinds are the subspace model, the linear and the polynomial one of least simulation error, the latter with rails
     where a sensor rests at its least or largest reading and they gain; and for one or two sensors those with
     neurons, with the rails if the best one before has them. With neurons the best one and the smallest of other orders
-    are judged, if they are calm and err by a tenth less than all others. Where records are too short for a kind, it is
-    left out; so is a model that on the first stretches errs by half more than the best calm one so far.
+    are judged, if they are calm and err by a tenth less than all others; else the best one, if it errs by less than
+    half more. Where records are too short for a kind, it is left out; so is a model that on the first stretches errs by
+    half more than the best calm one so far.
 
     Parameters
     ----------
@@ -68,7 +70,7 @@ def judge_hidden_states(
         Called with what is done and how many there are.
     """
     begun = perf_counter()
-    found = search_hidden_states(measured, bilinear, rival, progress)
+    found = search_hidden_states(measured, bilinear, rival, progress, near=NEAR)
     searched = (perf_counter() - begun) / max(len(found), 1)
     results: list[tuple[LeaderboardRow, FreeRun]] = []
     for structure in found:
@@ -84,9 +86,12 @@ def judge_hidden_states(
 
 
 def search_hidden_states(
-    measured: Episodes, bilinear: bool, rival: float = np.inf, progress: Progress | None = None
+    measured: Episodes, bilinear: bool, rival: float = np.inf, progress: Progress | None = None, *, near: float = PAYS
 ) -> list[HiddenStructure]:
-    """Return the best structure of each kind, as `judge_hidden_states` lists them; of those that err far more, none."""
+    """Return the best structure of each kind, as `judge_hidden_states` lists them; of those that err far more, none.
+
+    If no model with neurons errs by a tenth less, the best one is among them if it errs by less than `near` times all.
+    """
     found: list[HiddenStructure] = []
     neural: list[HiddenStructure] = []
     try:
@@ -123,6 +128,9 @@ def search_hidden_states(
             tried = []
         best = min([rival, *(one.error for one in found if one.calm)])
         calm = [one for one in tried if one.calm and one.error < PAYS * best]
+        if not calm:  # one quarter hardly tells models apart: the others may
+            close = [one for one in tried if one.calm and one.error < near * best]
+            calm = [choose_hidden(close)] if close else []
         orders = sorted({one.order for one in calm})
         each = [choose_hidden([one for one in calm if one.order == order]) for order in orders]
         each.sort(key=lambda one: one.parameters)

@@ -7,8 +7,10 @@ import pytest
 
 import koopmpc as km
 from koopmpc.errors import DataError
+from koopmpc.identify.records.hidden_structure import HiddenStructure
+from koopmpc.synthesis import hidden_states
 from koopmpc.synthesis.candidates import relift_model
-from koopmpc.synthesis.hidden_states import judge_hidden_states
+from koopmpc.synthesis.hidden_states import NEAR, PAYS, judge_hidden_states
 from koopmpc.synthesis.records import (
     FreeRun,
     choose_by_free_run,
@@ -203,6 +205,19 @@ def test_hidden_states_far_behind_the_best_calm_polynomial_are_left_out():
     assert names(0.2, calm=True) == both
     assert names(1e-4, calm=False) == both
     assert names(1e-4, calm=True) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "near", "judged"), [(0.03, PAYS, True), (0.055, PAYS, False), (0.055, NEAR, True), (0.07, NEAR, False)]
+)
+def test_neurons_that_err_little_more_on_one_quarter_are_judged_on_all(monkeypatch, error, near, judged):
+    def make(error, neurons):
+        return HiddenStructure(2, 2 - (neurons > 0), 8, 50, None, np.full(4, error), True, 20, neurons=neurons)
+
+    monkeypatch.setattr(hidden_states, "search_hidden", lambda *_, **__: [make(0.04, 0)])
+    monkeypatch.setattr(hidden_states, "search_neural", lambda *_, **__: [make(error, 3), make(9.0, 6)])
+    found = hidden_states.search_hidden_states(oscillator(rows=240), True, near=near)
+    assert any(one.neurons for one in found) == judged
 
 
 @pytest.mark.slow
