@@ -32,7 +32,7 @@ Precision = Literal["double", "float"]
 
 _ZERO_ROW = 1e-11  # DAQP leaves a row as it is if its squared length is below this
 
-_LONG = 2**13  # numbers in the reference's share of a plan from which on a step first asks for its first input alone
+_LONG = 2**11  # numbers in the reference's share of a plan from which on a step first asks for its first input alone
 _TABLE_NOTE = (
     "`koopmpc_table.h` holds the equilibria of the reference rows that `export` was given, and what the end of the "
     "horizon costs there. Any other row may come at run time: the step that meets it finds its equilibrium from that "
@@ -383,8 +383,7 @@ def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool) -
         "MOVED": MOVED,
         "COLD_START": int(solver.settings["cold_start"]),
     }
-    plain = program.given is None and program.bounds is None and program.levels is None
-    if plain and not program.disturbance.shape[1] and program.from_reference.size >= _LONG:
+    if program.levels is None and not program.disturbance.shape[1] and program.from_reference.size >= _LONG:
         tables.sizes["FIRST_ALONE"] = 1
         tables.plan["shares"] = np.abs(program.from_reference[:, program.nr :]).sum(axis=1)
     tables.define({"UNPUSHED": program.unpushed})

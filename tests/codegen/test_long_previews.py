@@ -65,3 +65,34 @@ def test_a_preview_that_stays_costs_its_product_once_and_no_digit(pair):
     x, still = np.array([0.1, 0.0]), rows(5, 0.2)
     first, again = twin(x, still).u, twin(x, still).u
     assert again == pytest.approx(first, abs=1e-12)
+
+
+def test_input_targets_and_limits_in_time_enter_such_a_step_as_well():
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("a", "b"), ("u",))
+    waves = 1.0 + 0.5 * np.sin(0.2 * np.arange(120))[:, None]
+    cost = km.Cost([1.0, 0.1], 0.1, u_target=0.2 * np.cos(0.1 * np.arange(120))[:, None])
+    mpc = km.KoopmanMPC(model, cost, km.Limits(-2 * waves, waves, x_max=[1.5, np.inf]), N)
+    twin, seen = km.compiled(mpc), set()
+    for size in (0.05, 0.4, 2.0):
+        x = np.array([0.1, 0.0])
+        mpc.reset()
+        twin.reset()
+        for k in range(25):
+            y = [np.nan, 0.0] if k % 9 == 8 else x
+            one, other = mpc(y, rows(k, size)), twin(y, rows(k, size))
+            assert other.u == pytest.approx(one.u, abs=1e-9)
+            assert (other.status, other.fallback) == (one.status, one.fallback)
+            seen.add(one.status.name)
+            x = A @ x + B @ one.u
+    assert {"UNCONSTRAINED", "BAD_MEASUREMENT"} < seen
+
+
+def test_an_input_that_nobody_measured_is_replaced_before_the_whole_plan_is_made():
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("a", "b"), ("u",))
+    mpc = km.KoopmanMPC(model, km.Cost([1.0, 0.1], 0.1, R_delta=0.1), km.Limits(-2, 2, du_max=0.5), N)
+    twin, x = km.compiled(mpc), np.array([0.1, 0.0])
+    for k in range(12):
+        applied = np.array([np.nan]) if k % 3 else None
+        one, other = mpc(x, rows(k, 0.4), applied), twin(x, rows(k, 0.4), applied)
+        assert other.u == pytest.approx(one.u, abs=1e-9)
+        x = A @ x + B @ one.u

@@ -75,7 +75,7 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *re
     }
   }
   if (!same || !s->aimed) {
-    first_alone = KOOPMPC_FIRST_ALONE && good && !held && !same && peak <= KOOPMPC_UNPUSHED;
+    first_alone = KOOPMPC_FIRST_ALONE && good && !held && !same && peak <= UNPUSHED(s);
     s->aimed = !good || moves_on || first_alone ? 0 : held ? HELD : MOVING;
     if (!good) {
       koopmpc_fill(s->column, (koopmpc_real)NAN, KOOPMPC_NT);
@@ -145,17 +145,18 @@ void koopmpc_settle(const koopmpc_state *s, koopmpc_real *kept) {
 
 /** Whether a plan for the first row meets all limits wherever the others are within `reach` of it; then its input. */
 static int certain(koopmpc_state *s, koopmpc_real reach) {
+  const koopmpc_real *low = KOOPMPC_PLAN_LOW(s), *high = KOOPMPC_PLAN_HIGH(s);
   koopmpc_real first[KOOPMPC_NU];
   int broken = 0;
   for (int i = 0; i < PLANNED; i++) {
     const koopmpc_real by = reach * koopmpc_shares[i];
-    broken |= !(s->t[i] - by >= koopmpc_low[i]) | !(s->t[i] + by <= koopmpc_high[i]);
+    broken |= !(s->t[i] - by >= low[i]) | !(s->t[i] + by <= high[i]);
   }
   koopmpc_copy(first, s->t, KOOPMPC_NU);
   for (int j = KOOPMPC_NR; j < (KOOPMPC_N + 1) * KOOPMPC_NR && !broken; j++)
     for (int i = 0; i < KOOPMPC_NU; i++)
       first[i] += (s->reference[j] - s->reference[j % KOOPMPC_NR]) * koopmpc_from_reference[j * PLANNED + i];
-  for (int i = 0; i < KOOPMPC_NU; i++) broken |= !(first[i] >= koopmpc_low[i]) | !(first[i] <= koopmpc_high[i]);
+  for (int i = 0; i < KOOPMPC_NU; i++) broken |= !(first[i] >= low[i]) | !(first[i] <= high[i]);
   if (!broken) koopmpc_copy(s->t, first, KOOPMPC_NU);
   return !broken;
 }
@@ -518,9 +519,10 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
     return;
   }
   if (first_alone) { /* a limit may be met: the whole plan */
-    koopmpc_copy(s->column, koopmpc_offset, PLANNED);
-    koopmpc_add(s->column, koopmpc_from_reference, PLANNED, s->reference, (KOOPMPC_N + 1) * KOOPMPC_NR);
-    s->aimed = 1;
+    koopmpc_real moved[KOOPMPC_N * KOOPMPC_NR];
+    for (int j = 0; j < KOOPMPC_N * KOOPMPC_NR; j++)
+      moved[j] = s->reference[j + KOOPMPC_NR] - s->reference[j % KOOPMPC_NR];
+    koopmpc_add(s->column, koopmpc_from_reference + KOOPMPC_NR * PLANNED, PLANNED, moved, KOOPMPC_N * KOOPMPC_NR);
     evaluate(s);
   }
 #else
