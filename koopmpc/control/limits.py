@@ -1,6 +1,7 @@
 """Limits: the inequalities that every controller and every metric shares."""
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
@@ -145,24 +146,12 @@ class Limits(Value):
     def __post_init__(self) -> None:
         if self.terminal is not None:
             object.__setattr__(self, "terminal", read_terminal_set(self.terminal))
-        for low, high, name in _ENDS:
-            for end in (low, high):
-                value = getattr(self, end)
-                if value is not None:
-                    object.__setattr__(self, end, bounds.check_bound(value, end))
-            if not any(isinstance(getattr(self, end), Mapping) for end in (low, high)):
-                bounds.require_room(getattr(self, low), getattr(self, high), low, high, name)
+        self._check_ends(BOUNDS)
         if not all(checks.among(name, BOUNDS) for name in checks.texts(self.rows, "rows")):
             raise DataError(f"rows is {self.rows!r}; pass a tuple of {', '.join(BOUNDS)}")
         object.__setattr__(self, "rows", tuple(self.rows))
-        if (self.y_min is not None or self.y_max is not None) and self.of is None:
-            raise DataError("y_min and y_max limit observables; say which with of=, for example of=km.Fourier(1)")
         if self.of is not None:
             checks.kind(self.of, "of", Lifting, 'for example km.Fourier(1, states="theta")')
-        for end, sign in (("du_min", 1.0), ("du_max", -1.0)):
-            value = getattr(self, end)
-            if value is not None and any((sign * np.asarray(v) > 0).any() for v in bounds.list_bound(value)):
-                raise DataError(f"{end} is {value}; an input must be free to stay, so keep 0 inside its rates")
         for name in ("slack", "du_slack", "terminal_slack"):
             value = getattr(self, name)
             if value is not None and not (name != "du_slack" and isinstance(value, str) and value == "auto"):
@@ -172,6 +161,23 @@ class Limits(Value):
         if self.priority is not None and not isinstance(self.priority, Mapping):
             object.__setattr__(self, "priority", checks.array(self.priority, "priority", (None,)))
         self._check_levels()
+
+    def _check_ends(self, ends: Sequence[str]) -> None:
+        """Check these bounds, each against the other end of its pair."""
+        for end in ends:
+            value = getattr(self, end)
+            if value is not None:
+                object.__setattr__(self, end, bounds.check_bound(value, end))
+        for low, high, name in _ENDS:
+            pair = getattr(self, low), getattr(self, high)
+            if (low in ends or high in ends) and not any(isinstance(value, Mapping) for value in pair):
+                bounds.require_room(*pair, low, high, name)
+        if (self.y_min is not None or self.y_max is not None) and self.of is None:
+            raise DataError("y_min and y_max limit observables; say which with of=, for example of=km.Fourier(1)")
+        for end, sign in (("du_min", 1.0), ("du_max", -1.0)):
+            value = getattr(self, end) if end in ends else None
+            if value is not None and any((sign * np.asarray(v) > 0).any() for v in bounds.list_bound(value)):
+                raise DataError(f"{end} is {value}; an input must be free to stay, so keep 0 inside its rates")
 
     def _check_levels(self) -> None:
         """Check the levels, their dwell times, and the steps in which they count."""
@@ -232,7 +238,13 @@ class Limits(Value):
         unknown = [name for name in ends if name not in BOUNDS]
         if unknown:
             raise DataError(f"Limits has no bound {unknown[0]}; it has {', '.join(BOUNDS)}")
-        return replace(self, **cast("Any", ends))
+        other = copy(self)
+        for end, value in ends.items():
+            object.__setattr__(other, end, value)
+        other._check_ends(tuple(ends))
+        if self.margin is not None and ("x_min" in ends or "x_max" in ends):
+            other._margin(cast("Float[np.ndarray, 'K nx']", self.margin))
+        return other
 
     def at(self, step: int) -> "Limits":
         """Return the limits of one step, without rows; past their end the last row holds."""

@@ -360,3 +360,42 @@ def test_a_page_of_limits_reads_the_rows_of_its_steps_alone():
             low, high = pages.fill(k)
             both = window.table.reshape(-1)[k * window.table.shape[1] + pages.entries]
             np.testing.assert_array_equal(np.concatenate([low, high]), both)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_further_calls_with_new_limits_are_those_of_a_controller_that_meets_them_first(seed):
+    """A second call takes over numbers alone: the same inputs and statuses, and the same sentences."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(2, 2))
+    model = km.LinearPredictor(
+        A / np.abs(np.linalg.eigvals(A)).max(), np.eye(2), np.eye(2), km.State(), 0.1, ("a", "b"), ("u", "v")
+    )
+    limits = km.Limits(
+        u_min=-1, u_max=1, x_max=[1.0, np.inf], of=km.State("b"), y_max=0.8, **[{}, {"du_max": 0.4}][seed % 2]
+    )
+    old, x, statuses = km.KoopmanMPC(model, km.Cost(Q=1.0, R=0.1), limits, 4), rng.normal(size=2), set()
+    for k in range(8):
+        wave = 0.7 + 0.4 * np.sin(k + np.arange(5 + k % 2)[:, None] * rng.uniform(0.3, 1, 2))
+        ends = {
+            "u_max": wave,
+            "u_min": -wave[:, :1],
+            "x_max": np.where([True, k == 7], wave, np.inf),
+            "y_max": 0.1 * k + 0.3,
+        }
+        if seed % 2:
+            ends["du_max"] = 0.5 * wave
+        own = limits.with_bounds(**{end: ends[end] for end in ends if rng.random() < 0.7 or k == 7})
+        r = np.round(0.3 * rng.normal(size=2), 1) if k % 3 else 0.3 * np.sin(k + np.arange(10).reshape(5, 2))
+        fresh = km.KoopmanMPC(model, km.Cost(Q=1.0, R=0.1), limits, 4)
+        fresh.reset(u_prev=np.zeros(2) if k == 0 else move.u)
+        if k == 7:
+            for each in (old, fresh):
+                with pytest.raises(DataError, match="x_max limits b at step 0"):
+                    each(x, r, limits=own)
+            break
+        move, first = old(x, r, limits=own), fresh(x, r, limits=own)
+        np.testing.assert_allclose(move.u, first.u, rtol=0, atol=1e-9)
+        assert move.status is first.status
+        statuses.add(move.status)
+        x = model.A @ x + move.u
+    assert km.Status.UNCONSTRAINED in statuses or seed % 2

@@ -18,6 +18,7 @@ from koopmpc.control.horizon import Coordinates
 from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits, clip_input
+from koopmpc.control.linear.call_windows import CallWindows, has_fields_of
 from koopmpc.control.linear.condensed_program import CondensedProgram
 from koopmpc.control.linear.moving import MovingMap
 from koopmpc.control.linear.plan import plan_map, planned_states
@@ -127,10 +128,12 @@ class KoopmanMPC(MPCBase):
     _rows_of_limits: LimitWindows | None = None  # of the controller's own limits in time
     _window: LimitWindows | None = None  # by which the limits of the last step were set
     _called_with: Limits | None = None  # the limits in time of the last call that had some
+    _quick: CallWindows | None = None  # makes windows of further calls
     _step = 0  # calls since reset, as far as limits move in time
     _row = 0  # row of the windows that belongs to the last step
     _pushed = False  # whether limits in time moved a target that the plan's last column is aimed at
     _free_steps: Sequence[bool] = ()  # steps in which they would move none
+    _values: Float[np.ndarray, "N1 nl"] | None = None  # limited values of the targets of the last column
 
     def __init__(
         self,
@@ -445,13 +448,23 @@ class KoopmanMPC(MPCBase):
 
     def _hold_limits(self) -> None:
         """Make the windows of the controller's own limits, where these move in time."""
-        self._called_with = self._window = self._rows_of_limits = None
+        self._called_with = self._window = self._rows_of_limits = self._quick = None
         if self.limits.in_time:
             self._rows_of_limits = self._window = self._make_windows(self.limits, at_call=False)
 
     def _make_windows(self, limits: Limits, *, at_call: bool) -> LimitWindows:
         model = self.predictor
         return limit_windows(self._map, limits, model.states, model.inputs, self._latency, at_call=at_call)
+
+    def _read_windows(self, limits: Limits) -> LimitWindows:
+        """Return the windows of the limits of a call: by their numbers alone where they were made by `with_bounds`."""
+        quick, found = self._quick, None
+        if quick is not None and quick.fits and has_fields_of(limits, self.limits):
+            found = quick.make(limits)
+        if found is None:
+            found = self._make_windows(self.read_limits(limits), at_call=True)
+            self._quick = CallWindows(self._map, self._latency)
+        return found
 
     def read_limits(self, limits: Limits) -> Limits:
         """Return the limits of a call with arrays in place of names.
@@ -491,10 +504,14 @@ class KoopmanMPC(MPCBase):
     def _change_window(self, limits: Limits | None) -> LimitWindows | None:
         """Return the windows of the limits of a call, or of the controller's own, where the last call had others."""
         if limits is not None and limits is not self._called_with:
-            self._at_call, self._called_with = self._make_windows(self.read_limits(limits), at_call=True), limits
+            self._at_call, self._called_with = self._read_windows(limits), limits
         window = self._rows_of_limits if limits is None else self._at_call
         if window is not self._window:
-            self._window, self._aimed = window, self._aimed and not self._map.aims_inside
+            stays = not self._map.aims_inside
+            if limits is not None and window is not None and self._window is not None and not (stays or self._pushed):
+                stays = self._values is not None and window.leaves_targets(self._values)
+                self._free_steps = (True,)
+            self._window, self._aimed = window, self._aimed and stays
         if window is None:
             self._map.restore_limits()
         return window
@@ -568,6 +585,7 @@ class KoopmanMPC(MPCBase):
             column[:] = np.nan
             self._pushed = True  # no steps are known in which limits in time would leave it as it is
             return
+        self._values = None
         v = maps.from_reference.dot(R.reshape(-1))
         v += plan.offset
         if plan.aimed:
@@ -579,7 +597,8 @@ class KoopmanMPC(MPCBase):
                 v += maps.from_target @ (targets.coordinates(R) - alpha).ravel()
             else:
                 k = self._row
-                self._free_steps = window.find_free_steps(alpha @ targets.rows.T).tolist()
+                self._values = alpha @ targets.rows.T
+                self._free_steps = window.find_free_steps(self._values).tolist()
                 self._pushed = not self._free_steps[k]
                 if self._pushed:
                     v += maps.from_target @ (targets.coordinates(R, box=window.target_box(k)) - alpha).ravel()

@@ -118,6 +118,10 @@ class LimitWindows:
         low, high = self.table[rows, first : first + count], self.table[rows, W + first : W + first + count]
         return ((limited.min(axis=0) >= low) & (limited.max(axis=0) <= high)).all(axis=1)
 
+    def leaves_targets(self, values: Float[np.ndarray, "N1 nl"]) -> bool:
+        """Return whether the limits of a call move no target with these limited values."""
+        return bool(self.find_free_steps(values)[0])
+
     def first_inputs(self, k: int) -> tuple[Interval, Interval | None]:
         """Return the box of the input that acts first in step k, and that of its change."""
         W, nu, row = self.table.shape[1] // 2, len(self.plan.track.inputs.low), self.table[self._row(k)]
@@ -249,13 +253,30 @@ def limit_windows(
     if plan.aims_inside:
         first = [part[latency : latency + steps] - shift for part in tightest]
         reaches = find_reach(targets.rows[limited] @ targets.from_reference, *first).tolist()
+    endless = not all(np.isfinite(part).all() for part in planned)
+    return make_windows(plan, table, latency, steps, endless=endless, reaches=reaches, margin=margin)
+
+
+def make_windows(
+    plan: PlanMap,
+    table: Float[np.ndarray, "rows W2"],
+    latency: int,
+    steps: int,
+    *,
+    endless: bool,
+    reaches: list[float],
+    margin: Float[np.ndarray, " outputs"] | None,
+) -> LimitWindows:
+    """Return the windows of a table whose limits were checked; see `LimitWindows`."""
+    layout, track = plan.layout, plan.track
+    assert layout is not None, "a plan with a table has a layout"
     pages = [_Pages(table, entries, latency, steps - 1, layout.outputs, margin) for entries in layout.entries]
     return LimitWindows(
         plan=plan,
         last=steps - 1,
         latency=latency,
         table=table,
-        endless=not all(np.isfinite(part).all() for part in planned),
+        endless=endless,
         targets=layout.raw,
         swept=layout.tight,
         hard=None if track.hard_rates is None else np.isinf(track.rate_softness.linear),
