@@ -307,6 +307,9 @@ def test_levels_keep_to_those_inside_the_rows_and_maintenance_stops_a_pump():
     low[8, 0] = 0.1
     with pytest.raises(DataError, match=r"no level of u0 is between its limits 0\.1 … 0\.4 at step 8"):
         km.KoopmanMPC(model, COST, limits.with_bounds(u_min=low, u_max=u_max), N)
+    for kind in (km.BilinearMPC, km.NonlinearMPC):
+        with pytest.raises(DataError, match=r"no level of u0 is between its limits 0\.1 … 0\.4 at step 8"):
+            kind(model, COST, limits.with_bounds(u_min=low, u_max=u_max), N)
 
 
 @pytest.mark.slow

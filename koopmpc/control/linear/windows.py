@@ -370,15 +370,7 @@ def _require_inputs(
     levels = None if limits.levels is None else limits.base.input_levels(len(inputs))
     low, high = np.where(used, box.low, -np.inf), np.where(used, box.high, np.inf)
     if levels is not None:
-        inside = levels.inside(Interval(low, high))
-        none = np.argwhere(inside.low > inside.high)
-        if len(none):
-            k, j = (int(v) for v in none[0])
-            i = int(levels.which[j])
-            raise DataError(
-                f"no level of {inputs[i]} is between its limits {low[k, i]:g} … {high[k, i]:g} at step {k}{why}; "
-                "pass wider limits, or other levels"
-            )
+        levels.refuse_missing(Interval(low, high), inputs, why)
     refuse_crossed_rows(low, high, "input", inputs, why=why)
 
 

@@ -1,5 +1,6 @@
 """Limits in time for the stages of BilinearMPC and NonlinearMPC: rows of u, x and y in place of the constructor's."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -44,19 +45,23 @@ class StageLimits(NamedTuple):
     stages: Interval
 
 
-def check_rows(limits: Limits, outputs: StateTracking, problem: StagedProblem, preview: int | None) -> None:
+def check_rows(
+    limits: Limits, outputs: StateTracking, problem: StagedProblem, inputs: Sequence[str], preview: int | None
+) -> None:
     """Raise where limits in time ask for what the stages do not have.
 
     Parameters
     ----------
+    inputs
+        Names of the model.
     preview
         Steps that a call reads; None for the rows of a run.
 
     Raises
     ------
     DataError
-        The rates have rows, moves are blocked, there is a terminal set; limits cross; a bound is set that is infinite
-        in the constructor's limits.
+        The rates have rows, moves are blocked, there is a terminal set; limits cross, or have no level between; a bound
+        is set that is infinite in the constructor's limits.
     ShapeError
         A bound has too few rows.
     """
@@ -75,12 +80,15 @@ def check_rows(limits: Limits, outputs: StateTracking, problem: StagedProblem, p
     count = max(counts.values(), default=1)
     nu, n = len(outputs.inputs.low), len(outputs.movable.outputs)
     nx = len(outputs.sizes.states)
-    base = outputs.limits.base
+    base, box = outputs.limits.base, limits.input_rows(nu, 0, count)
+    levels = base.input_levels(nu)
+    if levels is not None:
+        levels.refuse_missing(box, inputs)
     for what, rows, widest in (
-        ("input", limits.input_rows(nu, 0, count), base.inputs(nu)),
+        ("input", box, base.inputs(nu)),
         ("state and output", limits.output_rows(nx, n - nx, 0, count), base.ends(nx, n - nx)),
     ):
-        refuse_crossed_rows(*rows, what)
+        refuse_crossed_rows(*rows, what, inputs if what == "input" else ())
         for end, own, name in zip(rows, widest, ("lower", "upper"), strict=True):
             missing = np.argwhere(np.isfinite(end) & ~np.isfinite(own))
             if len(missing):

@@ -118,7 +118,7 @@ class StagedMPC(MPCBase):
         self._disturbed = estimator is not None or given.nw > 0
         self._scheduled_for, self._rest = np.zeros(given.nw), np.zeros(given.nx)
         if self._timed:
-            check_rows(self.limits, o, self._problem, None)
+            check_rows(self.limits, o, self._problem, model.inputs, None)
 
     def _make_keeper(self, given: TerminalSet | HasTerminalSet) -> PlanKeeper | None:
         """Return what keeps the accepted plan; None where the set is soft or has no feedback, or moves are not free."""
@@ -217,7 +217,7 @@ class StagedMPC(MPCBase):
 
     def check_limits(self, limits: Limits) -> None:
         """Raise where limits of a call cross, have no row in the stages, or too few rows."""
-        check_rows(limits, self._outputs, self._problem, self._N + self._latency)
+        check_rows(limits, self._outputs, self._problem, self.model.inputs, self._N + self._latency)
 
     def _move_limits(self, limits: Limits | None) -> None:
         """Set the limits of this step: those of the call, or the controller's own."""

@@ -67,6 +67,24 @@ class InputLevels(Value):
         least, most = np.ceil(low - NEAR), np.floor(high + NEAR)
         return LevelBox(np.maximum(least, 0).astype(np.intp), np.minimum(most, self.count - 1).astype(np.intp))
 
+    def refuse_missing(self, box: Interval, inputs: Sequence[str], why: str = "") -> None:
+        """Raise where no level of an input is between its limits (steps, nu), and name the input and the step.
+
+        Raises
+        ------
+        DataError
+            There is none.
+        """
+        inside = self.inside(box)
+        none = np.argwhere(inside.low > inside.high)
+        if len(none):
+            k, j = (int(v) for v in none[0])
+            i = int(self.which[j])
+            raise DataError(
+                f"no level of {inputs[i]} is between its limits {box.low[k, i]:g} … {box.high[k, i]:g} at step {k}"
+                f"{why}; pass wider limits, or other levels"
+            )
+
     def least(self, index: Int[np.ndarray, "*rows leveled"]) -> Int[np.ndarray, "*rows leveled"]:
         """Return for how many steps each input has to hold the level of this index."""
         return np.where(index == 0, self.dwell[:, 0], self.dwell[:, 1])
