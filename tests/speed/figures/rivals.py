@@ -1,4 +1,4 @@
-"""The cart-pole of LinearMPC.jl by another solver: `python tests/speed/figures/rivals.py ours|osqp|tinympc N …`.
+"""The cart-pole of LinearMPC.jl by another solver: `python tests/speed/figures/rivals.py ours|osqp|tinympc|lmpc|lmpc-warm|cvxpygen N …`.
 
 500 closed-loop steps, each called from Python; prints the median step, the mean of the slowest fifth and the cost. OSQP
 is its generated C on the sparse program, TinyMPC gets changes of the input as inputs, for it weighs none.
@@ -16,6 +16,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as scipy_sparse
 from scipy.signal import cont2discrete
+
+sys.path.insert(0, str(Path(__file__).parent))
+import generated
 
 sp: Any = scipy_sparse  # it has no types
 STEPS, TURNS = 500, 3
@@ -130,7 +133,15 @@ def run(step: Step) -> tuple[Any, float]:
 
 def main() -> None:
     """Print a line for each horizon."""
-    make = {"ours": make_ours, "osqp": make_osqp, "tinympc": make_tinympc}[sys.argv[1]]
+    given = A, B, (POSITION, ANGLE, CHANGE, PRICE), (MOST, TILT)
+    make = {
+        "ours": make_ours,
+        "osqp": make_osqp,
+        "tinympc": make_tinympc,
+        "lmpc": lambda N: generated.make_lmpc(*given, N, warm=False),
+        "lmpc-warm": lambda N: generated.make_lmpc(*given, N, warm=True),
+        "cvxpygen": lambda N: generated.make_cvxpygen(*given, N),
+    }[sys.argv[1]]
     for N in map(int, sys.argv[2:]):
         spent, cost = run(make(N))
         slowest = np.sort(spent)[-STEPS // 5 :].mean()
