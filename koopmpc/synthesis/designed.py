@@ -104,6 +104,8 @@ class ExpectedLoop(Value):
         Length of a run.
     fresh
         Loops after the choice; None where there are none.
+    compared
+        Number of loops of all finalists, in which the choice was confirmed or changed.
     """
 
     cost: Float[np.ndarray, " runs"]
@@ -115,6 +117,7 @@ class ExpectedLoop(Value):
     surrogate: tuple[int, ...]
     steps: int
     fresh: FreshLoops | None = None
+    compared: int = 0
 
     @property
     def cost_interval(self) -> tuple[float, float]:
@@ -136,6 +139,7 @@ class ExpectedLoop(Value):
     def loops(self) -> dict[str, int]:
         """Number of loops of each kind: those of the choice, and the fresh ones by what stood in for the plant."""
         chosen = {"choice": len(self.cost), "choice, inputs 20 % off": len(self.cost_off)}
+        chosen |= {"finalists": self.compared} if self.compared else {}
         return chosen if self.fresh is None else chosen | self.fresh.counts
 
     def _judged_runs(
@@ -403,6 +407,7 @@ def _list_figures(row: DesignRow) -> list[str]:
 _PLACES = {  # a kind of loops in `ExpectedLoop.loops`, as it is printed
     "choice": "in the choice",
     "choice, inputs 20 % off": "there with inputs 20 % off",
+    "finalists": "of all finalists",
     "models": "fresh on learned models",
     "neighbours": "fresh on nearest rows of the logs",
     "corners": "from corners of the goal's range",

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.codegen.compiled import Compiled
+from koopmpc.plants.routines import find_compiler
 from koopmpc.synthesis.asked import check_task, measure_settling
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.synthesis.designed import ExpectedLoop, choose_row
 from koopmpc.synthesis.fresh.drawn import LoopResult, draw_starts
 from koopmpc.synthesis.fresh.horizon import choose_horizon
-from koopmpc.synthesis.fresh.loops import is_preferable
+from koopmpc.synthesis.fresh.loops import choose_finalist, is_preferable, list_finalists
 from koopmpc.synthesis.fresh.neighbours import MOST, NeighbourMap, goal_box, probe_range
 from koopmpc.synthesis.fresh.verdict import bound_value, cost_interval
 from koopmpc.synthesis.judging import measure_errors
@@ -21,8 +23,8 @@ from koopmpc.validate import bound_failure_rate
 from tests.closed_loop.controllers import Parts
 from tests.closed_loop.judge import judged, kept_promises, promised
 from tests.closed_loop.more_tasks import MORE
-from tests.synthesis.test_design import LIMITS, A, B, data, designed, usual
-from tests.synthesis.test_select import episodes_of
+from tests.synthesis.test_design import LIMITS, A, B, data, designed, mass, usual
+from tests.synthesis.test_select import PLAIN, episodes_of
 
 
 def bent(x, u):
@@ -359,6 +361,63 @@ def test_one_controller_is_better_where_it_alone_keeps_more_loops_than_chance_ex
     assert is_preferable(loops(), loops(np.inf), 0.9)
     mixed = [LoopResult(cost, 0.0) for cost in [0.2, 4.0] * 50]
     assert not is_preferable(mixed, loops(), 0.95)  # less on average, and not by three standard errors
+
+
+class CountedPool:
+    """A pool in which each controller, a number, has its own cost, and breaks a limit in every so many loops."""
+
+    ran = 0
+
+    def draw(self, count, _):
+        return list(range(count))
+
+    def run(self, controller, loops):
+        self.ran += len(loops)
+        cost, every = controller.figures
+        return [LoopResult(cost, 0.1 if every and i % every == 0 else 0.0, run=True) for i in loops]
+
+
+def test_a_finalist_that_is_safer_or_two_percent_cheaper_takes_the_place_of_the_chosen_one(monkeypatch):
+    def prefer(*figures):
+        made = []
+        for each in figures:
+            one = Compiled.__new__(Compiled)
+            one.figures = each
+            made.append(one)
+        monkeypatch.setattr("koopmpc.synthesis.fresh.loops.speed_up", lambda one: one)
+        pool = CountedPool()
+        place, loops, why = choose_finalist(pool, made, np.random.default_rng(0))
+        assert loops == pool.ran == 60 * len(figures) + 480
+        assert bool(why) == bool(place)
+        return place
+
+    assert prefer((1.0, 0), (0.99, 0), (1.1, 0)) == 0
+    assert prefer((1.0, 0), (1.1, 0), (0.97, 0)) == 2
+    assert prefer((1.0, 10), (1.05, 0), (0.5, 10)) == 1
+    assert prefer((1.0, 0), (0.5, 10)) == 0
+    assert choose_finalist(CountedPool(), [1, 2], np.random.default_rng(0)) == (0, 0, "")  # not in machine code
+
+
+@pytest.mark.slow
+def test_a_design_counts_the_loops_of_its_finalists():
+    found = designed(episodes_of(mass, count=9, steps=30), candidates=[PLAIN, PLAIN + km.Monomials(2)], loops=6)
+    finalists = found.expected.loops.get("finalists", 0)
+    assert finalists == (0 if find_compiler() is None else 2 * 60 + 480)
+    assert (finalists > 0) == ("of all finalists" in str(found.expected))
+
+
+def test_finalists_have_other_models_the_same_estimator_and_scores_within_three_percent():
+    data = km.Episodes([km.Episode(X=np.zeros((3, 2)), U=np.zeros((2, 1)))], 0.1)
+    base = replace(usual().best, score=1.0, lost=0, off=True)
+    recipes = [
+        replace(base.recipe, candidate=Candidate("", one).bind(data.states, data.inputs), estimator=None)
+        for one in (km.State() + km.Constant(), *(km.State() + km.Constant() + km.Monomials(n) for n in (2, 3, 4, 5)))
+    ]
+    rows = [replace(base, recipe=one) for one in recipes]
+    assert list_finalists(rows, 0) == [1, 2, 3]
+    rows[1] = replace(rows[1], score=1.04)
+    rows[2] = replace(rows[2], recipe=replace(recipes[2], estimator=km.LiftedDisturbance()))
+    assert list_finalists([*rows, rows[3]], 0) == [3, 4]
 
 
 def test_the_chosen_horizon_does_not_change_with_the_units():

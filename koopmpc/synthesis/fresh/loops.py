@@ -16,19 +16,23 @@ from koopmpc.lifting.base import strip_unit
 from koopmpc.lifting.state import State
 from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Recipe, get_model
+from koopmpc.synthesis.designed import DesignRow
 from koopmpc.synthesis.fresh.abreast import speed_up
 from koopmpc.synthesis.fresh.drawn import KEPT, DrawnLoop, LoopPool, LoopResult
 from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box, probe_range
 from koopmpc.synthesis.fresh.verdict import FreshLoops
-from koopmpc.synthesis.judging import LITTLE
+from koopmpc.synthesis.judging import LITTLE, UNSURE
 from koopmpc.text import to_percent
 from koopmpc.validate.scoring import AnyPredictor
 
 CORNERS = 8  # corners of the goal's range from which loops run, at most
-COMPARED = 60  # fresh loops in which horizons are compared in machine code
+COMPARED = 60  # fresh loops in which horizons, or finalists, are compared in machine code
 FEW = 12  # and in Python
-DIFFERENT = 0.02  # share of the loops by which one of two controllers must keep more
+FINALISTS = 3  # rows beside the chosen one whose controllers run many fresh loops
+FURTHER = 240  # further loops of the last two finalists
+DIFFERENT = 0.05  # share of the loops by which one of two controllers must keep more
 CHANCE = 0.05  # and probability that this is chance
+CHEAPER = 0.98  # a finalist that costs this share of the chosen one takes its place
 MUCH = 0.9  # a horizon that costs this share of the given one is much better
 DRAWN = 400  # states outside the data that are kept for a picture, at most
 BLIND_RANGE = 0.3  # share of them outside the data above which a design says so
@@ -180,10 +184,57 @@ def compare_longer_horizon(
     return [said]
 
 
+def list_finalists(rows: Sequence[DesignRow], best: int) -> list[int]:
+    """Return up to three rows with other models whose scores are within 3 % of the best and that lose no more runs.
+
+    They have the estimator of the chosen row, for stand-ins underrate what an estimator corrects: see `choose_row`.
+    """
+    chosen, least, found = rows[best], min(row.score for row in rows if row.off), list[int]()
+    known = [chosen.recipe.candidate]
+    for i, row in enumerate(rows):
+        one = row.recipe
+        other = row.off and one.candidate not in known and one.estimator == chosen.recipe.estimator
+        if other and row.score <= (1 + UNSURE) * least and row.lost <= chosen.lost:
+            known.append(one.candidate)
+            found.append(i)
+    return found[:FINALISTS]
+
+
+def choose_finalist(pool: LoopPool, finalists: Sequence[Designed], rng: np.random.Generator) -> tuple[int, int, str]:
+    """Return the place of the finalist that fresh loops prefer, how many loops ran, and why if it is not the first.
+
+    All run the same 60 loops, and the first and the best of the others 240 more. The first stays unless the other is
+    safer, or costs 2 % less and by three standard errors, see `is_preferable`. Those without machine code are left out.
+    """
+    fast = [speed_up(one) for one in finalists]
+    places = [i for i, one in enumerate(fast) if isinstance(one, Compiled)]
+    if len(places) < 2 or places[0] != 0:
+        return 0, 0, ""
+    drawn = pool.draw(COMPARED, rng)
+    results = {i: pool.run(fast[i], drawn) for i in places}
+
+    def rank(i: int) -> tuple[float, ...]:
+        return _count_lost(results[i]), _count_broken(results[i]), _compare_costs(results[i], results[0])[0]
+
+    other = min(places[1:], key=rank)
+    more, loops = pool.draw(FURTHER, rng), len(places) * COMPARED + 2 * FURTHER
+    first, second = (results[i] + pool.run(fast[i], more) for i in (0, other))
+    if not is_preferable(second, first, CHEAPER):
+        return 0, loops, ""
+    lost, broken = ([count_loops(one) for one in (first, second)] for count_loops in (_count_lost, _count_broken))
+    return (
+        other,
+        loops,
+        f"of {len(first)} fresh loops {lost[1]} are lost in place of {lost[0]}, {broken[1]} violate limits by more "
+        f"than {to_percent(KEPT)} of their range in place of {broken[0]}, and they cost "
+        f"{_compare_costs(second, first)[0]:.3g} times as much",
+    )
+
+
 def is_preferable(one: Sequence[LoopResult], other: Sequence[LoopResult], cheaper: float) -> bool:
     """Return whether of the same loops one controller loses fewer or keeps more limits, or else costs less.
 
-    Loops that one of the two alone loses, or keeps, decide: a fiftieth of all, and more than the toss of a coin
+    Loops that one of the two alone loses, or keeps, decide: a twentieth of all, and more than the toss of a coin
     explains in one case of twenty. A cost is less by a factor `cheaper` and by three standard errors.
     """
     for fails in (_is_lost, _is_broken):
@@ -212,7 +263,7 @@ def _is_lost(result: LoopResult) -> bool:
 
 
 def _is_broken(result: LoopResult) -> bool:
-    return not result.keeps
+    return result.violation > KEPT
 
 
 def _count_lost(results: Sequence[LoopResult]) -> int:
