@@ -71,6 +71,8 @@ def test_a_controller_prints_what_it_is():
         "daqp",
     ):
         assert part in text
+    alone = km.LinearPredictor([[0.9]], [[1]], [[1]], km.State().bind(["theta"]), 0.05, ["theta"], ["u"])
+    assert "(1 observable of theta;" in repr(km.KoopmanMPC(alone, km.Cost(Q=[1], R=1), None, horizon=5))
     assert "horizon 5" in repr(km.NonlinearMPC(PLANT, cost, limits, horizon=5))
     assert repr(km.LQR(MODEL, cost)).startswith("LQR(3 observables")
 

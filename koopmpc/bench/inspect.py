@@ -319,11 +319,14 @@ class Compared:
 
     def __str__(self) -> str:
         """Return the verdict in one line."""
-        alone = f"; {self.alone} runs are in one of the two only" if self.alone else ""
-        if not self.regressions:
-            return f"no regression beyond {self.threshold:.1%} in {len(self.pairs)} comparisons{alone}"
-        share = f"{len(self.regressions)} of {len(self.pairs)} comparisons"
-        return f"{share} are worse by more than {self.threshold:.1%}{alone}"
+        alone = (
+            f"; {self.alone} run{' is' if self.alone == 1 else 's are'} in one of the two only" if self.alone else ""
+        )
+        compared = f"{len(self.pairs)} comparison{'' if len(self.pairs) == 1 else 's'}"
+        worse = len(self.regressions)
+        if not worse:
+            return f"no regression beyond {self.threshold:.1%} in {compared}{alone}"
+        return f"{worse} of {compared} {'is' if worse == 1 else 'are'} worse by more than {self.threshold:.1%}{alone}"
 
 
 def compared(a: str | Path, b: str | Path, *, threshold: float = 0.02, times: bool = False) -> Compared:

@@ -163,7 +163,7 @@ def describe_controller(controller: Any) -> str:
 def _describe_model(model: Any) -> str:
     count = getattr(model, "nz", None)
     states = ", ".join(map(strip_unit, getattr(model, "states", ())))
-    size = f"{count} observables" if count is not None else type(model).__name__
+    size = type(model).__name__ if count is None else f"{count} observable{'' if count == 1 else 's'}"
     return f"{size} of {states}" if states else size
 
 

@@ -65,9 +65,10 @@ def application_of(about: About) -> str:
 def title_of(about: About) -> str:
     """Return problem, case, controller and fault in one line, without those that are unknown; or the run's own title.
 
-    A run has a title of its own by ``simulate(…, metadata={"title": "tank, new valve"})``.
+    A run has a title of its own by ``simulate(…, metadata={"title": "tank, new valve"})``. That of a run of a problem
+    file is the problem's, the same for all its controllers.
     """
-    if "title" in about.metadata:
+    if "title" in about.metadata and "problem" not in about.metadata:
         return str(about.metadata["title"])
     parts = [about.metadata.get(key) for key in ("problem", "case", "controller", "fault")]
     known = [str(p) for p in parts if p is not None]

@@ -186,7 +186,7 @@ def test_a_sweep_is_no_regression_of_itself_and_a_worse_one_is(problem, whole, t
 
 def test_two_logs_are_compared_and_strangers_are_refused(whole):
     log = whole[1] / "tiny-near-lqr.rrd"
-    assert not km.bench.compared(log, log).regressions
+    assert str(km.bench.compared(log, log)) == "no regression beyond 2.0% in 1 comparison"
     other = whole[1] / next(row.log.name for row in whole[0] if row.log and row.key[:3] == ("tiny", "near", TWO[1]))
     (pair,) = km.bench.compared(log, other, threshold=1e6).pairs
     assert pair.what == f"tiny near {TWO[1]} / lqr"

@@ -291,3 +291,5 @@ def test_a_run_has_a_title_of_its_own(tmp_path: Path) -> None:
     run = km.simulate(plant, lambda y, r: [0.0], x0=[0.5, 0], reference=[0, 0], steps=5, metadata=told)
     km.record(run, tmp_path / "run.rrd")
     assert title_of(km.load_run(tmp_path / "run.rrd")) == "bench 3, new valve"
+    problem = {"title": "Pendulum: driven upright.", "problem": "pendulum", "case": "hang", "controller": "lqr"}
+    assert title_of(About(**make_run(metadata=problem).about())) == "pendulum · hang · lqr"
