@@ -48,7 +48,7 @@ def page(path: Path, *, pictures: bool = True) -> Page:
     moving = FOLDER / name / "run.gif"
     if moving.is_file():
         made.parts.append(f"![{name}, {case}, {best}]({name}/run.gif)")
-    made.parts.append(f"*`koopmpc run {name}:{case} -c {best}`*")
+    made.parts.append(f"*`koopmpc run {name}:{case} -c {best}`*. [All problems](../library.md)")
     made.text("## The plant")
     made.code((type(problem.dynamics).__doc__ or "").strip())
     told = f" Measured disturbances: {_listed(problem.dynamics.disturbances)}." if problem.dynamics.nw else ""

@@ -117,6 +117,13 @@ def test_no_two_entries_of_a_menu_have_one_title():
         assert len(titles) == len(set(titles)), folder
 
 
+def test_every_page_of_a_problem_leads_to_the_table_of_all():
+    for path in (DOCS / "problems").glob("*.md"):
+        assert "../library.md" in [
+            target for picture, _, target in links(path.read_text(encoding="utf-8")) if not picture
+        ]
+
+
 def test_pictures_of_the_site_are_small():
     for path in [*(DOCS / "pictures").iterdir(), *DOCS.rglob("*.gif")]:
         assert path.stat().st_size <= 200_000, path
