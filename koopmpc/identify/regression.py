@@ -14,7 +14,7 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import FitWarning
+from koopmpc.errors import DataError, FitWarning
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.solve import RegressionRows, column_norms, scaled_rank
@@ -96,6 +96,8 @@ def read_regression(
     **options: Unpack[ReadOptions],
 ) -> Regression:
     """Return the regression on [ψ(x) u w] of these episodes; `second_moments` explains the options."""
+    if "bilinear" in options:  # which second_moments takes, and no fit on [ψ(x) u w]
+        raise DataError(f"{method} fits a linear model; km.bilinear_edmd fits a bilinear one")
     source = source_of(episodes)
     if embedding is not None:
         checks.kind(embedding, "embedding", Delay, "pass km.Delay(2), or leave it out")

@@ -208,6 +208,11 @@ def test_full_rank_without_truncation_predicts_the_same() -> None:
     assert np.allclose(whole.rollout([0.3, -0.2], U), reduced.rollout([0.3, -0.2], U), atol=1e-10)
 
 
+def test_who_asks_edmd_for_a_bilinear_model_is_told_its_function() -> None:
+    with pytest.raises(km.errors.DataError, match=r"km\.bilinear_edmd"):
+        km.edmd(random_episodes(0, [50], 2, 1), LIFTING, **{"bilinear": True})
+
+
 def test_a_wrong_ridge_or_rank_is_refused() -> None:
     data = random_episodes(0, [50], 2, 1)
     with pytest.raises(km.errors.DataError, match=r"ridge is -1; it must be 0 or above"):
