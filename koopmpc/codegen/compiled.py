@@ -289,8 +289,9 @@ class Compiled:
         if limits is not None:
             if limits is not self._at_call:
                 original = cast("Any", self.original)
-                self._called_with = original.read_limits(limits)
-                original.check_limits(self._called_with)
+                read = original.read_limits(limits)
+                original.check_limits(read)
+                self._called_with = read
             if limits is not self._at_call or self._passed is None:
                 self._passed = self._fill_bounds(self._called_with, 0, 1)
             self._at_call = limits

@@ -196,6 +196,16 @@ def test_the_same_limits_at_a_call_hold_as_long_as_they_are_passed_and_no_longer
     assert "OPTIMAL" in require_parity(mpc, fast, 30, lambda k: narrow if k % 7 in (1, 2, 3) else None)
 
 
+def test_limits_that_were_refused_do_not_enter_a_copy():
+    _, fast = compile_mpc(km.Limits(-1, 1, rows=("u_max",)))
+    narrow, short = fast.limits.with_bounds(u_max=0.2), fast.limits.with_bounds(u_max=np.ones((2, 2)))
+    y, r = [1.0, 0.0], [0.0, 0.0]
+    used = fast(y, r, limits=narrow).u
+    with pytest.raises(km.errors.ShapeError):
+        fast(y, r, limits=short)
+    np.testing.assert_allclose(copy.copy(fast)(y, r, limits=narrow).u, used, atol=1e-9)
+
+
 def test_targets_that_limits_in_time_push_are_pushed_in_c_too():
     """Small references need no look at their targets, large ones do: the border is that of the limits ahead."""
     limits = km.Limits(-ROWS, WAVES, x_min=-WAVES, x_max=WAVES)

@@ -212,7 +212,8 @@ class QPSolver(ABC):
 class SolverTurn(NamedTuple):
     """A solver and its own settings; a `late` one is set up when it is first needed.
 
-    One with `patience` gives up after so many iterations, and is asked first again once so few rows push.
+    One with `patience` gives up after so many iterations. It is asked first again once so few rows push, or once
+    another one than the next has found a plan.
     """
 
     solver: type[QPSolver]
@@ -309,7 +310,7 @@ class StepSolver:
             self._last = None
             return found, conflict
         self._last = found
-        if self._few is not None and self._turn and np.count_nonzero(found.y) <= self._few:
+        if self._few is not None and (self._turn > 1 or np.count_nonzero(found.y) <= self._few):
             self._turn = 0
         return found, max(conflict, self._gave_way(found, moved, limits)) if self._soft else conflict
 

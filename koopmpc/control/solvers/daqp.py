@@ -155,17 +155,17 @@ class DAQP(QPSolver):
             linear, rho = (np.where(self._sense == _SOFT, part, 0.0) for part in (self._linear, 1 / self._curved))
             self._model.soft_weights(rho_l=rho, rho_u=rho, w_l=linear, w_u=linear)
 
-    def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], tuple[Interval, bool]]:
+    def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], tuple[Interval, bool, int | None]]:
         self.resumes = False  # a copy starts from y, and the original has to have the same iterates
         return (
             type(self),
             (self._qp, self._settings),
-            (Interval(self.low, self.high), bool(self._far and not self._stale)),
+            (Interval(self.low, self.high), bool(self._far and not self._stale), self.patience),
         )
 
-    def __setstate__(self, state: tuple[Interval, bool]) -> None:
-        """Take over the limits that the original had, and how far from them its last solution was."""
-        limits, self._far = state
+    def __setstate__(self, state: tuple[Interval, bool, int | None]) -> None:
+        """Take over the limits that the original had, how far from them its last solution was, and its patience."""
+        limits, self._far, self.patience = state
         self.set_bounds(*limits)
 
     @property

@@ -1,7 +1,8 @@
 # pyright: basic
 """PIQP behind our interface, as CasADi ships it: an interior-point method on the stages of a QP, which stay sparse.
 
-Its time grows with the number of stages, and hardly with that of active rows. A solve starts from nothing.
+Its time grows with the number of stages, and hardly with that of active rows. A solve starts from nothing, and does
+not stop at a time limit.
 
 Schwan, Jiang, Kuhn & Jones, "PIQP: a proximal interior-point quadratic programming solver", CDC 2023.
 """
@@ -14,6 +15,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
+from koopmpc import checks
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolution, QPSolver, StepQP
@@ -38,7 +40,7 @@ class PIQP(QPSolver):
     Raises
     ------
     DataError
-        PIQP refuses a setting.
+        PIQP refuses a setting, or it is no positive number.
     """
 
     name = "piqp"
@@ -69,6 +71,8 @@ class PIQP(QPSolver):
         unknown = set(self._settings) - self.setting_names()
         if unknown:
             raise DataError(f"PIQP has no setting {min(unknown)!r}; it has {', '.join(sorted(self.setting_names()))}")
+        for name, value in self._settings.items():
+            checks.positive(value, f"PIQP's setting {name}")
         try:
             self._solver = ca.conic("piqp", "piqp", shape, options)
         except (RuntimeError, NotImplementedError) as error:

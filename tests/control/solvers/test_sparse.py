@@ -77,9 +77,10 @@ def test_only_a_long_plan_whose_solver_nobody_named_is_solved_stage_by_stage(mon
     assert moves["long"].u == pytest.approx(moves["named"].u, abs=1e-6)
 
 
-def test_once_few_rows_push_the_active_set_method_is_asked_first_again(monkeypatch):
+@pytest.mark.parametrize("renew", [lambda mpc: mpc, copy.deepcopy])
+def test_once_few_rows_push_the_active_set_method_is_asked_first_again(monkeypatch, renew):
     shorten(monkeypatch)
-    mpc, r = controller("auto", 60), np.zeros(4)
+    mpc, r = renew(controller("auto", 60)), np.zeros(4)
     asked = [mpc(x * np.array([1.0, 0.0, 0.0, 0.0]), r).solver for x in (3.0, 0.8, 0.8, 3.0)]
     assert asked == ["piqp", "piqp", "daqp", "piqp"]
 
@@ -104,7 +105,23 @@ def test_what_has_no_solution_is_left_to_the_condensed_qp(monkeypatch):
     assert move.solver != "piqp"
 
 
+def test_a_step_without_a_solution_does_not_leave_all_later_ones_to_the_slow_solver(monkeypatch):
+    shorten(monkeypatch)
+    mpc = controller("auto", 60)
+    first = mpc([3.0, 0.45, 2.0, 0.0], np.zeros(4))
+    assert (first.status, first.solver) == (km.Status.INFEASIBLE, "daqp")
+    later = [mpc([x, 0.0, 0.0, 0.0], np.zeros(4)).solver for x in (3.0, -3.0, 3.0)]
+    assert later == ["daqp", "piqp", "piqp"]
+
+
 def test_a_setting_that_it_does_not_have_is_refused():
     model = km.LinearPredictor(A, B[:, :1], np.eye(4), km.State(), 0.1, tuple("abcd"), ("u",))
     with pytest.raises(DataError, match="PIQP has no setting 'rho'"):
         km.KoopmanMPC(model, km.Cost(np.ones(4), 0.1), km.Limits(-1, 1), 5, solver="piqp", settings={"rho": 1.0})
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan])
+def test_a_setting_that_is_no_positive_number_is_refused(value):
+    model = km.LinearPredictor(A, B[:, :1], np.eye(4), km.State(), 0.1, tuple("abcd"), ("u",))
+    with pytest.raises(DataError, match="PIQP's setting eps_abs"):
+        km.KoopmanMPC(model, km.Cost(np.ones(4), 0.1), km.Limits(-1, 1), 5, solver="piqp", settings={"eps_abs": value})
