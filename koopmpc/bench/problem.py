@@ -67,6 +67,8 @@ class Training:
     measured: OpenLoop | ArrayLike | None = None
 
     def __post_init__(self) -> None:
+        if self.measured is not None and not isinstance(self.measured, OpenLoop):
+            object.__setattr__(self, "measured", np.atleast_1d(checks.array(self.measured, "Training.measured")))
         checks.count(self.episodes, "Training.episodes")
         checks.count(self.steps, "Training.steps")
 
@@ -226,9 +228,10 @@ class Problem:
                 )
             if case.limits is not None:
                 _fits(case.limits, self.dynamics, f"case {name!r}: limits")
-            _check_measured(case.measured, self.dynamics, case.steps, f"case {name!r}")
-        told = None if self.training.measured is None else np.zeros(nw)  # `collect` checks the values
-        _check_measured(told, self.dynamics, self.training.steps, "training")
+            _check_measured(case.measured, self.dynamics, (case.steps,), f"case {name!r}")
+            _check_plant(case.plant, nw, f"case {name!r}")
+        _check_plant(self.plant, nw, "the problem")
+        _check_measured(self.training.measured, self.dynamics, (self.training.episodes, self.training.steps), "training")
         wrong = [i for i in self.angles if not 0 <= i < nx]
         if wrong:
             raise DataError(f"angles holds {wrong[0]}; pass indices of states, 0 to {nx - 1}")
@@ -290,7 +293,9 @@ def _fits(limits: Limits, dynamics: Dynamics, what: str) -> None:
         raise ShapeError(f"{what}: {error}") from error
 
 
-def _check_measured(measured: ArrayLike | None, dynamics: Dynamics, steps: int, what: str) -> None:
+def _check_measured(
+    measured: OpenLoop | ArrayLike | None, dynamics: Dynamics, rows: tuple[int, ...], what: str
+) -> None:
     """Raise where measured disturbances are missing, are not those of the plant, or have another shape."""
     nw, names = dynamics.nw, ", ".join(dynamics.disturbances)
     if measured is None:
@@ -299,9 +304,18 @@ def _check_measured(measured: ArrayLike | None, dynamics: Dynamics, steps: int, 
         return
     if not nw:
         raise DataError(f"{what}: measured is given, but the dynamics name no disturbances; name them, or leave it out")
-    if np.shape(measured) not in ((nw,), (steps, nw)):
-        expected = f"({nw},) or (steps, nw) = ({steps}, {nw}): a column for {names}"
-        raise ShapeError(f"{what}: measured has shape {np.shape(measured)}, expected {expected}")
+    shapes = [(*rows[i:], nw) for i in range(len(rows), -1, -1)]
+    if not isinstance(measured, OpenLoop) and np.shape(measured) not in shapes:
+        expected = " or ".join(map(str, shapes))
+        raise ShapeError(
+            f"{what}: measured has shape {np.shape(measured)}, expected {expected}: a row a step, a column for {names}"
+        )
+
+
+def _check_plant(plant: Dynamics | StepMap | Plant | None, nw: int, what: str) -> None:
+    """Raise where equations or a step map in place of the dynamics have another number of measured disturbances."""
+    if isinstance(plant, (Dynamics, StepMap)) and plant.nw != nw:
+        raise ShapeError(f"{what}: its plant has {plant.nw} measured disturbances, the dynamics {nw}; give both as many")
 
 
 class Entry(NamedTuple):

@@ -115,7 +115,8 @@ def sweep(
         Called with (name of the run, runs done, runs in all).
     on_case
         Called with all runs of a case when the last one has ended; cases come in their order. In this process it does
-        not wait for the logs of loops that take less than three seconds: they are written afterwards.
+        not wait for the logs of loops that take less than three seconds: they are written afterwards, and a run that is
+        interrupted before its log is written runs again when the sweep goes on.
 
     Returns
     -------

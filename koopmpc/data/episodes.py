@@ -75,7 +75,7 @@ def find_lines(file: str, numbers: Sequence[int]) -> tuple[str, list[int]]:
     """
     if not file.endswith(".csv") or not Path(file).is_file():
         return "row", list(numbers)
-    with Path(file).open(newline="", encoding="utf-8", errors="replace") as stream:
+    with Path(file).open(newline="", encoding="utf-8-sig", errors="replace") as stream:
         lines = csv.reader(stream)
         rows = ((lines.line_num, cells) for cells in lines if cells and not cells[0].startswith("#"))
         first = next(rows, (0, list[str]()))

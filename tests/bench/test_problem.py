@@ -89,12 +89,22 @@ def test_every_form_of_a_reference_that_simulate_takes_fits(problem, reference):
         (
             {"cases": {"bad": km.Case([20.0, 20.0], [21.0], 3, measured=[[1.0]] * 4)}},
             km.errors.ShapeError,
-            r"case 'bad': measured has shape \(4, 1\), expected \(1,\) or \(steps, nw\) = \(3, 1\): a column for outside",
+            r"case 'bad': measured has shape \(4, 1\), expected \(1,\) or \(3, 1\): a row a step, a column for outside",
         ),
         (
             {"training": km.Training([20.0, 20.0], km.Noise(0, 4), episodes=2, steps=3)},
             km.errors.DataError,
             r"training: the plant has measured disturbances",
+        ),
+        (
+            {"training": km.Training([20.0, 20.0], km.Noise(0, 4), episodes=2, steps=3, measured=[[1.0]] * 2)},
+            km.errors.ShapeError,
+            r"training: measured has shape \(2, 1\), expected \(1,\) or \(3, 1\) or \(2, 3, 1\)",
+        ),
+        (
+            {"plant": km.load_problem("pendulum").dynamics},
+            km.errors.ShapeError,
+            "the problem: its plant has 0 measured disturbances, the dynamics 1",
         ),
     ],
 )
@@ -110,6 +120,11 @@ def test_a_plant_without_disturbances_refuses_their_values(problem):
         replace(problem, training=replace(problem.training, measured=[1.0]))
     with pytest.raises(km.errors.DataError, match=r"Case\.measured holds 1 NaN"):
         km.Case([1.0], [0.0], 3, measured=[float("nan")])
+    with pytest.raises(km.errors.DataError, match=r"Training\.measured holds 1 NaN"):
+        km.Training([1.0], km.Noise(0, 4), episodes=2, steps=3, measured=[float("nan")])
+    disturbed = km.load_problem("heat_pump").dynamics
+    with pytest.raises(km.errors.ShapeError, match="case 'bad': its plant has 1 measured disturbances, the dynamics 0"):
+        replace(problem, cases={"bad": km.Case([1.0], [0.0], 3, plant=disturbed)})
 
 
 def test_a_case_needs_steps_and_numbers():

@@ -471,3 +471,17 @@ def test_a_monitor_counts_unknown_steps_of_learned_mpc_in_rows_logs_and_table(tm
     assert (km.load_run(rows[1].log).known >= 0).all()
     assert "unknown" in printed(km.bench.results_table(rows[1:2]))
     assert "unknown" not in printed(km.bench.results_table(rows[:1]))
+
+
+def test_a_table_that_interrupts_a_sweep_loses_no_run_of_the_next_call(tmp_path):
+    problem, told = km.load_problem(write(tmp_path)), []
+
+    def stop(runs):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        km.sweep([problem], ["lqr"], folder=tmp_path / "logs", on_case=stop)
+    rows = km.sweep([problem], ["lqr"], folder=tmp_path / "logs", on_case=told.extend)
+    assert [row.name for row in told] == [row.name for row in rows]
+    assert len(rows) == len(problem.cases)
+    assert all(row.log.is_file() for row in rows)

@@ -1,5 +1,6 @@
 """Tables as text: what is told and what is guessed, gaps, unequal time, and files that are no tables."""
 
+import pickle
 import re
 from pathlib import Path
 
@@ -296,6 +297,24 @@ def test_truth_values_with_one_missing_cut_an_episode(tmp_path: Path) -> None:
     with pytest.warns(km.FitWarning, match="1 gap .* cut 1 episode into 2; 1 of 5 rows are lost"):
         read = km.load_episodes(file)
     assert [episode.X[:, 0].tolist() for episode in read] == [[1, 0], [1, 0]]
+
+
+def test_files_of_one_name_keep_their_folders_in_a_warning_that_pickles(tmp_path: Path) -> None:
+    rows, files = "".join(f"{t},{k},{k % 2}\n" for k, t in enumerate([0, 1, 2.1, 3, 4])), []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        files.append(text(tmp_path / name / "log.csv", f"time [s],level,pump\n{rows}"))
+    with pytest.warns(km.FitWarning) as caught:
+        km.load_episodes(*files, resample=1.0)
+    (sentence,) = (str(one.message) for one in caught)
+    assert all(f"{file} (2 of 4, from line 4)" in sentence for file in files)
+    assert str(pickle.loads(pickle.dumps(caught[0].message))) == sentence
+
+
+def test_a_gap_below_a_comment_behind_a_byte_order_mark_is_named_by_its_line(tmp_path: Path) -> None:
+    file = text(tmp_path / "log.csv", "# a sheet\ntime [s],level,pump\n0,1,2\n1,3,1\n5,2,2\n6,1,1\n", "utf-8-sig")
+    with pytest.warns(km.FitWarning, match=r"1 gap \(after line 4\)"):
+        km.load_episodes(file)
 
 
 def test_what_several_files_share_is_one_sentence_that_names_them(tmp_path: Path) -> None:

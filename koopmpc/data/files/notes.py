@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from koopmpc.errors import FitWarning
 
@@ -30,12 +31,21 @@ class ResampledWarning(FitWarning):
             f"2 %, the first at {first[0]}, where it is {first[1]:g} s; interpolated to {dt:g} s"
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what a pickle makes it of again: its text and attributes."""
+        return type(self).__new__, (type(self), *self.args), self.__dict__
+
+
+def _shorten_names(files: Sequence[str]) -> list[str]:
+    """Return the names of files, without the folder of those that share it with the first one."""
+    return [files[0], *(Path(f).name if Path(f).parent == Path(files[0]).parent else f for f in files[1:])]
+
 
 def name_files(files: Sequence[str], known: Sequence[str]) -> str:
     """Return the count of several files and their names, without the folder that they share with the first one."""
     if len(files) == 1:
         return files[0]
-    short = [files[0], *(Path(f).name if Path(f).parent == Path(files[0]).parent else f for f in files[1:])]
+    short = _shorten_names(files)
     at = known.index(files[0]) if files[0] in known else 0
     if len(files) > 3 and list(known[at : at + len(files)]) == list(files):
         return f"{len(files)} files ({short[0]} to {short[-1]})"
@@ -46,7 +56,7 @@ def name_resampled(caught: Sequence[ResampledWarning]) -> str:
     """Return the sentence on files whose rows were interpolated, with the first line of each."""
     if len(caught) == 1:
         return str(caught[0])
-    names = [one.file if i == 0 else Path(one.file).name for i, one in enumerate(caught)]
+    names = _shorten_names([one.file for one in caught])
     places = [
         f"{name} ({one.counts[0]} of {one.counts[1]}, from {one.first[0]})"
         for name, one in zip(names, caught, strict=True)
