@@ -231,7 +231,9 @@ class Problem:
             _check_measured(case.measured, self.dynamics, (case.steps,), f"case {name!r}")
             _check_plant(case.plant, nw, f"case {name!r}")
         _check_plant(self.plant, nw, "the problem")
-        _check_measured(self.training.measured, self.dynamics, (self.training.episodes, self.training.steps), "training")
+        _check_measured(
+            self.training.measured, self.dynamics, (self.training.episodes, self.training.steps), "training"
+        )
         wrong = [i for i in self.angles if not 0 <= i < nx]
         if wrong:
             raise DataError(f"angles holds {wrong[0]}; pass indices of states, 0 to {nx - 1}")
@@ -315,7 +317,9 @@ def _check_measured(
 def _check_plant(plant: Dynamics | StepMap | Plant | None, nw: int, what: str) -> None:
     """Raise where equations or a step map in place of the dynamics have another number of measured disturbances."""
     if isinstance(plant, (Dynamics, StepMap)) and plant.nw != nw:
-        raise ShapeError(f"{what}: its plant has {plant.nw} measured disturbances, the dynamics {nw}; give both as many")
+        raise ShapeError(
+            f"{what}: its plant has {plant.nw} measured disturbances, the dynamics {nw}; give both as many"
+        )
 
 
 class Entry(NamedTuple):

@@ -231,11 +231,12 @@ def tracking_error(run: Run) -> Float[np.ndarray, "T1 nr"]:
     tracked = None if run.cost is None else bind_outputs(run.cost.of, run.states)
     outputs = X if tracked is None else tracked(X)
     if outputs.shape != run.reference.shape:
-        likely = run.outputs if set(run.outputs) <= set(run.states) else run.states
-        names = [name.partition(" [")[0] for name in likely[: run.reference.shape[1]]]
+        aims, of = run.reference.shape[1], "…)"
+        if set(run.outputs) <= set(run.states) and aims <= len(run.outputs):
+            of = f"km.State({[name.partition(' [')[0] for name in run.outputs[:aims]]}))"
         raise ShapeError(
             f"the reference has shape {run.reference.shape}, and what it is compared with {outputs.shape}; pass "
-            f"simulate a cost that names the outputs of the reference: cost=km.Cost(Q=…, R=…, of=km.State({names}))"
+            f"simulate a cost that says what of the state the reference is for: cost=km.Cost(Q=…, R=…, of={of}"
         )
     error = outputs - run.reference
     names = run.states if tracked is None else tracked.names

@@ -41,6 +41,13 @@ def speed_alone():
     return km.StepMap(ca.Function("F", [x, u], [x]), 0.1, h, ["p", "v [m/s]"], ["u"], ["v [m/s]"])
 
 
+def follow(measure, output):
+    """Ask for the metrics of a run whose reference is for a measured output, and whose cost is missing."""
+    how = {"dt": 0.1, "states": ["p", "v [m/s]"], "inputs": ["u"], "measure": measure, "outputs": [output]}
+    plant = km.black_box(lambda x, u: 0.5 * x, **how)
+    km.metrics(km.simulate(plant, lambda y, r: [0.0], x0=[1.0, 1.0], reference=[0.0], steps=3))
+
+
 class Longer(Outside):
     """A plant whose state has an entry more than its states have names."""
 
@@ -120,9 +127,11 @@ MISTAKES = [
     ),
     (
         SHAPE,
-        "the reference has shape (13, 1), and what it is compared with (13, 2); pass simulate a cost that names the outputs",
+        "the reference has shape (13, 1), and what it is compared with (13, 2); pass simulate a cost that says what",
         lambda: km.metrics(random_run(np.random.default_rng(4), nr=1)),
     ),
+    (SHAPE, "reference is for: cost=km.Cost(Q=…, R=…, of=km.State(['v']))", lambda: follow(lambda x: x[1:], "v [m/s]")),
+    (SHAPE, "reference is for: cost=km.Cost(Q=…, R=…, of=…)", lambda: follow(lambda x: x[1:] ** 2, "square")),
 ]
 
 
