@@ -79,7 +79,7 @@ def test_a_state_that_does_not_move_has_size_one():
 
 def test_a_model_suffices_where_each_state_is_missed_by_half_more_than_its_own_data_at_most():
     rng, one = np.random.default_rng(3), learning()
-    pairs = path(rng, 30)
+    pairs = path(rng, 300)  # so many that chance explains less than a half more
     one._memory.extend(pairs)
     missed = np.array([p.x_next - A @ p.x - B @ p.u - E @ p.w for p in pairs])
     usual = np.sqrt(np.mean(missed**2, axis=0))
