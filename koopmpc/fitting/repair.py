@@ -531,10 +531,10 @@ def _divide_records(
     `_FEWEST` of a record that is too short for `_ENOUGH` of the usual horizon, and so for a band.
     """
     past, verdict = max(delay, *DELAYS), None
-    held = sum(min(len(e) - round((1 - _SHARE) * len(e)), _JUDGED) for e in records)
-    least = _ENOUGH if held // _ENOUGH - past >= ahead else _FEWEST
+    held = [min(len(e) - round((1 - _SHARE) * len(e)), _JUDGED) for e in records]
+    least = _ENOUGH if _longest_block(held, _ENOUGH) - past >= ahead else _FEWEST
     pace: int = find_pace(records) if follow else 0
-    longer = min(pace, held // least - past)
+    longer = min(pace, _longest_block(held, least) - past)
     if longer > ahead:
         verdict = longer
     shortest = (verdict or ahead) + past
@@ -567,6 +567,12 @@ def _divide_records(
     seen, _ = take_sample(Held(train), _JUDGED)
     judged = records.with_episodes(held_out)
     return DividedData(records, seen, judged, ahead, size, notes, delay, learned=train, verdict=verdict)
+
+
+def _longest_block(lengths: Sequence[int], count: int) -> int:
+    """Return the most steps of a block of which these lengths hold so many, none of them across two lengths."""
+    most = range(sum(lengths) // count, 0, -1)
+    return next((steps for steps in most if sum(length // steps for length in lengths) >= count), 0)
 
 
 def drop_origins(episodes: Episodes) -> Episodes:

@@ -273,9 +273,10 @@ def design(
     short: list[str] = []
     longest = max(len(one) for one in held)
     if asked.steps > max(longest, RUN * ahead):
+        why = "since the reference moves" if asked.moves else "until a linear loop on the data settles, at most 120"
         short = [
-            f"loops take {asked.steps} steps, for so long a linear loop on the data settles; no episode is longer than "
-            f"{longest}, so what comes later rests on stand-ins that no log has followed so far"
+            f"loops take {asked.steps} steps, {why}; no episode is longer than {longest}, so what comes later rests on "
+            "stand-ins that no log has followed so far"
         ]
     if forecast < ahead:
         short += [f"models were judged {forecast} steps ahead, not {ahead}, for episodes are no longer"]
@@ -345,13 +346,19 @@ def design(
     drawn_from = LoopPool(asked, test.surrogates, neighbours, test.low, test.high)
     compared = 0
     if few and (others := list_finalists(rows, best)):
-        said = list(turned)
-        tried = [(i, one) for i in others if (one := fit_row(i)) is not None]
-        place, compared, why = choose_finalist(drawn_from, [controller, *(one for _, one in tried)], draw)
+        said, tried = list(turned), list[tuple[int, Designed, list[str]]]()
+        for i in others:
+            turned.clear()
+            if (one := fit_row(i)) is not None:
+                tried.append((i, one, list(turned)))
+        place, compared, why = choose_finalist(drawn_from, [controller, *(one for _, one, _ in tried)], draw)
         turned[:] = said
         if place:
-            turned.append(f"{rows[tried[place - 1][0]].title} takes the place of {rows[best].title}: {why}")
-            best, controller = tried[place - 1]
+            i, controller, fitted = tried[place - 1]
+            turned += [f"{rows[i].title} takes the place of {rows[best].title}: {why}", *fitted]
+            best = i
+            if rows[best].recipe.candidate.kind == "linear":
+                simple, linear = controller, best
     promise: CoveragePromise | None = None
     if wished is not None:
         recipe, band = rows[best].recipe, outcomes[best].band

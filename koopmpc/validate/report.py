@@ -32,7 +32,7 @@ _OVERFIT = 2.0  # above this ratio of held-out to training error, a model is ove
 _UNSEEN = 0.05  # above this share of held-out samples in cells without training data, the report asks for care
 _NOTABLE_GROWTH = 2.0  # mention a spurious eigenfunction that grows by more than this factor over the horizon
 _FEEDBACK = 0.9  # if ψ(x) explains a larger share of an input's energy, the input counts as feedback
-_HELD = 4  # times the episodes that a band needs there must be: a third is held out, three quarters of these calibrate
+_EPISODES = 36  # with so many `koopmpc fit` has a band of 90 %: a third is held out, and 9 of these calibrate
 _MOST_NAMES = 3  # list at most this many names in one sentence
 
 
@@ -406,8 +406,8 @@ def _check_band(report: TrustReport) -> Iterator[tuple[str, str]]:
         reason = f"there are {band.episodes} calibration episodes, at least {band.needed} are needed"
         yield (
             f"there is no band at {to_percent(band.level)}: {reason}",
-            f"record more episodes, or cut long files into several: `koopmpc fit` holds out enough of "
-            f"{_HELD * band.needed} in all; in Python hold out more by hand, or pass a lower level=",
+            f"record more episodes, or cut long files into several: `koopmpc fit` holds out enough of {_EPISODES} in "
+            "all for a level of 90 %; in Python hold out more by hand, or pass a lower level=",
         )
 
 

@@ -211,6 +211,19 @@ def test_the_verdict_on_a_record_looks_as_far_ahead_as_its_output_remembers(tmp_
     assert "the outputs remember" in " ".join(short.notes)
 
 
+def test_the_verdict_on_several_records_looks_no_further_ahead_than_a_block_of_one_of_them(tmp_path):
+    rng = np.random.default_rng(0)
+    for i in range(5):
+        u = rng.standard_normal(300)
+        y = signal.lfilter([0, 1], [1, -np.exp(-1 / 100)], u)
+        rows = np.column_stack([0.01 * np.arange(300), u, y])
+        np.savetxt(tmp_path / f"{i}.csv", rows, delimiter=",", header="time [s],u,y", comments="")
+    split = read_logs(tmp_path, None, rng, 10**9, {})
+    assert len(split.held_out) == 5  # a block of a fifth of all would cross the ends of records
+    assert 20 < split.ahead < 60
+    assert all(len(e) > split.ahead for e in split.held_out)
+
+
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("memory", [10**9, 1000])
 def test_columns_that_say_nothing_are_left_out_and_wrapped_angles_unwrapped_and_that_is_said(

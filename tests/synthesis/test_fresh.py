@@ -344,9 +344,13 @@ def test_loops_last_until_a_linear_loop_settles_and_three_horizons_at_least():
 
 @pytest.mark.slow
 def test_a_design_says_where_its_loops_last_longer_than_every_episode():
-    found = designed(data(), horizon=3, limits=replace(LIMITS, u_min=-0.2, u_max=0.2))
+    found = designed(data(), horizon=3, limits=replace(LIMITS, u_min=-0.2, u_max=0.2), loops=0)
     assert found.expected.steps > 30
-    assert any(f"loops take {found.expected.steps} steps" in note for note in found.notes)
+    assert any(f"loops take {found.expected.steps} steps, until a linear loop" in note for note in found.notes)
+    reference = 0.2 * np.sin(np.arange(200) / 20)[:, None] * [1.0, 0.0]
+    moves = designed(data(), horizon=3, reference=reference, loops=0)
+    assert moves.expected.steps == 120
+    assert any("loops take 120 steps, since the reference moves" in note for note in moves.notes)
 
 
 def test_one_controller_is_better_where_it_alone_keeps_more_loops_than_chance_explains_or_costs_less():
@@ -404,6 +408,17 @@ def test_a_design_counts_the_loops_of_its_finalists():
     finalists = found.expected.loops.get("finalists", 0)
     assert finalists == (0 if find_compiler() is None else 2 * 60 + 480)
     assert (finalists > 0) == ("of all finalists" in str(found.expected))
+
+
+@pytest.mark.slow
+def test_a_linear_finalist_that_is_taken_is_the_linear_controller_of_the_design_too(monkeypatch):
+    monkeypatch.setattr("koopmpc.synthesis.design.list_finalists", lambda rows, best: [i for i in (0, 1) if i != best])
+    monkeypatch.setattr("koopmpc.synthesis.design.choose_finalist", lambda *_: (1, 0, "it is safer"))
+    plants = episodes_of(mass, count=9, steps=30)
+    found = designed(plants, candidates=[PLAIN, PLAIN + km.Monomials(2)], bilinear=False, loops=2)
+    assert any("takes the place of" in note for note in found.notes)
+    assert found.chosen_linear == found.chosen
+    assert found.linear is found.controller
 
 
 def test_finalists_have_other_models_the_same_estimator_and_scores_within_three_percent():

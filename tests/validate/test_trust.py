@@ -189,8 +189,11 @@ def test_few_episodes_give_no_band_and_it_says_so(data) -> None:
     report = km.trust(km.edmd(train, LIFTING), held_out[:4], HORIZON)
     assert np.isinf(report.band.quantile)
     (found,) = [f for f in report.findings if "3 calibration episodes, at least 9 are needed" in f.says]
-    assert "cut long files into several: `koopmpc fit` holds out enough of 36 in all" in found.do
+    assert "cut long files into several: `koopmpc fit` holds out enough of 36 in all for a level of 90 %" in found.do
     assert report.trusted
+    higher = km.trust(km.edmd(train, LIFTING), held_out[:4], HORIZON, level=0.95)  # of 76 in all fit holds out 15
+    (found,) = [f for f in higher.findings if "3 calibration episodes, at least 19 are needed" in f.says]
+    assert "36 in all for a level of 90 %" in found.do
 
 
 def test_a_model_that_diverges_gets_a_report_too(data) -> None:
