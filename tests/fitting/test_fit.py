@@ -406,7 +406,7 @@ def test_logs_are_audited_and_what_is_safe_is_done_and_said(tmp_path):
     told = []
     found = fit_data(tmp_path / "in", tmp_path / "out", horizon=10, bilinear=False, say=told.append)
     assert re.search(
-        r"! spikes: theta leaves its path for single rows 20 times: .*these rows were left out", told[0], re.S
+        r"! spikes: theta leaves its path and returns, 20 times: .*these rows were left out", told[0], re.S
     )
     assert re.search(r"! input delay: force acts 3 steps late; models that see 3 steps of the past are", told[0])
     assert max(np.abs(e.X[:, 1]).max() for e in found.held_out) < 20
