@@ -103,7 +103,8 @@ def test_a_model_that_cannot_follow_the_plant_is_not_chosen():
         candidates=[SQUARES, PLAIN],
     )
     assert "Monomials" in found.best.title
-    assert found.best.score == pytest.approx(min(row.score for row in found.leaderboard if row.off), rel=0.005)
+    least = min(row.score for row in found.leaderboard if row.off)
+    assert least <= found.best.score <= 1.02 * least  # an estimator that finds its gain may cost 2 % more
 
 
 def test_the_same_data_and_seed_give_the_same_design_whoever_works():
