@@ -115,8 +115,7 @@ def sweep(
         Called with (name of the run, runs done, runs in all).
     on_case
         Called with all runs of a case when the last one has ended; cases come in their order. In this process it does
-        not wait for the logs of loops that take less than three seconds: they are written afterwards, and a run that is
-        interrupted before its log is written runs again when the sweep goes on.
+        not wait for the logs of loops that take less than three seconds: they come afterwards, after Ctrl-C, too.
 
     Returns
     -------
@@ -311,28 +310,40 @@ def _do(
     """Do the runs of a batch one after the other; those that a worker which died had finished are not run again.
 
     Their lines go to the file of the batch's number. With `on_end`, which is called with each run that has ended, logs
-    wait until the last loop has ended, or loops and logs have taken `_HELD`.
+    wait until the last loop has ended, or loops and logs have taken `_HELD`; Ctrl-C writes those that wait, a second
+    gives them up.
     """
     number, rows = batch
     due = time.monotonic() + (0.0 if on_end is None else _HELD)
     with Journal(grid.folder / ROWS / f"{number:06d}.jsonl") as journal:
         finished = [journal.rows[row.key] for row in rows if row.key in journal.rows]
-        left, done = [row for row in rows if row.key not in journal.rows], None
-        waiting: list[tuple[RunRow, Run | None]] = []
-        for row in left:
-            died = journal.turn(done, row)
-            done = None
-            waiting.append(_measure(grid, row, died))
-            if on_end is not None:
-                on_end(waiting[-1][0])
-            if row is not left[-1] and time.monotonic() < due:
-                continue
-            for ended, run in waiting:
+        left = [row for row in rows if row.key not in journal.rows]
+        done: RunRow | None = None
+        waiting: deque[tuple[RunRow, Run | None]] = deque()
+
+        def log_waiting() -> None:
+            nonlocal done
+            while waiting:
                 if done is not None:
                     journal.turn(done, None)
-                done = _log(grid, ended, run)
+                done = _log(grid, *waiting[0])
                 finished.append(done)
-            waiting.clear()
+                waiting.popleft()
+
+        try:
+            for row in left:
+                died = journal.turn(done, row)
+                done = None
+                waiting.append(_measure(grid, row, died))
+                if on_end is not None:
+                    on_end(waiting[-1][0])
+                if row is left[-1] or time.monotonic() >= due:
+                    log_waiting()
+        except KeyboardInterrupt:
+            if on_end is not None:  # the table of these runs may be out
+                log_waiting()
+                journal.turn(done, None)
+            raise
         journal.turn(done, None)
     return finished
 

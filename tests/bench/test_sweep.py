@@ -143,6 +143,20 @@ def test_the_table_of_a_case_waits_for_no_log_but_where_loops_are_slow(tmp_path,
     assert [row.log for row in km.bench.load_rows(tmp_path / "logs")] == [row.log for row in rows]
 
 
+def test_what_has_ended_at_ctrl_c_gets_its_log_and_is_not_run_again(tmp_path, monkeypatch):
+    def interrupt(runs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("koopmpc.bench.sweep._HELD", 60.0)
+    problem, logs = km.load_problem(write(tmp_path)), tmp_path / "logs"
+    with pytest.raises(KeyboardInterrupt):
+        km.sweep([problem], ["lqr", "koopman-lqr"], folder=logs, on_case=interrupt)
+    kept = km.bench.load_rows(logs)
+    assert [row.controller for row in kept] == ["lqr", "koopman-lqr"]
+    assert all(km.load_run(row.log).steps == problem.cases[row.case].steps for row in kept)
+    assert pq.read_table(logs / "results.parquet").num_rows == 2
+
+
 def test_the_truth_may_be_another_plant(swept):
     problem, *_ = swept
     heavier = type(problem.dynamics)
