@@ -4,6 +4,8 @@
 
 #include "daqp/types.h"
 
+/* Floats keep DAQP's own product, four rows at a time: a Cortex-M4F has no vectors, and loads less there. */
+#ifndef KOOPMPC_FLOAT
 /** M u, as DAQP's own daqp_compute_Mu, but by eight sums a row, so that compilers may use vectors. */
 static void koopmpc_daqp_product(DAQPWorkspace *work) {
   const int n = work->n, rows = work->m - work->ms;
@@ -31,6 +33,7 @@ static void koopmpc_daqp_product(DAQPWorkspace *work) {
 #define daqp_compute_Mu(of) KOOPMPC_MU_##of)
 #define KOOPMPC_MU_work koopmpc_daqp_product(work
 #define KOOPMPC_MU_DAQPWorkspace koopmpc_daqp_compute_Mu(DAQPWorkspace
+#endif
 
 #include "daqp/auxiliary.c"
 #include "daqp/daqp.c"
