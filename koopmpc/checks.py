@@ -266,8 +266,10 @@ def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int, first: 
     """
     R = array(reference, "reference", finite=False)
     if R.shape[-1:] != (nr,) or R.ndim > 2 or len(R) == 0:
+        given = R.shape[-1] if R.ndim else 1
+        fewer = "; to track fewer outputs pass Cost(of=km.State(…), …)" if 0 < given < nr else ""
         raise ShapeError(
-            f"reference has shape {R.shape}, expected ({nr},), or rows of {nr} for steps k … k+{first + N}"
+            f"reference has shape {R.shape}, expected ({nr},), or rows of {nr} for steps k … k+{first + N}{fewer}"
         )
     R = np.where(np.abs(R) < HUGE, R, np.nan).reshape(-1, nr)
     return np.ascontiguousarray(R[np.minimum(np.arange(first, first + N + 1), len(R) - 1)])

@@ -134,10 +134,12 @@ def check_task(
     limits.inputs(data.nu)
     limits.find_rows(nx, ny)
     rows = checks.array(reference, "reference")
-    if rows.ndim > 2 or (rows.shape or (1,))[-1] != of.nz or not rows.size:
+    given = (rows.shape or (1,))[-1]
+    if rows.ndim > 2 or given != of.nz or not rows.size:
+        fewer = "; to track fewer pass Cost(of=km.State(…), …)" if 0 < given < of.nz else ""
         raise ShapeError(
             f"reference has shape {rows.shape}, expected ({of.nz},) or rows (T+1, {of.nz}), one column for each "
-            f"output that the cost tracks: {', '.join(of.names)}"
+            f"output that the cost tracks: {', '.join(of.names)}{fewer}"
         )
     rows = rows.reshape(-1, of.nz)
     outside = [i for i in angles if not 0 <= i < nx]

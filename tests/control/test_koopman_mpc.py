@@ -413,6 +413,11 @@ def test_messages():
         ),
         (
             km.errors.ShapeError,
+            r"reference has shape \(1,\), expected \(2,\).*; to track fewer outputs pass Cost\(of=km\.State",
+            lambda: km.KoopmanMPC(model, cost)([0, 0], [0]),
+        ),
+        (
+            km.errors.ShapeError,
             r"reference has shape \(0,\), expected \(2,\)",
             lambda: km.KoopmanMPC(model, cost)([0, 0], []),
         ),
