@@ -298,6 +298,19 @@ def test_check_looks_for_the_file_before_it_plans_its_loops(call):
     assert "missing.npz does not exist" in missed.stderr
 
 
+def test_check_takes_a_folder_of_logs_of_the_plant_and_says_if_it_holds_none(call, tmp_path):
+    (tmp_path / "controller.npz").write_bytes(b"")
+    (tmp_path / "plant").mkdir()
+    refused = call("check", str(tmp_path / "controller.npz"), "--on-plant", str(tmp_path / "plant"))
+    assert refused.exit_code == 2
+    assert "it holds nothing" in " ".join(refused.stderr.split())
+
+
+@pytest.mark.parametrize("word", ["Q_N", "worst run", "certificate", "steps without a good status"])
+def test_the_words_of_a_check_and_of_its_promise_are_explained(call, word):
+    assert call("explain", *word.split()).exit_code == 0
+
+
 def test_a_case_is_explained_with_what_controllers_are_not_told(call, tmp_path):
     said = " ".join(call("explain", "pendulum:hold").stdout.split())
     assert "pendulum:hold is a case of pendulum: from the state (0.7854, 0) to the reference (0.8, 0), 10 s." in said

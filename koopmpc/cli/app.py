@@ -219,7 +219,8 @@ def check(
         float, typer.Option("--rate", help="Wished bound on the share of failing loops; it says how many are run.")
     ] = 0.05,
     on_plant: Annotated[
-        Path | None, typer.Option("--on-plant", help="A log of this controller on its plant, an episode a run.")
+        Path | None,
+        typer.Option("--on-plant", help="Logs of this controller on its plant, an episode a run: a file or a folder."),
     ] = None,
     logs: Logs = Path("logs"),
 ) -> None:
@@ -227,6 +228,7 @@ def check(
 
     Exit code 0: the goal is kept. 1: it is not. 3: the logs do not show whether it is.
     """
+    from koopmpc.data.files.folder import list_files
     from koopmpc.data.files.load import load_episodes
     from koopmpc.disk import existing
     from koopmpc.fitting.changed import read_new_logs
@@ -236,7 +238,7 @@ def check(
     with friendly():
         existing(controller, "pass the .npz of a saved Controller or Design")
         say(plan_verdict(rate))
-        seen = None if on_plant is None else load_episodes(on_plant)
+        seen = None if on_plant is None else load_episodes(*list_files(on_plant))
     with friendly(), folder_of(logs, "check") as folder, bar("runs") as progress:
         logged = None if not new else read_new_logs(controller, new)
         done = check_controller(
@@ -413,6 +415,16 @@ TERMS: dict[str, str] = {
     "stand-in": (
         "A model of the plant from the same logs that the controller's own model does not know; it takes the plant's "
         "place in tests. Where the logs are blind, so is it."
+    ),
+    "Q_N": "The weight of the error at the end of the horizon; Q_N = Q is that of every other step.",
+    "worst run": "The closed loop in which a controller's cost is the largest multiple of the best one's in that loop.",
+    "certificate": (
+        "A checked statement that the loop with the learned model is stable at the reference, from logs that the model "
+        "has not seen; it says for which starts and errors, and nothing beyond them."
+    ),
+    "steps without a good status": (
+        "Steps whose solve did not end as asked, whose fallback acted, or whose measurement was missing (NaN). "
+        "Where a fault of the run causes them, the goal can be kept all the same."
     ),
     "surrogate": "Another word for a stand-in of the plant.",
     "corners": "The ends of the range of starts in the goal, at which loops begin that the logs may never have shown.",

@@ -326,7 +326,9 @@ def _write_readme(tables: Tables, measured: tuple[int, int, int] | None, precisi
         ""
         if tables.is_lqr or tables.is_staged
         else 'A bound on the worst step comes from the iterations: export a controller with `solver="daqp", '
-        'settings={"iter_limit": 100}`.\n'
+        'settings={"iter_limit": 100}`. Of a saved controller c (`design.controller`): `saved = c.as_data()`, then '
+        '`type(c).from_data(dataclasses.replace(saved, options={**saved.options, "solver": "daqp", "settings": '
+        '{"iter_limit": 100}}))`.\n'
     )
     dt, state_names, input_names = model.dt, ", ".join(model.states), ", ".join(model.inputs)
     return f"""# {tables.program.controller} in C99

@@ -173,11 +173,13 @@ _VERDICTS = {
 
 
 def _explain_cost(checked: Checked) -> str:
-    steps = checked.cost_steps
+    steps, figures = checked.cost_steps, checked.figures
     return (
         f"A cost is the sum over the first {steps} steps ({format_duration(steps * checked.dt)}) of a run. That of the "
         "design is over as many, from other starts and on other stand-ins. Of a run of your own, compare the first "
         f"{steps} steps: km.metrics(run.take_first({steps})).cost."
+        + " A step whose measurement is missing has no good status, too."
+        * any(f.bad and f.kind.faults for f in figures)
     )
 
 

@@ -25,6 +25,7 @@ from koopmpc.identify.records.state_space import fit_hidden
 from koopmpc.identify.records.structure import Structure, solve_structure
 from koopmpc.identify.regression import Regression, build_regression
 from koopmpc.identify.solve import BilinearColumns, solve_path
+from koopmpc.lifting.base import strip_unit
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.text import with_unit
@@ -134,7 +135,9 @@ def smooth_data(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple
         for name, size, found in zip(held.states, smoother.noise, smoother.is_noisy, strict=True)
         if found
     )
-    note = f"the measurements hold noise (standard deviations): {told}; models are of smoothed states"
+    quiet = [strip_unit(name) for name, found in zip(held.states, smoother.is_noisy, strict=True) if not found]
+    others = f"; that of {', '.join(quiet)} is too small to tell" if quiet else ""
+    note = f"the measurements hold noise (standard deviations): {told}{others}; models are of smoothed states"
     return *_apply_change(source, held, smoother), (note,), smoother.noise
 
 

@@ -329,7 +329,7 @@ def test_what_several_files_share_is_one_sentence_that_names_them(tmp_path: Path
     targets, unequal = (str(one.message) for one in caught)
     assert targets == (
         f"12 files ({files[0]} to run_11.csv): 'level setpoint' is a set point of a controller by its name, and left "
-        "out; name it among inputs or states to use it"
+        "out; a fit with --goal follows it: --set-point"
     )
     assert unequal.startswith(
         "sampling is unequal in 12 files, interpolated to 1 s; steps that differ by more than 2 %"

@@ -362,7 +362,7 @@ def test_the_template_is_a_goal_file_with_the_ranges_of_the_logs(tmp_path):
     assert "steps of 0.1 s" in text
     (line,) = (line for line in text.splitlines() if line.startswith("horizon = "))
     assert line.count(" s ") == 1  # the sample time alone: a product would stay behind when the number is changed
-    assert "The horizon is about the time in which the plant settles" in text
+    assert "half of the time in which the closed loop is to settle" in text
     assert "A weight says what an error costs" in text
 
 

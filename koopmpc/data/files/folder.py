@@ -54,7 +54,7 @@ class Files(Source):
     ) -> None:
         if reader is not None and reading:
             raise DataError(f"a reader of your own is given no {', '.join(reading)}; bind them with partial")
-        self.files = _list_files(paths)
+        self.files = list_files(paths)
         self._reader = partial(load_episodes, **reading) if reader is None else reader
         self._reading = None if reader is not None else reading
         cut = self._cut(self.files[0], 0, None)
@@ -116,7 +116,7 @@ def _read_folder(file: Path, reader: EpisodesReader) -> Episodes:
         raise type(error)(f"{file}: {error}") from error
 
 
-def _list_files(paths: str | PathLike[str] | Iterable[str | PathLike[str]]) -> tuple[Path, ...]:
+def list_files(paths: str | PathLike[str] | Iterable[str | PathLike[str]]) -> tuple[Path, ...]:
     """Return the files, those of a folder by name."""
     if is_frame(paths):
         raise DataError("a DataFrame is in memory, and no file; pass km.load_episodes(frame) to the fit")

@@ -160,7 +160,7 @@ def _say_set_points(names: Sequence[str]) -> str:
     listed = " and ".join(filter(None, [", ".join(map(repr, names[:-1])), repr(names[-1])]))
     what, them = ("is a set point", "it") if len(names) == 1 else ("are set points", "them")
     by = "by its name" if len(names) == 1 else "by their names"
-    return f"{listed} {what} of a controller {by}, and left out; name {them} among inputs or states to use {them}"
+    return f"{listed} {what} of a controller {by}, and left out; a fit with --goal follows {them}: --set-point"
 
 
 def _rename_columns(table: LogTable, told: TableSettings, where: str) -> LogTable:

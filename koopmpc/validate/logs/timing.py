@@ -101,7 +101,8 @@ class InputTiming(Value):
         """Return a sentence."""
         name = strip_unit(self.input)
         if self.timing is Timing.UNKNOWN:
-            return f"cannot say whether {name} acts within its own row: {self.why}"
+            late = "if you know that its column is a row late, move it one row up"
+            return f"cannot say whether {name} acts within its own row: {self.why}; {late}"
         return f"{name} {self.timing.value}: {self.why}"
 
 

@@ -21,6 +21,7 @@ _STUCK_ROWS = 12  # a sensor is stuck if it repeats a number for this many rows
 _LIMIT_ROWS = 8  # a sensor is at its limit if at least this many rows have the same extreme value
 _REST = 0.1  # a constant state is at rest if the one-step law predicts it to this share of a usual change
 _OVERLAP = 10  # two episodes repeat one another if they share this many successive rows
+_NEAR_STEPS = 3  # rows that change by at most so many steps of a display say how many repeat by chance
 _FAR = 3.0  # a spike is larger than this many times the largest usual change
 _JUMP = 1.5  # a jump is larger than this many times the largest usual change from row to row
 _OFF = 10.0  # at a jump the residual is larger than this many times the largest usual residual
@@ -241,12 +242,16 @@ def find_held_samples(log: Log) -> Iterator[LogFault]:
     places: list[Place] = []
     travels: list[float] = []
     smooth, limits = _find_smoothest_state(log, live), find_sensor_limits(log)
+    by_chance, again = _repeat_by_chance(log, live), 0
     for e, episode in enumerate(log.data):
         X, U = episode.X, episode.U
         same = (np.diff(X[:, live], axis=0) == 0).all(axis=1)
         for a, b in find_stretches(same):
             if b >= len(U) or a == 0 or all(X[a, i] in limits.get(i, ()) for i in live):  # sensors at their limits
                 continue
+            if by_chance and b - a == 1:
+                continue
+            again += np.array_equal(U[b - 1], U[b])
             contradiction = np.array_equal(U[b - 1], U[b]) or (np.ptp(U[a:b], axis=0) > 0).any()
             if contradiction or not episode.U.shape[1] or b - a == 1:
                 places.append(Place(e, a + 1, b + 1))
@@ -260,7 +265,7 @@ def find_held_samples(log: Log) -> Iterator[LogFault]:
     if not places or (len(places) < 3 and max(lengths) < 3):
         return
     rows, longest, where = sum(lengths), max(lengths), list_places(tuple(places))
-    if longest > 2 or not travels or float(np.median(travels)) > 0.72:
+    if longest > 2 or not travels or float(np.median(travels)) > 0.72 or 2 * again < len(places):
         yield LogFault(
             "held samples",
             f"no sensor moves in {rows} rows, up to {longest} in sequence, though the plant does: {where}",
@@ -274,6 +279,29 @@ def find_held_samples(log: Log) -> Iterator[LogFault]:
             "drop the second of each pair",
             places=tuple(places),
         )
+
+
+def _repeat_by_chance(log: Log, live: list[int]) -> bool:
+    """Return True if about as many rows repeat the row before them as change by any other few steps of the display.
+
+    The step is that of the decimals in which the repeated values are written, after an interpolation too.
+    """
+    changes = log.changes[:, live]
+    same = (changes == 0).all(axis=1)
+    repeated = np.concatenate([e.X[1:, live] for e in log.data])[same]
+    steps = np.array([_find_decimal_step(column) for column in repeated.T])
+    near = int((np.abs(changes) < (_NEAR_STEPS + 0.5) * steps).all(axis=1).sum() - same.sum())
+    expected = near / ((2 * _NEAR_STEPS + 1) ** len(live) - 1)
+    return bool(same.sum() <= expected + 3 * np.sqrt(expected))
+
+
+def _find_decimal_step(values: np.ndarray) -> float:
+    """Return the power of ten of which all values are multiples, at least 1e-12."""
+    rounding = 4e-16 * np.abs(values).max(initial=0.0)
+    for digits in range(12):
+        if np.abs(np.round(values, digits) - values).max(initial=0.0) < 1e-9 * 10.0**-digits + rounding:
+            return 10.0**-digits
+    return 1e-12
 
 
 def _find_smoothest_state(log: Log, among: list[int]) -> int:

@@ -177,3 +177,17 @@ def test_the_corpus_varies_what_it_claims_to():
     assert {of.bed for of in drawn} == set(BEDS)
     assert len({of.drive for of in drawn}) == 5
     assert {of.noise for of in drawn} == {0.0, 1e-4, 1e-3, 5e-3, 2e-2}
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_noisy_level_of_two_decimals_repeats_by_chance_and_a_row_written_twice_is_found(again):
+    rng = np.random.default_rng(4)
+    X, U = [2.0], rng.uniform(-1, 1, (900, 1))
+    for u in U:
+        X.append(0.9 * X[-1] + 0.5 * u[0])
+    x = np.array(X) if again else np.round(X + 0.1 * rng.standard_normal(901), 2)
+    assert again or np.count_nonzero(np.diff(x) == 0) > 5
+    order = np.sort(np.r_[np.arange(901), np.arange(50, 850, 40)]) if again else np.arange(901)
+    told = str(km.validate.audit(km.Episodes([km.Episode(X=x[order][:, None], U=U[order[:-1]])], dt=1.0)))
+    assert ("rows twice" in told) is again
+    assert "held samples" not in told
