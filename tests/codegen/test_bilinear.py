@@ -404,3 +404,19 @@ def test_targets_that_a_jump_of_w_moves_to_other_limits_are_those_of_python():
             np.testing.assert_allclose(quick.u, slow.u, rtol=0, atol=1e-6)
             used.append(slow.u)
     np.testing.assert_allclose(used[-2], [-1.032, -0.871], atol=1e-3)  # not where no target was found, [-.099, -.027]
+
+
+def test_a_target_that_w_takes_off_a_limit_is_found_in_c_as_in_python():
+    """Close to the w that frees the input, no piece of the way settled in 40 steps: ipopt found it, and C nothing."""
+    A, B = np.array([[0.27, -0.63], [0.26, 0.08]]), np.array([[-1.11], [0.0]])
+    N, P, S = ([[-0.25, -0.02], [0.16, 0.03]], [[-0.03], [-0.38]], [[0.13, -0.13], [-0.06, 0.08]])
+    x, u, w = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("w")
+    f = A @ x + B @ u + np.array([[0.4], [0.23]]) @ w + u * (ca.DM(N) @ x) + w * (ca.DM(P) @ u + ca.DM(S) @ x)
+    plant = km.StepMap(ca.Function("F", [x, u, w], [f]), 0.1)
+    controller = km.BilinearMPC(plant, km.Cost(Q=[0.17, 0.9], R=0.11), km.Limits(u_min=-1.43, u_max=1.19), 6)
+    fast = km.compiled(controller)
+    for W in (0.0, -0.32):
+        for _ in range(3):
+            slow, quick = (one([-0.78, -0.18], [0.96, -1.07], w=[W]) for one in (controller, fast))
+            assert quick.status is slow.status
+            np.testing.assert_allclose(quick.u, slow.u, rtol=0, atol=1e-6)

@@ -243,7 +243,7 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
   (void)w;
   scaled(x, u, s);
   koopmpc_copy(held_now, active, LIMITS);
-  for (int pass = 0; pass < (careful ? SHORTENED : NEWTON); pass++) {
+  for (int pass = 0; pass < (careful ? careful * SHORTENED : NEWTON); pass++) {
     koopmpc_real at[KOOPMPC_LOCAL], E[MOST_ROWS * SIZE], kept[MOST_ROWS * SIZE], gain[SIZE * MOST_ROWS], null[SIZE * SIZE];
     koopmpc_real W[LEFT * SIZE], back[SIZE * LEFT], left[LEFT], missed[MOST_ROWS], step[SIZE], rows[LIMITS * SIZE];
     koopmpc_real value[LIMITS], here[NX], input[NV], reach, pull[LEFT], turned[SIZE], least_pull = 0;

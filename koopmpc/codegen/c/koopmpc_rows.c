@@ -17,6 +17,7 @@ enum {
   ROW = KOOPMPC_NR,
   TAILED = KOOPMPC_GOAL - KOOPMPC_NR, /* entries of the tail's state: x, and the last input where its changes are weighed */
   HALVINGS = 40,                      /* pieces of the line between two rows, at most */
+  PATIENCE = 5,                       /* times as many steps at its end, where the pieces lead nowhere else */
   RESTING = TAILED < 50 ? TAILED : 50 /* steps for which a gain that has settled must rest */
 };
 
@@ -77,7 +78,7 @@ static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc
       stride /= 2;
     }
   }
-  return 0;
+  return careful && koopmpc_near(x, u, active, row, w, none, KOOPMPC_HELD, PATIENCE);
 }
 
 /** du/de of an equilibrium without active limits. */

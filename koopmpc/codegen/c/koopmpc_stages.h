@@ -98,7 +98,8 @@ int koopmpc_inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_re
 /**
  * Gauss-Newton steps to the equilibrium of a row, of w where that multiplies x or u, and of a disturbance e: a violated
  * limit is added, one with a wrong sign released. The last step is at most a share `enough` of (x, u); 0, and nothing
- * written, if they fail. `careful` steps end at the first limit, and are shorter where they would swing.
+ * written, if they fail. `careful` steps end at the first limit, and are shorter where they would swing; there may be
+ * `careful` times as many.
  */
 int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *w,
                  const koopmpc_real *e, koopmpc_real enough, int careful);

@@ -41,6 +41,7 @@ _QUIET = {
 }
 _NEWTON = 20  # whole Gauss–Newton steps, at most
 _SHORTENED = 40  # Gauss–Newton steps that may be shorter, at most
+_PATIENCE = 5  # times as many at the end of a way in pieces that leads nowhere else
 _BENT = 0.25  # where the cost bends by more than this share beyond its Gauss–Newton part, steps are shorter
 _LEAST = 0.05  # shortest length of such a step, 1 being the longest
 _PIECES = 40  # pieces of the way from w = 0 to a measured disturbance, at most
@@ -242,13 +243,14 @@ class Equilibria:
         enough: float = SETTLED,
         *,
         careful: bool = False,
+        patience: int = 1,
     ) -> Equilibrium | None:
         """Return the equilibrium by Gauss–Newton steps from `begin`, None where they do not lead to one.
 
         The limits that are active at `begin` are held. A limit that is broken is added, and one whose multiplier has
         the wrong sign is released. The last step is at most `enough` of the size of (x, u). `careful` steps end at the
         first limit that they would break, and where they would swing, as far from a row that cannot be reached, they
-        are as short as Barzilai and Borwein's.
+        are as short as Barzilai and Borwein's; there may be `patience` times as many.
         """
         (nx, nu), size, sizes = (self.model.nx, self.model.nu), self.size, self._limit_size
         s, active = np.concatenate([begin.x, begin.u]) / size, begin.active.copy()
@@ -256,7 +258,7 @@ class Equilibria:
         limited[:nu, nx:] = np.eye(nu)
         low, high = self._low / sizes, self._high / sizes
         before: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]] | None = None  # steps, while limits stay
-        for _ in range(_SHORTENED if careful else _NEWTON):
+        for _ in range(patience * _SHORTENED if careful else _NEWTON):
             x, u = np.split(s * size, [nx])
             try:
                 at = self.linearise(x, u)
@@ -644,6 +646,10 @@ class TerminalTargets:
                 begin, done, stride = found, share, 2 * stride
                 if done == 1:
                     return found
+            equilibria.update(self._map.at(self._w))
+            found = equilibria.near(begin, row, nothing, careful=True, patience=_PATIENCE)
+            if found is not None:
+                return found
         finally:
             equilibria.update(self._map.at(self._w))
         return self._polish(equilibria.find(row), row)
