@@ -1,5 +1,7 @@
 """Station switches without a bump; PID by its laws; a plain function wherever a controller is."""
 
+import os
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -389,6 +391,11 @@ def test_an_object_with_a_step_of_its_own_is_a_law_as_a_function_is():
     own.dt = 0.2
     with pytest.raises(km.errors.DataError, match=r"the controller has dt = 0\.2 s, the plant 0\.1 s"):
         km.simulate(plant, own, x0=[0], reference=[1.0], steps=2)
+
+
+@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+def test_an_object_whose_step_is_a_word_is_refused():
+    plant, own = km.black_box(lambda x, u: 0.9 * x + u, dt=0.1, states=["x"], inputs=["u"]), OwnLaw()
     own.dt = "fast"
     with pytest.raises(km.errors.DataError, match="dt of the controller"):
         km.simulate(plant, own, x0=[0], reference=[1.0], steps=2)

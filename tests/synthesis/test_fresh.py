@@ -1,5 +1,6 @@
 """Fresh loops: exact bounds, a stand-in by nearest rows, and what a design says of places without data."""
 
+import os
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -381,6 +382,7 @@ class CountedPool:
         return [LoopResult(cost, 0.1 if every and i % every == 0 else 0.0, run=True) for i in loops]
 
 
+@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
 def test_a_finalist_that_is_safer_or_two_percent_cheaper_takes_the_place_of_the_chosen_one(monkeypatch):
     def prefer(*figures):
         made = []

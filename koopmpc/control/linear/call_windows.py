@@ -111,7 +111,7 @@ class CallWindows:
         rows = self._hold(limits, end, nu)
         if limits.du_min is None and rows is not None:
             mirrored = self._hold(limits, "du_max", nu)
-            rows = None if mirrored is None else mirrored if j else -mirrored
+            rows = None if mirrored is None else mirrored if j else np.asarray(-mirrored)
         return _write(self._sides[:, j, nu : 2 * nu], rows)
 
     def _find_reach(self, low: Float[np.ndarray, " nl"], high: Float[np.ndarray, " nl"]) -> float:

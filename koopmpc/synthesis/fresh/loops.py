@@ -244,7 +244,7 @@ def is_preferable(one: Sequence[LoopResult], other: Sequence[LoopResult], cheape
         if many - few >= DIFFERENT * len(mine) and bdtr(few, few + many, 0.5) <= CHANCE:
             return better > worse
     change, error = _compare_costs(one, other)
-    return change < cheaper and np.log(change) < -3 * error
+    return change < cheaper and bool(np.log(change) < -3 * error)
 
 
 def _compare_costs(one: Sequence[LoopResult], other: Sequence[LoopResult]) -> tuple[float, float]:
