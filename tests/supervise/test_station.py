@@ -1,7 +1,5 @@
 """Station switches without a bump; PID by its laws; a plain function wherever a controller is."""
 
-import os
-
 import numpy as np
 import pytest
 import scipy.signal
@@ -9,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
+from tests.bare import shown
 
 
 def model_of(A, B):
@@ -393,9 +392,13 @@ def test_an_object_with_a_step_of_its_own_is_a_law_as_a_function_is():
         km.simulate(plant, own, x0=[0], reference=[1.0], steps=2)
 
 
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
 def test_an_object_whose_step_is_a_word_is_refused():
-    plant, own = km.black_box(lambda x, u: 0.9 * x + u, dt=0.1, states=["x"], inputs=["u"]), OwnLaw()
-    own.dt = "fast"
-    with pytest.raises(km.errors.DataError, match="dt of the controller"):
-        km.simulate(plant, own, x0=[0], reference=[1.0], steps=2)
+    code = """
+class Law:
+    dt = "fast"
+    def __call__(self, y, r):
+        return [0.0]
+plant = km.black_box(lambda x, u: 0.9 * x + u, dt=0.1, states=["x"], inputs=["u"])
+show(lambda: km.simulate(plant, Law(), x0=[0], reference=[1.0], steps=2))
+"""
+    assert shown(code)[0].startswith("DataError dt of the controller")

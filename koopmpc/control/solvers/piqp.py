@@ -54,18 +54,17 @@ class PIQP(QPSolver):
 
     def _setup(self) -> None:
         qp = self._qp
-        stages = qp.stages if isinstance(qp, StepQP) else None
-        if stages is None or not isinstance(qp, StepQP):
-            P, rows, model = qp.P, scipy.sparse.csc_matrix(qp.A), np.zeros((0, len(qp.q)))
-            self._gradient = qp.q
-        else:
+        if isinstance(qp, StepQP) and (stages := qp.stages) is not None:
             P, rows, model = stages.cost(), stages.limits(qp.source, qp.scale), stages.dynamics()
-            self._gradient = np.zeros(P.shape[0])
+            gradient = np.zeros(P.shape[0])
+        else:
+            stages, P, rows, model = None, qp.P, scipy.sparse.csc_matrix(qp.A), np.zeros((0, len(qp.q)))
+            gradient = qp.q
         self._stages, self._count = stages, model.shape[0]
         self._split(rows.tocsr())
         rows = rows.tocsr()[self._others]
         A = ca.DM(scipy.sparse.vstack([scipy.sparse.csc_matrix(model), rows]).tocsc())
-        H, gradient = ca.DM(scipy.sparse.csc_matrix(P)), self._gradient
+        H = ca.DM(scipy.sparse.csc_matrix(P))
         shape = {"h": H.sparsity(), "a": A.sparsity()}
         options = {"piqp": {**DEFAULTS, **self._settings}, "error_on_fail": False}
         unknown = set(self._settings) - self.setting_names()
