@@ -222,21 +222,30 @@ def count(value: int, name: str, least: int = 1) -> int:
     return int(value)
 
 
+def article(value: object) -> str:
+    """Return the name of the value's class with its article: a dict, an int."""
+    return _article(type(value).__name__)
+
+
+def _article(name: str) -> str:
+    return f"{'an' if name[0] in 'AEIOaeio' else 'a'} {name}"
+
+
 def members(value: object, name: str, needed: Sequence[str], advice: str) -> None:
     """Raise where `value` lacks an attribute or a method that it needs, or is a class that has them."""
     if isinstance(value, type):
         raise DataError(f"{name} is the class {value.__name__}; pass one that was made of it")
     missing = [member for member in needed if not hasattr(value, member)]
     if missing:
-        raise DataError(f"{name} is a {type(value).__name__} and has no {', '.join(missing)}; {advice}")
+        raise DataError(f"{name} is {article(value)} and has no {', '.join(missing)}; {advice}")
 
 
 def kind(value: object, name: str, wanted: type | tuple[type, ...], advice: str) -> None:
     """Raise where `value` is of another class than `wanted`."""
     if not isinstance(value, wanted):
         classes = wanted if isinstance(wanted, tuple) else (wanted,)
-        names = " or a ".join(each.__name__ for each in classes)
-        raise DataError(f"{name} is a {type(value).__name__}, expected a {names}; {advice}")
+        names = " or ".join(_article(each.__name__) for each in classes)
+        raise DataError(f"{name} is {article(value)}, expected {names}; {advice}")
 
 
 def takes(function: Callable[..., object], name: str, count: int, advice: str) -> None:

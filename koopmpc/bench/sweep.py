@@ -1,16 +1,17 @@
 """sweep: problems × controllers × starts × seeds × noise × wrong parameters × faults, into a store that survives."""
 
+import json
 import pickle
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from functools import lru_cache, partial
 from itertools import groupby, islice, product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 from uuid import uuid4
 
 import numpy as np
@@ -21,11 +22,11 @@ from koopmpc.bench.problem import Problem, load_problem
 from koopmpc.bench.single import FAULTS, log_run, measure_run
 from koopmpc.bench.store import RESULTS, ROWS, Journal, RunRow, load_rows, next_batch, open_sweep, write_results
 from koopmpc.control.limits import Limits
-from koopmpc.errors import ProblemError
+from koopmpc.errors import DataError, ProblemError
 from koopmpc.loop.run import Run
 from koopmpc.parallel import map_tasks
 from koopmpc.recording.viewer import find_viewer, why_none
-from koopmpc.values import fingerprint
+from koopmpc.values import fingerprint, to_data
 
 MODELS = "models"  # beside the logs: what was learned
 _BATCHES = 40  # give each worker about this many batches
@@ -243,9 +244,22 @@ def possible_faults(limits: Limits) -> tuple[str, ...]:
 def _print_of(problem: Problem) -> dict[str, Any]:
     """Return what tells one problem from another, and how to load it again."""
     file = Path(problem.file) if problem.file else None
-    text = repr((problem.dynamics, problem.dt, problem.horizon, problem.cost, problem.limits)).encode()
-    content = file.read_bytes() if file is not None and file.is_file() else text
+    content = file.read_bytes() if file is not None and file.is_file() else json.dumps(_tree_of(problem)).encode()
     return {"file": problem.file, "cases": list(problem.cases), "sha256": fingerprint(content)}
+
+
+def _tree_of(value: Any) -> Any:
+    """Return every number and name that a value holds, the same in each process."""
+    try:
+        return to_data(value)
+    except DataError:
+        if isinstance(value, Mapping):
+            return [[str(key), _tree_of(item)] for key, item in cast("Mapping[Any, Any]", value).items()]
+        if isinstance(value, tuple | list):
+            return [_tree_of(item) for item in cast("Sequence[Any]", value)]
+        if is_dataclass(value):
+            return [type(value).__qualname__, *(_tree_of(getattr(value, part.name)) for part in fields(value))]
+        return getattr(value, "__qualname__", type(value).__qualname__)
 
 
 def _sendable(problem: Problem) -> bytes | str:

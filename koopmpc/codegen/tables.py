@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc import checks
 from koopmpc.codegen import tolerances
 from koopmpc.control.limits import Interval
 from koopmpc.control.linear.condensed_program import BoundsProgram, CondensedProgram
@@ -163,7 +164,7 @@ def make_tables(program: StepProgram, *, single: bool) -> Tables:
             _add_staged(tables, program, single=single)
         case _:
             raise DataError(
-                f"there is no C code for a {type(program).__name__}; make a FeedbackProgram or a CondensedProgram"
+                f"there is no C code for {checks.article(program)}; make a FeedbackProgram or a CondensedProgram"
             )
     return tables
 

@@ -326,7 +326,7 @@ class MPCBase(Published):
             raise DataError("the controller's model is a StepMap, which is code and cannot be saved; fit a predictor")
         if not isinstance(self._estimator, Value | None):
             raise DataError(
-                f"a {type(self._estimator).__name__} is not an estimator of koopmpc and cannot be saved as data"
+                f"{checks.article(self._estimator)} is not an estimator of koopmpc and cannot be saved as data"
             )
         return SavedController(
             kind,

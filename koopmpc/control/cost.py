@@ -639,11 +639,11 @@ def check_cost_and_limits(
         One is something else, perhaps the other; or names a signal that the plant does not have.
     """
     if not isinstance(cost, Cost):
-        raise DataError(f"cost is a {type(cost).__name__}; pass a Cost, and the Limits after it")
+        raise DataError(f"cost is {checks.article(cost)}; pass a Cost, and the Limits after it")
     if limits is None:
         limits = Limits()
     elif not isinstance(limits, Limits):
-        raise DataError(f"limits is a {type(limits).__name__}; pass Limits, or None for none")
+        raise DataError(f"limits is {checks.article(limits)}; pass Limits, or None for none")
     if callable(cost.stage) or any(isinstance(v, Mapping) for v in (*vars(cost).values(), *vars(limits).values())):
         cost, limits = cost.resolve(states, inputs), limits.resolve(states, inputs)
     return _drop_constant_rows(cost, states, inputs), limits

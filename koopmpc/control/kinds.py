@@ -114,4 +114,4 @@ def kind_for(model: LinearPredictor | BilinearPredictor) -> ControllerKind:
     for kind in list_kinds().values():
         if kind.designed_for is not None and isinstance(model, kind.designed_for):
             return kind
-    raise DataError(f"no controller is registered for the design on a {type(model).__name__}")
+    raise DataError(f"no controller is registered for the design on {checks.article(model)}")

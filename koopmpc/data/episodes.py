@@ -73,7 +73,7 @@ def find_lines(file: str, numbers: Sequence[int]) -> tuple[str, list[int]]:
 
     Rows count from 1, below comments, the names of columns where there are any, and empty lines.
     """
-    if not file.endswith(".csv") or not Path(file).is_file():
+    if not file.lower().endswith(".csv") or not Path(file).is_file():
         return "row", list(numbers)
     with Path(file).open(newline="", encoding="utf-8-sig", errors="replace") as stream:
         lines = csv.reader(stream)
@@ -219,12 +219,12 @@ class Episodes(Named, Value):
         disturbances: Sequence[str] | None = None,
     ) -> None:
         if not isinstance(cast(object, episodes), Sequence):
-            raise DataError(f"episodes is a {type(episodes).__name__}; pass a list of Episode(X=…, U=…)")
+            raise DataError(f"episodes is {checks.article(episodes)}; pass a list of Episode(X=…, U=…)")
         if not episodes:
             raise DataError("there is no episode; pass at least one")
         for i, episode in enumerate(episodes):
             if not isinstance(cast(object, episode), Episode):
-                raise DataError(f"episode {i} is a {type(episode).__name__}; pass Episode(X=…, U=…)")
+                raise DataError(f"episode {i} is {checks.article(episode)}; pass Episode(X=…, U=…)")
         nx, nu, nw = episodes[0].X.shape[1], episodes[0].U.shape[1], episodes[0].W.shape[1]
         for i, episode in enumerate(episodes):
             if len(episode) < 1:

@@ -318,7 +318,7 @@ class Feedback(Excitation):
         u_max: ArrayLike = np.inf,
     ) -> None:
         if hasattr(K, "K"):
-            raise DataError(f"K is a {type(K).__name__}; pass its matrix, gain.K")
+            raise DataError(f"K is {checks.article(K)}; pass its matrix, gain.K")
         gain = checks.array(K, "K", (None, None))
         if noise is not None:
             checks.members(noise, "noise", ("nu", "start"), "pass an excitation, such as Noise(-1, 1), or None")

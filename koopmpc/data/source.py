@@ -7,6 +7,7 @@ from functools import partial
 from itertools import chain
 from typing import cast
 
+from koopmpc import checks
 from koopmpc.data.episodes import Episodes, PlantSignature, explain_wrong_data, join_sets, name_drives
 from koopmpc.errors import DataError
 from koopmpc.values import Named
@@ -178,7 +179,7 @@ class Stream(Source):
 
     def __init__(self, sets: Iterable[Episodes]) -> None:
         if not isinstance(cast(object, sets), Iterable):
-            raise DataError(f"the stream is a {type(sets).__name__}; pass an iterable of Episodes")
+            raise DataError(f"the stream is {checks.article(sets)}; pass an iterable of Episodes")
         again = iter(sets)
         replayable = again is not sets
         first = next(again, None)
@@ -218,7 +219,7 @@ class Stream(Source):
 def _set(given: object, place: str) -> Episodes:
     if isinstance(given, Episodes):
         return given
-    raise DataError(f"{place} is a {type(given).__name__}; pass Episodes([Episode(X=…, U=…)], dt)")
+    raise DataError(f"{place} is {checks.article(given)}; pass Episodes([Episode(X=…, U=…)], dt)")
 
 
 def _place(start: int, count: int) -> str:

@@ -107,7 +107,7 @@ def build_output(dynamics: Dynamics) -> tuple[ca.Function, tuple[str, ...]]:
 def _check_expression(value: object, name: str, known: ca.SX, rows: int | None = None) -> ca.SX:
     """Return the value as a dense column; raise if it is not an expression, or holds symbols other than `known`."""
     if not isinstance(value, ca.SX | ca.DM):
-        raise DataError(f"{name} returned a {type(value).__name__}; return one column, ca.vertcat(...)")
+        raise DataError(f"{name} returned {checks.article(value)}; return one column, ca.vertcat(...)")
     column = ca.SX(value)
     if column.size2() != 1 or (rows is not None and column.size1() != rows):
         expected = f"({rows}, 1), one row a state" if rows is not None else "one column"

@@ -215,7 +215,7 @@ def black_box(
     """
     for function, name in ((step, "step"), (measure, "measure")):
         if function is not None and not callable(function):
-            raise DataError(f"{name} is a {type(function).__name__}; pass a function")
+            raise DataError(f"{name} is {checks.article(function)}; pass a function")
     if (measure is None) != (outputs is None):
         raise DataError("measure and outputs belong together: pass the function and the names of y, or neither")
     states, inputs = checks.texts(states, "states"), checks.texts(inputs, "inputs")

@@ -59,7 +59,7 @@ def load_value(path: str | Path, *kinds: type[V]) -> V:
     except (OSError, ValueError) as error:
         raise LogError(f"{path} is damaged, or koopmpc did not save it: {error}; {advice}") from error
     if not isinstance(value, kinds):
-        raise LogError(f"{path} holds a {type(value).__name__}, not a {wanted}")
+        raise LogError(f"{path} holds {checks.article(value)}, not a {wanted}")
     return value
 
 

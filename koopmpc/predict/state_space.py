@@ -47,7 +47,7 @@ def read_state_space(
     if not is_state_space(system) and hasattr(system, "to_ss"):
         system = system.to_ss()
     if not is_state_space(system):
-        raise DataError(f"system is a {type(system).__name__}; pass scipy.signal.StateSpace or control.ss")
+        raise DataError(f"system is {checks.article(system)}; pass scipy.signal.StateSpace or control.ss")
     A, B, C, D = (checks.array(getattr(system, name), name, (None, None)) for name in _MATRICES)
     if D.any():
         raise DataError("D is not zero: the input acts on the output of its own step, and a predictor has none of that")

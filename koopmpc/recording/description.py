@@ -12,6 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from koopmpc import checks
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Fallback, Status
@@ -119,7 +120,7 @@ def from_json(text: str) -> tuple[About, int | None]:
     except (ValueError, KeyError, TypeError) as error:
         raise LogError(f"the description is damaged: {error}") from error
     if not isinstance(about, About):
-        raise LogError(f"the description holds a {type(about).__name__} in place of the description of a run")
+        raise LogError(f"the description holds {checks.article(about)} in place of the description of a run")
     return about, steps
 
 

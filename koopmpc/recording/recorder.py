@@ -138,7 +138,7 @@ class Recorder:
         if path is None and not live:
             raise DataError("a Recorder needs somewhere to write: pass a path, live=True, or both")
         if not isinstance(cast(object, metadata), Mapping | None):
-            raise DataError(f"metadata is a {type(metadata).__name__}; pass names with numbers and texts")
+            raise DataError(f"metadata is {checks.article(metadata)}; pass names with numbers and texts")
         self._about = About(
             cost=cost,
             limits=limits,

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from koopmpc import checks
 from koopmpc.errors import DataError
 from koopmpc.loop.run import About, StepRows, bind_outputs
 from koopmpc.scene import Box, Color, Disk, Line, Scene, Shape
@@ -214,7 +215,7 @@ class Names:
         for shape in scene:
             if (kind := self.kind(shape.name)) not in (None, type(shape)):
                 raise DataError(
-                    f"the scene of step {step} draws {shape.name!r} as a {type(shape).__name__} and as a "
+                    f"the scene of step {step} draws {shape.name!r} as {checks.article(shape)} and as a "
                     f"{kind.__name__}; in space a name stands for one kind of shape"
                 )
         return list(scene)

@@ -73,7 +73,7 @@ class Guarded(Published):
         options: dict[str, Any] = {"patience": self._patience, "region": self._watch is not None}
         for name, part in (("controller", self.controller), ("standby", self.standby)):
             if not isinstance(part, Published):
-                raise DataError(f"a {type(part).__name__} is not a controller of koopmpc and cannot be saved as data")
+                raise DataError(f"{checks.article(part)} is not a controller of koopmpc and cannot be saved as data")
             options[name] = part.as_data()
         return SavedController("Guarded", None, options=options)
 

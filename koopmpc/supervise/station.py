@@ -149,7 +149,7 @@ class Station(Published):
             if part is None:
                 continue
             if not isinstance(part, Published):
-                raise DataError(f"a {type(part).__name__} is not a controller of koopmpc and cannot be saved as data")
+                raise DataError(f"{checks.article(part)} is not a controller of koopmpc and cannot be saved as data")
             options[name] = part.as_data()
         return SavedController("Station", None, limits=self.limits, options=options)
 

@@ -103,7 +103,7 @@ def test_what_is_not_found_is_named_with_the_nearest_that_is(text, message):
         ("import sys\n\nsys.exit(3)\n", r", line 3: SystemExit: 3"),
         ("x = 1\ny = (\n", r", line 2: SyntaxError"),
         ("x = 1\n", r" must define `problem = km\.Problem\(\.\.\.\)`, but holds nothing of that name"),
-        ("problem = 3\n", r" must define `problem = km\.Problem\(\.\.\.\)`, but holds a int"),
+        ("problem = 3\n", r" must define `problem = km\.Problem\(\.\.\.\)`, but holds an int"),
     ],
 )
 def test_a_file_that_gives_no_problem_is_named_with_its_line_and_cause(tmp_path, source, message):

@@ -115,6 +115,24 @@ def test_another_sweep_is_refused_in_the_same_folder(problem, whole, tmp_path):
         km.sweep([changed], TWO, folder=whole[1], **GRID)
 
 
+@pytest.mark.parametrize(
+    "part",
+    [
+        {"horizon": 3},
+        {"ridge": 0.5},
+        {"cost": km.Cost(Q=2.0, R=1.0)},
+        {"cases": {"near": km.Case(x0=[0.2], reference=[0.0], steps=4)}},
+    ],
+)
+def test_a_problem_that_was_changed_in_memory_is_another_one(part, problem, tmp_path):
+    near = {"cases": {"near": km.Case(x0=[0.1], reference=[0.0], steps=4)}}
+    first = replace(problem, **near)
+    km.sweep([first], ["lqr"], folder=tmp_path)
+    km.sweep([replace(problem, **near)], ["lqr"], folder=tmp_path)
+    with pytest.raises(km.errors.ProblemError, match="holds another sweep, of other problems"):
+        km.sweep([replace(first, **part)], ["lqr"], folder=tmp_path)
+
+
 def test_wrong_parameters_move_the_plant_and_no_controller(tmp_path):
     problem = km.load_problem("pendulum:upright")
     rows = km.sweep([problem], TWO, folder=tmp_path, wrong=[0.0, 0.1], starts=2)

@@ -54,7 +54,7 @@ def test_a_tail_of_nan_and_settings_without_names_are_refused():
         "show(lambda: km.KoopmanMPC(model, km.Cost(1, 1), None, 5, settings=3))"
     )
     assert lines[0] == "DataError tail is nan; pass a whole number"
-    assert lines[1].startswith("DataError settings is a int, expected a Mapping; pass the solver's own by name")
+    assert lines[1].startswith("DataError settings is an int, expected a Mapping; pass the solver's own by name")
 
 
 @pytest.mark.parametrize("kind", CONTROLLERS)

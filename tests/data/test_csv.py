@@ -202,7 +202,7 @@ def test_words_anywhere_in_a_name_tell_inputs_and_a_set_point_is_no_part_of_the_
 
 
 @pytest.mark.parametrize("separator", [" ", "\t", " \t ", ",", ";"])
-@pytest.mark.parametrize("suffix", [".dat", ".txt", ".csv"])
+@pytest.mark.parametrize("suffix", [".dat", ".txt", ".CSV"])
 def test_a_file_without_a_line_of_names_is_read_by_names_or_by_numbers_of_columns(
     tmp_path: Path, separator: str, suffix: str
 ) -> None:

@@ -195,9 +195,9 @@ show(lambda: list(km.data.Stream([km.Episodes([km.Episode(X=[[1], [2]])], 0.1), 
 show(lambda: km.edmd([1], km.State()))
 """)
     assert lines == [
-        "DataError the stream is a int; pass an iterable of Episodes",
-        "DataError set 0 of the stream is a int; pass Episodes([Episode(X=…, U=…)], dt)",
-        "DataError set 1 of the stream is a int; pass Episodes([Episode(X=…, U=…)], dt)",
+        "DataError the stream is an int; pass an iterable of Episodes",
+        "DataError set 0 of the stream is an int; pass Episodes([Episode(X=…, U=…)], dt)",
+        "DataError set 1 of the stream is an int; pass Episodes([Episode(X=…, U=…)], dt)",
         "DataError episodes is a list; pass Episodes([Episode(X=…, U=…), …], dt), what collect returns, "
         "km.data.Files(folder) or km.data.Stream(episodes)",
     ]

@@ -202,7 +202,7 @@ def test_a_goal_that_nests_too_deep_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("settings", ["max_iter", [("max_iter", 5)], 5])
 def test_settings_of_a_solver_are_given_by_name(model, settings):
-    with pytest.raises(km.errors.DataError, match=r"settings is a \w+, expected a Mapping; pass the solver's own by"):
+    with pytest.raises(km.errors.DataError, match=r"settings is an? \w+, expected a Mapping; pass the solver's own by"):
         km.KoopmanMPC(model, PENDULUM.cost, PENDULUM.limits, 5, settings=settings)
 
 

@@ -84,7 +84,7 @@ def test_what_cannot_be_a_plant_is_refused(changed, message):
 
 def test_a_step_that_is_no_function_is_refused():
     (line,) = shown('show(lambda: km.black_box(3, dt=0.1, states=("a",), inputs=("u",)))')
-    assert "step is a int; pass a function" in line
+    assert "step is an int; pass a function" in line
 
 
 def test_a_map_that_has_no_state_of_its_own_asks_for_x0():

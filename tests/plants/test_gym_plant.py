@@ -74,7 +74,7 @@ def test_what_does_not_fit_is_refused_with_the_name_of_the_environment(name, set
 
 
 def test_what_is_no_environment_is_refused():
-    with pytest.raises(km.KoopmpcError, match="env is a int, expected a Env"):
+    with pytest.raises(km.KoopmpcError, match="env is an int, expected an Env"):
         km.plants.GymPlant(3)
 
 

@@ -5,6 +5,7 @@ from dataclasses import fields
 
 import numpy as np
 
+from koopmpc import checks
 from koopmpc.control.in_time.bounds import refuse_crossed_rows
 from koopmpc.control.limits import BOUNDS, Interval, Limits, Movable
 from koopmpc.errors import DataError, ShapeError
@@ -62,7 +63,7 @@ def check_bounds_alone(limits: object, own: Limits, states: Sequence[str], input
         They are no Limits, or differ from the controller's own in more than bounds.
     """
     if not isinstance(limits, Limits):
-        raise DataError(f"limits is a {type(limits).__name__}; pass controller.limits.with_bounds(u_max=…)")
+        raise DataError(f"limits is {checks.article(limits)}; pass controller.limits.with_bounds(u_max=…)")
     known = limits.resolve(states, inputs)
     other = [name for name in _FIXED if not same(getattr(known, name), getattr(own, name))]
     if other:

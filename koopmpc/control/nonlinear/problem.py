@@ -95,7 +95,7 @@ class LearnedMap:
             raise DataError("a StepMap has no matrices that could be exchanged; make a new controller")
         if type(model) is not type(self.model):
             raise DataError(
-                f"the controller was made for a {type(self.model).__name__}, and got a {type(model).__name__}; "
+                f"the controller was made for {checks.article(self.model)}, and got {checks.article(model)}; "
                 "pass a predictor of the same kind, or make a new controller"
             )
         for name in _SHARED:

@@ -95,7 +95,7 @@ class StagedMPC(MPCBase):
         o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, in_time=True)
         self._outputs, self._box, self._steps, self._called_with = o, o.inputs, 0, None
         self._timed = o.limits.in_time
-        refuse_priority(o.limits, f"a {type(self).__name__}")
+        refuse_priority(o.limits, f"{checks.article(self)}")
         super().__init__(
             model.dt,
             given,

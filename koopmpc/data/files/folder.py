@@ -135,7 +135,7 @@ def list_files(paths: str | PathLike[str] | Iterable[str | PathLike[str]]) -> tu
     if not folder.is_dir():
         raise LogError(f"{folder} does not exist; pass a folder of files, or their paths")
     suffixes = list_suffixes(folders=True)
-    files = tuple(sorted(file for file in folder.iterdir() if file.suffix in suffixes and file.is_file()))
+    files = tuple(sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes and file.is_file()))
     if not files:
         content = ", ".join(sorted(item.name for item in folder.iterdir())[:5]) or "nothing"
         raise LogError(f"{folder} holds no {', '.join(suffixes[:-1])} or {suffixes[-1]} file: it holds {content}")

@@ -163,8 +163,9 @@ def find_format(file: Path, *, writable: bool = False) -> LogFormat:
     DataError
         No format has this suffix, or it cannot be written.
     """
-    load_joint(_JOINT, until=lambda: file.suffix in _FORMATS)
-    log_format = _FORMATS.get(file.suffix)
+    suffix = file.suffix.lower()
+    load_joint(_JOINT, until=lambda: suffix in _FORMATS)
+    log_format = _FORMATS.get(suffix)
     if log_format is None or (writable and log_format.write is None):
         known = ", ".join(list_suffixes(writable=writable))
         raise DataError(f"episodes are kept in {known} files, not in {file.name!r}; rename it")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.columns import TableSettings
 from koopmpc.data.files.formats import LogTable
@@ -34,7 +35,7 @@ def read_frame(frame: Any, settings: TableSettings, by: str | None = None, time:
         It is no DataFrame, or has no column `by` or `time`; else as a table of a file.
     """
     if not is_frame(frame):
-        raise DataError(f"frame is a {type(frame).__name__}; pass a pandas.DataFrame")
+        raise DataError(f"frame is {checks.article(frame)}; pass a pandas.DataFrame")
     names = [str(name) for name in frame.columns]
     columns = {name: np.asarray(frame.iloc[:, i]) for i, name in enumerate(names) if names.count(name) == 1}
     if time is None and str(frame.index.dtype).startswith("datetime"):
