@@ -24,9 +24,9 @@ def reset_parts(parts: Iterable[Controller], x0: ArrayLike | None, u_prev: Array
         x0 is no vector of finite numbers, or no model has as many states.
     """
     parts = list(parts)
-    start = None if x0 is None else checks.array(x0, "x0", (None,))
     sizes = sorted(join_start_sizes(parts))
-    if start is not None and sizes and len(start) not in sizes:
+    start = None if x0 is None else checks.array(x0, "x0", None if sizes else (None,))
+    if start is not None and sizes and start.shape not in [(size,) for size in sizes]:
         expected = " or ".join(f"({size},)" for size in sizes)
         raise ShapeError(f"x0 has shape {start.shape}, expected {expected}, the states of a model in it; or pass None")
     for part in parts:

@@ -367,6 +367,8 @@ def test_each_of_two_controllers_begins_with_what_its_model_can_know(make):
     assert begun == [None, 3, 2, None, None, None]
     with pytest.raises(km.errors.ShapeError, match=r"x0 has shape \(4,\), expected \(2,\) or \(3,\)"):
         both.reset([1.0] * 4)
+    with pytest.raises(km.errors.ShapeError, match=r"x0 has shape \(\), expected \(2,\) or \(3,\)"):
+        both.reset(1.0)
 
 
 class OwnLaw:
