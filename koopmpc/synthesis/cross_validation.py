@@ -277,6 +277,8 @@ class Trial:
         Weights to try, the least first.
     relift
         Lift the forecasts of bilinear models at every step, as BilinearMPC does.
+    raw
+        The same episodes as they were measured, from which hidden states learn; by default the episodes themselves.
     """
 
     candidate: Candidate
@@ -286,6 +288,7 @@ class Trial:
     first: int
     ridges: tuple[float, ...]
     relift: bool = False
+    raw: Episodes | None = None
 
     @property
     def lifts_at_each_step(self) -> bool:
@@ -379,18 +382,18 @@ def cross_validate(trial: Trial) -> Tried:
 
 
 def _cross_validate_hidden(trial: Trial, structure: HiddenStructure) -> Tried:
-    """Cross-validate a model with a hidden state, whose fit sees rows and no moments, and needs no ridge."""
+    """Cross-validate a model with a hidden state, whose fit sees measured rows and no moments, and needs no ridge."""
     start, count, sizes = perf_counter(), max(trial.fold) + 1, _sizes(trial.episodes)
     errors = np.full((1, count, trial.horizon), np.inf)
-    A = np.eye(trial.candidate.lifting.nz)[None]
+    A, learned = np.eye(trial.candidate.lifting.nz)[None], trial.episodes if trial.raw is None else trial.raw
     with hide_fit_warnings():
         try:
-            A = fit_hidden(structure, trial.episodes, quick=True).A[None]
+            A = fit_hidden(structure, learned, quick=True).A[None]
         except KoopmpcError:  # blocks are too short for its segments: no fold is judged, and it is not chosen
             count = 0
         for i in range(count):
             try:
-                model = fit_hidden(structure, drop_fold(trial.episodes, trial.fold, i), quick=True)
+                model = fit_hidden(structure, drop_fold(learned, trial.fold, i), quick=True)
             except KoopmpcError:  # what is left is too short
                 continue
             errors[:, i] = _errors(trial, [model], select_fold(trial.episodes, trial.fold, i), sizes)

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -188,7 +189,7 @@ def design(
         know, by at most half of the distance from the reference to the limit.
     smooth
         Replace glitches, and learn from smoothed states if the states contain noise (see `select`); the surrogates
-        then measure with this noise.
+        then measure with this noise. Hidden states learn from the measured rows.
     instruments
         For each episode (T, nr) or (T + 1, nr) rows of the set point of the loop that made the logs, or of a signal
         added to its inputs. Where the logs hold feedback, least squares is found biased and unseen rows gain, models
@@ -255,7 +256,7 @@ def design(
         if sampled:
             said = f"chosen on and fitted to a sample of {len(held)} episodes, without those left out"
             notes = (said, *notes[len(sampled) :])
-    noise, measured = projected if projected.any() else np.zeros(held.nx), held
+    noise, measured, unsmoothed = projected if projected.any() else np.zeros(held.nx), held, source
     if smooth:
         source, held, freed, noise = smooth_data(source, held)
         notes = (*notes, *freed)
@@ -280,14 +281,16 @@ def design(
         ]
     if forecast < ahead:
         short += [f"models were judged {forecast} steps ahead, not {ahead}, for episodes are no longer"]
+    again = deepcopy(draw)
     folds = make_folds(held, forecast + first, FOLDS, draw)
+    raw = folds.episodes if held is measured else make_folds(measured, forecast + first, FOLDS, again).episodes
     if folds.number < FOLDS:
         raise DataError(
             f"{len(held)} episodes give {folds.number} folds, and a design needs {FOLDS}: one to judge on and two to "
             f"learn from; pass more episodes of {forecast + first} steps or more, or a shorter horizon"
         )
     trials = [
-        Trial(one, folds.episodes, folds.fold, forecast, first, RIDGES if one.structure is None else (0.0,), True)
+        Trial(one, folds.episodes, folds.fold, forecast, first, RIDGES if one.structure is None else (0.0,), True, raw)
         for one in models
     ]
     with Workers(workers, scheduler) as pool:
@@ -296,7 +299,7 @@ def design(
         )
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
         pair = choose_surrogates(results, floor, hidden=hidden)
-        test, doubts, holds = prepare_test(folds, asked, pair, tighten and wished is None, noise, pool)
+        test, doubts, holds = prepare_test(folds, asked, pair, tighten and wished is None, noise, pool, raw)
         doubts = [*left.values(), *doubts]
         for sentence in doubts:
             warnings.warn(sentence, FitWarning, stacklevel=2)
@@ -309,8 +312,9 @@ def design(
         recipe, near, outcome = rows[place].recipe, None, outcomes[place]
         if recipe.weighted:
             near = Nearness.of(outcome.visited, test.episodes)
-        for data in sets:
-            model = recipe.fit(data, near, workers=workers, scheduler=scheduler)
+        for data, as_measured in zip(sets, (unsmoothed, source_of(raw)), strict=False):
+            learned = as_measured if recipe.candidate.has_hidden_state else data
+            model = recipe.fit(learned, near, workers=workers, scheduler=scheduler)
             controller = recipe.controller(model, asked.cost, test.limits(outcome.band), ahead)
             if is_confirmed(test, controller, outcome):
                 if data is not source:

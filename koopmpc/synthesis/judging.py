@@ -79,7 +79,8 @@ class LoopTest:
 
     A run that leaves the box from `low` to `high` is lost. The margins of controllers to the limits are at most `room`
     (nx,); None for no margins. `noise` is the (nx,) standard deviation of the noise that a smoother took out of the
-    data. `ignored` are states that nothing depends on, `turning` angles that make whole turns.
+    data. `ignored` are states that nothing depends on, `turning` angles that make whole turns. Hidden states learn from
+    `raw`, the episodes as they were measured; None where nothing was smoothed.
     """
 
     asked: DesignTask
@@ -93,6 +94,7 @@ class LoopTest:
     noise: Float[np.ndarray, " nx"]
     ignored: tuple[int, ...] = ()
     turning: tuple[int, ...] = ()
+    raw: Episodes | None = None
 
     def limits(self, band: Float[np.ndarray, "h nx"]) -> Limits:
         """Return the limits of a controller whose model has these errors."""
@@ -244,8 +246,10 @@ def judge_job(test: LoopTest, job: Job) -> Outcome:
 
 
 def _fit_folds(test: LoopTest, recipe: Recipe, near: Nearness | None = None) -> _Models:
-    folds = range(max(test.fold) + 1)
-    models = [recipe.fit(drop_fold(test.episodes, test.fold, k), near) for k in folds]
+    folds, rows = range(max(test.fold) + 1), test.episodes
+    if test.raw is not None and recipe.candidate.has_hidden_state:
+        rows = test.raw
+    models = [recipe.fit(drop_fold(rows, test.fold, k), near) for k in folds]
     bands = [measure_band(model, select_fold(test.episodes, test.fold, k)) for k, model in enumerate(models)]
     return _Models(tuple(models), np.hypot(np.max(bands, axis=0), _NINETY * test.noise))
 

@@ -14,6 +14,7 @@ from scipy.signal import dlsim
 
 import koopmpc as km
 from koopmpc.identify.records.hidden_structure import HiddenStructure
+from koopmpc.identify.records.state_space import fit_hidden
 from koopmpc.identify.records.structure import Structure
 from koopmpc.synthesis.candidates import Candidate, Recipe
 from koopmpc.synthesis.cross_validation import Tried
@@ -512,14 +513,25 @@ HELD_LEVEL = (km.Cost(Q=10.0, R=0.01, u_target="equilibrium"), km.Limits(u_min=0
 
 
 @pytest.mark.slow
-def test_models_with_a_hidden_state_are_judged_in_the_loops_of_one_record():
+def test_models_with_a_hidden_state_are_judged_in_the_loops_of_one_record(monkeypatch):
     cost, limits = HELD_LEVEL
+    learned = list[float]()
+
+    def watch(structure, episodes, *, quick=False):
+        learned.extend(np.concatenate([e.X[:, 0] for e in episodes]).tolist())
+        return fit_hidden(structure, episodes, quick=quick)
+
+    for module in ("candidates", "cross_validation"):
+        monkeypatch.setattr(f"koopmpc.synthesis.{module}.fit_hidden", watch)
     found = designed(
         hidden_record(), cost, limits, horizon=15, delays=None, candidates=None, bilinear=True, reference=[1.2]
     )
     hidden = [row for row in found.leaderboard if "hidden state" in row.title]
     assert hidden
     assert min(row.score for row in hidden) < 1.1  # beside the best of all
+    assert any("smoothed" in note for note in found.notes)
+    assert learned
+    assert {*learned} <= {*hidden_record()[0].X[:, 0].tolist()}  # rows as they were measured
     valve, level = 0.2, 0.1
     for _ in range(80):
         valve, level = lagged(valve, level, float(found.controller([level], [1.2]).u[0]))

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.data.angles import find_angles
+from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.state import State
 from koopmpc.parallel import Workers
 from koopmpc.synthesis.asked import (
@@ -36,11 +37,13 @@ def prepare_test(
     tighten: bool,
     noise: Float[np.ndarray, " nx"],
     pool: Workers,
+    raw: Episodes | None = None,
 ) -> tuple[LoopTest, list[str], bool]:
     """Return the conditions of all closed loops, doubts about the task, and whether the goal can be held.
 
     For each fold and each family there is a surrogate that is fitted to the two other folds. A model that does not know
-    fold k is tested on two surrogates, which do not know fold k + 1 and fold k + 2.
+    fold k is tested on two surrogates, which do not know fold k + 1 and fold k + 2. Hidden states learn from the `raw`
+    episodes.
     """
     data = folds.episodes
     wanted: list[Condition] = []
@@ -84,6 +87,7 @@ def prepare_test(
         noise,
         tuple(ignored),
         tuple(turning),
+        raw,
     )
     unreachable = explain_unreachable(surrogates[0], asked)
     holds = not asked.moves and not unreachable
