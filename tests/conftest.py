@@ -4,7 +4,9 @@ With KOOPMPC_TESTS=typed every jaxtyping shape is checked too; that hook must co
 With KOOPMPC_TESTS=bare nothing is checked: tests/speed measures what users run.
 """
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -53,6 +55,17 @@ LONGEST = [
     "faults/test_glitches.py",
     "synthesis/test_train.py",
 ]  # files that take a process 8 s and more, here or in `make typed`
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Leave what was imported and collected to no search for garbage: each would walk through 1.5 million objects."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -4,12 +4,18 @@ import ast
 from collections import defaultdict
 from pathlib import Path
 
+import pytest
+
 import koopmpc
 
 ROOT = Path(koopmpc.__file__).parent
-TREES = {path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8")) for path in sorted(ROOT.rglob("*.py"))}
 ALLOWED = {"_asdict", "_exit", "_fields_", "_replace"}  # of NamedTuple, os and ctypes: public in spite of their names
 OF_RERUN = {"_from_native", "_log_to_stream"}  # Rerun offers nothing else; recording/ alone asks for them
+
+
+@pytest.fixture(scope="module")
+def trees() -> dict[Path, ast.Module]:
+    return {path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8")) for path in sorted(ROOT.rglob("*.py"))}
 
 
 def is_private(name: str) -> bool:
@@ -40,14 +46,14 @@ def used(tree: ast.Module) -> list[tuple[int, str]]:
     return [(line, name) for line, name in found if is_private(name)]
 
 
-def test_no_file_uses_an_underscore_name_that_another_room_or_library_defines():
+def test_no_file_uses_an_underscore_name_that_another_room_or_library_defines(trees: dict[Path, ast.Module]):
     homes = defaultdict(set)
-    for path, tree in TREES.items():
+    for path, tree in trees.items():
         for name in defined(tree):
             homes[name].add(path.parts[0])
     foreign = [
         f"{path}:{line} {name}"
-        for path, tree in TREES.items()
+        for path, tree in trees.items()
         for line, name in used(tree)
         if path.parts[0] not in homes[name]
         and name not in ALLOWED
@@ -56,8 +62,8 @@ def test_no_file_uses_an_underscore_name_that_another_room_or_library_defines():
     assert foreign == []
 
 
-def test_code_generation_reads_no_underscore_name_of_an_object_but_its_own():
-    for path, tree in TREES.items():
+def test_code_generation_reads_no_underscore_name_of_an_object_but_its_own(trees: dict[Path, ast.Module]):
+    for path, tree in trees.items():
         if path.parts[0] == "codegen":
             own = defined(tree)
             assert [(line, name) for line, name in used(tree) if name not in own] == [], path

@@ -338,10 +338,7 @@ def shipped() -> tuple[Path, ...]:
 
 def list_problems() -> tuple[Entry, ...]:
     """Return every problem that can be loaded by name: those in ./problems first, then the shipped ones."""
-    found: dict[str, Path] = {}
-    for path in (*_files(Path("problems")), *shipped()):
-        found.setdefault(path.stem, path)
-    return tuple(Entry(name, _title(path), path) for name, path in found.items())
+    return tuple(Entry(name, _title(path), path) for name, path in _paths().items())
 
 
 def load_problem(problem: str | Path) -> Problem:
@@ -400,12 +397,20 @@ def new_problem(name: str | Path) -> Path:
     return path
 
 
+def _paths() -> dict[str, Path]:
+    """The problem files that have a name, without what they say of themselves."""
+    found: dict[str, Path] = {}
+    for path in (*_files(Path("problems")), *shipped()):
+        found.setdefault(path.stem, path)
+    return found
+
+
 def _find(text: str) -> Path | None:
     path = Path(text)
     with suppress(OSError):  # of a name that is too long for a file
         if path.is_file():
             return path
-    return next((entry.path for entry in list_problems() if entry.name == text), None)
+    return _paths().get(text)  # no title: reading all of them takes longer than the problem itself
 
 
 def _unknown(text: str) -> str:
@@ -417,7 +422,7 @@ def _unknown(text: str) -> str:
         return f"{text} is a folder; pass the path of one problem file: {inside}"
     if text.endswith(".py") or "/" in text or "\\" in text:
         return f"there is no file {text}; pass the path of a problem file, or a name that `koopmpc list` shows"
-    names = [entry.name for entry in list_problems()]
+    names = list(_paths())
     return f"there is no problem {text!r}{nearest(text, names)}; there are {', '.join(names)}, or pass a path"
 
 
