@@ -85,7 +85,8 @@ class Cost(Value):
     Q_rows, R_rows
         Weights in time, (T, nr) and (T, nu), or by name a value a step: row k is the diagonal that weighs x_k, or u_k,
         of a run in place of that of Q or R; the last row is held. Q and R, both diagonal then, stay the weights of V,
-        of set points and of sizes. For BilinearMPC and NonlinearMPC.
+        of set points and of sizes. For all predictive controllers; `KoopmanMPC` and `LinearMPC` make a plan anew for
+        each preview of weights that they have not met, and keep the last 64 of these plans.
     output_price
         q, what a unit of each tracked output costs in a step, (nr,) or by name; an omitted output is free. A priced
         output needs a weight in Q. The tail of linear controllers counts q too, and so does ``tail=0`` at x_N; other
@@ -407,7 +408,7 @@ class Tracking(Generic[Read]):
     u_target that is given as numbers, None for one by name. `Q_root` and `R_root` are S with SᵀS = Q and R. `sizes` are
     those of states, inputs, limits and cost. Where limits have rows, all these are of their widest values, and
     `movable` says which inputs, rates and outputs [x; of(x)] have a limit, or may get one. `shift` is what a price adds
-    to u_r, `pull` what an output price adds to the reference.
+    to u_r, `pull` what an output price adds to the reference; `weighed` says that weights move in time.
     """
 
     cost: Cost
@@ -432,6 +433,7 @@ class Tracking(Generic[Read]):
     movable: Movable
     shift: Float[np.ndarray, "prices nu"] | None
     pull: Float[np.ndarray, " nr"] | None
+    weighed: bool
 
 
 LiftedTracking: TypeAlias = Tracking[np.ndarray]
@@ -443,13 +445,13 @@ def lifted_tracking(
 ) -> LiftedTracking:
     """Return what `cost` tracks and `limits` bound, as matrices on the lifted coordinates of `predictor`.
 
-    `in_time` says that who asks knows limits with rows, and prices of inputs.
+    `in_time` says that who asks knows limits and weights with rows, and prices of inputs.
 
     Raises
     ------
     DataError
-        Limits have rows in time, or the cost has a price, and who asks does not know them; or ``cost.beyond`` is
-        "motion".
+        Limits or weights have rows in time, or the cost has a price, and who asks does not know them; or
+        ``cost.beyond`` is "motion".
     ObservableError
         The cost or a limit is on an observable that the lifting lacks.
     ShapeError
@@ -458,7 +460,8 @@ def lifted_tracking(
     cost, limits = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
     if not in_time:
         refuse_steps(cost, limits)
-    refuse_stage(cost, "a controller on a linear model")
+    who = "a controller on a linear model" if in_time else "a law with one gain for all steps"
+    refuse_stage(cost, who, in_time=in_time)
     if cost.beyond == "motion":
         raise DataError(
             'beyond="motion" needs a BilinearMPC or a NonlinearMPC; leave it out, or pass more reference rows'
@@ -537,23 +540,24 @@ def refuse_steps(cost: Cost, limits: Limits) -> None:
         )
 
 
-def refuse_stage(cost: Cost, who: str) -> None:
-    """Raise where the cost has a stage of its own, or weights in time.
+def refuse_stage(cost: Cost, who: str, *, in_time: bool = False) -> None:
+    """Raise where the cost has a stage of its own, or weights in time that who asks does not know.
 
     Raises
     ------
     DataError
         It has one of the two.
     """
-    for name, what, there in (
-        ("Q_rows and R_rows", "rows of weights in time", cost.weighs_in_time),
-        ("stage", "a stage of its own", cost.stage is not None),
-    ):
-        if there:
-            raise DataError(
-                f"the cost has {what}, which {who} does not know; take a BilinearMPC or a NonlinearMPC, or leave {name}"
-                " out"
-            )
+    if cost.weighs_in_time and not in_time:
+        raise DataError(
+            f"the cost has rows of weights in time, which {who} does not know; take a KoopmanMPC, a LinearMPC, a "
+            "BilinearMPC or a NonlinearMPC, or leave Q_rows and R_rows out"
+        )
+    if cost.stage is not None:
+        raise DataError(
+            f"the cost has a stage of its own, which {who} does not know; take a BilinearMPC or a NonlinearMPC, or "
+            "leave stage out"
+        )
 
 
 def _tracking(
@@ -617,6 +621,7 @@ def _tracking(
         movable=base.movable(nx, len(sizes.rows) - nx, nu),
         shift=cost.find_shift(nu),
         pull=cost.find_pull(nr),
+        weighed=cost.weighs_in_time,
     )
 
 

@@ -34,6 +34,13 @@ WELL_CONDITIONED = 1e3
 INPUTS_ALONE = 1e5
 
 
+class WeightRows(NamedTuple):
+    """The diagonals that weigh the tracked outputs and the input of each step of a plan."""
+
+    Q: Float[np.ndarray, "N nr"]
+    R: Float[np.ndarray, "N nu"]
+
+
 class SignalLayout(NamedTuple):
     """Where w_0 … w_{N−1} and d stand in f, how many entries these have, and f; the last entry of f is 1."""
 
@@ -49,7 +56,8 @@ class Horizon:
     """z⁺ = A z + B u + E w + d over blocks of held inputs; tracked outputs C z, limited outputs G z, the weights.
 
     `with_rates` puts the last input beside z, ξ = [z; u_{k−1}], as a weight or a limit of u_k − u_{k−1} needs it;
-    `bounded` says that there is such a limit.
+    `bounded` says that there is such a limit. Where weights move in time, `rows` are the diagonals that weigh the
+    tracked outputs and the input of each step in place of Q and R.
     """
 
     A: Float[np.ndarray, "nz nz"]
@@ -65,6 +73,7 @@ class Horizon:
     bounded: bool
     disturbed: bool
     periodic: int = 0
+    rows: WeightRows | None = None
 
     N: int = field(init=False)  # steps
     size: int = field(init=False)  # entries of ξ
@@ -76,6 +85,10 @@ class Horizon:
         layout = SignalLayout(steps, slice(N * nw, N * nw + nd), nw, nd, N * nw + nd + 1)
         for name, value in (("N", N), ("size", nz + nu * self.with_rates), ("signals", layout)):
             object.__setattr__(self, name, value)
+
+    def weights(self, k: int) -> tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]]:
+        """Return the weights of step k."""
+        return (self.Q, self.R) if self.rows is None else (np.diag(self.rows.Q[k]), np.diag(self.rows.R[k]))
 
     def disturbance(self, k: int) -> Float[np.ndarray, "nz nf"] | None:
         """Return E w_k + d as a matrix on f; None where there is neither."""
@@ -112,6 +125,7 @@ class Horizon:
             Q=to_units(self.Q, C),
             R=to_units(self.R, inputs),
             R_delta=None if self.R_delta is None else to_units(self.R_delta, inputs),
+            rows=None if self.rows is None else WeightRows(self.rows.Q * C**2 / scale, self.rows.R * inputs**2 / scale),
         )
 
 
@@ -121,14 +135,15 @@ def build_stages(horizon: Horizon, targets: Targets) -> list[Stage]:
     powers = [(np.eye(nz), np.zeros((nz, nu))), (horizon.A, horizon.B)]
     while len(powers) <= max(horizon.blocks):
         powers.append((horizon.A @ powers[-1][0], horizon.A @ powers[-1][1] + horizon.B))
-    weighed = horizon.R @ input_target(horizon, targets)
+    target = input_target(horizon, targets)
     known: dict[tuple[int, int], Stage] = {}
     result: list[Stage] = []
     k = 0
     for b in horizon.blocks:
-        key = b, k if horizon.signals.nw else 0  # without a preview all blocks of a length are the same
+        # without a preview and weights in time all blocks of a length are the same
+        key = b, k if horizon.signals.nw or horizon.rows is not None else 0
         if key not in known:
-            known[key] = _stage(horizon, powers[: b + 1], k, -b * weighed)
+            known[key] = _stage(horizon, powers[: b + 1], k, target)
         result.append(known[key])
         k += b
     return result
@@ -138,15 +153,16 @@ def _stage(
     h: Horizon,
     powers: Sequence[tuple[Float[np.ndarray, "nz nz"], Float[np.ndarray, "nz nu"]]],
     k: int,
-    r: Float[np.ndarray, "nu nf"],
+    target: Float[np.ndarray, "nu nf"],
 ) -> Stage:
-    """Return the stage of the block that starts at step k; `r` is the linear term in u that input targets make."""
+    """Return the stage of the block that starts at step k, whose inputs aim at `target`."""
     nz, nu = h.B.shape
     (A, B), q, e = powers[-1], None, h.disturbance(k)
+    r = -_sum_inputs(h, k, len(powers) - 1) @ target
     for i, (Ai, Bi) in enumerate(powers[1:-1], 1):
         moved = h.disturbance(k + i)
         if e is not None and moved is not None:
-            missed = h.C.T @ (h.Q @ (h.C @ e))
+            missed = h.C.T @ (h.weights(k + i)[0] @ (h.C @ e))
             q = np.zeros((h.size, h.signals.size)) if q is None else q
             q[:nz] += Ai.T @ missed
             r = r + Bi.T @ missed
@@ -154,7 +170,7 @@ def _stage(
     if h.with_rates:
         A, B = block_diag(A, np.zeros((nu, nu))), np.vstack([B, np.eye(nu)])
         e = None if e is None else np.vstack([e, np.zeros((nu, h.signals.size))])
-    return Stage(A, B, *_weights(h, powers[:-1]), e, q, r)
+    return Stage(A, B, *_weights(h, powers[:-1], k), e, q, r)
 
 
 def input_target(h: Horizon, targets: Targets) -> Float[np.ndarray, "nu nf"]:
@@ -166,18 +182,25 @@ def input_target(h: Horizon, targets: Targets) -> Float[np.ndarray, "nu nf"]:
 
 
 def _weights(
-    h: Horizon, powers: Sequence[tuple[Float[np.ndarray, "nz nz"], Float[np.ndarray, "nz nu"]]]
+    h: Horizon, powers: Sequence[tuple[Float[np.ndarray, "nz nz"], Float[np.ndarray, "nz nu"]]], k: int
 ) -> tuple[Float[np.ndarray, "nx nx"], Float[np.ndarray, "nx nu"] | None, Float[np.ndarray, "nu nu"]]:
-    """Return Q, M and R of a block on ξ and its input; M = None stands for zero."""
+    """Return Q, M and R of the block of step k on ξ and its input; M = None stands for zero."""
     nz, nu = h.B.shape
-    CQC = h.C.T @ h.Q @ h.C
-    Q, M, R = CQC.copy(), np.zeros((nz, nu)), len(powers) * h.R
-    for Ai, Bi in powers[1:]:
+    CQC = h.C.T @ h.weights(k)[0] @ h.C
+    Q, M, R = CQC.copy(), np.zeros((nz, nu)), _sum_inputs(h, k, len(powers))
+    for i, (Ai, Bi) in enumerate(powers[1:], 1):
+        if h.rows is not None:
+            CQC = h.C.T @ h.weights(k + i)[0] @ h.C
         Q, M, R = Q + Ai.T @ CQC @ Ai, M + Ai.T @ CQC @ Bi, R + Bi.T @ CQC @ Bi
     if not h.with_rates:
         return Q, M if len(powers) > 1 else None, R
     R_delta = np.zeros((nu, nu)) if h.R_delta is None else h.R_delta
     return block_diag(Q, R_delta), np.vstack([M, -R_delta]), R + R_delta
+
+
+def _sum_inputs(h: Horizon, k: int, steps: int) -> Float[np.ndarray, "nu nu"]:
+    """Return the weight of an input that is held for so many steps from k on."""
+    return steps * h.R if h.rows is None else np.diag(h.rows.R[k : k + steps].sum(axis=0))
 
 
 def horizon_of(
@@ -187,6 +210,7 @@ def horizon_of(
     *,
     disturbed: bool,
     periodic: bool = False,
+    rows: WeightRows | None = None,
 ) -> Horizon:
     """Return the horizon of a predictor for what it tracks and limits; a periodic disturbance acts on all of z."""
     return Horizon(
@@ -203,6 +227,7 @@ def horizon_of(
         bounded=track.rates is not None,
         disturbed=disturbed,
         periodic=predictor.nz if periodic else 0,
+        rows=rows,
     )
 
 
@@ -350,8 +375,9 @@ def _pull_of_targets(
     """Return −½ times the gradient in w that references, coordinates of targets and given input targets make."""
     nw, nr, na, nu = U.shape[2], len(h.C), targets.Z.shape[1], U.shape[1]
     reference, target, given = (np.zeros((nw, h.N + 1, columns)) for columns in (nr, na, nu))
-    reference[:, 1 : h.N] = (Z[:-1].transpose(2, 0, 1) @ h.C.T) @ h.Q
-    given[:, : h.N] = np.repeat(U, h.blocks, axis=0).transpose(2, 0, 1) @ h.R
+    tracked, held = Z[:-1].transpose(2, 0, 1) @ h.C.T, np.repeat(U, h.blocks, axis=0).transpose(2, 0, 1)
+    reference[:, 1 : h.N] = tracked @ h.Q if h.rows is None else tracked * h.rows.Q[1:]
+    given[:, : h.N] = held @ h.R if h.rows is None else held * h.rows.R
     target[:, : h.N] = given[:, : h.N] @ targets.W
     last = np.vstack([Z[-1], U[-1]])[: h.size].T  # ξ_N
     for asked, linear in ((reference, terminal.reference), (target, terminal.target), (given, terminal.given)):

@@ -10,10 +10,11 @@ from tests.control.models import end_of
 TIGHT = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}
 
 
-def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=None, C=None, of=None):
+def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=None, C=None, of=None, step=0):
     """U (N, nu) and the least cost, by CLARABEL; None where there is none.
 
-    `of` is the matrix of limited observables. Row k of limits in time is that of u_k, u_k − u_{k−1}, x_k and y_k.
+    `of` is the matrix of limited observables. Row k of limits in time is that of u_k, u_k − u_{k−1}, x_k and y_k;
+    row `step` + k of weights in time is that of x_k and u_k.
     """
     import cvxpy as cp
 
@@ -24,7 +25,9 @@ def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=No
     targets = targets_of(model, cost, limits, R, e, C, of)
     u_prev = np.zeros(nu) if u_prev is None else u_prev
     blocks = (1,) * N if blocks is None else blocks
-    Q, Ru = cost.matrices(len(C), nu)
+    Q, Ru = ([weight] * N for weight in cost.matrices(len(C), nu))
+    if cost.weighs_in_time:
+        Q, Ru = ([np.diag(row) for row in rows] for rows in cost.weight_rows(len(C), nu, step, N))
     psd = cp.psd_wrap
     Z, U = cp.Variable((N + 1, nz)), cp.Variable((N, nu))
     held, objective = [Z[0] == z0], 0
@@ -55,12 +58,12 @@ def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=No
         push = np.zeros(nz) if W is None else model.E @ W[k]
         push = push if d is None else push + d
         held += [Z[k + 1] == model.A @ Z[k] + model.B @ U[k] + push]
-        objective += cp.quad_form(U[k] - targets[k][1], psd(Ru))
+        objective += cp.quad_form(U[k] - targets[k][1], psd(Ru[k]))
         if cost.R_delta is not None:
             before = u_prev if k == 0 else U[k - 1]
             objective += cp.quad_form(U[k] - before, psd(cost.rate(nu)))
         if k + 1 < N:
-            objective += cp.quad_form(C @ Z[k + 1] - R[k + 1], psd(Q))
+            objective += cp.quad_form(C @ Z[k + 1] - R[k + 1], psd(Q[k + 1]))
     F, h = end_of(model, cost, targets, R, e, C)
     objective += cp.sum_squares(F @ (Z[N] if F.shape[1] == nz else cp.hstack([Z[N], U[N - 1]])) - h)
 

@@ -1,6 +1,8 @@
 """Weights in time: constant rows are constant weights, moving ones give the plan of a solver that knows nothing of
 stages, metrics count them, and laws that do not know them refuse them."""
 
+import copy
+
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
@@ -8,13 +10,14 @@ from scipy.optimize import lsq_linear
 from scipy.signal import StateSpace
 
 import koopmpc as km
+from tests.control.oracle import oracle
 
 A, B = np.array([[1.0, 0.2], [-0.1, 0.9]]), np.array([[0.02], [0.2]])
 MODEL = km.LinearPredictor.from_state_space(StateSpace(A, B, np.eye(2), np.zeros((2, 1)), dt=0.2))
 LIMITS, END, N = km.Limits(u_min=-1, u_max=1), np.diag([3.0, 1.0]), 5
 Q_ROWS = np.random.default_rng(0).uniform(0, 4, (12, 2))
 R_ROWS = np.random.default_rng(1).uniform(0.05, 2, (12, 1))
-KINDS = [km.BilinearMPC, km.NonlinearMPC]
+KINDS = [km.BilinearMPC, km.NonlinearMPC, km.KoopmanMPC]
 slow = pytest.mark.slow
 
 
@@ -44,7 +47,12 @@ def find_best(x, k, R_delta, last):
 
 @pytest.mark.parametrize(
     ("kind", "R_delta"),
-    [(KINDS[0], 0.0), (KINDS[0], 0.3), (KINDS[1], 0.0), pytest.param(KINDS[1], 0.3, marks=slow)],
+    [
+        *((kind, 0.0) for kind in KINDS),
+        (KINDS[0], 0.3),
+        pytest.param(KINDS[1], 0.3, marks=slow),
+        (KINDS[2], 0.3),
+    ],
 )
 def test_the_plan_of_each_step_is_that_of_least_squares(kind, R_delta):
     mpc = make(kind, Q_rows=Q_ROWS, R_rows=R_ROWS, R_delta=R_delta or None)
@@ -63,6 +71,62 @@ def test_a_call_that_is_refused_counts_as_no_step():
         mpc(x, [0, 0, 0])
     mpc(x, [0, 0])
     np.testing.assert_allclose(mpc.plan().U[:, 0], find_best(x, 0, 0.0, 0.0), atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("blocks", "R_delta", "limited"),
+    [
+        pytest.param(None, None, True, id="limits"),
+        pytest.param((1, 1, 3), 0.3, False, id="blocks, changes", marks=slow),
+    ],
+)
+def test_linear_plans_with_limits_and_a_preview_are_those_of_cvxpy(blocks, R_delta, limited):
+    cost = km.Cost(Q=[1, 0.5], R=0.2, Q_rows=Q_ROWS, R_rows=R_ROWS, R_delta=R_delta)
+    limits = km.Limits(u_min=-0.6, u_max=0.5, du_max=0.4, **({"x_max": [0.4, np.inf]} if limited else {}), slack=(9, 5))
+    mpc = km.KoopmanMPC(MODEL, cost, limits, N, moves=blocks)
+    reference, x, u = np.column_stack([np.sin(np.arange(20) / 3), np.zeros(20)]), np.array([0.5, 0.3]), np.zeros(1)
+    for k in range(2):
+        rows = reference[k : k + N + 1]
+        move = mpc(x, rows)
+        found = oracle(MODEL, cost, limits, x, rows, u_prev=u, blocks=blocks, step=k)
+        assert found is not None
+        plan = mpc.plan()
+        assert plan is not None
+        np.testing.assert_allclose(plan.U, found[0], atol=2e-6)
+        u, x = move.u, A @ x + B @ move.u
+
+
+def test_linear_plans_whose_preview_holds_the_constant_weights_are_alike_to_the_bit_and_copies_go_on():
+    rows = np.vstack([np.tile([1, 0.5], (10, 1)), [[5, 0]]])
+    plain, moving = make(km.KoopmanMPC), make(km.KoopmanMPC, Q_rows=rows)
+    for _ in range(2):
+        x = np.array([2.0, 0.5])
+        moving.reset()
+        for k in range(12):
+            now = plain(x, [0.3, 0]).u, moving(x, [0.3, 0]).u
+            assert np.array_equal(*now) == (k < 6)  # of 5 steps the plan weighs x_1 … x_4
+            x = A @ x + B @ now[1]
+            if k == 8:
+                twin = copy.copy(moving)
+                np.testing.assert_array_equal(twin(x, [0.3, 0]).u, copy.copy(moving)(x, [0.3, 0]).u)
+
+
+def test_linear_mpc_weighs_the_rows_of_a_controller_on_its_linearisation():
+    cost = km.Cost(Q=[1, 0.5], R=0.2, Q_rows=Q_ROWS, R_rows=R_ROWS)
+    kinds = km.LinearMPC(MODEL.step_map(), [0, 0], [0], cost, LIMITS, N), km.KoopmanMPC(MODEL, cost, LIMITS, N)
+    x = np.array([1.0, 0.2])
+    for _ in range(3):
+        a, b = (mpc(x, [0.1, 0]).u for mpc in kinds)
+        np.testing.assert_allclose(a, b, atol=1e-10)
+        x = A @ x + B @ a
+
+
+def test_with_a_latency_the_rows_are_those_of_the_steps_in_which_inputs_act():
+    late, now = (make(km.KoopmanMPC, Q_rows=Q_ROWS[k:], R_rows=R_ROWS[k:]) for k in (0, 1))
+    late = km.KoopmanMPC(MODEL, late.cost, LIMITS, N, latency=1)
+    late.reset(u_prev=[0.0])
+    x = np.array([0.3, 0.1])
+    np.testing.assert_allclose(late(x, [0, 0]).u, now(A @ x, [0, 0]).u, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -104,7 +168,9 @@ def test_rows_that_cannot_be_are_refused(said):
 
 
 def test_laws_that_do_not_know_rows_refuse_them():
-    for kind in (km.KoopmanMPC, km.LQR):
-        with pytest.raises(km.errors.DataError, match="rows of weights in time"):
-            kind(MODEL, km.Cost(Q=1, R=1, Q_rows=[[1, 2]]))
-    assert "weights move in time" in make(km.BilinearMPC, Q_rows=[[1, 2]]).program().obstacle
+    with pytest.raises(
+        km.errors.DataError, match="which a law with one gain for all steps does not know; take a Koopm"
+    ):
+        km.LQR(MODEL, km.Cost(Q=1, R=1, Q_rows=[[1, 2]]))
+    for kind in (km.BilinearMPC, km.KoopmanMPC):
+        assert "weights move in time" in make(kind, Q_rows=[[1, 2]]).program().obstacle

@@ -93,7 +93,7 @@ def draw_cost(rng, kind, nx, nu, found):
     if rng.random() < 0.3:
         found.append("price")
         weights["price"] = 0.3 * rng.normal(size=(STEPS, nu))
-    elif kind is not km.KoopmanMPC and rng.random() < 0.4:
+    elif rng.random() < 0.4:
         found.append("rows of weights")
         weights["Q_rows"] = rng.uniform(0.1, 2.0, (STEPS, nx))
     if "Q_rows" not in weights and rng.random() < 0.3:

@@ -14,14 +14,15 @@ from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, add_held, lifted_tracking
-from koopmpc.control.horizon import Coordinates
+from koopmpc.control.horizon import Coordinates, WeightRows
 from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.linear.call_windows import CallWindows, has_fields_of
 from koopmpc.control.linear.condensed_program import CondensedProgram
 from koopmpc.control.linear.moving import MovingMap
-from koopmpc.control.linear.plan import plan_map, planned_states
+from koopmpc.control.linear.plan import PlanKind, PlanMap, plan_map, planned_states
+from koopmpc.control.linear.weights import WeighedPlan, WeighedPlans
 from koopmpc.control.linear.windows import LimitWindows, describe_bounds, limit_windows
 from koopmpc.control.move import Fallback, Move, Plan, Status, alone, busy
 from koopmpc.control.program import linear_parts, no_export, publish_estimator, reference_table
@@ -129,7 +130,8 @@ class KoopmanMPC(MPCBase):
     _window: LimitWindows | None = None  # by which the limits of the last step were set
     _called_with: Limits | None = None  # the limits in time of the last call that had some
     _quick: CallWindows | None = None  # makes windows of further calls
-    _step = 0  # calls since reset, as far as limits move in time
+    _step = 0  # calls since reset, as far as limits or weights move in time
+    _weighed: WeighedPlans | None = None  # the plans of weights in time
     _row = 0  # row of the windows that belongs to the last step
     _pushed = False  # whether limits in time moved a target that the plan's last column is aimed at
     _free_steps: Sequence[bool] = ()  # steps in which they would move none
@@ -178,17 +180,12 @@ class KoopmanMPC(MPCBase):
         )
         self.predictor, self._disturbed = predictor, disturbed
         coordinates = self._wanted or turns[0].solver.coordinates
-        self._map = plan_map(
-            predictor,
-            track,
-            self._moves,
-            coordinates,
-            self._initial.buffer,
-            disturbed=disturbed,
-            periodic=self._initial.periodic.size > 0,
-            staged=self._solver == order.SPARSE or self._N >= order.LONG,
-        )
+        long = self._solver == order.SPARSE or self._N >= order.LONG
+        self._plan_kind = PlanKind(disturbed, self._initial.periodic.size > 0, staged=long and not track.weighed)
+        self._map = plan_map(predictor, track, self._moves, coordinates, self._initial.buffer, self._plan_kind)
         self._hold_limits()
+        if track.weighed:
+            self._hold_weights()
         self._options = {"solver": self._solver, "settings": settings}
         self._levels: LevelSearch | None = None
         ball = self._map.ball
@@ -242,6 +239,10 @@ class KoopmanMPC(MPCBase):
             )
         if self.limits.priority is not None:
             raise no_export(self, "its C weighs soft limits, and knows no priority", "one without a priority")
+        if self._weighed is not None:
+            raise no_export(
+                self, "its weights move in time, and its C holds one plan", "one without Cost(Q_rows=…, R_rows=…)"
+            )
         plan, track = self._map, self._map.track
         if plan.ball is not None:
             raise no_export(
@@ -332,25 +333,12 @@ class KoopmanMPC(MPCBase):
             if getattr(predictor, name) != getattr(self.predictor, name):
                 raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
         track = lifted_tracking(predictor, self.cost, self.limits, in_time=True)
-        coordinates = "plain" if self.coordinates == "plain" else "riccati"
-        self._map = plan_map(
-            predictor,
-            track,
-            self._moves,
-            coordinates,
-            self._initial.buffer,
-            disturbed=self._disturbed,
-            periodic=self._initial.periodic.size > 0,
-            staged=self._solver == order.SPARSE or self._N >= order.LONG,
-        )
-        self._read = self._map.moving
         self.predictor, self._states = predictor, None
-        if isinstance(self._qps, BallSolver) and self._map.ball is not None:
-            self._qps.change(self._map.qp, self._map.ball)
-        else:
-            self._qps.update(self._map.qp)
+        coordinates = "plain" if self.coordinates == "plain" else "riccati"
+        self._take_plan(plan_map(predictor, track, self._moves, coordinates, self._initial.buffer, self._plan_kind))
         self._hold_limits()
-        self._reference_key = None
+        if track.weighed:
+            self._hold_weights()
         self._initial.update(predictor)
         if self._watch is not None:
             self._watch.update(predictor)
@@ -397,6 +385,8 @@ class KoopmanMPC(MPCBase):
             raise
         try:
             start = perf_counter()
+            if self._weighed is not None:
+                self._follow_weights(self._weighed)
             target = numbers(reference, "reference")
             key, moving = target.tobytes(), None
             if key != self._reference_key:
@@ -412,7 +402,7 @@ class KoopmanMPC(MPCBase):
             origin.take(y, self._given, applied, w)
             if self._held is not None:
                 self._count_held(applied)
-            if self._window is not None:
+            if self._window is not None or self._weighed is not None:
                 self._step += 1
             plan, t = self._map, self._spare
             if moving is None or self._near:
@@ -445,6 +435,38 @@ class KoopmanMPC(MPCBase):
             return move
         finally:
             self._token.append(held)
+
+    def _take_plan(self, plan: PlanMap) -> None:
+        """Go on with another plan of the same sizes; the warm start is kept."""
+        self._map, self._read, self._reference_key = plan, plan.moving, None
+        if isinstance(self._qps, BallSolver) and plan.ball is not None:
+            self._qps.change(plan.qp, plan.ball)
+        else:
+            self._qps.update(plan.qp)
+
+    def _hold_weights(self) -> None:
+        """Make the table of plans of weights in time."""
+        base = WeighedPlan(self._map, self._rows_of_limits)
+        self._weighed = WeighedPlans(self._map.track, self._N, base, self._weigh)
+
+    def _weigh(self, rows: WeightRows) -> WeighedPlan:
+        """Return the plan of weights in time."""
+        now, model, buffer = self._map, self.predictor, self._initial.buffer
+        coordinates = "plain" if self.coordinates == "plain" else "riccati"
+        plan = plan_map(model, now.track, self._moves, coordinates, buffer, self._plan_kind, rows, now)
+        if not self.limits.in_time:
+            return WeighedPlan(plan, None)
+        windows = limit_windows(plan, self.limits, model.states, model.inputs, self._latency, at_call=False)
+        return WeighedPlan(plan, windows)
+
+    def _follow_weights(self, weighed: WeighedPlans) -> None:
+        """Take the plan of the weights of this step."""
+        plan, windows = weighed.find(self._step + self._latency)
+        if plan is not self._map:
+            self._take_plan(plan)
+            plan.restore_limits()
+            self._called_with = self._quick = None
+            self._window = self._rows_of_limits = windows
 
     def _hold_limits(self) -> None:
         """Make the windows of the controller's own limits, where these move in time."""

@@ -9,7 +9,16 @@ from jaxtyping import Bool, Float, Int
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.control.cost import LiftedTracking, add_held
-from koopmpc.control.horizon import Condensed, Coordinates, Horizon, build_stages, condense, horizon_of
+from koopmpc.control.horizon import (
+    Condensed,
+    Coordinates,
+    Horizon,
+    Terminal,
+    WeightRows,
+    build_stages,
+    condense,
+    horizon_of,
+)
 from koopmpc.control.limits import Interval, Softness, preview_margin
 from koopmpc.control.linear.blocking import tie_moves
 from koopmpc.control.linear.layout import WindowLayout
@@ -40,6 +49,14 @@ class PlanLimits(NamedTuple):
     size: Float[np.ndarray, " nv"]
     next: Int[np.ndarray, " nv"]
     kept: Bool[np.ndarray, " nv"]
+
+
+class PlanKind(NamedTuple):
+    """Whether a plan knows a constant disturbance, a periodic one, and its QP before condensing, a stage a step."""
+
+    disturbed: bool
+    periodic: bool
+    staged: bool
 
 
 class PlanMap(Viewing):
@@ -91,6 +108,7 @@ class PlanMap(Viewing):
 
     _VIEWS = ("met", "met_low", "met_high", "low", "high")
     layout: WindowLayout | None = None  # where rows of limits stand in a table, once there are some
+    terminal: Terminal  # what the end of the horizon costs, in its units
 
     def __init__(
         self,
@@ -194,25 +212,25 @@ def plan_map(
     moves: MoveBlocks,
     coordinates: Coordinates,
     buffer: Float[np.ndarray, " n"],
-    *,
-    disturbed: bool,
-    periodic: bool = False,
-    staged: bool = False,
+    kind: PlanKind,
+    rows: WeightRows | None = None,
+    like: PlanMap | None = None,
 ) -> PlanMap:
     """Return the plan of a predictor: its horizon, solved by the Riccati recursion, condensed, and limited.
 
-    A `staged` one also keeps its QP as it was before, where each stage is one step.
+    `rows` are weights in time; then the plan may have the targets and the end of another one, `like`, which differs by
+    them alone.
     """
-    targets, units = targets_of(predictor, track), Units.of(predictor, track)
+    targets, units = targets_of(predictor, track) if like is None else like.targets, Units.of(predictor, track)
     aims, cost = units.targets(targets), units.cost(track.cost)
-    horizon = horizon_of(predictor, track, moves.lengths, disturbed=disturbed, periodic=periodic)
+    horizon = horizon_of(predictor, track, moves.lengths, disturbed=kind.disturbed, periodic=kind.periodic, rows=rows)
     own = horizon.in_units(units)
     parts = build_stages(own, aims)
-    end = terminal_of(predictor, cost, own, aims, units.inverse)
+    end = terminal_of(predictor, cost, own, aims, units.inverse) if like is None else like.terminal
     law = recursion(parts, end.P, end.p)
     wanted = track.limits.terminal
-    rows = None if wanted is None else read_end(wanted, predictor)
-    maps = condense(own, law, end, aims, units, "riccati" if moves.own else coordinates, rows)
+    last = None if wanted is None else read_end(wanted, predictor)
+    maps = condense(own, law, end, aims, units, "riccati" if moves.own else coordinates, last)
     if moves.own:
         maps = tie_moves(maps, moves.held)
     if track.pull is not None:  # an end of one's own does not count the price
@@ -221,11 +239,13 @@ def plan_map(
         maps = replace(maps, offset=maps.offset + maps.from_reference @ pulled)
     scaled = _scale_deviation(maps, track.inputs, len(moves.lengths))
     stages = None
-    plain = not moves.own and rows is None and len(horizon.blocks) == horizon.N
-    if staged and plain and maps.coordinates == "riccati":
+    plain = not moves.own and last is None and len(horizon.blocks) == horizon.N
+    if kind.staged and plain and maps.coordinates == "riccati":
         columns = np.diagonal(scaled.deviation) / np.diagonal(maps.deviation)
         stages = _keep_stages(own, parts[0], law, end.P, units, columns, units.scale / scaled.unit)
-    return PlanMap(track, targets, horizon, scaled, rows, moves.held, buffer, stages)
+    plan = PlanMap(track, targets, horizon, scaled, last, moves.held, buffer, stages)
+    plan.terminal = end
+    return plan
 
 
 def _keep_stages(
