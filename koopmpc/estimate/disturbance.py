@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
-from koopmpc.estimate.gate import BRIDGED, gate_graph
+from koopmpc.estimate.gate import BRIDGED, ROUNDING, gate_graph
 from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
 from koopmpc.estimate.periodic import PeriodicObserver, find_harmonics
 from koopmpc.interrupts import raise_swallowed
@@ -34,11 +34,11 @@ class LiftedDisturbance(Value):
     the states have the disturbances.
 
     A plan holds d over its horizon, but what a model lacks in a transient is not what it lacks where the plan ends.
-    Therefore d ← d + c (m − d), m the mean of the last misfits and c the share of them that was constant, as the
-    states show it: c = 1 − Σ vᵢ/sᵢ² / Σ max((C m)ᵢ², (C d)ᵢ²)/sᵢ², at least 0. v is the variance of C e about C m,
-    without half the mean square of its successive differences, which is noise, and s the largest step or misfit that a
-    state has shown so far. Where the misfits vary by more than their mean nothing is learned; at rest v = 0 and
-    d = m = e.
+    Therefore d ← d + c (m − d), m the mean of the last misfits and c the share of them that was constant, as the states
+    show it: c = 1 − Σ vᵢ/sᵢ² / Σ max((C m)ᵢ², (C d)ᵢ²)/sᵢ², at least 0. v is the variance of C e about C m, without
+    half the mean square of its successive differences, which is noise, and s the largest step or misfit that a state
+    has shown so far, at least 1e-9 of its size. Where the misfits vary by more than their mean nothing is learned; at
+    rest v = 0 and d = m = e.
 
     Exact measurements need no mean. If the gain is not given, and c' = 1 − L² D / max(Σ (C e)ᵢ²/sᵢ², Σ (C d)ᵢ²/sᵢ²) is
     above c or above 0.99, the last misfit takes the place of the mean: d ← d + c' (e − d). D is the running mean of
@@ -277,7 +277,8 @@ def _rule(
     learns = ca.logic_and(ca.logic_and(good, seen), ca.logic_and(flags[0], ca.dot(e, e) < HUGE**2))
     weight = ca.fmax(gain, newest)
     f_new, moved = C @ e, C @ (z - last)
-    squares_new = ca.fmax(squares, ca.fmax(moved**2, f_new**2))
+    shown = ca.fmax(ca.fmax(moved**2, f_new**2), (ROUNDING * (C @ z)) ** 2)
+    squares_new = ca.fmax(squares, shown)
     weights = ca.if_else(squares_new > 0, 1 / squares_new, 0)
     m_new = m + weight * (e - m)
     rough_new = rough + weight * (f_new**2 - 0.5 * (learned > 0) * (f_new - f) ** 2 - rough)

@@ -24,7 +24,7 @@ FALL = RISE ** (-1 / 9)  # and one below it by this: nine of ten are below where
 WIDEN = 4.0  # while all readings are used, the quantile follows the last innovation by at most this factor a step,
 NARROW = 0.7  # and downwards by this one
 LEAST = 0.01  # the quantile counts as at least this share of the largest step that the output has made
-ROUNDING = 1e-9  # and as this share of the prediction's size
+ROUNDING = 1e-9  # and as this share of the reading's and the prediction's size: what is smaller is rounding
 SUSPECTS = 2  # the first readings, and those after a reading that leaps, may be left behind so many times
 FADING = 0.8  # what a predicted step allows fades by this factor a step
 
@@ -34,13 +34,14 @@ FADING = 0.8  # what a predicted step allows fades by this factor a step
 def gate_function(ny: int) -> ca.Function:
     """Return (y, prediction, memory) → [whether y is refused; 1 if the gate has opened, 2 if all is lost; the memory].
 
-    y is refused if |yᵢ − ŷᵢ| > 5 max(qᵢ, 0.01 Sᵢ, 1e-9 |ŷᵢ|) + ρ Sᵢ for any of its entries. qᵢ is the running 0.9
-    quantile of |yᵢ − ŷᵢ|, and Sᵢ the largest step of this output that was used. ρ is the largest predicted step of all
-    outputs, each in units of its S, and fades by 0.8 a step: in a transient a model may err by as much as the outputs
-    move. After five refused readings in sequence the gate opens, and all readings are used until one is inside the
-    bound. Before the tenth reading only one is refused that is off by 1e4 times all that its output has shown, |last| +
-    max(q, S); the bound counts from there. Such a reading opens the gate after ten refused ones only. Without a
-    prediction it is refused if it is so far from the last one that was used. Entries that are NaN are not judged.
+    y is refused if |yᵢ − ŷᵢ| > 5 qᵢ + ρ Sᵢ for any of its entries. qᵢ is the running 0.9 quantile of |yᵢ − ŷᵢ|, and
+    counts and goes on as at least 0.01 Sᵢ and 1e-9 of yᵢ and ŷᵢ, so that rounding decides nothing. Sᵢ is the largest
+    step of this output that was used. ρ is the largest predicted step of all outputs, each in units of its S, and fades
+    by 0.8 a step: in a transient a model may err by as much as the outputs move. After five refused readings in
+    sequence the gate opens, and all readings are used until one is inside the bound. Before the tenth reading only one
+    is refused that is off by 1e4 times all that its output has shown, |last| + max(q, S); the bound counts from there.
+    Such a reading opens the gate after ten refused ones only. Without a prediction it is refused if it is so far from
+    the last one that was used. Entries that are NaN are not judged.
 
     Among the first readings, and while the gate is open, a wild one may be used. Where a prediction is then off by more
     than 1e4 (S + |y|), the estimate is lost: the observer starts again from y. A plant that does not move, whatever is
@@ -63,9 +64,11 @@ def gate_function(ny: int) -> ca.Function:
     error = ca.if_else(came, ca.fabs(y - predicted), 0)
     ahead_new = ca.fmax(ca.if_else(ca.logic_and(came, count > 0), ca.fabs(predicted - last), 0), FADING * ahead)
     size = ca.fmax(largest, ahead_new)
-    share = ca.mmax(ahead_new / ca.if_else(size > 0, size, 1))
-    least = ca.fmax(LEAST * largest, ca.if_else(came, ROUNDING * ca.fabs(predicted), 0))
-    inside = error <= BEYOND * ca.fmax(quantile, least) + share * size
+    moving = ca.fmax(size, ca.if_else(came, ROUNDING * ca.fmin(ca.fabs(predicted), ca.fabs(last)), 0))
+    share = ca.mmax(ahead_new / ca.if_else(moving > 0, moving, 1))
+    least = ca.fmax(LEAST * largest, ca.if_else(came, ROUNDING * ca.fmin(ca.fabs(predicted), ca.fabs(y)), 0))
+    wide = ca.fmax(quantile, least)
+    inside = error <= BEYOND * wide + share * size
     judged, good, closed = ca.mmax(came), ca.mmin(inside), count >= FEW
     shown = ca.fmax(quantile, size) + ca.fabs(last)
     jump = ca.if_else(foreseen, error, ca.if_else(known, ca.fabs(y - last), 0))
@@ -84,8 +87,8 @@ def gate_function(ny: int) -> ca.Function:
     opened = ca.logic_and(wild, ca.logic_not(refused))
     used = ca.if_else(refused, predicted, y)
     learned = ca.logic_and(came, ca.logic_not(refused))
-    follows = ca.if_else(quantile > 0, ca.fmin(ca.fmax(error, NARROW * quantile), WIDEN * quantile), error)
-    tracks = quantile * ca.if_else(error > quantile, RISE, FALL)
+    follows = ca.if_else(wide > 0, ca.fmin(ca.fmax(error, NARROW * wide), WIDEN * wide), error)
+    tracks = wide * ca.if_else(error > wide, RISE, FALL)
     step = ca.if_else(ca.logic_and(ca.logic_and(learned, inside), count > 0), ca.fabs(y - last), 0)
     waited = ca.if_else(count < FEW - 1, count + 1, ca.if_else(good, FEW, FEW - 1))
     counted = ca.if_else(refused, ca.fmax(count, FEW) + 1, ca.if_else(opened, FEW - 1, ca.if_else(closed, FEW, waited)))

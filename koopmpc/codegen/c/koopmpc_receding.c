@@ -31,20 +31,23 @@ static void advance(koopmpc_real *next, const koopmpc_real *z, const koopmpc_rea
 static void learn(koopmpc_state *s, koopmpc_real *misfit) {
   enum { NZ = KOOPMPC_NZ, NX = KOOPMPC_NX };
   const koopmpc_real weight = s->fresh > KOOPMPC_GAIN ? s->fresh : KOOPMPC_GAIN;
-  koopmpc_real states[KOOPMPC_NX], step[KOOPMPC_NX], believed[KOOPMPC_NX], varied = 0, most = 0;
+  koopmpc_real states[KOOPMPC_NX], step[KOOPMPC_NX], believed[KOOPMPC_NX], shown[KOOPMPC_NX], varied = 0, most = 0;
   koopmpc_real changed = 0, largest = 0, share, exact;
   for (int i = 0; i < NZ; i++)
     if (i == KOOPMPC_CONSTANT || i >= KOOPMPC_LEARNED) misfit[i] = 0;
   if (!koopmpc_usable(misfit, NZ)) return;
-  for (int i = 0; i < NX; i++) states[i] = step[i] = believed[i] = 0;
+  for (int i = 0; i < NX; i++) states[i] = step[i] = believed[i] = shown[i] = 0;
   koopmpc_add(states, koopmpc_C, NX, misfit, NZ);
   for (int i = 0; i < NZ; i++) s->scratch[i] = s->z[i] - s->from[i];
   koopmpc_add(step, koopmpc_C, NX, s->scratch, NZ);
+  koopmpc_add(shown, koopmpc_C, NX, s->z, NZ);
   koopmpc_add(believed, koopmpc_C, NX, s->d, NZ);
   for (int i = 0; i < NX; i++) {
     const koopmpc_real square = states[i] * states[i], moved = step[i] * step[i];
     const koopmpc_real change = states[i] - s->newest[NZ + i];
-    const koopmpc_real size = square > moved ? square : moved;
+    const koopmpc_real least = KOOPMPC_RESTS * KOOPMPC_RESTS * shown[i] * shown[i];
+    koopmpc_real size = square > moved ? square : moved;
+    if (size < least) size = least;
     if (size > s->sizes[i]) {
       s->sizes[i] = size;
       s->weights[i] = 1 / size;
