@@ -36,8 +36,8 @@ class LiftedDisturbance(Value):
     A plan holds d over its horizon, but what a model lacks in a transient is not what it lacks where the plan ends.
     Therefore d ← d + c (m − d), m the mean of the last misfits and c the share of them that was constant, as the states
     show it: c = 1 − Σ vᵢ/sᵢ² / Σ max((C m)ᵢ², (C d)ᵢ²)/sᵢ², at least 0. v is the variance of C e about C m, without
-    half the mean square of its successive differences, which is noise, and s the largest step or misfit that a state
-    has shown so far, at least 1e-9 of its size. Where the misfits vary by more than their mean nothing is learned; at
+    half the mean square of its successive differences, which is noise. s is the largest step or misfit that a state has
+    shown so far, and at least 1e-9 of its size. Where the misfits vary by more than their mean nothing is learned; at
     rest v = 0 and d = m = e.
 
     Exact measurements need no mean. If the gain is not given, and c' = 1 − L² D / max(Σ (C e)ᵢ²/sᵢ², Σ (C d)ᵢ²/sᵢ²) is
