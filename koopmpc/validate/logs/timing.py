@@ -7,15 +7,15 @@ differs from zero by more than chance says that u_{k+1} acts within its own row:
 column is one row late.
 
 Under feedback u_{k+1} = −K y_{k+1} + … the coefficient differs from zero too, so that one log cannot tell the two
-apart. Three tests look for feedback:
+apart. Four tests look for feedback:
 
 1. Past outputs predict an input better than its own past does (Granger), or a few of them do as well.
 2. The past p_k predicts an input only by K times its prediction of y_{k+1} (Sargan's test of p_k as instruments).
 3. A later input u_{k+2} seems to act on y_{k+1}.
+4. The law of a PD or PID controller predicts u_{k+1} as well as y_{k+1} and all the past do. The set points are white
+   or constant, and the plant's gain does not tell that this controller would drive the output away.
 
-A feedback of one output that would drive it away, by the sign of the plant's gain, is none: no controller does that.
-
-None of them sees every PI controller of white set points whose sensor is as noisy as the set point moves.
+In the first two, a feedback of one output that would drive it away is none: no controller does that.
 
 References
 ----------
@@ -50,6 +50,9 @@ _STATE_ROWS = 4  # rows of these outputs
 _REPEATED = 0.3  # an input that keeps its exact value in this share of the rows does not follow a noisy output
 _WEAK = 2.5  # below this t value the coefficient is taken for zero
 _INSTRUMENTS = 1e-4  # significance at which a proportional feedback is rejected
+_LAW = 1e-4  # significance at which the law of a controller is rejected
+_EXACT = 1e-6  # share of an input's variance that an exact law leaves open, at most
+_TELLS = 0.5  # standard errors by which the plant's gain must show that a controller would drive the output away
 _STRONG = 0.1  # squared partial correlation of u_{k+1} and y_{k+1} above which a feedback must be strong, thus seen
 
 
@@ -160,6 +163,9 @@ def measure_timing(log: Log) -> tuple[InputTiming, ...]:
         elif not agree or np.abs(later[j]).max() > max(_LATER * abs(value), _WEAK):
             why = "rows before it seem to hold its effect too" if agree else "parts of the log disagree"
             found.append(InputTiming(name, Timing.UNKNOWN, value, why))
+        elif _follows_law(rows, j) and not _score_gain(rows, j, value) > _TELLS:
+            why = "a PID controller that answers to disturbances would move it in the same way"
+            found.append(InputTiming(name, Timing.UNKNOWN, value, why, feedback=True))
         else:
             found.append(InputTiming(name, Timing.SAME_ROW, value, f"its own row holds its effect (t = {value:.3g})"))
     return tuple(found)
@@ -267,6 +273,47 @@ def _amplifies(rows: _Rows, j: int, t: float) -> bool:
         if not (np.abs(poles) < 1).all() or k[own].sum() * t <= 0:
             return False
     return True
+
+
+def _follows_law(rows: _Rows, j: int) -> bool:
+    """Return whether the law of a PD or a PID controller predicts input j as well as all rows of the log do.
+
+    PD: u_{k+1} = c₀ y_{k+1} + c₁ y_k + r_{k+1}.
+
+    PID: u_{k+1} − u_k = c₀ y_{k+1} + c₁ y_k + c₂ y_{k−1} + r_{k+1}.
+
+    The set points r are what y_{k+1} and the past leave open of this row of u and two before. Several outputs hold
+    their slopes: laws of them have a row less.
+    """
+    u, nx = rows.same[:, [j]], rows.after.shape[1]
+    slopes = int(nx == 1)
+    every = np.hstack([rows.after, rows.states, rows.inputs])
+    open_part = _leave_out(_find_basis(every), u)
+    set_points = np.hstack([np.vstack([np.zeros((i, 1)), open_part[:-i]]) for i in (1, 2)])
+    whole = _find_basis(np.hstack([every, set_points]))
+    left = float((_leave_out(whole, u) ** 2).sum())
+    for earlier, target in ((slopes, u), (slopes + 1, u - rows.inputs[:, [j]])):
+        short = _find_basis(np.hstack([rows.after, rows.states[:, : nx * earlier], set_points[:, :earlier]]))
+        rest = float((_leave_out(short, target) ** 2).sum())
+        more, free = whole.shape[1] - short.shape[1], len(u) - whole.shape[1] - 1
+        if rest < _EXACT * float((u**2).sum()) or fdtrc(more, free, (rest - left) / more / (left / free)) > _LAW:
+            return True
+    return False
+
+
+def _score_gain(rows: _Rows, j: int, t: float) -> float:
+    """Return by how many standard errors the gain Σ bᵢ of input j on the output of t has the sign of t; 0 if unknown.
+
+    Under feedback y_{k+1} = Σ aᵢ y_{k−i} + Σ bᵢ u_{k−i} + e holds without u_{k+1}; the controller has the other sign.
+    """
+    past = np.hstack([rows.states, rows.inputs])
+    if rows.after.shape[1] > 1 or _find_basis(past).shape[1] < past.shape[1]:
+        return 0.0
+    inverse = np.linalg.pinv(past)
+    weights = inverse[rows.states.shape[1] + j :: rows.same.shape[1]].sum(axis=0)
+    left = _leave_out(_find_basis(past), rows.after)
+    size = np.sqrt(float((left**2).sum()) / (len(past) - past.shape[1]) * float(weights @ weights))
+    return float(weights @ rows.after[:, 0]) * np.sign(t) / max(size, 1e-300)
 
 
 def _explain_feedback(rows: _Rows, j: int, limits: _Strictness) -> str:

@@ -63,18 +63,32 @@ def record(seed, late=False, feedback=None):
     return km.Episodes([km.Episode(X=X[:, None], U=U[:, None])], 0.1, ["y"], ["u"])
 
 
-def loop(a, b, r, noise, gain, kind):
-    """Return y and u under u = K (r − y) + Kᵢ Σ (r − y), or None where the loop is unstable."""
+@cache
+def disturbed(seed, kind, set_points):
+    """Return one record under feedback which disturbances of the output drive: set points are that many times as large."""
+    rng = np.random.default_rng([seed, 77])
+    r = set_points * rng.normal(size=ROWS + 200)
+    a, b = plant_of(rng, rng.normal(size=len(r)))
+    d = signal.lfilter([1], [1, -rng.choice([0.0, rng.uniform(0.5, 0.98)])], rng.normal(size=len(r)))
+    gains = np.geomspace(2, 0.05, 16)
+    y, u = next(run for gain in gains if (run := loop(a, b, r, d / d.std(), gain, kind, 1.0)) is not None)
+    return km.Episodes([km.Episode(X=y[200:-1, None], U=u[200:-2, None])], 0.1, ["y"], ["u"])
+
+
+def loop(a, b, r, noise, gain, kind, size=None):
+    """Return y and u under u = K (r − y) + Kᵢ Σ (r − y) + D Δ(r − y), or None where the loop is unstable."""
     K, n = gain * np.sign(b.sum() / a.sum()), len(b)
-    integral = 0.1 * K if kind == "PI" else 0.0
-    x, y, u, total = np.zeros(len(r)), np.zeros(len(r)), np.zeros(len(r)), 0.0
+    integral, slope = 0.1 * K * ("I" in kind), 0.5 * K * ("D" in kind)
+    x, y, u, total, last = np.zeros(len(r)), np.zeros(len(r)), np.zeros(len(r)), 0.0, 0.0
+    size = r.std() if size is None else size
     for k in range(len(r)):
         x[k] = sum(b[i - 1] * u[k - i] - a[i] * x[k - i] for i in range(1, min(n, k) + 1))
         if abs(x[k]) > 100:
             return None
-        y[k] = x[k] + r.std() * noise[k]
+        y[k] = x[k] + size * noise[k]
         total += r[k] - y[k]
-        u[k] = K * (r[k] - y[k]) + integral * total
+        u[k] = K * (r[k] - y[k]) + integral * total + slope * (r[k] - y[k] - last)
+        last = r[k] - y[k]
     return y, u
 
 
@@ -97,6 +111,18 @@ def test_what_looks_like_a_feedback_that_drives_the_output_away_is_a_late_column
 @pytest.mark.parametrize(("seed", "kind"), [(1055, "P"), (1082, "PI")])
 def test_an_effect_within_the_row_that_a_feedback_can_make_is_not_named(seed, kind):
     assert not same_row(record(seed, feedback=kind))
+
+
+@pytest.mark.parametrize("kind", ["P", "PI", "PD", "PID"])
+@pytest.mark.parametrize("set_points", [0.0, 0.1])
+def test_a_feedback_that_disturbances_drive_is_not_named(kind, set_points):
+    assert not any(same_row(disturbed(seed, kind, set_points)) for seed in (2, 3))
+
+
+@pytest.mark.slow
+def test_counts_of_records_whose_feedback_disturbances_drive():
+    tasks = [(seed, kind, r) for seed in range(30) for kind in ("P", "PI", "PD", "PID") for r in (0.0, 0.1, 1.0)]
+    assert sum(same_row(disturbed(*task)) for task in tasks) <= len(tasks) // 20
 
 
 @pytest.mark.slow
