@@ -1,5 +1,6 @@
 """`certify`: a feedback with a proof of stability, from a bilinear or linear lifted model and pairs of data."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +22,8 @@ from koopmpc.guarantees.error_bounds import (
     sizes_of,
     split_pairs,
 )
-from koopmpc.guarantees.search import DECAY, Found, Room, find_largest, prove
+from koopmpc.guarantees.search import DECAY, Found, Room, prove
+from koopmpc.guarantees.statement import Refused, explain_refusal
 from koopmpc.lifting.base import find_observables
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
@@ -29,6 +31,7 @@ _SCALES = (1.0, 0.7, 0.5, 0.35, 0.25, 0.12, 0.06)  # shares of the box that are 
 _WORSE = 2  # stop after this many smaller boxes in sequence gave smaller regions
 _MOST = 16  # with more observables than this only the states are tried
 _LEAST_PAIRS = 30  # a box with fewer pairs is not tried
+_BEYOND = 0.05  # share of the sampled width by which a region may be wider; it is cut there
 _PROBES = 4000  # states at which the slope of the lifting is measured for noise
 
 Corners = tuple[ArrayLike, ArrayLike]
@@ -74,7 +77,7 @@ def certify(
         Whether the set point is not exactly an equilibrium. Then the error has a constant part c_0, u is found by
         least squares on the model, and what is proved is a ball that is reached.
     region
-        (low, high), a box in place of that of the sampled states.
+        (low, high), a box in place of that of the sampled states; inside it but for a bound that is given.
     error
         (c_x, c_u) where they are known: then S, D and d are identities, and the proof rests on them.
     lipschitz
@@ -137,7 +140,7 @@ def certify(
         if other is not None and (best is None or other.size > best.size):
             best, deviation = other, few.model
     if best is None:
-        raise CertificateError(_explain_failure(few or whole))
+        raise CertificateError(explain_refusal((few or whole).describe_failure()))
     low, high, room, pairs = whole.low, whole.high, whole.room, whole.pairs
     return Certificate(
         deviation=deviation,
@@ -186,7 +189,9 @@ class _Search:
         self.sizing = self.pairs
         if not asked.given:  # a scenario bound takes box, sizes and shape as given: they are of other episodes
             self.sizing, self.bounding = split_pairs(self.pairs, np.random.default_rng(asked.seed), share=0.5)
-        self.room, self.low, self.high = _find_room(model, self.sizing, asked.limits, asked.region, sampled=sampled)
+        self.room, self.low, self.high = _find_room(
+            model, self.sizing, asked.limits, asked.region, sampled=sampled, scenario=not asked.given
+        )
         inside = self.sizing.within(self.low, self.high)
         if not asked.given and len(inside.phi) < _LEAST_PAIRS:
             raise DataError(
@@ -223,8 +228,20 @@ class _Search:
 
     def prove(self, bound: ErrorBound, scale: float) -> Found | None:
         """Return the proof for a bound on this share of the box, None where there is none."""
-        eta = 0.0 if self.slope is None else float(np.linalg.norm(self.slope / bound.phi_size))
+        eta = self.find_noise(bound)
         return prove(self.model, bound, self.room.scale_by(scale), scale, decay=self.asked.decay, noise=eta)
+
+    def find_noise(self, bound: ErrorBound) -> float:
+        """Return the largest ‖D⁻¹(ψ(x + n) − ψ(x))‖ of the measurement."""
+        return 0.0 if self.slope is None else float(np.linalg.norm(self.slope / bound.phi_size))
+
+    def describe_failure(self) -> Refused:
+        """Return all that the reason of a refusal is sought in."""
+        tried = {scale: self.find_bound(scale) for scale in _SCALES}
+        bounds = {scale: bound for scale, bound in tried.items() if bound is not None}
+        noise = self.find_noise(next(iter(bounds.values()))) if bounds else 0.0
+        pairs = None if self.asked.given else self.bounding
+        return Refused(self.model, self.room, bounds, self.asked.decay, noise, pairs, len(bounds) < len(tried))
 
     def run(self) -> Found | None:
         """Return the proof with the largest region over the shares of the box."""
@@ -278,7 +295,13 @@ def _read_pairs(model: DeviationModel, data: Episodes) -> ErrorPairs:
 
 
 def _find_room(
-    model: DeviationModel, pairs: ErrorPairs, limits: Limits | None, region: Corners | None, *, sampled: bool
+    model: DeviationModel,
+    pairs: ErrorPairs,
+    limits: Limits | None,
+    region: Corners | None,
+    *,
+    sampled: bool,
+    scenario: bool,
 ) -> tuple[Room, Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
     """Return where the region and the inputs may be, and the box of states that the bound of the error is on."""
     nx, nu = len(model.x), len(model.u)
@@ -290,7 +313,8 @@ def _find_room(
         raise DataError("limits of changes of the inputs are not part of a certificate; pass limits without du_max")
     low, high = pairs.X.min(axis=0), pairs.X.max(axis=0)
     if region is not None:
-        low, high = checks.vector(region[0], "region", nx), checks.vector(region[1], "region", nx)
+        corners = checks.vector(region[0], "region", nx), checks.vector(region[1], "region", nx)
+        low, high = _stay_inside(corners, (low, high), names) if scenario else corners
     x_low, x_high = allowed.states(nx)
     where = "the sampled box" if region is None else "the region"
     for box_low, box_high, what in ((low, high, where), (x_low, x_high, "the limits")):
@@ -327,6 +351,29 @@ def _find_room(
     return Room(widths, table, inputs), low, high
 
 
+def _stay_inside(
+    region: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
+    sampled: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
+    names: Sequence[str],
+) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
+    """Return the part of a region that was sampled; a bound that is made of samples says nothing of the rest.
+
+    Raises
+    ------
+    DataError
+        More of it than rounding was not sampled.
+    """
+    (low, high), (first, last) = region, sampled
+    beyond = np.maximum(first - low, high - last) / np.maximum(last - first, 1e-300)
+    i = int(np.argmax(beyond))
+    if beyond[i] > _BEYOND:
+        raise DataError(
+            f"the region has {names[i]} = {low[i]:g} … {high[i]:g}, and the data have {first[i]:g} … {last[i]:g}; a"
+            " bound of the error from data holds where they are: pass a region inside, or collect data in it"
+        )
+    return np.maximum(low, first), np.minimum(high, last)
+
+
 def _noise_in_lifting(
     model: DeviationModel,
     low: Float[np.ndarray, " nx"],
@@ -338,50 +385,3 @@ def _noise_in_lifting(
     X = rng.uniform(low, high, (_PROBES, len(low)))
     moved = X + noise * rng.choice([-1.0, 1.0], X.shape)
     return 1.1 * np.abs(model.lift(moved) - model.lift(X)).max(axis=0)
-
-
-def _explain_failure(search: _Search) -> str:
-    """Return which assumption is in the way, found by bisection."""
-    model, room, decay = search.model, search.room, search.asked.decay
-    tried = {scale: search.find_bound(scale) for scale in _SCALES}
-    known: dict[float, ErrorBound] = {scale: bound for scale, bound in tried.items() if bound is not None}
-    if not known:
-        return (
-            "no certificate: the data have too few independent episodes for a bound of the error; collect 30 or more,"
-            " best of one step each"
-        )
-    if decay is not None and not is_stabilisable(model, decay) and is_stabilisable(model, DECAY):
-        return (
-            f"no certificate: V cannot fall to decay={decay:g} of itself in each step, for a mode of the model that no"
-            " input moves falls more slowly. Pass a decay nearer to 1, or leave it out"
-        )
-    if not is_stabilisable(model, decay or DECAY):
-        return (
-            "no certificate: the model itself cannot be stabilised around the set point, whatever its error. Its linear"
-            " part (A, B) has an unstable mode that no input moves; check the inputs of the model, or leave"
-            " observables out"
-        )
-    scale, bound = min(known.items(), key=lambda pair: pair[1].c_x + pair[1].c_u + pair[1].c_0)
-    constants = f"c_x = {bound.c_x:.3g}, c_u = {bound.c_u:.3g}" + (f", c_0 = {bound.c_0:.3g}" if bound.c_0 else "")
-    share = find_largest(lambda f: search.prove(bound.scale_by(f), scale) is not None, 1e-3, 1.0)
-    if share > 0:
-        return (
-            f"no certificate: the error of the model is too large. It is bounded by {constants} on {scale:.3g} of the"
-            f" box, and a certificate exists for {share:.2g} of these constants. Try a lifting with a smaller error,"
-            " more data near the set point for the fit, or a smaller region"
-        )
-    exact = bound.scale_by(0.0)
-    size = find_largest(lambda s: search.prove(exact, s) is not None, 1e-4 * scale, scale)
-    if size > 0:
-        return (
-            f"no certificate: the region is too large. Even a model without error has none on {scale:.3g} of the box,"
-            f" and one on {size:.2g} of it. Pass a smaller region=, wider limits of the inputs, or data with larger"
-            " inputs"
-        )
-    free = replace(room, inputs=np.full_like(room.inputs, np.inf))
-    if prove(model, exact, free.scale_by(1e-4 * scale), scale, decay=decay) is not None:
-        return "no certificate: the limits of the inputs leave no room around the set point; widen them"
-    return (
-        "no certificate: even around the set point, without an error and without limits, the program finds none. The"
-        " lifting holds observables that are nearly functions of one another; leave some of them out"
-    )

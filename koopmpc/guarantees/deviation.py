@@ -139,15 +139,23 @@ def reduce_to_states(deviation: DeviationModel) -> DeviationModel:
 
 def is_stabilisable(model: DeviationModel, decay: float) -> bool:
     """Return whether inputs reach every mode of A with |λ|² ≥ ρ, by the rank test of Popov, Belevitch and Hautus."""
+    return not find_stray_mode(model, decay)
+
+
+def find_stray_mode(model: DeviationModel, decay: float) -> str:
+    """Return |λ| of the fastest mode with |λ|² ≥ ρ that no input moves, and where it is largest; nothing if none."""
     A, B = model.A, model.B
     size = max(float(np.abs(A).max()), 1.0)
     reach = B / np.maximum(np.linalg.norm(B, axis=0), 1e-300)
-    for value in np.linalg.eigvals(A):
-        if abs(value) ** 2 >= decay:
-            least = np.linalg.svd(np.hstack([A - value * np.eye(len(A)), reach]), compute_uv=False)[-1]
-            if least < _UNREACHED * size:
-                return False
-    return True
+    values, modes = np.linalg.eig(A)
+    for i in np.argsort(-np.abs(values)):
+        if abs(values[i]) ** 2 < decay:
+            break
+        least = np.linalg.svd(np.hstack([A - values[i] * np.eye(len(A)), reach]), compute_uv=False)[-1]
+        if least < _UNREACHED * size:
+            name = model.lifting.names[int(model.kept[int(np.argmax(np.abs(modes[:, i])))])]
+            return f"|λ| = {abs(values[i]):.4g}, largest in {name}"
+    return ""
 
 
 def _reads_states(model: LinearPredictor | BilinearPredictor) -> bool:

@@ -62,6 +62,7 @@ def make_task(model: DeviationModel, bound: ErrorBound, room: Room, decay: float
     C = model.C * D
     rows = np.vstack([C / room.widths[:, None], room.rows * D])
     rows = rows[np.isfinite(rows).all(axis=1) & (np.abs(rows).max(axis=1, initial=0.0) > 0)]
+    narrow = max(1.0, float((rows**2).sum(axis=1).max(initial=0.0)))  # a small room asks for a small ellipsoid
     return FeedbackTask(
         A=model.A * D / D[:, None],
         B=model.B * d / D[:, None],
@@ -69,7 +70,7 @@ def make_task(model: DeviationModel, bound: ErrorBound, room: Room, decay: float
         S=bound.shape / np.outer(D, D),
         c_x=bound.c_x,
         c_u=bound.c_u,
-        E=np.eye(n) * n * 3.0,
+        E=np.eye(n) * n * 3.0 / narrow,
         inputs=room.inputs / d if m else room.inputs,
         rows=rows,
         volume=C / np.linalg.norm(C, axis=1, keepdims=True),
@@ -80,15 +81,13 @@ def make_task(model: DeviationModel, bound: ErrorBound, room: Room, decay: float
 def grow(task: FeedbackTask, *, linear: bool = False) -> FeedbackProof | None:
     """Return the proof with the largest region that is found by letting the ellipsoid E follow the region."""
     best = solve_feedback(task, linear=linear)
-    if task.N is None:
-        return best
     for _ in range(_TRIES):
         if best is not None:
             break
         task = replace(task, E=_SHRINK * task.E)
         best = solve_feedback(task, linear=linear)
-    if best is None:
-        return None
+    if best is None or task.N is None:
+        return best
     for _ in range(_ROUNDS):
         before = best.size
         for factor in _GROWTH:

@@ -100,7 +100,7 @@ def solve_feedback(task: FeedbackTask, *, linear: bool = False) -> FeedbackProof
 
     model: Any = cvxpy
     # inside, φ = T φ̂ with E = T Tᵀ and v = g v̂ with inputs of unit effect: the ellipsoid is the unit ball
-    T = _root(task.E) if task.N is not None else np.eye(len(task.A))
+    T = _root(task.E)
     back = np.linalg.inv(T)
     g = 1 / np.maximum(np.linalg.norm(back @ task.B, axis=0), 1e-9)
     A, B, S = back @ task.A @ T, back @ task.B * g, back @ task.S @ back.T
