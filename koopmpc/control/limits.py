@@ -104,7 +104,8 @@ class Limits(Value):
     priority
         Which soft limits are kept longest, ``{"pressure": 2, "level": 1}``, or an entry for every state and then for
         every observable of `of`; others have 0. A limit gives way only as far as no limit of a lower priority can
-        spare it that, whatever the weights are. For KoopmanMPC and LinearMPC.
+        spare it that, whatever the weights are. In BilinearMPC and NonlinearMPC, beside `levels`, and in C a limit
+        weighs 1,000 times one of the priority below instead, for at most 3 different priorities.
     rows
         Bounds that limit nothing now, and that a step may bring, such as ``("x_max",)``; see `with_bounds`.
 
@@ -461,7 +462,7 @@ class Limits(Value):
 
 
 def refuse_priority(limits: Limits | None, who: str) -> None:
-    """Raise where soft limits have priorities, for a controller that weighs them alone.
+    """Raise where soft limits have priorities, for a choice that compares controllers by weights alone.
 
     Raises
     ------
@@ -470,8 +471,8 @@ def refuse_priority(limits: Limits | None, who: str) -> None:
     """
     if limits is not None and limits.priority is not None:
         raise DataError(
-            f"the limits have a priority, which {who} does not know; take a KoopmanMPC or a LinearMPC, or weigh the"
-            " limits with slack="
+            f"the limits have a priority, which {who} does not know; weigh the limits with slack=, and make the"
+            " controller anew with the priority"
         )
 
 

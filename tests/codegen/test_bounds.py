@@ -216,3 +216,15 @@ def test_targets_that_limits_in_time_push_are_pushed_in_c_too():
         for k in range(12):
             r = size * np.array([np.cos(k), np.sin(k)])
             np.testing.assert_allclose(fast([0.1, 0.0], r).u, mpc([0.1, 0.0], r).u, atol=1e-6)
+
+
+@pytest.mark.parametrize("make", [compile_mpc, pytest.param(compile_bilinear, marks=slow)])
+def test_in_c_weights_stand_for_priorities(make):
+    limits = km.Limits(u_min=-0.6, u_max=0.6, x_max=[0.2, 0.1], x_min=[-0.3, -0.2], priority=[1, 0])
+    mpc, fast = make(limits)
+    assert "SOFTENED" in require_parity(mpc, fast, within=1e-5)
+
+
+def test_four_priorities_are_too_many_for_c():
+    limits = km.Limits(x_max=0.3, of=km.State(), y_max=0.2, priority=[0, 1, 2, 3])
+    assert "can tell 3 apart" in km.KoopmanMPC(MODEL, COST, limits, 6).program().obstacle

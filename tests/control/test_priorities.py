@@ -1,5 +1,7 @@
 """Priorities of soft limits: a limit gives way no further than it would without those below it."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -100,7 +102,6 @@ REFUSED = {
     "c has priority 1 and no limit": {"priority": [0, 2, 1], "x_max": [1.0, 1.0, np.inf]},
     "pass whole numbers": {"priority": [0.5, 0, 0]},
     "the limit of b is hard and has priority 2": {"priority": {"b": 2}, "slack": None},
-    "levels and a priority": {"priority": {"b": 2}, "levels": [[-1, 1]]},
 }
 
 
@@ -111,13 +112,47 @@ def test_priorities_that_cannot_be_are_refused(said):
         km.KoopmanMPC(model, cost, km.Limits(u_min=-1, u_max=1, **({"x_max": 1.0} | REFUSED[said])), 5)
 
 
-def test_others_say_that_they_know_no_priority(tmp_path):
+@pytest.mark.parametrize("kind", [km.BilinearMPC, km.NonlinearMPC])
+def test_where_weights_stand_for_priorities_plans_are_those_of_a_qp_for_each(kind, monkeypatch):
+    """On linear models, of which KoopmanMPC solves the priorities one after the other."""
+    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)  # a step is shorter than its compilation
+    gave_way = 0
+    for seed in range(6):
+        model, cost, high, x = draw(seed)
+        limits = km.Limits(u_min=-1, u_max=1, x_max=high, priority={"b": 2, "a": 1})
+        exact, weighed = km.KoopmanMPC(model, cost, limits, 8), kind(model, cost, limits, 8)
+        moves = [mpc(x, np.zeros(3)) for mpc in (exact, weighed)]
+        np.testing.assert_allclose(moves[1].u, moves[0].u, atol=1e-4)
+        assert (
+            violations(weighed, model, x, high)[:2] <= violations(exact, model, x, high)[:2] + np.array([1e-4, 1e-5])
+        ).all()
+        gave_way += moves[0].slack > 0
+    assert gave_way > 3
+
+
+def test_beside_levels_the_more_important_limit_wins_as_in_an_enumeration():
+    levels = [-1.0, 0.0, 1.0]
+    for seed in range(6):
+        model, cost, high, x = draw(seed)
+        limits = km.Limits(u_min=-1, u_max=1, x_max=high, priority={"b": 2}, levels=[levels])
+        mpc = km.KoopmanMPC(model, cost, limits, 4)
+        mpc(x, np.zeros(3))
+        least = np.inf
+        for U in product(levels, repeat=4):
+            X = [x]
+            for u in U:
+                X.append(model.A @ X[-1] + model.B[:, 0] * u)
+            least = min(least, np.maximum(np.array(X[1:])[:, 1] - high[1], 0).sum())
+        assert violations(mpc, model, x, high)[1] <= least + 1e-6
+
+
+def test_others_say_that_they_know_no_priority():
     model, cost, *_ = draw(0)
     limits = km.Limits(x_max=1.0, priority={"b": 2})
+    four = km.Limits(x_max=1.0, of=km.State("a"), y_max=1.0, priority=[0, 1, 2, 3])
     for act, said in (
-        (lambda: km.NonlinearMPC(model.step_map(), cost, limits, 5), "a NonlinearMPC does not know"),
-        (lambda: km.export(km.KoopmanMPC(model, cost, limits, 5), tmp_path), "knows no priority"),
         (lambda: km.KoopmanMPC(model, cost, limits, 5, solver="osqp"), 'need "daqp"'),
+        (lambda: km.BilinearMPC(model, cost, four, 5), "4 priorities, 0, 1, 2, 3, and a BilinearMPC can tell 3 apart"),
     ):
         with pytest.raises(km.errors.DataError, match=said):
             act()

@@ -13,7 +13,7 @@ from scipy.linalg.blas import idamax
 from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
 from koopmpc.control.base import MPCBase
-from koopmpc.control.cost import Cost, add_held, lifted_tracking
+from koopmpc.control.cost import Cost, LiftedTracking, add_held, lifted_tracking
 from koopmpc.control.horizon import Coordinates, WeightRows
 from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
@@ -30,7 +30,7 @@ from koopmpc.control.solvers import FINISHER, add_sparse, exact_turn, order, ord
 from koopmpc.control.solvers.base import StepSolver
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.stepped.blocks import Moves
-from koopmpc.control.stepped.priorities import PrioritySolver, spread_priorities
+from koopmpc.control.stepped.priorities import PrioritySolver, spread_priorities, weigh_priorities
 from koopmpc.control.stepped.search import LevelSearch, LevelSolver
 from koopmpc.control.terminal.cuts import BallSolver
 from koopmpc.control.watching import StepMonitor, find_monitor
@@ -47,6 +47,10 @@ _FREE = Status.UNCONSTRAINED
 _NONE = Fallback.NONE
 _OTHER_SOLVER = (
     "The controller solves with OSQP; this C solves with DAQP, to rounding: inputs differ by OSQP's tolerance."
+)
+_BY_WEIGHTS = (
+    "The controller solves a QP for each priority of its limits; this C solves one, in which a limit weighs 1,000 "
+    "times as much as one of the priority below."
 )
 
 
@@ -129,6 +133,7 @@ class KoopmanMPC(MPCBase):
     _rows_of_limits: LimitWindows | None = None  # of the controller's own limits in time
     _window: LimitWindows | None = None  # by which the limits of the last step were set
     _called_with: Limits | None = None  # the limits in time of the last call that had some
+    _weighs_priorities: ClassVar[bool] = False  # where one QP has to do
     _quick: CallWindows | None = None  # makes windows of further calls
     _step = 0  # calls since reset, as far as limits or weights move in time
     _weighed: WeighedPlans | None = None  # the plans of weights in time
@@ -164,6 +169,8 @@ class KoopmanMPC(MPCBase):
         turns = order_solvers(solver, settings)
         self._solver = turns[0].solver.name
         track, disturbed = lifted_tracking(predictor, cost, limits, in_time=True), estimator is not None
+        if track.limits.priority is not None:
+            track = self._weigh_priorities(track, predictor)
         super().__init__(
             predictor.dt,
             predictor,
@@ -190,13 +197,11 @@ class KoopmanMPC(MPCBase):
         self._levels: LevelSearch | None = None
         ball = self._map.ball
         if self._held is not None:
-            if self.limits.priority is not None:
-                raise DataError("the limits have levels and a priority; pass one of the two")
             if ball is not None:
                 raise DataError("the limits have levels and a terminal ellipsoid; pass a polytope, or no terminal set")
             self._levels = LevelSearch(self._held, self._blocks, self.nu)
             self._qps = LevelSolver(self._map.qp, exact_turn(turns), self._levels)
-        elif self.limits.priority is not None:
+        elif self.limits.priority is not None and not self._weighs_priorities:
             if ball is not None:
                 raise DataError(
                     "the limits have a priority and a terminal ellipsoid; pass a polytope, or no terminal set"
@@ -219,6 +224,14 @@ class KoopmanMPC(MPCBase):
         self._rows = np.zeros((self._N + 1, len(track.tracked)))
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # the states of a plan, once somebody asks for one
 
+    def _weigh_priorities(self, track: LiftedTracking, predictor: LinearPredictor) -> LiftedTracking:
+        """Return what is tracked and limited; beside levels, and in C, weights stand for priorities."""
+        known = track.limits
+        if known.levels is None and not self._weighs_priorities:
+            return track
+        who = "its C code" if self._weighs_priorities else f"{checks.article(self)} with levels"
+        return replace(track, softness=weigh_priorities(track.softness, known, predictor.states, who))
+
     def _priorities(self) -> Int[np.ndarray, " nv"]:
         """Return the priority of each entry of a plan."""
         plan = self._map
@@ -237,8 +250,6 @@ class KoopmanMPC(MPCBase):
                 "only some of its inputs or steps are on levels, and this search has no C code",
                 "one whose inputs are all on levels in all steps",
             )
-        if self.limits.priority is not None:
-            raise no_export(self, "its C weighs soft limits, and knows no priority", "one without a priority")
         if self._weighed is not None:
             raise no_export(
                 self, "its weights move in time, and its C holds one plan", "one without Cost(Q_rows=…, R_rows=…)"
@@ -260,6 +271,9 @@ class KoopmanMPC(MPCBase):
             twin = KoopmanMPC.from_data(replace(saved, options={"solver": FINISHER.name}))
             notes = (_OTHER_SOLVER,) if self._solver == "osqp" else ()
             return replace(twin.build_program(rows), controller=type(self).__name__, notes=notes)
+        if isinstance(self._qps, PrioritySolver):
+            twin = _PriorityWeights.from_data(self.as_data())
+            return replace(twin.build_program(rows), controller=type(self).__name__, notes=(_BY_WEIGHTS,))
         setup = cast("DAQP", self._qps.first).setup
         return CondensedProgram(
             controller=type(self).__name__,
@@ -333,6 +347,8 @@ class KoopmanMPC(MPCBase):
             if getattr(predictor, name) != getattr(self.predictor, name):
                 raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
         track = lifted_tracking(predictor, self.cost, self.limits, in_time=True)
+        if track.limits.priority is not None:
+            track = self._weigh_priorities(track, predictor)
         self.predictor, self._states = predictor, None
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
         self._take_plan(plan_map(predictor, track, self._moves, coordinates, self._initial.buffer, self._plan_kind))
@@ -707,6 +723,12 @@ class KoopmanMPC(MPCBase):
         if gap:
             move.status, move.gap = Status.TIME_LIMIT, gap
         return move
+
+
+class _PriorityWeights(KoopmanMPC):
+    """A KoopmanMPC in which weights stand for priorities, as in C."""
+
+    _weighs_priorities = True
 
 
 class LinearMPC(KoopmanMPC):

@@ -1,6 +1,7 @@
 """What BilinearMPC and NonlinearMPC share: a step from the measurement, over the targets of its stages, to a Move."""
 
 from abc import abstractmethod
+from dataclasses import replace
 from time import perf_counter
 from typing import NamedTuple
 
@@ -13,13 +14,14 @@ from koopmpc.checks import HUGE
 from koopmpc.control.base import MPCBase
 from koopmpc.control.cost import Cost, data_ranges, state_tracking
 from koopmpc.control.in_time.preview import check_bounds_alone
-from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation, refuse_priority
+from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation
 from koopmpc.control.move import Fallback, Move, Plan, Status, alone
 from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
 from koopmpc.control.nonlinear.motion import BEYOND, Course, can_drift, extend_rows, shift_target
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.control.nonlinear.rows import StageLimits, check_rows, find_stage_limits
 from koopmpc.control.stepped.blocks import Moves
+from koopmpc.control.stepped.priorities import weigh_priorities
 from koopmpc.control.stepped.search import LevelSearch
 from koopmpc.control.terminal.kept_plan import JudgedPlan, PlanKeeper, choose_plan
 from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set
@@ -93,9 +95,10 @@ class StagedMPC(MPCBase):
         self._map = given = learned_map(model)
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
         o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, in_time=True)
+        if o.limits.priority is not None:
+            o = replace(o, softness=weigh_priorities(o.softness, o.limits, model.states, checks.article(self)))
         self._outputs, self._box, self._steps, self._called_with = o, o.inputs, 0, None
         self._timed = o.limits.in_time
-        refuse_priority(o.limits, f"{checks.article(self)}")
         super().__init__(
             model.dt,
             given,

@@ -9,11 +9,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc import checks
-from koopmpc.control.limits import Interval, Limits
+from koopmpc.control.limits import Interval, Limits, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolution, QPSolver, SolverTurn, StepQP, StepSolver
 from koopmpc.errors import DataError, ShapeError
 
+WEIGHT = 1e3  # where weights stand for priorities, a limit costs this many times one of the priority below
+MOST = 3  # priorities that weights tell apart: more would exhaust double precision
 _ROUNDING = 1e-3  # limits that are decided become wider by this share of the slack that is reported: room to solve in
 
 
@@ -61,8 +63,8 @@ def find_priorities(
     return row.astype(np.intp)
 
 
-def spread_priorities(limits: Limits, states: Sequence[str], layout: tuple[int, int, int]) -> Int[np.ndarray, " nv"]:
-    """Return the priority of each entry of a plan; `layout` is its first output, its steps and its length.
+def find_row_priorities(limits: Limits, states: Sequence[str]) -> Int[np.ndarray, " n"]:
+    """Return the priority of each row of [x; of(x)] that has a limit, or may get one.
 
     Raises
     ------
@@ -73,11 +75,44 @@ def spread_priorities(limits: Limits, states: Sequence[str], layout: tuple[int, 
     rows = limits.base.find_rows(len(states), len(outputs))
     linear = np.zeros(len(states) + len(outputs))
     linear[rows.kept] = rows.softness.linear + rows.softness.quadratic  # a limit may be weighed by its square alone
+    return find_priorities(limits.priority, states, outputs, linear)[rows.kept]
+
+
+def spread_priorities(limits: Limits, states: Sequence[str], layout: tuple[int, int, int]) -> Int[np.ndarray, " nv"]:
+    """Return the priority of each entry of a plan; `layout` is its first output, its steps and its length.
+
+    Raises
+    ------
+    DataError, ShapeError
+        As `find_priorities`.
+    """
     first, steps, length = layout
     priority = np.zeros(length, dtype=np.intp)
-    own = find_priorities(limits.priority, states, outputs, linear)[rows.kept]
+    own = find_row_priorities(limits, states)
     priority[first : first + steps * len(own)] = np.tile(own, steps)
     return priority
+
+
+def weigh_priorities(softness: Softness, limits: Limits, states: Sequence[str], who: str) -> Softness:
+    """Return what soft limits cost where weights stand for their priorities: `WEIGHT` times as much each.
+
+    Raises
+    ------
+    DataError
+        There are more priorities than weights can tell apart.
+    DataError, ShapeError
+        As `find_priorities`.
+    """
+    own = find_row_priorities(limits, states)
+    soft = np.isfinite(softness.linear)
+    known = np.unique(own[soft])
+    if len(known) > MOST:
+        raise DataError(
+            f"the limits have {len(known)} priorities, {', '.join(map(str, known))}, and {who} can tell {MOST} apart;"
+            " give some the same one, or take a KoopmanMPC or a LinearMPC without levels"
+        )
+    factor = np.where(soft, WEIGHT ** np.searchsorted(known, own).astype(np.float64), 1.0)
+    return softness._replace(linear=softness.linear * factor, quadratic=softness.quadratic * factor)
 
 
 class PrioritySolver(StepSolver):
