@@ -231,6 +231,7 @@ def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram) ->
             "DELAY_Y": estimator.delay,
             "PATIENCE": estimator.patience,
             "KEPT": len(estimator.kept),
+            "HELD": estimator.held,
         }
         plan |= {
             "filter_F": stack(F),

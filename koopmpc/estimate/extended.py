@@ -13,6 +13,7 @@ from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import GAIN
 from koopmpc.estimate.gate import ReadingGate
+from koopmpc.estimate.kalman import NOT_TOGETHER
 from koopmpc.estimate.observer import StateModel
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.hidden_state import HiddenState
@@ -47,11 +48,14 @@ class ExtendedKalman(Value):
         default `noise` is that of the fit's residuals, and `process` a standard deviation of 1 % of the outputs' size;
         a model that was given has sizes of one. With the default `drift` an error of d dies out within the horizon, and
         within the 38 steps of a mean with gain 0.1.
+    feedthrough
+        The plant has y = h(x, u), and the model is one of log rows with inputs moved one row up: see `LiftedKalman`. A
+        reading is then the model's next output under the input of the step before.
 
     Raises
     ------
     DataError
-        A variance is below zero; when a controller is built, its model is linear and lifted once, as in KoopmanMPC.
+        A variance is below zero; feedthrough of a StepMap, whose own output says what y is; when a controller is built, its model is linear and lifted once, as in KoopmanMPC.
 
     References
     ----------
@@ -72,8 +76,10 @@ class ExtendedKalman(Value):
     process: ArrayLike | None = None
     drift: ArrayLike | None = None
     noise: ArrayLike | None = None
+    feedthrough: bool = False
 
     def __post_init__(self) -> None:
+        checks.kind(self.feedthrough, "feedthrough", (bool, np.bool_), "pass True or False")
         for name in ("process", "drift", "noise"):
             if getattr(self, name) is not None:
                 variance = checks.array(getattr(self, name), name)
@@ -124,10 +130,16 @@ class ExtendedObserver:
         self._model, n = model, model.nz
         self._embedding = model.embedding
         if isinstance(given, StepMap):
+            if self._rule.feedthrough:
+                raise DataError(
+                    "feedthrough is a matter of fitted models; give the StepMap an output h(x, u), and leave it out"
+                )
             self._map, self.ny, self._disturbed = given, given.ny, given.measures_all
             size, residual = np.ones(self.ny), np.zeros(self.ny)
             self._enters = np.eye(n)
         elif isinstance(given, LinearPredictor | BilinearPredictor):
+            if self._rule.feedthrough and given.nw:
+                raise DataError(NOT_TOGETHER)
             self._map, self.ny, self._disturbed = _open_map(given), given.nx, True
             size = np.ones(self.ny) if given.scale is None else np.linalg.norm(given.scale @ given.C.T, axis=0)
             residual = np.zeros(self.ny) if given.report is None else given.report.residual
@@ -181,14 +193,12 @@ class ExtendedObserver:
             return bool(np.isfinite(y).all()) and self._begin(y, u, np.ones(self.ny, dtype=np.bool_))
         n, ny = self._model.nz, self.ny
         F = np.eye(n + ny)
-        slope = getattr(self._model, "slope", None) if getattr(self._model, "scheduled", 0) else None
-        F[:n, :n] = self._map.linearize(self.z, u).A if slope is None else slope(self.z, u, w)
+        F[:n, :n] = self._slope(self.z, u, w)
         F[:ny, n:] = np.eye(ny) if self._disturbed else 0.0
         z = np.array(self._model.advance(self.z, u, w, self.d), dtype=np.float64)
         Q = scipy.linalg.block_diag(self._Q, self._drift)
         P = F @ self._P @ F.T + Q
-        H = np.hstack([self._output_slope(z), np.zeros((ny, ny))])
-        predicted = self._output(z)
+        H, predicted = self._predict_reading(z, u, w)
         came = np.abs(y) < HUGE  # False for NaN
         useful = came if self._embedding is None else came & ~self._embedding.is_beyond(y, predicted)
         shown = np.where(useful | ~came, y, predicted)
@@ -235,6 +245,23 @@ class ExtendedObserver:
         K = np.linalg.solve(S / np.outer(size, size), (H @ P) / size[:, None]).T / size
         kept = np.eye(len(s)) - K @ H
         return s + K @ gap, kept @ P @ kept.T + K @ R @ K.T
+
+    def _slope(
+        self, z: Float[np.ndarray, " nz"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
+    ) -> Float[np.ndarray, "nz nz"]:
+        """Return ∂F/∂x."""
+        slope = getattr(self._model, "slope", None) if getattr(self._model, "scheduled", 0) else None
+        return self._map.linearize(z, u).A if slope is None else slope(z, u, w)
+
+    def _predict_reading(
+        self, z: Float[np.ndarray, " nz"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]
+    ) -> tuple[Float[np.ndarray, "ny ns"], Float[np.ndarray, " ny"]]:
+        """Return ∂y/∂[z; d] and y; with feedthrough those of the next output under u, which has acted last."""
+        ny = self.ny
+        if not self._rule.feedthrough:
+            return np.hstack([self._output_slope(z), np.zeros((ny, ny))]), self._output(z)
+        slope = np.hstack([self._slope(z, u, w)[:ny], np.eye(ny)])
+        return slope, np.array(self._model.advance(z, u, w, self.d), dtype=np.float64)[:ny]
 
     def _output(self, z: Float[np.ndarray, " nz"]) -> Float[np.ndarray, " ny"]:
         return self._map.measure(z)[: self.ny] if self._embedding is None else z[: self.ny]

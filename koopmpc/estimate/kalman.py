@@ -33,6 +33,7 @@ DRIFTS = 10.0 ** np.arange(
 )  # candidate variances of d's random walk; the smallest one that settles in time is used
 SLOWEST = -1 / log(1 - GAIN)  # steps that d takes to settle, at most: those of a mean of this gain
 LEAST = 1e-8  # variance of the noise if a fit leaves no residual
+NOT_TOGETHER = "feedthrough and measured disturbances do not go together; fit the model without W"
 TOLERANCE = 1e-6  # singular values below this share of the largest, or of |λ|; |λ| as near to 1 does not die out
 
 
@@ -77,6 +78,22 @@ class Augmented:
         self.to_d[kept, n:] = Bd[kept] + shift @ self.turn - A @ shift
         self.to_periodic = self.to_d[:, n + self.steady :].copy()  # and `to_d` gives the constant part alone
         self.to_d[:, n + self.steady :] = 0.0
+        self.rows, self.held = self.M, 0
+
+    def read_before(self) -> None:
+        """Have y be what the model's next outputs are under the input of the step before, y = M (F s + G v) + h."""
+        self.h, self.M = self.M @ self.f + self.h, self.M @ self.F
+
+    def hold_input(self) -> None:
+        """Append u_{k−1}, which acts on y after `read_before`, to s."""
+        nu, extent, nz = self.predictor.nu, len(self.F), len(self.one)
+        D = self.rows @ self.G
+        self.F = scipy.linalg.block_diag(self.F, np.zeros((nu, nu)))
+        self.G = np.vstack([self.G, np.eye(nu)])
+        self.f, self.M = np.append(self.f, np.zeros(nu)), np.hstack([self.M, D])
+        self.rows = np.hstack([self.rows, np.zeros((len(D), nu))])
+        self.to_z, self.to_d = (np.hstack([part, np.zeros((nz, nu))]) for part in (self.to_z, self.to_d))
+        self.held = len(self.F) - extent
 
 
 FilterModel = tuple[Augmented, Float[np.ndarray, "n n"], Float[np.ndarray, "ny ny"]]
@@ -97,6 +114,8 @@ class FilterProgram(EstimatorProgram):
         The entries of z at a known start with which s begins; d begins at zero.
     delay, patience
         Steps that y is old; samples in sequence without any measurement that are bridged.
+    held
+        Entries at the end of s that are the input of the step before: nu with feedthrough, else 0.
     """
 
     F: Float[np.ndarray, "ns ns"]
@@ -112,6 +131,7 @@ class FilterProgram(EstimatorProgram):
     kept: Int[np.ndarray, " kept"]
     delay: int
     patience: int
+    held: int = 0
 
 
 class KalmanFilter(Viewing):
@@ -146,7 +166,8 @@ class KalmanFilter(Viewing):
         """Return the data with which z and d are found."""
         parts = {name: getattr(self._system, name) for name in ("F", "G", "f", "M", "h", "to_z", "one", "to_d", "kept")}
         gate = gate_graph(self.ny)
-        return FilterProgram(**parts, P=self._P, R=self._R, delay=self._delay, patience=self._patience, gate=gate)
+        about = {"delay": self._delay, "patience": self._patience, "held": self._system.held}
+        return FilterProgram(**parts, P=self._P, R=self._R, gate=gate, **about)
 
     @property
     def refused(self) -> bool:
@@ -209,6 +230,8 @@ class KalmanFilter(Viewing):
         system = self._system
         if self._started:
             self._inputs.append(np.concatenate([u, w]))
+        elif system.held:
+            self._s[-system.held :] = u
         if len(self._inputs) > self._delay:
             self._s[:] = self._next(self._s, self._inputs.popleft())
         came = np.abs(y) < HUGE  # False for NaN
@@ -216,7 +239,7 @@ class KalmanFilter(Viewing):
         if not first and (self._delay or not self._started):
             self._gate.judge(y, self._clip(system.M @ self._s + system.h))
         if self._gate.lost:
-            self._s[:] = self._start
+            self._s[: len(self._s) - system.held] = self._start[: len(self._s) - system.held]
         useful = came & ~self._is_silent(y, system.M @ self._s + system.h)
         if not first and useful.any() and not self._gate.refused:
             self._s += self._gain(useful) @ (y[useful] - system.M[useful] @ self._s - system.h[useful])
@@ -287,7 +310,7 @@ def _find_rails(predictor: LinearPredictor, system: Augmented) -> Float[np.ndarr
     """Return the rails of the outputs that are states of the model; None where no sensor saturates."""
     if predictor.embedding is None or predictor.embedding.rails is None:
         return None
-    H = system.M[:, : len(system.kept)]
+    H = system.rows[:, : len(system.kept)]
     rails = np.vstack([np.full(len(H), -np.inf), np.full(len(H), np.inf)])
     for i, row in enumerate(H):
         found = np.flatnonzero((row == predictor.C[:, system.kept]).all(axis=1))
@@ -354,6 +377,11 @@ class LiftedKalman(Value):
         Of disturbances that repeat themselves [s], as in `LiftedDisturbance`: each is a constant and harmonics.
     patience
         How many samples in a row without any measurement are bridged by prediction; after them the state is unknown.
+    feedthrough
+        The plant has y = h(x, u), and the model is one of log rows y_k = h(x_k, u_k), whose inputs were moved one row
+        up (`input_lead` 1). A controller reads y before it chooses u_k, so the reading is h(x_k, u_{k−1}), which is
+        H (A z + B u_{k−1}) + C_d d. A plan then weighs and limits h(x_k, u_k) first, and row k + 1 of a moving
+        reference belongs to it. Not with `period`.
 
     Raises
     ------
@@ -377,6 +405,7 @@ class LiftedKalman(Value):
     patience: int = 10
     period: float | None = None
     harmonics: int = 3
+    feedthrough: bool = False
 
     def __post_init__(self) -> None:
         given = self.outputs
@@ -399,6 +428,9 @@ class LiftedKalman(Value):
         checks.count(self.harmonics, "harmonics")
         if self.period is not None:
             checks.positive(self.period, "period", "s")
+        checks.kind(self.feedthrough, "feedthrough", (bool, np.bool_), "pass True or False")
+        if self.feedthrough and self.period is not None:
+            raise DataError("feedthrough and a period do not go together; leave one of them out")
 
     def start(self, model: LinearPredictor | StateModel, horizon: int) -> KalmanFilter:
         """Return the observer of one controller with plans of this many steps.
@@ -421,6 +453,8 @@ class LiftedKalman(Value):
     def _model(self, settling: float, predictor: LinearPredictor) -> FilterModel:
         """Return the filter's matrices for a predictor, or say why there are none; `settling` in steps."""
         nz, nu = predictor.nz, predictor.nu
+        if self.feedthrough and predictor.nw:
+            raise DataError(NOT_TOGETHER)
         H = self._matrix(predictor)
         ny, constant = len(H), predictor.lifting.constant_index
         kept = np.array([i for i in range(nz) if i != constant], dtype=np.intp)
@@ -437,6 +471,8 @@ class LiftedKalman(Value):
             Bd, Cd = np.hstack([predictor.B, np.zeros((nz, ny - nu))]), np.eye(ny, ny)
             Cd[:nu] = 0.0
         model = Augmented(predictor, kept, H, Bd, Cd)
+        if self.feedthrough:
+            model.read_before()
         unit, y_unit = _sizes(predictor, kept, H, Cd)
         size, y_size = (unit, y_unit) if predictor.scale is not None else _balance(model.F, model.M, len(kept))
         F, M = model.F * size / size[:, None], model.M * size / y_size[:, None]
@@ -465,8 +501,11 @@ class LiftedKalman(Value):
                     " frequency; measure more, or pass another period or fewer harmonics"
                 )
             drift = np.kron(np.eye(1 + 2 * len(turns)), drift)
-        P = _stationary(F, M, scipy.linalg.block_diag(process, drift), R_scaled)
-        return model, P * units, R
+        P = _stationary(F, M, scipy.linalg.block_diag(process, drift), R_scaled) * units
+        if self.feedthrough:
+            model.hold_input()
+            P = scipy.linalg.block_diag(P, np.zeros((nu, nu)))
+        return model, P, R
 
     def _matrix(self, predictor: LinearPredictor) -> Float[np.ndarray, "ny nz"]:
         if isinstance(self.outputs, tuple):

@@ -58,7 +58,9 @@ class StepMap(Named):
     dt
         Sample time [s].
     h
-        CasADi function of x that returns y (ny); by default y = x.
+        CasADi function of x that returns y (ny); by default y = x. Or of x and u, where an input acts on the output at
+        once. The state then ends with u_{k−1}, and y_k = h(x_k, u_{k−1}) is what a controller reads before it chooses
+        u_k; `simulate` and `collect` read so too.
     states, inputs, outputs
         Names with units; by default x0, x1, …; u0, …; and the states' names or y0, ….
     scene
@@ -108,6 +110,13 @@ class StepMap(Named):
         _check_signature(h, "h", 1)
         if h.size1_in(0) != nx:
             raise ShapeError(f"h takes {h.size1_in(0)} states, F has {nx}; pass h of the same x")
+        if h.n_in() > 1:
+            if h.size1_in(1) != nu:
+                raise ShapeError(f"h takes {h.size1_in(1)} inputs, F has {nu}; pass h of the same u")
+            own, moves = checks.names(states, "states", "x", nx), checks.names(inputs, "inputs", "u", nu)
+            outputs = checks.names(outputs, "outputs", "y", h.size1_out(0))
+            F, h, scene = _keep_input(F, h), _read_before(h), _leave_input(scene, nx)
+            nx, states = nx + nu, (*own, *map(_name_before, moves))
         freeze(
             self,
             F=make_dense(F),
@@ -307,6 +316,35 @@ def _hold(F: ca.Function, w: Float[np.ndarray, " nw"]) -> ca.Function:
     return held.expand("F") if F.is_a("SXFunction") else held
 
 
+@raise_swallowed()
+def _keep_input(F: ca.Function, h: ca.Function) -> ca.Function:
+    """Return F of the state [x; u_{k−1}], as SX where F and h are."""
+    kind = ca.SX if F.is_a("SXFunction") and h.is_a("SXFunction") else ca.MX
+    names = ["x", "u", "w"][: F.n_in()]
+    x, u, *w = [kind.sym(name, F.size1_in(i)) for i, name in enumerate(names)]
+    last = kind.sym("last", F.size1_in(1))
+    return ca.Function("F", [ca.vertcat(x, last), u, *w], [ca.vertcat(F(x, u, *w), u)], names, ["x_next"])
+
+
+@raise_swallowed()
+def _read_before(h: ca.Function) -> ca.Function:
+    """Return h(x, u) of the state [x; u_{k−1}]."""
+    kind = ca.SX if h.is_a("SXFunction") else ca.MX
+    x, last = kind.sym("x", h.size1_in(0)), kind.sym("last", h.size1_in(1))
+    return ca.Function("h", [ca.vertcat(x, last)], [h(x, last)], ["x"], ["y"])
+
+
+def _leave_input(scene: Scene | None, nx: int) -> Scene | None:
+    """Return the scene of x alone."""
+    return None if scene is None else lambda x, u: scene(x[:nx], u)
+
+
+def _name_before(name: str) -> str:
+    """Return ``"u[k-1] [N]"`` for ``"u [N]"``."""
+    stem, bracket, unit = name.partition(" [")
+    return f"{stem}[k-1]{bracket}{unit}"
+
+
 def _as_vector(value: ArrayLike, name: str, length: int) -> Float[np.ndarray, " n"]:
     """Return `value` as float64 (length,), without a copy if it is one already: a control loop calls this each step."""
     if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == (length,):
@@ -321,8 +359,8 @@ def _check_signature(function: ca.Function, name: str, arguments: int) -> None:
     checks.members(function, name, ("n_in", "n_out"), "pass a casadi Function")
     wanted = "(x, u)" if arguments == 2 else "(x)"
     given = function.n_in()
-    if given not in {arguments, 3 if arguments == 2 else 1} or function.n_out() != 1:
-        with_w = " or F(x, u, w)" if arguments == 2 else ""
+    if given not in {arguments, arguments + 1} or function.n_out() != 1:
+        with_w = " or F(x, u, w)" if arguments == 2 else " or h(x, u)"
         raise ShapeError(
             f"{name} has {given} arguments and {function.n_out()} results, "
             f"expected {name}{wanted} with one result{with_w}"

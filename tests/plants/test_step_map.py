@@ -171,9 +171,14 @@ GOOD = ca.Function("F", [x2, u1], [x2])
             r"expected columns: F\(x, u\)",
         ),
         (
-            lambda: km.StepMap(GOOD, 1.0, GOOD),
+            lambda: km.StepMap(GOOD, 1.0, ca.Function("h", [x2, u1, ca.SX.sym("w")], [x2])),
             km.errors.ShapeError,
-            r"h has 2 arguments and 1 results, expected h\(x\)",
+            r"h has 3 arguments and 1 results, expected h\(x\) with one result or h\(x, u\)",
+        ),
+        (
+            lambda: km.StepMap(GOOD, 1.0, ca.Function("h", [x2, ca.SX.sym("v", 2)], [x2])),
+            km.errors.ShapeError,
+            "h takes 2 inputs, F has 1; pass h of the same u",
         ),
         (
             lambda: km.StepMap(GOOD, 1.0, ca.Function("h", [u1], [u1])),

@@ -152,10 +152,10 @@ static void correct(koopmpc_state *s, const koopmpc_real *y) {
     for (int j = 0; j < KOOPMPC_NS; j++) s->s[j] += koopmpc_filter_PM[came[i] * KOOPMPC_NS + j] * x[i];
 }
 
-/** s <- that of the start. */
+/** s <- that of the start, but for the input of the step before. */
 static void forget_estimate(koopmpc_state *s) {
   koopmpc_lift(s->zeta, s->z);
-  koopmpc_fill(s->s, 0, KOOPMPC_NS);
+  koopmpc_fill(s->s, 0, KOOPMPC_NS - KOOPMPC_HELD);
   for (int i = 0; i < KOOPMPC_KEPT; i++) s->s[i] = s->z[koopmpc_kept[i]];
 }
 
@@ -167,6 +167,8 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
     koopmpc_copy(last, u, KOOPMPC_NU);
     koopmpc_copy(last + KOOPMPC_NU, s->w, KOOPMPC_NW);
     s->queued++;
+  } else {
+    koopmpc_copy(s->s + KOOPMPC_NS - KOOPMPC_HELD, u, KOOPMPC_HELD);
   }
   if (s->queued > KOOPMPC_DELAY_Y) {
     predict(s, s->s, s->queue);
