@@ -55,7 +55,8 @@ class ExtendedKalman(Value):
     Raises
     ------
     DataError
-        A variance is below zero; feedthrough of a StepMap, whose own output says what y is; when a controller is built, its model is linear and lifted once, as in KoopmanMPC.
+        A variance is below zero; feedthrough of a StepMap, whose own output says what y is, or with measured
+        disturbances; when a controller is built, its model is linear and lifted once, as in KoopmanMPC.
 
     References
     ----------

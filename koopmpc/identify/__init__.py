@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from koopmpc.lazy import attach
 
 if TYPE_CHECKING:
+    from koopmpc.identify.first_rows import estimate_start as estimate_start
     from koopmpc.identify.fits.constrained import constrained_edmd as constrained_edmd
     from koopmpc.identify.fits.eigenfunctions import eigenfunctions as eigenfunctions
     from koopmpc.identify.fits.kernel import kernel_edmd as kernel_edmd

@@ -115,7 +115,7 @@ class StepMap(Named):
                 raise ShapeError(f"h takes {h.size1_in(1)} inputs, F has {nu}; pass h of the same u")
             own, moves = checks.names(states, "states", "x", nx), checks.names(inputs, "inputs", "u", nu)
             outputs = checks.names(outputs, "outputs", "y", h.size1_out(0))
-            F, h, scene = _keep_input(F, h), _read_before(h), _leave_input(scene, nx)
+            F, h, scene = _keep_input(F), _read_before(h), _leave_input(scene, nx)
             nx, states = nx + nu, (*own, *map(_name_before, moves))
         freeze(
             self,
@@ -317,21 +317,20 @@ def _hold(F: ca.Function, w: Float[np.ndarray, " nw"]) -> ca.Function:
 
 
 @raise_swallowed()
-def _keep_input(F: ca.Function, h: ca.Function) -> ca.Function:
-    """Return F of the state [x; u_{k−1}], as SX where F and h are."""
-    kind = ca.SX if F.is_a("SXFunction") and h.is_a("SXFunction") else ca.MX
+def _keep_input(F: ca.Function) -> ca.Function:
+    """Return F of the state [x; u_{k−1}], which keeps u."""
     names = ["x", "u", "w"][: F.n_in()]
-    x, u, *w = [kind.sym(name, F.size1_in(i)) for i, name in enumerate(names)]
-    last = kind.sym("last", F.size1_in(1))
-    return ca.Function("F", [ca.vertcat(x, last), u, *w], [ca.vertcat(F(x, u, *w), u)], names, ["x_next"])
+    v, u, *w = [ca.MX.sym(n, F.size1_in(i) + (i == 0) * F.size1_in(1)) for i, n in enumerate(names)]
+    kept = ca.Function("F", [v, u, *w], [ca.vertcat(F(v[: F.size1_in(0)], u, *w), u)], names, ["x_next"])
+    return kept.expand("F") if F.is_a("SXFunction") else kept
 
 
 @raise_swallowed()
 def _read_before(h: ca.Function) -> ca.Function:
     """Return h(x, u) of the state [x; u_{k−1}]."""
-    kind = ca.SX if h.is_a("SXFunction") else ca.MX
-    x, last = kind.sym("x", h.size1_in(0)), kind.sym("last", h.size1_in(1))
-    return ca.Function("h", [ca.vertcat(x, last)], [h(x, last)], ["x"], ["y"])
+    v = ca.MX.sym("x", h.size1_in(0) + h.size1_in(1))
+    y = ca.Function("h", [v], [h(v[: h.size1_in(0)], v[h.size1_in(0) :])], ["x"], ["y"])
+    return y.expand("h") if h.is_a("SXFunction") else y
 
 
 def _leave_input(scene: Scene | None, nx: int) -> Scene | None:
