@@ -27,12 +27,13 @@ def estimate_start(
     min over p_0 of Σ_{k=0}^{K} ‖(x̂_k − x_k) / σ‖² + ‖(p_0 − p̄) / s‖², p_{k+1} = F(p_k, u_k), where x̂ is the first part
     of p. σ is the residual of the fit, s the sizes of the data, and p̄ the point of a plant that has rested in x_0 under
     u_0. So fewer rows than the model's past suffice. Of more rows the first ones give p̄, and s is σ, or 0.1 for entries
-    of a hidden state; the others take noise out of it. A forecast begins at
-    the result, with `model.step_map().rollout(p_K, U)`: F is the re-lifted map, as in BilinearMPC. A linear model with a
-    hidden state z = T ζ is lifted once; there z is found, ζ is the nearest past with this z, and a forecast is
-    `model.rollout(p_K, U)`. Gauss-Newton with exact derivatives solves it. Entries of X that are NaN are left out, and
-    so are readings at a rail with x̂ beyond. Errors of the model between the rows count as noise of readings, so pass
-    few rows of a model that errs.
+    of a hidden state; the others take noise out of it. Errors of the model between the rows count as noise of readings,
+    so pass few rows of a model that errs. Gauss-Newton with exact derivatives finds p_0. Entries of X that are NaN are
+    left out, and so are readings at a rail with x̂ beyond.
+
+    A forecast begins at the result: `model.step_map().rollout(p_K, U)`, where F is the re-lifted map, as in
+    BilinearMPC. A linear model with a hidden state z = T ζ is lifted once: z is found, ζ is the nearest past with this
+    z, and a forecast is `model.rollout(p_K, U)`.
 
     Parameters
     ----------
