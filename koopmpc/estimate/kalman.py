@@ -166,8 +166,10 @@ class KalmanFilter(Viewing):
         """Return the data with which z and d are found."""
         parts = {name: getattr(self._system, name) for name in ("F", "G", "f", "M", "h", "to_z", "one", "to_d", "kept")}
         gate = gate_graph(self.ny)
-        about = {"delay": self._delay, "patience": self._patience, "held": self._system.held}
-        return FilterProgram(**parts, P=self._P, R=self._R, gate=gate, **about)
+        held = self._system.held
+        return FilterProgram(
+            **parts, P=self._P, R=self._R, delay=self._delay, patience=self._patience, held=held, gate=gate
+        )
 
     @property
     def refused(self) -> bool:

@@ -91,8 +91,11 @@ def estimate_start(
             usual = model.start(rows[past], Episode(X=rows[: past + 1], U=moves[:past]))
             spread = np.minimum(model.embedding.spread(noise, np.zeros(model.nu)), _ENCODED)
             rows, moves = rows[past:], moves[past:]
-    plain = isinstance(model, LinearPredictor) and is_hidden(model)
-    course = _LinearCourse(model, usual, spread) if plain else _PointCourse(model, usual, spread)
+    course: _LinearCourse | _PointCourse
+    if isinstance(model, LinearPredictor) and is_hidden(model):
+        course = _LinearCourse(model, usual, spread)
+    else:
+        course = _PointCourse(model, usual, spread)
 
     def explain(
         w: Float[np.ndarray, " n"],
