@@ -174,8 +174,6 @@ def test_what_feedthrough_does_not_go_with_is_refused_in_a_sentence():
     model = learn(1)
     with pytest.raises(DataError, match=r"feedthrough and a period"):
         km.LiftedKalman(model.C, feedthrough=True, period=1.0)
-    with pytest.raises(DataError, match="feedthrough is a str"):
-        km.ExtendedKalman(feedthrough="yes")
     plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
     with pytest.raises(DataError, match="give the StepMap an output"):
         km.NonlinearMPC(plant, km.Cost(Q=[1, 1], R=1), None, 5, estimator=km.ExtendedKalman(feedthrough=True))

@@ -57,5 +57,3 @@ def test_what_tells_no_start_is_refused_in_a_sentence():
         km.identify.estimate_start(model, [[np.nan], [np.nan]], [[0.0]])
     with pytest.raises(ShapeError, match="U has shape"):
         km.identify.estimate_start(model, [[0.0], [0.0]], [[0.0], [0.0]])
-    with pytest.raises(DataError, match="model is a str"):
-        km.identify.estimate_start("model", [[0.0]], np.zeros((0, 1)))
