@@ -70,6 +70,7 @@ from koopmpc.synthesis.fresh.loops import (
     describe_outside,
     find_blind_range,
     find_blind_reference,
+    find_room_to_stop,
     list_finalists,
     run_fresh_loops,
     watch_data,
@@ -154,7 +155,9 @@ def design(
     7. Finalists: up to three controllers with other models, whose scores are within 3 % of the best, run the same fresh
        loops as the chosen one, the best of them 300 in all. One that loses fewer, keeps more limits, or costs 2 % less
        takes its place. This is left out where a controller does not run as machine code, and with `loops=0`.
-    8. Fresh loops: the controller runs from starts that took no part in the choice, on nearest neighbours of the data
+    8. Short plans: if one in twenty of 60 fresh loops breaks limits of states, plans have to end where an affine model
+       can keep these for 40 more steps with nine tenths of the inputs. That stays if the same loops prefer it.
+    9. Fresh loops: the controller runs from starts that took no part in the choice, on nearest neighbours of the data
        and on the surrogates. They give the interval and the bounds of `expected`, and say where it is outside the data.
 
     The choice depends only on the data and `rng`, never on time or on the number of workers.
@@ -363,6 +366,17 @@ def design(
             best = i
             if rows[best].recipe.candidate.kind == "linear":
                 simple, linear = controller, best
+    held_inputs = next(one.u_reference for one in test.conditions if one.gain == 1.0)
+    wide = find_blind_range(test.episodes, asked, neighbours) if few else []
+    blind = find_blind_reference(test.episodes, asked, neighbours, held_inputs)
+    if few:
+        recipe, model = rows[best].recipe, get_model(controller)
+        limits, why = find_room_to_stop(drawn_from, recipe, controller, test.episodes, draw)
+        if why:
+            turned.append(why)
+            stopping = recipe.controller(model, asked.cost, limits, ahead)
+            simple = stopping if simple is controller else simple
+            controller = watch_data(recipe, model, stopping, measured)
     promise: CoveragePromise | None = None
     if wished is not None:
         recipe, band = rows[best].recipe, outcomes[best].band
@@ -370,9 +384,7 @@ def design(
         if limits.margin is not None:
             model = get_model(controller)
             controller = watch_data(recipe, model, recipe.controller(model, asked.cost, limits, ahead), measured)
-    held_inputs = next(one.u_reference for one in test.conditions if one.gain == 1.0)
-    wide = find_blind_range(test.episodes, asked, neighbours) if few else []
-    fresh, blind = None, find_blind_reference(test.episodes, asked, neighbours, held_inputs)
+    fresh = None
     if few:
         fast = speed_up(controller)
         count = MANY if loops is None and isinstance(fast, Compiled) else few

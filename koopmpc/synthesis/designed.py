@@ -387,8 +387,11 @@ class Design:
         parts += [
             "",
             "A score is the mean over closed loops on surrogates of the cost, with a price on violations, relative to "
-            "the best controller in the same loop. → marks the chosen controller, the simplest within 0.5 % of the "
-            "best; l the best linear one. Rows without inputs 20 % off are of the first round and stand last.",
+            "the best controller in the same loop. → marks the chosen controller, l the best linear one. Of rows "
+            "within 0.5 % of the best, or within their standard error up to 3 %, whose worst run is at most 3 % worse, "
+            "the safest and then the simplest is chosen. One with an estimator may cost 2 % more. Then up to three "
+            "finalists, other models within 3 %, run the same fresh loops, and one that is safer or 2 % cheaper there "
+            "takes its place; the notes say so. Rows without inputs 20 % off are of the first round and stand last.",
         ]
         said = [render_text(*parts)]
         if self.promise is not None:

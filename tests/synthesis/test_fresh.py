@@ -16,7 +16,7 @@ from koopmpc.synthesis.candidates import Candidate
 from koopmpc.synthesis.designed import ExpectedLoop, choose_row
 from koopmpc.synthesis.fresh.drawn import LoopResult, draw_starts
 from koopmpc.synthesis.fresh.horizon import choose_horizon
-from koopmpc.synthesis.fresh.loops import choose_finalist, is_preferable, list_finalists
+from koopmpc.synthesis.fresh.loops import choose_finalist, find_stopping_set, is_preferable, list_finalists
 from koopmpc.synthesis.fresh.neighbours import MOST, NeighbourMap, goal_box, probe_range
 from koopmpc.synthesis.fresh.verdict import bound_value, cost_interval
 from koopmpc.synthesis.judging import measure_errors
@@ -459,13 +459,39 @@ def test_where_each_signal_is_inside_but_no_log_has_both_the_design_says_so_and_
 
 
 @pytest.mark.slow
-def test_a_horizon_too_short_to_stop_before_a_limit_is_told_with_both_numbers():
+def test_plans_too_short_to_stop_before_a_limit_end_where_it_can_be_kept():
+    """With this horizon the design went 12 % of the range beyond its limit."""
     parts = Parts(MORE["short horizon"], 0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", km.FitWarning)
-        sentences = parts.design.advice
-    assert any("a horizon of 12 steps in place of 6" in sentence for sentence in sentences)
-    assert judged(parts, "designed", 0).promise["violation"] > 0.01
+        notes = parts.design.notes
+    assert any("6 steps are too short to stop before a limit" in note for note in notes)
+    row = judged(parts, "designed", 0)
+    assert row.ratio < 1.02
+    assert row.violation < 0.005
+    assert parts.design.controller.horizon == parts.task.horizon
+
+
+def test_a_stopping_set_leaves_out_exactly_what_full_braking_cannot_keep():
+    A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]])
+    limits = km.Limits(u_min=-1, u_max=1, x_max=[1, 9])
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ["x", "v"], ["u"])
+    X = np.random.default_rng(0).uniform([-1, -1.5], [1, 1.5], (400, 2))
+    found = find_stopping_set(model, limits, np.zeros(1), X)
+    assert found is not None
+    x, furthest = X.T, X[:, 0]
+    for _ in range(40):  # with nine tenths of the brake
+        x = A @ x - 0.9 * B
+        furthest = np.maximum(furthest, x[0])
+    assert (furthest > 1).sum() > 30
+    assert (found.contains(X) == (furthest <= 1)).all()
+
+
+def test_there_is_no_stopping_set_without_limits_or_where_inputs_have_none():
+    model = km.LinearPredictor([[0.5]], [[1.0]], [[1.0]], km.State(), 0.1, ["x"], ["u"])
+    X = np.array([[-1.0], [0.0], [1.0]])
+    for limits in (km.Limits(u_min=-1, u_max=1), km.Limits(x_max=[0.5]), km.Limits(u_min=-1, u_max=1, x_max=[2.0])):
+        assert find_stopping_set(model, limits, np.zeros(1), X) is None
 
 
 @pytest.mark.slow

@@ -70,15 +70,17 @@ def keep_limits(
     rest = test.surrogates[0].holding(asked.cost, asked.limits)(asked.reference[0])
     nx = len(asked.low)
     tube = find_tube(model, asked, width[0], np.asarray(rest.x)[:nx], np.asarray(rest.u))
-    return promise_coverage(
+    ends = controller.limits.terminal
+    promise, limits = promise_coverage(
         pool,
-        lambda limits: recipe.controller(model, asked.cost, limits, asked.horizon),
+        lambda limits: recipe.controller(model, asked.cost, replace(limits, terminal=ends), asked.horizon),
         width if tube is None else tube,
         limit_margins(asked, test.episodes),
         coverage,
         loops,
         rng,
     )
+    return promise, replace(limits, terminal=ends)
 
 
 def promise_coverage(

@@ -1,6 +1,7 @@
 """run_fresh_loops: the loops of a chosen controller from fresh starts, and where they are outside the data."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -9,11 +10,15 @@ from jaxtyping import Float
 from scipy.special import bdtr
 
 from koopmpc.codegen.compiled import Compiled
+from koopmpc.control.limits import Limits
+from koopmpc.control.terminal.sets import TerminalSet
 from koopmpc.data.angles import find_angles
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
+from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.base import strip_unit
-from koopmpc.lifting.state import State
+from koopmpc.lifting.state import Constant, State
+from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.candidates import Designed, Recipe, get_model
 from koopmpc.synthesis.designed import DesignRow
@@ -35,6 +40,8 @@ CHANCE = 0.05  # and probability that this is chance
 CHEAPER = 0.98  # a finalist that costs this share of the chosen one takes its place
 MUCH = 0.9  # a horizon that costs this share of the given one is much better
 DRAWN = 400  # states outside the data that are kept for a picture, at most
+AHEAD = 40  # steps after the end of a plan in which limits are to be kept
+ACTING = 0.9  # share of an input's way to its limit that is trusted to stop a motion
 BLIND_RANGE = 0.3  # share of them outside the data above which a design says so
 BLIND = 0.05  # share of steps outside the data above which a design says where they are
 
@@ -150,6 +157,94 @@ def watch_data(recipe: Recipe, model: AnyPredictor, controller: Designed, data: 
     except DataError:
         controller.reset()
         return controller
+
+
+def find_room_to_stop(
+    pool: LoopPool, recipe: Recipe, controller: Designed, data: Episodes, rng: np.random.Generator
+) -> tuple[Limits, str]:
+    """Return the limits of a controller, with an end of its plans if these are too short to stop, and why; "" if not.
+
+    If a twentieth of the fresh loops break limits, plans have to end where an affine model of the data can
+    still keep them, see `find_stopping_set`. That stays if the same loops prefer it, see `is_preferable`.
+    """
+    limits, near = controller.limits, pool.neighbours
+    low, high = limits.states(len(pool.asked.low))
+    if limits.terminal is not None or near is None or data.nw or not np.isfinite(np.stack([low, high])).any():
+        return limits, ""
+    fast = speed_up(controller)
+    drawn = pool.draw(COMPARED if isinstance(fast, Compiled) else FEW, rng)
+    given = pool.run(fast, drawn)
+    X = near.points[((near.points >= low) & (near.points <= high)).all(axis=1)]
+    if _count_broken(given) < DIFFERENT * len(given) or not len(X):
+        return limits, ""
+    with hide_fit_warnings():
+        model = edmd(data, State() + Constant())
+    ends = find_stopping_set(model, pool.asked.limits, near.middle, X[:: -(-len(X) // DRAWN)])
+    if ends is None:
+        return limits, ""
+    kept = replace(limits, terminal=ends)
+    try:
+        other = recipe.controller(get_model(controller), pool.asked.cost, kept, controller.horizon)
+    except KoopmpcError:  # the model's states are others
+        return limits, ""
+    stopped = pool.run(speed_up(other), drawn)
+    if not is_preferable(stopped, given, MUCH):
+        return limits, ""
+    broken = [_count_broken(one) for one in (given, stopped)]
+    return kept, (
+        f"plans of {controller.horizon} steps are too short to stop before a limit, so they have to end where it can "
+        f"be kept: of {len(given)} fresh loops {broken[1]} violate limits by more than {to_percent(KEPT)} of their "
+        f"range in place of {broken[0]}, and they cost {_compare_costs(stopped, given)[0]:.3g} times as much"
+    )
+
+
+def find_stopping_set(
+    model: LinearPredictor, limits: Limits, middle: Float[np.ndarray, " nu"], points: Float[np.ndarray, "n nx"]
+) -> TerminalSet | None:
+    """Return where a plan has to end so that limits of states can be kept afterwards; None where it may end anywhere.
+
+    For each limit c x ≤ b of a state and each k ≤ 40 the set has a row c x_k ≤ b under those inputs that make c x_k
+    least. So it leaves out only what no input can keep inside, if the plant is the `model`. Inputs are trusted with
+    nine tenths of their way from `middle` to their limits.
+
+    Parameters
+    ----------
+    model
+        z⁺ = A z + B u of observables that are affine in the state.
+    limits
+        Of states and inputs; those of the inputs bound how fast a motion can be stopped.
+    middle
+        (nu,) usual inputs.
+    points
+        (n, nx) states in whose box the set is wanted. The one that is deepest inside is its center.
+    """
+    nx = model.nx
+    bounds = np.stack([-limits.states(nx).low, limits.states(nx).high])
+    u_low, u_high = (middle + ACTING * (each - middle) for each in limits.inputs(model.nu))
+    zero, *ones = model.lifting(np.vstack([np.zeros(nx), np.eye(nx)]))
+    S = np.column_stack([one - zero for one in ones])
+    H, h = list[Float[np.ndarray, " nx"]](), list[float]()
+    for way, i in np.argwhere(np.isfinite(bounds)).tolist():
+        row, least = (-1.0, 1.0)[way] * model.C[i], 0.0
+        for _ in range(AHEAD):
+            effect = row @ model.B
+            reach = np.where(effect > 0, u_low, u_high)[effect != 0]
+            row, least = row @ model.A, least + float(effect[effect != 0] @ reach)
+            if not (np.isfinite(least) and np.isfinite(row).all()):
+                break
+            H.append(row @ S)
+            h.append(float(bounds[way, i]) - least - float(row @ zero))
+    if not H:
+        return None
+    rows, ends, low, high = np.array(H), np.array(h), points.min(axis=0), points.max(axis=0)
+    room = ((ends - points @ rows.T) / np.maximum(np.abs(rows) @ (high - low), 1e-300)).min(axis=1)
+    center = points[int(room.argmax())]
+    if room.max() <= 0:
+        return None
+    rows = rows / (ends - rows @ center)[:, None]
+    most: Float[np.ndarray, "p nx"] = np.maximum(rows * (low - center), rows * (high - center))
+    rows = rows[most.sum(axis=1) > 1]
+    return TerminalSet(center, of=State(), H=rows, h=np.ones(len(rows))) if len(rows) else None
 
 
 def compare_longer_horizon(
