@@ -19,15 +19,17 @@ for _ in range(4):
 data = km.Episodes(episodes, dt=0.1)
 
 def followed(name, call, ground=False):
-    seen, returns, last, known = [], 0, None, set()
+    seen, returns, last, known = [], 0, None, {}
     def hook(frame, event, arg):
         nonlocal returns, last
         code = frame.f_code
-        if event != "call" or code in known or not code.co_filename.startswith(root) or "<" in code.co_name:
+        if id(code) in known:
+            return
+        known[id(code)] = code  # by its id: its hash is that of all its bytes, at each call
+        if not code.co_filename.startswith(root) or "<" in code.co_name:
             return
         if not code.co_flags & inspect.CO_OPTIMIZED:  # the body of a class, which an import runs
             return
-        known.add(code)
         file = code.co_filename.removeprefix(root)
         if file == DECORATOR:
             return
@@ -37,11 +39,11 @@ def followed(name, call, ground=False):
         if file not in seen:
             seen.append(file)
         last = file
-    sys.setprofile(hook)
+    sys.settrace(hook)  # which asks for calls alone, as long as the hook returns None
     try:
         result = call()
     finally:
-        sys.setprofile(None)
+        sys.settrace(None)
     print(name, len(seen), returns)
     return result
 
@@ -65,7 +67,7 @@ followed("record_all", lambda: km.record(run, folder / "run.rrd"), ground=True)
 followed("export_all", lambda: km.export(mpc, folder / "c"), ground=True)
 few = [km.State() + km.Constant(), lifting]
 followed("select_all", lambda: km.select(data, candidates=few, horizon=5, delays=[0], workers=1), ground=True)
-task = dict(horizon=5, reference=[0, 0], candidates=[lifting], delays=[0], workers=1)
+task = dict(horizon=5, reference=[0, 0], candidates=[lifting], delays=[0], loops=60, workers=1)
 followed("design_all", lambda: km.design(data, cost, limits, **task), ground=True)
 """
 MOST = {  # files, returns

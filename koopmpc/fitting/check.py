@@ -19,7 +19,7 @@ from koopmpc.fitting.changed import ComparedLogs, compare_logs
 from koopmpc.fitting.report import OFF, write_design_report
 from koopmpc.fitting.verdict import PlantVerdict, RateVerdict, judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.loop.faults import ActuatorLoss, DroppedSamples, Fault, FrozenSensor, NaNSensor, SensorDelay, SolverFailure
-from koopmpc.loop.metrics import metrics, tracking_error, violation_shares
+from koopmpc.loop.metrics import total_cost, tracking_error, violation_shares
 from koopmpc.loop.run import Step
 from koopmpc.page import HtmlPage
 from koopmpc.parallel import StageProgress
@@ -373,7 +373,7 @@ class _TestBench:
         last = np.abs(error[-max(len(error) // 10, 1) :]) / np.where(size > 0, size, 1.0)
         weighed = np.diag(asked.cost.matrices(of.nz, run.U.shape[1])[0]) > 0
         return _Outcome(
-            cost=metrics(run.take_first(asked.steps)).cost,
+            cost=total_cost(run.take_first(asked.steps)),
             violation=float(violation_shares(run, asked.limit_sizes).max()),
             error=float(last[:, weighed].max(initial=0.0)),
             statuses=watch.statuses,

@@ -16,7 +16,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError
 from koopmpc.lifting.base import strip_unit
 from koopmpc.loop.faults import Fault
-from koopmpc.loop.metrics import metrics, violation_shares
+from koopmpc.loop.metrics import total_cost, violation_shares
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import StepObserver, simulate
 from koopmpc.plants.plant import SimulatedPlant, Transition
@@ -327,7 +327,7 @@ def _run_condition(test: LoopTest, one: Condition, controller: Designed, seed: i
         u_reference=one.u_reference,
         rng=seed,
     )
-    cost = np.inf if run is None else metrics(run).cost
+    cost = np.inf if run is None else total_cost(run)
     return (run, cost) if np.isfinite(cost) else (None, np.inf)
 
 

@@ -1,4 +1,4 @@
-"""A controller that was designed from logs of the mass, made anew for each file of tests."""
+"""A controller that was designed from logs of the mass, made once for all files of tests."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from koopmpc.fitting.goal import design_data
 from tests.fitting.mass import GOAL, logs
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("designed")
     logs().save(folder / "logs.npz")

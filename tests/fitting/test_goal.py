@@ -35,7 +35,7 @@ def test_inputs_that_only_the_goal_file_names_are_inputs(tmp_path, monkeypatch):
     assert refused.exit_code == 2
     assert "no column is named as an input; its columns are" in refused.stderr
     assert "push [V] holds its value" in " ".join(refused.stderr.split())
-    written = CliRunner().invoke(app, ["fit", ".", "--inputs", "push", "--goal-template"])
+    written = CliRunner().invoke(app, ["fit", ".", "--inputs", "push", "--horizon", "5", "--goal-template"])
     assert written.exit_code == 0
     lines = Path("goal.toml").read_text().splitlines()
     Path("goal.toml").write_text("\n".join(line for line in lines if not line.startswith("inputs =")))
@@ -67,7 +67,7 @@ def tank_logs(folder, files=4, rows=300, glitch=None):
 
 def test_the_line_that_a_template_prints_designs_with_all_that_the_template_was_told(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    tank_logs(tmp_path / "csv")
+    tank_logs(tmp_path / "csv", files=3, rows=150)
     told = "--states level,temperature --inputs inflow,heater --resample 1 --horizon 8 --linear --name tank"
     result = CliRunner().invoke(app, ["fit", "csv", *told.split(), "--goal-template"])
     assert result.exit_code == 0, result.output
@@ -215,9 +215,11 @@ def test_logs_and_a_goal_end_in_a_controller_file_that_keeps_the_goal_on_the_pla
 
 @pytest.fixture(autouse=True)
 def quick(request, monkeypatch):
-    """Leave the pictures of a check out, which take a second, where a test does not look at them."""
+    """Leave the pages of a design and of a check out, which take a second each, where a test does not look at them."""
     if not {"page", "told"} & {*request.node.name.split("_")}:
         monkeypatch.setattr("koopmpc.fitting.check.write_design_report", lambda *_, **__: None)
+    if "made" not in request.fixturenames:
+        monkeypatch.setattr("koopmpc.fitting.goal.write_design_report", lambda *arguments: arguments[2])
 
 
 def test_the_page_shows_what_to_expect_and_the_goal(made):
@@ -419,7 +421,7 @@ def test_the_commands_write_a_template_design_and_check(tmp_path, monkeypatch):
     assert "fit logs.npz --goal goal.toml" in result.stdout
     again = call(app, ["fit", "logs.npz", "--goal-template"])
     assert (again.exit_code, "goal.toml is there already" in again.stderr) == (2, True)
-    Path("goal.toml").write_text(GOAL)
+    Path("goal.toml").write_text(GOAL.replace("horizon = 15", "horizon = 10"))
     result = call(app, ["fit", "logs.npz", "--goal", "goal.toml", "--linear"])
     assert result.exit_code == 0, result.output
     assert "the reference rests at force = 0 N/kg of -2 … 2" in result.stdout

@@ -10,7 +10,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.figures.style import save
-from koopmpc.loop.metrics import running_cost
+from koopmpc.loop.metrics import running_cost, total_cost
 from koopmpc.page import Curves, Page
 from koopmpc.recording.comparison import record_comparison
 from koopmpc.recording.curves import record_curves
@@ -46,6 +46,7 @@ def test_the_cost_so_far_grows_by_the_cost_of_each_step_and_ends_at_that_of_the_
         assert so_far[0] == 0
         assert so_far.shape == (run.steps + 1,)
         assert so_far[-1] == pytest.approx(km.metrics(weighed).cost)
+        assert total_cost(weighed) == km.metrics(weighed).cost
         for k in (1, 5):
             error, moved = run.X[k] - run.reference[k], run.U[k - 1] - run.u_reference[k - 1]
             step = error @ np.diag([2.0, 1.0]) @ error + 0.5 * moved @ moved
@@ -54,9 +55,11 @@ def test_the_cost_so_far_grows_by_the_cost_of_each_step_and_ends_at_that_of_the_
     none = running_cost(replace(make_run(), cost=None))
     assert none.shape == (21,)
     assert np.isnan(none).all()
+    assert np.isnan(total_cost(replace(make_run(), cost=None)))
     with np.errstate(all="raise"):  # the cost of a loop that diverged overflows to inf in silence
         far = replace(run, X=np.full_like(run.X, 7e153), cost=km.Cost([2.0, 1.0], 0.5), angles=())
         assert np.isinf(running_cost(far)[-1])
+        assert np.isinf(total_cost(far))
 
 
 def test_each_run_is_a_curve_of_every_plot_and_a_column_of_the_table(logs: list[Path], tmp_path: Path) -> None:

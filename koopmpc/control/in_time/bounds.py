@@ -72,7 +72,9 @@ def hold_rows(
     ShapeError
         Its rows have another number of signals.
     """
-    value = checks.array(omitted if bound is None else bound, end, infinite=True)
+    if bound is None:
+        return np.broadcast_to(omitted, (count, n))
+    value = checks.array(bound, end, infinite=True)
     if value.ndim < 2:
         return np.broadcast_to(checks.vector(value, end, n, infinite=True), (count, n))
     if value.shape[1] not in (1, n):

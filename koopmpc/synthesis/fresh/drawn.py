@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.codegen.compiled import Compiled
-from koopmpc.loop.metrics import metrics, violation_shares
+from koopmpc.loop.metrics import total_cost, violation_shares
 from koopmpc.loop.run import Run
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.asked import DesignTask
@@ -107,7 +107,7 @@ class LoopPool:
     def _judge(self, run: Run | None) -> LoopResult:
         if run is None:
             return LoopResult(np.inf, np.inf)
-        cost, over = metrics(run).cost, float(violation_shares(run, self.asked.limit_sizes)[1:].max(initial=0.0))
+        cost, over = total_cost(run), float(violation_shares(run, self.asked.limit_sizes)[1:].max(initial=0.0))
         return LoopResult(cost, over, run) if np.isfinite(cost) else LoopResult(np.inf, np.inf)
 
     def _run_place(self, controller: Any, loops: Sequence[DrawnLoop]) -> list[Run | None]:
