@@ -186,7 +186,9 @@ def total_cost(run: Run) -> float:
     return float("nan") if run.cost is None else _sum_up(*cost_terms(run, tracking_error(run)))
 
 
-def _sum_up(stage: Float[np.ndarray, " T1"], moved: Float[np.ndarray, " T"], changed: Float[np.ndarray, " T0"]) -> float:
+def _sum_up(
+    stage: Float[np.ndarray, " T1"], moved: Float[np.ndarray, " T"], changed: Float[np.ndarray, " T0"]
+) -> float:
     return float(stage[1:].sum() + moved.sum() + changed.sum())
 
 
