@@ -22,9 +22,12 @@ _SOLVER_FILES = (*_SOLVER, "factorization.h", "LICENSE")
 _CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"  # for the step times of a whole run
 
 
-def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
-    """Return the text of every file by its name: header, controller, model, numbers, solver."""
-    language = Language(single)
+def write_sources(tables: Tables, *, single: bool, packed: bool = False) -> dict[str, str]:
+    """Return the text of every file by its name: header, controller, model, numbers, solver.
+
+    With `packed` long arrays are bytes in the order of this machine, which a compiler reads sooner.
+    """
+    language = Language(single, packed)
     if tables.is_staged:
         own = (*_OWN, *_RECEDING, *_STAGED, *(["koopmpc_motion.c"] if tables.sizes["BEYOND"] else ()))
         own = (*own, *(_QP if tables.sizes["FINISH_ROWS"] else ()))
@@ -60,8 +63,9 @@ def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
 
 
 def write_one_source(tables: Tables, *, single: bool) -> str:
-    """Return all C of a controller as one file, with the functions by which Python calls it."""
-    return "\n".join([_CLOCK + join_sources(write_sources(tables, single=single)), read_shipped("c", "door.c")])
+    """Return all C of a controller as one file for this machine, with the functions by which Python calls it."""
+    texts = write_sources(tables, single=single, packed=True)
+    return "\n".join([_CLOCK + join_sources(texts), read_shipped("c", "door.c")])
 
 
 def join_sources(texts: Mapping[str, str]) -> str:

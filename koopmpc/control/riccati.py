@@ -294,13 +294,15 @@ def iterate(stage: Stage, P: Float[np.ndarray, "nz nz"], most: int) -> tuple[Gai
 
 def controllable(A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"]) -> Float[np.ndarray, "nz nc"]:
     """Return an orthonormal basis of the controllable subspace, the span of [B, AB, A²B, …]."""
-    V = np.empty((len(A), 0))
-    new, least = B, SETTLED * float(np.linalg.norm(B, 2))
-    while new.shape[1] and V.shape[1] < len(A):
+    n, found = len(A), 0
+    V, least, kept = np.empty((n, n)), SETTLED * float(np.linalg.norm(B, 2)), SETTLED * float(np.linalg.norm(A, 2))
+    new = B
+    while new.shape[1] and found < n:
         for _ in range(2):  # twice is enough for orthogonality to rounding
-            new = new - V @ (V.T @ new)
+            new = new - V[:, :found] @ (V[:, :found].T @ new)
         left, sigma, _ = np.linalg.svd(new, full_matrices=False)
-        left = left[:, sigma > least]
-        V = np.hstack([V, left])
-        new, least = A @ left, SETTLED * float(np.linalg.norm(A, 2))
-    return V
+        left = left[:, sigma > least][:, : n - found]
+        V[:, found : found + left.shape[1]] = left
+        found += left.shape[1]
+        new, least = A @ left, kept
+    return np.ascontiguousarray(V[:, :found])
