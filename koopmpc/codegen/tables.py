@@ -94,9 +94,7 @@ class Tables:
 
     def define(self, reals: Mapping[str, float]) -> None:
         """Add constants of the C code, each under a name that nothing else has: the later one would be used by both."""
-        twice = sorted(self.reals.keys() & reals.keys())
-        if twice:
-            raise ValueError(f"the C code has two constants of the name {twice[0]}; give one of them another name")
+        _refuse_twins(self.reals, reals)
         self.reals |= reals
 
     @property
@@ -166,7 +164,14 @@ def make_tables(program: StepProgram, *, single: bool) -> Tables:
             raise DataError(
                 f"there is no C code for {checks.article(program)}; make a FeedbackProgram or a CondensedProgram"
             )
+    _refuse_twins(tables.sizes, tables.reals)
     return tables
+
+
+def _refuse_twins(one: Mapping[str, float], other: Mapping[str, float]) -> None:
+    twice = sorted(one.keys() & other.keys())
+    if twice:
+        raise ValueError(f"the C code has two constants of the name {twice[0]}; give one of them another name")
 
 
 def stack(matrix: np.ndarray) -> np.ndarray:

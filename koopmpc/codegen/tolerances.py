@@ -9,7 +9,7 @@ from koopmpc.control.riccati import SETTLED as RESTED
 from koopmpc.control.stepped.levels import NEAR
 from koopmpc.control.stepped.sequences import EQUAL
 from koopmpc.control.target import ROUNDING
-from koopmpc.estimate.gate import ROUNDING as RESTS
+from koopmpc.estimate.gate import ROUNDING as AT_REST
 
 # DAQP's tolerances in single precision: its own are below the rounding of a float.
 SINGLE = {
@@ -19,7 +19,7 @@ SINGLE = {
 _OTHERS = ("cycle_tol", "iter_limit", "eps_prox", "eta_prox", "rho_soft", "rel_subopt", "abs_subopt", "w_soft")
 SETTINGS = (*SINGLE, "fval_bound", *_OTHERS)
 
-OF_ALL = {"WIDER": (1e-8, 1e-5), "ACCURACY": (1e-6, 5e-3), "ROUNDING": (ROUNDING, 1e-6), "RESTS": (RESTS, 1e-6)}
+OF_ALL = {"WIDER": (1e-8, 1e-5), "ACCURACY": (1e-6, 5e-3), "ROUNDING": (ROUNDING, 1e-6), "AT_REST": (AT_REST, 1e-6)}
 OF_LEVELS = {"NEAR_LEVEL": (NEAR, 1e-4), "BETTER": (1 - EQUAL, 1 - 1e-6)}
 OF_STAGES = {
     "PRECISE": (PRECISE, 1e-6),

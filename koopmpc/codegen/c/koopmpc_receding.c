@@ -45,7 +45,7 @@ static void learn(koopmpc_state *s, koopmpc_real *misfit) {
   for (int i = 0; i < NX; i++) {
     const koopmpc_real square = states[i] * states[i], moved = step[i] * step[i];
     const koopmpc_real change = states[i] - s->newest[NZ + i];
-    const koopmpc_real least = KOOPMPC_RESTS * KOOPMPC_RESTS * shown[i] * shown[i];
+    const koopmpc_real least = KOOPMPC_AT_REST * KOOPMPC_AT_REST * shown[i] * shown[i];
     koopmpc_real size = square > moved ? square : moved;
     if (size < least) size = least;
     if (size > s->sizes[i]) {
