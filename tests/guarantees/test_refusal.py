@@ -111,3 +111,9 @@ def test_a_region_outside_the_data_is_refused_unless_the_bound_is_given():
     inside = km.certify(MODEL, data, region=(-1, 1))  # ends of random data are a little inside
     assert -1 < inside.low[0] < inside.high[0] < 1
     assert km.certify(MODEL, data, region=(-2, 2), error=(0.01, 0.01)).high[0] == 2
+
+
+def test_a_model_with_measured_disturbances_is_refused():
+    pushed = km.LinearPredictor([[1.2]], [[0.5]], [[1.0]], km.State(), 1.0, ["x"], ["u"], E=[[0.1]])
+    with pytest.raises(km.errors.DataError, match="fit it without W, or pass model"):
+        km.certify(pushed, draw_pairs())

@@ -157,8 +157,10 @@ def test_what_cannot_be_refined_is_refused_in_a_sentence():
         [km.Episode(X=e.X, U=e.U, W=np.zeros((len(e), 1)) + rng.standard_normal((len(e), 1))) for e in data],
         data.dt, data.states, data.inputs, ["w"],
     )  # fmt: skip
-    with pytest.raises(DataError, match="measured disturbances"):
-        km.identify.refine(km.edmd(watched, km.State()), watched, horizon=5)
+    with pytest.raises(
+        KoopmpcError, match="1 measured disturbances, w, and the episodes hold 0; give each Episode its W"
+    ):
+        km.identify.refine(km.edmd(watched, km.State()), data, horizon=5)
     with pytest.raises(KoopmpcError, match="horizon"):
         km.identify.refine(model, data, horizon=0)
 
@@ -174,3 +176,43 @@ def test_coefficients_that_are_zero_stay_zero():
     refined = km.identify.refine(km.BilinearPredictor(A, start.B, N, *about), data, horizon=8, iterations=5)
     assert refined.A[0, 1] == refined.N[0, 1, 0] == 0.0
     assert (refined.A[0, [0, 2]] != A[0, [0, 2]]).all()
+
+
+def weathered(rng, *, scheduled, delays=0):
+    """Episodes of a plant that w pushes, and where `scheduled` multiplies in state and input; its model, and it 10 % off."""
+    A, B, E = np.diag([0.9, 0.8, 0.0]), np.array([[0.3], [0.2], [0.0]]), np.array([[0.2], [-0.1], [0.0]])
+    A[0, 1], A[1, 2], A[2, 2] = 0.1, 0.05, 1.0
+    N, S, M = np.zeros((1, 3, 3)), np.zeros((1, 3, 3)), np.zeros((1, 3, 1))
+    N[0, 0, 1], S[0, 1, 0], M[0, 0, 0] = 0.1, 0.15 * scheduled, 0.2 * scheduled
+    about = np.eye(2, 3), km.State() + km.Constant(), 0.1, ["a", "b"], ["u"]
+    true = km.BilinearPredictor(A, B, N, *about, E=E, S=S, M=M)
+    off = [each * rng.uniform(0.9, 1.1, each.shape) for each in (A, B, N, E, S, M)]
+    off[0][2], off[1][2], off[3][2] = A[2], 0.0, 0.0
+    start = km.BilinearPredictor(*off[:3], *about, E=off[3], S=off[4], M=off[5])
+    parts = []
+    for _ in range(5):
+        U, W = rng.uniform(-1, 1, (40, 1)), rng.uniform(-1, 1, (40, 1))
+        X = true.step_map().rollout(rng.uniform(-1, 1, 2), U, W)
+        parts.append(km.Episode(X=X, U=U, W=W))
+    return km.Episodes(parts, 0.1, ["a", "b"], ["u"]), true, start
+
+
+@pytest.mark.parametrize("scheduled", [False, True])
+def test_models_with_measured_disturbances_are_found_again(scheduled):
+    rng = np.random.default_rng(3)
+    data, true, start = weathered(rng, scheduled=scheduled)
+    found = km.identify.refine(start, data, horizon=6, iterations=60)
+    for name in ("A", "B", "N", "E", "S", "M"):
+        np.testing.assert_allclose(getattr(found, name), getattr(true, name), atol=1e-6)
+    assert found.disturbances == start.disturbances
+
+
+def test_linear_models_with_delays_and_measured_disturbances_are_refined():
+    rng = np.random.default_rng(4)
+    data = weathered(rng, scheduled=False)[0]
+    noisy = data.with_episodes([km.Episode(X=e.X + 0.1 * rng.standard_normal(e.X.shape), U=e.U, W=e.W) for e in data])
+    start = km.edmd(noisy, km.State() + km.Constant(), embedding=km.Delay(1))
+    found = km.identify.refine(start, noisy, horizon=8)
+    errors = [km.score(model, data, 8).rmse[-1].mean() for model in (start, found)]
+    assert found.nw == 1
+    assert errors[1] < errors[0]

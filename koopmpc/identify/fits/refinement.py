@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.levenberg_marquardt import minimise
 from koopmpc.identify.records.conversion import SignalUnits, cut_segments, from_standard, is_hidden, to_standard
 from koopmpc.identify.records.hidden import SimulationError, join_segments
@@ -26,17 +26,18 @@ ROWS = 20_000  # steps of all segments together, at most: beyond it segments beg
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """RecordSegments of `horizon` steps: the points ζ they start from, their inputs, and the states that followed."""
+    """RecordSegments of `horizon` steps: the points ζ they start from, [u; w] of each step, and the states after it."""
 
     points: Float[np.ndarray, "m npoint"]
-    inputs: Float[np.ndarray, "horizon m nu"]
+    inputs: Float[np.ndarray, "horizon m nv"]
     states: Float[np.ndarray, "horizon m nx"]
 
 
 class MultiStepError:
-    """The error of x̂_{k+1} = Θ φ(ζ̂_k, u_k), lifted afresh at each step, over segments, and its derivative by Θ.
+    """The error of x̂_{k+1} = Θ φ(ζ̂_k, v_k), lifted afresh at each step, over segments, and its derivative by Θ.
 
-    φ = [ψ(ζ); u; u ⊗ ψ(ζ)] for a bilinear model, [ψ(ζ); u] for a linear one. Errors are relative to `size`, one number
+    φ = [ψ(ζ); v] with v = [u; w] for a linear model, [ψ(ζ); v; u ⊗ ψ(ζ)] for a bilinear one, and w ⊗ ψ(ζ) and w ⊗ u
+    behind it where w multiplies something. Errors are relative to `size`, one number
     a state. With D_k = ∂x̂_k/∂Θ and J = ∂(Θ φ)/∂ζ the derivative follows D_{k+1} = I ⊗ φᵀ + J ∂ζ̂_k/∂Θ.
     """
 
@@ -48,14 +49,17 @@ class MultiStepError:
         free: Int[np.ndarray, " f"] | None = None,
     ) -> None:
         self.embedding, self.size, self._free = model.embedding, size, free
-        zeta, u = ca.SX.sym("zeta", len(model.point_names)), ca.SX.sym("u", model.nu)
-        z = model.lifting.symbolic(zeta)
+        zeta, v = ca.SX.sym("zeta", len(model.point_names)), ca.SX.sym("v", model.nu + model.nw)
+        z, u, w = model.lifting.symbolic(zeta), v[: model.nu], v[model.nu :]
         products = [ca.kron(u, z)] if isinstance(model, BilinearPredictor) else []
-        phi = ca.densify(ca.vertcat(z, u, *products))
+        if isinstance(model, BilinearPredictor) and model.is_scheduled:
+            products += [ca.kron(w, z), ca.kron(w, u)]
+        phi = ca.densify(ca.vertcat(z, v, *products))
+        self._nu = model.nu
         theta = ca.SX.sym("theta", model.nx, phi.numel())
         slope = ca.densify(ca.jacobian(theta @ phi, zeta))
-        self._features = ca.Function("features", [zeta, u], [phi], {"cse": True})
-        self._slopes = ca.Function("slopes", [zeta, u, ca.vec(theta.T)], [phi, slope], {"cse": True})
+        self._features = ca.Function("features", [zeta, v], [phi], {"cse": True})
+        self._slopes = ca.Function("slopes", [zeta, v, ca.vec(theta.T)], [phi, slope], {"cse": True})
         self.shape = model.nx, phi.numel()
         self._bound: dict[tuple[bool, int], tuple[list[np.ndarray], Callable[[], None], Any]] = {}
 
@@ -64,12 +68,12 @@ class MultiStepError:
         """Return the mean squared relative error over all segments and steps; inf where a forecast overflows."""
         total, point = 0.0, data.points
         with np.errstate(over="ignore", invalid="ignore"):
-            for u, truth in zip(data.inputs, data.states, strict=True):
-                x = self.find_features(point, u)[0] @ theta.T
+            for v, truth in zip(data.inputs, data.states, strict=True):
+                x = self.find_features(point, v)[0] @ theta.T
                 total += float(np.sum(((x - truth) / self.size) ** 2))
                 if not np.isfinite(total):
                     return np.inf
-                point = x if self.embedding is None else self.embedding.shift(point, u, x)
+                point = x if self.embedding is None else self.embedding.shift(point, v[:, : self._nu], x)
         return total / data.states.size
 
     def find_features(self, *values: np.ndarray) -> list[np.ndarray]:
@@ -99,8 +103,8 @@ class MultiStepError:
         rows, columns, every = free // count, free % count, np.arange(len(free))
         slopes, squares = np.zeros(len(free)), np.zeros((len(free), len(free)))
         point, moved = data.points, np.zeros((m, len(free), n))
-        for u, truth in zip(data.inputs, data.states, strict=True):
-            phi, slope = self.find_features(point, u, theta)
+        for v, truth in zip(data.inputs, data.states, strict=True):
+            phi, slope = self.find_features(point, v, theta)
             D = moved @ slope  # (m, f, nx)
             D[:, every, rows] += phi[:, columns]
             x = phi @ theta.T
@@ -110,8 +114,8 @@ class MultiStepError:
             if self.embedding is None:
                 point, moved = x, D
             else:
-                point = self.embedding.shift(point, u, x)
-                moved = self.embedding.shift(moved, np.zeros((*D.shape[:2], u.shape[1])), D)
+                point = self.embedding.shift(point, v[:, : self._nu], x)
+                moved = self.embedding.shift(moved, np.zeros((*D.shape[:2], self._nu)), D)
         gradient, matrix = np.zeros(nx * count), np.zeros((nx * count, nx * count))
         gradient[free], matrix[np.ix_(free, free)] = slopes, squares
         return gradient / data.states.size, matrix / data.states.size
@@ -125,11 +129,11 @@ def refine(
     held_out: Episodes | None = None,
     iterations: int = 30,
 ) -> LinearPredictor | BilinearPredictor:
-    """Refine the rows Θ = C [A B N] of a model by least squares of forecasts: min_Θ Σ_s Σ_h ‖(x̂_{s+h} − x_{s+h}) / σ‖².
+    """Refine the rows Θ = C [A B E N] of a model on forecasts: min_Θ Σ_s Σ_h ‖(x̂_{s+h} − x_{s+h}) / σ‖².
 
-    The forecast x̂_{k+1} = C (A ψ(ζ̂_k) + B u_k + Σ uᵢ Nᵢ ψ(ζ̂_k)) starts at measured ζ_s and is lifted afresh at
-    each step, as `step_map()` simulates and BilinearMPC plans; a model that is linear in the state and its past
-    forecasts the same lifted once. One-step least squares learns the noise where samples are fast; the error over
+    The forecast x̂_{k+1} = C (A ψ(ζ̂_k) + B u_k + E w_k + Σ uᵢ Nᵢ ψ(ζ̂_k)) starts at measured ζ_s and knows the measured
+    w; products of w that the model has are refined, too. It is lifted afresh at each step, as `step_map()` simulates
+    and BilinearMPC plans; a model that is linear in the state and its past forecasts the same lifted once. One-step least squares learns the noise where samples are fast; the error over
     many steps does not. Coefficients that are exactly zero stay zero. Segments of `horizon` steps begin at measured
     points, as in multiple shooting for an unstable plant. The minimisation is Levenberg-Marquardt with exact
     derivatives, in units of the states' standard deviations σ. It stops on held-out rows, and the model returned
@@ -139,6 +143,7 @@ def refine(
     ----------
     model
         Its lifting holds the states (C picks them), as `State() + …` does. Of ψ(ζ⁺) only the rows of the states change.
+        Measured disturbances stay those of the episodes.
         Or a model with a hidden state, of `subspace` or `polynomial_state_space`: then the dynamics of z, C and the
         encoder T of z_0 = T ζ change, and a segment runs in z, without lifting afresh.
     episodes
@@ -153,10 +158,9 @@ def refine(
     Raises
     ------
     DataError
-        The episodes are too short for one segment in each part; C does not pick the states from ψ; the model has
-        measured disturbances.
+        The episodes are too short for one segment in each part; C does not pick the states from ψ.
     ShapeError
-        The episodes have other states or inputs.
+        The episodes have other states or inputs, or another number of measured disturbances than the model.
 
     References
     ----------
@@ -179,9 +183,13 @@ def refine(
     if is_hidden(model):
         return _refine_hidden(model, episodes_of(episodes), horizon, held_out, iterations)
     places = rows_of_states(model)
-    if model.nw:
-        raise DataError("the model has measured disturbances, which refine does not know; refine a model without them")
     whole = episodes_of(episodes)
+    for part in (whole, whole if held_out is None else episodes_of(held_out)):
+        if part.nw < model.nw:
+            raise ShapeError(
+                f"the model has {model.nw} measured disturbances, {', '.join(model.disturbances)}, and the episodes "
+                f"hold {part.nw}; give each Episode its W"
+            )
     learn, unseen = split_ends(whole) if held_out is None else (list(whole), list(episodes_of(held_out)))
     size = np.concatenate([episode.X for episode in learn]).std(axis=0)
     size = np.where(size > 0, size, 1.0)
@@ -252,9 +260,11 @@ def rows_of_states(model: LinearPredictor | BilinearPredictor) -> Int[np.ndarray
 def coefficients_of_states(
     model: LinearPredictor | BilinearPredictor, rows: Int[np.ndarray, " nx"]
 ) -> Float[np.ndarray, "nx nphi"]:
-    """Return Θ = C [A B N₁ N₂ …]."""
+    """Return Θ = C [A B E N₁ N₂ … S₁ S₂ … M₁ M₂ …], without S and M where no w multiplies anything."""
     products = [Ni[rows] for Ni in model.N] if isinstance(model, BilinearPredictor) else []
-    return np.hstack([model.A[rows], model.B[rows], *products])
+    if isinstance(model, BilinearPredictor) and model.is_scheduled:
+        products += [each[rows] for each in (*model.S, *model.M)]
+    return np.hstack([model.A[rows], model.B[rows], model.E[rows], *products])
 
 
 def with_coefficients(
@@ -264,18 +274,35 @@ def with_coefficients(
     sentence: str,
 ) -> LinearPredictor | BilinearPredictor:
     """Return the model with Θ as its rows of the states."""
-    nz, nu = model.nz, model.nu
-    A, B = model.A.copy(), model.B.copy()
-    A[rows], B[rows] = theta[:, :nz], theta[:, nz : nz + nu]
+    nz, nu, nw = model.nz, model.nu, model.nw
+    A, B, E = model.A.copy(), model.B.copy(), model.E.copy()
+    ends = np.cumsum([nz, nu, nw, nu * nz, nw * nz])
+    A[rows], B[rows], E[rows], of_N, of_S, of_M = np.split(theta, ends, axis=1)
     report: FitReport | None = model.report
     if report is not None:
         report = replace(report, changes=(*report.changes, sentence))
     about = (model.C, model.lifting, model.dt, model.states, model.inputs, report)
     if isinstance(model, LinearPredictor):
-        return LinearPredictor(A, B, *about, embedding=model.embedding, scale=model.scale)
-    N = model.N.copy()
-    N[:, rows] = theta[:, nz + nu :].reshape(len(rows), nu, nz).transpose(1, 0, 2)
-    return BilinearPredictor(A, B, N, *about, embedding=model.embedding, scale=model.scale)
+        return LinearPredictor(
+            A, B, *about, embedding=model.embedding, scale=model.scale, E=E, disturbances=model.disturbances
+        )
+    N, S, M = model.N.copy(), model.S.copy(), model.M.copy()
+    N[:, rows] = of_N.reshape(len(rows), nu, nz).transpose(1, 0, 2)
+    if model.is_scheduled:
+        S[:, rows] = of_S.reshape(len(rows), nw, nz).transpose(1, 0, 2)
+        M[:, rows] = of_M.reshape(len(rows), nw, nu).transpose(1, 0, 2)
+    return BilinearPredictor(
+        A,
+        B,
+        N,
+        *about,
+        embedding=model.embedding,
+        scale=model.scale,
+        E=E,
+        S=S,
+        M=M,
+        disturbances=model.disturbances,
+    )
 
 
 def split_ends(episodes: Episodes) -> tuple[list[Episode], list[Episode]]:
@@ -299,13 +326,13 @@ def cut_into_segments(
     points = model.embed(episodes.with_episodes(long))
     apart = _apart(points, horizon)
     starts: list[Float[np.ndarray, "_ npoint"]] = []
-    inputs: list[Float[np.ndarray, "horizon _ nu"]] = []
+    inputs: list[Float[np.ndarray, "horizon _ nv"]] = []
     states: list[Float[np.ndarray, "horizon _ nx"]] = []
     for episode in points:
         first = np.arange(0, len(episode) - horizon + 1, apart)
         ahead = np.arange(horizon)[:, None] + first
         starts.append(episode.X[first])
-        inputs.append(episode.U[ahead])
+        inputs.append(np.concatenate([episode.U, episode.W[:, : model.nw]], axis=1)[ahead])
         states.append(episode.X[ahead + 1, : model.nx])
     return Segments(_join(starts, 0), _join(inputs, 1), _join(states, 1))
 
