@@ -131,13 +131,14 @@ def refine(
 ) -> LinearPredictor | BilinearPredictor:
     """Refine the rows Θ = C [A B E N] of a model on forecasts: min_Θ Σ_s Σ_h ‖(x̂_{s+h} − x_{s+h}) / σ‖².
 
-    The forecast x̂_{k+1} = C (A ψ(ζ̂_k) + B u_k + E w_k + Σ uᵢ Nᵢ ψ(ζ̂_k)) starts at measured ζ_s and knows the measured
-    w; products of w that the model has are refined, too. It is lifted afresh at each step, as `step_map()` simulates
-    and BilinearMPC plans; a model that is linear in the state and its past forecasts the same lifted once. One-step least squares learns the noise where samples are fast; the error over
-    many steps does not. Coefficients that are exactly zero stay zero. Segments of `horizon` steps begin at measured
-    points, as in multiple shooting for an unstable plant. The minimisation is Levenberg-Marquardt with exact
-    derivatives, in units of the states' standard deviations σ. It stops on held-out rows, and the model returned
-    has the least error there: `model` itself where no step lowers that.
+    The forecast x̂_{k+1} = C (A ψ(ζ̂_k) + B u_k + E w_k + Σ uᵢ Nᵢ ψ(ζ̂_k)) starts at measured ζ_s and knows the
+    measured w; products of w that the model has are refined, too. It is lifted afresh at each step, as `step_map()`
+    simulates and BilinearMPC plans; a model that is linear in the state and its past forecasts the same lifted once.
+    One-step least squares learns the noise where samples are fast; the error over many steps does not. Coefficients
+    that are exactly zero stay zero. Segments of `horizon` steps begin at measured points, as in multiple shooting for
+    an unstable plant. The minimisation is Levenberg-Marquardt with exact derivatives, in units of the states' standard
+    deviations σ. It stops on held-out rows, and the model returned has the least error there: `model` itself where no
+    step lowers that.
 
     Parameters
     ----------
