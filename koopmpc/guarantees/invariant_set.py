@@ -7,6 +7,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
+from koopmpc.control.terminal.inclusion import find_support
 from koopmpc.control.terminal.sets import TerminalSet
 from koopmpc.errors import CertificateError, DataError
 from koopmpc.values import Value
@@ -105,7 +106,7 @@ def find_invariant_set(
                 " limits"
             )
         new = row / room[:, None]
-        added = np.array([_largest(each, kept) > 1 + _TOLERANCE for each in new], dtype=np.bool_)
+        added = np.array([find_support(kept, each, ball=False) > 1 + _TOLERANCE for each in new], dtype=np.bool_)
         if not added.any():
             kept = _drop_redundant(kept)
             return InvariantPolytope(kept, np.ones(len(kept)), step)
@@ -116,19 +117,11 @@ def find_invariant_set(
     )
 
 
-def _largest(row: Float[np.ndarray, " n"], H: Float[np.ndarray, "p n"]) -> float:
-    """Return max row·z over H z ≤ 1; inf where nothing bounds it."""
-    from scipy.optimize import linprog  # slow to import
-
-    found = linprog(-row, A_ub=H, b_ub=np.ones(len(H)), bounds=(None, None), method="highs")
-    return float(-found.fun) if found.status == 0 and found.fun is not None else np.inf
-
-
 def _drop_redundant(H: Float[np.ndarray, "p n"]) -> Float[np.ndarray, "kept n"]:
     """Return the rows of {H z ≤ 1} that the others do not imply."""
     alive = np.ones(len(H), dtype=np.bool_)
     for i in range(len(H)):
         alive[i] = False
         others = H[alive]
-        alive[i] = not len(others) or _largest(H[i], others) > 1 + _TOLERANCE
+        alive[i] = not len(others) or find_support(others, H[i], ball=False) > 1 + _TOLERANCE
     return H[alive]

@@ -25,7 +25,7 @@ _INSIDE = 1e-9  # share of a limit that a set point has to be inside it
 class TailLoop(NamedTuple):
     """ξ⁺ = (A − B K) ξ around the set point, ξ = z or [z; u_{k−1}] without the Constant, and its limits H ξ ≤ h.
 
-    V = ξᵀP ξ is the cost-to-go.
+    V = ξᵀP ξ falls in every step: it is the cost-to-go, and what the last input cost where only its limits count.
     """
 
     transition: Float[np.ndarray, "n n"]
@@ -111,6 +111,11 @@ def find_terminal_set(
     if kind == "ellipsoid":
         if error is not None:
             raise DataError("an ellipsoid is not tightened by errors; take kind='polytope', or leave error out")
+        if np.linalg.eigvalsh(loop.P)[0] <= 0:
+            raise DataError(
+                "the cost-to-go does not grow in every direction, so its level sets do not end; weigh every state, and"
+                " every input whose rate is limited"
+            )
         # max H_i ξ over ξᵀP ξ ≤ α is √(α H_i P⁻¹ H_iᵀ)
         reach = np.einsum("ij,ij->i", loop.H, np.linalg.solve(loop.P, loop.H.T).T)
         level = float((loop.h**2 / np.maximum(reach, 1e-300)).min())
@@ -160,7 +165,7 @@ def build_tail_loop(predictor: LinearPredictor, cost: Cost, limits: Limits, refe
     if track.rates is not None and track.R_delta is None:  # the last input counts for its limits alone
         K = np.hstack([K, np.zeros((nu, nu))])
         transition = np.block([[A - B @ K[:, :nk], np.zeros((nk, nu))], [-K]])
-        P = block_diag(P, np.zeros((nu, nu)))
+        P = block_diag(P, track.R)  # V⁺ + uᵀR u = V − xᵀQ x
     radius = float(np.abs(np.linalg.eigvals(transition)).max())
     if radius >= 1 - 1e-9:
         raise DataError(

@@ -29,6 +29,7 @@ from koopmpc.control.solvers.stages import QPStages
 from koopmpc.control.stepped.blocks import MoveBlocks
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
 from koopmpc.control.terminal.cuts import Ball, make_ball
+from koopmpc.control.terminal.inclusion import EndReach
 from koopmpc.control.terminal.sets import EndRows, read_end
 from koopmpc.control.terminal_cost import terminal_of
 from koopmpc.predict.predictors import LinearPredictor
@@ -96,6 +97,8 @@ class PlanMap(Viewing):
         Whether a target enters the plan, and whether the last column of M is that of targets inside the limits.
     qp
         The QP of w.
+    end, ends
+        The rows of a terminal set, and how many there are: the last entries of v.
     ball
         The entries of v that a terminal ellipsoid limits; their limits here are those of a box inside it.
     given, offset
@@ -108,6 +111,7 @@ class PlanMap(Viewing):
 
     _VIEWS = ("met", "met_low", "met_high", "low", "high")
     layout: WindowLayout | None = None  # where rows of limits stand in a table, once there are some
+    reach: EndReach | None = None  # the extremes on the terminal set, once there are rows of limits
     terminal: Terminal  # what the end of the horizon costs, in its units
 
     def __init__(
@@ -130,6 +134,7 @@ class PlanMap(Viewing):
         self.qp = _step_qp(maps, limits, 0 if track.rates is None else len(track.inputs.low), stages)
         low, high, nv = limits.low, limits.high, len(limits.low)
         self.ball: Ball | None = None
+        self.end, self.ends = end, 0 if end is None else len(end.F)
         if end is not None and end.ball:
             softness = track.limits.end_softness(len(end.F), track.sizes.scale)
             self.ball = make_ball(softness, maps.deviation, maps.unit, nv - len(end.F))

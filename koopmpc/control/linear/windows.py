@@ -16,7 +16,8 @@ from koopmpc.control.linear.layout import TableColumns, WindowLayout
 from koopmpc.control.linear.moving import MovingMap, find_reach
 from koopmpc.control.linear.plan import PlanMap
 from koopmpc.control.target import ROUNDING
-from koopmpc.errors import DataError
+from koopmpc.control.terminal.inclusion import measure_reach, require_inside
+from koopmpc.control.terminal.sets import EndRows
 
 _PAGE = 2**14  # entries of limits that are made at once: more cost a step more than 0.1 ms
 _SHARE = 1e-5  # a rate that gives way by more of its allowance than this is reported
@@ -204,7 +205,7 @@ def limit_windows(
     Raises
     ------
     DataError
-        A limit has no row in the plan; limits cross in some step; the limits have a terminal set.
+        A limit has no row in the plan; limits cross in some step; the terminal set leaves limits of later rows.
     ShapeError
         A bound has too few rows for the plan, or as many signals as it should not.
     """
@@ -213,8 +214,6 @@ def limit_windows(
     names = [*states, *(() if limits.of is None else limits.of.bind(tuple(states)).names)]
     if at_call:
         require_preview(limits, N + latency)
-    if plan.planned != len(plan.blocks) * nu * (1 + (track.rates is not None)) + N * len(track.outputs.low):
-        raise DataError("limits in time were passed with a terminal set, which holds for its own limits; leave one out")
     steps = 1 if at_call else max(limits.count_rows().values(), default=1)
     count = steps + latency + N
     box, change = limits.input_rows(nu, 0, count), limits.rate_rows(nu, 0, count)
@@ -235,6 +234,8 @@ def limit_windows(
     why = " once tightened by the margin" if most.any() else ""
     refuse_crossed_rows(outputs.low + most, outputs.high - most, "state and output", shown, why=why)
 
+    if plan.end is not None:
+        _require_end(plan, plan.end, limits, (box, change, outputs), N + latency, inputs, shown)
     raw = Interval(*(np.hstack([a, b]) - targets.values for a, b in zip(box, outputs, strict=True)))
     limited, reach = plan.limited_targets, ROUNDING * targets.size[plan.limited_targets]
     shift = targets.rows[limited] @ targets.offset  # the tests of a MovingMap are of K r alone
@@ -244,6 +245,9 @@ def limit_windows(
     free = Interval(np.full((count, 1), -HUGE), np.full((count, 1), HUGE))
     parts = [box, *([] if track.rates is None else [change]), outputs, raw, test, tightest, free]
     parts += [swept for b, swept in blocks.items() if b > 1]
+    start = plan.planned - plan.ends  # a terminal set has the same limits in every row
+    low, high = (np.tile(end[start : plan.planned], (count, 1)) for end in np.split(plan.limits, 2))
+    parts.append(Interval(low, high))
     table = np.concatenate([part[i] for i in (0, 1) for part in parts], axis=1)
     margin = preview_margin(track.margin, N).ravel() if track.margin.any() else None
     W, raw_at = layout.width, layout.raw.first
@@ -253,8 +257,32 @@ def limit_windows(
     if plan.aims_inside:
         first = [part[latency : latency + steps] - shift for part in tightest]
         reaches = find_reach(targets.rows[limited] @ targets.from_reference, *first).tolist()
-    endless = not all(np.isfinite(part).all() for part in planned)
+    endless = plan.ends > 0 or not all(np.isfinite(part).all() for part in planned)
     return make_windows(plan, table, latency, steps, endless=endless, reaches=reaches, margin=margin)
+
+
+def _require_end(
+    plan: PlanMap,
+    end: EndRows,
+    limits: Limits,
+    rows: tuple[Interval, Interval, Interval],
+    first: int,
+    inputs: Sequence[str],
+    shown: Sequence[str],
+) -> None:
+    """Raise where the terminal set leaves limits of the inputs, their changes or the outputs after a plan's end."""
+    track, (box, change, outputs) = plan.track, rows
+    if plan.reach is None:
+        plan.reach = measure_reach(end.of, end.places, track.limited, end.constant)
+    most, moving = track.margin.max(axis=0, initial=0.0), limits.count_rows()
+    within = Interval(outputs.low + most, outputs.high - most)
+    require_inside("state and output", plan.reach.outputs, within, first + 1, shown, moved=True)
+    for what, reach, asked, bounds in (
+        ("input", plan.reach.inputs, "u_", box),
+        ("rate", plan.reach.rates, "du_", change),
+    ):
+        moved = any(name.startswith(asked) for name in moving)
+        require_inside(what, reach, bounds, first, inputs, moved=moved)
 
 
 def make_windows(
@@ -294,12 +322,13 @@ def _lay_out(plan: PlanMap) -> WindowLayout:
     start, length = _find_holds(plan, nu)
     used = {b: (length == b).any(axis=0) | (b == 1) for b in sorted({1, *length.ravel().tolist()})}
     outs, limited, rated = len(track.outputs.low), int(plan.limited_targets.sum()), track.rates is not None
-    widths = [nu, *([nu] if rated else []), outs, nu + outs, limited, limited, 1, *([nu] * (len(used) - 1))]
+    widths = [nu, *([nu] if rated else []), outs, nu + outs, limited, limited, 1, *([nu] * (len(used) - 1)), plan.ends]
     starts = np.cumsum([0, *widths]).tolist()
     at = iter(starts)
     u_at, du_at = next(at), next(at) if rated else 0
     out_at, raw_at, test_at, tight_at, free_at = (next(at) for _ in range(5))
     block_at = {b: next(at) for b in used if b > 1} | {1: u_at}
+    end_at = next(at)
     W = starts[-1]
 
     first = np.cumsum([0, *plan.blocks[:-1]])
@@ -311,6 +340,7 @@ def _lay_out(plan: PlanMap) -> WindowLayout:
         changes[plan.held.ravel()] = free_at
         places.append(changes)
     places += [(k + 1) * 2 * W + out_at + np.arange(outs) for k in range(N)]
+    places.append(end_at + np.arange(plan.ends))
     mine = np.concatenate(places).astype(np.intp)
     low_places, high_places = [mine], [mine + W]
     if len(plan.low) > plan.planned:
@@ -330,7 +360,7 @@ def _lay_out(plan: PlanMap) -> WindowLayout:
         raw=TableColumns(raw_at, nu + outs),
         tight=TableColumns(tight_at, limited),
         moves=moves,
-        outputs=slice(len(mine) - N * outs, len(mine)),
+        outputs=slice(len(mine) - plan.ends - N * outs, len(mine) - plan.ends),
         entries=entries,
     )
 

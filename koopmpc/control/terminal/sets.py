@@ -148,11 +148,17 @@ class HasTerminalSet(Protocol):
 
 
 class EndRows(NamedTuple):
-    """F ξ_N − F c on ξ_N = z_N, or [z_N; u_{N−1}]: below 1 row by row, or below 1 in norm where it is a `ball`."""
+    """F ξ_N − F c on ξ_N = z_N, or [z_N; u_{N−1}]: below 1 row by row, or below 1 in norm where it is a `ball`.
+
+    `places` (n, nz) reads the coordinates of the set `of` from z, of which the entry `constant` is 1.
+    """
 
     F: Float[np.ndarray, "p nx"]
     offset: Float[np.ndarray, " p"]
     ball: bool
+    of: TerminalSet
+    places: Float[np.ndarray, "n nz"]
+    constant: int | None
 
 
 def read_terminal_set(given: object) -> TerminalSet:
@@ -190,12 +196,11 @@ def read_end(given: TerminalSet | HasTerminalSet, predictor: LinearPredictor) ->
             if isinstance(bound, State)
             else whole[find_observables(predictor.lifting, bound)]
         )
-    E = E if wanted.kept is None else E[list(wanted.kept)]
-    if wanted.with_input:
-        E = block_diag(E, np.eye(nu))
+    places = E if wanted.kept is None else E[list(wanted.kept)]
+    E = block_diag(places, np.eye(nu)) if wanted.with_input else places
     F, center = wanted.rows, np.asarray(wanted.center)
     _require_size(len(center), len(E))
-    return EndRows(F @ E, -F @ center, wanted.is_ellipsoid)
+    return EndRows(F @ E, -F @ center, wanted.is_ellipsoid, wanted, places, predictor.lifting.constant_index)
 
 
 def terminal_function(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> ca.Function:
