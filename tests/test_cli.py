@@ -363,6 +363,24 @@ def test_the_doctor_names_what_is_missing_and_how_it_is_had(call, monkeypatch):
         assert extra in ("dev", "docs", "peers") or f"[{extra}]'" in ill, extra
 
 
+@pytest.mark.parametrize(
+    ("display", "program", "said"),
+    [
+        (":0", "there", "opens logs"),
+        ("", "there", "no display: logs are written all the same"),
+        (":0", "", "not found"),
+    ],
+)
+def test_the_doctor_says_whether_a_log_can_be_opened(call, monkeypatch, tmp_path, display, program, said):
+    (tmp_path / "there").touch()
+    monkeypatch.setattr("koopmpc.recording.viewer.program", lambda: tmp_path / (program or "gone"))
+    monkeypatch.setattr("koopmpc.cli.start.sys.platform", "linux")
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    told = " ".join(call("doctor").stdout.split())
+    assert [words for words in ("opens logs", "no display: logs", "not found") if words in told] == [said[:16].strip()]
+
+
 def test_the_doctor_tries_the_compiler_and_says_what_it_said(call, monkeypatch, tmp_path):
     broken = tmp_path / "cc"
     broken.write_text("#!/bin/sh\necho 'math.h: no such file' >&2\nexit 4\n")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.experiment.ensemble import fit_ensemble
+from koopmpc.experiment.ensemble import Ensemble, fit_ensemble
 from koopmpc.experiment.standing import check_standing
 from koopmpc.experiment.visits import weigh_visits
 
@@ -55,6 +55,20 @@ def test_inputs_and_bands_keep_all_limits(plan):
     assert (plan.high >= plan.X).all()
     assert plan.U.shape == (2, 80, 1)
     assert plan.X.shape == (2, 81, 2)
+
+
+def test_all_members_begin_where_the_plan_begins(logs, monkeypatch):
+    begun, simulate = [], Ensemble.simulate
+
+    def watched(self, start, *more):
+        begun.append(start)
+        return simulate(self, start, *more)
+
+    monkeypatch.setattr(Ensemble, "simulate", watched)
+    plan = km.next_experiment(logs, COST, LIMITS, reference=[1, 0], steps=12, rng=1)
+    for start in begun[-2:]:  # the candidates on the model alone, and the best ones on all members
+        np.testing.assert_array_equal(start, np.tile(plan.X[0, 0], (len(start), 1)))
+    assert 1 < len(begun[-1]) < len(begun[-2])
 
 
 def test_the_true_plant_keeps_limits_under_it_and_mostly_the_band(plan):

@@ -115,6 +115,7 @@ def test_it_prints_what_it_understood_the_leaderboard_and_the_verdict(fitted):
     assert re.search(r"over that of the plain linear fit.*:\n  x [\d.]+, theta", out)
     assert re.search(r"look at it: .*koopmpc view .*model\.rrd", out)
     page = (folder / "report.md").read_text()
+    assert re.match(r"# Model report\s+(DO NOT )?TRUST", page)
     for picture in re.findall(r"!\[.*?\]\((.*?)\)", page):
         assert (folder / picture).exists()
     assert page.count("![") == 5

@@ -1,9 +1,11 @@
 """Trajectories are exact to far below what is reported, and feedback acts as it says."""
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from koopmpc.papers import kaiser
 from koopmpc.papers.plants import (
     CartPole,
     Pendulum,
@@ -34,6 +36,15 @@ def test_trajectories_agree_with_another_integrator(fed):
         cart_pole, (0, 10), start, "DOP853", np.arange(1001) * 0.01, args=arguments, rtol=1e-12, atol=1e-12
     )
     np.testing.assert_allclose(X, other.y.T, rtol=0, atol=1e-8)
+
+
+def test_the_saddle_of_the_asymmetric_well_is_its_highest_point_between_the_wells():
+    q = ca.SX.sym("q")
+    energy = kaiser.POTENTIALS["asymmetric well"](q)
+    slopes = ca.Function("slopes", [q], [ca.jacobian(energy, q), ca.hessian(energy, q)[0]])
+    slope, bend = map(float, slopes(kaiser.SADDLE))
+    assert abs(slope) < 1e-12
+    assert bend < 0
 
 
 def test_energy_of_the_hanging_pendulum_is_kept():

@@ -9,6 +9,8 @@ import pytest
 
 import koopmpc as km
 from koopmpc.figures.eigenvalues import evaluate_eigenfunctions, make_plane
+from koopmpc.figures.style import SEQUENTIAL
+from koopmpc.recording.blueprint import draw_eigenvalues
 from koopmpc.recording.reader import LogColumns, read_columns
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning
 from tests.recording.viewing import drawn
@@ -82,6 +84,15 @@ def test_eigenvalues_stand_upright_with_their_residuals(log: Path, report: km.va
     assert len(_points(log, "/model/spurious")) == spurious.sum()
     (turn,) = (np.array(strip) for strip in _all(log, "/model/circle", "strips"))
     assert np.hypot(*turn.T) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_points_are_darker_the_smaller_their_residual_over_the_whole_scale() -> None:
+    shares = np.array([1e-3, 1e-2, 10**-0.5, 10.0, 1e3])  # of the tolerance; below 1/100 and above 10 nothing changes
+    found = km.validate.ResidualDMD(0.1j * np.arange(5), 0.2 * shares, tolerance=0.2, samples=9)
+    drawn = draw_eigenvalues(turning(0.9), found)["model/eigenvalues"]
+    colors = np.array(drawn.colors.as_arrow_array().to_pylist(), dtype=np.uint32)
+    shades = mpl.colormaps[SEQUENTIAL](0.85 * np.array([0.0, 0.0, 0.5, 1.0, 1.0]), bytes=True)
+    np.testing.assert_array_equal(colors >> 8, shades[:, :3] @ [1 << 16, 1 << 8, 1])
 
 
 def test_pictures_are_the_eigenfunctions_with_the_second_state_upwards(log: Path) -> None:

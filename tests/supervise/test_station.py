@@ -187,6 +187,14 @@ def test_the_standby_acts_while_the_primary_fails_and_the_run_keeps_who_acted(tm
     assert km.load_run(tmp_path / "run.rrd").actor == run.actor
 
 
+def test_a_second_manual_mode_begins_with_the_input_of_its_moment_and_not_with_the_old_hand():
+    station = km.supervise.Station(km.LQR(TANK, COST, BOX), limits=BOX, mode="manual", hand=[0.7])
+    _, U, _ = loop(station, 20, act=lambda k: station.switch("automatic" if k in range(3, 15) else "manual"))
+    assert (U[:3] == 0.7).all()
+    assert abs(U[14] - 0.7) > 0.1
+    assert (U[15:] == U[14]).all()
+
+
 def test_set_points_move_by_the_ramp_and_start_at_the_measurement_after_a_hand():
     seen = []
 
