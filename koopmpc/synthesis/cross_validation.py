@@ -137,7 +137,9 @@ def smooth_data(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple
     )
     quiet = [strip_unit(name) for name, found in zip(held.states, smoother.is_noisy, strict=True) if not found]
     others = f"; that of {', '.join(quiet)} is too small to tell" if quiet else ""
-    note = f"the measurements hold noise (standard deviations): {told}{others}; models are of smoothed states"
+    note = (
+        f"the measurements hold noise (standard deviations): {told}{others}; candidates are fitted to smoothed states"
+    )
     return *_apply_change(source, held, smoother), (note,), smoother.noise
 
 

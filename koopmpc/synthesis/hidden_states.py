@@ -50,7 +50,7 @@ def judge_hidden_states(
     neurons, with the rails if the best one before has them. With neurons the best one and the smallest of other orders
     are judged, if they are calm and err by a tenth less than all others; else the best one, if it errs by less than
     half more. Where records are too short for a kind, it is left out; so is a model that on the first stretches errs by
-    half more than the best calm one so far.
+    a tenth more than the best calm one so far.
 
     Parameters
     ----------

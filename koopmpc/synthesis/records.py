@@ -43,7 +43,8 @@ _GAIN = 0.98  # keep a refinement if it lowers the error on unseen rows to less 
 _PAYS = 0.9  # take a hidden state if it lowers the error on unseen rows to less than this share
 _LOST = 1e3  # a free run counts as this many spreads at most
 _HALVES = 2  # errors of a quarter
-_BEHIND = 1.5  # a model that errs by this many times a rival's error on the first quarters is not fitted to others
+_ROWS_AT_ONCE = 500  # longer forecasts run in the compiled map, which takes as long to build as these rows take without
+_BEHIND = 1.1  # a model that errs by this many times a rival's error on the first quarters is not fitted to others
 _LONGEST = 4000  # rows of a free run that judges finalists, at most; the search for terms cuts shorter pieces
 
 
@@ -183,8 +184,8 @@ def judge_free_run(
 ) -> FreeRun:
     """Return how a fit does on each quarter of the records when it learns from the others.
 
-    Where it errs by far more than a `rival` on each of the first two quarters, it is not fitted to the others, and has
-    lost there. One quarter does not decide: without it the data may lack what only that quarter holds.
+    Where it errs by a tenth more than a `rival` on each of the first two quarters, it is not fitted to the others, and
+    has lost there. One quarter does not decide: without it the data may lack what only that quarter holds.
 
     Parameters
     ----------
@@ -337,8 +338,15 @@ def cut_pieces(episodes: Episodes) -> Episodes:
 def forecast_rows(
     model: AnyPredictor, episode: Episodes, starts: Sequence[int], horizon: int, relift: bool
 ) -> Float[np.ndarray, "horizon starts nx"]:
-    """Return the errors of forecasts that begin at these rows of one episode."""
+    """Return the errors of forecasts that begin at these rows of one episode, without measured disturbances."""
     past = 0 if model.embedding is None else model.embedding.steps
+    if relift and horizon >= _ROWS_AT_ONCE * len(starts) and not model.nw:
+        points, step = model.embed(episode)[0], model.step_map()
+        runs = [step.rollout(points.X[k - past], points.U[k - past : k - past + horizon])[1:] for k in starts]
+        truth = [points.X[k - past + 1 : k - past + 1 + horizon] for k in starts]
+        with np.errstate(invalid="ignore"):
+            gaps = (np.array(truth) - np.array(runs))[..., : model.nx].swapaxes(0, 1)
+        return np.where(np.isnan(gaps), np.inf, gaps)
     rows = [np.array(starts) - past]
     return np.concatenate(
         [gap for gap, _ in forecast_errors(model, model.embed(episode), rows, horizon, relift=relift)], axis=1

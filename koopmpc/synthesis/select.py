@@ -72,7 +72,7 @@ LATE = (
     "model.align(logs) does the same to other logs"
 )
 
-ROUGH = "the chosen model learns from the rows as they were measured: smoothed ones forecast unseen rows no better"
+ROUGH = "the chosen model is fitted to the rows as they were measured: smoothed ones forecast unseen rows no better"
 
 
 def extend_past(past: Sequence[int], learned: Episodes, measured: Episodes) -> list[int]:

@@ -139,6 +139,36 @@ def edited(source: Path, target: Path, change) -> Path:
     return target
 
 
+NEWER = ("E", "M", "S", "disturbances", "input_lead", "rails", "scale")  # fields that models had not at first
+
+
+def without_newer_fields(tree: dict) -> dict:
+    return {k: without_newer_fields(v) if isinstance(v, dict) else v for k, v in tree.items() if k not in NEWER}
+
+
+@pytest.mark.parametrize(
+    "fit",
+    [
+        lambda data: km.edmd(data, km.State() + km.Constant(), embedding=km.Delay(2)),
+        lambda data: km.bilinear_edmd(data, km.State() + km.Constant(), embedding=km.Delay(1)),
+        lambda data: km.identify.polynomial_state_space(data, order=1, degree=2),
+        lambda data: km.identify.subspace(data, order=2),
+    ],
+    ids=["delays", "bilinear delays", "polynomial hidden state", "linear hidden state"],
+)
+def test_a_model_file_of_before_has_the_newer_fields_at_their_defaults(fit, tmp_path: Path) -> None:
+    data = random_episodes(0, [300], 1, 1)
+    model = fit(data)
+    model.save(tmp_path / "model.npz")
+    again = km.load_model(edited(tmp_path / "model.npz", tmp_path / "old.npz", without_newer_fields))
+    assert (again.input_lead, again.embedding, again.disturbances) == (0, model.embedding, ())
+    past = again.embedding.steps
+    history = km.Episode(X=data[0].X[: past + 1], U=data[0].U[:past])
+    U = data[0].U[past : past + 20]
+    runs = [one.rollout(data[0].X[past], U, history=history) for one in (model, again)]
+    np.testing.assert_array_equal(*runs)
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [

@@ -14,6 +14,7 @@ from koopmpc.synthesis.hidden_states import NEAR, PAYS, judge_hidden_states
 from koopmpc.synthesis.records import (
     FreeRun,
     choose_by_free_run,
+    forecast_rows,
     is_fed_back,
     is_late,
     is_record,
@@ -38,6 +39,9 @@ def oscillator(rows=420, noise=0.01, late=False, gain=None, seed=0):
     if late:
         U = np.vstack([U[:1], U[:-1]])  # the row of u_k holds y_{k+1}
     return km.Episodes([km.Episode(X=X, U=U)], 0.1, ["y [mm]"], ["u"])
+
+
+MODEL = ("A", "B", "N", "C", "lifting", "dt", "states", "inputs", "embedding")
 
 
 @cache
@@ -192,6 +196,16 @@ def test_a_quarter_before_the_first_row_of_a_free_run_judges_no_model():
     alone = judge_free_run(fit, data, data, 110, 10, relift=False)  # a quarter has 104 rows
     beside = judge_free_run(fit, data, data, 110, 10, relift=False, rival=alone)
     np.testing.assert_array_equal(beside.errors, alone.errors)
+
+
+@pytest.mark.parametrize(("rails", "factor"), [([[-0.5], [0.5]], 1.0), (None, 3.0)])
+def test_one_long_forecast_in_the_compiled_map_is_that_of_the_numpy_loop(rails, factor):
+    data = oscillator(rows=800)
+    model = km.bilinear_edmd(data, km.State() + km.Monomials(3), embedding=km.Delay(2, rails=rails))
+    model = km.BilinearPredictor(**{**{name: getattr(model, name) for name in MODEL}, "A": factor * model.A})
+    one, many = (forecast_rows(model, data, starts, 700, True) for starts in ([5], [5, 5]))
+    assert np.isfinite(one).all() == (factor == 1.0)
+    np.testing.assert_allclose(one[:, 0], many[:, 1], rtol=1e-9, atol=1e-12)
 
 
 def test_hidden_states_far_behind_the_best_calm_polynomial_are_left_out():
