@@ -258,14 +258,15 @@ def takes(function: Callable[..., object], name: str, count: int, advice: str) -
         return
 
 
-def refuse_crossed(low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], name: str) -> None:
-    """Raise where a lower limit stands above its upper one."""
+def refuse_crossed(
+    low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], name: str, signals: Sequence[str] = ()
+) -> None:
+    """Raise where a lower limit stands above its upper one; `signals` name the entries, where they are known."""
     bad = np.flatnonzero(low > high)
     if bad.size:
         i = int(bad[0])
-        raise DataError(
-            f"{name} limits cross at index {i}: lower {low[i]:g} is above upper {high[i]:g}; swap or widen them"
-        )
+        place = f"for {signals[i]}" if signals else f"at index {i}"
+        raise DataError(f"{name} limits cross {place}: lower {low[i]:g} is above upper {high[i]:g}; swap or widen them")
 
 
 def reference_rows(reference: Float[np.ndarray, "..."], N: int, nr: int, first: int = 0) -> Float[np.ndarray, "N1 nr"]:

@@ -107,7 +107,9 @@ def _run_cells(row: RunRow, figures: Metrics, oracle: float, violated: bool, uni
     yield f"{figures.cost:.1f}" if figures.cost < 1e5 else f"{figures.cost:.2g}"
     ratio = figures.cost / oracle if oracle > 0 else np.nan
     yield "–" if np.isnan(ratio) else f"{ratio:.3f}" if ratio < 100 else f"{ratio:.1g}"
-    if not row.reached:
+    if np.isnan(figures.settling_time) and np.isfinite(figures.cost):
+        yield "starts there"
+    elif not row.reached:
         yield "does not reach"
     else:
         yield f"{figures.settling_time:.2f} {unit}" if np.isfinite(figures.settling_time) else "within 5 %"

@@ -372,8 +372,11 @@ TERMS: dict[str, str] = {
     ),
     "does not reach": (
         "Over the last tenth of the run the error is above 5 % of its first value: the controller did not bring "
-        "the plant to its reference. A run that begins on its reference is measured against its largest error: "
-        "this says that the error had not faded at the end. This is a result, not a failure of the program."
+        "the plant to its reference. This is a result, not a failure of the program."
+    ),
+    "starts there": (
+        "The run begins on its reference, so that no time until it is there can be told: see its cost, and what it is "
+        "off at the end."
     ),
     "off": "The largest entry of x − r at the end of the run, in the unit of that state.",
     "over": "How far a limit of a state or an output was broken, at most, as a share of that limit's size.",

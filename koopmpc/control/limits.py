@@ -210,11 +210,12 @@ class Limits(Value):
             return self
         outputs = () if self.of is None else self.of.bind(tuple(states)).names
         known = {"u": inputs, "d": inputs, "x": states, "y": outputs}
-        return replace(
-            self,
-            **{end: bounds.order_bound(getattr(self, end), end, known[end[0]], _free(end)) for end in named},
-            **entries,
-        )
+        ordered = {end: bounds.order_bound(getattr(self, end), end, known[end[0]], _free(end)) for end in named}
+        for low, high, name in _ENDS:
+            if low in ordered or high in ordered:
+                lower, upper = (ordered.get(end, getattr(self, end)) for end in (low, high))
+                bounds.require_room(lower, upper, low, high, name, known[low[0]])
+        return replace(self, **ordered, **entries)
 
     @property
     def in_time(self) -> bool:

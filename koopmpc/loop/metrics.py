@@ -45,7 +45,8 @@ class Metrics(Value):
     effort
         Σ_{k=0}^{T−1} ‖u_k‖² dt.
     settling_time
-        Time after which ‖of(x_k) − r_k‖_Q stays within 2 % of its first value [s]; inf where it never does.
+        Time after which ‖of(x_k) − r_k‖_Q stays within 2 % of its first value [s]; inf where it never does, NaN
+        where such a run started on its reference.
     solve_time_p50, solve_time_p99, solve_time_max
         Median, 99 % quantile and maximum of the wall-clock time of a step [s].
     late
@@ -96,6 +97,7 @@ class Metrics(Value):
         `unit` is that of the plant's time.
         """
         settles = f"{self.settling_time:.3g} {unit}" if np.isfinite(self.settling_time) else "does not settle"
+        settles = "starts on its reference" if np.isnan(self.settling_time) else settles
         times = (self.solve_time_p50, self.solve_time_p99, self.solve_time_max)
         missed = np.isnan(self.final_error).any() or np.isnan(self.tracking_rmse).any()
         cost = "unknown, a state was not measured" if missed else "none was given"
@@ -360,8 +362,10 @@ def _counts(counts: Mapping[str, int]) -> str:
 
 
 def _settling_time(stage: Float[np.ndarray, " T1"], dt: float) -> float:
-    """Return the time after which √stage stays below 2 % of its first value."""
+    """Return the time after which √stage stays below 2 % of its first value; NaN where that is 0 and it never does."""
     outside = np.flatnonzero(~(np.sqrt(stage) <= SETTLED * np.sqrt(stage[0])))
     if not outside.size:
         return 0.0
-    return float("inf") if outside[-1] == len(stage) - 1 else float((outside[-1] + 1) * dt)
+    if outside[-1] == len(stage) - 1:
+        return float("nan" if stage[0] == 0 else "inf")
+    return float((outside[-1] + 1) * dt)

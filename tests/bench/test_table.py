@@ -39,6 +39,7 @@ def rows():
             "plant", "case", "koopman-mpc", replace(GOOD, violation=0.25), reached=True, training_time=0.31
         ),
         km.bench.RunRow("plant", "case", "nonlinear-mpc", GOOD, reached=True),
+        km.bench.RunRow("plant", "case", "pid", replace(GOOD, settling_time=np.nan), reached=False),
         km.bench.RunRow("plant", "other", "lqr", failure="RuntimeError: the [gain] is lost"),
     ]
 
@@ -67,8 +68,9 @@ def test_each_row_says_how_it_went():
     lines = printed(km.bench.results_table(rows())).split("\n")
     line = {
         name: next(text for text in lines if text.strip().startswith(name))
-        for name in ("koopman-mpc", "linear-mpc", "nonlinear-mpc", "lqr")
+        for name in ("koopman-mpc", "linear-mpc", "nonlinear-mpc", "lqr", "pid")
     }
+    assert "starts there" in line["pid"]
     assert "does not reach" in line["lqr"]
     assert "2e+04" in line["lqr"]  # the ratio to nonlinear-mpc
     assert "within 5 %" in line["linear-mpc"]

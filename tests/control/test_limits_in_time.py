@@ -271,6 +271,16 @@ def test_laws_without_a_plan_clip_each_input_to_the_row_of_its_step(rates):
         km.compiled(km.LQR(model, cost, limits))
 
 
+def test_limits_by_name_that_cross_name_signal_and_step():
+    rows = np.repeat([2.0, 1.0], 10)
+    for ends, said in (
+        ({"u_min": {"u1": 1.5}, "u_max": {"u1": rows}}, "input limits cross for u1 at step 10: lower 1.5 is above"),
+        ({"x_min": {"x1": 1.5}, "x_max": {"x1": 1.0}}, "state limits cross for x1: lower 1.5 is above upper 1"),
+    ):
+        with pytest.raises(DataError, match=said):
+            km.KoopmanMPC(linear(A, B), COST, km.Limits(**ends), N)
+
+
 def test_limits_by_name_may_have_a_value_a_step():
     limits = km.Limits(u_max={"pump": [1.0, 0.5, 0.2]}, x_max={"b": 2.0}).resolve(
         ("a [K]", "b [K]"), ("fan", "pump [V]")

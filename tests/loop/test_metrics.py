@@ -114,6 +114,7 @@ def test_tracked_observables_wrap_only_where_they_are_the_angle():
         ([1, 0, 0, 0, 0], 0.1),
         ([0, 0, 0, 0, 0], 0.0),
         ([0, 0, 1, 0, 0], 0.3),
+        ([0, 0, 1, 0, 1], np.nan),  # it has no first error to measure by
         ([1, np.nan, 0, 0, 0], 0.2),
         ([np.nan, 0, 0, 0, 0], np.inf),
     ],
@@ -121,7 +122,9 @@ def test_tracked_observables_wrap_only_where_they_are_the_angle():
 def test_a_run_settles_after_the_last_step_outside_two_percent(errors, settled):
     run = random_run(np.random.default_rng(2), T=4, cost=km.Cost(1, 0))
     X = np.column_stack([errors, np.zeros(5)])
-    assert km.metrics(replace(run, X=X, reference=np.zeros((5, 2)))).settling_time == pytest.approx(settled)
+    assert km.metrics(replace(run, X=X, reference=np.zeros((5, 2)))).settling_time == pytest.approx(
+        settled, nan_ok=True
+    )
 
 
 def test_without_a_cost_there_is_none_and_measurements_stand_in_for_a_hidden_state():
@@ -162,6 +165,7 @@ def test_metrics_print_a_figure_a_line():
         assert lines[name] == ", ".join(f"{n} {kind}" for kind, n in counts.items())
     assert len(str(found).splitlines()) == 11
     assert "does not settle" in str(replace(found, settling_time=np.inf))
+    assert "starts on its reference" in str(replace(found, settling_time=np.nan))
 
 
 @given(st.floats(1e-8, 1e4))

@@ -96,8 +96,8 @@ def find_widest(bound: Float[np.ndarray, "T n"], omitted: float) -> Float[np.nda
     return narrow(np.where(known.any(axis=0), ends, omitted))
 
 
-def require_room(low: Any, high: Any, low_name: str, high_name: str, name: str) -> None:
-    """Raise where no number is between the limits, in any row.
+def require_room(low: Any, high: Any, low_name: str, high_name: str, name: str, signals: Sequence[str] = ()) -> None:
+    """Raise where no number is between the limits, in any row; `signals` name them, where names are known.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def require_room(low: Any, high: Any, low_name: str, high_name: str, name: str) 
                 f"{low_name} has shape {lower.shape} and {high_name} {upper.shape}; pass one limit a row, or scalars"
             )
         a, b = np.broadcast_arrays(lower, upper)
-        checks.refuse_crossed(a, b, name)
+        checks.refuse_crossed(a, b, name, signals)
     else:
         widths = {end.shape[-1] for end in (lower, upper)} - {1}
         if len(widths) > 1:
@@ -124,7 +124,7 @@ def require_room(low: Any, high: Any, low_name: str, high_name: str, name: str) 
         lower, upper = (end.reshape(()) if end.shape == (1,) else end for end in (lower, upper))
         a = hold_rows(lower, low_name, width, 0, steps, -np.inf)
         b = hold_rows(upper, high_name, width, 0, steps, np.inf)
-        refuse_crossed_rows(a, b, name)
+        refuse_crossed_rows(a, b, name, signals)
     if (lower == np.inf).any() or (upper == -np.inf).any():
         raise DataError(f"{low_name} is +inf or {high_name} is −inf somewhere; use −inf, +inf where there is no limit")
 
