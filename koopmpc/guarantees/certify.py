@@ -16,6 +16,7 @@ from koopmpc.guarantees.deviation import DeviationModel, deviate, is_stabilisabl
 from koopmpc.guarantees.error_bounds import (
     ErrorBound,
     ErrorPairs,
+    bound_by_covering,
     bound_by_lipschitz,
     bound_by_scenario,
     shape_of,
@@ -81,7 +82,9 @@ def certify(
     error
         (c_x, c_u) where they are known: then S, D and d are identities, and the proof rests on them.
     lipschitz
-        L with ‖D⁻¹(r − r′)‖ ≤ L (‖D⁻¹(φ − φ′)‖ + ‖(v − v′)/d‖), where it is known: c_x = c_u = L.
+        L with ‖D⁻¹(r − r′)‖ ≤ L (‖(x − x′)/d_x‖ + ‖(u − u′)/d‖) in the box, where it is known; d_x are the sizes D of
+        the states. Then c_x = c_u = L. If `estimated`, the constants come from the pairs and L by a covering of the
+        box: a proof, given L, of a ball that is smaller the denser the data are.
     noise
         (nx,) or a number: largest error of each measured state. The certificate is then a ball.
     decay
@@ -130,6 +133,8 @@ def certify(
     if not 0 < level < 1:
         raise DataError(f"confidence is {confidence}; it must be above 0 and below 1")
     reach = np.zeros(model.nx) if noise is None else checks.vector(noise, "noise", model.nx)
+    if lipschitz is not None and estimated and reach.any():
+        raise DataError("a covering needs exact pairs; leave noise out, or leave lipschitz out")
     asked = _Asked(data, limits, region, given, estimated, reach, decay, level, seed)
     whole = _Search(deviation, asked)
     best = whole.run() if len(deviation.kept) <= _MOST and is_stabilisable(deviation, decay or DECAY) else None
@@ -212,6 +217,17 @@ class _Search:
         sizing = self.sizing.within(low, high)
         if len(sizing.phi) < _LEAST_PAIRS:
             return None
+        if given and asked.estimated:
+            return bound_by_covering(
+                given[0],
+                sizing,
+                self.phi_size,
+                self.v_size,
+                x_size=model.C @ self.phi_size,
+                low=np.concatenate([low, model.u - self.room.inputs]),
+                high=np.concatenate([high, model.u + self.room.inputs]),
+                center=np.concatenate([model.x, model.u]),
+            )
         if given:
             return bound_by_lipschitz(given[0], sizing, self.phi_size, self.v_size)
         calibration, held_out = split_pairs(self.bounding.within(low, high), np.random.default_rng(asked.seed))
@@ -262,8 +278,8 @@ def _check_constants(error: tuple[float, float] | None, lipschitz: float | None,
     checks.kind(estimated, "estimated", (bool, np.bool_), "pass True or False")
     if error is not None and lipschitz is not None:
         raise DataError("error and lipschitz are both given; pass one of them")
-    if (error is not None or lipschitz is not None) and estimated:
-        raise DataError("estimated=True measures the error on data; leave error and lipschitz out")
+    if error is not None and estimated:
+        raise DataError("estimated=True measures the error on data; leave error out, or pass lipschitz in its place")
     if error is not None:
         c = checks.array(error, "error", (2,))
         if (c < 0).any():

@@ -14,6 +14,9 @@ from koopmpc.values import Value
 _LEAST = 1e-9  # constants below are rounding of exact data and count as this
 _THIN = 1e-6  # the shape of the error has eigenvalues of at least this share of the largest
 _FEW = 10  # fewer calibration episodes bound nothing
+_CELLS = 10_000  # of the grid of a covering
+_WORTH = 3.0  # weight of the constant part of a covering, which sets the ball, beside those of the others
+_NEAR = 16  # nearest pairs that bound the error on a cell; any pair is a bound
 
 
 @dataclass(frozen=True)
@@ -44,8 +47,8 @@ class ErrorBound(Value):
     Attributes
     ----------
     method
-        "given": the user's constants. "lipschitz": from the user's Lipschitz constant of the error. "scenario": the
-        least constants that hold on calibration pairs.
+        "given": the user's constants. "lipschitz": from the user's Lipschitz constant of the error. "covering": from
+        it and the pairs. "scenario": the least constants that hold on calibration pairs.
     c_x, c_u, c_0
         The constants; c_0 is 0 where the error vanishes at the set point.
     shape
@@ -59,9 +62,11 @@ class ErrorBound(Value):
         episodes, with this confidence; of a Certificate, whichever of its bounds was chosen. 0 and 1 for the others.
     held_out, broken
         Pairs that were not used, and how many of them broke the bound.
+    lipschitz
+        The user's Lipschitz constant; 0 without one.
     """
 
-    method: Literal["given", "lipschitz", "scenario"]
+    method: Literal["given", "lipschitz", "covering", "scenario"]
     c_x: float
     c_u: float
     c_0: float
@@ -74,6 +79,7 @@ class ErrorBound(Value):
     confidence: float = 1.0
     held_out: int = 0
     broken: int = 0
+    lipschitz: float = 0.0
 
     def measure(self, pairs: ErrorPairs) -> Float[np.ndarray, " M"]:
         """Return ‖S^−½ r‖ − c_x ‖D⁻¹φ‖ − c_u ‖v/d‖ − c_0 of each pair; above zero it breaks the bound."""
@@ -178,16 +184,18 @@ def bound_by_scenario(
 def bound_by_lipschitz(
     constant: float, pairs: ErrorPairs, phi_size: Float[np.ndarray, " n"], v_size: Float[np.ndarray, " m"]
 ) -> ErrorBound:
-    """Return c_x = c_u = L of an error with ‖r(x, u) − r(x′, u′)‖ ≤ L (‖φ − φ′‖ + ‖v − v′‖) that is 0 at the set point.
+    """Return c_x = c_u = L of an error with ‖r(x, u) − r(x′, u′)‖ ≤ L (‖x − x′‖ + ‖u − u′‖) that is 0 at the set point.
 
-    Norms are of D⁻¹r, D⁻¹φ and v/d. The constant is the user's: pairs can refute it, and cannot prove it.
+    Norms are of D⁻¹r, x/d_x and u/d, where d_x are the entries of D of the states. The constant is the user's: pairs
+    can refute it, and cannot prove it.
 
     Raises
     ------
     DataError
         Pairs refute the constant.
     """
-    bound = ErrorBound("lipschitz", constant, constant, 0.0, np.diag(phi_size**2), phi_size, v_size)
+    shape = np.diag(phi_size**2)
+    bound = ErrorBound("lipschitz", constant, constant, 0.0, shape, phi_size, v_size, lipschitz=constant)
     excess = bound.measure(pairs)
     if len(excess) and excess.max() > 0:
         size, phi, v = bound.norms(pairs)
@@ -197,6 +205,79 @@ def bound_by_lipschitz(
             f" {needed:.4g} at least"
         )
     return replace(bound, held_out=len(excess))
+
+
+def bound_by_covering(
+    constant: float,
+    pairs: ErrorPairs,
+    phi_size: Float[np.ndarray, " n"],
+    v_size: Float[np.ndarray, " m"],
+    *,
+    x_size: Float[np.ndarray, " nx"],
+    low: Float[np.ndarray, " nxm"],
+    high: Float[np.ndarray, " nxm"],
+    center: Float[np.ndarray, " nxm"],
+) -> ErrorBound | None:
+    """Return constants that hold on a whole box of [x; u] around `center`, from pairs and a Lipschitz constant L.
+
+    ‖r(x, u)‖ ≤ ‖r_i‖ + L (‖x − x_i‖ + ‖u − u_i‖) for every pair i, in norms of D⁻¹r, x/d_x and u/d. On a cell of a grid
+    this is at most the value in its middle, plus L times the reach of the cell. The least c_x, c_u and c_0 above it on
+    all cells are those of a linear program; ‖D⁻¹φ‖ is at least ‖(x − x_s)/d_x‖, for the lifting holds the states. So
+    the bound is proved where L is.
+
+    Raises
+    ------
+    DataError
+        Two pairs refute L, or a grid of so many states and inputs has too many cells.
+    """
+    from scipy.optimize import linprog  # slow to import
+    from scipy.spatial import cKDTree
+
+    nx, size = len(x_size), np.concatenate([x_size, v_size])
+    points, errors = np.hstack([pairs.X, pairs.U]) / size, pairs.r / phi_size
+    if 2 ** len(size) > _CELLS:
+        raise DataError(
+            f"a covering of {len(size)} states and inputs has too many cells; leave estimated or lipschitz out"
+        )
+    tree = cKDTree(points)
+
+    def measure(away: Float[np.ndarray, "k nxm"]) -> Float[np.ndarray, " k"]:
+        return np.asarray(np.linalg.norm(away[..., :nx], axis=-1) + np.linalg.norm(away[..., nx:], axis=-1))
+
+    near = np.asarray(tree.query(points, min(_NEAR, len(points)))[1])
+    change = np.linalg.norm(errors[near] - errors[:, None], axis=-1)
+    needed = float((change / np.maximum(measure(points[near] - points[:, None]), 1e-12)).max())
+    if needed > constant * (1 + 1e-6):
+        raise DataError(f"lipschitz={constant:.4g} is refuted by two pairs; the data need {needed:.4g} at least")
+    count = max(2, int(_CELLS ** (1 / len(size))))
+    half = (high - low) / (2 * count * size)
+    steps = np.indices((count,) * len(size)).reshape(len(size), -1).T
+    middle: Float[np.ndarray, "cells nxm"] = low / size + half * (1 + 2 * steps)
+    reach = np.array([np.linalg.norm(half[:nx]), np.linalg.norm(half[nx:])])
+    near = np.asarray(tree.query(middle, min(_NEAR, len(points)))[1])
+    above = np.linalg.norm(errors, axis=1)[near] + constant * measure(points[near] - middle[:, None])
+    most = above.min(axis=1) + constant * reach.sum()
+    away = middle - center / size
+    least = np.stack([np.linalg.norm(away[:, :nx], axis=1), np.linalg.norm(away[:, nx:], axis=1)], axis=1) - reach
+    rows = np.hstack([np.maximum(least, 0.0), np.ones((len(middle), 1))])
+    worth = rows.mean(axis=0) * [1.0, 1.0, _WORTH]
+    found = linprog(worth, A_ub=-rows, b_ub=-most, bounds=(0, None), method="highs")
+    if found.status != 0:
+        return None
+    c = np.maximum(np.asarray(found.x, dtype=np.float64), _LEAST)
+    c *= max(1.0, float((most / (rows @ c)).max()))  # rounding of the linear program
+    shape = np.diag(phi_size**2)
+    return ErrorBound(
+        "covering",
+        float(c[0]),
+        float(c[1]),
+        float(c[2]),
+        shape,
+        phi_size,
+        v_size,
+        pairs=len(points),
+        lipschitz=constant,
+    )
 
 
 def sizes_of(values: Sequence[Float[np.ndarray, " M"]] | Float[np.ndarray, "M n"]) -> Float[np.ndarray, " n"]:

@@ -12,8 +12,10 @@ from koopmpc.text import format_markdown_table, to_percent
 
 _METHODS = {
     "given": "You gave the constants. The proof rests on them.",
-    "lipschitz": "c_x = c_u = L, because the error is 0 at the set point and has the Lipschitz constant L that you"
-    " gave. The data did not refute L; they cannot prove it.",
+    "covering": "They are a proof, given L: the errors of the pairs, and L times the distance to them, bound the error"
+    " on every cell of a grid over the box and the inputs. The data did not refute L; they cannot prove it.",
+    "lipschitz": "They are a proof, given L: c_x = c_u = L, because the error is 0 at the set point and has"
+    " the Lipschitz constant L that you gave. The data did not refute L; they cannot prove it.",
 }
 
 
@@ -56,11 +58,15 @@ def state_theorem(certificate: Certificate) -> str:
 
 
 def _list_assumptions(c: Certificate) -> list[tuple[str, str]]:
+    error = c.error
+    measured = "measured on the data, which include it"
     equilibrium = (
-        ("the error is at most c_0 at the set point", "measured on the data, which include it")
+        ("the error is at most c_0 at the set point", "see below" if error.method == "covering" else measured)
         if c.estimated
         else ("(x_s, u_s) is an equilibrium of the plant", "you gave it")
     )
+    steep = f"you gave L = {error.lipschitz:.4g}"
+    slope = [("the error has the Lipschitz constant L in the box", steep)] if error.lipschitz else []
     noise = (
         ("the whole state is measured exactly", "you said so: noise was not given")
         if not c.noise.any()
@@ -69,6 +75,7 @@ def _list_assumptions(c: Certificate) -> list[tuple[str, str]]:
     return [
         equilibrium,
         ("the error keeps its bound everywhere in the box", "see below"),
+        *slope,
         noise,
         ("the plant is a map x⁺ = f(x, u) that does not change, without disturbances", "not checked"),
         ("the input acts at once and as computed", "not checked"),
@@ -218,6 +225,7 @@ def _explain_constants(refused: Refused, scale: float, bound: ErrorBound) -> str
                 f"the error at the set point is too large: c_0 = {bound.c_0:.3g} pushes the loop out of every region"
                 f" inside the box, and a certificate exists for {share:.2g} of it. Try a set point that the plant can"
                 " hold, more data near it for the fit, less noise in the data, or a wider box"
+                + (", and denser data for the covering" if bound.method == "covering" else "")
             )
     share = find_largest(lambda f: refused.is_provable(bound, scale, wider=1 / f), 1e-4, 1.0)
     if share > 0:
@@ -264,6 +272,8 @@ def _explain_error(refused: Refused, scale: float, bound: ErrorBound) -> str:
 
 def _locate(refused: Refused, scale: float, bound: ErrorBound) -> str:
     """Return at which state and input the error is nearest to its bound; nothing where no pairs made it."""
+    if bound.method == "covering":
+        return " They are those of a covering: denser data lower them."
     if refused.pairs is None:
         return " You gave the constants."
     model = refused.model
