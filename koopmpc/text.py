@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 
 _LONG = 32  # characters of an observable's name in a sentence
 _SCALED = re.compile(r"~[0-9a-f]{8}")  # how names tell one standardization from another
+_WEIGHED = re.compile(r"\|[0-9a-f]{8}")  # how names of neurons tell their weights
 
 
 def format_duration(seconds: float) -> str:
@@ -33,7 +34,7 @@ def to_percent(share: float) -> str:
 
 def shorten_observable(name: str) -> str:
     """Return an observable's name for a sentence: standardized states said in words, a long name cut in its middle."""
-    plain, scaled = _SCALED.subn("", name)
+    plain, scaled = _SCALED.subn("", _WEIGHED.sub("", name))
     short = plain if len(plain) <= _LONG else f"{plain[: _LONG // 2]}…{plain[-_LONG // 2 + 1 :]}"
     return f"{short} of the standardized states" if scaled else short
 

@@ -87,9 +87,8 @@ def take_sample(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
     if whole:
         return result, ()
     steps = sum(len(episode) for episode in result)
-    return result, (
-        f"chosen on {steps} steps in {len(result)} episodes, evenly spread over the data, and fitted to all",
-    )
+    count = f"{len(result)} episode{'s' * (len(result) != 1)}"
+    return result, (f"chosen on {steps} steps in {count}, evenly spread over the data, and fitted to all",)
 
 
 def replace_glitches(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple[str, ...]]:

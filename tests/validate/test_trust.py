@@ -2,6 +2,7 @@
 
 import warnings
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -105,6 +106,28 @@ def test_a_bilinear_model_is_judged_by_the_forecast_that_its_controller_makes(da
         assert report.score == km.score(model, held_out, HORIZON, relift=afresh)
         assert report.score != km.score(model, held_out, HORIZON, relift=not afresh)
         assert report.band.relift is afresh
+
+
+@pytest.mark.parametrize("bilinear", [True, False])
+def test_what_a_model_forgets_at_once_asks_for_care_where_it_is_lifted_once_only(bilinear) -> None:
+    """x⁺ = 0.5 x − 0.01 tanh(x) + u, whose model does not forecast tanh(x): its eigenvalue is zero."""
+    rng, runs = np.random.default_rng(0), []
+    for _ in range(20):
+        X, U = [rng.uniform(-0.2, 0.2, 1)], rng.uniform(-0.2, 0.2, (30, 1))
+        for u in U:
+            X.append(0.5 * X[-1] - 0.01 * np.tanh(X[-1]) + u)
+        runs.append(km.Episode(X=np.array(X), U=U))
+    data = km.Episodes(runs, 0.1, ["x"], ["u"])
+    lifting = (km.State() + km.Expressions(lambda x: [ca.tanh(x[0])], ["bend"])).bind(("x",))
+    parts = [[0.5, -0.01], [0.0, 0.0]], [[1.0], [0.0]], [[1.0, 0.0]], lifting, 0.1, ("x",), ("u",)
+    if bilinear:
+        model = km.BilinearPredictor(parts[0], parts[1], np.zeros((1, 2, 2)), *parts[2:])
+    else:
+        model = km.LinearPredictor(*parts)
+    report = km.trust(model, data, 5)
+    spurious = [one for one in report.findings if "spurious" in one.says]
+    assert bool(spurious) is not bilinear
+    assert report.score.rmse.max() < 1e-12 or not bilinear
 
 
 def test_steps_end_where_a_band_leaves_its_share_of_the_range(data) -> None:
