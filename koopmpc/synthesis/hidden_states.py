@@ -40,7 +40,6 @@ def judge_hidden_states(
     rival: float = np.inf,
     *,
     ran: FreeRun | None = None,
-    ran_linear: FreeRun | None = None,
     short: int | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[LeaderboardRow, FreeRun]]:
@@ -51,8 +50,7 @@ def judge_hidden_states(
     neurons, with the rails if the best one before has them. With neurons the best one and the smallest of other orders
     are judged, if they are calm and err by a tenth less than all others; else the best one, if it errs by less than
     half more. Where records are too short for a kind, it is left out; so is a model that on the first stretches errs by
-    a tenth more than the best calm one so far. Linear models compete with linear ones alone, for a `KoopmanMPC` takes
-    no other.
+    a tenth more than the best calm one so far.
 
     Parameters
     ----------
@@ -64,8 +62,8 @@ def judge_hidden_states(
         Least error of other models on unseen rows; what errs by far more is not judged.
     bilinear
         Try polynomial ones, which are bilinear predictors.
-    ran, ran_linear
-        How the best of the other models, and of the other linear models, ran over the same stretches.
+    ran
+        How the best of the other models ran over the same stretches.
     short
         Steps of the short forecasts that judge; `horizon` by default, whose errors the leaderboard shows.
     progress
@@ -76,11 +74,7 @@ def judge_hidden_states(
     searched = (perf_counter() - begun) / max(len(found), 1)
     results: list[tuple[LeaderboardRow, FreeRun]] = []
     for structure in found:
-        if structure.is_nonlinear:
-            others = [ran, *(run for _, run in results)]
-        else:
-            others = [ran_linear, *(run for row, run in results if not row.bilinear)]
-        others = [run for run in others if run is not None and run.calm]
+        others = [run for run in (ran, *(run for _, run in results)) if run is not None and run.calm]
         best = min(others, key=lambda run: run.error, default=None)
         try:
             result = _judge(structure, measured, first, horizon, short or horizon, searched, best)
@@ -143,16 +137,13 @@ def search_hidden_states(
         best_one = min(each, key=lambda one: one.error, default=None)
         neural = [one for one in each if one is each[0] or one is best_one]  # the best one races against the smallest
     least = min([rival, *(one.error for one in (*found, *neural))])
-    straight = min((one.error for one in found if not one.is_nonlinear), default=np.inf)
-    return [*(one for one in found if one.error < FAR * (least if one.is_nonlinear else straight)), *neural]
+    return [*(one for one in found if one.error < FAR * least), *neural]
 
 
 def propose_hidden_states(episodes: Episodes, bilinear: bool, progress: Progress | None = None) -> list[Candidate]:
     """Return the two best candidates with a hidden state; none where the records are too short."""
     found: list[Candidate] = []
     structures = search_hidden_states(episodes, bilinear, progress=progress)
-    least = min((one.error for one in structures), default=np.inf)
-    structures = [one for one in structures if one.error < FAR * least]
     for structure in sorted(structures, key=lambda one: (not one.calm, one.error))[:_PROPOSED]:
         try:
             with hide_fit_warnings():

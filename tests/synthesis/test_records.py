@@ -213,7 +213,7 @@ def test_hidden_states_far_behind_the_best_calm_polynomial_are_left_out():
 
     def names(errors, calm):
         ran = FreeRun(np.full(8, errors), calm)
-        return [row.name for row, _ in judge_hidden_states(data, 2, 10, False, ran_linear=ran)]
+        return [row.name for row, _ in judge_hidden_states(data, 2, 10, False, ran=ran)]
 
     both = ["hidden state of order 2, subspace", "hidden state of order 2, simulation error"]
     assert names(0.2, calm=True) == both
