@@ -119,11 +119,11 @@ def test_among_others_the_task_that_kills_is_named_after_the_results_before_it()
 
 
 def test_workers_that_are_busy_end_when_nobody_waits_for_them(tmp_path: Path) -> None:
-    results = map_tasks(tasks.sleep, [(str(tmp_path), seconds) for seconds in (0, 60, 60, 60)], **PROCESSES)
+    results = map_tasks(tasks.sleep, [(str(tmp_path), seconds) for seconds in (0, 600, 600, 600)], **PROCESSES)
     assert next(results) == 0
     started = time.perf_counter()
     results.close()
-    assert time.perf_counter() - started < 20
+    assert time.perf_counter() - started < 300
     pids = [int(file.name) for file in tmp_path.iterdir()]
     assert pids
     assert not [pid for pid in pids if _is_alive(pid)]

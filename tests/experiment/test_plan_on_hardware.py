@@ -48,7 +48,7 @@ def held():
 
 def run(plan, plant, steps, dt):
     seen = []
-    km.realtime(plan, plant, dt=dt, reference=[0, 0], steps=steps, x0=plan.starts[0], recorder=seen.append)
+    km.realtime(plan, plant, dt=dt, reference=[0, 0], steps=steps, x0=plan.starts[0], recorder=seen.append, watchdog=20)
     return [one for one in seen if one.move.status != km.Status.TIME_LIMIT]
 
 

@@ -60,7 +60,7 @@ def killed_and_resumed(problem, folder, moments, grid, most=10**9):
 
 def resumed(problem, folder, grid):
     """End a sweep in this process, as soon as the workers of the last one have ended with their parent."""
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while time.monotonic() < deadline:
         try:
             return km.sweep([problem], TWO, folder=folder, **grid)

@@ -93,7 +93,7 @@ def test_a_plant_in_another_process_is_brought_to_its_reference_and_gets_the_saf
     assert paced.steps + paced.skipped == 120
     assert abs(run.Y[:-1][measured][-1, 0] - 1.0) < 0.2
     assert given[-1] == ("stop", 0.25)
-    assert [value for _, value in given[: run.steps - paced.skipped]] == run.U[measured, 0].tolist()
+    assert [value for kind, value in given if kind == "u"] == run.U[measured, 0].tolist()  # skipped last: no row
 
 
 def test_a_plant_that_stalls_gets_the_safe_input_and_the_loop_ends(tmp_path):
@@ -101,7 +101,7 @@ def test_a_plant_that_stalls_gets_the_safe_input_and_the_loop_ends(tmp_path):
         stall = Toward(at={25: lambda: process.send_signal(signal.SIGSTOP)})
         paced = km.realtime(stall, plant, dt=DT, x0=[0, 0], reference=[1, 0], watchdog=0.4, safe=-0.5)
         process.send_signal(signal.SIGCONT)
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 60
         while time.monotonic() < deadline and inputs_in(heard)[-1] != ("stop", -0.5):
             time.sleep(0.05)
         assert inputs_in(heard)[-1] == ("stop", -0.5)
@@ -231,8 +231,8 @@ def test_a_step_reads_when_it_begins_and_sees_the_rows_of_its_time():
 
 def test_a_controller_that_never_returns_is_interrupted_and_the_plant_is_safe():
     plant = Here()
-    paced = km.realtime(Toward(at={2: lambda: time.sleep(1e6)}), plant, dt=DT, reference=[0.0], watchdog=0.3, safe=9.0)
-    assert paced.ended == "watchdog: the controller did not return within 0.3 s"
+    paced = km.realtime(Toward(at={2: lambda: time.sleep(1e6)}), plant, dt=DT, reference=[0.0], watchdog=1.0, safe=9.0)
+    assert paced.ended == "watchdog: the controller did not return within 1 s"
     assert paced.steps == 2
     assert plant.got[2:] == [9.0]
 
@@ -254,8 +254,8 @@ def test_a_reading_or_a_recorder_that_never_returns_is_named_and_the_plant_is_sa
 
     plant = Reading()
     recorder = None if part == "the plant" else lambda step: stuck() if step.k == 1 else None
-    paced = km.realtime(Toward(), plant, dt=DT, reference=[0.0], watchdog=0.3, safe=9.0, recorder=recorder)
-    assert paced.ended == f"watchdog: {part} did not return within 0.3 s"
+    paced = km.realtime(Toward(), plant, dt=DT, reference=[0.0], watchdog=1.0, safe=9.0, recorder=recorder)
+    assert paced.ended == f"watchdog: {part} did not return within 1 s"
     assert plant.got[-1] == 9.0
     assert len(plant.got) == 3
 

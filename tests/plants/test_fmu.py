@@ -171,9 +171,11 @@ def test_simulate_and_realtime_drive_a_co_simulation_unit(tanks):
         dt=0.02,
         steps=5,
         safe=[0.0],
-        recorder=lambda step: moves.append(step.u[0]),
+        watchdog=20,
+        recorder=lambda step: moves.extend(step.u[:1] if step.move.status != km.Status.TIME_LIMIT else []),
     )
-    assert moves[:3] == pytest.approx(run.U[:3, 0], abs=1e-9)
+    assert moves == pytest.approx(run.U[: len(moves), 0], abs=1e-9)  # a busy machine may have skipped some
+    assert moves
 
 
 def test_a_step_that_the_unit_refuses_names_its_reason_and_a_reset_mends_it(pendulum):

@@ -86,15 +86,16 @@ def feed(recorder: km.Recorder, run: km.Run) -> None:
 
 def test_no_viewer_costs_one_warning_and_no_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connect, "has_display", lambda: False)
+    monkeypatch.setattr(
+        "rerun.GrpcSink", lambda _: pytest.fail("Rerun waits five seconds for a viewer that is not there")
+    )
     run, port = make_run(), free_port()
-    start = time.monotonic()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with km.Recorder(tmp_path / "run.rrd", live=True, port=port, **about(run)) as recorder:
             feed(recorder, run)
         with km.Recorder(live=True, port=port, **about(run)) as recorder:
             feed(recorder, run)
-    assert time.monotonic() - start < 4.0  # Rerun would wait five seconds for a viewer, twice
     assert [w.category for w in caught] == [UserWarning, UserWarning]
     listens = f"no Rerun viewer listens at 127.0.0.1:{port}, and there is no display to open one on"
     assert str(caught[0].message) == f"{listens}; the log is written all the same"
