@@ -37,6 +37,7 @@ _STATUS = list(Status)
 _FALLBACK = list(Fallback)
 _ROWS = 100_000  # reference rows whose targets a controller keeps
 _PLANTS = 8  # plants whose machine code a controller keeps
+_ROOM = 2**20  # numbers of a table of given input targets: 8 MB
 _PAGE = 1024  # steps whose limits are made at once, which takes one of them 0.1 ms
 # head of the C file of a plant
 _PLANT_HEAD = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
@@ -110,7 +111,7 @@ def _compile(program: StepProgram, precision: Precision, command: list[str]) -> 
         The compiler fails or its output does not load.
     """
     single = precision == "float"
-    tables = make_tables(program, single=single)
+    tables = make_tables(program, single=single, room=_ROOM)
     text = write_one_source(tables, single=single) + f"/* {_read_processor()} */\n"
     cache = find_private_cache()
     machine = ["-march=native", "-fvisibility=default"] if platform.machine() in ("x86_64", "AMD64") else []

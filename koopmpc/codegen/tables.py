@@ -124,8 +124,11 @@ def read_program(controller: object, reference: Any = None) -> StepProgram:
     return program
 
 
-def make_tables(program: StepProgram, *, single: bool) -> Tables:
+def make_tables(program: StepProgram, *, single: bool, room: int = 0) -> Tables:
     """Return the numbers of a Program's C code.
+
+    `room` is how many numbers a table of what given input targets share in the plan may have; it may always have as
+    many as the matrix that it replaces.
 
     Raises
     ------
@@ -157,7 +160,7 @@ def make_tables(program: StepProgram, *, single: bool) -> Tables:
         case FeedbackProgram():
             _add_feedback(tables, program)
         case CondensedProgram():
-            _add_condensed(tables, program, single=single)
+            _add_condensed(tables, program, single=single, room=room)
         case StagedProgram():
             _add_staged(tables, program, single=single)
         case _:
@@ -361,7 +364,7 @@ def _add_feedback(tables: Tables, program: FeedbackProgram) -> None:
     _add_memory(tables, 1, 0, 0)
 
 
-def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool) -> None:
+def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool, room: int) -> None:
     """Write a plan by one matrix, and its condensed QP."""
     _add_linear(tables, program)
     model, qp, solver, targets = program.model, program.qp, program.solver, program.targets
@@ -393,6 +396,11 @@ def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool) -
     if program.levels is None and not program.disturbance.shape[1] and program.from_reference.size >= _LONG:
         tables.sizes["FIRST_ALONE"] = 1
         tables.plan["shares"] = np.abs(program.from_reference[:, program.nr :]).sum(axis=1)
+    given, tabled = np.zeros(0) if program.given is None else stack(program.from_given), False
+    if program.given is not None:
+        tabled = len(program.given) * len(program.offset) <= max(room, given.size)
+        given = _tabulate(program) if tabled else given
+    tables.sizes["GIVEN_TABLED"] = int(tabled)
     tables.define({"UNPUSHED": program.unpushed})
     _add_limits(tables, hard_rate=program.hard_rates)
     tables.limits["move_of"] = np.asarray(program.move_of, dtype=np.intc)
@@ -407,7 +415,7 @@ def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool) -
         "from_reference": stack(program.from_reference),
         "from_held": stack(program.from_reference.reshape(len(program.offset), -1, program.nr).sum(axis=1)),
         "from_target": stack(program.from_target) if program.aimed else np.zeros(0),
-        "from_given": np.zeros(0) if program.given is None else stack(program.from_given),
+        "from_given": given,
         "checked": targets.rows[program.checked] if checked else np.zeros(0),
         "disturbance": stack(program.disturbance) if checked else np.zeros(0),
         "M": M,
@@ -436,6 +444,14 @@ def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool) -
         tables.plan |= {"lambda": np.maximum(values, 0.0), "V": V, "MV": solver.M @ V}
     _add_estimator(tables, program)
     _add_memory(tables, moves, m, int(soft.sum()))
+
+
+def _tabulate(program: CondensedProgram) -> Float[np.ndarray, " entries"]:
+    """Return, for each step at which the given input targets move on, their share of the plan and its offset."""
+    assert program.given is not None, "there are some"
+    ahead = np.arange(len(program.given))[:, None] + program.latency + np.arange(program.N + 1)
+    rows = program.given[np.minimum(ahead, len(program.given) - 1)]
+    return (program.offset + rows.reshape(len(rows), -1) @ program.from_given.T).ravel()
 
 
 def _add_levels(tables: Tables, program: LevelsProgram, *, single: bool) -> None:

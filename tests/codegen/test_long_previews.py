@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+import koopmpc.codegen.compiled
 
 N = 70
 A, B = np.array([[1.0, 0.1], [-0.1, 0.95]]), np.array([[0.0], [0.1]])
@@ -67,11 +68,14 @@ def test_a_preview_that_stays_costs_its_product_once_and_no_digit(pair):
     assert again == pytest.approx(first, abs=1e-12)
 
 
-def test_input_targets_and_limits_in_time_enter_such_a_step_as_well():
+@pytest.mark.parametrize(("room", "latency"), [(0, 0), (2**20, 0), (2**20, 2)])
+def test_input_targets_and_limits_in_time_enter_such_a_step_as_well(monkeypatch, room, latency):
+    """Input targets by their matrix and, where there is room, by a table of their steps."""
+    monkeypatch.setattr(koopmpc.codegen.compiled, "_ROOM", room)
     model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("a", "b"), ("u",))
     waves = 1.0 + 0.5 * np.sin(0.2 * np.arange(120))[:, None]
     cost = km.Cost([1.0, 0.1], 0.1, u_target=0.2 * np.cos(0.1 * np.arange(120))[:, None])
-    mpc = km.KoopmanMPC(model, cost, km.Limits(-2 * waves, waves, x_max=[1.5, np.inf]), N)
+    mpc = km.KoopmanMPC(model, cost, km.Limits(-2 * waves, waves, x_max=[1.5, np.inf]), N, latency=latency)
     twin, seen = km.compiled(mpc), set()
     for size in (0.05, 0.4, 2.0):
         x = np.array([0.1, 0.0])

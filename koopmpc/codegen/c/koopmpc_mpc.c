@@ -26,7 +26,7 @@
 
 
 /** Row k of the given input targets, counted from this step. */
-#if KOOPMPC_GIVEN
+#if KOOPMPC_GIVEN && !KOOPMPC_GIVEN_TABLED
 static const koopmpc_real *given_row(const koopmpc_state *s, int k) {
   const int row = s->row + KOOPMPC_LATENCY + k;
   return koopmpc_given + KOOPMPC_NU * (row < KOOPMPC_GIVEN ? row : KOOPMPC_GIVEN - 1);
@@ -80,12 +80,13 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *re
     if (!good) {
       koopmpc_fill(s->column, (koopmpc_real)NAN, KOOPMPC_NT);
     } else {
-      koopmpc_copy(s->column, koopmpc_offset, PLANNED);
+      /* of given input targets the table holds each step's share, with the offset */
+      koopmpc_copy(s->column, KOOPMPC_GIVEN_TABLED ? koopmpc_from_given + s->row * PLANNED : koopmpc_offset, PLANNED);
       if (held || first_alone)
         koopmpc_add(s->column, koopmpc_from_held, PLANNED, s->reference, KOOPMPC_NR);
       else
         koopmpc_add(s->column, koopmpc_from_reference, PLANNED, s->reference, (KOOPMPC_N + 1) * KOOPMPC_NR);
-#if KOOPMPC_GIVEN
+#if KOOPMPC_GIVEN && !KOOPMPC_GIVEN_TABLED
       for (int k = 0; k <= KOOPMPC_N; k++)
         koopmpc_add(s->column, koopmpc_from_given + k * KOOPMPC_NU * PLANNED, PLANNED, given_row(s, k), KOOPMPC_NU);
 #endif
