@@ -490,7 +490,8 @@ def _add_levels(tables: Tables, program: LevelsProgram, *, single: bool) -> None
 
 def _add_bounds(tables: Tables, bounds: BoundsProgram, *, rated: bool) -> None:
     """Write how rows of limits become those of the plan."""
-    tables.sizes |= {"BOUNDS": 1, "OUTPUTS": bounds.margin.shape[1], "CHANGES": int(rated)}
+    once = (bounds.count == 1).all() and (bounds.first.T == np.arange(len(bounds.first))).all()
+    tables.sizes |= {"BOUNDS": 1, "OUTPUTS": bounds.margin.shape[1], "CHANGES": int(rated), "HELD_ONCE": int(once)}
     whole = {
         "hold_first": bounds.first,
         "hold_count": bounds.count,

@@ -199,6 +199,7 @@ typedef struct {
   koopmpc_real opened_low[KOOPMPC_MOVES], opened_high[KOOPMPC_MOVES];
   koopmpc_real target_low[(KOOPMPC_N + 1) * KOOPMPC_NL], target_high[(KOOPMPC_N + 1) * KOOPMPC_NL];
   koopmpc_real unpushed; /**< no limit moves a target of rows that are no larger */
+  koopmpc_real peak;     /**< the largest number of the last reference */
 #endif
 #if KOOPMPC_LEVELED
   int level[KOOPMPC_NU], level_steps[KOOPMPC_NU]; /**< level of each input, and for how many steps it has held it */

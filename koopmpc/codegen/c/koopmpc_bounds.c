@@ -24,56 +24,95 @@ void koopmpc_reset_bounds(koopmpc_state *s) {
   s->unpushed = KOOPMPC_UNPUSHED;
 }
 
+/** Rows `first` to `first + count - 1` of some limits, no larger than numbers are; the last row holds. */
+static void read_rows(koopmpc_real *to, const koopmpc_rows *rows, int first, int count, int width) {
+  const int given = rows->count > first ? rows->count - first : 0, there = given < count ? given : count;
+  const koopmpc_real *from = rows->values + first * width, *last = rows->values + (rows->count - 1) * width;
+  for (int j = 0; j < there * width; j++) to[j] = koopmpc_clip(from[j], -KOOPMPC_HUGE, KOOPMPC_HUGE);
+  for (int k = there; k < count; k++)
+    for (int i = 0; i < width; i++) to[k * width + i] = koopmpc_clip(last[i], -KOOPMPC_HUGE, KOOPMPC_HUGE);
+}
+
 void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
   enum { NU = KOOPMPC_NU, OUT = KOOPMPC_OUTPUTS, OUT1 = OUT > 0 ? OUT : 1, FIRST = KOOPMPC_MOVES * (1 + KOOPMPC_CHANGES) };
+  enum { LATE = KOOPMPC_LATENCY, AHEAD = KOOPMPC_N + 1 };
+  koopmpc_real u_low[AHEAD * NU], u_high[AHEAD * NU], x_low[AHEAD * OUT1], x_high[AHEAD * OUT1];
+  read_rows(u_low, &b->u_low, LATE, AHEAD, NU);
+  read_rows(u_high, &b->u_high, LATE, AHEAD, NU);
+  if (OUT > 0) {
+    read_rows(x_low, &b->x_low, LATE, AHEAD, OUT);
+    read_rows(x_high, &b->x_high, LATE, AHEAD, OUT);
+  }
+#if KOOPMPC_HELD_ONCE
+  koopmpc_copy(s->box_low, u_low, KOOPMPC_MOVES);
+  koopmpc_copy(s->box_high, u_high, KOOPMPC_MOVES);
+#else
   for (int at = 0; at < KOOPMPC_MOVES; at++) { /* the tightest limits of the steps in which a move is held */
-    const int i = at % NU;
     koopmpc_real low = -KOOPMPC_HUGE, high = KOOPMPC_HUGE;
     for (int k = 0; k < koopmpc_hold_count[at]; k++) {
-      const int row = KOOPMPC_LATENCY + koopmpc_hold_first[at] + k;
-      const koopmpc_real below = koopmpc_bound_of(&b->u_low, row, NU, i), above = koopmpc_bound_of(&b->u_high, row, NU, i);
-      low = below > low ? below : low;
-      high = above < high ? above : high;
+      const int row = (koopmpc_hold_first[at] + k) * NU + at % NU;
+      low = u_low[row] > low ? u_low[row] : low;
+      high = u_high[row] < high ? u_high[row] : high;
     }
     s->box_low[at] = low;
     s->box_high[at] = high;
-    s->low[at] = koopmpc_tied[at] ? -KOOPMPC_HUGE : low;
-    s->high[at] = koopmpc_tied[at] ? KOOPMPC_HUGE : high;
-    if (KOOPMPC_CHANGES) {
-      const int row = KOOPMPC_LATENCY + koopmpc_move_start[at / NU];
-      s->low[KOOPMPC_MOVES + at] = koopmpc_held[at] ? -KOOPMPC_HUGE : koopmpc_bound_of(&b->du_low, row, NU, i);
-      s->high[KOOPMPC_MOVES + at] = koopmpc_held[at] ? KOOPMPC_HUGE : koopmpc_bound_of(&b->du_high, row, NU, i);
-    }
+  }
+#endif
+  for (int at = 0; at < KOOPMPC_MOVES; at++) {
+    s->low[at] = koopmpc_tied[at] ? -KOOPMPC_HUGE : s->box_low[at];
+    s->high[at] = koopmpc_tied[at] ? KOOPMPC_HUGE : s->box_high[at];
+  }
+  for (int at = 0; at < KOOPMPC_MOVES && KOOPMPC_CHANGES; at++) {
+    const int row = LATE + koopmpc_move_start[at / NU], i = at % NU;
+    s->low[KOOPMPC_MOVES + at] = koopmpc_held[at] ? -KOOPMPC_HUGE : koopmpc_bound_of(&b->du_low, row, NU, i);
+    s->high[KOOPMPC_MOVES + at] = koopmpc_held[at] ? KOOPMPC_HUGE : koopmpc_bound_of(&b->du_high, row, NU, i);
   }
   for (int i = 0; i < NU && KOOPMPC_CHANGES; i++) {
-    s->rate_low[i] = koopmpc_bound_of(&b->du_low, KOOPMPC_LATENCY, NU, i);
-    s->rate_high[i] = koopmpc_bound_of(&b->du_high, KOOPMPC_LATENCY, NU, i);
+    s->rate_low[i] = koopmpc_bound_of(&b->du_low, LATE, NU, i);
+    s->rate_high[i] = koopmpc_bound_of(&b->du_high, LATE, NU, i);
   }
   for (int j = 0; j < KOOPMPC_N * OUT; j++) {
-    const int row = KOOPMPC_LATENCY + j / OUT1 + 1;
-    s->low[FIRST + j] = koopmpc_bound_of(&b->x_low, row, OUT, j % OUT1) + koopmpc_inwards[j];
-    s->high[FIRST + j] = koopmpc_bound_of(&b->x_high, row, OUT, j % OUT1) - koopmpc_inwards[j];
+    s->low[FIRST + j] = x_low[OUT + j] + koopmpc_inwards[j];
+    s->high[FIRST + j] = x_high[OUT + j] - koopmpc_inwards[j];
   }
   for (int i = KOOPMPC_PLANNED; i < KOOPMPC_PLANNED + 2 * KOOPMPC_CHECKED; i++) {
     s->low[i] = -KOOPMPC_HUGE;
     s->high[i] = KOOPMPC_HUGE;
   }
-  for (int k = 0; k <= KOOPMPC_N && KOOPMPC_AIMED; k++)
-    for (int i = 0; i < NU + OUT; i++) { /* limits of the target of this row */
-      const int row = KOOPMPC_LATENCY + k;
-      const koopmpc_real below = i < NU ? koopmpc_bound_of(&b->u_low, row, NU, i) : koopmpc_bound_of(&b->x_low, row, OUT, i - NU);
-      const koopmpc_real above = i < NU ? koopmpc_bound_of(&b->u_high, row, NU, i) : koopmpc_bound_of(&b->x_high, row, OUT, i - NU);
-      s->target_low[k * KOOPMPC_NL + i] = below - koopmpc_target_values[i];
-      s->target_high[k * KOOPMPC_NL + i] = above - koopmpc_target_values[i];
+  for (int k = 0; k <= KOOPMPC_N && KOOPMPC_AIMED; k++) { /* limits of the target of this row */
+    koopmpc_real *low = s->target_low + k * KOOPMPC_NL, *high = s->target_high + k * KOOPMPC_NL;
+    for (int i = 0; i < NU; i++) {
+      low[i] = u_low[k * NU + i] - koopmpc_target_values[i];
+      high[i] = u_high[k * NU + i] - koopmpc_target_values[i];
     }
+    for (int i = 0; i < OUT; i++) {
+      low[NU + i] = x_low[k * OUT + i] - koopmpc_target_values[NU + i];
+      high[NU + i] = x_high[k * OUT + i] - koopmpc_target_values[NU + i];
+    }
+  }
 #if KOOPMPC_AIMED
+  const koopmpc_real before = s->unpushed;
   s->unpushed = KOOPMPC_HUGE;
   for (int i = 0; i < NU + OUT; i++) { /* the tightest limits of a target |r| times its gain away from its offset */
-    koopmpc_real below = -KOOPMPC_HUGE, above = KOOPMPC_HUGE, room;
-    for (int k = 0; k <= KOOPMPC_N; k++) {
+    enum { LANES = 8 };
+    koopmpc_real lower[LANES], upper[LANES], below = -KOOPMPC_HUGE, above = KOOPMPC_HUGE, room;
+    int k = 0;
+    koopmpc_fill(lower, below, LANES);
+    koopmpc_fill(upper, above, LANES);
+    for (; k + LANES <= AHEAD; k += LANES)
+      for (int j = 0; j < LANES; j++) {
+        const koopmpc_real low = s->target_low[(k + j) * KOOPMPC_NL + i], high = s->target_high[(k + j) * KOOPMPC_NL + i];
+        lower[j] = low > lower[j] ? low : lower[j];
+        upper[j] = high < upper[j] ? high : upper[j];
+      }
+    for (; k < AHEAD; k++) {
       const koopmpc_real low = s->target_low[k * KOOPMPC_NL + i], high = s->target_high[k * KOOPMPC_NL + i];
       below = low > below ? low : below;
       above = high < above ? high : above;
+    }
+    for (int j = 0; j < LANES; j++) {
+      below = lower[j] > below ? lower[j] : below;
+      above = upper[j] < above ? upper[j] : above;
     }
     below = koopmpc_target_shift[i] - below;
     above -= koopmpc_target_shift[i];
@@ -81,6 +120,7 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
     room = koopmpc_target_gain[i] > 0 ? room / koopmpc_target_gain[i] : room < 0 ? -1 : KOOPMPC_HUGE;
     s->unpushed = room < s->unpushed ? room : s->unpushed;
   }
+  if (!KOOPMPC_CHECKED_LIMITS && !(s->peak <= before && s->peak <= s->unpushed)) s->aimed = 0; /* else no target moves */
 #endif
   for (int i = 0; i < KOOPMPC_CHECKED; i++) { /* the tightest of them, which a plan is tested by */
     const int at = koopmpc_checked_limit[i];
@@ -93,7 +133,6 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
       *high = above < *high ? above : *high;
     }
   }
-  s->aimed = 0;
 }
 
 koopmpc_real koopmpc_open_rates(koopmpc_state *s) {

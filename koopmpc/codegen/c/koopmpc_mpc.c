@@ -74,6 +74,9 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *re
       if (KOOPMPC_FIRST_ALONE && k > 0) *reach = far > *reach ? far : *reach;
     }
   }
+#if KOOPMPC_BOUNDS
+  s->peak = peak;
+#endif
   if (!same || !s->aimed) {
     first_alone = KOOPMPC_FIRST_ALONE && good && !held && !same && peak <= UNPUSHED(s);
     s->aimed = !good || moves_on || first_alone ? 0 : held ? HELD : MOVING;
