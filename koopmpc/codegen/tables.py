@@ -396,6 +396,7 @@ def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool, r
     if program.levels is None and not program.disturbance.shape[1] and program.from_reference.size >= _LONG:
         tables.sizes["FIRST_ALONE"] = 1
         tables.plan["shares"] = np.abs(program.from_reference[:, program.nr :]).sum(axis=1)
+        tables.plan["first_shares"] = program.from_reference[: program.model.nu, program.nr :]
     given, tabled = np.zeros(0) if program.given is None else stack(program.from_given), False
     if program.given is not None:
         tabled = len(program.given) * len(program.offset) <= max(room, given.size)
@@ -490,7 +491,7 @@ def _add_levels(tables: Tables, program: LevelsProgram, *, single: bool) -> None
 
 def _add_bounds(tables: Tables, bounds: BoundsProgram, *, rated: bool) -> None:
     """Write how rows of limits become those of the plan."""
-    once = (bounds.count == 1).all() and (bounds.first.T == np.arange(len(bounds.first))).all()
+    once = (bounds.count == 1).all() and (np.arange(len(bounds.first)) == bounds.first.T).all()
     tables.sizes |= {"BOUNDS": 1, "OUTPUTS": bounds.margin.shape[1], "CHANGES": int(rated), "HELD_ONCE": int(once)}
     whole = {
         "hold_first": bounds.first,

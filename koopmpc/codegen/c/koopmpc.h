@@ -98,6 +98,7 @@ typedef struct {
   koopmpc_real reference[(KOOPMPC_N + 1) * KOOPMPC_NR]; /**< rows of the last step */
   koopmpc_real kept[KOOPMPC_MOVES];        /**< inputs of the last good plan */
 #if KOOPMPC_FIRST_ALONE
+  koopmpc_real apart[(KOOPMPC_N + 1) * KOOPMPC_NR]; /**< rows less their first one */
   koopmpc_real moved[(KOOPMPC_N + 1) * KOOPMPC_NR]; /**< rows less their first one, if `kept` still is without them */
   int owes;
 #endif

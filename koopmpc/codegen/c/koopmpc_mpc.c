@@ -45,6 +45,19 @@ static int target_of_row(koopmpc_state *s, int k, const koopmpc_real *e, koopmpc
 }
 #endif
 
+enum { LANES = 8 }; /* sums and maxima side by side, for a processor does several at once, and one after the other slowly */
+
+/** The largest of |a|. */
+static koopmpc_real largest(const koopmpc_real *a, int n) {
+  koopmpc_real most[LANES] = {0}, result = 0;
+  int j = 0;
+  for (; j + LANES <= n; j += LANES)
+    for (int i = 0; i < LANES; i++) most[i] = koopmpc_abs(a[j + i]) > most[i] ? koopmpc_abs(a[j + i]) : most[i];
+  for (; j < n; j++) result = koopmpc_abs(a[j]) > result ? koopmpc_abs(a[j]) : result;
+  for (int i = 0; i < LANES; i++) result = most[i] > result ? most[i] : result;
+  return result;
+}
+
 enum { MOVING = 1, HELD }; /* whether the rows of the last reference were the same */
 
 /**
@@ -54,26 +67,28 @@ enum { MOVING = 1, HELD }; /* whether the rows of the last reference were the sa
  * distance of a row from it: a step may need no more.
  */
 static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *reach) {
+  enum { NR = KOOPMPC_NR, SIZE = (KOOPMPC_N + 1) * NR };
   const int moves_on = s->row + 1 < KOOPMPC_GIVEN;
+  const int last = reference->count - 1, after = last - KOOPMPC_LATENCY, there = after < KOOPMPC_N ? after : KOOPMPC_N;
   int good = 1, same = 1, held = 1; /* held: all rows are the same */
   int first_alone = 0, rests = s->aimed == HELD && reference->count == 1;
-  koopmpc_real peak = 0;
+  koopmpc_real peak, ahead[SIZE];
   *reach = 0;
-  for (int i = 0; i < KOOPMPC_NR; i++) rests &= reference->values[i] == s->reference[i];
+  for (int i = 0; i < NR; i++) rests &= reference->values[i] == s->reference[i];
   if (rests) return 0;
-  for (int k = 0; k <= KOOPMPC_N; k++) {
-    const koopmpc_real *row = koopmpc_row(reference, k + KOOPMPC_LATENCY, KOOPMPC_NR);
-    koopmpc_real *mine = s->reference + k * KOOPMPC_NR;
-    for (int i = 0; i < KOOPMPC_NR; i++) {
-      const koopmpc_real size = koopmpc_abs(row[i]), far = koopmpc_abs(row[i] - s->reference[i]);
-      same &= mine[i] == row[i];
-      mine[i] = row[i];
-      held &= row[i] == s->reference[i];
-      good &= size < KOOPMPC_HUGE;
-      peak = size > peak ? size : peak;
-      if (KOOPMPC_FIRST_ALONE && k > 0) *reach = far > *reach ? far : *reach;
-    }
-  }
+  for (int j = 0; j < (there + 1) * NR; j++) ahead[j] = reference->values[KOOPMPC_LATENCY * NR + j];
+  for (int k = there < 0 ? 0 : there + 1; k <= KOOPMPC_N; k++)
+    koopmpc_copy(ahead + k * NR, reference->values + last * NR, NR);
+  for (int j = 0; j < SIZE; j++) same &= s->reference[j] == ahead[j];
+  for (int j = 0; j < SIZE; j++) good &= koopmpc_abs(ahead[j]) < KOOPMPC_HUGE;
+  for (int j = NR; j < SIZE; j++) held &= ahead[j] == ahead[j - NR];
+  koopmpc_copy(s->reference, ahead, SIZE);
+  peak = largest(ahead, SIZE);
+#if KOOPMPC_FIRST_ALONE
+  for (int k = 0; k <= KOOPMPC_N; k++)
+    for (int i = 0; i < NR; i++) s->apart[k * NR + i] = ahead[k * NR + i] - ahead[i];
+  *reach = largest(s->apart, SIZE);
+#endif
 #if KOOPMPC_BOUNDS
   s->peak = peak;
 #endif
@@ -147,6 +162,17 @@ void koopmpc_settle(const koopmpc_state *s, koopmpc_real *kept) {
     for (int i = KOOPMPC_NU; i < MOVES; i++) kept[i] += s->moved[j] * koopmpc_from_reference[j * PLANNED + i];
 }
 
+static koopmpc_real sum_products(const koopmpc_real *a, const koopmpc_real *b) {
+  enum { SIZE = KOOPMPC_N * KOOPMPC_NR };
+  koopmpc_real sums[LANES] = {0}, result = 0;
+  int j = 0;
+  for (; j + LANES <= SIZE; j += LANES)
+    for (int i = 0; i < LANES; i++) sums[i] += a[j + i] * b[j + i];
+  for (; j < SIZE; j++) result += a[j] * b[j];
+  for (int i = 0; i < LANES; i++) result += sums[i];
+  return result;
+}
+
 /** Whether a plan for the first row meets all limits wherever the others are within `reach` of it; then its input. */
 static int certain(koopmpc_state *s, koopmpc_real reach) {
   const koopmpc_real *low = KOOPMPC_PLAN_LOW(s), *high = KOOPMPC_PLAN_HIGH(s);
@@ -157,9 +183,8 @@ static int certain(koopmpc_state *s, koopmpc_real reach) {
     broken |= !(s->t[i] - by >= low[i]) | !(s->t[i] + by <= high[i]);
   }
   koopmpc_copy(first, s->t, KOOPMPC_NU);
-  for (int j = KOOPMPC_NR; j < (KOOPMPC_N + 1) * KOOPMPC_NR && !broken; j++)
-    for (int i = 0; i < KOOPMPC_NU; i++)
-      first[i] += (s->reference[j] - s->reference[j % KOOPMPC_NR]) * koopmpc_from_reference[j * PLANNED + i];
+  for (int i = 0; i < KOOPMPC_NU && !broken; i++)
+    first[i] += sum_products(s->apart + KOOPMPC_NR, koopmpc_first_shares + i * KOOPMPC_N * KOOPMPC_NR);
   for (int i = 0; i < KOOPMPC_NU; i++) broken |= !(first[i] >= low[i]) | !(first[i] <= high[i]);
   if (!broken) koopmpc_copy(s->t, first, KOOPMPC_NU);
   return !broken;
@@ -518,15 +543,13 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
 #if KOOPMPC_FIRST_ALONE
   if (first_alone && certain(s, reach)) {
     unconstrained(s, u, report);
-    for (int j = 0; j < (KOOPMPC_N + 1) * KOOPMPC_NR; j++) s->moved[j] = s->reference[j] - s->reference[j % KOOPMPC_NR];
+    koopmpc_copy(s->moved, s->apart, (KOOPMPC_N + 1) * KOOPMPC_NR);
     s->owes = 1;
     return;
   }
   if (first_alone) { /* a limit may be met: the whole plan */
-    koopmpc_real moved[KOOPMPC_N * KOOPMPC_NR];
-    for (int j = 0; j < KOOPMPC_N * KOOPMPC_NR; j++)
-      moved[j] = s->reference[j + KOOPMPC_NR] - s->reference[j % KOOPMPC_NR];
-    koopmpc_add(s->column, koopmpc_from_reference + KOOPMPC_NR * PLANNED, PLANNED, moved, KOOPMPC_N * KOOPMPC_NR);
+    koopmpc_add(s->column, koopmpc_from_reference + KOOPMPC_NR * PLANNED, PLANNED, s->apart + KOOPMPC_NR,
+                KOOPMPC_N * KOOPMPC_NR);
     evaluate(s);
   }
 #else
