@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.identify.free_starts import shoot
 from koopmpc.identify.levenberg_marquardt import minimise
 from koopmpc.identify.records.conversion import SignalUnits, cut_segments, from_standard, is_hidden, to_standard
 from koopmpc.identify.records.hidden import SimulationError, join_segments
@@ -128,6 +129,7 @@ def refine(
     horizon: int,
     held_out: Episodes | None = None,
     iterations: int = 30,
+    free_starts: bool = False,
 ) -> LinearPredictor | BilinearPredictor:
     """Refine the rows Θ = C [A B E N] of a model on forecasts: min_Θ Σ_s Σ_h ‖(x̂_{s+h} − x_{s+h}) / σ‖².
 
@@ -155,6 +157,10 @@ def refine(
         Episodes that decide when to stop; by default the last quarter of each episode, which is then not learned from.
     iterations
         Levenberg-Marquardt steps, at most.
+    free_starts
+        Of a hidden state: each segment first begins with its own z_0, the one that explains it best (multiple
+        shooting), and T is fitted to these; from there all is refined as above. For unstable plants, and where noise
+        in few past rows hides the state. The best of both ways on held-out rows is kept.
 
     Raises
     ------
@@ -182,7 +188,11 @@ def refine(
     checks.kind(model, "model", (LinearPredictor, BilinearPredictor), "pass what a fit returns")
     horizon, iterations = checks.count(horizon, "horizon"), checks.count(iterations, "iterations")
     if is_hidden(model):
-        return _refine_hidden(model, episodes_of(episodes), horizon, held_out, iterations)
+        return _refine_hidden(model, episodes_of(episodes), horizon, held_out, iterations, free_starts)
+    if free_starts:
+        raise DataError(
+            "free_starts is for models with a hidden state; this model begins at measured rows: leave it out"
+        )
     places = rows_of_states(model)
     whole = episodes_of(episodes)
     for part in (whole, whole if held_out is None else episodes_of(held_out)):
@@ -219,6 +229,7 @@ def _refine_hidden(
     horizon: int,
     held_out: Episodes | None,
     iterations: int,
+    free_starts: bool,
 ) -> LinearPredictor | BilinearPredictor:
     """Refine the dynamics, the output and the encoder of a hidden state on forecasts of `horizon` steps."""
     check_same_names(model, episodes)
@@ -234,6 +245,11 @@ def _refine_hidden(
     error = SimulationError(start)
     theta, steps = minimise(error, start.parameters, fitted, judged, iterations)
     before, after = error.evaluate(start.parameters, judged), error.evaluate(theta, judged)
+    if free_starts:
+        shot = shoot(start, fitted, judged, iterations)
+        other, more = minimise(error, shot.parameters, fitted, judged, iterations)
+        if (other_error := error.evaluate(other, judged)) < after:
+            theta, steps, after = other, more, other_error
     if not after < before:
         return model
     report = model.report

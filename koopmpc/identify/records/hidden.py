@@ -145,12 +145,16 @@ class SimulationError:
     def _weight(self, data: Sets) -> float:
         return self._noise**2 / min(len(part.inputs) for part in data)
 
+    def begin(self, model: HiddenModel, data: RecordSegments) -> Float[np.ndarray, "m n"]:
+        """Return the state z_0 of each segment."""
+        return start_states(model, data.points)
+
     def _evaluate(self, theta: Float[np.ndarray, " p"], data: RecordSegments) -> float:
         model = self.model.with_parameters(theta)
-        z = _list_states(model, start_states(model, data.points), data.inputs)[1:]
+        z = list_states(model, self.begin(model, data), data.inputs)[1:]
         if not (np.abs(z) < _FAR).all():
             return np.inf
-        return float(np.mean(_gap(z @ model.H[:, :-1].T + model.H[:, -1], data) ** 2))
+        return float(np.mean(find_gap(z @ model.H[:, :-1].T + model.H[:, -1], data) ** 2))
 
     def _derivatives(
         self, theta: Float[np.ndarray, " p"], data: RecordSegments
@@ -162,10 +166,10 @@ class SimulationError:
         weighed = np.flatnonzero(model.E[:, nphi - len(model.neurons) :].any(axis=0))  # V of others changes nothing
         bends: Int[np.ndarray, " q"] = nphi - len(model.neurons) + weighed
         C, W, q, width = model.H[:, :-1], model.E[:, bends], len(bends), last + len(bends) * (n + 1)
-        z = _list_states(model, start_states(model, data.points), data.inputs)
+        z = list_states(model, self.begin(model, data), data.inputs)
         out = np.concatenate([z, np.ones((steps + 1, m, 1))], axis=2)
         y = z[1:] @ C.T + model.H[:, -1]
-        gap, told = _gap(y, data), None if data.low is None else ~_is_silent(y, data)
+        gap, told = find_gap(y, data), None if data.low is None else ~_is_silent(y, data)
         D, begun = np.zeros((m, width - last + first, n)), np.tile(np.eye(n), (m, 1, 1))  # by E and V, by z_0
         slope, both = np.zeros(width), np.zeros((width, width))
         early, cross, square = np.zeros((m, n)), np.zeros((m, n, width)), np.zeros((m, n, n))
@@ -196,22 +200,36 @@ class SimulationError:
             early += np.matmul(own_rows, gaps[..., None])[..., 0]
             cross += np.matmul(own_rows, rows)
             square += np.matmul(own_rows, own_rows.swapaxes(1, 2))
-        gradient, matrix = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
         begin = last + model.T.size
-        encoder = np.arange(last, begin)
         by_neurons = begin + weighed[:, None] * (n + 1) + np.arange(n + 1)
         others: Int[np.ndarray, " width"] = np.append(np.arange(last), by_neurons)
-        zeta = np.hstack([data.points, np.ones((m, 1))])  # z_0 = T [ζ; 1], row after row of T
+        gradient, matrix = self._assemble(len(theta), others, (slope, both), (early, cross, square), data.points)
+        return gradient / data.outputs.size, matrix / data.outputs.size
+
+    def _assemble(
+        self,
+        size: int,
+        others: Int[np.ndarray, " width"],
+        by_others: tuple[Float[np.ndarray, " width"], Float[np.ndarray, "width width"]],
+        by_starts: tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n width"], Float[np.ndarray, "m n n"]],
+        points: Float[np.ndarray, "m nzeta"],
+    ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
+        """Return sums by all parameters: those of E, H and V, and those of T by what they are by each z_0."""
+        (slope, both), (early, cross, square) = by_others, by_starts
+        m, n, width = cross.shape
+        gradient, matrix, first = np.zeros(size), np.zeros((size, size)), self.model.E.size + self.model.H.size
+        encoder = np.arange(first, first + self.model.T.size)
+        zeta = np.hstack([points, np.ones((m, 1))])  # z_0 = T [ζ; 1], row after row of T
         gradient[others], gradient[encoder] = slope, (early.T @ zeta).ravel()
         matrix[np.ix_(others, others)] = both
         mixed = (zeta.T @ cross.reshape(m, -1)).reshape(-1, n, width).swapaxes(0, 1).reshape(-1, width)
         matrix[np.ix_(encoder, others)], matrix[np.ix_(others, encoder)] = mixed, mixed.T
         pairs = (zeta[:, :, None] * zeta[:, None]).reshape(m, -1).T @ square.reshape(m, -1)
-        size = len(zeta[0])
+        count = len(zeta[0])
         matrix[np.ix_(encoder, encoder)] = (
-            pairs.reshape(size, size, n, n).transpose(2, 0, 3, 1).reshape(n * size, n * size)
+            pairs.reshape(count, count, n, n).transpose(2, 0, 3, 1).reshape(n * count, n * count)
         )
-        return gradient / data.outputs.size, matrix / data.outputs.size
+        return gradient, matrix
 
     def _features(
         self, model: HiddenModel, z: Float[np.ndarray, "m n"], u: Float[np.ndarray, "m nu"]
@@ -237,10 +255,10 @@ def simulate_hidden(
     model: HiddenModel, points: Float[np.ndarray, "m nzeta"], inputs: Float[np.ndarray, "steps m nu"]
 ) -> Float[np.ndarray, "steps m ny"]:
     """Return ŷ_1, ŷ_2, … from several points ζ."""
-    return _list_states(model, start_states(model, points), inputs)[1:] @ model.H[:, :-1].T + model.H[:, -1]
+    return list_states(model, start_states(model, points), inputs)[1:] @ model.H[:, :-1].T + model.H[:, -1]
 
 
-def _list_states(
+def list_states(
     model: HiddenModel, z: Float[np.ndarray, "m n"], inputs: Float[np.ndarray, "steps m nu"]
 ) -> Float[np.ndarray, "steps1 m n"]:
     """Return z_0, z_1, …, which stop at `_FAR` spreads."""
@@ -255,7 +273,7 @@ def _list_states(
 def bound_states(model: HiddenModel, data: RecordSegments, reach: float) -> HiddenModel:
     """Return the model with bounds at `reach` times the largest |z| that occurs on these stretches."""
     model = replace(model, bound=np.full(model.order, np.inf))
-    z = _list_states(model, start_states(model, data.points), data.inputs)
+    z = list_states(model, start_states(model, data.points), data.inputs)
     return replace(model, bound=reach * np.abs(z).max(axis=(0, 1)))
 
 
@@ -331,7 +349,8 @@ def _is_silent(y: Float[np.ndarray, "steps m ny"], data: RecordSegments) -> Bool
     return (data.low & (y < data.outputs)) | (data.high & (y > data.outputs))
 
 
-def _gap(y: Float[np.ndarray, "steps m ny"], data: RecordSegments) -> Float[np.ndarray, "steps m ny"]:
+def find_gap(y: Float[np.ndarray, "steps m ny"], data: RecordSegments) -> Float[np.ndarray, "steps m ny"]:
+    """Return ŷ − y; zero where a reading says nothing."""
     gap = y - data.outputs
     return gap if data.low is None else np.where(_is_silent(y, data), 0.0, gap)
 
