@@ -84,7 +84,8 @@ class FreeStartsError(SimulationError):
         (slope, both), (early, cross, square) = by_others, by_starts
         n = square.shape[1]
         soft = _SOFT * np.trace(square, axis1=1, axis2=2)[:, None, None] / n + 1e-300
-        follows = np.linalg.solve(square + soft * np.eye(n), np.concatenate([early[..., None], cross], axis=2))
+        joined: Float[np.ndarray, "m n width1"] = np.concatenate([early[..., None], cross], axis=2)
+        follows: Float[np.ndarray, "m n width1"] = np.asarray(np.linalg.solve(square + soft * np.eye(n), joined))
         gradient, matrix = np.zeros(size), np.zeros((size, size))
         gradient[others] = slope - np.einsum("snw,sn->w", cross, follows[..., 0])
         matrix[np.ix_(others, others)] = both - np.tensordot(cross, follows[..., 1:], axes=([0, 1], [0, 1]))
