@@ -41,8 +41,7 @@ class FreeStartsError(SimulationError):
         for _ in range(_STEPS):
             slope, square = self._by_starts(model, z, data)
             n, before = model.order, errors.sum()
-            soft = _SOFT * np.trace(square, axis1=1, axis2=2)[:, None, None] / n + 1e-300
-            move = -np.linalg.solve(square + soft * np.eye(n), slope[..., None])[..., 0]
+            move = -np.matmul(_invert(square), slope.reshape(-1, n, 1)).reshape(-1, n)
             waits = np.ones(len(z), dtype=np.bool_)
             for share in _SHARES:
                 trial = np.where(waits[:, None], z + share * move, z)
@@ -83,13 +82,20 @@ class FreeStartsError(SimulationError):
         """Return sums by E, H and V, those of z_0 taken out; by T they are zero."""
         (slope, both), (early, cross, square) = by_others, by_starts
         n = square.shape[1]
-        soft = _SOFT * np.trace(square, axis1=1, axis2=2)[:, None, None] / n + 1e-300
-        joined: Float[np.ndarray, "m n width1"] = np.concatenate([early[..., None], cross], axis=2)
-        follows: Float[np.ndarray, "m n width1"] = np.asarray(np.linalg.solve(square + soft * np.eye(n), joined))
+        joined = np.concatenate([early.reshape(-1, n, 1), cross], axis=2)
+        follows = np.matmul(_invert(square), joined)
         gradient, matrix = np.zeros(size), np.zeros((size, size))
         gradient[others] = slope - np.einsum("snw,sn->w", cross, follows[..., 0])
         matrix[np.ix_(others, others)] = both - np.tensordot(cross, follows[..., 1:], axes=([0, 1], [0, 1]))
         return gradient, matrix
+
+
+def _invert(square: Float[np.ndarray, "m n n"]) -> Float[np.ndarray, "m n n"]:
+    """Return the inverse of each matrix, with a little weight on its diagonal."""
+    n = square.shape[1]
+    weighed = square.copy()
+    weighed[:, np.arange(n), np.arange(n)] += _SOFT * np.trace(square, axis1=1, axis2=2)[:, None] / n + 1e-300
+    return np.linalg.inv(weighed)
 
 
 def shoot(model: HiddenModel, fitted: Sets, judged: Sets, iterations: int, noise: float = 0.0) -> HiddenModel:
