@@ -188,10 +188,12 @@ class Delay(Value):
         """Return what the sensors show of x: no more than their rails."""
         return x if self.rails is None else np.clip(x, *self.rails)
 
-    def is_beyond(self, y: Float[np.ndarray, " nx"], predicted: Float[np.ndarray, " nx"]) -> Bool[np.ndarray, " nx"]:
+    def is_beyond(
+        self, y: Float[np.ndarray, "*batch nx"], predicted: Float[np.ndarray, "*batch nx"]
+    ) -> Bool[np.ndarray, "*batch nx"]:
         """Return which readings are at a rail with a prediction at it or beyond: they tell nothing more."""
         if self.rails is None:
-            return np.zeros(len(y), dtype=np.bool_)
+            return np.zeros(y.shape, dtype=np.bool_)
         low, high = self.rails
         return ((y <= low) & (predicted <= low)) | ((y >= high) & (predicted >= high))
 

@@ -22,7 +22,7 @@ from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments, space_evenly
 from koopmpc.identify.records.hidden_structure import HiddenStructure
 from koopmpc.identify.records.state_space import fit_hidden
-from koopmpc.identify.records.structure import Structure, solve_structure
+from koopmpc.identify.records.structure import Structure, solve_structure, weigh_rows
 from koopmpc.identify.regression import Regression, build_regression
 from koopmpc.identify.solve import BilinearColumns, solve_path
 from koopmpc.lifting.base import strip_unit
@@ -474,14 +474,17 @@ def _solutions(
 
 def _moments(candidate: Candidate, episodes: Episodes) -> Moments:
     """Return moments as triangular factors, whatever their condition, so that all folds are solved in the same way."""
-    sparse = isinstance(candidate.structure, Structure)
-    products = candidate.structure.has_products if isinstance(candidate.structure, Structure) else candidate.bilinear
+    sparse, weights = isinstance(candidate.structure, Structure), None
+    products = candidate.bilinear
+    if isinstance(candidate.structure, Structure):
+        products, weights = candidate.structure.has_products, weigh_rows(candidate.structure)
     return second_moments(
         episodes.driven(products=candidate.bilinear and not sparse),
         candidate.lifting,
         embedding=candidate.embedding,
         route="qr",
         bilinear=products,
+        weights=weights,
     )
 
 

@@ -38,8 +38,9 @@ class MultiStepError:
     """The error of x̂_{k+1} = Θ φ(ζ̂_k, v_k), lifted afresh at each step, over segments, and its derivative by Θ.
 
     φ = [ψ(ζ); v] with v = [u; w] for a linear model, [ψ(ζ); v; u ⊗ ψ(ζ)] for a bilinear one, and w ⊗ ψ(ζ) and w ⊗ u
-    behind it where w multiplies something. Errors are relative to `size`, one number
-    a state. With D_k = ∂x̂_k/∂Θ and J = ∂(Θ φ)/∂ζ the derivative follows D_{k+1} = I ⊗ φᵀ + J ∂ζ̂_k/∂Θ.
+    behind it where w multiplies something. Errors are relative to `size`, one number a state; a reading at a rail of
+    its sensor counts on one side only. With D_k = ∂x̂_k/∂Θ and J = ∂(Θ φ)/∂ζ the derivative follows
+    D_{k+1} = I ⊗ φᵀ + J ∂ζ̂_k/∂Θ.
     """
 
     @raise_swallowed()
@@ -71,11 +72,16 @@ class MultiStepError:
         with np.errstate(over="ignore", invalid="ignore"):
             for v, truth in zip(data.inputs, data.states, strict=True):
                 x = self.find_features(point, v)[0] @ theta.T
-                total += float(np.sum(((x - truth) / self.size) ** 2))
+                total += float(np.sum((self._find_gap(x, truth) / self.size) ** 2))
                 if not np.isfinite(total):
                     return np.inf
                 point = x if self.embedding is None else self.embedding.shift(point, v[:, : self._nu], x)
         return total / data.states.size
+
+    def _find_gap(self, x: Float[np.ndarray, "m nx"], truth: Float[np.ndarray, "m nx"]) -> Float[np.ndarray, "m nx"]:
+        """Return x̂ − x; zero where a reading is at a rail and x̂ lies beyond it."""
+        gap = x - truth
+        return gap if self.embedding is None else np.where(self.embedding.is_beyond(truth, x), 0.0, gap)
 
     def find_features(self, *values: np.ndarray) -> list[np.ndarray]:
         """Return φ of every segment, (m, nphi), of points and inputs; with Θ also the slopes, (m, npoint, nx)."""
@@ -109,14 +115,18 @@ class MultiStepError:
             D = moved @ slope  # (m, f, nx)
             D[:, every, rows] += phi[:, columns]
             x = phi @ theta.T
-            weighed = (D / self.size).transpose(0, 2, 1).reshape(m * nx, -1)
-            slopes += weighed.T @ ((x - truth) / self.size).ravel()
+            gap, shown = self._find_gap(x, truth) / self.size, D / self.size
+            if self.embedding is not None and self.embedding.rails is not None:
+                shown = shown * (~self.embedding.is_beyond(truth, x))[:, None]
+                D = D * (self.embedding.clip(x) == x)[:, None]
+            weighed = shown.transpose(0, 2, 1).reshape(m * nx, -1)
+            slopes += weighed.T @ gap.ravel()
             squares += weighed.T @ weighed
             if self.embedding is None:
                 point, moved = x, D
             else:
                 point = self.embedding.shift(point, v[:, : self._nu], x)
-                moved = self.embedding.shift(moved, np.zeros((*D.shape[:2], self._nu)), D)
+                moved = self.embedding.without_rails().shift(moved, np.zeros((*D.shape[:2], self._nu)), D)
         gradient, matrix = np.zeros(nx * count), np.zeros((nx * count, nx * count))
         gradient[free], matrix[np.ix_(free, free)] = slopes, squares
         return gradient / data.states.size, matrix / data.states.size

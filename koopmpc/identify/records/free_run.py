@@ -83,12 +83,14 @@ def embed_rows(
 class Models:
     """Nested polynomial models x⁺ᵢ = c₀ + Σ_t c_t v^{terms_t}, for each state i its terms and (s, 1 + terms) c.
 
-    Model number q has its own coefficients on the same terms; those of terms that it lacks are zero.
+    Model number q has its own coefficients on the same terms; those of terms that it lacks are zero. Forecasts end at
+    `rails`, (2, nx), if sensors saturate.
     """
 
     delays: int
     terms: tuple[Terms, ...]
     coefficients: tuple[Float[np.ndarray, "s n1"], ...]
+    rails: Float[np.ndarray, "2 nx"] | None = None
 
     @property
     def count(self) -> int:
@@ -97,7 +99,7 @@ class Models:
 
     def keep(self, which: Sequence[int] | Int[np.ndarray, " k"]) -> "Models":
         """Return some of the models."""
-        return Models(self.delays, self.terms, tuple(c[which] for c in self.coefficients))
+        return Models(self.delays, self.terms, tuple(c[which] for c in self.coefficients), self.rails)
 
 
 def run_freely(
@@ -116,6 +118,8 @@ def run_freely(
         inputs[: len(u) - first, b, 0] = u[first:]
         V[b, :, 1 : 1 + n] = embed_rows(y[first - d : first + 2], u[first - d : first + 1], d)[0][0, 1 : 1 + n]
     out = np.empty((length, len(U), models.count, nx))
+    ends = np.array([[-_LOST], [_LOST]]).repeat(nx, axis=1) if models.rails is None else models.rails
+    ends = np.clip(ends, -_LOST, _LOST)
     constants = [c[:, 0] for c in models.coefficients]
     weights = [np.ascontiguousarray(c[:, 1:]) for c in models.coefficients]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -123,7 +127,7 @@ def run_freely(
             V[..., 1 + n :] = inputs[k]
             for i, terms in enumerate(models.terms):
                 value = np.einsum("bst,st->bs", evaluate_terms(terms, V), weights[i]) + constants[i]
-                np.clip(value, -_LOST, _LOST, out=out[k, :, :, i])
+                np.clip(value, *ends[:, i], out=out[k, :, :, i])
             if d:
                 V[..., 1 + block : 1 + n] = V[..., 1 : 1 + n - block].copy()
                 V[..., 1 + nx : 1 + block] = inputs[k]

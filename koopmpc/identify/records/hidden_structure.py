@@ -6,9 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.identify.records.conversion import SignalUnits, cut_segments
 from koopmpc.identify.records.free_run import HELD
@@ -240,11 +238,3 @@ def report_fit(structure: HiddenStructure, found: HiddenModel, units: SignalUnit
         state_residual=np.zeros(units.ny),
         changes=(structure.describe(),),
     )
-
-
-def check_rails(rails: ArrayLike, ny: int) -> Float[np.ndarray, "2 ny"]:
-    """Return the rails, one pair for each output."""
-    given = checks.array(rails, "rails", infinite=True)
-    if given.shape == (2,):
-        given = np.repeat(given[:, None], ny, axis=1)
-    return checks.array(given, "rails", (2, ny), infinite=True)

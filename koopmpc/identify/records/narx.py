@@ -5,6 +5,7 @@ from typing import Unpack
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episodes, episodes_of
@@ -20,7 +21,14 @@ from koopmpc.identify.records.forward import (
     solve_nested,
 )
 from koopmpc.identify.records.free_run import Models, Pieces, embed_rows, is_calm, run_freely
-from koopmpc.identify.records.structure import EXACT, Structure, find_forecast_horizon, fit_structure
+from koopmpc.identify.records.structure import (
+    EXACT,
+    Structure,
+    check_rails,
+    find_forecast_horizon,
+    find_told_rows,
+    fit_structure,
+)
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 DELAYS = (0, 1, 2, 3, 4, 6, 8, 12)  # numbers of past rows that are tried
@@ -31,6 +39,8 @@ MOST = 2600  # terms to choose from, of all states together: a structure with mo
 NUMBERS = 8_000_000  # entries of the table that terms are chosen on: of more rows evenly spread ones are taken
 EACH = 4  # rows of data for each chosen term, at least
 
+RAILED = 2  # pairs of delays and degree that are tried with the rails of the sensors too
+_NEAR = np.array([[1e-9], [-1e-9]])  # spreads from a rail that rounding makes
 _MEDIAN = 0.1  # log of the ratio by which the errors of half of the blocks may be larger
 
 Ask = Callable[[str, int, int], object]  # name of a structure, done, of how many
@@ -42,6 +52,7 @@ def narx(
     delays: Sequence[int] | int = DELAYS,
     degrees: Sequence[int] | int = DEGREES,
     terms: int = SIZES[-1],
+    rails: ArrayLike | None = None,
     **options: Unpack[ReadOptions],
 ) -> LinearPredictor | BilinearPredictor:
     """Fit x⁺ = Σ_t c_t v^{a_t}, v = [ζ_k, u_k], ζ_k = [x_k, u_{k−1}, x_{k−1}, …]: a polynomial NARX model of few terms.
@@ -67,13 +78,19 @@ def narx(
         Numbers of past rows and total degrees to try. Structures of more than 2,600 terms are left out.
     terms
         Terms of a state's polynomial, at most.
+    rails
+        (2, nx) or (2,), the least and the largest reading of the sensors, ±inf for none. Forecasts then end there, and
+        a reading at a rail is no target. For the two best numbers of delays and degrees, rows with such readings in
+        their past are kept in one model, and left out of another; the error on unseen rows decides between both and
+        the model without rails. Models without delays have no rails.
     **options
         ``weights``, ``workers``, ``scheduler`` and ``progress`` of the last fit, as in `km.moments.second_moments`.
 
     Raises
     ------
     DataError
-        The records are too short for the delays, or hold measured disturbances; no structure is small enough.
+        The records are too short for the delays, or hold measured disturbances; no structure is small enough; rails
+        are not in order; with them, weights are no function of an episode.
 
     References
     ----------
@@ -94,7 +111,9 @@ def narx(
     True
     """
     source = source_of(episodes)
-    found = search_structures(source_episodes(source), check_list(delays, 0), check_list(degrees, 1), terms)
+    whole = source_episodes(source)
+    limits = None if rails is None else check_rails(rails, whole.nx)
+    found = search_structures(whole, check_list(delays, 0), check_list(degrees, 1), terms, rails=limits)
     return fit_structure(choose_structure(found), source, **options)
 
 
@@ -141,6 +160,7 @@ def search_structures(
     terms: int = SIZES[-1],
     horizon: int | None = None,
     ask: Ask | None = None,
+    rails: Float[np.ndarray, "2 nx"] | None = None,
 ) -> list[Structure]:
     """Return structures of all delays, degrees and sizes with their errors in free run; the calm ones if there are any.
 
@@ -154,6 +174,8 @@ def search_structures(
         Steps of the short forecasts; `find_forecast_horizon` says what it is by default.
     ask
         Called before each pair of delays and degree.
+    rails
+        As in `narx`.
     """
     if episodes.nw:
         raise DataError("the records hold measured disturbances, which narx does not know; pass them as inputs")
@@ -179,27 +201,45 @@ def search_structures(
         if ask is not None:
             ask(f"polynomials of degree {g} with {d} past rows", i, len(plans))
         found += list(_try_plan(pieces, d, g, first, terms, horizon))
+    if rails is not None:
+        ranked = dict.fromkeys((one.delays, one.degree) for one in sorted(found, key=lambda one: one.error))
+        for d, g in [(d, g) for d, g in ranked if d][:RAILED]:
+            for masked in (False, True):
+                try:
+                    found += list(_try_plan(pieces, d, g, first, terms, horizon, rails, masked))
+                except DataError:  # a stretch has no row without a rail
+                    continue
     driven = [structure for structure in found if structure.is_driven] or found  # a controller needs the input
     return [structure for structure in driven if structure.calm] or driven
 
 
-def _try_plan(pieces: Pieces, delays: int, degree: int, first: int, terms: int, horizon: int) -> Iterator[Structure]:
+def _try_plan(
+    pieces: Pieces,
+    delays: int,
+    degree: int,
+    first: int,
+    terms: int,
+    horizon: int,
+    rails: Float[np.ndarray, "2 nx"] | None = None,
+    masked: bool = False,
+) -> Iterator[Structure]:
     """Yield the structures of all sizes for these delays and this degree."""
     nx, nu = pieces.nx, pieces.nu
+    ends = None if rails is None else (rails - pieces.mean[:nx]) / pieces.scale[:nx]
     candidates = list_terms(nx + delays * (nx + nu), nu, degree)
     spans = [[round(len(u) * i / FOLDS) for i in range(FOLDS + 1)] for u in pieces.U]
     sizes = np.array([size for size in SIZES if size <= min(terms, len(candidates))])
     errors: list[Float[np.ndarray, " s"]] = []
     for fold in range(FOLDS):
         out = [(span[fold], span[fold + 1]) for span in spans]
-        models = _fit_models(pieces, candidates, delays, sizes, out)
+        models = _fit_models(pieces, candidates, delays, sizes, out, ends, masked)
         errors += _unseen_errors(models, pieces, [(max(a, first), b) for a, b in out], first, horizon)
     table = np.array(errors)
-    models = _fit_models(pieces, candidates, delays, sizes, [(0, 0)] * len(pieces.U))
+    models = _fit_models(pieces, candidates, delays, sizes, [(0, 0)] * len(pieces.U), ends, masked)
     calm = is_calm(models, pieces, first)
     for i, size in enumerate(sizes):
         chosen = tuple(own[:size] for own in models.terms)
-        yield Structure(delays, degree, chosen, pieces.mean, pieces.scale, table[:, i], bool(calm[i]))
+        yield Structure(delays, degree, chosen, pieces.mean, pieces.scale, table[:, i], bool(calm[i]), rails, masked)
         if all(len(own) <= size for own in models.terms):
             return
 
@@ -233,15 +273,25 @@ def _mean_squares(gaps: Float[np.ndarray, "*rows s nx"]) -> Float[np.ndarray, " 
 
 
 def _fit_models(
-    pieces: Pieces, candidates: Terms, delays: int, sizes: Int[np.ndarray, " s"], out: Sequence[tuple[int, int]]
+    pieces: Pieces,
+    candidates: Terms,
+    delays: int,
+    sizes: Int[np.ndarray, " s"],
+    out: Sequence[tuple[int, int]],
+    rails: Float[np.ndarray, "2 nx"] | None = None,
+    masked: bool = False,
 ) -> Models:
     """Return nested models of these sizes, from all rows whose past and target are outside of the spans `out`."""
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     for y, u, (a, b) in zip(pieces.Y, pieces.U, out, strict=True):
         for low, high in ((0, a), (b, len(u))):
             if high - low > delays:
-                parts.append(embed_rows(y[low : high + 1], u[low:high], delays))
-    if not parts:
+                V, T = embed_rows(y[low : high + 1], u[low:high], delays)
+                told = slice(None)
+                if rails is not None:
+                    told = find_told_rows(y[low : high + 1], rails + _NEAR, delays, masked)[delays:]
+                parts.append((V[told], T[told]))
+    if not sum(len(T) for _, T in parts):
         raise DataError(f"no stretch of the records is longer than {delays} delays; pass fewer, or a longer record")
     V, T = np.concatenate([v for v, _ in parts]), np.concatenate([t for _, t in parts])
     apart = -(-len(V) * len(candidates) // NUMBERS)
@@ -253,4 +303,4 @@ def _fit_models(
         own = candidates[select_forward(P, target[::apart], most)]
         found.append(own)
         solved.append(solve_nested(evaluate_terms(own, V), target, sizes))
-    return Models(delays, tuple(found), tuple(solved))
+    return Models(delays, tuple(found), tuple(solved), rails)

@@ -23,7 +23,6 @@ from koopmpc.identify.records.hidden import (
 )
 from koopmpc.identify.records.hidden_structure import (
     HiddenStructure,
-    check_rails,
     choose_hidden,
     cut_sets,
     find_noise,
@@ -36,7 +35,7 @@ from koopmpc.identify.records.hidden_structure import (
 from koopmpc.identify.records.narx import Ask, check_list, source_episodes
 from koopmpc.identify.records.neurons.candidates import draw_neurons, take_neurons
 from koopmpc.identify.records.neurons.contained import ContainedError, contain
-from koopmpc.identify.records.structure import HORIZON, find_forecast_horizon
+from koopmpc.identify.records.structure import HORIZON, check_rails, find_forecast_horizon
 from koopmpc.identify.records.subspace import build_realisation, compute_block_moments
 from koopmpc.identify.records.unseen import UNSEEN
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor

@@ -20,7 +20,6 @@ from koopmpc.identify.records.hidden_structure import (
     ROWS,
     STEPS,
     HiddenStructure,
-    check_rails,
     choose_hidden,
     cut_sets,
     find_noise,
@@ -32,7 +31,7 @@ from koopmpc.identify.records.hidden_structure import (
 )
 from koopmpc.identify.records.narx import Ask, check_list, source_episodes
 from koopmpc.identify.records.neural import fit_neural
-from koopmpc.identify.records.structure import find_forecast_horizon
+from koopmpc.identify.records.structure import check_rails, find_forecast_horizon
 from koopmpc.identify.records.subspace import build_realisation, compute_block_moments
 from koopmpc.identify.records.unseen import UNSEEN
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor

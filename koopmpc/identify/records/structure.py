@@ -1,18 +1,22 @@
 """The structure of a polynomial model, its terms in standard units, and the predictor with these terms."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Unpack
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 
+from koopmpc import checks
 from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episodes
+from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.pace import find_pace
 from koopmpc.data.source import Source, source_of
+from koopmpc.errors import DataError
 from koopmpc.identify.moments.moments import Moments
-from koopmpc.identify.moments.read import ReadOptions, second_moments
+from koopmpc.identify.moments.read import ReadOptions, Weights, second_moments
 from koopmpc.identify.records.forward import Terms, list_terms
 from koopmpc.identify.regression import (
     FitResult,
@@ -63,6 +67,11 @@ class Structure(Value):
         terms nor their coefficients saw.
     calm
         Fitted to all rows it stays within three times the range of the data, in free run over each record twice.
+    rails
+        (2, nx) the least and the largest reading of each sensor; None where none saturates. No row whose target is at
+        a rail is learned from.
+    masked
+        Rows whose past holds a reading at a rail are left out too.
     """
 
     delays: int
@@ -72,6 +81,8 @@ class Structure(Value):
     scale: Float[np.ndarray, " nv"]
     errors: Float[np.ndarray, " blocks"]
     calm: bool
+    rails: Float[np.ndarray, "2 nx"] | None = None
+    masked: bool = False
 
     @property
     def size(self) -> int:
@@ -91,7 +102,7 @@ class Structure(Value):
     @property
     def delay(self) -> Delay | None:
         """The embedding; None without past rows."""
-        return Delay(self.delays) if self.delays else None
+        return Delay(self.delays, rails=self.rails) if self.delays else None
 
     @property
     def signals(self) -> Int[np.ndarray, " n"]:
@@ -148,6 +159,10 @@ class Structure(Value):
     def describe(self) -> str:
         """Return a sentence on terms, delays and the error in free run."""
         past = f"{self.delays} past row{'s' * (self.delays != 1)}"
+        if self.rails is not None:
+            past += ", with the sensors' rails, " + (
+                "without rows behind them" if self.masked else "none of them a target"
+            )
         return (
             f"{self.size} terms of degree {self.degree} at most in {past}, by forward regression; on unseen rows, "
             f"in free run and in forecasts, it errs by {self.error:.3g} spreads"
@@ -165,8 +180,45 @@ def fit_structure(
     """Return the predictor of a structure, its coefficients by least squares over all rows of the data."""
     source = source_of(episodes)
     mixes, delay = structure.has_products, structure.delay
+    options["weights"] = weigh_rows(structure, options.get("weights"))
     total = second_moments(source, structure.lifting, bilinear=mixes, embedding=delay, **options)
     return solve_structure(structure, total)
+
+
+def weigh_rows(structure: Structure, weights: Weights | None = None) -> Weights | None:
+    """Return weights of rows: zero where a rail hides the target or, if so asked, some of the past."""
+    if structure.rails is None:
+        return weights
+    if weights is not None and not callable(weights):
+        raise DataError("with rails, weights must be a function of an episode; pass one")
+    return partial(_weigh_episode, structure, weights)
+
+
+def _weigh_episode(
+    structure: Structure, weights: Callable[[Episode], ArrayLike] | None, episode: Episode
+) -> Float[np.ndarray, " T"]:
+    """Return the weights of an episode of points ζ."""
+    assert structure.rails is not None, "else no row is left out"
+    nx, signals = len(structure.terms), structure.signals
+    own = np.flatnonzero(signals < nx)
+    low, high = structure.rails[:, signals[own]]
+    railed = (episode.X[:, own] <= low) | (episode.X[:, own] >= high)
+    told = ~railed[1:, :nx].any(axis=1)
+    if structure.masked:
+        told &= ~railed[:-1].any(axis=1)
+    return told * (1.0 if weights is None else np.asarray(weights(episode), dtype=np.float64))
+
+
+def find_told_rows(
+    X: Float[np.ndarray, "T1 nx"], rails: Float[np.ndarray, "2 nx"], delays: int, masked: bool
+) -> Bool[np.ndarray, " T"]:
+    """Return the rows k whose target x_{k+1} no rail hides; if `masked`, those alone whose past has none either."""
+    railed = ((rails[0] >= X) | (rails[1] <= X)).any(axis=1)
+    told = ~railed[1:]
+    if masked:
+        for i in range(delays + 1):
+            told[i:] &= ~railed[: len(told) - i]
+    return told
 
 
 def solve_structure(structure: Structure, total: Moments) -> LinearPredictor | BilinearPredictor:
@@ -266,3 +318,14 @@ def _build_model(
         regression.embedding,
         compute_scale(regression, regression.lifting),
     )
+
+
+def check_rails(rails: ArrayLike, ny: int) -> Float[np.ndarray, "2 ny"]:
+    """Return the rails, one pair for each output."""
+    given = checks.array(rails, "rails", infinite=True)
+    if given.shape == (2,):
+        given = np.repeat(given[:, None], ny, axis=1)
+    found = checks.array(given, "rails", (2, ny), infinite=True)
+    if not (found[0] < found[1]).all():
+        raise DataError("rails must hold the least and the largest reading of each output, low below high")
+    return found
