@@ -90,3 +90,29 @@ def test_wrong_rails_are_refused_in_a_sentence():
         km.identify.narx(data, delays=1, degrees=1, rails=(0.8, 0.0))
     with pytest.raises(DataError, match="weights must be a function of an episode"):
         km.identify.narx(data, delays=1, degrees=1, rails=(-np.inf, 0.8), weights=[np.ones(200)])
+
+
+def test_an_extended_filter_of_a_bilinear_model_corrects_nothing_where_the_prediction_lies_beyond():
+    data = record(np.random.default_rng(3), noise=0.01)
+    found = search_structures(data, [1], [2], 5, rails=RAILS)
+    structure = next(one for one in found if one.rails is not None and one.size == 4)
+    model = fit_structure(structure, data)
+    assert isinstance(model, km.BilinearPredictor)
+    mpc = km.BilinearMPC(model, km.Cost(Q=1.0, R=1.0), None, 5, estimator=km.ExtendedKalman(noise=0.01))
+    observer = mpc.observer
+    observer.observe(np.array([0.7]), np.zeros(1), np.zeros(0))
+    for reading, beyond in ((0.8, True), (0.5, False)):
+        observer.z[:] = [1.1, 1.5, 1.0]
+        free = observer._model.advance(observer.z, np.array([1.5]), np.zeros(0), observer.d)
+        assert free[0] > 0.8
+        observer.observe(np.array([reading]), np.array([1.5]), np.zeros(0))
+        assert np.allclose(observer.z, free) is beyond
+
+
+def test_machine_code_of_a_sensor_that_saturates_is_refused_in_a_sentence(tmp_path):
+    delay = km.Delay(1, rails=RAILS).bind(("y",), ("u",))
+    model = km.edmd(record(np.random.default_rng(3)), km.State(), embedding=delay)
+    mpc = km.KoopmanMPC(model, km.Cost(Q=1.0, R=1.0), None, 5)
+    with pytest.raises(DataError, match="sensors that saturate, which C code does not know"):
+        km.export(mpc, tmp_path / "c")
+    assert not (tmp_path / "c").exists()
