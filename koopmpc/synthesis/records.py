@@ -15,7 +15,7 @@ from koopmpc.errors import KoopmpcError, hide_fit_warnings
 from koopmpc.identify.fits.refinement import refine
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.records.free_run import HELD, PIECE, ROWS
-from koopmpc.identify.records.hidden_structure import HiddenStructure
+from koopmpc.identify.records.hidden_structure import HiddenStructure, find_rails
 from koopmpc.identify.records.narx import DELAYS, FOLDS, choose_structure, is_worse, search_structures
 from koopmpc.identify.records.structure import EXACT, Structure, fit_structure
 from koopmpc.parallel import Progress
@@ -137,7 +137,8 @@ def propose_structures(
             progress(done, total)
 
     try:
-        found = search_structures(episodes, DELAYS if delays is None else delays, ask=ask)
+        tried = DELAYS if delays is None else delays
+        found = search_structures(episodes, tried, ask=ask, rails=find_rails(episodes))
     except KoopmpcError:  # too short for any delay
         return []
     kinds = (False, True) if bilinear else (False,)

@@ -10,6 +10,7 @@ from koopmpc.errors import DataError
 from koopmpc.identify.fits.refinement import MultiStepError, coefficients_of_states, cut_into_segments, rows_of_states
 from koopmpc.identify.records.narx import search_structures
 from koopmpc.identify.records.structure import find_told_rows, fit_structure
+from koopmpc.synthesis.records import propose_structures
 
 RAILS = np.array([[-np.inf], [0.8]])
 
@@ -116,3 +117,10 @@ def test_machine_code_of_a_sensor_that_saturates_is_refused_in_a_sentence(tmp_pa
     with pytest.raises(DataError, match="sensors that saturate, which C code does not know"):
         km.export(mpc, tmp_path / "c")
     assert not (tmp_path / "c").exists()
+
+
+def test_a_choice_of_models_tries_the_rails_of_a_sensor_that_rests_at_its_end():
+    found = propose_structures(record(np.random.default_rng(1), noise=0.01), [1], bilinear=True)
+    rails = [one.embedding.rails for one in found if one.embedding is not None and one.embedding.rails is not None]
+    assert rails
+    assert rails[0].tolist() == [[-np.inf], [0.8]]
