@@ -152,7 +152,8 @@ def _state_iterations(tables: Tables, figure: IterationBound | ObservedIteration
             'settings={"cold_start": True}'
         )
     tables.sizes |= {"MOST_ITERATIONS": figure.most, "ITERATIONS_PROVED": int(proved)}
-    tables.effort = f"Iterations of the QP solver: {figure}."
+    warm = "" if proved or tables.sizes.get("COLD_START", 0) else " Steps of this C start warm: that was not counted."
+    tables.effort = f"Iterations of the QP solver: {figure}.{warm}"
 
 
 def _write(path: Path, text: str) -> None:

@@ -56,8 +56,9 @@ class Cost(Value):
         positive definite.
     Q_N
         Terminal weight in place of the tail, of x_N − r_N if (nx, nx), of z_N − z_r if (nz, nz), where z_r is the
-        equilibrium that comes nearest to r_N. Or a Certificate: its V times the number that makes it fall by at least
-        the stage cost.
+        equilibrium that comes nearest to r_N. BilinearMPC and NonlinearMPC weigh of(x_N) − r_N, (nr, nr): for lifted
+        coordinates let the cost track the lifting. Or a Certificate: its V times the number that makes it fall by at
+        least the stage cost.
     of
         The tracked outputs as observables of the state; the references have as many columns. A controller on a
         lifted predictor finds them in its own lifting by name: any lifted coordinates may be tracked.

@@ -241,7 +241,7 @@ def bound_by_covering(
         )
     tree = cKDTree(points)
 
-    def measure(away: Float[np.ndarray, "k nxm"]) -> Float[np.ndarray, " k"]:
+    def measure(away: Float[np.ndarray, "... nxm"]) -> Float[np.ndarray, "..."]:
         return np.asarray(np.linalg.norm(away[..., :nx], axis=-1) + np.linalg.norm(away[..., nx:], axis=-1))
 
     near = np.asarray(tree.query(points, min(_NEAR, len(points)))[1])

@@ -52,7 +52,8 @@ class IterationBound(Value):
         """Return the bound, and of which steps it is."""
         which = "step" if self.every_step else "step that starts cold"
         seen = ", and one takes as many" if self.attained else ""
-        return f"proved: no {which} in the box takes more than {self.most} iterations{seen} ({self.ways} ways)"
+        end = "; all steps start cold" if self.every_step else ""
+        return f"proved: no {which} in the box takes more than {self.most} iterations{seen} ({self.ways} ways){end}"
 
 
 def bound_iterations(

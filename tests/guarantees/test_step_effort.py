@@ -106,11 +106,16 @@ def test_the_c_code_states_the_bound_and_keeps_it(tmp_path):
     cold = make_mpc(limits, horizon=2, settings={"cold_start": True})
     bound, box = km.guarantees.bound_iterations(cold, (-3, 3), (0, 0)), ((-3, 3), (0, 0))
     seen = km.guarantees.observe_iterations(warm, *box, samples=20)
-    for mpc, figure, words in ((cold, bound, "proved: no step"), (warm, seen, "observed, not proved")):
+    both = (
+        (cold, bound, "proved: no step", "all steps start cold"),
+        (warm, seen, "observed, not proved", "start warm"),
+    )
+    for mpc, figure, words, how in both:
         km.export(mpc, tmp_path / words[:3], reference=[0.0, 0.0], iterations=figure)
         header = (tmp_path / words[:3] / "koopmpc_sizes.h").read_text()
         assert f"#define KOOPMPC_MOST_ITERATIONS {figure.most}\n" in header
         assert words in header
+        assert how in header
         assert "koopmpc_set_bounds" not in header  # a note of the README alone
         assert words in (tmp_path / words[:3] / "README.md").read_text()
     with pytest.raises(km.errors.DataError, match="start warm"):

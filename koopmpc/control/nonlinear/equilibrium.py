@@ -491,7 +491,7 @@ class TerminalTargets:
     Raises
     ------
     ShapeError
-        Q_N weighs states, but the cost tracks something else.
+        Q_N weighs neither states nor what the cost tracks.
     """
 
     def __init__(self, model: LearnedMap, cost: Cost, outputs: StateTracking, most: int) -> None:
@@ -500,9 +500,19 @@ class TerminalTargets:
         self.equilibria = Equilibria(model, cost, outputs)
         self._end_weight = cast("ArrayLike | None", cost.Q_N)
         if self._end_weight is not None:
-            checks.weight(self._end_weight, "Q_N", model.ny)
-            if not self.equilibria.of_state:
-                raise ShapeError("Q_N weighs x_N − r_N, but the reference is not of the state; leave Q_N out")
+            nr = len(outputs.Q)
+            if not self.equilibria.of_state and np.shape(self._end_weight) != (nr, nr):
+                raise ShapeError(
+                    f"Q_N weighs x_N − r_N, but the reference is not of the state; pass ({nr}, {nr}) on what the cost"
+                    " tracks, or leave Q_N out"
+                )
+            shape = np.shape(self._end_weight)
+            if self.equilibria.of_state and shape and shape[0] != nr:
+                raise ShapeError(
+                    f"Q_N has shape {shape}, expected ({nr}, {nr}) of the tracked states; for lifted coordinates let"
+                    " the cost track the lifting of the model: of=model.lifting, with references as long"
+                )
+            checks.weight(self._end_weight, "Q_N", nr)
         self._known: dict[bytes, TerminalTarget] = {}
         self._inputs: dict[bytes, ReferenceInput] = {}
         self._found: dict[bytes, Equilibrium | None] = {}  # None where there is none
