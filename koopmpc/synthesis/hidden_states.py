@@ -1,5 +1,6 @@
 """Models of records with a hidden state: linear and polynomial ones, with rails and without, and neurons."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from time import perf_counter
 
@@ -39,7 +40,7 @@ def judge_hidden_states(
     bilinear: bool,
     rival: float = np.inf,
     *,
-    ran: FreeRun | None = None,
+    ran: Mapping[str, FreeRun] | None = None,
     short: int | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[LeaderboardRow, FreeRun]]:
@@ -50,7 +51,7 @@ def judge_hidden_states(
     neurons, with the rails if the best one before has them. With neurons the best one and the smallest of other orders
     are judged, if they are calm and err by a tenth less than all others; else the best one, if it errs by less than
     half more. Where records are too short for a kind, it is left out; so is a model that on the first stretches errs by
-    a tenth more than the best calm one so far.
+    a tenth more than the best calm one so far, and one that does not err a tenth less than the calm one of its kind.
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ def judge_hidden_states(
     bilinear
         Try polynomial ones, which are bilinear predictors.
     ran
-        How the best of the other models ran over the same stretches.
+        How the best other model of each kind ran over the same stretches.
     short
         Steps of the short forecasts that judge; `horizon` by default, whose errors the leaderboard shows.
     progress
@@ -73,11 +74,13 @@ def judge_hidden_states(
     found = search_hidden_states(measured, bilinear, rival, progress, near=NEAR)
     searched = (perf_counter() - begun) / max(len(found), 1)
     results: list[tuple[LeaderboardRow, FreeRun]] = []
+    calm = {kind: run for kind, run in (ran or {}).items() if run.calm}
     for structure in found:
-        others = [run for run in (ran, *(run for _, run in results)) if run is not None and run.calm]
+        others = [*calm.values(), *(run for _, run in results if run.calm)]
         best = min(others, key=lambda run: run.error, default=None)
+        beaten = calm.get("bilinear" if structure.is_nonlinear else "linear")
         try:
-            result = _judge(structure, measured, first, horizon, short or horizon, searched, best)
+            result = _judge(structure, measured, first, horizon, short or horizon, searched, best, beaten)
         except KoopmpcError:
             continue
         if result is not None:
@@ -175,8 +178,12 @@ def _judge(
     short: int,
     searched: float,
     rival: FreeRun | None,
+    beaten: FreeRun | None,
 ) -> tuple[LeaderboardRow, FreeRun] | None:
-    """Return the line of the leaderboard and the free runs of a structure; None where a rival does much better."""
+    """Return the line of the leaderboard and the free runs of a structure; None where a rival does much better.
+
+    `beaten` is as in `judge_free_run`.
+    """
     begun, models = perf_counter(), list[AnyPredictor]()
 
     def fit(episodes: Episodes) -> AnyPredictor:
@@ -185,7 +192,9 @@ def _judge(
         return models[-1]
 
     start = max(first, structure.delays)
-    run = judge_free_run(fit, measured, measured, start, short, relift=structure.is_nonlinear, rival=rival)
+    run = judge_free_run(
+        fit, measured, measured, start, short, relift=structure.is_nonlinear, rival=rival, beaten=beaten
+    )
     if len(models) <= FOLDS:
         return None
     run = replace(run, calm=run.calm and bool(run.errors.max() < LOST))

@@ -182,6 +182,7 @@ def judge_free_run(
     *,
     relift: bool,
     rival: FreeRun | None = None,
+    beaten: FreeRun | None = None,
 ) -> FreeRun:
     """Return how a fit does on each quarter of the records when it learns from the others.
 
@@ -202,6 +203,9 @@ def judge_free_run(
         Lift the forecasts at every step.
     rival
         How another model did on the same stretches.
+    beaten
+        How a model did that this one must beat by a tenth to be taken. Where it would have to halve those errors on the
+        quarters that are left, it is not fitted to them; nor to all rows where it did not.
     """
     seen, truth = cut_pieces(learned), cut_pieces(measured)
     scale = np.concatenate([episode.X for episode in truth]).std(axis=0)
@@ -212,8 +216,12 @@ def judge_free_run(
         kept = [e.cut(a, b) for e, (low, high) in zip(seen, spans, strict=True) for a, b in ((0, low), (high, len(e)))]
         model = fit(truth.with_episodes([e for e in kept if len(e) > first]))
         errors += _stretch_errors(model, truth, spans, scale, first, horizon, relift=relift)
-        if rival is not None and len(errors) > _HALVES and _is_behind(errors, rival.errors[: len(errors)]):
-            return FreeRun(np.array(errors + [_LOST] * (len(rival.errors) - len(errors))), False)
+        if len(errors) <= _HALVES:
+            continue
+        behind = rival is not None and _is_behind(errors, rival.errors[: len(errors)])
+        if behind or (beaten is not None and _must_halve(errors, beaten.errors)):
+            left = _HALVES * FOLDS - len(errors) if rival is None else len(rival.errors) - len(errors)
+            return FreeRun(np.array(errors + [_LOST] * left), False)
     return FreeRun(np.array(errors), _is_calm(fit(seen), truth, first, relift))
 
 
@@ -221,6 +229,13 @@ def _is_behind(errors: Sequence[float], than: Float[np.ndarray, " blocks"]) -> b
     """Return whether errors are far larger on each of their quarters that have rows behind `first`."""
     own, others = (np.log(np.maximum(e, EXACT)).reshape(-1, _HALVES).mean(axis=1) for e in (errors, than))
     return bool((own > others + np.log(_BEHIND)).all())
+
+
+def _must_halve(errors: Sequence[float], than: Float[np.ndarray, " blocks"]) -> bool:
+    """Return whether errors so far leave only errors of half of `than` on the other blocks, if all shall pay."""
+    done = len(errors)
+    gap = np.sum(np.log(np.maximum(errors, EXACT)) - np.log(np.maximum(than[:done], EXACT)))
+    return bool(len(than) * np.log(_PAYS) - gap < -(len(than) - done) * np.log(2))
 
 
 def run_structure(structure: Structure, measured: Episodes, first: int, horizon: int) -> FreeRun:

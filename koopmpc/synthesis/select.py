@@ -285,8 +285,7 @@ def select(
         sparse = {one.kind: one.structure for one in given if isinstance(one.structure, Structure)}
         rival = min((one.error for one in sparse.values()), default=np.inf)
         runs = {kind: run_structure(one, measured[1], first, nearer) for kind, one in sparse.items()}
-        best = min((run for run in runs.values() if run.calm), key=lambda run: run.error, default=None)
-        ran = judge_hidden_states(measured[1], first, ahead, both, rival, ran=best, short=nearer, progress=told)
+        ran = judge_hidden_states(measured[1], first, ahead, both, rival, ran=runs, short=nearer, progress=told)
         told = report_stage(progress, "free runs")
         rows, chosen, found = judge_finalists(rows, held, measured[1], first, nearer, runs, told, ran)
         if held is not measured[1] and (rows[chosen].rough or rows[chosen].structure is not None):

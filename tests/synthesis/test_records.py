@@ -213,10 +213,10 @@ def test_hidden_states_far_behind_the_best_calm_polynomial_are_left_out():
 
     def names(errors, calm):
         ran = FreeRun(np.full(8, errors), calm)
-        return [row.name for row, _ in judge_hidden_states(data, 2, 10, False, ran=ran)]
+        return [row.name for row, _ in judge_hidden_states(data, 2, 10, False, ran={"linear": ran})]
 
     both = ["hidden state of order 2, subspace", "hidden state of order 2, simulation error"]
-    assert names(0.2, calm=True) == both
+    assert names(2.0, calm=True) == both
     assert names(1e-4, calm=False) == both
     assert names(1e-4, calm=True) == []
 

@@ -179,7 +179,7 @@ def _rename_columns(table: LogTable, told: TableSettings, where: str) -> LogTabl
             first = ", ".join(f"{table.columns[name][0]:g}" for name in table.names[:4])
             raise LogError(
                 f"{where} has no line of names: its first row is {first}; write one above it, or pass columns= with "
-                f"{count} names, or inputs= with the numbers of the columns that are inputs, 1 to {count}"
+                f"{count} names a,b,… or inputs= with the numbers of the columns that are inputs, 1 to {count}"
             )
         return table
     return table.renamed(told.rename(table.names, where))
