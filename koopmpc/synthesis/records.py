@@ -232,7 +232,7 @@ def _is_behind(errors: Sequence[float], than: Float[np.ndarray, " blocks"]) -> b
 
 
 def _must_halve(errors: Sequence[float], than: Float[np.ndarray, " blocks"]) -> bool:
-    """Return whether errors so far leave only errors of half of `than` on the other blocks, if all shall pay."""
+    """Return whether the other blocks must have less than half the errors `than`, for the mean to be low enough."""
     done = len(errors)
     gap = np.sum(np.log(np.maximum(errors, EXACT)) - np.log(np.maximum(than[:done], EXACT)))
     return bool(len(than) * np.log(_PAYS) - gap < -(len(than) - done) * np.log(2))

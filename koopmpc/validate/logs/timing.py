@@ -15,7 +15,7 @@ apart. Four tests look for feedback:
 4. The law of a PD or PID controller predicts u_{k+1} as well as y_{k+1} and all the past do. The set points are white
    or constant, and the plant's gain does not tell that this controller would drive the output away.
 
-In the first two, a feedback of one output that would drive it away is none: no controller does that.
+In the first two, a feedback of one output that would drive it away does not count: no controller does that.
 
 References
 ----------
