@@ -198,7 +198,7 @@ def test_a_quarter_before_the_first_row_of_a_free_run_judges_no_model():
     np.testing.assert_array_equal(beside.errors, alone.errors)
 
 
-@pytest.mark.parametrize(("rails", "factor"), [([[-0.5], [0.5]], 1.0), (None, 3.0)])
+@pytest.mark.parametrize(("rails", "factor"), [(np.array([[-0.5], [0.5]]), 1.0), (None, 3.0)])
 def test_one_long_forecast_in_the_compiled_map_is_that_of_the_numpy_loop(rails, factor):
     data = oscillator(rows=800)
     model = km.bilinear_edmd(data, km.State() + km.Monomials(3), embedding=km.Delay(2, rails=rails))
