@@ -173,6 +173,25 @@ def test_a_run_repeats_to_the_bit_after_reset_and_in_a_copy() -> None:
         assert np.array_equal(first, run(other))
 
 
+def test_copies_go_on_to_the_bit_where_w_multiplies_and_a_disturbance_is_estimated(monkeypatch) -> None:
+    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)
+    x, u, w = ca.SX.sym("x", 2), ca.SX.sym("u", 1), ca.SX.sym("w", 1)
+    first = 0.9 * x[0] + 0.2 * x[1] + 0.1 * u[0] * x[1] + 0.2 * w[0] * x[0] + 0.1 * w[0]
+    F = ca.vertcat(first, 0.8 * x[1] + 0.4 * u[0] + 0.3 * w[0] * u[0])
+    plant = km.StepMap(ca.Function("F", [x, u, w], [F]), 0.1)
+    cost, estimator = km.Cost(Q=[1, 0.5], R=0.3), km.LiftedDisturbance()
+    mpc = km.BilinearMPC(plant, cost, km.Limits(u_min=-1, u_max=1), 4, estimator=estimator)
+    rng, y = np.random.default_rng(0), np.array([0.4, -0.3])
+    rows = 0.5 * rng.standard_normal((4, 2))
+    for k in range(12):
+        W, r = np.array([0.5 * np.sin(k // 3)]), rows[k // 2 % 4]
+        twins = [copy.copy(mpc), pickle.loads(pickle.dumps(mpc))] if k % 4 == 1 else []
+        u_k = mpc(y, r, w=W).u
+        for twin in twins:
+            assert np.array_equal(twin(y, r, w=W).u, u_k)
+        y = np.asarray(plant(y, u_k, W)).ravel() + 0.03 * rng.standard_normal(2)
+
+
 def test_two_in_two_threads_do_not_disturb_each_other() -> None:
     limits, plant = km.Limits(-0.8, 0.5, x_max=[np.inf, 0.5]), pendulum().step_map()
 

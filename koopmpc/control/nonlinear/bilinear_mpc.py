@@ -61,7 +61,11 @@ _COPIED = (
     "_row",
     "_X",
     "_U",
-)  # what a copy takes over, with the plan
+    "_reference",
+    "_target",
+    "_scheduled_for",
+)  # what a copy takes over, with the plan and the targets
+_AIMED = ("_preview", "_targets")  # the same, once a step had a reference
 
 
 class BilinearMPC(StagedMPC):
@@ -264,6 +268,8 @@ class BilinearMPC(StagedMPC):
             monitor=None if self._watch is None else self._watch.monitor,
         )
         held = {name: getattr(self, name) for name in _COPIED}
+        held |= {name: self.__dict__[name] for name in _AIMED if name in self.__dict__}
+        held["terminal"] = self._terminal.memory()
         iteration = self._iteration
         held["levels"] = self._levels
         held["ahead"] = None if self._keeper is None else self._keeper.ahead
@@ -271,7 +277,7 @@ class BilinearMPC(StagedMPC):
         return build, (self.model, self.cost, self.limits, self._N), held
 
     def __setstate__(self, held: dict[str, Any]) -> None:
-        """Go on where the original was; the next step searches its targets again."""
+        """Go on where the original was."""
         iteration = self._iteration
         iteration.X[:], iteration.U[:], iteration.e[:] = held.pop("plan")
         levels: LevelSearch | None = held.pop("levels")
@@ -281,8 +287,8 @@ class BilinearMPC(StagedMPC):
         if levels is not None:
             self._levels, self._held = levels, levels.held
             self._on_levels = StageLevels(levels, self._problem)
+        self._terminal.remember(held.pop("terminal"))
         self.__dict__.update(held)
-        self._forget_targets()
 
     def update(self, model: ModelOrMap) -> None:
         """Go on with new A, B, N, C and E of the same lifting: the plan and the last input are kept.

@@ -51,6 +51,8 @@ _STARTS = 12  # guesses of an equilibrium where the reference is not of the stat
 _MISSED = 1e-6  # share of ‖r‖²_Q that a good equilibrium may leave
 _FAR = 3.0  # standard deviations from the mean of the data, beyond which another equilibrium is looked for
 _MOST = 10_000  # terminal targets kept in memory; it is cleared beyond
+# what a copy takes over
+_MEMORY = ("_known", "_inputs", "_found", "_missed", "_last", "_w", "_still", "_end")
 
 
 class Equilibrium(NamedTuple):
@@ -534,6 +536,16 @@ class TerminalTargets:
         end = np.zeros((nr, nr)) if Q_N is None else checks.root(checks.weight(Q_N, "Q_N", nr))
         R, R_delta = (weight * np.outer(su, su) / scale for weight in (o.R, changes))
         return TailProgram(self._cost.tail or 0, size, scale, o.Q * np.outer(size, size) / scale, R, R_delta, end)
+
+    def memory(self) -> dict[str, Any]:
+        """Return what was found until now, for a copy."""
+        return {name: getattr(self, name) for name in _MEMORY}
+
+    def remember(self, memory: dict[str, Any]) -> None:
+        """Go on with what another one of the same model had found."""
+        self.__dict__.update(memory)
+        if self._w.any():
+            self.equilibria.update(self._map.at(self._w))
 
     def is_missed(self, row: Float[np.ndarray, " nr"]) -> bool:
         """Return whether no equilibrium was found for a row that was asked for."""
