@@ -3,6 +3,7 @@
 
 import shutil
 import weakref
+from collections import deque
 from collections.abc import Mapping, Sequence
 from ctypes import c_double, c_uint
 from pathlib import Path
@@ -29,6 +30,9 @@ from koopmpc.plants.fmu_files import (
 from koopmpc.scene import Scene
 
 _ROUNDING = 1e-9  # share by which the state after a reset may differ from x0
+# FMPy knows one logger for all units of FMI 2 in a process, the last one, and calls it also after its unit was freed.
+_HEARD = deque[str](maxlen=10)  # what units said last
+_LOGGERS: dict[int, Any] = {}  # the last logger of each version of FMI, so that it stays in memory
 
 
 def fmu(
@@ -180,8 +184,7 @@ class FMUPlant:
         given = [values.get(each.name, each.start) for each in own]
         self.x0 = np.array(given, dtype=np.float64)
         self._unit, self._values, self._own, self._measured = unit, values, own, measured
-        self._messages: list[str] = []  # the unit's last ones
-        self._slave: Any = _load(unit, self._messages)
+        self._slave: Any = _load(unit)
         weakref.finalize(self, _free, self._slave)
         self._is_fresh, self._has_run, self._steps, self.ended = True, False, 0, "not started"
         # One call reads outputs and states: their references in one array, the values in another.
@@ -266,7 +269,7 @@ class FMUPlant:
     def _refused(self, what: str, error: Exception) -> DataError:
         """Return the error that says what the unit refused, with its own last message; only a reset helps then."""
         self.ended = "it refused a step"
-        said = f", and said: {self._messages[-1]}" if self._messages else ""
+        said = f", and said: {_HEARD[-1]}" if _HEARD else ""
         return DataError(
             f"{self._unit.file} refused {what}: {error}{said}; try another dt, or inputs inside u_min … u_max"
         )
@@ -285,7 +288,7 @@ class FMUPlant:
         if not self._is_fresh:
             slave.reset()
         self._is_fresh = False
-        self._messages.clear()
+        _HEARD.clear()
         if is_two:
             slave.setupExperiment(startTime=0.0)
         values: dict[str, StartValue] = dict(self._values)
@@ -306,25 +309,26 @@ def _reload(path: str, *parts: Any) -> FMUPlant:
     return FMUPlant(read_description(path, "co-simulation"), *parts)
 
 
-def _load(unit: UnitDescription, messages: list[str]) -> Any:
+def _load(unit: UnitDescription) -> Any:
     """Return an instance of a co-simulation unit in FMPy; its machine code is unpacked into a temporary folder."""
     fmpy = import_fmpy()
     folder = str(make_temporary_folder())
-
-    def log(*parts: Any) -> None:
-        text = parts[-1].decode(errors="replace") if isinstance(parts[-1], bytes) else ""
-        if text:
-            messages[:] = [*messages[-9:], text]
-
     try:
         fmpy.extract(str(unit.path), folder)
-        slave = fmpy.instantiate_fmu(folder, unit.source, "CoSimulation", logger=log)
+        slave = fmpy.instantiate_fmu(folder, unit.source, "CoSimulation", logger=_log)
     except Exception as error:  # FMPy raises bare Exceptions
         shutil.rmtree(folder, ignore_errors=True)
-        said = f", and said: {messages[-1]}" if messages else ""
+        said = f", and said: {_HEARD[-1]}" if _HEARD else ""
         raise LogError(f"{unit.file} could not be loaded: {error}{said}") from error
-    messages.clear()
+    _LOGGERS[unit.version] = getattr(slave, "callbacks", None)
+    _HEARD.clear()
     return slave
+
+
+def _log(*parts: Any) -> None:
+    """Keep what a unit says."""
+    if isinstance(parts[-1], bytes) and parts[-1]:
+        _HEARD.append(parts[-1].decode(errors="replace"))
 
 
 def _free(slave: Any) -> None:

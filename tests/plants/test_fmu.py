@@ -295,6 +295,30 @@ assert any(name.startswith("koopmpc-") for name in os.listdir(tempfile.gettempdi
 """
 
 
+TALKING = """
+import gc, sys
+import koopmpc as km
+
+first, second = (km.plants.fmu(sys.argv[1], dt=0.3, interface="co-simulation") for _ in range(2))
+if sys.argv[2] == "freed":
+    del second
+    gc.collect()
+for plant in (first, first):
+    plant.reset(None)
+    try:
+        plant.step([0.0])
+    except km.KoopmpcError as error:
+        print(error)
+"""
+
+
+@pytest.mark.parametrize("other", ["freed", "alive"])
+def test_a_unit_speaks_for_itself_after_another_one_was_loaded(other, pendulum):
+    done = subprocess.run([sys.executable, "-c", TALKING, str(pendulum), other], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("and said: at most 0.2 s") == 2
+
+
 def test_processes_with_units_leave_no_files_behind(pendulum, tmp_path):
     places = [tmp_path / "here", tmp_path / "temporary"]
     for place in places:
