@@ -8,6 +8,7 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episode
 from koopmpc.errors import DataError
 from koopmpc.identify.records.conversion import is_hidden
+from koopmpc.predict.hidden_state import HiddenState
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 _ITERATIONS = 20  # Gauss-Newton steps, at most
@@ -74,7 +75,7 @@ def estimate_start(
     if model.nw:
         raise DataError("the model has measured disturbances, of which its past holds none; fit it without them")
     rows = checks.array(X, "X", (None, model.nx), finite=False)
-    moves = checks.array(U, "U", (len(rows) - 1, model.nu))
+    moves = checks.array(U, "U", (max(len(rows) - 1, 0), model.nu))
     whole = np.flatnonzero(np.isfinite(rows).all(axis=1))
     if not len(whole):
         raise DataError("no row of X is whole, so nothing tells where the record begins; pass one that is")
@@ -82,20 +83,22 @@ def estimate_start(
     size = np.ones(model.nx) if model.scale is None else np.linalg.norm(model.scale @ model.C.T, axis=0)
     size = np.where(size > 0, size, 1.0)
     noise = _KNOWN * size if model.report is None else np.maximum(model.report.residual, _EXACT * size)
-    usual, spread = first, size
+    usual, spread, reach = first, size, size
     if model.embedding is not None:
         past = model.embedding.steps
         usual = model.embedding.repeat(first, before)
-        spread = np.abs(model.embedding.spread(size, np.abs(moves).max(axis=0, initial=1.0)))
+        spread = reach = np.abs(model.embedding.spread(size, np.abs(moves).max(axis=0, initial=1.0)))
         if past < len(rows) and np.isfinite(rows[: past + 1]).all():
             usual = model.start(rows[past], Episode(X=rows[: past + 1], U=moves[:past]))
-            spread = np.minimum(model.embedding.spread(noise, np.zeros(model.nu)), _ENCODED)
+            spread = model.embedding.spread(noise, np.zeros(model.nu))
+            if isinstance(model.embedding, HiddenState):
+                spread[model.nx :] = _ENCODED
             rows, moves = rows[past:], moves[past:]
     course: _LinearCourse | _PointCourse
     if isinstance(model, LinearPredictor) and is_hidden(model):
-        course = _LinearCourse(model, usual, spread)
+        course = _LinearCourse(model, usual, spread, reach)
     else:
-        course = _PointCourse(model, usual, spread)
+        course = _PointCourse(model, usual, spread, reach)
 
     def explain(
         w: Float[np.ndarray, " n"],
@@ -143,9 +146,10 @@ class _PointCourse:
         model: LinearPredictor | BilinearPredictor,
         usual: Float[np.ndarray, " npoint"],
         spread: Float[np.ndarray, " npoint"],
+        reach: Float[np.ndarray, " npoint"],
     ) -> None:
         self._plant, n = model.step_map(), len(usual)
-        self.mean, self.factor, self.reach = usual, np.diag(spread), np.maximum(spread, 1.0)
+        self.mean, self.factor, self.reach = usual, np.diag(spread), np.maximum(reach, 1.0)
         self.C: Float[np.ndarray, "nx n"] = np.eye(model.nx, n)
         self.c: Float[np.ndarray, " nx"] = np.zeros(model.nx)
 
@@ -169,7 +173,11 @@ class _LinearCourse:
     """z⁺ = A z + B u + b of a linear model with a hidden state z = T ζ, lifted once as KoopmanMPC does."""
 
     def __init__(
-        self, model: LinearPredictor, usual: Float[np.ndarray, " nzeta"], spread: Float[np.ndarray, " nzeta"]
+        self,
+        model: LinearPredictor,
+        usual: Float[np.ndarray, " nzeta"],
+        spread: Float[np.ndarray, " nzeta"],
+        reach: Float[np.ndarray, " nzeta"],
     ) -> None:
         n = model.nz - 1
         assert model.embedding is not None, "z is a function of the past"
@@ -181,7 +189,8 @@ class _LinearCourse:
         self.mean = self._T @ usual + zero
         U, S, _ = np.linalg.svd(self._weighed, full_matrices=False)
         self.factor = U * S
-        self.C, self.c, self.reach = model.C[:, :n], model.C[:, n], np.maximum(np.linalg.norm(self.factor, axis=1), 1.0)
+        self.C, self.c = model.C[:, :n], model.C[:, n]
+        self.reach: Float[np.ndarray, " n"] = np.maximum(np.linalg.norm(self._T * reach, axis=1), 1.0)
         self._zero, self._spread = zero, spread
 
     def advance(self, v: Float[np.ndarray, " n"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " n"]:

@@ -98,8 +98,8 @@ def _invert(square: Float[np.ndarray, "m n n"]) -> Float[np.ndarray, "m n n"]:
     return np.linalg.inv(weighed)
 
 
-def shoot(model: HiddenModel, fitted: Sets, judged: Sets, iterations: int, noise: float = 0.0) -> HiddenModel:
-    """Return the model with E, H and V of least error from free starts, and the T that gives these starts best.
+def shoot(model: HiddenModel, fitted: Sets, judged: Sets, iterations: int) -> tuple[HiddenModel, int]:
+    """Return the model with E, H and V of least error from free starts, and T that gives these best; and its iteration.
 
     Where no step lowers the error of the judged segments, from free starts too, it is the model itself.
     """
@@ -107,17 +107,17 @@ def shoot(model: HiddenModel, fitted: Sets, judged: Sets, iterations: int, noise
     free = np.delete(np.arange(model.parameters.size), np.arange(first, first + model.T.size))
     theta, steps = minimise(error, model.parameters, fitted, judged, iterations, free=free)
     if not steps:
-        return model
+        return model, 0
     found = model.with_parameters(theta)
     zeta = np.vstack([np.hstack([part.points, np.ones((len(part.points), 1))]) for part in fitted])
     z = np.vstack([error.begin(found, part) for part in fitted])
     gap = z - zeta @ found.T.T
-    ridge = np.sqrt(len(zeta)) * np.append(np.full(zeta.shape[1] - 1, max(noise, _LEAST)), 0.0)
+    ridge = np.sqrt(len(zeta)) * np.append(np.full(zeta.shape[1] - 1, _LEAST), 0.0)
     rows, target = np.vstack([zeta, np.diag(ridge)]), np.vstack([gap, np.zeros((len(ridge), z.shape[1]))])
     turn = np.linalg.lstsq(rows, target, rcond=None)[0]
     theta = theta.copy()
     theta[first : first + model.T.size] += turn.T.ravel()
-    return model.with_parameters(theta)
+    return model.with_parameters(theta), steps
 
 
 def _errors_of(model: HiddenModel, z: Float[np.ndarray, "m n"], data: RecordSegments) -> Float[np.ndarray, " m"]:

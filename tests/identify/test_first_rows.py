@@ -49,11 +49,24 @@ def test_a_hidden_state_with_polynomials_begins_with_four_rows():
     assert errors[1] < 0.5 * errors[0]
 
 
+@pytest.mark.parametrize("fit", [km.identify.subspace, km.identify.narx], ids=["subspace", "narx"])
+def test_units_of_an_output_change_no_start(fit):
+    rng = np.random.default_rng(4)
+    (e,), starts = record_of(linear_plant(rng, 2), rng, steps=300, noise=0.05), []
+    for unit in (1.0, 1e6, 1e-6):
+        data = km.Episodes([km.Episode(X=unit * e.X, U=e.U)], 0.1)
+        model = fit(data, delays=3, **({"degrees": 1} if fit is km.identify.narx else {}))
+        starts.append(km.identify.estimate_start(model, unit * e.X[100:110], e.U[100:109])[0] / unit)
+    assert starts[1:] == pytest.approx([starts[0]] * 2, rel=1e-6)
+
+
 def test_what_tells_no_start_is_refused_in_a_sentence():
     rng = np.random.default_rng(0)
     data = record_of(linear_plant(rng, 2), rng, steps=200)
     model = km.identify.subspace(data, 2, delays=3)
     with pytest.raises(DataError, match="no row of X is whole"):
         km.identify.estimate_start(model, [[np.nan], [np.nan]], [[0.0]])
+    with pytest.raises(DataError, match="no row of X is whole"):
+        km.identify.estimate_start(model, np.zeros((0, 1)), np.zeros((0, 1)))
     with pytest.raises(ShapeError, match="U has shape"):
         km.identify.estimate_start(model, [[0.0], [0.0]], [[0.0], [0.0]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.fits.refinement import MultiStepError, coefficients_of_states, cut_into_segments, rows_of_states
 from koopmpc.identify.records.narx import search_structures
 from koopmpc.identify.records.structure import find_told_rows, fit_structure
@@ -91,6 +91,8 @@ def test_wrong_rails_are_refused_in_a_sentence():
         km.identify.narx(data, delays=1, degrees=1, rails=(0.8, 0.0))
     with pytest.raises(DataError, match="weights must be a function of an episode"):
         km.identify.narx(data, delays=1, degrees=1, rails=(-np.inf, 0.8), weights=[np.ones(200)])
+    with pytest.raises(ShapeError, match="the weight of episode 0 has shape"):
+        km.identify.narx(data, delays=1, degrees=1, rails=(-np.inf, 0.8), weights=lambda e: np.ones(3))
 
 
 def test_an_extended_filter_of_a_bilinear_model_corrects_nothing_where_the_prediction_lies_beyond():

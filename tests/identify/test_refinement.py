@@ -157,10 +157,16 @@ def test_what_cannot_be_refined_is_refused_in_a_sentence():
         [km.Episode(X=e.X, U=e.U, W=np.zeros((len(e), 1)) + rng.standard_normal((len(e), 1))) for e in data],
         data.dt, data.states, data.inputs, ["w"],
     )  # fmt: skip
-    with pytest.raises(
-        KoopmpcError, match="1 measured disturbances, w, and the episodes hold 0; give each Episode its W"
-    ):
+    with pytest.raises(KoopmpcError, match=r"the episodes have disturbances \(\), the predictor has \(w\)"):
         km.identify.refine(km.edmd(watched, km.State()), data, horizon=5)
+    driven, (X, U) = km.edmd(data, km.State()), (data[0].X, data[0].U)
+    for other, said in (
+        (km.Episodes([km.Episode(X=X, U=U)], 2 * data.dt, data.states, data.inputs), "have dt"),
+        (km.Episodes([km.Episode(X=X, U=U)], data.dt, data.states, ["other"]), "have inputs"),
+    ):
+        for learned, held_out in ((other, None), (data, other)):
+            with pytest.raises(KoopmpcError, match=said):
+                km.identify.refine(driven, learned, horizon=5, held_out=held_out)
     with pytest.raises(KoopmpcError, match="horizon"):
         km.identify.refine(model, data, horizon=0)
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from koopmpc import checks
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.errors import DataError
 from koopmpc.identify.free_starts import shoot
 from koopmpc.identify.levenberg_marquardt import minimise
 from koopmpc.identify.records.conversion import SignalUnits, cut_segments, from_standard, is_hidden, to_standard
@@ -175,9 +175,9 @@ def refine(
     Raises
     ------
     DataError
-        The episodes are too short for one segment in each part; C does not pick the states from ψ.
+        The episodes are too short for one segment in each part, or have another dt; C does not pick the states from ψ.
     ShapeError
-        The episodes have other states or inputs, or another number of measured disturbances than the model.
+        The episodes have other states, inputs or measured disturbances than the model.
 
     References
     ----------
@@ -197,20 +197,16 @@ def refine(
     """
     checks.kind(model, "model", (LinearPredictor, BilinearPredictor), "pass what a fit returns")
     horizon, iterations = checks.count(horizon, "horizon"), checks.count(iterations, "iterations")
+    whole = episodes_of(episodes)
+    for part in (whole, whole if held_out is None else episodes_of(held_out)):
+        check_same_names(model, part)
     if is_hidden(model):
-        return _refine_hidden(model, episodes_of(episodes), horizon, held_out, iterations, free_starts)
+        return _refine_hidden(model, whole, horizon, held_out, iterations, free_starts)
     if free_starts:
         raise DataError(
             "free_starts is for models with a hidden state; this model begins at measured rows: leave it out"
         )
     places = rows_of_states(model)
-    whole = episodes_of(episodes)
-    for part in (whole, whole if held_out is None else episodes_of(held_out)):
-        if part.nw < model.nw:
-            raise ShapeError(
-                f"the model has {model.nw} measured disturbances, {', '.join(model.disturbances)}, and the episodes "
-                f"hold {part.nw}; give each Episode its W"
-            )
     learn, unseen = split_ends(whole) if held_out is None else (list(whole), list(episodes_of(held_out)))
     size = np.concatenate([episode.X for episode in learn]).std(axis=0)
     size = np.where(size > 0, size, 1.0)
@@ -242,7 +238,6 @@ def _refine_hidden(
     free_starts: bool,
 ) -> LinearPredictor | BilinearPredictor:
     """Refine the dynamics, the output and the encoder of a hidden state on forecasts of `horizon` steps."""
-    check_same_names(model, episodes)
     assert model.embedding is not None, "a hidden state begins with past rows"
     parts = split_ends(episodes) if held_out is None else (list(episodes), list(episodes_of(held_out)))
     learn, unseen = (episodes.with_episodes(part) for part in parts)
@@ -256,10 +251,10 @@ def _refine_hidden(
     theta, steps = minimise(error, start.parameters, fitted, judged, iterations)
     before, after = error.evaluate(start.parameters, judged), error.evaluate(theta, judged)
     if free_starts:
-        shot = shoot(start, fitted, judged, iterations)
+        shot, first = shoot(start, fitted, judged, iterations)
         other, more = minimise(error, shot.parameters, fitted, judged, iterations)
         if (other_error := error.evaluate(other, judged)) < after:
-            theta, steps, after = other, more, other_error
+            theta, steps, after = other, first + more, other_error
     if not after < before:
         return model
     report = model.report

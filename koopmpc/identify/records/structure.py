@@ -206,7 +206,8 @@ def _weigh_episode(
     told = ~railed[1:, :nx].any(axis=1)
     if structure.masked:
         told &= ~railed[:-1].any(axis=1)
-    return told * (1.0 if weights is None else np.asarray(weights(episode), dtype=np.float64))
+    given = np.ones(()) if weights is None else np.asarray(weights(episode), dtype=np.float64)
+    return told * given if given.shape in {(), told.shape} else given  # moments refuse another shape
 
 
 def find_told_rows(
