@@ -20,7 +20,14 @@ from koopmpc.validate.bands import BandCoverage, ConformalBand, conformal, cut_r
 from koopmpc.validate.memory import Memory, find_hidden_state
 from koopmpc.validate.residuals import Invariance, ResidualDMD, compute_moments, measure_eigenpairs, measure_invariance
 from koopmpc.validate.scoring import AnyPredictor, Score, score
-from koopmpc.validate.sufficiency import Coverage, Persistency, coverage, explain_inputs, persistency
+from koopmpc.validate.sufficiency import (
+    Coverage,
+    Persistency,
+    coverage,
+    explain_beyond_past,
+    explain_inputs,
+    persistency,
+)
 from koopmpc.values import Value
 
 _MOST_ORDER = 20  # test persistency of excitation up to this order
@@ -32,7 +39,8 @@ _OVERFIT = 2.0  # above this ratio of held-out to training error, a model is ove
 _UNSEEN = 0.05  # above this share of held-out samples in cells without training data, the report asks for care
 _FORGOTTEN = 1e-9  # an eigenvalue below this belongs to observables whose next values the model does not forecast
 _NOTABLE_GROWTH = 2.0  # mention a spurious eigenfunction that grows by more than this factor over the horizon
-_FEEDBACK = 0.9  # if ψ(x) explains a larger share of an input's energy, the input counts as feedback
+_FEEDBACK = 0.9  # if ψ(x) explains a larger share of an input's energy, the input counts as feedback …
+_BEYOND = 0.1  # … unless it explains a smaller share than this of what the input's own past leaves open
 _EPISODES = 36  # with so many `koopmpc fit` has a band of 90 %: a third is held out, and 9 of these calibrate
 _MOST_NAMES = 3  # list at most this many names in one sentence
 
@@ -73,8 +81,8 @@ class TrustReport(Value):
     coverage
         Bins and cells that the training episodes visited; without training episodes, those of the held-out episodes.
     persistency, feedback
-        Excitation of the inputs, and the share of them that ψ(x) explains, on the same episodes as `coverage`; None
-        without inputs.
+        Excitation of the inputs, and the share of them that ψ(x) explains, of slow inputs the share of what their own
+        past leaves open; on the same episodes as `coverage`. None without inputs.
     band
         Conformal band of the held-out episodes.
     train_score, unseen
@@ -197,7 +205,8 @@ def trust(
     - an observable's own one-step error is above 10 % (the dictionary is not invariant);
     - the errors on held-out episodes are more than twice those on the training episodes;
     - more than 5 % of the held-out samples lie in cells without training data;
-    - the inputs do not excite to order 2, or ψ(x) explains more than 90 % of an input (feedback);
+    - the inputs do not excite to order 2, or ψ(x) explains more than 90 % of an input (feedback), and
+      more than a tenth of what the two rows before leave open;
     - past rows tell what the present one does not, so that a state is hidden, and the model does not see them;
     - the conformal band is infinite because there are too few episodes;
     - closed-loop forecasts stay in the band significantly less often than its level.
@@ -271,7 +280,7 @@ def trust(
         invariance=measure_invariance(total),
         coverage=covered,
         persistency=persistency(driven, order) if driven.nu else None,
-        feedback=explain_inputs(judged_total) if driven.nu else None,
+        feedback=_find_feedback(predictor, judged, explain_inputs(judged_total)) if driven.nu else None,
         band=band,
         train_score=None if train is None else score(predictor, train, horizon, relift=relift),
         unseen=None if train is None else _unseen_share(covered, held_out),
@@ -282,6 +291,18 @@ def trust(
         inputs=total.inputs,
         memory=find_hidden_state(judged) if predictor.embedding is None else None,
     )
+
+
+def _find_feedback(
+    predictor: AnyPredictor, episodes: Episodes, shares: Float[np.ndarray, " nu"]
+) -> Float[np.ndarray, " nu"]:
+    """Return the shares of inputs that ψ explains; of slow ones the share of what their own past leaves open."""
+    nu = predictor.nu
+    if not (shares[:nu] > _FEEDBACK).any():
+        return shares
+    beyond = explain_beyond_past(episodes, predictor)
+    slow = (shares[:nu] > _FEEDBACK) & (beyond < _BEYOND)
+    return np.append(np.where(slow, beyond, shares[:nu]), shares[nu:])
 
 
 def _constant_predictor(predictor: AnyPredictor) -> LinearPredictor:

@@ -15,7 +15,7 @@ from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.moments.moments import Moments, both_sides
-from koopmpc.identify.solve import column_norms, orthonormal_basis, scale_to_unit_norm
+from koopmpc.identify.solve import column_norms, orthonormal_basis, project_onto, scale_to_unit_norm
 from koopmpc.lifting.base import Lifting
 from koopmpc.text import with_unit
 from koopmpc.validate.residuals import compute_moments
@@ -27,6 +27,8 @@ _MOST_BINS = 10  # default number of bins of a coordinate, if the data are enoug
 _CELL_SAMPLES = 10  # the default number of bins leaves on average this many samples in a cell of a pair
 _MOST_PAIRED = 40  # count cells of pairs up to this number of coordinates
 _BLOCK_WINDOWS = 4096  # windows of the inputs in one block
+_MOST_ROWS = 20_000  # rows on which outputs and past inputs are compared
+_EXACT = 1e-9  # share of an input's energy below which its past determines it
 _NOTABLE = 0.05  # report an empty rectangle if its share of the pair's box is at least this
 
 
@@ -395,6 +397,28 @@ def explain_inputs(total: Moments) -> Float[np.ndarray, " nu"]:
     varies = variation > cut * column_norms(U)
     rest = np.divide(unexplained**2, variation**2, out=1.0 * moves, where=varies)
     return 1.0 - rest
+
+
+def explain_beyond_past(episodes: Episodes, predictor: AnyPredictor) -> Float[np.ndarray, " nu"]:
+    """Return for each input the share R² that ψ explains of what its two rows before, and those of others, leave open.
+
+    A slow input is no feedback: outputs that answer to it tell no more of the next row than its own past does. At 1
+    where the past leaves less than a billionth, as a wave and an exact law do.
+    """
+    before, psi, u = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    for episode in predictor.embed(episodes):
+        U = episode.U[:_MOST_ROWS]
+        before.append(np.hstack([U[1:-1], U[:-2], np.ones((max(len(U) - 2, 0), 1))]))
+        psi.append(predictor.lifting(episode.X[2 : len(U)]))
+        u.append(U[2:])
+        if sum(map(len, u)) >= _MOST_ROWS:
+            break
+    past, targets = np.concatenate(before), np.concatenate(u)
+    left = column_norms(targets - project_onto(past, targets))
+    both = np.hstack([past, np.concatenate(psi)])
+    rest = column_norms(targets - project_onto(both, targets))
+    varies = left > np.sqrt(_EXACT) * column_norms(targets - targets.mean(axis=0))
+    return np.where(varies, 1.0 - (rest / np.where(varies, left, 1.0)) ** 2, 1.0)
 
 
 def _name_past_inputs(total: Moments) -> set[str]:

@@ -193,6 +193,21 @@ def test_feedback_and_weak_inputs_ask_for_care(data) -> None:
         assert any(expected in finding.says for finding in findings)
 
 
+def test_a_slow_input_that_outputs_follow_is_no_feedback() -> None:
+    """Steps of an open loop last until the outputs have settled, so that outputs tell the input as well as its past."""
+    rng = np.random.default_rng(5)
+    for gain in (0.0, 1.0):
+        steps, X = np.repeat(rng.uniform(-1, 1, 24), 50)[:, None], np.zeros((1201, 1))
+        U = steps.copy()
+        for k in range(1200):
+            U[k] = steps[k] if not gain else 0.1 * steps[k] - X[k]
+            X[k + 1] = 0.5 * X[k] + 0.5 * U[k] + 0.5 * gain * rng.standard_normal()
+        record = km.Episodes([km.Episode(X=X, U=U)], 0.1)
+        report = km.trust(km.edmd(record, km.State() + km.Constant()), record, 5)
+        assert km.validate.feedback_share(record, km.State() + km.Constant())[0] > 0.9
+        assert any("feedback" in finding.says for finding in report.findings) == bool(gain)
+
+
 def test_closed_loop_coverage_is_shown_beside_the_promise(data) -> None:
     train, held_out = data
     model = km.edmd(train, km.State())
