@@ -244,7 +244,7 @@ def kind(value: object, name: str, wanted: type | tuple[type, ...], advice: str)
     """Raise where `value` is of another class than `wanted`."""
     if not isinstance(value, wanted):
         classes = wanted if isinstance(wanted, tuple) else (wanted,)
-        names = " or ".join(_article(each.__name__) for each in classes)
+        names = " or ".join(dict.fromkeys(_article(each.__name__) for each in classes))  # NumPy has a bool, too
         raise DataError(f"{name} is {article(value)}, expected {names}; {advice}")
 
 

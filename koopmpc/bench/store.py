@@ -25,7 +25,7 @@ import numpy as np
 from koopmpc import disk
 from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import LogError, ProblemError
-from koopmpc.loop.metrics import Metrics, tracking_error
+from koopmpc.loop.metrics import Metrics, tracking_error, weigh_error
 from koopmpc.loop.run import Run
 from koopmpc.parallel import is_orphan
 from koopmpc.values import checksum
@@ -115,9 +115,7 @@ def reached(run: Run) -> bool:
 
     A run that starts on its reference is measured against its largest error.
     """
-    error = tracking_error(run)
-    Q = np.eye(error.shape[1]) if run.cost is None else run.cost.matrices(error.shape[1], run.U.shape[1])[0]
-    weighted = np.sqrt(np.einsum("ki,ij,kj->k", error, Q, error))
+    weighted = weigh_error(run, tracking_error(run))
     scale = weighted[0] if weighted[0] > 0 else weighted.max()
     last = weighted[-max(1, len(weighted) // 10) :]
     return bool((last <= REACHED * scale).all() and np.isfinite(last).all())

@@ -169,7 +169,7 @@ def metrics(run: Run) -> Metrics:
         violation_share=float(violation_shares(run).max()),
         input_violation=0.0 if run.limits is None else _input_violation(run.U, run.limits),
         effort=float((run.U**2).sum() * run.dt),
-        settling_time=_settling_time(stage, run.dt),
+        settling_time=_settling_time(weigh_error(run, error), run.dt),
         solve_time_p50=float(p50),
         solve_time_p99=float(p99),
         solve_time_max=float(run.solve_time.max()),
@@ -259,6 +259,12 @@ def tracking_error(run: Run) -> Float[np.ndarray, "T1 nr"]:
             j = names.index(run.states[i])
             error[:, j] = np.pi - np.mod(np.pi - error[:, j], 2 * np.pi)
     return error
+
+
+def weigh_error(run: Run, error: Float[np.ndarray, "T1 nr"]) -> Float[np.ndarray, " T1"]:
+    """Return ‖error_k‖_Q without prices and weights in time; Q = I where there is no Cost."""
+    Q = np.eye(error.shape[1]) if run.cost is None else run.cost.matrices(error.shape[1], run.U.shape[1])[0]
+    return np.sqrt(np.einsum("ki,ij,kj->k", error, Q, error))
 
 
 def _states(run: Run) -> Float[np.ndarray, "T1 nx"]:
@@ -361,11 +367,11 @@ def _counts(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
 
 
-def _settling_time(stage: Float[np.ndarray, " T1"], dt: float) -> float:
-    """Return the time after which √stage stays below 2 % of its first value; NaN where that is 0 and it never does."""
-    outside = np.flatnonzero(~(np.sqrt(stage) <= SETTLED * np.sqrt(stage[0])))
+def _settling_time(size: Float[np.ndarray, " T1"], dt: float) -> float:
+    """Return the time after which `size` stays below 2 % of its first value; NaN where that is 0 and it never does."""
+    outside = np.flatnonzero(~(size <= SETTLED * size[0]))
     if not outside.size:
         return 0.0
-    if outside[-1] == len(stage) - 1:
-        return float("nan" if stage[0] == 0 else "inf")
+    if outside[-1] == len(size) - 1:
+        return float("nan" if size[0] == 0 else "inf")
     return float((outside[-1] + 1) * dt)

@@ -111,10 +111,9 @@ def paced(seed: int, folder: Path) -> None:
         x0 = [rng.uniform(-1, 1), 0.0]
         plant = km.plants.SimulatedPlant(PLANT)
         done = km.realtime(controller, plant, dt=PLANT.dt, reference=[0, 0], steps=5, x0=x0, recorder=recorder)
-    logged = km.load_run(
-        folder / "paced.rrd"
-    ).steps  # on a busy machine steps are skipped, and the log holds their rows
-    assert done.steps <= logged <= 5, f"{done.steps} steps, {logged} rows"
+    logged = km.load_run(folder / "paced.rrd").steps
+    # On a busy machine steps are skipped. The log holds those before the last step, too, and at times some after it.
+    assert done.steps <= logged <= done.steps + done.skipped, f"{done}: {logged} rows"
 
 
 def designed(seed: int, _: Path) -> None:

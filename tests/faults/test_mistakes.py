@@ -429,3 +429,8 @@ def test_things_of_another_kind_for_rows_solver_instruments_and_smooth_are_named
         km.identify.instrumental_edmd(data, km.State(), 1j)
     with pytest.raises(km.errors.DataError, match="smooth is a list"):
         km.select(data, candidates=[km.State()], smooth=[])
+
+
+def test_a_switch_that_is_no_bool_is_refused_by_one_name_of_a_bool():
+    with pytest.raises(km.errors.DataError, match="feedthrough is an int, expected a bool; pass True or False"):
+        km.ExtendedKalman(feedthrough=1)

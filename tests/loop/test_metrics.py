@@ -127,6 +127,15 @@ def test_a_run_settles_after_the_last_step_outside_two_percent(errors, settled):
     )
 
 
+@pytest.mark.parametrize("more", [{"output_price": [0.5, 0]}, {"Q_rows": [[0.0, 1.0], [1.0, 1.0]]}])
+def test_prices_and_weights_in_time_do_not_move_the_settling_time(more):
+    X = np.column_stack([[-1, -0.5, 0.019, 0.01, 0], np.zeros(5)])
+    run = replace(
+        random_run(np.random.default_rng(2), T=4), X=X, reference=np.zeros((5, 2)), cost=km.Cost(1, 1, **more)
+    )
+    assert km.metrics(run).settling_time == pytest.approx(0.2)
+
+
 def test_without_a_cost_there_is_none_and_measurements_stand_in_for_a_hidden_state():
     rng = np.random.default_rng(3)
     run = random_run(rng)
