@@ -127,7 +127,7 @@ show(lambda: km.bilinear_edmd(X, km.State()))
     assert lines == [
         "DataError episode 0 is a ndarray; pass Episode(X=…, U=…)",
         "DataError episodes is a ndarray; pass a list of Episode(X=…, U=…)",
-        "DataError episodes is a Episode; pass a list of Episode(X=…, U=…)",
+        "DataError episodes is an Episode; pass a list of Episode(X=…, U=…)",
         "DataError fraction holds 1 NaN or inf, the first at (); remove or repair them first",
         "DataError fraction is not an array of numbers: got str, numbers cannot be None or text;"
         " pass numbers of one shape",

@@ -6,15 +6,20 @@ import sys
 
 import pytest
 
+from koopmpc.control.solvers import SOLVERS
 from koopmpc.data.files import formats
 from tests.docs.page import DOCS
 
 
 @pytest.fixture(autouse=True)
-def formats_of_pages(monkeypatch):
-    """Forget the formats that the blocks of a page register: other tests of the process would meet them."""
+def registries_of_pages(monkeypatch):
+    """Forget what the blocks of a page register: other tests of the process would meet it."""
     formats.list_suffixes()  # the library's own are registered now
     monkeypatch.setattr(formats, "_FORMATS", dict(formats._FORMATS))
+    solvers = dict(SOLVERS)
+    yield
+    SOLVERS.clear()
+    SOLVERS.update(solvers)
 
 
 @pytest.fixture(scope="session")
