@@ -37,6 +37,7 @@ from koopmpc.lazy import find_public
 
 Array = NDArray[Any]
 Arrays = dict[str, Array]
+LINE = 8  # floats in a line of the cache
 
 
 @runtime_checkable

@@ -29,7 +29,7 @@ from koopmpc.estimate.observer import (
 )
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.values import Value, Viewing
+from koopmpc.values import LINE, Value, Viewing
 
 _Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 
@@ -258,7 +258,7 @@ class MPCBase(Published):
             self._latency,
             with_rates=self._with_rates,
             estimated=estimator is not None,
-            room=0 if stagewise else (N + 1) * len(tracking.Q),
+            room=0 if stagewise else (N + 1) * len(tracking.Q) + LINE,
         )
         levels = self.limits.base.input_levels(self.nu)
         self._held = None if levels is None else HeldLevels(levels)

