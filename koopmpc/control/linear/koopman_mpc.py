@@ -606,10 +606,12 @@ class KoopmanMPC(MPCBase):
 
     def _add_given(self, t: Float[np.ndarray, " nt"]) -> None:
         """Add the share of the rows of a given u_target that belong to this step, and go on to the next one."""
-        plan, given = self._map, self._map.given
+        plan, k = self._map, self._given_row
+        given, n = plan.given, plan.planned
         assert given is not None, "the caller knows"
-        t[: plan.planned] += given.at(self._given_row + self._latency)
-        self._given_row += 1
+        planned = t if n == len(t) else t[:n]
+        planned += given.at(k + self._latency)  # `t[:n] +=` would copy the sum onto itself
+        self._given_row = k + 1
 
     def _aim(self) -> None:
         """Write the part of the plan that depends on the reference into the last column of the plan's matrix.

@@ -171,7 +171,8 @@ class GivenShares:
 
     def at(self, k: int) -> Float[np.ndarray, " nv"]:
         """Return the share of the preview that begins with row k."""
-        k = min(k, self.last)
+        if k > self.last:
+            k = self.last
         if self._table is not None:
             return self._table[k]
         N = len(self._rows) - self.last - 1

@@ -1,7 +1,7 @@
 """LimitWindows: limits in time as the right-hand sides of a PlanMap; matrices, sizes and slack weights stay."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,14 +18,18 @@ from koopmpc.control.linear.plan import PlanMap
 from koopmpc.control.target import ROUNDING
 from koopmpc.control.terminal.inclusion import measure_reach, require_inside
 from koopmpc.control.terminal.sets import EndRows
+from koopmpc.values import Viewing
 
+_Row = tuple[Float[np.ndarray, " nt"], Float[np.ndarray, " nt"]]  # lower and upper limits of a step
 _PAGE = 2**14  # entries of limits that are made at once: more cost a step more than 0.1 ms
 _SHARE = 1e-5  # a rate that gives way by more of its allowance than this is reported
 
 
 @dataclass(eq=False)
-class _Pages:
+class _Pages(Viewing):
     """The limits of a map of the plan in consecutive steps, a page of them at a time: a step takes one row.
+
+    A row holds until the next page is made.
 
     Attributes
     ----------
@@ -37,30 +41,44 @@ class _Pages:
         Where the outputs of all stages stand among the limits, and what moves them inwards.
     """
 
+    _VIEWS = ("rows", "views", "low", "high")
+
     table: Float[np.ndarray, "rows W2"]
     entries: Int[np.ndarray, " n"]
     latency: int
     last: int
     outputs: slice
     margin: Float[np.ndarray, " outputs"] | None
-    rows: dict[int, tuple[Float[np.ndarray, " nt"], Float[np.ndarray, " nt"]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._see()
+
+    def _see(self) -> None:
+        """Begin without a page; see `Viewing`."""
+        self.rows: dict[int, _Row] = {}
+        self.views: list[_Row] = []
+        self.low: Float[np.ndarray, "steps nt"] = self.table[:0]
+        self.high: Float[np.ndarray, "steps nt"] = self.low
 
     def turn(self, target: PlanMap | MovingMap | None, k: int) -> None:
         """Put the limits of step k into a map."""
         assert target is not None, "a map that is not there is never asked"
         target.low, target.high = self.rows.get(k) or self.fill(k)
 
-    def fill(self, k: int) -> tuple[Float[np.ndarray, " nt"], Float[np.ndarray, " nt"]]:
+    def fill(self, k: int) -> _Row:
         """Make the page that begins with step k, and return its first row."""
         steps = min(max(1, _PAGE // max(len(self.entries), 1)), self.last + 1 - k)
         half, span, (stride, _) = len(self.entries) // 2, int(self.entries.max(initial=0)) + 1, self.table.strides
         ahead = np.ndarray((steps, span), np.float64, self.table, (k + self.latency) * stride, (stride, 8))
-        low, high = (np.ascontiguousarray(ahead[:, part]) for part in (self.entries[:half], self.entries[half:]))
+        if len(self.views) != steps:  # else the arrays of the last page are filled again
+            self.low, self.high = np.empty((2, steps, half))
+            self.views = list(zip(self.low, self.high, strict=True))  # quick to take
+        self.low[:], self.high[:] = ahead[:, self.entries[:half]], ahead[:, self.entries[half:]]
         if self.margin is not None:
-            low[:, self.outputs] += self.margin
-            high[:, self.outputs] -= self.margin
-        self.rows = dict(zip(range(k, k + steps), zip(low, high, strict=True), strict=True))  # views: quick to take
-        return self.rows[k]
+            self.low[:, self.outputs] += self.margin
+            self.high[:, self.outputs] -= self.margin
+        self.rows = dict(zip(range(k, k + steps), self.views, strict=True))
+        return self.views[0]
 
 
 @dataclass(frozen=True, eq=False)
