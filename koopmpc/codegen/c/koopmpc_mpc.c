@@ -33,7 +33,7 @@ static const koopmpc_real *given_row(const koopmpc_state *s, int k) {
 }
 #endif
 
-#if KOOPMPC_AIMED
+#if KOOPMPC_AIMED && (!KOOPMPC_CHECKED_LIMITS || KOOPMPC_CHECKED > 0)
 /** Coordinates of the nearest target of row k inside its limits; 1 if a limit moved it. */
 static int target_of_row(koopmpc_state *s, int k, const koopmpc_real *e, koopmpc_real *alpha) {
   const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
