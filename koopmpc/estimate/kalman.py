@@ -86,14 +86,14 @@ class Augmented:
 
     def hold_input(self) -> None:
         """Append u_{k−1}, which acts on y after `read_before`, to s."""
-        nu, extent, nz = self.predictor.nu, len(self.F), len(self.one)
+        nu, nz = self.predictor.nu, len(self.one)
         D = self.rows @ self.G
         self.F = scipy.linalg.block_diag(self.F, np.zeros((nu, nu)))
         self.G = np.vstack([self.G, np.eye(nu)])
         self.f, self.M = np.append(self.f, np.zeros(nu)), np.hstack([self.M, D])
         self.rows = np.hstack([self.rows, np.zeros((len(D), nu))])
         self.to_z, self.to_d = (np.hstack([part, np.zeros((nz, nu))]) for part in (self.to_z, self.to_d))
-        self.held = len(self.F) - extent
+        self.held = nu
 
 
 FilterModel = tuple[Augmented, Float[np.ndarray, "n n"], Float[np.ndarray, "ny ny"]]
