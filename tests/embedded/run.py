@@ -1,4 +1,6 @@
-"""`make embedded`: the float controllers of three problems, and a BilinearMPC, on an emulated Cortex-M4F, beside the same C on this machine.
+"""`make embedded`: float controllers on an emulated Cortex-M4F, beside the same C on this machine.
+
+They are those of three problems, a BilinearMPC, and the cart-pole of LinearMPC.jl's benchmark.
 
 It needs the Debian packages gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm, and says so where one is missing.
 """
@@ -14,9 +16,11 @@ from pathlib import Path
 import numpy as np
 
 import koopmpc as km
+from tests.speed.test_codegen import cart_pole
 
 HERE = Path(__file__).parent
 PROBLEMS = ("pendulum:upright", "cart_pole", "pendulum_swing", "pendulum_swing bilinear")
+HORIZONS = (50, 125)  # of LinearMPC.jl's cart-pole
 STEPS, CLOSE = 200, 1e-3
 TOOLS = {
     "arm-none-eabi-gcc": "gcc-arm-none-eabi and libnewlib-arm-none-eabi",
@@ -44,6 +48,9 @@ def main() -> int:
     for name in PROBLEMS:
         with tempfile.TemporaryDirectory() as folder:
             failed |= not shown(name, exported(name, Path(folder)))
+    for N in HORIZONS:
+        with tempfile.TemporaryDirectory() as folder:
+            failed |= not shown(f"LinearMPC.jl's, N {N}", exported_benchmark(N, Path(folder)))
     return int(failed)
 
 
@@ -62,6 +69,15 @@ def exported(name: str, folder: Path) -> Path:
     return km.export(
         controller, folder / "c", precision="float", plant=parts.step_map, x0=case.x0, reference=row, steps=STEPS
     )
+
+
+def exported_benchmark(N: int, folder: Path) -> Path:
+    """Export the cart-pole of LinearMPC.jl's benchmark in single precision, from 0.2 rad to a set point 1 m away."""
+    model, plant = cart_pole()
+    cost, end = km.Cost(Q=[1.44, 0, 1, 0], R=0.0, R_delta=0.01, tail=0), np.array([np.inf, np.inf, 0.3, np.inf])
+    controller = km.KoopmanMPC(model, cost, km.Limits(-2, 2, x_min=-end, x_max=end, slack=(0.0, 1e3)), N)
+    x0, row = [0.0, 0.0, 0.2, 0.0], [1.0, 0.0, 0.0, 0.0]
+    return km.export(controller, folder / "c", precision="float", plant=plant, x0=x0, reference=row, steps=STEPS)
 
 
 def shown(name: str, folder: Path) -> bool:

@@ -5,7 +5,11 @@ import time
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
+from glob import glob
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -227,8 +231,31 @@ def test_edmd_over_a_plain_gram_that_lifts_each_row_once(benchmark, observables:
     told(benchmark)
 
 
+def scan_by_pyarrow(files: str) -> None:
+    """Read all batches."""
+    dataset: Any = import_module("pyarrow.dataset")
+    for _ in dataset.dataset(sorted(glob(files))).to_batches():
+        pass
+
+
+def scan_by_duckdb(files: str) -> None:
+    """Sum all columns."""
+    duckdb: Any = import_module("duckdb")
+    duckdb.sql("SET threads = 1")
+    duckdb.sql(f"SELECT sum(COLUMNS(*)) FROM '{files}'").fetchall()
+
+
+def scan_by_polars(files: str) -> None:
+    """Sum all columns."""
+    polars: Any = import_module("polars")
+    polars.scan_parquet(files).sum().collect()
+
+
+SCANS = {"pyarrow": scan_by_pyarrow, "duckdb": scan_by_duckdb, "polars": scan_by_polars}
+
+
 def test_rows_a_second_from_parquet_files(benchmark, tmp_path: Path) -> None:
-    """34 observables of three states, from files, beside the lifting and the Gram matrix of rows in memory."""
+    """34 observables of three states, from files, beside Gram matrices of rows in memory and scans of the same files."""
     rng, parts = np.random.default_rng(0), 4
     for i in range(parts):
         episodes = [km.Episode(X=rng.uniform(-1, 1, (10_001, 3)), U=rng.uniform(-1, 1, (10_000, 1))) for _ in range(25)]
@@ -249,6 +276,16 @@ def test_rows_a_second_from_parquet_files(benchmark, tmp_path: Path) -> None:
 
     benchmark.pedantic(both, rounds=3, warmup_rounds=1)
     ours, plain = np.median(pairs, axis=0)
+    every = str(tmp_path / "*.parquet")
+    for name, scan in SCANS.items():
+        if find_spec(name) is None:
+            continue
+        spent: list[float] = []
+        for _ in range(4):
+            start = time.process_time()
+            scan(every)
+            spent.append(time.process_time() - start)
+        benchmark.extra_info[f"{name} [rows/s]"] = round(parts * sum(map(len, episodes)) / float(np.median(spent[1:])))
     benchmark.extra_info |= {
         "from files [rows/s]": round(float(ours)),
         "numpy, in memory [rows/s]": round(float(plain)),
