@@ -5,7 +5,6 @@ import time
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
-from glob import glob
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -231,21 +230,21 @@ def test_edmd_over_a_plain_gram_that_lifts_each_row_once(benchmark, observables:
     told(benchmark)
 
 
-def scan_by_pyarrow(files: str) -> None:
+def scan_by_pyarrow(files: list[Path]) -> None:
     """Read all batches."""
     dataset: Any = import_module("pyarrow.dataset")
-    for _ in dataset.dataset(sorted(glob(files))).to_batches():
+    for _ in dataset.dataset([str(file) for file in files]).to_batches():
         pass
 
 
-def scan_by_duckdb(files: str) -> None:
+def scan_by_duckdb(files: list[Path]) -> None:
     """Sum all columns."""
     duckdb: Any = import_module("duckdb")
     duckdb.sql("SET threads = 1")
-    duckdb.sql(f"SELECT sum(COLUMNS(*)) FROM '{files}'").fetchall()
+    duckdb.sql(f"SELECT sum(COLUMNS(*)) FROM read_parquet({[str(file) for file in files]})").fetchall()
 
 
-def scan_by_polars(files: str) -> None:
+def scan_by_polars(files: list[Path]) -> None:
     """Sum all columns."""
     polars: Any = import_module("polars")
     polars.scan_parquet(files).sum().collect()
@@ -276,7 +275,7 @@ def test_rows_a_second_from_parquet_files(benchmark, tmp_path: Path) -> None:
 
     benchmark.pedantic(both, rounds=3, warmup_rounds=1)
     ours, plain = np.median(pairs, axis=0)
-    every = str(tmp_path / "*.parquet")
+    every = sorted(tmp_path.glob("*.parquet"))
     for name, scan in SCANS.items():
         if find_spec(name) is None:
             continue
