@@ -100,6 +100,8 @@ class TrustReport(Value):
     memory
         What past rows tell beyond the present one, on the same episodes as `coverage`; None for a model that sees past
         rows or has a hidden state.
+    divisible
+        True if a held-out episode has room for two forecasts, each with the model's past.
     """
 
     score: Score
@@ -119,6 +121,7 @@ class TrustReport(Value):
     dt: float
     inputs: tuple[str, ...]
     memory: Memory | None = None
+    divisible: bool = True
 
     @property
     def error(self) -> Float[np.ndarray, "horizon nx"]:
@@ -268,6 +271,7 @@ def trust(
     total = compute_moments(held_out, predictor)
     judged = held_out if train is None else episodes_of(train)
     low, high = _find_range(held_out)
+    past = 0 if predictor.embedding is None else predictor.embedding.steps
     covered = coverage(judged) if train is None else coverage(judged, low=low, high=high)
     judged_total = total if train is None else compute_moments(train, predictor)
     driven = judged if isinstance(predictor, BilinearPredictor) and not predictor.nw else judged.driven()
@@ -290,6 +294,7 @@ def trust(
         dt=predictor.dt,
         inputs=total.inputs,
         memory=find_hidden_state(judged) if predictor.embedding is None else None,
+        divisible=max(map(len, held_out)) >= 2 * (horizon + past),
     )
 
 
@@ -429,10 +434,15 @@ def _check_band(report: TrustReport) -> Iterator[tuple[str, str]]:
         yield "forecasts overflow", "look at the spectrum of A"
     else:
         reason = f"there are {band.episodes} calibration episodes, at least {band.needed} are needed"
+        more = (
+            f"record more episodes, or cut long files into several: `koopmpc fit` holds out enough of {_EPISODES} in "
+            "all for a level of 90 %"
+            if report.divisible
+            else f"record more rows, or judge fewer than {report.score.horizon} steps ahead"
+        )
         yield (
             f"there is no band at {to_percent(band.level)}: {reason}",
-            f"record more episodes, or cut long files into several: `koopmpc fit` holds out enough of {_EPISODES} in "
-            "all for a level of 90 %; in Python hold out more by hand, or pass a lower level=",
+            f"{more}; in Python hold out more by hand, or pass a lower level=",
         )
 
 

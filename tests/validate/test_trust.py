@@ -232,6 +232,10 @@ def test_few_episodes_give_no_band_and_it_says_so(data) -> None:
     higher = km.trust(km.edmd(train, LIFTING), held_out[:4], HORIZON, level=0.95)  # of 76 in all fit holds out 15
     (found,) = [f for f in higher.findings if "3 calibration episodes, at least 19 are needed" in f.says]
     assert "36 in all for a level of 90 %" in found.do
+    record = held_out.with_episodes([held_out[0]])
+    blocks = km.trust(km.edmd(train, LIFTING), record, len(held_out[0]) // 3)  # too short to be cut once more
+    (found,) = [f for f in blocks.findings if "calibration episodes" in f.says]
+    assert found.do.startswith(f"record more rows, or judge fewer than {len(held_out[0]) // 3} steps ahead; in Python")
 
 
 def test_a_model_that_diverges_gets_a_report_too(data) -> None:
