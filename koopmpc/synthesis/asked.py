@@ -25,6 +25,7 @@ MOVING = 120  # steps of a run with a moving reference, at least: three short ho
 LONGEST = 120  # steps of a run that is as long as a loop takes to settle, at most
 STARTS = 12  # default number of starts: one for each condition of a design
 _FEW = 4  # if at least this many first states are inside the limits, only those are used
+_ROWS = 400  # rows along a few records from which random starts are drawn, at most
 ROOM = 0.5  # a run may leave the data by this share of their range
 SETTLED = 0.1  # a loop has settled where its error is below this share of its first error
 TRIED = 400  # steps of the trial loop
@@ -46,7 +47,7 @@ class DesignTask(Value):
         (n, nx) states from which runs begin.
     first_states
         (m, nx) first states of all episodes, or only those inside the limits if there are enough; random starts are
-        drawn from them.
+        drawn from them. Three records or fewer have too few of them: rows all along the records stand beside them.
     steps
         Length of a run: three horizons, and as many steps as a linear loop on the data takes to settle from the
         starts, at most 120; at least 120 where the reference moves; or all its steps.
@@ -57,6 +58,8 @@ class DesignTask(Value):
     limit_sizes
         (nx + ny,) size of each limited row, in which violations are measured: the distance of its two limits, or the
         range of the data.
+    along
+        Whether random starts are rows along a few records, with the past that they had there.
     """
 
     cost: Cost
@@ -70,6 +73,7 @@ class DesignTask(Value):
     low: Float[np.ndarray, " nx"]
     high: Float[np.ndarray, " nx"]
     limit_sizes: Float[np.ndarray, " nl"]
+    along: bool = False
 
     @property
     def moves(self) -> bool:
@@ -147,7 +151,7 @@ def check_task(
         raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
     X = np.concatenate([episode.X for episode in data])
     low, high = X.min(axis=0), X.max(axis=0)
-    firsts = _first_states(data, limits)
+    firsts, along = _first_states(data, limits), starts is None and len(data) < _FEW
     if starts is None:
         points = _choose_spread(firsts)
     else:
@@ -171,12 +175,13 @@ def check_task(
         horizon=horizon,
         reference=rows,
         starts=points,
-        first_states=firsts,
+        first_states=np.vstack([firsts, _rows_along(data, limits)]) if along else firsts,
         steps=min(steps, max(len(rows) - 1, 1)),
         angles=tuple(angles),
         low=low,
         high=high,
         limit_sizes=sizes,
+        along=along,
     )
 
 
@@ -402,6 +407,14 @@ def _first_states(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
     low, high = limits.states(data.nx)
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
     return inside if len(inside) >= _FEW else points
+
+
+def _rows_along(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
+    """Return states spread evenly over all steps of the episodes, those inside the limits."""
+    rows = np.concatenate([episode.X for episode in data])
+    low, high = limits.states(data.nx)
+    inside = rows[((rows >= low) & (rows <= high)).all(axis=1)]
+    return inside[:: -(-len(inside) // _ROWS) or 1]
 
 
 def _choose_spread(points: Float[np.ndarray, "n nx"]) -> Float[np.ndarray, "m nx"]:

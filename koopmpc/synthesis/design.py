@@ -62,7 +62,7 @@ from koopmpc.synthesis.feedback import remove_feedback, require_episodes
 from koopmpc.synthesis.fresh.abreast import explain_python, speed_up
 from koopmpc.synthesis.fresh.conditions import FOLDS, prepare_test
 from koopmpc.synthesis.fresh.coverage import check_coverage, keep_limits
-from koopmpc.synthesis.fresh.drawn import LoopPool
+from koopmpc.synthesis.fresh.drawn import KEPT, LoopPool
 from koopmpc.synthesis.fresh.horizon import choose_horizon
 from koopmpc.synthesis.fresh.loops import (
     choose_finalist,
@@ -105,6 +105,8 @@ _GAINS = (None, 0.05)  # gains of the estimators: the default, and one for noisy
 GAINED = 0.01  # another end of the horizon is tried on further models if it costs this share less
 MANY = 600  # fresh loops of a controller in machine code
 FEW = 60  # fresh loops of one in Python
+ALONG = "first rows of {count} records are few: fresh loops start at rows all along them, with the past they had there"
+RARELY = 0.01  # share of the fresh loops above which violated limits are advice
 WORRY = 0.05  # a bound of lost loops above this is advice
 _KEPT = 6000  # steps of the data that a saved design keeps, to compare new logs with
 
@@ -159,6 +161,7 @@ def design(
        can keep these for 40 more steps with nine tenths of the inputs. That stays if the same loops prefer it.
     9. Fresh loops: the controller runs from starts that took no part in the choice, on nearest neighbours of the data
        and on the surrogates. They give the interval and the bounds of `expected`, and say where it is outside the data.
+       Of three records or fewer they start at rows all along them, with the past of these rows.
 
     The choice depends only on the data and `rng`, never on time or on the number of workers.
 
@@ -392,6 +395,8 @@ def design(
             why = explain_python(controller)
             notes = (*notes, f"{few} fresh loops ran in place of {MANY}, for {why}; loops={MANY} takes longer")
         fresh = run_fresh_loops(drawn_from, fast, count, draw)
+        if asked.along:
+            notes = (*notes, ALONG.format(count=len(held)))
         blind = [*describe_outside(test.episodes, asked, fresh), *blind, *wide]
         blind += compare_longer_horizon(drawn_from, rows[best].recipe, controller, fast, draw)
     controller.reset()
@@ -623,6 +628,20 @@ def _summarise_expected(test: LoopTest, outcome: Outcome) -> ExpectedLoop:
     )
 
 
+def _describe_violation(row: DesignRow, expected: ExpectedLoop) -> str:
+    """Return by how much limits are violated, by fresh loops of the returned controller if any ran; "" if little."""
+    if expected.fresh is None:
+        return "" if row.violation <= KEPT else f"{to_percent(row.violation)} of their range"
+    known = expected.fresh.violation[np.isfinite(expected.fresh.violation)]
+    broken = int(np.sum(known > KEPT))
+    if broken <= RARELY * len(known):
+        return ""
+    return (
+        f"{to_percent(float(known.max()))} of their range, in {broken} of {len(expected.fresh.violation)} fresh loops "
+        f"by more than {to_percent(KEPT)}"
+    )
+
+
 def _give_advice(rows: Sequence[DesignRow], best: int, linear: int | None, expected: ExpectedLoop) -> list[str]:
     """Return sentences on what limits the closed loop, and which data would help."""
     said: list[str] = []
@@ -643,10 +662,9 @@ def _give_advice(rows: Sequence[DesignRow], best: int, linear: int | None, expec
     known = expected.cost[np.isfinite(expected.cost)]
     if not known.size:
         said.append("every run with inputs as in the data was lost: trust no controller of these data")
-    if row.violation > 0.01:
+    if (over := _describe_violation(row, expected)) != "":
         said.append(
-            f"limits are violated by up to {to_percent(row.violation)} of their range; collect data near the limits, "
-            "or ask for limits further inside"
+            f"limits are violated by up to {over}; collect data near the limits, or ask for limits further inside"
         )
     if row.worst > 2 and not expected.lost:
         said.append(

@@ -341,7 +341,7 @@ def run_on_surrogate(
     surrogate: Surrogate | NeighbourMap,
     plant: Transition,
     controller: Controller,
-    x0: Float[np.ndarray, " nx"],
+    x0: Float[np.ndarray, " n"],
     *,
     box: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
     reference: Float[np.ndarray, "rows nr"],

@@ -76,10 +76,11 @@ class Surrogate(Value):
         h = ca.Function("h", [x], [x[: model.nx]])
         return StepMap(F, model.dt, h, model.point_names, model.inputs, model.states)
 
-    def start(self, x0: Float[np.ndarray, " nx"]) -> Float[np.ndarray, " n"]:
-        """Return the state of the plant, its past included, after a rest at x0."""
+    def start(self, x0: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
+        """Return the state of the plant, its past included, after a rest at x0; x0 itself if it includes its past."""
         embedding = self.model.embedding
-        return x0 if embedding is None else embedding.repeat(x0, self.middle)
+        same = embedding is None or len(x0) == len(self.model.point_names)
+        return x0 if same or embedding is None else embedding.repeat(x0, self.middle)
 
     def holding(self, cost: Cost, limits: Limits, gain: float = 1.0) -> "Holding":
         """Return the search for equilibria of this plant."""

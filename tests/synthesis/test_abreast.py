@@ -14,7 +14,7 @@ from koopmpc.synthesis.fresh.abreast import speed_up
 from koopmpc.synthesis.fresh.acting import Acting
 from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool
 from koopmpc.synthesis.fresh.loops import run_fresh_loops
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap
+from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box
 from koopmpc.synthesis.surrogates import fit_surrogate
 from tests.compiler import needs_compiler
 from tests.synthesis.test_select import episodes_of
@@ -42,6 +42,33 @@ def make(*, bilinear=False, delays=0, moves=False):
     low, high = task.hull((), ())
     pool = LoopPool(task, models, NeighbourMap.of(data, models[0].model.embedding, noise), low, high)
     return pool, recipe.controller(recipe.fit(data), task.cost, LIMITS, 8)
+
+
+@pytest.mark.parametrize("delays", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_loops_of_a_few_records_start_all_along_them_with_their_past(delays):
+    """The first rows of two records are two states, and an interval from there holds nowhere else."""
+    data = episodes_of(bent, count=2, steps=300)
+    embedding = km.Delay(delays) if delays else None
+    cost, rest = km.Cost(Q=[1, 0.1], R=0.1), [0.3, 0.0]
+    task = check_task(data, cost, LIMITS, 8, rest, None, ())
+    recipe = Recipe(Candidate("x, 1", LIFTING, embedding, False).bind(data.states, data.inputs), 1e-6)
+    model = fit_surrogate(recipe, data, data, np.zeros(2))
+    near = NeighbourMap.of(data, model.model.embedding, np.zeros(2))
+    pool = LoopPool(task, (model,), near, *task.hull((), ()))
+    loops = pool.draw(60, np.random.default_rng(0))
+    starts = np.array([one.x0 for one in loops])
+    low, high = goal_box(task)
+    assert (np.ptp(starts, axis=0) > 0.7 * (high - low)).all()
+    short = replace(pool, asked=replace(task, steps=3))
+    results = short.run(recipe.controller(recipe.fit(data), cost, LIMITS, 8), loops[:8])
+    kept = [i for i, one in enumerate(results) if one.run is not None]
+    assert len(kept) >= 4
+    np.testing.assert_array_equal([results[i].run.X[0] for i in kept], starts[kept])
+    for one in loops if delays else ():
+        inputs = [u for e in data for u in e.U[:, 0]]
+        assert np.isclose(inputs, one.past[2], rtol=0, atol=1e-12).any()  # u_{k-1} of a row, and no mean
+    assert not check_task(data, cost, LIMITS, 8, rest, [0.1, 0.0], ()).along
+    assert not make()[0].asked.along
 
 
 CASES = [

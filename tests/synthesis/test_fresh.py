@@ -252,6 +252,15 @@ def test_fresh_starts_stay_in_the_range_of_the_goal_or_of_the_starts():
     assert len(np.unique(X, axis=0)) == 200
 
 
+def test_advice_on_limits_is_of_the_controller_that_is_returned():
+    """Its fresh loops say it, and no loop of the choice, which had another end of its plans or another model."""
+    for design in (fresh(), narrow()):
+        over = design.expected.fresh.violation[np.isfinite(design.expected.fresh.violation)]
+        said = [sentence for sentence in design.advice if sentence.startswith("limits are violated by up to")]
+        assert len(said) == (np.mean(over > 0.01) > 0.01)
+        assert all(f"in {np.sum(over > 0.01)} of {len(design.expected.fresh.violation)} fresh loops" in s for s in said)
+
+
 def test_a_designed_controller_says_whether_a_step_is_known():
     controller = fresh().controller
     controller.reset()

@@ -61,14 +61,14 @@ class Crowd:
     acting
         How the inputs of each loop act.
     starts
-        (E, nx) first states.
+        (E, nx) first states, or (E, n) with their past.
     seeds
         The seed of each loop's measurement noise, as `simulate` draws it.
     """
 
     stand_in: Surrogate | NeighbourMap
     acting: Acting
-    starts: Float[np.ndarray, "E nx"]
+    starts: Float[np.ndarray, "E n"]
     seeds: Sequence[int]
 
     def draw_noise(self, steps: int) -> Float[np.ndarray, "E T1 nx"]:

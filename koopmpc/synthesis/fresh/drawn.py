@@ -24,11 +24,15 @@ SHIFT = 0.05  # a fresh start is a start of the task moved by up to this share o
 GAIN = 0.1  # in fresh loops inputs act by up to this share more or less
 LATE = 0.1  # and up to this share of a step late
 ABREAST = 256  # loops that run side by side, at most: their controllers need about 0.1 MB each
+NEARBY = 30  # rows of a record of which a start takes the nearest, with its past
 _PLACES = 4  # a loop begins at one of so many places of a long reference
 
 
 class DrawnLoop(NamedTuple):
-    """One loop: where it starts, what stands in for the plant (−1 for nearest neighbours), and its other draws."""
+    """One loop: where it starts, what stands in for the plant (−1 for nearest neighbours), and its other draws.
+
+    `past` is ζ of that start as it was in the data, None where the loop starts after a rest.
+    """
 
     x0: Float[np.ndarray, " nx"]
     place: int
@@ -36,6 +40,7 @@ class DrawnLoop(NamedTuple):
     first: int
     seed: int
     late: float = 0.0
+    past: Float[np.ndarray, " nzeta"] | None = None
 
 
 class LoopResult(NamedTuple):
@@ -66,8 +71,9 @@ def draw_starts(asked: DesignTask, count: int, rng: np.random.Generator) -> Floa
 class LoopPool:
     """The distribution of loops: two in three on bootstrapped nearest neighbours, the others on a learned model.
 
-    Starts are those of the task, moved by up to 5 % of the data's range. Inputs act by up to 10 % more or less, and up
-    to a tenth of a step late. A loop is lost if it leaves the box from `low` to `high`.
+    Starts are those of the task, moved by up to 5 % of the data's range. Of a few records with an embedding they are
+    rows of the data with their past, of thirty rows the nearest to such a start. Inputs act by up to 10 % more or
+    less, and up to a tenth of a step late. A loop is lost if it leaves the box from `low` to `high`.
     """
 
     asked: DesignTask
@@ -88,10 +94,18 @@ class LoopPool:
         firsts = self.asked.late * rng.integers(_PLACES, size=count) // (_PLACES - 1)
         seeds = rng.integers(2**31, size=count)
         late = LATE * rng.uniform(size=count)
-        return [
+        loops = [
             DrawnLoop(starts[i], int(places[i]), float(gains[i]), int(firsts[i]), int(seeds[i]), float(late[i]))
             for i in range(count)
         ]
+        near = self.neighbours
+        if near is None or near.embedding is None or not self.asked.along:
+            return loops
+        nx, size = starts.shape[1], np.maximum(self.asked.high - self.asked.low, 1e-300)
+        some = rng.integers(len(near.pasts), size=(count, NEARBY))
+        apart = ((near.pasts[some, :nx] - starts[:, None]) / size) ** 2
+        pasts = near.pasts[some[np.arange(count), apart.sum(axis=2).argmin(axis=1)]]
+        return [loop._replace(x0=past[:nx], past=past) for loop, past in zip(loops, pasts, strict=True)]
 
     def run(self, controller: Any, loops: Sequence[DrawnLoop]) -> list[LoopResult]:
         """Return what became of these loops, those of a controller in machine code side by side."""
@@ -115,10 +129,11 @@ class LoopPool:
         asked, place, box = self.asked, loops[0].place, (self.low, self.high)
         near = self.neighbours if place < 0 else None
         stand_in: Surrogate | NeighbourMap = self.surrogates[max(place, 0)] if near is None else near
+        starts = [self._find_start(loop, stand_in) for loop in loops]
         rows, held = zip(*(self._find_rows(loop, controller.horizon) for loop in loops), strict=True)
         acting = Acting(stand_in.middle, np.array([one.gain for one in loops]), np.array([one.late for one in loops]))
         if isinstance(controller, Compiled):
-            crowd = Crowd(stand_in, acting, np.array([loop.x0 for loop in loops]), [loop.seed for loop in loops])
+            crowd = Crowd(stand_in, acting, np.array(starts), [loop.seed for loop in loops])
             step = self._step_model(place)
             if near is not None:
                 step = near.draw_many([np.random.default_rng(seed) for seed in crowd.seeds]).step
@@ -129,7 +144,7 @@ class LoopPool:
                 stand_in,
                 self._find_model(place) if near is None else near.draw(np.random.default_rng(loop.seed)),
                 controller,
-                loop.x0,
+                starts[i],
                 box=box,
                 reference=rows[i],
                 u_reference=held[i],
@@ -138,6 +153,13 @@ class LoopPool:
             )
             for i, loop in enumerate(loops)
         ]
+
+    def _find_start(self, loop: DrawnLoop, stand_in: Surrogate | NeighbourMap) -> Float[np.ndarray, " n"]:
+        """Return ζ of a start, with its past where the stand-in has the same embedding as the rows of the data."""
+        near = self.neighbours
+        embedding = stand_in.embedding if isinstance(stand_in, NeighbourMap) else stand_in.model.embedding
+        rests = loop.past is None or near is None or embedding != near.embedding
+        return stand_in.start(loop.x0) if rests or loop.past is None else loop.past
 
     def _find_rows(self, loop: DrawnLoop, ahead: int) -> tuple[Float[np.ndarray, "rows nr"], Float[np.ndarray, "T nu"]]:
         """Return the reference of a loop, with so many rows that are only seen ahead, and the inputs without cost."""

@@ -143,9 +143,15 @@ class NeighbourMap(Value):
         distance, _ = self.tree.query(self.rows[::apart], self.near)
         return ROOM * float(np.quantile(np.reshape(distance, (-1, self.near))[:, -1], KNOWN))
 
-    def start(self, x0: Float[np.ndarray, " nx"]) -> Float[np.ndarray, " nzeta"]:
-        """Return ζ after a rest at x0."""
-        return x0 if self.embedding is None else self.embedding.repeat(x0, self.middle)
+    def start(self, x0: Float[np.ndarray, " n"]) -> Float[np.ndarray, " nzeta"]:
+        """Return ζ after a rest at x0; x0 itself if it is a ζ."""
+        same = self.embedding is None or len(x0) == self.steps.shape[1]
+        return x0 if same or self.embedding is None else self.embedding.repeat(x0, self.middle)
+
+    @cached_property
+    def pasts(self) -> Float[np.ndarray, "M nzeta"]:
+        """ζ of the rows, states with the past that they had in the data; only where there is an embedding."""
+        return self.rows[:, : self.steps.shape[1]] * self.scale[: self.steps.shape[1]]
 
     def scale_rows(
         self, Z: Float[np.ndarray, "T nzeta"], U: Float[np.ndarray, "T nu"], W: Float[np.ndarray, "T nw"] | None = None
