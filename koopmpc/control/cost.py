@@ -187,10 +187,11 @@ class Cost(Value):
 
     def _check_rows(self, name: str) -> Any:
         """Return rows of weights, checked."""
-        rows: Any = bounds.check_bound(getattr(self, name), name)
-        values = [np.asarray(value) for value in bounds.list_bound(rows)]
-        if not all((np.isfinite(value) & (value >= 0)).all() for value in values):
-            raise DataError(f"{name} holds a number below 0 or no finite one; pass weights of 0 or above")
+        given: Any = getattr(self, name)
+        for value in bounds.list_bound(given):
+            if (checks.array(value, name) < 0).any():
+                raise DataError(f"{name} holds a number below 0; pass weights of 0 or above")
+        rows: Any = bounds.check_bound(given, name)
         if not bounds.is_rows(rows):
             raise ShapeError(f"{name} is {rows!r}; pass rows (steps, n), or by name a value a step")
         if self.price is not None and name == "R_rows":

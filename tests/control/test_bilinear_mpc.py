@@ -192,6 +192,21 @@ def test_copies_go_on_to_the_bit_where_w_multiplies_and_a_disturbance_is_estimat
         y = np.asarray(plant(y, u_k, W)).ravel() + 0.03 * rng.standard_normal(2)
 
 
+def test_copies_follow_a_disturbance_to_the_bit_with_the_factors_of_an_earlier_step(monkeypatch) -> None:
+    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
+    F = ca.vertcat(0.9 * x[0] + 0.2 * x[1] + 0.1 * u[0] * x[1], 0.8 * x[1] + 0.3 * ca.sin(x[0]) + 0.4 * u[0])
+    plant = km.StepMap(ca.Function("F", [x, u], [F]), 0.1)
+    mpc = km.BilinearMPC(plant, km.Cost(Q=[1, 0.5], R=0.3), None, 4, estimator=km.LiftedDisturbance())
+    y = np.array([0.8, -0.3])
+    for k in range(7):
+        twins = [copy.copy(mpc)] if k == 6 else []
+        u_k = mpc(y, [0.3, 0.0]).u
+        for twin in twins:
+            assert np.array_equal(twin(y, [0.3, 0.0]).u, u_k)
+        y = np.asarray(plant(y, u_k)).ravel() + np.array([0.02, 0.1])
+
+
 def test_two_in_two_threads_do_not_disturb_each_other() -> None:
     limits, plant = km.Limits(-0.8, 0.5, x_max=[np.inf, 0.5]), pendulum().step_map()
 

@@ -150,6 +150,8 @@ def test_metrics_count_the_rows_and_names_are_resolved():
 
 REFUSED = {
     "below 0": {"Q_rows": [[-1, 0]]},
+    "Q_rows holds 1 NaN or inf": {"Q_rows": [[1, np.nan]]},
+    "R_rows holds 1 NaN or inf": {"R_rows": {"u0": [0.1, np.inf]}},
     "pass rows": {"R_rows": [0.1, 0.2]},
     "one of the two": {"R_rows": [[0.1]], "price": [0.1]},
     "Q_rows are diagonals, and Q is a full matrix": {"Q": [[1, 0.2], [0.2, 1]], "Q_rows": [[1, 1]]},
@@ -165,6 +167,15 @@ REFUSED = {
 def test_rows_that_cannot_be_are_refused(said):
     with pytest.raises((km.errors.DataError, km.errors.ShapeError), match=said):
         make(km.BilinearMPC, **REFUSED[said])
+
+
+def test_weights_that_leave_a_later_input_without_cost_are_refused_before_the_first_step():
+    weights = {"Q_rows": [[1, 1]] * 9 + [[0, 0]] * 5 + [[1, 1]], "Q_N": np.zeros((2, 2))}
+    with pytest.raises(km.errors.DefinitenessError, match=r"begins at row 7 of .* some change of the inp"):
+        make(km.KoopmanMPC, R_rows=[[0.1]] * 11 + [[0], [0.1]], **weights)
+    mpc = make(km.KoopmanMPC, R_rows=[[0.1]] * 11 + [[0], [0.1]], Q_rows=weights["Q_rows"])
+    for k in range(16):  # a free input is decided where a later state has a weight
+        assert mpc([0.2, 0.1], [0, 0]).status.name in ("UNCONSTRAINED", "OPTIMAL"), k
 
 
 def test_laws_that_do_not_know_rows_refuse_them():

@@ -122,6 +122,19 @@ def test_a_set_that_leaves_a_later_row_is_refused_and_earlier_rows_do_not_count(
         km.KoopmanMPC(model, cost, km.Limits(**narrow, terminal=plain), horizon=4)
 
 
+def test_a_set_of_some_states_reaches_any_value_of_the_others():
+    model, cost, box = make_cart(), km.Cost(Q=1, R=0.1), {"u_min": -1, "u_max": 1}
+    some = km.guarantees.TerminalSet([0.0], H=[[2.0], [-2.0]], h=[1, 1], of=km.State("x1"))
+    rows = np.tile([np.inf, 0.6], (8, 1))
+    mpc = km.KoopmanMPC(model, cost, km.Limits(**box, x_max=rows, terminal=some, rows=("x_max",)), horizon=3)
+    assert mpc([-0.1, 0.0], [0.0, 0.0]).status in NORMAL
+    with pytest.raises(km.errors.DataError, match=r"reaches x1 = 0\.5 and .* limit of row 3 is 0\.49999,"):
+        mpc([-0.1, 0.0], [0.0, 0.0], limits=mpc.limits.with_bounds(x_max=[*rows[:3], [np.inf, 0.49999]]))
+    rows[:, 0] = 2.0
+    with pytest.raises(km.errors.DataError, match="reaches x0 = inf and the state and output limit of row 4 is 2,"):
+        km.KoopmanMPC(model, cost, km.Limits(**box, x_max=rows, terminal=some), horizon=3)
+
+
 def test_an_ellipsoid_needs_a_cost_to_go_that_grows_in_every_direction():
     limits = km.Limits(u_min=-1, u_max=1, du_max=0.5)
     with pytest.raises(km.errors.DataError, match="weigh every state, and every input whose rate is limited"):

@@ -464,6 +464,7 @@ class KoopmanMPC(MPCBase):
         """Make the table of plans of weights in time."""
         base = WeighedPlan(self._map, self._rows_of_limits)
         self._weighed = WeighedPlans(self._map.track, self._N, base, self._weigh)
+        self._weighed.check_free_inputs()
 
     def _weigh(self, rows: WeightRows) -> WeighedPlan:
         """Return the plan of weights in time."""

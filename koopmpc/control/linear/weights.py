@@ -10,6 +10,7 @@ from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.horizon import WeightRows
 from koopmpc.control.linear.plan import PlanMap
 from koopmpc.control.linear.windows import LimitWindows
+from koopmpc.errors import DefinitenessError
 
 _KEPT = 64  # plans that are kept; with weights of a day in hours all are found again after the first day
 
@@ -48,6 +49,30 @@ class WeighedPlans:
     @staticmethod
     def _key(Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N nu"]) -> bytes:
         return Q[1:].tobytes() + R.tobytes()  # the weight of the present state changes no plan
+
+    def check_free_inputs(self) -> None:
+        """Raise where a plan of some later step cannot be made: only rows of R that hold a zero may do that.
+
+        Raises
+        ------
+        DefinitenessError
+            In the plan of a step some change of the inputs costs nothing.
+        """
+        cost = self._track.cost
+        steps = max(len(np.asarray(rows)) for rows in (cost.Q_rows, cost.R_rows) if rows is not None)
+        Q, R = cost.weight_rows(len(self._track.Q), len(self._track.R), 0, steps + self._N)
+        tried = set[bytes]()
+        for k in range(steps):
+            own = slice(k, k + self._N)
+            key = self._key(Q[own], R[own])
+            if R[own].min() <= 0 and key not in tried:
+                tried.add(key)
+                try:
+                    self.find(k)
+                except DefinitenessError as error:
+                    raise DefinitenessError(
+                        f"in the plan that begins at row {k} of Q_rows and R_rows {error}"
+                    ) from None
 
     def find(self, step: int) -> WeighedPlan:
         """Return the plan whose first input acts in this step."""

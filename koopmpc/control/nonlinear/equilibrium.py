@@ -175,7 +175,7 @@ class Equilibria:
         self._local = Buffered(local.expand() if model.F.is_a("SXFunction") else local)
         values = ca.Function("values", [x, u, theta], [ca.densify(each) for each in (F, of, g)])
         self._values = Buffered(values.expand() if model.F.is_a("SXFunction") else values)
-        self._chord: Chord | None = None
+        self.chord: Chord | None = None  # of the last search that followed another one
         self._scale, inputs = o.sizes.scale, o.sizes.inputs
         self.size = np.concatenate([point_sizes(model, o), inputs])
         self._limit_size = np.concatenate([inputs, o.softness.allowance / SOFTENED])
@@ -199,7 +199,7 @@ class Equilibria:
 
     def update(self, model: LearnedMap) -> None:
         """Go on with another θ."""
-        self.model, self._chord = model, None
+        self.model, self.chord = model, None
 
     def values(
         self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]
@@ -313,10 +313,10 @@ class Equilibria:
         nx, size = self.model.nx, self.size
         if begin.active.any():
             return None
-        s, chord = np.concatenate([begin.x, begin.u]) / size, self._chord
+        s, chord = np.concatenate([begin.x, begin.u]) / size, self.chord
         close = CLOSE * (1 + np.abs(s).max())
         if chord is None or np.abs(s - chord.s).max() > close:
-            chord = self._chord = self._factors(begin, s)
+            chord = self.chord = self._factors(begin, s)
         F, of, g = self.values(begin.x, begin.u)
         left = np.concatenate([self._weight @ (row - of), -self._small * s])
         step = chord.H @ ((F + e - begin.x) / size[:nx]) + chord.T @ left
@@ -539,13 +539,15 @@ class TerminalTargets:
 
     def memory(self) -> dict[str, Any]:
         """Return what was found until now, for a copy."""
-        return {name: getattr(self, name) for name in _MEMORY}
+        return {name: getattr(self, name) for name in _MEMORY} | {"chord": self.equilibria.chord}
 
     def remember(self, memory: dict[str, Any]) -> None:
         """Go on with what another one of the same model had found."""
+        chord = memory.pop("chord")
         self.__dict__.update(memory)
         if self._w.any():
             self.equilibria.update(self._map.at(self._w))
+        self.equilibria.chord = chord
 
     def is_missed(self, row: Float[np.ndarray, " nr"]) -> bool:
         """Return whether no equilibrium was found for a row that was asked for."""

@@ -100,14 +100,15 @@ def require_inside(
                 " set of km.guarantees.find_terminal_set with the same cost and limits, or leave one out"
             )
         return
-    low, high = (end[min(first, len(end) - 1) :] for end in rows)
-    for end, bound, sign in ((reach.low, low, -1.0), (reach.high, high, 1.0)):
-        over = sign * (end - bound) - _TOLERANCE * (1 + np.abs(np.where(np.isfinite(bound), bound, 0.0)))
-        over = np.where(np.isfinite(bound), over, -np.inf)
+    first = min(first, len(rows.low) - 1)
+    for end, bound, sign in ((reach.low, rows.low[first:], -1.0), (reach.high, rows.high[first:], 1.0)):
+        known = np.isfinite(bound)
+        limit = np.where(known, bound, 0.0)
+        over = np.where(known, sign * (end - limit) - _TOLERANCE * (1 + np.abs(limit)), -np.inf)
         if (over > 0).any():
             k, i = (int(at) for at in np.argwhere(over == over.max())[0])
             raise DataError(
-                f"the terminal set reaches {names[i]} = {end[i]:.4g} and the {what} limit of row {k + first} is"
-                f" {bound[k, i]:.4g}, so plans that end in it may leave limits of later rows; make the set with the"
+                f"the terminal set reaches {names[i]} = {end[i]:.7g} and the {what} limit of row {k + first} is"
+                f" {bound[k, i]:.7g}, so plans that end in it may leave limits of later rows; make the set with the"
                 " tightest limits of these rows, or leave one out"
             )
