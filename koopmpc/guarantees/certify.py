@@ -104,7 +104,8 @@ def certify(
     CertificateError
         None was found: which assumption is in the way, and what to try.
     DataError
-        The limits exclude the set point, the box does not hold it, or the model is of a kind that has no certificate.
+        The limits exclude the set point, the box does not hold it, decay is not between 0 and 1, noise is below 0, or
+        the model is of a kind that has no certificate.
 
     References
     ----------
@@ -133,6 +134,10 @@ def certify(
     if not 0 < level < 1:
         raise DataError(f"confidence is {confidence}; it must be above 0 and below 1")
     reach = np.zeros(model.nx) if noise is None else checks.vector(noise, "noise", model.nx)
+    if (reach < 0).any():
+        raise DataError(f"noise is {noise}; an error of measurement is 0 or above")
+    if decay is not None and not checks.positive(decay, "decay") < 1:
+        raise DataError(f"decay is {decay:g}, and V has to fall; pass a number below 1")
     if lipschitz is not None and estimated and reach.any():
         raise DataError("a covering needs exact pairs; leave noise out, or leave lipschitz out")
     asked = _Asked(data, limits, region, given, estimated, reach, decay, level, seed)

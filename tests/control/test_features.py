@@ -341,6 +341,18 @@ def test_update_is_a_fresh_controller(moves):
     np.testing.assert_allclose(mpc(x, [0.3, 0]).u, fresh(x, [0.3, 0], applied=move.u).u, atol=1e-6)
 
 
+def test_an_update_that_is_refused_changes_nothing():
+    A, B = UNSTABLE
+    model = linear(A, B)
+    mpc = km.KoopmanMPC(model, km.Cost([2, 0.5], 0), km.Limits(-0.6, 0.6), 4)
+    u = mpc([0.1, 0.0], [0.0, 0.0]).u
+    with pytest.raises(km.errors.DefinitenessError):
+        mpc.update(linear(A, 0 * B))
+    assert mpc.predictor is model
+    mpc.reset()
+    np.testing.assert_array_equal(mpc([0.1, 0.0], [0.0, 0.0]).u, u)
+
+
 def whole(seed=0):
     """A controller with all there is to copy."""
     A, B = UNSTABLE

@@ -291,6 +291,13 @@ def test_a_refusal_names_the_error_or_the_model():
 
 def test_bad_input_is_an_error_that_says_what_to_do(tanks):
     _, model, data, limits, x, u, _ = tanks
+    for decay in (1.0, 2.0):  # of which every region were a certificate
+        with pytest.raises(km.errors.DataError, match=f"decay is {decay:g}, and V has to fall; pass a number below 1"):
+            km.certify(model, data, limits, x=x, u=u, decay=decay)
+    with pytest.raises(km.errors.DataError, match="decay is 0; it must be above zero"):
+        km.certify(model, data, limits, x=x, u=u, decay=0)
+    with pytest.raises(km.errors.DataError, match=r"noise is -0\.1; an error of measurement is 0 or above"):
+        km.certify(model, data, limits, x=x, u=u, noise=-0.1)
     with pytest.raises(km.errors.DataError, match="not inside the sampled box"):
         km.certify(model, data, limits, x=[100, 100], u=u)
     with pytest.raises(km.errors.DataError, match="not inside the limits"):

@@ -349,9 +349,10 @@ class KoopmanMPC(MPCBase):
         track = lifted_tracking(predictor, self.cost, self.limits, in_time=True)
         if track.limits.priority is not None:
             track = self._weigh_priorities(track, predictor)
-        self.predictor, self._states = predictor, None
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
-        self._take_plan(plan_map(predictor, track, self._moves, coordinates, self._initial.buffer, self._plan_kind))
+        plan = plan_map(predictor, track, self._moves, coordinates, self._initial.buffer, self._plan_kind)
+        self.predictor, self._states = predictor, None
+        self._take_plan(plan)
         self._hold_limits()
         if track.weighed:
             self._hold_weights()
