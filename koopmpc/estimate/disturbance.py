@@ -206,7 +206,9 @@ class DisturbanceObserver(Viewing, Measured):
 
     def program(self) -> DisturbanceProgram:
         """Return the data with which z and d are found."""
-        return DisturbanceProgram(self.gain, self.reach, self._known, self._to_y.copy(), gate=gate_graph(self.ny))
+        return DisturbanceProgram(
+            self.gain, self.reach, self._known, self._to_y.copy(), gate=gate_graph(self.ny, self._remembers)
+        )
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""

@@ -26,12 +26,14 @@ NARROW = 0.7  # and downwards by this one
 LEAST = 0.01  # the quantile counts as at least this share of the largest step that the output has made
 ROUNDING = 1e-9  # and as this share of the reading's and the prediction's size: what is smaller is rounding
 SUSPECTS = 2  # the first readings, and those after a reading that leaps, may be left behind so many times
+LEAP = 10.0  # where a disturbance is learned: a reading leaps if it and its misfit are beyond so many largest steps
+LEAPS = 6  # the first readings before one that leaps may be left behind so many times
 FADING = 0.8  # what a predicted step allows fades by this factor a step
 
 
 @cache
 @raise_swallowed()
-def gate_function(ny: int) -> ca.Function:
+def gate_function(ny: int, leaps: bool = False) -> ca.Function:
     """Return (y, prediction, memory) → [whether y is refused; 1 if the gate has opened, 2 if all is lost; the memory].
 
     y is refused if |yᵢ − ŷᵢ| > 5 qᵢ + ρ Sᵢ for any of its entries. qᵢ is the running 0.9 quantile of |yᵢ − ŷᵢ|, and
@@ -51,6 +53,10 @@ def gate_function(ny: int) -> ca.Function:
     last used value, but not to zero. If its prediction is off by more than 1e4 times what it falls to, the readings
     before were wild: the observer starts again from y, and S is forgotten. This is done twice, and twice again after a
     reading off by 1e4 times all that its output had shown was used.
+
+    With `leaps`, where a disturbance is learned, smaller wild ones are left behind too. While the gate is open, a
+    reading leaps if |y − last| and |y − ŷ| are both beyond 10 times the largest step, used or predicted. An absurd one
+    does not, nor the fifth or a later one before any step. The observer starts again from y, up to six times.
 
     The memory is q, S, the predicted steps, the last used values, a count, whether the observer has started again
     since, and how often it has left wild readings behind. Below a count of 10 the gate is open, and 10 less the count
@@ -78,7 +84,15 @@ def gate_function(ny: int) -> ca.Function:
     astray = ca.logic_and(error > ABSURD * (largest + ca.fabs(y)), may_restart)
     fell = ca.logic_and(ca.logic_and(known, y != 0), ca.fabs(last) > ABSURD * ca.fabs(y))
     missed = ca.if_else(foreseen, error > ABSURD * ca.fabs(y), 1)
-    back = ca.logic_and(ca.mmax(ca.logic_and(fell, missed)), ca.logic_and(left < SUSPECTS, ca.logic_not(closed)))
+    suspected, apart = ca.mmax(ca.logic_and(fell, missed)), ca.SX(0)
+    if leaps:
+        ahead_first = ca.if_else(came, ca.fabs(predicted - last), 0)
+        rounded = ca.if_else(came, ROUNDING * ca.fmax(ca.fabs(last), ca.fmax(ca.fabs(predicted), ca.fabs(y))), 0)
+        steps, moved = ca.fmax(size, ahead_first), ca.if_else(came, ca.fmin(error, ca.fabs(y - last)), 0)
+        leap = ca.logic_and(ca.logic_and(steps > rounded, moved > LEAP * steps), ca.logic_or(largest > 0, count <= 2))
+        apart = ca.logic_and(ca.mmax(leap), ca.logic_not(far))
+        suspected = ca.logic_or(suspected, apart)
+    back = ca.logic_and(suspected, ca.logic_and(left < (LEAPS if leaps else SUSPECTS), ca.logic_not(closed)))
     lost = ca.logic_or(ca.logic_and(ca.mmax(astray), ca.logic_not(far)), back)
     absurd = ca.logic_and(far, ca.logic_not(ca.logic_and(judged, closed)))
     wild = ca.logic_and(ca.logic_and(judged, closed), ca.logic_not(good))
@@ -103,14 +117,14 @@ def gate_function(ny: int) -> ca.Function:
     )
     none = ca.SX(ny, 1)
     first = ca.vertcat(none, ca.if_else(back, none, largest), none, ca.if_else(known, y, last))
-    anew = ca.vertcat(first, ca.fmin(count, 2) + 1, ca.logic_and(count > 2, ca.logic_not(back)), left + back)
+    anew = ca.vertcat(first, ca.fmin(count, 2 - apart) + 1, ca.logic_and(count > 2, ca.logic_not(back)), left + back)
     result = ca.vertcat(refused, ca.if_else(lost, 2, opened), ca.if_else(lost, anew, after))
     return ca.Function("gate", [y, predicted, memory], [ca.densify(result)], {"cse": True})
 
 
-def gate_graph(ny: int) -> Graph:
+def gate_graph(ny: int, leaps: bool = False) -> Graph:
     """Return `gate_function` as data, for a Program."""
-    return Graph.trace(gate_function(ny))
+    return Graph.trace(gate_function(ny, leaps))
 
 
 class ReadingGate(Viewing):
@@ -129,12 +143,14 @@ class ReadingGate(Viewing):
     ----------
     ny
         Number of entries of a reading.
+    leaps
+        Whether a leap among the first readings starts the observer again, see `gate_function`.
     """
 
     _VIEWS = ("_y", "_predicted", "_after", "_evaluate", "_buffer")
 
-    def __init__(self, ny: int) -> None:
-        self._ny, self._function = ny, gate_function(ny)
+    def __init__(self, ny: int, leaps: bool = False) -> None:
+        self._ny, self._function = ny, gate_function(ny, leaps)
         self._memory = np.zeros(self._function.numel_in(2))
         self._see()
         self.reset()

@@ -287,14 +287,15 @@ def test_the_run_of_a_loop_holds_which_readings_were_refused():
     assert run.refused.dtype == np.int64
 
 
-@given(st.integers(0, 10**6), st.lists(st.floats(-6, 6), min_size=2, max_size=2))
-def test_units_do_not_decide_what_is_refused(seed, powers):
+@given(st.integers(0, 10**6), st.lists(st.floats(-6, 6), min_size=2, max_size=2), st.booleans())
+def test_units_do_not_decide_what_is_refused(seed, powers, leaps):
     rng, scale = np.random.default_rng(seed), 10.0 ** np.array(powers)
-    gate, scaled = ReadingGate(2), ReadingGate(2)
+    gate, scaled = ReadingGate(2, leaps), ReadingGate(2, leaps)
     for _ in range(80):
         predicted = rng.normal(size=2)
         y = predicted + rng.normal(size=2) * rng.choice([0.1, 0.1, 0.1, 20.0])
         assert gate.judge(y, predicted) == scaled.judge(scale * y, scale * predicted)
+        assert gate.lost == scaled.lost
 
 
 def test_the_bound_follows_the_spread_of_the_innovations_and_the_steps_of_the_output():
