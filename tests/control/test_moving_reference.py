@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -164,3 +165,33 @@ def test_a_copy_turns_the_pages_of_limits_on_its_own(duplicate, monkeypatch):
         np.testing.assert_array_equal(twin([1.0, 0.0], [0.0, 0.0]).u, expected)
         if k % 2:
             mpc([1.0, 0.0], [0.0, 0.0])
+
+
+def test_what_noise_looks_like_to_an_estimator_sends_no_target_far_away():
+    """A disturbed target may be out of the inputs' reach: where it meets their limits, the row's own target stays."""
+
+    def plant(x, u):
+        return np.array([x[0] + 0.2 * x[1], 0.9 * x[1] + 0.3 * u[0] - 0.1 * np.sin(x[0])])
+
+    rng, runs = np.random.default_rng(0), []
+    for _ in range(12):
+        X, U = [rng.uniform(-1, 1, 2)], rng.uniform(-1, 1, (40, 1))
+        for u in U:
+            X.append(plant(X[-1], u))
+        runs.append(km.Episode(X=np.array(X), U=U))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", km.FitWarning)  # of a delay, one column follows from the others
+        model = km.bilinear_edmd(km.Episodes(runs, 0.1), km.State() + km.Constant(), embedding=km.Delay(1), ridge=1e-6)
+    weights, limits = np.array([1, 0.1]), km.Limits(u_min=-1, u_max=1, x_max=[np.inf, 0.4])
+    rows = np.column_stack([0.3 * np.sin(np.arange(70) / 5), np.zeros(70)])
+    spent = []
+    for estimator in (None, km.LiftedDisturbance()):
+        mpc = km.BilinearMPC(model, km.Cost(Q=weights, R=0.1), limits, 8, estimator=estimator)
+        noise, x, total = np.random.default_rng(1), np.zeros(2), 0.0
+        mpc.reset(x)
+        for k in range(60):
+            u = mpc(x + noise.normal(size=2) * [0.01, 0.02], rows[k : k + 9]).u
+            total += float(weights @ (x - rows[k]) ** 2 + 0.1 * u @ u)
+            x = plant(x, u)
+        spent.append(total)
+    assert spent[1] < 2 * spent[0]

@@ -26,6 +26,7 @@ enum {
 #define RANK ((koopmpc_real)KOOPMPC_RANK)
 #define CLOSE ((koopmpc_real)1e-2)
 #define BENT ((koopmpc_real)0.25) /* where the cost bends by this share beyond its Gauss-Newton part, steps are shorter */
+#define AWAY ((koopmpc_real)2)
 #define LEAST_LENGTH ((koopmpc_real)0.05)
 
 static koopmpc_real largest_of(const koopmpc_real *a, int n) {
@@ -140,6 +141,12 @@ static void least(const koopmpc_real *W, const koopmpc_real *null, int count, ko
 /** (x, u) in their sizes. */
 static void scaled(const koopmpc_real *x, const koopmpc_real *u, koopmpc_real *s) {
   for (int i = 0; i < SIZE; i++) s[i] = (i < NX ? x[i] : u[i - NX]) / koopmpc_rest_size[i];
+}
+
+int koopmpc_is_limited(const koopmpc_real *active) {
+  int limited = 0;
+  for (int i = 0; i < LIMITS; i++) limited |= active[i] < 0 || active[i] > 0;
+  return limited;
 }
 
 void koopmpc_factors(const koopmpc_real *at, koopmpc_real *H, koopmpc_real *T) {
@@ -337,16 +344,25 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
 }
 
 #if KOOPMPC_DISTURBED
+/** Whether an equilibrium at limits is several sizes of the state from that of the row, which meets them. */
+static int is_far(const koopmpc_real *x, const koopmpc_real *active, const koopmpc_real *target) {
+  koopmpc_real away = 0;
+  for (int i = 0; i < NX; i++) {
+    const koopmpc_real off = koopmpc_abs(x[i] - target[TARGET_X + i]) / koopmpc_rest_size[i];
+    away = off > away ? off : away;
+  }
+  return koopmpc_is_limited(active) && !koopmpc_is_limited(target + TARGET_ACTIVE) && away > AWAY;
+}
+
 void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_real *e) {
   koopmpc_real x[NX], u[NV], active[LIMITS], at[KOOPMPC_LOCAL];
-  int found, limited = 0;
+  int found;
   koopmpc_copy(x, s->has_rest ? s->rest : target + TARGET_X, NX);
   koopmpc_copy(u, s->has_rest ? s->rest_u : target + TARGET_U, NV);
   koopmpc_copy(active, s->has_rest ? s->rest_active : target + TARGET_ACTIVE, LIMITS);
-  for (int i = 0; i < LIMITS; i++) limited |= active[i] > 0 || active[i] < 0;
-  found = (!limited && chord(s, x, u, target, e)) ||
+  found = (!koopmpc_is_limited(active) && chord(s, x, u, target, e)) ||
           koopmpc_near(x, u, active, target, koopmpc_end_w(s), e, CLOSE, 1);
-  if (!(target[TARGET_FOUND] > 0)) found = 0;
+  if (!(target[TARGET_FOUND] > 0) || is_far(x, active, target)) found = 0;
   if (!found) {
     koopmpc_copy(x, target + TARGET_X, NX);
     koopmpc_copy(u, target + TARGET_U, NV);

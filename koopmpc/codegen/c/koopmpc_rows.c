@@ -92,12 +92,6 @@ static void slope_of(const koopmpc_real *at, koopmpc_real *slope) {
 }
 
 #if KOOPMPC_SCHEDULED
-static int is_limited(const koopmpc_real *active) {
-  int limited = 0;
-  for (int i = 0; i < KOOPMPC_NU + KOOPMPC_BOX; i++) limited |= active[i] < 0 || active[i] > 0;
-  return limited;
-}
-
 /** The equilibrium of a row for w = 0: of the table, or found from the nearest one; NULL without any. */
 static const koopmpc_real *still_of(koopmpc_state *s, const koopmpc_real *row) {
   const koopmpc_real *from = nearest(s, row), none[KOOPMPC_NW1] = {0};
@@ -117,7 +111,7 @@ int koopmpc_is_free(koopmpc_state *s, const koopmpc_real *row) {
   if (!still) return 0;
   koopmpc_local(still + TARGET_X, still + TARGET_U KOOPMPC_AND(none), at);
   if (!(apart(row, at + LOCAL_OF) <= KOOPMPC_HELD * apart(row, nothing))) return 0; /* several may come as near */
-  return !is_limited(still + TARGET_ACTIVE) && still[still == s->still ? TARGET_M : TARGET_FOUND] > 0;
+  return !koopmpc_is_limited(still + TARGET_ACTIVE) && still[still == s->still ? TARGET_M : TARGET_FOUND] > 0;
 }
 
 /** Move the equilibrium of a row with w: from that of the last step, or of w = 0. */
@@ -126,10 +120,10 @@ static int move_on(koopmpc_state *s, const koopmpc_real *row, const koopmpc_real
   int moved = 0;
   koopmpc_fill(none, 0, NX);
   for (int i = 0; i < KOOPMPC_NW; i++) moved |= w[i] < 0 || w[i] > 0;
-  if (moved && s->has_last_end && is_row(s->last_end, row) && !is_limited(s->last_end + TARGET_ACTIVE)) {
+  if (moved && s->has_last_end && is_row(s->last_end, row) && !koopmpc_is_limited(s->last_end + TARGET_ACTIVE)) {
     koopmpc_copy(own, s->last_end, TARGET_M);
     if (koopmpc_near(own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE, row, w, none, KOOPMPC_HELD, 0) &&
-        !is_limited(own + TARGET_ACTIVE))
+        !koopmpc_is_limited(own + TARGET_ACTIVE))
       return 1;
   }
   koopmpc_copy(own, still_of(s, row), TARGET_M);

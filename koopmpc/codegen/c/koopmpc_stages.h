@@ -104,6 +104,9 @@ int koopmpc_inverse(koopmpc_real *E, int m, int n, koopmpc_real rank, koopmpc_re
 int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const koopmpc_real *row, const koopmpc_real *w,
                  const koopmpc_real *e, koopmpc_real enough, int careful);
 
+/** Whether a limit of a target is active. */
+int koopmpc_is_limited(const koopmpc_real *active);
+
 /** The factors of a Gauss-Newton step at `koopmpc_local` without active limits: H of F + e - x, T of the residuals. */
 void koopmpc_factors(const koopmpc_real *at, koopmpc_real *H, koopmpc_real *T);
 

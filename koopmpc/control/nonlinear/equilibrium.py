@@ -42,6 +42,7 @@ _QUIET = {
 _NEWTON = 20  # whole Gauss–Newton steps, at most
 _SHORTENED = 40  # Gauss–Newton steps that may be shorter, at most
 _PATIENCE = 5  # times as many at the end of a way in pieces that leads nowhere else
+AWAY = 2.0  # an equilibrium at limits may be so many sizes of a state from that of its row
 _BENT = 0.25  # where the cost bends by more than this share beyond its Gauss–Newton part, steps are shorter
 _LEAST = 0.05  # shortest length of such a step, 1 being the longest
 _PIECES = 40  # pieces of the way from w = 0 to a measured disturbance, at most
@@ -722,18 +723,25 @@ class TerminalTargets:
         """Return the target of a row where x⁺ = F(x, u) + e, mostly by one step from that of the last control step.
 
         The error that this leaves is of the square of the change of e, and gone once e rests. Where no Gauss–Newton
-        steps lead to an equilibrium, the target of the row stays.
+        steps lead to an equilibrium, or only e makes limits active and the equilibrium is far, as under noise beyond
+        what inputs hold, it returns the target of the row.
         """
         target = self(row)
         begin = (target if last is None else last).equilibrium
         each = self.equilibria
         found = each.follow(begin, row, e) or each.near(begin, row, e, CLOSE, careful=True)
-        if found is None or self.is_missed(row):
+        if found is None or self.is_missed(row) or self._is_far(found, target.equilibrium):
             return target
         u, m = found.u * self._hold, target.m
         if self._cost.Q_N is None:
             m = target.M @ each.values(found.x, found.u)[1] + target.L @ found.x + target.V @ u
         return target._replace(equilibrium=found, u=u, m=m)
+
+    def _is_far(self, found: Equilibrium, own: Equilibrium) -> bool:
+        """Return whether an equilibrium at limits is several sizes of the state from one that meets them."""
+        nx = len(own.x)
+        away = (np.abs(found.x - own.x) / self.equilibria.size[:nx]).max()
+        return bool(found.active.any() and not own.active.any() and away > AWAY)
 
     def _target(self, row: Float[np.ndarray, " nr"], found: Equilibrium) -> TerminalTarget:
         o, nx, nr = self._outputs, len(found.x), len(row)
