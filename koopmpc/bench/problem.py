@@ -442,7 +442,7 @@ def _load(path: Path) -> Problem:
         raise ProblemError(f"{path}{_line(error, path)}: {type(error).__name__}: {error}") from error
     loaded = module.__dict__.get("problem")
     if not isinstance(loaded, Problem):
-        got = "nothing of that name" if loaded is None else f"{checks.article(loaded)}"
+        got = "nothing of that name" if loaded is None else checks.article(loaded)
         raise ProblemError(f"{path} must define `problem = km.Problem(...)`, but holds {got}; see a file in problems/")
     return replace(loaded, name=path.stem, title=_first_line(module.__doc__)).of_file(str(path))
 

@@ -1,6 +1,5 @@
 """Fresh loops: exact bounds, a stand-in by nearest rows, and what a design says of places without data."""
 
-import os
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -14,7 +13,7 @@ from koopmpc.plants.routines import find_compiler
 from koopmpc.synthesis.asked import check_task, measure_settling
 from koopmpc.synthesis.candidates import Candidate
 from koopmpc.synthesis.designed import ExpectedLoop, choose_row
-from koopmpc.synthesis.fresh.drawn import LoopResult, draw_starts
+from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool, LoopResult, draw_starts
 from koopmpc.synthesis.fresh.horizon import choose_horizon
 from koopmpc.synthesis.fresh.loops import choose_finalist, find_stopping_set, is_preferable, list_finalists
 from koopmpc.synthesis.fresh.neighbours import MOST, NeighbourMap, goal_box, probe_range
@@ -377,31 +376,32 @@ def test_one_controller_is_better_where_it_alone_keeps_more_loops_than_chance_ex
     assert not is_preferable(mixed, loops(), 0.95)  # less on average, and not by three standard errors
 
 
-class CountedPool:
-    """A pool in which each controller, a number, has its own cost, and breaks a limit in every so many loops."""
+class CountedPool(LoopPool):
+    """A pool in which each controller has its own cost, and breaks a limit in every so many loops."""
 
-    ran = 0
+    def __init__(self):
+        object.__setattr__(self, "ran", 0)
 
     def draw(self, count, _):
-        return list(range(count))
+        return [DrawnLoop(np.zeros(1), 0, 1.0, 0, i) for i in range(count)]
 
     def run(self, controller, loops):
-        self.ran += len(loops)
+        object.__setattr__(self, "ran", self.ran + len(loops))
         cost, every = controller.figures
-        return [LoopResult(cost, 0.1 if every and i % every == 0 else 0.0, run=True) for i in loops]
+        return [LoopResult(cost, 0.1 if every and loop.seed % every == 0 else 0.0) for loop in loops]
 
 
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
 def test_a_finalist_that_is_safer_or_two_percent_cheaper_takes_the_place_of_the_chosen_one(monkeypatch):
+    model = km.edmd(episodes_of(mass, count=2), PLAIN)
+
     def prefer(*figures):
-        made = []
-        for each in figures:
-            one = Compiled.__new__(Compiled)
-            one.figures = each
-            made.append(one)
-        monkeypatch.setattr("koopmpc.synthesis.fresh.loops.speed_up", lambda one: one)
+        finalists, fast = [km.KoopmanMPC(model, km.Cost(1, 1), None, 2) for _ in figures], {}
+        for one, each in zip(finalists, figures, strict=True):
+            fast[one] = Compiled.__new__(Compiled)
+            fast[one].figures = each
+        monkeypatch.setattr("koopmpc.synthesis.fresh.loops.speed_up", fast.get)
         pool = CountedPool()
-        place, loops, why = choose_finalist(pool, made, np.random.default_rng(0))
+        place, loops, why = choose_finalist(pool, finalists, np.random.default_rng(0))
         assert loops == pool.ran == 60 * len(figures) + 480
         assert bool(why) == bool(place)
         return place
@@ -410,7 +410,9 @@ def test_a_finalist_that_is_safer_or_two_percent_cheaper_takes_the_place_of_the_
     assert prefer((1.0, 0), (1.1, 0), (0.97, 0)) == 2
     assert prefer((1.0, 10), (1.05, 0), (0.5, 10)) == 1
     assert prefer((1.0, 0), (0.5, 10)) == 0
-    assert choose_finalist(CountedPool(), [1, 2], np.random.default_rng(0)) == (0, 0, "")  # not in machine code
+    slow = [km.KoopmanMPC(model, km.Cost(1, 1), None, 2) for _ in range(2)]
+    monkeypatch.setattr("koopmpc.synthesis.fresh.loops.speed_up", lambda one: one)  # without a compiler
+    assert choose_finalist(CountedPool(), slow, np.random.default_rng(0)) == (0, 0, "")
 
 
 @pytest.mark.slow

@@ -42,7 +42,7 @@ _QUIET = {
 _NEWTON = 20  # whole Gauss–Newton steps, at most
 _SHORTENED = 40  # Gauss–Newton steps that may be shorter, at most
 _PATIENCE = 5  # times as many at the end of a way in pieces that leads nowhere else
-AWAY = 2.0  # an equilibrium at limits may be so many sizes of a state from that of its row
+_AWAY = 2.0  # an equilibrium at limits may be so many sizes of a state from that of its row
 _BENT = 0.25  # where the cost bends by more than this share beyond its Gauss–Newton part, steps are shorter
 _LEAST = 0.05  # shortest length of such a step, 1 being the longest
 _PIECES = 40  # pieces of the way from w = 0 to a measured disturbance, at most
@@ -741,7 +741,7 @@ class TerminalTargets:
         """Return whether an equilibrium at limits is several sizes of the state from one that meets them."""
         nx = len(own.x)
         away = (np.abs(found.x - own.x) / self.equilibria.size[:nx]).max()
-        return bool(found.active.any() and not own.active.any() and away > AWAY)
+        return bool(found.active.any() and not own.active.any() and away > _AWAY)
 
     def _target(self, row: Float[np.ndarray, " nr"], found: Equilibrium) -> TerminalTarget:
         o, nx, nr = self._outputs, len(found.x), len(row)
