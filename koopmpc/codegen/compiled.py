@@ -112,13 +112,14 @@ def _compile(program: StepProgram, precision: Precision, command: list[str]) -> 
     """
     single = precision == "float"
     tables = make_tables(program, single=single, room=_ROOM)
-    text = write_one_source(tables, single=single) + f"/* {_read_processor()} */\n"
+    text, packed = write_one_source(tables, single=single)
+    text += f"/* {_read_processor()} */\n"
     cache = find_private_cache()
     machine = ["-march=native", "-fvisibility=default"] if platform.machine() in ("x86_64", "AMD64") else []
     try:
-        code = load_library(text, [*command, *machine], cache)
+        code = load_library(text, [*command, *machine], cache, numbers=packed)
     except subprocess.SubprocessError:
-        code = load_library(text, command, cache)  # the compiler does not know this processor
+        code = load_library(text, command, cache, numbers=packed)  # the compiler does not know this processor
     code.koopmpc_state_size.restype = ctypes.c_long
     code.koopmpc_init.restype = code.koopmpc_call.restype = None
     return code, tables.sizes

@@ -18,8 +18,8 @@ from koopmpc.plants.graph import OPERATIONS, Graph
 
 _LARGEST = 4000  # operations of a function that is written line by line: gcc takes 0.5 s for 5,000, 6 s for 20,000
 _WIDTH = 118
-_PACKED = 5000  # numbers from which on an array is bytes, if it is for this machine: gcc reads 8 times as many a second
-_OCTAL = np.frombuffer(b"".join(b"\\%03o" % byte for byte in range(256)), dtype="S4")
+_PACKED = 5000  # numbers from which on an array is bytes, if it is for this machine: gcc never sees them
+_LINE = 64  # bytes of a cache line, at which such an array begins
 _INTEGERS = {np.dtype(np.uint16): "unsigned short", np.dtype(np.intc): "int"}
 
 # Each operation of `plants.graph` as C; {0} and {1} are its operands. Names of math.h go through KOOPMPC_FN, which
@@ -64,10 +64,14 @@ _CALL = 20
 
 @dataclass(frozen=True)
 class Language:
-    """How numbers are written: in double or in single precision, for any machine or, `packed`, for this one alone."""
+    """How numbers are written: in double or in single precision.
+
+    With `packed`, code for this machine alone, long arrays are appended to it as bytes in the machine's order. Their
+    definitions read them from a file that holds `packed`, whose path is the macro KOOPMPC_NUMBERS.
+    """
 
     single: bool = False
-    packed: bool = False
+    packed: bytearray | None = None
 
     def number(self, value: float) -> str:
         """Return a literal that reads back as this number; numbers beyond ±1e30 become ±1e30."""
@@ -87,8 +91,8 @@ class Language:
             kind, words = _INTEGERS.get(flat.dtype, "int"), [str(int(value)) for value in flat] or ["0"]
         else:
             clipped = np.clip(flat.astype(np.float64), -1e30, 1e30)
-            if self.packed and flat.size >= _PACKED:
-                return self._pack(name, clipped)
+            if self.packed is not None and flat.size >= _PACKED:
+                return self._pack(name, clipped, self.packed)
             kind, words = "koopmpc_real", self._words(clipped) or [self.number(0.0)]
         lines = [f"static const {kind} {name}[{len(words)}] = {{"]
         line = " "
@@ -105,14 +109,16 @@ class Language:
             return [self.number(value) for value in flat]
         return list(map(repr, flat.tolist()))
 
-    def _pack(self, name: str, flat: Float[np.ndarray, " n"]) -> str:
-        """Return the definition of an array by its bytes in this machine's order, as a string."""
+    def _pack(self, name: str, flat: Float[np.ndarray, " n"], packed: bytearray) -> str:
+        """Append an array to `packed`, and return its definition, which the assembler reads from there."""
+        packed += bytes(-len(packed) % _LINE)
         values = flat.astype(np.float32 if self.single else np.float64)
-        text = _OCTAL[np.frombuffer(values.tobytes(), np.uint8)].tobytes().decode()
-        size = f"{flat.size} * sizeof(koopmpc_real) + 1"
+        place, symbol = len(packed), f"{name}_packed"
+        packed += values.tobytes()
         return (
-            f"static const union {{\n  char bytes[{size}];\n  koopmpc_real numbers[{flat.size}];\n}} {name}_packed = "
-            f'{{"{text}"}};\n#define {name} {name}_packed.numbers'
+            f'__asm__(".data\\n.balign {_LINE}\\n{symbol}:\\n"\n'
+            f'        ".incbin \\"" KOOPMPC_NUMBERS "\\", {place}, {values.nbytes}\\n.text\\n");\n'
+            f'extern const koopmpc_real {name}[{flat.size}] __asm__("{symbol}") __attribute__((visibility("hidden")));'
         )
 
     def arrays(self, table: Mapping[str, np.ndarray]) -> str:

@@ -22,10 +22,10 @@ _SOLVER_FILES = (*_SOLVER, "factorization.h", "LICENSE")
 _CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"  # for the step times of a whole run
 
 
-def write_sources(tables: Tables, *, single: bool, packed: bool = False) -> dict[str, str]:
+def write_sources(tables: Tables, *, single: bool, packed: bytearray | None = None) -> dict[str, str]:
     """Return the text of every file by its name: header, controller, model, numbers, solver.
 
-    With `packed` long arrays are bytes in the order of this machine, which a compiler reads sooner.
+    With `packed` long arrays are appended to it, see `Language`.
     """
     language = Language(single, packed)
     if tables.is_staged:
@@ -62,10 +62,14 @@ def write_sources(tables: Tables, *, single: bool, packed: bool = False) -> dict
     return result
 
 
-def write_one_source(tables: Tables, *, single: bool) -> str:
-    """Return all C of a controller as one file for this machine, with the functions by which Python calls it."""
-    texts = write_sources(tables, single=single, packed=True)
-    return "\n".join([_CLOCK + join_sources(texts), read_shipped("c", "door.c")])
+def write_one_source(tables: Tables, *, single: bool) -> tuple[str, bytes]:
+    """Return all C of a controller as one file for this machine, with the functions by which Python calls it.
+
+    Beside it are the bytes of its long arrays, which `load_library` takes.
+    """
+    packed = bytearray()
+    texts = write_sources(tables, single=single, packed=packed)
+    return "\n".join([_CLOCK + join_sources(texts), read_shipped("c", "door.c")]), bytes(packed)
 
 
 def join_sources(texts: Mapping[str, str]) -> str:

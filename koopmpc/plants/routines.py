@@ -186,11 +186,14 @@ def choose_level(text: str) -> str:
     return next((level for most, level in _LEVELS if len(text) <= most), "-O0")
 
 
-def load_library(text: str, command: list[str], cache: Path | None, level: str = "-O3") -> ctypes.CDLL:
+def load_library(
+    text: str, command: list[str], cache: Path | None, level: str = "-O3", numbers: bytes = b""
+) -> ctypes.CDLL:
     """Return the machine code of this C, loaded from `cache` or compiled into it; without a cache no file remains.
 
     The flags in the environment variable KOOPMPC_CFLAGS follow the library's own flags. The name of a cached file
-    depends on the flags, so code compiled with other flags is another file.
+    depends on the flags, so code compiled with other flags is another file. While it is compiled, the macro
+    KOOPMPC_NUMBERS is the path of a file that holds `numbers`.
 
     Raises
     ------
@@ -200,15 +203,15 @@ def load_library(text: str, command: list[str], cache: Path | None, level: str =
     command = [*command, level, *_FLAGS, *_read_words("KOOPMPC_CFLAGS")]
     if cache is None:
         with tempfile.TemporaryDirectory() as folder:  # loaded code stays valid when its file is gone
-            return ctypes.CDLL(str(_compile(text, command, Path(folder) / "step.so")))
+            return ctypes.CDLL(str(_compile(text, command, Path(folder) / "step.so", numbers)))
     key = "\0".join([text, *command, platform.machine(), platform.system()])
-    path = cache / f"{fingerprint(key.encode())}.so"
+    path = cache / f"{fingerprint(key.encode() + numbers)}.so"
     if path.is_file():
         try:
             return ctypes.CDLL(str(path))
         except OSError:  # another kind of machine wrote the file: compile again
             path.unlink()
-    return ctypes.CDLL(str(_compile(text, command, path)))
+    return ctypes.CDLL(str(_compile(text, command, path, numbers)))
 
 
 def find_private_cache() -> Path | None:
@@ -237,10 +240,13 @@ def _is_private(folder: Path) -> bool:
     )
 
 
-def _compile(text: str, command: list[str], path: Path) -> Path:
+def _compile(text: str, command: list[str], path: Path, numbers: bytes) -> Path:
     """Compile in a temporary folder beside `path`, then move the file to `path` in one step."""
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        code, library = Path(folder) / "step.c", Path(folder) / "step.so"
+        code, library, packed = (Path(folder) / f"step.{kind}" for kind in ("c", "so", "bin"))
+        if numbers:
+            packed.write_bytes(numbers)
+            text = f'#define KOOPMPC_NUMBERS "{packed}"\n{text}'
         code.write_text(text)
         subprocess.run([*command, "-o", str(library), str(code), "-lm"], check=True, capture_output=True)
         library.replace(path)
