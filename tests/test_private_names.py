@@ -9,7 +9,13 @@ import pytest
 import koopmpc
 
 ROOT = Path(koopmpc.__file__).parent
-ALLOWED = {"_asdict", "_exit", "_fields_", "_replace"}  # of NamedTuple, os and ctypes: public in spite of their names
+ALLOWED = {
+    "_asdict",
+    "_exit",
+    "_fields_",
+    "_handle",
+    "_replace",
+}  # of NamedTuple, os and ctypes: public in spite of their names
 OF_RERUN = {"_from_native", "_log_to_stream"}  # Rerun offers nothing else; recording/ alone asks for them
 
 

@@ -1,5 +1,6 @@
 """CasADi functions on numpy arrays, run by the interpreter or as machine code from the C that CasADi generates."""
 
+import _ctypes
 import ctypes
 import os
 import platform
@@ -9,6 +10,7 @@ import stat
 import subprocess
 import tempfile
 import threading
+import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -29,7 +31,9 @@ _FLAGS = ("-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
 # The time of a compiler grows faster than a function that CasADi wrote. 366 kB took 5 s by -O3, 1.7 s by -O1, 0.4 s by
 # -O0, and ran 6.9, 6.4 and 11.6 µs. 1.3 MB took above 100 s by -O3, 19 s by -O1, 1.3 s by -O0.
 _LEVELS = ((100_000, "-O3"), (500_000, "-O1"))  # text of at most so many characters is compiled by this level
+_CLOSE = "FreeLibrary" if os.name == "nt" else "dlclose"
 _PROBE = 30.0  # a compiler has this long for a program of one line [s]
+_COMPILING = 900.0  # and this long for any other [s]: the largest took 100 s on a quiet machine
 _STEPS_A_THREAD = 50_000  # least steps for one thread: they take about 5 ms, and starting a thread takes 0.1 ms
 _LOOP = """
 #ifdef _WIN32
@@ -186,6 +190,13 @@ def choose_level(text: str) -> str:
     return next((level for most, level in _LEVELS if len(text) <= most), "-O0")
 
 
+def open_library(path: Path) -> ctypes.CDLL:
+    """Return the library of this file, which leaves the process with the last reference to it or to its functions."""
+    code = ctypes.CDLL(str(path))
+    weakref.finalize(code, getattr(_ctypes, _CLOSE), code._handle).atexit = False
+    return code
+
+
 def load_library(
     text: str, command: list[str], cache: Path | None, level: str = "-O3", numbers: bytes = b""
 ) -> ctypes.CDLL:
@@ -203,15 +214,15 @@ def load_library(
     command = [*command, level, *_FLAGS, *_read_words("KOOPMPC_CFLAGS")]
     if cache is None:
         with tempfile.TemporaryDirectory() as folder:  # loaded code stays valid when its file is gone
-            return ctypes.CDLL(str(_compile(text, command, Path(folder) / "step.so", numbers)))
+            return open_library(_compile(text, command, Path(folder) / "step.so", numbers))
     key = "\0".join([text, *command, platform.machine(), platform.system()])
     path = cache / f"{fingerprint(key.encode() + numbers)}.so"
     if path.is_file():
         try:
-            return ctypes.CDLL(str(path))
+            return open_library(path)
         except OSError:  # another kind of machine wrote the file: compile again
             path.unlink()
-    return ctypes.CDLL(str(_compile(text, command, path, numbers)))
+    return open_library(_compile(text, command, path, numbers))
 
 
 def find_private_cache() -> Path | None:
@@ -248,7 +259,8 @@ def _compile(text: str, command: list[str], path: Path, numbers: bytes) -> Path:
             packed.write_bytes(numbers)
             text = f'#define KOOPMPC_NUMBERS "{packed}"\n{text}'
         code.write_text(text)
-        subprocess.run([*command, "-o", str(library), str(code), "-lm"], check=True, capture_output=True)
+        words = [*command, "-o", str(library), str(code), "-lm"]
+        subprocess.run(words, check=True, capture_output=True, timeout=_COMPILING)
         library.replace(path)
     return path
 

@@ -140,9 +140,8 @@ def load_look() -> Callable[[ctypes.c_void_p], int] | None:
         library = load_library(CODE, command, find_private_cache())
     except (OSError, subprocess.SubprocessError):
         return None
-    address = ctypes.cast(library.koopmpc_look, ctypes.c_void_p).value
-    # a call that keeps the interpreter's lock is faster; the loaded code stays in the process
-    return None if address is None else ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(address)
+    # a call that keeps the interpreter's lock is faster
+    return ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(("koopmpc_look", library))
 
 
 class Watch(Viewing):

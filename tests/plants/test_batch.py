@@ -1,7 +1,10 @@
 """Batches of a plant and its machine code give what the interpreter gives."""
 
+import gc
 import stat
+import subprocess
 import warnings
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -209,6 +212,31 @@ def test_flags_of_the_environment_come_last_and_code_of_other_flags_is_another_f
         for cache in (tmp_path, tmp_path, None):
             assert routines.load_library(text, command, cache).told() == told
     assert len(list(tmp_path.glob("*.so"))) == 2
+
+
+@needs_compiler
+def test_a_library_leaves_the_process_with_the_last_reference_to_its_functions(tmp_path):
+    """A process that designs for days would else hold all libraries that it ever loaded."""
+    command, maps = routines.find_compiler(), Path("/proc/self/maps")
+    if not maps.is_file():
+        pytest.skip("this system does not list the libraries of a process")
+    code = routines.load_library("int told(void) { return 4; }", command, tmp_path)
+    again = routines.load_library("int told(void) { return 4; }", command, tmp_path)
+    told = code.told
+    del code
+    gc.collect()
+    assert str(tmp_path) in maps.read_text()
+    assert told() == again.told() == 4
+    del told, again
+    gc.collect()
+    assert str(tmp_path) not in maps.read_text()
+
+
+def test_a_compiler_that_hangs_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(routines, "_COMPILING", 0.05)
+    with pytest.raises(subprocess.TimeoutExpired):
+        routines.load_library("int f(void) { return 0; }", ["sh", "-c", "sleep 60"], tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_without_a_compiler_batches_run_over_columns(monkeypatch):
