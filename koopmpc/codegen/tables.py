@@ -1,7 +1,7 @@
 """From a `Program` to the numbers of its C code: sizes, arrays and functions by the names that they have in C."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -158,7 +158,7 @@ def make_tables(program: StepProgram, *, single: bool, room: int = 0) -> Tables:
     tables.conditioning = _amplify(program)
     match program:
         case FeedbackProgram():
-            _add_feedback(tables, program)
+            _add_feedback(tables, program, single=single)
         case CondensedProgram():
             _add_condensed(tables, program, single=single, room=room)
         case StagedProgram():
@@ -215,16 +215,18 @@ def _add_settings(tables: Tables, *, single: bool) -> None:
     tables.define({name: values[single] for name, values in tolerances.OF_ALL.items()})
 
 
-def _add_gate(tables: Tables, gate: Graph | None, ny: int) -> None:
-    """Write which readings are refused."""
+def _add_gate(tables: Tables, gate: Graph | None, ny: int, *, single: bool) -> None:
+    """Write which readings are refused; what counts as rounding depends on the precision."""
     tables.sizes["GATE"] = 0 if gate is None else gate.m - 2
     tables.sizes["BRIDGED"] = BRIDGED
     if gate is not None:
+        rounding = tolerances.OF_ALL["AT_REST"]
+        gate = replace(gate, constants=np.where(gate.constants == rounding[0], rounding[single], gate.constants))
         arguments = {"y": ny, "predicted": ny, "memory": gate.m - 2}
         tables.functions["koopmpc_gate"] = CFunction(gate, arguments, "result")
 
 
-def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram) -> None:
+def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram, *, single: bool) -> None:
     """Write how z and d follow from y, and the linear model where it is advanced."""
     plan, sizes, estimator = tables.observer, tables.sizes, program.estimator
     sizes["ESTIMATOR"] = 0
@@ -258,7 +260,7 @@ def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram) ->
     elif isinstance(estimator, DisturbanceProgram):
         sizes["ESTIMATOR"] = 1
         tables.define({"GAIN": estimator.gain, "STEADY": estimator.reach, "EXACT": EXACT})
-    _add_gate(tables, estimator.gate, sizes["NY"])
+    _add_gate(tables, estimator.gate, sizes["NY"], single=single)
     if isinstance(program, StagedProgram):
         plan |= {"C": stack(np.eye(program.ny, program.nx)), "E": stack(program.E)}
     elif sizes["ESTIMATOR"] == 1 or program.latency or estimator.gate is not None:
@@ -271,7 +273,7 @@ def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram) ->
         }
 
 
-def _add_linear(tables: Tables, program: LinearProgram) -> None:
+def _add_linear(tables: Tables, program: LinearProgram, *, single: bool) -> None:
     """Write the sizes of a linear model, its targets, and the two QPs that move one inside its limits.
 
     Without equilibria C has one coordinate, which is not used.
@@ -301,7 +303,9 @@ def _add_linear(tables: Tables, program: LinearProgram) -> None:
         M, unit, rinv = np.zeros((count, 1)), np.ones(count), np.eye(1)
         if na:
             solver = program.target_solvers[which]
-            rinv = np.linalg.inv(np.linalg.cholesky(solver.H).T)
+            least = np.diag(solver.columns**2 * float((solver.H.diagonal() / solver.columns**2).sum()))
+            H = solver.H + single * tolerances.FLAT * least  # what moves no tracked output has next to no weight
+            rinv = np.linalg.inv(np.linalg.cholesky(H).T)
             M, unit = solver.M @ rinv, solver.rows
             rinv = solver.columns[:, None] * rinv
         M, scaling = _normalise(M)
@@ -344,9 +348,9 @@ def _add_memory(tables: Tables, n: int, m: int, soft: int) -> None:
     }
 
 
-def _add_feedback(tables: Tables, program: FeedbackProgram) -> None:
+def _add_feedback(tables: Tables, program: FeedbackProgram, *, single: bool) -> None:
     """Write a feedback law."""
-    _add_linear(tables, program)
+    _add_linear(tables, program, single=single)
     model, targets = program.model, program.targets
     tables.sizes |= {"IS_LQR": 1, "HORIZON": 0, "LATENCY": 0, "N": 1, "WITH_RATES": int(program.K_rate.size > 0)}
     tables.plan |= {
@@ -358,7 +362,7 @@ def _add_feedback(tables: Tables, program: FeedbackProgram) -> None:
         "target_span": stack(targets.W if targets.Z.shape[1] else np.zeros((model.nu, 1))),
         "target_push": stack(targets.u_disturbance),
     }
-    _add_gate(tables, program.gate, model.nx)
+    _add_gate(tables, program.gate, model.nx, single=single)
     if program.gate is not None:
         tables.plan |= {"A": stack(model.A), "B": stack(model.B), "C": stack(model.C)}
     _add_memory(tables, 1, 0, 0)
@@ -366,7 +370,7 @@ def _add_feedback(tables: Tables, program: FeedbackProgram) -> None:
 
 def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool, room: int) -> None:
     """Write a plan by one matrix, and its condensed QP."""
-    _add_linear(tables, program)
+    _add_linear(tables, program, single=single)
     model, qp, solver, targets = program.model, program.qp, program.solver, program.targets
     moves, m = program.deviation.shape[0], len(qp.source)
     checked, constant = int(program.checked.sum()), model.lifting.constant_index
@@ -443,7 +447,7 @@ def _add_condensed(tables: Tables, program: CondensedProgram, *, single: bool, r
     elif solver.metric is not None:
         values, V = np.linalg.eigh(solver.metric)
         tables.plan |= {"lambda": np.maximum(values, 0.0), "V": V, "MV": solver.M @ V}
-    _add_estimator(tables, program)
+    _add_estimator(tables, program, single=single)
     _add_memory(tables, moves, m, int(soft.sum()))
 
 
@@ -627,7 +631,7 @@ def _add_staged(tables: Tables, program: StagedProgram, *, single: bool) -> None
     tables.define({"TAIL_SCALE": p.tail.scale})
     tables.define({name: values[single] for name, values in tolerances.OF_STAGES.items()})
     _add_finish(tables, p, low, high)
-    _add_estimator(tables, p)
+    _add_estimator(tables, p, single=single)
     tables.targets = {"table": p.table}
     tables.notes += [_TABLE_NOTE, *([_SCHEDULE_NOTE] if p.scheduled else [])]
 

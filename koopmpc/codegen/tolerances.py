@@ -19,6 +19,8 @@ SINGLE = {
 _OTHERS = ("cycle_tol", "iter_limit", "eps_prox", "eta_prox", "rho_soft", "rel_subopt", "abs_subopt", "w_soft")
 SETTINGS = (*SINGLE, "fval_bound", *_OTHERS)
 
+FLAT = 1e-6  # the least weight of a target's coordinates in single precision, whose rounding would hide Python's 1e-9
+
 OF_ALL = {"WIDER": (1e-8, 1e-5), "ACCURACY": (1e-6, 5e-3), "ROUNDING": (ROUNDING, 1e-6), "AT_REST": (AT_REST, 1e-6)}
 OF_LEVELS = {"NEAR_LEVEL": (NEAR, 1e-4), "BETTER": (1 - EQUAL, 1 - 1e-6)}
 OF_STAGES = {

@@ -147,6 +147,21 @@ def test_floats_answer_to_a_thousandth_of_the_range(name, steps, pendulum):
     assert other <= 0.002 * steps  # within a tolerance of a limit
 
 
+def test_floats_find_the_target_out_of_reach_of_two_inputs_on_one_state():
+    """Which of the two inputs acts has next to no weight in the search of a target; rounding had hidden it."""
+    A, B, names = np.array([[0.29]]), np.array([[0.77, 1.52]]), (("x",), ("a", "b"))
+    model = km.LinearPredictor(A, B, np.eye(1), km.State(), 0.1, *names)
+    limits = km.Limits([-0.46, -1.3], [0.86, 1.87], du_max=[0.44, 0.39], x_min=-3.6)
+    controller = km.KoopmanMPC(model, km.Cost(0.013, [0.017, 0.17]), limits, 10, solver="daqp")
+    twin = km.compiled(controller, precision="float")
+    x = np.array([0.7])
+    for _ in range(6):
+        a, b = controller(x, [-4.3]), twin(x, [-4.3])
+        np.testing.assert_allclose(b.u, a.u, rtol=0, atol=3e-3)
+        x = A @ x + B @ a.u
+    np.testing.assert_allclose(a.u, [-0.46, -1.3], atol=1e-6)
+
+
 def test_a_past_two_inputs_and_a_measured_disturbance_are_told_alike(cart):
     limits = km.Limits(u_min=-2.0, u_max=2.0, du_max=[0.5, 1.0], du_slack=(50.0, 5.0), x_max=[0.6, 1.0])
     cost = km.Cost(Q=[5.0, 0.1], R=[0.1, 0.2])

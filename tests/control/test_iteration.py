@@ -90,10 +90,8 @@ def test_a_step_is_the_solution_of_its_quadratic_program(kind, most, monkeypatch
         if wanted is None:
             assert found.status is km.Status.INFEASIBLE
             continue
-        np.testing.assert_allclose(found.X, wanted[0], atol=5e-4 if most else 1e-5)
-        np.testing.assert_allclose(
-            found.U[plan.problem.free], wanted[1][plan.problem.free], atol=5e-4 if most else 1e-5
-        )
+        np.testing.assert_allclose(found.X, wanted[0], atol=1e-5)
+        np.testing.assert_allclose(found.U[plan.problem.free], wanted[1][plan.problem.free], atol=1e-5)
         if most and found.status is km.Status.OPTIMAL:
             assert each.multipliers is None
             assert 1 <= found.iterations <= 25

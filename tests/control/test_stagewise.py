@@ -326,6 +326,8 @@ def test_without_limits_the_sweeps_solve_the_equations_of_all_stages(kind):
 def test_an_interior_step_is_newtons_on_all_equations_at_once(kind, aim, seed):
     """Mehrotra's predictor aims at no complementarity, and the corrector at what the predictor leads to."""
     dense = Dense(kind, seed)
+    (E, e), n = dense.equations(), dense.N * dense.nx
+    dense.X = np.linalg.solve(E[:, :n], e - E[:, n:] @ dense.U.ravel()).reshape(dense.N, -1)  # a plan of the dynamics
     pairs = dense.t, dense.lam, dense.eps, dense.nu
     mu = dense.mean(*pairs)
     affine = dense.newton(np.zeros_like(dense.t), np.zeros_like(dense.eps))

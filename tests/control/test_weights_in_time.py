@@ -2,6 +2,7 @@
 stages, metrics count them, and laws that do not know them refuse them."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -176,6 +177,11 @@ def test_weights_that_leave_a_later_input_without_cost_are_refused_before_the_fi
     mpc = make(km.KoopmanMPC, R_rows=[[0.1]] * 11 + [[0], [0.1]], Q_rows=weights["Q_rows"])
     for k in range(16):  # a free input is decided where a later state has a weight
         assert mpc([0.2, 0.1], [0, 0]).status.name in ("UNCONSTRAINED", "OPTIMAL"), k
+    model, u = mpc.predictor, mpc([0.2, 0.1], [0, 0]).u
+    with pytest.raises(km.errors.DefinitenessError, match="some change of the inp"):
+        mpc.update(replace(model, B=0 * model.B))
+    assert mpc.predictor is model
+    np.testing.assert_array_equal(mpc([0.2, 0.1], [0, 0]).u, u)  # a refused model has changed nothing
 
 
 def test_laws_that_do_not_know_rows_refuse_them():

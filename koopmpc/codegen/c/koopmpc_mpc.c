@@ -434,7 +434,7 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   report->slack = conflict > opened ? conflict : opened;
   for (int i = 0; i < ROWS; i++) {
     const koopmpc_real dual = qp->dual[i];
-    if (koopmpc_sense[i] && (dual < 0 || dual > 0) && koopmpc_abs(dual) >= (1 - (koopmpc_real)1e-9) * koopmpc_linear[i]) {
+    if (koopmpc_sense[i] && (dual < 0 || dual > 0) && koopmpc_abs(dual) >= (1 - KOOPMPC_ROUNDING) * koopmpc_linear[i]) {
       const koopmpc_real unit = koopmpc_unit[i] * koopmpc_scale[i];
       const koopmpc_real value = qp->product[i] / unit + s->t[koopmpc_source[i]];
       const koopmpc_real over = value - row_high(s, i) / koopmpc_scale[i];

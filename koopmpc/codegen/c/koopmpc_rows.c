@@ -20,6 +20,7 @@ enum {
   PATIENCE = 5,                       /* times as many steps at its end, where the pieces lead nowhere else */
   RESTING = TAILED < 50 ? TAILED : 50 /* steps for which a gain that has settled must rest */
 };
+#define BESIDE ((koopmpc_real)0.3) /* rows are close to each other within this share of a row's size */
 
 /** Whether a target is that of this row. */
 static int is_row(const koopmpc_real *target, const koopmpc_real *row) {
@@ -39,8 +40,9 @@ static koopmpc_real apart(const koopmpc_real *a, const koopmpc_real *b) {
   return sum;
 }
 
-/** The known target whose row is nearest; one without an equilibrium only if all are. NULL without any. */
-static const koopmpc_real *nearest(const koopmpc_state *s, const koopmpc_real *row) {
+/** The known target whose row is nearest; one without an equilibrium only if all are. NULL without any. Of another row
+ * alone with `others`. */
+static const koopmpc_real *nearest(const koopmpc_state *s, const koopmpc_real *row, int others_alone) {
   const koopmpc_real *found = 0, *others = s->made;
   koopmpc_real least = 0;
   int count = s->made_count;
@@ -54,12 +56,23 @@ static const koopmpc_real *nearest(const koopmpc_state *s, const koopmpc_real *r
       const koopmpc_real *each = made < 0 ? s->targets + i * KOOPMPC_TARGET : others + made * KOOPMPC_MADE_SIZE;
       const int known = each[made < 0 ? TARGET_FOUND : TARGET_M] > 0;
       const koopmpc_real far = apart(row, each);
-      if (known != good || (found && !(far < least))) continue;
+      if (known != good || (found && !(far < least)) || (others_alone && is_row(each, row))) continue;
       least = far;
       found = each;
     }
   return found;
 }
+
+#if !KOOPMPC_SCHEDULED
+int koopmpc_is_alone(const koopmpc_state *s, const koopmpc_real *row, const koopmpc_real *target) {
+  const koopmpc_real nothing[ROW] = {0}, none[KOOPMPC_NW1] = {0}, *beside = nearest(s, row, 1);
+  koopmpc_real at[KOOPMPC_LOCAL], size = apart(row, nothing);
+  (void)none;
+  koopmpc_local(target + TARGET_X, target + TARGET_U KOOPMPC_AND(none), at);
+  if (apart(row, at + LOCAL_OF) <= KOOPMPC_HELD * (1 + size)) return 1;
+  return beside && apart(row, beside) <= BESIDE * BESIDE * (size > 1 ? size : 1);
+}
+#endif
 
 /** Walk from an equilibrium of w = 0 to that of another row, and of w, in one go or in pieces. */
 static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc_real *w, int careful, koopmpc_real *x,
@@ -94,7 +107,7 @@ static void slope_of(const koopmpc_real *at, koopmpc_real *slope) {
 #if KOOPMPC_SCHEDULED
 /** The equilibrium of a row for w = 0: of the table, or found from the nearest one; NULL without any. */
 static const koopmpc_real *still_of(koopmpc_state *s, const koopmpc_real *row) {
-  const koopmpc_real *from = nearest(s, row), none[KOOPMPC_NW1] = {0};
+  const koopmpc_real *from = nearest(s, row, 0), none[KOOPMPC_NW1] = {0};
   koopmpc_real own[KOOPMPC_MADE_SIZE];
   if (!from || is_row(from, row)) return from;
   koopmpc_copy(own, from, TARGET_M);
@@ -133,7 +146,7 @@ static int move_on(koopmpc_state *s, const koopmpc_real *row, const koopmpc_real
 
 /** Find the equilibrium of a row and keep it; NULL if there is no table to start from. */
 static const koopmpc_real *make(koopmpc_state *s, const koopmpc_real *row) {
-  const koopmpc_real *from = nearest(s, row);
+  const koopmpc_real *from = nearest(s, row, 0);
   koopmpc_real at[KOOPMPC_LOCAL], own[KOOPMPC_MADE_SIZE];
   const koopmpc_real *w = koopmpc_end_w(s);
   int found;

@@ -552,7 +552,8 @@ static int is_found(koopmpc_state *s, const koopmpc_real *row, int whole) {
   if (target >= s->targets && target < known) return 1;
   for (int i = 0; i < NV + KOOPMPC_BOX && target; i++)
     free &= !(target[TARGET_ACTIVE + i] < 0 || target[TARGET_ACTIVE + i] > 0);
-  return target && free && target[target == s->made_end ? TARGET_FOUND : TARGET_M] > 0;
+  free = target && free && target[target == s->made_end ? TARGET_FOUND : TARGET_M] > 0;
+  return free && koopmpc_is_alone(s, row, target);
 #endif
 }
 

@@ -150,7 +150,10 @@ static void factor(koopmpc_state *s, const koopmpc_real *barrier) {
   }
 }
 
-/** The sweeps for gradients: those of the program plus `push` (NQ, N) on [v; g], NULL for none; writes newX and newU. */
+/**
+ * The sweeps for the gradients of the program, which write its solution into newX and newU. With `push` (NQ, N) on [v; g]
+ * they write the way there from dX and dU, which obey the dynamics: its rounding is a share of it, whatever barriers weigh.
+ */
 static void sweep(koopmpc_state *s, const koopmpc_real *push) {
   koopmpc_real p[NS], x[NS];
   koopmpc_fill(p, 0, NS);
@@ -158,12 +161,17 @@ static void sweep(koopmpc_state *s, const koopmpc_real *push) {
     const koopmpc_real *A = s->A + k * NS * NS, *B = s->B + k * NS * NV, *K = s->K + k * NV * NS;
     const koopmpc_real *half = s->half + k * NV * NV;
     koopmpc_real h[NS], pulled[NV], *feed = s->feed + k * NV;
-    for (int i = 0; i < NS; i++) h[i] = s->Pc[k * NS + i] + p[i] + s->q[k * NS + i];
+    for (int i = 0; i < NS; i++) h[i] = p[i] + s->q[k * NS + i];
     koopmpc_copy(pulled, s->r + k * NV, NV);
     if (push) {
+      const koopmpc_real *R = koopmpc_free[k] ? koopmpc_R : koopmpc_R_held;
+      koopmpc_add(h, s->Q + k * NS * NS, NS, s->dX + k * NS, NS); /* both weights are symmetric */
+      koopmpc_add(pulled, R, NV, s->dU + k * NV, NV);
       for (int g = 0; g < NG; g++)
         for (int i = 0; i < NS; i++) h[i] += push[(NV + g) * STEPS + k] * s->G[(k * NG + g) * NS + i];
       for (int i = 0; i < NV; i++) pulled[i] += push[i * STEPS + k];
+    } else {
+      for (int i = 0; i < NS; i++) h[i] += s->Pc[k * NS + i];
     }
     for (int m = 0; m < NS; m++)
       for (int i = 0; i < NV; i++) pulled[i] += B[m * NV + i] * h[m];
@@ -182,13 +190,14 @@ static void sweep(koopmpc_state *s, const koopmpc_real *push) {
       feed[i] /= half[i * NV + i];
     }
   }
-  koopmpc_copy(x, s->start, NS);
+  koopmpc_fill(x, 0, NS);
+  if (!push) koopmpc_copy(x, s->start, NS);
   for (int k = 0; k < STEPS; k++) {
     const koopmpc_real *A = s->A + k * NS * NS, *B = s->B + k * NS * NV;
     koopmpc_real *u = s->newU + k * NV, *next = s->newX + k * NS;
     for (int i = 0; i < NV; i++) u[i] = s->feed[k * NV + i] - koopmpc_dot(s->K + (k * NV + i) * NS, x, NS);
     for (int i = 0; i < NS; i++)
-      next[i] = koopmpc_dot(A + i * NS, x, NS) + koopmpc_dot(B + i * NV, u, NV) + s->c[k * NS + i];
+      next[i] = koopmpc_dot(A + i * NS, x, NS) + koopmpc_dot(B + i * NV, u, NV) + (push ? 0 : s->c[k * NS + i]);
     koopmpc_copy(x, next, NS);
   }
 }
@@ -229,7 +238,7 @@ static void newton(koopmpc_state *s, koopmpc_real centre) {
         ease += w * s->kappa[soft];
       }
       s->base[at] = s->lam[at] + (-w * given - s->lam[at] + (centre - s->second[at]) / s->t[at]) / ease;
-      push[k] -= scale * (s->base[at] + s->eased[at] * s->moved[at]);
+      push[k] -= scale * s->base[at];
     }
   }
   sweep(s, s->push);
@@ -238,7 +247,7 @@ static void newton(koopmpc_state *s, koopmpc_real centre) {
     const koopmpc_real scale = koopmpc_side_scale[i], *reach = s->reach + koopmpc_side_row[i] * STEPS;
     for (int k = 0; k < STEPS; k++) {
       const int at = i * STEPS + k, soft = at - HARD * STEPS;
-      const koopmpc_real far = scale * reach[k] - s->moved[at];
+      const koopmpc_real far = scale * reach[k];
       s->step_lam[at] = s->base[at] - s->eased[at] * far - s->lam[at];
       s->step_t[at] = far + s->gap[at];
       if (i >= HARD) {
@@ -307,8 +316,7 @@ static koopmpc_real interior(koopmpc_state *s, koopmpc_real mu, koopmpc_real sig
     for (int k = 0; k < STEPS; k++) {
       const int at = i * STEPS + k, soft = at - HARD * STEPS;
       const koopmpc_real w = s->lam[at] / s->t[at];
-      s->moved[at] = scale * reach[k];
-      s->gap[at] = s->d_side[at] + s->moved[at] - s->t[at];
+      s->gap[at] = s->d_side[at] + scale * reach[k] - s->t[at];
       s->eased[at] = w;
       if (i >= HARD) {
         s->kappa[soft] = 1 / (koopmpc_soft_quadratic[i - HARD] + s->nu[soft] / s->eps[soft]);
@@ -332,8 +340,6 @@ static koopmpc_real interior(koopmpc_state *s, koopmpc_real mu, koopmpc_real sig
   }
   newton(s, centre);
   length = 1 / larger(longest(s) / SHORT_OF, 1);
-  for (int i = 0; i < STEPS * NS; i++) s->newX[i] -= s->dX[i];
-  for (int i = 0; i < STEPS * NV; i++) s->newU[i] -= s->dU[i];
   if (!(length > 0 && koopmpc_usable(s->newX, STEPS * NS) && koopmpc_usable(s->newU, STEPS * NV)))
     return (koopmpc_real)NAN;
   add_step(s->dX, s->newX, length, STEPS * NS);
@@ -361,6 +367,32 @@ static koopmpc_real unit_of(const koopmpc_state *s) {
   return larger(sum, (koopmpc_real)1e-30);
 }
 
+#if KOOPMPC_HARD_OUTPUTS
+/** Whether no first input inside its limits leads to a state inside its hard limits, row by row, as after wild readings. */
+static int hard_limits_are_out_of_reach(const koopmpc_state *s) {
+  koopmpc_real next[NS];
+  for (int i = 0; i < NS; i++) next[i] = s->c[i] + koopmpc_dot(s->A + i * NS, s->start, NS);
+  for (int h = 0; h < KOOPMPC_HARD_OUTPUTS; h++) {
+    const int row = koopmpc_hard_output[h];
+    const koopmpc_real *G = s->G + row * NS;
+    koopmpc_real least = s->g[row] + koopmpc_dot(G, next, NS), most = least;
+    for (int j = 0; j < NV; j++) {
+      koopmpc_real gain = 0, one, other;
+      for (int i = 0; i < NS; i++) gain += G[i] * s->B[i * NV + j];
+      if (!(gain < 0 || gain > 0)) continue;
+      one = gain * (koopmpc_low_of(s, 0, j) - s->V[j]);
+      other = gain * (koopmpc_high_of(s, 0, j) - s->V[j]);
+      least += one < other ? one : other;
+      most += one < other ? other : one;
+    }
+    if (koopmpc_low_of(s, 0, NV + row) - most > koopmpc_hard_allowance[h] ||
+        least - koopmpc_high_of(s, 0, NV + row) > koopmpc_hard_allowance[h])
+      return 1;
+  }
+  return 0;
+}
+#endif
+
 /** Follow the central path from the unconstrained solution. */
 static koopmpc_status limited(koopmpc_state *s, int *iterations) {
   const koopmpc_real unit = unit_of(s);
@@ -369,6 +401,9 @@ static koopmpc_status limited(koopmpc_state *s, int *iterations) {
   for (int i = 0; i < HARD; i++) /* between two equal limits there is no interior point */
     for (int k = 0; k < STEPS; k++)
       narrow |= !(koopmpc_low_of(s, k, koopmpc_side_row[i]) < koopmpc_high_of(s, k, koopmpc_side_row[i]));
+#if KOOPMPC_HARD_OUTPUTS
+  if (hard_limits_are_out_of_reach(s)) return KOOPMPC_INFEASIBLE;
+#endif
   if (s->finishing || narrow) return koopmpc_finish(s, iterations);
   koopmpc_fill(s->step_t, 0, PAIRS);
   koopmpc_fill(s->step_lam, 0, PAIRS);

@@ -116,6 +116,11 @@ void koopmpc_factors(const koopmpc_real *at, koopmpc_real *H, koopmpc_real *T);
  */
 const koopmpc_real *koopmpc_find_row(koopmpc_state *s, const koopmpc_real *row, int whole);
 
+#if !KOOPMPC_SCHEDULED
+/** Whether a target holds its row, or was found from another row close by: else other equilibria may be as near. */
+int koopmpc_is_alone(const koopmpc_state *s, const koopmpc_real *row, const koopmpc_real *target);
+#endif
+
 #if KOOPMPC_SCHEDULED
 /** Whether an equilibrium holds a row for w = 0 that is known, or found from a known one, without active limits. */
 int koopmpc_is_free(koopmpc_state *s, const koopmpc_real *row);

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Any, ClassVar, cast
 
@@ -190,9 +191,7 @@ class KoopmanMPC(MPCBase):
         long = self._solver == order.SPARSE or self._N >= order.LONG
         self._plan_kind = PlanKind(disturbed, self._initial.periodic.size > 0, staged=long and not track.weighed)
         self._map = plan_map(predictor, track, self._moves, coordinates, self._initial.buffer, self._plan_kind)
-        self._hold_limits()
-        if track.weighed:
-            self._hold_weights()
+        self._hold(*self._read_own(predictor, self._map))
         self._options = {"solver": self._solver, "settings": settings}
         self._levels: LevelSearch | None = None
         ball = self._map.ball
@@ -351,11 +350,10 @@ class KoopmanMPC(MPCBase):
             track = self._weigh_priorities(track, predictor)
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
         plan = plan_map(predictor, track, self._moves, coordinates, self._initial.buffer, self._plan_kind)
+        windows, weighed = self._read_own(predictor, plan)  # what may be refused is refused before anything changes
         self.predictor, self._states = predictor, None
         self._take_plan(plan)
-        self._hold_limits()
-        if track.weighed:
-            self._hold_weights()
+        self._hold(windows, weighed)
         self._initial.update(predictor)
         if self._watch is not None:
             self._watch.update(predictor)
@@ -461,21 +459,32 @@ class KoopmanMPC(MPCBase):
         else:
             self._qps.update(plan.qp)
 
-    def _hold_weights(self) -> None:
-        """Make the table of plans of weights in time."""
-        base = WeighedPlan(self._map, self._rows_of_limits)
-        self._weighed = WeighedPlans(self._map.track, self._N, base, self._weigh)
-        self._weighed.check_free_inputs()
+    def _read_own(self, predictor: LinearPredictor, plan: PlanMap) -> tuple[LimitWindows | None, WeighedPlans | None]:
+        """Return the windows of its own limits, and the table of plans of its weights, where these move in time."""
+        windows = None
+        if self.limits.in_time:
+            names = predictor.states, predictor.inputs
+            windows = limit_windows(plan, self.limits, *names, self._latency, at_call=False)
+        if not plan.track.weighed:
+            return windows, None
+        weighed = WeighedPlans(plan.track, self._N, WeighedPlan(plan, windows), partial(self._weigh, predictor, plan))
+        weighed.check_free_inputs()
+        return windows, weighed
 
-    def _weigh(self, rows: WeightRows) -> WeighedPlan:
+    def _hold(self, windows: LimitWindows | None, weighed: WeighedPlans | None) -> None:
+        """Go on with these windows and this table."""
+        self._called_with = self._quick = None
+        self._window, self._rows_of_limits, self._weighed = windows, windows, weighed
+
+    def _weigh(self, model: LinearPredictor, plan: PlanMap, rows: WeightRows) -> WeighedPlan:
         """Return the plan of weights in time."""
-        now, model, buffer = self._map, self.predictor, self._initial.buffer
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
-        plan = plan_map(model, now.track, self._moves, coordinates, buffer, self._plan_kind, rows, now)
+        buffer = self._initial.buffer
+        weighed = plan_map(model, plan.track, self._moves, coordinates, buffer, self._plan_kind, rows, plan)
         if not self.limits.in_time:
-            return WeighedPlan(plan, None)
-        windows = limit_windows(plan, self.limits, model.states, model.inputs, self._latency, at_call=False)
-        return WeighedPlan(plan, windows)
+            return WeighedPlan(weighed, None)
+        windows = limit_windows(weighed, self.limits, model.states, model.inputs, self._latency, at_call=False)
+        return WeighedPlan(weighed, windows)
 
     def _follow_weights(self, weighed: WeighedPlans) -> None:
         """Take the plan of the weights of this step."""
@@ -486,15 +495,9 @@ class KoopmanMPC(MPCBase):
             self._called_with = self._quick = None
             self._window = self._rows_of_limits = windows
 
-    def _hold_limits(self) -> None:
-        """Make the windows of the controller's own limits, where these move in time."""
-        self._called_with = self._window = self._rows_of_limits = self._quick = None
-        if self.limits.in_time:
-            self._rows_of_limits = self._window = self._make_windows(self.limits, at_call=False)
-
-    def _make_windows(self, limits: Limits, *, at_call: bool) -> LimitWindows:
+    def _make_windows(self, limits: Limits) -> LimitWindows:
         model = self.predictor
-        return limit_windows(self._map, limits, model.states, model.inputs, self._latency, at_call=at_call)
+        return limit_windows(self._map, limits, model.states, model.inputs, self._latency, at_call=True)
 
     def _read_windows(self, limits: Limits) -> LimitWindows:
         """Return the windows of the limits of a call: by their numbers alone where they were made by `with_bounds`."""
@@ -502,7 +505,7 @@ class KoopmanMPC(MPCBase):
         if quick is not None and quick.fits and has_fields_of(limits, self.limits):
             found = quick.make(limits)
         if found is None:
-            found = self._make_windows(self.read_limits(limits), at_call=True)
+            found = self._make_windows(self.read_limits(limits))
             self._quick = CallWindows(self._map, self._latency)
         return found
 
@@ -518,7 +521,7 @@ class KoopmanMPC(MPCBase):
 
     def check_limits(self, limits: Limits) -> None:
         """Raise where limits of a call cross, have no row in the plan, or too few rows."""
-        self._make_windows(limits, at_call=True)
+        self._make_windows(limits)
 
     def _move_limits(self, limits: Limits | None, moving: MovingMap | None) -> None:
         """Put the limits of this step into the plan, and let targets that they move be found again."""

@@ -390,7 +390,7 @@ class BilinearMPC(StagedMPC):
         Plans that follow the model come before those that do not yet. No further start begins after SPENT iterations
         of the solver, or where the problem is affine and a plan was found: all starts lead to that one.
         """
-        iteration, total, best = self._iteration, 0, (3, 0.0)
+        iteration, total, best, done = self._iteration, 0, (3, 0.0), False
         status, kept = Status.FAILED, (iteration.X.copy(), iteration.U.copy(), 0.0)
         for X, U in self._starts(s[: self._map.nx], u_prev):
             ended, iterations = self._improve(s, u_prev, EACH, deadline, NEARLY, (X, U))
@@ -403,10 +403,10 @@ class BilinearMPC(StagedMPC):
                 rank = (0, iteration.cost()) if followed else (1, max(gap, broken))
             if rank < best:
                 best, status, kept = rank, ended, (iteration.X.copy(), iteration.U.copy(), iteration.slack)
-            if total >= SPENT or (self._affine and best[0] == 0) or perf_counter() > deadline:
+            done = total >= SPENT or (self._affine and best[0] == 0)
+            if done or perf_counter() > deadline:
                 break
         iteration.X[:], iteration.U[:], iteration.slack = kept
-        done = total >= SPENT or (self._affine and best[0] == 0)
         if status not in GOOD or done or perf_counter() > deadline:
             return status, total
         polished, iterations = self._improve(s, u_prev, max(FIRST, self._sqp_iterations), deadline)

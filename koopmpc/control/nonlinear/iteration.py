@@ -136,7 +136,7 @@ class RealTimeIteration:
         plan = [self.X, self.U, self._R, self._U_r, *self._terminal, self.theta, *self._weights]
         self._base_R, self._R_k = R.reshape(nu, N, nu).transpose(1, 0, 2).copy(), zeros((N, nu, nu))
         self._R_k[:] = self._base_R
-        self._A, self._stages = A, Stages(A, B, Q, self._R_k, self._G, problem.free)
+        self._A, self._B, self._stages = A, B, Stages(A, B, Q, self._R_k, self._G, problem.free)
         self._quadratic, self._gradients = (Q, self._R_k), (q, r)
         self._own_stage = (
             ConvexStage(problem, self.X, self.U, compiles=compiles_model) if problem.stage is not None else None
@@ -328,6 +328,8 @@ class RealTimeIteration:
         s = self._sides
         rows = s.row
         unlimited = self._dX.copy(), self._dU.copy()
+        if self._hard_limits_are_out_of_reach():
+            return StageStep(*unlimited, np.zeros_like(self._eps), Status.INFEASIBLE, 0)
         if self.multipliers is not None or not self._roomy():
             return self._finish(free, *unlimited, deadline, 0)
         bound = np.where(s.sign > 0, self.low[:, rows], self.high[:, rows])
@@ -384,6 +386,8 @@ class RealTimeIteration:
         if found is None:
             return StageStep(dX, dU, np.zeros_like(self._eps), Status.FAILED, iterations)
         self.multipliers = found.multipliers if found.status is Status.OPTIMAL else None
+        if found.status is Status.INFEASIBLE and not self.limits_outputs:  # limits of inputs alone always have a plan
+            found = found._replace(status=Status.FAILED)
         return self._deviate(free, dX, dU, found, iterations)
 
     def _deviate(
@@ -401,6 +405,24 @@ class RealTimeIteration:
         rows, sign = s.row[len(s.row) - s.soft :], s.sign[len(s.row) - s.soft :]
         past = np.where(sign > 0, room.low[:, rows] - moved[:, rows], moved[:, rows] - room.high[:, rows])
         return StageStep(self._dX, self._dU, np.maximum(past, 0.0), found.status, iterations + found.iterations)
+
+    def _hard_limits_are_out_of_reach(self) -> bool:
+        """Return whether no first input inside its limits leads to a state inside its hard limits, row by row.
+
+        So it is after most wild readings, and an active-set method would take its time to find that out.
+        """
+        if not self.limits_outputs:
+            return False
+        hard, nu = self._hard, self._shape[2]
+        G = self._G[0][:, hard]
+        gain, at = self._B[0] @ G, self._g[0, hard] + (self._c[0] + self._x0 @ self._A[0]) @ G
+        ends = np.where(
+            gain != 0, np.stack([each[0, :nu] - self.U[0] for each in (self.low, self.high)])[:, :, None], 0
+        )
+        reach = np.sort(ends * gain, axis=0).sum(axis=1)
+        low, high = self.low[0, nu + hard], self.high[0, nu + hard]
+        past = np.maximum(low - at - reach[1], at + reach[0] - high)
+        return bool((past > self._hard_allowance).any())
 
     def _roomy(self) -> bool:
         """Return whether there is room between all hard limits, without which there is no interior."""

@@ -249,14 +249,15 @@ def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"] | None, si
 
     (A, B, c, Q, q, r, δx_0, G, d, σ; X, U, t, λ, ε, ν) → (X, U, t, λ, ε, ν, [μ, α]): d the plan's distances (ns, N), t
     ≥ 0 their slack variables, λ the multipliers, ε ≥ 0 and ν those of the soft sides, μ the mean complementarity before
-    the step, α the step's length. σ is zero in a predictor–corrector step. A step with σ > 0 aims at the
-    complementarity σ μ everywhere and leaves the corrector out: it returns to the central path. Without R here, it is
-    the argument behind δx_0.
+    the step, α the step's length. (X, U) obeys the dynamics, and only the way from there is solved for: rounding is
+    then a share of that way, though barriers weigh 1e11 times as much as the cost. σ is zero in a predictor–corrector
+    step. A step with σ > 0 aims at the complementarity σ μ everywhere and leaves the corrector out: it returns to the
+    central path. Without R here, it is the argument behind δx_0.
     """
     nx, nu, N = sweeps.nx, sweeps.nu, sweeps.N
     ns, nsoft = len(sides.row), sides.soft
     arguments = _problem(nx, nu, N, R)
-    A, B, c, Q, q, r, x0 = arguments[:7]
+    A, B, _, Q, q, r, _ = arguments[:7]
     G, d, sigma = ca.MX.sym("G", ng, N * nx), ca.MX.sym("d", ns, N), ca.MX.sym("sigma")
     X, U = ca.MX.sym("X", nx, N), ca.MX.sym("U", nu, N)
     t, lam = ca.MX.sym("t", ns, N), ca.MX.sym("lam", ns, N)
@@ -276,33 +277,38 @@ def interior_step(sweeps: RiccatiSweeps, R: Float[np.ndarray, "nu m"] | None, si
     x = ca.SX.sym("x", nx)
     seen = ca.Function("seen", [row, x], [ca.densify(row @ x)]).map(N)
     diagonal = ca.Function("diagonal", [v := ca.SX.sym("w", nu)], [ca.densify(ca.diag(v))]).map(N)
+    weigh_x, weigh_u = (
+        ca.Function("weighed", [M := ca.SX.sym("M", n, n), v := ca.SX.sym("v", n)], [M @ v]).map(N) for n in (nx, nu)
+    )
 
     def distances(X: ca.MX, U: ca.MX) -> ca.MX:
         return S @ (ca.vertcat(U, seen(G, X)) if ng else U)
 
-    moved = distances(X, U)
     w = lam / t
     kappa = 1 / (l2 + nu_ / eps)
     K = pad(kappa)
     eased = w / (1 + w * K)
-    gap = d + moved + pad(eps) - t
+    gap = d + distances(X, U) + pad(eps) - t
     weights = (S.T**2) @ eased
-    R_k = (arguments[7] if R is None else ca.MX(ca.DM(R))) + diagonal(weights[:nu, :])
+    own = arguments[7] if R is None else ca.MX(ca.DM(R))
+    R_k = own + diagonal(weights[:nu, :])
     Q_k = Q + gram(G, weights[nu:, :]) if ng else Q
-    factors = sweeps.factors(A, B, c, Q_k, R_k)
+    rest = ca.MX(nx, N)
+    factors = sweeps.factors(A, B, rest, Q_k, R_k)
+    slope_x, slope_u = q + weigh_x(Q, X), r + weigh_u(own, U)  # of the cost, at this point
 
     def solve(c1: ca.MX | float, c2: ca.MX | float) -> tuple[ca.MX, ...]:
         rho = lam[ns - nsoft :, :] - l1 - l2 * eps + c2 / eps
         base = lam + (-w * (K * pad(rho) + gap) - lam + c1 / t) / (1 + w * K)
-        gradient = -S.T @ (base + eased * moved)
-        q_k = q + pulled(G, gradient[nu:, :]) if ng else q
-        X_new, U_new = sweeps.solve(factors, B, c, q_k, r + gradient[:nu, :], x0)
-        reached = distances(X_new, U_new) - moved
+        gradient = -S.T @ base
+        q_k = slope_x + pulled(G, gradient[nu:, :]) if ng else slope_x
+        d_X, d_U = sweeps.solve(factors, B, rest, q_k, slope_u + gradient[:nu, :], ca.MX(nx, 1))
+        reached = distances(d_X, d_U)
         d_lam = base - eased * reached - lam
         d_eps = kappa * (rho + d_lam[ns - nsoft :, :])
         d_t = reached + pad(d_eps) + gap
         d_nu = -(nu_ / eps) * d_eps - nu_ + c2 / eps
-        return X_new - X, U_new - U, d_t, d_lam, d_eps, d_nu
+        return d_X, d_U, d_t, d_lam, d_eps, d_nu
 
     def longest(d_t: ca.MX, d_lam: ca.MX, d_eps: ca.MX, d_nu: ca.MX) -> ca.MX:
         pairs = [(d_t, t), (d_lam, lam)] + ([(d_eps, eps), (d_nu, nu_)] if nsoft else [])
