@@ -191,7 +191,8 @@ class KoopmanMPC(MPCBase):
         long = self._solver == order.SPARSE or self._N >= order.LONG
         self._plan_kind = PlanKind(disturbed, self._initial.periodic.size > 0, staged=long and not track.weighed)
         self._map = plan_map(predictor, track, self._moves, coordinates, self._initial.buffer, self._plan_kind)
-        self._hold(*self._read_own(predictor, self._map))
+        self._rows_of_limits, self._weighed = self._read_own(predictor, self._map)
+        self._window = self._rows_of_limits
         self._options = {"solver": self._solver, "settings": settings}
         self._levels: LevelSearch | None = None
         ball = self._map.ball
@@ -351,9 +352,9 @@ class KoopmanMPC(MPCBase):
         coordinates = "plain" if self.coordinates == "plain" else "riccati"
         plan = plan_map(predictor, track, self._moves, coordinates, self._initial.buffer, self._plan_kind)
         windows, weighed = self._read_own(predictor, plan)  # what may be refused is refused before anything changes
-        self.predictor, self._states = predictor, None
+        self.predictor, self._states, self._called_with, self._quick = predictor, None, None, None
         self._take_plan(plan)
-        self._hold(windows, weighed)
+        self._window, self._rows_of_limits, self._weighed = windows, windows, weighed
         self._initial.update(predictor)
         if self._watch is not None:
             self._watch.update(predictor)
@@ -470,11 +471,6 @@ class KoopmanMPC(MPCBase):
         weighed = WeighedPlans(plan.track, self._N, WeighedPlan(plan, windows), partial(self._weigh, predictor, plan))
         weighed.check_free_inputs()
         return windows, weighed
-
-    def _hold(self, windows: LimitWindows | None, weighed: WeighedPlans | None) -> None:
-        """Go on with these windows and this table."""
-        self._called_with = self._quick = None
-        self._window, self._rows_of_limits, self._weighed = windows, windows, weighed
 
     def _weigh(self, model: LinearPredictor, plan: PlanMap, rows: WeightRows) -> WeighedPlan:
         """Return the plan of weights in time."""
