@@ -181,6 +181,7 @@ typedef struct {
 #endif
   const koopmpc_real *targets; /**< the table of targets, see koopmpc_use_targets */
   int finishing;               /**< whether the active-set method finished the last program of this step */
+  int spent;                   /**< the effort of the solver in this step, in interior-point steps */
   int target_count, found;     /**< number of its rows, and the row that was found last */
   int moved_on;                /**< whether the disturbance or the row of given input targets has moved */
 #else

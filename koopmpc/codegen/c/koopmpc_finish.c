@@ -14,7 +14,11 @@
 #if KOOPMPC_FINISH_ROWS > 0
 #include "koopmpc_qp.h"
 
-enum { COUNT = KOOPMPC_FINISH_ROWS, WIDTH = KOOPMPC_FINISH_WIDTH };
+enum {
+  COUNT = KOOPMPC_FINISH_ROWS,
+  WIDTH = KOOPMPC_FINISH_WIDTH,
+  FINISHED = 150 /* about as many interior-point steps take as long; how many iterations there are rounding decides */
+};
 
 /** x and u = -K x + L^-T w of a stage, w its part of `all`; NULL for zero. */
 static void deviate(const koopmpc_state *s, int k, const koopmpc_real *all, const koopmpc_real *x, koopmpc_real *u,
@@ -95,6 +99,7 @@ koopmpc_status koopmpc_finish(koopmpc_state *s, int *iterations) {
   koopmpc_qp_memory qp = koopmpc_qp_on(&problem, s->finish_reals, s->finish_ints);
   koopmpc_qp_end end;
   int good = 0, unmet = 0;
+  s->spent += FINISHED;
   for (int r = 0; r < COUNT; r++) { /* the program without limits is in newX and newU */
     const int k = koopmpc_finish_row[r] / NQ, i = koopmpc_finish_row[r] % NQ;
     s->finish_free[r] = moved_by(s, koopmpc_finish_row[r]) + (i < NV ? s->V[k * NV + i] : s->g[k * NG + i - NV]);

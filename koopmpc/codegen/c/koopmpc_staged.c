@@ -168,10 +168,10 @@ static int rests(const koopmpc_state *s, koopmpc_real settled) {
 static koopmpc_status improve(koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev, int most,
                               koopmpc_real settled, int *iterations) {
   koopmpc_status status = KOOPMPC_FAILED;
-  const int before = *iterations;
+  const int begun = s->spent;
   for (int k = 0; k < most; k++) {
     int taken = 0;
-    if (k && *iterations - before >= SPENT) break;
+    if (k && s->spent - begun >= SPENT) break;
     const koopmpc_status found = koopmpc_program(s, x, s->without_limits, &taken);
     *iterations += taken;
     if (!is_good(found)) return found;
@@ -281,7 +281,7 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
                                  int *iterations) {
   koopmpc_status status = KOOPMPC_FAILED, polished;
   koopmpc_real best = KOOPMPC_HUGE;
-  const int before = *iterations;
+  const int begun = s->spent;
   int best_kind = 3, done = 0;
   save(s);
   s->best_slack = 0;
@@ -307,7 +307,7 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
       status = ended;
       save(s);
     }
-    done = *iterations - before >= SPENT || (KOOPMPC_AFFINE && best_kind == 0);
+    done = s->spent - begun >= SPENT || (KOOPMPC_AFFINE && best_kind == 0);
   }
   restore(s);
   if (!is_good(status) || done) return status;
@@ -514,7 +514,7 @@ static int first_stage(koopmpc_state *s, const koopmpc_real *u_prev, koopmpc_rea
 /** The plan from `stage` on. */
 static koopmpc_status solve(koopmpc_state *s, const koopmpc_real *stage, const koopmpc_real *u_prev, int *iterations) {
   koopmpc_status status = KOOPMPC_FAILED;
-  s->finishing = 0;
+  s->finishing = s->spent = 0;
   if (s->warm) {
     int near = 1;
     for (int i = 0; i < NX; i++) near &= koopmpc_abs(stage[i] - s->S[NS + i]) <= FAR_OFF * koopmpc_sizes[i];

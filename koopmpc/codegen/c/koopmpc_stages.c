@@ -487,7 +487,12 @@ koopmpc_status koopmpc_program(koopmpc_state *s, const koopmpc_real *x, koopmpc_
   koopmpc_fill(s->eps, 0, STEPS * SOFT);
   if (inside && good) return KOOPMPC_UNCONSTRAINED;
 #if KOOPMPC_SIDES > 0
-  if (good) return limited(s, iterations);
+  if (good) {
+    const int spent = s->spent;
+    const koopmpc_status status = limited(s, iterations);
+    if (s->spent == spent) s->spent += *iterations; /* no active-set method has finished it */
+    return status;
+  }
 #else
   (void)iterations;
 #endif

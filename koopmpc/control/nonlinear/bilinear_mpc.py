@@ -39,7 +39,7 @@ from koopmpc.predict.predictors import BilinearPredictor
 
 EACH = 12  # linearisations from each start of a first step, at most
 FIRST = 10  # further linearisations of the best of these plans, at most
-SPENT = 300  # after so many iterations of the solver no further start, and no further linearisation from one, begins
+SPENT = 300  # after so much effort of the solver no further start, and no further linearisation from one, begins
 FOLLOWED = 0.02  # a plan follows the model whose defects are below this share of the range of their state
 SETTLED = (
     1e-6  # a plan is a solution when no input and no state moves by more than this share of its size and the plan's
@@ -163,7 +163,7 @@ class BilinearMPC(StagedMPC):
         self._sqp_iterations = checks.count(sqp_iterations, "sqp_iterations")
         self._iteration = RealTimeIteration(self._problem, compiles_model=self._compiles_model)
         self._iteration.set_theta(self._map.theta)
-        self._affine = self._problem.affine
+        self._affine, self._spent = self._problem.affine, 0  # effort of the solver in this step
         self._e = self._iteration.e[:, : self._map.nx]
         self._X, self._U = self._iteration.X[:, : self._map.nx], np.zeros((self._N, self.nu))
         self._on_levels = None if self._levels is None else StageLevels(self._levels, self._problem)
@@ -318,7 +318,7 @@ class BilinearMPC(StagedMPC):
         first: Interval,
         deadline: float,
     ) -> StagePlan:
-        iteration = self._iteration
+        iteration, self._spent = self._iteration, 0
         iteration.multipliers = None
         if self._with_rates:
             iteration.low[0, : self.nu], iteration.high[0, : self.nu] = first
@@ -387,10 +387,10 @@ class BilinearMPC(StagedMPC):
     ) -> tuple[Status, int]:
         """Take the cheapest of the plans to which several starts lead; return how it ended, and all iterations.
 
-        Plans that follow the model come before those that do not yet. No further start begins after SPENT iterations
-        of the solver, or where the problem is affine and a plan was found: all starts lead to that one.
+        Plans that follow the model come before those that do not yet. No further start begins after an effort of
+        SPENT, or where the problem is affine and a plan was found: all starts lead to that one.
         """
-        iteration, total, best, done = self._iteration, 0, (3, 0.0), False
+        iteration, total, best, done, begun = self._iteration, 0, (3, 0.0), False, self._spent
         status, kept = Status.FAILED, (iteration.X.copy(), iteration.U.copy(), 0.0)
         for X, U in self._starts(s[: self._map.nx], u_prev):
             ended, iterations = self._improve(s, u_prev, EACH, deadline, NEARLY, (X, U))
@@ -403,7 +403,7 @@ class BilinearMPC(StagedMPC):
                 rank = (0, iteration.cost()) if followed else (1, max(gap, broken))
             if rank < best:
                 best, status, kept = rank, ended, (iteration.X.copy(), iteration.U.copy(), iteration.slack)
-            done = total >= SPENT or (self._affine and best[0] == 0)
+            done = self._spent - begun >= SPENT or (self._affine and best[0] == 0)
             if done or perf_counter() > deadline:
                 break
         iteration.X[:], iteration.U[:], iteration.slack = kept
@@ -451,14 +451,15 @@ class BilinearMPC(StagedMPC):
         a share `settled` of the plan moves, where F is nowhere near its linearisation, and at the deadline; then the
         plan found so far is used, and the step is late.
         """
-        total, status, iteration = 0, Status.FAILED, self._iteration
+        total, status, iteration, begun = 0, Status.FAILED, self._iteration, self._spent
         if begin is not None:
             self._enter(*begin, u_prev)
         for k in range(most):
-            if k and (total >= SPENT or perf_counter() > deadline):
+            if k and (self._spent - begun >= SPENT or perf_counter() > deadline):
                 break
             found = iteration.step(s, self._targets, deadline)
             total += found.iterations
+            self._spent += found.effort
             if found.status not in GOOD:
                 return (status, total) if k and found.status is Status.TIME_LIMIT else (found.status, total)
             iteration.take(s, found)

@@ -38,6 +38,7 @@ from koopmpc.control.solvers.base import QP
 from koopmpc.errors import DefinitenessError
 from koopmpc.plants.routines import Routine
 
+FINISHED = 150  # about as many interior-point steps take as long as an active-set method
 MOST = 40  # interior-point steps, before an active-set method finishes the program
 STALLED = 5  # after this many steps without half the μ, one step only returns to the central path
 CENTRING = 0.3  # that step aims at this share of μ for every pair
@@ -58,6 +59,12 @@ class StageStep(NamedTuple):
     slacks: Float[np.ndarray, "N nsoft"]
     status: Status
     iterations: int
+    finished: bool = False  # by an active-set method, whose iterations rounding decides
+
+    @property
+    def effort(self) -> int:
+        """What the program cost, in interior-point steps; rounding decides nothing of it."""
+        return FINISHED if self.finished else self.iterations
 
 
 @runtime_checkable
@@ -384,11 +391,11 @@ class RealTimeIteration:
         room = Interval(self.low - free, self.high - free)
         found = least_deviation(self._stages, room, self._softness, self.multipliers, deadline - perf_counter())
         if found is None:
-            return StageStep(dX, dU, np.zeros_like(self._eps), Status.FAILED, iterations)
+            return StageStep(dX, dU, np.zeros_like(self._eps), Status.FAILED, iterations, finished=True)
         self.multipliers = found.multipliers if found.status is Status.OPTIMAL else None
         if found.status is Status.INFEASIBLE and not self.limits_outputs:  # limits of inputs alone always have a plan
             found = found._replace(status=Status.FAILED)
-        return self._deviate(free, dX, dU, found, iterations)
+        return self._deviate(free, dX, dU, found, iterations)._replace(finished=True)
 
     def _deviate(
         self,
