@@ -33,7 +33,7 @@ class HangingCartPole(km.Dynamics):
         return ca.vertcat(x[2], omega, a, -(a * C + 9.81 * S) / 0.5 - 0.05 * omega)
 
 
-def cart_pole(episodes, steps=80, rng=0):
+def cart_pole(episodes, steps=40, rng=0):
     start = km.Uniform([-0.5, -1.5, -0.5, -2], [0.5, 1.5, 0.5, 2])
     plant = km.discretize(HangingCartPole(), 0.02)
     return km.collect(plant, start, km.Noise(-4, 4, hold=5), episodes=episodes, steps=steps, rng=rng)
@@ -169,7 +169,7 @@ def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path,
         say=told.append,
     )
     assert "read in 12 parts: 1 of them is held out" in told[0]
-    assert found.selection.predictor.report.samples == 22 * 80
+    assert found.selection.predictor.report.samples == 22 * 40
     rest = km.Episodes([e for e in data if e.X.tobytes() not in {h.X.tobytes() for h in found.held_out}], data.dt)
     assert len(rest) == 22
     best = found.selection.best
@@ -181,14 +181,14 @@ def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path,
 
 @pytest.mark.usefixtures("quick")
 def test_the_end_of_one_long_log_is_held_out_and_that_is_said(tmp_path):
-    data = cart_pole(1, steps=600)
+    data = cart_pole(1, steps=500)
     write_csv(data, tmp_path / "csv")
     told = []
     found = fit_data(tmp_path / "csv" / "00.csv", tmp_path / "out", horizon=10, bilinear=False, say=told.append)
     assert re.search(r"the last fifth of the record is held out, in \d+ blocks", told[0])
     assert len(found.held_out) >= 4
     last = np.concatenate([e.X[:-1] for e in found.held_out])
-    assert np.allclose(last, data[0].X[480:-1])
+    assert np.allclose(last, data[0].X[400:-1])
 
 
 def test_the_verdict_on_a_record_looks_as_far_ahead_as_its_output_remembers(tmp_path):
@@ -275,7 +275,7 @@ def test_a_folder_of_runs_is_data_though_their_table_is_in_it(tmp_path):
 def test_gaps_are_told(tmp_path):
     folder = write_csv(cart_pole(16), tmp_path / "csv")
     lines = (folder / "03.csv").read_text().splitlines()
-    (folder / "03.csv").write_text("\n".join(lines[:40] + lines[45:]) + "\n")
+    (folder / "03.csv").write_text("\n".join(lines[:20] + lines[25:]) + "\n")
     told = []
     fit_data(folder, tmp_path / "out", horizon=10, say=told.append)
     assert re.search(r"! .*03\.csv.*gap", told[0])
@@ -397,7 +397,7 @@ def test_of_notes_that_differ_from_file_to_file_the_first_are_shown_and_the_othe
 @pytest.mark.usefixtures("quick")
 def test_logs_are_audited_and_what_is_safe_is_done_and_said(tmp_path):
     """Spikes are left out, a late input widens the past that models may see, and a clock that jitters is evened."""
-    made, data = [], cart_pole(20)
+    made, data = [], cart_pole(20, steps=80)
     for e in data:
         X, U = e.X[:-3].copy(), e.U[3:]  # the force acts three steps late
         X[30, 1] += 40
@@ -427,7 +427,7 @@ def test_a_clock_that_jitters_is_evened_and_that_is_said(tmp_path):
     told = []
     fit_data(tmp_path / "csv", tmp_path / "out", horizon=10, bilinear=False, say=told.append)
     unequal = r"sampling is unequal in 16 files, interpolated to 0\.0\d+ s; steps that differ by more than 2 %: "
-    assert re.search(unequal + r"\S*00\.csv \(\d+ of 80, from line \d+\), 01\.csv \(", " ".join(told[0].split()))
+    assert re.search(unequal + r"\S*00\.csv \(\d+ of 40, from line \d+\), 01\.csv \(", " ".join(told[0].split()))
     with pytest.raises(km.errors.DataError, match="sampling is unequal"):
         km.load_episodes(tmp_path / "csv" / "00.csv")
 

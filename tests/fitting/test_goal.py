@@ -23,6 +23,7 @@ from koopmpc.synthesis.designed import SavedDesign, read_controller
 from koopmpc.synthesis.surrogates import describe_rest
 from koopmpc.text import format_duration
 from tests.fitting.mass import GOAL, NAMES, A, B, logs
+from tests.small_designs import small_designs
 
 
 def test_inputs_that_only_the_goal_file_names_are_inputs(tmp_path, monkeypatch):
@@ -215,11 +216,13 @@ def test_logs_and_a_goal_end_in_a_controller_file_that_keeps_the_goal_on_the_pla
 
 @pytest.fixture(autouse=True)
 def quick(request, monkeypatch):
-    """Leave the pages of a design and of a check out, which take a second each, where a test does not look at them."""
+    """Keep designs small, and leave out the pages, which take a second each, where a test does not look at them."""
     if not {"page", "told"} & {*request.node.name.split("_")}:
         monkeypatch.setattr("koopmpc.fitting.check.write_design_report", lambda *_, **__: None)
     if "made" not in request.fixturenames:
         monkeypatch.setattr("koopmpc.fitting.goal.write_design_report", lambda *arguments: arguments[2])
+    with small_designs():
+        yield
 
 
 def test_the_page_shows_what_to_expect_and_the_goal(made):

@@ -21,6 +21,7 @@ from koopmpc.synthesis.designed import SavedDesign
 from koopmpc.validate.bands import forecast
 from koopmpc.validate.logs.log import Place
 from koopmpc.validate.logs.summary import excerpt_logs
+from tests.small_designs import small_designs
 
 EVIL = 'x</svg><script>alert(1)</script> $\\frac$ ![p](http://e.org/p.png) "&--> [m]'
 GOAL = """
@@ -80,7 +81,8 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     write_tank(folder / "logs")
     (folder / "goal.toml").write_text(GOAL)
-    return design_data(folder / "logs", folder / "goal.toml", folder / "out", bilinear=False)
+    with small_designs():
+        return design_data(folder / "logs", folder / "goal.toml", folder / "out", bilinear=False)
 
 
 SECTIONS = [

@@ -15,6 +15,7 @@ from koopmpc.fitting.verdict import judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign, rebuild_controller
 from tests.fitting.mass import GOAL, NAMES, A, B, logs
+from tests.small_designs import small_designs
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,8 @@ def made(tmp_path_factory):
     logs().save(folder / "logs.npz")
     goal = GOAL.replace("horizon = 15", "horizon = 8\ncoverage = 0.9\ncertify = true")
     (folder / "goal.toml").write_text(goal)
-    return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", bilinear=False)
+    with small_designs():
+        return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", bilinear=False)
 
 
 def load(made):
@@ -105,7 +107,8 @@ def test_fit_with_a_goal_writes_a_certificate_and_its_page_where_logs_suffice(tm
     monkeypatch.chdir(tmp_path)
     logs(200, 8).save(tmp_path / "logs.npz")
     (tmp_path / "goal.toml").write_text(GOAL.replace("horizon = 15", "horizon = 4\ncertify = true"))
-    result = CliRunner().invoke(app, ["fit", "logs.npz", "--goal", "goal.toml", "--linear"])
+    with small_designs():
+        result = CliRunner().invoke(app, ["fit", "logs.npz", "--goal", "goal.toml", "--linear"])
     assert result.exit_code == 0
     assert "certificate.md states it" in " ".join(result.stdout.split())
     (page,) = tmp_path.rglob("certificate.md")

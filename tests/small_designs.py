@@ -1,0 +1,36 @@
+"""Small designs: two models, and fewer and shorter loops, for tests of what becomes of a design, not of its choice."""
+
+import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+import koopmpc as km
+from koopmpc.data.episodes import Episodes
+from koopmpc.synthesis.candidates import Candidate
+
+ROOM = importlib.import_module("koopmpc.synthesis.design")  # the module; the room has a function of this name
+LOOPS = importlib.import_module("koopmpc.synthesis.fresh.loops")
+ASKED = importlib.import_module("koopmpc.synthesis.asked")
+
+
+def propose_two(episodes: Episodes, _: object, bilinear: bool, *__: object) -> list[Candidate]:
+    """Return a linear model and one with squares, and where bilinear models are asked for one of these too."""
+    plain = km.State() + km.Constant()
+    squares = plain + km.State() * km.State()
+    tried = [Candidate("x, 1", plain), Candidate("squares", squares)]
+    tried += [Candidate("squares", squares, bilinear=True)] * bilinear
+    return [one.bind(episodes.states, episodes.inputs) for one in tried]
+
+
+@contextmanager
+def small_designs() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ROOM, "propose_candidates", propose_two)
+        patch.setattr(ROOM, "MANY", 100)
+        patch.setattr(LOOPS, "COMPARED", 20)
+        patch.setattr(LOOPS, "FURTHER", 40)
+        patch.setattr(ASKED, "STARTS", 6)
+        patch.setattr(ASKED, "LONGEST", 60)
+        yield
