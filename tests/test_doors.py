@@ -2,22 +2,17 @@
 
 import ast
 import tomllib
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Iterable, Iterator
 
 import pytest
 
-import koopmpc as km
 from koopmpc.lazy import load_joint
+from tests.sources import ROOT, nodes, texts
 
-ROOT = Path(km.__file__).parent
 SETTINGS = tomllib.loads((ROOT.parent / "pyproject.toml").read_text(encoding="utf-8"))
 LAYERS: list[str] = next(c for c in SETTINGS["tool"]["importlinter"]["contracts"] if c.get("exhaustive"))["layers"]
 RANK = {room: -i for i, room in enumerate(LAYERS)}
-MODULES = {
-    ".".join(["koopmpc", *file.relative_to(ROOT).with_suffix("").parts]).removesuffix(".__init__"): file
-    for file in ROOT.rglob("*.py")
-}
+MODULES = {".".join(["koopmpc", *file.with_suffix("").parts]).removesuffix(".__init__"): file for file in texts()}
 FRONT_DOOR = ("koopmpc", "koopmpc.__main__")
 BY_NAME = ("koopmpc.lazy", "koopmpc.papers.registry")  # import modules by names that they compute
 
@@ -26,9 +21,9 @@ def room(module: str) -> str:
     return module.split(".")[1]
 
 
-def imported(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def imported(found: Iterable[ast.AST]) -> Iterator[tuple[int, str]]:
     """Yield the line and the name of each module of koopmpc that the source imports, or names in a string."""
-    for node in ast.walk(tree):
+    for node in found:
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "koopmpc":
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
@@ -39,25 +34,25 @@ def imported(tree: ast.Module) -> Iterator[tuple[int, str]]:
             yield node.lineno, node.value
 
 
-def upward(module: str, source: str) -> list[str]:
+def upward(module: str, found: Iterable[ast.AST]) -> list[str]:
     """Return the imports of a module that lead to a room above its own, or to the front door."""
     return [
         f"{module}:{line} imports {target}"
-        for line, target in imported(ast.parse(source))
+        for line, target in imported(found)
         if target in FRONT_DOOR or RANK[room(target)] > RANK[room(module)]
     ]
 
 
 def test_no_room_imports_one_above_it_in_any_way() -> None:
     inside = [name for name in MODULES if name not in FRONT_DOOR]
-    assert [fault for name in inside for fault in upward(name, MODULES[name].read_text(encoding="utf-8"))] == []
+    assert [fault for name in inside for fault in upward(name, nodes(MODULES[name]))] == []
 
 
 def test_modules_are_imported_by_computed_names_in_two_files_alone() -> None:
     computed = {
         name
         for name, file in MODULES.items()
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        for node in nodes(file)
         if isinstance(node, ast.Call)
         and getattr(node.func, "id", getattr(node.func, "attr", "")) in ("import_module", "__import__")
         and not isinstance(node.args[0], ast.Constant)
@@ -76,8 +71,9 @@ def test_modules_are_imported_by_computed_names_in_two_files_alone() -> None:
     ],
 )
 def test_each_way_up_is_seen(source: str) -> None:
-    assert len(upward("koopmpc.data.episodes", source)) == 1
-    assert upward("koopmpc.data.episodes", "from koopmpc.values import Value") == []
+    assert len(upward("koopmpc.data.episodes", ast.walk(ast.parse(source)))) == 1
+    downward = ast.walk(ast.parse("from koopmpc.values import Value"))
+    assert upward("koopmpc.data.episodes", downward) == []
 
 
 @pytest.mark.parametrize("joint", ["log formats", "monitor", "controllers"])

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import koopmpc as km
+from tests.sources import trees
 
 ROOT = Path(km.__file__).parent
 SERVING = ["koopmpc", *(f"koopmpc.{room.name}" for room in ROOT.iterdir() if (room / "__init__.py").exists())]
@@ -121,9 +122,9 @@ def named(node: ast.stmt) -> list[str]:
 
 def test_the_name_of_a_class_means_one_thing() -> None:
     homes: dict[str, list[str]] = {}
-    for file in ROOT.rglob("*.py"):
-        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+    for file, tree in trees().items():
+        for node in tree.body:
             for name in named(node):
-                homes.setdefault(name, []).append(str(file.relative_to(ROOT)))
+                homes.setdefault(name, []).append(str(file))
     twice = {name: files for name, files in homes.items() if len(files) > 1}
     assert not twice

@@ -5,11 +5,10 @@ import io
 import re
 import tokenize
 from collections import defaultdict
-from pathlib import Path
 
 import pytest
 
-import koopmpc as km
+from tests.sources import texts, trees
 
 MOST = {
     "functions named by a participle": 32,
@@ -44,9 +43,9 @@ def sets_two_constants(node: ast.stmt) -> bool:
     return all(isinstance(e, ast.Name) and e.id.strip("_").isupper() for e in node.targets[0].elts)
 
 
-def sentences_of(tree: ast.Module):
+def sentences_of(nodes: list[ast.AST]):
     documented = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Module)
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, documented) and (text := ast.get_docstring(node)):
             yield from re.split(r"(?<=[.;:?!])\s+", SECTIONS.split(text)[0])
 
@@ -60,13 +59,13 @@ def spoken_lines(text: str):
             yield token.string
 
 
-def find_places(files: list[tuple[str, str]]) -> dict[str, list[str]]:
-    """Return the places of each kind in files, given as (name, text)."""
+def find_places(files: list[tuple[str, str, ast.Module]]) -> dict[str, list[str]]:
+    """Return the places of each kind in files, given as (name, text, tree)."""
     places: dict[str, list[str]] = defaultdict(list)
     homes: dict[str, set[str]] = defaultdict(set)
-    for file, text in files:
-        tree = ast.parse(text)
-        for node in ast.walk(tree):
+    for file, text, tree in files:
+        every = list(ast.walk(tree))
+        for node in every:
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and is_participle(node.name):
                 places["functions named by a participle"].append(f"{file}:{node.lineno} {node.name}")
         for node in tree.body:
@@ -74,12 +73,13 @@ def find_places(files: list[tuple[str, str]]) -> dict[str, list[str]]:
                 homes[node.name].add(file)
             if sets_two_constants(node):
                 places["lines with two constants"].append(f"{file}:{node.lineno}")
-        for sentence in sentences_of(tree):
+        for sentence in sentences_of(every):
             if len(sentence.split()) > 40:
                 places["sentences above 40 words"].append(f"{file}: {sentence[:80]}")
             if RIDDLES.search(sentence):
                 places["riddling words"].append(f"{file}: {sentence[:80]}")
-        places["riddling words"] += [f"{file}: {line[:80]}" for line in spoken_lines(text) if RIDDLES.search(line)]
+        spoken = spoken_lines(text) if RIDDLES.search(text) else ()  # reading tokens takes most of the time
+        places["riddling words"] += [f"{file}: {line[:80]}" for line in spoken if RIDDLES.search(line)]
     shared = {name: sorted(where) for name, where in homes.items() if len(where) > 1}
     places["public names with two homes"] = [f"{name}: {', '.join(where)}" for name, where in shared.items()]
     return places
@@ -87,9 +87,8 @@ def find_places(files: list[tuple[str, str]]) -> dict[str, list[str]]:
 
 @pytest.fixture(scope="module")
 def places():
-    root = Path(km.__file__).parent
-    files = [(str(path.relative_to(root)), path.read_text()) for path in sorted(root.rglob("*.py"))]
-    return find_places([(name, text) for name, text in files if not name.startswith("problems/")])
+    files = [(str(path), text, trees()[path]) for path, text in texts().items()]
+    return find_places([one for one in files if not one[0].startswith("problems/")])
 
 
 @pytest.mark.parametrize("kind", MOST)
@@ -102,7 +101,8 @@ def test_each_kind_is_found_where_it_stands():
     text = (
         f'"""{long}."""\nA, B = 1, 2  # found anew\ndef solved():\n    raise ValueError("x is told")\nclass Box: ...\n'
     )
-    found = find_places([("one.py", text), ("two.py", "class Box: ...\nC = 1\ndef solve(): ...\n")])
+    files = {"one.py": text, "two.py": "class Box: ...\nC = 1\ndef solve(): ...\n"}
+    found = find_places([(name, text, ast.parse(text)) for name, text in files.items()])
     assert {kind: len(found[kind]) for kind in MOST} == {
         "functions named by a participle": 1,
         "lines with two constants": 1,
