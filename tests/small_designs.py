@@ -12,6 +12,7 @@ from koopmpc.synthesis.candidates import Candidate
 
 ROOM = importlib.import_module("koopmpc.synthesis.design")  # the module; the room has a function of this name
 LOOPS = importlib.import_module("koopmpc.synthesis.fresh.loops")
+NEIGHBOURS = importlib.import_module("koopmpc.synthesis.fresh.neighbours")
 ASKED = importlib.import_module("koopmpc.synthesis.asked")
 
 
@@ -25,12 +26,22 @@ def propose_two(episodes: Episodes, _: object, bilinear: bool, *__: object) -> l
 
 
 @contextmanager
-def small_designs() -> Iterator[None]:
+def short_loops() -> Iterator[None]:
+    """Let designs run fewer and shorter loops, and choose the slope of nearest rows by fewer forecasts."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ROOM, "propose_candidates", propose_two)
         patch.setattr(ROOM, "MANY", 100)
         patch.setattr(LOOPS, "COMPARED", 20)
         patch.setattr(LOOPS, "FURTHER", 40)
-        patch.setattr(ASKED, "STARTS", 6)
         patch.setattr(ASKED, "LONGEST", 60)
+        patch.setattr(ASKED, "MOVING", 60)
+        patch.setattr(NEIGHBOURS, "BEGUN", 80)
+        yield
+
+
+@contextmanager
+def small_designs() -> Iterator[None]:
+    """Let designs try two models, from few starts and in short loops."""
+    with short_loops(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ROOM, "propose_candidates", propose_two)
+        patch.setattr(ASKED, "STARTS", 6)
         yield

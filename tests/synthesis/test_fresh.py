@@ -100,7 +100,7 @@ def test_nearest_rows_forecast_no_worse_than_a_map_fitted_to_all_rows(noise):
 
 def test_one_short_episode_does_not_choose_the_slope_of_nearest_rows():
     """Over one step small noise hides what a few rows get wrong; over ten it shows."""
-    rng, quiet = np.random.default_rng(0), episodes_of(bent, count=12, steps=60, keep=1)
+    rng, quiet = np.random.default_rng(0), episodes_of(bent, count=10, steps=40, keep=1)
     logs = quiet.with_episodes([km.Episode(X=e.X + 0.02 * rng.standard_normal(e.X.shape), U=e.U) for e in quiet])
     past = km.Delay(2).bind(logs.states, logs.inputs)
     one, more = (

@@ -89,7 +89,7 @@ def test_its_data_are_enough_for_a_design_that_holds_the_plant():
         warnings.simplefilter("ignore", km.FitWarning)
         design = km.design(
             found(pendulum).data, cost, limits, horizon=15, reference=[0, 0],
-            candidates=[km.State() + km.Constant()], delays=[0], bilinear=False,
+            candidates=[km.State() + km.Constant()], delays=[0], bilinear=False, loops=0, smooth=False,
         )  # fmt: skip
     run = km.simulate(plant, design.controller, x0=[0.3, 0.0], reference=[0, 0], steps=100)
     assert np.abs(run.X[-1]).max() < 0.02
