@@ -29,6 +29,7 @@ RIDDLES = re.compile(
     r"\bthe same of\b|\bhas not shown up\b|\blet through\b|\bas little as\b|\bthe one who\b|\bwhat is left of\b",
     re.I,
 )
+DOCUMENTED = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Module)
 SECTIONS = re.compile(r"\n\s*(?:Parameters|Raises|References|Examples|Returns|Attributes)\n\s*-+")
 
 
@@ -44,9 +45,8 @@ def sets_two_constants(node: ast.stmt) -> bool:
 
 
 def sentences_of(nodes: list[ast.AST]):
-    documented = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Module)
     for node in nodes:
-        if isinstance(node, documented) and (text := ast.get_docstring(node)):
+        if isinstance(node, DOCUMENTED) and (text := ast.get_docstring(node)):
             yield from re.split(r"(?<=[.;:?!])\s+", SECTIONS.split(text)[0])
 
 
@@ -57,6 +57,18 @@ def spoken_lines(text: str):
         middle = token.type == getattr(tokenize, "FSTRING_MIDDLE", None)  # text of f-strings from Python 3.12 on
         if token.type == tokenize.COMMENT or ((plain or middle) and " " in token.string):
             yield token.string
+
+
+def may_riddle(text: str, nodes: list[ast.AST]) -> bool:
+    """Return whether a line with a comment or a string, outside docstrings, holds a riddling word."""
+    inside = {
+        line
+        for node in nodes
+        if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False)
+        for line in range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1)
+    }
+    lines = enumerate(text.splitlines(), start=1)
+    return any(RIDDLES.search(line) for k, line in lines if re.search("[#\"']", line) and k not in inside)
 
 
 def find_places(files: list[tuple[str, str, ast.Module]]) -> dict[str, list[str]]:
@@ -78,7 +90,7 @@ def find_places(files: list[tuple[str, str, ast.Module]]) -> dict[str, list[str]
                 places["sentences above 40 words"].append(f"{file}: {sentence[:80]}")
             if RIDDLES.search(sentence):
                 places["riddling words"].append(f"{file}: {sentence[:80]}")
-        spoken = spoken_lines(text) if RIDDLES.search(text) else ()  # reading tokens takes most of the time
+        spoken = spoken_lines(text) if may_riddle(text, every) else ()  # tokens take most of the time
         places["riddling words"] += [f"{file}: {line[:80]}" for line in spoken if RIDDLES.search(line)]
     shared = {name: sorted(where) for name, where in homes.items() if len(where) > 1}
     places["public names with two homes"] = [f"{name}: {', '.join(where)}" for name, where in shared.items()]
