@@ -16,17 +16,18 @@ from koopmpc.control.horizon import Horizon, Terminal, input_target
 from koopmpc.control.riccati import (
     LARGEST,
     SETTLED,
+    Recursion,
     Stage,
     controllable,
     find_gain,
     one_step,
+    recurse,
     recursion,
     solve_factored,
     stationary,
-    step,
 )
 from koopmpc.control.target import Targets
-from koopmpc.errors import DefinitenessError, ShapeError
+from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -186,14 +187,20 @@ def learned_steps(
     if predictor.report is None or scale is None:
         return N
     back = np.eye(len(scale)) if inverse is None else inverse
-    rested = _rested_steps(stage, predictor, N, back)
+    gains = Recursion(recurse(stage, _last(stage)))
+    rested = _rested_steps(gains, stage, predictor, N, back)
     if predictor.embedding is not None or predictor.lifting.nz != len(scale):
         return rested or N
-    return believed_steps(stage, predictor, N, rested or _ahead(N), back)
+    return believed_steps(gains, stage, predictor, N, rested or _ahead(N), back)
 
 
 def believed_steps(
-    stage: Stage, predictor: LinearPredictor, N: int, most: int, inverse: Float[np.ndarray, "nz nz"]
+    gains: Recursion,
+    stage: Stage,
+    predictor: LinearPredictor,
+    N: int,
+    most: int,
+    inverse: Float[np.ndarray, "nz nz"],
 ) -> int:
     """Return the shortest tail of none, N, `most`, a half, a quarter … of these steps, down to N/4, that is as good.
 
@@ -214,7 +221,7 @@ def believed_steps(
     C, nz, constant = predictor.C, len(scale), lifting.constant_index
     halves = max(2, (4 * most // N).bit_length() - 1)
     lengths = sorted({0, min(N, most), *(most >> i for i in range(halves + 1))})
-    laws = _laws(stage, [n + N for n in lengths])
+    laws = _laws(gains, stage, [n + N for n in lengths])
     seen = scale @ inverse.T
     if max(np.linalg.norm(seen @ (law - laws[-1])[:nz]) for law in laws) <= ALIKE * np.linalg.norm(
         seen @ laws[-1][:nz]
@@ -230,17 +237,19 @@ def believed_steps(
     V, cost = np.zeros((*X.shape[:2], stage.B.shape[1])), np.zeros(len(laws))
     CA, CB = C @ predictor.A, np.linalg.solve(inverse.T, C.T).T @ stage.B[:nz]
     rest, steps = lifting(center[None]), _ahead(N)
+    if len(stage.A) > nz:  # the last input is beside z
+        inverse = scipy.linalg.block_diag(inverse, np.eye(len(stage.A) - nz))
+    laws, crossed = inverse.T @ laws, None if stage.M is None else inverse.T @ stage.M
+    weight = _root_of_few(inverse.T @ stage.Q @ inverse)
     unsure = min(1.0, (steps * _measure_residual(predictor, scale)) ** 2 / WORTH)
     with np.errstate(all="ignore"):
         for _ in range(steps):
             moved = lifting(X.reshape(-1, len(center))).reshape(*X.shape[:2], nz) - rest
-            xi = moved @ inverse.T
-            if len(stage.A) > nz:  # the last input is beside z
-                xi = np.concatenate([xi, V], axis=2)
+            xi = moved if len(inverse) == nz else np.concatenate([moved, V], axis=2)
             V_before, V = V, -xi @ laws
-            spent = ((xi @ stage.Q) * xi).sum(axis=(1, 2)) + ((V @ stage.R) * V).sum(axis=(1, 2))
-            if stage.M is not None:
-                spent += 2 * ((xi @ stage.M) * V).sum(axis=(1, 2))
+            spent = ((xi @ weight) ** 2).sum(axis=(1, 2)) + ((V @ stage.R) * V).sum(axis=(1, 2))
+            if crossed is not None:
+                spent += 2 * ((xi @ crossed) * V).sum(axis=(1, 2))
             cost += spent
             if not (spent > LITTLE * WORTH * unsure * cost).any():  # all loops are at rest, or beyond all numbers
                 break
@@ -251,37 +260,35 @@ def believed_steps(
     return next(n for n, each in zip(lengths, cost, strict=True) if each <= (1 + WORTH * unsure) * cost.min())
 
 
-def _laws(stage: Stage, steps: list[int]) -> Float[np.ndarray, "laws nx nu"]:
+def _root_of_few(Q: Float[np.ndarray, "nx nx"]) -> Float[np.ndarray, "nx n"]:
+    """Return F with F Fᵀ = Q, without columns that are rounding: a weight of few outputs has few."""
+    F = checks.root(Q)
+    sizes = np.linalg.norm(F, axis=1)
+    return F[sizes > np.finfo(float).eps * len(F) * sizes.max(initial=0.0)].T
+
+
+def _laws(gains: Recursion, stage: Stage, steps: list[int]) -> Float[np.ndarray, "laws nx nu"]:
     """Return Kᵀ after so many steps of the recursion each; NaN where P has lost its digits."""
-    found = np.full((len(steps), *stage.B.shape), np.nan)
-    P = _last(stage)
-    for n in range(1, max(steps) + 1):
-        try:
-            K, _, P = step(stage, P)
-        except (DefinitenessError, np.linalg.LinAlgError):
-            break
-        found[[i for i, wanted in enumerate(steps) if wanted == n]] = K.T
-    return found
+    found = [gains.find_step(n) for n in steps]
+    return np.array([np.full(stage.B.shape, np.nan) if each is None else each.K.T for each in found])
 
 
-def _rested_steps(stage: Stage, predictor: LinearPredictor, N: int, inverse: Float[np.ndarray, "nz nz"]) -> int:
+def _rested_steps(
+    gains: Recursion, stage: Stage, predictor: LinearPredictor, N: int, inverse: Float[np.ndarray, "nz nz"]
+) -> int:
     """Return the steps until the gain rests as far as the model is accurate, 0 where it does not."""
     scale = predictor.scale
     if scale is None:
         return 0
     enough, spread = max(_measure_residual(predictor, scale), SETTLED), _spread(predictor, scale) @ inverse.T
-    P = _last(stage)
     nz, needed, rested = len(scale), len(predictor.lifting.bound or ()), 0
     K = np.zeros(stage.B.T.shape)
     for n in range(1, _ahead(N) + 1):
-        try:
-            K_next, L, P = step(stage, P)
-        except DefinitenessError:  # P has lost its digits
+        found = gains.find_step(n)
+        if found is None or not found.largest < HUGE:
             break
-        if not np.abs(P).max() < HUGE:
-            break
-        moved, whole = (np.linalg.norm(L.T @ gains[:, :nz] @ spread.T) for gains in (K_next - K, K_next))
-        K, rested = K_next, rested + 1 if moved <= enough * whole else 0
+        moved, whole = (np.linalg.norm(found.L.T @ each[:, :nz] @ spread.T) for each in (found.K - K, found.K))
+        K, rested = found.K, rested + 1 if moved <= enough * whole else 0
         if rested >= needed:
             return n
     return 0

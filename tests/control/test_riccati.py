@@ -9,7 +9,19 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.control import riccati
-from koopmpc.control.riccati import Stage, _growth, iterate, leap, one_step, recursion, stationary, sweep_backwards
+from koopmpc.control.riccati import (
+    Recursion,
+    Stage,
+    _growth,
+    iterate,
+    leap,
+    one_step,
+    recurse,
+    recursion,
+    stationary,
+    step,
+    sweep_backwards,
+)
 from tests.control.models import random_pair
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -391,3 +403,31 @@ def test_a_gain_rests_once_it_did_for_as_many_steps_as_there_are_states_and_fift
     taken.clear()
     iterate(stage, P, rests)
     assert len(taken) == rests
+
+
+@pytest.mark.parametrize("rates", [False, True])
+def test_gains_of_many_coordinates_by_what_a_step_adds_to_the_cost_are_those_of_the_whole_recursion(rates):
+    """Three weighed outputs of 120 coordinates, one of which grows; without the last change of the input at the end."""
+    rng, nz, nu = np.random.default_rng(0), 120, 2
+    A, B, C = rng.normal(size=(nz, nz)), rng.normal(size=(nz, nu)), rng.normal(size=(3, nz))
+    A *= 1.02 / np.abs(np.linalg.eigvals(A)).max()
+    stage = one_step(A, B, C.T @ C, np.eye(nu), np.eye(nu) if rates else None)
+    P = stage.Q.copy()
+    if rates:
+        P[nz:, nz:] = 0.0
+    gains = Recursion(recurse(stage, P))
+    for n in range(1, 61):
+        K, L, P = step(stage, P)
+        found = gains.find_step(n)
+        assert found is not None
+        np.testing.assert_allclose(found.K, K, atol=1e-9 * np.abs(K).max())
+        np.testing.assert_allclose(found.L, L, atol=1e-9 * np.abs(L).max())
+        assert found.largest == pytest.approx(np.abs(P).max())
+
+
+def test_gains_end_where_rounding_hides_the_weight_of_the_inputs():
+    rng, nz = np.random.default_rng(0), 120
+    A, B, C = 3 * rng.normal(size=(nz, nz)), rng.normal(size=(nz, 1)), rng.normal(size=(2, nz))
+    gains = Recursion(recurse(one_step(A, B, C.T @ C, np.eye(1)), C.T @ C))
+    assert gains.find_step(1) is not None
+    assert gains.find_step(200) is None
