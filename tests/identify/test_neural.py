@@ -8,8 +8,10 @@ import pytest
 
 import koopmpc as km
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.identify.records import neural
 from koopmpc.identify.records.conversion import SignalUnits, from_standard, to_standard
 from koopmpc.identify.records.hidden import SimulationError, simulate_hidden, smooth_basis, start_with_differences
+from koopmpc.identify.records.hidden_structure import HiddenStructure
 from koopmpc.identify.records.neurons.contained import ContainedError, contain
 from koopmpc.lifting import Neurons
 from tests.identify.test_hidden_state import random_model, random_segments
@@ -146,3 +148,21 @@ def test_an_output_that_never_moves_is_refused_in_a_sentence():
     data = km.Episodes([km.Episode(X=np.ones((201, 1)), U=np.random.default_rng(0).uniform(-1, 1, (200, 1)))], 0.1)
     with pytest.raises(DataError, match="no output moves"):
         km.identify.neural_state_space(data, order=2, neurons=1)
+
+
+def test_a_short_record_is_fitted_from_several_sets_of_neurons(monkeypatch):
+    u, y = np.random.default_rng(0).uniform(-1, 1, 150), np.zeros(151)
+    for k in range(150):
+        y[k + 1] = 0.9 * y[k] + u[k] - 0.3 * np.tanh(10 * y[k])
+    data = km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["y"], ["u"])
+    chain = neural.fit_chain
+
+    def fit_chain(data, structure, neurons, **options):
+        found = chain(data, replace(structure, start=0), neurons, **options)
+        return found if structure.start else [next(found)]  # no neurons in the first set
+
+    monkeypatch.setattr(neural, "fit_chain", fit_chain)
+    plan = HiddenStructure(1, 1, 8, 50, None, np.ones(1), True, 4, neurons=1)
+    model = neural.fit_neural(plan, data)
+    start = model.embed(data)[0].X[0]
+    assert abs(model.step_map().rollout(start, u[8:, None])[:, 0] - y[8:]).max() < 0.02 * y.std()

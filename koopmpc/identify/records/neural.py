@@ -53,9 +53,10 @@ SEGMENTS = 50, 200  # steps of the shorter segments, at least and at most
 LONGER = 5  # the longer segments have this many times the steps of the shorter ones
 PACE = 10  # the past rows reach over 1/10 of the rows in which the outputs move by their spread
 STARTS = 2  # sets of candidates for the neurons that the best order is tried with
-_ITERATIONS = 40  # Levenberg-Marquardt steps for each number of neurons
-_PATIENCE = 8  # steps in a row that do not lower the error on unseen rows
+SHORT = 1_500  # rows of records whose last fit tries all these sets too, at most
 _CONVERGED = 1e-3  # a step that lowers the squared error by a smaller share is the last
+_USUAL = 40, 8, _CONVERGED  # steps for each number of neurons, steps in a row that do not gain on unseen rows, and this
+_CLOSE = 80, 20, 1e-4  # the same three of short records
 _POLISH = 15  # steps on all rows, at the end
 
 
@@ -191,8 +192,9 @@ def fit_neural(
 ) -> LinearPredictor | BilinearPredictor:
     """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows.
 
-    With `quick` a third of the segments is taken. Where that is not calm, the last one before it that is: before the
-    polish, with fewer neurons, or without any.
+    Short records are fitted from several sets of candidates, and the one of least error on the last quarters is taken:
+    they are cheap, and their few rows leave minima apart. With `quick` a third of the segments is taken. Where that is
+    not calm, the last one before it that is: before the polish, with fewer neurons, or without any.
 
     Raises
     ------
@@ -201,7 +203,8 @@ def fit_neural(
     """
     s, data = structure, thin_records(episodes, ROWS, PIECE)
     counts = [q for q in NEURONS if q < s.neurons] + [s.neurons]
-    chain = list(fit_chain(data, s, counts, quick=quick, plain=True))
+    few = not quick and sum(map(len, data)) <= SHORT
+    chain = _best_chain(data, s, counts) if few else list(fit_chain(data, s, counts, quick=quick, plain=True))
     units, models = chain[-1][1], [model for model, _ in reversed(chain)]
     models.insert(0, _polish(models[0], data, units, s, quick))
     for one in models:
@@ -213,6 +216,21 @@ def fit_neural(
         f"free runs of a hidden state of order {s.order} leave ten ranges of the data, with neurons and without; pass "
         "another order, or use polynomial_state_space"
     )
+
+
+def _best_chain(
+    data: Episodes, structure: HiddenStructure, counts: Sequence[int]
+) -> list[tuple[HiddenModel, SignalUnits]]:
+    """Return the models of the set of candidates whose last one errs least on the last quarters; calm ones go first."""
+    s, ahead = structure, find_forecast_horizon(data)
+
+    def rank(chain: list[tuple[HiddenModel, SignalUnits]]) -> tuple[bool, float]:
+        model, units = chain[-1]
+        errors = measure_hidden(model, data, units, s.delays, ahead)
+        return not is_calm_anywhere(model, data, units, s.delays), float(np.log(errors).sum())
+
+    starts = range(s.start, s.start + STARTS)
+    return min((list(fit_chain(data, replace(s, start=i), counts, plain=True, close=True)) for i in starts), key=rank)
 
 
 def _polish(
@@ -244,11 +262,18 @@ def choose_window(data: Episodes) -> tuple[int, int]:
 
 
 def fit_chain(
-    data: Episodes, structure: HiddenStructure, neurons: Sequence[int], *, quick: bool = False, plain: bool = False
+    data: Episodes,
+    structure: HiddenStructure,
+    neurons: Sequence[int],
+    *,
+    quick: bool = False,
+    plain: bool = False,
+    close: bool = False,
 ) -> Iterator[tuple[HiddenModel, SignalUnits]]:
     """Yield models with more and more neurons that learn from the first three quarters of each record.
 
-    With `plain` the linear model that they begin with comes first; `quick` is as in `fit_neural`.
+    With `plain` the linear model that they begin with comes first; `quick` is as in `fit_neural`, and `close` takes
+    more and smaller steps.
     """
     s = structure
     units = SignalUnits.of(data, s.rails)
@@ -269,7 +294,7 @@ def fit_chain(
         drawn = draw_neurons(model, sets[0][0][0], rng)
         model = model.add_neurons(take_neurons(model, sets[0][0], drawn, count - before, noise))
         for part in sets:
-            model = _fit(model, noise, part)
+            model = _fit(model, noise, part, _CLOSE if close else _USUAL)
         yield _change_past(model, basis), units
 
 
@@ -284,12 +309,14 @@ def _cut(
     return cut_sets(data, units, structure.delays, horizon, spans, max(HORIZON, horizon // LONGER), most)
 
 
-def _fit(model: HiddenModel, noise: float, part: tuple[Sets, ...]) -> HiddenModel:
+def _fit(
+    model: HiddenModel, noise: float, part: tuple[Sets, ...], effort: tuple[int, int, float] = _USUAL
+) -> HiddenModel:
     """Return the model that Levenberg-Marquardt finds, whose linear part does not grow; unseen segments stop it."""
-    fitted, judged = part
+    (fitted, judged), (iterations, patience, converged) = part, effort
     theta, _ = minimise(
-        ContainedError(SimulationError(model, noise)), model.parameters, fitted, judged, _ITERATIONS,
-        patience=_PATIENCE, converged=_CONVERGED,
+        ContainedError(SimulationError(model, noise)), model.parameters, fitted, judged, iterations,
+        patience=patience, converged=converged,
     )  # fmt: skip
     return contain(model.with_parameters(theta))
 
