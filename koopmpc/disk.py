@@ -23,6 +23,7 @@ from zipfile import ZipFile, ZipInfo, is_zipfile
 import numpy as np
 
 from koopmpc.errors import DataError, FullDiskError, LogError
+from koopmpc.interrupts import raise_swallowed
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _DEFLATED = 1100  # deflate makes a member at most 1032 times smaller
@@ -64,25 +65,26 @@ def writing(path: str | PathLike[str]) -> Generator[BinaryIO]:
     """
     file = target(path)
     stream: _Stream | None = None
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        part = beside(file)
-        try:  # before the file is there, so that no interrupt leaves it
-            stream = _Stream(part, "wb" if part == file else "xb")
-            _lock(stream.fileno())
-            with io.BufferedWriter(stream) as buffered:
-                yield cast("BinaryIO", buffered)
-                buffered.flush()
-                settle(part, file, stream.fileno())
-        except BaseException:
-            if part != file:
-                part.unlink(missing_ok=True)
-            raise
-    except Exception as error:
-        failure = stream.failure if stream is not None else None
-        if failure is None and not isinstance(error, OSError):
-            raise
-        raise explain_failure(file, failure or cast("OSError", error)) from error
+    with raise_swallowed():  # numpy closes a zip with an error of its own, which would hide the interrupt
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            part = beside(file)
+            try:  # before the file is there, so that no interrupt leaves it
+                stream = _Stream(part, "wb" if part == file else "xb")
+                _lock(stream.fileno())
+                with io.BufferedWriter(stream) as buffered:
+                    yield cast("BinaryIO", buffered)
+                    buffered.flush()
+                    settle(part, file, stream.fileno())
+            except BaseException:
+                if part != file:
+                    part.unlink(missing_ok=True)
+                raise
+        except Exception as error:
+            failure = stream.failure if stream is not None else None
+            if failure is None and not isinstance(error, OSError):
+                raise
+            raise explain_failure(file, failure or cast("OSError", error)) from error
 
 
 def target(path: str | PathLike[str]) -> Path:

@@ -1,8 +1,11 @@
 """Saves are whole or not there: full disks, interrupts and flipped bits lose no file and change none in silence."""
 
+import gc
 import io
 import random
+import signal
 import subprocess
+import sys
 import warnings
 import zipfile
 from pathlib import Path
@@ -65,6 +68,30 @@ def test_an_interrupt_in_a_save_leaves_the_old_file(tmp_path: Path, name: str, m
         WRITERS[name](tmp_path / name)
     assert (tmp_path / name).read_bytes() == UNCHANGED
     assert left(tmp_path) == [name]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of the zip that numpy had open
+def test_an_interrupt_that_numpy_turns_into_an_error_of_its_zip_is_still_one(tmp_path: Path) -> None:
+    path = tmp_path / "model.npz"
+    model(1).save(path)
+    before = path.read_bytes()
+
+    def interrupt(frame, event, _):
+        if event == "return" and frame.f_code.co_name == "_open_to_write":
+            sys.setprofile(None)
+            signal.raise_signal(signal.SIGINT)
+
+    heard = signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.setprofile(interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            model(2).save(path)
+    finally:
+        sys.setprofile(None)
+        signal.signal(signal.SIGINT, heard)
+    gc.collect()
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_save_keeps_links_permissions_and_read_only_files(tmp_path: Path) -> None:
