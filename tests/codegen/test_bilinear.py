@@ -182,16 +182,12 @@ def test_a_loop_that_learns_what_the_model_lacks_is_that_of_python_to_rounding(s
 def test_delays_and_a_disturbance_without_an_equilibrium_are_answered_as_in_python(seed):
     """Readings that no constant load explains: Gauss–Newton leads to an equilibrium at some steps, and at others to none."""
     controller = make(bilinear=True, delays=1)[1]
-    machine, rng = km.compiled(controller), np.random.default_rng(seed)
-    readings, others = 0.3 * rng.normal(size=(30, 2)), [copy.copy(controller) for _ in range(5)]
-    for each in (controller, *others):
-        each.reset(readings[0])
+    machine, readings = km.compiled(controller), 0.3 * np.random.default_rng(seed).normal(size=(30, 2))
+    controller.reset(readings[0])
     for y in readings:
         slow, fast = controller(y, [0.3, 0.0]), machine(y, [0.3, 0.0])
         assert (slow.status, slow.fallback) == (fast.status, fast.fallback)
-        # where a soft limit is near, the last bits of a reading may move a plan by 2e-5
-        moved = [each(y * (1 + 1e-14 * rng.normal(size=2)), [0.3, 0.0]).u - slow.u for each in others]
-        np.testing.assert_allclose(slow.u, fast.u, rtol=0, atol=1e-6 + 5 * np.abs(moved).max())
+        np.testing.assert_allclose(slow.u, fast.u, rtol=0, atol=1e-6)
 
 
 def test_a_constant_of_the_c_code_has_one_meaning(swung, monkeypatch):

@@ -361,7 +361,7 @@ void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_re
   koopmpc_copy(u, s->has_rest ? s->rest_u : target + TARGET_U, NV);
   koopmpc_copy(active, s->has_rest ? s->rest_active : target + TARGET_ACTIVE, LIMITS);
   found = (!koopmpc_is_limited(active) && chord(s, x, u, target, e)) ||
-          koopmpc_near(x, u, active, target, koopmpc_end_w(s), e, CLOSE, 1);
+          koopmpc_near(x, u, active, target, koopmpc_end_w(s), e, CLOSE, 0);
   if (!(target[TARGET_FOUND] > 0) || is_far(x, active, target)) found = 0;
   if (!found) {
     koopmpc_copy(x, target + TARGET_X, NX);

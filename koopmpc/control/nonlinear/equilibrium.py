@@ -729,7 +729,7 @@ class TerminalTargets:
         target = self(row)
         begin = (target if last is None else last).equilibrium
         each = self.equilibria
-        found = each.follow(begin, row, e) or each.near(begin, row, e, CLOSE, careful=True)
+        found = each.follow(begin, row, e) or each.near(begin, row, e, CLOSE)
         if found is None or self.is_missed(row) or self._is_far(found, target.equilibrium):
             return target
         u, m = found.u * self._hold, target.m
