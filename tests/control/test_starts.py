@@ -78,7 +78,7 @@ def test_of_the_plans_that_follow_the_model_the_cheapest_is_taken(monkeypatch, e
     monkeypatch.setattr(RealTimeIteration, "cost", lambda _: now["cost"])
     monkeypatch.setattr(mpc, "_starts", lambda x, u: [(i, i) for i in range(3)])
 
-    def improve(s, u_prev, most, deadline, settled=bilinear_mpc.SETTLED, begin=None):
+    def improve(s, u_prev, most, deadline, settled=bilinear_mpc.SETTLED, begin=None, until=None):
         asked.append((most, settled, begin))
         if begin is None:
             now["before"] = mpc._iteration.X[0, 0]

@@ -164,14 +164,13 @@ static int rests(const koopmpc_state *s, koopmpc_real settled) {
   return moved <= settled * (1 + size) && input <= settled * (1 + plan);
 }
 
-/** Iterate at most this many times from the plan; returns how the last iteration ended. */
+/** Iterate at most this many times from the plan, up to the effort `until`; returns how the last iteration ended. */
 static koopmpc_status improve(koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev, int most,
-                              koopmpc_real settled, int *iterations) {
+                              koopmpc_real settled, int until, int *iterations) {
   koopmpc_status status = KOOPMPC_FAILED;
-  const int begun = s->spent;
   for (int k = 0; k < most; k++) {
     int taken = 0;
-    if (k && s->spent - begun >= SPENT) break;
+    if (k && s->spent >= until) break;
     const koopmpc_status found = koopmpc_program(s, x, s->without_limits, &taken);
     *iterations += taken;
     if (!is_good(found)) return found;
@@ -270,7 +269,7 @@ static koopmpc_status meet_limits(koopmpc_state *s, koopmpc_status status, const
                                   const koopmpc_real *u_prev, int *iterations) {
   for (int k = 0; k < ENDINGS; k++) {
     if (!is_good(status) || excess_of(s) <= 1) return status;
-    status = improve(s, x, u_prev, 1, KOOPMPC_SETTLED, iterations);
+    status = improve(s, x, u_prev, 1, KOOPMPC_SETTLED, 0, iterations);
   }
   return !is_good(status) || excess_of(s) <= 1 ? status : KOOPMPC_MAX_ITERATIONS;
 }
@@ -281,7 +280,7 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
                                  int *iterations) {
   koopmpc_status status = KOOPMPC_FAILED, polished;
   koopmpc_real best = KOOPMPC_HUGE;
-  const int begun = s->spent;
+  const int until = s->spent + SPENT;
   int best_kind = 3, done = 0;
   save(s);
   s->best_slack = 0;
@@ -290,7 +289,7 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
     koopmpc_real value = 0;
     int kind = 2;
     if (!begin(s, which, x, u_prev)) continue;
-    ended = improve(s, x, u_prev, EACH, NEARLY, iterations);
+    ended = improve(s, x, u_prev, EACH, NEARLY, until, iterations);
     if (is_good(ended)) {
       const koopmpc_real gap = gap_of(s);
 #if KOOPMPC_HARD_OUTPUTS
@@ -307,11 +306,12 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
       status = ended;
       save(s);
     }
-    done = s->spent - begun >= SPENT || (KOOPMPC_AFFINE && best_kind == 0);
+    done = s->spent >= until || (KOOPMPC_AFFINE && best_kind == 0);
   }
   restore(s);
   if (!is_good(status) || done) return status;
-  polished = improve(s, x, u_prev, KOOPMPC_ITERATIONS > AGAIN ? KOOPMPC_ITERATIONS : AGAIN, KOOPMPC_SETTLED, iterations);
+  polished =
+      improve(s, x, u_prev, KOOPMPC_ITERATIONS > AGAIN ? KOOPMPC_ITERATIONS : AGAIN, KOOPMPC_SETTLED, until, iterations);
   if (!is_good(polished)) {
     restore(s);
     return status;
@@ -520,7 +520,7 @@ static koopmpc_status solve(koopmpc_state *s, const koopmpc_real *stage, const k
     for (int i = 0; i < NX; i++) near &= koopmpc_abs(stage[i] - s->S[NS + i]) <= FAR_OFF * koopmpc_sizes[i];
     if (near) {
       shift(s, u_prev);
-      status = improve(s, stage, u_prev, KOOPMPC_ITERATIONS, KOOPMPC_SETTLED, iterations);
+      status = improve(s, stage, u_prev, KOOPMPC_ITERATIONS, KOOPMPC_SETTLED, SPENT, iterations);
 #if KOOPMPC_HARD_OUTPUTS
       status = meet_limits(s, status, stage, u_prev, iterations);
 #endif

@@ -387,13 +387,14 @@ class BilinearMPC(StagedMPC):
     ) -> tuple[Status, int]:
         """Take the cheapest of the plans to which several starts lead; return how it ended, and all iterations.
 
-        Plans that follow the model come before those that do not yet. No further start begins after an effort of
-        SPENT, or where the problem is affine and a plan was found: all starts lead to that one.
+        Plans that follow the model come before those that do not yet. After an effort of SPENT no further linearisation
+        begins, and no further start. None does either where the problem is affine and a plan was found: all starts lead
+        to that one.
         """
-        iteration, total, best, done, begun = self._iteration, 0, (3, 0.0), False, self._spent
+        iteration, total, best, done, until = self._iteration, 0, (3, 0.0), False, self._spent + SPENT
         status, kept = Status.FAILED, (iteration.X.copy(), iteration.U.copy(), 0.0)
         for X, U in self._starts(s[: self._map.nx], u_prev):
-            ended, iterations = self._improve(s, u_prev, EACH, deadline, NEARLY, (X, U))
+            ended, iterations = self._improve(s, u_prev, EACH, deadline, NEARLY, (X, U), until)
             total += iterations
             rank = (2, 0.0)
             if ended in GOOD:
@@ -403,13 +404,14 @@ class BilinearMPC(StagedMPC):
                 rank = (0, iteration.cost()) if followed else (1, max(gap, broken))
             if rank < best:
                 best, status, kept = rank, ended, (iteration.X.copy(), iteration.U.copy(), iteration.slack)
-            done = self._spent - begun >= SPENT or (self._affine and best[0] == 0)
+            done = self._spent >= until or (self._affine and best[0] == 0)
             if done or perf_counter() > deadline:
                 break
         iteration.X[:], iteration.U[:], iteration.slack = kept
         if status not in GOOD or done or perf_counter() > deadline:
             return status, total
-        polished, iterations = self._improve(s, u_prev, max(FIRST, self._sqp_iterations), deadline)
+        most = max(FIRST, self._sqp_iterations)
+        polished, iterations = self._improve(s, u_prev, most, deadline, until=until)
         if polished not in GOOD:
             iteration.X[:], iteration.U[:], iteration.slack = kept
             polished = status
@@ -444,6 +446,7 @@ class BilinearMPC(StagedMPC):
         deadline: float,
         settled: float = SETTLED,
         begin: tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]] | None = None,
+        until: float = np.inf,
     ) -> tuple[Status, int]:
         """Return how the last of at most this many iterations ended, and the solver's iterations of all.
 
@@ -451,11 +454,11 @@ class BilinearMPC(StagedMPC):
         a share `settled` of the plan moves, where F is nowhere near its linearisation, and at the deadline; then the
         plan found so far is used, and the step is late.
         """
-        total, status, iteration, begun = 0, Status.FAILED, self._iteration, self._spent
+        total, status, iteration, until = 0, Status.FAILED, self._iteration, min(self._spent + SPENT, until)
         if begin is not None:
             self._enter(*begin, u_prev)
         for k in range(most):
-            if k and (self._spent - begun >= SPENT or perf_counter() > deadline):
+            if k and (self._spent >= until or perf_counter() > deadline):
                 break
             found = iteration.step(s, self._targets, deadline)
             total += found.iterations

@@ -539,26 +539,4 @@ def least_deviation(
     qp = QP(np.eye(n), none, rows[kept], low[kept], high[kept], Softness(linear, quadratic, allowance))
     y = np.zeros(len(linear)) if multipliers is None else multipliers
     found = FINISHER(qp).solve(none, y, seconds if np.isfinite(seconds) else None)
-    status = found.status
-    if status is Status.FAILED and _contradictory(qp):
-        status = Status.INFEASIBLE
-    return Deviation(X[1:] @ found.v, U @ found.v, found.y, status, found.iterations)
-
-
-def _contradictory(qp: QP) -> bool:
-    """Return whether the hard rows have no point in common, by a linear program: DAQP may go in circles there.
-
-    The least t with low − t ≤ A v ≤ high + t, rows of unit length, is then above what rounding makes of zero.
-    """
-    from scipy.optimize import linprog
-
-    norms = np.linalg.norm(qp.A, axis=1)
-    hard = np.isinf(qp.softness.linear) if qp.softness is not None else np.ones_like(norms, dtype=np.bool_)
-    rows, sizes = qp.A[hard], np.maximum(norms[hard], 1e-300)
-    ends = np.concatenate([qp.high[hard] / sizes, -qp.low[hard] / sizes])
-    kept = np.isfinite(ends)
-    sides = np.vstack([rows / sizes[:, None], -rows / sizes[:, None]])[kept]
-    wanted = np.append(np.zeros(rows.shape[1]), 1.0)
-    free: list[tuple[float | None, float | None]] = [(None, None)] * rows.shape[1]
-    found = linprog(wanted, np.hstack([sides, -np.ones((len(sides), 1))]), ends[kept], bounds=[*free, (0.0, None)])
-    return bool(found.fun is not None and found.fun > 1e-7 * (1 + np.abs(ends[kept]).max(initial=0.0)))
+    return Deviation(X[1:] @ found.v, U @ found.v, found.y, found.status, found.iterations)
