@@ -10,12 +10,8 @@ A difference is another status or fallback, or inputs that differ by more than 1
 is lost. TIME_LIMIT and OSQP do not come up.
 
 The differences known, and their causes:
-- BilinearMPC, u is apart by 1e-6 to 2e-4: interior points stop at μ = 1e-9, and the cost is flat there. A later input of a plan,
-  which a fallback takes, was apart by 5e-4.
-- BilinearMPC, another status at a reading of 50 or more without an estimator: no plan from there is near the data of the
-  model, and rounding decides which of several starts ends first.
-- BilinearMPC, u apart by 0.07 (seed 4): no input holds the reference, and two stationary points are near it. C starts at the
-  nearest row that it knows, Python at the state.
+- BilinearMPC: none in 11,274 steps (even seeds to 36, 20 episodes each) but two statuses, since mended: what an active-set
+  method gave up was FAILED or MAX_ITERATIONS by rounding.
 - KoopmanMPC, u apart by 4e-6 or more at such a reading: plans miss their soft limits by 1e4 ranges or more, and what is
   missed agrees to 1e-7, DAQP's tolerance.
 - KoopmanMPC, FAILED in C where Python proves INFEASIBLE (seed 59): both hold the last plan.

@@ -122,7 +122,7 @@ koopmpc_status koopmpc_finish(koopmpc_state *s, int *iterations) {
     *iterations += end.iterations;
   }
   if (!good)
-    return end.flag == -1 && KOOPMPC_HARD_OUTPUTS ? KOOPMPC_INFEASIBLE : end.flag == -4 ? KOOPMPC_MAX_ITERATIONS : KOOPMPC_FAILED;
+    return end.flag == -1 && KOOPMPC_HARD_OUTPUTS ? KOOPMPC_INFEASIBLE : KOOPMPC_FAILED;
   koopmpc_copy(s->finish_dual, qp.dual, COUNT);
   s->finishing = 1;
   deviation(s, qp.primal);

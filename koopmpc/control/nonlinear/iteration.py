@@ -393,7 +393,8 @@ class RealTimeIteration:
         if found is None:
             return StageStep(dX, dU, np.zeros_like(self._eps), Status.FAILED, iterations, finished=True)
         self.multipliers = found.multipliers if found.status is Status.OPTIMAL else None
-        if found.status is Status.INFEASIBLE and not self.limits_outputs:  # limits of inputs alone always have a plan
+        impossible = found.status is Status.INFEASIBLE and not self.limits_outputs  # inputs alone always have a plan
+        if impossible or found.status is Status.MAX_ITERATIONS:  # which of both limits ends it rounding decides
             found = found._replace(status=Status.FAILED)
         return self._deviate(free, dX, dU, found, iterations)._replace(finished=True)
 
