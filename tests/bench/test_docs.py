@@ -65,7 +65,8 @@ def test_the_example_of_the_documentation_runs_and_reaches(tmp_path):
     (source,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     path = tmp_path / "spring.py"
     path.write_text(source)
-    rows = km.sweep([km.load_problem(path)], folder=tmp_path / "logs")
+    names = ["lqr", "linear-mpc", "koopman-mpc", "nonlinear-mpc"]
+    rows = km.sweep([km.load_problem(path)], names, folder=tmp_path / "logs")
     assert [row.failure for row in rows] == [None] * len(rows)
     push = {row.controller: row for row in rows if row.case == "push"}
     for row in rows:

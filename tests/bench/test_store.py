@@ -1,5 +1,6 @@
 """A sweep's store: many starts, seeds and noises, workers, kill -9, and two sweeps that do not mix."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ import koopmpc as km
 from tests.bench.tiny import write
 
 TWO = ["lqr", "koopman-mpc"]
-GRID = {"starts": 7, "seeds": 2, "noise": [0.0, 0.05]}
+GRID = {"starts": 6, "seeds": 2, "noise": [0.0, 0.05]}
 
 
 def figures(rows):
@@ -33,7 +34,7 @@ def whole(problem, tmp_path_factory):
 
 def test_every_combination_runs_once_and_what_learns_nothing_has_one_seed(whole):
     rows, folder = whole
-    assert len(rows) == len({row.key for row in rows}) == 2 * 2 * 7 * (1 + 2)
+    assert len(rows) == len({row.key for row in rows}) == 2 * 2 * 6 * (1 + 2)
     assert all(row.failure is None for row in rows)
     stored = pq.read_table(folder / "results.parquet").to_pylist()
     assert [(line["controller"], line["start"], line["noise"], line["cost"]) for line in stored] == [
@@ -48,7 +49,7 @@ def test_all_controllers_meet_the_same_starts_and_the_same_noise(whole):
     for row in rows:
         starts.setdefault((row.case, row.start), set()).add(row.x0)
     assert all(len(found) == 1 for found in starts.values())
-    assert len({x0 for found in starts.values() for x0 in found}) == 6 + 2
+    assert len({x0 for found in starts.values() for x0 in found}) == 5 + 2
     loud = {row.key: row.metrics.cost for row in rows}
     differ = [loud[key] != loud[(*key[:4], 0.05, *key[5:])] for key in loud if key[4] == 0.0]
     assert np.mean(differ) > 0.7  # an input that stays at its limit is the same with noise
@@ -98,11 +99,11 @@ def test_what_is_finished_is_not_run_again(problem, whole, tmp_path, monkeypatch
 
 
 def test_a_torn_line_is_run_again_and_nothing_else(problem, whole, tmp_path):
-    km.sweep([problem], TWO, folder=tmp_path, **GRID)
-    journal = sorted((tmp_path / "rows").glob("*.jsonl"))[-1]
+    folder = shutil.copytree(whole[1], tmp_path / "torn")
+    journal = sorted((folder / "rows").glob("*.jsonl"))[-1]
     journal.write_bytes(journal.read_bytes()[:-40])
-    assert len(km.bench.load_rows(tmp_path)) == len(whole[0]) - 1
-    assert figures(km.sweep([problem], TWO, folder=tmp_path, **GRID)) == figures(whole[0])
+    assert len(km.bench.load_rows(folder)) == len(whole[0]) - 1
+    assert figures(km.sweep([problem], TWO, folder=folder, **GRID)) == figures(whole[0])
 
 
 def test_another_sweep_is_refused_in_the_same_folder(problem, whole, tmp_path):
