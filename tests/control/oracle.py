@@ -28,7 +28,6 @@ def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=No
     Q, Ru = ([weight] * N for weight in cost.matrices(len(C), nu))
     if cost.weighs_in_time:
         Q, Ru = ([np.diag(row) for row in rows] for rows in cost.weight_rows(len(C), nu, step, N))
-    psd = cp.psd_wrap
     Z, U = cp.Variable((N + 1, nz)), cp.Variable((N, nu))
     held, objective = [Z[0] == z0], 0
     first = 0
@@ -54,16 +53,14 @@ def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=No
             return np.full(n, np.inf), np.zeros(n)
         return (np.broadcast_to(part, (n,)) for part in slack)
 
-    for k in range(N):
-        push = np.zeros(nz) if W is None else model.E @ W[k]
-        push = push if d is None else push + d
-        held += [Z[k + 1] == model.A @ Z[k] + model.B @ U[k] + push]
-        objective += cp.quad_form(U[k] - targets[k][1], psd(Ru[k]))
-        if cost.R_delta is not None:
-            before = u_prev if k == 0 else U[k - 1]
-            objective += cp.quad_form(U[k] - before, psd(cost.rate(nu)))
-        if k + 1 < N:
-            objective += cp.quad_form(C @ Z[k + 1] - R[k + 1], psd(Q[k + 1]))
+    push = np.zeros((N, nz)) if W is None else np.asarray(W)[:N] @ model.E.T
+    held += [Z[1:] == Z[:-1] @ model.A.T + U @ model.B.T + (push if d is None else push + d)]
+    objective += weighed(U - np.array([u for _, u in targets[:N]]), Ru[:N])
+    if cost.R_delta is not None:
+        before = u_prev[None] if N == 1 else cp.vstack([u_prev[None], U[:-1]])
+        objective += weighed(U - before, [cost.rate(nu)])
+    if N > 1:
+        objective += weighed(Z[1:N] @ C.T - np.asarray(R)[1:N], Q[1:N])
     F, h = end_of(model, cost, targets, R, e, C)
     objective += cp.sum_squares(F @ (Z[N] if F.shape[1] == nz else cp.hstack([Z[N], U[N - 1]])) - h)
 
@@ -74,8 +71,9 @@ def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=No
         low, high = limits.rate_rows(nu, 0, N)
         linear, quadratic = weights(limits.du_slack, nu)
         starts = np.cumsum([0, *blocks[:-1]])
+        differ = np.eye(N)[starts] - np.eye(N, k=-1)[starts]
         for i in range(nu):
-            changes = cp.hstack([U[k, i] - (u_prev[i] if k == 0 else U[k - 1, i]) for k in starts])
+            changes = differ @ U[:, i] - np.eye(len(starts))[0] * u_prev[i]
             limit(changes, low[starts, i], high[starts, i], linear[i], quadratic[i])
     G, (low, high) = model.C, limits.output_rows(model.nx, 0 if of is None else len(of), 1, N)
     given = [limits.x_min is not None or limits.x_max is not None] * model.nx
@@ -88,6 +86,16 @@ def oracle(model, cost, limits, z0, R, *, u_prev=None, W=None, d=None, blocks=No
 
     value = minimum(objective, held)
     return None if value is None else (U.value, value)
+
+
+def weighed(rows, weights):
+    """Return the sum of rowᵀ W row over the rows of an expression; weights that differ from row to row are diagonal."""
+    import cvxpy as cp
+
+    if all(np.array_equal(weight, weights[0]) for weight in weights):
+        values, vectors = np.linalg.eigh(weights[0])
+        return cp.sum_squares(rows @ (vectors * np.sqrt(np.maximum(values, 0.0))))
+    return cp.sum_squares(cp.multiply(np.sqrt([np.diag(weight) for weight in weights]), rows))
 
 
 def minimum(objective, held):

@@ -8,7 +8,7 @@ import pytest
 import koopmpc as km
 from koopmpc.errors import DataError
 from tests.control.models import linear
-from tests.control.oracle import targets_of
+from tests.control.oracle import targets_of, weighed
 
 N = 10
 A, B = np.array([[0.95, 0.2], [-0.1, 0.9]]), np.array([[0.02, 0.1], [0.2, -0.05]])
@@ -22,12 +22,10 @@ def cheapest(model, x, rows, price, u_r, limits, q=(0.0, 0.0)):
     import cvxpy as cp
 
     X, U = cp.Variable((N + 1, 2)), cp.Variable((N, 2))
-    cost, held = 0, [X[0] == x]
-    for k in range(N):
-        held += [X[k + 1] == model.A @ X[k] + model.B @ U[k], U[k] >= -0.4, U[k] <= 0.6, X[k + 1][0] <= 0.7]
-        cost += cp.quad_form(U[k] - u_r[k], R) + price[k] @ U[k]
-        cost += np.array(q) @ X[k + 1]
-        cost += 2.0 * cp.square(X[k + 1][0] - rows[k + 1][0]) + 0.1 * cp.square(X[k + 1][1] - rows[k + 1][1])
+    held = [X[0] == x, X[1:] == X[:-1] @ model.A.T + U @ model.B.T, U >= -0.4, U <= 0.6, X[1:, 0] <= 0.7]
+    error = X[1:] - np.asarray(rows)[1 : N + 1]
+    cost = weighed(U - np.array(u_r), [R]) + cp.sum(cp.multiply(price, U)) + cp.sum(X[1:] @ np.array(q))
+    cost += 2.0 * cp.sum_squares(error[:, 0]) + 0.1 * cp.sum_squares(error[:, 1])
     cp.Problem(cp.Minimize(cost), held).solve(cp.CLARABEL)
     return U.value
 

@@ -20,7 +20,7 @@ def good(outcomes: list[Outcome]) -> None:
 
 
 def test_a_sample_of_random_loops() -> None:
-    outcomes = outcomes_of(range(150))
+    outcomes = outcomes_of(range(80))
     good(outcomes)
     assert {name for one in outcomes for name in one.solvers} == {"", "osqp", "daqp"}
     assert np.quantile(np.concatenate([one.iterations for one in outcomes]), 0.99) <= 200
