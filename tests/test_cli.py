@@ -331,7 +331,7 @@ def test_logs_are_served_to_this_machine_alone_until_the_server_is_stopped(call,
     with serve(log, port) as (address, data):
         assert address.startswith(f"http://127.0.0.1:{port}?url=")
         assert is_up(data)
-        assert b"<html" in urlopen(f"http://127.0.0.1:{port}", timeout=10).read().lower()
+        assert b"<html" in urlopen(f"http://127.0.0.1:{port}", timeout=60).read().lower()
         listening = subprocess.run(["ss", "-ltn"], capture_output=True, text=True, check=False).stdout
         ours = [line.split()[3] for line in listening.splitlines() if f":{port} " in line or f":{data} " in line]
         assert all(place.startswith("127.0.0.1:") for place in ours)

@@ -93,7 +93,7 @@ print(json.dumps(ended))
 
 def fresh(script, **how):
     return subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False, **how
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False, **how
     )
 
 

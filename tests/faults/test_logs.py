@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import time
 import warnings
 from dataclasses import fields, replace
 from pathlib import Path
@@ -61,13 +62,18 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of 60 steps, written as it happens in three batches."""
     path = tmp_path_factory.mktemp("logs") / "run.rrd"
     run = make_run(T=60)
-    import time
-
     with km.Recorder(path, **about(run)) as recorder:
         for step in steps_of(run):
             recorder(step)
-            time.sleep(0.5 if step.k in (19, 39) else 0.0)
+            end = time.monotonic() + 60
+            while step.k in (19, 39) and count_flushed(path) < step.k - 1 and time.monotonic() < end:
+                time.sleep(0.1)  # until the batch is written; a step is held back for what follows it
     return path
+
+
+def count_flushed(path: Path) -> int:
+    read, _ = outcome(path)
+    return 0 if read is None else read.steps
 
 
 @pytest.mark.parametrize("share", [0.1, 0.9])

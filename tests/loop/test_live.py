@@ -101,8 +101,8 @@ def test_a_controller_that_hangs_is_made_safe_by_the_watchdog(tank):
             return tank.mpc(y, reference)
 
     began = time.monotonic()
-    paced = loop(tank, 100, mpc=Hanging(), watchdog=0.3)
-    assert paced.ended == "watchdog: the controller did not return within 0.3 s"
+    paced = loop(tank, 100, mpc=Hanging(), watchdog=1.0)
+    assert paced.ended == "watchdog: the controller did not return within 1 s"
     assert time.monotonic() - began < 15
     assert tank.inflow.read_value() == 0.0
 
