@@ -28,6 +28,11 @@ def list_changes(sources: dict[str, bytes]) -> list[tuple[Mutant, str]]:
     return [(mutant, "\n".join(mutant.lines(sources[mutant.file]))) for mutant in found]
 
 
+def name_of(mutant: Mutant, source: bytes) -> str:
+    """Return what names a change, wherever its line moves: ten digits of a hash of its line before and after."""
+    return hashlib.sha256("\n".join(mutant.lines(source)).encode()).hexdigest()[:10]
+
+
 def room_of(file: str) -> str:
     """Return the room of a file: a folder of koopmpc, "c", or "koopmpc" for the files on top."""
     parts = file.split("/")

@@ -3,18 +3,26 @@
 import ast
 import hashlib
 import json
+import os
+import re
+import shutil
+import signal
 import subprocess
 import sys
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import koopmpc as km
 from tests.compiler import find_compiler, needs_compiler
+from tests.mutation.__main__ import Copy, Warm, interval
 from tests.mutation.c_changes import c_mutants
 from tests.mutation.changes import mutants
 from tests.mutation.draw import drawn_of, list_changes, read_sources, room_of
+from tests.mutation.switched import switched
 from tests.tiers import slow
 
 SOURCE = '''"""Words with 1 < 2."""
@@ -169,15 +177,94 @@ def test_other_seeds_draw_from_every_room_and_every_kind_of_change() -> None:
     assert not any("daqp/" in name for name in read_sources(4))
 
 
-@pytest.mark.parametrize(
-    "text", ["import nothing_of_this_name", "def test_it():\n    assert False", "def test_it():\n    pass"]
-)
-def test_a_change_that_breaks_an_import_is_noticed_as_one_that_fails_a_test(tmp_path: Path, text: str):
-    path = tmp_path / "test_it.py"
-    path.write_text(text)
-    asked = json.dumps([[str(path)], 60, 1e9]) + "\n"
-    command = [sys.executable, "-m", "tests.mutation.warm"]
-    code, failed = json.loads(
-        subprocess.run(command, input=asked, stdout=subprocess.PIPE, text=True, check=True).stdout
+def test_each_change_is_made_where_it_is_on_and_only_there() -> None:
+    named = {str(i): mutant for i, mutant in enumerate(mutants("file.py", SOURCE))}
+    for name, mutant in named.items():
+        text, held, outside = switched(SOURCE, {name: mutant}, "file.py")
+        assert held == {name}
+        assert (outside == {name}) == mutant.lines(SOURCE)[1].startswith("def")
+        for on in (name, ""):
+            expected = ast.parse(mutant.of(SOURCE) if on else SOURCE)
+            assert ast.unparse(Chosen(on).visit(ast.parse(text))) == ast.unparse(expected)
+
+
+class Chosen(ast.NodeTransformer):
+    """Leaves of a source with switches what one change makes of it, without what notes that a function is entered."""
+
+    def __init__(self, on: str) -> None:
+        self._on = on
+
+    def _choice(self, node: ast.If | ast.IfExp) -> Any:
+        if not ast.unparse(node.test).startswith("is_on("):
+            return self.generic_visit(node)
+        return node.body if ast.unparse(node.test) == f"is_on('{self._on}')" else node.orelse
+
+    visit_If = visit_IfExp = _choice
+
+    def visit_Expr(self, node: ast.Expr) -> Any:
+        return None if ast.unparse(node).startswith("is_on(") else self.generic_visit(node)
+
+
+TESTS = """
+import os, subprocess, sys, pytest
+
+def test_it():
+    assert not is_on("here")
+
+def test_a_process_that_it_starts():
+    subprocess.run([sys.executable, "-c", "assert not is_on('there')"], check=True)
+
+def test_it_ends():
+    while is_on("endless"):
+        pass
+
+def test_it_starts_clean():
+    assert "left" not in os.environ
+    os.environ["left"] = "here"
+"""
+
+
+@pytest.mark.slow
+def test_tests_that_were_collected_once_meet_each_change_in_a_child_of_their_own(tmp_path: Path) -> None:
+    (tmp_path / "test_it.py").write_text(TESTS)
+    shutil.copy(Path(__file__).parent / "switch.py", tmp_path / "sitecustomize.py")
+    path = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
+    their_end, asks = os.pipe()
+    answers, our_end = os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.mutation.warm", str(their_end), str(our_end), "test_it.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+        stdout=subprocess.DEVNULL,
+        pass_fds=(their_end, our_end),
     )
-    assert (code > 0, bool(failed)) == ((False, False) if "pass" in text else (True, True))
+    os.close(their_end)
+    os.close(our_end)
+    tests = [[f"test_it.py::{name}", -0.7] for name in re.findall(r"def (test_\w+)", TESTS)]
+    with os.fdopen(answers) as lines, os.fdopen(asks, "w") as requests:
+        assert json.loads(lines.readline()) == ["ready"]
+        for change, code, name in [
+            ("here", 1, "test_it"),
+            ("there", 1, "test_a_process_that_it_starts"),
+            ("endless", -signal.SIGXCPU, "test_it_ends"),
+            ("nothing", 0, ""),
+            ("nothing", 0, ""),
+        ]:
+            requests.write(json.dumps([change, tests]) + "\n")
+            requests.flush()
+            assert json.loads(lines.readline()) == [code, f"test_it.py::{name}" if name else ""]
+    assert process.wait() == 0
+
+
+def test_a_change_that_breaks_an_import_leaves_nothing_to_ask(tmp_path: Path) -> None:
+    (tmp_path / "test_it.py").write_text("import nothing_of_this_name")
+    copy = Copy.__new__(Copy)
+    copy.folder = tmp_path
+    shutil.copy(Path(__file__).parent / "switch.py", tmp_path / "sitecustomize.py")
+    with closing(Warm(copy, ["test_it.py"], "any")) as warm:
+        assert warm.run("any", [("test_it.py::test_it", 0.1)]) == ("killed", "")
+
+
+def test_an_interval_is_that_of_wilson() -> None:
+    assert interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)  # Newcombe (1998), table I, method 3
+    assert interval(20, 20)[1] == pytest.approx(1)
