@@ -49,7 +49,7 @@ def write_csv(data: km.Episodes, folder, header="time [s],x,theta,v,omega,force"
 
 @pytest.fixture
 def few(monkeypatch):
-    """Let a selection try three models only."""
+    """Let a selection try three models only, and no hidden states."""
 
     def usual(episodes, _, bilinear, *__):
         base = km.State() + km.Constant()
@@ -63,6 +63,7 @@ def few(monkeypatch):
     monkeypatch.setattr("koopmpc.synthesis.select.propose_candidates", usual)
     monkeypatch.setattr("koopmpc.synthesis.records.DELAYS", (0, 1))
     monkeypatch.setattr("koopmpc.synthesis.select.is_late", lambda _: False)
+    monkeypatch.setattr("koopmpc.synthesis.select.judge_hidden_states", lambda *_, **__: [])
 
 
 @pytest.fixture

@@ -40,8 +40,16 @@ def test_inputs_that_only_the_goal_file_names_are_inputs(tmp_path, monkeypatch):
     assert written.exit_code == 0
     lines = Path("goal.toml").read_text().splitlines()
     Path("goal.toml").write_text("\n".join(line for line in lines if not line.startswith("inputs =")))
-    found = design_data(".", "goal.toml", "out", bilinear=False).design.controller
-    assert (found.predictor.states, found.predictor.inputs) == (NAMES[0], ("push [V]",))
+    told = []
+
+    def stop(data, *_, **__):
+        told.append((data.states, data.inputs))
+        raise km.KoopmpcError("read")
+
+    monkeypatch.setattr("koopmpc.fitting.goal.design", stop)
+    with pytest.raises(km.KoopmpcError, match="read"):
+        design_data(".", "goal.toml", "out", bilinear=False)
+    assert told == [(NAMES[0], ("push [V]",))]
 
 
 def tank_logs(folder, files=4, rows=300, glitch=None):
