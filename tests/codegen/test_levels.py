@@ -112,7 +112,7 @@ def test_a_step_without_a_plan_has_no_slack_in_c_as_in_python():
 
 def test_a_search_that_meets_its_bound_in_c_says_what_its_plan_may_miss(monkeypatch):
     rng, gaps = np.random.default_rng(3), []
-    for _ in range(6):
+    for _ in range(3):
         mpc = km.KoopmanMPC(draw_model(rng, 1), COST, km.Limits(levels=[[-1, 1]]), 9)
         best = km.compiled(mpc)
         monkeypatch.setattr(koopmpc.codegen.tables, "NODES", 9)

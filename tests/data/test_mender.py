@@ -34,7 +34,7 @@ def test_a_wrong_measurement_is_found_and_nearly_undone(size: float, share: floa
         assert (np.abs(one.X - whole.X) < 0.5 * spread(clean)).all()
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 4), st.sampled_from([0.0, 0.02, 0.2]))
 def test_random_linear_plants_have_no_glitches_but_those_that_were_made(seed: int, nx: int, process: float) -> None:
     rng = np.random.default_rng(seed)

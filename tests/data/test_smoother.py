@@ -95,7 +95,7 @@ def test_the_estimate_is_the_least_squares_of_all_measurements(delays: int) -> N
     np.testing.assert_allclose(found, best, rtol=0, atol=1e-8)
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 4), st.sampled_from([0.02, 0.1]))
 def test_on_random_linear_plants_the_noise_is_found_and_most_of_it_taken_out(seed: int, nx: int, share: float) -> None:
     clean = linear_data(np.random.default_rng(seed), nx)

@@ -8,7 +8,7 @@ A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])
 NAMES = ("position [m]", "speed [m/s]"), ("force [N/kg]",)
 
 
-def logs(count=16, steps=40):
+def logs(count=12, steps=40):
     rng, made = np.random.default_rng(0), []
     for _ in range(count):
         X, U = [rng.uniform(-1, 1, 2)], np.repeat(rng.uniform(-2, 2, (steps // 4, 1)), 4, axis=0)
