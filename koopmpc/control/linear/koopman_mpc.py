@@ -21,6 +21,7 @@ from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controlle
 from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.linear.call_windows import CallWindows, has_fields_of
 from koopmpc.control.linear.condensed_program import CondensedProgram
+from koopmpc.control.linear.first_input import FirstInput
 from koopmpc.control.linear.moving import MovingMap
 from koopmpc.control.linear.plan import PlanKind, PlanMap, plan_map, planned_states
 from koopmpc.control.linear.weights import WeighedPlan, WeighedPlans
@@ -220,6 +221,8 @@ class KoopmanMPC(MPCBase):
         self._read: MovingMap | None = self._map.moving  # the map that holds the reference of the last call
         self._peak, self._near = 0.0, False  # largest |r| of that reference; whether no limit moves its targets
         self._aimed = False  # whether the plan's last column is that of the reference
+        self._bound = self._make_bound() if self._map.is_long else None
+        self._owes = False  # whether the last plan is known by its first input alone
         self._going = False  # whether a step was made since reset: the first one repeats to the bit in every run
         self._rows = np.zeros((self._N + 1, len(track.tracked)))
         self._states: Float[np.ndarray, "N1nx nvk"] | None = None  # the states of a plan, once somebody asks for one
@@ -331,7 +334,9 @@ class KoopmanMPC(MPCBase):
             self._called_with = self._reference_key = None
         super().reset(x0, u_prev)
         self._qps.reset()
-        self._going, self._given_row = False, 0
+        self._going, self._given_row, self._owes = False, 0, False
+        if self._bound is not None:
+            self._bound.forget()
 
     @alone
     def update(self, predictor: LinearPredictor) -> None:
@@ -353,8 +358,10 @@ class KoopmanMPC(MPCBase):
         plan = plan_map(predictor, track, self._moves, coordinates, self._initial.buffer, self._plan_kind)
         windows, weighed = self._read_own(predictor, plan)  # what may be refused is refused before anything changes
         self.predictor, self._states, self._called_with, self._quick = predictor, None, None, None
+        self._settle()
         self._take_plan(plan)
         self._window, self._rows_of_limits, self._weighed = windows, windows, weighed
+        self._bound = self._make_bound() if self._map.is_long else None
         self._initial.update(predictor)
         if self._watch is not None:
             self._watch.update(predictor)
@@ -421,7 +428,7 @@ class KoopmanMPC(MPCBase):
             if self._window is not None or self._weighed is not None:
                 self._step += 1
             plan, t = self._map, self._spare
-            if moving is None or self._near:
+            if moving is None or (self._near and (self._bound is None or moving is plan.single)):
                 if moving is None:
                     plan.matrix.dot(origin.known, t)
                 else:
@@ -433,6 +440,8 @@ class KoopmanMPC(MPCBase):
                 # no 0 byte: every limit is met, and nothing is NaN (NaN meets no limit)
                 ask = self._solve_limited if 0 in plan.met else self._return_free_plan
                 move = ask(t, applied, start)
+            elif self._near:
+                move = self._find_first(plan, moving, applied, start)
             else:
                 whole = moving.multiply()
                 if plan.given is not None:
@@ -451,6 +460,55 @@ class KoopmanMPC(MPCBase):
             return move
         finally:
             self._token.append(held)
+
+    def _make_bound(self) -> FirstInput | None:
+        """Return what finds the first input of long previews alone, where that is possible."""
+        if self._weighed is not None or self._levels is not None:
+            return None
+        return FirstInput(self._map, self.nu, in_time=self._rows_of_limits is not None)
+
+    def _find_first(self, plan: PlanMap, moving: MovingMap, applied: ArrayLike | None, start: float) -> Move:
+        """Return the move of a long preview near which no limit moves a target: by its first input, if that will do."""
+        bound, window, t = self._bound, self._window, self._spare
+        if bound is not None and window is self._rows_of_limits:
+            u = bound.find(self._peak, window, self._row, self._given_row + self._latency)
+            if u is not None:
+                return self._return_first(u, start)
+        if window is not None:
+            window.plan_pages.turn(plan, self._row)
+        moving.rows_of_plan.dot(moving.known, t)
+        if plan.given is not None:
+            self._add_given(t)
+        _at_least(t, plan.low, plan.met_low)
+        _at_most(t, plan.high, plan.met_high)
+        return (self._solve_limited if 0 in plan.met else self._return_free_plan)(t, applied, start)
+
+    def _return_first(self, u: Float[np.ndarray, " nu"], start: float) -> Move:
+        """Return the move of a plan of which only the first input is known."""
+        self._qps.rest()
+        self._kept, self._age, self._planned, self._owes = self._plan, 0, True, True
+        self._given, self._given_row = u, self._given_row + 1
+        taken = perf_counter() - start
+        return Move(u.copy(), _FREE if taken <= self._allowed else Status.TIME_LIMIT, _NONE, taken, 0)
+
+    def _fail(
+        self,
+        free: Float[np.ndarray, " nu"] | None,
+        applied: ArrayLike | None,
+        status: Status,
+        iterations: int,
+        start: float,
+        solver: str = "",
+    ) -> Move:
+        """Return the move that replaces a failed step; see `MPCBase`."""
+        self._settle()
+        return super()._fail(free, applied, status, iterations, start, solver)
+
+    def _settle(self) -> None:
+        """Compute the rest of a plan of which only the first input is known."""
+        if self._owes and self._bound is not None:
+            self._bound.write_plan(self._plan)
+        self._owes = False
 
     def _take_plan(self, plan: PlanMap) -> None:
         """Go on with another plan of the same sizes; the warm start is kept."""
@@ -535,6 +593,8 @@ class KoopmanMPC(MPCBase):
         if moving is not None and not self._near:
             (window.single_pages if moving is plan.single else window.moving_pages).turn(moving, k)
             return
+        if moving is not None and self._bound is not None and moving is not plan.single:  # see _find_first
+            return
         pages = window.plan_pages
         plan.low, plan.high = pages.rows.get(k) or pages.fill(k)  # not by a method, for it costs each free step
         if self._aimed and plan.aims_inside and (self._pushed or not self._free_steps[k]):
@@ -563,6 +623,7 @@ class KoopmanMPC(MPCBase):
         """Return the plan of the last call; None where it had none."""
         if not self._planned:
             return None
+        self._settle()
         if self._states is None:
             rates = self._with_rates
             self._states = planned_states(
@@ -650,7 +711,7 @@ class KoopmanMPC(MPCBase):
             return self._solve_qp(t, applied, start)
         self._qps.rest()
         self._plan, self._spare = t, self._plan
-        self._kept, self._age, self._planned = t, 0, True
+        self._kept, self._age, self._planned, self._owes = t, 0, True, False
         self._given = u = t[: self.nu]
         taken = perf_counter() - start  # in this step a call of `_keep` and of `_move` would take 5 % of the time
         return Move(u.copy(), _FREE if taken <= self._allowed else Status.TIME_LIMIT, _NONE, taken, 0)
@@ -719,7 +780,7 @@ class KoopmanMPC(MPCBase):
         gap = 0.0
         if self._levels is not None:
             gap = self._levels.place(U)
-        self._plan, self._spare = t, self._plan  # swap: the previous plan's array becomes the spare
+        self._plan, self._spare, self._owes = t, self._plan, False  # swap: the last plan's array becomes the spare
         self._keep(t)
         status = Status.SOFTENED if gave_way else Status.OPTIMAL
         move = self._move(u.copy(), status, found.iterations, start, gave_way, found.solver)

@@ -159,21 +159,28 @@ class GivenShares:
         F.
     rows
         The rows of u_target, the last one repeated N times.
+
+    Attributes
+    ----------
+    table
+        These parts, a row a step; None where they would take too much memory.
+    last
+        The row from which on all parts are the same.
     """
 
     def __init__(self, from_given: Float[np.ndarray, "nv Nnu"], rows: Float[np.ndarray, "T nu"]) -> None:
         N = from_given.shape[1] // rows.shape[1] - 1
         self._from_given, self._rows, self.last = from_given, rows, len(rows) - N - 1
-        self._table = None
+        self.table: Float[np.ndarray, "T nv"] | None = None
         if (self.last + 1) * len(from_given) <= _TABLE:
             windows = sliding_window_view(rows, N + 1, axis=0).transpose(0, 2, 1)
-            self._table = windows.reshape(self.last + 1, -1) @ from_given.T
+            self.table = windows.reshape(self.last + 1, -1) @ from_given.T
 
     def at(self, k: int) -> Float[np.ndarray, " nv"]:
         """Return the share of the preview that begins with row k."""
         if k > self.last:
             k = self.last
-        if self._table is not None:
-            return self._table[k]
+        if self.table is not None:
+            return self.table[k]
         N = len(self._rows) - self.last - 1
         return self._from_given @ self._rows[k : k + N + 1].reshape(-1)

@@ -35,6 +35,8 @@ from koopmpc.control.terminal_cost import terminal_of
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Viewing
 
+_LONG = 2**13  # entries of a preview's share of a plan from which on a bound on it saves time
+
 
 class PlanLimits(NamedTuple):
     """The limits of every entry of a plan [moves; their changes, where they have limits; outputs], stage by stage.
@@ -105,6 +107,8 @@ class PlanMap(Viewing):
         The share of rows of a given u_target, moved by a price, None where there are none; what a plan begins with.
     moving, single
         The maps of a reference that moves: of a preview, and of one row that is held over the horizon.
+    is_long
+        Whether a preview is so long that its first input is worth a bound; see `FirstInput`.
     met
         A byte for each limit, met or not; `met_low` and `met_high` are views of the lower and of the upper ones.
     """
@@ -192,6 +196,9 @@ class PlanMap(Viewing):
         )
         nr = len(track.tracked)
         self.moving, self.single = MovingMap.of(parts, nr)
+        tabled = self.given is None or self.given.table is not None
+        few = self.planned < len(self.low) or self.maps.from_reference.size < _LONG
+        self.is_long = self.moving is not None and tabled and not few
         self.row_shape, self.rows_shape = (nr,), (horizon.N + 1, nr)
 
     def restore_limits(self) -> None:

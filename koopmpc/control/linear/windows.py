@@ -137,6 +137,16 @@ class LimitWindows:
         low, high = self.table[rows, first : first + count], self.table[rows, W + first : W + first + count]
         return ((limited.min(axis=0) >= low) & (limited.max(axis=0) <= high)).all(axis=1)
 
+    def find_rows(self, k: int, steps: int) -> Interval:
+        """Return the limits of inputs, rates and outputs, less the largest margin, that plans of so many steps read."""
+        W, n, most = self.table.shape[1] // 2, self.targets.first, self.plan.track.margin.max(axis=0, initial=0.0)
+        rows = slice(self._row(k), self._row(k) + steps + sum(self.plan.blocks))
+        low, high = self.table[rows, :n].copy(), self.table[rows, W : W + n].copy()
+        if self.plan_pages.margin is not None:
+            low[:, n - len(most) :] += most
+            high[:, n - len(most) :] -= most
+        return Interval(low, high)
+
     def leaves_targets(self, values: Float[np.ndarray, "N1 nl"]) -> bool:
         """Return whether the limits of a call move no target with these limited values."""
         return bool(self.find_free_steps(values)[0])
