@@ -1,5 +1,6 @@
 """Levenberg-Marquardt descent that stops on rows which it does not fit."""
 
+from collections.abc import Callable
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -42,6 +43,7 @@ def minimise(
     free: Int[np.ndarray, " f"] | None = None,
     patience: int = PATIENCE,
     converged: float = CONVERGED,
+    project: Callable[[Float[np.ndarray, "..."]], Float[np.ndarray, "..."]] | None = None,
 ) -> tuple[Float[np.ndarray, "..."], int]:
     """Return the Θ on the way down the error of `fitted` that has the least error on `judged`, and its iteration.
 
@@ -61,6 +63,8 @@ def minimise(
         Stop after this many steps in a row that do not lower the error of `judged`.
     converged
         Stop where a step lowers the error of `fitted` by less than this share.
+    project
+        Returns the Θ that may be taken in place of that of a step.
     """
     theta = best = start
     places = np.arange(theta.size) if free is None else free
@@ -83,6 +87,7 @@ def minimise(
                 break  # the quadratic model promises too little for another step
             move[places] = -directions @ along / scale
             trial = theta + move.reshape(theta.shape)
+            trial = trial if project is None else project(trial)
             lower = error.evaluate(trial, fitted)
             if lower < value:
                 theta = trial

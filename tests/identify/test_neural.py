@@ -8,9 +8,16 @@ import pytest
 
 import koopmpc as km
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.identify.levenberg_marquardt import minimise
 from koopmpc.identify.records import neural
 from koopmpc.identify.records.conversion import SignalUnits, from_standard, to_standard
-from koopmpc.identify.records.hidden import SimulationError, simulate_hidden, smooth_basis, start_with_differences
+from koopmpc.identify.records.hidden import (
+    RecordSegments,
+    SimulationError,
+    simulate_hidden,
+    smooth_basis,
+    start_with_differences,
+)
 from koopmpc.identify.records.hidden_structure import HiddenStructure
 from koopmpc.identify.records.neurons.contained import ContainedError, contain
 from koopmpc.lifting import Neurons
@@ -100,6 +107,32 @@ def test_a_contained_model_never_leaves_all_numbers():
     for _ in range(2000):
         far = model.E[:, 1:4] @ far  # what is left of the dynamics far away
     assert np.abs(far).max() < 100 * np.abs(z).max()
+
+
+def test_only_eigenvalues_above_one_move_and_they_end_at_one():
+    model = growing_model(np.random.default_rng(3))
+    error, n = ContainedError(SimulationError(model)), model.order
+    model = model.with_parameters(error.project(model.parameters))
+    assert np.array_equal(error.project(model.parameters), model.parameters)
+    E, turn = model.E.copy(), np.array([[1.0, 0.3, 0.0], [0.2, 1.0, 0.1], [0.0, -0.4, 1.0]])
+    E[:, 1 : 1 + n] = turn @ np.diag([1.3, 0.7, -0.2]) @ np.linalg.inv(turn)
+    found = replace(model, E=E)
+    found = found.with_parameters(error.project(found.parameters))
+    assert np.allclose(found.E[:, 1 : 1 + n], turn @ np.diag([1.0, 0.7, -0.2]) @ np.linalg.inv(turn), atol=1e-9)
+    assert np.array_equal(found.E[:, 1 + n :], E[:, 1 + n :])
+
+
+@pytest.mark.parametrize("seed", [5, 6, 8])
+def test_a_fit_that_starts_beside_the_bound_on_eigenvalues_reaches_the_plant(seed):
+    rng = np.random.default_rng(seed)
+    start = start_with_differences(1, 1, 2, 3)
+    plant = replace(start, E=np.array([[0, 0.9, 0.2, 0.3], [0, -0.3, 0.8, 0.5]]))
+    noisy = random_segments(plant, rng, count=6, steps=40)
+    data = RecordSegments(noisy.points, noisy.inputs, simulate_hidden(plant, noisy.points, noisy.inputs))
+    near = replace(start, E=np.array([[0, 0.999, 0, 0.1], [0, 0, 0.999, 0.1]]))
+    error = ContainedError(SimulationError(near))
+    theta, _ = minimise(error, near.parameters, [data], [data], 20, project=error.project)
+    assert error.evaluate(theta, [data]) < 1e-20 < 1 < error.evaluate(near.parameters, [data])
 
 
 def test_a_growing_free_run_is_refused_in_a_sentence(monkeypatch):

@@ -1,5 +1,6 @@
 """select on long records: sparse polynomials of the past, late input columns, free runs that decide."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 import koopmpc as km
 from koopmpc.errors import DataError
 from koopmpc.identify.records.hidden_structure import HiddenStructure
-from koopmpc.synthesis import hidden_states
+from koopmpc.identify.records.structure import Structure
+from koopmpc.synthesis import hidden_states, records
 from koopmpc.synthesis.candidates import relift_model
 from koopmpc.synthesis.hidden_states import NEAR, PAYS, judge_hidden_states
 from koopmpc.synthesis.records import (
@@ -274,3 +276,22 @@ def test_of_models_alike_one_without_a_hidden_state_is_taken():
     assert hidden
     assert all(np.isfinite(row.free) and row.worst < 1 for row in hidden)
     assert "hidden" not in found.best.title
+
+
+@pytest.mark.parametrize(
+    ("error", "calm", "other_calm", "taken"),
+    [(0.89, True, True, 2), (0.91, True, True, 1), (2.0, False, True, 2), (0.1, True, False, 1)],
+)
+def test_the_best_linear_structure_is_taken_where_it_wins_on_long_stretches(
+    monkeypatch, error, calm, other_calm, taken
+):
+    data = km.Episodes([km.Episode(X=np.zeros((1602, 1)), U=np.zeros((1601, 1)))], 0.1, ["y"], ["u"])
+    one = Structure(1, 1, (np.array([[1]]),), np.zeros(2), np.ones(2), np.array([1.0, 2.0]), True)
+    other = replace(one, terms=(np.array([[1], [2]]),), errors=np.array([0.9, 1.9]))
+    runs = {1: FreeRun(np.array([1.0, 1.0]), calm), 2: FreeRun(np.array([error, error]), other_calm)}
+    monkeypatch.setattr(records, "search_structures", lambda *_, **__: [one, other])
+    monkeypatch.setattr(records, "choose_structure", lambda _: one)
+    monkeypatch.setattr(records, "run_structure", lambda structure, *_: runs[structure.size])
+    (found,) = records.propose_structures(data, [1], bilinear=False)
+    assert isinstance(found.structure, Structure)
+    assert found.structure.size == taken

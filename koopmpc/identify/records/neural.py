@@ -242,7 +242,7 @@ def _polish(
     whole = _project(_cut(data, units, structure, structure.horizon, [(0, len(e)) for e in data], most), basis)
     small = _change_past(model, basis.T)
     error = ContainedError(SimulationError(small))
-    theta, _ = minimise(error, small.parameters, whole, whole, _POLISH, converged=_CONVERGED)
+    theta, _ = minimise(error, small.parameters, whole, whole, _POLISH, converged=_CONVERGED, project=error.project)
     return contain(_change_past(small.with_parameters(theta), basis))
 
 
@@ -314,9 +314,10 @@ def _fit(
 ) -> HiddenModel:
     """Return the model that Levenberg-Marquardt finds, whose linear part does not grow; unseen segments stop it."""
     (fitted, judged), (iterations, patience, converged) = part, effort
+    error = ContainedError(SimulationError(model, noise))
     theta, _ = minimise(
-        ContainedError(SimulationError(model, noise)), model.parameters, fitted, judged, iterations,
-        patience=patience, converged=converged,
+        error, model.parameters, fitted, judged, iterations, patience=patience, converged=converged,
+        project=error.project,
     )  # fmt: skip
     return contain(model.with_parameters(theta))
 

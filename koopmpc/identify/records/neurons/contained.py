@@ -8,6 +8,8 @@ from jaxtyping import Float, Int
 from koopmpc.identify.records.hidden import HiddenModel, Sets, SimulationError
 
 WEIGHT = 1e5  # of the squared excess of an eigenvalue, beside the mean squared error in spreads²
+_INSIDE = 1e-12  # an eigenvalue that is moved to one ends by this share inside
+_DEFECTIVE = 1e8  # eigenvectors of a larger condition number do not tell eigenvalues apart
 
 
 class ContainedError:
@@ -52,6 +54,21 @@ class ContainedError:
                 matrix[np.ix_(self._places, self._places)] += WEIGHT * np.outer(slope, slope)
         return gradient, matrix
 
+    def project(self, theta: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Return Θ with the eigenvalues of A that are above one moved to one, along their eigenvectors.
+
+        A step near |λ| = 1 would otherwise be refused for an eigenvalue that it hardly needs.
+        """
+        A = theta[self._places].reshape(self._n, self._n)
+        values, right = np.linalg.eig(A)
+        size = np.abs(values)
+        if not (size > 1).any() or not np.linalg.cond(right) < _DEFECTIVE:
+            return theta
+        inside = np.where(size > 1, values / (size * (1 + _INSIDE)), values)
+        projected = theta.copy()
+        projected[self._places] = np.real((right * inside) @ np.linalg.inv(right)).ravel()
+        return projected
+
 
 def contain(model: HiddenModel) -> HiddenModel:
     """Return the model with A divided by its spectral radius, where that is above one."""
@@ -60,5 +77,5 @@ def contain(model: HiddenModel) -> HiddenModel:
     if radius <= 1:
         return model
     E = model.E.copy()
-    E[:, 1 : 1 + n] /= radius * (1 + 1e-12)
+    E[:, 1 : 1 + n] /= radius * (1 + _INSIDE)
     return replace(model, E=E)
