@@ -1,5 +1,6 @@
 """Pages show the figures that are stored: times of steps, long horizons, and coverage on plants."""
 
+import importlib
 import json
 import sys
 
@@ -40,6 +41,12 @@ def test_the_page_of_speed_shows_the_stored_long_horizons():
         f"{round(daqp, -1):.0f} times as long, one of `BilinearMPC` {staged:.0f} times, in C {compiled:.0f}."
         in "\n".join(lines)
     )
+
+
+def test_the_page_of_speed_shows_the_stored_large_problems(monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(turns.HERE), *sys.path])
+    growth = importlib.import_module("growth")
+    assert growth.write_large_rows(json.loads(growth.LARGE.read_text())) in "\n".join(read_lines("speed.md"))
 
 
 def test_the_page_of_guarantees_shows_the_stored_coverage():
