@@ -18,8 +18,9 @@ from collections import Counter
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from functools import partial
+from importlib import import_module
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType, ModuleType, TracebackType
 from typing import Any
 
 Handler = Callable[[int, FrameType | None], Any]
@@ -78,6 +79,15 @@ def defer_interrupts() -> Generator[None]:
     finally:
         for number, handler in came:
             handler(number, None)
+
+
+def import_whole(name: str) -> ModuleType:
+    """Import a library that takes a Ctrl-C for the lack of one of its parts, as CVXPY does with solvers.
+
+    The interrupt is answered once the library is there as a whole.
+    """
+    with defer_interrupts():
+        return import_module(name)
 
 
 @contextmanager

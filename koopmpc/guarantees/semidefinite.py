@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.interrupts import call_uninterrupted
+from koopmpc.interrupts import call_uninterrupted, import_whole
 
 _STRICT = 1e-7  # least eigenvalue that the program asks of its matrices, in scaled coordinates
 _SOLVED = ("optimal", "optimal_inaccurate")  # the solver's word is checked afterwards in either case
@@ -96,9 +96,7 @@ def solve_feedback(task: FeedbackTask, *, linear: bool = False) -> FeedbackProof
     linear
         Keep K_w = 0, so that v = K φ.
     """
-    import cvxpy  # slow to import
-
-    model: Any = cvxpy
+    model: Any = import_whole("cvxpy")  # slow
     # inside, φ = T φ̂ with E = T Tᵀ and v = g v̂ with inputs of unit effect: the ellipsoid is the unit ball
     T = _root(task.E)
     back = np.linalg.inv(T)

@@ -3,6 +3,7 @@
 import gc
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import pytest
 import rerun as rr
 
 import koopmpc as km
-from koopmpc.interrupts import clean_folder
+from koopmpc.interrupts import clean_folder, import_whole
 from tests.bench.tiny import write
 from tests.faults.test_controllers import BUILD, controllers, models  # noqa: F401  # fixtures
 
@@ -108,6 +109,19 @@ def _ctrl_c_is_heard():
     yield
     signal.signal(signal.SIGINT, before)
     gc.enable()
+
+
+def test_an_interrupt_waits_for_a_library_that_would_take_it_for_a_missing_part(tmp_path, monkeypatch):
+    """CVXPY catches what the import of a solver raises: a Ctrl-C in it was lost, and the solver with it."""
+    greedy = "import signal\ntry:\n    signal.raise_signal(2)\nexcept BaseException:\n    whole = False\nelse:\n    whole = True\n"
+    (tmp_path / "greedy.py").write_text(greedy)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "greedy", raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        import_whole("greedy")
+    assert sys.modules["greedy"].whole
+    sources = {path.name: path.read_text() for path in Path(km.__file__).parent.rglob("*.py")}
+    assert [name for name, text in sources.items() if re.search(r"^ *(import|from) cvxpy", text, re.M)] == []
 
 
 SENDER = """
