@@ -1,5 +1,6 @@
 """koopmpc fit: from logs of an unknown plant to a model file, a report, pictures and a Rerun log."""
 
+import contextlib
 import re
 import subprocess
 import sys
@@ -78,9 +79,9 @@ def fitted(tmp_path_factory):
     """Return the folder of one call without any option, what it printed, and fresh data of the same plant."""
     place = tmp_path_factory.mktemp("fit")
     write_csv(cart_pole(18, steps=60), place / "csv")
-    command = [sys.executable, "-m", "koopmpc", "fit", "csv"]
-    result = subprocess.run(command, cwd=place, capture_output=True, encoding="utf8", check=False)
-    assert result.returncode == 0, result.stderr
+    with contextlib.chdir(place):
+        result = CliRunner().invoke(app, ["fit", "csv"])
+    assert result.exit_code == 0, result.stderr
     (folder,) = (place / "logs").iterdir()
     return folder, result, cart_pole(12, steps=60, rng=1)
 
