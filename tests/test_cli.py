@@ -7,13 +7,15 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
+from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import koopmpc as km
-from koopmpc.cli.console import find_program
+from koopmpc.cli.console import find_program, new_folder
 from koopmpc.loop.run import About
 from koopmpc.recording.description import table_figures, to_markdown
 from tests.bench.tiny import write
@@ -49,6 +51,15 @@ def test_run_takes_a_path_and_leaves_a_log_a_run_and_the_table(call, tmp_path):
     assert (view, log) == ("view", f"logs{os.sep}{folder.name}{os.sep}tiny-near-koopman-mpc.rrd")
     shown = subprocess.run([*program, "inspect", log], capture_output=True, text=True, cwd=tmp_path)
     assert shown.stdout.startswith("tiny near koopman-mpc")  # what is printed can be called as it stands
+    compared = call("compare", folder, folder)
+    assert compared.exit_code == 0, compared.output
+    assert "no regression beyond 2.0% in 4 comparisons" in compared.stdout
+
+
+def test_calls_that_share_a_second_make_a_folder_each(tmp_path, monkeypatch):
+    monkeypatch.setattr("koopmpc.cli.console.datetime", SimpleNamespace(now=lambda: datetime(2026, 11, 27, 1, 2, 3)))
+    stem = "2026-11-27T01-02-03-tiny"
+    assert [new_folder(tmp_path, "tiny").name for _ in range(3)] == [stem, f"{stem}-1", f"{stem}-2"]
 
 
 def test_a_plant_whose_time_is_in_hours_settles_in_hours(call, tmp_path):

@@ -162,6 +162,8 @@ def test_a_continuous_system_is_sampled_with_a_zero_order_hold(seed, dt):
 
 
 def test_a_system_without_a_sample_time_or_with_feedthrough_is_refused():
+    with pytest.raises(km.KoopmpcError, match=r"system is a list; pass scipy.signal.StateSpace or control.ss"):
+        km.LinearPredictor.from_state_space([[0.5]], dt=0.1)
     system = scipy.signal.StateSpace([[0.0]], [[1.0]], [[1.0]], [[0.0]])
     with pytest.raises(km.KoopmpcError, match="pass dt="):
         km.LinearPredictor.from_state_space(system)

@@ -102,13 +102,17 @@ def test_a_log_that_was_cut_is_read_and_repaired_and_one_that_is_none_is_refused
 
 def test_every_run_of_a_sweep_replays_to_the_bit(swept):
     for row in swept[0]:
-        assert km.bench.replayed(row.log).differences == (), row.name
+        found = km.bench.replayed(row.log)
+        assert found.differences == (), row.name
+        assert str(found).startswith("the same to the bit: ")
 
 
 def test_a_problem_that_has_changed_since_is_told(swept, tmp_path):
     rows = km.sweep([km.load_problem(write(tmp_path))], ["lqr"], folder=tmp_path / "logs")
     write(tmp_path, **{"Q=1.0": "Q=3.0"})
-    differences = km.bench.replayed(rows[0].log).differences
+    found = km.bench.replayed(rows[0].log)
+    differences = found.differences
+    assert str(found) == "not the same: " + "\n".join(differences)
     assert any(each.startswith("U from step 0") for each in differences)
     assert "cost: the problem has changed since" in differences
     run = km.load_run(rows[0].log)

@@ -95,6 +95,13 @@ def test_a_long_sum_is_one_run():
     assert ("sin", 100) in plan.runs
 
 
+def test_a_register_is_taken_again_after_its_last_reader():
+    x = value = ca.SX.sym("x")
+    for _ in range(50):
+        value = ca.sin(value)
+    assert plan_runs(Graph.trace(ca.Function("f", [x], [value]))).registers <= 3
+
+
 KINDS = {
     "thin plate": lambda n, rng: km.ThinPlate(rng.uniform(-2, 2, (n, 2))),
     "gaussian": lambda n, rng: km.Gaussian(rng.uniform(-2, 2, (n, 2)), 1.0),

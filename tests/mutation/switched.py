@@ -14,7 +14,7 @@ STATEMENTS = ("Assign", "AugAssign", "Break", "Continue", "Expr", "Raise", "Retu
 def switched(source: bytes, changes: Mapping[str, Mutant], mark: str) -> tuple[bytes, set[str], set[str]]:
     """Return the source with switches for the changes, the names of those it holds, and of those that an import runs.
 
-    Where an import runs one, each function notes the mark when it is entered.
+    Where an import runs one, or one overlaps with another, each function notes the mark when it is entered.
     """
     outside = {name for name, change in changes.items() if not _is_inside(source, change)}
     edits = [(change.start, change.end, name) for name, change in changes.items()]
@@ -24,7 +24,7 @@ def switched(source: bytes, changes: Mapping[str, Mutant], mark: str) -> tuple[b
         apart = all(end <= other[0] or other[1] <= start for other in held.values())
         if apart and text and _compiles(source[:start] + text + source[end:]):
             held[name] = (start, end, text)
-    made = [*held.values(), *(_entries(source, mark) if outside else ())]
+    made = [*held.values(), *(_entries(source, mark) if outside or len(held) < len(changes) else ())]
     for start, end, text in sorted(made, key=lambda edit: edit[:2], reverse=True):
         source = source[:start] + text + source[end:]
     return source, set(held), outside

@@ -16,6 +16,7 @@ import koopmpc as km
 from koopmpc.loop.run import About, StepRows
 from koopmpc.recording.description import _FORMAT, drawable, from_json, title_of, to_json, to_markdown
 from koopmpc.recording.reader import read_columns
+from koopmpc.recording.rrd import file_recording
 from koopmpc.recording.scenes import ReferenceScenes
 from koopmpc.recording.writer import block_of_run, blocks
 from tests.control.models import step_map
@@ -293,3 +294,13 @@ def test_a_run_has_a_title_of_its_own(tmp_path: Path) -> None:
     assert title_of(km.load_run(tmp_path / "run.rrd")) == "bench 3, new valve"
     problem = {"title": "Pendulum: driven upright.", "problem": "pendulum", "case": "hang", "controller": "lqr"}
     assert title_of(About(**make_run(metadata=problem).about())) == "pendulum · hang · lqr"
+
+
+def test_a_recording_that_cannot_begin_says_why_and_leaves_no_file(tmp_path: Path, monkeypatch) -> None:
+    def fail(application: str) -> None:
+        raise MemoryError(application)
+
+    monkeypatch.setattr("koopmpc.recording.rrd.new_recording", fail)
+    with pytest.raises(MemoryError, match="mine"), file_recording(tmp_path / "a.rrd", "mine", None):
+        pass
+    assert not any(tmp_path.iterdir())
