@@ -45,7 +45,12 @@ static int target_of_row(koopmpc_state *s, int k, const koopmpc_real *e, koopmpc
 }
 #endif
 
-enum { LANES = 8 }; /* sums and maxima side by side, for a processor does several at once, and one after the other slowly */
+/* sums and maxima side by side, where a processor does several at once; others lose time with it */
+#if defined(__SSE2__) || defined(_M_X64) || defined(__ARM_NEON) || defined(__aarch64__)
+enum { LANES = 8 };
+#else
+enum { LANES = 1 };
+#endif
 
 /** The largest of |a|. */
 static koopmpc_real largest(const koopmpc_real *a, int n) {
@@ -85,9 +90,9 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *re
   koopmpc_copy(s->reference, ahead, SIZE);
   peak = largest(ahead, SIZE);
 #if KOOPMPC_FIRST_ALONE
-  for (int k = 0; k <= KOOPMPC_N; k++)
+  for (int k = 0; k <= KOOPMPC_N && !held; k++)
     for (int i = 0; i < NR; i++) s->apart[k * NR + i] = ahead[k * NR + i] - ahead[i];
-  *reach = largest(s->apart, SIZE);
+  if (!held) *reach = largest(s->apart, SIZE);
 #endif
 #if KOOPMPC_BOUNDS
   s->peak = peak;
