@@ -13,8 +13,8 @@ first, then those of its room, the short ones first. No other test could notice 
 out. What an import runs, or overlaps with another change, is met by every test that enters a function of its file, and C by
 those that build its file.
 
-A change that no test notices survives, and is printed. Where the tests that meet one take more than ENOUGH seconds, the
-rest is not run, and the print says so. Changes that nobody could notice stand, with the reason, in
+A change that no test notices survives, and is printed. Where the tests of other names that meet one take more than ENOUGH
+seconds, the rest is not run, and the print says so. Changes that nobody could notice stand, with the reason, in
 tests/mutation/equivalent.txt; they count neither as noticed nor as survived.
 """
 
@@ -44,7 +44,7 @@ COPIED = (
     *("koopmpc", "problems", "tests", "docs", "pyproject.toml", "README.md", "CHANGELOG.md", "Makefile"),
     *("CONTRIBUTING.md", "CITATION.cff", "LICENSE", "mkdocs.yml", "constraints.txt"),
 )
-ENOUGH = 30.0  # seconds of processor time of tests that a change has to outlive
+ENOUGH = 30.0  # seconds of processor time of tests in files of other names that a change has to outlive
 PYTEST = (sys.executable, "-m", "pytest", "-q", "--benchmark-disable", "-p", "no:cacheprovider", "-p", "no:cov")
 ORDER = ("killed", "timed out", "equivalent", "survived", "not run")
 
@@ -207,13 +207,14 @@ def interval(noticed: int, judged: int) -> tuple[float, float]:
     return (share + z**2 / (2 * n) - half) / (1 + z**2 / n), (share + z**2 / (2 * n) + half) / (1 + z**2 / n)
 
 
-def within(tests: list[tuple[str, float]]) -> Iterator[tuple[str, float]]:
-    """Yield the first of these tests, as many as take ENOUGH."""
+def within(tests: list[tuple[str, float]], mutant: Mutant) -> Iterator[tuple[str, float]]:
+    """Yield the tests in the file of the same name, of which one may have paid for all, and ENOUGH seconds of others."""
     spent = 0.0
     for test, seconds in tests:
-        spent += seconds
-        if spent > ENOUGH and spent > seconds:
-            return
+        if Path(test.split("::")[0]).name != f"test_{Path(mutant.file).stem}.py":
+            spent += seconds
+            if spent > ENOUGH and spent > seconds:
+                return
         yield test, seconds
 
 
@@ -280,7 +281,7 @@ def main() -> int:
             try:
                 every = found_by.tests_of(name, mutant, outside=name in copy.outside or name not in copy.switched)
                 while True:
-                    tests = [test for test in within(every) if test[0] not in found_by.broken]
+                    tests = [test for test in within(every, mutant) if test[0] not in found_by.broken]
                     found, failed = copy.outcome(name, mutant, tests) if tests else ("survived", "")
                     if not failed or failed in sound:
                         break
