@@ -35,6 +35,7 @@ FIRST = "daqp"
 SPARSE = "piqp"
 LONG = 300  # steps from which on it is faster, first steps from nothing and later ones
 WIDE = 60  # and so many steps for each entry of a stage's state, of which its time is a power of 1.2 to 2
+PLANNED = 1000  # or so many planned inputs: 8 over 200 steps took half of the time, 4 over 150 steps 2.5 times as long
 PATIENCE = 20  # iterations that the first solver gets there
 
 
@@ -65,7 +66,10 @@ def order_solvers(solver: str, settings: Mapping[str, Any]) -> list[SolverTurn]:
 def add_sparse(turns: list[SolverTurn], qp: StepQP) -> list[SolverTurn]:
     """Return the solvers of a step where none was named: for a long plan of small stages the sparse one is second."""
     stages, hard = qp.stages, bool(np.isinf(qp.softness.linear).all())
-    if stages is None or max(LONG, WIDE * len(stages.A)) > stages.N or not hard:
+    if stages is None or not hard:
+        return turns
+    n, nu = stages.B.shape
+    if max(LONG, WIDE * n) > stages.N and stages.N * nu < PLANNED:
         return turns
     first = turns[0]
     sparse = SolverTurn(SOLVERS[SPARSE], {})

@@ -30,6 +30,13 @@ def controller(solver: str, N: int, rates: bool = False, nu: int = 1, **limits):
     return km.KoopmanMPC(model, cost, box, N, solver=solver)
 
 
+@pytest.mark.parametrize(("planned", "solver"), [(80, "piqp"), (81, "daqp")])
+def test_a_plan_of_many_inputs_is_solved_by_stages_where_none_is_named(monkeypatch, planned, solver):
+    monkeypatch.setattr(order, "PLANNED", planned)
+    monkeypatch.setattr(order, "PATIENCE", 1)
+    assert controller("auto", 40, nu=2)([3.0, 0.0, 0.0, 0.0], np.zeros(4)).solver == solver
+
+
 @pytest.mark.parametrize(("rates", "nu"), [(False, 1), (True, 1), (False, 2), (True, 2)])
 def test_the_stages_and_the_condensed_qp_have_the_same_plan(rates, nu):
     dense, sparse = (controller(name, 60, rates, nu) for name in ("daqp", "piqp"))
