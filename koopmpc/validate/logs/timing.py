@@ -320,10 +320,10 @@ def _score_gain(rows: _Rows, j: int, t: float) -> float:
     return float(weights @ rows.after[:, 0]) * np.sign(t) / max(size, 1e-300)
 
 
-def _test_outputs(
-    inputs: Float[np.ndarray, "M q"], outputs: Float[np.ndarray, "M p"], u: Float[np.ndarray, "M 1"]
-) -> float:
-    """Return the significance of past outputs beside past inputs for an input.
+def _score_outputs(
+    outputs: Float[np.ndarray, "M p"], inputs: Float[np.ndarray, "M q"], u: Float[np.ndarray, "M 1"]
+) -> tuple[int, float]:
+    """Return how many past outputs stand beside past inputs, and what they tell of an input: by chance χ² of so many.
 
     White's test, each residual without its own row: where an input moves rarely, a few rows hold most of what its past
     leaves open, and a test for equal variances finds past outputs in it by chance.
@@ -335,7 +335,7 @@ def _test_outputs(
     e = _leave_out(more, _leave_out(past, u))[:, 0] / np.maximum(left, 0.01)
     spread: np.ndarray = more.T @ (more * (e**2)[:, None])
     excess: np.ndarray = b * (np.linalg.pinv(spread) @ b)
-    return float(chdtrc(more.shape[1], excess.sum()))
+    return len(b), float(excess.sum())
 
 
 def _explain_feedback(rows: _Rows, j: int, limits: _Strictness) -> str:
@@ -346,7 +346,12 @@ def _explain_feedback(rows: _Rows, j: int, limits: _Strictness) -> str:
     alone, joint = (float((_leave_out(Q, u) ** 2).sum()) for Q in (own, both))
     if joint < 1e-9 * float((u**2).sum()):
         return "the rows before determine it"
-    if _test_outputs(rows.inputs, rows.states, u) < limits.significance:
+    more, free = both.shape[1] - own.shape[1], ones - both.shape[1] - 1
+    if (
+        more > 0
+        and fdtrc(more, free, (alone - joint) / more / (joint / free)) < limits.significance
+        and chdtrc(*_score_outputs(rows.states, rows.inputs, u)) < limits.significance
+    ):
         return "past outputs predict it, so it may be a feedback"
     nx, nu = rows.after.shape[1], rows.same.shape[1]
     if rows.repeated[j] < _REPEATED:
