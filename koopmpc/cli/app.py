@@ -101,6 +101,9 @@ def fit(
         int | None, typer.Option("--horizon", help="Steps ahead that the model is chosen and judged by.")
     ] = None,
     linear: Annotated[bool, typer.Option("--linear", help="Try linear models only.")] = False,
+    feedthrough: Annotated[
+        bool, typer.Option("--feedthrough", help="Inputs act on the outputs of their own row: y = h(x, u).")
+    ] = False,
     workers: Annotated[
         int | None, typer.Option("--workers", help="Local processes, or those of --scheduler local.")
     ] = None,
@@ -170,6 +173,8 @@ def fit(
     }
     if goal is not None:
         with friendly():
+            if feedthrough:
+                raise DataError("--feedthrough is for models; a design with --goal has inputs that act on the next row")
             if horizon is not None:
                 raise DataError(f"--horizon {horizon} is of no use with --goal; write horizon = {horizon} into {goal}")
         with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
@@ -196,7 +201,7 @@ def fit(
         with friendly():
             raise DataError("--coverage and --certify are for a controller; pass --goal, too")
     with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
-        done = fit_data(source, folder, horizon=horizon, progress=progress, **how)
+        done = fit_data(source, folder, horizon=horizon, feedthrough=feedthrough, progress=progress, **how)
     for failure in done.failures:
         Console(stderr=True).print(Text.assemble(("not made: ", "yellow"), failure), soft_wrap=True)
     say(f"model, report and pictures: {folder}")

@@ -78,6 +78,7 @@ def fit_data(
     *,
     horizon: int | None = None,
     bilinear: bool = True,
+    feedthrough: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
     memory: int = IN_MEMORY,
@@ -98,6 +99,8 @@ def fit_data(
         Steps ahead; `select` says what it is by default.
     bilinear
         Try bilinear models too; if one is chosen, the best linear one goes to linear.npz.
+    feedthrough
+        Outputs answer to inputs at once, y = h(x, u), as in `select`.
     workers, scheduler
         As in `koopmpc.parallel.map_tasks`.
     memory
@@ -135,6 +138,7 @@ def fit_data(
             horizon=split.horizon,
             delays=None if split.delay <= (max(DELAYS) if record else PAST) else [*range(PAST + 1), split.delay],
             bilinear=bilinear,
+            feedthrough=feedthrough,
             workers=workers,
             scheduler=scheduler,
             progress=progress,

@@ -16,7 +16,7 @@ from koopmpc.data.angles import count_wraps
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import FitWarning, hide_fit_warnings
+from koopmpc.errors import DataError, FitWarning, hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.records.structure import Structure, find_forecast_horizon
@@ -71,6 +71,10 @@ LATE = (
     "the inputs were moved up by one row: the log's row k holds the outputs after its inputs have acted; "
     "model.align(logs) does the same to other logs"
 )
+FEEDTHROUGH = (
+    "the inputs act on outputs at once, and were moved up by one row: give a controller's estimator feedthrough=True; "
+    "model.align(logs) moves them in other logs"
+)
 
 ROUGH = "the chosen model is fitted to the rows as they were measured: smoothed ones forecast unseen rows no better"
 
@@ -113,6 +117,7 @@ def select(
     bilinear: bool = True,
     relift: bool = True,
     smooth: bool = True,
+    feedthrough: bool = False,
     instruments: Sequence[ArrayLike] | None = None,
     sample: int = 30_000,
     workers: int | None = None,
@@ -179,6 +184,10 @@ def select(
         squares on noisy states makes an unstable plant look tame, and so do forecasts that begin at them. On records
         fits to the measured rows are tried too, and kept unless smoothing gains on unseen rows. The notes tell what
         was found.
+    feedthrough
+        The plant has y = h(x, u): row k of the log holds the outputs under u_k. One log cannot tell this from a late
+        input column, which `select` looks for otherwise. The inputs are moved one row up in any case; an estimator
+        with ``feedthrough=True`` then reads h(x_k, u_{k−1}), for the model's next output is h(x_k, u_k).
     instruments
         For each episode (T, nr) or (T + 1, nr) rows of the set point of the loop that made the logs, or of a signal
         added to its inputs. Where the logs hold feedback, least squares is found biased and unseen rows gain, models
@@ -195,7 +204,8 @@ def select(
     Raises
     ------
     DataError
-        Too few steps for two folds of one horizon; a stream that can be read once only; no candidate; a negative ridge.
+        Too few steps for two folds of one horizon; a stream that can be read once only; no candidate; a negative ridge;
+        feedthrough of data without inputs.
     KoopmpcError
         A worker died on the same task each time, or no scheduler answers.
 
@@ -218,6 +228,9 @@ def select(
         episodes, used = loop.episodes, loop.sentence
         smooth = smooth and not loop.noise.any()
     source = source_of(episodes)
+    checks.kind(feedthrough, "feedthrough", (bool, np.bool_), "pass True or False")
+    if feedthrough and not source.nu:
+        raise DataError("feedthrough says how inputs act, and the data have none; give each Episode its U")
     weights = RIDGES if ridges is None else check_ridges(ridges)
     folds = checks.count(folds, "folds", 2)
     past = check_delays((0, 1, 2) if delays is None else delays)
@@ -242,10 +255,10 @@ def select(
     if smooth:
         source, held, replaced = replace_glitches(source, held)
         notes = (*notes, *replaced)
-    lead = int(record and is_late(held))
+    lead, moved = int(feedthrough or (record and is_late(held))), FEEDTHROUGH if feedthrough else LATE
     if lead:
         source, held = advance_inputs(source, held)
-        notes = (*notes, LATE)
+        notes = (*notes, moved)
     measured = source, held
     if smooth:
         source, held, freed, _ = smooth_data(source, held)
@@ -318,7 +331,7 @@ def select(
         if isinstance(row.structure, Structure):
             model, refined[place] = refine_structure(row.structure, model, measured[1], first, nearer)
         if lead and model.report is not None:
-            report = replace(model.report, input_lead=lead, changes=(*model.report.changes, LATE))
+            report = replace(model.report, input_lead=lead, changes=(*model.report.changes, moved))
             model = replace_report(model, report)
         return model
 

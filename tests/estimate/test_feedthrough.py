@@ -71,6 +71,33 @@ def test_an_exact_linear_plant_of_each_timing_is_driven_as_by_the_optimum_writte
         x = A @ x + B @ u
 
 
+def test_a_model_that_select_takes_with_feedthrough_drives_the_plant_as_its_optimum():
+    found = km.select(
+        log_of(1, np.random.default_rng(0)), candidates=[PLAIN], delays=[2], horizon=5, smooth=False, feedthrough=True
+    )
+    assert found.predictor.input_lead == 1
+    assert "feedthrough=True" in str(found)
+    e = found.predictor.align(log_of(1, np.random.default_rng(1)))[0]
+    history = km.Episode(X=e.X[:3], U=e.U[:2])
+    assert found.linear.rollout(e.X[2], e.U[2:60], history=history)[:, 0] == pytest.approx(e.X[2:61, 0], abs=1e-5)
+    rule = km.LiftedKalman(found.linear.C, feedthrough=True)
+    mpc = km.KoopmanMPC(found.linear, COST, None, N, estimator=rule)
+    x, u = np.zeros(2), np.zeros(1)
+    for _ in range(30):
+        best = best_input(x, 1)
+        u = mpc(C @ x + D @ u, [GOAL]).u
+        assert abs(u[0] - best) < 1e-4
+        x = A @ x + B @ u
+
+
+def test_feedthrough_without_inputs_is_refused_in_a_sentence():
+    data = log_of(1, np.random.default_rng(0))
+    with pytest.raises(DataError, match="feedthrough says how inputs act, and the data have none"):
+        km.select(km.Episodes([km.Episode(X=data[0].X)], 0.1), feedthrough=True)
+    with pytest.raises(DataError, match="feedthrough is an int"):
+        km.select(data, feedthrough=1)
+
+
 def plant_with_feedthrough():
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
     F = ca.Function("F", [x, u], [ca.DM(A) @ x + ca.DM(B) @ u])
