@@ -64,7 +64,7 @@ def minimise(
     converged
         Stop where a step lowers the error of `fitted` by less than this share.
     project
-        Returns the Θ that may be taken in place of that of a step.
+        Returns the Θ that may be taken in place of that of a step, tried where no step itself lowers the error.
     """
     theta = best = start
     places = np.arange(theta.size) if free is None else free
@@ -78,22 +78,26 @@ def minimise(
         scale = np.sqrt(np.where(matrix.diagonal() > 0, matrix.diagonal(), 1.0))
         sizes, directions = np.linalg.eigh(matrix / np.outer(scale, scale))  # once for all dampings
         slope, lower = directions.T @ (gradient / scale), np.inf
-        for _ in range(TRIALS):
-            move = np.zeros(theta.size)
-            damped = sizes + damping
-            steep = damped > _ROUNDING * len(sizes) * damped[-1]  # directions that are more than rounding error
-            along = np.divide(slope, damped, out=np.zeros(len(sizes)), where=steep)
-            if along @ (2 * slope - sizes * along) < converged * value:
-                break  # the quadratic model promises too little for another step
-            move[places] = -directions @ along / scale
-            trial = theta + move.reshape(theta.shape)
-            trial = trial if project is None else project(trial)
-            lower = error.evaluate(trial, fitted)
+        begun = damping
+        for turn in (_keep,) if project is None else (_keep, project):
+            damping = begun
+            for _ in range(TRIALS):
+                move = np.zeros(theta.size)
+                damped = sizes + damping
+                steep = damped > _ROUNDING * len(sizes) * damped[-1]  # directions that are more than rounding error
+                along = np.divide(slope, damped, out=np.zeros(len(sizes)), where=steep)
+                if along @ (2 * slope - sizes * along) < converged * value:
+                    break  # the quadratic model promises too little for another step
+                move[places] = -directions @ along / scale
+                trial = turn(theta + move.reshape(theta.shape))
+                lower = error.evaluate(trial, fitted)
+                if lower < value:
+                    theta = trial
+                    damping = max(DECAY * damping, LEAST_DAMPING)
+                    break
+                damping *= GROWTH
             if lower < value:
-                theta = trial
-                damping = max(DECAY * damping, LEAST_DAMPING)
                 break
-            damping *= GROWTH
         if not lower < value:
             break
         gained, value = 1 - lower / value, lower
@@ -105,3 +109,7 @@ def minimise(
         if gained < converged or waited == patience:
             break
     return best, at
+
+
+def _keep(theta: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    return theta
