@@ -187,6 +187,22 @@ def test_a_past_two_inputs_and_a_measured_disturbance_are_told_alike(cart):
     assert {"SOFTENED", "BAD_MEASUREMENT"} <= seen
 
 
+def test_readings_near_the_largest_that_count_end_alike():
+    """Many entries of a plan may be below 1e30 while the length of all is above."""
+    A, B = np.array([[0.9, 0.2], [0.0, 0.9]]), np.array([[0.0], [0.1]])
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("p", "q"), ("u",))
+    controller = km.KoopmanMPC(model, km.Cost([1.0, 1.0], 0.1), km.Limits(-1, 1, x_max=[2, 2]), 8, solver="daqp")
+    twin, seen = km.compiled(controller), set()
+    for size in 10.0 ** np.linspace(28, 30.5, 26):
+        controller.reset()
+        twin.reset()
+        a, b = controller([size, -size], [0.0, 0.0]), twin([size, -size], [0.0, 0.0])
+        assert (a.status, a.fallback) == (b.status, b.fallback)
+        seen.add(a.status.name)
+    assert "BAD_MEASUREMENT" in seen
+    assert len(seen) > 1
+
+
 def test_a_closed_loop_costs_the_same(pendulum):
     plant, model = pendulum
     limits = km.Limits(**BOX, x_max=[1.0, 0.2])
