@@ -8,6 +8,7 @@ import pytest
 
 import koopmpc as km
 from tests.codegen.interpreter import Interpreter
+from tests.tiers import few
 
 BOX = {"u_min": -8.0, "u_max": 8.0}
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
@@ -91,7 +92,9 @@ def models(pendulum):
     return plant, model, km.bilinear_edmd(data, lifting, difference=True)
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize(
+    "name", few(KINDS, *(name for name in KINDS if "Bilinear" not in name), "BilinearMPC", "BilinearMPC of a map")
+)
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_a_program_in_a_plain_loop_gives_the_inputs_of_the_controller_and_of_its_c(name, seed, models):
     plant, rng = models[0], np.random.default_rng(seed)

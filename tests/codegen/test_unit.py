@@ -9,6 +9,7 @@ import pytest
 import koopmpc as km
 from tests.commands import koopmpc
 from tests.compiler import find_compiler, needs_compiler
+from tests.tiers import few
 
 fmpy = pytest.importorskip("fmpy", reason="the extra fmu is not installed")
 pytestmark = needs_compiler
@@ -63,7 +64,7 @@ def controllers(pendulum, cart):
     yield "pushed", km.KoopmanMPC(cart, km.Cost(Q=[10, 1], R=[0.1, 0.2]), km.Limits(-1, 1), horizon=8, solver="daqp"), 2
 
 
-@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("version", few([2, 3], 3))
 def test_a_closed_loop_with_the_unit_is_that_with_the_controller(version, pendulum, cart, tmp_path):
     plant, rows = pendulum[0], np.repeat([[0.0, 0.0], [0.3, 0.0]], 12, axis=0)
     rng, seen = np.random.default_rng(0), set()

@@ -10,7 +10,7 @@ import koopmpc as km
 from tests.control.kkt import CheckedDAQP, CheckedOSQP
 from tests.control.models import PRECISE, dense_plan, equilibrium, linear, random_pair, step_map
 from tests.control.oracle import oracle
-from tests.tiers import slow
+from tests.tiers import few, slow
 
 SEEDS = st.integers(0, 2**32 - 1)
 UNSTABLE = np.array([[1.05, 0.1], [0.08, 1.0]]), np.array([[0.005], [0.1]])
@@ -59,7 +59,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", few(CASES, "inputs", "one side", "soft", "hard"))
 @pytest.mark.parametrize("nu", [*slow([1]), 2])
 def test_it_equals_cvxpy_along_a_closed_loop(name, nu):
     limits = CASES[name]

@@ -163,7 +163,15 @@ TRACKED = km.Cost(Q=[10, 1], R=0.1, R_delta=0.01)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("mass", "load"), [(1.0, 0.0), (1.0, 0.02), (1.2, 0.0), (1.2, -0.02)])
+@pytest.mark.parametrize(
+    ("mass", "load"),
+    [
+        (1.0, 0.0),
+        pytest.param(1.0, 0.02, marks=pytest.mark.slow),
+        pytest.param(1.2, 0.0, marks=pytest.mark.slow),
+        (1.2, -0.02),
+    ],
+)
 def test_an_estimator_leaves_no_offset(kind, mass, load):
     mpc = built(kind, pendulum(), TRACKED, km.Limits(-3, 3, du_max=1), 20, estimator=km.LiftedDisturbance(gain=0.2))
     truth = pendulum(mass, load).step_map()

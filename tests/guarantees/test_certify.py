@@ -82,6 +82,7 @@ def test_the_invariant_example_is_certified_beyond_its_published_starts():
         assert np.abs(run.X[-1]).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_the_published_pendulum_is_stabilised_from_all_starts_and_lqr_on_edmdc_from_none():
     plant, data = published_data(Upright(), -2, 10, 6000, 1e-2)
     model = km.bilinear_edmd(data, SINE)

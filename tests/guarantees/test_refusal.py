@@ -83,7 +83,11 @@ REASONS = {
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("region", "wider"))) for name in REASONS]
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("region", "wider", "point", "noise")))
+        for name in REASONS
+    ],
 )
 def test_the_reason_is_named_and_its_advice_gives_a_certificate(name):
     model, data, options, words, mended = REASONS[name]
