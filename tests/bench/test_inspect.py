@@ -67,6 +67,7 @@ def test_conditions_choose_logs(swept):
             km.bench.Where(bad).holds({"cost": 1.0})
 
 
+@pytest.mark.slow
 def test_a_log_that_was_cut_is_read_and_repaired_and_one_that_is_none_is_refused(tmp_path):
     run = km.simulate(
         km.load_problem("pendulum") and km.discretize(km.load_problem("pendulum").dynamics, 0.05),

@@ -17,11 +17,13 @@ from koopmpc.bench.single import run_closed_loop
 from koopmpc.bench.store import ORACLE, RunRow
 from koopmpc.figures.reports import draw_trajectories
 from koopmpc.loop.metrics import Metrics
+from tests import tiers
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "tools"))
 from standings import compute_standings, find_frugal, format_goals, format_standings
 
 FILES = {path.stem: path for path in km.bench.shipped()}
+SMALL = ("bilinear_motor", "cart_pole", "duffing", "heat_pump", "pendulum", "pendulum_swing", "van_der_pol")
 MOST_LINES = 120
 STEPS = 4
 
@@ -73,6 +75,7 @@ def test_a_problem_is_one_short_file_that_imports_numpy_casadi_and_koopmpc_alone
     assert {str(name).split(".")[0] for name in names} <= {"casadi", "dataclasses", "koopmpc", "numpy"}
 
 
+@pytest.mark.parametrize("path", tiers.few(sorted(FILES), *SMALL), indirect=True)
 @pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_each_controller_runs_on_each_problem_and_keeps_its_hard_limits(path: Path, every: bool):
     """Every one on every problem, or each on a third of the problems."""

@@ -72,6 +72,7 @@ def test_all_eight_controllers_end_as_they_should_on_all_cases(tmp_path):
     assert [row.failure for row in swept if row.failure] == []
 
 
+@pytest.mark.slow
 def test_a_payload_that_grows_leaves_an_error_to_those_who_neither_learn_nor_estimate(tmp_path):
     problem = replace(km.load_problem("drifting_arm"), scene=lambda x, u: [])
     names = ["lqr", "koopman-mpc", "offset-free", "bilinear-mpc", "adaptive"]

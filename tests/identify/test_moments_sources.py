@@ -77,6 +77,7 @@ def test_a_worker_that_dies_while_it_reads_changes_nothing(folder: Path, schedul
     assert (folder / "1.died").exists()
 
 
+@pytest.mark.slow
 def test_a_file_that_kills_each_worker_is_named(folder: Path) -> None:
     with pytest.raises(km.KoopmpcError, match=rf"task 1, {folder}/1\.npz: each worker that did it died"):
         km.moments.second_moments(km.data.Files(folder, reader=always_dying), LIFTING, route="gram", workers=2)

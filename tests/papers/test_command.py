@@ -29,9 +29,8 @@ PAGES = Path(__file__).parents[2] / "docs" / "papers"
 QUICK = (
     "brunton",
     "proctor",
-    "williams",
     "kic",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("korda", "dictionary", "kaiser", "kernel")),
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("williams", "korda", "dictionary", "kaiser", "kernel")),
 )
 
 
