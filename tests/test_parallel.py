@@ -20,6 +20,7 @@ from koopmpc.cluster import DaskPool, QueuedTask
 from koopmpc.parallel import Workers, is_orphan, map_tasks
 from tests import tasks
 from tests.cluster import scheduler_process, two_workers
+from tests.tiers import few
 
 ROOT = Path(__file__).parents[1]
 HERE = {"workers": 1}
@@ -105,7 +106,7 @@ def test_a_lost_worker_costs_its_task_nothing(where: dict, tmp_path: Path) -> No
     assert (tmp_path / "died").exists()
 
 
-@MORTAL
+@pytest.mark.parametrize("where", few(["processes", "a mortal cluster"], "processes"), indirect=True)
 def test_a_task_that_kills_each_worker_is_named(where: dict) -> None:
     with pytest.raises(km.KoopmpcError, match=r"task 0, the first: each worker that did it died .*workers=1 to see"):
         list(map_tasks(tasks.die, ["the first"], **where))

@@ -149,7 +149,7 @@ def _ctrl_c_is_heard():
 
 
 QUICK = {"discretize", "CVODES", "Collocation", "linearize", "rollouts", "collect", "edmd", "kic", "kic, linear"} | {
-    *("step_map", "delays", "surrogate", "offset-free", "LinearMPC")
+    *("step_map", "delays", "LinearMPC")
 }
 
 

@@ -248,10 +248,10 @@ def moments(what: str, count: int) -> list[float]:
     ("arguments", "sent"),
     [
         (["bench", "tiny.py", "pendulum"], signal.SIGINT),
-        (["fit", "data.csv"], signal.SIGINT),
+        pytest.param(["fit", "data.csv"], signal.SIGINT, marks=pytest.mark.slow),
         (["fit", "data.csv", "--workers", "2"], signal.SIGINT),
         (["fit", "data.csv"], signal.SIGTERM),
-        (["reproduce", "snyder"], signal.SIGINT),
+        pytest.param(["reproduce", "snyder"], signal.SIGINT, marks=pytest.mark.slow),
     ],
     ids=["bench", "fit", "fit with workers", "fit, SIGTERM", "reproduce"],
 )

@@ -18,6 +18,7 @@ from koopmpc.bench.store import RESULTS
 from koopmpc.cli.app import app
 from koopmpc.fitting.fit import fit_data
 from koopmpc.fitting.repair import describe_guesses, divide_files, find_repairs, read_logs, shorten_notes
+from tests import tiers
 from tests.bench.tiny import write
 
 
@@ -154,6 +155,7 @@ def test_the_report_is_of_episodes_that_no_fit_saw(tmp_path):
     assert km.load_model(tmp_path / "out" / "linear.npz") == found.selection.linear
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.data.files.folder._PART", 1)
@@ -228,7 +230,7 @@ def test_the_verdict_on_several_records_looks_no_further_ahead_than_a_block_of_o
 
 
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("memory", [10**9, 1000])
+@pytest.mark.parametrize("memory", tiers.few([10**9, 1000], 1000))
 def test_columns_that_say_nothing_are_left_out_and_wrapped_angles_unwrapped_and_that_is_said(
     tmp_path, monkeypatch, memory
 ):

@@ -74,6 +74,7 @@ def tank_logs(folder, files=4, rows=300, glitch=None):
         np.savetxt(folder / f"{number}.csv", lines, delimiter=",", header=head, comments="", fmt="%.4f")
 
 
+@pytest.mark.slow
 def test_the_line_that_a_template_prints_designs_with_all_that_the_template_was_told(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tank_logs(tmp_path / "csv", files=3, rows=150)

@@ -102,6 +102,7 @@ def test_the_goal_file_asks_for_coverage_and_a_certificate_and_the_report_answer
             read_goal(tmp_path / "goal.toml", logs())
 
 
+@pytest.mark.slow
 def test_fit_with_a_goal_writes_a_certificate_and_its_page_where_logs_suffice(tmp_path, monkeypatch):
     """A fifth of 200 episodes is held out; from the edge of the region V falls on the plant, and limits are kept."""
     monkeypatch.chdir(tmp_path)

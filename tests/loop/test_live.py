@@ -42,6 +42,7 @@ def loop(tank, steps, recorder=None, mpc=None, reference=(0.8,), watchdog=20.0):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_page_of_opcua_prints_what_it_shows(tmp_path):
     pytest.importorskip("asyncua", reason="the extra opcua is not installed")
     for shown, printed in run("how/opcua.md", tmp_path)[1]:

@@ -16,6 +16,7 @@ import pytest
 
 import koopmpc as km
 from tests.loop.socket_plant import SocketPlant, inputs_in, started
+from tests.tiers import few
 
 ROOT = Path(__file__).parents[2]
 DT = 0.02
@@ -145,9 +146,7 @@ def flushed_steps(log):
             return 0
 
 
-@pytest.mark.parametrize(
-    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL]
-)
+@pytest.mark.parametrize("number", few([signal.SIGTERM, signal.SIGINT, signal.SIGKILL], signal.SIGKILL))
 def test_the_log_is_whole_up_to_its_last_flush_whatever_ends_the_process(tmp_path, number):
     log = tmp_path / "run.rrd"
     restored = "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -331,6 +330,7 @@ def test_signals_and_switches_are_as_they_were():
     assert before == (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT), sys.getswitchinterval())
 
 
+@pytest.mark.slow
 def test_the_example_of_the_page_runs(tmp_path, monkeypatch, capsys):
     (source,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "realtime.md").read_text(), re.DOTALL)
     monkeypatch.chdir(tmp_path)

@@ -167,7 +167,11 @@ for warning in caught:
     ("end", "told"),
     [
         ("viewer.kill(); viewer.wait()", "was closed"),
-        ("viewer.send_signal(signal.SIGSTOP)", "takes in nothing more (it took in no more for 1 s)"),
+        pytest.param(
+            "viewer.send_signal(signal.SIGSTOP)",
+            "takes in nothing more (it took in no more for 1 s)",
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["killed", "slow"],
 )
@@ -232,6 +236,7 @@ with km.Recorder({path!r}, **about(run)) as recorder:
 """
 
 
+@pytest.mark.slow
 def test_a_killed_writer_keeps_what_was_flushed(tmp_path: Path) -> None:
     path, root = tmp_path / "run.rrd", str(Path(__file__).parents[2])
     code = _KILLED.format(root=root, path=str(path))

@@ -111,12 +111,12 @@ def test_a_model_that_cannot_follow_the_plant_is_not_chosen():
     assert least <= found.best.score <= 1.02 * least  # an estimator that finds its gain may cost 2 % more
 
 
-def test_the_same_data_and_seed_give_the_same_design_whoever_works():
-    again, other = designed(data()), designed(data(), workers=2)
-    for one in (again, other):
-        assert one.leaderboard == usual().leaderboard
-        assert one.controller.predictor == usual().controller.predictor
-        assert one.expected == usual().expected
+@pytest.mark.parametrize("workers", [*slow([1]), 2])
+def test_the_same_data_and_seed_give_the_same_design_whoever_works(workers):
+    one = designed(data(), workers=workers)
+    assert one.leaderboard == usual().leaderboard
+    assert one.controller.predictor == usual().controller.predictor
+    assert one.expected == usual().expected
 
 
 def test_a_recipe_that_is_lost_on_every_surrogate_is_never_chosen():
@@ -207,8 +207,13 @@ def test_measured_disturbances_reach_surrogates_and_controllers():
     "of",
     [
         km.Fourier(1, [0]),
-        km.Expressions(lambda x: [x[0] + x[1]], names=["s"]),
-        *slow([km.Gaussian(np.array([[0.3, 0.0], [0.0, 0.0]]), width=1.0), km.RandomFourier(2, 0.5, 0)]),
+        *slow(
+            [
+                km.Expressions(lambda x: [x[0] + x[1]], names=["s"]),
+                km.Gaussian(np.array([[0.3, 0.0], [0.0, 0.0]]), width=1.0),
+                km.RandomFourier(2, 0.5, 0),
+            ]
+        ),
     ],
     ids=lambda of: type(of).__name__,
 )
@@ -230,6 +235,7 @@ def test_a_cost_on_observables_is_of_the_present_state_with_and_without_delays(o
         assert [told[name] for name in wanted.names] == pytest.approx(wanted(x), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_design_with_the_usual_candidates_takes_a_cost_on_observables():
     rotor = episodes_of(lambda x, u: np.array([x[0] + 0.1 * x[1], 0.9 * x[1] + 0.1 * u[0]]), count=9, steps=30)
     cost = km.Cost(Q=[1.0, 1.0], R=0.1, of=km.Fourier(1, [0]))
@@ -302,9 +308,10 @@ def test_a_moving_state_is_no_equilibrium_to_rest_at():
             r"a start has x1 = -0\.6, beyond the limit x1 = -0\.5: no input can keep the limit",
             marks=pytest.mark.slow,
         ),
-        (
+        pytest.param(
             {"reference": np.column_stack([np.zeros(12), np.linspace(0, 0.6, 12)])},
             r"the reference has x1 = 0\.6, beyond the limit x1 = 0\.5: the loop stays at the limit there; ask for less",
+            marks=pytest.mark.slow,
         ),
     ],
 )
@@ -452,6 +459,7 @@ def test_a_single_wrong_measurement_is_replaced_and_its_episode_kept():
     assert found.best.recipe.candidate == designed(data(12)).best.recipe.candidate
 
 
+@pytest.mark.slow
 def test_one_record_of_a_sensor_tries_as_much_of_the_past_as_many_episodes():
     rng = np.random.default_rng(0)
     spring = ([[0.98, 0.28], [-0.14, 0.87]], [[0.043], [0.28]], [[1.0, 0.0]], [[0.0]], 0.3)

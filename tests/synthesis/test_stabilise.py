@@ -82,6 +82,7 @@ def test_a_plant_that_holds_its_state_is_taken_as_well():
     assert result == found(pendulum)
 
 
+@pytest.mark.slow
 def test_its_data_are_enough_for_a_design_that_holds_the_plant():
     plant, _, _, low, high = pendulum()
     cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=low, u_max=high)
