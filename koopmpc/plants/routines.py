@@ -4,6 +4,7 @@ import _ctypes
 import ctypes
 import os
 import platform
+import re
 import shlex
 import shutil
 import stat
@@ -204,7 +205,7 @@ def load_library(
 
     The flags in the environment variable KOOPMPC_CFLAGS follow the library's own flags. The name of a cached file
     depends on the flags, so code compiled with other flags is another file. While it is compiled, the macro
-    KOOPMPC_NUMBERS is the path of a file that holds `numbers`.
+    KOOPMPC_NUMBERS is the path of a file that holds `numbers`, written for a string of the assembler.
 
     Raises
     ------
@@ -257,12 +258,19 @@ def _compile(text: str, command: list[str], path: Path, numbers: bytes) -> Path:
         code, library, packed = (Path(folder) / f"step.{kind}" for kind in ("c", "so", "bin"))
         if numbers:
             packed.write_bytes(numbers)
-            text = f'#define KOOPMPC_NUMBERS "{packed}"\n{text}'
+            text = f'#define KOOPMPC_NUMBERS "{_escape_path(packed)}"\n{text}'
         code.write_text(text)
         words = [*command, "-o", str(library), str(code), "-lm"]
         subprocess.run(words, check=True, capture_output=True, timeout=_COMPILING)
         library.replace(path)
     return path
+
+
+def _escape_path(path: Path) -> str:
+    """Return a path as it stands in C in a string of the assembler; a quote in the name would end that string."""
+    return re.sub(
+        r"[^\w./:-]", lambda found: "".join(rf"\\{byte:03o}" for byte in os.fsencode(found[0])), path.as_posix()
+    )
 
 
 _CALL = """

@@ -149,7 +149,7 @@ def test_a_controller_of_a_thousand_observables_compiles_and_moves_as_in_python(
 
 @needs_compiler
 @pytest.mark.parametrize("single", [False, True])
-def test_a_packed_array_holds_the_numbers_that_its_literals_hold(single):
+def test_a_packed_array_holds_the_numbers_that_its_literals_hold(single, tmp_path):
     values = np.random.default_rng(0).standard_normal(functions._PACKED) * 10.0 ** np.arange(-35, 35).repeat(72)[:5000]
     values[:4] = -0.0, 1e300, -np.inf, 5e-324
     kind, command = np.float32 if single else np.float64, find_compiler()
@@ -160,7 +160,9 @@ def test_a_packed_array_holds_the_numbers_that_its_literals_hold(single):
         assert (array.count(",") < 3) == (packed is not None)
         head = f"typedef {'float' if single else 'double'} koopmpc_real;\n"
         text = f"{head}{array}\nkoopmpc_real look(int i) {{ return numbers[i]; }}\n"
-        code = load_library(text, command, None, "-O1", bytes(packed or b""))
+        cache = tmp_path / 'a "quote", a \\, 50 % ü'
+        cache.mkdir(exist_ok=True)
+        code = load_library(text, command, cache, "-O1", bytes(packed or b""))
         code.look.restype = ctypes.c_float if single else ctypes.c_double
         found.append(np.array([code.look(i) for i in range(len(values))], dtype=kind))
     assert found[0].tobytes() == found[1].tobytes() == np.clip(values, -1e30, 1e30).astype(kind).tobytes()

@@ -90,3 +90,17 @@ def test_a_model_that_is_updated_has_a_bound_of_its_own(monkeypatch):
     for k in range(3, 6):
         expected = other([0.1, 0.0], SIGNAL[k : k + N + 1]).u
         np.testing.assert_allclose(mpc([0.1, 0.0], SIGNAL[k : k + N + 1]).u, expected, rtol=0, atol=1e-9)
+
+
+def test_a_run_after_one_that_ended_at_once_begins_as_the_first(monkeypatch):
+    """A miss of the last run is no reason to take limits and the reference of this one's second step."""
+    monkeypatch.setattr(LONG, 0)
+    mpc, far = make("far from 0"), CASES["far from 0"][3]
+    found = []
+    for _ in range(3):
+        mpc.reset()
+        found.append([])
+        for k in range(2):
+            mpc([3.0, 0.0], far[k : k + N + 1])
+            found[-1].append(mpc._owes)
+    assert found[0] == found[1] == found[2]

@@ -73,6 +73,7 @@ class FirstInput(Viewing):
         """Go on from limits and c as they were taken first, as every run does."""
         self._waits = self._wait = 0
         if self._is_first:
+            self._aimed = True  # a miss of the last run may have ended it
             return
         (low, high), (_, nr) = np.split(self._plan.limits, 2), self._moving.shape
         self._aimed = self._is_first = self._measure(Interval(low, high), 0 * low)
