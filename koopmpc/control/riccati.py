@@ -217,7 +217,7 @@ def find_gain(
 
 
 class RecursionStep(NamedTuple):
-    """The gain of a step, L of S = L Lᵀ, and the largest entry of P before it."""
+    """The gain K of a step, L of S = L Lᵀ, and the largest entry of the P that the step makes."""
 
     K: Float[np.ndarray, "nu nx"]
     L: Float[np.ndarray, "nu nu"]
