@@ -113,6 +113,7 @@ def test_each_controller_runs_on_each_problem_and_keeps_its_hard_limits(path: Pa
             assert np.isfinite(km.metrics(run).cost), (name, controller)
 
 
+@pytest.mark.parametrize("path", tiers.few(sorted(FILES), *(name for name in FILES if name != "kdv")), indirect=True)
 def test_each_problem_draws_the_same_shapes_wherever_it_is(path: Path):
     problem = few(path).problem
     scene = problem.scene or problem.dynamics.scene

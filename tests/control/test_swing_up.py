@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.tiers import few
 
 NAMES = ["cart_pole_swing", "pendulum_swing"]
 SECONDS, HELD = 10.0, 2.0
@@ -48,7 +49,7 @@ class Learned:
         return km.BilinearMPC(self.model, problem.cost, problem.limits, problem.horizon)
 
 
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(scope="module", params=few(NAMES, "pendulum_swing"))
 def learned(request) -> Learned:
     return Learned(request.param)
 

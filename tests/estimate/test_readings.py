@@ -13,6 +13,7 @@ from koopmpc.estimate.gate import BEYOND, BRIDGED, FEW, LEAST, LONG, ReadingGate
 from tests.compiler import needs_compiler
 from tests.estimate.pendulums import PROBLEM, truth
 from tests.estimate.plants import linear
+from tests.tiers import few
 
 NOISE = 1e-3
 WHOLE = km.Cost(Q=[10.0, 1.0], R=0.1)
@@ -188,7 +189,7 @@ def plant_for(kind):
     return km.discretize(PROBLEM.dynamics, PROBLEM.dt) if kind in ("LQR, delays", EXTENDED) else TRUE
 
 
-@pytest.mark.parametrize("kind", MORE)
+@pytest.mark.parametrize("kind", few(MORE, *(kind for kind in MORE if kind != "BilinearMPC")))
 def test_an_absurd_reading_among_the_first_does_not_stay_in_the_estimate(kind):
     """Nothing has been shown yet by which it could be refused: it is used, and the next reading shows what it was."""
     controller, plant = MORE[kind](), plant_for(kind)
@@ -357,7 +358,7 @@ def test_a_missing_entry_is_neither_judged_nor_refused():
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", few(KINDS, *(kind for kind in KINDS if kind != "BilinearMPC, delays")))
 def test_machine_code_refuses_the_same_readings(kind):
     controller, wild = built(kind), np.zeros((18, 2))
     code = km.compiled(controller)

@@ -135,7 +135,7 @@ def flipped(data: bytes, rng: random.Random) -> bytes:
     return bytes(bad)
 
 
-@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("name", few(READERS, *(name for name in READERS if name != "run.rrd")))
 @pytest.mark.parametrize("count", [50, pytest.param(1000, marks=pytest.mark.slow)])
 def test_no_flipped_bit_is_read_as_other_data(tmp_path: Path, name: str, count: int) -> None:
     written, read = READERS[name][0](), READERS[name][1]

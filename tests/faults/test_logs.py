@@ -77,7 +77,7 @@ def count_flushed(path: Path) -> int:
     return 0 if read is None else read.steps
 
 
-@pytest.mark.parametrize("share", [0.1, 0.9])
+@pytest.mark.parametrize("share", [0.1, *slow([0.9])])
 def test_a_log_cut_before_its_description_is_refused(written: Path, tmp_path: Path, share: float) -> None:
     whole = written.read_bytes()
     (tmp_path / "cut.rrd").write_bytes(whole[: int(share * whole.find(b"koopmpc-log-2"))])
@@ -156,7 +156,7 @@ def test_a_recorded_log_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("count", [4, pytest.param(1000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("grown", [False, True], ids=["record", "Recorder"])
+@pytest.mark.parametrize("grown", [*slow([False]), True], ids=["record", "Recorder"])
 def test_a_log_cut_at_a_random_byte_is_read_and_repaired_or_refused(
     written: Path, tmp_path: Path, grown: bool, count: int
 ) -> None:

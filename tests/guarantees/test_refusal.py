@@ -85,7 +85,7 @@ REASONS = {
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.slow] * (name in ("region", "wider", "point", "noise")))
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("region", "wider", "point", "noise", "error")))
         for name in REASONS
     ],
 )

@@ -14,6 +14,7 @@ import pytest
 import koopmpc as km
 from tests.compiler import find_compiler
 from tests.plants import units
+from tests.tiers import few
 
 pytest.importorskip("fmpy", reason="the extra fmu is not installed")
 
@@ -312,7 +313,7 @@ for plant in (first, first):
 """
 
 
-@pytest.mark.parametrize("other", ["freed", "alive"])
+@pytest.mark.parametrize("other", few(["freed", "alive"], "freed"))
 def test_a_unit_speaks_for_itself_after_another_one_was_loaded(other, pendulum):
     done = subprocess.run([sys.executable, "-c", TALKING, str(pendulum), other], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -10,7 +10,7 @@ from tests.validate.logs.corpus import BEDS, FAULTS, Draw, clean, draw, episodes
 
 # 91058: the other state follows better from the future of a sensor in time; 3021: a law is not known before it is met;
 # 12061: a stiff plant whose rate tells more a step later; 20187: a smooth input that wins by any delay
-CLEAN = [0, 7, 19, 40, 51, 87, 91058, 3021, 12061, 20187]
+CLEAN = [0, 19, 91058, 3021, 12061, 20187]
 
 
 @pytest.mark.parametrize(
