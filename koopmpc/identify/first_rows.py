@@ -17,6 +17,7 @@ _CONVERGED = 1e-12  # stop where a step lowers the sum of squares by less than t
 _ENCODED = 0.1  # spread of an entry of a hidden state that past rows give
 _EXACT = 1e-6  # share of an output's size that its noise is at least
 _KNOWN = 0.01  # share of an output's size that is its noise where the model has no report
+_PUSH = 0.1  # spread of an unknown past input, at least, as a share of one that moves an output by its size
 _FAR = 1e6  # a forecast of so many sizes has left the model
 
 
@@ -26,11 +27,12 @@ def estimate_start(
     """Return the point p_K behind K + 1 first rows of a record, from the p_0 that explains them best.
 
     min over p_0 of Σ_{k=0}^{K} ‖(x̂_k − x_k) / σ‖² + ‖(p_0 − p̄) / s‖², p_{k+1} = F(p_k, u_k), where x̂ is the first part
-    of p. σ is the residual of the fit, s the sizes of the data, and p̄ the point of a plant that has rested in x_0 under
-    u_0. So fewer rows than the model's past suffice. Of more rows the first ones give p̄, and s is σ, or 0.1 for entries
-    of a hidden state; the others take noise out of it. Errors of the model between the rows count as noise of readings,
-    so pass few rows of a model that errs. Gauss-Newton with exact derivatives finds p_0. Entries of X that are NaN are
-    left out, and so are readings at a rail with x̂ beyond.
+    of p. σ is the residual of the fit, s the sizes of the data, of inputs a tenth of what moves an output so far at
+    least, and p̄ the point of a plant that has rested in x_0 under u_0. So fewer rows than the model's past suffice. Of
+    more rows the first ones give p̄, and s is σ, or 0.1 for entries of a hidden state; the others take noise out of it.
+    Errors of the model between the rows count as noise of readings, so pass few rows of a model that errs. Gauss-Newton
+    with exact derivatives finds p_0. Entries of X that are NaN are left out, and so are readings at a rail with x̂
+    beyond.
 
     A forecast begins at the result: `model.step_map().rollout(p_K, U)`, where F is the re-lifted map, as in
     BilinearMPC. A linear model with a hidden state z = T ζ is lifted once: z is found, ζ is the nearest past with this
@@ -87,7 +89,8 @@ def estimate_start(
     if model.embedding is not None:
         past = model.embedding.steps
         usual = model.embedding.repeat(first, before)
-        spread = reach = np.abs(model.embedding.spread(size, np.abs(moves).max(axis=0, initial=1.0)))
+        pushes = np.maximum(np.abs(moves).max(axis=0, initial=0.0), _PUSH * _size_inputs(model, usual, before, size))
+        spread = reach = np.abs(model.embedding.spread(size, pushes))
         if past < len(rows) and np.isfinite(rows[: past + 1]).all():
             usual = model.start(rows[past], Episode(X=rows[: past + 1], U=moves[:past]))
             spread = model.embedding.spread(noise, np.zeros(model.nu))
@@ -136,6 +139,21 @@ def estimate_start(
         if gap @ gap > (1 - _CONVERGED) * value:
             break
     return course.point(last, rows, moves)
+
+
+def _size_inputs(
+    model: LinearPredictor | BilinearPredictor,
+    usual: Float[np.ndarray, " npoint"],
+    before: Float[np.ndarray, " nu"],
+    size: Float[np.ndarray, " nx"],
+) -> Float[np.ndarray, " nu"]:
+    """Return for each input how much of it, held for as long as the model's past, moves some output by its size."""
+    here = model.step_map().linearize(usual, before)
+    held, most = np.zeros_like(here.B), np.zeros(model.nu)
+    for _ in range(1 if model.embedding is None else model.embedding.steps + 1):
+        held = here.A @ held + here.B
+        most = np.maximum(most, np.abs(held[: model.nx] / size[:, None]).max(axis=0, initial=0.0))
+    return np.divide(1.0, most, out=np.ones(model.nu), where=most > 0)
 
 
 class _PointCourse:

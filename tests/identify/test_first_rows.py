@@ -60,6 +60,19 @@ def test_units_of_an_output_change_no_start(fit):
     assert starts[1:] == pytest.approx([starts[0]] * 2, rel=1e-6)
 
 
+@pytest.mark.parametrize("rows", [2, 3])
+@pytest.mark.parametrize("fit", [km.identify.subspace, km.identify.narx], ids=["subspace", "narx"])
+def test_units_of_an_input_change_no_free_run_from_fewer_rows_than_the_past(fit, rows):
+    rng = np.random.default_rng(4)
+    (e,), runs = record_of(linear_plant(rng, 2), rng, steps=300, noise=0.05), []
+    for unit in (1.0, 1e3, 1e-3):
+        data = km.Episodes([km.Episode(X=e.X, U=unit * e.U)], 0.1)
+        model = fit(data, delays=3, **({"degrees": 1} if fit is km.identify.narx else {}))
+        start = km.identify.estimate_start(model, e.X[100 : 100 + rows], unit * e.U[100 : 99 + rows])
+        runs.append(model.rollout(start, unit * e.U[99 + rows : 130])[:, 0])
+    assert max(np.abs(run - runs[0]).max() for run in runs) < 1e-6
+
+
 def test_what_tells_no_start_is_refused_in_a_sentence():
     rng = np.random.default_rng(0)
     data = record_of(linear_plant(rng, 2), rng, steps=200)
