@@ -118,7 +118,7 @@ def _compile(program: StepProgram, precision: Precision, command: list[str]) -> 
     machine = ["-march=native", "-fvisibility=default"] if platform.machine() in ("x86_64", "AMD64") else []
     try:
         code = load_library(text, [*command, *machine], cache, numbers=packed)
-    except subprocess.SubprocessError:
+    except subprocess.CalledProcessError:
         code = load_library(text, command, cache, numbers=packed)  # the compiler does not know this processor
     code.koopmpc_state_size.restype = ctypes.c_long
     code.koopmpc_init.restype = code.koopmpc_call.restype = None

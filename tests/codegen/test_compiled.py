@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import subprocess
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -96,6 +97,19 @@ def test_without_a_compiler_it_stays_in_python_and_says_so_once(controller, monk
     with pytest.warns(UserWarning, match="no C compiler was found") as said:
         assert km.compiled(controller) is controller
     assert len(said) == 1
+
+
+def test_a_compiler_that_hangs_is_not_waited_for_twice(controller, monkeypatch):
+    asked = []
+
+    def hang(_, command, *__, **___):
+        asked.append(command)
+        raise subprocess.TimeoutExpired(command, 900)
+
+    monkeypatch.setattr("koopmpc.codegen.compiled.load_library", hang)
+    with pytest.warns(UserWarning, match="timed out after 900 seconds"):
+        assert km.compiled(controller) is controller
+    assert len(asked) == 1
 
 
 def test_a_compiler_that_fails_shows_its_first_error(controller, monkeypatch, tmp_path):
