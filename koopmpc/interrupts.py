@@ -7,6 +7,7 @@ for a failed evaluation: ipopt then reports a failure, CVODES no next state, fat
 that comes while an object is deleted.
 """
 
+import atexit
 import io
 import os
 import signal
@@ -144,11 +145,13 @@ class Ending:
 
     folder: Path | None = None
     _said = False
+    _came = False
 
     def __enter__(self) -> None:
         if threading.current_thread() is not threading.main_thread():
             return
         try:
+            atexit.register(self._finish)  # before any library, so it is called as the last
             for number in _SIGNALS:
                 signal.signal(number, self._interrupt)
             ends, begins = socket.socketpair()
@@ -171,8 +174,20 @@ class Ending:
             os._exit(INTERRUPTED)  # unloading all modules would take most of a second
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        self._came = True
         sys.stderr = io.StringIO()  # CasADi warns of the exception, which would be a second line
         raise KeyboardInterrupt
+
+    def _finish(self) -> None:
+        """End with the exit code of a signal that came while the program left; ignore a later one: all is done.
+
+        Python takes its handlers away before it unloads modules, and the system would end the process by the signal.
+        """
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+        if self._came:
+            self._say()
+            os._exit(INTERRUPTED)
 
     def _watch(self, ends: socket.socket) -> None:
         """End the process if it still runs a while after a signal, whatever the main thread does."""

@@ -7,6 +7,8 @@ from sys import modules as loaded
 from types import UnionType
 from typing import Any, ForwardRef, Union, cast, get_args, get_origin
 
+from koopmpc.interrupts import raise_swallowed
+
 _ROOMS: list[str] = []
 """Modules that the front door serves as rooms: `find_public` looks into them in this order."""
 
@@ -54,6 +56,7 @@ def attach(
         _JOINTS.update({joint: tuple(f"{package}.{file}" for file in files) for joint, files in joints.items()})
         _ROOMS[:] = [package, *dict.fromkeys(rooms.values())]
 
+    @raise_swallowed()  # libraries take a Ctrl-C while they are imported for an ImportError, or a RuntimeError
     def serve(name: str) -> Any:
         if name in rooms or name in home:
             while waiting:

@@ -18,6 +18,7 @@ import pytest
 import rerun as rr
 
 import koopmpc as km
+from koopmpc import lazy
 from koopmpc.interrupts import clean_folder, import_whole
 from tests.bench.tiny import write
 from tests.faults.test_controllers import BUILD, controllers, models  # noqa: F401  # fixtures
@@ -122,6 +123,20 @@ def test_an_interrupt_waits_for_a_library_that_would_take_it_for_a_missing_part(
     assert sys.modules["greedy"].whole
     sources = {path.name: path.read_text() for path in Path(km.__file__).parent.rglob("*.py")}
     assert [name for name, text in sources.items() if re.search(r"^ *(import|from) cvxpy", text, re.M)] == []
+
+
+def test_an_interrupt_that_a_first_import_hides_behind_an_error_is_raised(monkeypatch):
+    """Modules in C answer any error of what they import with ImportError, those in Rust with RuntimeError."""
+
+    def hide(name):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise ImportError(f"{name} failed to import") from None
+
+    monkeypatch.setattr(lazy, "import_module", hide)
+    with pytest.raises(KeyboardInterrupt):
+        km.__getattr__("train")
 
 
 SENDER = """
@@ -309,6 +324,26 @@ with ENDING:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted; nothing was written\n")
+
+
+@pytest.mark.parametrize(("late", "code"), [(False, 130), (True, 3)], ids=["leaving", "unloading"])
+def test_an_interrupt_while_the_program_leaves_ends_it_by_a_code_and_no_signal(late: bool, code: int) -> None:
+    source = f"""
+import atexit, os, signal, sys
+from koopmpc.interrupts import ENDING
+class Sending:
+    def __del__(self, kill=os.kill, pid=os.getpid()):
+        kill(pid, 2)
+    def send(self):
+        self.__del__()
+sending = Sending()  # is deleted when modules are unloaded
+with ENDING:
+    if not {late}:
+        atexit.register(sending.send)
+    sys.exit(3)
+"""
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (code, "" if late else "interrupted; nothing was written\n")
 
 
 def test_what_was_kept_is_said_and_half_files_go(tmp_path: Path) -> None:
