@@ -120,7 +120,7 @@ class ExtendedObserver:
     def __init__(self, rule: ExtendedKalman, model: StateModel, gain: float) -> None:
         self._rule, self._settle = rule, gain
         self._take(model)
-        self._gate = ReadingGate(self.ny)
+        self._gate = ReadingGate(self.ny, leaps=True)
         self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.reset()

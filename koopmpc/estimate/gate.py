@@ -26,7 +26,7 @@ NARROW = 0.7  # and downwards by this one
 LEAST = 0.01  # the quantile counts as at least this share of the largest step that the output has made
 ROUNDING = 1e-9  # and as this share of the reading's and the prediction's size: what is smaller is rounding
 SUSPECTS = 2  # the first readings, and those after a reading that leaps, may be left behind so many times
-LEAP = 10.0  # where a disturbance is learned: a reading leaps if it and its misfit are beyond so many largest steps
+LEAP = 10.0  # with `leaps`: a reading leaps if it and its misfit are beyond so many largest steps
 LEAPS = 6  # the first readings before one that leaps may be left behind so many times
 FADING = 0.8  # what a predicted step allows fades by this factor a step
 
@@ -54,9 +54,10 @@ def gate_function(ny: int, leaps: bool = False) -> ca.Function:
     before were wild: the observer starts again from y, and S is forgotten. This is done twice, and twice again after a
     reading off by 1e4 times all that its output had shown was used.
 
-    With `leaps`, where a disturbance is learned, smaller wild ones are left behind too. While the gate is open, a
-    reading leaps if |y − last| and |y − ŷ| are both beyond 10 times the largest step, used or predicted. An absurd one
-    does not, nor the fifth or a later one before any step. The observer starts again from y, up to six times.
+    With `leaps`, where a disturbance is learned and in an ExtendedKalman, smaller wild ones are left behind too. While
+    the gate is open, a reading leaps if |y − last| and |y − ŷ| are both beyond 10 times the largest step, used or
+    predicted. An absurd one does not, nor the fifth or a later one before any step. The observer starts again from y,
+    up to six times.
 
     The memory is q, S, the predicted steps, the last used values, a count, whether the observer has started again
     since, and how often it has left wild readings behind. Below a count of 10 the gate is open, and 10 less the count
