@@ -139,7 +139,7 @@ typedef struct {
   koopmpc_real c[KOOPMPC_N * KOOPMPC_POINT], q[KOOPMPC_N * KOOPMPC_POINT], r[KOOPMPC_MOVES];
   koopmpc_real g[KOOPMPC_N * KOOPMPC_LIMITED1], start[KOOPMPC_POINT];
   koopmpc_real K[KOOPMPC_MOVES * KOOPMPC_POINT], half[KOOPMPC_MOVES * KOOPMPC_NU]; /**< its Riccati recursion */
-  koopmpc_real Pc[KOOPMPC_N * KOOPMPC_POINT], feed[KOOPMPC_MOVES], curvature[KOOPMPC_MOVES];
+  koopmpc_real gradient[KOOPMPC_N * KOOPMPC_POINT], feed[KOOPMPC_MOVES], curvature[KOOPMPC_MOVES];
   koopmpc_real dX[KOOPMPC_N * KOOPMPC_POINT], dU[KOOPMPC_MOVES], newX[KOOPMPC_N * KOOPMPC_POINT], newU[KOOPMPC_MOVES];
   koopmpc_real t[KOOPMPC_PAIRS], lam[KOOPMPC_PAIRS], d_side[KOOPMPC_PAIRS]; /**< its limits */
   koopmpc_real gap[KOOPMPC_PAIRS], eased[KOOPMPC_PAIRS], base[KOOPMPC_PAIRS], second[KOOPMPC_PAIRS];

@@ -84,7 +84,10 @@ static void linearise(koopmpc_state *s) {
   }
 }
 
-/** The backward sweep: K, the factor of R + B'PB and P c of every stage; `barrier` (NQ, N) is added, NULL for none. */
+/**
+ * The backward sweep: K, the factor of R + B'PB and the gradient of every stage, q + P c, or with a `barrier` (NQ, N)
+ * q + Q dX for both ways of a step; NULL for none.
+ */
 static void factor(koopmpc_state *s, const koopmpc_real *barrier) {
   koopmpc_real P[NS * NS];
   koopmpc_fill(P, 0, NS * NS);
@@ -103,7 +106,8 @@ static void factor(koopmpc_state *s, const koopmpc_real *barrier) {
     koopmpc_fill(WA, 0, NS * NS);
     koopmpc_fill(WB, 0, NS * NV);
     for (int i = 0; i < NS; i++) {
-      s->Pc[k * NS + i] = koopmpc_dot(P + i * NS, s->c + k * NS, NS);
+      s->gradient[k * NS + i] = s->q[k * NS + i] + (barrier ? koopmpc_dot(s->Q + (k * NS + i) * NS, s->dX + k * NS, NS)
+                                                            : koopmpc_dot(P + i * NS, s->c + k * NS, NS));
       for (int m = 0; m < NS; m++) {
         for (int j = 0; j < NS; j++) WA[i * NS + j] += P[i * NS + m] * A[m * NS + j];
         for (int j = 0; j < NV; j++) WB[i * NV + j] += P[i * NS + m] * B[m * NV + j];
@@ -161,17 +165,14 @@ static void sweep(koopmpc_state *s, const koopmpc_real *push) {
     const koopmpc_real *A = s->A + k * NS * NS, *B = s->B + k * NS * NV, *K = s->K + k * NV * NS;
     const koopmpc_real *half = s->half + k * NV * NV;
     koopmpc_real h[NS], pulled[NV], *feed = s->feed + k * NV;
-    for (int i = 0; i < NS; i++) h[i] = p[i] + s->q[k * NS + i];
+    for (int i = 0; i < NS; i++) h[i] = p[i] + s->gradient[k * NS + i];
     koopmpc_copy(pulled, s->r + k * NV, NV);
     if (push) {
       const koopmpc_real *R = koopmpc_free[k] ? koopmpc_R : koopmpc_R_held;
-      koopmpc_add(h, s->Q + k * NS * NS, NS, s->dX + k * NS, NS); /* both weights are symmetric */
-      koopmpc_add(pulled, R, NV, s->dU + k * NV, NV);
+      koopmpc_add(pulled, R, NV, s->dU + k * NV, NV); /* R is symmetric */
       for (int g = 0; g < NG; g++)
         for (int i = 0; i < NS; i++) h[i] += push[(NV + g) * STEPS + k] * s->G[(k * NG + g) * NS + i];
       for (int i = 0; i < NV; i++) pulled[i] += push[i * STEPS + k];
-    } else {
-      for (int i = 0; i < NS; i++) h[i] += s->Pc[k * NS + i];
     }
     for (int m = 0; m < NS; m++)
       for (int i = 0; i < NV; i++) pulled[i] += B[m * NV + i] * h[m];
