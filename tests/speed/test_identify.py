@@ -152,7 +152,7 @@ def cluster(workers: int) -> Iterator[str]:
     with (
         dask.config.set({"distributed.nanny.pre-spawn-environ": alone}),
         distributed.LocalCluster(
-            workers, threads_per_worker=1, host="127.0.0.1", processes=True, dashboard_address="127.0.0.1:0"
+            n_workers=workers, threads_per_worker=1, host="127.0.0.1", processes=True, dashboard_address="127.0.0.1:0"
         ) as made,
     ):
         yield made.scheduler_address
