@@ -413,6 +413,9 @@ class MPCBase(Published):
         status = status if taken <= self._allowed else Status.TIME_LIMIT
         return Move(u, status, Fallback.NONE, taken, iterations, slack, solver)
 
+    def _settle(self) -> None:
+        """Compute what the plan of the last step lacks; most controllers return whole plans."""
+
     def _fail(
         self,
         free: Float[np.ndarray, " nu"] | None,
@@ -431,6 +434,7 @@ class MPCBase(Published):
         applied
             The input that acted last, if it is not the last input returned.
         """
+        self._settle()
         self._planned = False
         before = self._find_last(applied)
         late = self._held is not None and status is Status.TIME_LIMIT  # no plan was found: hold the levels

@@ -491,19 +491,6 @@ class KoopmanMPC(MPCBase):
         taken = perf_counter() - start
         return Move(u.copy(), _FREE if taken <= self._allowed else Status.TIME_LIMIT, _NONE, taken, 0)
 
-    def _fail(
-        self,
-        free: Float[np.ndarray, " nu"] | None,
-        applied: ArrayLike | None,
-        status: Status,
-        iterations: int,
-        start: float,
-        solver: str = "",
-    ) -> Move:
-        """Return the move that replaces a failed step; see `MPCBase`."""
-        self._settle()
-        return super()._fail(free, applied, status, iterations, start, solver)
-
     def _settle(self) -> None:
         """Compute the rest of a plan of which only the first input is known."""
         if self._owes and self._bound is not None:
