@@ -1,11 +1,15 @@
-"""Messages that the type hook of the tests would forestall: with the hook they come from a process without it."""
+"""What the type hook of the tests would forestall: with the hook it comes from a process without it."""
 
 import os
 import subprocess
 import sys
+import tempfile
 import warnings
 from contextlib import redirect_stdout
+from functools import cache
 from io import StringIO
+from pathlib import Path
+from xml.etree import ElementTree
 
 PRELUDE = """
 import koopmpc as km, numpy as np
@@ -29,3 +33,34 @@ def shown(code, fresh=False):
         warnings.simplefilter("ignore")
         exec(PRELUDE + code, {"__name__": "__main__"})
     return out.getvalue().splitlines()
+
+
+@cache
+def run_unhooked(file, which):
+    """Run the tests of `file` that are marked unhooked, and are of `which` marks, in one process without the hook.
+
+    Return what each ended in: nothing where it passed, else the text of its failure.
+    """
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "KOOPMPC_TESTS"))
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder, "report.xml")
+        marks = f"unhooked and ({which})" if which else "unhooked"
+        options = [
+            "-n",
+            "0",
+            "-p",
+            "no:cacheprovider",
+            "-o",
+            "junit_family=xunit1",
+            f"--junitxml={report}",
+            "-m",
+            marks,
+        ]
+        root = Path(__file__).parents[1]
+        command = [sys.executable, "-m", "pytest", *options, str(file)]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=root, check=False)
+        assert report.exists(), done.stdout + done.stderr
+        cases = ElementTree.parse(report).iter("testcase")
+        return {case.get("name"): "\n".join(part.text or part.get("message") for part in case) for case in cases}

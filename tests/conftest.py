@@ -15,6 +15,7 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import pytest
 from hypothesis import settings
 
+import tests.bare
 import tests.typecheck
 
 MODE = os.environ.get("KOOPMPC_TESTS", "")
@@ -79,6 +80,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest files: at the end no process waits long for another."""
     place = {Path(__file__).parent / file: i for i, file in enumerate(LONGEST)}
     items.sort(key=lambda item: place.get(item.path, len(place)))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run what the type hook would forestall, or stand between, in a process without it: one for each file."""
+    if MODE != "typed" or not pyfuncitem.get_closest_marker("unhooked"):
+        return None
+    outcomes = tests.bare.run_unhooked(pyfuncitem.path, pyfuncitem.config.option.markexpr)
+    assert not outcomes[pyfuncitem.name], outcomes[pyfuncitem.name]
+    return True
 
 
 settings.register_profile("default", deadline=None, max_examples=30, derandomize=True)

@@ -1,7 +1,6 @@
 """km.control.EigenfunctionLQR: its gain is the Riccati solution, energies arrive, limits hold, bad input is refused."""
 
 import copy
-import os
 
 import casadi as ca
 import numpy as np
@@ -119,7 +118,7 @@ def test_a_copy_goes_on_by_itself():
     assert (law.dt, law.nu, law.horizon) == (0.01, 1, 0)
 
 
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+@pytest.mark.unhooked
 def test_bad_input_is_refused_in_a_sentence():
     pair = km.Expressions(lambda x: [x[0], x[1]], ["a", "b"]).bind(STATES)
     for options, text in (

@@ -1,7 +1,5 @@
 """Cost(beyond="motion"): a reference goes on by its linear recurrence, and the end of a short plan aims there."""
 
-import os
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -80,7 +78,7 @@ def test_a_reference_that_rests_is_followed_as_before():
         assert (moved == rested).all()
 
 
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+@pytest.mark.unhooked
 def test_it_is_refused_where_it_cannot_be():
     with pytest.raises(km.errors.DataError, match="leave Q_N and tail out"):
         km.Cost(Q=[1, 1], R=1, tail=0, beyond="motion")

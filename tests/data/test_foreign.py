@@ -2,7 +2,6 @@
 
 import gc
 import json
-import os
 import sqlite3
 import struct
 import subprocess
@@ -353,7 +352,7 @@ def fit_states(data):
     return km.edmd(data, km.State())
 
 
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+@pytest.mark.unhooked
 def test_a_path_or_a_frame_in_the_place_of_data_names_what_reads_it():
     frame = pd.DataFrame({"x": [1.0, 2.0, 4.0], "u": [1.0, 2.0, 1.0]})
     for wrong, said in ((frame, "frame"), ("logs.csv", "'logs.csv'")):

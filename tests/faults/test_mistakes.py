@@ -1,6 +1,5 @@
 """Mistakes get a sentence of ours: what was got, and what to do."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from koopmpc.predict import spectrum
 from tests.faults.garbage import foreign
 from tests.tiers import slow
 
-pytestmark = pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+pytestmark = pytest.mark.unhooked
 
 PENDULUM = km.load_problem("pendulum")
 PLANT = km.discretize(PENDULUM.dynamics, 0.05)

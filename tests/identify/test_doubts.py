@@ -1,6 +1,5 @@
 """A doubtful fit warns once, says why, and keeps the sentence in its report."""
 
-import os
 import warnings
 from inspect import currentframe
 from pathlib import Path
@@ -151,7 +150,7 @@ def test_a_rank_that_the_data_do_not_have_is_lowered() -> None:
     assert not warned(flat, km.State(), rank=2)[1]
 
 
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook stands between the calls")
+@pytest.mark.unhooked
 def test_a_doubt_points_at_the_callers_line() -> None:
     data = km.Episodes([km.Episode(X=np.ones((6, 2)), U=np.zeros((5, 0)))], 0.1)
     line = currentframe().f_lineno + 2

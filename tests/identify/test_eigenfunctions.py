@@ -1,6 +1,5 @@
 """km.identify.eigenfunctions: conserved quantities and eigenpairs from data, the effect of inputs, validation, bad input."""
 
-import os
 import re
 from dataclasses import dataclass
 
@@ -185,7 +184,7 @@ def test_an_eigenfunction_is_an_observable_of_models_and_comes_back_from_their_f
     np.testing.assert_array_equal(again.lift(x), model.lift(x))
 
 
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+@pytest.mark.unhooked
 def test_bad_input_is_refused_in_a_sentence(one):
     for options, text in (
         ({"by": "slopes"}, 'by is \'slopes\'; pass "steps" or "derivatives"'),

@@ -1,7 +1,5 @@
 """km.identify.kic: observables of states and inputs, three kinds of input, and the models that controllers take."""
 
-import os
-
 import numpy as np
 import pytest
 
@@ -95,7 +93,7 @@ def test_products_and_squares_of_inputs_are_held_exactly_and_go_to_nonlinear_con
         found.linear()
 
 
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+@pytest.mark.unhooked
 def test_bad_input_is_refused_in_a_sentence():
     episodes = data(lambda x, held, rng: rng.uniform(-1, 1, 1))
     for bad, options, text in (

@@ -1,6 +1,5 @@
 """ridge="gcv" is generalised cross-validation on all the data, though it sees only moments."""
 
-import os
 from typing import Any, cast
 
 import numpy as np
@@ -182,7 +181,7 @@ def test_towards_affine_an_unstable_plant_stays_as_unstable_as_it_is() -> None:
     assert abs(radius["affine"] - 1.2) < 0.03
 
 
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+@pytest.mark.unhooked
 def test_what_a_ridge_pulls_to_is_checked() -> None:
     data = noisy(0, 40, 0.1)
     with pytest.raises(km.KoopmpcError, match='pass "zero" or "affine"'):

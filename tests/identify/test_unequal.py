@@ -1,7 +1,5 @@
 """Fits to sensors of unequal rates: exact plants, order of the error in noise, invariances, and errors."""
 
-import os
-
 import numpy as np
 import pytest
 
@@ -230,7 +228,7 @@ def test_fits_say_what_they_cannot_take():
         km.identify.unequal_rates(still, km.State(), bilinear=True)
 
 
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+@pytest.mark.unhooked
 def test_one_step_fits_name_what_takes_partial_rows():
     data = km.data.PartialEpisodes(X=[X], U=[U], dt=0.1)
     with pytest.raises(km.errors.DataError, match="complete_pairs"):

@@ -316,7 +316,7 @@ def test_a_plant_that_cannot_be_made_safe_is_named():
         ({"watchdog": -1.0}, r"watchdog"),
     ],
 )
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+@pytest.mark.unhooked
 def test_arguments_that_do_not_fit_say_so_before_the_plant_moves(wrong, message):
     plant = Here()
     with pytest.raises((km.errors.DataError, km.errors.ShapeError), match=message):

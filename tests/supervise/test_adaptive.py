@@ -1,7 +1,5 @@
 """Adaptive learns while it runs, with guards; Guarded hands over where the model does not know."""
 
-import os
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -177,7 +175,7 @@ def test_guarded_controllers_must_agree_and_the_first_must_say_what_it_knows(mod
         km.supervise.Guarded(first, slower)
 
 
-@pytest.mark.skipif(os.environ.get("KOOPMPC_TESTS") == "typed", reason="the type hook speaks first")
+@pytest.mark.unhooked
 def test_what_is_no_controller_is_not_guarded(model):
     first, other = km.KoopmanMPC(model, COST, LIMITS, HORIZON), km.LQR(model, COST, LIMITS)
     with pytest.raises(km.errors.DataError, match="the one that stands by is a LinearPredictor"):
