@@ -1,9 +1,11 @@
 """Checks of arguments, with the messages about shapes, dtypes, NaN and definiteness."""
 
 import inspect
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from itertools import chain
 from typing import Any, cast
 
 import numpy as np
@@ -182,6 +184,13 @@ def names(given: Sequence[str] | None, what: str, letter: str, size: int) -> tup
     if len(given) != size:
         raise ShapeError(f"{what} has {len(given)} names, expected {size}; give one name each: got {tuple(given)}")
     return given
+
+
+def distinct(*lists: Sequence[str]) -> None:
+    """Raise a DataError where two states, inputs or disturbances have one name."""
+    repeated = [name for name, n in Counter(chain(*lists)).items() if n > 1]
+    if repeated:
+        raise DataError(f"two states or inputs are named {repeated[0]!r}; rename one")
 
 
 def texts(given: object, what: str) -> tuple[str, ...]:

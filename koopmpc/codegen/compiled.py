@@ -551,6 +551,7 @@ class Compiled:
         """Return a copy that shares no state with this one."""
         twin = object.__new__(Compiled)
         twin.__dict__.update(self.__dict__)
+        twin._plants = dict(self._plants)  # two threads may run two copies
         twin._memory = self._memory.copy()
         twin._connect()
         return twin

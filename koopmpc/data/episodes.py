@@ -2,7 +2,6 @@
 
 import csv
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -251,10 +250,7 @@ class Episodes(Named, Value):
             inputs=checks.names(inputs, "inputs", "u", nu),
             disturbances=checks.names(disturbances, "disturbances", "w", nw),
         )
-        names = self.states + self.inputs + self.disturbances
-        repeated = [name for name, n in Counter(names).items() if n > 1]
-        if repeated:
-            raise DataError(f"two states or inputs are named {repeated[0]!r}; rename one")
+        checks.distinct(self.states, self.inputs, self.disturbances)
 
     def __len__(self) -> int:
         """Return the number of episodes."""

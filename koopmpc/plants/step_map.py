@@ -73,7 +73,7 @@ class StepMap(Named):
     ShapeError
         F or h takes or returns other shapes, or there are more or fewer names than rows.
     DataError
-        dt is not above zero.
+        dt is not above zero, or a name of a state, an input or a disturbance is used twice.
     """
 
     F: ca.Function
@@ -128,6 +128,7 @@ class StepMap(Named):
             scene=scene,
             disturbances=checks.names(disturbances, "disturbances", "w", F.size1_in(2) if F.n_in() > 2 else 0),
         )
+        checks.distinct(self.states, self.inputs, self.disturbances)
 
     @property
     def ny(self) -> int:

@@ -225,3 +225,14 @@ def test_what_is_no_step_map_is_refused(build, error, message):
 def test_bad_arguments_are_named(call, error, message):
     with pytest.raises(error, match=message):
         call(PLANTS["RK4(substeps=1)"])
+
+
+def test_a_name_that_is_used_twice_is_refused():
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    F, h = ca.Function("F", [x, u], [x + u]), ca.Function("h", [x, u], [x[0] + u])
+    with pytest.raises(km.errors.DataError, match="two states or inputs are named 'a'; rename one"):
+        km.StepMap(F, 0.1, states=["a", "a"])
+    with pytest.raises(km.errors.DataError, match="two states or inputs are named 'a'; rename one"):
+        km.StepMap(F, 0.1, states=["a", "b"], inputs=["a"])
+    with pytest.raises(km.errors.DataError, match=r"two states or inputs are named 'u\[k-1\]'; rename one"):
+        km.StepMap(F, 0.1, h, states=["u[k-1]", "b"], inputs=["u"])

@@ -92,8 +92,8 @@ class KoopmanMPC(MPCBase):
         The solver that is asked first: "daqp", an active-set method, exact to rounding; "osqp", an operator-splitting
         method; "piqp", an interior-point method on the stages; or "auto", the one that was measured to be faster, which
         the attribute `solver` names. If OSQP has not solved a QP in 100 iterations, or in the ``max_iter`` of
-        `settings`, DAQP solves it. In plans of 300 steps or 1,000 inputs with hard limits alone, "auto" leaves to PIQP
-        what DAQP has not solved in 20 iterations: inputs then agree to 1e-6 of their range.
+        `settings`, DAQP solves it. In plans of 300 steps, 60 a state, or of 1,000 inputs, with hard limits alone,
+        "auto" leaves to PIQP what DAQP has not solved in 20 iterations: inputs then agree to 1e-6 of their range.
     settings
         The solver's own settings, for example ``{"eps_abs": 1e-9, "eps_rel": 1e-9}`` of OSQP. With "auto", the solver
         that has them is asked first.
