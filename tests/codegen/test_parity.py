@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from tests.codegen.parity_fuzz import compare
+from tests.codegen.parity_fuzz import SETTLED, STATUSES, compare, make_linear
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
 BOX = {"u_min": -25.0, "u_max": 25.0}
@@ -226,6 +226,28 @@ def test_random_controllers_answer_alike():
     assert not [one for one in differences if one.kind == "KoopmanMPC"]
     assert not [one for one in differences if not one.wild and one.python.split()[0] != one.c.split()[0]]
     assert sum(one.wild or one.apart > 1e-5 for one in differences) <= 1e-3 * steps
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "episodes"), SETTLED)
+def test_soft_limits_missed_by_far_leave_inputs_alike(seed, episodes):
+    assert not compare(seed, episodes)[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "episodes"), STATUSES)
+def test_a_status_that_rounding_decides_changes_no_input(seed, episodes):
+    assert all(one.apart <= CLOSE for one in compare(seed, episodes)[1])
+
+
+def test_inputs_at_their_limits_are_there_to_the_last_digit_however_far_soft_limits_are_missed():
+    controller, _, _ = make_linear(np.random.default_rng(183))
+    low, high = controller.limits.u_min, controller.limits.u_max
+    move = controller([1e6, 0.1, -0.2, 0.3][: controller.predictor.nx], np.zeros(controller.predictor.nx))
+    assert move.status.name == "SOFTENED"
+    U = controller.plan().U
+    gap = np.minimum(np.abs(U - low), np.abs(U - high)) / (high - low)
+    assert ((gap == 0) | (gap > 1e-2)).all(), gap
 
 
 @pytest.mark.parametrize(("growth", "horizon", "more"), [(1.4, 40, {}), (1.4, 60, {"du_max": 0.3})])

@@ -396,6 +396,36 @@ static int lasts(const koopmpc_state *s) {
   return changed <= KOOPMPC_MOVED;
 }
 
+/**
+ * Put the moves that hard limits or rates determine where these say: soft rows missed by far push by 1e12 and more, and
+ * rounding of their sum would be 1e-4 of an input's range.
+ */
+static void meet_limits(koopmpc_state *s, const koopmpc_real *dual) {
+  koopmpc_real change[MOVES] = {0};
+  int known[MOVES] = {0}, follows[MOVES] = {0};
+  for (int i = 0; i < ROWS; i++) {
+    const int at = koopmpc_source[i];
+    if (!(dual[i] < 0 || dual[i] > 0)) continue;
+    if (at < MOVES) {
+      s->t[at] = (dual[i] > 0 ? KOOPMPC_PLAN_HIGH(s) : KOOPMPC_PLAN_LOW(s))[at];
+      known[at] = 1;
+    } else if (KOOPMPC_HARD_RATED && at < 2 * MOVES && !koopmpc_sense[i]) {
+      change[at - MOVES] = (dual[i] > 0 ? row_high(s, i) : row_low(s, i)) / koopmpc_scale[i];
+      follows[at - MOVES] = 1;
+    }
+  }
+  for (int j = 0; j < MOVES; j++) {
+    if (!follows[j] || known[j] || !(j < KOOPMPC_NU || known[j - KOOPMPC_NU])) continue;
+    s->t[j] = (j < KOOPMPC_NU ? s->known[KOOPMPC_U_PREV + j] : s->t[j - KOOPMPC_NU]) + change[j];
+    known[j] = 1;
+  }
+  for (int j = MOVES - 1; j >= KOOPMPC_NU; j--) {
+    if (!follows[j] || !known[j] || known[j - KOOPMPC_NU]) continue;
+    s->t[j - KOOPMPC_NU] = s->t[j] - change[j];
+    known[j - KOOPMPC_NU] = 1;
+  }
+}
+
 /** Find the least deviation from the plan inside the limits; writes how far a limit gave way. */
 static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_report *report) {
   koopmpc_real push[KOOPMPC_QP_M1], conflict;
@@ -504,6 +534,7 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
     return;
 #else
     koopmpc_add(s->t, koopmpc_deviation, MOVES, qp.primal, MOVES);
+    if (report->slack > 0) meet_limits(s, qp.dual);
 #if KOOPMPC_BOUNDS
     koopmpc_real low[KOOPMPC_NU], high[KOOPMPC_NU];
     for (int i = 0; i < MOVES; i++) s->t[i] = koopmpc_clip(s->t[i], s->box_low[i], s->box_high[i]);

@@ -47,6 +47,7 @@ _at_least = np.greater_equal  # looked up once, as the three below
 _at_most = np.less_equal
 _FREE = Status.UNCONSTRAINED
 _NONE = Fallback.NONE
+_FAR = 1e12  # length² of multipliers above which rounding shows in an input, 1 moving it to its limit
 _OTHER_SOLVER = (
     "The controller solves with OSQP; this C solves with DAQP, to rounding: inputs differ by OSQP's tolerance."
 )
@@ -760,6 +761,8 @@ class KoopmanMPC(MPCBase):
             return self._fail(v[: self.nu], applied, status, found.iterations, start, found.solver)
         U, (low, high) = t[: plan.moves], plan.box if window is None else window.input_box(self._row)
         U += plan.deviation.dot(found.v)
+        if gave_way and self._levels is None and found.solver == FINISHER.name and found.y.dot(found.y) > _FAR:
+            self._meet_limits(U, found.y, Interval(low, high), bounds)
         np.maximum(U, low, out=U)
         np.minimum(U, high, out=U)
         u = U[: self.nu]
@@ -775,6 +778,35 @@ class KoopmanMPC(MPCBase):
         if gap:
             move.status, move.gap = Status.TIME_LIMIT, gap
         return move
+
+    def _meet_limits(
+        self, U: Float[np.ndarray, " moves"], y: Float[np.ndarray, " m"], box: Interval, rows: Interval | None
+    ) -> None:
+        """Put the moves that hard limits and rates determine where these say; y are the multipliers of the QP's rows.
+
+        Soft rows that are missed by far push by 1e12 and more. Rounding of their sum is 1e-4 of an input's range, where
+        its limit is known to the last digit. `box` has the limits of the moves, `rows` those of the QP, None for its
+        own.
+        """
+        plan, nu, last = self._map, self.nu, self._initial.u_prev
+        qp, count = plan.qp, plan.moves if plan.track.rates is None else 2 * plan.moves
+        low, high = (qp.low, qp.high) if rows is None else rows
+        known, changes = set[int](), dict[int, float]()
+        for i in np.flatnonzero(y[: np.searchsorted(qp.source, count)]).tolist():
+            at = int(qp.source[i])
+            if at < plan.moves:
+                U[at] = (box.high if y[i] > 0 else box.low)[at]
+                known.add(at)
+            elif np.isinf(qp.softness.linear[i]):
+                changes[at - plan.moves] = float((high if y[i] > 0 else low)[i] / qp.scale[i])
+        for j, change in changes.items():
+            if j not in known and (j < nu or j - nu in known):
+                U[j] = (last[j] if j < nu else U[j - nu]) + change
+                known.add(j)
+        for j, change in reversed(changes.items()):
+            if j in known and j >= nu and j - nu not in known:
+                U[j - nu] = U[j] - change
+                known.add(j - nu)
 
 
 class _PriorityWeights(KoopmanMPC):
