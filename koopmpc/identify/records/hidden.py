@@ -11,7 +11,7 @@ from koopmpc.identify.records.forward import Terms, evaluate_terms, list_terms
 
 _FULL = 8  # of more past rows only the smooth part tells where the state begins
 _SMOOTH = 3  # degree in time of that part
-_STEPS = 32  # the rows of so many steps are multiplied at once
+_ROWS = 2000  # so many rows are multiplied at once, about
 _FAR = 1e3  # a state beyond this many spreads has left the model
 
 
@@ -165,45 +165,46 @@ class SimulationError:
         first, last, own = model.E.size, model.E.size + model.H.size, np.arange(n)
         weighed = np.flatnonzero(model.E[:, nphi - len(model.neurons) :].any(axis=0))  # V of others changes nothing
         bends: Int[np.ndarray, " q"] = nphi - len(model.neurons) + weighed
-        C, W, q, width = model.H[:, :-1], model.E[:, bends], len(bends), last + len(bends) * (n + 1)
+        C, W, q = model.H[:, :-1], np.repeat(model.E[:, bends], n + 1, axis=1), len(bends)
         z = list_states(model, self.begin(model, data), data.inputs)
         out = np.concatenate([z, np.ones((steps + 1, m, 1))], axis=2)
         y = z[1:] @ C.T + model.H[:, -1]
         gap, told = find_gap(y, data), None if data.low is None else ~_is_silent(y, data)
-        D, begun = np.zeros((m, width - last + first, n)), np.tile(np.eye(n), (m, 1, 1))  # by E and V, by z_0
-        slope, both = np.zeros(width), np.zeros((width, width))
-        early, cross, square = np.zeros((m, n)), np.zeros((m, n, width)), np.zeros((m, n, n))
-        for low in range(0, steps, _STEPS):
-            now = slice(low, min(low + _STEPS, steps))
+        moving = n + first + q * (n + 1)  # columns: z_0, E, V, then H and the gap, which do not go on
+        D, spare = np.zeros((m, n, moving)), np.empty((m, n, moving))
+        D[:, own, own] = 1.0
+        columns, most = moving + model.H.size + 1, max(_ROWS // (m * ny), 1)
+        table = np.zeros(min(most, steps) * m * ny * columns)
+        total, starts = np.zeros((columns - n, columns - n)), np.zeros((m, n, columns))
+        for low in range(0, steps, most):
+            now = slice(low, min(low + most, steps))
             count = now.stop - low
-            J, S = np.zeros((m, count, ny, width)), np.empty((m, count, ny, n))
+            J = table[: count * m * ny * columns].reshape(m, count, ny, columns)
             phi, turned = self._features(model, z[now].reshape(-1, n), data.inputs[now].reshape(count * m, -1))
-            phi, turned = phi.reshape(count, m, nphi), turned.reshape(count, m, n, n).swapaxes(2, 3)
-            bent = (1 - phi[..., bends] ** 2)[..., None] * out[now, :, None]  # (count, m, q, n + 1)
+            phi, turned = phi.reshape(count, m, nphi), turned.reshape(count, m, n, n)
+            bent = ((1 - phi[..., bends] ** 2)[..., None] * out[now, :, None]).reshape(count, m, q * (n + 1))
             for i in range(count):
-                D, begun = np.matmul(D, turned[i]), np.matmul(begun, turned[i])
-                D[:, :first].reshape(m, n, nphi, n)[:, own, :, own] += phi[i]  # a view: the rows of E in D
-                if q:
-                    D[:, first:].reshape(m, q, n + 1, n)[...] += bent[i][..., None] * W.T[:, None]
-                moved = (D.reshape(-1, n) @ C.T).reshape(m, -1, ny).swapaxes(1, 2)
-                J[:, i, :, :first], J[:, i, :, last:] = moved[:, :, :first], moved[:, :, first:]
-                S[:, i] = (begun @ C.T).swapaxes(1, 2)
+                np.matmul(turned[i], D, out=spare)
+                D, spare = spare, D
+                for j in range(n):  # row j of E moves z_j alone, those of V all that have a weight
+                    D[:, j, n + j * nphi : n + (j + 1) * nphi] += phi[i]
+                    D[:, j, n + first :] += bent[i] * W[j]
+                np.matmul(C, D, out=J[:, i, :, :moving])
+            J[..., moving:-1] = 0.0
             for i in range(ny):
-                J[:, :, i, first + i * (n + 1) : first + (i + 1) * (n + 1)] = out[1:][now].swapaxes(0, 1)
+                J[:, :, i, moving + i * (n + 1) : moving + (i + 1) * (n + 1)] = out[1:][now].swapaxes(0, 1)
             if told is not None:
                 J *= told[now].swapaxes(0, 1)[..., None]
-                S *= told[now].swapaxes(0, 1)[..., None]
-            rows, own_rows = J.reshape(m, -1, width), S.reshape(m, -1, n).swapaxes(1, 2)
-            gaps = gap[now].swapaxes(0, 1).reshape(m, -1)
-            slope += rows.reshape(-1, width).T @ gaps.ravel()
-            both += rows.reshape(-1, width).T @ rows.reshape(-1, width)
-            early += np.matmul(own_rows, gaps[..., None])[..., 0]
-            cross += np.matmul(own_rows, rows)
-            square += np.matmul(own_rows, own_rows.swapaxes(1, 2))
-        begin = last + model.T.size
-        by_neurons = begin + weighed[:, None] * (n + 1) + np.arange(n + 1)
-        others: Int[np.ndarray, " width"] = np.append(np.arange(last), by_neurons)
-        gradient, matrix = self._assemble(len(theta), others, (slope, both), (early, cross, square), data.points)
+            J[..., -1] = gap[now].swapaxes(0, 1)
+            rows, by_segment = J.reshape(-1, columns)[:, n:], J.reshape(m, count * ny, columns)
+            total += rows.T @ rows
+            starts += np.matmul(by_segment[..., :n].swapaxes(1, 2), by_segment)
+        by_neurons = last + model.T.size + weighed[:, None] * (n + 1) + np.arange(n + 1)
+        others: Int[np.ndarray, " width"] = np.concatenate(
+            [np.arange(first), by_neurons.ravel(), np.arange(first, last)]
+        )
+        by_others, by_starts = (total[:-1, -1], total[:-1, :-1]), (starts[..., -1], starts[..., n:-1], starts[..., :n])
+        gradient, matrix = self._assemble(len(theta), others, by_others, by_starts, data.points)
         return gradient / data.outputs.size, matrix / data.outputs.size
 
     def _assemble(
@@ -244,11 +245,12 @@ class SimulationError:
         weights = np.zeros((2, products, n, n))  # of terms that bounds do not concern, and of others
         for t, j, rest, times, bounded in self._slopes:
             weights[int(bounded), rest, :, j] += times * E[:, t]
-        slope, bounded = near @ weights.reshape(2, products, -1)
-        slope = (slope + bounded * np.tile(inside, n)).reshape(-1, n, n)
-        if q := len(self.model.neurons):
-            slope += ((1 - phi[:, -q:] ** 2)[:, None] * E[:, -q:]) @ model.neurons[:, :-1]
-        return phi, slope
+        slope, bounded = (near @ each.reshape(products, -1) if each.any() else 0.0 for each in weights)
+        slope = slope + bounded * np.tile(inside, n)
+        if q := len(model.neurons):
+            by_bend = E[:, -q:].T[:, :, None] * model.neurons[:, None, :-1]
+            slope = slope + (1 - phi[:, -q:] ** 2) @ by_bend.reshape(q, -1)
+        return phi, slope.reshape(-1, n, n)
 
 
 def simulate_hidden(
@@ -263,10 +265,12 @@ def list_states(
 ) -> Float[np.ndarray, "steps1 m n"]:
     """Return z_0, z_1, …, which stop at `_FAR` spreads."""
     features, out = FeatureTable(model), np.empty((len(inputs) + 1, z.shape[1], len(z)))
-    out[0] = z.T
+    E, out[0] = model.E[:, features.order], z.T
     with np.errstate(over="ignore", invalid="ignore"):
-        for k, u in enumerate(inputs):
-            np.minimum(np.maximum(model.E @ features.read(out[k], u.T), -_FAR), _FAR, out=out[k + 1])
+        for k, u in enumerate(inputs.swapaxes(1, 2)):
+            ahead = np.matmul(E, features.fill(out[k], u), out=out[k + 1])
+            np.maximum(ahead, -_FAR, out=ahead)
+            np.minimum(ahead, _FAR, out=ahead)
     return np.ascontiguousarray(out.swapaxes(1, 2))
 
 
@@ -308,32 +312,46 @@ class FeatureTable:
     def __init__(self, model: HiddenModel) -> None:
         self._model, self._limited = model, bool(np.isfinite(model.bound).any())
         factors = [tuple(v for v in term if v) for term in model.terms.tolist()]
-        place = {(): 0} | {term: t for t, term in enumerate(factors, 1)}
-        self._blocks = [
-            (
-                np.array([place[term] for term in same], dtype=np.intp),
-                np.array([place[term[:-1]] for term in same], dtype=np.intp),
-                np.array([term[-1] for term in same], dtype=np.intp),
-            )
-            for size in range(1, max(map(len, factors), default=0) + 1)
-            if (same := [term for term in factors if len(term) == size])
-        ]
-        self._curved = 1 + np.flatnonzero(is_nonlinear(model.terms, model.order))
+        sorted_terms = sorted(range(len(factors)), key=lambda t: (len(factors[t]), factors[t]))
+        ends = len(factors) + 1, model.E.shape[1]
+        self.order: Int[np.ndarray, " nphi"] = np.array(
+            [0, *(t + 1 for t in sorted_terms), *range(*ends)], dtype=np.intp
+        )
+        place = {(): 0} | {factors[t]: row for row, t in enumerate(sorted_terms, 1)}
+        self._blocks: list[tuple[slice, Int[np.ndarray, " k"], Int[np.ndarray, " k"]]] = []
+        for size in range(2, max(map(len, factors), default=0) + 1):
+            same = [factors[t] for t in sorted_terms if len(factors[t]) == size]
+            shorter = np.array([place[term[:-1]] for term in same], dtype=np.intp)
+            last = np.array([place[term[-1:]] for term in same], dtype=np.intp)
+            self._blocks.append((slice(place[same[0]], place[same[-1]] + 1), shorter, last))
+        bends = is_nonlinear(model.terms, model.order)
+        self._curved = np.array([row for row, t in enumerate(sorted_terms, 1) if bends[t]], dtype=np.intp)
+        self._curved_terms = model.terms[self.order[self._curved] - 1]
+        self._phi = np.empty((0, 0))
 
     def read(self, z: Float[np.ndarray, "n m"], u: Float[np.ndarray, "nu m"]) -> Float[np.ndarray, "nphi m"]:
         """Return φ(z, u), a column for each column of z and u."""
+        phi = np.empty((len(self.order), z.shape[1]))
+        phi[self.order] = self.fill(z, u)
+        return phi
+
+    def fill(self, z: Float[np.ndarray, "n m"], u: Float[np.ndarray, "nu m"]) -> Float[np.ndarray, "nphi m"]:
+        """Return φ(z, u) with its entries in `order`, shorter products first, in an array that the next call fills."""
         model, n = self._model, len(z)
-        phi = np.empty((model.E.shape[1], z.shape[1]))
-        signals = np.empty((1 + n + len(u), z.shape[1]))
-        phi[0] = signals[0] = 1.0
-        signals[1 : 1 + n], signals[1 + n :] = z, u
-        for i, (rows, shorter, last) in enumerate(self._blocks):
-            phi[rows] = signals[last] if i == 0 else phi[shorter] * signals[last]
+        if self._phi.shape[1] != z.shape[1]:
+            self._phi = np.ones((len(self.order), z.shape[1]))
+        phi = self._phi
+        phi[1 : 1 + n], phi[1 + n : 1 + n + len(u)] = z, u
+        for rows, shorter, last in self._blocks:
+            np.multiply(phi[shorter], phi[last], out=phi[rows])
         if self._limited and len(self._curved) and (np.abs(z) > model.bound[:, None]).any():
+            signals = phi[: 1 + n + len(u)].copy()
             signals[1 : 1 + n] = np.clip(z, -model.bound[:, None], model.bound[:, None])
-            phi[self._curved] = evaluate_terms(model.terms[self._curved - 1], signals.T).T
+            phi[self._curved] = evaluate_terms(self._curved_terms, signals.T).T
         if model.V is not None:
-            phi[1 + len(model.terms) :] = np.tanh(model.V[:, :-1] @ z + model.V[:, -1:])
+            bent = phi[1 + len(model.terms) :]
+            np.matmul(model.V[:, :-1], z, out=bent)
+            np.tanh(np.add(bent, model.V[:, -1:], out=bent), out=bent)
         return phi
 
 
