@@ -19,7 +19,6 @@ SEEDS = (0, 1, 2)
 HORIZON = 20  # steps ahead of the short forecast, those of a controller
 OURS = ("fit", "select", "select linear", "select bilinear")
 KNOWING = "true structure"  # the twin's own equations, fitted by simulation error
-TOLD_ROWS = 30  # a model with a longer past gets no more rows than the protocol allows; the first row stands for them
 
 
 @dataclass(frozen=True)
@@ -63,22 +62,19 @@ def records_of(name: str) -> list[Record]:
 def free_run(model: km.LinearPredictor | km.BilinearPredictor, test: Record, relift: bool) -> np.ndarray:
     """Return the outputs of a model over the test part, which begins at the rows that are known.
 
-    Row k of the inputs acts on row k + 1, or on row k where the model's inputs are one row up. A model whose past is longer than the known rows gets the first row repeated.
+    Row k of the inputs acts on row k + 1, or on row k where the model's inputs are one row up. Of a model whose past is
+    longer than the known rows least squares over these finds the start.
     """
-    past, early = (0 if model.embedding is None else model.embedding.steps), model.input_lead
-    told = test.U_test[early:]  # row k of the model's inputs is row k + early of the log
-    lead = max(past - (test.known - 1), 0)
-    Y = np.vstack([np.repeat(test.Y_test[:1], lead, axis=0), test.Y_test[: test.known]])
-    U = np.vstack([np.repeat(told[:1], lead, axis=0), told])
-    begin = len(Y) - 1
-    history = km.Episode(X=Y, U=U[:begin]) if past else None
-    start, ahead = (model.start(Y[-1], history) if past else Y[-1]), U[begin : lead + len(test.Y_test) - 1]
+    past, told = (0 if model.embedding is None else model.embedding.steps), test.U_test[model.input_lead :]
+    Y, U = test.Y_test[: test.known], told[: test.known - 1]
+    if past > len(U):
+        start = km.identify.estimate_start(model, Y, U)
+    else:
+        start = model.start(Y[-1], km.Episode(X=Y, U=U)) if past else Y[-1]
+    ahead = told[test.known - 1 : len(test.Y_test) - 1]
     with np.errstate(all="ignore"):
-        if relift:
-            X = model.step_map().rollout(start, ahead)[:, : model.nx]
-        else:
-            X = model.rollout(Y[-1], ahead, history=history)
-    return np.vstack([test.Y_test[: test.known - 1], X])
+        X = model.step_map().rollout(start, ahead)[:, : model.nx] if relift else model.rollout(start, ahead)
+    return np.vstack([Y, X[1:]])
 
 
 def has_diverged(test: Record, Y: np.ndarray) -> bool:

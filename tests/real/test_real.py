@@ -50,6 +50,8 @@ def test_a_free_run_uses_the_known_rows_and_the_inputs_alone(delays, relift):
     assert np.array_equal(free_run(model, spoiled, relift), found)
     if delays == 2:  # the true structure
         assert record.error(found) < 1e-8
+    elif delays:  # of its 9 past rows 5 are known: with the first one repeated it errs by .004
+        assert record.error(found) < 2e-3
 
 
 @pytest.mark.parametrize("name", TWINS)
