@@ -39,6 +39,14 @@ def short_loops() -> Iterator[None]:
 
 
 @contextmanager
+def undrawn_pages() -> Iterator[None]:
+    """Let pages of designs and checks hold no pictures, whose rendering takes longer than a check with few runs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("koopmpc.fitting.report.render_svg", lambda _: "<svg></svg>")
+        yield
+
+
+@contextmanager
 def small_designs() -> Iterator[None]:
     """Let designs try two models, from few starts and in short loops."""
     with short_loops(), pytest.MonkeyPatch.context() as patch:

@@ -70,19 +70,26 @@ def gains_of(model: StateSpace, length: int) -> SmootherGains:
     one, V = np.eye(N), np.zeros((N, N))
     V[:nx, :nx] = model.V
     P, result = model.start_spread, SmootherGains([], [], [], [])
+    aheads: list[Float[np.ndarray, "N _"]] = []
+    onward: list[Float[np.ndarray, "N _"]] = []
     for k in range(length):
-        H, R = (one, np.tile(model.R, N // nx)) if k == 0 else (one[:nx], model.R)  # s_d is measured as a whole
-        K = np.linalg.solve(H @ P @ H.T + np.diag(R), H @ P).T
+        seen, R = (N, np.tile(model.R, N // nx)) if k == 0 else (nx, model.R)  # s_d is measured as a whole
+        K = np.linalg.solve(P[:seen, :seen] + np.diag(R), P[:seen]).T
         result.before.append(P)
         result.filter.append(K)
-        P = (one - K @ H) @ P @ (one - K @ H).T + (K * R) @ K.T
+        left = one.copy()
+        left[:, :seen] -= K
+        P = left @ P @ left.T + (K * R) @ K.T
         result.after.append(P)
-        ahead = F @ P @ F.T + V
+        onward.append(F @ P)
+        ahead = onward[-1] @ F.T + V
         ahead = (ahead + ahead.T) / 2
-        result.back.append(np.linalg.solve(ahead + _ROUNDING * one, F @ P).T)
+        aheads.append(ahead)
         if k > 0 and np.abs(ahead - result.before[-1]).max() < _SETTLED:
             break
         P = ahead
+    back = np.linalg.solve(np.array(aheads) + _ROUNDING * one, np.array(onward))
+    result.back.extend(back.transpose(0, 2, 1))
     return result
 
 
@@ -201,11 +208,13 @@ def _improve(
     before, after, gaps = _filter(model, gains, given, D @ model.K[N:])
     S = _back(gains, before, after, given.last - d)
     total, lag = _covariances(gains, length)
-    likelihood = 0.0
-    for k, gap in enumerate(gaps, 1):
-        if k + d > max(DELAYS):
-            W = gains.before[min(k, len(gains.before) - 1)][:nx, :nx] + np.diag(model.R)
-            likelihood -= (np.sum(gap * np.linalg.solve(W, gap.T).T) + E * np.linalg.slogdet(W)[1]) / 2
+    likelihood, first = 0.0, max(max(DELAYS) - d, 0)
+    spreads = np.array([P[:nx, :nx] + np.diag(model.R) for P in gains.before])
+    which = np.minimum(np.arange(first + 1, len(gaps) + 1), len(spreads) - 1)
+    logarithms = np.linalg.slogdet(spreads)[1][which]
+    weighed = np.linalg.solve(spreads[which], np.array(gaps[first:]).transpose(0, 2, 1))
+    for gap, by, logarithm in zip(gaps[first:], weighed, logarithms, strict=True):
+        likelihood -= (np.sum(gap * by.T) + E * logarithm) / 2
     D = model.regressors(S, given.U)
     rows, ahead = _rows(S, D), S[:, 1:, :nx].reshape(-1, nx)
     square, cross = rows.T @ rows, rows.T @ ahead

@@ -15,7 +15,7 @@ from koopmpc.fitting.verdict import judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign, rebuild_controller
 from tests.fitting.mass import GOAL, NAMES, A, B, logs
-from tests.small_designs import small_designs
+from tests.small_designs import small_designs, undrawn_pages
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def made(tmp_path_factory):
     logs().save(folder / "logs.npz")
     goal = GOAL.replace("horizon = 15", "horizon = 8\ncoverage = 0.9\ncertify = true")
     (folder / "goal.toml").write_text(goal)
-    with small_designs():
+    with small_designs(), undrawn_pages():
         return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", bilinear=False)
 
 
