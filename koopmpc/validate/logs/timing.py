@@ -9,7 +9,8 @@ column is one row late.
 Under feedback u_{k+1} = −K y_{k+1} + … the coefficient differs from zero too, so that one log cannot tell the two
 apart. Four tests look for feedback:
 
-1. Past outputs predict an input better than its own past does (Granger), or a few of them do as well.
+1. Past outputs predict an input better than its own past does (Granger), or a few of them do as well. Where no row
+   shows its effect, the past holds how long the input has been held, which outputs of nonlinear plants tell.
 2. The past p_k predicts an input only by K times its prediction of y_{k+1} (Sargan's test of p_k as instruments).
 3. A later input u_{k+2} seems to act on y_{k+1}.
 4. The law of a PD or PID controller predicts u_{k+1} as well as y_{k+1} and all the past do. The set points are white
@@ -31,7 +32,7 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.special import chdtrc, fdtrc
 
 from koopmpc.lifting.base import strip_unit
@@ -122,6 +123,7 @@ class _Rows:
     after: Float[np.ndarray, "M nx"]
     same: Float[np.ndarray, "M nu"]
     later: Float[np.ndarray, "M nu"]
+    ages: Int[np.ndarray, "M nu"]
     repeated: Float[np.ndarray, " nu"]
 
 
@@ -156,7 +158,7 @@ def measure_timing(log: Log) -> tuple[InputTiming, ...]:
         agree = signs[np.flatnonzero(moving).tolist().index(j), i] >= _BLOCKS - 1
         strong = value**2 > _STRONG * (len(rows.same) + value**2)
         limits = _USUAL if strong or abs(value) <= _WEAK else _STRICT
-        if not (strong and _amplifies(rows, j, value)) and (why := _explain_feedback(rows, j, limits)):
+        if not (strong and _amplifies(rows, j, value)) and (why := _explain_feedback(rows, j, value, limits)):
             found.append(InputTiming(name, Timing.UNKNOWN, value, why, feedback=True))
         elif abs(value) < _WEAK:
             found.append(InputTiming(name, Timing.NEXT_ROW, value, "its own row does not hold its effect"))
@@ -212,6 +214,7 @@ def _stack_rows(log: Log) -> _Rows | None:
                 Z[k + 1],
                 V[k + 1],
                 V[k + 2],
+                _count_held(V)[k],
             )
         )
         count += len(k)
@@ -222,8 +225,16 @@ def _stack_rows(log: Log) -> _Rows | None:
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     if len(columns[0]) < max(200, 4 * sum(column.shape[1] for column in columns[:3])):
         return None
+    ages = columns.pop()
     repeated = np.mean(columns[5] == columns[1][:, :nu], axis=0)
-    return _Rows(*(column - column.mean(axis=0) for column in columns), repeated=repeated)
+    return _Rows(*(column - column.mean(axis=0) for column in columns), ages=ages, repeated=repeated)
+
+
+def _count_held(V: Float[np.ndarray, "T nu"]) -> Int[np.ndarray, "T nu"]:
+    """Return for how many rows before its own each input has had its exact value."""
+    rows = np.arange(len(V))[:, None]
+    changes = np.vstack([np.ones((1, V.shape[1]), bool), V[1:] != V[:-1]])
+    return rows - np.maximum.accumulate(rows * changes, axis=0)
 
 
 def _find_basis(P: Float[np.ndarray, "M p"]) -> Float[np.ndarray, "M rank"]:
@@ -320,38 +331,48 @@ def _score_gain(rows: _Rows, j: int, t: float) -> float:
     return float(weights @ rows.after[:, 0]) * np.sign(t) / max(size, 1e-300)
 
 
-def _score_outputs(
-    outputs: Float[np.ndarray, "M p"], inputs: Float[np.ndarray, "M q"], u: Float[np.ndarray, "M 1"]
-) -> tuple[int, float]:
-    """Return how many past outputs stand beside past inputs, and what they tell of an input: by chance χ² of so many.
+def _tells_more(
+    outputs: Float[np.ndarray, "M p"], inputs: Float[np.ndarray, "M q"], u: Float[np.ndarray, "M 1"], limit: float
+) -> bool:
+    """Return whether past outputs predict an input beyond its past, by a test for equal variances and by White's.
 
-    White's test, each residual without its own row: where an input moves rarely, a few rows hold most of what its past
+    In White's each residual is without its own row: where an input moves rarely, a few rows hold most of what its past
     leaves open, and a test for equal variances finds past outputs in it by chance.
     """
-    past = _find_basis(inputs)
+    past = _find_basis(np.hstack([np.ones_like(u), inputs]))
     more = _find_basis(_leave_out(past, outputs))
     b: np.ndarray = more.T @ u[:, 0]
-    left = 1 - (past**2).sum(axis=1) - (more**2).sum(axis=1)
-    e = _leave_out(more, _leave_out(past, u))[:, 0] / np.maximum(left, 0.01)
+    e = _leave_out(more, _leave_out(past, u))[:, 0]
+    free, rest = len(u) - past.shape[1] - len(b), float(e @ e)
+    if not len(b) or free < 1 or rest < 1e-9 * float((u**2).sum()):
+        return False
+    if fdtrc(len(b), free, float(b @ b) / len(b) / (rest / free)) >= limit:
+        return False
+    e = e / np.maximum(1 - (past**2).sum(axis=1) - (more**2).sum(axis=1), 0.01)
     spread: np.ndarray = more.T @ (more * (e**2)[:, None])
     excess: np.ndarray = b * (np.linalg.pinv(spread) @ b)
-    return len(b), float(excess.sum())
+    return bool(chdtrc(len(b), float(excess.sum())) < limit)
 
 
-def _explain_feedback(rows: _Rows, j: int, limits: _Strictness) -> str:
+def _split_by_age(rows: _Rows, j: int) -> Float[np.ndarray, "M ages"]:
+    """Return input j in a column for each age, zero elsewhere: one held for five rows changes after five equal ones.
+
+    No sum of past rows tells that, but the outputs of a nonlinear plant do, so that they predict it without a feedback.
+    """
+    most = rows.inputs.shape[1] // rows.same.shape[1]
+    ages, u = np.minimum(rows.ages[:, j], most), rows.inputs[:, j]
+    return np.column_stack([u * (ages == age) for age in range(most + 1)])
+
+
+def _explain_feedback(rows: _Rows, j: int, t: float, limits: _Strictness) -> str:
     """Return why input j may be a feedback of the states, or an empty text."""
     u, ones = rows.same[:, [j]], len(rows.same)
-    own = _find_basis(rows.inputs)
-    both = _find_basis(np.hstack([rows.inputs, rows.states]))
-    alone, joint = (float((_leave_out(Q, u) ** 2).sum()) for Q in (own, both))
+    past = rows.inputs if abs(t) > _SURE else np.hstack([rows.inputs, _split_by_age(rows, j)])
+    both = _find_basis(np.hstack([past, rows.states]))
+    alone, joint = (float((_leave_out(Q, u) ** 2).sum()) for Q in (_find_basis(past), both))
     if joint < 1e-9 * float((u**2).sum()):
         return "the rows before determine it"
-    more, free = both.shape[1] - own.shape[1], ones - both.shape[1] - 1
-    if (
-        more > 0
-        and fdtrc(more, free, (alone - joint) / more / (joint / free)) < limits.significance
-        and chdtrc(*_score_outputs(rows.states, rows.inputs, u)) < limits.significance
-    ):
+    if _tells_more(rows.states, past, u, limits.significance):
         return "past outputs predict it, so it may be a feedback"
     nx, nu = rows.after.shape[1], rows.same.shape[1]
     if rows.repeated[j] < _REPEATED:

@@ -124,16 +124,35 @@ def test_a_controller_whose_law_is_known_up_to_its_set_points_is_not_named(which
     assert not same_row(disturbed(*which))
 
 
-@pytest.mark.parametrize("seed", [5, 11, 12, 16])
-def test_a_slow_input_that_nobody_computes_from_the_outputs_is_no_feedback(seed):
-    """It is held for ten rows: its few jumps hold all that its past does not tell."""
+def held(seed, rows, gain=0.0, noise=0.0):
+    """Return a nonlinear plant's log: an input held for so many rows is drawn, or −gain times the first output."""
     rng = np.random.default_rng([seed, 5])
-    u, X = np.repeat(rng.normal(size=300), 10), np.zeros((3000, 2))
-    for k in range(len(u) - 1):
-        slow = np.array([[0.95, 0.05], [-0.05, 0.9]]) @ X[k] + np.array([0.05, 0.1]) * u[k]
-        X[k + 1] = slow + 0.02 * np.tanh(3 * X[k, ::-1])
-    (timing,) = km.validate.audit(km.Episodes([km.Episode(X=X, U=u[:-1, None])], 1.0)).timing
+    levels, noises, u, X = (
+        rng.normal(size=3000),
+        noise * rng.normal(size=(3000, 2)),
+        np.zeros(3000),
+        np.zeros((3000, 2)),
+    )
+    X[0] = noises[0]
+    for k in range(2999):
+        u[k] = u[k - 1] if k % rows else -gain * X[k, 0] if gain else levels[k // rows]
+        x = X[k] - noises[k]
+        slow = np.array([[0.95, 0.05], [-0.05, 0.9]]) @ x + np.array([0.05, 0.1]) * u[k]
+        X[k + 1] = slow + 0.02 * np.tanh(3 * x[::-1]) + noises[k + 1]
+    return km.Episodes([km.Episode(X=X, U=u[:-1, None])], 1.0)
+
+
+@pytest.mark.parametrize(("seed", "rows"), [(5, 10), (11, 10), (12, 10), (16, 10), (0, 5), (1, 5), (2, 3), (20, 10)])
+def test_a_held_input_that_nobody_computes_from_the_outputs_is_no_feedback(seed, rows):
+    """Its few jumps hold all that its past does not tell; when the next one comes, a nonlinear plant tells."""
+    (timing,) = km.validate.audit(held(seed, rows)).timing
     assert not timing.feedback
+
+
+@pytest.mark.parametrize(("seed", "rows"), [(0, 2), (0, 5), (1, 2), (1, 5)])
+def test_a_controller_that_holds_its_input_is_a_feedback(seed, rows):
+    (timing,) = km.validate.audit(held(seed, rows, gain=2.0, noise=0.05)).timing
+    assert timing.feedback
 
 
 @pytest.mark.slow
