@@ -7,7 +7,7 @@ import koopmpc as km
 from koopmpc.errors import DataError
 from koopmpc.identify.records.forward import count_terms, evaluate_terms, list_terms, select_forward, solve_nested
 from koopmpc.identify.records.free_run import Pieces, run_freely
-from koopmpc.identify.records.narx import _fit_models, search_structures
+from koopmpc.identify.records.narx import _Fits, search_structures
 from koopmpc.identify.records.structure import fit_structure
 
 
@@ -28,6 +28,11 @@ def forecast(model, data):
     return model.step_map().rollout(episode.X[0], episode.U)[:, : model.nx]
 
 
+def choose(P, y, most):
+    P, y = P - P.mean(axis=0), y - y.mean()
+    return select_forward(P.T @ P, P.T @ y, float(y @ y), np.full(P.shape[1], 1e-18 * len(P)), most)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_greedy_choice_is_that_of_least_squares_on_every_candidate(seed):
     rng = np.random.default_rng(seed)
@@ -41,7 +46,7 @@ def test_the_greedy_choice_is_that_of_least_squares_on_every_candidate(seed):
             A = np.column_stack([np.ones(40), P[:, [*taken, j]]])
             errors[j] = np.sum((y - A @ np.linalg.lstsq(A, y, rcond=None)[0]) ** 2)
         taken.append(min(errors, key=errors.get))
-    assert select_forward(P, y, 6) == taken
+    assert choose(P, y, 6) == taken
     nested = solve_nested(P[:, taken], y, np.array([2, 6]))
     A = np.column_stack([np.ones(40), P[:, taken[:2]]])
     assert np.allclose(nested[0, :3], np.linalg.lstsq(A, y, rcond=None)[0])
@@ -52,7 +57,7 @@ def test_a_column_that_others_span_is_never_taken():
     rng = np.random.default_rng(0)
     P = rng.standard_normal((30, 5))
     P[:, 3], P[:, 4] = 2.0, P[:, 0] - P[:, 1]
-    chosen = select_forward(P, rng.standard_normal(30), 5)
+    chosen = choose(P, rng.standard_normal(30), 5)
     assert 3 not in chosen
     assert len(set(chosen) & {0, 1, 4}) == 2
 
@@ -109,7 +114,7 @@ def test_the_free_run_that_chooses_is_that_of_the_model(delays):
     structure = max(found, key=lambda one: one.size)
     model = fit_structure(structure, data)
     candidates = structure.terms[0]
-    models = _fit_models(pieces, candidates, delays, np.array([len(candidates)]), [(0, 0)] * 2)
+    models = _Fits(pieces, candidates, delays).fit(np.array([len(candidates)]), [(0, 0)] * 2)
     out = run_freely(models, pieces.Y, pieces.U, delays)[:, 0, 0]
     assert np.allclose(out * pieces.scale[:1] + pieces.mean[:1], forecast(model, data)[1:], rtol=0, atol=1e-8)
 

@@ -9,7 +9,6 @@ from math import comb
 import numpy as np
 from jaxtyping import Float, Int
 
-_DEAD = 1e-9  # a column with less than this standard deviation is constant
 _DEPENDENT = 1e-10  # skip a column if less than this share of its energy is independent of the chosen ones
 _EXPLAINED = 1e-14  # stop where the next term explains less than this share of the target's energy
 
@@ -41,19 +40,29 @@ def evaluate_terms(terms: Terms, V: Float[np.ndarray, "*batch nv"]) -> Float[np.
     return product
 
 
-def select_forward(P: Float[np.ndarray, "M n"], y: Float[np.ndarray, " M"], most: int) -> list[int]:
+def select_forward(
+    products: Float[np.ndarray, "n n"],
+    cross: Float[np.ndarray, " n"],
+    energy: float,
+    floor: Float[np.ndarray, " n"],
+    most: int,
+) -> list[int]:
     """Return the columns of P that explain y, the one that explains most of what is left first.
 
     In each step the column with the largest error reduction ratio ⟨w_j, y⟩² / (‖w_j‖² ‖y‖²) is taken, where w_j is p_j
-    less its projection on the columns taken before. Columns and target are taken as deviations from their means, so a
-    constant is always among the regressors.
+    less its projection on the columns taken before. Columns and target are deviations from their means, so a constant
+    is always among the regressors. All of this follows from their products, by a Cholesky factorisation that pivots.
 
     Parameters
     ----------
-    P
-        Values of the terms.
-    y
-        Target.
+    products
+        PᵀP.
+    cross
+        Pᵀy.
+    energy
+        ‖y‖².
+    floor
+        ‖p_j‖² up to which a column is constant.
     most
         Number of columns to take; fewer where the rest explains nothing.
 
@@ -62,14 +71,11 @@ def select_forward(P: Float[np.ndarray, "M n"], y: Float[np.ndarray, " M"], most
     Chen, Billings & Luo, "Orthogonal least squares methods and their application to non-linear system
     identification", Int. J. Control 50, 1989.
     """
-    size, energy = len(P), float(np.sum((y - y.mean()) ** 2))
-    centred = P - P.mean(axis=0)
-    norm = np.sqrt(np.einsum("ij,ij->j", centred, centred))
-    live = norm > _DEAD * np.sqrt(size)
-    centred /= np.where(live, norm, 1.0)
-    target = y - y.mean()
-    explains, left = target @ centred, np.where(live, 1.0, 0.0)  # ⟨w_j, y⟩ and ‖w_j‖², kept up to date
-    basis, chosen = np.empty((most, size)), list[int]()
+    squares = products.diagonal()
+    live = squares > floor
+    size = np.sqrt(np.where(live, squares, 1.0))
+    explains, left = np.where(live, cross, 0.0) / size, np.where(live, 1.0, 0.0)  # ⟨w_j, y⟩ and ‖w_j‖², up to date
+    basis, chosen = np.empty((most, len(size))), list[int]()  # w_i of the columns taken, times all columns
     while len(chosen) < most:
         usable = left > _DEPENDENT
         usable[chosen] = False
@@ -77,15 +83,11 @@ def select_forward(P: Float[np.ndarray, "M n"], y: Float[np.ndarray, " M"], most
         best = int(np.argmax(gain))
         if not gain[best] > _EXPLAINED * energy:
             break
-        w = centred[:, best].copy()
-        taken = basis[: len(chosen)]
-        for _ in range(2):  # twice is enough to be orthogonal to rounding error
-            w -= (taken @ w) @ taken
-        w /= np.linalg.norm(w)
-        basis[len(chosen)] = w
+        taken, norm = basis[: len(chosen)], np.sqrt(left[best])
+        along = (products[best] / (size[best] * size) - taken[:, best] @ taken) / norm
+        basis[len(chosen)] = along
         chosen.append(best)
-        along = w @ centred
-        explains -= along * (w @ target)
+        explains -= along * (explains[best] / norm)
         left -= along**2
     return chosen
 

@@ -38,7 +38,8 @@ FOLDS = 4  # stretches of the record that are left out in turn
 MOST = 2600  # terms to choose from, of all states together: a structure with more is not tried
 NUMBERS = 8_000_000  # entries of the table that terms are chosen on: of more rows evenly spread ones are taken
 EACH = 4  # rows of data for each chosen term, at least
-
+_DEAD = 1e-9  # a column with less than this standard deviation is constant
+_LOST = 1e-12  # so is one with less than this share of its squares in the rows that are left
 RAILED = 2  # pairs of delays and degree that are tried with the rails of the sensors too
 _NEAR = np.array([[1e-9], [-1e-9]])  # spreads from a rail that rounding makes
 _MEDIAN = 0.1  # log of the ratio by which the errors of half of the blocks may be larger
@@ -230,12 +231,13 @@ def _try_plan(
     spans = [[round(len(u) * i / FOLDS) for i in range(FOLDS + 1)] for u in pieces.U]
     sizes = np.array([size for size in SIZES if size <= min(terms, len(candidates))])
     errors: list[Float[np.ndarray, " s"]] = []
+    fits = _Fits(pieces, candidates, delays, ends, masked)
     for fold in range(FOLDS):
         out = [(span[fold], span[fold + 1]) for span in spans]
-        models = _fit_models(pieces, candidates, delays, sizes, out, ends, masked)
+        models = fits.fit(sizes, out)
         errors += _unseen_errors(models, pieces, [(max(a, first), b) for a, b in out], first, horizon)
     table = np.array(errors)
-    models = _fit_models(pieces, candidates, delays, sizes, [(0, 0)] * len(pieces.U), ends, masked)
+    models = fits.fit(sizes, [(0, 0)] * len(pieces.U))
     calm = is_calm(models, pieces, first)
     for i, size in enumerate(sizes):
         chosen = tuple(own[:size] for own in models.terms)
@@ -272,35 +274,53 @@ def _mean_squares(gaps: Float[np.ndarray, "*rows s nx"]) -> Float[np.ndarray, " 
     return np.maximum(np.mean(gaps.reshape(-1, *gaps.shape[-2:]) ** 2, axis=(0, 2)), EXACT**2)
 
 
-def _fit_models(
-    pieces: Pieces,
-    candidates: Terms,
-    delays: int,
-    sizes: Int[np.ndarray, " s"],
-    out: Sequence[tuple[int, int]],
-    rails: Float[np.ndarray, "2 nx"] | None = None,
-    masked: bool = False,
-) -> Models:
-    """Return nested models of these sizes, from all rows whose past and target are outside of the spans `out`."""
-    parts: list[tuple[np.ndarray, np.ndarray]] = []
-    for y, u, (a, b) in zip(pieces.Y, pieces.U, out, strict=True):
-        for low, high in ((0, a), (b, len(u))):
-            if high - low > delays:
-                V, T = embed_rows(y[low : high + 1], u[low:high], delays)
-                told = slice(None)
-                if rails is not None:
-                    told = find_told_rows(y[low : high + 1], rails + _NEAR, delays, masked)[delays:]
-                parts.append((V[told], T[told]))
-    if not sum(len(T) for _, T in parts):
-        raise DataError(f"no stretch of the records is longer than {delays} delays; pass fewer, or a longer record")
-    V, T = np.concatenate([v for v, _ in parts]), np.concatenate([t for _, t in parts])
-    apart = -(-len(V) * len(candidates) // NUMBERS)
-    P = evaluate_terms(candidates, V[::apart])
-    most = max(min(int(sizes[-1]), len(P) // EACH), 1)
-    found: list[Terms] = []
-    solved: list[Float[np.ndarray, "s n1"]] = []
-    for target in T.T:
-        own = candidates[select_forward(P, target[::apart], most)]
-        found.append(own)
-        solved.append(solve_nested(evaluate_terms(own, V), target, sizes))
-    return Models(delays, tuple(found), tuple(solved), rails)
+class _Fits:
+    """Nested models of few of these candidates, from pieces without some of their rows.
+
+    Products of all candidates and targets are added up once, and those of the rows that are left out are taken away.
+    """
+
+    def __init__(
+        self,
+        pieces: Pieces,
+        candidates: Terms,
+        delays: int,
+        rails: Float[np.ndarray, "2 nx"] | None = None,
+        masked: bool = False,
+    ) -> None:
+        rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+        for i, (y, u) in enumerate(zip(pieces.Y, pieces.U, strict=True)):
+            if len(u) > delays:
+                V, T = embed_rows(y, u, delays)
+                told = np.ones(len(u), bool) if rails is None else find_told_rows(y, rails + _NEAR, delays, masked)
+                at = np.flatnonzero(told[delays:])
+                rows.append((V[at], T[at], np.full(len(at), i), at + delays))
+        if not sum(len(T) for _, T, _, _ in rows):
+            raise DataError(f"no stretch of the records is longer than {delays} delays; pass fewer, or a longer record")
+        self._candidates, self._delays, self._rails = candidates, delays, rails
+        self._V, self._T, self._piece, self._at = map(np.concatenate, zip(*rows, strict=True))
+        self._thin = slice(None, None, max(-(-len(self._V) * len(candidates) // NUMBERS), 1))
+        self._table = np.hstack([evaluate_terms(candidates, self._V[self._thin]), self._T[self._thin]])
+        self._table -= self._table.mean(axis=0)
+        self._products, self._sums = self._table.T @ self._table, self._table.sum(axis=0)
+
+    def fit(self, sizes: Int[np.ndarray, " s"], out: Sequence[tuple[int, int]]) -> Models:
+        """Return models of these sizes, from all rows whose past and target are outside of the spans `out`."""
+        first, last = np.array(out).T[:, self._piece]
+        hidden = (self._at >= first) & (self._at < last + self._delays) & (last > first)
+        V, T = self._V[~hidden], self._T[~hidden]
+        if not len(T):
+            raise DataError("no row is left; pass fewer delays, or a longer record")
+        unseen, n = self._table[hidden[self._thin]], len(self._candidates)
+        count = len(self._table) - len(unseen)
+        sums = self._sums - unseen.sum(axis=0)
+        products = self._products - unseen.T @ unseen - np.outer(sums, sums) / max(count, 1)
+        floor = np.maximum(_DEAD**2 * count, _LOST * self._products.diagonal()[:n])
+        most = max(min(int(sizes[-1]), count // EACH), 1)
+        found: list[Terms] = []
+        solved: list[Float[np.ndarray, "s n1"]] = []
+        for i, target in enumerate(T.T, n):
+            own = self._candidates[select_forward(products[:n, :n], products[:n, i], products[i, i], floor, most)]
+            found.append(own)
+            solved.append(solve_nested(evaluate_terms(own, V), target, sizes))
+        return Models(self._delays, tuple(found), tuple(solved), self._rails)
