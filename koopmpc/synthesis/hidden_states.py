@@ -192,10 +192,11 @@ def _judge(
         return models[-1]
 
     start = max(first, structure.delays)
+    known = True if structure.neurons and structure.calm else None  # from other states too, and the last fit sees again
     run = judge_free_run(
-        fit, measured, measured, start, short, relift=structure.is_nonlinear, rival=rival, beaten=beaten
+        fit, measured, measured, start, short, relift=structure.is_nonlinear, rival=rival, beaten=beaten, calm=known
     )
-    if len(models) <= FOLDS:
+    if len(models) <= FOLDS and not (known and run.calm):  # it was given up
         return None
     run = replace(run, calm=run.calm and bool(run.errors.max() < LOST))
     errors, whole = _errors_ahead(models, measured, start, horizon), models[-1]

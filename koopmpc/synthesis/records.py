@@ -201,6 +201,7 @@ def judge_free_run(
     relift: bool,
     rival: FreeRun | None = None,
     beaten: FreeRun | None = None,
+    calm: bool | None = None,
 ) -> FreeRun:
     """Return how a fit does on each quarter of the records when it learns from the others.
 
@@ -224,6 +225,8 @@ def judge_free_run(
     beaten
         How a model did that this one must beat by a tenth to be taken. Where it would have to halve those errors on the
         quarters that are left, it is not fitted to them; nor to all rows where it did not.
+    calm
+        Whether it is calm, where that is known; else it is fitted to all rows to see.
     """
     seen, truth = cut_pieces(learned), cut_pieces(measured)
     scale = np.concatenate([episode.X for episode in truth]).std(axis=0)
@@ -240,7 +243,7 @@ def judge_free_run(
         if behind or (beaten is not None and _must_halve(errors, beaten.errors)):
             left = _HALVES * FOLDS - len(errors) if rival is None else len(rival.errors) - len(errors)
             return FreeRun(np.array(errors + [_LOST] * left), False)
-    return FreeRun(np.array(errors), _is_calm(fit(seen), truth, first, relift))
+    return FreeRun(np.array(errors), _is_calm(fit(seen), truth, first, relift) if calm is None else calm)
 
 
 def _is_behind(errors: Sequence[float], than: Float[np.ndarray, " blocks"]) -> bool:
