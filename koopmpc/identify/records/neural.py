@@ -193,8 +193,9 @@ def fit_neural(
     """Return the predictor of a structure: learned from three quarters of each record, and polished on all rows.
 
     Short records are fitted from several sets of candidates, and the one of least error on the last quarters is taken:
-    they are cheap, and their few rows leave minima apart. With `quick` a third of the segments is taken. Where that is
-    not calm, the last one before it that is: before the polish, with fewer neurons, or without any.
+    they are cheap, and their few rows leave minima apart. Others learn from a third of the segments, and without
+    `quick` the last number of neurons goes on with all of them. Where that is not calm, the last model before it that
+    is: before the polish, with fewer neurons, or without any.
 
     Raises
     ------
@@ -204,7 +205,11 @@ def fit_neural(
     s, data = structure, thin_records(episodes, ROWS, PIECE)
     counts = [q for q in NEURONS if q < s.neurons] + [s.neurons]
     few = not quick and sum(map(len, data)) <= SHORT
-    chain = _best_chain(data, s, counts) if few else list(fit_chain(data, s, counts, quick=quick, plain=True))
+    chain = (
+        _best_chain(data, s, counts)
+        if few
+        else list(fit_chain(data, s, counts, quick=True, plain=True, last=not quick))
+    )
     units, models = chain[-1][1], [model for model, _ in reversed(chain)]
     models.insert(0, _polish(models[0], data, units, s, quick))
     for one in models:
@@ -269,11 +274,12 @@ def fit_chain(
     quick: bool = False,
     plain: bool = False,
     close: bool = False,
+    last: bool = False,
 ) -> Iterator[tuple[HiddenModel, SignalUnits]]:
     """Yield models with more and more neurons that learn from the first three quarters of each record.
 
     With `plain` the linear model that they begin with comes first; `quick` is as in `fit_neural`, and `close` takes
-    more and smaller steps.
+    more and smaller steps. With `last` the last number of neurons learns from all segments behind them.
     """
     s = structure
     units = SignalUnits.of(data, s.rails)
@@ -281,8 +287,11 @@ def fit_chain(
     ends = [round((1 - UNSEEN) * len(e)) for e in data]
     spans = [(0, a) for a in ends], [(a, len(e)) for e, a in zip(data, ends, strict=True)]
     steps = [max(s.horizon // LONGER, 1), s.horizon]
-    most = QUICK_STEPS if quick else STEPS
-    sets = [tuple(_project(_cut(data, units, s, h, part, most), basis) for part in spans) for h in steps]
+
+    def cut(most: int) -> list[tuple[list[RecordSegments], ...]]:
+        return [tuple(_project(_cut(data, units, s, h, part, most), basis) for part in spans) for h in steps]
+
+    sets = cut(QUICK_STEPS if quick else STEPS)
     learned = data.with_episodes([e.cut(0, a) for e, a in zip(data, ends, strict=True) if a > 0])
     model, noise = _start(learned, units, s, basis, sets[0])
     if s.degree > 1:
@@ -293,7 +302,7 @@ def fit_chain(
     for before, count in pairwise([0, *neurons]):
         drawn = draw_neurons(model, sets[0][0][0], rng)
         model = model.add_neurons(take_neurons(model, sets[0][0], drawn, count - before, noise))
-        for part in sets:
+        for part in (*sets, *(cut(STEPS) if last and count == neurons[-1] else ())):
             model = _fit(model, noise, part, _CLOSE if close else _USUAL)
         yield _change_past(model, basis), units
 
