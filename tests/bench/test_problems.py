@@ -173,6 +173,18 @@ def test_a_problem_with_measured_disturbances_is_learned_told_recorded_and_repla
     assert again.differences == ()
 
 
+def test_a_design_that_was_written_before_is_read_for_its_limits_and_no_other(tmp_path: Path):
+    problem = km.load_problem("pendulum")
+    case = next(iter(problem.cases))
+    limits = problem.limits_of(case)
+    local = km.LinearPredictor.local(km.discretize(problem.dynamics, problem.dt), *problem.equilibrium)
+    km.LQR(local, problem.cost).save(tmp_path / f"pendulum-0-{case}.npz")
+    kept = Prepared(problem, kept=tmp_path).load_design(limits)
+    assert isinstance(kept, km.LQR)
+    assert Prepared(problem, seed=1, kept=tmp_path).load_design(limits) is None
+    assert Prepared(problem, kept=tmp_path).load_design(km.Limits(u_max=1e-3)) is None
+
+
 def test_inputs_that_hold_a_reference_are_those_under_the_weather_of_each_step():
     problem = km.load_problem("heat_pump:cold")
     problem = replace(problem, cost=replace(problem.cost, u_target="equilibrium"))

@@ -1,5 +1,6 @@
 """Mistakes at figures say what was got and what to do."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,13 @@ MISTAKES = [
         lambda: km.plot.rollout(MODEL, EPISODES[0], 5, states=[]),
     ),
     (DATA, "there is no score; pass one", lambda: km.plot.error({})),
+    (
+        SHAPE,
+        r"one score is of \(angle .*\), another of \(a \[m\], .*\); compare models of the same states",
+        lambda: km.plot.error(
+            {"one": km.score(MODEL, EPISODES, 3), "other": replace(km.score(MODEL, EPISODES, 3), states=CUBE.states)}
+        ),
+    ),
     (
         DATA,
         "the figure is asked for state 'x'; the states are angle",

@@ -1,5 +1,7 @@
 """koopmpc check --new: whether a design still holds for the plant of new logs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -9,6 +11,7 @@ from koopmpc.cli.app import app
 from koopmpc.fitting.changed import compare_logs, read_new_logs
 from koopmpc.predict.base import load_value
 from koopmpc.synthesis.designed import SavedDesign
+from koopmpc.validate import find_drift
 from tests.fitting.mass import NAMES, A, B, logs
 
 
@@ -36,6 +39,17 @@ def test_a_design_holds_on_the_same_plant_and_where_its_runs_bear_the_change(old
     assert borne.holds is all(one.kind == "input" for one in report.changes)
     assert compare_logs(old, weak, ()).holds is False
     assert "design again" in compare_logs(old, weak, ()).sentence
+
+
+def test_a_design_that_bears_what_alone_changed_holds(old, monkeypatch):
+    weak = record(gain=0.82)
+    report = find_drift(old, weak)
+    gain = [one for one in report.changes if one.kind == "input"]
+    monkeypatch.setattr("koopmpc.fitting.changed.find_drift", lambda *logs: replace(report, changes=tuple(gain)))
+    held = compare_logs(old, weak, ("inputs 20 % weaker",))
+    assert held.holds
+    assert "keeps its goal with such inputs" in held.sentence
+    assert compare_logs(old, weak, ("inputs 20 % stronger",)).holds is False
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Certificates: the theorem holds on samples and on true plants, and a refusal names what is in the way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -261,6 +263,20 @@ def test_the_page_states_what_is_not_claimed(tanks):
     drawing = km.plot.certificate(tanks[-1], tanks[2], spread=[tanks[-1]])
     assert drawing.axes[0].get_xlabel() == tanks[-1].states[0]
     assert "of resampled data" in [text.get_text() for text in drawing.legends[0].get_texts()]
+
+
+def test_words_and_figure_say_whether_loops_reach_the_point_or_a_ball(tanks):
+    point = tanks[-1]
+    ball = replace(point, ball=0.25)
+    assert [str(each).split(", if")[0].split("reaches ")[1] for each in (point, ball)] == [
+        "the set point",
+        "the ball V ≤ 0.25",
+    ]
+    panels = [km.plot.certificate(each).axes[0] for each in (point, ball)]
+    levels = [[drawn.levels.tolist() for drawn in panel.collections if hasattr(drawn, "levels")] for panel in panels]
+    assert [[0.25] in each for each in levels] == [False, True]
+    names = [panel.get_legend_handles_labels()[1] for panel in panels]
+    assert ["ball that is reached" in each for each in names] == [False, True]
 
 
 def test_given_constants_are_a_proof_and_a_lipschitz_constant_may_be_refuted(tanks):

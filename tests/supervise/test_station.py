@@ -187,6 +187,19 @@ def test_the_standby_acts_while_the_primary_fails_and_the_run_keeps_who_acted(tm
     assert km.load_run(tmp_path / "run.rrd").actor == run.actor
 
 
+def test_the_plan_of_a_station_is_that_of_its_controller_while_that_acts():
+    mpc = km.KoopmanMPC(TANK, COST, BOX, 5)
+    station = km.supervise.Station(mpc, standby=km.control.PID.tune(TANK, COST, BOX))
+    station([0.2], [0.5])
+    plan = station.plan()
+    assert plan is not None
+    assert (plan.X == mpc.plan().X).all()
+    for mode in ("manual", "standby"):
+        station.mode = mode
+        station([0.2], [0.5])
+        assert station.plan() is None
+
+
 def test_a_second_manual_mode_begins_with_the_input_of_its_moment_and_not_with_the_old_hand():
     station = km.supervise.Station(km.LQR(TANK, COST, BOX), limits=BOX, mode="manual", hand=[0.7])
     _, U, _ = loop(station, 20, act=lambda k: station.switch("automatic" if k in range(3, 15) else "manual"))

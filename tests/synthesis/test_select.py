@@ -11,6 +11,7 @@ from koopmpc.data.angles import find_angles
 from koopmpc.synthesis.candidates import propose_candidates
 from koopmpc.synthesis.cross_validation import Trial, cross_validate, make_folds, take_sample, usual_horizon
 from koopmpc.synthesis.leaderboard import choose_model
+from koopmpc.synthesis.select import extend_past
 from tests.roundtrip import returned
 
 A, B = np.array([[0.9, 0.2], [-0.1, 0.95]]), np.array([[0.0], [0.3]])
@@ -198,6 +199,18 @@ def test_on_an_unstable_plant_the_next_step_is_not_given_up_for_the_last_one():
     chosen = spent(km.KoopmanMPC(model, km.Cost(Q=Q, R=R), limits, 20))
     plain = spent(km.KoopmanMPC(km.dmdc(data), km.Cost(Q=Q, R=R, tail=0), limits, 20))
     assert chosen < 1.1 * plain < 1.0
+
+
+@pytest.mark.parametrize(("seen", "more"), [(2, False), (1, True)])
+def test_one_long_log_shows_a_hidden_state_as_eight_short_ones_do(seen, more):
+    rng, X = np.random.default_rng(0), [np.zeros(2)]
+    U = rng.uniform(-1, 1, (400, 1))
+    for u in U:
+        X.append(np.array([[0.9, 0.1], [-0.1, 0.95]]) @ X[-1] + [0.1, 0.3] * u)
+    whole = km.Episode(X=np.array(X)[:, :seen] + 0.01 * rng.standard_normal((401, seen)), U=U)
+    one = km.Episodes([whole], dt=0.1)
+    eight = one.with_episodes([whole.cut(50 * i, 50 * i + 50) for i in range(8)])
+    assert [len(extend_past([1, 2], logs, logs)) > 2 for logs in (one, eight)] == [more, more]
 
 
 def test_delays_are_taken_only_where_they_halve_the_error():
