@@ -46,6 +46,38 @@ def test_what_needs_python_between_two_steps_gets_it(pendulum, controllers):
     assert not np.array_equal(noisy.Y, run.Y)
 
 
+@pytest.mark.parametrize(
+    "signal",
+    [
+        {"noise": [0.02, 0.02]},
+        {"disturbance": [0.0, 0.05]},
+        {"faults": [km.faults.FrozenSensor()]},
+    ],
+    ids=lambda signal: next(iter(signal)),
+)
+def test_what_disturbs_a_run_disturbs_that_of_a_compiled_controller_as_much(pendulum, controllers, signal):
+    told = {"x0": [0.3, 0.0], "reference": [0.0, 0.0], "steps": 8}
+    slow, fast = (km.simulate(pendulum[0], one, **told, **signal, rng=0) for one in controllers)
+    np.testing.assert_allclose(fast.Y, slow.Y, atol=1e-6)
+    assert np.abs(fast.Y - km.simulate(pendulum[0], controllers[1], **told).Y).max() > 1e-3
+
+
+def test_a_run_in_c_is_told_disturbances_that_the_plant_does_not_know():
+    model = km.LinearPredictor([[0.9]], [[0.2]], [[1.0]], km.State(), 0.05, ["x"], ["u"], E=[[0.5]])
+    x, u = ca.MX.sym("x"), ca.MX.sym("u")
+    plant = km.StepMap(ca.Function("F", [x, u], [0.9 * x + 0.2 * u]), 0.05)
+    mpc = km.KoopmanMPC(model, km.Cost(Q=1.0, R=0.1), km.Limits(-1, 1), 5)
+    told = {"x0": [0.5], "reference": [0.0], "steps": 6}
+    runs = [
+        km.simulate(plant, one, **told, measured=W)
+        for one in (mpc, km.compiled(mpc))
+        for W in (np.zeros((6, 1)), np.linspace(0.1, 0.6, 6)[:, None])
+    ]
+    np.testing.assert_allclose(runs[2].U, runs[0].U, atol=1e-6)
+    np.testing.assert_allclose(runs[3].U, runs[1].U, atol=1e-6)
+    assert np.abs(runs[3].U - runs[2].U).max() > 0.1
+
+
 def test_a_plant_that_cannot_be_written_in_c_is_driven_from_python(controllers):
     x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
     jump = ca.Function("jump", [x, u], [ca.if_else(x[0] > 0, x, x + 0.05 * ca.vertcat(x[1], u), False)])

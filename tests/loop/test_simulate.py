@@ -355,15 +355,17 @@ class Ending(Outside):
         return super().step(u)
 
 
-@pytest.mark.parametrize("steps", [3, 8])
+@pytest.mark.parametrize("steps", [3, 4, 8])
 def test_a_run_is_as_long_as_the_plant_goes_on(steps):
     observed = []
     if steps == 3:  # it ends with the run itself
         run = km.simulate(Ending(), Recorded(), x0=[0.5, 0], reference=[0, 0], steps=3, observers=[observed.append])
         assert "ended" not in run.metadata
     else:
-        with pytest.warns(UserWarning, match="the plant ended the run after 3 of 8 steps: it fell"):
-            run = km.simulate(Ending(), Recorded(), x0=[0.5, 0], reference=[0, 0], steps=8, observers=[observed.append])
+        with pytest.warns(UserWarning, match=f"the plant ended the run after 3 of {steps} steps: it fell"):
+            run = km.simulate(
+                Ending(), Recorded(), x0=[0.5, 0], reference=[0, 0], steps=steps, observers=[observed.append]
+            )
         assert run.metadata["ended"] == "it fell"
     assert run.steps == len(observed) == 3
     assert len(run.X) == len(run.Y) == len(run.reference) == 4
