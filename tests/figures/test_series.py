@@ -146,6 +146,54 @@ def test_runs_of_a_report_show_the_limits_that_are_near() -> None:
     assert torque.get_ylim()[0] < -5
 
 
+def find_hidden(drawing):
+    """Return what is drawn outside its panel: curves, inputs, and limits that are near."""
+    hidden = []
+    for axes in drawing.axes:
+        (left, right), (low, high) = sorted(axes.get_xlim()), sorted(axes.get_ylim())
+        if not axes.get_visible() or axes.get_yscale() == "log":
+            continue
+        drawn = [(line.get_label(), line.get_xdata(), line.get_ydata()) for line in axes.get_lines()]
+        drawn += [
+            ("steps", each.get_data()[1], each.get_data()[0]) for each in axes.patches if hasattr(each, "get_data")
+        ]
+        for name, x, y in drawn:
+            x, y = (np.asarray(each, dtype=float) for each in (x, y))
+            far = name == "limit" and not 2 * low - high < y[0] < 2 * high - low
+            if not far and not ((left <= x) & (x <= right)).all() | (name == "limit"):
+                hidden.append((axes.get_ylabel(), name, "x"))
+            if not far and not ((low <= y) & (y <= high)).all():
+                hidden.append((axes.get_ylabel(), name, "y"))
+    return hidden
+
+
+def test_what_is_drawn_is_inside_its_panel() -> None:
+    data, limits = episodes(4), km.Limits(-2.0, 2.5, x_min=[-1.0, -1.2], x_max=[1.0, 1.2])
+    swing, grown = turning(0.99), turning(0.97)
+    cost = km.Cost(Q=[1.0, 0.1], R=0.1)
+    plant = km.black_box(lambda x, u: swing.A @ x + swing.B @ u, dt=DT, states=STATES, inputs=INPUTS)
+    runs = {
+        str(r): km.simulate(
+            plant,
+            km.KoopmanMPC(swing, cost, limits, 8),
+            x0=[r, 0.8],
+            reference=[0, 0],
+            steps=30,
+            cost=cost,
+            limits=limits,
+        )
+        for r in (0.9, -0.8)
+    }
+    wide = [km.validate.forecast(grown, episode, 12) for episode in data]
+    beyond = [each.predicted.min() < each.truth.min() for each in wide]
+    beyond += [each.predicted.max() > each.truth.max() for each in wide]
+    assert any(beyond)
+    drawings = [km.plot.rollout(grown, episode, 12) for episode in data]
+    drawings += [km.plot.error({"a": km.score(swing, data, 8), "b": km.score(grown, data, 8)})]
+    drawings += [km.plot.run(runs["0.9"]), km.plot.runs({"": runs}), draw_trajectories(runs)]
+    assert [find_hidden(drawing) for drawing in drawings] == [[]] * len(drawings)
+
+
 def test_runs_show_the_reference_of_the_states_that_their_cost_tracks():
     plant = km.discretize(km.load_problem("two_tanks").dynamics, 4.0)
     cost = km.Cost(Q=1.0, R=0.1, of=km.State("lower"))
