@@ -206,11 +206,15 @@ def send_blueprint(rec: Any, application: str, layout: Any) -> None:
 def file_recording(path: str | Path, application: str, layout: Any) -> Generator[Any]:
     """Yield a recording that is written beside `path`, and takes its place at the end of the block.
 
+    It ends with a checksum: whole, it is read without a process of its own.
+
     Raises
     ------
     LogError
         The path cannot be written.
     """
+    import rerun as rr
+
     file = LogFile(path)
     rec: Any = None
     try:
@@ -218,6 +222,7 @@ def file_recording(path: str | Path, application: str, layout: Any) -> Generator
         file.attach(rec)
         send_blueprint(rec, application, layout)
         yield rec
+        rec.log("checksum", rr.AnyValues(check=CHECK), static=True)
         rec.flush(timeout_sec=_WRITING)
         rec.disconnect()
         file.close()

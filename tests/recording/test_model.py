@@ -114,6 +114,21 @@ def test_the_report_is_a_page(log: Path, report: km.validate.TrustReport) -> Non
     assert f"| observables | 2: {', '.join(STATES)} |" in page
 
 
+def test_a_whole_log_is_read_without_another_process_and_a_damaged_one_is_not(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def started(*_: object, **__: object) -> None:
+        raise ChildProcessError
+
+    monkeypatch.setattr("koopmpc.recording.rrd.subprocess.run", started)
+    assert read_columns(log, ("/description",)).static("/description", "json") is not None
+    content = bytearray(log.read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "damaged.rrd").write_bytes(content)
+    with pytest.raises(km.errors.LogError, match="damaged"):
+        read_columns(tmp_path / "damaged.rrd", ("/description",))
+
+
 def test_without_a_report_the_band_is_that_of_the_errors(tmp_path: Path) -> None:
     data = episodes(3, noise=0.05)
     km.recording.record_model(turning(), data, tmp_path / "a.rrd")
