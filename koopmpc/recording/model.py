@@ -29,7 +29,7 @@ from koopmpc.recording.blueprint import (
 )
 from koopmpc.recording.description import Entity, drawable, written_with
 from koopmpc.recording.reader import naming, read_columns
-from koopmpc.recording.rrd import file_recording, times
+from koopmpc.recording.rrd import CHECK, file_recording, is_intact, times
 from koopmpc.scene import Color
 from koopmpc.text import format_markdown_table, shorten_observable
 from koopmpc.validate.bands import Forecast, forecast
@@ -341,8 +341,10 @@ def load_model_log(path: str | Path) -> ModelLog:
         The file is missing or damaged, or no log of a model whose format this version knows.
     """
     path = Path(path)
-    log = read_columns(path, (f"/{Entity.DESCRIPTION}", "/error/**", "/rollout/**"))
+    log = read_columns(path, (f"/{Entity.DESCRIPTION}", "/error/**", "/rollout/**", "/checksum"))
     with naming(path):
+        if log.static("checksum", "check") not in (None, CHECK) and not is_intact(path):
+            raise LogError(f"{path} is damaged: it no longer holds what was written; take another copy")
         text = log.static(Entity.DESCRIPTION, "json")
         about: dict[str, Any] = {} if text is None else json.loads(text)
         if about.get("format") != _FORMAT:

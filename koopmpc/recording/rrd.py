@@ -277,13 +277,13 @@ def read(path: Path, entities: tuple[str, ...]) -> tuple[list[Column], bool]:
     LogError
         Rerun's reader refuses the file, or ended the child that read it.
     """
-    if _intact(path):
+    if is_intact(path):
         return _read_here(path, entities), False
     with _whole_messages(path) as (whole, torn):
         return _read_in_child(whole, entities, path), torn
 
 
-def _intact(path: Path) -> bool:
+def is_intact(path: Path) -> bool:
     """Return whether the file is, to the bit, the one that was written: its checksum stands in it and is right."""
     from mmap import ACCESS_READ, mmap
 

@@ -11,6 +11,7 @@ import koopmpc as km
 from koopmpc.figures.eigenvalues import evaluate_eigenfunctions, make_plane
 from koopmpc.figures.style import SEQUENTIAL
 from koopmpc.recording.blueprint import draw_eigenvalues
+from koopmpc.recording.model import load_model_log
 from koopmpc.recording.reader import LogColumns, read_columns
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning
 from tests.recording.viewing import drawn
@@ -120,13 +121,16 @@ def test_a_whole_log_is_read_without_another_process_and_a_damaged_one_is_not(
     def started(*_: object, **__: object) -> None:
         raise ChildProcessError
 
+    content, damaged = log.read_bytes(), tmp_path / "damaged.rrd"
+    value = np.float64(load_model_log(log).forecasts[0, 0][0][5]).tobytes()
+    assert content.count(value) == 1
+    damaged.write_bytes(content.replace(value, np.float64(0.5).tobytes()))
+    with pytest.raises(km.errors.LogError, match="no longer holds what was written"):
+        load_model_log(damaged)
     monkeypatch.setattr("koopmpc.recording.rrd.subprocess.run", started)
-    assert read_columns(log, ("/description",)).static("/description", "json") is not None
-    content = bytearray(log.read_bytes())
-    content[len(content) // 2] ^= 1
-    (tmp_path / "damaged.rrd").write_bytes(content)
+    assert load_model_log(log).states == STATES
     with pytest.raises(km.errors.LogError, match="damaged"):
-        read_columns(tmp_path / "damaged.rrd", ("/description",))
+        load_model_log(damaged)
 
 
 def test_without_a_report_the_band_is_that_of_the_errors(tmp_path: Path) -> None:
