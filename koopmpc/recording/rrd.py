@@ -17,6 +17,7 @@ import tempfile
 import uuid
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from threading import Thread
 from typing import Any, BinaryIO, NamedTuple
@@ -190,6 +191,7 @@ def send_blueprint(rec: Any, application: str, layout: Any) -> None:
     import rerun as rr
     import rerun_bindings
 
+    _name(layout.root_container, application)
     with defer_interrupts():
         own = rerun_bindings.new_blueprint(
             application_id=application, make_default=False, make_thread_default=False, default_enabled=True
@@ -200,6 +202,32 @@ def send_blueprint(rec: Any, application: str, layout: Any) -> None:
         rerun_bindings.send_blueprint(stream.memory_recording().storage, False, True, recording=rec.to_native())
         stream.disconnect()  # else what it holds and the stream hold each other
         del stream
+
+
+def _name(root: Any, application: str) -> None:
+    """Give the parts of a layout the same ids in every log: Rerun keeps each id that it has met, 300 bytes, for ever.
+
+    An id stands for the place and the kind of a part, because a viewer keeps what it knows of a view by its id.
+    """
+    from rerun.blueprint import Container
+    from rerun.blueprint.visualizers import VisualizableArchetype, Visualizer
+
+    number = count()
+
+    def give(part: Any) -> Any:
+        kind = getattr(part, "class_identifier", type(part).__name__)
+        part.id = uuid.uuid5(uuid.NAMESPACE_OID, f"koopmpc {application} {next(number)} {kind}")
+        return part
+
+    parts = [root]
+    while parts:
+        part = give(parts.pop())
+        if isinstance(part, Container):
+            parts.extend(part.contents)
+            continue
+        for entity, shown in part.visualizer_overrides.items():
+            each = [one.visualizer() if isinstance(one, VisualizableArchetype) else one for one in shown]
+            part.visualizer_overrides[entity] = [give(one) if isinstance(one, Visualizer) else one for one in each]
 
 
 @contextmanager

@@ -44,6 +44,21 @@ def test_a_log_without_the_solvers_of_its_steps_reads_as_before(tmp_path: Path) 
     assert km.metrics(run).solver == {}
 
 
+def test_logs_of_a_problem_name_the_parts_of_their_layouts_alike(tmp_path: Path) -> None:
+    """Rerun keeps every name of an entity for ever: a process that writes many logs would grow with each."""
+    from rerun.chunk import RrdReader
+
+    names: list[list[str]] = []
+    for i in range(2):
+        km.record(make_run(N=3), tmp_path / f"{i}.rrd")
+        reader = RrdReader(tmp_path / f"{i}.rrd")
+        chunks = reader.stream(store=reader.blueprints()[0])
+        names.append(sorted(chunk.entity_path for chunk in chunks))
+    assert names[0] == names[1]
+    parts = {name.split("/")[2] for name in names[0] if name.startswith(("/view/", "/container/"))}
+    assert len(parts) > 10, "parts of a layout share an id"
+
+
 @pytest.mark.slow
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(some=options)
