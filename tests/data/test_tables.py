@@ -80,7 +80,8 @@ def test_a_state_may_be_named_step(tmp_path: Path) -> None:
         ({}, {"resample": 0.1}, r"has no column of time to resample by; its columns are x, u"),
         ({}, {"dt": 0.1, "states": []}, r"has no column that could be a state: its columns are x, u; pass states="),
         ({"time [day]": [0, 1, 2]}, {}, r"the unit of 'time \[day\]' is not one of s, ms"),
-        ({"time": [1, 1, 1]}, {"states": ["x"]}, r"time does not advance in any two rows; pass dt="),
+        ({"time": [1, 1, 1]}, {"states": ["x"]}, r"time does not advance in any two rows; sort the rows by time"),
+        ({"time": [2, 1, 0]}, {"states": ["x"], "dt": 1.0}, r"time does not advance in any two rows; sort the rows"),
         ({"time": [0, 0.1, 0.22]}, {"states": ["x"], "inputs": ["u"]},
          r"sampling is unequal: 2 of 2 steps differ from dt = 0\.11 s by more "
          r"than 2 %, the first at row 1, where it is 0\.1 s; pass resample=0\.11"),

@@ -57,7 +57,7 @@ def sample_time(times: list[np.ndarray], where: str) -> float:
     steps = np.concatenate([np.zeros(0), *map(np.diff, times)])
     steps = steps[np.isfinite(steps) & (steps > 0)]
     if not len(steps):
-        raise DataError(f"{where}: time does not advance in any two rows; pass dt=")
+        raise DataError(f"{where}: time does not advance in any two rows; sort the rows by time, or check that column")
     return float(f"{np.median(steps):.6g}")
 
 

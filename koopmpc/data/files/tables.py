@@ -131,8 +131,9 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
         dt = table.dt
     if dt is None and time is not None and names[: len(SAVED)] == list(SAVED):
         dt = _find_exact_step(columns[SAVED[1]], time)
+    usual = None if time is None else sample_time([part.time for part in parts if part.time is not None], where)
     if dt is None:
-        if time is None:
+        if usual is None:
             clock = next(
                 (f"; {name!r} looks like it: rename it by columns=" for name in found.states if _even(values[name])), ""
             )
@@ -140,7 +141,7 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
                 f"{where} does not say its sample time: pass dt=, or add a column 'time [s]'{clock}; its columns are "
                 f"{', '.join(names)}"
             )
-        dt = sample_time([part.time for part in parts if part.time is not None], where)
+        dt = usual
     dt = checks.positive(dt, "dt", "s")
     if told.resample is not None:
         _affordable(parts, dt, len(found.values), where)
