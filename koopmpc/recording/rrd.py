@@ -209,8 +209,7 @@ def _name(root: Any, application: str) -> None:
 
     An id stands for the place and the kind of a part, because a viewer keeps what it knows of a view by its id.
     """
-    from rerun.blueprint import Container
-    from rerun.blueprint.visualizers import VisualizableArchetype, Visualizer
+    from rerun.blueprint import Container, VisualizableArchetype, Visualizer
 
     number = count()
 

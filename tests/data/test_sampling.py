@@ -33,7 +33,9 @@ def test_the_sample_time_is_the_median_of_steps_ahead_to_six_digits():
     assert sample_time([np.array([0, 0.1234567891])], "f") == 0.123457
     assert sample_time([np.array([0, 0, 0, 3.0])], "f") == 3.0  # time that stands is no step
     for times in ([], [np.zeros(0)], [np.array([1.0])], [np.array([2.0, 2.0, 1.0])]):
-        with pytest.raises(km.errors.DataError, match="f: time does not advance in any two rows; sort the rows by time"):
+        with pytest.raises(
+            km.errors.DataError, match="f: time does not advance in any two rows; sort the rows by time"
+        ):
             sample_time(times, "f")
 
 
