@@ -153,7 +153,7 @@ def fit(
         with friendly():
             path = new_file(Path("goal.toml"), write_template(source, horizon=horizon, say=say_line, **reading))
         say(f"written: {path}; say in it what you want")
-        more = ["--linear"] * linear
+        more = ["--linear"] * linear + ["--feedthrough"] * feedthrough
         for option, value, usual in (
             ("--workers", workers, None),
             ("--scheduler", scheduler, None),
@@ -173,8 +173,6 @@ def fit(
     }
     if goal is not None:
         with friendly():
-            if feedthrough:
-                raise DataError("--feedthrough is for models; a design with --goal has inputs that act on the next row")
             if horizon is not None:
                 raise DataError(f"--horizon {horizon} is of no use with --goal; write horizon = {horizon} into {goal}")
         with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
@@ -182,6 +180,7 @@ def fit(
                 source,
                 goal,
                 folder,
+                feedthrough=feedthrough,
                 coverage=coverage,
                 certify=certify,
                 progress=progress,

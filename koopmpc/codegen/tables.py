@@ -242,6 +242,7 @@ def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram, *,
             "PATIENCE": estimator.patience,
             "KEPT": len(estimator.kept),
             "HELD": estimator.held,
+            "RESTS": int(estimator.rests),
         }
         plan |= {
             "filter_F": stack(F),

@@ -78,7 +78,7 @@ class Augmented:
         self.to_d[kept, n:] = Bd[kept] + shift @ self.turn - A @ shift
         self.to_periodic = self.to_d[:, n + self.steady :].copy()  # and `to_d` gives the constant part alone
         self.to_d[:, n + self.steady :] = 0.0
-        self.rows, self.held = self.M, 0
+        self.rows, self.held, self.rests = self.M, 0, False
 
     def read_before(self) -> None:
         """Have y be what the model's next outputs are under the input of the step before, y = M (F s + G v) + h."""
@@ -93,7 +93,7 @@ class Augmented:
         self.f, self.M = np.append(self.f, np.zeros(nu)), np.hstack([self.M, D])
         self.rows = np.hstack([self.rows, np.zeros((len(D), nu))])
         self.to_z, self.to_d = (np.hstack([part, np.zeros((nz, nu))]) for part in (self.to_z, self.to_d))
-        self.held = nu
+        self.held, self.rests = nu, np.array_equal(self.rows[:, : len(self.kept)], self.predictor.C[:, self.kept])
 
 
 FilterModel = tuple[Augmented, Float[np.ndarray, "n n"], Float[np.ndarray, "ny ny"]]
@@ -116,6 +116,8 @@ class FilterProgram(EstimatorProgram):
         Steps that y is old; samples in sequence without any measurement that are bridged.
     held
         Entries at the end of s that are the input of the step before: nu with feedthrough, else 0.
+    rests
+        Where no start is given, s begins as if the plant had rested at the first y.
     """
 
     F: Float[np.ndarray, "ns ns"]
@@ -132,6 +134,7 @@ class FilterProgram(EstimatorProgram):
     delay: int
     patience: int
     held: int = 0
+    rests: bool = False
 
 
 class KalmanFilter(Viewing):
@@ -166,9 +169,16 @@ class KalmanFilter(Viewing):
         """Return the data with which z and d are found."""
         parts = {name: getattr(self._system, name) for name in ("F", "G", "f", "M", "h", "to_z", "one", "to_d", "kept")}
         gate = gate_graph(self.ny)
-        held = self._system.held
+        held, rests = self._system.held, self._system.rests
         return FilterProgram(
-            **parts, P=self._P, R=self._R, delay=self._delay, patience=self._patience, held=held, gate=gate
+            **parts,
+            P=self._P,
+            R=self._R,
+            delay=self._delay,
+            patience=self._patience,
+            held=held,
+            rests=rests,
+            gate=gate,
         )
 
     @property
@@ -176,9 +186,9 @@ class KalmanFilter(Viewing):
         """Whether the last y was refused: the filter only predicted."""
         return self._gate.refused
 
-    def update(self, predictor: LinearPredictor) -> None:
+    def update(self, model: LinearPredictor) -> None:
         """Go on with another model, from the same state."""
-        self._take(predictor)
+        self._take(model)
 
     def _take(self, predictor: LinearPredictor) -> None:
         """Take over the matrices of a model."""
@@ -195,17 +205,24 @@ class KalmanFilter(Viewing):
         self._omega[len(s) : len(s) + len(system.one), -1] += system.one
 
     def reset(self, x0: ArrayLike | None = None) -> None:
-        """Start at z = ψ(x0), by default ψ(0), and d = 0."""
+        """Start at z = ψ(x0), and d = 0; by default at ψ(0), with feedthrough at rest where the first y is."""
         system = self._system
         start = checks.start(x0, system.predictor.nx)
-        start = np.zeros(system.predictor.nx) if start is None else start
-        self._s[:] = 0.0
-        self._s[: len(system.kept)] = system.predictor.lift(system.predictor.rest_point(start))[system.kept]
-        self._start = self._s.copy()
+        self._sought = start is None and system.rests
+        self._rest_at(np.zeros(system.predictor.nx) if start is None else start, np.zeros(system.predictor.nu))
         self._inputs.clear()
         self._started = False
         self._missed = 0
         self._gate.reset()
+
+    def _rest_at(self, x: Float[np.ndarray, " nx"], u: Float[np.ndarray, " nu"]) -> None:
+        """Have s be that of a plant that has rested in x under u; the input of the step before stays."""
+        system = self._system
+        predictor, free = system.predictor, len(self._s) - system.held
+        point = x if predictor.embedding is None else predictor.embedding.repeat(x, u)
+        self._s[:free] = 0.0
+        self._s[: len(system.kept)] = predictor.lift(point)[system.kept]
+        self._start = self._s[:free].copy()
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Correct the state of `delay` steps ago with y, and predict it to the present with the inputs since then.
@@ -234,6 +251,8 @@ class KalmanFilter(Viewing):
             self._inputs.append(np.concatenate([u, w]))
         elif system.held:
             self._s[-system.held :] = u
+            if self._sought and (np.abs(y) < HUGE).all():
+                self._rest_at(y, u)
         if len(self._inputs) > self._delay:
             self._s[:] = self._next(self._s, self._inputs.popleft())
         came = np.abs(y) < HUGE  # False for NaN
@@ -241,7 +260,9 @@ class KalmanFilter(Viewing):
         if not first and (self._delay or not self._started):
             self._gate.judge(y, self._clip(system.M @ self._s + system.h))
         if self._gate.lost:
-            self._s[: len(self._s) - system.held] = self._start[: len(self._s) - system.held]
+            if system.rests and came.all():
+                self._rest_at(y, u)
+            self._s[: len(self._start)] = self._start
         useful = came & ~self._is_silent(y, system.M @ self._s + system.h)
         if not first and useful.any() and not self._gate.refused:
             self._s += self._gain(useful) @ (y[useful] - system.M[useful] @ self._s - system.h[useful])
@@ -383,7 +404,8 @@ class LiftedKalman(Value):
         The plant has y = h(x, u), and the model is one of log rows y_k = h(x_k, u_k), whose inputs were moved one row
         up (`input_lead` 1). A controller reads y before it chooses u_k, so the reading is h(x_k, u_{k−1}), which is
         H (A z + B u_{k−1}) + C_d d. A plan then weighs and limits h(x_k, u_k) first, and row k + 1 of a moving
-        reference belongs to it. Not with `period`.
+        reference belongs to it. Where y are the states, a run whose x0 is not given begins at rest at its first
+        reading. Not with `period`.
 
     Raises
     ------

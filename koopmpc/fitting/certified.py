@@ -30,7 +30,7 @@ def describe_certificate(
     try:
         certificate = certify(
             model,
-            unseen,
+            model.align(unseen),
             limits,
             x=np.asarray(rest.x)[: model.nx],
             u=np.asarray(rest.u),
@@ -51,6 +51,8 @@ def _explain_unfit(design: Design, reference: Float[np.ndarray, "..."]) -> str:
     """Return why a certificate cannot be sought at all; empty if it can."""
     asked, model = design.evidence.asked, get_model(design.controller)
     of = asked.cost.of.bind(model.states)
+    if design.best.recipe.feedthrough:
+        return "the inputs act on outputs at once, and a certificate is of a state that a controller reads"
     if model.embedding is not None:
         return "the chosen model holds past rows, and a certificate is of a model of the present state"
     if np.ndim(reference) > 1:

@@ -24,6 +24,7 @@ from koopmpc.loop.run import Step
 from koopmpc.page import HtmlPage
 from koopmpc.parallel import StageProgress
 from koopmpc.plants.step_map import StepMap
+from koopmpc.synthesis.candidates import get_model
 from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign, read_controller, rebuild_controller
 from koopmpc.synthesis.fresh.loops import goal_box
 from koopmpc.synthesis.judging import read_reference, run_on_surrogate
@@ -288,7 +289,7 @@ def check_controller(
     compared = None
     if new is not None:
         kept_kinds = [one.kind.name for one in figures if not _reasons(evidence, [one], cold, hot, controller.dt)[0]]
-        compared = compare_logs(evidence.logs, new, kept_kinds)
+        compared = compare_logs(evidence.logs, get_model(controller).align(new), kept_kinds)
         reasons += [compared.sentence] if compared.holds is False else []
         doubts += [compared.sentence] if compared.holds is None else []
     controller.reset()

@@ -109,6 +109,7 @@ def design_data(
     folder: str | PathLike[str],
     *,
     bilinear: bool = True,
+    feedthrough: bool = False,
     coverage: float | None = None,
     certify: bool = False,
     workers: int | None = None,
@@ -138,7 +139,7 @@ def design_data(
     coverage, certify
         Replace those of the goal: a promised share of loops that keep their limits, and a certificate of stability,
         whose page is certificate.md. A refused certificate is a sentence of the report.
-    bilinear, workers, scheduler, memory, say, progress, rng
+    bilinear, feedthrough, workers, scheduler, memory, say, progress, rng
         As for `fit_data`.
     set_points
         Columns with the set points of the loop that made the logs: instruments of `design`.
@@ -192,6 +193,7 @@ def design_data(
                 reference=asked.reference,
                 angles=asked.angles,
                 bilinear=bilinear,
+                feedthrough=feedthrough,
                 instruments=instruments,
                 coverage=asked.coverage,
                 workers=workers,
@@ -275,13 +277,14 @@ def _summarise_logs(
     assert split.excerpt is not None, "divide_files makes it"
     model, horizon = designed.controller.as_data().model, split.ahead
     assert model is not None, "every design has a model"
+    align = model.align
     forecasts, findings = list[Forecast](), list[str]()
     error = plain = np.zeros((0, model.nx))
     with collect_notes([]):  # the fits repeat the doubts of the design
         try:
             if split.learned is not None:  # a record: the controller's model knows its end
-                model = designed.best.recipe.fit(split.learned)
-            seen, held_out = (model.align(data) for data in (split.seen, split.held_out))
+                model = designed.best.recipe.fit(align(split.learned))
+            seen, held_out = (align(data) for data in (split.seen, split.held_out))
             report = trust(model, held_out, horizon, rng=rng)
             verdict, error = str(report).partition("\n")[0], report.score.rmse
             findings = [f"{finding.says}; {finding.do}" for finding in report.findings]

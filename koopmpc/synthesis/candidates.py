@@ -21,6 +21,9 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ShapeError, hide_fit_warnings
 from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.estimate.extended import ExtendedKalman
+from koopmpc.estimate.kalman import LiftedKalman
+from koopmpc.estimate.observer import Estimator
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import Towards, edmd
 from koopmpc.identify.moments.read import ReadOptions
@@ -337,6 +340,9 @@ class Recipe(Value):
         Fit the model again with weights around the states that its closed loops visit.
     rests
         The reference rests beyond its rows, also where it moved and the cost names no other end; bilinear models only.
+    feedthrough
+        Inputs act on outputs at once, and the model is one of log rows with the inputs moved up. The estimator is then
+        a Kalman filter on [z; d] that knows it: a `LiftedDisturbance` needs the state as the model has it.
     """
 
     candidate: Candidate
@@ -345,6 +351,7 @@ class Recipe(Value):
     tail: int | None = None
     weighted: bool = False
     rests: bool = False
+    feedthrough: bool = False
 
     def __str__(self) -> str:
         """Return kind, name and delays of the model, and what the controller has besides the default."""
@@ -360,6 +367,8 @@ class Recipe(Value):
             parts.append("the reference rests at its end")
         if estimator is not None:
             parts.append("offset-free" + ("" if estimator.gain is None else f" (gain {estimator.gain:g})"))
+        if self.feedthrough:
+            parts.append("offset-free by a filter")
         if self.weighted:
             parts.append("weighted")
         return ", ".join(parts)
@@ -402,4 +411,8 @@ class Recipe(Value):
         if self.rests or not self.candidate.bilinear:
             cost = replace(cost, beyond="rest")
         build: Any = (kind.brief if brief else None) or kind.controller
-        return build(model, cost, limits, horizon, estimator=self.estimator, monitor=monitor)
+        estimator: Estimator | None = self.estimator
+        if self.feedthrough:
+            known = isinstance(model, LinearPredictor)
+            estimator = LiftedKalman(model.C, feedthrough=True) if known else ExtendedKalman(feedthrough=True)
+        return build(model, cost, limits, horizon, estimator=estimator, monitor=monitor)

@@ -19,6 +19,7 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, FitWarning
 from koopmpc.estimate.disturbance import LiftedDisturbance
+from koopmpc.estimate.kalman import NOT_TOGETHER
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Present
 from koopmpc.lifting.state import State
@@ -89,8 +90,16 @@ from koopmpc.synthesis.judging import (
     measure_errors,
     rate_runs,
 )
-from koopmpc.synthesis.records import is_record
-from koopmpc.synthesis.select import RIDGES, extend_past, report_stage
+from koopmpc.synthesis.records import advance_inputs, is_late
+from koopmpc.synthesis.select import (
+    LATE_COLUMN,
+    RIDGES,
+    check_feedthrough,
+    extend_past,
+    is_record,
+    mark_lead,
+    report_stage,
+)
 from koopmpc.synthesis.surrogates import (
     choose_surrogates,
     is_unstable,
@@ -108,6 +117,10 @@ FEW = 60  # fresh loops of one in Python
 ALONG = "first rows of {count} records are few: fresh loops start at rows all along them, with the past they had there"
 RARELY = 0.01  # share of the fresh loops above which violated limits are advice
 WORRY = 0.05  # a bound of lost loops above this is advice
+MOVED = (
+    "the inputs act on outputs at once, and were moved up by one row: the controller's filter takes a reading as "
+    "h(x, u) of the input before; model.align(logs) moves them in other logs"
+)
 _KEPT = 6000  # steps of the data that a saved design keeps, to compare new logs with
 
 
@@ -123,6 +136,7 @@ def design(
     candidates: Sequence[Candidate | Lifting] | None = None,
     delays: Sequence[int] | None = None,
     bilinear: bool = True,
+    feedthrough: bool = False,
     tighten: bool = True,
     smooth: bool = True,
     instruments: Sequence[ArrayLike] | None = None,
@@ -163,6 +177,8 @@ def design(
        and on the surrogates. They give the interval and the bounds of `expected`, and say where it is outside the data.
        Of three records or fewer they start at rows all along them, with the past of these rows.
 
+    Of long records whose input column is one row late the inputs are moved up, as in `select`.
+
     The choice depends only on the data and `rng`, never on time or on the number of workers.
 
     Parameters
@@ -190,6 +206,12 @@ def design(
         see `select`. Of records that show one, models with a hidden state are tried too.
     bilinear
         Try bilinear models too; the surrogates are then bilinear.
+    feedthrough
+        The plant has y = h(x, u), see `select`, and a log's row k holds h(x_k, u_k), while a controller reads
+        h(x_k, u_{k−1}) before it chooses u_k. Every controller then has a filter that knows it, and estimates a
+        disturbance for each output: `LiftedKalman` or `ExtendedKalman` with ``feedthrough=True``. A `LiftedDisturbance`
+        needs the model's own state, which no reading holds. Plans weigh and limit h(x_k, u_k) first, against row k + 1
+        of a moving reference.
     tighten
         Tighten the limits of every controller (`Limits.tightened`) by its model's errors on the fold that it does not
         know, by at most half of the distance from the reference to the limit.
@@ -220,7 +242,7 @@ def design(
     ------
     DataError
         There are too few long episodes for three folds, no inputs, or NaN; or the data are a stream that can be read
-        only once.
+        only once; feedthrough with measured disturbances.
     ShapeError
         Reference, starts, weights or limits have other sizes than the data.
     DefinitenessError
@@ -236,18 +258,26 @@ def design(
     wished = None if coverage is None else check_coverage(coverage, few)
     ahead = 1 if horizon is None else checks.count(horizon, "horizon")
     used, projected = "", np.zeros(0)
-    if instruments is not None or (smooth and isinstance(data, Episodes)):
+    if instruments is not None or (smooth and not feedthrough and isinstance(data, Episodes)):
         loop = remove_feedback(require_episodes(data), instruments)
         data, projected, used = loop.episodes, loop.noise, loop.sentence
         smooth = smooth and not projected.any()
     source = source_of(data)
     if source.nu == 0:
         raise DataError("the data have no inputs, so there is nothing to control; give each Episode its U")
+    check_feedthrough(feedthrough, source)
+    if feedthrough and source.nw:
+        raise DataError(NOT_TOGETHER)
     held, sampled = take_sample(source, checks.count(sample, "sample"))
     notes = (*sampled, used) if used else sampled
     if smooth:
         source, held, replaced = replace_glitches(source, held)
         notes = (*notes, *replaced)
+    lead, moved = int(feedthrough or (candidates is None and is_record(held) and is_late(held))), MOVED
+    if lead:
+        moved = moved if feedthrough else LATE_COLUMN
+        source, held = advance_inputs(source, held)
+        notes = (*notes, moved)
     if horizon is None:
         check_task(held, cost, limits, ahead, reference, starts, angles)
         ahead, sentence = choose_horizon(held, cost, limits, reference)
@@ -304,13 +334,14 @@ def design(
             cross_validate, trials, report_stage(progress, "models"), size=lambda trial: trial.candidate.size
         )
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
-        pair = choose_surrogates(results, floor, hidden=hidden)
+        pair = [replace(one, feedthrough=bool(feedthrough)) for one in choose_surrogates(results, floor, hidden=hidden)]
         test, doubts, holds = prepare_test(folds, asked, pair, tighten and wished is None, noise, pool, raw)
         doubts = [*left.values(), *doubts]
         for sentence in doubts:
             warnings.warn(sentence, FitWarning, stacklevel=2)
         unstable = is_unstable(test.surrogates, asked)
-        rows, outcomes = _judge_rounds(test, _list_first_round(results, floor), unstable, pool, progress)
+        screened = [replace(one, feedthrough=bool(feedthrough)) for one in _list_first_round(results, floor)]
+        rows, outcomes = _judge_rounds(test, screened, unstable, pool, progress)
     best, linear = choose_row(rows, unstable=unstable), choose_row(rows, "linear", unstable=unstable)
     assert best is not None, "the last round is never empty"
 
@@ -320,7 +351,7 @@ def design(
             near = Nearness.of(outcome.visited, test.episodes)
         for data, as_measured in zip(sets, (unsmoothed, source_of(raw)), strict=False):
             learned = as_measured if recipe.candidate.has_hidden_state else data
-            model = recipe.fit(learned, near, workers=workers, scheduler=scheduler)
+            model = mark_lead(recipe.fit(learned, near, workers=workers, scheduler=scheduler), lead, moved)
             controller = recipe.controller(model, asked.cost, test.limits(outcome.band), ahead)
             if is_confirmed(test, controller, outcome):
                 if data is not source:
@@ -349,10 +380,12 @@ def design(
     standby: Any = None
     if plain is not None and outcomes[plain].models:
         recipe = replace(rows[plain].recipe, estimator=None)
-        model = recipe.fit(source, workers=workers, scheduler=scheduler)
+        model = mark_lead(recipe.fit(source, workers=workers, scheduler=scheduler), lead, moved)
         standby = recipe.controller(model, asked.cost, test.limits(outcomes[plain].band), ahead)
     embedding = test.surrogates[0].model.embedding
-    neighbours = NeighbourMap.of(test.episodes, embedding, test.surrogates[0].noise, test.ignored, test.turning)
+    alone = test.ignored, test.turning
+    noises = test.surrogates[0].noise
+    neighbours = NeighbourMap.of(test.episodes, embedding, noises, *alone, feedthrough=bool(feedthrough))
     drawn_from = LoopPool(asked, test.surrogates, neighbours, test.low, test.high)
     compared = 0
     if few and (others := list_finalists(rows, best)):
@@ -538,7 +571,9 @@ def _judge_rounds(
     if small is not None and small not in linear:  # else no later round can choose the simplest of equals
         linear.append(small)
     bilinear = [one for one in ranked if one.candidate.bilinear][:_BILINEAR]
-    estimators = (None, *(LiftedDisturbance(gain=gain) for gain in _GAINS))
+    estimators: tuple[LiftedDisturbance | None, ...] = (None, *(LiftedDisturbance(gain=gain) for gain in _GAINS))
+    if screened[0].feedthrough:  # each has the filter of a Recipe
+        estimators = (None,)
     cost = test.asked.cost
     ends: list[dict[str, Any]] = [{}, {"tail": 0}, {"tail": test.asked.horizon}]
     if test.asked.moves and cost.moves_on:
@@ -556,7 +591,7 @@ def _judge_rounds(
     outcomes = pool.map(run, jobs, report_stage(progress, "closed loops of the best"), size=Job.size)
     if bilinear:
         tried_ones = average_ratios(rate_runs(outcomes[: len(estimators)]), test.weights)
-        best = estimators[choose_estimator(tried_ones.tolist(), unstable=unstable)]
+        best = estimators[choose_estimator(tried_ones.tolist(), unstable=unstable)] if len(estimators) > 1 else None
         tried_ends = average_ratios(
             rate_runs([outcomes[0], *outcomes[len(estimators) : len(estimators) + len(ends) - 1]]), test.weights
         )

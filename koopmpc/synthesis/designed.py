@@ -199,7 +199,8 @@ class Evidence(Value):
     neighbours
         Stand-in by the nearest rows of the data; None in a design without fresh loops.
     logs
-        Some of the data, as measured, with which new logs are compared; None in files of earlier designs.
+        Some of the data, not smoothed, with which new logs are compared; their inputs stand where the model has them.
+        None in files of earlier designs.
     promise
         The promised share of loops that keep their limits; None if no `coverage` was asked for.
     """

@@ -208,7 +208,9 @@ class Fenced(SimulatedPlant):
             before = now if self._before is None else self._before
             u, self._before = self._acting.change(now, before, np.zeros(1, dtype=np.int64))[0], now
         y = super().step(u, disturbance)
-        if not ((y >= self._low) & (y <= self._high)).all():
+        state = self.state
+        x = y if state is None else state[: len(self._low)]  # with feedthrough y differs from the state
+        if not ((x >= self._low) & (x <= self._high)).all():
             raise LostError
         return y
 
@@ -355,14 +357,15 @@ def run_on_surrogate(
     """Return a closed loop on the plant of a surrogate, with the states without their past; None if it is lost.
 
     The run is lost if a state leaves the box. It is judged by the cost and the limits of the task. `reference` is as
-    `simulate` takes it, `noise` a factor on the noise of the surrogate, and `acting` says how the inputs act.
+    `simulate` takes it, `noise` a factor on the noise of the surrogate, and `acting` says how the inputs act. With
+    feedthrough its state k + 1 is h(x_k, u_k), the row k of a log.
     """
-    states = surrogate.states
+    states, start = surrogate.states, surrogate.start(x0)
     try:
         run = simulate(
             Fenced(plant, *box, acting),
             controller,
-            x0=surrogate.start(x0),
+            x0=np.concatenate([start, surrogate.middle]) if surrogate.feedthrough else start,
             reference=reference,
             steps=len(u_reference),
             noise=noise * surrogate.noise,

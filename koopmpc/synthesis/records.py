@@ -27,9 +27,6 @@ from koopmpc.synthesis.leaderboard import LeaderboardRow, Selection, choose_mode
 from koopmpc.validate.scoring import AnyPredictor, forecast_errors
 from koopmpc.values import Value
 
-FEW = 10  # records are fewer episodes than this, which select would cut into blocks
-LONG = 150  # steps: half of the data are in episodes at least as long, so that a free run says something
-OUTPUTS = 4  # states of a record at most: with more the search for terms takes too long
 MARGIN = 0.8  # the input column is moved up if that lowers the error on unseen rows to this share
 FEEDBACK = 0.95  # inputs are fed back if outputs lower the error of their prediction below this share
 _STATIC = 0.1  # inputs are fed back if outputs of the same row leave less than this share of their moves open
@@ -46,13 +43,6 @@ _HALVES = 2  # errors of a quarter
 _ROWS_AT_ONCE = 500  # longer forecasts run in the compiled map, which takes as long to build as these rows take without
 _BEHIND = 1.1  # a model that errs by this many times a rival's error on the first quarters is not fitted to others
 _LONGEST = 4000  # rows of a free run that judges finalists, at most; the search for terms cuts shorter pieces
-
-
-def is_record(episodes: Episodes) -> bool:
-    """Return whether these are a few long records of few signals, on which models run freely."""
-    lengths = np.sort([len(episode) for episode in episodes])[::-1]
-    half = int(lengths[np.argmax(np.cumsum(lengths) >= lengths.sum() / 2)])
-    return len(lengths) < FEW and half >= LONG and episodes.nx <= OUTPUTS and episodes.nw == 0
 
 
 def is_fed_back(episodes: Episodes) -> bool:

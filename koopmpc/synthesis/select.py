@@ -52,7 +52,6 @@ from koopmpc.synthesis.leaderboard import Selection, choose_model, make_row
 from koopmpc.synthesis.records import (
     advance_inputs,
     is_late,
-    is_record,
     judge_finalists,
     propose_structures,
     refine_structure,
@@ -61,13 +60,16 @@ from koopmpc.synthesis.records import (
 from koopmpc.validate.memory import find_hidden_state
 from koopmpc.validate.scoring import AnyPredictor, score
 
+FEW = 10  # records are fewer episodes than this, which select would cut into blocks
+LONG = 150  # steps: half of the data are in episodes at least as long, so that a free run says something
+OUTPUTS = 4  # states of a record at most: with more the search for terms takes too long
 ENOUGH = 1e-2  # error of a forecast, as a share of the states' spread, below which a controller gains nothing
 _NEAR = 10  # steps of the forecasts that say whether more of the past is worth a trial
 _GAINS = 0.9  # it is, where two past steps lower the error of one to this share
 _LONGER = (4,)  # then these are tried too
 _EPISODES = 8  # of which a quarter is forecast
 RIDGES = tuple(10.0**power for power in range(-9, -2))
-LATE = (
+LATE_COLUMN = (
     "the inputs were moved up by one row: the log's row k holds the outputs after its inputs have acted; "
     "model.align(logs) does the same to other logs"
 )
@@ -77,6 +79,28 @@ FEEDTHROUGH = (
 )
 
 ROUGH = "the chosen model is fitted to the rows as they were measured: smoothed ones forecast unseen rows no better"
+
+
+def is_record(episodes: Episodes) -> bool:
+    """Return whether these are a few long records of few signals, on which models run freely."""
+    lengths = np.sort([len(episode) for episode in episodes])[::-1]
+    half = int(lengths[np.argmax(np.cumsum(lengths) >= lengths.sum() / 2)])
+    return len(lengths) < FEW and half >= LONG and episodes.nx <= OUTPUTS and episodes.nw == 0
+
+
+def check_feedthrough(feedthrough: bool, source: Source) -> None:
+    """Raise a DataError where the data cannot be those of a plant whose inputs act on its outputs at once."""
+    checks.kind(feedthrough, "feedthrough", (bool, np.bool_), "pass True or False")
+    if feedthrough and not source.nu:
+        raise DataError("feedthrough says how inputs act, and the data have none; give each Episode its U")
+
+
+def mark_lead(model: AnyPredictor, lead: int, sentence: str) -> AnyPredictor:
+    """Return the model with `lead` as the `input_lead` of its report, and a sentence on it; itself if that is 0."""
+    report = model.report
+    if not lead or report is None:
+        return model
+    return replace_report(model, replace(report, input_lead=lead, changes=(*report.changes, sentence)))
 
 
 def extend_past(past: Sequence[int], learned: Episodes, measured: Episodes) -> list[int]:
@@ -228,9 +252,7 @@ def select(
         episodes, used = loop.episodes, loop.sentence
         smooth = smooth and not loop.noise.any()
     source = source_of(episodes)
-    checks.kind(feedthrough, "feedthrough", (bool, np.bool_), "pass True or False")
-    if feedthrough and not source.nu:
-        raise DataError("feedthrough says how inputs act, and the data have none; give each Episode its U")
+    check_feedthrough(feedthrough, source)
     weights = RIDGES if ridges is None else check_ridges(ridges)
     folds = checks.count(folds, "folds", 2)
     past = check_delays((0, 1, 2) if delays is None else delays)
@@ -255,7 +277,7 @@ def select(
     if smooth:
         source, held, replaced = replace_glitches(source, held)
         notes = (*notes, *replaced)
-    lead, moved = int(feedthrough or (record and is_late(held))), FEEDTHROUGH if feedthrough else LATE
+    lead, moved = int(feedthrough or (record and is_late(held))), FEEDTHROUGH if feedthrough else LATE_COLUMN
     if lead:
         source, held = advance_inputs(source, held)
         notes = (*notes, moved)
@@ -330,10 +352,7 @@ def select(
         model = fit_candidate(row.candidate, source if smoothed else measured[0], row.ridge, read)
         if isinstance(row.structure, Structure):
             model, refined[place] = refine_structure(row.structure, model, measured[1], first, nearer)
-        if lead and model.report is not None:
-            report = replace(model.report, input_lead=lead, changes=(*model.report.changes, moved))
-            model = replace_report(model, report)
-        return model
+        return mark_lead(model, lead, moved)
 
     models = {place: refit(place) for place in dict.fromkeys([*found.values(), chosen])}
     best_linear, best_bilinear = models[linear], models[found.get("bilinear", chosen)]

@@ -48,6 +48,9 @@ class Surrogate(Value):
         a smoother took out of the data.
     spread
         (nu,) standard deviation of the inputs; (0,) in files of earlier designs, whose u_0 is the mean.
+    feedthrough
+        The model is one of log rows h(x_k, u_k), and a controller reads h(x_k, u_{k−1}): the model's next output under
+        the input of the step before.
     """
 
     model: AnyPredictor
@@ -55,6 +58,7 @@ class Surrogate(Value):
     w: Float[np.ndarray, " nw"]
     noise: Float[np.ndarray, " nx"]
     spread: Float[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0))
+    feedthrough: bool = False
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -67,17 +71,26 @@ class Surrogate(Value):
         return self.model.inputs
 
     @raise_swallowed()
-    def plant(self, gain: float = 1.0) -> StepMap:
-        """Return the plant whose inputs act `gain` times as much as in the data; y is the state without its past."""
+    def plant(self, gain: float = 1.0, *, reads: bool = True) -> StepMap:
+        """Return the plant whose inputs act `gain` times as much as in the data; y is the state without its past.
+
+        With feedthrough its state ends with the input of the step before, see `StepMap`, and y is what a controller
+        reads; if not `reads`, they are as without.
+        """
         model, given = self.model, self._map(gain)
         x, u = ca.SX.sym("x", given.nx), ca.SX.sym("u", model.nu)
         x_next = given.F(x, u, ca.DM(given.theta)) + ca.DM(given.E @ self.w)
         F = ca.Function("F", [x, u], [ca.densify(x_next)], ["x", "u"], ["x_next"], {"cse": True})
         h = ca.Function("h", [x], [x[: model.nx]])
-        return StepMap(F, model.dt, h, model.point_names, model.inputs, model.states)
+        if self.feedthrough and reads:
+            h = ca.Function("h", [x, u], [ca.densify(x_next)[: model.nx]], {"cse": True})
+        names = model.point_names
+        if h.n_in() > 1:  # the StepMap has u[k-1] of its own
+            names = (*model.states, *(f"{name} of the row before" for name in names[model.nx :]))
+        return StepMap(F, model.dt, h, names, model.inputs, model.states)
 
     def start(self, x0: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
-        """Return the state of the plant, its past included, after a rest at x0; x0 itself if it includes its past."""
+        """Return the point of the model, its past included, after a rest at x0; x0 itself if it includes its past."""
         embedding = self.model.embedding
         same = embedding is None or len(x0) == len(self.model.point_names)
         return x0 if same or embedding is None else embedding.repeat(x0, self.middle)
@@ -174,7 +187,7 @@ def fit_surrogate(
     driven, spread = rows.mean(axis=0), rows[:, : fitted.nu].std(axis=0)
     error = score(model, held_out, 1, relift=True).rmse[0]
     noise = np.hypot(np.where(np.isfinite(error), error, 0.0) / np.sqrt(2), smoothed)
-    return Surrogate(model, driven[: fitted.nu], driven[fitted.nu :], noise, spread)
+    return Surrogate(model, driven[: fitted.nu], driven[fitted.nu :], noise, spread, recipe.feedthrough)
 
 
 def find_ignored_states(one: Surrogate, X: Float[np.ndarray, "M nx"]) -> list[int]:
@@ -184,7 +197,7 @@ def find_ignored_states(one: Surrogate, X: Float[np.ndarray, "M nx"]) -> list[in
     learned models of six plants, positions on which nothing depends changed them by 1 to 22 %, all other states by 83 %
     and more.
     """
-    plant = one.plant()
+    plant = one.plant(reads=False)
     if plant.nx != X.shape[1]:
         return []
     points = X[:: -(-len(X) // _SAMPLE)]
@@ -213,7 +226,7 @@ def is_unstable(surrogates: Sequence[Surrogate], asked: DesignTask) -> bool:
     places = (0, len(asked.reference) // 2, -1) if asked.moves else (0,)
     found: list[bool] = []
     for one in surrogates:
-        plant, find = one.plant(), one.holding(asked.cost, asked.limits)
+        plant, find = one.plant(reads=False), one.holding(asked.cost, asked.limits)
         for place in places:
             at = find(asked.reference[place])
             A = plant.linearize(at.x, at.u).A

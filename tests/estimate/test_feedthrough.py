@@ -186,16 +186,29 @@ def test_a_bilinear_plant_with_feedthrough_is_driven_as_by_its_optimum():
     assert max(gaps) < 1e-6
 
 
+def test_a_filter_begins_where_the_first_reading_says_that_the_plant_rests():
+    """A plant that rests under u = 0.7 is driven as by the optimum from the first step on."""
+    mpc, u = controller("linear", 1), np.array([0.7])
+    x = np.linalg.solve(np.eye(2) - A, B @ u)
+    mpc.reset(u_prev=u)
+    for _ in range(10):
+        best = best_input(x, 1)
+        u = mpc(C @ x + D @ u, [GOAL]).u
+        assert abs(u[0] - best) < 1e-6
+        x = A @ x + B @ u
+
+
 @needs_compiler
-def test_machine_code_reads_as_python_does(tmp_path):
+@pytest.mark.parametrize("start", [[0.2], None])
+def test_machine_code_reads_as_python_does(start):
     mpc = controller("linear", 1)
     fast = km.compiled(controller("linear", 1))
     rng = np.random.default_rng(3)
     for one in (mpc, fast):
-        one.reset(x0=[0.2], u_prev=[0.5])
+        one.reset(x0=start, u_prev=[0.5])
     x, u = np.array([0.3, 0.1]), np.array([0.5])
     for k in range(40):
-        y = C @ x + D @ u + 1e-3 * rng.standard_normal(1) if k % 7 else np.array([np.nan])
+        y = C @ x + D @ u + 1e-3 * rng.standard_normal(1) if k % 7 or not k else np.array([np.nan])
         u = mpc(y, [GOAL]).u
         assert np.abs(fast(y, [GOAL]).u - u).max() < 1e-9
         x = A @ x + B @ u

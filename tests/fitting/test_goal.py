@@ -42,14 +42,15 @@ def test_inputs_that_only_the_goal_file_names_are_inputs(tmp_path, monkeypatch):
     Path("goal.toml").write_text("\n".join(line for line in lines if not line.startswith("inputs =")))
     told = []
 
-    def stop(data, *_, **__):
-        told.append((data.states, data.inputs))
+    def stop(data, *_, **how):
+        told.append((data.states, data.inputs, how["feedthrough"]))
         raise km.KoopmpcError("read")
 
     monkeypatch.setattr("koopmpc.fitting.goal.design", stop)
     with pytest.raises(km.KoopmpcError, match="read"):
         design_data(".", "goal.toml", "out", bilinear=False)
-    assert told == [(NAMES[0], ("push [V]",))]
+    assert CliRunner().invoke(app, ["fit", ".", "--goal", "goal.toml", "--feedthrough"]).exit_code
+    assert told == [(NAMES[0], ("push [V]",), flag) for flag in (False, True)]
 
 
 def tank_logs(folder, files=4, rows=300, glitch=None):

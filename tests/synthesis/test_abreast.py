@@ -28,19 +28,21 @@ def bent(x, u):
 
 
 @cache
-def make(*, bilinear=False, delays=0, moves=False):
+def make(*, bilinear=False, delays=0, moves=False, feedthrough=False):
     """Return a pool of loops and a controller of another model of the same logs."""
-    data = episodes_of(bent, count=12, steps=40)
+    data = episodes_of(bent, count=12, steps=40).with_inputs_advanced(int(feedthrough))
     embedding = km.Delay(delays) if delays else None
     candidate = Candidate("x, 1", LIFTING, embedding, bilinear).bind(data.states, data.inputs)
-    recipe = Recipe(candidate, 1e-6, estimator=km.LiftedDisturbance())
+    rule = None if feedthrough else km.LiftedDisturbance()
+    recipe = Recipe(candidate, 1e-6, estimator=rule, feedthrough=feedthrough)
     rows = np.column_stack([0.3 * np.sin(np.arange(150) / 5), np.zeros(150)]) if moves else [0.3, 0.0]
     task = check_task(data, km.Cost(Q=[1, 0.1], R=0.1), LIMITS, 8, rows, None, ())
     noise = np.array([0.01, 0.02])
     halves = [data.with_episodes(list(data)[i::2]) for i in (0, 1)]
     models = tuple(fit_surrogate(recipe, one, other, noise) for one, other in (halves, halves[::-1]))
     low, high = task.hull((), ())
-    pool = LoopPool(task, models, NeighbourMap.of(data, models[0].model.embedding, noise), low, high)
+    near = NeighbourMap.of(data, models[0].model.embedding, noise, feedthrough=feedthrough)
+    pool = LoopPool(task, models, near, low, high)
     return pool, recipe.controller(recipe.fit(data), task.cost, LIMITS, 8)
 
 
@@ -75,6 +77,7 @@ CASES = [
     {},
     pytest.param({"bilinear": True, "delays": 1, "moves": True}, marks=pytest.mark.slow),
     pytest.param({"delays": 2}, marks=pytest.mark.slow),
+    pytest.param({"delays": 1, "feedthrough": True}, marks=pytest.mark.slow),
 ]
 
 

@@ -19,10 +19,10 @@ from koopmpc.synthesis.records import (
     forecast_rows,
     is_fed_back,
     is_late,
-    is_record,
     judge_finalists,
     judge_free_run,
 )
+from koopmpc.synthesis.select import is_record
 from tests.identify.test_hidden_state import saturating_record
 from tests.identify.test_neural import friction_record
 from tests.validate.logs.test_timing import record

@@ -159,6 +159,20 @@ static void forget_estimate(koopmpc_state *s) {
   for (int i = 0; i < KOOPMPC_KEPT; i++) s->s[i] = s->z[koopmpc_kept[i]];
 }
 
+/** s <- that of a plant that has rested at y under u, if all of y has come; else that of the start. */
+static void rest_at(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
+#if KOOPMPC_RESTS
+  if (koopmpc_usable(y, KOOPMPC_NY)) {
+    s->seen = 0;
+    koopmpc_observe(s->zeta, &s->seen, s->z, y, u);
+  }
+#else
+  (void)y;
+  (void)u;
+#endif
+  forget_estimate(s);
+}
+
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
   koopmpc_real *now = s->scratch + KOOPMPC_NS, largest = 0, expected[KOOPMPC_NY];
   int any = 0, opened;
@@ -169,6 +183,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
     s->queued++;
   } else {
     koopmpc_copy(s->s + KOOPMPC_NS - KOOPMPC_HELD, u, KOOPMPC_HELD);
+    if (KOOPMPC_RESTS && !s->seen) rest_at(s, y, u);
   }
   if (s->queued > KOOPMPC_DELAY_Y) {
     predict(s, s->s, s->queue);
@@ -180,7 +195,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
     for (int i = 0; i < KOOPMPC_NY; i++)
       expected[i] = koopmpc_filter_h[i] + koopmpc_dot(koopmpc_filter_M + i * KOOPMPC_NS, s->s, KOOPMPC_NS);
     s->refused = koopmpc_refuse(s->gate, y, expected, &opened);
-    if (opened == 2) forget_estimate(s);
+    if (opened == 2) rest_at(s, y, u);
     if (any && !s->refused) correct(s, y);
   }
   s->missed = any ? 0 : s->missed + 1;
@@ -315,6 +330,7 @@ void koopmpc_start(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real 
       const int place = (i - KOOPMPC_NX) % PAST - KOOPMPC_NU * KOOPMPC_DELAYED_INPUTS;
       s->zeta[i] = place < 0 ? 0 : start[place];
     }
+    s->seen = x0 != 0;
     forget_estimate(s);
   }
 #else

@@ -95,23 +95,29 @@ def run_abreast(
     stand_in, N, nx = crowd.stand_in, controller.horizon, len(crowd.stand_in.states)
     E, T1 = len(reference), u_reference.shape[1] + 1
     Z = np.array([stand_in.start(x0) for x0 in crowd.starts])
-    noise = crowd.draw_noise(T1 - 1)
+    noise, V = crowd.draw_noise(T1 - 1), np.tile(stand_in.middle, (E, 1))
     W = np.tile(stand_in.w, (N + 1, 1)) if len(stand_in.w) else None
-    fleet = controller.start_abreast(reference, Z if Z.shape[1] == nx else None, W)
+    known = Z.shape[1] == nx and not stand_in.feedthrough
+    fleet = controller.start_abreast(reference, Z if known else None, W)
     X, U = np.full((E, T1, nx), np.nan), np.zeros((E, T1 - 1, controller.nu))
     reports = np.zeros((E, T1 - 1, 2), dtype=np.int64)
     X[:, 0] = Z[:, :nx]
-    Y, alive = X + noise, np.ones(E, dtype=bool)
+    Y, alive = np.full(X.shape, np.nan), np.ones(E, dtype=bool)
     for k in range(T1 - 1):
         which = np.flatnonzero(alive)
         if not which.size:
             break
+        read = step(Z[which], V[which], which) if stand_in.feedthrough else Z[which]
+        Y[which, k] = read[:, :nx] + noise[which, k]
         U[which, k] = fleet.step(k, Y[:, k], which)[which]
         reports[which, k] = fleet.reports[which]
-        Z[which] = step(Z[which], crowd.acting.change(U[which, k], U[which, max(k - 1, 0)], which), which)
+        V[which] = crowd.acting.change(U[which, k], U[which, max(k - 1, 0)], which)
+        Z[which] = step(Z[which], V[which], which)
         X[which, k + 1] = Z[which, :nx]
-        Y[which, k + 1] = X[which, k + 1] + noise[which, k + 1]
         alive[which] = ((X[which, k + 1] >= box[0]) & (X[which, k + 1] <= box[1])).all(axis=1)
+    which = np.flatnonzero(alive)
+    last = step(Z[which], V[which], which) if stand_in.feedthrough and which.size else Z[which]
+    Y[which, -1] = last[:, :nx] + noise[which, -1]
     nothing = np.zeros(T1 - 1)
     return [
         Run(

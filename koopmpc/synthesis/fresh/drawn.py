@@ -81,7 +81,7 @@ class LoopPool:
     neighbours: NeighbourMap | None
     low: Float[np.ndarray, " nx"]
     high: Float[np.ndarray, " nx"]
-    _plants: dict[int, StepMap] = field(default_factory=dict[int, StepMap])
+    _plants: dict[tuple[int, bool], StepMap] = field(default_factory=dict[tuple[int, bool], StepMap])
     _inputs: dict[int, Float[np.ndarray, "T nu"]] = field(default_factory=dict[int, Any])
 
     def draw(self, count: int, rng: np.random.Generator) -> list[DrawnLoop]:
@@ -173,12 +173,13 @@ class LoopPool:
         rows = read_reference(asked, loop.first, asked.steps + 1 + ahead)
         return rows, held[np.minimum(at - given * loop.first, len(held) - 1)]
 
-    def _find_model(self, place: int) -> StepMap:
+    def _find_model(self, place: int, *, reads: bool = True) -> StepMap:
         """Return a learned model as a plant; each is built once."""
-        if place not in self._plants:
-            self._plants[place] = self.surrogates[place].plant()
-        return self._plants[place]
+        key = place, reads and self.surrogates[place].feedthrough
+        if key not in self._plants:
+            self._plants[key] = self.surrogates[place].plant(reads=reads)
+        return self._plants[key]
 
     def _step_model(self, place: int) -> CrowdStep:
-        plant = self._find_model(max(place, 0))
+        plant = self._find_model(max(place, 0), reads=False)
         return lambda Z, U, which: plant.rollouts(Z, U[:, None])[:, 1]

@@ -68,6 +68,8 @@ class NeighbourMap(Value):
         Sampling time [s].
     local, ridge
         Neighbours for each coefficient of the local slope, and its ridge.
+    feedthrough
+        As of a `Surrogate`.
     """
 
     rows: Float[np.ndarray, "M n"]
@@ -86,6 +88,7 @@ class NeighbourMap(Value):
     dt: float
     local: int = SLOPES[0][0]
     ridge: float = SLOPES[0][1]
+    feedthrough: bool = False
 
     @classmethod
     def of(
@@ -95,6 +98,8 @@ class NeighbourMap(Value):
         noise: Float[np.ndarray, " nx"],
         ignored: Sequence[int] = (),
         turning: Sequence[int] = (),
+        *,
+        feedthrough: bool = False,
     ) -> "NeighbourMap":
         """Return the map of these data; of more than 6,000 rows every second, third … is kept."""
         points = data if embedding is None else embedding(data)
@@ -122,6 +127,7 @@ class NeighbourMap(Value):
             states=data.states,
             inputs=data.inputs,
             dt=data.dt,
+            feedthrough=feedthrough,
         )
         local, ridge = _choose_slope(found, points)
         return replace(found, local=local, ridge=ridge)
@@ -292,7 +298,7 @@ class NeighbourPlants:
 
 
 class NeighbourPlant:
-    """The first of `NeighbourPlants`, a Transition."""
+    """The first of `NeighbourPlants`, a Transition; with feedthrough its state ends with the last input."""
 
     scene: Scene | None = None
 
@@ -300,15 +306,23 @@ class NeighbourPlant:
         self._plants, self._first = plants, np.zeros(1, dtype=np.int64)
         self.nx, self.dt, self.inputs, self.outputs = map_.steps.shape[1], map_.dt, map_.inputs, map_.states
         self.states = map_.states if map_.embedding is None else map_.embedding.names
+        self._held = len(self.inputs) * map_.feedthrough
+        if self._held:
+            self.nx, self.states = self.nx + self._held, (*self.states, *(f"{name} before" for name in self.inputs))
 
     def measure(self, x: ArrayLike) -> Float[np.ndarray, " ny"]:
-        """Return the state without its past."""
-        return np.array(x, dtype=np.float64)[: len(self.outputs)]
+        """Return the state without its past; with feedthrough that of the next step under the input held."""
+        point = np.array(x, dtype=np.float64)
+        return (self._step(point, point[-self._held :]) if self._held else point)[: len(self.outputs)]
 
     def __call__(self, x: ArrayLike, u: ArrayLike) -> Float[np.ndarray, " nzeta"]:
         """x⁺ = F(x, u)."""
-        zeta, driven = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
-        return self._plants.step(zeta[None], driven[None], self._first)[0]
+        driven = np.asarray(u, dtype=np.float64)
+        after = self._step(np.asarray(x, dtype=np.float64), driven)
+        return np.concatenate([after, driven]) if self._held else after
+
+    def _step(self, x: Float[np.ndarray, " n"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nzeta"]:
+        return self._plants.step(x[None, : len(x) - self._held], u[None], self._first)[0]
 
 
 def goal_box(asked: DesignTask) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
