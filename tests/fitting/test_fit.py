@@ -16,6 +16,7 @@ import koopmpc as km
 import koopmpc.fitting.fit
 from koopmpc.bench.store import RESULTS
 from koopmpc.cli.app import app
+from koopmpc.figures import style
 from koopmpc.fitting.fit import fit_data
 from koopmpc.fitting.repair import describe_guesses, divide_files, find_repairs, read_logs, shorten_notes
 from tests import tiers
@@ -80,7 +81,8 @@ def fitted(tmp_path_factory):
     """Return the folder of one call without any option, what it printed, and fresh data of the same plant."""
     place = tmp_path_factory.mktemp("fit")
     write_csv(cart_pole(18, steps=60), place / "csv")
-    with contextlib.chdir(place):
+    with contextlib.chdir(place), pytest.MonkeyPatch.context() as patch:
+        patch.setitem(style._RC, "savefig.dpi", 50.0)
         result = CliRunner().invoke(app, ["fit", "csv"])
     assert result.exit_code == 0, result.stderr
     (folder,) = (place / "logs").iterdir()
