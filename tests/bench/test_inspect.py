@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.recording import rrd
 from tests.bench.tiny import write
 
 
@@ -67,20 +68,28 @@ def test_conditions_choose_logs(swept):
             km.bench.Where(bad).holds({"cost": 1.0})
 
 
+def record_pendulum(path, steps):
+    plant = km.discretize(km.load_problem("pendulum").dynamics, 0.05)
+    cost, about = km.Cost(1, 1), {"x0": [0.1, 0], "reference": [0, 0], "steps": steps}
+    run = km.simulate(plant, km.LQR(km.LinearPredictor.local(plant, [0, 0], [0]), cost), cost=cost, **about)
+    km.record(run, path)
+    return run
+
+
+def test_a_cut_log_is_repaired_as_far_as_it_is_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr(rrd, "_read_in_child", lambda whole, entities, _: rrd._read_here(whole, entities))
+    run = record_pendulum(tmp_path / "cut.rrd", 600)
+    data = (tmp_path / "cut.rrd").read_bytes()
+    (tmp_path / "cut.rrd").write_bytes(data[: int(0.4 * len(data))])
+    (cut,) = km.bench.inspected([tmp_path], repair=True)
+    assert "ends after step" in cut.cut
+    assert 0 < cut.values["steps"] < 600
+    np.testing.assert_array_equal(km.load_run(cut.repaired).X, run.X[: cut.values["steps"] + 1])
+
+
 @pytest.mark.slow
 def test_a_log_that_was_cut_is_read_and_repaired_and_one_that_is_none_is_refused(tmp_path):
-    run = km.simulate(
-        km.load_problem("pendulum") and km.discretize(km.load_problem("pendulum").dynamics, 0.05),
-        km.LQR(
-            km.LinearPredictor.local(km.discretize(km.load_problem("pendulum").dynamics, 0.05), [0, 0], [0]),
-            km.Cost(1, 1),
-        ),
-        x0=[0.1, 0],
-        reference=[0, 0],
-        steps=600,
-        cost=km.Cost(1, 1),
-    )
-    km.record(run, tmp_path / "whole.rrd")
+    run = record_pendulum(tmp_path / "whole.rrd", 600)
     data = (tmp_path / "whole.rrd").read_bytes()
     (tmp_path / "cut.rrd").write_bytes(data[: int(0.4 * len(data))])
     (tmp_path / "none.rrd").write_bytes(b"RRF2" + bytes(100))

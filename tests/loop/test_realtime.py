@@ -330,16 +330,16 @@ def test_signals_and_switches_are_as_they_were():
     assert before == (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT), sys.getswitchinterval())
 
 
-@pytest.mark.slow
-def test_the_example_of_the_page_runs(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("steps", few([20, 300], 20))
+def test_the_example_of_the_page_runs(tmp_path, monkeypatch, capsys, steps):
     (source,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "realtime.md").read_text(), re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    exec(source, names := {})
+    exec(source.replace("steps=300", f"steps={steps}"), names := {})
     assert "stopped by u = [0.]\n" in capsys.readouterr().out
     paced = names["paced"]
     assert paced.ended == "done"
-    assert paced.steps + paced.skipped == 300
-    assert 300 - paced.skipped <= km.load_run("rig.rrd").steps <= 300  # ticks that are skipped last have no row
+    assert paced.steps + paced.skipped == steps
+    assert steps - paced.skipped <= km.load_run("rig.rrd").steps <= steps  # ticks that are skipped last have no row
 
 
 def test_the_report_tells_the_median_and_the_99_percent_quantile_of_the_delays():

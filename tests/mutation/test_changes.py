@@ -243,16 +243,17 @@ def test_tests_that_were_collected_once_meet_each_change_in_a_child_of_their_own
     tests = [[f"test_it.py::{name}", -5.9] for name in re.findall(r"def (test_\w+)", TESTS)]
     with os.fdopen(answers) as lines, os.fdopen(asks, "w") as requests:
         assert json.loads(lines.readline()) == ["ready"]
-        for change, code, name in [
-            ("here", 1, "test_it"),
-            ("there", 1, "test_a_process_that_it_starts"),
-            ("endless", -signal.SIGXCPU, "test_it_ends"),
-            ("nothing", 0, ""),
-            ("nothing", 0, ""),
+        for change, codes, name in [
+            ("here", {1}, "test_it"),
+            ("there", {1}, "test_a_process_that_it_starts"),
+            ("endless", {-signal.SIGXCPU, -signal.SIGALRM}, "test_it_ends"),  # a busy machine gives it no second
+            ("nothing", {0}, ""),
+            ("nothing", {0}, ""),
         ]:
             requests.write(json.dumps([change, tests]) + "\n")
             requests.flush()
-            assert json.loads(lines.readline()) == [code, f"test_it.py::{name}" if name else ""]
+            code, met = json.loads(lines.readline())
+            assert (code in codes, met) == (True, f"test_it.py::{name}" if name else "")
     assert process.wait() == 0
 
 

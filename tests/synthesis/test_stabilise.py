@@ -82,6 +82,14 @@ def test_a_plant_that_holds_its_state_is_taken_as_well():
     assert result == found(pendulum)
 
 
+def test_its_data_are_enough_for_a_model_whose_controller_holds_the_plant():
+    plant, _, _, low, high = pendulum()
+    model = km.edmd(found(pendulum).data, km.State() + km.Constant())
+    controller = km.KoopmanMPC(model, km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=low, u_max=high), 15)
+    run = km.simulate(plant, controller, x0=[0.3, 0.0], reference=[0, 0], steps=100)
+    assert np.abs(run.X[-1]).max() < 0.02
+
+
 @pytest.mark.slow
 def test_its_data_are_enough_for_a_design_that_holds_the_plant():
     plant, _, _, low, high = pendulum()
