@@ -4,6 +4,7 @@ import io
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from rich.console import Console
 
 import koopmpc as km
@@ -133,6 +134,13 @@ def test_under_faults_each_controller_has_a_line_below_the_table_of_their_case()
     assert "under faults: cost over that without the fault" in text
     assert max(len(t) for t in text.split("\n")) <= 100
     assert "…" not in text
+
+
+@pytest.mark.parametrize(("ratio", "word"), [(99.5, "99.500"), (100.25, "1e+02")])
+def test_the_cost_under_a_fault_has_at_most_six_letters(ratio, word):
+    whole = km.bench.RunRow("plant", "case", "lqr", GOOD, reached=True)
+    under = replace(whole, metrics=replace(GOOD, cost=ratio * GOOD.cost), fault="delay")
+    assert f" {word} " in printed(km.bench.results_table([whole, under]))
 
 
 def test_who_does_not_reach_without_a_fault_is_not_lost_to_it():

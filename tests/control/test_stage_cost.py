@@ -75,6 +75,19 @@ def test_a_stage_that_is_not_convex_is_said_and_still_planned_with():
     assert km.BilinearMPC(MODEL, km.Cost(**cost), LIMITS, 6).stage_is_convex
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("stage", "x"),
+    [(lambda x, u: ca.fabs(x[1]) ** 1.5, [0.0, 0.0]), (lambda x, u: 5e307 * x[0] ** 2, [2.5, 0.5])],
+    ids=["its curvature", "its slope"],
+)
+def test_a_stage_that_is_infinite_in_one_of_its_derivatives_fails_the_step_and_holds_the_input(kind, stage, x):
+    mpc = kind(MODEL, km.Cost(Q=0, R=0.01, Q_N=END, u_target="zero", stage=stage), LIMITS, 8)
+    move = mpc(x, [0, 0])
+    assert move.status is km.Status.FAILED
+    assert move.u == pytest.approx(0.0)
+
+
 def test_metrics_and_files_know_the_stage(tmp_path):
     cost = km.Cost(Q=[1, 0.1], R=0.1, u_target="zero", stage=economic)
     mpc = km.BilinearMPC(MODEL, cost, LIMITS, 6)
