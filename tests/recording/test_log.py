@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.loop.run import About, StepRows
-from koopmpc.recording.description import _FORMAT, drawable, from_json, title_of, to_json, to_markdown
+from koopmpc.recording.description import _FORMAT, DRAWN, drawable, from_json, title_of, to_json, to_markdown
 from koopmpc.recording.reader import read_columns
 from koopmpc.recording.rrd import file_recording
 from koopmpc.recording.scenes import ReferenceScenes
@@ -209,6 +209,28 @@ def test_metadata_that_is_no_data_is_refused_before_a_file_is_made(tmp_path: Pat
     with pytest.raises(km.errors.DataError, match="a function cannot be saved as data; use numbers, names and arrays"):
         km.record(make_run(metadata={"controller": make_run}), tmp_path / "run.rrd")
     assert not (tmp_path / "run.rrd").exists()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_only_for_people_who_look_is_in_the_log_as_well(tmp_path: Path, seed: int) -> None:
+    run = make_run(T=12, nu=2, seed=seed)
+    km.record(run, tmp_path / "run.rrd")
+    log = read_columns(tmp_path / "run.rrd", tuple(f"/{entity}" for entity in DRAWN))
+    ends, deadline = log.matrix("solver/deadline_ms")
+    assert ends.tolist() == [0, 12]
+    assert deadline == pytest.approx(1e3 * run.dt)
+    ends, limits = log.matrix("control/limits")
+    assert ends.tolist() == [0, 12]
+    np.testing.assert_array_equal(limits, np.tile(run.limits.inputs(2).high, (2, 1)))  # no low limit is finite
+    pairs = list(zip(run.status, run.fallback, strict=True))
+    begun = [
+        k for k in range(12) if pairs[k][1] is not km.control.Fallback.NONE and (not k or pairs[k] != pairs[k - 1])
+    ]
+    steps, _, texts = log.rows("log", "text")
+    assert steps.tolist() == begun
+    assert [text.split(":")[0] for text in texts.to_pylist()] == [f"step {k}" for k in begun]
+    words = [run.fallback[k].name.lower().replace("_", " ") for k in begun]
+    assert [text.split("then ")[1] for text in texts.to_pylist()] == words
 
 
 def test_a_log_draws_the_plants_scene_the_controllers_eigenvalues_and_the_reference_unasked(tmp_path: Path) -> None:
