@@ -35,7 +35,6 @@ _LAGS = range(1, _PAST + 1)
 _PASSES = 6  # weighted least squares fits for least absolute deviations
 _PROBE = (2, 4)  # past rows of the models that compare both timings of the inputs
 _PROBED = 3000  # rows of each record that these models learn from, at most
-_ITERATIONS = 12  # Levenberg-Marquardt steps of a refinement
 _GAIN = 0.98  # keep a refinement if it lowers the error on unseen rows to less than this share
 _PAYS = 0.9  # take a hidden state if it lowers the error on unseen rows to less than this share
 _LOST = 1e3  # a free run counts as this many spreads at most
@@ -316,14 +315,14 @@ def refine_structure(
             before += _stretch_errors(start, truth, spans, scale, first, horizon, relift=relift)
             for h in _segments(truth, horizon) if not fold else tuple(after):
                 long = learned.with_episodes([e for e in learned if len(e) >= h + max(DELAYS)])
-                one = refine(start, long, horizon=h, held_out=long, iterations=_ITERATIONS)
+                one = refine(start, long, horizon=h, held_out=long)
                 after.setdefault(h, []).extend(_stretch_errors(one, truth, spans, scale, first, horizon, relift=relift))
         if not after:
             return model, 0
         best = min(after, key=lambda h: float(np.prod(after[h])))
         if not is_surely_better(np.array(after[best]), np.array(before)):
             return model, 0
-        refined = refine(model, truth, horizon=best, held_out=truth, iterations=_ITERATIONS)
+        refined = refine(model, truth, horizon=best, held_out=truth)
     except KoopmpcError:  # a record is too short for its segments
         return model, 0
     calm = _is_calm(refined, truth, first, relift) or not structure.calm
@@ -502,7 +501,7 @@ def fit_again(selection: Selection, episodes: Episodes) -> AnyPredictor:
         room = selection.refined + max(DELAYS)
         long = pieces.with_episodes([e for e in pieces if len(e) >= room])
         if len(long):
-            model = refine(model, long, horizon=selection.refined, held_out=long, iterations=_ITERATIONS)
+            model = refine(model, long, horizon=selection.refined, held_out=long)
     report = model.report
     if selection.predictor.input_lead and report is not None:
         model = replace_report(model, replace(report, input_lead=selection.predictor.input_lead))
