@@ -11,7 +11,7 @@ from koopmpc.identify.records.forward import Terms, evaluate_terms, list_terms
 
 _FULL = 8  # of more past rows only the smooth part tells where the state begins
 _SMOOTH = 3  # degree in time of that part
-_ROWS = 2000  # so many rows are multiplied at once, about
+_ROWS = 2000  # so many rows, and eight steps at least, are multiplied at once
 _FAR = 1e3  # a state beyond this many spreads has left the model
 
 
@@ -173,7 +173,7 @@ class SimulationError:
         moving = n + first + q * (n + 1)  # columns: z_0, E, V, then H and the gap, which do not go on
         D, spare = np.zeros((m, n, moving)), np.empty((m, n, moving))
         D[:, own, own] = 1.0
-        columns, most = moving + model.H.size + 1, max(_ROWS // (m * ny), 1)
+        columns, most = moving + model.H.size + 1, max(_ROWS // (m * ny), 8)
         table = np.zeros(min(most, steps) * m * ny * columns)
         total, starts = np.zeros((columns - n, columns - n)), np.zeros((m, n, columns))
         for low in range(0, steps, most):
