@@ -133,6 +133,21 @@ def test_plans_of_a_model_of_the_outputs_are_recorded_and_drawn_where_the_plant_
         assert not len(log.matrix("/plots/0/ahead/3")[0])
 
 
+def test_each_plan_is_drawn_whole_across_the_blocks_of_a_log(tmp_path: Path) -> None:
+    run = make_run(T=230, N=3)
+    assert run.plans is not None
+    run.plans.U[[7, 114], 1] = np.nan  # one input of a plan: its states are drawn all the same
+    assert len(blocks(block_of_run(run))) == 2
+    km.record(run, tmp_path / "run.rrd")
+    log = read_columns(tmp_path / "run.rrd", ("/plots/**",))
+    for j in (1, 2, 3):
+        drawn = [log.matrix(f"/plots/{name}/ahead/{j}") for name in (0, 1, "u")]
+        assert [at.tolist() for at, _ in drawn] == [list(range(j, 231))] * 3
+        first = slice(231 - j)
+        np.testing.assert_array_equal(np.hstack([drawn[i][1] for i in (0, 1)]), run.plans.X[first, j])
+        np.testing.assert_array_equal(drawn[2][1], run.plans.U[first, min(j, 2)])
+
+
 def test_what_is_kept_of_a_move_is_what_the_move_has(tmp_path: Path) -> None:
     """Every field of a Move but u is a column of the run that `simulate` returns, and of the log of that run."""
     told = {
