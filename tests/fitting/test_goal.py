@@ -75,6 +75,23 @@ def tank_logs(folder, files=4, rows=300, glitch=None):
         np.savetxt(folder / f"{number}.csv", lines, delimiter=",", header=head, comments="", fmt="%.4f")
 
 
+def test_the_line_that_a_template_prints_reads_logs_and_goal_as_the_template_was_told(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tank_logs(tmp_path / "csv", files=3, rows=60)
+    told, asked = "--states level,temperature --inputs inflow,heater --resample 1 --horizon 8 --linear", []
+    result = CliRunner().invoke(app, ["fit", "csv", *told.split(), "--goal-template"])
+    assert result.exit_code == 0, result.output
+
+    def stop(data, *_, **options):
+        asked.append((data.states, data.inputs, data.dt, options["horizon"], options["bilinear"]))
+        raise km.KoopmpcError("read")
+
+    monkeypatch.setattr("koopmpc.fitting.goal.design", stop)
+    line = shlex.split(result.stdout.partition("then: ")[2])
+    assert "read" in CliRunner().invoke(app, line[line.index("fit") :]).stderr
+    assert asked == [(("level [cm]", "temperature [degC]"), ("inflow [l/s]", "heater [kW]"), 1.0, 8, False)]
+
+
 @pytest.mark.slow
 def test_the_line_that_a_template_prints_designs_with_all_that_the_template_was_told(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
