@@ -278,6 +278,8 @@ class Writer:
         """Close the recording and let go of it."""
         with defer_interrupts():
             if self._rec is not None:
+                if not self._opened:
+                    self._rec.binary_stream().read()  # else Rerun prints that it drops what no sink has taken
                 self._rec.disconnect()
             self._rec = None
 
@@ -285,12 +287,12 @@ class Writer:
         """Open the sinks, once the first drawings say how large the animation is, and write what is static."""
         import rerun as rr
 
-        self._opened = True
         sinks = [] if self._viewer is None else [rr.GrpcSink(self._viewer)]
         if self._file is None:
             self._rec.set_sinks(*sinks)
         else:
             self._file.attach(self._rec, *sinks)
+        self._opened = True
         self._rec.send_recording_name(drawable(title_of(self._about)))
         self._sum(f"/{Entity.DESCRIPTION}:json", self._json.encode())
         write_page(self._rec, Entity.DESCRIPTION, self._page, rr.AnyValues(json=self._json))

@@ -59,6 +59,18 @@ def test_logs_of_a_problem_name_the_parts_of_their_layouts_alike(tmp_path: Path)
     assert len(parts) > 10, "parts of a layout share an id"
 
 
+def test_a_run_whose_scene_fails_costs_no_line_of_rerun(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A Ctrl-C while a run is drawn is one line of text, and so is an error."""
+
+    def scene(x: np.ndarray, u: np.ndarray) -> list[km.scene.Disk]:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        km.record(make_run(), tmp_path / "run.rrd", scene=scene)
+    km.record(make_run(), tmp_path / "next.rrd")  # Rerun now lets go of the recording before
+    assert (capfd.readouterr().err, list(tmp_path.iterdir())) == ("", [tmp_path / "next.rrd"])
+
+
 @pytest.mark.slow
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(some=options)
