@@ -60,6 +60,7 @@ def loops(seed: int, _: Path) -> None:
 def files(seed: int, folder: Path) -> None:
     rng, name = random.Random(seed), random.Random(seed).choice(list(READERS))
     written, read = READERS[name][0](), READERS[name][1]
+    (folder / name).unlink(missing_ok=True)  # a journal is written on, and would grow with each round
     MAKERS[name](folder / name)
     data = bytearray((folder / name).read_bytes())
     bit = rng.randrange(8 * len(data))
