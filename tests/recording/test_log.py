@@ -148,7 +148,8 @@ def test_plans_of_a_model_of_the_outputs_are_recorded_and_drawn_where_the_plant_
 def test_each_plan_is_drawn_whole_across_the_blocks_of_a_log(tmp_path: Path) -> None:
     run = make_run(T=230, N=3)
     assert run.plans is not None
-    run.plans.U[[7, 114], 1] = np.nan  # one input of a plan: its states are drawn all the same
+    run.plans.U[[7, 114], 1] = np.nan  # what is missing of one plan leaves nothing out of the others
+    run.plans.X[[9, 114], 1] = np.nan
     assert len(blocks(block_of_run(run))) == 2
     km.record(run, tmp_path / "run.rrd")
     log = read_columns(tmp_path / "run.rrd", ("/plots/**",))
