@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import koopmpc as km
 from koopmpc.loop.run import About, StepRows
 from koopmpc.recording.description import _FORMAT, DRAWN, drawable, from_json, title_of, to_json, to_markdown
-from koopmpc.recording.reader import read_columns
+from koopmpc.recording.reader import LogColumns, read_columns
 from koopmpc.recording.rrd import file_recording
 from koopmpc.recording.scenes import ReferenceScenes
 from koopmpc.recording.writer import block_of_run, blocks
@@ -143,6 +143,21 @@ def test_plans_of_a_model_of_the_outputs_are_recorded_and_drawn_where_the_plant_
         at, seen = log.matrix("/plots/1/ahead/3")
         np.testing.assert_array_equal(seen[:, 0], run.plans.X[at - 3, 3, 0])
         assert not len(log.matrix("/plots/0/ahead/3")[0])
+
+
+@pytest.mark.parametrize("lost", [1, 40])
+def test_a_log_without_the_status_of_its_first_step_is_refused(lost: int, tmp_path: Path, monkeypatch) -> None:
+    km.record(make_run(), tmp_path / "run.rrd")
+    rows = LogColumns.rows
+
+    def shortened(log: LogColumns, entity: str, component: str = "scalars") -> Any:
+        found = rows(log, entity, component)
+        return tuple(each[lost:] for each in found) if entity == "solver/status" else found
+
+    monkeypatch.setattr(LogColumns, "rows", shortened)
+    monkeypatch.setattr(LogColumns, "find_changed", lambda log: [])
+    with pytest.raises(km.errors.LogError, match="lacks the status of its first step"):
+        km.load_run(tmp_path / "run.rrd")
 
 
 def test_each_plan_is_drawn_whole_across_the_blocks_of_a_log(tmp_path: Path) -> None:
