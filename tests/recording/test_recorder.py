@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from dataclasses import replace
@@ -234,6 +235,27 @@ with km.Recorder({path!r}, **about(run)) as recorder:
     print("written", flush=True)
     time.sleep(60)
 """
+
+
+def test_a_file_that_takes_in_no_more_is_told_after_the_patience_for_files(tmp_path: Path, monkeypatch) -> None:
+    goes_on, write, run = threading.Event(), writer.Writer.write, make_run(T=3, N=None)
+
+    def wait(self: writer.Writer, rows: writer.LogBlock) -> None:
+        goes_on.wait()
+        write(self, rows)
+
+    monkeypatch.setattr(writer.Writer, "write", wait)
+    monkeypatch.setattr("koopmpc.recording.recorder._PATIENCE_FILE", 0.05)
+    monkeypatch.setattr("koopmpc.recording.recorder._PATIENCE_VIEWER", 0.01)
+    told = pytest.warns(UserWarning, match=r"run\.rrd is not complete: it took in no more for 0\.05 s")
+    with told, km.Recorder(tmp_path / "run.rrd", **about(run)) as recorder:
+        for step in steps_of(run):
+            recorder(step)
+    goes_on.set()
+    for thread in threading.enumerate():
+        if thread.name == "koopmpc-recording":
+            thread.join()
+    assert km.load_run(tmp_path / "run.rrd").steps == 3
 
 
 @pytest.mark.slow
