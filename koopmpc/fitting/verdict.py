@@ -166,8 +166,10 @@ def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> Pla
         failures += bool(over.max(initial=0.0) > KEPT)
     own = alike / max(steps, 1)
     if own < OWN:
+        direct = evidence.surrogates[0].feedthrough
+        timing = ", each row with the reading h(x, u) of the input before, which the controller had" * direct
         raise DataError(
             f"in the logged states this controller asks for {to_percent(own)} of the logged inputs: the "
-            "logs hold other runs, not those of this controller towards its reference; pass these"
+            "logs hold other runs, not those of this controller towards its reference; pass these" + timing
         )
     return PlantVerdict(len(logs), failures, own)

@@ -9,6 +9,7 @@ from scipy.optimize import lsq_linear
 
 import koopmpc as km
 from koopmpc.errors import DataError
+from koopmpc.fitting.verdict import judge_plant_runs
 from tests.bare import shown
 from tests.estimate.test_feedthrough import PLAIN, A, B, C, D, log_of
 from tests.small_designs import short_loops, small_designs
@@ -92,6 +93,24 @@ def test_a_stand_in_shows_a_controller_its_next_output_under_the_input_of_the_st
     assert one.plant(reads=False)(point, rows.U[7])[:1] == pytest.approx(rows.X[8], abs=1e-5)
     other = near.draw(np.random.default_rng(0))
     assert other.measure(np.concatenate([point, rows.U[7]])) == pytest.approx(rows.X[8], abs=1e-3)
+
+
+def test_runs_on_the_plant_are_judged_by_what_the_controller_read_and_others_are_told_so():
+    found = usual()
+    x, u, readings, inputs = np.zeros(2), np.zeros(1), [], []
+    found.controller.reset()
+    for _ in range(12):
+        readings.append(C @ x + D @ u)
+        u = found.controller(readings[-1], [GOAL]).u
+        inputs.append(u)
+        x = A @ x + B @ u
+    for rows, own in ((np.array(readings), True), (steer(found.controller, np.zeros(2), 0.0, 12)[1][:, None], False)):
+        runs = km.Episodes([km.Episode(X=rows, U=np.array(inputs)[:-1])], 0.1, ["y"], ["u"])
+        if own:
+            assert judge_plant_runs(found.evidence, found.controller, runs).own == 1
+        else:
+            with pytest.raises(DataError, match="of the input before, which the controller had"):
+                judge_plant_runs(found.evidence, found.controller, runs)
 
 
 @pytest.mark.slow
