@@ -132,8 +132,7 @@ def search_hidden_states(
         best = min([rival, *(one.error for one in found if one.calm)])
         calm = [one for one in tried if one.calm and one.error < PAYS * best]
         if not calm:  # one quarter hardly tells models apart: the others may
-            close = [one for one in tried if one.calm and one.error < near * best]
-            calm = [choose_hidden(close)] if close else []
+            calm = [one for one in tried if one.calm and one.error < near * best]
         orders = sorted({one.order for one in calm})
         each = [choose_hidden([one for one in calm if one.order == order]) for order in orders]
         each.sort(key=lambda one: one.parameters)
