@@ -16,6 +16,8 @@ The differences known, and their causes:
   rows pushed by 1e12, and u is their sum. The limits that inputs were at say them to the last digit, and now do.
 - KoopmanMPC, FAILED in C where Python proves INFEASIBLE (`STATUSES`): hard rows are so close to dependent that a plan
   grows to 4e8 on the way, and by rounding one solve cycles; both hold the last plan.
+- BilinearMPC with measured disturbances, of which none comes up here: a row that two equilibria serve, each the best close
+  by. ipopt finds one with an input at its limit, steps from the last target one that holds the row, and u is another.
 """
 
 import argparse

@@ -426,3 +426,18 @@ def test_a_target_that_w_takes_off_a_limit_is_found_in_c_as_in_python():
             slow, quick = (one([-0.78, -0.18], [0.96, -1.07], w=[W]) for one in (controller, fast))
             assert quick.status is slow.status
             np.testing.assert_allclose(quick.u, slow.u, rtol=0, atol=1e-6)
+
+
+def test_a_target_in_a_corner_of_limits_is_left_in_c_as_in_python():
+    """x at its limit, an input at its own: nothing is free to move, and C found no target where ipopt found one."""
+    x, u, w = ca.SX.sym("x"), ca.SX.sym("u", 2), ca.SX.sym("w")
+    f = -0.95 * x + 0.25 * u[0] + 0.74 * u[1] - 0.47 * w
+    f = f + x * (0.15 * u[0] + 0.063 * u[1]) + w * (0.24 * u[1] - 0.33 * u[0])
+    plant = km.StepMap(ca.Function("F", [x, u, w], [f]), 0.1)
+    limits = km.Limits(u_min=-0.71, u_max=1.4, x_max=[0.87], x_min=[-1.41])
+    controller = km.BilinearMPC(plant, km.Cost(Q=0.5, R=[0.5, 0.5]), limits, 6)
+    fast = km.compiled(controller)
+    for y, row in ((0.21, [[-1.33], [0.85]]), (0.83, [[1.63]]), (0.5, [[0.85]]), (0.83, [[1.63]])):
+        slow, quick = (one([y], row, w=[-0.744]) for one in (controller, fast))
+        assert quick.status is slow.status
+        np.testing.assert_allclose(quick.u, slow.u, rtol=0, atol=1e-6)

@@ -255,6 +255,7 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
     koopmpc_real W[LEFT * SIZE], back[SIZE * LEFT], left[LEFT], missed[MOST_ROWS], step[SIZE], rows[LIMITS * SIZE];
     koopmpc_real value[LIMITS], here[NX], input[NV], reach, pull[LEFT], turned[SIZE], least_pull = 0;
     koopmpc_real most_pull = 0, off = 0, along[SIZE], whole[SIZE], length, close = enough;
+    koopmpc_real pulls[LIMITS];
     int held[LIMITS], n = 0, count, release = -1;
     for (int i = 0; i < NX; i++) here[i] = s[i] * koopmpc_rest_size[i];
     for (int i = 0; i < NV; i++) input[i] = s[NX + i] * koopmpc_rest_size[NX + i];
@@ -307,6 +308,7 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
       koopmpc_real multiplier = 0;
       for (int j = 0; j < SIZE; j++) multiplier += gain[j * (NX + n) + NX + i] * turned[j];
       multiplier *= held_now[held[i]];
+      pulls[i] = multiplier;
       if (koopmpc_abs(multiplier) > most_pull) most_pull = koopmpc_abs(multiplier);
       if (multiplier < least_pull) {
         least_pull = multiplier;
@@ -319,6 +321,22 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
     } else {
       koopmpc_real share = 1;
       const int hit = find_hit(value, rows, step, held_now, careful, &share);
+      if (hit && careful && !count) { /* a corner: for the new limit another one gives way */
+        const koopmpc_real *row = rows + (hit > 0 ? hit - 1 : -1 - hit) * SIZE;
+        koopmpc_real least_share = KOOPMPC_HUGE;
+        for (int i = 0; i < n; i++) {
+          koopmpc_real push = 0, needed;
+          for (int j = 0; j < SIZE; j++) push += gain[j * (NX + n) + NX + i] * row[j];
+          push *= hit > 0 ? held_now[held[i]] : -held_now[held[i]];
+          if (!(push > RANK)) continue;
+          needed = (pulls[i] > 0 ? pulls[i] : 0) / push;
+          if (!(needed < least_share)) continue;
+          least_share = needed;
+          release = held[i];
+        }
+        if (!(least_share < KOOPMPC_HUGE)) return 0;
+        held_now[release] = 0;
+      }
       if (hit) {
         held_now[hit > 0 ? hit - 1 : -1 - hit] = hit > 0 ? 1 : -1;
         going = 0;

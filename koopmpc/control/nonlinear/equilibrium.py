@@ -252,7 +252,8 @@ class Equilibria:
 
         The limits that are active at `begin` are held. A limit that is broken is added, and one whose multiplier has
         the wrong sign is released. The last step is at most `enough` of the size of (x, u). `careful` steps end at the
-        first limit that they would break, and where they would swing, as far from a row that cannot be reached, they
+        first limit that they would break. Where nothing is free to move, another limit gives way for it: the one whose
+        multiplier would change its sign first. Where they would swing, as far from a row that cannot be reached, they
         are as short as Barzilai and Borwein's; there may be `patience` times as many.
         """
         (nx, nu), size, sizes = (self.model.nx, self.model.nu), self.size, self._limit_size
@@ -291,6 +292,12 @@ class Equilibria:
                 active[held[multipliers.argmin()]], before = 0, None
             else:
                 hit, share = _find_hit(values, moved, Interval(low, high), active, careful=careful)
+                if hit and careful and not free.shape[1]:  # a corner: for the new limit another one gives way
+                    push = active[held] * (gain.T @ (np.sign(hit) * limited[abs(hit) - 1]))[nx:]
+                    if not (push > RANK).any():
+                        return None
+                    shares = np.maximum(multipliers, 0.0) / np.where(push > RANK, push, np.nan)
+                    active[held[np.nanargmin(shares)]] = 0
                 if hit:
                     active[abs(hit) - 1], before = np.sign(hit), None
                     step = share * step
