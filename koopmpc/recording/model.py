@@ -3,6 +3,7 @@
 
 import json
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -339,12 +340,19 @@ def load_model_log(path: str | Path) -> ModelLog:
     ------
     LogError
         The file is missing or damaged, or no log of a model whose format this version knows.
+
+    Warns
+    -----
+    UserWarning
+        The end of the file is cut.
     """
     path = Path(path)
     log = read_columns(path, (f"/{Entity.DESCRIPTION}", "/error/**", "/rollout/**", "/checksum"))
     with naming(path):
         if log.static("checksum", "check") not in (None, CHECK) and not is_intact(path):
             raise LogError(f"{path} is damaged: it no longer holds what was written; take another copy")
+        if log.torn:
+            warnings.warn(f"{path}: its end is cut; take another copy, curves may lack rows", UserWarning, stacklevel=2)
         text = log.static(Entity.DESCRIPTION, "json")
         about: dict[str, Any] = {} if text is None else json.loads(text)
         if about.get("format") != _FORMAT:

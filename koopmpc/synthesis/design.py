@@ -266,6 +266,7 @@ def design(
     if source.nu == 0:
         raise DataError("the data have no inputs, so there is nothing to control; give each Episode its U")
     check_feedthrough(feedthrough, source)
+    feedthrough = bool(feedthrough)
     if feedthrough and source.nw:
         raise DataError(NOT_TOGETHER)
     held, sampled = take_sample(source, checks.count(sample, "sample"))
@@ -334,13 +335,13 @@ def design(
             cross_validate, trials, report_stage(progress, "models"), size=lambda trial: trial.candidate.size
         )
         floor = max(min(result.misfit for result in results) / np.sqrt(10), LEAST)
-        pair = [replace(one, feedthrough=bool(feedthrough)) for one in choose_surrogates(results, floor, hidden=hidden)]
+        pair = [replace(one, feedthrough=feedthrough) for one in choose_surrogates(results, floor, hidden=hidden)]
         test, doubts, holds = prepare_test(folds, asked, pair, tighten and wished is None, noise, pool, raw)
         doubts = [*left.values(), *doubts]
         for sentence in doubts:
             warnings.warn(sentence, FitWarning, stacklevel=2)
         unstable = is_unstable(test.surrogates, asked)
-        screened = [replace(one, feedthrough=bool(feedthrough)) for one in _list_first_round(results, floor)]
+        screened = [replace(one, feedthrough=feedthrough) for one in _list_first_round(results, floor)]
         rows, outcomes = _judge_rounds(test, screened, unstable, pool, progress)
     best, linear = choose_row(rows, unstable=unstable), choose_row(rows, "linear", unstable=unstable)
     assert best is not None, "the last round is never empty"
@@ -385,7 +386,7 @@ def design(
     embedding = test.surrogates[0].model.embedding
     alone = test.ignored, test.turning
     noises = test.surrogates[0].noise
-    neighbours = NeighbourMap.of(test.episodes, embedding, noises, *alone, feedthrough=bool(feedthrough))
+    neighbours = NeighbourMap.of(test.episodes, embedding, noises, *alone, feedthrough=feedthrough)
     drawn_from = LoopPool(asked, test.surrogates, neighbours, test.low, test.high)
     compared = 0
     if few and (others := list_finalists(rows, best)):

@@ -49,8 +49,8 @@ def judge_hidden_states(
     The kinds are the subspace model, the linear and the polynomial one of least simulation error, the latter with rails
     where a sensor rests at its least or largest reading and they gain; and for one or two sensors those with
     neurons, with the rails if the best one before has them. With neurons the best one and the smallest of other orders
-    are judged, if they are calm and err by a tenth less than all others; else the best one, if it errs by less than
-    half more. Where records are too short for a kind, it is left out; so is a model that on the first stretches errs by
+    are judged, if they are calm and err by a tenth less than all others; else of those that err by less than half more.
+    Where records are too short for a kind, it is left out; so is a model that on the first stretches errs by
     a tenth more than the best calm one so far, and one that does not err a tenth less than the calm one of its kind.
 
     Parameters
@@ -93,7 +93,7 @@ def search_hidden_states(
 ) -> list[HiddenStructure]:
     """Return the best structure of each kind, as `judge_hidden_states` lists them; of those that err far more, none.
 
-    If no model with neurons errs by a tenth less, the best one is among them if it errs by less than `near` times all.
+    If no model with neurons errs by a tenth less, those count that err by less than `near` times the best of all.
     """
     found: list[HiddenStructure] = []
     neural: list[HiddenStructure] = []

@@ -133,6 +133,18 @@ def test_a_whole_log_is_read_without_another_process_and_a_damaged_one_is_not(
         load_model_log(damaged)
 
 
+def test_a_log_of_a_model_that_lost_its_end_is_never_read_in_silence(tmp_path: Path) -> None:
+    whole, cut = tmp_path / "whole.rrd", tmp_path / "cut.rrd"
+    km.recording.record_model(turning(), episodes(3, noise=0.05), whole)
+    content = whole.read_bytes()
+    cut.write_bytes(content[: len(content) // 2])  # behind all curves, before the checksum
+    with pytest.warns(UserWarning, match="its end is cut"):
+        assert load_model_log(cut).states == STATES
+    cut.write_bytes(content[: -len(content) // 20])
+    with pytest.raises(km.errors.LogError, match="no longer holds what was written"):
+        load_model_log(cut)
+
+
 def test_without_a_report_the_band_is_that_of_the_errors(tmp_path: Path) -> None:
     data = episodes(3, noise=0.05)
     km.recording.record_model(turning(), data, tmp_path / "a.rrd")
