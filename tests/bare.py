@@ -39,7 +39,7 @@ def shown(code, fresh=False):
 def run_unhooked(file, which):
     """Run the tests of `file` that are marked unhooked, and are of `which` marks, in one process without the hook.
 
-    Return what each ended in: nothing where it passed, else the text of its failure.
+    Return for each how it ended, "passed" or what pytest's report calls it, and what is said of that.
     """
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "KOOPMPC_TESTS"))
@@ -63,4 +63,12 @@ def run_unhooked(file, which):
         done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=root, check=False)
         assert report.exists(), done.stdout + done.stderr
         cases = ElementTree.parse(report).iter("testcase")
-        return {case.get("name"): "\n".join(part.text or part.get("message") for part in case) for case in cases}
+        return {case.get("name"): _end_of(case) for case in cases}
+
+
+def _end_of(case):
+    """Return how a case of pytest's report ended, and what is said of it."""
+    for part in case:
+        if part.tag in ("failure", "error", "skipped"):
+            return part.tag, f"{part.get('message')}\n{part.text or ''}"
+    return "passed", ""

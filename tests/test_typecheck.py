@@ -11,6 +11,7 @@ from jaxtyping import Float, TypeCheckError
 
 import koopmpc as km
 from tests import typecheck
+from tests.bare import run_unhooked
 
 
 def product(A: Float[np.ndarray, "m n"], x: Float[np.ndarray, "n"], count: int = 1) -> Float[np.ndarray, "m"]:
@@ -111,3 +112,34 @@ def test_an_inner_function_checks_each_time_that_it_is_made_and_sees_its_own_mak
 def test_the_hook_stands_above_the_library():
     with pytest.raises(TypeCheckError):
         km.loop.Plans(np.zeros((3, 2)), np.zeros((1, 1, 1)))
+
+
+OUTCOMES = """
+import pytest
+pytestmark = pytest.mark.unhooked
+@pytest.fixture
+def torn():
+    yield
+    raise OSError("the end")
+def test_well():
+    pass
+def test_skip():
+    pytest.skip("no compiler")
+def test_wrong():
+    assert 1 == 2, "one is not two"
+def test_torn(torn):
+    pass
+"""
+
+
+def test_what_runs_without_the_hook_may_be_skipped_and_what_fails_is_told(tmp_path):
+    (file := tmp_path / "test_outcomes.py").write_text(OUTCOMES)
+    ends = run_unhooked(file, "")
+    assert {name: end for name, (end, _) in ends.items()} == {
+        "test_well": "passed",
+        "test_skip": "skipped",
+        "test_wrong": "failure",
+        "test_torn": "error",
+    }
+    for name, said in (("skip", "no compiler"), ("wrong", "one is not two"), ("torn", "the end")):
+        assert said in ends[f"test_{name}"][1]
