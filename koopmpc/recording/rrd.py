@@ -403,7 +403,8 @@ def _read_in_child(path: Path, entities: tuple[str, ...], told: Path) -> list[Co
     except subprocess.TimeoutExpired as error:
         raise LogError(f"{told} is damaged: reading it did not end within {patience:.0f} s") from error
     if done.returncode == _REFUSED:
-        raise LogError(f"{told} is not a log, or is damaged: {done.stdout.decode(errors='replace')}")
+        said = done.stdout.decode(errors="replace").replace(str(path), str(told))
+        raise LogError(f"{told} is not a log, or is damaged: {said}")
     if done.returncode:
         raise LogError(f"{told} is damaged, beyond what can be read: the process that read it ended on it")
     try:

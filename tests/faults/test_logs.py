@@ -25,6 +25,9 @@ def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
             km.errors.LogError, match=rf"{path.name} is not a log of koopmpc: it does not start as an \.rrd file does"
         ):
             km.load_run(path)
+    text.write_bytes(b"RRF2")  # what stands before a cut is read from a copy, which no message names
+    with pytest.raises(km.errors.LogError, match=rf"RRD file at {re.escape(str(text))}: "):
+        km.load_run(text)
     with pytest.raises(km.errors.LogError, match=r"folder\.rrd is a folder; pass the \.rrd of a run"):
         km.load_run(folder)
     with pytest.raises(km.errors.LogError, match=r"nowhere\.rrd does not exist; pass the \.rrd of a run"):

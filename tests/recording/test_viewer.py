@@ -1,5 +1,7 @@
 """The viewer is found or opened, never waited for in vain, and it draws what a log tells it to."""
 
+import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -43,6 +45,20 @@ def test_several_logs_open_in_one_viewer(log: Path, monkeypatch: pytest.MonkeyPa
     km.recording.view([log, str(log)])
     km.recording.view(log)
     assert opened == [[str(log), str(log)], [str(log)]]
+
+
+def test_a_server_that_does_not_end_when_asked_is_killed(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stubborn = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(600)"
+    server = subprocess.Popen([sys.executable, "-S", "-c", stubborn], stdout=subprocess.PIPE)
+    assert server.stdout is not None
+    server.stdout.readline()  # from here on it ignores the signal
+    monkeypatch.setattr(viewer, "start_viewer", lambda *arguments, port: server)
+    monkeypatch.setattr(viewer, "_comes_up", lambda server, port: True)
+    monkeypatch.setattr(viewer, "_END", 0.1)
+    with viewer.serve(log, free_port()):
+        assert server.poll() is None
+    assert server.returncode == -signal.SIGKILL
+    server.stdout.close()
 
 
 def test_without_a_display_the_command_for_another_machine_is_told(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
