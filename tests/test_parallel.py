@@ -138,9 +138,10 @@ def run_script(script: Path, text: str, **options: Any) -> subprocess.Popen[str]
     return subprocess.Popen([sys.executable, script], stdout=pipe, stderr=pipe, text=True, env=environment, **options)
 
 
-def pids_in(folder: Path, least: int) -> list[int]:
-    """Return the process numbers that `tasks.sleep` wrote, once there are so many."""
-    wait_until(lambda: len(list(folder.iterdir())) >= least)
+def pids_in(folder: Path, least: int, program: subprocess.Popen[str]) -> list[int]:
+    """Return the process numbers that `tasks.sleep` wrote for a program that still runs, once there are so many."""
+    wait_until(lambda: len(list(folder.iterdir())) >= least or program.poll() is not None)
+    assert program.poll() is None, program.communicate()
     return [int(file.name) for file in folder.iterdir()]
 
 
@@ -161,7 +162,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
         list(map_tasks(tasks.sleep, [({str(folder)!r}, 300)] * 4, workers=2))
         """,
     )
-    pids = pids_in(folder, 2)
+    pids = pids_in(folder, 2, parent)
     parent.kill()
     parent.communicate(timeout=300)
     wait_until(lambda: not any(map(_is_alive, pids)))
@@ -180,7 +181,7 @@ def test_ctrl_c_ends_the_program_with_130_and_one_line_and_leaves_no_worker(tmp_
         """,
         start_new_session=True,
     )
-    pids = pids_in(folder, 2)
+    pids = pids_in(folder, 2, program)
     os.killpg(program.pid, signal.SIGINT)
     assert program.communicate(timeout=300) == ("", "interrupted; nothing was written\n")
     assert program.returncode == 130
