@@ -10,6 +10,7 @@ from jaxtyping import Float
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.loop.metrics import stack_limited
+from koopmpc.synthesis.candidates import get_model
 from koopmpc.synthesis.designed import Evidence
 from koopmpc.synthesis.fresh.abreast import speed_up
 from koopmpc.synthesis.fresh.drawn import KEPT, SHIFT, LoopPool, LoopResult
@@ -140,7 +141,9 @@ class PlantVerdict:
 
 
 def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> PlantVerdict:
-    """Return the verdict of logged runs of this controller on its plant.
+    """Return the verdict of logged runs of this controller on its plant, in rows timed as those of the design's logs.
+
+    With feedthrough each row holds the reading h(x, u) of the input before, which the controller had.
 
     Raises
     ------
@@ -150,26 +153,28 @@ def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> Pla
     asked, nx, nu = evidence.asked, len(evidence.asked.low), controller.nu
     if logs.nx != nx or logs.nu != nu:
         raise DataError(f"the logs have {logs.nx} states and {logs.nu} inputs, the design {nx} and {nu}")
+    direct = evidence.surrogates[0].feedthrough
     low, high = asked.limits.inputs(nu)
     spread = np.ptp(np.concatenate([episode.U for episode in logs]), axis=0)
     size = np.where(np.isfinite(high - low), high - low, np.maximum(spread, 1e-12))
-    failures, alike, steps = 0, 0, 0
-    for episode in logs:
+    alike, steps = 0, 0
+    for episode in logs if direct else get_model(controller).align(logs):
         controller.reset(episode.X[0])
         last: Float[np.ndarray, " nu"] | None = None
         for k, u in enumerate(episode.U):
             rows = asked.reference[min(k, len(asked.reference) - 1) :][: controller.horizon + 1]
             move = controller(episode.X[k], rows, applied=last)
             alike, steps, last = alike + bool((np.abs(move.u - u) <= SAME * size).all()), steps + 1, u
-        values, box = stack_limited(asked.limits, episode.X[1:], logs.states)
-        over = np.maximum(box.low - values, values - box.high) / asked.limit_sizes
-        failures += bool(over.max(initial=0.0) > KEPT)
     own = alike / max(steps, 1)
     if own < OWN:
-        direct = evidence.surrogates[0].feedthrough
         timing = ", each row with the reading h(x, u) of the input before, which the controller had" * direct
         raise DataError(
             f"in the logged states this controller asks for {to_percent(own)} of the logged inputs: the "
             "logs hold other runs, not those of this controller towards its reference; pass these" + timing
         )
+    failures = 0
+    for episode in logs:
+        values, box = stack_limited(asked.limits, episode.X[1:], logs.states)
+        over = np.maximum(box.low - values, values - box.high) / asked.limit_sizes
+        failures += bool(over.max(initial=0.0) > KEPT)
     return PlantVerdict(len(logs), failures, own)

@@ -12,7 +12,8 @@ from koopmpc.cli.app import app
 from koopmpc.fitting.check import check_controller
 from koopmpc.fitting.goal import design_data, read_goal
 from koopmpc.fitting.verdict import judge_plant_runs, judge_rate, plan_verdict
-from koopmpc.predict.base import load_value, save_value
+from koopmpc.predict.base import load_value, replace_report, save_value
+from koopmpc.synthesis.candidates import get_model
 from koopmpc.synthesis.designed import SavedDesign, rebuild_controller
 from tests.fitting.mass import GOAL, NAMES, A, B, logs
 from tests.small_designs import small_designs, undrawn_pages
@@ -85,6 +86,16 @@ def test_logged_runs_on_the_plant_are_judged_and_those_of_another_controller_ref
     assert done.rate.loops == km.validate.count_runs_needed(0.4)
     assert "on the plant 0 of 20 logged runs" in " ".join(str(done).split())
     assert "How often it fails" in done.page.read_text()
+
+
+def test_runs_in_a_late_log_are_judged_by_the_input_that_answered_each_row(made):
+    saved, controller = load(made)
+    runs, model = run_plant(made, 3), get_model(controller)
+    late = km.Episodes([km.Episode(X=e.X, U=np.concatenate([np.zeros((1, 1)), e.U[:-1]])) for e in runs], 0.1, *NAMES)
+    with pytest.raises(km.errors.DataError, match="the logs hold other runs"):
+        judge_plant_runs(saved.evidence, controller, late)
+    controller.predictor = replace_report(model, replace(model.report, input_lead=1))
+    assert judge_plant_runs(saved.evidence, controller, late).own > 0.99
 
 
 def test_the_goal_file_asks_for_coverage_and_a_certificate_and_the_report_answers(made, tmp_path):
