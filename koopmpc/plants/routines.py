@@ -14,6 +14,7 @@ import threading
 import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
@@ -32,6 +33,7 @@ _FLAGS = ("-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
 # The time of a compiler grows faster than a function that CasADi wrote. 366 kB took 5 s by -O3, 1.7 s by -O1, 0.4 s by
 # -O0, and ran 6.9, 6.4 and 11.6 µs. 1.3 MB took above 100 s by -O3, 19 s by -O1, 1.3 s by -O0.
 _LEVELS = ((100_000, "-O3"), (500_000, "-O1"))  # text of at most so many characters is compiled by this level
+_SEAL = ".sha256"  # ends the name of the file beside cached machine code that holds its checksum
 _CLOSE = "FreeLibrary" if os.name == "nt" else "dlclose"
 _PROBE = 30.0  # a compiler has this long for a program of one line [s]
 _COMPILING = 900.0  # and this long for any other [s]: the largest took 100 s on a quiet machine
@@ -218,12 +220,20 @@ def load_library(
             return open_library(_compile(text, command, Path(folder) / "step.so", numbers))
     key = "\0".join([text, *command, platform.machine(), platform.system()])
     path = cache / f"{fingerprint(key.encode() + numbers)}.so"
-    if path.is_file():
+    if _is_whole(path):
         try:
             return open_library(path)
         except OSError:  # another kind of machine wrote the file: compile again
             path.unlink()
     return open_library(_compile(text, command, path, numbers))
+
+
+def _is_whole(library: Path) -> bool:
+    """Return whether a cached file is, to the bit, what was compiled; a damaged one could end the process."""
+    try:
+        return library.with_suffix(_SEAL).read_text() == fingerprint(library.read_bytes())
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def find_private_cache() -> Path | None:
@@ -253,7 +263,7 @@ def _is_private(folder: Path) -> bool:
 
 
 def _compile(text: str, command: list[str], path: Path, numbers: bytes) -> Path:
-    """Compile in a temporary folder beside `path`, then move the file to `path` in one step."""
+    """Compile in a temporary folder beside `path`, move the file to `path` in one step, and write its checksum."""
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         code, library, packed = (Path(folder) / f"step.{kind}" for kind in ("c", "so", "bin"))
         if numbers:
@@ -262,7 +272,10 @@ def _compile(text: str, command: list[str], path: Path, numbers: bytes) -> Path:
         code.write_text(text)
         words = [*command, "-o", str(library), str(code), "-lm"]
         subprocess.run(words, check=True, capture_output=True, timeout=_COMPILING)
+        seal = fingerprint(library.read_bytes())
         library.replace(path)
+        with suppress(OSError):  # code without a checksum is compiled again
+            path.with_suffix(_SEAL).write_text(seal)
     return path
 
 

@@ -15,6 +15,7 @@ import koopmpc as km
 from koopmpc.plants import routines, step_map
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Routine
+from koopmpc.values import fingerprint
 from tests.compiler import needs_compiler
 from tests.example_plants import CartPole, Pendulum
 
@@ -126,11 +127,11 @@ def cache(tmp_path, monkeypatch):
 def test_large_batches_compile_once_a_user(cache, monkeypatch):
     X0, U = random_episodes(MAPS["rk4"], 100, 200)
     first = km.discretize(CartPole(), 0.02).rollouts(X0, U)
-    (library,) = cache.iterdir()
+    (library,) = cache.glob("*.so")
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
     monkeypatch.setattr(routines, "_compile", lambda *_: pytest.fail("compiled twice"))
     assert km.discretize(CartPole(), 0.02).rollouts(X0, U).tobytes() == first.tobytes()
-    assert list(cache.iterdir()) == [library]
+    assert list(cache.glob("*.so")) == [library]
 
 
 @needs_compiler
@@ -141,12 +142,33 @@ def test_small_batches_do_not_compile(cache):
 
 
 @needs_compiler
-def test_a_broken_file_in_the_cache_is_written_again(cache):
+@pytest.mark.parametrize("damage", ["a bit", "a cut", "no checksum"])
+def test_damaged_machine_code_in_the_cache_is_not_loaded(cache, damage, monkeypatch):
+    """Loading it could end the process: it is compiled again."""
     X0, U = random_episodes(MAPS["rk4"], 100, 200)
     want = km.discretize(CartPole(), 0.02).rollouts(X0, U)
-    (library,) = cache.iterdir()
+    (library,) = cache.glob("*.so")
+    data, compiled = bytearray(library.read_bytes()), []
+    data[len(data) // 2] ^= 1
     library.unlink()
-    library.write_bytes(b"no machine code")
+    library.write_bytes(data[: len(data) // (2 if damage == "a cut" else 1)])
+    if damage == "no checksum":
+        library.with_suffix(".sha256").unlink()
+    compiler = routines._compile
+    monkeypatch.setattr(routines, "_compile", lambda *given: compiled.append(given) or compiler(*given))
+    for _ in range(2):
+        assert km.discretize(CartPole(), 0.02).rollouts(X0, U).tobytes() == want.tobytes()
+    assert len(compiled) == 1
+
+
+@needs_compiler
+def test_machine_code_of_another_kind_of_machine_is_written_again(cache):
+    X0, U = random_episodes(MAPS["rk4"], 100, 200)
+    want = km.discretize(CartPole(), 0.02).rollouts(X0, U)
+    (library,) = cache.glob("*.so")
+    library.unlink()
+    library.write_bytes(b"no machine code here")
+    library.with_suffix(".sha256").write_text(fingerprint(library.read_bytes()))
     assert km.discretize(CartPole(), 0.02).rollouts(X0, U).tobytes() == want.tobytes()
 
 
