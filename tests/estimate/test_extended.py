@@ -157,3 +157,21 @@ def test_linear_observers_learn_nothing_at_a_rail_either(kind):
         found.append(float(np.abs(observer.d).max()))
     assert found[0] < 0.02
     assert found[1] > 0.1
+
+
+@pytest.mark.parametrize("zero", [0.0, 5.0, -5.0])
+def test_the_zero_of_a_sensor_that_saturates_does_not_count(zero):
+    delay = km.Delay(1, rails=np.array([[-np.inf], [1.0 + zero]])).bind(("y",), ("u",))
+    A, B, C = np.zeros((4, 4)), np.array([[0.3], [1.0], [0.0], [0.0]]), np.array([[1.0, 0.0, 0.0, zero]])
+    A[[0, 0, 2, 3], [0, 1, 0, 3]] = 0.9, 0.1, 1.0, 1.0
+    lifting = km.State() + km.Constant()
+    model = km.LinearPredictor(A, B, C, lifting, 0.1, ["y"], ["u"], embedding=delay)
+    observer = km.KoopmanMPC(model, km.Cost(Q=1, R=1), None, 10, estimator=km.LiftedKalman(C)).observer
+    observer.reset()
+    y, shares = 0.0, []
+    for k in range(60):  # the input drives the output far beyond the rail, and the model knows
+        observer.observe(np.array([min(y, 1.0) + zero]), np.array([float(k > 0)]), np.zeros(0))
+        shares.append(float(np.abs(observer.d).max()))
+        y = 0.9 * y + 0.3 + 0.1 * (k > 0)
+    assert y > 2.0
+    assert max(shares) < 1e-9

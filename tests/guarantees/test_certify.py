@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 import koopmpc as km
 from koopmpc.guarantees.semidefinite import FeedbackTask, check_feedback, solve_feedback
@@ -277,6 +278,22 @@ def test_words_and_figure_say_whether_loops_reach_the_point_or_a_ball(tanks):
     assert [[0.25] in each for each in levels] == [False, True]
     names = [panel.get_legend_handles_labels()[1] for panel in panels]
     assert ["ball that is reached" in each for each in names] == [False, True]
+    (box,) = [line.get_xydata() for line in panels[0].get_lines() if line.get_label() == "box of the bound"]
+    assert [box.min(axis=0).tolist(), box.max(axis=0).tolist()] == [point.low.tolist(), point.high.tolist()]
+
+
+def test_states_are_drawn_evenly_from_the_region():
+    """In an ellipsoid of n dimensions V^(n/2) is even in [0, 1], and so is the angle, in units of its axes."""
+    rng, T = np.random.default_rng(0), np.array([[1.0, 0.0], [0.9, 0.4]])  # states that go together
+    A, B = T @ [[1.0, 0.3], [0.0, 1.1]] @ np.linalg.inv(T), T @ [[0.0], [0.3]]
+    pairs = [(x, rng.uniform(-1, 1, 1)) for x in rng.uniform(-1, 1, (300, 2))]
+    data = km.Episodes([km.Episode(X=[x, A @ x + B @ u], U=[u]) for x, u in pairs], 1.0)
+    model = km.LinearPredictor(A, B, np.eye(2), km.State(), 1.0, data.states, data.inputs)
+    found = km.certify(model, data, error=(0.01, 0.01))
+    X = found.sample(2000)
+    V, turned = found.value(X), np.linalg.solve(np.linalg.cholesky(found.P), (X - found.deviation.x).T)
+    assert kstest(V, "uniform").pvalue > 0.01
+    assert kstest(np.arctan2(*turned) / (2 * np.pi) + 0.5, "uniform").pvalue > 0.01
 
 
 def test_given_constants_are_a_proof_and_a_lipschitz_constant_may_be_refuted(tanks):

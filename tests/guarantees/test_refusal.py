@@ -100,6 +100,18 @@ def test_the_reason_is_named_and_its_advice_gives_a_certificate(name):
     assert found.margin > 0
 
 
+def test_the_refusal_names_the_pair_that_sets_the_bound():
+    worst = 7
+
+    def error(X, U):
+        apart = 0.9 * np.sin(20 * X)
+        apart[worst], X[worst], U[worst] = 9.0, 0.0123, 0.0456
+        return apart
+
+    with pytest.raises(km.errors.CertificateError, match=r"set at x = 0.0123, u\[0\] = 0.0456: data for the fit near"):
+        km.certify(MODEL, draw_pairs(error))
+
+
 def test_observables_that_are_nearly_one_another_are_named():
     lifting = km.State() + km.Expressions(lambda x: [x[0] + 1e-6 * x[0] ** 2], ["e"])
     data = draw_pairs(lambda X, U: 0.3 * X * U)

@@ -132,6 +132,16 @@ def test_the_c_code_states_the_bound_and_keeps_it(tmp_path):
     assert again.iterations == bound.most
 
 
+def test_a_bound_over_lifted_states_that_no_state_may_have_is_not_said_to_be_attained():
+    lifting = km.State() + km.Monomials(2)
+    A, B = np.array([[0.9, 0.2], [0.0, 0.8]]), np.array([[1.0], [0.0]])
+    model = km.LinearPredictor(A, B, np.eye(1, 2), lifting, 0.1, ["x"], ["u"])
+    mpc = km.KoopmanMPC(model, km.Cost(Q=1, R=0.1), km.Limits(u_min=-1, u_max=1), horizon=2)
+    bound = km.guarantees.bound_iterations(mpc, (-3, 3), (0, 0))
+    assert bound.most > 1
+    assert not bound.attained
+
+
 def test_what_is_not_in_the_analysis_is_said():
     find = km.guarantees.bound_iterations
     with pytest.raises(km.errors.DataError, match="without an estimator"):

@@ -222,3 +222,13 @@ def test_linear_models_with_delays_and_measured_disturbances_are_refined():
     errors = [km.score(model, data, 8).rmse[-1].mean() for model in (start, found)]
     assert found.nw == 1
     assert errors[1] < errors[0]
+
+
+@pytest.mark.parametrize(("rows", "horizon"), [(300, 7), (6000, 7), (30_000, 20), (90_000, 7), (90_000, 40)])
+def test_segments_begin_every_half_horizon_and_have_no_more_steps_than_are_read(rows, horizon):
+    rng = np.random.default_rng(0)
+    model = bilinear_plant(rng, 1)
+    data = km.Episodes([km.Episode(X=rng.standard_normal((rows + 1, 1)), U=np.zeros((rows, 1)))], 0.1, ["x0"], ["u0"])
+    count, most = cut_into_segments(model, data, horizon, "here").points.shape[0], 20_000 // horizon
+    every = (rows - horizon) // -(-horizon // 2) + 1
+    assert count == every if every <= most else 0.9 * most <= count <= most + 1

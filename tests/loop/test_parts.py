@@ -1,6 +1,11 @@
-"""What is no plant or no controller is told what it lacks; the type hook of the tests would say so first."""
+"""What is no plant or no controller is told what it lacks, and one that writes into the arrays of others moves nothing."""
 
+import numpy as np
+
+import koopmpc as km
 from tests.bare import shown
+from tests.control.models import step_map
+from tests.loop.test_simulate import A, B, Careless, Outside, Recorded, mpc
 
 PARTS = """
 import casadi as ca
@@ -25,7 +30,7 @@ collect = lambda plant: km.collect(plant, [0, 0], km.Noise(-1, 1), episodes=2, s
 """
 
 
-def test_what_cannot_be_driven_says_what_it_lacks():
+def test_what_cannot_be_driven_says_what_it_lacks():  # the type hook of the tests would say so first
     lines = shown(
         PARTS
         + """
@@ -53,3 +58,35 @@ show(lambda: simulate(plant, Push()))
     assert lines[0].startswith("DataError the function ")
     assert "write def f(y, r), which returns the input u" in lines[0]
     assert lines[1].startswith("DataError what the controller returned is a ndarray and has no u, status, fallback, ")
+
+
+class Rough(Outside):
+    """A plant that shows its own arrays, and writes into what it is given."""
+
+    x = np.zeros(2)
+
+    @property
+    def state(self):
+        return self.x
+
+    def reset(self, x0, rng):
+        self.x = np.array(x0, dtype=float)
+        return self.x
+
+    def step(self, u):
+        self.x[:] = A @ self.x + B @ u
+        u[:] = 1e9
+        return self.x
+
+
+def test_a_plant_that_writes_into_its_input_and_shows_its_own_arrays_moves_neither_loop_nor_record():
+    loop = {"x0": [0.5, 0], "reference": [0.2, 0], "steps": 6}
+    for controller in (Recorded(), Careless(), mpc()):
+        whole = km.simulate(step_map(A, B), controller, **loop)
+        moves = []
+        rough = km.simulate(
+            Rough(), controller, **loop, observers=[lambda step, moves=moves: moves.append(step.move.u)]
+        )
+        np.testing.assert_array_equal(rough.U, moves)
+        for name in ("X", "Y", "U"):
+            np.testing.assert_allclose(getattr(rough, name), getattr(whole, name), atol=1e-12)

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from collections import deque
@@ -259,6 +260,33 @@ def test_a_reading_or_a_recorder_that_never_returns_is_named_and_the_plant_is_sa
     assert paced.ended == f"watchdog: {part} did not return within 1 s"
     assert plant.got[-1] == 9.0
     assert len(plant.got) == 3
+
+
+def test_an_input_that_comes_after_the_watchdog_has_acted_never_reaches_the_plant():
+    """Outside the main thread no call can be interrupted: the controller returns in its own time."""
+    plant, ended = Here(), []
+    late = Toward(at={2: lambda: time.sleep(0.5)})
+    loop = {"dt": DT, "reference": [0.0], "watchdog": 0.2, "safe": 9.0}
+    thread = threading.Thread(target=lambda: ended.append(km.realtime(late, plant, **loop).ended))
+    thread.start()
+    thread.join(60)
+    assert ended == ["watchdog: the controller did not return within 0.2 s"]
+    assert plant.got[-1] == 9.0
+    assert plant.got.count(9.0) == 1
+
+
+def test_the_controller_is_told_the_input_that_the_plant_has():
+    told = []
+
+    class Asked(Counting):
+        def __call__(self, y, reference, applied=None, w=None):
+            told.append(None if applied is None else float(applied[0]))
+            return super().__call__(y, reference)
+
+    plant = Here()
+    km.realtime(Asked(), plant, dt=DT, reference=[0.0], steps=4, watchdog=20)
+    assert told == [None, *plant.got[:-1]][: len(told)]
+    assert len(told) > 1
 
 
 def test_a_plant_that_fails_once_is_made_safe_by_its_next_step():

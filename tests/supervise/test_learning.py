@@ -128,6 +128,31 @@ def test_nothing_is_learned_where_nothing_moved_or_nothing_is_known(x, applied, 
     assert (one.learned, one.skipped, len(one._memory)) == (0, 1, 0)
 
 
+def test_what_was_applied_is_told_to_the_controller_and_kept_as_it_was():
+    one, given, told = learning(), np.array([0.7]), []
+    one(np.ones(2), [0, 0], w=[0.1])
+    inner, one.controller = one.controller, Told(one.controller, told)
+    one(np.array([0.5, 0.2]), [0, 0], given, w=[0.1])
+    given[:] = 9.0
+    assert [each.tolist() for each in told] == [[0.7]]
+    assert one._memory[-1].u.tolist() == [0.7]
+    assert inner is one.controller.inner
+
+
+class Told:
+    """A controller that notes the inputs it is told."""
+
+    def __init__(self, inner, told):
+        self.inner, self.told = inner, told
+
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
+
+    def __call__(self, y, reference, applied, w):
+        self.told.append(np.array(applied))
+        return self.inner(y, reference, applied, w)
+
+
 def test_the_memory_is_looked_at_every_so_many_steps_once_it_has_as_many_pairs(monkeypatch):
     for every, memory, first in ((3, 5, 6), (4, 2, 4), (2, 9, 4)):
         one, looked = learning(every=every, memory=memory), []
