@@ -33,6 +33,7 @@ _MARK = b"koopmpc-crc32:"  # stands before the checksum of a file
 _BLANK = b"x7k2q9zp"  # holds the place of the checksum until the file is closed
 _CHECK = re.compile(rb"koopmpc-crc32:([0-9a-f]{8})")
 _PIECE = 1 << 20  # bytes
+_PIPED = 1 << 16  # bytes that a pipe holds; each thread's heap would keep the room of larger pieces for ever
 _CLOSING = 10.0  # longest wait for the thread to end once Rerun has closed the pipe [s]
 _WRITING = 10.0  # longest wait for a file that is written at once [s]
 _PIPES = Path("/dev/fd")  # where a process opens a pipe of its own by name; Windows has no such folder
@@ -150,7 +151,7 @@ class LogFile:
     def _pump(self, end: int) -> None:
         """Take all bytes out of the pipe, until Rerun closes it."""
         with os.fdopen(end, "rb", buffering=0) as pipe:
-            while piece := pipe.read(_PIECE):
+            while piece := pipe.read(_PIPED):
                 if self._failure is not None:
                     continue
                 try:
