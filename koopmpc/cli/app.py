@@ -397,7 +397,8 @@ TERMS: dict[str, str] = {
     "out of time": "The step took longer than it may (Status.TIME_LIMIT).",
     "infeasible": "No plan meets the hard limits, and a fallback took over (Status.INFEASIBLE).",
     "bad y": (
-        "The measurement or the reference held NaN or infinity, and a fallback took over (Status.BAD_MEASUREMENT)."
+        "The measurement or the reference held NaN or infinity, or the model overflows from there, and a fallback took "
+        "over (Status.BAD_MEASUREMENT)."
     ),
     "failed": "The solver gave no usable answer, and a fallback took over (Status.FAILED).",
     "fallback": (

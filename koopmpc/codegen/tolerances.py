@@ -5,6 +5,7 @@ from koopmpc.control.nonlinear.bilinear_mpc import SETTLED
 from koopmpc.control.nonlinear.equilibrium import PSEUDO, RANK
 from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
 from koopmpc.control.nonlinear.iteration import DIGITS, ENOUGH, PRECISE, STUCK
+from koopmpc.control.nonlinear.staged_mpc import NO_DIGITS
 from koopmpc.control.riccati import SETTLED as RESTED
 from koopmpc.control.stepped.levels import NEAR
 from koopmpc.control.stepped.sequences import EQUAL
@@ -30,6 +31,7 @@ OF_STAGES = {
     "STUCK": (STUCK, 1e-6),
     "SETTLED": (SETTLED, 1e-4),
     "REACH": (1e-9, 1e-5),
+    "NO_DIGITS": (NO_DIGITS, 1e6),
     "RANK": (RANK, 1e-6),
     "HELD": (HELD, 1e-4),
     "TURN": (1e-15, 1e-7),

@@ -34,7 +34,7 @@ class Status(Enum):
     MAX_ITERATIONS = 4  # the solver ended before its tolerance
     TIME_LIMIT = 5  # the step took longer than it may
     INFEASIBLE = 6  # no plan meets the hard limits
-    BAD_MEASUREMENT = 7  # NaN or inf in y or in the reference
+    BAD_MEASUREMENT = 7  # NaN or inf in y or in the reference, or a nonlinear model overflows from y
     FAILED = 8  # the solver gave no usable answer
 
 

@@ -55,8 +55,8 @@ class Metrics(Value):
         Number of steps that ended with each status, by its name. As intended: UNCONSTRAINED (no limit was active),
         OPTIMAL (a QP or NLP was solved), SOFTENED (solved, and a soft limit gave way), SATURATED (a feedback law was
         clipped). Otherwise: MAX_ITERATIONS, INFEASIBLE, FAILED (the solver gave no answer), BAD_MEASUREMENT (NaN or
-        inf in y or the reference), and TIME_LIMIT (the step took longer than allowed, whether or not its answer
-        was used).
+        inf in y or the reference, or the model overflows from y), and TIME_LIMIT (the step took longer than allowed,
+        whether or not its answer was used).
     fallback
         Number of steps whose input each fallback gave, by its name: NONE (the controller's own answer),
         SHIFTED_PLAN (the last plan, moved on by one step), CLIPPED_LQR (the unconstrained optimum, clipped), HOLD

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.compiler import needs_compiler
 
 FALLBACKS = ("FAILED", "MAX_ITERATIONS", "INFEASIBLE")
 
@@ -79,6 +80,25 @@ def test_a_soft_limit_or_a_reference_beyond_it_is_no_reason_to_fail(models, tria
     count = sum((statuses(trial, models) for trial in trials), Counter())
     assert not any(count[name] for name in FALLBACKS), count
     assert count["SOFTENED"] > 0
+
+
+@needs_compiler
+def test_a_reading_from_which_the_model_runs_away_is_a_bad_measurement_and_no_failed_step() -> None:
+    """A cubic spring stretched to 50 leaves all numbers within ten steps, whatever an input of 2 does."""
+    mpc = km.BilinearMPC(PLANTS[0], km.Cost(Q=[10.0, 1.0], R=0.1), km.Limits(-2, 2, x_max=[0.5, 1.0]), 15)
+    for controller in (mpc, km.compiled(mpc)):
+        controller([0.1, 0.0], [0.3, 0.0])
+        planned = controller.plan().U[1]
+        for y in ([50.0, 0.0], [0.1, -1e6], [1e29, 0.0]):
+            move = controller(y, [0.3, 0.0])
+            assert move.status is km.Status.BAD_MEASUREMENT, y
+            assert np.abs(move.u).max() <= 2
+            if y[0] == 50.0:
+                assert move.fallback is km.control.Fallback.SHIFTED_PLAN
+                np.testing.assert_array_equal(move.u, planned)
+        assert controller([0.1, 0.0], [0.3, 0.0]).status.name in ("OPTIMAL", "SOFTENED", "UNCONSTRAINED")
+    mpc.solver_fails = True
+    assert mpc([50.0, 0.0], [0.3, 0.0]).status is km.Status.FAILED  # a fault that is made keeps its name
 
 
 @pytest.mark.parametrize("case", ["hang", pytest.param("aside", marks=pytest.mark.slow)])

@@ -36,7 +36,7 @@ typedef enum {
   KOOPMPC_MAX_ITERATIONS = 4,  /**< the solver met its bound of iterations */
   KOOPMPC_TIME_LIMIT = 5,      /**< solved, but a search over levels met its bound of nodes: see `gap` */
   KOOPMPC_INFEASIBLE = 6,      /**< no plan meets the hard limits */
-  KOOPMPC_BAD_MEASUREMENT = 7, /**< NaN, inf or beyond 1e30 in y, the reference or w */
+  KOOPMPC_BAD_MEASUREMENT = 7, /**< NaN, inf or beyond 1e30 in y, the reference or w; the model overflows from y */
   KOOPMPC_FAILED = 8           /**< the solver gave no usable answer */
 } koopmpc_status;
 

@@ -220,6 +220,24 @@ static int begin(koopmpc_state *s, int which, const koopmpc_real *x, const koopm
   return 1;
 }
 
+/** Whether no digit of a state is left within the horizon of the model's motion from x, without an input. */
+static int runs_away(const koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev) {
+  koopmpc_real at[NX], next[NX], u[NV];
+  koopmpc_copy(at, x, NX);
+  for (int i = 0; i < NV; i++)
+    u[i] = koopmpc_clip(KOOPMPC_WITH_RATES ? u_prev[i] : 0, koopmpc_input_low[i], koopmpc_input_high[i]);
+  for (int k = 0; k <= STEPS; k++) {
+    for (int i = 0; i < NX; i++)
+      if (koopmpc_abs(at[i]) >= KOOPMPC_NO_DIGITS * koopmpc_sizes[i]) return 1; /* 0 for NaN */
+    if (k < STEPS) {
+      koopmpc_map(at, u KOOPMPC_AND(koopmpc_w_of(s, k)), next);
+      koopmpc_copy(at, next, NX);
+    }
+  }
+  (void)s;
+  return 0;
+}
+
 /** Keep the plan, or restore the kept one. */
 static void save(koopmpc_state *s) {
   koopmpc_copy(s->bestS, s->S, PLAN_S);
@@ -598,6 +616,7 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
     koopmpc_real free_input[NV];
     for (int i = 0; i < NV; i++) free_input[i] = s->without_limits[i] + (KOOPMPC_WITH_RATES ? u_prev[i] : 0);
     koopmpc_fail(s, known && koopmpc_usable(free_input, NV) ? free_input : 0, applied, u, report, status);
+    if (status == KOOPMPC_FAILED && runs_away(s, stage, u_prev)) report->status = KOOPMPC_BAD_MEASUREMENT;
     return;
   }
   s->warm = 1;

@@ -31,6 +31,7 @@ from koopmpc.estimate.observer import Estimator, start_observer
 from koopmpc.plants.step_map import StepMap
 
 GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
+NO_DIGITS = 1e15  # of a state that many sizes away no digit is left: rounding is a fifth of its size
 
 
 class StagePlan(NamedTuple):
@@ -270,7 +271,10 @@ class StagedMPC(MPCBase):
         if self._keeper is not None:
             found, status, kept = self._choose(self._keeper, found._replace(status=status), s, u_prev, first)
         if status not in GOOD and not kept:
-            return self._lose(applied, status, found.iterations, start, found.free)
+            move = self._lose(applied, status, found.iterations, start, found.free)
+            if move.status is Status.FAILED and not self.solver_fails and self._runs_away(x, u_prev, start):
+                move.status = Status.BAD_MEASUREMENT
+            return move
         self._warm = True
         self._X, self._U = self._trajectory(found.S, found.V)
         if self._levels is not None:
@@ -319,6 +323,20 @@ class StagedMPC(MPCBase):
         if status in GOOD:
             status = Status.SOFTENED if chosen.slack else Status.OPTIMAL if status is Status.SOFTENED else status
         return StagePlan(chosen.S, chosen.V, status, found.iterations, chosen.slack), status, chosen is kept
+
+    def _runs_away(self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"], start: float) -> bool:
+        """Return whether no digit of a state is left within the horizon of the model's motion from x without an input.
+
+        Where changes of inputs count, the last one acts. Then no plan can be found from x, and x is to blame.
+        """
+        u, most = np.clip(u_prev * self._with_rates, *self._outputs.inputs), NO_DIGITS * self._problem.sizes[: len(x)]
+        for w in self._initial.W:
+            if (np.abs(x) >= most).any():
+                return True
+            if np.isnan(x).any() or perf_counter() > start + self._allowed:  # a model may have NaN near its data
+                return False
+            x = self._map.step(x, u, w)
+        return bool((np.abs(x) >= most).any())
 
     @abstractmethod
     def _go_on_from(self, S: Float[np.ndarray, "N1 ns"], V: Float[np.ndarray, "N nu"]) -> None:
