@@ -1,6 +1,7 @@
 """Ctrl-C and SIGTERM: no library swallows them, what must be whole is done first, and the program ends with one line.
 
-This file imports the standard library alone, so that its handlers stand before anything else is imported.
+This file imports the standard library alone, and what takes milliseconds only where it is used, so that its handlers
+stand before anything else is imported.
 
 CasADi asks Python for signals while a solver or an integrator runs, but takes the KeyboardInterrupt that comes of it
 for a failed evaluation: ipopt then reports a failure, CVODES no next state, fatrop nothing at all. Python drops one
@@ -11,7 +12,6 @@ import atexit
 import io
 import os
 import signal
-import socket
 import sys
 import threading
 import time
@@ -20,9 +20,12 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 from types import FrameType, ModuleType, TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import socket
+    from pathlib import Path
 
 Handler = Callable[[int, FrameType | None], Any]
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended
@@ -143,7 +146,7 @@ class Ending:
     some swallow the exception. So a thread ends the process if it still runs after a while.
     """
 
-    folder: Path | None = None
+    folder: "Path | None" = None
     _said = False
     _came = False
 
@@ -154,6 +157,8 @@ class Ending:
             atexit.register(self._finish)  # before any library, so it is called as the last
             for number in _SIGNALS:
                 signal.signal(number, self._interrupt)
+            import socket
+
             ends, begins = socket.socketpair()
             begins.setblocking(False)
             signal.set_wakeup_fd(begins.fileno(), warn_on_full_buffer=False)
@@ -189,7 +194,7 @@ class Ending:
             self._say()
             os._exit(INTERRUPTED)
 
-    def _watch(self, ends: socket.socket) -> None:
+    def _watch(self, ends: "socket.socket") -> None:
         """End the process if it still runs a while after a signal, whatever the main thread does."""
         while True:
             if set(ends.recv(64)) & set(_SIGNALS):
@@ -208,7 +213,7 @@ class Ending:
             os.write(2, f"interrupted; {clean_folder(self.folder)}\n".encode())
 
 
-def clean_folder(folder: Path | None) -> str:
+def clean_folder(folder: "Path | None") -> str:
     """Return which files of a call are whole; remove the others, and the folder if it is then empty."""
     files: list[Path] = []
     for path in sorted(folder.rglob("*")) if folder is not None and folder.is_dir() else ():

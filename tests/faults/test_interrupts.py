@@ -314,6 +314,22 @@ def test_a_command_ends_at_once_with_one_line_and_whole_files(
     assert interrupted > 0
 
 
+def test_the_program_listens_before_what_takes_milliseconds_is_imported() -> None:
+    code = """
+import signal, sys
+from koopmpc.cli import ENDING
+set_handler = signal.signal
+def shown(*handler):
+    print(*{"casadi", "numpy", "pathlib", "rich", "socket", "typer"} & set(sys.modules))
+    return set_handler(*handler)
+signal.signal = shown
+with ENDING:
+    pass
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[:2] == ["", ""]
+
+
 def test_an_interrupt_while_the_program_begins_to_listen_ends_it_with_one_line() -> None:
     code = """
 import os, signal, threading
