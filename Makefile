@@ -9,7 +9,7 @@ PINNED := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 PYTEST := $(PINNED) PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --benchmark-disable
 TYPED := KOOPMPC_TESTS=typed $(PYTEST)
 
-.PHONY: bench test typed full mutants loops real soak speed docs check format clean embedded
+.PHONY: bench test typed full mutants loops real soak speed docs check format clean embedded lowest newest
 
 bench: $(VENV)/installed
 	$(PINNED) $(BIN)/koopmpc bench
@@ -52,6 +52,26 @@ soak: $(VENV)/installed-dev
 # Three controllers in C on an emulated Cortex-M4F; says so where the Debian packages for it are missing.
 embedded: $(VENV)/installed-dev
 	$(PINNED) $(BIN)/python -m tests.embedded.run
+
+# In an environment of its own, the lowest versions that pyproject.toml allows; warnings of newer neighbours of old packages
+# are no errors here.
+LOWEST := tests/test_front_door.py tests/test_checks.py tests/test_values.py tests/test_cli.py tests/figures tests/lifting \
+	tests/control tests/identify tests/codegen tests/predict tests/loop tests/validate tests/guarantees
+lowest: $(VENV)/lowest/bin/python
+	$(PYTHON) -m tests.lowest > $(VENV)/lowest/constraints.txt
+	$< -m pip install --quiet --disable-pip-version-check -c $(VENV)/lowest/constraints.txt -e ".[gym,sklearn]" \
+		pytest pytest-xdist pytest-benchmark hypothesis beartype
+	$< -m pip check
+	$(PINNED) $< -m pytest -n 2 --dist loadfile --benchmark-disable -W default $(LOWEST)
+
+# In an environment of its own, the newest of everything, without our constraints.
+newest: $(VENV)/newest/bin/python
+	$< -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager -e ".[dev]"
+	$< -m pip check
+	$(PINNED) $< -m pytest -n 2 --dist loadfile --benchmark-disable
+
+$(VENV)/lowest/bin/python $(VENV)/newest/bin/python:
+	$(PYTHON) -m venv $(patsubst %/bin/python,%,$@)
 
 # The site, into site/: strict, and without a network once the tools are installed.
 docs: $(VENV)/installed-docs

@@ -27,6 +27,9 @@ def test_the_workflow_runs_the_pythons_that_the_package_names_and_files_that_exi
     smoke = re.findall(r"\btests/[\w/.]+", text)
     assert smoke
     assert all((ROOT / name).exists() for name in smoke)
+    targets = re.findall(r"^([\w ]+):(?!=)", (ROOT / "Makefile").read_text(), re.M)
+    made = re.findall(r"\bmake (\w+)", text)
+    assert {"lowest", "newest"} <= set(made) <= set(" ".join(targets).split())
     assert (ROOT / ".ci" / "run").stat().st_mode & 0o111
 
 
