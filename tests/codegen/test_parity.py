@@ -264,3 +264,29 @@ def test_an_unstable_plant_whose_hard_rows_are_nearly_dependent_is_solved_alike(
         np.testing.assert_allclose(b.u, a.u, rtol=0, atol=1e-6)
         seen.add(a.status.name)
     assert "OPTIMAL" in seen
+
+
+@pytest.mark.parametrize(
+    "rule", [km.LiftedDisturbance(), km.LiftedKalman(["a", "b"], disturbance="output", patience=2)]
+)
+def test_a_disturbance_beyond_all_numbers_is_not_learned_and_readings_are_bridged_as_long_as_in_python(rule):
+    """Of a filter all readings are missing for 0 to 5 steps in a row, or one entry; an observer is told w of 1e29."""
+    A, B, E = np.zeros((3, 3)), np.array([[0.0], [0.5], [0.0]]), np.array([[0.0], [0.0], [1e3]])
+    A[:2, :2], A[0, 2] = [[0.9, 0.1], [0.0, 0.8]], 0.05
+    lifting = km.State() + km.Expressions(lambda x: [x[0] ** 2], ["a²"])  # w acts there: the gate sees nothing of it
+    model = km.LinearPredictor(A, B, np.eye(2, 3), lifting, 0.1, ["a", "b"], ["u"], E=E)
+    own = km.KoopmanMPC(model, km.Cost(Q=1, R=0.1), km.Limits(-1, 1), 4, estimator=rule, solver="daqp")
+    fast, rng, filtered = km.compiled(own), np.random.default_rng(0), isinstance(rule, km.LiftedKalman)
+    x, u, missed = np.array([1.0, 0.0]), None, 0
+    for k in range(60):
+        y, w = x.copy(), 1e-4 * rng.normal(size=1)
+        told = np.full(1, [3e28, np.nan, -1e29][k // 9 % 3]) if not filtered and k % 9 == 4 else w
+        if filtered and k % 8 >= 3:
+            y[slice(2) if k % 8 < 3 + k // 8 % 6 else k // 8 % 2] = np.nan
+        missed = missed + 1 if np.isnan(y).all() else 0
+        moves = [each(y, [0.5, 0.0], u, w=told) for each in (own, fast)]
+        assert moves[0].status is moves[1].status
+        assert not filtered or (moves[0].status is km.Status.BAD_MEASUREMENT) == (missed > 2)
+        assert moves[1].u == pytest.approx(moves[0].u, abs=1e-9)
+        u = moves[0].u
+        x = A[:2, :2] @ x + B[:2] @ u + [0.05, -0.02]

@@ -159,6 +159,23 @@ def test_linear_observers_learn_nothing_at_a_rail_either(kind):
     assert found[1] > 0.1
 
 
+@pytest.mark.parametrize("kind", ["disturbance", "kalman"])
+def test_nothing_is_learned_where_one_of_two_sensors_is_at_its_rail(kind):
+    delay = km.Delay(1, rails=np.array([[-np.inf, -np.inf], [1.0, np.inf]])).bind(("y", "v"), ("u",))
+    A, B = np.zeros((5, 5)), np.array([[0.3], [0.3], [1.0], [0.0], [0.0]])  # of y, v, u[k-1], y[k-1], v[k-1]
+    A[[0, 1, 0, 1, 3, 4], [0, 1, 2, 2, 0, 1]] = 0.9, 0.9, 0.1, 0.1, 1.0, 1.0
+    model = km.LinearPredictor(A, B, np.eye(2, 5), km.State(), 0.1, ["y", "v"], ["u"], embedding=delay)
+    rule = km.LiftedDisturbance() if kind == "disturbance" else km.LiftedKalman(model.C, disturbance="output")
+    observer = km.KoopmanMPC(model, km.Cost(Q=1.0, R=1.0), None, 10, estimator=rule).observer
+    y, most = 0.0, 0.0
+    for k in range(60):
+        observer.observe(np.array([min(y, 1.0), y]), np.array([float(k > 0)]), np.zeros(0))
+        most = max(most, float(np.abs(observer.d).max()))
+        y = 0.9 * y + 0.3 + 0.1 * (k > 0)
+    assert y > 2.0
+    assert most < 1e-3
+
+
 @pytest.mark.parametrize("zero", [0.0, 5.0, -5.0])
 def test_the_zero_of_a_sensor_that_saturates_does_not_count(zero):
     delay = km.Delay(1, rails=np.array([[-np.inf], [1.0 + zero]])).bind(("y",), ("u",))
