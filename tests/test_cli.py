@@ -20,6 +20,7 @@ from koopmpc.loop.run import About
 from koopmpc.recording.description import table_figures, to_markdown
 from tests.bench.tiny import write
 from tests.commands import koopmpc
+from tests.recording.runs import make_run
 
 TWO = ["-c", "lqr", "-c", "koopman-mpc"]
 
@@ -246,6 +247,30 @@ def test_view_opens_all_logs_in_one_viewer(call, monkeypatch):
     monkeypatch.setattr("koopmpc.recording.viewer.view", opened.append)
     assert call("view", "a.rrd", "b.rrd").exit_code == 0
     assert [[path.name for path in paths] for paths in opened] == [["a.rrd", "b.rrd"]]
+
+
+def test_without_a_display_view_names_the_line_that_serves_with_the_options_it_was_given(call, tmp_path, monkeypatch):
+    for name in "ab":
+        km.record(make_run(T=3), tmp_path / f"{name}.rrd")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("koopmpc.recording.comparison.record_comparison", lambda *_: None)
+    for options in ([], ["--compare"]):
+        result = call("view", *options, "a.rrd", "b.rrd")
+        assert result.exit_code == 2
+        assert f"`koopmpc view {''.join(f'{each} ' for each in options)}--web a.rrd b.rrd`" in " ".join(
+            result.stderr.split()
+        )
+
+
+@pytest.mark.parametrize(("count", "whole"), [(1, True), (2, True), (3, True), (4, False)])
+def test_inspect_tells_of_up_to_three_logs_in_full(call, tmp_path, count, whole):
+    for k in range(count):
+        km.record(make_run(T=3), tmp_path / f"{k}.rrd")
+    result = call("inspect", *(f"{k}.rrd" for k in range(count)))
+    assert result.exit_code == 0, result.output
+    assert ("worst" in result.stdout.lower()) == whole
 
 
 def test_fit_warnings_are_one_line(call, tmp_path):

@@ -62,6 +62,22 @@ def test_the_first_input_and_the_plan_are_those_of_the_whole_product(case, monke
     assert owed > STEPS / 3
 
 
+@pytest.mark.parametrize("ends", [(-4, 9), (-9, 4), (-6, 6)])
+def test_first_inputs_are_found_alone_as_far_as_limits_reach_on_either_side(ends, monkeypatch):
+    whole = km.KoopmanMPC(linear(A, B), COST, km.Limits(*ends), N)
+    monkeypatch.setattr(LONG, 0)
+    mpc, alone, met = km.KoopmanMPC(linear(A, B), COST, km.Limits(*ends), N), [], 0
+    for sign in (1, -1):
+        for k, rate in enumerate(np.linspace(0, 3, 61)):  # up to the limit, and beyond
+            y, reference = [0.15, sign * rate], 0.02 * SIGNAL[k % STEPS : k % STEPS + N + 1]
+            move, other = mpc(y, reference), whole(y, reference)
+            alone.append(mpc._owes)
+            met += other.u[0] in ends
+            assert move.u == pytest.approx(other.u, abs=1e-9)
+    assert np.mean(alone) > 0.4
+    assert met > 15
+
+
 @pytest.mark.parametrize("case", ["far from 0", "in time, given targets"])
 def test_runs_repeat_to_the_bit_and_copies_go_on(case, monkeypatch):
     monkeypatch.setattr(LONG, 0)

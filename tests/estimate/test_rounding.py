@@ -71,3 +71,18 @@ def test_c_refuses_and_learns_what_python_does_where_a_model_is_exact(seed):
             u = a.u
             x = A @ x + B @ u
     assert refused
+
+
+def test_a_reading_is_believed_to_a_ten_thousandth_of_its_size_where_a_fit_left_no_residual():
+    rng, A, B = np.random.default_rng(0), np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.5]])
+    episodes = []
+    for _ in range(5):
+        X, U = [rng.normal(size=2) * [1.0, 100.0]], rng.normal(size=(30, 1))
+        for u in U:
+            X.append(A @ X[-1] + B @ u)
+        episodes.append(km.Episode(X=np.array(X), U=U))
+    model = km.edmd(km.Episodes(episodes, 0.1), km.State())
+    assert model.report.residual.max() < 1e-6
+    filtered = km.KoopmanMPC(model, km.Cost(Q=1, R=1), None, 5, estimator=km.LiftedKalman(list(model.states)))
+    size = np.sqrt(np.mean(np.vstack([e.X[:-1] for e in episodes]) ** 2, axis=0))
+    assert np.sqrt(np.diag(filtered.observer.program().R)) == pytest.approx(1e-4 * size)

@@ -15,6 +15,7 @@ from koopmpc.figures.style import render_svg
 from koopmpc.fitting.check import check_controller
 from koopmpc.fitting.goal import design_data
 from koopmpc.fitting.repair import read_logs
+from koopmpc.fitting.report import _SHOWN, _add_goal, _choose_columns
 from koopmpc.page import HtmlPage
 from koopmpc.predict.base import load_value
 from koopmpc.synthesis.designed import SavedDesign
@@ -243,3 +244,23 @@ def test_foreign_names_are_text_in_pages_and_pictures():
     assert is_alone(seen)
     assert seen.tags.count("svg") == 3
     assert sum(EVIL in words for words in seen.words) >= 8
+
+
+@pytest.mark.parametrize(("nx", "nu", "nw"), [(1, 1, 0), (2, 1, 3), (9, 9, 9), (30, 2, 40)])
+def test_the_first_of_each_kind_of_columns_are_drawn(nx, nu, nw):
+    rng = np.random.default_rng(0)
+    one = km.Episode(X=rng.normal(size=(31, nx)), U=rng.normal(size=(30, nu)), W=rng.normal(size=(30, nw)))
+    raw = km.Episodes([one], 1.0)
+    kinds = [range(nx), range(nx, nx + nu), range(nx + nu, nx + nu + nw)]
+    assert _choose_columns(excerpt_logs(raw)) == [i for kind in kinds for i in kind[:_SHOWN]]
+
+
+def test_a_goal_that_no_input_holds_is_said_where_it_is_asked(made):
+    evidence, words = (
+        load_value(made.controller, SavedDesign).evidence,
+        "No input inside the limits holds the reference",
+    )
+    for holds in (True, False):
+        page = HtmlPage("")
+        _add_goal(page, replace(evidence, goal_can_be_held=holds), made.design.controller)
+        assert (words in page.html) != holds

@@ -296,6 +296,18 @@ def test_states_are_drawn_evenly_from_the_region():
     assert kstest(np.arctan2(*turned) / (2 * np.pi) + 0.5, "uniform").pvalue > 0.01
 
 
+def test_the_region_keeps_limits_that_are_nearer_on_one_side_than_the_data():
+    rng = np.random.default_rng(0)
+    X, U = rng.uniform(-1, 1, (2, 300))
+    data = km.Episodes([km.Episode(X=[[x], [1.2 * x + 0.5 * u]], U=[[u]]) for x, u in zip(X, U, strict=True)], 1.0)
+    model = km.LinearPredictor([[1.2]], [[0.5]], [[1.0]], km.State(), 1.0, data.states, data.inputs)
+    for low, high in ((-0.1, 0.7), (-0.7, 0.1)):
+        found = km.certify(model, data, km.Limits(-1, 1, x_min=low, x_max=high), error=(0.01, 0.01))
+        seen = found.sample(500)
+        assert low - 1e-9 <= seen.min() < seen.max() <= high + 1e-9
+        assert seen.max() - seen.min() > 0.15
+
+
 def test_given_constants_are_a_proof_and_a_lipschitz_constant_may_be_refuted(tanks):
     _, model, data, limits, x, u, _ = tanks
     with pytest.raises(km.errors.DataError, match=r"lipschitz=0.0001 is refuted by \d+ of \d+ pairs"):
