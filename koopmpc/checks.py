@@ -201,7 +201,10 @@ def texts(given: object, what: str) -> tuple[str, ...]:
     DataError
         It is a single text, or holds what is no text.
     """
-    found = tuple(cast("Iterable[object]", given)) if isinstance(given, Iterable) else (None,)
+    try:
+        found = tuple(cast("Iterable[object]", given))
+    except TypeError:  # an array without dimensions is an Iterable too
+        found = (None,)
     if isinstance(given, str) or not all(isinstance(name, str) for name in found):
         raise DataError(f"{what} is {given!r}; pass a tuple of names")
     return cast("tuple[str, ...]", found)
@@ -227,7 +230,8 @@ def count(value: int, name: str, least: int = 1) -> int:
     if value < least:
         raise DataError(f"{name} is {value}; it must be at least {least}")
     if value > MOST:
-        raise DataError(f"{name} is {value:.3g}; it must be at most {MOST}")
+        told = f"{value:.3g}" if value < LARGEST else "beyond 1e100"  # an integer beyond 1e308 overflows
+        raise DataError(f"{name} is {told}; it must be at most {MOST}")
     return int(value)
 
 
@@ -325,7 +329,7 @@ def numbers(value: ArrayLike | None, name: str) -> Float[np.ndarray, "..."]:
     try:
         if value is not None and getattr(value, "dtype", _REAL).kind != "c":  # numpy would only warn of these
             return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pass
     return array(value, name, finite=False)  # pyright: ignore[reportArgumentType]
 

@@ -168,7 +168,7 @@ class Limits(Value):
         for end in ends:
             value = getattr(self, end)
             if value is not None:
-                object.__setattr__(self, end, bounds.check_bound(value, end))
+                object.__setattr__(self, end, bounds.check_limit(value, end))
         for low, high, name in _ENDS:
             pair = getattr(self, low), getattr(self, high)
             if (low in ends or high in ends) and not any(isinstance(value, Mapping) for value in pair):

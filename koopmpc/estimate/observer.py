@@ -294,7 +294,8 @@ def start_observer(estimator: Estimator | None, model: LinearPredictor | StateMo
     """
     if estimator is None:
         return Measured(model)
-    if isinstance(estimator, type) or not isinstance(cast(object, estimator), Estimator):
+    is_one = isinstance(cast(object, estimator), Estimator) and callable(estimator.start)  # a range has a start, too
+    if isinstance(estimator, type) or not is_one:
         raise DataError(f"estimator is {estimator!r}; pass an object, for example km.LiftedDisturbance()")
     return estimator.start(model, horizon)
 

@@ -301,8 +301,10 @@ def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) ->
     array([[0.0003],
            [0.0125]])
     """
-    checks.positive(dt, "dt", "s")
-    checks.members(integrator, "the integrator", ("step",), "pass one of km.plants, as km.plants.RK4()")
+    dt = checks.positive(dt, "dt", "s")
+    how = "pass one of km.plants, as km.plants.RK4()"
+    checks.members(integrator, "the integrator", ("step",), how)
+    checks.takes(integrator.step, "the integrator's step", 2, how)
     F = split_inputs(integrator.step(build_right_side(dynamics), dt), dynamics.nu, dynamics.nw)
     h, outputs = build_output(dynamics)
     names = dynamics.states, dynamics.inputs, outputs

@@ -22,6 +22,7 @@ from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 _ROUNDING = float(np.finfo(float).eps)
 _ROWS = 4096  # evaluate the eigenfunctions of so many states at once, to bound the memory
 _FITTED = "pass one that edmd returned"
+_EPISODES = "pass Episodes, of collect or load_episodes"
 
 
 def continuous_eigenvalues(predictor: LinearPredictor) -> Complex[np.ndarray, " nz"]:
@@ -116,6 +117,7 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
         The data have another dt, an eigenfunction is 0 on all of them, or A is defective.
     """
     check_same_names(predictor, episodes)
+    checks.members(episodes, "episodes", ("__iter__",), _EPISODES)
     forced = predictor.left_eigenvectors @ np.hstack([predictor.B, predictor.E])
     error, size = np.zeros(predictor.nz), np.zeros(predictor.nz)
     points = predictor.embed(episodes)
@@ -131,7 +133,7 @@ def linearity_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
 def check_same_names(predictor: LinearPredictor | BilinearPredictor, episodes: Episodes | Source) -> None:
     """Raise if data and predictor differ in states, inputs, dt, or the disturbances of the predictor."""
     checks.members(predictor, "the model", ("states", "inputs", "dt"), "pass one that edmd or bilinear_edmd returned")
-    checks.members(episodes, "episodes", ("states", "inputs", "dt"), "pass Episodes, of collect or load_episodes")
+    checks.members(episodes, "episodes", ("states", "inputs", "dt"), _EPISODES)
     known = getattr(predictor, "disturbances", ())
     for model_names, data_names, what in (
         (predictor.states, episodes.states, "states"),
@@ -186,6 +188,7 @@ def evolution_error(predictor: LinearPredictor, episodes: Episodes) -> Float[np.
             "linearity_error"
         )
     check_same_names(predictor, episodes)
+    checks.members(episodes, "episodes", ("__iter__",), _EPISODES)
     error, size = np.zeros(predictor.nz), np.zeros(predictor.nz)
     for episode in episodes:
         phi = predictor.eigenfunctions(episode.X)

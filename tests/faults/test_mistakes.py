@@ -1,6 +1,8 @@
 """Mistakes get a sentence of ours: what was got, and what to do."""
 
 from dataclasses import replace
+from decimal import Decimal
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -184,6 +186,43 @@ def test_garbage_is_refused_in_a_sentence_where_models_and_runs_are_judged(where
 def test_a_horizon_beyond_all_counting_is_refused():
     with pytest.raises(km.errors.DataError, match=r"horizon is 1e\+30; it must be at most 2147483647"):
         km.KoopmanMPC(LIFTED, PENDULUM.cost, PENDULUM.limits, 10**30)
+
+
+BEYOND = 10**400  # an integer that no float holds
+
+
+def test_an_integer_beyond_all_floats_is_refused_as_a_reading_and_as_a_count(stateful):
+    with pytest.raises(km.errors.DataError, match=r"horizon is beyond 1e100; it must be at most 2147483647"):
+        km.KoopmanMPC(LIFTED, PENDULUM.cost, PENDULUM.limits, BEYOND)
+    for name in ("LQR", "KoopmanMPC", "BilinearMPC", "NonlinearMPC", "filtered"):
+        stateful[name].reset()
+        with pytest.raises(km.errors.DataError, match="too large to convert to float"):
+            stateful[name]([BEYOND, 0], [0.0, 0.0])
+
+
+@pytest.mark.parametrize("end", ["u_min", "u_max", "du_max", "x_min", "x_max"])
+@pytest.mark.parametrize("value", [1e200, 1.7e308])
+def test_a_limit_whose_square_overflows_is_refused_by_name_and_infinity_is_not(end, value):
+    sign = -1 if "min" in end else 1
+    for given in (sign * value, [sign * value], {"theta": sign * value}):
+        with pytest.raises(km.errors.DataError, match=rf"{end} holds a number beyond 1e100; pass ±inf where"):
+            km.Limits(**{end: given})
+    assert np.isinf(getattr(km.Limits(**{end: sign * np.inf}), end))
+
+
+def test_numbers_of_other_kinds_are_steps_and_what_only_has_the_name_of_a_method_is_refused(tmp_path):
+    for dt in (Decimal("0.05"), Fraction(1, 20)):
+        assert km.discretize(PENDULUM.dynamics, dt).dt == 0.05
+    for bad in (range(3), slice(1)):
+        with pytest.raises(km.errors.DataError, match="the integrator's step does not take 2 arguments; pass one of"):
+            km.discretize(PENDULUM.dynamics, 0.05, integrator=bad)
+        with pytest.raises(km.errors.DataError, match=r"estimator is (range|slice).*; pass an object"):
+            km.KoopmanMPC(LIFTED, PENDULUM.cost, PENDULUM.limits, 5, estimator=bad)
+    with pytest.raises(km.errors.DataError, match=r"states is array.*pass a tuple of names"):
+        km.Recorder(tmp_path / "run.rrd", dt=0.1, states=np.array("x"), inputs=["u"])
+    for judge in (spectrum.linearity_error, spectrum.evolution_error):
+        with pytest.raises(km.errors.DataError, match=r"has no __iter__; pass Episodes|the predictor has inputs"):
+            judge(LIFTED, LIFTED)
 
 
 def test_a_controller_that_measures_one_state_does_not_adapt():

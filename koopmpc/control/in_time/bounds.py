@@ -53,6 +53,16 @@ def check_bound(bound: Any, end: str) -> Any:
     return checked
 
 
+def check_limit(bound: Any, end: str) -> Any:
+    """Return a bound as `check_bound` does; DataError where a finite number is beyond 1e100, whose square overflows."""
+    checked = check_bound(bound, end)
+    for values in list_bound(checked):
+        sizes = np.abs(np.asarray(values))
+        if ((sizes > checks.LARGEST) & np.isfinite(sizes)).any():
+            raise DataError(f"{end} holds a number beyond 1e100; pass ±inf where there is no limit")
+    return checked
+
+
 def order_bound(bound: BoundByName, end: str, names: Sequence[str], omitted: float) -> Float[np.ndarray, "..."]:
     """Return a bound by name as a vector, or as rows (T, n) where a name has one a step."""
     steps = max((len(np.asarray(value)) for value in bound.values() if np.ndim(value)), default=0)
