@@ -110,6 +110,12 @@ def exported(tmp_path_factory):
     return folder, koopmpc(*words, "--reference", "0.3, 0; 0, 0")
 
 
+def test_a_unit_of_version_2_that_is_none_is_an_error_and_not_a_crash(exported):
+    library = Unit(exported[0] / "c" / "arm.fmu").slave.dll
+    for name in ("fmi2EnterInitializationMode", "fmi2Terminate"):
+        assert getattr(library, name)(None) == 3  # fmi2Error
+
+
 def test_the_command_writes_the_unit_with_names_units_and_sources(exported):
     folder, printed = exported
     assert "arm.fmu: the controller as a co-simulation unit, FMI 2" in printed.output.replace("\n", "")

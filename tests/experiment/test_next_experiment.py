@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.experiment.ensemble import Ensemble, fit_ensemble
+from koopmpc.experiment.ensemble import Ensemble, fit_ensemble, stack_regressors
+from koopmpc.experiment.planner import _name_terms
 from koopmpc.experiment.standing import check_standing
 from koopmpc.experiment.visits import weigh_visits
+from koopmpc.lifting.base import strip_unit
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,32 @@ def test_an_aborted_experiment_is_named(plan):
     half = km.collect(CART, plan.starts, plan, episodes=2, steps=30)
     assert "ends after 30 of 80 steps: the experiment was aborted" in str(plan.review(half))
     assert plan.review(half).steps == (30, 30)
+
+
+def test_each_log_of_an_experiment_is_said_to_stay_inside_its_band_or_to_leave_it(plan):
+    episodes = [
+        km.Episode(X=(low + high) / 2, U=np.zeros((80, 1))) for low, high in zip(plan.low, plan.high, strict=True)
+    ]
+    X = np.array(episodes[1].X)
+    X[7, 1] = plan.high[1, 7, 1] + 0.01
+    found = plan.review(km.Episodes([episodes[0], km.Episode(X=X, U=episodes[1].U)], plan.dt, plan.states, plan.inputs))
+    assert found.held == (True, False)
+    assert found.sentences[0] == "log 0 stays inside the band"
+    assert found.sentences[1].startswith("log 1 leaves the band at step 7: ")
+    assert len(found.sentences) == 2
+
+
+def test_the_terms_of_a_model_are_named_as_its_regressors_stand(logs):
+    lifting = km.State() + km.Constant() + km.Monomials(2)
+    model = km.bilinear_edmd(logs, lifting, ridge=1e-6)
+    names, point = _name_terms(model), np.array([0.5, 0.25])
+    values = {strip_unit(name): value for name, value in zip(model.lifting.names, model.lifting(point), strict=True)}
+    u = strip_unit(model.inputs[0])
+    expected = [values.get(name, 3.0 * values.get(name.removeprefix(f"{u} × "), 1.0)) for name in names]
+    regressors = stack_regressors(model.lifting(point)[None], np.array([[3.0]]), np.zeros((1, 0)), bilinear=True)
+    np.testing.assert_allclose(regressors[0], expected)
+    assert names.count(u) == 2  # alone, and times the Constant
+    assert len(set(names)) == len(names) - 1
 
 
 def test_set_points_are_planned_for_a_standing_controller():

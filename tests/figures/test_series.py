@@ -146,6 +146,18 @@ def test_runs_of_a_report_show_the_limits_that_are_near() -> None:
     assert torque.get_ylim()[0] < -5
 
 
+def test_runs_of_a_report_show_a_reference_of_their_states_alone() -> None:
+    model, limits = turning(), km.Limits(-9, 9)
+    for cost, columns, drawn in ((km.Cost(1, 1), 2, True), (km.Cost(1, 1, of=km.State([1])), 1, False)):
+        mpc = km.KoopmanMPC(model, cost, limits, 4)
+        run = km.simulate(model.step_map(), mpc, x0=[1, 0], reference=[0.5, 0.2][:columns], steps=5, cost=cost)
+        shown = [
+            [line.get_ydata().tolist() for line in panel.lines if line.get_label() == "reference"]
+            for panel in draw_trajectories({"mpc": run}).axes
+        ]
+        assert shown == ([[[0.5] * 6], [[0.2] * 6], []] if drawn else [[], [], []])
+
+
 def find_hidden(drawing):
     """Return what is drawn outside its panel: curves, inputs, and limits that are near."""
     hidden = []

@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 from koopmpc.cli.app import app
+from koopmpc.fitting.certified import _explain_unfit
 from koopmpc.fitting.check import check_controller
 from koopmpc.fitting.goal import design_data, read_goal
 from koopmpc.fitting.verdict import judge_plant_runs, judge_rate, plan_verdict
@@ -159,3 +160,8 @@ def test_a_design_without_neighbours_is_judged_on_its_models(made, tmp_path):
     assert verdict.on_models == verdict.loops
     save_value(saved, tmp_path / "again.npz")
     assert load_value(tmp_path / "again.npz", SavedDesign).evidence.promise == saved.evidence.promise
+
+
+def test_a_certificate_is_not_sought_around_a_reference_that_moves(made):
+    assert _explain_unfit(made.design, np.zeros(2)) == ""
+    assert _explain_unfit(made.design, np.zeros((5, 2))).startswith("the reference moves")

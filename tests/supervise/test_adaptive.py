@@ -140,6 +140,24 @@ def test_only_so_many_unknown_steps_in_sequence_hand_over_and_as_many_known_ones
         assert {move.solve_time for move in moves} == {0.5}  # of both
 
 
+def test_both_controllers_are_told_the_input_that_acted_and_the_last_move_where_nobody_says_which():
+    class Noting(Scripted):
+        def reset(self, x0=None, u_prev=None):
+            super().reset()
+            self.seen = []
+
+        def __call__(self, y, reference, applied=None, w=None):
+            self.seen.append(None if applied is None else float(applied[0]))
+            return super().__call__(y, reference)
+
+    both = Noting(0.25, [True, False, False, False, True]), Noting(0.75, ())
+    guarded = km.supervise.Guarded(*both, patience=2)
+    guarded.reset()
+    for applied in (None, None, [0.5], None, None):
+        guarded([0.0], [0.0], applied)
+    assert [one.seen for one in both] == [[None, 0.25, 0.5, 0.75, 0.75]] * 2
+
+
 def test_by_region_a_plant_that_has_changed_hands_nothing_over_and_a_state_outside_the_data_does(
     model, train, tmp_path
 ):
