@@ -243,6 +243,7 @@ def _add_estimator(tables: Tables, program: CondensedProgram | StagedProgram, *,
             "KEPT": len(estimator.kept),
             "HELD": estimator.held,
             "RESTS": int(estimator.rests),
+            "SHOWS": int(estimator.shows),
         }
         plan |= {
             "filter_F": stack(F),

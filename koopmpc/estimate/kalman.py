@@ -79,6 +79,7 @@ class Augmented:
         self.to_periodic = self.to_d[:, n + self.steady :].copy()  # and `to_d` gives the constant part alone
         self.to_d[:, n + self.steady :] = 0.0
         self.rows, self.held, self.rests = self.M, 0, False
+        self.shows = np.array_equal(H[:, kept], predictor.C[:, kept])
 
     def read_before(self) -> None:
         """Have y be what the model's next outputs are under the input of the step before, y = M (F s + G v) + h."""
@@ -93,7 +94,7 @@ class Augmented:
         self.f, self.M = np.append(self.f, np.zeros(nu)), np.hstack([self.M, D])
         self.rows = np.hstack([self.rows, np.zeros((len(D), nu))])
         self.to_z, self.to_d = (np.hstack([part, np.zeros((nz, nu))]) for part in (self.to_z, self.to_d))
-        self.held, self.rests = nu, np.array_equal(self.rows[:, : len(self.kept)], self.predictor.C[:, self.kept])
+        self.held, self.rests = nu, self.shows
 
 
 FilterModel = tuple[Augmented, Float[np.ndarray, "n n"], Float[np.ndarray, "ny ny"]]
@@ -118,6 +119,8 @@ class FilterProgram(EstimatorProgram):
         Entries at the end of s that are the input of the step before: nu with feedthrough, else 0.
     rests
         Where no start is given, s begins as if the plant had rested at the first y.
+    shows
+        y are the states of the model: an estimate that is lost begins again as if the plant had rested at y.
     """
 
     F: Float[np.ndarray, "ns ns"]
@@ -135,6 +138,7 @@ class FilterProgram(EstimatorProgram):
     patience: int
     held: int = 0
     rests: bool = False
+    shows: bool = False
 
 
 class KalmanFilter(Viewing):
@@ -155,7 +159,7 @@ class KalmanFilter(Viewing):
         self.ny, nz = len(self._system.M), len(self._system.one)
         n, inputs = self._system.G.shape
         self._known, self._found = np.ones(n + inputs + self.ny + 1), np.zeros(n + 2 * nz + self.ny)
-        self._gate = ReadingGate(self.ny)
+        self._gate = ReadingGate(self.ny, self._system.shows)
         self._see()
         self.reset()
 
@@ -168,17 +172,17 @@ class KalmanFilter(Viewing):
     def program(self) -> FilterProgram:
         """Return the data with which z and d are found."""
         parts = {name: getattr(self._system, name) for name in ("F", "G", "f", "M", "h", "to_z", "one", "to_d", "kept")}
-        gate = gate_graph(self.ny)
-        held, rests = self._system.held, self._system.rests
+        system = self._system
         return FilterProgram(
             **parts,
             P=self._P,
             R=self._R,
             delay=self._delay,
             patience=self._patience,
-            held=held,
-            rests=rests,
-            gate=gate,
+            held=system.held,
+            rests=system.rests,
+            shows=system.shows,
+            gate=gate_graph(self.ny, system.shows),
         )
 
     @property
@@ -210,6 +214,7 @@ class KalmanFilter(Viewing):
         start = checks.start(x0, system.predictor.nx)
         self._sought = start is None and system.rests
         self._rest_at(np.zeros(system.predictor.nx) if start is None else start, np.zeros(system.predictor.nu))
+        self._start = self._s[: len(self._s) - system.held].copy()
         self._inputs.clear()
         self._started = False
         self._missed = 0
@@ -222,7 +227,6 @@ class KalmanFilter(Viewing):
         point = x if predictor.embedding is None else predictor.embedding.repeat(x, u)
         self._s[:free] = 0.0
         self._s[: len(system.kept)] = predictor.lift(point)[system.kept]
-        self._start = self._s[:free].copy()
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Correct the state of `delay` steps ago with y, and predict it to the present with the inputs since then.
@@ -253,6 +257,7 @@ class KalmanFilter(Viewing):
             self._s[-system.held :] = u
             if self._sought and (np.abs(y) < HUGE).all():
                 self._rest_at(y, u)
+                self._start = self._s[: len(self._start)].copy()
         if len(self._inputs) > self._delay:
             self._s[:] = self._next(self._s, self._inputs.popleft())
         came = np.abs(y) < HUGE  # False for NaN
@@ -260,9 +265,10 @@ class KalmanFilter(Viewing):
         if not first and (self._delay or not self._started):
             self._gate.judge(y, self._clip(system.M @ self._s + system.h))
         if self._gate.lost:
-            if system.rests and came.all():
+            if system.shows and came.all():
                 self._rest_at(y, u)
-            self._s[: len(self._start)] = self._start
+            else:
+                self._s[: len(self._start)] = self._start
         useful = came & ~self._is_silent(y, system.M @ self._s + system.h)
         if not first and useful.any() and not self._gate.refused:
             self._s += self._gain(useful) @ (y[useful] - system.M[useful] @ self._s - system.h[useful])

@@ -199,7 +199,11 @@ class Estimate:
         due = len(self.queue) >= rule.delay
         if due:
             self.judge(y, rule.M @ self.s + rule.h)
-            self.s = self.start if self.lost else self.s
+            if self.lost:
+                self.s = self.start.copy()
+                if rule.shows and came.all():
+                    self.zeta, kept = None, rule.kept
+                    self.s[: len(kept)] = evaluate(self.program.lifting, self.point(y, u))[kept]
         if due and came.any() and not self.refused:
             M = rule.M[came]
             S = M @ rule.P @ M.T + rule.R[np.ix_(came, came)]

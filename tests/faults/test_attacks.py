@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import koopmpc as km
+from tests.compiler import needs_compiler
 from tests.estimate.plants import linear
 from tests.estimate.test_readings import LIMITS, MORE, PERIODIC, burst, loop, plant_for
 from tests.faults.test_glitches import PLANT, online, pairs, worst
@@ -76,7 +77,7 @@ def test_what_learns_online_learns_no_wild_reading_and_counts_each(size, length)
     assert worst(learner.predictor(), PLANT) == pytest.approx(worst(twin.predictor(), PLANT), rel=0.2)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in MORE if kind != "KoopmanMPC, filter"])
+@pytest.mark.parametrize("kind", MORE)
 def test_smaller_wild_readings_from_the_first_step_on_are_left_behind(kind):
     """Off by hundreds of steps of the plant, not by the 1e4 that make a reading absurd; equal ones agree with each other."""
     controller, plant = build(kind), plant_for(kind)
@@ -86,6 +87,18 @@ def test_smaller_wild_readings_from_the_first_step_on_are_left_behind(kind):
     for wild, at in filters if "filter" in kind else others:
         away = np.abs(loop(controller, 1, wild, plant, 90, at)[0] - X) / np.ptp(X, axis=0)
         assert (away[-15:] <= (0.2 if kind == PERIODIC else 0.1)).all(), (wild[0], len(wild), at)
+
+
+@needs_compiler
+@pytest.mark.parametrize("at", [0, 1, 4])
+def test_machine_code_leaves_the_first_wild_readings_behind_as_python_does(at):
+    python, plant = build("KoopmanMPC, filter"), plant_for("KoopmanMPC, filter")
+    c = km.compiled(python)
+    for wild in (np.full((1, 2), 50.0), np.full((5, 2), 1000.0), np.array([[50.0, 50.0], [np.nan, 0.1]])):
+        X, U, *_ = loop(python, 1, wild, plant, 60, at)
+        X_c, U_c, *_ = loop(c, 1, wild, plant, 60, at)
+        np.testing.assert_allclose(U_c, U, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(X_c, X, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", MORE)

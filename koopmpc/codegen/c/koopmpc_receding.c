@@ -161,7 +161,7 @@ static void forget_estimate(koopmpc_state *s) {
 
 /** s <- that of a plant that has rested at y under u, if all of y has come; else that of the start. */
 static void rest_at(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
-#if KOOPMPC_RESTS
+#if KOOPMPC_SHOWS
   if (koopmpc_usable(y, KOOPMPC_NY)) {
     s->seen = 0;
     koopmpc_observe(s->zeta, &s->seen, s->z, y, u);
@@ -171,6 +171,14 @@ static void rest_at(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real 
   (void)u;
 #endif
   forget_estimate(s);
+}
+
+/** Begin a lost estimate again at y, and keep the start of the run. */
+static void begin_again(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
+  koopmpc_real start[KOOPMPC_NZETA];
+  koopmpc_copy(start, s->zeta, KOOPMPC_NZETA);
+  rest_at(s, y, u);
+  koopmpc_copy(s->zeta, start, KOOPMPC_NZETA);
 }
 
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
@@ -195,7 +203,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
     for (int i = 0; i < KOOPMPC_NY; i++)
       expected[i] = koopmpc_filter_h[i] + koopmpc_dot(koopmpc_filter_M + i * KOOPMPC_NS, s->s, KOOPMPC_NS);
     s->refused = koopmpc_refuse(s->gate, y, expected, &opened);
-    if (opened == 2) rest_at(s, y, u);
+    if (opened == 2) begin_again(s, y, u);
     if (any && !s->refused) correct(s, y);
   }
   s->missed = any ? 0 : s->missed + 1;
