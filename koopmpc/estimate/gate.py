@@ -54,7 +54,7 @@ def gate_function(ny: int, leaps: bool = False) -> ca.Function:
     before were wild: the observer starts again from y, and S is forgotten. This is done twice, and twice again after a
     reading off by 1e4 times all that its output had shown was used.
 
-    With `leaps`, where a disturbance is learned or a filter reads all states, smaller wild ones are left behind too. While
+    With `leaps`, where a disturbance is learned or a filter reads all states, smaller ones are left behind too. While
     the gate is open, a reading leaps if |y − last| and |y − ŷ| are both beyond 10 times the largest step, used or
     predicted. An absurd one does not, nor the fifth or a later one before any step. The observer starts again from y,
     up to six times.
