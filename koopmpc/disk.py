@@ -109,7 +109,9 @@ def beside(file: Path) -> Path:
     """Return the path of a new file beside this one; a device or a pipe itself."""
     if file.exists() and not file.is_file():
         return file
-    _remove_abandoned(file)
+    for part in _list_parts(file.parent):
+        if part.name[: -len(PART) - 9] == f".{file.name[:80]}":
+            _remove_abandoned(part)
     return file.with_name(f".{file.name[:80]}.{secrets.token_hex(4)}{PART}")
 
 
@@ -117,19 +119,31 @@ PART = ".part"  # ends the name of a file that is being written
 _ABANDONED = 3600.0  # [s] after which one that no process holds and nobody has written to is what a killed one left
 
 
-def _remove_abandoned(file: Path) -> None:
-    """Remove what processes that were killed while they wrote this file left beside it."""
-    for part in _list_parts(file.parent):
-        if part.name[: -len(PART) - 9] == f".{file.name[:80]}":
-            with suppress(OSError), part.open("rb") as stream:
-                if time.time() - part.stat().st_mtime > _ABANDONED and _lock(stream.fileno()):
-                    part.unlink()
+_PARTS = f".*.{'[0-9a-f]' * 8}{PART}"
+_CALLS = "????-??-??T??-??-??-*"  # folders of calls
+
+
+def remove_abandoned(logs: Path) -> None:
+    """Remove what killed processes left in the folders of calls in this one; a folder that is then empty goes too."""
+    for part in list(logs.glob(f"{_CALLS}/**/{_PARTS}")):
+        if _remove_abandoned(part):
+            with suppress(OSError):
+                part.parent.rmdir()
+
+
+def _remove_abandoned(part: Path) -> bool:
+    """Remove the unfinished file if a killed process left it; return whether it did."""
+    with suppress(OSError), part.open("rb") as stream:
+        if time.time() - part.stat().st_mtime > _ABANDONED and _lock(stream.fileno()):
+            part.unlink()
+            return True
+    return False
 
 
 @cache
 def _list_parts(folder: Path) -> tuple[Path, ...]:
     """Return the unfinished files that this process found in a folder at its first save: a sweep saves thousands."""
-    return tuple(folder.glob(f".*.{'[0-9a-f]' * 8}{PART}"))
+    return tuple(folder.glob(_PARTS))
 
 
 def settle(part: Path, file: Path, number: int) -> None:
