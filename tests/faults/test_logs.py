@@ -12,6 +12,7 @@ import pyarrow as pa
 import pytest
 
 import koopmpc as km
+from koopmpc.recording.description import Entity
 from koopmpc.recording.reader import LogColumns
 from tests.recording.runs import about, make_run, steps_of
 from tests.tiers import slow
@@ -274,3 +275,36 @@ def test_rows_come_in_order_of_their_steps_whatever_that_of_their_batches(seed: 
     for length in (count, 5):  # what lies beyond the end is left out
         expected = [values[k, 0] if k in there and told[k] else -1.0 for k in range(length)]
         assert log.fill("s", "scalars", np.full(length, -1.0)).tolist() == expected
+
+
+@pytest.mark.parametrize("entity", [Entity.STATE, Entity.REFERENCE, Entity.INPUT, Entity.SOLVER])
+@pytest.mark.parametrize("lost", [1, 3])
+def test_a_run_is_as_long_as_the_shortest_of_its_columns(
+    entity: Entity, lost: int, tmp_path: Path, monkeypatch
+) -> None:
+    run, path = make_run(T=9), tmp_path / "run.rrd"
+    km.record(run, path)
+    rows = LogColumns.rows
+
+    def shortened(log: LogColumns, name: str, component: str = "scalars") -> tuple:
+        k, widths, values = rows(log, name, component)
+        if name.removeprefix("/") != entity or component != "scalars":
+            return k, widths, values
+        return k[:-lost], widths[:-lost], values[: int(widths[:-lost].sum())]
+
+    monkeypatch.setattr(LogColumns, "rows", shortened)
+    read, said = outcome(path)
+    assert said == [word(path, 9 - lost, 9, planned=" of 9")]
+    assert read == head(run, 9 - lost)
+
+
+def test_a_log_that_was_not_closed_says_so_though_all_steps_are_there(tmp_path: Path, monkeypatch) -> None:
+    run, path = make_run(T=9), tmp_path / "run.rrd"
+    km.record(run, path)
+    static = LogColumns.static
+    monkeypatch.setattr(
+        LogColumns, "static", lambda log, name, part: None if name == Entity.METRICS else static(log, name, part)
+    )
+    read, said = outcome(path)
+    assert said == [word(path, 9, 9, planned=" of 9")]
+    assert read == run

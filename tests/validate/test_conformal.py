@@ -34,6 +34,9 @@ def test_the_band_is_the_ranked_score_times_the_scale() -> None:
     assert again.quantile == pytest.approx(np.sort(worst)[26], rel=1e-12)  # ⌈30 · 0.9⌉ = 27th of 29
     assert np.array_equal(again.scale, band.scale)
     assert np.allclose(again.width, again.quantile * band.scale)
+    drawn = km.validate.forecast(MODEL, fresh[0], STEPS, bands=again)
+    for end, sign in ((drawn.low, -1), (drawn.high, 1)):
+        np.testing.assert_allclose(end[1:], drawn.predicted[1:] + sign * again.width)
     assert again.measure_coverage(MODEL, fresh).share == pytest.approx(27 / 29)
 
 

@@ -39,6 +39,7 @@ def test_it_is_silent_on_logs_of_a_sound_plant(seed):
         "spikes",
         "constant input",
         "feedback",
+        "jump",
     ),
 )
 def test_each_kind_of_fault_is_found_in_two_of_three_logs_that_have_it(kind):
