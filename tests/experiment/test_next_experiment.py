@@ -9,7 +9,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.experiment.ensemble import Ensemble, fit_ensemble, stack_regressors
-from koopmpc.experiment.planner import _name_terms
+from koopmpc.experiment.planner import Planner, _name_terms
 from koopmpc.experiment.standing import check_standing
 from koopmpc.experiment.visits import weigh_visits
 from koopmpc.lifting.base import strip_unit
@@ -196,6 +196,21 @@ def test_the_terms_of_a_model_are_named_as_its_regressors_stand(logs):
     np.testing.assert_allclose(regressors[0], expected)
     assert names.count(u) == 2  # alone, and times the Constant
     assert len(set(names)) == len(names) - 1
+
+
+def test_a_past_is_as_wide_as_the_room_of_its_states_and_inputs(logs, monkeypatch):
+    widths, find = [], Planner._widths
+
+    def watched(self, point):
+        widths.append((find(self, point), self.asked.high - self.asked.low))
+        return widths[-1][0]
+
+    monkeypatch.setattr(Planner, "_widths", watched)
+    model = km.edmd(logs, km.State() + km.Constant(), embedding=km.Delay(1), ridge=1e-6)
+    km.next_experiment(logs, COST, LIMITS, reference=[1, 0], steps=12, rng=1, model=model)
+    for found, states in widths:
+        assert found.tolist() == [*states, 4.0, *states]  # x_k, u_{k-1}, x_{k-1}: inputs from -2 to 2
+    assert widths
 
 
 def test_set_points_are_planned_for_a_standing_controller():

@@ -140,6 +140,12 @@ def test_nan_passes_through_a_step():
     assert np.isnan(PLANTS["RK4(substeps=1)"]([0, np.nan, 0, 0], [0.0])).any()
 
 
+@pytest.mark.parametrize(("x", "u"), [(3, 1), (5, 1), (4, 2), (4, 0)])
+def test_arrays_of_another_length_are_refused_though_their_type_is_right(x, u):
+    with pytest.raises(km.errors.ShapeError, match=r"has shape"):
+        PLANTS["RK4(substeps=1)"](np.zeros(x), np.zeros(u))
+
+
 def test_a_step_map_is_frozen():
     with pytest.raises(AttributeError):
         PLANTS["RK4(substeps=1)"].dt = 1.0
