@@ -191,7 +191,11 @@ def _build_problem(program: CondensedProgram, plan: Float[np.ndarray, "n p1"]) -
 
 
 def _read_box(corners: Corners, name: str, size: int) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    low, high = (np.asarray(checks.vector(end, name, size), dtype=float) for end in corners)
+    try:
+        first, last = corners
+    except (TypeError, ValueError) as error:  # of what cannot be iterated, and of other than two parts
+        raise DataError(f"{name} is {checks.article(corners)}; pass (low, high)") from error
+    low, high = (np.asarray(checks.vector(end, name, size), dtype=float) for end in (first, last))
     if (low > high).any():
         raise DataError(f"{name} is {low.tolist()} … {high.tolist()}; pass (low, high) with low ≤ high")
     return low, high

@@ -102,7 +102,7 @@ def find_terminal_set(
     'OPTIMAL'
     """
     checks.kind(predictor, "predictor", LinearPredictor, "a bilinear model has a certificate: use km.certify")
-    if kind not in ("polytope", "ellipsoid"):
+    if not checks.among(kind, ("polytope", "ellipsoid")):
         raise DataError(f"kind is {kind!r}; pass 'polytope' or 'ellipsoid'")
     loop = build_tail_loop(predictor, cost, limits, reference)
     kept = tuple(int(i) for i in loop.kept)

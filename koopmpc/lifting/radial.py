@@ -92,7 +92,8 @@ class Gaussian(Lifting):
 
     def __init__(self, centers: ArrayLike, width: ArrayLike, *, bound: tuple[str, ...] | None = None) -> None:
         rows = check_centers(centers)
-        if np.ndim(width) == 0:
+        widths = checks.array(width, "width")
+        if widths.ndim == 0:
             freeze(self, centers=rows, width=checks.positive(cast("float", width), "width"), bound=bound)
             return
         widths = checks.array(width, "width", (len(rows),))

@@ -14,6 +14,8 @@ from typing import Any, Literal, cast
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc import checks
+from koopmpc.disk import path_of
 from koopmpc.errors import DataError, KoopmpcError, LogError, install
 
 Interface = Literal["model exchange", "co-simulation"]
@@ -132,9 +134,9 @@ def read_description(path: str | Path, interface: str | None) -> UnitDescription
     DataError
         The unit is FMI 1, lacks the interface, or holds no binary for this platform.
     """
-    if interface is not None and interface not in INTERFACES:
+    if interface is not None and not checks.among(interface, INTERFACES):
         raise DataError(f'interface is {interface!r}; pass "model exchange" or "co-simulation"')
-    fmpy, place = import_fmpy(), Path(path)
+    fmpy, place = import_fmpy(), path_of(path, "pass the path of an .fmu file")
     names = _check_archive(place)
     try:
         with zipfile.ZipFile(place) as archive:

@@ -98,6 +98,11 @@ def fmu(
     ----------
     Functional Mock-up Interface Specification 2.0.4 and 3.0.1, Modelica Association.
     """
+    if start_values is not None:
+        checks.kind(start_values, "start_values", Mapping, 'pass {"name": value}')
+    how = "pass one of km.plants, as km.plants.RK4()"
+    checks.members(integrator, "the integrator", ("step",), how)
+    checks.takes(integrator.step, "the integrator's step", 2, how)
     unit = read_description(path, interface)
     step = unit.step_size if dt is None else dt
     if step is None:

@@ -258,6 +258,8 @@ def design(
     wished = None if coverage is None else check_coverage(coverage, few)
     ahead = 1 if horizon is None else checks.count(horizon, "horizon")
     used, projected = "", np.zeros(0)
+    for switch, name in ((smooth, "smooth"), (feedthrough, "feedthrough")):
+        checks.kind(switch, name, (bool, np.bool_), "pass True or False")
     if instruments is not None or (smooth and not feedthrough and isinstance(data, Episodes)):
         loop = remove_feedback(require_episodes(data), instruments)
         data, projected, used = loop.episodes, loop.noise, loop.sentence

@@ -13,9 +13,34 @@ import numpy as np
 
 import koopmpc as km
 
-ROOMS = ("identify", "validate", "data", "control", "plot", "supervise", "plants", "faults")
+ROOMS = (
+    "identify",
+    "validate",
+    "data",
+    "control",
+    "plot",
+    "supervise",
+    "plants",
+    "faults",
+    "guarantees",
+    "estimate",
+    "predict",
+    "experiment",
+)
 # What opens a window, runs for minutes, or is given to a program of its own.
-LEFT_OUT = ("view", "serve", "cluster", "realtime", "sweep", "export", "compiled", "video", "record", "fmu", "FMU")
+LEFT_OUT = (
+    "view",
+    "serve",
+    "cluster",
+    "realtime",
+    "sweep",
+    "export",
+    "compiled",
+    "video",
+    "record",
+    "FMUPlant",
+    "FMUStep",
+)
 SECONDS = 10
 BAD: list[Any] = [
     *(None, 7, -1, 0, 1e308, float("nan"), float("inf"), 10**30, "", "x", "\x00", b"x", [], {}, object(), [1, 2]),

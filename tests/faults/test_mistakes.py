@@ -472,3 +472,20 @@ def test_things_of_another_kind_for_rows_solver_instruments_and_smooth_are_named
 def test_a_switch_that_is_no_bool_is_refused_by_one_name_of_a_bool():
     with pytest.raises(km.errors.DataError, match="feedthrough is an int, expected a bool; pass True or False"):
         km.ExtendedKalman(feedthrough=1)
+
+
+def test_garbage_for_a_unit_a_prior_and_a_box_is_named(model):
+    for given, said in (
+        ({"path": 3}, r"3 is not a path; pass the path of an \.fmu file"),
+        ({"interface": {}}, "interface is {}; pass"),
+        ({"start_values": [1]}, "start_values is a list"),
+        ({"integrator": 7}, "the integrator"),
+    ):
+        with pytest.raises(km.errors.DataError, match=said):
+            km.plants.fmu(**{"path": "none.fmu", **given})
+    with pytest.raises(km.errors.DataError, match="symmetric is a ndarray"):
+        km.identify.Prior(symmetric=np.zeros((0, 2)))
+    mpc = km.KoopmanMPC(model, PENDULUM.cost, PENDULUM.limits, 5)
+    for bad in (mpc, (0, 1, 2)):
+        with pytest.raises(km.errors.DataError, match=r"states is .*; pass \(low, high\)"):
+            km.guarantees.bound_iterations(mpc, bad, (0, 0))

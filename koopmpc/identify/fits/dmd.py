@@ -68,7 +68,9 @@ def dmd(
     >>> abs(np.log(model.eigenvalues).imag / 0.1).round(6)  # rad/s
     array([2., 2.])
     """
-    regression = _regression(source_of(episodes), "dmd", inputs=(), noisy=method != "ls", options=options)
+    regression = _regression(
+        source_of(episodes), "dmd", inputs=(), noisy=not checks.among(method, ("ls",)), options=options
+    )
     return build_predictor(regression, fit_regression(regression, rank=rank, method=method))
 
 
@@ -115,7 +117,9 @@ def dmdc(
     if source.nw:
         raise DataError("the episodes hold measured disturbances, which dmdc does not fit; use edmd on State()")
     known = None if B is None else checks.array(B, "B", (source.nx, source.nu))
-    regression = _regression(source, "dmdc", inputs=source.inputs, B=known, noisy=method != "ls", options=options)
+    regression = _regression(
+        source, "dmdc", inputs=source.inputs, B=known, noisy=not checks.among(method, ("ls",)), options=options
+    )
     return build_predictor(regression, fit_regression(regression, rank=rank, method=method))
 
 

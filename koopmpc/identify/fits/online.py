@@ -100,7 +100,7 @@ class OnlineEDMD:
         factor = checks.positive(forgetting, "forgetting")
         if factor > 1:
             raise DataError(f"forgetting is {factor:g}; it must lie in (0, 1], 1 forgets nothing")
-        if not 0 < keep < 1:
+        if not 0 < float(checks.array(keep, "keep", ())) < 1:
             raise DataError(f"keep is {keep:g}; it must lie between 0 and 1")
         nz, nf = self._lifting.nz, len(self._inputs) + len(self._disturbances)
         self._n, width = nz + nf, nf + 2 * self._full.nz

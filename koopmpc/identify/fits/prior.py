@@ -164,6 +164,7 @@ class Prior(Value):
             checks.kind(rows, "rows", Mapping, 'pass {"x [m]": {"v [m/s]": 0.1}}')
             for name, row in rows.items():
                 checks.kind(row, f"rows[{name!r}]", Mapping, 'pass {"v [m/s]": 0.1}')
+        checks.kind(symmetric, "symmetric", (bool, np.bool_), "pass True or False")
         known = {
             name: {other: float(checks.array(v, f"rows[{name!r}]", ())) for other, v in row.items()}
             for name, row in (rows or {}).items()
