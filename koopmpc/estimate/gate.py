@@ -46,8 +46,9 @@ def gate_function(ny: int, leaps: bool = False) -> ca.Function:
     the last one that was used. Entries that are NaN are not judged.
 
     Among the first readings, and while the gate is open, a wild one may be used. Where a prediction is then off by more
-    than 1e4 (S + |y|), the estimate is lost: the observer starts again from y. A plant that does not move, whatever is
-    predicted, looks alike: after the first readings this is done once, and again when an absurd reading was used.
+    than 1e4 (S + |y|), and y itself is not absurd, the estimate is lost: the observer starts again from y. A plant that
+    does not move, whatever is predicted, looks alike: after the first readings this is done once, if an output has
+    moved or a wild reading was left behind, and again when an absurd reading was used.
 
     Several wild ones in a row hide each other so. While the gate is open, an output may fall to less than 1e-4 of its
     last used value, but not to zero. If its prediction is off by more than 1e4 times what it falls to, the readings
@@ -81,7 +82,8 @@ def gate_function(ny: int, leaps: bool = False) -> ca.Function:
     jump = ca.if_else(foreseen, error, ca.if_else(known, ca.fabs(y - last), 0))
     leapt = ca.mmax(ca.logic_and(shown > 0, jump > ABSURD * shown))
     far = ca.logic_and(leapt, count > 1)
-    may_restart = ca.logic_or(count <= 2, ca.logic_and(largest > 0, ca.logic_not(restarted)))
+    moved = ca.logic_or(largest > 0, left > 0)  # leaving wild readings behind forgets S
+    may_restart = ca.logic_or(count <= 2, ca.logic_and(moved, ca.logic_not(restarted)))
     astray = ca.logic_and(error > ABSURD * (largest + ca.fabs(y)), may_restart)
     fell = ca.logic_and(ca.logic_and(known, y != 0), ca.fabs(last) > ABSURD * ca.fabs(y))
     missed = ca.if_else(foreseen, error > ABSURD * ca.fabs(y), 1)
@@ -89,12 +91,13 @@ def gate_function(ny: int, leaps: bool = False) -> ca.Function:
     if leaps:
         ahead_first = ca.if_else(came, ca.fabs(predicted - last), 0)
         rounded = ca.if_else(came, ROUNDING * ca.fmax(ca.fabs(last), ca.fmax(ca.fabs(predicted), ca.fabs(y))), 0)
-        steps, moved = ca.fmax(size, ahead_first), ca.if_else(came, ca.fmin(error, ca.fabs(y - last)), 0)
-        leap = ca.logic_and(ca.logic_and(steps > rounded, moved > LEAP * steps), ca.logic_or(largest > 0, count <= 2))
+        steps, way = ca.fmax(size, ahead_first), ca.if_else(came, ca.fmin(error, ca.fabs(y - last)), 0)
+        leap = ca.logic_and(ca.logic_and(steps > rounded, way > LEAP * steps), ca.logic_or(largest > 0, count <= 2))
         apart = ca.logic_and(ca.mmax(leap), ca.logic_not(far))
         suspected = ca.logic_or(suspected, apart)
     back = ca.logic_and(suspected, ca.logic_and(left < (LEAPS if leaps else SUSPECTS), ca.logic_not(closed)))
-    lost = ca.logic_or(ca.logic_and(ca.mmax(astray), ca.logic_not(far)), back)
+    away = ca.mmax(ca.logic_and(known, ca.fabs(y - last) > ABSURD * shown))  # else the prediction is absurd, not y
+    lost = ca.logic_or(ca.logic_and(ca.mmax(astray), ca.logic_not(ca.logic_and(far, away))), back)
     absurd = ca.logic_and(far, ca.logic_not(ca.logic_and(judged, closed)))
     wild = ca.logic_and(ca.logic_and(judged, closed), ca.logic_not(good))
     patient = count < FEW + ca.if_else(far, LONG, BRIDGED)

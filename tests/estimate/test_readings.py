@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 import koopmpc as km
 from koopmpc.estimate.gate import BEYOND, BRIDGED, FEW, LEAST, LONG, ReadingGate
 from tests.compiler import needs_compiler
+from tests.control.test_random_bilinear_loops import PLANTS as OSCILLATORS
 from tests.estimate.pendulums import PROBLEM, truth
 from tests.estimate.plants import linear
 from tests.tiers import few
@@ -411,3 +412,24 @@ def test_an_output_that_falls_beside_its_prediction_starts_the_estimate_again_tw
     for y in (1.0, 1e-5, 1e-9):  # as predicted
         gate.judge(np.array([y]), np.array([y]))
         assert not gate.lost
+
+
+SIX, TWO = [(1, 1e29), (0, 50.0), (1, 50.0), (0, 50.0), (0, -1e6), (0, 50.0)], [(1, 50.0), (0, 50.0)]
+
+
+@pytest.mark.parametrize(("plant", "burst"), [(0, SIX), (1, TWO)], ids=["six", "two"])
+def test_what_a_nonlinear_model_predicts_from_the_first_wild_readings_is_no_disturbance(plant, burst, monkeypatch):
+    """From 50 a cubic spring goes to 3e4: that was learned as d, and let a reading of 50 pass twenty steps later."""
+    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)  # a loop is shorter than its compilation
+    cost, limits = km.Cost(Q=[10.0, 1.0], R=0.1), km.Limits(-3, 3)
+    mpc = km.BilinearMPC(OSCILLATORS[plant], cost, limits, 15, estimator=km.LiftedDisturbance())
+    wild, x = dict(enumerate(burst, 2)) | {25: (0, 50.0)}, np.array([0.2, 0.1])
+    for k in range(26):
+        y = x.copy()
+        if k in wild:
+            y[wild[k][0]] = wild[k][1]
+        move = mpc(y, [0.3, 0.0])
+        assert k in wild or move.status.name in ("UNCONSTRAINED", "OPTIMAL"), (k, move.status)
+        assert np.abs(mpc.observer.d).max() < 1e-6, k
+        x = OSCILLATORS[plant](x, move.u)
+    assert move.refused
