@@ -49,7 +49,7 @@ def gate_function(ny: int, leaps: bool = False) -> ca.Function:
     than 1e4 (S + |y|), and y itself is not absurd, the estimate is lost: the observer starts again from y. A plant that
     does not move, whatever is predicted, looks alike: after the first readings this is done once, if an output has
     moved or a wild reading was left behind, again when an absurd reading was used, and wherever an output falls to a
-    tenth of its last used value. Once wild readings were left behind, S is forgotten with the rest.
+    tenth of its last used value, but not to zero. Once wild readings were left behind, S is forgotten with the rest.
 
     Several wild ones in a row hide each other so. While the gate is open, an output may fall to less than 1e-4 of its
     last used value, but not to zero. If its prediction is off by more than 1e4 times what it falls to, the readings
@@ -84,8 +84,8 @@ def gate_function(ny: int, leaps: bool = False) -> ca.Function:
     leapt = ca.mmax(ca.logic_and(shown > 0, jump > ABSURD * shown))
     far = ca.logic_and(leapt, count > 1)
     moved = ca.logic_or(largest > 0, left > 0)  # leaving wild readings behind forgets S
-    dropped = ca.mmax(ca.logic_and(known, ca.fabs(last) > LEAP * ca.fabs(y)))
-    may_restart = ca.logic_or(ca.logic_or(count <= 2, dropped), ca.logic_and(moved, ca.logic_not(restarted)))
+    dropped = ca.logic_and(ca.logic_and(known, y != 0), ca.fabs(last) > LEAP * (largest + ca.fabs(y)))
+    may_restart = ca.logic_or(ca.logic_or(count <= 2, ca.mmax(dropped)), ca.logic_and(moved, ca.logic_not(restarted)))
     astray = ca.logic_and(error > ABSURD * (largest + ca.fabs(y)), may_restart)
     fell = ca.logic_and(ca.logic_and(known, y != 0), ca.fabs(last) > ABSURD * ca.fabs(y))
     missed = ca.if_else(foreseen, error > ABSURD * ca.fabs(y), 1)
