@@ -47,9 +47,9 @@ def gate_function(ny: int, leaps: bool = False) -> ca.Function:
 
     Among the first readings, and while the gate is open, a wild one may be used. Where a prediction is then off by more
     than 1e4 (S + |y|), and y itself is not absurd, the estimate is lost: the observer starts again from y. A plant that
-    does not move, whatever is predicted, looks alike: after the first readings this is done once, if an output has
-    moved or a wild reading was left behind, again when an absurd reading was used, and wherever an output falls to a
-    tenth of its last used value, but not to zero. Once wild readings were left behind, S is forgotten with the rest.
+    does not move, whatever is predicted, looks alike. After the first readings this is done once, if an output has
+    moved or a wild reading was left behind, and again when an absurd reading was used. It is done wherever an output
+    falls to a tenth of its last used value, but not to zero. Once wild readings were left behind, S is forgotten too.
 
     Several wild ones in a row hide each other so. While the gate is open, an output may fall to less than 1e-4 of its
     last used value, but not to zero. If its prediction is off by more than 1e4 times what it falls to, the readings
