@@ -50,6 +50,10 @@ def delayed():
     return km.edmd(data(), km.State() + km.Constant(), embedding=km.Delay(1))
 
 
+def surrogate():
+    return km.synthesis.Surrogate(linear(), np.zeros(1), np.zeros(0), np.zeros(2))
+
+
 def take_steps(controller):
     for angle in (0.1, 1.9):
         controller([angle, 0.0], [0.3, 0.0])
@@ -80,7 +84,8 @@ BUILDS = {
     "KoopmanMPC": lambda _: take_steps(km.KoopmanMPC(linear(), COST, BOX, 8)),
     "offset-free": lambda _: take_steps(km.KoopmanMPC(linear(), COST, BOX, 8, estimator=km.LiftedDisturbance())),
     "delays": lambda _: delayed().step_map(),
-    "surrogate": lambda _: km.synthesis.Surrogate(linear(), np.zeros(1), np.zeros(0), np.zeros(2)).plant(1.2),
+    "surrogate": lambda _: surrogate().plant(1.2),
+    "equilibria": lambda _: surrogate().holding(COST, BOX),
     "LinearMPC": lambda _: take_steps(km.LinearMPC(plant(), *STEADY, COST, BOX, 8)),
     "BilinearMPC": lambda _: take_steps(km.BilinearMPC(bilinear(), COST, BOX, 3, estimator=km.LiftedDisturbance())),
     "NonlinearMPC": lambda _: take_steps(km.NonlinearMPC(plant(), COST, BOX, 4)),
