@@ -239,13 +239,15 @@ def test_a_sweep_waits_for_the_worker_of_one_that_was_killed(problem, tmp_path, 
         "fcntl.flock(file, fcntl.LOCK_EX)\n"
         "print('held', flush=True)\n"
         "time.sleep(float(sys.argv[1]))\n"
+        "print(time.time(), flush=True)\n"
     )
     for lives in (0.5, 60.0):
         with subprocess.Popen([sys.executable, "-c", hold, str(lives)], stdout=subprocess.PIPE, text=True) as worker:
             assert worker.stdout.readline() == "held\n"
             if lives < 1.0:
                 assert figures(km.sweep([problem], TWO, folder=folder, **grid)) == expected
-                assert worker.poll() == 0
+                ended = time.time()
+                assert float(worker.stdout.readline()) <= ended
             else:
                 monkeypatch.setattr("koopmpc.bench.store._OUTLIVES", 0.2)
                 with pytest.raises(km.errors.ProblemError, match="another process runs a sweep in"):
