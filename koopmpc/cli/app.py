@@ -233,16 +233,15 @@ def check(
     Exit code 0: the goal is kept. 1: it is not. 3: the logs do not show whether it is.
     """
     from koopmpc.data.files.folder import list_files
-    from koopmpc.data.files.load import load_episodes
     from koopmpc.disk import existing
-    from koopmpc.fitting.changed import read_new_logs
+    from koopmpc.fitting.changed import read_new_logs, read_plant_runs
     from koopmpc.fitting.check import check_controller
     from koopmpc.fitting.verdict import plan_verdict
 
     with friendly():
         existing(controller, "pass the .npz of a saved Controller or Design")
         say(plan_verdict(rate))
-        seen = None if on_plant is None else load_episodes(*list_files(on_plant))
+        seen = None if on_plant is None else read_plant_runs(controller, list_files(on_plant))
     with friendly(), folder_of(logs, "check") as folder, bar("runs") as progress:
         logged = None if not new else read_new_logs(controller, new)
         done = check_controller(

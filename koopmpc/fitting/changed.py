@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
-from koopmpc.data.episodes import Episode, Episodes, join_sets
-from koopmpc.data.files.load import load_episodes
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.files.load import load_alike, load_episodes
 from koopmpc.errors import DataError
 from koopmpc.synthesis.designed import SavedDesign, read_controller
 from koopmpc.validate.drift import DriftReport, find_drift
 
-_TABLES = (".csv", ".dat", ".txt")  # files whose columns have to be named
 _OFF = 0.2  # runs with inputs off by this share say whether a design bears such a change
 
 
@@ -82,18 +81,28 @@ def read_new_logs(path: str | PathLike[str], files: Sequence[str | PathLike[str]
     LogError
         A file cannot be read.
     """
-    saved = read_controller(Path(path))
-    own = saved.evidence.logs if isinstance(saved, SavedDesign) else None
+    own = _logs_of(path)
     if own is None:
         raise DataError(f"{path} holds no logs of a design, so new ones cannot be compared; design again, and save")
-    parts = [
-        load_episodes(file, states=own.states, inputs=own.inputs)
-        if Path(file).suffix.lower() in _TABLES
-        else load_episodes(file)
-        for file in files
-    ]
-    for file, part in zip(files, parts, strict=True):
-        if (part.states, part.inputs) != (own.states, own.inputs):
-            found, known = (", ".join(one.states + one.inputs) for one in (part, own))
-            raise DataError(f"{file} holds {found}, the design {known}; pass logs with these columns, in this order")
-    return join_sets([part.with_episodes([Episode(X=e.X, U=e.U) for e in part]) for part in parts])
+    new = load_alike(files, own)
+    if (new.states, new.inputs) != (own.states, own.inputs):
+        found, known = (", ".join(one.states + one.inputs) for one in (new, own))
+        raise DataError(f"{files[0]} holds {found}, the design {known}; pass logs with these columns, in this order")
+    return new.with_episodes([Episode(X=e.X, U=e.U) for e in new])
+
+
+def read_plant_runs(path: str | PathLike[str], files: Sequence[str | PathLike[str]]) -> Episodes:
+    """Return logged runs of a saved design on its plant; columns of tables have the names that it gave them.
+
+    Raises
+    ------
+    DataError, LogError
+        A file cannot be read, or lacks a column of the design.
+    """
+    own = _logs_of(path)
+    return load_episodes(*files) if own is None else load_alike(files, own)
+
+
+def _logs_of(path: str | PathLike[str]) -> Episodes | None:
+    saved = read_controller(Path(path))
+    return saved.evidence.logs if isinstance(saved, SavedDesign) else None

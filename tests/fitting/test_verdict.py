@@ -89,6 +89,29 @@ def test_logged_runs_on_the_plant_are_judged_and_those_of_another_controller_ref
     assert "How often it fails" in done.page.read_text()
 
 
+def test_runs_in_a_table_are_read_with_the_names_and_the_step_of_the_design(made, tmp_path, monkeypatch):
+    """No name says which column is the input, and there is none of time: the design knows both."""
+    saved, _ = load(made)
+    named = km.Episodes(list(saved.evidence.logs), 0.1, ["p", "q"], ["s"])
+    save_value(replace(saved, evidence=replace(saved.evidence, logs=named)), tmp_path / "design.npz")
+    runs, seen = run_plant(made, 2), []
+    runs.save(tmp_path / "runs.npz")  # holds its own names
+    (tmp_path / "runs").mkdir()
+    for i, run in enumerate(runs):
+        table = np.column_stack([run.X, np.concatenate([run.U, run.U[-1:]])])
+        np.savetxt(tmp_path / "runs" / f"{i}.csv", table, delimiter=",", header="p,q,s", comments="")
+    (tmp_path / "other.csv").write_text("p,s\n0,0\n0,0\n0,0\n")
+    monkeypatch.setattr("koopmpc.fitting.check.check_controller", lambda *_, on_plant, **__: seen.append(on_plant))
+    for name in ("runs", "runs.npz", "other.csv"):
+        said = CliRunner().invoke(app, ["check", str(tmp_path / "design.npz"), "--on-plant", str(tmp_path / name)])
+    assert "'q'" in said.stderr
+    tables, whole = seen
+    assert (tables.dt, tables.states, tables.inputs, whole.states) == (0.1, ("p", "q"), ("s",), NAMES[0])
+    for one, other, run in zip(tables, whole, runs, strict=True):
+        np.testing.assert_allclose(np.hstack([one.X[:-1], one.U]), np.hstack([run.X[:-1], run.U]), atol=1e-15)
+        np.testing.assert_array_equal(other.X, run.X)
+
+
 def test_runs_in_a_late_log_are_judged_by_the_input_that_answered_each_row(made):
     saved, controller = load(made)
     runs, model = run_plant(made, 3), get_model(controller)

@@ -78,26 +78,41 @@ def load_episodes(
         There are gaps, columns that are constant or repeat another, or no column with the name of an input; unequal
         steps were interpolated. What is the same in several files is one warning, with their count and names.
     """
-    settings = TableSettings(dt, states, inputs, disturbances, resample, columns)
-    files = [log if is_frame(log) else disk.path_of(log) for log in (path, *more)]
+    return _load((path, *more), TableSettings(dt, states, inputs, disturbances, resample, columns))
+
+
+def load_alike(files: Sequence[str | PathLike[str]], like: Episodes) -> Episodes:
+    """Read files as one set, tables with the names and the sample time of other episodes of the same plant.
+
+    Raises
+    ------
+    LogError, DataError
+        As `load_episodes` does.
+    """
+    return _load(files, TableSettings(like.dt, like.states, like.inputs), own=True)
+
+
+def _load(logs: Sequence[Any], settings: TableSettings, *, own: bool = False) -> Episodes:
+    """Read files as one set; with `own`, those that hold their own names and dt keep them."""
+    files = [log if is_frame(log) else disk.path_of(log) for log in logs]
     places = ["a DataFrame" if is_frame(log) else str(log) for log in files]
     if len(files) == 1:
-        return _load_file(files[0], settings)
+        return _load_file(files[0], settings, own)
     caught: list[warnings.WarningMessage] = []
     try:
         with warnings.catch_warnings(record=True) as caught:
-            sets = [_load_file(file, settings) for file in files]
+            sets = [_load_file(file, settings, own) for file in files]
     finally:
         said = [one.message for one in caught if isinstance(one.message, Warning)]
         for joined in join_warnings(said, places):
-            warnings.warn(joined, stacklevel=2)
+            warnings.warn(joined, stacklevel=3)
     plant = PlantSignature.of(sets[0], places[0])
     for place, episodes in zip(places, sets, strict=True):
         plant.check(episodes, place, tolerance=0.0)
     return join_sets(sets)
 
 
-def _load_file(file: Any, settings: TableSettings) -> Episodes:
+def _load_file(file: Any, settings: TableSettings, own: bool) -> Episodes:
     if is_frame(file):
         return read_frame(file, settings)
     content = read_log(file)
@@ -105,6 +120,6 @@ def _load_file(file: Any, settings: TableSettings) -> Episodes:
         return read_table(file, content, settings)
     if not isinstance(content, Episodes):
         return read_recording(file, content, settings)
-    if not settings.nothing:
+    if not own and not settings.nothing:
         raise DataError(f"{file} holds its own names and dt; leave out dt, states and inputs")
     return content
