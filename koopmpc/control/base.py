@@ -158,6 +158,7 @@ class InitialCondition(Viewing):
         self.refused = getattr(observer, "refused", False)
         if self._ahead.size:  # a disturbance that is not finite keeps its last value
             self._w = np.where(np.abs(self._ahead[0]) < HUGE, self._ahead[0], self._w)
+            self._hold(getattr(observer, "stand_in_w", None), w is None or np.ndim(w) == 1 or len(np.asarray(w)) == 1)
         z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
         p = np.zeros((self._latency, 1))
         if self._np:
@@ -168,6 +169,15 @@ class InitialCondition(Viewing):
         self.z[:] = z
         if self._estimated:
             self.d[:] = d
+
+    def _hold(self, held: Float[np.ndarray, " nw"] | None, constant: bool) -> None:
+        """Plan with the last w that was used where the last one was wild; of a preview only its first row changes."""
+        if held is None:
+            return
+        count = None if constant else 1
+        self._ahead[:count] = held
+        if constant or not self._latency:
+            self.W[:count] = held
 
     def _preview(self, w: ArrayLike | None) -> None:
         """Store the preview of the measured disturbances."""
@@ -182,6 +192,7 @@ class InitialCondition(Viewing):
             raise ShapeError(f"w has shape {rows.shape}, expected ({nw},), or rows of {nw} for steps k … k+{steps - 1}")
         if rows.ndim == 2 and len(rows) != steps:
             rows = rows[np.minimum(np.arange(steps), len(rows) - 1)]
+        rows = np.where(np.abs(rows) < HUGE, rows, np.nan)  # products with inf, or of what is larger, would warn
         self._ahead[:] = rows if rows.ndim == 1 else rows[: self._latency + 1]
         self.W[:] = rows if rows.ndim == 1 else rows[self._latency :]
 

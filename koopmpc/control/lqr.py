@@ -293,10 +293,14 @@ class LQR(FeedbackLaw):
         if key != self._reference_key:
             self._aim(target, told)
             self._reference_key = key
-        if self._given_rows is not None and self._row + 1 < len(self._given_rows):
-            self._row += 1
         self.take_applied(applied)
         self._observer.observe(x, self._last, self._w)
+        held = self._observer.stand_in_w if len(self._w) else None
+        if held is not None:
+            self._aim(target, held)
+            self._reference_key = None
+        if self._given_rows is not None and self._row + 1 < len(self._given_rows):
+            self._row += 1
         self._w = self._no_w if told is None else np.where(np.isfinite(told), told, self._w)
         free = self._feedforward - self._K @ self._observer.z
         if self._K_rate.size:

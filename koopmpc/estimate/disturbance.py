@@ -177,8 +177,8 @@ class DisturbanceObserver(Viewing, Measured):
         self._memory, self._C = np.zeros(self._rule.numel_in(2)), np.zeros(self.ny * own.nz)
         self._predicted, self._still = np.zeros(own.nz), np.zeros(own.nz)
         self._stood_in = False  # whether a prediction stood in for a part of the last reading
-        self._see()
         self._take(model)
+        self._see()
 
     def _see(self) -> None:
         """Make the views of the memory, and the call of the rule on these arrays; see `Viewing`."""
@@ -220,14 +220,8 @@ class DisturbanceObserver(Viewing, Measured):
         gate, expected, beyond = self._gate, self._nothing, False
         assert gate is not None, "it remembers readings"
         if self._seen[0]:
-            if self._ABE is None:
-                self._predicted[:] = self._model.advance(self.z, u, w, self._still)
-            else:
-                self._u[:] = u
-                if len(w):
-                    self._w[:] = w
-                self._ABE.dot(self._driven, self._predicted)
-            expected = self._to_y.dot(self._predicted + self.d)
+            self._u[:] = u
+            expected = gate.choose(y, w, self._predict) if len(w) else self._predict(w)
             if self._rails is not None:
                 beyond = bool(self._rails.is_beyond(y, expected).any())
                 expected = self._rails.clip(expected)
@@ -253,6 +247,15 @@ class DisturbanceObserver(Viewing, Measured):
             self._seen[0], self._stood_in = 1.0, True
             self._bridged += 1
         return False
+
+    def _predict(self, w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
+        """Store A z + B u + E w, and return the reading that it and d predict."""
+        if self._ABE is None:
+            self._predicted[:] = self._model.advance(self.z, self._u, w, self._still)
+        else:
+            self._w[:] = w
+            self._ABE.dot(self._driven, self._predicted)
+        return self._to_y.dot(self._predicted + self.d)
 
 
 @raise_swallowed()

@@ -173,6 +173,11 @@ class ExtendedObserver:
         """Whether the last y was refused: the filter only predicted."""
         return self._gate.refused
 
+    @property
+    def stand_in_w(self) -> Float[np.ndarray, " nw"] | None:
+        """The w to plan with, if the last one was wild."""
+        return self._gate.stand_in
+
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Forget everything; the run starts at x0, where it is known, or at the first reading."""
         self._begun, self._missed, n = False, 0, self._model.nz
@@ -194,6 +199,9 @@ class ExtendedObserver:
             return bool(np.isfinite(y).all()) and self._begin(y, u, np.ones(self.ny, dtype=np.bool_))
         n, ny = self._model.nz, self.ny
         F = np.eye(n + ny)
+        if len(w):
+            self._gate.choose(y, w, lambda w: self._predict_reading(self._model.advance(self.z, u, w, self.d), u, w)[1])
+            w = w if self._gate.w is None else self._gate.w
         F[:n, :n] = self._slope(self.z, u, w)
         F[:ny, n:] = np.eye(ny) if self._disturbed else 0.0
         z = np.array(self._model.advance(self.z, u, w, self.d), dtype=np.float64)

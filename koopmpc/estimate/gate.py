@@ -1,5 +1,6 @@
 """ReadingGate: a reading far from its prediction is not used; the prediction stands in for a few steps."""
 
+from collections.abc import Callable
 from functools import cache
 
 import casadi as ca
@@ -134,7 +135,7 @@ def gate_graph(ny: int, leaps: bool = False) -> Graph:
 
 
 class ReadingGate(Viewing):
-    """The gate of one closed loop; see `gate_function` for its rule.
+    """The gate of one closed loop; see `gate_function` for its rule, and `choose` for measured disturbances.
 
     Attributes
     ----------
@@ -144,6 +145,8 @@ class ReadingGate(Viewing):
         Whether the last reading is used though it is beyond the bound, after refused ones.
     lost
         Whether the last prediction was absurd, so that the observer starts again from the reading.
+    w
+        The measured disturbance of the last prediction that was chosen.
 
     Parameters
     ----------
@@ -157,6 +160,8 @@ class ReadingGate(Viewing):
 
     def __init__(self, ny: int, leaps: bool = False) -> None:
         self._ny, self._function = ny, gate_function(ny, leaps)
+        self.w: Float[np.ndarray, " nw"] | None = None
+        self._doubted = 0  # wild w in sequence
         self._memory = np.zeros(self._function.numel_in(2))
         self._see()
         self.reset()
@@ -171,6 +176,48 @@ class ReadingGate(Viewing):
         """Forget all readings."""
         self._memory[:] = 0.0
         self.refused = self.opened = self.lost = False
+        self.w, self._doubted = None, 0
+
+    def choose(
+        self,
+        y: Float[np.ndarray, " ny"],
+        w: Float[np.ndarray, " nw"],
+        predict: Callable[[Float[np.ndarray, " nw"]], Float[np.ndarray, " ny"]],
+    ) -> Float[np.ndarray, " ny"]:
+        """Return what this w predicts, or where it is wild what the last w that was used predicts.
+
+        w is wild if its prediction, as a reading, would be refused beside that of the last one, and y would not. A step
+        of w that the reading shows is used at once; after five wild ones in sequence w is used whatever it predicts.
+
+        Parameters
+        ----------
+        predict
+            w → the predicted reading. The last call is that of the prediction that is returned.
+        """
+        last = np.zeros(len(w)) if self.w is None else self.w
+        if self._doubted < BRIDGED and (w != last).any():
+            expected = predict(last).copy()
+            predicted = predict(w)
+            moved = np.where(np.abs(y) < HUGE, predicted, expected)
+            if self._is_beyond(moved, expected) and not self._is_beyond(y, expected):
+                self._doubted += 1
+                self.w = last
+                return predict(last)
+        else:
+            predicted = predict(w)
+        self.w, self._doubted = w.copy(), 0
+        return predicted
+
+    def _is_beyond(self, y: Float[np.ndarray, " ny"], predicted: Float[np.ndarray, " ny"]) -> bool:
+        """Return whether y would be refused, or would start the observer again."""
+        self._y[:], self._predicted[:] = y, predicted
+        self._evaluate()
+        return bool(self._after[0] or self._after[1] == 2)
+
+    @property
+    def stand_in(self) -> Float[np.ndarray, " nw"] | None:
+        """The last w that was used, if the last one was wild."""
+        return self.w if self._doubted else None
 
     def judge(self, y: Float[np.ndarray, " ny"], predicted: Float[np.ndarray, " ny"]) -> bool:
         """Return whether y is refused; a NaN in `predicted` says that this entry was not predicted."""

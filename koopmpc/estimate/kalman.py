@@ -190,6 +190,11 @@ class KalmanFilter(Viewing):
         """Whether the last y was refused: the filter only predicted."""
         return self._gate.refused
 
+    @property
+    def stand_in_w(self) -> Float[np.ndarray, " nw"] | None:
+        """The w to plan with, if the last one was wild."""
+        return self._gate.stand_in
+
     def update(self, model: LinearPredictor) -> None:
         """Go on with another model, from the same state."""
         self._take(model)
@@ -235,11 +240,13 @@ class KalmanFilter(Viewing):
         """
         if self._started and not self._delay:
             self._uw[: len(u)] = u
-            if len(w):
-                self._uw[len(u) :] = w
             whole = y.dot(y) < HUGE**2  # False for NaN, which would make NaN of every prediction
             self._y[:] = y if whole else 0.0
-            self._omega.dot(self._known, self._found)
+            if len(w):
+                self._gate.choose(y, w, self._predict)
+                w = w if self._gate.w is None else self._gate.w
+            else:
+                self._omega.dot(self._known, self._found)
             refused = self._gate.judge(y, self._clip(self._expected))
             silent = self._rails is not None and self._is_silent(y, self._expected).any()
             if whole and not (refused or silent or self._gate.lost) and self._found.dot(self._found) < HUGE**2:
@@ -247,6 +254,27 @@ class KalmanFilter(Viewing):
                 self._missed = 0
                 return True
         return self._correct(y, u, w)
+
+    def _predict(self, w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
+        """Make the product of a step, and return the reading that it predicts."""
+        self._uw[len(self._uw) - len(w) :] = w
+        self._omega.dot(self._known, self._found)
+        return self._expected
+
+    def _predict_delayed(
+        self, y: Float[np.ndarray, " ny"], v: Float[np.ndarray, " nuw"], nw: int
+    ) -> Float[np.ndarray, " n"]:
+        """Return the state after v = [u; w], without a wild w."""
+        s, system = self._s, self._system
+        u = v[: len(v) - nw]
+
+        def predict(w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
+            nonlocal s
+            s = self._next(self._s, np.concatenate([u, w]))
+            return system.M @ s + system.h
+
+        self._gate.choose(y, v[len(u) :], predict)
+        return s
 
     def _correct(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Predict, and correct with the entries of y that have come, unless y is refused."""
@@ -259,7 +287,8 @@ class KalmanFilter(Viewing):
                 self._rest_at(y, u)
                 self._start = self._s[: len(self._start)].copy()
         if len(self._inputs) > self._delay:
-            self._s[:] = self._next(self._s, self._inputs.popleft())
+            v = self._inputs.popleft()
+            self._s[:] = self._predict_delayed(y, v, len(w)) if self._delay and len(w) else self._next(self._s, v)
         came = np.abs(y) < HUGE  # False for NaN
         first = len(self._inputs) < self._delay  # y is older than the start
         if not first and (self._delay or not self._started):

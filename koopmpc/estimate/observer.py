@@ -236,6 +236,11 @@ class Measured:
         """Whether the last y was refused, and its prediction stood in."""
         return self._gate is not None and self._gate.refused
 
+    @property
+    def stand_in_w(self) -> Float[np.ndarray, " nw"] | None:
+        """The w to plan with, if the last one was wild."""
+        return None if self._gate is None else self._gate.stand_in
+
     def program(self) -> EstimatorProgram:
         """Return the data with which z and d are found."""
         return EstimatorProgram(gate=None if self._gate is None else gate_graph(self.ny, self._remembers))
@@ -250,7 +255,10 @@ class Measured:
         expected = self._nothing_z
         if self._history is not None and self._gate is not None:
             if self._known_z:
-                expected = self._model.advance(self._from, u, w, self.d)
+                if len(w):
+                    expected = self._choose_prediction(self._gate, y, u, w)
+                else:
+                    expected = self._model.advance(self._from, u, w, self.d)
             y = self._history.take(self._check_reading(self._gate, y, expected), u)
         if self.lift is None:
             self.z = y
@@ -270,11 +278,32 @@ class Measured:
         self._bridged = self._bridged + 1 if bridges else 0
         self._known_z = known or bridges
 
+    def _choose_prediction(
+        self,
+        gate: ReadingGate,
+        y: Float[np.ndarray, " ny"],
+        u: Float[np.ndarray, " nu"],
+        w: Float[np.ndarray, " nw"],
+    ) -> Float[np.ndarray, " nz"]:
+        """Return the z that u and w predict, without a wild w."""
+        expected = self._nothing_z
+
+        def predict(w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
+            nonlocal expected
+            expected = self._model.advance(self._from, u, w, self.d)
+            return self._show(expected)
+
+        gate.choose(y, w, predict)
+        return expected
+
+    def _show(self, z: Float[np.ndarray, " nz"]) -> Float[np.ndarray, " ny"]:
+        return z[: self.ny] if self._to_y is None else self._to_y.dot(z)
+
     def _check_reading(
         self, gate: ReadingGate, y: Float[np.ndarray, " ny"], z: Float[np.ndarray, " nz"]
     ) -> Float[np.ndarray, " ny"]:
         """Return y, or what this z shows where y is refused."""
-        predicted = z[: self.ny] if self._to_y is None else self._to_y.dot(z)
+        predicted = self._show(z)
         if self._model.embedding is not None:
             predicted = self._model.embedding.clip(predicted)
         refused = gate.judge(y, predicted)

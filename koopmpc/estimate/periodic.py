@@ -106,9 +106,14 @@ class PeriodicObserver(Measured):
         phi = make_regressor(self._turns, self._k - 1)
         expected = self._nothing
         if np.isfinite(self._last).all():
-            predicted = self._model.advance(self._last, u, w, self._none)
-            after = predicted + phi @ self._theta
-            expected = after[: self.ny] if self._to_y is None else self._to_y.dot(after)
+            ahead = phi @ self._theta
+
+            def predict(w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
+                nonlocal predicted
+                predicted = self._model.advance(self._last, u, w, self._none)
+                return self._show(predicted + ahead)
+
+            expected = gate.choose(y, w, predict) if len(w) else predict(w)
         stands_in = gate.judge(y, expected)
         if gate.lost:
             self._theta[:], self._P, predicted = 0.0, np.eye(len(self._P)), self._nothing_z

@@ -86,7 +86,8 @@ typedef struct {
   int row;  /**< row of given input targets */
 #if KOOPMPC_GATE
   koopmpc_real gate[KOOPMPC_GATE], w[KOOPMPC_NW1], from[KOOPMPC_NZ];
-  int has_z, bridged;
+  koopmpc_real used_w[KOOPMPC_NW1]; /**< the last w that was not wild */
+  int has_z, bridged, doubted;
 #endif
 } koopmpc_state;
 
@@ -122,7 +123,8 @@ typedef struct {
 #if KOOPMPC_GATE
   koopmpc_real gate[KOOPMPC_GATE]; /**< memory of the test of readings */
   koopmpc_real from[KOOPMPC_NZ];   /**< what the next reading is predicted from */
-  int has_z, bridged;
+  koopmpc_real used_w[KOOPMPC_NW1]; /**< the last w that was not wild */
+  int has_z, bridged, doubted;     /**< doubted: wild w in sequence */
 #endif
 #if KOOPMPC_IS_STAGED
   koopmpc_real S[(KOOPMPC_N + 1) * KOOPMPC_POINT], V[KOOPMPC_MOVES];         /**< the plan: states, inputs of stages */

@@ -63,6 +63,32 @@ int koopmpc_refuse(koopmpc_real *memory, const koopmpc_real *y, const koopmpc_re
   return result[0] > 0;
 }
 
+#if KOOPMPC_NW
+static int is_beyond(const koopmpc_real *memory, const koopmpc_real *y, const koopmpc_real *predicted) {
+  koopmpc_real result[KOOPMPC_GATE + 2];
+  koopmpc_gate(y, predicted, memory, result);
+  return result[0] > 0 || result[1] == 2;
+}
+
+int koopmpc_doubt(const koopmpc_real *memory, const koopmpc_real *y, const koopmpc_real *predicted,
+                  const koopmpc_real *without) {
+  koopmpc_real moved[KOOPMPC_NY];
+  for (int i = 0; i < KOOPMPC_NY; i++) moved[i] = koopmpc_abs(y[i]) < KOOPMPC_HUGE ? predicted[i] : without[i];
+  return is_beyond(memory, moved, without) && !is_beyond(memory, y, without);
+}
+
+int koopmpc_differs(const koopmpc_state *s, const koopmpc_real *w) {
+  int differs = 0;
+  for (int i = 0; i < KOOPMPC_NW; i++) differs |= w[i] != s->used_w[i];
+  return differs && s->doubted < KOOPMPC_BRIDGED;
+}
+
+void koopmpc_settle_w(koopmpc_state *s, int wild, koopmpc_real *w) {
+  s->doubted = wild ? s->doubted + 1 : 0;
+  koopmpc_copy(wild ? w : s->used_w, wild ? s->used_w : w, KOOPMPC_NW);
+}
+#endif
+
 int koopmpc_bridge(koopmpc_real *from, int has, int *bridged, const koopmpc_real *z, const koopmpc_real *expected) {
   const int known = koopmpc_usable(z, KOOPMPC_NZ), bridges = !known && has && *bridged < KOOPMPC_BRIDGED;
   koopmpc_copy(from, bridges ? expected : z, KOOPMPC_NZ);

@@ -39,6 +39,18 @@ void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *
     s->last[i] = u_prev ? u_prev[i] : koopmpc_clip(0, koopmpc_input_low[i], koopmpc_input_high[i]);
 }
 
+#if KOOPMPC_GATE
+/** The z that w and the last input predict, and what it shows. */
+static void predict(const koopmpc_state *s, const koopmpc_real *w, koopmpc_real *z, koopmpc_real *expected) {
+  koopmpc_fill(z, 0, KOOPMPC_NZ);
+  koopmpc_add(z, koopmpc_A, KOOPMPC_NZ, s->from, KOOPMPC_NZ);
+  koopmpc_add(z, koopmpc_B, KOOPMPC_NZ, s->last, KOOPMPC_NU);
+  if (KOOPMPC_NW) koopmpc_add(z, koopmpc_E, KOOPMPC_NZ, w, KOOPMPC_NW);
+  koopmpc_fill(expected, 0, KOOPMPC_NY);
+  koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, z, KOOPMPC_NZ);
+}
+#endif
+
 void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *reference, const koopmpc_real *applied,
                   const koopmpc_rows *w, koopmpc_real *u, koopmpc_report *report) {
   koopmpc_real free_input[KOOPMPC_NU];
@@ -46,24 +58,35 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
   koopmpc_status status = KOOPMPC_UNCONSTRAINED;
   koopmpc_fallback fallback = KOOPMPC_NONE;
   good = feedforward(s, reference->values, w, free_input);
-  if (s->row + 1 < KOOPMPC_GIVEN) s->row++;
   if (applied && koopmpc_usable(applied, KOOPMPC_NU)) koopmpc_copy(s->last, applied, KOOPMPC_NU);
 #if KOOPMPC_GATE
   koopmpc_real next[KOOPMPC_NZ] = {0}, expected[KOOPMPC_NY];
   int opened;
   koopmpc_fill(expected, s->has_z ? 0 : (koopmpc_real)NAN, KOOPMPC_NY);
   if (s->has_z) {
-    koopmpc_add(next, koopmpc_A, KOOPMPC_NZ, s->from, KOOPMPC_NZ);
-    koopmpc_add(next, koopmpc_B, KOOPMPC_NZ, s->last, KOOPMPC_NU);
-    if (KOOPMPC_NW) koopmpc_add(next, koopmpc_E, KOOPMPC_NZ, s->w, KOOPMPC_NW);
-    koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, next, KOOPMPC_NZ);
+#if KOOPMPC_NW
+    koopmpc_real without[KOOPMPC_NY];
+    int wild = koopmpc_differs(s, s->w);
+    if (wild) predict(s, s->used_w, next, without);
+    predict(s, s->w, next, expected);
+    wild = wild && koopmpc_doubt(s->gate, y, expected, without);
+    koopmpc_settle_w(s, wild, s->w);
+    if (wild) predict(s, s->w, next, expected);
+#else
+    predict(s, s->w, next, expected);
+#endif
   }
   refused = koopmpc_refuse(s->gate, y, expected, &opened);
   if (opened == 2) s->seen = s->has_z = 0; /* the estimate is lost */
   if (refused) y = expected;
   for (int i = 0; i < KOOPMPC_NW; i++) /* one that is not finite keeps its last value */
     if (!w || koopmpc_abs(w->values[i]) < KOOPMPC_HUGE) s->w[i] = w ? w->values[i] : 0;
+  if (s->doubted) {
+    const koopmpc_rows held = {s->used_w, 1};
+    good = feedforward(s, reference->values, &held, free_input);
+  }
 #endif
+  if (s->row + 1 < KOOPMPC_GIVEN) s->row++;
   koopmpc_observe(s->zeta, &s->seen, s->z, y, s->last);
 #if KOOPMPC_GATE
   s->has_z = koopmpc_bridge(s->from, s->has_z, &s->bridged, s->z, next);

@@ -85,14 +85,31 @@ static void forget_estimate(koopmpc_state *s) {
   s->learned = s->seen = s->has_z = 0;
 }
 
+/** The z that u and w predict without d; with d it stands in `scratch`, and what it shows in `expected`. */
+static void predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real *w, koopmpc_real *z,
+                    koopmpc_real *expected) {
+  advance(z, s->from, u, w, 0);
+  for (int i = 0; i < KOOPMPC_NZ; i++) s->scratch[i] = z[i] + s->d[i];
+  koopmpc_fill(expected, 0, KOOPMPC_NY);
+  koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, s->scratch, KOOPMPC_NZ);
+}
+
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
   koopmpc_real misfit[KOOPMPC_NZ], expected[KOOPMPC_NY];
   int opened, learns = s->has_z && !s->stood_in;
-  koopmpc_fill(expected, s->has_z ? 0 : (koopmpc_real)NAN, KOOPMPC_NY);
+  koopmpc_fill(expected, (koopmpc_real)NAN, KOOPMPC_NY);
   if (s->has_z) {
-    advance(misfit, s->from, u, s->w, 0);
-    for (int i = 0; i < KOOPMPC_NZ; i++) s->scratch[i] = misfit[i] + s->d[i];
-    koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, s->scratch, KOOPMPC_NZ);
+#if KOOPMPC_NW
+    koopmpc_real without[KOOPMPC_NY];
+    int wild = koopmpc_differs(s, s->w);
+    if (wild) predict(s, u, s->used_w, misfit, without);
+    predict(s, u, s->w, misfit, expected);
+    wild = wild && koopmpc_doubt(s->gate, y, expected, without);
+    koopmpc_settle_w(s, wild, s->w);
+    if (wild) predict(s, u, s->w, misfit, expected);
+#else
+    predict(s, u, s->w, misfit, expected);
+#endif
   }
   s->refused = s->stood_in = koopmpc_refuse(s->gate, y, expected, &opened);
   if (opened == 2) forget_estimate(s);
@@ -124,6 +141,32 @@ static void predict(koopmpc_state *s, koopmpc_real *state, const koopmpc_real *d
   koopmpc_add(s->scratch, koopmpc_filter_G, KOOPMPC_NS, drive, DRIVE);
   koopmpc_copy(state, s->scratch, KOOPMPC_NS);
 }
+
+/** expected <- M s + h. */
+static void show(const koopmpc_real *state, koopmpc_real *expected) {
+  for (int i = 0; i < KOOPMPC_NY; i++)
+    expected[i] = koopmpc_filter_h[i] + koopmpc_dot(koopmpc_filter_M + i * KOOPMPC_NS, state, KOOPMPC_NS);
+}
+
+#if KOOPMPC_NW
+/** Replace a wild w of the step that led to y by the last one that was used. */
+static void check_w(koopmpc_state *s, const koopmpc_real *y) {
+  koopmpc_real *w = s->queue + KOOPMPC_NU, drive[DRIVE], state[KOOPMPC_NS], expected[KOOPMPC_NY], without[KOOPMPC_NY];
+  int wild = koopmpc_differs(s, w);
+  if (wild) {
+    koopmpc_copy(drive, s->queue, KOOPMPC_NU);
+    koopmpc_copy(drive + KOOPMPC_NU, s->used_w, KOOPMPC_NW);
+    koopmpc_copy(state, s->s, KOOPMPC_NS);
+    predict(s, state, drive);
+    show(state, without);
+    koopmpc_copy(state, s->s, KOOPMPC_NS);
+    predict(s, state, s->queue);
+    show(state, expected);
+    wild = koopmpc_doubt(s->gate, y, expected, without);
+  }
+  koopmpc_settle_w(s, wild, w);
+}
+#endif
 
 /** s <- s + P M' S^-1 (y - M s - h) with the outputs that came; S = M P M' + R in units of its diagonal. */
 static void correct(koopmpc_state *s, const koopmpc_real *y) {
@@ -194,14 +237,16 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
     if (KOOPMPC_RESTS && !s->seen) rest_at(s, y, u);
   }
   if (s->queued > KOOPMPC_DELAY_Y) {
+#if KOOPMPC_NW
+    check_w(s, y);
+#endif
     predict(s, s->s, s->queue);
     s->queued--;
     for (int i = 0; i < s->queued * DRIVE; i++) s->queue[i] = s->queue[i + DRIVE];
   }
   for (int i = 0; i < KOOPMPC_NY; i++) any |= koopmpc_abs(y[i]) < KOOPMPC_HUGE;
   if (s->queued >= KOOPMPC_DELAY_Y) { /* else y was measured before the start */
-    for (int i = 0; i < KOOPMPC_NY; i++)
-      expected[i] = koopmpc_filter_h[i] + koopmpc_dot(koopmpc_filter_M + i * KOOPMPC_NS, s->s, KOOPMPC_NS);
+    show(s->s, expected);
     s->refused = koopmpc_refuse(s->gate, y, expected, &opened);
     if (opened == 2) begin_again(s, y, u);
     if (any && !s->refused) correct(s, y);
@@ -223,14 +268,33 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
 
 #else
 
+#if KOOPMPC_GATE
+/** The z that u and w predict, and what it shows. */
+static void predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real *w, koopmpc_real *z,
+                    koopmpc_real *expected) {
+  advance(z, s->from, u, w, 0);
+  koopmpc_fill(expected, 0, KOOPMPC_NY);
+  koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, z, KOOPMPC_NZ);
+}
+#endif
+
 static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u) {
 #if KOOPMPC_GATE
   koopmpc_real next[KOOPMPC_NZ] = {0}, expected[KOOPMPC_NY];
   int opened;
-  koopmpc_fill(expected, s->has_z ? 0 : (koopmpc_real)NAN, KOOPMPC_NY);
+  koopmpc_fill(expected, (koopmpc_real)NAN, KOOPMPC_NY);
   if (s->has_z) {
-    advance(next, s->from, u, s->w, 0);
-    koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, next, KOOPMPC_NZ);
+#if KOOPMPC_NW
+    koopmpc_real without[KOOPMPC_NY];
+    int wild = koopmpc_differs(s, s->w);
+    if (wild) predict(s, u, s->used_w, next, without);
+    predict(s, u, s->w, next, expected);
+    wild = wild && koopmpc_doubt(s->gate, y, expected, without);
+    koopmpc_settle_w(s, wild, s->w);
+    if (wild) predict(s, u, s->w, next, expected);
+#else
+    predict(s, u, s->w, next, expected);
+#endif
   }
   s->refused = koopmpc_refuse(s->gate, y, expected, &opened);
   if (opened == 2) s->seen = s->has_z = 0; /* the estimate is lost */
@@ -269,6 +333,16 @@ void koopmpc_take(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *a
   good = observe(s, y, acted);
   for (int i = 0; i < KOOPMPC_NW; i++) /* one that is not finite keeps its last value */
     if (koopmpc_abs(s->ahead[i]) < KOOPMPC_HUGE) s->w[i] = s->ahead[i];
+#if KOOPMPC_GATE && KOOPMPC_NW
+  if (s->doubted) { /* plan with the last w that was not wild; of a preview only the first row changes */
+    const int rows = w && w->count > 1 ? 1 : KOOPMPC_N + KOOPMPC_LATENCY;
+    for (int k = 0; k < rows; k++) {
+      if (k <= KOOPMPC_LATENCY) koopmpc_copy(s->ahead + k * KOOPMPC_NW, s->used_w, KOOPMPC_NW);
+      if (k >= KOOPMPC_LATENCY)
+        koopmpc_copy(s->known + KOOPMPC_PREVIEW + (k - KOOPMPC_LATENCY) * KOOPMPC_NW, s->used_w, KOOPMPC_NW);
+    }
+  }
+#endif
   if (good)
     koopmpc_copy(s->known, s->z, KOOPMPC_NZ);
   else
