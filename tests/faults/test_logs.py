@@ -14,6 +14,7 @@ import pytest
 import koopmpc as km
 from koopmpc.recording.description import Entity
 from koopmpc.recording.reader import LogColumns
+from koopmpc.recording.rrd import Column
 from tests.recording.runs import about, make_run, steps_of
 from tests.tiers import slow
 
@@ -266,7 +267,7 @@ def test_rows_come_in_order_of_their_steps_whatever_that_of_their_batches(seed: 
     for part in np.array_split(order, 4):
         for entity, rows in (("/a", values), ("/s", [[each[0]] if told[k] else [] for k, each in enumerate(values)])):
             lists = pa.array([list(rows[k]) for k in part], pa.list_(pa.float64()))
-            columns.append((entity, "scalars", pa.array(part), lists))
+            columns.append(Column(entity, "scalars", pa.array(part), lists))
     log, there = LogColumns(columns, ("/a", "/s"), torn=False), sorted(order.tolist())
     for steps, rows in (log.matrix("a"), log.lists("a", "scalars")):
         assert steps.tolist() == there
