@@ -162,20 +162,39 @@ class DaskPool(Generic[Task, Result]):
 
 
 def _knock(scheduler: str) -> None:
-    """Raise OSError where nothing listens at the address, or what listens does not greet as a scheduler in time."""
+    """Raise an error where nothing listens at the address, or what listens does not greet as a scheduler in time.
+
+    Raises
+    ------
+    KoopmpcError
+        Nothing listens, or something else than a scheduler.
+    TimeoutError
+        No greeting came.
+    """
     place, last = urlsplit(scheduler), time.monotonic() + _ANSWER
+    host, port = place.hostname or "", place.port or 8786
     while True:
         try:
-            line = socket.create_connection((place.hostname or "", place.port or 8786), timeout=_ANSWER)
+            left = max(last - time.monotonic(), 0.2)
+            count = len(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM))  # each is tried in turn
+            line = socket.create_connection((host, port), timeout=left / count)
             break
         except OSError as error:
             if time.monotonic() + 0.2 > last:
-                raise ConnectionError(str(error)) from error  # a TimeoutError means that no greeting came
+                raise _absent(f"no Dask scheduler answers at {scheduler} within {_ANSWER:g} s") from error
         time.sleep(0.2)
-    with line:
-        if place.scheme == "tcp":  # a scheduler speaks first, and a Client would wait for it without end
-            line.settimeout(_GREETING)
-            line.recv(1)
+    if place.scheme != "tcp":
+        return line.close()
+    with line, suppress(ConnectionError):  # a scheduler speaks first, and a Client would wait for it without end
+        line.settimeout(_GREETING)
+        size = line.recv(8)  # of its greeting: eight bytes, the lowest first
+        if size and not any(size[4:]):
+            return None
+    raise _absent(f"what listens at {scheduler} does not greet as a Dask scheduler")
+
+
+def _absent(said: str) -> KoopmpcError:
+    return KoopmpcError(f'{said}; start one with `dask scheduler`, or pass "local"')
 
 
 def _close(cluster: Any) -> None:
@@ -231,9 +250,5 @@ def open_dask(
                 _knock(scheduler)  # a Client without an answer needs 11 s to say so
             client = open_now.enter_context(Client(address, set_as_default=False, timeout=_GREETING))
         except (OSError, ValueError, MemoryError) as error:  # MemoryError: another service's words were read as a size
-            waited = _GREETING if isinstance(error, TimeoutError) else _ANSWER
-            raise KoopmpcError(
-                f"no Dask scheduler answers at {scheduler} within {waited:g} s; start one with `dask scheduler`, "
-                'or pass "local"'
-            ) from error
+            raise _absent(f"no Dask scheduler answers at {scheduler} within {_GREETING:g} s") from error
         yield DaskPool(function, client, scheduler)

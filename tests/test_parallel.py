@@ -251,6 +251,38 @@ def test_a_service_that_does_not_greet_as_a_scheduler_is_told(monkeypatch: pytes
             list(map_tasks(tasks.square, [1], scheduler=address))
 
 
+@pytest.mark.parametrize("words", [b"", b"SSH-2.0-OpenSSH_9.0\r\n"])
+def test_a_service_that_speaks_otherwise_or_closes_the_line_is_told_before_a_client_waits_for_it(words: bytes) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        address = f"tcp://127.0.0.1:{other.getsockname()[1]}"
+
+        def answer() -> None:
+            with other.accept()[0] as line:
+                line.sendall(words)
+
+        talk = threading.Thread(target=answer)
+        talk.start()
+        with pytest.raises(km.KoopmpcError, match=f"what listens at {address} does not greet as a Dask scheduler; st"):
+            list(map_tasks(tasks.square, [1], scheduler=address))
+        talk.join()
+
+
+def test_the_time_for_an_answer_is_shared_by_the_addresses_of_a_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of three addresses was given all of it: a host that drops what comes was told after three times as long."""
+    given: list[float] = []
+
+    def drop(_: object, timeout: float) -> None:
+        given.append(timeout)
+        raise TimeoutError
+
+    monkeypatch.setattr("koopmpc.cluster._ANSWER", 0.1)
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: [()] * 3)
+    monkeypatch.setattr(socket, "create_connection", drop)
+    with pytest.raises(km.KoopmpcError, match=r"no Dask scheduler answers at tcp://three:1 within 0\.1 s"):
+        list(map_tasks(tasks.square, [1], scheduler="tcp://three:1"))
+    assert max(given) <= 0.2 / 3
+
+
 def test_no_task_is_no_result() -> None:
     assert list(map_tasks(tasks.square, [], **PROCESSES)) == []
 
