@@ -228,7 +228,8 @@ def count(value: int, name: str, least: int = 1) -> int:
     if isinstance(value, bool) or not isinstance(cast(object, value), int | np.integer):
         raise DataError(f"{name} is {value!r}; pass a whole number")
     if value < least:
-        raise DataError(f"{name} is {value}; it must be at least {least}")
+        told = f"{value}" if value > -LARGEST else "below -1e100"  # Python writes no integer of 4,301 digits
+        raise DataError(f"{name} is {told}; it must be at least {least}")
     if value > MOST:
         told = f"{value:.3g}" if value < LARGEST else "beyond 1e100"  # an integer beyond 1e308 overflows
         raise DataError(f"{name} is {told}; it must be at most {MOST}")

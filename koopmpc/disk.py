@@ -124,11 +124,17 @@ _CALLS = "????-??-??T??-??-??-*"  # folders of calls
 
 
 def remove_abandoned(logs: Path) -> None:
-    """Remove what killed processes left in the folders of calls in this one; a folder that is then empty goes too."""
-    for part in list(logs.glob(f"{_CALLS}/**/{_PARTS}")):
+    """Remove what killed processes left in the folders of calls in this one; folders that are then empty go too."""
+    parts: list[Path] = []
+    with suppress(OSError):  # another call may remove its folder at this moment
+        parts.extend(logs.glob(f"{_CALLS}/**/{_PARTS}"))
+    for part in parts:
         if _remove_abandoned(part):
-            with suppress(OSError):
-                part.parent.rmdir()
+            folder = part.parent
+            with suppress(OSError):  # the first that is not empty stays, and all above it
+                while folder != logs:
+                    folder.rmdir()
+                    folder = folder.parent
 
 
 def _remove_abandoned(part: Path) -> bool:

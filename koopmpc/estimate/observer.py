@@ -323,8 +323,8 @@ def start_observer(estimator: Estimator | None, model: LinearPredictor | StateMo
     """
     if estimator is None:
         return Measured(model)
-    is_one = isinstance(cast(object, estimator), Estimator) and callable(estimator.start)  # a range has a start, too
-    if isinstance(estimator, type) or not is_one:
+    can_start = isinstance(cast(object, estimator), Estimator) and callable(estimator.start)  # a range has a start, too
+    if isinstance(estimator, type) or not can_start:
         raise DataError(f"estimator is {estimator!r}; pass an object, for example km.LiftedDisturbance()")
     return estimator.start(model, horizon)
 

@@ -92,8 +92,7 @@ class Gaussian(Lifting):
 
     def __init__(self, centers: ArrayLike, width: ArrayLike, *, bound: tuple[str, ...] | None = None) -> None:
         rows = check_centers(centers)
-        widths = checks.array(width, "width")
-        if widths.ndim == 0:
+        if checks.array(width, "width").ndim == 0:
             freeze(self, centers=rows, width=checks.positive(cast("float", width), "width"), bound=bound)
             return
         widths = checks.array(width, "width", (len(rows),))

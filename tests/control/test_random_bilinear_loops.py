@@ -82,20 +82,34 @@ def test_a_soft_limit_or_a_reference_beyond_it_is_no_reason_to_fail(models, tria
     assert count["SOFTENED"] > 0
 
 
+@dataclass(frozen=True)
+class CubeAndRoot(km.Dynamics):
+    """x₁' = x₁³ − x₁ + u, x₂' = √(1 + x₂) − 1 + u: x₁ grows beyond all numbers, and x₂ is none below −1."""
+
+    states = ("x1", "x2")
+    inputs = ("u",)
+
+    def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
+        """Return [x₁', x₂']."""
+        return ca.vertcat(x[0] ** 3 - x[0] + u, ca.sqrt(1 + x[1]) - 1 + u)
+
+
 @needs_compiler
 def test_a_reading_from_which_the_model_runs_away_is_a_bad_measurement_and_no_failed_step() -> None:
-    """A cubic spring stretched to 50 leaves all numbers within ten steps, whatever an input of 2 does."""
-    mpc = km.BilinearMPC(PLANTS[0], km.Cost(Q=[10.0, 1.0], R=0.1), km.Limits(-2, 2, x_max=[0.5, 1.0]), 15)
+    """From 50 a cube leaves all numbers within ten steps, whatever an input of 2 does; a root is NaN before."""
+    plant = km.discretize(CubeAndRoot(), 0.05)
+    mpc = km.BilinearMPC(plant, km.Cost(Q=[10.0, 1.0], R=0.1), km.Limits(-2, 2, x_max=[0.5, 1.0]), 15)
     for controller in (mpc, km.compiled(mpc)):
         controller([0.1, 0.0], [0.3, 0.0])
         planned = controller.plan().U[1]
-        for y in ([50.0, 0.0], [0.1, -1e6], [1e29, 0.0]):
+        for y in ([50.0, 0.0], [-1e6, 0.1], [1e29, 0.0]):
             move = controller(y, [0.3, 0.0])
             assert move.status is km.Status.BAD_MEASUREMENT, y
             assert np.abs(move.u).max() <= 2
             if y[0] == 50.0:
                 assert move.fallback is km.control.Fallback.SHIFTED_PLAN
                 np.testing.assert_array_equal(move.u, planned)
+        assert controller([2.0, -2.0], [0.3, 0.0]).status is km.Status.FAILED  # the model has no answer there
         assert controller([0.1, 0.0], [0.3, 0.0]).status.name in ("OPTIMAL", "SOFTENED", "UNCONSTRAINED")
     mpc.solver_fails = True
     assert mpc([50.0, 0.0], [0.3, 0.0]).status is km.Status.FAILED  # a fault that is made keeps its name

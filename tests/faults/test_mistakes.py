@@ -194,6 +194,8 @@ BEYOND = 10**400  # an integer that no float holds
 def test_an_integer_beyond_all_floats_is_refused_as_a_reading_and_as_a_count(stateful):
     with pytest.raises(km.errors.DataError, match=r"horizon is beyond 1e100; it must be at most 2147483647"):
         km.KoopmanMPC(LIFTED, PENDULUM.cost, PENDULUM.limits, BEYOND)
+    with pytest.raises(km.errors.DataError, match=r"horizon is below -1e100; it must be at least 1"):
+        km.KoopmanMPC(LIFTED, PENDULUM.cost, PENDULUM.limits, -(10**5000))
     for name in ("LQR", "KoopmanMPC", "BilinearMPC", "NonlinearMPC", "filtered"):
         stateful[name].reset()
         with pytest.raises(km.errors.DataError, match="too large to convert to float"):
@@ -223,6 +225,8 @@ def test_numbers_of_other_kinds_are_steps_and_what_only_has_the_name_of_a_method
     for judge in (spectrum.linearity_error, spectrum.evolution_error):
         with pytest.raises(km.errors.DataError, match=r"has no __iter__; pass Episodes|the predictor has inputs"):
             judge(LIFTED, LIFTED)
+    with pytest.raises(km.errors.DataError, match=r"keep is 1\.5; it must lie between 0 and 1"):
+        km.OnlineEDMD(km.State(), dt=0.05, states=("x",), keep=Fraction(3, 2))
 
 
 def test_a_controller_that_measures_one_state_does_not_adapt():

@@ -228,13 +228,15 @@ static int runs_away(const koopmpc_state *s, const koopmpc_real *x, const koopmp
     u[i] = koopmpc_clip(KOOPMPC_WITH_RATES ? u_prev[i] : 0, koopmpc_input_low[i], koopmpc_input_high[i]);
   for (int k = 0; k <= STEPS; k++) {
     for (int i = 0; i < NX; i++)
-      if (koopmpc_abs(at[i]) >= KOOPMPC_NO_DIGITS * koopmpc_sizes[i]) return 1; /* 0 for NaN */
+      if (koopmpc_abs(at[i]) >= KOOPMPC_NO_DIGITS * koopmpc_sizes[i]) return 1; /* not for NaN */
+    for (int i = 0; i < NX; i++)
+      if (!(koopmpc_abs(at[i]) < KOOPMPC_NO_DIGITS * koopmpc_sizes[i])) return 0; /* NaN, which a model may have */
     if (k < STEPS) {
       koopmpc_map(at, u KOOPMPC_AND(koopmpc_w_of(s, k)), next);
       koopmpc_copy(at, next, NX);
     }
   }
-  (void)s;
+  (void)s; /* where no disturbance is measured */
   return 0;
 }
 

@@ -100,13 +100,14 @@ class OnlineEDMD:
         factor = checks.positive(forgetting, "forgetting")
         if factor > 1:
             raise DataError(f"forgetting is {factor:g}; it must lie in (0, 1], 1 forgets nothing")
-        if not 0 < float(checks.array(keep, "keep", ())) < 1:
-            raise DataError(f"keep is {keep:g}; it must lie between 0 and 1")
+        least = float(checks.array(keep, "keep", ()))
+        if not 0 < least < 1:
+            raise DataError(f"keep is {least:g}; it must lie between 0 and 1")
         nz, nf = self._lifting.nz, len(self._inputs) + len(self._disturbances)
         self._n, width = nz + nf, nf + 2 * self._full.nz
         self._memory: ForgettingMemory | WindowMemory
         if window is None:
-            self._forgetting = width, self._n, factor, float(keep)
+            self._forgetting = width, self._n, factor, least
             self._memory = ForgettingMemory(*self._forgetting)
         elif factor < 1:
             raise DataError(f"window is {window} and forgetting {factor:g}; choose one of them")
