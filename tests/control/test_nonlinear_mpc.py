@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -34,6 +35,21 @@ def test_no_solver_prints(solver, capfd):
     mpc = km.NonlinearMPC(step_map(A, B), *CASES["inputs"], 5, solver=solver)
     assert np.isfinite(mpc([0.5, 0.0], [0.0, 0.0]).u).all()
     assert capfd.readouterr() == ("", "")
+
+
+def test_the_names_that_a_solver_tells_stay() -> None:
+    """A name made anew takes a place in Python's table of names, which is some MB large and built again when full."""
+    km.NonlinearMPC(step_map(A, B), *CASES["inputs"], 5)([0.5, 0.0], [0.0, 0.0])
+    x = ca.MX.sym("x")
+    solver = ca.nlpsol(
+        "solver", "ipopt", {"x": x, "f": x**2}, {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes"}
+    )
+    found = solver(x0=1.0)
+    told, fresh = solver.stats(), {f"a name of {x}": 0}
+    alone, held = (
+        min(sys.getrefcount(name) for name in names) for names in ([*fresh], [*found, *told, *told["iterations"]])
+    )
+    assert held > alone
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,8 @@ _STATUS = {
     "SOLVER_RET_LIMITED": Status.MAX_ITERATIONS,
     "SOLVER_RET_INFEASIBLE": Status.INFEASIBLE,
 }
+# Names in the answers of solvers, kept: new ones at each step would fill Python's table of names, which is built again.
+_NAMES: set[str] = set()
 
 
 class Start(NamedTuple):
@@ -260,6 +262,7 @@ class Shooting:
             except RuntimeError:  # CasADi refuses bounds that overflow
                 return failed
             stats = self._solver.stats()
+            _NAMES.update(found, stats, stats.get("iterations", ()))
             v, bounds, constraints = (found[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
         unified = str(stats.get("unified_return_status"))
         status = _STATUS.get(str(stats["return_status"]), _STATUS.get(unified, Status.FAILED))
