@@ -220,7 +220,7 @@ static int begin(koopmpc_state *s, int which, const koopmpc_real *x, const koopm
   return 1;
 }
 
-/** Whether no digit of a state is left within the horizon of the model's motion from x, without an input. */
+/** Whether a state of the model grows beyond NO_DIGITS of its sizes within the horizon, from x with u = 0 or u_prev. */
 static int runs_away(const koopmpc_state *s, const koopmpc_real *x, const koopmpc_real *u_prev) {
   koopmpc_real at[NX], next[NX], u[NV];
   koopmpc_copy(at, x, NX);

@@ -31,7 +31,7 @@ from koopmpc.estimate.observer import Estimator, start_observer
 from koopmpc.plants.step_map import StepMap
 
 GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
-NO_DIGITS = 1e15  # of a state that many sizes away no digit is left: rounding is a fifth of its size
+NO_DIGITS = 1e15  # at so many sizes no digit of a state is left: rounding is a fifth of a size
 
 
 class StagePlan(NamedTuple):
@@ -325,9 +325,10 @@ class StagedMPC(MPCBase):
         return StagePlan(chosen.S, chosen.V, status, found.iterations, chosen.slack), status, chosen is kept
 
     def _runs_away(self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"], start: float) -> bool:
-        """Return whether no digit of a state is left within the horizon of the model's motion from x without an input.
+        """Return whether a state grows beyond NO_DIGITS of its sizes within the horizon, from x with u = 0.
 
-        Where changes of inputs count, the last one acts. Then no plan can be found from x, and x is to blame.
+        Where the cost or the limits count changes of inputs, u is the last input. Then no plan can be found, because
+        of x.
         """
         u, most = np.clip(u_prev * self._with_rates, *self._outputs.inputs), NO_DIGITS * self._problem.sizes[: len(x)]
         for w in self._initial.W:
