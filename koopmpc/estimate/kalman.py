@@ -79,7 +79,8 @@ class Augmented:
         self.to_periodic = self.to_d[:, n + self.steady :].copy()  # and `to_d` gives the constant part alone
         self.to_d[:, n + self.steady :] = 0.0
         self.rows, self.held, self.rests = self.M, 0, False
-        self.shows = np.array_equal(H[:, kept], predictor.C[:, kept])
+        self.shows = np.array_equal(H, predictor.C)
+        self.offset = H[:, known].sum(axis=1)
 
     def read_before(self) -> None:
         """Have y be what the model's next outputs are under the input of the step before, y = M (F s + G v) + h."""
@@ -365,15 +366,19 @@ class PeriodicFilter(KalmanFilter):
 
 
 def _find_rails(predictor: LinearPredictor, system: Augmented) -> Float[np.ndarray, "2 ny"] | None:
-    """Return the rails of the outputs that are states of the model; None where no sensor saturates."""
+    """Return the rails of the outputs that are states of the model, or differ from one by a constant.
+
+    None where no sensor saturates.
+    """
     if predictor.embedding is None or predictor.embedding.rails is None:
         return None
     H = system.rows[:, : len(system.kept)]
+    known = np.delete(predictor.C, system.kept, axis=1).sum(axis=1)
     rails = np.vstack([np.full(len(H), -np.inf), np.full(len(H), np.inf)])
     for i, row in enumerate(H):
         found = np.flatnonzero((row == predictor.C[:, system.kept]).all(axis=1))
         if len(found):
-            rails[:, i] = predictor.embedding.rails[:, found[0]]
+            rails[:, i] = predictor.embedding.rails[:, found[0]] + system.offset[i] - known[found[0]]
     return rails
 
 

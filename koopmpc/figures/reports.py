@@ -184,7 +184,7 @@ def draw_trajectories(runs: Mapping[str, Run]) -> "Figure":
         axes[-1, 0].step(run.time[:-1], run.U[:, 0], where="post", **line_style(i))
     for panel, j in zip(axes[:, 0], states, strict=False):
         panel.set_ylabel(**fit_label(first.states[j], 1.0))
-        if first.cost is None or first.reference.shape[1] == len(first.states):
+        if first.reference.shape[1] == len(first.states):
             panel.plot(first.time, first.reference[:, j], label="reference", **REFERENCE)
         _add_near_limits(panel, first, "states", j)
     _add_near_limits(axes[-1, 0], first, "inputs", 0)

@@ -159,6 +159,24 @@ def test_linear_observers_learn_nothing_at_a_rail_either(kind):
     assert found[1] > 0.1
 
 
+def test_an_output_that_is_a_state_and_a_constant_has_the_rails_of_the_state_moved_by_it():
+    delay = km.Delay(1, rails=np.array([[-np.inf], [1.0]])).bind(("y",), ("u",))
+    A = np.array([[0.9, 0.1, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    B = np.array([[0.3], [1.0], [0.0], [0.0]])
+    lifting = km.State() + km.Constant()
+    model = km.LinearPredictor(A, B, np.eye(1, 4), lifting, 0.1, ["y"], ["u"], embedding=delay)
+    H = model.C.copy()
+    H[0, 3] = 0.5
+    mpc = km.KoopmanMPC(model, km.Cost(Q=1.0, R=1.0), None, 10, estimator=km.LiftedKalman(H))
+    observer, y = mpc.observer, 0.0
+    assert not observer.program().shows  # y is no state: a lost estimate does not begin again at x = y
+    for k in range(110):  # the sensor reads y + 0.5, and is at its rail from 1.5 on; y rests at 0.9
+        observer.observe(np.array([y + 0.5]), np.array([0.2 if k else 0.0]), np.zeros(0))
+        y = 0.9 * y + 0.06 + 0.02 * (k > 0) + 0.01 * (k >= 60)
+    assert 0.8 < y < 1.0
+    assert abs(observer.z[0] - y) < 0.01
+
+
 @pytest.mark.parametrize("kind", ["disturbance", "kalman"])
 def test_nothing_is_learned_where_one_of_two_sensors_is_at_its_rail(kind):
     delay = km.Delay(1, rails=np.array([[-np.inf, -np.inf], [1.0, np.inf]])).bind(("y", "v"), ("u",))

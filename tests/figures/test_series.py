@@ -156,6 +156,11 @@ def test_runs_of_a_report_show_a_reference_of_their_states_alone() -> None:
             for panel in draw_trajectories({"mpc": run}).axes
         ]
         assert shown == ([[[0.5] * 6], [[0.2] * 6], []] if drawn else [[], [], []])
+    run = km.simulate(model.step_map(), lambda y, r: np.zeros(1), x0=[1, 0], reference=[0.5], steps=5)
+    assert run.cost is None
+    assert not any(
+        line.get_label() == "reference" for panel in draw_trajectories({"law": run}).axes for line in panel.lines
+    )
 
 
 def find_hidden(drawing):
