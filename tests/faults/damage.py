@@ -1,5 +1,7 @@
 """Files of every kind that the library writes, ways to damage them, and a disk that is full."""
 
+import ctypes
+import random
 import resource
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
@@ -11,12 +13,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import koopmpc as km
-from koopmpc.bench.store import Journal, RunRow, record_of, write_results
+from koopmpc.bench.store import MANIFEST, Journal, RunRow, manifest_of, open_sweep, record_of, write_results
 from koopmpc.page import Curves, Page
+from koopmpc.plants import routines
 from koopmpc.recording.curves import record_curves
 from koopmpc.synthesis.designed import SavedDesign, read_controller
 from tests.recording.runs import make_run
 from tests.synthesis.test_design import usual
+
+TEMPLATE = Path(km.__file__).parent / "bench" / "template.txt"
 
 
 def episodes(seed: int = 0, steps: int = 30) -> km.Episodes:
@@ -128,6 +133,148 @@ READERS: dict[str, tuple[Callable[[], Any], Callable[[Path], Any]]] = {
     "rows.jsonl": (lambda: texts(rows()), lambda path: texts(Journal(path).rows.values())),
 }
 """Each kind of file that is read: what was written, and what reads it."""
+
+
+def column_file(path: Path, mark: str) -> None:
+    t = 0.1 * np.arange(200)
+    np.savetxt(path, np.column_stack([t, np.sin(t), np.cos(3 * t)]), "%.5f", mark)
+
+
+def columns_of(path: Path) -> list[bytes]:
+    data = km.load_episodes(path, states=["x"], inputs=["u"], columns=["t", "x", "u"])
+    return [values.tobytes() for each in data for values in (each.X, each.U)]
+
+
+def network(path: Path) -> None:
+    from onnx import TensorProto, helper, numpy_helper
+
+    weights = np.random.default_rng(0).standard_normal((2, 4)).astype(np.float32)
+    x, z = (
+        helper.make_tensor_value_info(*of)
+        for of in (("x", TensorProto.FLOAT, [1, 2]), ("z", TensorProto.FLOAT, [1, 4]))
+    )
+    nodes = [helper.make_node("MatMul", ["x", "w"], ["a"]), helper.make_node("Tanh", ["a"], ["z"])]
+    graph = helper.make_graph(nodes, "g", [x], [z], [numpy_helper.from_array(weights, "w")])
+    path.write_bytes(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)]).SerializeToString())
+
+
+def unit(path: Path) -> None:
+    from tests.plants import units
+
+    builds = {"pendulum2": units.build_pendulum, "pendulum3": lambda folder: units.build_pendulum3(folder.parent)}
+    builds |= {f"tank{fmi}": lambda to, fmi=fmi: units.build_tank(to.parent, fmi) for fmi in (2, 3)}
+    (path.parent / "built").mkdir(exist_ok=True)
+    path.write_bytes(Path(builds[path.stem](path.parent / "built" / "made.fmu")).read_bytes())
+
+
+def unit_of(path: Path) -> Any:
+    if path.stem.startswith("tank"):
+        made = km.plants.fmu(path, dt=0.5, interface="co-simulation")
+        return made.states, made.inputs, made.reset(None).tolist()
+    made = km.plants.fmu(path, dt=0.05, interface="model exchange")
+    return made.states, made.inputs, made([0.1, 0.2], [0.3]).tolist()
+
+
+@cache
+def certificate() -> Any:
+    from tests.guarantees.plants import INVARIANT, Invariant, published_data
+
+    data = published_data(Invariant(), [-1, -1], [1, 1], 100, 0.0)[1]
+    return km.certify(km.bilinear_edmd(data, INVARIANT), data, error=(3e-4, 3e-4), region=(-12, 12))
+
+
+def pid() -> Any:
+    return km.control.PID(kp=[0.35, 1], ki=[0.004, 0.1], kd=[0.1, 0], dt=4.0, outputs=[1, 0], bias=3.0)
+
+
+def spare() -> Any:
+    return km.LQR(model(), km.Cost(Q=[1.0, 1.0, 0.1], R=0.1, R_delta=0.2), km.Limits(-1, 1))
+
+
+def parts_of_model_log(path: Path) -> Any:
+    from koopmpc.recording.model import load_model_log
+
+    log = load_model_log(path)
+    return dict(log.facts), log.states, log.dt, [error.tobytes() for error in log.errors]
+
+
+def sweep(path: Path) -> None:
+    with open_sweep(path.parent / "swept", {"problems": ["a"], "controllers": ["lqr"], "seed": 1}):
+        pass
+    path.write_bytes((path.parent / "swept" / MANIFEST).read_bytes())
+
+
+def sweep_of(path: Path) -> Any:
+    (path.parent / "asked").mkdir(exist_ok=True)
+    (path.parent / "asked" / MANIFEST).write_bytes(path.read_bytes())
+    return manifest_of(path.parent / "asked")["asked"]
+
+
+_CODE = "double koopmpc_twice(double x) { return 2 * x; }\n"
+
+
+def code_in(cache: Path) -> Any:
+    cache.mkdir(exist_ok=True)
+    return routines.load_library(_CODE, routines.find_compiler(), cache)
+
+
+def code(path: Path) -> None:
+    code_in(path.parent / "cache")
+    path.write_bytes(next((path.parent / "cache").glob("*.so")).read_bytes())
+
+
+def code_of(path: Path) -> float:
+    """Return what a routine says whose file in the cache is this one: it is built again if it is damaged."""
+    cache = path.parent / "cache"
+    code_in(cache)
+    (path.parent / "new").write_bytes(path.read_bytes())
+    (path.parent / "new").replace(next(cache.glob("*.so")))  # a new file: what is loaded stays as it is
+    twice = code_in(cache).koopmpc_twice
+    twice.restype, twice.argtypes = ctypes.c_double, [ctypes.c_double]
+    return twice(2.0)
+
+
+FORMATS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
+    "pid.npz": (lambda path: pid().save(path), saved),
+    "lqr.npz": (lambda path: spare().save(path), saved),
+    "guarded.npz": (lambda path: km.supervise.Guarded(controller(), spare()).save(path), saved),
+    "station.npz": (
+        lambda path: km.supervise.Station(controller(), spare(), limits=km.Limits(-1, 1)).save(path),
+        saved,
+    ),
+    "certified.npz": (lambda path: certificate().controller().save(path), saved),
+    "certificate.npz": (lambda path: certificate().save(path), km.guarantees.load_certificate),
+    "model.rrd": (WRITERS["model.rrd"], parts_of_model_log),
+    "manifest.json": (sweep, sweep_of),
+    "code.so": (code, code_of),
+    # What others write has no checksums: values may be others in silence.
+    "columns.dat": (lambda path: column_file(path, " "), columns_of),
+    "columns.txt": (lambda path: column_file(path, "\t"), columns_of),
+    "net.onnx": (network, lambda path: km.ONNX(path).bind(["a", "b"])([0.1, 0.2]).tolist()),
+    "problem.py": (lambda path: path.write_bytes(TEMPLATE.read_bytes()), lambda path: repr(km.load_problem(path).cost)),
+    "pendulum2.fmu": (unit, unit_of),
+    "pendulum3.fmu": (unit, unit_of),
+    "tank2.fmu": (unit, unit_of),
+    "tank3.fmu": (unit, unit_of),
+}
+"""More kinds of files that are read: what writes one, and what reads it; from columns.dat on without checksums."""
+
+PLAIN = list(FORMATS)[list(FORMATS).index("columns.dat") :]
+
+
+def damaged(data: bytes, rng: random.Random) -> bytes:
+    """Return the bytes cut, or with a bit, a block or some bytes changed, doubled or zeroed."""
+    size = min(rng.choice([8, 64, 512, 4096]), len(data))
+    at = rng.randrange(len(data) - size + 1)
+    block, bit = data[at : at + size], 1 << rng.randrange(8)
+    put = {
+        "bit": bytes([block[0] ^ bit]) + block[1:],
+        "doubled": 2 * block,
+        "zeroed": bytes(size),
+        "other": rng.randbytes(rng.randrange(1, 64)),
+        "cut": None,
+    }[rng.choice(["bit", "doubled", "zeroed", "other", "cut"])]
+    return data[:at] if put is None else data[:at] + put + data[at + size :]
 
 
 @contextmanager

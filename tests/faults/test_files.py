@@ -18,7 +18,7 @@ import pytest
 import koopmpc as km
 from koopmpc import disk
 from koopmpc.data.files.foreign.hdf5 import _require_sound_heaps
-from tests.faults.damage import READERS, WRITERS, episodes, journal, model, recorded, room_for
+from tests.faults.damage import FORMATS, PLAIN, READERS, WRITERS, damaged, episodes, journal, model, recorded, room_for
 from tests.recording.runs import make_run
 from tests.tiers import few
 
@@ -164,6 +164,27 @@ def test_no_flipped_bit_is_read_as_other_data(tmp_path: Path, name: str, count: 
         else:
             assert found == written or caught
     assert refused > 0
+
+
+@pytest.mark.parametrize("name", few(FORMATS, "pid.npz", "columns.dat", "problem.py"))
+@pytest.mark.parametrize("count", [50, pytest.param(1000, marks=pytest.mark.slow)])
+def test_damage_of_any_kind_ends_in_an_error_of_ours_or_in_data(tmp_path: Path, name: str, count: int) -> None:
+    write, read = FORMATS[name]
+    path, bad = tmp_path / name, tmp_path / "bad" / name
+    bad.parent.mkdir()
+    write(path)
+    data, rng, refused = path.read_bytes(), random.Random(f"{name} {count}"), 0
+    bad.write_bytes(data)
+    whole = read(bad)
+    for _ in range(4 if name == "model.rrd" and count < 1000 else count):
+        bad.write_bytes(damaged(data, rng))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                assert read(bad) == whole or caught or name in PLAIN
+            except km.KoopmpcError:
+                refused += 1
+    assert refused or name == "code.so"  # code is built again
 
 
 def test_every_page_of_a_parquet_file_has_a_checksum(tmp_path: Path) -> None:
