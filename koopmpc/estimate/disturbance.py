@@ -204,6 +204,10 @@ class DisturbanceObserver(Viewing, Measured):
         self._memory[:] = 0.0
         self._stood_in = False
 
+    def forget(self) -> None:
+        """Forget d and all misfits, but not the last state: a step that found no plan asks for it."""
+        self._memory[sum(self._sizes) : -1] = 0.0
+
     def program(self) -> DisturbanceProgram:
         """Return the data with which z and d are found."""
         return DisturbanceProgram(

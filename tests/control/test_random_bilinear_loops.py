@@ -115,6 +115,20 @@ def test_a_reading_from_which_the_model_runs_away_is_a_bad_measurement_and_no_fa
     assert mpc([50.0, 0.0], [0.3, 0.0]).status is km.Status.FAILED  # a fault that is made keeps its name
 
 
+def test_a_step_that_finds_no_plan_forgets_the_disturbance() -> None:
+    cost, limits = km.Cost(Q=[10.0, 1.0], R=0.1), km.Limits(-2, 2, x_max=[0.5, 1.0])
+    mpc = km.BilinearMPC(PLANTS[1], cost, limits, 10, estimator=km.LiftedDisturbance())
+    mpc([0.1, 0.0], [0.3, 0.0])
+    mpc.observer._gate.judge = lambda y, predicted: False  # it would find such a prediction absurd
+    mpc.observer.d[:], mpc.observer._stood_in = [0.0, 1e3], True  # so that the next reading does not change d
+    assert mpc([0.1, 0.0], [0.3, 0.0]).status is km.Status.FAILED
+    assert not mpc.observer.d.any()
+    assert mpc([0.1, 0.0], [0.3, 0.0]).status.name in ("OPTIMAL", "SOFTENED", "UNCONSTRAINED")
+    mpc.observer.d[:], mpc.solver_fails, mpc.observer._stood_in = 1e-3, True, True
+    assert mpc([0.1, 0.0], [0.3, 0.0]).status is km.Status.FAILED
+    assert mpc.observer.d.all()  # a fault that is made says nothing of d
+
+
 @pytest.mark.parametrize("case", ["hang", pytest.param("aside", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["cart_pole_swing", "pendulum_swing"])
 def test_a_swing_up_on_given_equations_costs_what_nonlinear_mpc_costs(name: str, case: str) -> None:

@@ -74,15 +74,20 @@ static void learn(koopmpc_state *s, koopmpc_real *misfit) {
   for (int i = 0; i < NZ; i++) s->d[i] += share < exact || exact > KOOPMPC_EXACT ? exact * (misfit[i] - s->d[i]) : share * (s->means[i] - s->d[i]);
 }
 
-/** Forget the past and all that was learned: the estimate is lost. */
-static void forget_estimate(koopmpc_state *s) {
+void koopmpc_forget(koopmpc_state *s) {
   koopmpc_fill(s->d, 0, KOOPMPC_NZ);
   koopmpc_fill(s->newest, 0, KOOPMPC_NZ + 2 * KOOPMPC_NX);
   koopmpc_fill(s->means, 0, KOOPMPC_NZ + 2 * KOOPMPC_NX);
   koopmpc_fill(s->sizes, 0, KOOPMPC_NX);
   koopmpc_fill(s->weights, 0, KOOPMPC_NX);
   s->fresh = s->change = 0;
-  s->learned = s->seen = s->has_z = 0;
+  s->learned = 0;
+}
+
+/** Forget the past and all that was learned: the estimate is lost. */
+static void forget_estimate(koopmpc_state *s) {
+  koopmpc_forget(s);
+  s->seen = s->has_z = 0;
 }
 
 /** The z that u and w predict without d; with d it stands in `scratch`, and what it shows in `expected`. */

@@ -18,6 +18,11 @@ void koopmpc_start(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real 
 /** Write the start of the plan into `known`; z is NaN if y cannot be used. */
 void koopmpc_take(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *applied, const koopmpc_rows *w);
 
+#if KOOPMPC_ESTIMATOR == 1
+/** Forget the disturbance and all misfits, but not the last state. */
+void koopmpc_forget(koopmpc_state *s);
+#endif
+
 #if KOOPMPC_FIRST_ALONE
 /** Write all inputs of a plan of which a step needed the first alone. */
 void koopmpc_settle(const koopmpc_state *s, koopmpc_real *kept);

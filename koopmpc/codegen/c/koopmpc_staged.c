@@ -618,6 +618,9 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
     koopmpc_real free_input[NV];
     for (int i = 0; i < NV; i++) free_input[i] = s->without_limits[i] + (KOOPMPC_WITH_RATES ? u_prev[i] : 0);
     koopmpc_fail(s, known && koopmpc_usable(free_input, NV) ? free_input : 0, applied, u, report, status);
+#if KOOPMPC_ESTIMATOR == 1
+    if (status == KOOPMPC_FAILED && !s->refused) koopmpc_forget(s);
+#endif
     if (status == KOOPMPC_FAILED && runs_away(s, stage, u_prev)) report->status = KOOPMPC_BAD_MEASUREMENT;
     return;
   }

@@ -27,6 +27,7 @@ from koopmpc.control.terminal.kept_plan import JudgedPlan, PlanKeeper, choose_pl
 from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set
 from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
+from koopmpc.estimate.disturbance import DisturbanceObserver
 from koopmpc.estimate.observer import Estimator, start_observer
 from koopmpc.plants.step_map import StepMap
 
@@ -272,8 +273,11 @@ class StagedMPC(MPCBase):
             found, status, kept = self._choose(self._keeper, found._replace(status=status), s, u_prev, first)
         if status not in GOOD and not kept:
             move = self._lose(applied, status, found.iterations, start, found.free)
-            if move.status is Status.FAILED and not self.solver_fails and self._runs_away(x, u_prev, start):
-                move.status = Status.BAD_MEASUREMENT
+            if move.status is Status.FAILED and not self.solver_fails:
+                if not initial.refused and isinstance(initial.observer, DisturbanceObserver):
+                    initial.observer.forget()
+                if self._runs_away(x, u_prev, start):
+                    move.status = Status.BAD_MEASUREMENT
             return move
         self._warm = True
         self._X, self._U = self._trajectory(found.S, found.V)
