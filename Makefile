@@ -59,7 +59,7 @@ LOWEST := tests/test_front_door.py tests/test_checks.py tests/test_values.py tes
 	tests/control tests/identify tests/codegen tests/predict tests/loop tests/validate tests/guarantees
 lowest: $(VENV)/lowest/bin/python
 	$(PYTHON) -m tests.lowest > $(VENV)/lowest/constraints.txt
-	$< -m pip install --quiet --disable-pip-version-check -c $(VENV)/lowest/constraints.txt -e ".[gym,sklearn]" \
+	$< -m pip install --quiet --disable-pip-version-check -c $(VENV)/lowest/constraints.txt -e ".[dask,gym,sklearn]" \
 		pytest pytest-xdist pytest-benchmark hypothesis beartype
 	$< -m pip check
 	$(PINNED) $< -m pytest -n 2 --dist loadfile --benchmark-disable -W default $(LOWEST)
