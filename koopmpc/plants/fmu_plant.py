@@ -100,7 +100,7 @@ def fmu(
     """
     if start_values is not None:
         checks.kind(start_values, "start_values", Mapping, 'pass {"name": value}')
-    how = "pass one of km.plants, as km.plants.RK4()"
+    how = "pass an integrator, as km.RK4()"
     checks.members(integrator, "the integrator", ("step",), how)
     checks.takes(integrator.step, "the integrator's step", 2, how)
     unit = read_description(path, interface)

@@ -302,7 +302,7 @@ def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) ->
            [0.0125]])
     """
     dt = checks.positive(dt, "dt", "s")
-    how = "pass one of km.plants, as km.plants.RK4()"
+    how = "pass an integrator, as km.RK4()"
     checks.members(integrator, "the integrator", ("step",), how)
     checks.takes(integrator.step, "the integrator's step", 2, how)
     F = split_inputs(integrator.step(build_right_side(dynamics), dt), dynamics.nu, dynamics.nw)
