@@ -23,7 +23,7 @@ from koopmpc.control.stepped.search import NODES
 from koopmpc.control.stepped.sequences import LevelsProgram
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import EXACT, DisturbanceProgram
-from koopmpc.estimate.gate import BRIDGED
+from koopmpc.estimate.gate import BEYOND, BRIDGED
 from koopmpc.estimate.kalman import FilterProgram
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
@@ -220,6 +220,7 @@ def _add_gate(tables: Tables, gate: Graph | None, ny: int, *, single: bool) -> N
     tables.sizes["GATE"] = 0 if gate is None else gate.m - 2
     tables.sizes["BRIDGED"] = BRIDGED
     if gate is not None:
+        tables.define({"AGREES": BEYOND})
         rounding = tolerances.OF_ALL["AT_REST"]
         gate = replace(gate, constants=np.where(gate.constants == rounding[0], rounding[single], gate.constants))
         arguments = {"y": ny, "predicted": ny, "memory": gate.m - 2}

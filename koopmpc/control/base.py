@@ -158,7 +158,9 @@ class InitialCondition(Viewing):
         self.refused = getattr(observer, "refused", False)
         if self._ahead.size:  # a disturbance that is not finite keeps its last value
             self._w = np.where(np.abs(self._ahead[0]) < HUGE, self._ahead[0], self._w)
-            self._hold(getattr(observer, "stand_in_w", None), w is None or np.ndim(w) == 1 or len(np.asarray(w)) == 1)
+            held = getattr(observer, "stand_in_w", None)
+            if held is not None:
+                self._hold(held, w is None or np.ndim(w) == 1 or len(np.asarray(w)) == 1)
         z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
         p = np.zeros((self._latency, 1))
         if self._np:
@@ -170,10 +172,8 @@ class InitialCondition(Viewing):
         if self._estimated:
             self.d[:] = d
 
-    def _hold(self, held: Float[np.ndarray, " nw"] | None, constant: bool) -> None:
-        """Plan with the last w that was used where the last one was wild; of a preview only its first row changes."""
-        if held is None:
-            return
+    def _hold(self, held: Float[np.ndarray, " nw"], constant: bool) -> None:
+        """Plan with this w, the last one that was not wild; of a preview only its first row changes."""
         count = None if constant else 1
         self._ahead[:count] = held
         if constant or not self._latency:

@@ -187,26 +187,34 @@ class ReadingGate(Viewing):
         """Return what this w predicts, or where it is wild what the last w that was used predicts.
 
         w is wild if its prediction, as a reading, would be refused beside that of the last one, and y would not. A step
-        of w that the reading shows is used at once; after five wild ones in sequence w is used whatever it predicts.
+        of w that the reading shows is used at once: no w is doubted while all |yᵢ − ŷᵢ| ≤ 5 qᵢ, see `gate_function`.
+        After five wild ones in sequence w is used whatever it predicts.
 
         Parameters
         ----------
         predict
             w → the predicted reading. The last call is that of the prediction that is returned.
         """
-        last = np.zeros(len(w)) if self.w is None else self.w
-        if self._doubted < BRIDGED and (w != last).any():
+        predicted, last = predict(w), np.zeros(len(w)) if self.w is None else self.w
+        if not self._agrees(y, predicted) and self._doubted < BRIDGED and (w != last).any():
+            predicted = predicted.copy()
             expected = predict(last).copy()
-            predicted = predict(w)
             moved = np.where(np.abs(y) < HUGE, predicted, expected)
             if self._is_beyond(moved, expected) and not self._is_beyond(y, expected):
                 self._doubted += 1
                 self.w = last
-                return predict(last)
-        else:
+                return expected
             predicted = predict(w)
         self.w, self._doubted = w.copy(), 0
         return predicted
+
+    def _agrees(self, y: Float[np.ndarray, " ny"], predicted: Float[np.ndarray, " ny"]) -> bool:
+        """Return whether y is as near to this prediction as readings that are not refused are to theirs at rest."""
+        quantiles = self._memory[: self._ny].tolist()
+        for measured, foreseen, q in zip(y.tolist(), predicted.tolist(), quantiles, strict=True):
+            if abs(measured - foreseen) > BEYOND * q:  # False for NaN
+                return False
+        return True
 
     def _is_beyond(self, y: Float[np.ndarray, " ny"], predicted: Float[np.ndarray, " ny"]) -> bool:
         """Return whether y would be refused, or would start the observer again."""

@@ -160,7 +160,7 @@ class KalmanFilter(Viewing):
         self.ny, nz = len(self._system.M), len(self._system.one)
         n, inputs = self._system.G.shape
         self._known, self._found = np.ones(n + inputs + self.ny + 1), np.zeros(n + 2 * nz + self.ny)
-        self._gate = ReadingGate(self.ny, self._system.shows)
+        self._gate, self._ahead = ReadingGate(self.ny, self._system.shows), np.zeros(n)
         self._see()
         self.reset()
 
@@ -266,16 +266,14 @@ class KalmanFilter(Viewing):
         self, y: Float[np.ndarray, " ny"], v: Float[np.ndarray, " nuw"], nw: int
     ) -> Float[np.ndarray, " n"]:
         """Return the state after v = [u; w], without a wild w."""
-        s, system = self._s, self._system
-        u = v[: len(v) - nw]
+        nu = len(v) - nw
+        self._gate.choose(y, v[nu:], partial(self._predict_after, v[:nu]))
+        return self._ahead
 
-        def predict(w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
-            nonlocal s
-            s = self._next(self._s, np.concatenate([u, w]))
-            return system.M @ s + system.h
-
-        self._gate.choose(y, v[len(u) :], predict)
-        return s
+    def _predict_after(self, u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
+        """Store the state after u and w, and return what it shows."""
+        self._ahead, system = self._next(self._s, np.concatenate([u, w])), self._system
+        return system.M @ self._ahead + system.h
 
     def _correct(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Predict, and correct with the entries of y that have come, unless y is refused."""

@@ -216,6 +216,7 @@ class Measured:
         self._gate = ReadingGate(model.ny, self._remembers) if self._remembers or model.embedding is not None else None
         self._nothing, self._known_z = np.full(model.ny, np.nan), False
         self._nothing_z = np.full(model.nz, np.nan)
+        self._foreseen, self._acted = self._nothing_z, np.zeros(model.nu)
         self._from, self._bridged = np.zeros(model.nz), 0  # what the next prediction starts from; missed readings since
         self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
@@ -256,7 +257,9 @@ class Measured:
         if self._history is not None and self._gate is not None:
             if self._known_z:
                 if len(w):
-                    expected = self._choose_prediction(self._gate, y, u, w)
+                    self._acted = u
+                    self._gate.choose(y, w, self._predict)
+                    expected = self._foreseen
                 else:
                     expected = self._model.advance(self._from, u, w, self.d)
             y = self._history.take(self._check_reading(self._gate, y, expected), u)
@@ -278,23 +281,10 @@ class Measured:
         self._bridged = self._bridged + 1 if bridges else 0
         self._known_z = known or bridges
 
-    def _choose_prediction(
-        self,
-        gate: ReadingGate,
-        y: Float[np.ndarray, " ny"],
-        u: Float[np.ndarray, " nu"],
-        w: Float[np.ndarray, " nw"],
-    ) -> Float[np.ndarray, " nz"]:
-        """Return the z that u and w predict, without a wild w."""
-        expected = self._nothing_z
-
-        def predict(w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
-            nonlocal expected
-            expected = self._model.advance(self._from, u, w, self.d)
-            return self._show(expected)
-
-        gate.choose(y, w, predict)
-        return expected
+    def _predict(self, w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
+        """Store the z that the last input and w predict, and return what it shows."""
+        self._foreseen = self._model.advance(self._from, self._acted, w, self.d)
+        return self._show(self._foreseen)
 
     def _show(self, z: Float[np.ndarray, " nz"]) -> Float[np.ndarray, " ny"]:
         return z[: self.ny] if self._to_y is None else self._to_y.dot(z)

@@ -3,6 +3,7 @@
 
 #include "koopmpc_common.h"
 #include "koopmpc_limits.h"
+#include "koopmpc_solver.h"
 
 void koopmpc_add(koopmpc_real *restrict to, const koopmpc_real *restrict map, int rows, const koopmpc_real *restrict x,
                  int columns) {
@@ -73,6 +74,9 @@ static int is_beyond(const koopmpc_real *memory, const koopmpc_real *y, const ko
 int koopmpc_doubt(const koopmpc_real *memory, const koopmpc_real *y, const koopmpc_real *predicted,
                   const koopmpc_real *without) {
   koopmpc_real moved[KOOPMPC_NY];
+  int agrees = 1; /* the memory begins with the quantiles of the misfits; NaN agrees */
+  for (int i = 0; i < KOOPMPC_NY; i++) agrees &= !(koopmpc_abs(y[i] - predicted[i]) > KOOPMPC_AGREES * memory[i]);
+  if (agrees) return 0;
   for (int i = 0; i < KOOPMPC_NY; i++) moved[i] = koopmpc_abs(y[i]) < KOOPMPC_HUGE ? predicted[i] : without[i];
   return is_beyond(memory, moved, without) && !is_beyond(memory, y, without);
 }
