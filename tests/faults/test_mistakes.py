@@ -216,7 +216,7 @@ def test_numbers_of_other_kinds_are_steps_and_what_only_has_the_name_of_a_method
     for dt in (Decimal("0.05"), Fraction(1, 20)):
         assert km.discretize(PENDULUM.dynamics, dt).dt == 0.05
     for bad in (range(3), slice(1)):
-        with pytest.raises(km.errors.DataError, match="the integrator's step does not take 2 arguments; pass one of"):
+        with pytest.raises(km.errors.DataError, match="the integrator's step does not take 2 arguments; pass an"):
             km.discretize(PENDULUM.dynamics, 0.05, integrator=bad)
         with pytest.raises(km.errors.DataError, match=r"estimator is (range|slice).*; pass an object"):
             km.KoopmanMPC(LIFTED, PENDULUM.cost, PENDULUM.limits, 5, estimator=bad)
