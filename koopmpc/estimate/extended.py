@@ -201,7 +201,7 @@ class ExtendedObserver:
         F = np.eye(n + ny)
         if len(w):
             self._gate.choose(y, w, lambda w: self._predict_reading(self._model.advance(self.z, u, w, self.d), u, w)[1])
-            w = w if self._gate.w is None else self._gate.w
+            w = self._gate.w
         F[:n, :n] = self._slope(self.z, u, w)
         F[:ny, n:] = np.eye(ny) if self._disturbed else 0.0
         z = np.array(self._model.advance(self.z, u, w, self.d), dtype=np.float64)

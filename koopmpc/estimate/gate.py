@@ -31,6 +31,8 @@ LEAP = 10.0  # with `leaps`: a reading leaps if it and its misfit are beyond so 
 LEAPS = 6  # the first readings before one that leaps may be left behind so many times
 FADING = 0.8  # what a predicted step allows fades by this factor a step
 
+_NO_W = np.zeros(0)
+
 
 @cache
 @raise_swallowed()
@@ -146,7 +148,7 @@ class ReadingGate(Viewing):
     lost
         Whether the last prediction was absurd, so that the observer starts again from the reading.
     w
-        The measured disturbance of the last prediction that was chosen.
+        The measured disturbance of the last prediction that was chosen; empty before.
 
     Parameters
     ----------
@@ -160,7 +162,7 @@ class ReadingGate(Viewing):
 
     def __init__(self, ny: int, leaps: bool = False) -> None:
         self._ny, self._function = ny, gate_function(ny, leaps)
-        self.w: Float[np.ndarray, " nw"] | None = None
+        self.w: Float[np.ndarray, " nw"] = _NO_W
         self._doubted = 0  # wild w in sequence
         self._memory = np.zeros(self._function.numel_in(2))
         self._see()
@@ -176,7 +178,7 @@ class ReadingGate(Viewing):
         """Forget all readings."""
         self._memory[:] = 0.0
         self.refused = self.opened = self.lost = False
-        self.w, self._doubted = None, 0
+        self.w, self._doubted = _NO_W, 0
 
     def choose(
         self,
@@ -195,7 +197,7 @@ class ReadingGate(Viewing):
         predict
             w → the predicted reading. The last call is that of the prediction that is returned.
         """
-        predicted, last = predict(w), np.zeros(len(w)) if self.w is None else self.w
+        predicted, last = predict(w), self.w if self.w.size else np.zeros(len(w))
         if not self._agrees(y, predicted) and self._doubted < BRIDGED and (w != last).any():
             predicted = predicted.copy()
             expected = predict(last).copy()

@@ -245,7 +245,7 @@ class KalmanFilter(Viewing):
             self._y[:] = y if whole else 0.0
             if len(w):
                 self._gate.choose(y, w, self._predict)
-                w = w if self._gate.w is None else self._gate.w
+                w = self._gate.w
             else:
                 self._omega.dot(self._known, self._found)
             refused = self._gate.judge(y, self._clip(self._expected))

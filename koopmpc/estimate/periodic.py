@@ -81,6 +81,7 @@ class PeriodicObserver(Measured):
         self._theta: Float[np.ndarray, "n nz"] = np.zeros((n, self._model.nz))
         self._P: Float[np.ndarray, "n n"] = np.eye(n)
         self._last: Float[np.ndarray, " nz"] = self._nothing_z
+        self._ahead: Float[np.ndarray, " nz"] = self._none
         self._k: int = 0
         self._stood_in = False
 
@@ -106,14 +107,9 @@ class PeriodicObserver(Measured):
         phi = make_regressor(self._turns, self._k - 1)
         expected = self._nothing
         if np.isfinite(self._last).all():
-            ahead = phi @ self._theta
-
-            def predict(w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
-                nonlocal predicted
-                predicted = self._model.advance(self._last, u, w, self._none)
-                return self._show(predicted + ahead)
-
-            expected = gate.choose(y, w, predict) if len(w) else predict(w)
+            self._acted, self._ahead = u, phi @ self._theta
+            expected = gate.choose(y, w, self._predict) if len(w) else self._predict(w)
+            predicted = self._foreseen
         stands_in = gate.judge(y, expected)
         if gate.lost:
             self._theta[:], self._P, predicted = 0.0, np.eye(len(self._P)), self._nothing_z
@@ -141,6 +137,11 @@ class PeriodicObserver(Measured):
         self._k += 1
         self.d[:] = self._theta[0]
         return True
+
+    def _predict(self, w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
+        """Store the z that the last input and w predict without d, and return what it shows with d."""
+        self._foreseen = self._model.advance(self._last, self._acted, w, self._none)
+        return self._show(self._foreseen + self._ahead)
 
     def _learn(self, phi: Float[np.ndarray, " n"], e: Float[np.ndarray, " nz"]) -> None:
         Pphi = self._P @ phi

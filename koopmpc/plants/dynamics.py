@@ -136,6 +136,13 @@ class Integrator(ABC):
         """Return F of x⁺ = F(x, u) from f of ẋ = f(x, u), dt [s]."""
 
 
+def check_integrator(given: object) -> None:
+    """Raise a DataError for an object without the method `step` of an integrator."""
+    how = "pass an integrator, as km.RK4()"
+    checks.members(given, "the integrator", ("step",), how)
+    checks.takes(cast("Integrator", given).step, "the integrator's step", 2, how)
+
+
 @dataclass(frozen=True)
 class Euler(Integrator):
     """x⁺ = x + dt f(x, u): order 1."""

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.disk import make_temporary_folder
 from koopmpc.errors import DataError, LogError
-from koopmpc.plants.dynamics import RK4, Integrator
+from koopmpc.plants.dynamics import RK4, Integrator, check_integrator
 from koopmpc.plants.fmu_equations import FMUStepMap, read_equations
 from koopmpc.plants.fmu_files import (
     StartValue,
@@ -100,9 +100,7 @@ def fmu(
     """
     if start_values is not None:
         checks.kind(start_values, "start_values", Mapping, 'pass {"name": value}')
-    how = "pass an integrator, as km.RK4()"
-    checks.members(integrator, "the integrator", ("step",), how)
-    checks.takes(integrator.step, "the integrator's step", 2, how)
+    check_integrator(integrator)
     unit = read_description(path, interface)
     step = unit.step_size if dt is None else dt
     if step is None:

@@ -22,6 +22,7 @@ from koopmpc.plants.dynamics import (
     Integrator,
     build_output,
     build_right_side,
+    check_integrator,
     find_scene,
     split_inputs,
 )
@@ -302,9 +303,7 @@ def discretize(dynamics: Dynamics, dt: float, integrator: Integrator = RK4()) ->
            [0.0125]])
     """
     dt = checks.positive(dt, "dt", "s")
-    how = "pass an integrator, as km.RK4()"
-    checks.members(integrator, "the integrator", ("step",), how)
-    checks.takes(integrator.step, "the integrator's step", 2, how)
+    check_integrator(integrator)
     F = split_inputs(integrator.step(build_right_side(dynamics), dt), dynamics.nu, dynamics.nw)
     h, outputs = build_output(dynamics)
     names = dynamics.states, dynamics.inputs, outputs

@@ -402,7 +402,7 @@ def explain_inputs(total: Moments) -> Float[np.ndarray, " nu"]:
 def explain_beyond_past(episodes: Episodes, predictor: AnyPredictor) -> Float[np.ndarray, " nu"]:
     """Return for each input the share R² that ψ explains of what its two rows before, and those of others, leave open.
 
-    A slow input is no feedback: outputs that answer to it tell no more of the next row than its own past does. At 1
+    A slow input is not feedback: outputs that answer to it tell no more of the next row than its own past does. At 1
     where the past leaves less than a billionth, as a wave and an exact law do.
     """
     before, psi, u = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.control.nonlinear.iteration import RealTimeIteration
-from tests.compiler import needs_compiler
+from tests.compiler import avoid_compiling, needs_compiler
 from tests.tiers import slow
 
 PRECISE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}
@@ -174,7 +174,7 @@ def test_a_run_repeats_to_the_bit_after_reset_and_in_a_copy() -> None:
 
 
 def test_copies_go_on_to_the_bit_where_w_multiplies_and_a_disturbance_is_estimated(monkeypatch) -> None:
-    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)
+    avoid_compiling(monkeypatch)
     x, u, w = ca.SX.sym("x", 2), ca.SX.sym("u", 1), ca.SX.sym("w", 1)
     first = 0.9 * x[0] + 0.2 * x[1] + 0.1 * u[0] * x[1] + 0.2 * w[0] * x[0] + 0.1 * w[0]
     F = ca.vertcat(first, 0.8 * x[1] + 0.4 * u[0] + 0.3 * w[0] * u[0])
@@ -193,7 +193,7 @@ def test_copies_go_on_to_the_bit_where_w_multiplies_and_a_disturbance_is_estimat
 
 
 def test_copies_follow_a_disturbance_to_the_bit_with_the_factors_of_an_earlier_step(monkeypatch) -> None:
-    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)
+    avoid_compiling(monkeypatch)
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
     F = ca.vertcat(0.9 * x[0] + 0.2 * x[1] + 0.1 * u[0] * x[1], 0.8 * x[1] + 0.3 * ca.sin(x[0]) + 0.4 * u[0])
     plant = km.StepMap(ca.Function("F", [x, u], [F]), 0.1)

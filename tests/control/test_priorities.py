@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.compiler import avoid_compiling
 
 STATES, INPUTS = ("a", "b", "c"), ("u [V]",)
 
@@ -115,7 +116,7 @@ def test_priorities_that_cannot_be_are_refused(said):
 @pytest.mark.parametrize("kind", [km.BilinearMPC, km.NonlinearMPC])
 def test_where_weights_stand_for_priorities_plans_are_those_of_a_qp_for_each(kind, monkeypatch):
     """On linear models, of which KoopmanMPC solves the priorities one after the other."""
-    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)  # a step is shorter than its compilation
+    avoid_compiling(monkeypatch)
     gave_way = 0
     for seed in range(6):
         model, cost, high, x = draw(seed)

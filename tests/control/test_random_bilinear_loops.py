@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from tests.compiler import needs_compiler
+from tests.compiler import avoid_compiling, needs_compiler
 
 FALLBACKS = ("FAILED", "MAX_ITERATIONS", "INFEASIBLE")
 
@@ -76,7 +76,7 @@ def statuses(trial: int, models: list[list[km.StepMap | km.BilinearPredictor]]) 
 
 @pytest.mark.parametrize("trials", [range(10), pytest.param(range(300), marks=pytest.mark.slow)])
 def test_a_soft_limit_or_a_reference_beyond_it_is_no_reason_to_fail(models, trials, monkeypatch) -> None:
-    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)  # a loop is shorter than its compilation
+    avoid_compiling(monkeypatch)
     count = sum((statuses(trial, models) for trial in trials), Counter())
     assert not any(count[name] for name in FALLBACKS), count
     assert count["SOFTENED"] > 0

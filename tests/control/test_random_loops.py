@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 
+from tests.compiler import avoid_compiling
 from tests.control.random_loops import Outcome, nonlinear, outcomes_of, table
 
 
@@ -33,7 +34,7 @@ HARD = [165, 85, 700, 1590]
 
 @pytest.mark.parametrize("seeds", [HARD, pytest.param(range(1000), marks=pytest.mark.slow)], ids=["hard", "1000"])
 def test_random_loops_of_bilinear_mpc(seeds, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)  # a loop is shorter than its compilation
+    avoid_compiling(monkeypatch)
     good(outcomes_of(seeds, bilinear=True))
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.compiler import avoid_compiling
 
 DT, PERIOD = 0.5, 7.3
 A, B = np.array([[0.9, 0.1], [-0.1, 0.8]]), np.array([[0.0], [0.3]])
@@ -14,7 +15,7 @@ MODEL = km.LinearPredictor(A, B, np.eye(2), km.State().bind(("a", "b")), DT, ("a
 
 @pytest.fixture(autouse=True)
 def interpret(monkeypatch):
-    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)  # a loop is shorter than its compilation
+    avoid_compiling(monkeypatch)
 
 
 def push(k):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.estimate.gate import BEYOND, BRIDGED, FEW, LEAST, LONG, ReadingGate
-from tests.compiler import needs_compiler
+from tests.compiler import avoid_compiling, needs_compiler
 from tests.control.test_random_bilinear_loops import PLANTS as OSCILLATORS
 from tests.estimate.pendulums import PROBLEM, truth
 from tests.estimate.plants import linear
@@ -420,7 +420,7 @@ SIX, TWO = [(1, 1e29), (0, 50.0), (1, 50.0), (0, 50.0), (0, -1e6), (0, 50.0)], [
 @pytest.mark.parametrize(("plant", "burst"), [(0, SIX), (1, TWO)], ids=["six", "two"])
 def test_what_a_nonlinear_model_predicts_from_the_first_wild_readings_is_no_disturbance(plant, burst, monkeypatch):
     """From 50 a cubic spring goes to 3e4: that was learned as d, and let a reading of 50 pass twenty steps later."""
-    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)  # a loop is shorter than its compilation
+    avoid_compiling(monkeypatch)
     cost, limits = km.Cost(Q=[10.0, 1.0], R=0.1), km.Limits(-3, 3)
     mpc = km.BilinearMPC(OSCILLATORS[plant], cost, limits, 15, estimator=km.LiftedDisturbance())
     wild, x = dict(enumerate(burst, 2)) | {25: (0, 50.0)}, np.array([0.2, 0.1])

@@ -16,7 +16,7 @@ from koopmpc.plants import routines, step_map
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Routine
 from koopmpc.values import fingerprint
-from tests.compiler import needs_compiler
+from tests.compiler import avoid_compiling, needs_compiler
 from tests.example_plants import CartPole, Pendulum
 
 MAPS = {
@@ -262,7 +262,7 @@ def test_a_compiler_that_hangs_is_given_up(tmp_path, monkeypatch):
 
 
 def test_without_a_compiler_batches_run_over_columns(monkeypatch):
-    monkeypatch.setattr(routines, "find_compiler", lambda: None)
+    avoid_compiling(monkeypatch)
     plant = km.discretize(CartPole(), 0.02)
     X0, U = random_episodes(plant, 100, 200)
     X = plant.rollouts(X0, U)
@@ -293,7 +293,7 @@ def results(routine_of) -> tuple[np.ndarray, np.ndarray, bool]:
 @needs_compiler
 def test_machine_code_is_the_interpreter_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     fast = results(Routine)
-    monkeypatch.setattr(routines, "find_compiler", lambda: None)
+    avoid_compiling(monkeypatch)
     slow = results(Routine)
     assert (fast[2], slow[2]) == (True, False)
     assert np.array_equal(fast[0], slow[0])

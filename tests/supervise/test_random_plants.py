@@ -4,6 +4,7 @@ import sys
 
 import pytest
 
+from tests.compiler import avoid_compiling
 from tests.supervise.random_plants import run_loops, table
 
 
@@ -15,7 +16,7 @@ def good(outcomes) -> None:
 
 @pytest.fixture(autouse=True)
 def interpret(monkeypatch):
-    monkeypatch.setattr("koopmpc.plants.routines.find_compiler", lambda: None)  # a loop is shorter than its compilation
+    avoid_compiling(monkeypatch)
 
 
 def test_a_sample_of_random_loops_with_all_features() -> None:

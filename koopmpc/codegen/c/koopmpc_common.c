@@ -71,27 +71,37 @@ static int is_beyond(const koopmpc_real *memory, const koopmpc_real *y, const ko
   return result[0] > 0 || result[1] == 2;
 }
 
-int koopmpc_doubt(const koopmpc_real *memory, const koopmpc_real *y, const koopmpc_real *predicted,
-                  const koopmpc_real *without) {
-  koopmpc_real moved[KOOPMPC_NY];
-  int agrees = 1; /* the memory begins with the quantiles of the misfits; NaN agrees */
-  for (int i = 0; i < KOOPMPC_NY; i++) agrees &= !(koopmpc_abs(y[i] - predicted[i]) > KOOPMPC_AGREES * memory[i]);
-  if (agrees) return 0;
-  for (int i = 0; i < KOOPMPC_NY; i++) moved[i] = koopmpc_abs(y[i]) < KOOPMPC_HUGE ? predicted[i] : without[i];
-  return is_beyond(memory, moved, without) && !is_beyond(memory, y, without);
-}
-
-int koopmpc_differs(const koopmpc_state *s, const koopmpc_real *w) {
-  int differs = 0;
+/** Whether w is to be tried against the last one: it is another, and y is not near what it predicts. */
+static int is_doubtful(const koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *w,
+                       const koopmpc_real *predicted) {
+  int differs = 0, agrees = 1; /* the memory begins with the quantiles of the misfits; NaN agrees */
   for (int i = 0; i < KOOPMPC_NW; i++) differs |= w[i] != s->used_w[i];
-  return differs && s->doubted < KOOPMPC_BRIDGED;
-}
-
-void koopmpc_settle_w(koopmpc_state *s, int wild, koopmpc_real *w) {
-  s->doubted = wild ? s->doubted + 1 : 0;
-  koopmpc_copy(wild ? w : s->used_w, wild ? s->used_w : w, KOOPMPC_NW);
+  for (int i = 0; i < KOOPMPC_NY; i++) agrees &= !(koopmpc_abs(y[i] - predicted[i]) > KOOPMPC_AGREES * s->gate[i]);
+  return differs && !agrees && s->doubted < KOOPMPC_BRIDGED;
 }
 #endif
+
+void koopmpc_choose(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u, koopmpc_real *w, koopmpc_real *z,
+                    koopmpc_real *expected) {
+  koopmpc_predict(s, u, w, z, expected);
+#if KOOPMPC_NW
+  int wild = 0;
+  if (is_doubtful(s, y, w, expected)) {
+    koopmpc_real without[KOOPMPC_NY], moved[KOOPMPC_NY];
+    koopmpc_predict(s, u, s->used_w, z, without);
+    for (int i = 0; i < KOOPMPC_NY; i++) moved[i] = koopmpc_abs(y[i]) < KOOPMPC_HUGE ? expected[i] : without[i];
+    wild = is_beyond(s->gate, moved, without) && !is_beyond(s->gate, y, without);
+    if (wild)
+      koopmpc_copy(expected, without, KOOPMPC_NY);
+    else
+      koopmpc_predict(s, u, w, z, expected);
+  }
+  s->doubted = wild ? s->doubted + 1 : 0;
+  koopmpc_copy(wild ? w : s->used_w, wild ? s->used_w : w, KOOPMPC_NW);
+#else
+  (void)y;
+#endif
+}
 
 int koopmpc_bridge(koopmpc_real *from, int has, int *bridged, const koopmpc_real *z, const koopmpc_real *expected) {
   const int known = koopmpc_usable(z, KOOPMPC_NZ), bridges = !known && has && *bridged < KOOPMPC_BRIDGED;

@@ -53,15 +53,13 @@ void koopmpc_gate(const koopmpc_real *y, const koopmpc_real *predicted, const ko
 /** Whether y is too far from its prediction to be used; NaN in `predicted` is no prediction. */
 int koopmpc_refuse(koopmpc_real *memory, const koopmpc_real *y, const koopmpc_real *predicted, int *opened);
 
-/** Whether w, and not y, is wild: the reading that w predicts would be refused, and y would not be. */
-int koopmpc_doubt(const koopmpc_real *memory, const koopmpc_real *y, const koopmpc_real *predicted,
-                  const koopmpc_real *without);
+/** The z that u and w lead to by the controller's model, and the reading that it shows. */
+void koopmpc_predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real *w, koopmpc_real *z,
+                     koopmpc_real *expected);
 
-/** Whether w is to be tried against the last one that was used. */
-int koopmpc_differs(const koopmpc_state *s, const koopmpc_real *w);
-
-/** Use w, or the last one if it is wild. */
-void koopmpc_settle_w(koopmpc_state *s, int wild, koopmpc_real *w);
+/** What u and w predict; where y denies that, with the last w that was used, which `w` is then: w was wild. */
+void koopmpc_choose(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *u, koopmpc_real *w, koopmpc_real *z,
+                    koopmpc_real *expected);
 
 /** from <- z, from which the next reading is predicted; for some missed readings its prediction. Return whether it is. */
 int koopmpc_bridge(koopmpc_real *from, int has, int *bridged, const koopmpc_real *z, const koopmpc_real *expected);

@@ -40,11 +40,11 @@ void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *
 }
 
 #if KOOPMPC_GATE
-/** The z that w and the last input predict, and what it shows. */
-static void predict(const koopmpc_state *s, const koopmpc_real *w, koopmpc_real *z, koopmpc_real *expected) {
+void koopmpc_predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real *w, koopmpc_real *z,
+                     koopmpc_real *expected) {
   koopmpc_fill(z, 0, KOOPMPC_NZ);
   koopmpc_add(z, koopmpc_A, KOOPMPC_NZ, s->from, KOOPMPC_NZ);
-  koopmpc_add(z, koopmpc_B, KOOPMPC_NZ, s->last, KOOPMPC_NU);
+  koopmpc_add(z, koopmpc_B, KOOPMPC_NZ, u, KOOPMPC_NU);
   if (KOOPMPC_NW) koopmpc_add(z, koopmpc_E, KOOPMPC_NZ, w, KOOPMPC_NW);
   koopmpc_fill(expected, 0, KOOPMPC_NY);
   koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, z, KOOPMPC_NZ);
@@ -62,20 +62,8 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
 #if KOOPMPC_GATE
   koopmpc_real next[KOOPMPC_NZ] = {0}, expected[KOOPMPC_NY];
   int opened;
-  koopmpc_fill(expected, s->has_z ? 0 : (koopmpc_real)NAN, KOOPMPC_NY);
-  if (s->has_z) {
-#if KOOPMPC_NW
-    koopmpc_real without[KOOPMPC_NY];
-    int wild = koopmpc_differs(s, s->w);
-    if (wild) predict(s, s->used_w, next, without);
-    predict(s, s->w, next, expected);
-    wild = wild && koopmpc_doubt(s->gate, y, expected, without);
-    koopmpc_settle_w(s, wild, s->w);
-    if (wild) predict(s, s->w, next, expected);
-#else
-    predict(s, s->w, next, expected);
-#endif
-  }
+  koopmpc_fill(expected, (koopmpc_real)NAN, KOOPMPC_NY);
+  if (s->has_z) koopmpc_choose(s, y, s->last, s->w, next, expected);
   refused = koopmpc_refuse(s->gate, y, expected, &opened);
   if (opened == 2) s->seen = s->has_z = 0; /* the estimate is lost */
   if (refused) y = expected;

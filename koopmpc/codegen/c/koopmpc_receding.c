@@ -90,9 +90,9 @@ static void forget_estimate(koopmpc_state *s) {
   s->seen = s->has_z = 0;
 }
 
-/** The z that u and w predict without d; with d it stands in `scratch`, and what it shows in `expected`. */
-static void predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real *w, koopmpc_real *z,
-                    koopmpc_real *expected) {
+/* z is without d; with d it stands in `scratch`, and is what `expected` shows. */
+void koopmpc_predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real *w, koopmpc_real *z,
+                     koopmpc_real *expected) {
   advance(z, s->from, u, w, 0);
   for (int i = 0; i < KOOPMPC_NZ; i++) s->scratch[i] = z[i] + s->d[i];
   koopmpc_fill(expected, 0, KOOPMPC_NY);
@@ -103,19 +103,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
   koopmpc_real misfit[KOOPMPC_NZ], expected[KOOPMPC_NY];
   int opened, learns = s->has_z && !s->stood_in;
   koopmpc_fill(expected, (koopmpc_real)NAN, KOOPMPC_NY);
-  if (s->has_z) {
-#if KOOPMPC_NW
-    koopmpc_real without[KOOPMPC_NY];
-    int wild = koopmpc_differs(s, s->w);
-    if (wild) predict(s, u, s->used_w, misfit, without);
-    predict(s, u, s->w, misfit, expected);
-    wild = wild && koopmpc_doubt(s->gate, y, expected, without);
-    koopmpc_settle_w(s, wild, s->w);
-    if (wild) predict(s, u, s->w, misfit, expected);
-#else
-    predict(s, u, s->w, misfit, expected);
-#endif
-  }
+  if (s->has_z) koopmpc_choose(s, y, u, s->w, misfit, expected);
   s->refused = s->stood_in = koopmpc_refuse(s->gate, y, expected, &opened);
   if (opened == 2) forget_estimate(s);
   koopmpc_observe(s->zeta, &s->seen, s->z, s->refused ? expected : y, u);
@@ -140,7 +128,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
 enum { DRIVE = KOOPMPC_NU + KOOPMPC_NW };
 
 /** s <- F s + G [u; w] + f. */
-static void predict(koopmpc_state *s, koopmpc_real *state, const koopmpc_real *drive) {
+static void move(koopmpc_state *s, koopmpc_real *state, const koopmpc_real *drive) {
   koopmpc_copy(s->scratch, koopmpc_filter_f, KOOPMPC_NS);
   koopmpc_add(s->scratch, koopmpc_filter_F, KOOPMPC_NS, state, KOOPMPC_NS);
   koopmpc_add(s->scratch, koopmpc_filter_G, KOOPMPC_NS, drive, DRIVE);
@@ -153,25 +141,15 @@ static void show(const koopmpc_real *state, koopmpc_real *expected) {
     expected[i] = koopmpc_filter_h[i] + koopmpc_dot(koopmpc_filter_M + i * KOOPMPC_NS, state, KOOPMPC_NS);
 }
 
-#if KOOPMPC_NW
-/** Replace a wild w of the step that led to y by the last one that was used. */
-static void check_w(koopmpc_state *s, const koopmpc_real *y) {
-  koopmpc_real *w = s->queue + KOOPMPC_NU, drive[DRIVE], state[KOOPMPC_NS], expected[KOOPMPC_NY], without[KOOPMPC_NY];
-  int wild = koopmpc_differs(s, w);
-  if (wild) {
-    koopmpc_copy(drive, s->queue, KOOPMPC_NU);
-    koopmpc_copy(drive + KOOPMPC_NU, s->used_w, KOOPMPC_NW);
-    koopmpc_copy(state, s->s, KOOPMPC_NS);
-    predict(s, state, drive);
-    show(state, without);
-    koopmpc_copy(state, s->s, KOOPMPC_NS);
-    predict(s, state, s->queue);
-    show(state, expected);
-    wild = koopmpc_doubt(s->gate, y, expected, without);
-  }
-  koopmpc_settle_w(s, wild, w);
+void koopmpc_predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real *w, koopmpc_real *z,
+                     koopmpc_real *expected) {
+  koopmpc_real drive[DRIVE];
+  koopmpc_copy(drive, u, KOOPMPC_NU);
+  koopmpc_copy(drive + KOOPMPC_NU, w, KOOPMPC_NW);
+  koopmpc_copy(z, s->s, KOOPMPC_NS);
+  move(s, z, drive);
+  show(z, expected);
 }
-#endif
 
 /** s <- s + P M' S^-1 (y - M s - h) with the outputs that came; S = M P M' + R in units of its diagonal. */
 static void correct(koopmpc_state *s, const koopmpc_real *y) {
@@ -242,10 +220,9 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
     if (KOOPMPC_RESTS && !s->seen) rest_at(s, y, u);
   }
   if (s->queued > KOOPMPC_DELAY_Y) {
-#if KOOPMPC_NW
-    check_w(s, y);
-#endif
-    predict(s, s->s, s->queue);
+    koopmpc_real ahead[KOOPMPC_NS];
+    koopmpc_choose(s, y, s->queue, s->queue + KOOPMPC_NU, ahead, expected);
+    koopmpc_copy(s->s, ahead, KOOPMPC_NS);
     s->queued--;
     for (int i = 0; i < s->queued * DRIVE; i++) s->queue[i] = s->queue[i + DRIVE];
   }
@@ -259,7 +236,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
   s->missed = any ? 0 : s->missed + 1;
   s->started = 1;
   koopmpc_copy(now, s->s, KOOPMPC_NS);
-  for (int k = 0; k < s->queued; k++) predict(s, now, s->queue + k * DRIVE);
+  for (int k = 0; k < s->queued; k++) move(s, now, s->queue + k * DRIVE);
   koopmpc_copy(s->z, koopmpc_filter_one, KOOPMPC_NZ);
   koopmpc_add(s->z, koopmpc_filter_z, KOOPMPC_NZ, now, KOOPMPC_NS);
   koopmpc_fill(s->d, 0, KOOPMPC_NZ);
@@ -274,9 +251,8 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
 #else
 
 #if KOOPMPC_GATE
-/** The z that u and w predict, and what it shows. */
-static void predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real *w, koopmpc_real *z,
-                    koopmpc_real *expected) {
+void koopmpc_predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real *w, koopmpc_real *z,
+                     koopmpc_real *expected) {
   advance(z, s->from, u, w, 0);
   koopmpc_fill(expected, 0, KOOPMPC_NY);
   koopmpc_add(expected, koopmpc_C, KOOPMPC_NX, z, KOOPMPC_NZ);
@@ -288,19 +264,7 @@ static int observe(koopmpc_state *s, const koopmpc_real *y, const koopmpc_real *
   koopmpc_real next[KOOPMPC_NZ] = {0}, expected[KOOPMPC_NY];
   int opened;
   koopmpc_fill(expected, (koopmpc_real)NAN, KOOPMPC_NY);
-  if (s->has_z) {
-#if KOOPMPC_NW
-    koopmpc_real without[KOOPMPC_NY];
-    int wild = koopmpc_differs(s, s->w);
-    if (wild) predict(s, u, s->used_w, next, without);
-    predict(s, u, s->w, next, expected);
-    wild = wild && koopmpc_doubt(s->gate, y, expected, without);
-    koopmpc_settle_w(s, wild, s->w);
-    if (wild) predict(s, u, s->w, next, expected);
-#else
-    predict(s, u, s->w, next, expected);
-#endif
-  }
+  if (s->has_z) koopmpc_choose(s, y, u, s->w, next, expected);
   s->refused = koopmpc_refuse(s->gate, y, expected, &opened);
   if (opened == 2) s->seen = s->has_z = 0; /* the estimate is lost */
   if (s->refused) y = expected;

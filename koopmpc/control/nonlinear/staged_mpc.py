@@ -260,7 +260,7 @@ class StagedMPC(MPCBase):
         self._count_held(applied)
         x, u_prev = initial.z, initial.u_prev if initial.u_prev.size else self._given
         s, first, conflict = self._first_stage(x, u_prev)
-        target = checks.numbers(reference, "reference") + 0.0  # -0.0 is no other row than 0.0
+        target = checks.numbers(reference, "reference") + 0.0  # -0.0 and 0.0 are the same row
         if self._problem.timed:
             self._pass_weights()
         self._terminal.deadline, self._terminal.sought, self._terminal.late = start + self._allowed, False, False
@@ -416,7 +416,7 @@ class StagedMPC(MPCBase):
             )
             self._reference = None if self._terminal.late else key  # the next step searches on
         R, U, slopes, held, end, beyond = self._preview
-        if self._disturbed:  # the last disturbance of the preview stays, but for what is periodic in it
+        if self._disturbed:  # the last disturbance of the preview goes on, without its periodic part
             e = self._rest
             end = self._target = self._terminal.find_disturbed(R[-1], e, self._target)
             U = np.clip(U + slopes @ e, *self._outputs.inputs)

@@ -23,7 +23,7 @@ from koopmpc.errors import DataError
 from koopmpc.interrupts import call_uninterrupted
 
 DEFAULTS: Mapping[str, Any] = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 60}
-_NO_LIMIT = 1e20  # an end as far as this is none
+_NO_LIMIT = 1e20  # bounds at least this large count as infinite
 _PUSHES = 1e-7  # multipliers below this share of the largest are those of rows that do not push
 
 
