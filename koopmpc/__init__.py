@@ -16,7 +16,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc import data as data
     from koopmpc import errors as errors
     from koopmpc import estimate as estimate
-    from koopmpc import experiment as experiment
     from koopmpc import guarantees as guarantees
     from koopmpc import identify as identify
     from koopmpc import loop as loop
@@ -61,7 +60,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
     from koopmpc.estimate.extended import ExtendedKalman as ExtendedKalman
     from koopmpc.estimate.kalman import LiftedKalman as LiftedKalman
-    from koopmpc.experiment.planning import next_experiment as next_experiment
     from koopmpc.guarantees.certify import certify as certify
     from koopmpc.identify import moments as moments
     from koopmpc.identify.fits.bilinear import bilinear_edmd as bilinear_edmd
@@ -112,6 +110,9 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
 
     plot = koopmpc.figures
 else:
+    _NO_PLANS = (
+        "experiments are no longer planned: design.advice says what to record; random steps from many starts serve"
+    )
     __getattr__, __dir__, __all__ = attach(
         __name__,
         modules={
@@ -157,6 +158,8 @@ else:
             "monitor": ("supervise.monitor",),
         },
         hints={
+            "next_experiment": _NO_PLANS,
+            "experiment": _NO_PLANS,
             "load": "km.load_episodes, load_model, load_controller, load_run and load_problem read files",
             "EDMD": "km.edmd(episodes, lifting) fits a model",
             "EDMDc": "km.edmd(episodes, lifting) fits a model; with inputs where the episodes have them",

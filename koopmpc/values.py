@@ -55,6 +55,8 @@ class Value:
     """Base of frozen dataclasses that hold arrays; `==` compares to the bit and NaN equals NaN."""
 
     _kinds: ClassVar[dict[str, type["Value"]]] = {}
+    _FORMER: ClassVar[Mapping[str, str]] = {}
+    """Field of older files → its name today; "" where it has gone."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Register the classes of the library itself, and no others, for `from_data`; keep the short repr."""
@@ -185,7 +187,8 @@ def from_data(tree: Any, arrays: Keyed | None = None, enums: Sequence[type[Enum]
         if cls is None:
             raise LogError(f"the file holds a {kind!r}, which this version of koopmpc does not know")
         build = cast("Callable[..., Any]", cls)
-        value = build(**{key: from_data(item, arrays, enums) for key, item in node.items() if key != "kind"})
+        names = {key: cls._FORMER.get(key, key) for key in node if key != "kind"}
+        value = build(**{name: from_data(node[key], arrays, enums) for key, name in names.items() if name})
         _check_types(value)
         return value
     except LogError:

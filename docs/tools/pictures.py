@@ -16,7 +16,7 @@ import koopmpc as km
 from koopmpc.bench.controllers import Prepared
 from koopmpc.bench.single import run_closed_loop
 from koopmpc.bench.store import RunRow
-from koopmpc.figures.style import LIMIT, REFERENCE, TRUTH, draw_band, draw_legend, line_style, make_figure, styled
+from koopmpc.figures.style import LIMIT, REFERENCE, TRUTH, draw_legend, line_style, make_figure, styled
 from koopmpc.recording.video import export_video
 
 DOCS = Path(__file__).parents[1]
@@ -474,31 +474,6 @@ def speed() -> Any:
     return drawing
 
 
-def next_experiment() -> Any:
-    """The first plan and the last one of the page on the next experiment, with their logs."""
-    plans = _run_page("how/next_experiment.md")["plans"]
-    drawing, axes = make_figure(3, 2, width="two columns", height=4.0, sharex=True)
-    for column, (plan, log) in zip(axes.T, (plans[0], plans[-1]), strict=True):
-        t = np.arange(plan.steps + 1) * plan.dt
-        for panel, i in zip(column, range(2), strict=False):
-            draw_band(panel, t, plan.low[0, :, i], plan.high[0, :, i], 0, "90 % band")
-            panel.plot(t, plan.X[0, :, i], **line_style(0, len(t)), label="expected")
-            panel.plot(t, log[0].X[:, i], **TRUTH, label="measured")
-            for end in (plan.x_low[i], plan.x_high[i]):
-                panel.axhline(end, **LIMIT, label="limit")
-        column[2].stairs(plan.U[0, :, 0], t, baseline=None, **TRUTH)
-        column[2].set(xlabel="time [s]", xlim=(0, t[-1]))
-    for panel, name in zip(axes[:, 0], ("x [m]", "v [m/s]", "F [N]"), strict=True):
-        panel.set_ylabel(name)
-    draw_legend(drawing, axes[0, :1], 4)
-    return drawing
-
-
-def next_design() -> Any:
-    """The closed loop at the end of the page on the next experiment."""
-    return km.plot.run(_run_page("how/next_experiment.md")["run"], width="two columns")
-
-
 def calibration() -> Any:
     """What designs promise and what happens on their plants: costs over the median of fresh loops, by task and seed."""
     table = json.loads((DOCS.parent / "tests" / "closed_loop" / "calibration.json").read_text())
@@ -570,8 +545,6 @@ PICTURES: dict[str, Callable[[], Any]] = {
         periodic,
         manual_automatic,
         from_pid,
-        next_experiment,
-        next_design,
         calibration,
         cart_pole,
     )

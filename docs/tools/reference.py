@@ -38,10 +38,6 @@ ROOMS = {  # where a name is defined → title and first sentence of its page, i
     ),
     "guarantees": ("Guarantees", "What is proved, with its assumptions; what is promised, with its probability."),
     "synthesis": ("From data to a controller", "Choose a model, choose a controller, with evidence from closed loops."),
-    "experiment": (
-        "The next experiment",
-        "What to record next: where the controller works and the model is unsure.",
-    ),
     "codegen": ("C code", "The same controller as C99 without a heap, in a folder or behind Python's protocol."),
     "figures": ("Figures", "`km.plot`: Matplotlib figures of models and runs."),
     "recording": ("Logs and the viewer", "A run as one .rrd file: written, read back to the bit, looked at in Rerun."),

@@ -126,11 +126,6 @@ def fit(
         str | None,
         typer.Option("--set-point", help="With --goal: columns with set points of the loop that made the logs, r,s,…"),
     ] = None,
-    plan: Annotated[
-        Path | None, typer.Option("--next", help="With --goal: plan the next experiment, and write it as this .csv.")
-    ] = None,
-    plan_steps: Annotated[int | None, typer.Option("--next-steps", help="Steps of an episode of --next.")] = None,
-    plan_episodes: Annotated[int, typer.Option("--next-episodes", help="Episodes of --next.")] = 1,
 ) -> None:
     """Choose a model for logged data, fit it, and say whether to trust it; with a goal, design a controller."""
     from koopmpc.fitting.fit import fit_data
@@ -185,17 +180,11 @@ def fit(
                 certify=certify,
                 progress=progress,
                 set_points=() if set_point is None else split(set_point),
-                plan=plan,
-                plan_steps=plan_steps,
-                plan_episodes=plan_episodes,
                 **how,
             )
         say(f"controller: {designed.controller}, report: {designed.page}")
         say(f"check it: {format_command('check', designed.controller)}\nuse it:\n{designed.usage}")
         return
-    if plan is not None:
-        with friendly():
-            raise DataError("--next needs --goal: what the controller is to do decides what is worth learning")
     if coverage is not None or certify:
         with friendly():
             raise DataError("--coverage and --certify are for a controller; pass --goal, too")

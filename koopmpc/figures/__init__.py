@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from koopmpc.figures.blind_regions import blindness as blindness
     from koopmpc.figures.eigenvalues import eigenfunction_maps as eigenfunction_maps
     from koopmpc.figures.eigenvalues import spectrum as spectrum
-    from koopmpc.figures.plans import plan as plan
     from koopmpc.figures.regions import certificate as certificate
     from koopmpc.figures.series import error as error
     from koopmpc.figures.series import reconstruction as reconstruction

@@ -5,7 +5,6 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from inspect import Parameter, signature
 from os import PathLike
 from pathlib import Path
@@ -17,17 +16,14 @@ from jaxtyping import Float
 from koopmpc import checks, disk
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
-from koopmpc.data.episodes import Episodes, join_sets
-from koopmpc.data.files.folder import Files
+from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.load import load_episodes
-from koopmpc.data.source import Source
 from koopmpc.errors import DataError, KoopmpcError, LogError
 from koopmpc.fitting.certified import describe_certificate
 from koopmpc.fitting.fit import Say, describe_data, ignore_text
-from koopmpc.fitting.further import FurtherData, plan_further
-from koopmpc.fitting.repair import IN_MEMORY, Data, DividedData, collect_notes, find_logs, read_logs
+from koopmpc.fitting.repair import IN_MEMORY, Data, DividedData, collect_notes, read_logs
 from koopmpc.fitting.report import write_design_report
-from koopmpc.fitting.set_points import drop_set_points, take_set_points
+from koopmpc.fitting.set_points import take_set_points
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
 from koopmpc.parallel import StageProgress
@@ -91,8 +87,6 @@ class DesignedData:
         Paths of the controller file, and of the report, one HTML page that needs no other file.
     usage
         Lines of Python that load the controller.
-    further
-        The next experiment, where one was asked for.
     """
 
     design: Design
@@ -100,7 +94,6 @@ class DesignedData:
     controller: Path
     page: Path
     usage: str
-    further: FurtherData | None = None
 
 
 def design_data(
@@ -119,14 +112,9 @@ def design_data(
     progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
     set_points: Sequence[str] = (),
-    plan: str | PathLike[str] | None = None,
-    plan_steps: int | None = None,
-    plan_episodes: int = 1,
     **reading: Any,
 ) -> DesignedData:
     """Read data and a goal, design a controller, and write controller.npz and report.html.
-
-    With `plan` the next experiment is planned, too; where the data suffice for no design it is all that is written.
 
     The data are read and repaired as by `fit_data`; the other arguments are the same as there.
 
@@ -143,9 +131,6 @@ def design_data(
         As for `fit_data`.
     set_points
         Columns with the set points of the loop that made the logs: instruments of `design`.
-    plan, plan_steps, plan_episodes
-        The .csv of the next experiment, its picture beside it, and steps and number of its episodes, see
-        `next_experiment`.
     reading
         Keywords of `load_episodes` for plain tables, which replace those in the section [logs] of the goal. Without
         ``inputs`` the inputs of the goal are inputs.
@@ -155,25 +140,15 @@ def design_data(
     LogError
         A file cannot be read, or the folder not written.
     DataError
-        The data are not of one plant, or too few; the goal names what the data do not have; `plan` is no .csv.
+        The data are not of one plant, or too few; the goal names what the data do not have.
     """
-    if plan is not None and Path(plan).suffix.lower() != ".csv":
-        raise DataError(f"the plan {plan} does not end with .csv; a plan is a table of text")
     place, draw = Path(folder), checks.generator(rng)
     tell = ignore_text if say is None else say
     pushed = list_goal_inputs(goal)
     reading = load_reading(goal) | {name: value for name, value in reading.items() if value is not None}
     if set_points:
         reading["disturbances"] = [*reading.get("disturbances", ()), *set_points]
-    further = partial(plan_goal, file=plan, steps=plan_steps, episodes=plan_episodes, tell=tell)
-    try:
-        split = _read_for(goal, data, draw, memory, reading, ask=not pushed)
-    except DataError as refusal:
-        if plan is None:
-            raise
-        few = drop_set_points(_load_few(data, reading, pushed), set_points)
-        further(few, read_goal(goal, few), refusal=refusal)
-        raise
+    split = _read_for(goal, data, draw, memory, reading, ask=not pushed)
     missed = tuple(name for name in pushed if name in split.seen.states)
     if missed and "inputs" not in reading:  # the goal knows inputs that no name in the logs shows
         reading["inputs"] = (*split.seen.inputs, *missed)
@@ -183,27 +158,23 @@ def design_data(
     tell(about)
     asked = read_goal(goal, split.seen)
     asked = replace(asked, coverage=coverage or asked.coverage, certify=certify or asked.certify)
-    try:
-        with collect_notes([]):  # its advice says the same
-            designed = design(
-                split.fitted,
-                asked.cost,
-                asked.limits,
-                horizon=asked.horizon,
-                reference=asked.reference,
-                angles=asked.angles,
-                bilinear=bilinear,
-                feedthrough=feedthrough,
-                instruments=instruments,
-                coverage=asked.coverage,
-                workers=workers,
-                scheduler=scheduler,
-                progress=progress,
-                rng=draw,
-            )
-    except DataError as refusal:
-        further(_join_rows(split), asked, refusal=refusal)
-        raise
+    with collect_notes([]):  # its advice says the same
+        designed = design(
+            split.fitted,
+            asked.cost,
+            asked.limits,
+            horizon=asked.horizon,
+            reference=asked.reference,
+            angles=asked.angles,
+            bilinear=bilinear,
+            feedthrough=feedthrough,
+            instruments=instruments,
+            coverage=asked.coverage,
+            workers=workers,
+            scheduler=scheduler,
+            progress=progress,
+            rng=draw,
+        )
     tell(str(designed))
     evidence = designed.evidence
     if evidence.goal_can_be_held:
@@ -213,14 +184,13 @@ def design_data(
         unseen = split.held_out if split.learned is None else None
         certified = describe_certificate(designed, asked.reference, unseen, place)
         tell(certified)
-    planned = further(_join_rows(split), asked, designed)
     file = place / "controller.npz"
-    summary = _summarise_logs(split, designed, about, Path(goal).read_text(), planned, draw)
+    summary = _summarise_logs(split, designed, about, Path(goal).read_text(), draw)
     designed.save(file, logs=replace(summary, certified=certified))
     usage = f'import koopmpc as km\ncontroller = km.load_controller("{file.as_posix()}")'
     saved = load_value(file, SavedDesign)
     page = write_design_report(saved, rebuild_controller(saved, file), place / "report.html", file.as_posix())
-    return DesignedData(designed, asked, file, page, usage, planned)
+    return DesignedData(designed, asked, file, page, usage)
 
 
 def _read_for(
@@ -243,25 +213,6 @@ def _read_for(
     return replace(split, notes=(*split.notes, note))
 
 
-def _load_few(data: Data, reading: Mapping[str, Any], pushed: Sequence[str]) -> Episodes:
-    """Return logs that are too few to learn from; columns that the goal pushes are inputs, whatever their names."""
-    files = find_logs(data)
-    with collect_notes([]):
-        few = join_sets([part.load() for part in Files(files, **reading).parts()])
-        missed = [name for name in pushed if name in few.states]
-        if not missed or "inputs" in reading:
-            return few
-        told: dict[str, Any] = {**reading, "inputs": (*few.inputs, *missed)}
-        return join_sets([part.load() for part in Files(files, **told).parts()])
-
-
-def _join_rows(split: DividedData) -> Episodes | Source:
-    """Return all rows in memory, the held-out ones too: what was recorded need not be recorded again."""
-    if split.learned is not None or not isinstance(split.fitted, Episodes):
-        return split.fitted
-    return split.fitted.with_episodes([*split.fitted, *split.held_out])
-
-
 _FORECASTS = 3  # held-out stretches whose forecasts a report may draw
 
 
@@ -270,7 +221,6 @@ def _summarise_logs(
     designed: Design,
     about: str,
     goal: str,
-    planned: FurtherData | None,
     rng: np.random.Generator,
 ) -> LogSummary:
     """Return what a report shows of the logs, with forecasts of rows that the chosen model did not learn from."""
@@ -307,49 +257,7 @@ def _summarise_logs(
         advice=designed.advice,
         choice=str(designed),
         goal=goal,
-        plan="" if planned is None else str(planned),
     )
-
-
-def plan_goal(
-    data: Episodes | Source,
-    asked: Goal,
-    known: Design | None = None,
-    *,
-    file: str | PathLike[str] | None,
-    steps: int | None,
-    episodes: int,
-    tell: Say,
-    refusal: DataError | None = None,
-) -> FurtherData | None:
-    """Plan and say the next experiment for a goal, where a file is given; raise if it follows a refused design.
-
-    Raises
-    ------
-    DataError
-        The design was refused, and the plan is written: both in one message.
-    """
-    if file is None:
-        return None
-    with collect_notes([]):
-        further = plan_further(
-            data,
-            asked.cost,
-            asked.limits,
-            asked.reference,
-            file,
-            horizon=asked.horizon,
-            design=known,
-            steps=steps,
-            episodes=episodes,
-        )
-    tell(str(further))
-    if refusal is not None and further.file is not None:
-        raise DataError(
-            f"{refusal}\nthe next experiment is planned in {further.file}: record it, and fit again with its logs "
-            "beside the old ones"
-        ) from refusal
-    return further
 
 
 _EVENED = "  # nobody asked for it: steps of the logs are unequal; states are interpolated to so many s, inputs held"

@@ -101,9 +101,6 @@ def write_design_report(
         page.text(
             "The checks of the design ask for no further data. Logs of this controller on the plant are the best."
         )
-    if logs is not None and logs.plan:
-        page.heading("The next experiment", 3)
-        page.code(logs.plan)
     page.heading("How to run it")
     _add_usage(page, file, controller, evidence)
     if logs is not None:

@@ -3,11 +3,7 @@
 import json
 import sys
 
-import numpy as np
-
-from koopmpc.experiment.ensemble import UNUSUAL
 from tests.docs.page import DOCS
-from tests.experiment.study.table import count_drift, count_halves, count_safety, load_rows
 from tests.guarantees.coverage.plants import list_tasks
 from tests.guarantees.coverage.table import find_shares
 from tests.guarantees.coverage.table import stored as read_coverage
@@ -61,34 +57,5 @@ def test_the_page_of_guarantees_shows_the_stored_coverage():
         f"on {shares['plants whose optimum touches']} plants whose optimum touches a limit | "
         f"{shares['touching, over_plain, median']:.2f}, {shares['touching, over_plain, most']:.2f} |",
         f"| {shares['free, over_plain, median']:.2f}, {shares['free, over_plain, most']:.2f} |",
-    ):
-        assert words in page
-
-
-def test_the_page_of_research_shows_the_stored_study_of_planned_experiments():
-    safety, halves, drift = (load_rows(study) for study in ("safety", "halves", "drift"))
-    bands, named = count_safety(safety.values()), count_drift(drift.values())["named rightly"]
-    held = {level: [one for row in safety.values() if row.level == level for one in row.held] for level in (0.7, 0.9)}
-    reached = {level: [one for row in safety.values() if row.level == level for one in row.reached] for level in held}
-    shares = {
-        level: ", ".join(f"{np.mean(np.array(some) <= factor / UNUSUAL):.2f}" for factor in (1, 1.2, 1.5, 2))
-        for level, some in reached.items()
-    }
-    planned, half = (
-        np.exp(np.mean([np.log(getattr(row, name) / row.random) for row in halves.values()]))
-        for name in ("planned", "half")
-    )
-    worse = count_halves(halves)
-    page = "\n".join(read_lines("research.md"))
-    for words in (
-        f"at a level of 0.7 {sum(held[0.7])} of {len(held[0.7])} episodes held",
-        f"at 0.9 {sum(held[0.9])} of {len(held[0.9])}; {bands['broken at all']} of {bands['episodes']} broke a limit",
-        f"{bands['broken where the band holds']} where the band held",
-        f"{shares[0.7]} held at 0.7, and {shares[0.9]} at 0.9",
-        f"{worse['tasks']} tasks: planned rows cost {planned:.2f} times those of random steps (geometric mean)",
-        f"at most 1.02 on {worse['at most 1.02 times']}, above 1.10 on {len(worse['worse'])}",
-        f"half of the random steps alone {half:.2f}.",
-        f"{sum(row.right for row in drift.values())} of {len(drift)} changes of 20 % named rightly",
-        f"(inputs {named['input']}, sensors {named['sensor']}, coefficients {named['coefficient']})",
     ):
         assert words in page

@@ -22,7 +22,6 @@ ELSEWHERE = {  # pages whose claims are tested beyond what they print, and where
     "how/fmu.md": "tests/test_docs_plants.py",
     "how/gymnasium.md": "tests/test_docs_plants.py",
     "how/hidden_states.md": "tests/test_docs_controllers.py",
-    "how/next_experiment.md": "tests/experiment/test_docs_next_experiment.py",
     "how/onnx.md": "tests/lifting/test_onnx.py",
     "how/opcua.md": "tests/loop/test_live.py",
     "how/own_step_function.md": "tests/test_docs_plants.py",

@@ -25,7 +25,6 @@ ROOMS = (
     "guarantees",
     "estimate",
     "predict",
-    "experiment",
 )
 # What opens a window, runs for minutes, or is given to a program of its own.
 LEFT_OUT = (

@@ -1,7 +1,8 @@
 """What a report shows of logs after they are gone: some of their rows, what was repaired, and forecasts beside them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -73,11 +74,11 @@ class LogSummary(Value):
         The leaderboard in lines.
     goal
         The goal file.
-    plan
-        The next experiment in words; empty where none was asked for.
     certified
         What came of the certificate, in a sentence; empty where none was asked for.
     """
+
+    _FORMER: ClassVar[Mapping[str, str]] = {"plan": ""}
 
     excerpt: LogExcerpt
     about: str
@@ -91,7 +92,6 @@ class LogSummary(Value):
     advice: tuple[str, ...]
     choice: str
     goal: str
-    plan: str = ""
     certified: str = ""
 
 

@@ -1,12 +1,18 @@
 """`find_drift` on nonlinear plants: how often unchanged ones are named, and changes of a fifth by their name."""
 
-from dataclasses import dataclass, replace
+import argparse
+import json
+import sys
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
+import casadi as ca
 import numpy as np
 
 import koopmpc as km
-from tests.experiment.study.plants import DT, build_plant
 
+FILE = Path(__file__).with_suffix(".json")
+DT = 0.1
 OLD, NEW, QUIET = (6, 150), (1, 500), (1, 300)  # episodes and steps
 HOLD = 5  # steps of an input's level
 NOISE = 0.005  # of the sensors, as a share of the states' spread
@@ -36,6 +42,34 @@ class Verdicts:
     kind: str
     changed: str
     right: bool
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnPlant(km.Dynamics):
+    """ẋ = A x + B u + C sin(2x) x_0 + D x u_0 + load: without a load each is at rest in 0."""
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    load: np.ndarray | float = 0.0
+    states = ("a", "b", "c")
+    inputs = ("u", "v")
+
+    def rhs(self, x: ca.SX, u: ca.SX) -> ca.SX:
+        """ẋ."""
+        return self.A @ x + self.B @ u + self.C @ ca.sin(2 * x) * x[0] + self.D @ x * u[0] + self.load
+
+
+def build_plant(
+    A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, load: np.ndarray | float = 0.0
+) -> km.StepMap:
+    """Return the step map of a `DrawnPlant` with as many names as it has states and inputs."""
+
+    class Plant(DrawnPlant):
+        states, inputs = DrawnPlant.states[: len(A)], DrawnPlant.inputs[: B.shape[1]]
+
+    return km.discretize(Plant(A, B, C, D, load), DT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,3 +166,24 @@ def judge_drift(number: int) -> Verdicts:
         found.verdict,
         name in {one.name for one in found.changes},
     )
+
+
+def load_rows() -> dict[str, Verdicts]:
+    """Return the stored rows, by the number of their plant."""
+    return {name: Verdicts(**row) for name, row in json.loads(FILE.read_text()).items()}
+
+
+def main() -> int:
+    """Judge plants again and store their rows."""
+    parser = argparse.ArgumentParser(prog="python -m tests.drift.nonlinear", description=__doc__)
+    parser.add_argument("--first", type=int, default=0, help="number of the first plant")
+    parser.add_argument("--count", type=int, default=10, help="number of plants")
+    asked = parser.parse_args()
+    rows = load_rows() | {str(n): judge_drift(n) for n in range(asked.first, asked.first + asked.count)}
+    lines = [f"{json.dumps(name)}: {json.dumps(asdict(row))}" for name, row in rows.items()]
+    FILE.write_text("{\n" + ",\n".join(lines) + "\n}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
