@@ -347,3 +347,19 @@ def test_a_row_is_named_by_the_line_that_an_editor_shows(tmp_path: Path) -> None
     assert find_lines(str(plain), [1, 2, 3]) == ("line", [1, 2, 4])
     assert find_lines(str(plain), [4]) == ("row", [4])  # not there
     assert find_lines("a DataFrame", [4, 5]) == ("row", [4, 5])
+
+
+@pytest.mark.parametrize(("unit", "per_second"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+@pytest.mark.parametrize("title", ["timestamp", "time [s]"])
+def test_a_clock_of_fractions_of_a_second_since_1970_is_read_in_its_unit(tmp_path, unit, per_second, title) -> None:
+    begin = 1_727_783_400
+    rows = [f"{round((begin + 10 * k) * per_second)};{k}.5;{k % 2}" for k in range(6)]
+    file = text(tmp_path / "log.csv", "\n".join([f"{title};x;u", *rows]) + "\n")
+    with pytest.warns(km.FitWarning, match=rf"'{re.escape(title)}' is read in {unit} since 1970"):
+        assert km.load_episodes(file).dt == 10.0
+
+
+@pytest.mark.parametrize("begin", [0, 946_684_000_000, 1_727_783_400])
+def test_a_clock_of_another_size_is_read_in_seconds(tmp_path, begin) -> None:
+    file = text(tmp_path / "log.csv", "\n".join(["t,x,u", *(f"{begin + 10 * k},{k}.5,{k % 2}" for k in range(6))]))
+    assert km.load_episodes(file).dt == 10.0

@@ -439,3 +439,73 @@ def test_a_file_cut_in_its_header_leaves_nothing_that_raises_later(size, tmp_pat
     gc.collect()
     assert not raised
     assert capfd.readouterr() == ("", "")
+
+
+def write_formula(path, formula, *, version="4.10", time=False, inside=False):
+    """Write theta as a raw channel with an algebraic conversion, by the library that other tools write with."""
+    from asammdf import MDF, Signal
+
+    conversion = {"formula": formula}
+    if inside:
+        conversion = {"lower_0": 5.0, "upper_0": 6.0, "text_0": b"far", "default_addr": f'"{{X}}*({formula})"'.encode()}
+    with MDF(version=version) as mdf:
+        signal = Signal(THETA, T, name="theta", unit="rad", conversion=conversion)
+        mdf.append([signal, Signal(TORQUE, T, name="u")])
+        if time:
+            master = mdf.groups[0].channels[mdf.masters_db[0]]
+            master.conversion = mdf.groups[0].channels[1].conversion
+        mdf.save(path, overwrite=True)
+
+
+@pytest.mark.parametrize(
+    ("formula", "value"),
+    [
+        ("2*X+3", 2 * THETA + 3),
+        ("-(X - 1)^2 / 4", -((THETA - 1) ** 2) / 4),
+        ("exp(X) + sqrt(abs(X))", np.exp(THETA) + np.sqrt(np.abs(THETA))),
+        ("pow(X, 2) - 1e-3 * log10(3 + X)", THETA**2 - 1e-3 * np.log10(3 + THETA)),
+        ("(X + 2) ** -1", 1 / (THETA + 2)),
+        ("X - X + 2.5", np.full_like(THETA, 2.5)),
+    ],
+)
+@pytest.mark.parametrize("version", ["4.10", "3.30"])
+def test_a_channel_with_a_formula_is_computed_by_arithmetic(formula, value, version, tmp_path):
+    path = tmp_path / f"log.{'mf4' if version[0] == '4' else 'mdf'}"
+    write_formula(path, formula, version=version)
+    episodes = km.load_episodes(path, states=["theta"], inputs=["u"])
+    np.testing.assert_allclose(episodes[0].X[:, 0], value, rtol=1e-12)
+
+
+@pytest.mark.parametrize("version", ["4.10", "3.30"])
+@pytest.mark.parametrize(
+    "formula",
+    [
+        "__import__('pathlib').Path('{ran}').touch()",
+        "[open('{ran}','w') for _ in (1,)][0]",
+        "(lambda: open('{ran}','w'))()",
+        "X.__class__",
+        "X if X else 2",
+        "X; 2",
+        "sin(X, 2)",
+        "foo(X)",
+        "X[0]",
+        "1j*X",
+        "(" * 900 + "X" + ")" * 900,
+    ],
+)
+def test_a_formula_with_anything_but_arithmetic_is_refused_by_name_and_runs_nothing(
+    formula, version, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / f"log.{'mf4' if version[0] == '4' else 'mdf'}"
+    write_formula(path, formula.replace("{ran}", "ran"), version=version)
+    with pytest.raises(km.errors.LogError, match=r"'theta' is converted by the formula .* export the log"):
+        km.load_episodes(path, states=["theta"], inputs=["u"])
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(("where", "message"), [("time", "for the time of its group"), ("inside", "inside another")])
+def test_formulas_of_clocks_and_inside_tables_are_refused_by_name(where, message, tmp_path):
+    write_formula(tmp_path / "log.mf4", "X*2", **{where: True})
+    with pytest.raises(km.errors.LogError, match=message):
+        km.load_episodes(tmp_path / "log.mf4", states=["theta"], inputs=["u"])

@@ -8,9 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from koopmpc.data.episodes import Episode, Origin, find_lines
+from koopmpc.data.files.columns import ColumnRoles
 from koopmpc.data.files.notes import ResampledWarning
 from koopmpc.errors import DataError, FitWarning
 
+_YEAR_2000 = 946_684_800.0  # [s] since 1970
+_YEAR_2100 = 4_102_444_800.0  # [s] since 1970
 _JITTER = 0.02  # share of dt by which a step may differ
 _GAP = 1.5  # a step longer than 1.5 dt is a gap
 _FEW = 10  # rows from which on single wild readings are looked for
@@ -44,6 +47,26 @@ class Signals:
         """Return these rows."""
         time = None if self.time is None else self.time[which]
         return Signals(time, self.X[which], self.U[which], self.W[which], self.rows[which], self.states)
+
+
+def read_clock(column: Float[np.ndarray, " M"], roles: ColumnRoles, where: str) -> Float[np.ndarray, " M"]:
+    """Return a column of time in seconds.
+
+    Seconds whose size says that they are milli-, micro- or nanoseconds since 1970 (years 2000 to 2100) are read in that
+    unit, and a warning says so.
+    """
+    known = np.abs(column[np.isfinite(column)])
+    if roles.scale == 1.0 and len(known):
+        for unit, per_second in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
+            if _YEAR_2000 * per_second <= known.min() and known.max() < _YEAR_2100 * per_second:
+                warnings.warn(
+                    f"{where}: {roles.time!r} is read in {unit} since 1970, which its size says; to say it, name the "
+                    f"column 'time [{unit}]'",
+                    FitWarning,
+                    stacklevel=3,
+                )
+                return column / per_second
+    return column * roles.scale
 
 
 def sample_time(times: list[np.ndarray], where: str) -> float:

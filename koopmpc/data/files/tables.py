@@ -15,7 +15,7 @@ from koopmpc import checks, disk
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.columns import ColumnRoles, TableSettings, drop_unit, find_roles, is_label
 from koopmpc.data.files.formats import LogTable
-from koopmpc.data.files.sampling import Signals, episodes_from, resample, restarts, sample_time
+from koopmpc.data.files.sampling import Signals, episodes_from, read_clock, resample, restarts, sample_time
 from koopmpc.errors import ColumnWarning, DataError, FitWarning, KoopmpcError, LogError, NoInputWarning
 
 SAVED = ("episode", "step", "time [s]")
@@ -107,7 +107,7 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
         )
     time = None
     if found.time is not None and not (found.time == clock and told.dt is not None):
-        time = checks.array(columns[found.time], found.time, (None,), finite=False) * found.scale
+        time = read_clock(checks.array(columns[found.time], found.time, (None,), finite=False), found, where)
     if time is None and told.resample is not None:
         raise DataError(f"{where} has no column of time to resample by; its columns are {', '.join(names)}")
     episode = np.zeros(rows, dtype=np.intp)
