@@ -1,11 +1,9 @@
 """A controller in machine code: the C of `export`, built with the compiler at hand, behind the Controller protocol."""
 
 import ctypes
-import platform
 import subprocess
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from threading import Lock
 from time import perf_counter
 from typing import Any, NamedTuple, cast
@@ -93,15 +91,6 @@ def _find_error(error: Exception) -> str:
     return lines[0] if lines else str(error)
 
 
-def _read_processor() -> str:
-    """Return the flags of this processor; code that was compiled for another one may not run here."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line for line in lines if line.startswith("flags")), platform.processor())
-
-
 def _compile(program: StepProgram, precision: Precision, command: list[str]) -> tuple[ctypes.CDLL, dict[str, int]]:
     """Return the machine code of a controller, for this processor if the compiler knows its flags, and the sizes.
 
@@ -112,14 +101,8 @@ def _compile(program: StepProgram, precision: Precision, command: list[str]) -> 
     """
     single = precision == "float"
     tables = make_tables(program, single=single, room=_ROOM)
-    text, packed = write_one_source(tables, single=single)
-    text += f"/* {_read_processor()} */\n"
-    cache = find_private_cache()
-    machine = ["-march=native", "-fvisibility=default"] if platform.machine() in ("x86_64", "AMD64") else []
-    try:
-        code = load_library(text, [*command, *machine], cache, numbers=packed)
-    except subprocess.CalledProcessError:
-        code = load_library(text, command, cache, numbers=packed)  # the compiler does not know this processor
+    text = write_one_source(tables, single=single)
+    code = load_library(text, command, find_private_cache(), native=True)
     code.koopmpc_state_size.restype = ctypes.c_long
     code.koopmpc_init.restype = code.koopmpc_call.restype = None
     return code, tables.sizes

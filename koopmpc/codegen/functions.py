@@ -18,8 +18,7 @@ from koopmpc.plants.graph import OPERATIONS, Graph
 
 _LARGEST = 4000  # operations of a function that is written line by line: gcc takes 0.5 s for 5,000, 6 s for 20,000
 _WIDTH = 118
-_PACKED = 5000  # numbers from which on an array is bytes, if it is for this machine: gcc never sees them
-_LINE = 64  # bytes of a cache line, at which such an array begins
+_LONG = 5000  # numbers from which on an array is hexadecimal: gcc reads those in half of the time
 _INTEGERS = {np.dtype(np.uint16): "unsigned short", np.dtype(np.intc): "int"}
 
 # Each operation of `plants.graph` as C; {0} and {1} are its operands. Names of math.h go through KOOPMPC_FN, which
@@ -64,14 +63,9 @@ _CALL = 20
 
 @dataclass(frozen=True)
 class Language:
-    """How numbers are written: in double or in single precision.
-
-    With `packed`, code for this machine alone, long arrays are appended to it as bytes in the machine's order. Their
-    definitions read them from a file that holds `packed`, whose path is the macro KOOPMPC_NUMBERS.
-    """
+    """How numbers are written: in double or in single precision."""
 
     single: bool = False
-    packed: bytearray | None = None
 
     def number(self, value: float) -> str:
         """Return a literal that reads back as this number; numbers beyond ±1e30 become ±1e30."""
@@ -91,8 +85,6 @@ class Language:
             kind, words = _INTEGERS.get(flat.dtype, "int"), [str(int(value)) for value in flat] or ["0"]
         else:
             clipped = np.clip(flat.astype(np.float64), -1e30, 1e30)
-            if self.packed is not None and flat.size >= _PACKED:
-                return self._pack(name, clipped, self.packed)
             kind, words = "koopmpc_real", self._words(clipped) or [self.number(0.0)]
         lines = [f"static const {kind} {name}[{len(words)}] = {{"]
         line = " "
@@ -104,22 +96,11 @@ class Language:
         return "\n".join([*lines, line, "};"])
 
     def _words(self, flat: Float[np.ndarray, " n"]) -> list[str]:
-        """Return the literal of each number, as `number` writes it."""
-        if self.single:
-            return [self.number(value) for value in flat]
-        return list(map(repr, flat.tolist()))
-
-    def _pack(self, name: str, flat: Float[np.ndarray, " n"], packed: bytearray) -> str:
-        """Append an array to `packed`, and return its definition, which the assembler reads from there."""
-        packed += bytes(-len(packed) % _LINE)
-        values = flat.astype(np.float32 if self.single else np.float64)
-        place, symbol = len(packed), f"{name}_packed"
-        packed += values.tobytes()
-        return (
-            f'__asm__(".data\\n.balign {_LINE}\\n{symbol}:\\n"\n'
-            f'        ".incbin \\"" KOOPMPC_NUMBERS "\\", {place}, {values.nbytes}\\n.text\\n");\n'
-            f'extern const koopmpc_real {name}[{flat.size}] __asm__("{symbol}") __attribute__((visibility("hidden")));'
-        )
+        """Return the literal of each number, as `number` writes it; of a long array in hexadecimal."""
+        if len(flat) >= _LONG:
+            end, rounded = ("F", flat.astype(np.float32)) if self.single else ("", flat)
+            return [value.hex() + end for value in rounded.tolist()]
+        return [self.number(value) for value in flat] if self.single else list(map(repr, flat.tolist()))
 
     def arrays(self, table: Mapping[str, np.ndarray]) -> str:
         """Return the definitions of all arrays."""

@@ -22,12 +22,9 @@ _SOLVER_FILES = (*_SOLVER, "factorization.h", "LICENSE")
 _CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"  # for the step times of a whole run
 
 
-def write_sources(tables: Tables, *, single: bool, packed: bytearray | None = None) -> dict[str, str]:
-    """Return the text of every file by its name: header, controller, model, numbers, solver.
-
-    With `packed` long arrays are appended to it, see `Language`.
-    """
-    language = Language(single, packed)
+def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
+    """Return the text of every file by its name: header, controller, model, numbers, solver."""
+    language = Language(single)
     if tables.is_staged:
         own = (*_OWN, *_RECEDING, *_STAGED, *(["koopmpc_motion.c"] if tables.sizes["BEYOND"] else ()))
         own = (*own, *(_QP if tables.sizes["FINISH_ROWS"] else ()))
@@ -62,14 +59,9 @@ def write_sources(tables: Tables, *, single: bool, packed: bytearray | None = No
     return result
 
 
-def write_one_source(tables: Tables, *, single: bool) -> tuple[str, bytes]:
-    """Return all C of a controller as one file for this machine, with the functions by which Python calls it.
-
-    Beside it are the bytes of its long arrays, which `load_library` takes.
-    """
-    packed = bytearray()
-    texts = write_sources(tables, single=single, packed=packed)
-    return "\n".join([_CLOCK + join_sources(texts), read_shipped("c", "door.c")]), bytes(packed)
+def write_one_source(tables: Tables, *, single: bool) -> str:
+    """Return all C of a controller as one file, with the functions by which Python calls it."""
+    return "\n".join([_CLOCK + join_sources(write_sources(tables, single=single)), read_shipped("c", "door.c")])
 
 
 def join_sources(texts: Mapping[str, str]) -> str:

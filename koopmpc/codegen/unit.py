@@ -17,7 +17,7 @@ from koopmpc.codegen.sources import join_sources, read_shipped, rename_symbols
 from koopmpc.codegen.tables import Tables
 from koopmpc.disk import writing
 from koopmpc.errors import SourcesOnlyWarning
-from koopmpc.plants.routines import find_compiler
+from koopmpc.plants.routines import build_library, find_compiler
 from koopmpc.values import fingerprint
 
 FMIVersion = Literal[2, 3]
@@ -98,14 +98,9 @@ def _compile(source: str) -> bytes | None:
     command, reason = find_compiler(), "no C compiler was found ($CC, cc, gcc, clang)"
     if command is not None:
         with tempfile.TemporaryDirectory() as folder:
-            text, library = Path(folder) / "unit.c", Path(folder) / "unit.so"
-            text.write_text(source)
-            flags = [*_FLAGS, *shlex.split(os.environ.get("KOOPMPC_CFLAGS", ""))]
             try:
-                subprocess.run(
-                    [*command, *flags, str(text), "-o", str(library), "-lm"], check=True, capture_output=True
-                )
-                return library.read_bytes()
+                flags = [*_FLAGS, *shlex.split(os.environ.get("KOOPMPC_CFLAGS", ""))]
+                return build_library(source, [*command, *flags], Path(folder)).read_bytes()
             except (OSError, subprocess.SubprocessError) as error:
                 reason = f"{command[0]} failed: {error}"
     warnings.warn(f"{reason}; the unit holds C sources only", SourcesOnlyWarning, stacklevel=4)

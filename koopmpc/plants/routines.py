@@ -4,7 +4,6 @@ import _ctypes
 import ctypes
 import os
 import platform
-import re
 import shlex
 import shutil
 import stat
@@ -15,6 +14,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import cache as remember
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
@@ -30,6 +30,7 @@ Kernel = Callable[[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]],
 
 # Without fused multiply-adds and -march the machine code gives the interpreter's numbers on all machines of a kind.
 _FLAGS = ("-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+_NATIVE = ("-march=native", "-fvisibility=default")  # of code for this processor alone
 # The time of a compiler grows faster than a function that CasADi wrote. 366 kB took 5 s by -O3, 1.7 s by -O1, 0.4 s by
 # -O0, and ran 6.9, 6.4 and 11.6 µs. 1.3 MB took above 100 s by -O3, 19 s by -O1, 1.3 s by -O0.
 _LEVELS = ((100_000, "-O3"), (500_000, "-O1"))  # text of at most so many characters is compiled by this level
@@ -201,31 +202,59 @@ def open_library(path: Path) -> ctypes.CDLL:
 
 
 def load_library(
-    text: str, command: list[str], cache: Path | None, level: str = "-O3", numbers: bytes = b""
+    text: str, command: list[str], cache: Path | None, level: str = "-O3", *, native: bool = False
 ) -> ctypes.CDLL:
     """Return the machine code of this C, loaded from `cache` or compiled into it; without a cache no file remains.
 
     The flags in the environment variable KOOPMPC_CFLAGS follow the library's own flags. The name of a cached file
-    depends on the flags, so code compiled with other flags is another file. While it is compiled, the macro
-    KOOPMPC_NUMBERS is the path of a file that holds `numbers`, written for a string of the assembler.
+    depends on the text, the flags, the processor and the compiler, so that machines that share a home share no code
+    that another one cannot run. With `native` the code is for this processor, if the compiler knows its flags.
 
     Raises
     ------
     OSError, subprocess.SubprocessError
         The compiler fails or its output does not load.
     """
-    command = [*command, level, *_FLAGS, *_read_words("KOOPMPC_CFLAGS")]
+    flags = [level, *_FLAGS, *_read_words("KOOPMPC_CFLAGS")]
+    if native and platform.machine() in ("x86_64", "AMD64"):
+        with suppress(subprocess.CalledProcessError):  # the compiler does not know this processor
+            return _load(text, [*command, *_NATIVE, *flags], cache)
+    return _load(text, [*command, *flags], cache)
+
+
+def _load(text: str, words: list[str], cache: Path | None) -> ctypes.CDLL:
+    """Return the machine code of this C by these words of a command, from `cache` where it is there."""
     if cache is None:
         with tempfile.TemporaryDirectory() as folder:  # loaded code stays valid when its file is gone
-            return open_library(_compile(text, command, Path(folder) / "step.so", numbers))
-    key = "\0".join([text, *command, platform.machine(), platform.system()])
-    path = cache / f"{fingerprint(key.encode() + numbers)}.so"
+            return open_library(_compile(text, words, Path(folder) / "step.so"))
+    key = "\0".join([text, *words, _describe_host(), _describe_compiler(tuple(words))])
+    path = cache / f"{fingerprint(key.encode())}.so"
     if _is_whole(path):
         try:
             return open_library(path)
         except OSError:  # another kind of machine wrote the file: compile again
             path.unlink()
-    return open_library(_compile(text, command, path, numbers))
+    return open_library(_compile(text, words, path))
+
+
+@remember
+def _describe_host() -> str:
+    """Return the system, its C library, and the flags of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    processor = next((line for line in lines if line.startswith("flags")), platform.processor())
+    return " ".join((platform.system(), platform.machine(), *platform.libc_ver(), processor))
+
+
+@remember
+def _describe_compiler(words: tuple[str, ...]) -> str:
+    """Return the file of a compiler and the version that it prints."""
+    with suppress(OSError, subprocess.SubprocessError):
+        printed = subprocess.run([*words, "--version"], capture_output=True, timeout=_COMPILING, check=False).stdout
+        return f"{shutil.which(words[0])} {printed.decode(errors='replace')}"
+    return words[0]
 
 
 def _is_whole(library: Path) -> bool:
@@ -262,16 +291,10 @@ def _is_private(folder: Path) -> bool:
     )
 
 
-def _compile(text: str, command: list[str], path: Path, numbers: bytes) -> Path:
+def _compile(text: str, words: list[str], path: Path) -> Path:
     """Compile in a temporary folder beside `path`, move the file to `path` in one step, and write its checksum."""
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        code, library, packed = (Path(folder) / f"step.{kind}" for kind in ("c", "so", "bin"))
-        if numbers:
-            packed.write_bytes(numbers)
-            text = f'#define KOOPMPC_NUMBERS "{_escape_path(packed)}"\n{text}'
-        code.write_text(text)
-        words = [*command, "-o", str(library), str(code), "-lm"]
-        subprocess.run(words, check=True, capture_output=True, timeout=_COMPILING)
+        library = build_library(text, words, Path(folder))
         seal = fingerprint(library.read_bytes())
         library.replace(path)
         with suppress(OSError):  # code without a checksum is compiled again
@@ -279,11 +302,19 @@ def _compile(text: str, command: list[str], path: Path, numbers: bytes) -> Path:
     return path
 
 
-def _escape_path(path: Path) -> str:
-    """Return a path as it stands in C in a string of the assembler; a quote in the name would end that string."""
-    return re.sub(
-        r"[^\w./:-]", lambda found: "".join(rf"\\{byte:03o}" for byte in os.fsencode(found[0])), path.as_posix()
-    )
+def build_library(text: str, words: list[str], folder: Path) -> Path:
+    """Compile this C into a library in `folder`, by these words of a command.
+
+    Raises
+    ------
+    OSError, subprocess.SubprocessError
+        The compiler fails.
+    """
+    code, library = folder / "step.c", folder / "step.so"
+    code.write_text(text, encoding="utf-8")
+    command = [*words, "-o", str(library), str(code), "-lm"]
+    subprocess.run(command, check=True, capture_output=True, timeout=_COMPILING)
+    return library
 
 
 _CALL = """

@@ -236,6 +236,17 @@ def test_flags_of_the_environment_come_last_and_code_of_other_flags_is_another_f
 
 
 @needs_compiler
+@pytest.mark.parametrize("other", ["_describe_host", "_describe_compiler"])
+def test_machines_that_share_a_home_share_no_code_of_another_processor_or_compiler(other, tmp_path, monkeypatch):
+    command, text = routines.find_compiler(), "int told(void) { return 4; }"
+    for count in (1, 2):
+        for _ in range(2):
+            assert routines.load_library(text, command, tmp_path, native=True).told() == 4
+            assert len(list(tmp_path.glob("*.so"))) == count
+        monkeypatch.setattr(routines, other, lambda *_: "another one")
+
+
+@needs_compiler
 def test_a_library_leaves_the_process_with_the_last_reference_to_its_functions(tmp_path):
     """A process that designs for days would else hold all libraries that it ever loaded."""
     command, gone = routines.find_compiler(), tmp_path / "gone"
