@@ -247,15 +247,13 @@ def test_a_bad_first_measurement_holds_what_reset_says():
 
 
 @pytest.mark.parametrize(
-    ("solver", "few", "other"),
-    [("osqp", {"max_iter": 1, "check_termination": 1}, "daqp"), ("daqp", {"iter_limit": 1}, "osqp")],
+    ("solver", "few"), [("osqp", {"max_iter": 1, "check_termination": 1}), ("daqp", {"iter_limit": 1})]
 )
-def test_where_a_solver_has_too_few_iterations_another_finishes_the_step(solver, few, other):
+def test_where_a_solver_has_too_few_iterations_daqp_finishes_the_step(solver, few):
     A, B = UNSTABLE
     make = lambda **options: km.KoopmanMPC(linear(A, B), km.Cost(1, 0.1), km.Limits(-0.2, 0.2), 8, **options)  # noqa: E731
-    move, alone = make(solver=solver, settings=few)([0.9, 0.5], [0, 0]), make(solver=other)([0.9, 0.5], [0, 0])
-    assert (move.status, move.fallback) == (km.Status.OPTIMAL, km.control.Fallback.NONE)
-    assert (move.solver, alone.solver) == (other, other)
+    move, alone = make(solver=solver, settings=few)([0.9, 0.5], [0, 0]), make(solver="daqp")([0.9, 0.5], [0, 0])
+    assert (move.status, move.fallback, move.solver) == (km.Status.OPTIMAL, km.control.Fallback.NONE, "daqp")
     assert move.iterations > 1
     np.testing.assert_allclose(move.u, alone.u, atol=1e-4)
 

@@ -90,11 +90,12 @@ class KoopmanMPC(MPCBase):
         assumes that the `u_prev` of `reset` acts: by default zero, or the limit nearest to zero if zero is not
         allowed.
     solver
-        The solver that is asked first: "daqp", an active-set method, exact to rounding; "osqp", an operator-splitting
+        The solver: "daqp", an active-set method, exact to rounding; "osqp", an operator-splitting
         method; "piqp", an interior-point method on the stages; or "auto", the one that was measured to be faster, which
         the attribute `solver` names. If OSQP has not solved a QP in 100 iterations, or in the ``max_iter`` of
-        `settings`, DAQP solves it. In plans of 300 steps, 60 a state, or of 1,000 inputs, with hard limits alone,
-        "auto" leaves to PIQP what DAQP has not solved in 20 iterations: inputs then agree to 1e-6 of their range.
+        `settings`, DAQP solves it; so it does what PIQP has not solved. PIQP comes with an extra, `koopmpc[piqp]`.
+        Where it is installed, "auto" asks it first for plans of 300 steps or more, 60 a state, with hard limits alone:
+        inputs then agree to 1e-6 of their range.
     settings
         The solver's own settings, for example ``{"eps_abs": 1e-9, "eps_rel": 1e-9}`` of OSQP. With "auto", the solver
         that has them is asked first.
@@ -190,7 +191,7 @@ class KoopmanMPC(MPCBase):
         )
         self.predictor, self._disturbed = predictor, disturbed
         coordinates = self._wanted or turns[0].solver.coordinates
-        long = self._solver == order.SPARSE or self._N >= order.LONG or self._N * self.nu >= order.PLANNED
+        long = self._solver == order.SPARSE or self._N >= order.LONG
         self._plan_kind = PlanKind(disturbed, self._initial.periodic.size > 0, staged=long and not track.weighed)
         self._map = plan_map(predictor, track, self._moves, coordinates, self._initial.buffer, self._plan_kind)
         self._rows_of_limits, self._weighed = self._read_own(predictor, self._map)
@@ -212,7 +213,7 @@ class KoopmanMPC(MPCBase):
         else:
             if ball is None and solver == "auto" and not settings:
                 turns = add_sparse(turns, self._map.qp)
-                if turns[0].patience is not None:
+                if turns[0].solver.name != self._solver:
                     self._options["solver"] = solver  # one that is made again of its data has the same turns
             self._qps = StepSolver(self._map.qp, turns) if ball is None else BallSolver(self._map.qp, turns, ball)
         rows = len(self._map.matrix)
@@ -270,7 +271,7 @@ class KoopmanMPC(MPCBase):
             self._time_limit,
             'solver="daqp", settings={"iter_limit": 100}',
         )
-        if self._solver != FINISHER.name or self._qps.first.patience is not None:
+        if self._qps.first.name != FINISHER.name:
             saved = self.as_data()
             twin = KoopmanMPC.from_data(replace(saved, options={"solver": FINISHER.name}))
             notes = (_OTHER_SOLVER,) if self._solver == "osqp" else ()

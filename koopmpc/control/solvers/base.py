@@ -91,8 +91,6 @@ class QPSolver(ABC):
     """The coordinates of the condensed QP that suit it: in "riccati" the Hessian is the identity; see `condense`."""
     resumes = False
     """Whether `resume` can go on from the end of the last solve."""
-    patience: int | None = None
-    """Iterations after which it leaves the QP to the solver after it."""
 
     def __init__(self, qp: QP, settings: Mapping[str, Any] | None = None) -> None:
         self._settings, self._stale = dict(settings or {}), False
@@ -210,49 +208,29 @@ class QPSolver(ABC):
 
 
 class SolverTurn(NamedTuple):
-    """A solver and its own settings; a `late` one is set up when it is first needed.
-
-    One with `patience` gives up after so many iterations. It is asked first again once so few rows push, or once
-    another one than the next has found a plan.
-    """
+    """A solver and its own settings."""
 
     solver: type[QPSolver]
     settings: Mapping[str, Any]
-    late: bool = False
-    patience: int | None = None
 
 
 class StepSolver:
-    """The QP of a step: solvers are asked in turn, from the last answer shifted by a step, until one has an answer.
-
-    A solver that had the answer where the first one had none is asked first in the next steps, until a plan meets all
-    limits: a first-order method that has reached its bound of iterations will reach it in the next step, too, and an
-    active-set method then needs few iterations.
+    """The QP of a step: a solver is asked from the last answer shifted by a step; what it leaves, the next one solves.
 
     Parameters
     ----------
     qp
         The QP; its limits move with the plan.
     turns
-        The solvers in the order in which they are asked.
+        The solver, and the exact one that finishes what it leaves; that one is set up when it is first needed.
     """
 
     def __init__(self, qp: StepQP, turns: Sequence[SolverTurn]) -> None:
         self._turns = turns
-        self._turn = 0
         self._last: QPSolution | None = None
         self._hold(qp)
-        self._solvers = [None if turn.late else turn.solver(qp, turn.settings) for turn in turns]
-        self._few = turns[0].patience
-        if self._few is not None:
-            self.first.patience = self._few
-
-    @property
-    def first(self) -> QPSolver:
-        """The solver that is asked first."""
-        solver = self._solvers[0]
-        assert solver is not None, "the first solver is set up at once"
-        return solver
+        self.first = turns[0].solver(qp, turns[0].settings)
+        self._solvers: list[QPSolver | None] = [self.first, *(None for _ in turns[1:])]
 
     def _hold(self, qp: StepQP) -> None:
         """Make this the QP; its rows are often those of the plan, one after the other."""
@@ -274,13 +252,11 @@ class StepSolver:
         """Forget the last answer."""
         self._last = None
 
-    def rest(self) -> None:
-        """Forget the last answer, and which solver found it, for the plan meets all limits."""
-        self._last, self._turn = None, 0
+    rest = cool  # the plan meets all limits
 
     def reset(self) -> None:
         """Forget all earlier solves, so that a run repeats to the bit."""
-        self.rest()
+        self.cool()
         for solver in self._solvers:
             if solver is not None:
                 solver.reset()
@@ -310,8 +286,6 @@ class StepSolver:
             self._last = None
             return found, conflict
         self._last = found
-        if self._few is not None and (self._turn > 1 or np.count_nonzero(found.y) <= self._few):
-            self._turn = 0
         return found, max(conflict, self._gave_way(found, moved, limits)) if self._soft else conflict
 
     def _limit(
@@ -327,22 +301,19 @@ class StepSolver:
     def _ask_all(
         self, moved: Float[np.ndarray, " m"], limits: Interval | None, deadline: float | None
     ) -> tuple[QPSolution, bool]:
-        """Ask the solver whose turn it is, then all others; return what the last one finds, and if it is the answer."""
-        found, answers = self._ask(self._turn, moved, limits, deadline)
-        if answers:
-            return found, True
+        """Ask one solver after the other until one has the answer; return what the last one says, and if it answers."""
+        found, answers = self._ask(0, moved, limits, deadline)
         iterations = found.iterations
-        for i in [i for i in range(len(self._solvers)) if i != self._turn]:
+        for i in range(1, len(self._solvers)):
+            if answers:
+                break
             if deadline is not None and perf_counter() >= deadline:
                 found.status = Status.TIME_LIMIT
                 break
             found, answers = self._ask(i, moved, limits, deadline)
             iterations += found.iterations
-            if answers:
-                self._turn = i
-                break
-            if found.status is Status.OPTIMAL:  # it keeps a row that has to give way
-                found.status = Status.FAILED
+        if not answers and found.status is Status.OPTIMAL:  # it keeps a row that has to give way
+            found.status = Status.FAILED
         found.iterations = iterations
         return found, answers
 

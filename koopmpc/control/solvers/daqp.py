@@ -155,17 +155,17 @@ class DAQP(QPSolver):
             linear, rho = (np.where(self._sense == _SOFT, part, 0.0) for part in (self._linear, 1 / self._curved))
             self._model.soft_weights(rho_l=rho, rho_u=rho, w_l=linear, w_u=linear)
 
-    def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], tuple[Interval, bool, int | None]]:
+    def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], tuple[Interval, bool]]:
         self.resumes = False  # a copy starts from y, and the original has to have the same iterates
         return (
             type(self),
             (self._qp, self._settings),
-            (Interval(self.low, self.high), bool(self._far and not self._stale), self.patience),
+            (Interval(self.low, self.high), bool(self._far and not self._stale)),
         )
 
-    def __setstate__(self, state: tuple[Interval, bool, int | None]) -> None:
-        """Take over the limits that the original had, how far from them its last solution was, and its patience."""
-        limits, self._far, self.patience = state
+    def __setstate__(self, state: tuple[Interval, bool]) -> None:
+        """Take over the limits that the original had, and how far from them its last solution was."""
+        limits, self._far = state
         self.set_bounds(*limits)
 
     @property
@@ -233,9 +233,7 @@ class DAQP(QPSolver):
         start = perf_counter() if limit else 0.0
         self._send(None if y is None else self._active(y))
         crowded = y is not None and self._soft and np.count_nonzero(y) > len(v)
-        x, multipliers, flag, iterations = self._run(limit, len(v) if crowded else self.patience)
-        if self.patience is not None and flag == _ITERATIONS and not crowded:
-            return QPSolution(v.copy(), np.zeros_like(self.low), Status.MAX_ITERATIONS, iterations, self.name)
+        x, multipliers, flag, iterations = self._run(limit, len(v) if crowded else None)
         if y is not None and crowded and flag == _ITERATIONS:
             self._send(self._active(np.where(self._sense == _SOFT, 0.0, y)))
             x, multipliers, flag, more = self._run(max(limit - (perf_counter() - start), 1e-6) if limit else limit)

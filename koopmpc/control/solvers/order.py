@@ -1,4 +1,4 @@
-"""The QP solvers by name: which answers first, which finishes what another leaves, which is asked last.
+"""The QP solvers by name: which answers first, and which finishes what it leaves unsolved.
 
 To add a solver, write a subclass of `QPSolver` in a file of its own in this folder, and name it in `SOLVERS` here.
 Nothing else names solvers: `KoopmanMPC` asks `order_solvers`. If the solver comes with a package of its own,
@@ -14,36 +14,30 @@ from koopmpc import checks
 from koopmpc.control.solvers.base import QPSolver, SolverTurn, StepQP
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.solvers.osqp import OSQP
-from koopmpc.control.solvers.piqp import PIQP
+from koopmpc.control.solvers.piqp import PIQP, has_piqp
 from koopmpc.errors import DataError
 
 SOLVERS: dict[str, type[QPSolver]] = {"osqp": OSQP, "daqp": DAQP, "piqp": PIQP}
 
 FINISHER = DAQP  # solves to rounding what an inexact solver leaves, the targets of references, and the QPs of C code
-RESCUER = "osqp"  # answers where the finisher has none; it is set up when it is first asked
 
-# The rule of solver="auto": the solver that is asked first. `python -m tests.speed.first_solver` measures it, and
-# docs/research.md has the table: the time of steps with a QP, OSQP first over DAQP first, by size and structure.
-# DAQP won the ten tasks, the random loops and all sizes up to N 200 and nu 4. OSQP won loops with limits of inputs
-# alone, n ≥ 400 and more than two thirds of the planned inputs at a limit, by up to 2.8; with few of them at a limit
-# DAQP won the same sizes by up to 46. How many there will be is not known when a controller is built: one row for all.
+# The solver of "auto". `python -m tests.speed.first_solver` measures it, and docs/research.md has the table. DAQP won
+# the ten tasks, the random loops and all sizes up to N 200 and nu 4. OSQP won loops with limits of inputs alone, 400
+# inputs and more in a plan, and more than two thirds of them at a limit, by up to 2.8; with few DAQP won by up to 46.
 FIRST = "daqp"
 
-# Where a plan is long, its stages are small, and all its limits are hard, the first solver gets few iterations; then
-# the stages are solved as they are, sparse. The time of PIQP grows with N, that of DAQP with N³ where as many rows act.
-# `python -m tests.speed.first_solver --parts long` measures it; docs/research.md has the table.
+# The solver of "auto" for a long plan with hard limits alone, if it is installed: the time of PIQP grows with N, that
+# of DAQP with N³ where as many rows act. `python -m tests.speed.first_solver --parts long` measures it.
 SPARSE = "piqp"
-LONG = 300  # steps from which on it is faster, first steps from nothing and later ones
-WIDE = 60  # and so many steps for each entry of a stage's state, of which its time is a power of 1.2 to 2
-PLANNED = 1000  # or so many planned inputs: 8 over 200 steps took half of the time, 4 over 150 steps 2.5 times as long
-PATIENCE = 20  # iterations that the first solver gets there
+LONG = 300  # steps from which on a plan is long
+WIDE = 60  # a plan is long only from so many steps on for each entry of a stage's state
 
 
 def order_solvers(solver: str, settings: Mapping[str, Any]) -> list[SolverTurn]:
-    """Return the solvers in the order in which a step asks them: the given one first, for "auto" that of the rule.
+    """Return the solver of this name, for "auto" that of the rule, and behind it the one that finishes what it leaves.
 
-    Settings that the solver of the rule does not have name the solver that has them all. A first solver that is not
-    exact has its `impatient` settings, and the finisher after it.
+    That is DAQP, of which a second one would find no more where the first has no settings of its own. Settings that
+    the solver of the rule does not have name the solver that has them all.
 
     Raises
     ------
@@ -58,22 +52,17 @@ def order_solvers(solver: str, settings: Mapping[str, Any]) -> list[SolverTurn]:
         raise DataError(f"solver is {solver!r}; there are 'auto', {', '.join(map(repr, SOLVERS))}")
     kind = SOLVERS[first]
     turns = [SolverTurn(kind, {**kind.impatient, **settings})]
-    if not kind.exact:
-        turns.append(SolverTurn(SOLVERS[FINISHER.name], {}))
-    return [*turns, SolverTurn(SOLVERS[RESCUER], {}, late=True)]
+    if first == FINISHER.name and not settings:
+        return turns
+    return [*turns, SolverTurn(SOLVERS[FINISHER.name], {})]
 
 
 def add_sparse(turns: list[SolverTurn], qp: StepQP) -> list[SolverTurn]:
-    """Return the solvers of a step where none was named: for a long plan of small stages the sparse one is second."""
+    """Return the solvers of a step where none was named: the sparse one solves long plans with hard limits alone."""
     stages, hard = qp.stages, bool(np.isinf(qp.softness.linear).all())
-    if stages is None or not hard:
+    if stages is None or not hard or max(LONG, WIDE * len(stages.A)) > stages.N or not has_piqp():
         return turns
-    n, nu = stages.B.shape
-    if max(LONG, WIDE * n) > stages.N and stages.N * nu < PLANNED:
-        return turns
-    first = turns[0]
-    sparse = SolverTurn(SOLVERS[SPARSE], {})
-    return [first._replace(patience=PATIENCE), sparse, first._replace(late=True), *turns[1:]]
+    return [SolverTurn(SOLVERS[SPARSE], {}), *turns]
 
 
 def exact_turn(turns: list[SolverTurn]) -> SolverTurn:

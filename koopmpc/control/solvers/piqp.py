@@ -1,16 +1,16 @@
-# pyright: basic
-"""PIQP behind our interface, as CasADi ships it: an interior-point method on the stages of a QP, which stay sparse.
+# pyright: basic, reportArgumentType=false
+"""PIQP behind our interface: the one file that imports it. An interior-point method on the stages of a QP.
 
-Its time grows with the number of stages, and hardly with that of active rows. A solve starts from nothing, and does
-not stop at a time limit.
+The stages stay sparse, so that its time grows with their number, and hardly with that of active rows. A solve starts
+from nothing, and does not stop at a time limit.
 
 Schwan, Jiang, Kuhn & Jones, "PIQP: a proximal interior-point quadratic programming solver", CDC 2023.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from importlib.util import find_spec
+from typing import Any, ClassVar
 
-import casadi as ca
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float
@@ -18,13 +18,17 @@ from jaxtyping import Float
 from koopmpc import checks
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
-from koopmpc.control.solvers.base import QP, QPSolution, QPSolver, StepQP
+from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver, StepQP
 from koopmpc.errors import DataError
 from koopmpc.interrupts import call_uninterrupted
 
 DEFAULTS: Mapping[str, Any] = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 60}
-_NO_LIMIT = 1e20  # bounds at least this large count as infinite
 _PUSHES = 1e-7  # multipliers below this share of the largest are those of rows that do not push
+
+
+def has_piqp() -> bool:
+    """Return whether PIQP is installed: it comes with an extra."""
+    return find_spec("piqp") is not None
 
 
 class PIQP(QPSolver):
@@ -40,57 +44,50 @@ class PIQP(QPSolver):
     Raises
     ------
     DataError
-        PIQP refuses a setting, or it is no positive number.
+        PIQP is not installed, or refuses a setting: one that is no positive number.
     """
 
     name = "piqp"
     exact = False
+    _STATUS: ClassVar[Mapping[str, Status]] = {
+        "PIQP_SOLVED": Status.OPTIMAL,
+        "PIQP_MAX_ITER_REACHED": Status.MAX_ITERATIONS,
+        "PIQP_PRIMAL_INFEASIBLE": Status.INFEASIBLE,
+    }
 
     @staticmethod
     def setting_names() -> frozenset[str]:
         """Return the names of PIQP's settings that are passed on."""
-        names = ("eps_abs", "eps_rel", "max_iter", "rho_init", "delta_init", "tau", "reg_lower_limit")
-        return frozenset(names)
+        return frozenset(("eps_abs", "eps_rel", "max_iter", "rho_init", "delta_init", "tau", "reg_lower_limit"))
 
     def _setup(self) -> None:
-        qp = self._qp
-        if isinstance(qp, StepQP) and (stages := qp.stages) is not None:
-            P, rows, model = stages.cost(), stages.limits(qp.source, qp.scale), stages.dynamics()
-            gradient = np.zeros(P.shape[0])
-        else:
-            stages, P, rows, model = None, qp.P, scipy.sparse.csc_matrix(qp.A), np.zeros((0, len(qp.q)))
-            gradient = qp.q
-        self._stages, self._count = stages, model.shape[0]
-        self._split(rows.tocsr())
-        rows = rows.tocsr()[self._others]
-        A = ca.DM(scipy.sparse.vstack([scipy.sparse.csc_matrix(model), rows]).tocsc())
-        H = ca.DM(scipy.sparse.csc_matrix(P))
-        shape = {"h": H.sparsity(), "a": A.sparsity()}
-        options = {"piqp": {**DEFAULTS, **self._settings}, "error_on_fail": False}
+        if not has_piqp():
+            raise DataError(
+                'solver is "piqp", which is not installed; run pip install "koopmpc[piqp]", or take solver="auto"'
+            )
+        import piqp
+
         unknown = set(self._settings) - self.setting_names()
         if unknown:
             raise DataError(f"PIQP has no setting {min(unknown)!r}; it has {', '.join(sorted(self.setting_names()))}")
-        for name, value in self._settings.items():
+        qp = self._qp
+        self._stages = qp.stages if isinstance(qp, StepQP) else None
+        if isinstance(qp, StepQP) and qp.stages is not None:
+            P, rows = qp.stages.cost(), qp.stages.limits(qp.source, qp.scale).tocsr()
+            dynamics, cost = qp.stages.dynamics(), np.zeros(P.shape[0])
+        else:
+            P, rows, dynamics, cost = scipy.sparse.csc_matrix(qp.P), scipy.sparse.csr_matrix(qp.A), None, qp.q
+        self._split(rows)
+        self._solver = piqp.SparseSolver()
+        options = self._solver.settings
+        if self._stages is not None:
+            options.kkt_solver = piqp.KKTSolver.sparse_multistage
+        for name, value in {**DEFAULTS, **self._settings}.items():
             checks.positive(value, f"PIQP's setting {name}")
-        try:
-            self._solver = ca.conic("piqp", "piqp", shape, options)
-        except (RuntimeError, NotImplementedError) as error:
-            raise DataError(f"PIQP refuses the problem or its settings {self._settings}: {error}") from error
-        (m, n), inf = A.shape, np.inf
-        self._rows, self._bounds = np.zeros((2, m)), np.array([[-inf], [inf]]) * np.ones(n)
-        self._found = {"x": np.zeros(n), "lam_a": np.zeros(m), "lam_x": np.zeros(n)}
-        self._given = {
-            "h": np.array(H.nonzeros()),
-            "g": np.array(gradient, dtype=np.float64),
-            "a": np.array(A.nonzeros()),
-            **dict(zip(("lba", "uba", "lbx", "ubx"), (*self._rows, *self._bounds), strict=True)),
-        }
-        buffer: Any = self._solver.buffer()
-        self._buffer, self._run = buffer
-        for name, array in self._given.items():
-            self._buffer.set_arg(self._solver.index_in(name), array.data)
-        for name, array in self._found.items():
-            self._buffer.set_res(self._solver.index_out(name), array.data)
+            setattr(options, name, int(value) if name == "max_iter" else float(value))
+        equal = {} if dynamics is None else {"A": dynamics, "b": np.zeros(dynamics.shape[0])}
+        G = rows[self._others].tocsc()
+        call_uninterrupted(lambda: self._solver.setup(P, cost, **equal, G=G, **self._bounds(len(cost))))
 
     def _split(self, rows: scipy.sparse.csr_matrix) -> None:
         """Find the rows that limit one variable: bounds take less time than rows."""
@@ -99,6 +96,13 @@ class PIQP(QPSolver):
         self._single, self._places = single[first], places
         self._factor = rows.data[rows.indptr[self._single]]
         self._others = np.setdiff1d(np.arange(rows.shape[0]), self._single)
+
+    def _bounds(self, n: int) -> dict[str, Float[np.ndarray, " k"]]:
+        """Return the present limits as bounds of the n variables and of the other rows."""
+        ends = self.low[self._single] / self._factor, self.high[self._single] / self._factor
+        box = np.array([[-INFINITY], [INFINITY]]) * np.ones(n)
+        box[:, self._places] = np.minimum(*ends), np.maximum(*ends)
+        return {"h_l": self.low[self._others], "h_u": self.high[self._others], "x_l": box[0], "x_u": box[1]}
 
     def __reduce__(self) -> tuple[type["PIQP"], tuple[QP, dict[str, Any]], Interval]:
         return type(self), (self._qp, self._settings), Interval(self.low, self.high)
@@ -115,21 +119,17 @@ class PIQP(QPSolver):
         """Do nothing: a solve starts from nothing."""
 
     def _solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None) -> QPSolution:
-        low, high = (
-            np.where(self.low > -_NO_LIMIT, self.low, -np.inf),
-            np.where(self.high < _NO_LIMIT, self.high, np.inf),
-        )
-        single, others, count = self._single, self._others, self._count
-        ends = low[single] / self._factor, high[single] / self._factor
-        self._bounds[:, self._places] = np.minimum(*ends), np.maximum(*ends)
-        self._rows[0, count:], self._rows[1, count:] = low[others], high[others]
-        call_uninterrupted(self._run)
-        x, push = self._found["x"].copy(), np.zeros(len(y))
-        push[single] = self._found["lam_x"][self._places] / self._factor
-        push[others] = self._found["lam_a"][count:]
-        if not (self._buffer.stats()["success"] and np.isfinite(x).all() and np.isfinite(push).all()):
-            return QPSolution(v.copy(), np.zeros_like(y), Status.FAILED, 0, self.name)
+        solver = self._solver
+        bounds = self._bounds(len(solver.result.x))
+        call_uninterrupted(lambda: (solver.update(**bounds), solver.solve()))
+        result = solver.result
+        x, iterations, push = np.array(result.x), int(result.info.iter), np.zeros(len(y))
+        push[self._single] = (result.z_bu - result.z_bl)[self._places] / self._factor
+        push[self._others] = result.z_u - result.z_l
+        status = self._STATUS.get(result.info.status.name, Status.FAILED)
+        if status is not Status.OPTIMAL or not (np.isfinite(x).all() and np.isfinite(push).all()):
+            failed = Status.FAILED if status is Status.OPTIMAL else status
+            return QPSolution(v.copy(), np.zeros_like(y), failed, iterations, self.name)
         push = np.where(np.abs(push) > _PUSHES * np.abs(push).max(initial=0.0), push, 0.0)
-        if self._stages is not None:
-            x = self._stages.condense(x)
-        return QPSolution(x, push, Status.OPTIMAL, 1, self.name)  # CasADi tells no number of iterations
+        x = x if self._stages is None else self._stages.condense(x)
+        return QPSolution(x, push, status, iterations, self.name)

@@ -8,8 +8,10 @@ import pytest
 import scipy.linalg
 
 import koopmpc as km
-from koopmpc.control.solvers import order
+from koopmpc.control.solvers import order, piqp
 from koopmpc.errors import DataError
+
+pytest.importorskip("piqp", reason="an extra")
 
 A = np.array([[1, 0.1, 0, 0], [0, 1.0, 0.1, 0], [0, 0, 0.95, 0.1], [0, 0, 0, 0.9]])
 B = np.array([[0.0, 0.02], [0.05, 0.0], [0.1, 0.0], [0.1, 0.05]])
@@ -28,13 +30,6 @@ def controller(solver: str, N: int, rates: bool = False, nu: int = 1, **limits):
     cost = km.Cost(np.ones(4), 0.1 * np.ones(nu), R_delta=0.05 if rates else None)
     box = km.Limits(-1, 1, **{"x_min": -FAR, "x_max": FAR, "slack": None, **more, **limits})
     return km.KoopmanMPC(model, cost, box, N, solver=solver)
-
-
-@pytest.mark.parametrize(("planned", "solver"), [(80, "piqp"), (81, "daqp")])
-def test_a_plan_of_many_inputs_is_solved_by_stages_where_none_is_named(monkeypatch, planned, solver):
-    monkeypatch.setattr(order, "PLANNED", planned)
-    monkeypatch.setattr(order, "PATIENCE", 1)
-    assert controller("auto", 40, nu=2)([3.0, 0.0, 0.0, 0.0], np.zeros(4)).solver == solver
 
 
 @pytest.mark.parametrize(("rates", "nu"), [(False, 1), (True, 1), (False, 2), (True, 2)])
@@ -84,14 +79,6 @@ def test_only_a_long_plan_whose_solver_nobody_named_is_solved_stage_by_stage(mon
     assert moves["long"].u == pytest.approx(moves["named"].u, abs=1e-6)
 
 
-@pytest.mark.parametrize("renew", [lambda mpc: mpc, copy.deepcopy])
-def test_once_few_rows_push_the_active_set_method_is_asked_first_again(monkeypatch, renew):
-    shorten(monkeypatch)
-    mpc, r = renew(controller("auto", 60)), np.zeros(4)
-    asked = [mpc(x * np.array([1.0, 0.0, 0.0, 0.0]), r).solver for x in (3.0, 0.8, 0.8, 3.0)]
-    assert asked == ["piqp", "piqp", "daqp", "piqp"]
-
-
 def test_copies_and_restored_controllers_go_on_alike(monkeypatch, tmp_path):
     shorten(monkeypatch)
     mpc, x, r = controller("auto", 60), np.array([3.0, 0.0, 0.0, 0.0]), np.zeros(4)
@@ -117,8 +104,16 @@ def test_a_step_without_a_solution_does_not_leave_all_later_ones_to_the_slow_sol
     mpc = controller("auto", 60)
     first = mpc([3.0, 0.45, 2.0, 0.0], np.zeros(4))
     assert (first.status, first.solver) == (km.Status.INFEASIBLE, "daqp")
-    later = [mpc([x, 0.0, 0.0, 0.0], np.zeros(4)).solver for x in (3.0, -3.0, 3.0)]
-    assert later == ["daqp", "piqp", "piqp"]
+    assert mpc([3.0, 0.0, 0.0, 0.0], np.zeros(4)).solver == "piqp"
+
+
+def test_without_its_extra_it_is_refused_and_auto_does_without(monkeypatch):
+    shorten(monkeypatch)
+    for module in (piqp, order):
+        monkeypatch.setattr(module, "has_piqp", lambda: False)
+    assert controller("auto", 60)([3.0, 0.0, 0.0, 0.0], np.zeros(4)).solver == "daqp"
+    with pytest.raises(DataError, match=r'pip install "koopmpc\[piqp\]"'):
+        controller("piqp", 60)
 
 
 def test_a_setting_that_it_does_not_have_is_refused():

@@ -81,7 +81,7 @@ def test_the_limits_move_by_the_plan_and_the_start_is_the_last_answer_moved_on_b
     solver.cool()
     solver.solve(PLAN, None, None)
     assert asked[-1] == ("solve", [0, 0], [0, 0, 0], None)
-    solver._solvers[0].resumes = True
+    solver.first.resumes = True
     solver.solve(PLAN, None, None)
     assert asked[-1] == ("resume", None)
     solver.reset()
@@ -90,38 +90,27 @@ def test_the_limits_move_by_the_plan_and_the_start_is_the_last_answer_moved_on_b
     assert asked[-1] == ("update",)
 
 
-def test_the_one_that_had_the_answer_is_asked_first_until_a_plan_meets_all_limits():
-    first, a = scripted("first", False, NONE, GOOD)
-    second, b = scripted("second", True, GOOD, GOOD, GOOD)
-    third, c = scripted("third", False)
-    solver = StepSolver(step_qp(), [SolverTurn(first, {}), SolverTurn(second, {}), SolverTurn(third, {}, late=True)])
-
-    def solves(*lists):
-        return [sum(each[0] == "solve" for each in asked) for asked in lists]
-
-    found, _ = solver.solve(PLAN, None, None)
-    assert (found.solver, found.iterations) == ("second", 12)
-    assert solves(a, b) == [1, 1]
-    found, _ = solver.solve(PLAN, None, None)
-    assert (found.solver, found.iterations) == ("second", 5)
-    assert solves(a, b) == [1, 2]
-    solver.rest()
-    found, _ = solver.solve(PLAN, None, None)
-    assert (found.solver, found.iterations) == ("first", 5)
-    assert solves(a, b) == [2, 2]
-    assert c == []  # a late one is set up when it is needed
+def test_the_second_is_set_up_and_asked_where_the_first_one_has_no_answer():
+    first, a = scripted("first", False, GOOD, NONE, GOOD)
+    second, b = scripted("second", True, GOOD)
+    solver = StepSolver(step_qp(), [SolverTurn(first, {}), SolverTurn(second, {})])
+    found = [solver.solve(PLAN, None, None)[0] for _ in range(3)]
+    assert [(each.solver, each.iterations) for each in found] == [("first", 5), ("second", 12), ("first", 5)]
+    assert sum(each[0] == "solve" for each in a) == 3
+    assert [each[0] for each in b] == ["made", "shift", "solve"]
 
 
-def test_where_nobody_has_the_answer_all_are_asked_and_the_last_one_says_why():
+def test_where_nobody_has_the_answer_the_last_one_says_why():
     first, _ = scripted("first", False, NONE, NONE)
     second, b = scripted("second", True, (FAILED, [0, 0], [0, 0, 0], 20), GOOD)
-    third, c = scripted("third", False, (OPTIMAL, [1, 1], [0, 0, 9], 100))  # a multiplier above the price of a slack
-    solver = StepSolver(step_qp(), [SolverTurn(first, {}), SolverTurn(second, {}), SolverTurn(third, {}, late=True)])
+    solver = StepSolver(step_qp(), [SolverTurn(first, {}), SolverTurn(second, {})])
     found, _ = solver.solve(PLAN, None, None)
-    assert (found.status, found.solver, found.iterations) == (FAILED, "third", 127)
-    assert [each[0] for each in c] == ["made", "shift", "solve"]
+    assert (found.status, found.solver, found.iterations) == (FAILED, "second", 27)
     solver.solve(PLAN, None, None)
     assert b[-1] == ("solve", [0, 0], [0, 0, 0], None)  # nothing is left to start from
+    inexact, _ = scripted("inexact", False, (OPTIMAL, [1, 1], [0, 0, 9], 100))  # a multiplier above a slack's price
+    found, _ = StepSolver(step_qp(), [SolverTurn(inexact, {})]).solve(PLAN, None, None)
+    assert (found.status, found.solver) == (FAILED, "inexact")
 
 
 @pytest.mark.parametrize(("multiplier", "is_exact", "answers"), [(4.0, False, True), (-4.0, False, True), (4.1, False, False), (-4.1, False, False), (4.1, True, True)])  # fmt: skip
@@ -155,14 +144,13 @@ def test_time_is_left_for_what_follows(monkeypatch):
         solver.solve(PLAN, None, 100.01)
         assert a[-1][-1] == pytest.approx(share * 0.01 - 5e-5)
         assert b[-1][-1] == pytest.approx(0.01 - 5e-5)
-        solver.rest()
         solver.solve(PLAN, None, 100.00002)
         assert a[-1][-1] == pytest.approx(share * 1e-5)
     first, _ = scripted("first", False, NONE)
     second, b = scripted("second", True, GOOD)
     found, _ = StepSolver(step_qp(), [SolverTurn(first, {}), SolverTurn(second, {})]).solve(PLAN, None, 100.0)
     assert (found.status, found.solver, found.iterations) == (km.Status.TIME_LIMIT, "first", 7)
-    assert [each[0] for each in b] == ["made"]
+    assert b == []
 
 
 @pytest.mark.parametrize(("multiplier", "share"), [(4.0, 1), (-4.0, 1), (3.9, 0), (0.0, 0)])
