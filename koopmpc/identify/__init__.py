@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from koopmpc.identify.innovations import prediction_error as prediction_error
     from koopmpc.identify.instruments import instrumental_edmd as instrumental_edmd
     from koopmpc.identify.records.narx import narx as narx
-    from koopmpc.identify.records.neural import neural_state_space as neural_state_space
+    from koopmpc.identify.records.state_space import neural_state_space as neural_state_space
     from koopmpc.identify.records.state_space import polynomial_state_space as polynomial_state_space
     from koopmpc.identify.records.subspace import subspace as subspace
     from koopmpc.identify.regressor import KoopmanRegressor as KoopmanRegressor

@@ -27,9 +27,9 @@ from koopmpc.estimate.observer import Estimator
 from koopmpc.identify.fits.bilinear import bilinear_edmd
 from koopmpc.identify.fits.edmd import Towards, edmd
 from koopmpc.identify.moments.read import ReadOptions
+from koopmpc.identify.records.hidden_fit import fit_hidden
 from koopmpc.identify.records.hidden_structure import HiddenStructure
 from koopmpc.identify.records.narx import source_episodes
-from koopmpc.identify.records.state_space import fit_hidden
 from koopmpc.identify.records.structure import Structure, fit_structure
 from koopmpc.lifting.base import Lifting, check_lifting, strip_unit
 from koopmpc.lifting.composed import Standardized, Sum

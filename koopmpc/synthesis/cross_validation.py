@@ -20,8 +20,8 @@ from koopmpc.data.source import Changed, EpisodesMap, Held, Source
 from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments, space_evenly
+from koopmpc.identify.records.hidden_fit import fit_hidden
 from koopmpc.identify.records.hidden_structure import HiddenStructure
-from koopmpc.identify.records.state_space import fit_hidden
 from koopmpc.identify.records.structure import Structure, solve_structure, weigh_rows
 from koopmpc.identify.regression import Regression, build_regression
 from koopmpc.identify.solve import BilinearColumns, solve_path

@@ -9,10 +9,10 @@ from jaxtyping import Float
 
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError, hide_fit_warnings
+from koopmpc.identify.records.hidden_fit import fit_hidden
 from koopmpc.identify.records.hidden_structure import HiddenStructure, choose_hidden, find_rails
 from koopmpc.identify.records.narx import FOLDS
-from koopmpc.identify.records.neural import search_neural
-from koopmpc.identify.records.state_space import fit_hidden, search_hidden
+from koopmpc.identify.records.state_space import search_hidden, search_neural
 from koopmpc.identify.records.subspace import choose_sizes
 from koopmpc.parallel import Progress
 from koopmpc.predict.base import sorted_eigen

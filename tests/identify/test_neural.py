@@ -9,7 +9,7 @@ import pytest
 import koopmpc as km
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.levenberg_marquardt import minimise
-from koopmpc.identify.records import neural
+from koopmpc.identify.records import hidden_fit
 from koopmpc.identify.records.conversion import SignalUnits, from_standard, to_standard
 from koopmpc.identify.records.hidden import (
     RecordSegments,
@@ -19,7 +19,7 @@ from koopmpc.identify.records.hidden import (
     start_with_differences,
 )
 from koopmpc.identify.records.hidden_structure import HiddenStructure
-from koopmpc.identify.records.neurons.contained import ContainedError, contain
+from koopmpc.identify.records.neurons import ContainedError, contain
 from koopmpc.lifting import Neurons
 from tests.identify.test_hidden_state import random_model, random_segments
 
@@ -140,7 +140,7 @@ def test_a_growing_free_run_is_refused_in_a_sentence(monkeypatch):
     data = km.Episodes(
         [km.Episode(X=rng.standard_normal((400, 1)), U=rng.standard_normal((399, 1)))], 1.0, ["y"], ["u"]
     )  # fmt: skip
-    monkeypatch.setattr("koopmpc.identify.records.neural.is_calm_anywhere", lambda *_: False)
+    monkeypatch.setattr("koopmpc.identify.records.hidden_fit.is_calm_hidden", lambda *_, **__: False)
     with pytest.raises(DataError, match="with neurons and without; pass another order"):
         km.identify.neural_state_space(data, order=1, neurons=1)
 
@@ -188,14 +188,14 @@ def test_a_short_record_is_fitted_from_several_sets_of_neurons(monkeypatch):
     for k in range(150):
         y[k + 1] = 0.9 * y[k] + u[k] - 0.3 * np.tanh(10 * y[k])
     data = km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["y"], ["u"])
-    chain = neural.fit_chain
+    chain = hidden_fit.fit_chain
 
     def fit_chain(data, structure, neurons, **options):
         found = chain(data, replace(structure, start=0), neurons, **options)
         return found if structure.start else [next(found)]  # no neurons in the first set
 
-    monkeypatch.setattr(neural, "fit_chain", fit_chain)
+    monkeypatch.setattr(hidden_fit, "fit_chain", fit_chain)
     plan = HiddenStructure(1, 1, 8, 50, None, np.ones(1), True, 4, neurons=1)
-    model = neural.fit_neural(plan, data)
+    model = hidden_fit.fit_hidden(plan, data)
     start = model.embed(data)[0].X[0]
     assert abs(model.step_map().rollout(start, u[8:, None])[:, 0] - y[8:]).max() < 0.02 * y.std()

@@ -13,8 +13,8 @@ from scipy.optimize import lsq_linear
 from scipy.signal import dlsim
 
 import koopmpc as km
+from koopmpc.identify.records.hidden_fit import fit_hidden
 from koopmpc.identify.records.hidden_structure import HiddenStructure
-from koopmpc.identify.records.state_space import fit_hidden
 from koopmpc.identify.records.structure import Structure
 from koopmpc.synthesis.candidates import Candidate, Recipe
 from koopmpc.synthesis.cross_validation import Tried

@@ -1,7 +1,7 @@
-"""The sizes of models with a hidden state, their errors on unseen rows, and what their fits have in common."""
+"""The sizes of models with a hidden state, their errors on unseen rows, and whether their free runs stay near them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,6 @@ from koopmpc.identify.records.conversion import SignalUnits, cut_segments
 from koopmpc.identify.records.free_run import HELD
 from koopmpc.identify.records.hidden import (
     HiddenModel,
-    RecordSegments,
     join_segments,
     simulate_hidden,
     start_states,
@@ -21,16 +20,9 @@ from koopmpc.identify.records.narx import is_worse
 from koopmpc.identify.records.structure import EXACT, HORIZON
 from koopmpc.identify.records.unseen import UNSEEN, average_gaps
 from koopmpc.predict.base import FitReport
-from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 
-ROWS = 4000  # rows that a search learns from, at most: of longer records evenly spread pieces are taken
-PIECE = 1000  # rows of such a piece
-STEPS = 8_000  # steps of all segments of one length, about
-OVERLAP = 3  # a long segment begins behind this share of the one before
-SHORT_OVERLAP = 7  # a short one behind this share
 RESTS = 10  # rows at the least or the largest reading, at least, that make it a rail
-ROBUST = 1.0  # share of the error of one step that counts as noise in the rows where the state begins
 FAR = 10.0  # ranges of the data that a free run from other states may leave, at most
 _STARTS = 8  # rows of each record at which it begins
 
@@ -116,7 +108,7 @@ def find_rails(episodes: Episodes) -> Float[np.ndarray, "2 ny"] | None:
     return rails if np.isfinite(rails).any() else None
 
 
-def thin_records(episodes: Episodes, most: int = ROWS, piece: int = PIECE) -> Episodes:
+def thin_records(episodes: Episodes, most: int, piece: int) -> Episodes:
     """Return the records; of more than `most` rows, evenly spread pieces of `piece` rows."""
     pieces = [
         e.cut(len(e) * i // count, len(e) * (i + 1) // count)
@@ -128,10 +120,16 @@ def thin_records(episodes: Episodes, most: int = ROWS, piece: int = PIECE) -> Ep
     return episodes if total <= most else episodes.with_episodes(pieces[:: -(-total // most)])
 
 
-def is_calm_hidden(model: HiddenModel, data: Episodes, units: SignalUnits, delays: int) -> bool:
-    """Return whether a model stays within three times the range of the data, run over each record twice."""
+def is_calm_hidden(
+    model: HiddenModel, data: Episodes, units: SignalUnits, delays: int, *, anywhere: bool = False
+) -> bool:
+    """Return whether a model stays within three times the range of the data, run over each record twice.
+
+    With `anywhere` it must also stay within ten ranges where inputs follow states that they did not follow in the data:
+    each record runs once over with all its inputs, from eight of its rows.
+    """
     X = (np.concatenate([e.X for e in data]) - units.mean[: units.ny]) / units.scale[: units.ny]
-    reach = HELD * np.abs(X).max(axis=0)
+    reach, low, high = HELD * np.abs(X).max(axis=0), X.min(axis=0), X.max(axis=0)
     for e in data:
         if len(e) <= delays:
             continue
@@ -139,19 +137,7 @@ def is_calm_hidden(model: HiddenModel, data: Episodes, units: SignalUnits, delay
         out = simulate_hidden(model, part.points, np.concatenate([part.inputs, part.inputs]))
         if not (np.abs(out) < reach).all():
             return False
-    return True
-
-
-def is_calm_anywhere(model: HiddenModel, data: Episodes, units: SignalUnits, delays: int) -> bool:
-    """Return whether a model also stays within ten ranges if inputs follow states that they did not follow in the data.
-
-    Each record runs once over with all its inputs, from eight of its rows.
-    """
-    if not is_calm_hidden(model, data, units, delays):
-        return False
-    X = (np.concatenate([e.X for e in data]) - units.mean[: units.ny]) / units.scale[: units.ny]
-    low, high = X.min(axis=0), X.max(axis=0)
-    for e in data:
+    for e in data if anywhere else ():
         if len(e) <= delays + _STARTS:
             continue
         points = join_segments(cut_segments(data.with_episodes([e]), units, delays, 1, (len(e) - delays) // _STARTS))
@@ -160,45 +146,6 @@ def is_calm_anywhere(model: HiddenModel, data: Episodes, units: SignalUnits, del
         if not ((out > low - FAR * (high - low)) & (out < high + FAR * (high - low))).all():
             return False
     return True
-
-
-def find_noise(start: LinearPredictor, units: SignalUnits) -> float:
-    """Return the noise in ζ: the error of one step of the linear model, in spreads."""
-    assert start.report is not None, "it was fitted"
-    return ROBUST * float(np.max(start.report.residual / units.scale[: units.ny]))
-
-
-def normalise(model: HiddenModel, points: Float[np.ndarray, "m nzeta"]) -> HiddenModel:
-    """Return a linear model whose state has mean zero and a spread of one at these points."""
-    z, n = start_states(model, points), model.order
-    mean, size = z.mean(axis=0), z.std(axis=0)
-    size = np.where(size > 0, size, 1.0)
-    E, H, T = model.E.copy(), model.H.copy(), model.T.copy()
-    E[:, 0] += E[:, 1 : 1 + n] @ mean - mean
-    H[:, -1] += H[:, :-1] @ mean
-    T[:, -1] -= mean
-    E[:, 1 : 1 + n] *= size
-    H[:, :-1] *= size
-    return replace(model, E=E / size[:, None], H=H, T=T / size[:, None])
-
-
-def cut_sets(
-    data: Episodes,
-    units: SignalUnits,
-    delays: int,
-    horizon: int,
-    spans: Sequence[tuple[int, int]],
-    short: int = HORIZON,
-    steps_of_all: int = STEPS,
-) -> list[RecordSegments]:
-    """Return long segments, which tell slow modes, and many short ones, which tell where the state begins."""
-    room = max(b - max(a, delays) for a, b in spans)
-    found: list[RecordSegments] = []
-    for steps, overlap in ((max(min(horizon, room), 1), OVERLAP), (max(min(short, room), 1), SHORT_OVERLAP)):
-        total = sum(max(b - max(a, delays) - steps + 1, 0) for a, b in spans)
-        apart = max(steps // overlap, total * steps // steps_of_all, 1)
-        found.append(join_segments(cut_segments(data, units, delays, steps, apart, spans)))
-    return found
 
 
 def measure_hidden(
