@@ -29,12 +29,12 @@ from koopmpc.control.linear.windows import LimitWindows, describe_bounds, limit_
 from koopmpc.control.move import Fallback, Move, Plan, Status, alone, busy
 from koopmpc.control.program import linear_parts, no_export, publish_estimator, reference_table
 from koopmpc.control.solvers import FINISHER, add_sparse, exact_turn, order, order_solvers
+from koopmpc.control.solvers.ball import BallSolver
 from koopmpc.control.solvers.base import StepSolver
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.stepped.priorities import PrioritySolver, spread_priorities, weigh_priorities
 from koopmpc.control.stepped.search import LevelSearch, LevelSolver
-from koopmpc.control.terminal.cuts import BallSolver
 from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
@@ -262,7 +262,9 @@ class KoopmanMPC(MPCBase):
         plan, track = self._map, self._map.track
         if plan.ball is not None:
             raise no_export(
-                self, "it adds tangent cuts of a terminal ellipsoid", "one with a polytope, or without a terminal set"
+                self,
+                "Clarabel solves its QP with a terminal ellipsoid",
+                "one with a polytope, or without a terminal set",
             )
         rows = reference_table(reference, len(track.Q))
         estimator = publish_estimator(

@@ -24,11 +24,11 @@ from koopmpc.control.linear.blocking import tie_moves
 from koopmpc.control.linear.layout import WindowLayout
 from koopmpc.control.linear.moving import GivenShares, MovingMap, PlanParts
 from koopmpc.control.riccati import Law, Stage, recursion
+from koopmpc.control.solvers.ball import Ball, make_ball
 from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.solvers.stages import QPStages
 from koopmpc.control.stepped.blocks import MoveBlocks
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
-from koopmpc.control.terminal.cuts import Ball, make_ball
 from koopmpc.control.terminal.inclusion import EndReach
 from koopmpc.control.terminal.sets import EndRows, read_end
 from koopmpc.control.terminal_cost import terminal_of
