@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc import supervise as supervise
     from koopmpc import synthesis as synthesis
     from koopmpc import validate as validate
+    from koopmpc.apps import papers as papers
     from koopmpc.bench.problem import Case as Case
     from koopmpc.bench.problem import Problem as Problem
     from koopmpc.bench.problem import Training as Training
@@ -118,6 +119,7 @@ else:
         modules={
             "faults": "loop.faults",
             "moments": "identify.moments",
+            "papers": "apps.papers",
             "plot": "figures",
             "spectrum": "predict.spectrum",
         },

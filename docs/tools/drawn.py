@@ -22,7 +22,7 @@ TABLES = {  # picture -> the stored rows that it shows
     "calibration": "tests/closed_loop/calibration.json",
     "coverage": "tests/guarantees/coverage/table.json",
 }
-PAPERS = {  # folder of docs/papers -> the module of koopmpc/papers that draws its pictures
+PAPERS = {  # folder of docs/papers -> the module of problems/papers that draws its pictures
     "brunton": "proctor.py",
     "dictionary": "kevrekidis.py",
     "kaiser": "kaiser.py",
@@ -30,7 +30,7 @@ PAPERS = {  # folder of docs/papers -> the module of koopmpc/papers that draws i
     "kic": "proctor.py",
     "korda": "korda.py",
     "proctor": "proctor.py",
-    "snyder": "snyder.py",
+    "snyder": "snyder/figures.py",
     "williams": "kevrekidis.py",
 }
 
@@ -47,7 +47,7 @@ def inputs_of(picture: str) -> list[str]:
     if folder.startswith("problems/"):
         return ["docs/tools/gallery.py:draw", f"problems/{folder.partition('/')[2]}.py"]
     if folder.startswith("papers/"):
-        return [f"koopmpc/papers/{PAPERS[folder.partition('/')[2]]}"]
+        return [f"problems/papers/{PAPERS[folder.partition('/')[2]]}"]
     if name.startswith("real_"):
         return ["tests/real/pictures.py:draw"]
     if name in TABLES:

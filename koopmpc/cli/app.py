@@ -499,7 +499,7 @@ def reproduce(
     """Reproduce a paper: its figures, its numbers, and a verdict on each claim; 1 where a required number is missed."""
     from time import perf_counter
 
-    from koopmpc.papers.registry import PAPERS, find_paper, make_summary_table, make_verdict_table, reproduce_all
+    from koopmpc.apps.papers import PAPERS, find_paper, make_summary_table, make_verdict_table, reproduce_all
 
     out, err = console(), Console(stderr=True)
     start = perf_counter()

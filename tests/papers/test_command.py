@@ -10,21 +10,11 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 from koopmpc.cli.app import app
-from koopmpc.papers import korda, registry
-from koopmpc.papers.registry import (
-    PAPERS,
-    Claim,
-    Verdict,
-    compare_value,
-    draw_curves,
-    find_paper,
-    judge_claim,
-    make_paper,
-    percent,
-)
-from koopmpc.papers.snyder_control import ORACLE, compute_costs, predict_held_out, prepare_contest
-from koopmpc.papers.snyder_settings import SHAKINGS, TASKS, all_settings
 
+registry = km.papers
+korda, control, settings = (
+    registry.import_paper_module(name) for name in ("korda", "snyder.control", "snyder.settings")
+)
 PAGES = Path(__file__).parents[2] / "docs" / "papers"
 QUICK = (
     "brunton",
@@ -37,7 +27,7 @@ QUICK = (
 @pytest.mark.slow
 def test_the_shortened_paper_writes_all_its_files(tmp_path):
     told = []
-    outcome = find_paper("snyder").reproduce(tmp_path, True, told.append)
+    outcome = registry.find_paper("snyder").reproduce(tmp_path, True, told.append)
     text = outcome.report.read_text(encoding="utf-8")
     pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
     assert len(pictures) == len(set(pictures)) >= 17
@@ -51,7 +41,7 @@ def test_the_shortened_paper_writes_all_its_files(tmp_path):
 
 
 def test_data_that_excite_find_B_and_feedback_data_do_not():
-    each = predict_held_out(all_settings()["pendulum-lqr"], SHAKINGS["pendulum"], episodes=10)
+    each = control.predict_held_out(settings.all_settings()["pendulum-lqr"], settings.SHAKINGS["pendulum"], episodes=10)
     assert each["DMDc, exciting data"].b == pytest.approx(1.0, abs=0.02)
     assert each["EDMDc, exciting data"].b == pytest.approx(1.0, abs=0.02)
     assert each["DMDc, feedback data"].warned == "A and B inseparable"
@@ -64,27 +54,29 @@ def test_energy_bounds_the_cost_of_the_hanging_pendulum_from_below():
     def value(x):  # V = 2√10 E solves min over u of 10 ω² + u² + ∇V·f(x, u) = 0
         return 2 * np.sqrt(10) * (2 * x[1] ** 2 + 19.62 * (1 - np.cos(x[0])))
 
-    task = prepare_contest("pendulum, hanging, π/4", 40, 20, episodes=20)  # horizon and tail see most of a swing
+    task = control.prepare_contest(
+        "pendulum, hanging, π/4", 40, 20, episodes=20
+    )  # horizon and tail see most of a swing
     task = replace(task, models={"Fourier 1": task.models["Fourier 1"]})
     runs = task.runs()
-    free, limited = compute_costs(runs, False), compute_costs(runs, True)
+    free, limited = control.compute_costs(runs, False), control.compute_costs(runs, True)
     total = {name: free[name] + value(runs[name, False].X[-1]) for name in free}
-    assert total["LQR, linearisation"] == pytest.approx(value(TASKS[task.title].x0), rel=5e-3)
-    assert total[ORACLE] == pytest.approx(value(TASKS[task.title].x0), rel=5e-3)
-    assert min(total.values()) > 0.995 * value(TASKS[task.title].x0)
-    assert limited["MPC, Fourier 1"] < 1.1 * limited[ORACLE]
+    assert total["LQR, linearisation"] == pytest.approx(value(settings.TASKS[task.title].x0), rel=5e-3)
+    assert total[control.ORACLE] == pytest.approx(value(settings.TASKS[task.title].x0), rel=5e-3)
+    assert min(total.values()) > 0.995 * value(settings.TASKS[task.title].x0)
+    assert limited["MPC, Fourier 1"] < 1.1 * limited[control.ORACLE]
     for (_, kind), run in runs.items():
         if kind:
             assert np.abs(run.U).max() <= 2.0 + 1e-9
 
 
 def test_every_paper_is_found_by_its_name():
-    assert [find_paper(name).name for name in registry.PAPERS] == list(registry.PAPERS)
+    assert [registry.find_paper(name).name for name in registry.PAPERS] == list(registry.PAPERS)
 
 
 def test_an_unknown_paper_is_refused_and_the_nearest_is_suggested():
     with pytest.raises(km.errors.ProblemError, match=r"no paper 'snider', did you mean 'snyder'\?; there are snyder"):
-        find_paper("snider")
+        registry.find_paper("snider")
     result = CliRunner().invoke(app, ["reproduce", "nobody"])
     assert result.exit_code == 2
     assert "there is no paper 'nobody'" in result.output
@@ -97,10 +89,13 @@ def test_the_command_prints_verdicts_and_paths_and_fails_where_a_required_number
     def work(page, quick, progress):
         assert not quick
         progress("working")
-        draw_curves(page, "curve", "A curve", 0.1, ("x",), {"a": np.zeros((5, 1)), "b": np.ones((3, 1))})
-        return [Claim("abstract", "it works", Verdict.FAILS, "half of it"), compare_value("π", 3.14159, ours, 0.005)]
+        registry.draw_curves(page, "curve", "A curve", 0.1, ("x",), {"a": np.zeros((5, 1)), "b": np.ones((3, 1))})
+        return [
+            registry.Claim("abstract", "it works", registry.Verdict.FAILS, "half of it"),
+            registry.compare_value("π", 3.14159, ours, 0.005),
+        ]
 
-    paper = make_paper("mine", "Mine and yours.\n\nA paper\nof ours.\n", work)
+    paper = registry.make_paper("mine", "Mine and yours.\n\nA paper\nof ours.\n", work)
     monkeypatch.setattr(registry, "PAPERS", ("mine",))
     monkeypatch.setattr(registry, "import_module", lambda name: type("M", (), {"paper": paper}))
     result = CliRunner().invoke(app, ["reproduce", "mine", "--logs", str(tmp_path)])
@@ -131,28 +126,28 @@ def test_all_papers_go_to_one_folder_with_a_table_of_them(tmp_path, monkeypatch)
 
 
 def test_a_claim_holds_or_holds_in_part_or_fails_and_an_error_has_three_digits():
-    assert judge_claim("a", "b", holds=True, why="c").verdict is Verdict.HOLDS
-    assert judge_claim("a", "b", holds=False, in_part=True, why="c").verdict is Verdict.IN_PART
-    assert judge_claim("a", "b", holds=False, why="c").verdict is Verdict.FAILS
-    assert [percent(v) for v in (0.0, 0.0111, 3.4e-6, np.inf, np.nan, 1e3)] == [
+    assert registry.judge_claim("a", "b", holds=True, why="c").verdict is registry.Verdict.HOLDS
+    assert registry.judge_claim("a", "b", holds=False, in_part=True, why="c").verdict is registry.Verdict.IN_PART
+    assert registry.judge_claim("a", "b", holds=False, why="c").verdict is registry.Verdict.FAILS
+    assert [registry.percent(v) for v in (0.0, 0.0111, 3.4e-6, np.inf, np.nan, 1e3)] == [
         "0", "1.11", "3.4e-04", "diverges", "diverges", "diverges",
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", QUICK)
 def test_a_paper_reproduces_its_required_numbers_and_writes_its_page(tmp_path, name):
-    outcome = find_paper(name).reproduce(tmp_path, True, lambda words: None)
+    outcome = registry.find_paper(name).reproduce(tmp_path, True, lambda words: None)
     assert outcome.failures == ()
     assert any(claim.required for claim in outcome.claims)
     assert outcome.recording.stat().st_size > 1e3
     assert outcome.report.read_text(encoding="utf-8").count("| **holds** |") > 0
 
 
-@pytest.mark.parametrize("name", [name for name in PAPERS if name != "snyder"])
+@pytest.mark.parametrize("name", [name for name in registry.PAPERS if name != "snyder"])
 def test_the_page_in_docs_has_pictures_and_no_required_claim_that_fails(name):
     text = (PAGES / f"{name}.md").read_text(encoding="utf-8")
-    assert text.startswith(f"# {find_paper(name).title}\n")
-    assert Verdict.HOLDS.value in text
+    assert text.startswith(f"# {registry.find_paper(name).title}\n")
+    assert registry.Verdict.HOLDS.value in text
     pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
     assert pictures
     for picture in pictures:
@@ -189,7 +184,7 @@ def test_the_local_mpc_of_the_motor_costs_what_the_paper_says():
 
 def test_the_table_of_all_papers_counts_the_claims_of_each_page():
     text = (PAGES / "index.md").read_text(encoding="utf-8")
-    for name in PAPERS:
+    for name in registry.PAPERS:
         page = (PAGES / f"{name}.md").read_text(encoding="utf-8")
         ((total, held, part, failed),) = re.findall(
             r"Of (\d+) claims (\d+) hold, (\d+) hold in part, (\d+) do not hold", page

@@ -8,22 +8,12 @@ import pytest
 from scipy.integrate import quad
 
 import koopmpc as km
-from koopmpc.page import Page
-from koopmpc.papers import snyder as report
-from koopmpc.papers import snyder_theory as theory
-from koopmpc.papers.plants import Pendulum, swing_frequency
-from koopmpc.papers.registry import Verdict, add_verdicts
-from koopmpc.papers.snyder import judge_figures, judge_text
-from koopmpc.papers.snyder_control import ORACLE, Prediction
-from koopmpc.papers.snyder_settings import (
-    FIGURES,
-    OBSERVABLES,
-    all_settings,
-    design_feedbacks,
-    measure_hold_change,
-    reconstruct_all,
-)
 
+Page, Verdict, add_verdicts = km.papers.Page, km.papers.Verdict, km.papers.add_verdicts
+report, theory, plants, control, setup = (
+    km.papers.import_paper_module(name)
+    for name in ("snyder.figures", "snyder.theory", "plants", "snyder.control", "snyder.settings")
+)
 PAGE = Path(__file__).parents[2] / "docs" / "papers" / "snyder.md"
 # Relative reconstruction errors in %, computed independently: (setting, observables, full rank).
 KNOWN = {
@@ -58,13 +48,13 @@ def spread(percent):
 
 @pytest.fixture(scope="module")
 def settings():
-    found = all_settings()
+    found = setup.all_settings()
     return {name: found[name] for name in ("pendulum", "pendulum-lqr", "upright", "cart-pole", "cart-pole-lqr")}
 
 
 @pytest.fixture(scope="module")
 def fits(settings):
-    return {name: reconstruct_all(setting) for name, setting in settings.items()}
+    return {name: setup.reconstruct_all(setting) for name, setting in settings.items()}
 
 
 @pytest.mark.parametrize("key", KNOWN)
@@ -82,7 +72,7 @@ def test_full_rank_leaves_the_known_number_of_singular_values(fits):
 
 
 def test_gains_agree_to_the_digits():
-    got = {name: K.ravel() for name, K in design_feedbacks().items()}
+    got = {name: K.ravel() for name, K in setup.design_feedbacks().items()}
     for name, known, digits in (
         ("pendulum", [0.0, 3.1623], 4),
         ("upright", [39.24, 17.998], 3),
@@ -97,23 +87,23 @@ def test_gains_agree_to_the_digits():
 def test_the_shift_stays_upright(settings):
     X = settings["cart-pole-lqr"].trajectory[0].X
     assert np.abs(X[:, 2] - np.pi).max() == pytest.approx(0.032, abs=6e-4)
-    u = -(X - [1.0, 0.0, np.pi, 0.0]) @ design_feedbacks()["cart-pole"].ravel()
+    u = -(X - [1.0, 0.0, np.pi, 0.0]) @ setup.design_feedbacks()["cart-pole"].ravel()
     assert np.abs(u).max() == pytest.approx(4.47, abs=6e-3)
 
 
 @pytest.mark.parametrize("amplitude", [1e-6, np.pi / 4, 1.5, 3.0])
 def test_the_frequency_is_that_of_the_elliptic_integral(amplitude):
-    plant = Pendulum()
+    plant = plants.Pendulum()
     k = np.sin(amplitude / 2)
     quarter = quad(lambda phi: 1 / np.sqrt(1 - (k * np.sin(phi)) ** 2), 0, np.pi / 2, epsabs=1e-14)[0]  # of a period
     exact = np.sqrt(plant.g / plant.L) * np.pi / 2 / quarter
-    assert swing_frequency(plant, amplitude) == pytest.approx(exact, rel=1e-12)
+    assert plants.swing_frequency(plant, amplitude) == pytest.approx(exact, rel=1e-12)
 
 
 def test_eigenvalues_are_those_of_the_amplitude_and_not_of_small_angles(fits):
-    small, right = swing_frequency(Pendulum(), 0.0), swing_frequency(Pendulum(), np.pi / 4)
+    small, right = plants.swing_frequency(plants.Pendulum(), 0.0), plants.swing_frequency(plants.Pendulum(), np.pi / 4)
     assert small == pytest.approx(np.sqrt(9.81 / 2))
-    for method in OBSERVABLES:
+    for method in setup.OBSERVABLES:
         fit = fits["pendulum"][method, True]
         turn = abs(km.spectrum.continuous_eigenvalues(fit.model)[fit.leading].imag)
         assert turn == pytest.approx(right, rel=1e-3)
@@ -153,12 +143,12 @@ def test_over_the_whole_run_the_caution_has_the_errors_of_the_figures(settings, 
 
 
 def test_a_held_input_changes_little(settings, fits):
-    assert 1e-4 < measure_hold_change(settings, fits) < 0.02
+    assert 1e-4 < setup.measure_hold_change(settings, fits) < 0.02
 
 
 @pytest.mark.parametrize(("method", "rank"), [("DMD", 2), ("EDMD monomials 3", 10), ("EDMD Fourier 1", 4)])
 def test_each_equation_equals_its_function(settings, method, rank):
-    lifting = OBSERVABLES[method]
+    lifting = setup.OBSERVABLES[method]
     trajectory = settings["pendulum"].trajectory
     checked = theory.check_equations(trajectory, lifting, rank)
     assert {e.number for e in checked} == {"10–12", "14–17", "18–23", "24–26", "27–31"}
@@ -167,13 +157,13 @@ def test_each_equation_equals_its_function(settings, method, rank):
 
 
 def test_eigenfunctions_are_left_eigenvectors(settings):
-    left, right = theory.compare_sides(settings["pendulum"].trajectory, OBSERVABLES["EDMD monomials 3"])
+    left, right = theory.compare_sides(settings["pendulum"].trajectory, setup.OBSERVABLES["EDMD monomials 3"])
     assert left < 0.05 * right
 
 
 def test_each_figure_has_its_verdict(fits):
-    found = {claim.where: claim.verdict for claim in judge_figures(fits)}
-    assert len(found) == sum(len(shown.settings) for shown in FIGURES)
+    found = {claim.where: claim.verdict for claim in report.judge_figures(fits)}
+    assert len(found) == sum(len(shown.settings) for shown in setup.FIGURES)
     for where, verdict in {
         "pendulum-dmd, pendulum": Verdict.HOLDS,
         "pendulum-monomials-3, pendulum": Verdict.HOLDS,
@@ -188,7 +178,7 @@ def test_each_figure_has_its_verdict(fits):
 def test_the_page_holds_these_numbers_and_verdicts(settings, fits):
     text = PAGE.read_text(encoding="utf-8")
     titles = {setting.title: name for name, setting in settings.items()}
-    verdicts = {claim.where: claim.verdict.value for claim in judge_figures(fits)}
+    verdicts = {claim.where: claim.verdict.value for claim in report.judge_figures(fits)}
     seen = 0
     for line in text.split("## The figures, in numbers")[1].split("## The figures\n")[0].splitlines():
         cells = [cell.strip() for cell in line.split("|")[1:-1]]
@@ -218,7 +208,7 @@ def test_the_lessons_of_the_page_are_those_of_its_costs():
         for cells in (line.split("|") for line in free.splitlines() if "(" in line)
     }
     hanging, upright, shift, _ = np.transpose(list(ratio.values()))
-    assert list(ratio)[-1] == ORACLE
+    assert list(ratio)[-1] == control.ORACLE
     assert ratio["LQR, monomials 3"][0] == hanging.max() == pytest.approx(float(cubic), abs=0.005)
     assert float(cubic) > 2
     assert ratio["LQR, linearisation"][0] == pytest.approx(hanging.min(), abs=1e-3)
@@ -230,9 +220,9 @@ def test_the_lessons_of_the_page_are_those_of_its_costs():
 def told(fits, *, ours, feedback, excited):
     """Return the verdicts of abstract and discussion for made-up costs and predictions."""
     names = ("DMD, feedback data", "DMDc, feedback data", "EDMDc, exciting data")
-    predicted = {"pendulum": {name: Prediction(name, feedback, excited, 1.0, "–") for name in names}}
-    ratios = {"a task": {"LQR, linearisation": 1.05, "LQR, Fourier 1": ours, ORACLE: 1.0}}
-    return {claim.says: claim.verdict for claim in judge_text(fits, 3e-5, predicted, ratios)}
+    predicted = {"pendulum": {name: control.Prediction(name, feedback, excited, 1.0, "–") for name in names}}
+    ratios = {"a task": {"LQR, linearisation": 1.05, "LQR, Fourier 1": ours, control.ORACLE: 1.0}}
+    return {claim.says: claim.verdict for claim in report.judge_text(fits, 3e-5, predicted, ratios)}
 
 
 def test_verdicts_of_the_text_follow_the_numbers(fits):
@@ -256,19 +246,16 @@ def test_verdicts_of_the_text_follow_the_numbers(fits):
 
 def test_reasons_of_the_text_end_with_what_they_say_and_point_to_no_other_table(fits):
     names = ("DMD, feedback data", "DMDc, feedback data", "EDMDc, exciting data")
-    predicted = {"pendulum": {name: Prediction(name, 0.0, 0.0, 1.0, "–") for name in names}}
-    ratios = {"a task": {"LQR, linearisation": 1.05, "LQR, Fourier 1": 1.0, ORACLE: 1.0}}
-    reasons = {claim.says: claim.why for claim in judge_text(fits, 3e-5, predicted, ratios)}
+    predicted = {"pendulum": {name: control.Prediction(name, 0.0, 0.0, 1.0, "–") for name in names}}
+    ratios = {"a task": {"LQR, linearisation": 1.05, "LQR, Fourier 1": 1.0, control.ORACLE: 1.0}}
+    reasons = {claim.says: claim.why for claim in report.judge_text(fits, 3e-5, predicted, ratios)}
     assert reasons["control on the lifted model is future work"].endswith("times the cost of nonlinear MPC at most")
     assert not [why for why in reasons.values() if "below" in why or why.endswith(":")]
 
 
-def test_the_parts_of_the_report_hold_their_tables_and_pictures(settings, fits, tmp_path, monkeypatch):
-    saved = []
-    for module in (report, theory):
-        monkeypatch.setattr(module, "save", lambda made, path: saved.append(path.stem))
+def test_the_parts_of_the_report_hold_their_tables_and_pictures(settings, fits, tmp_path):
     page = Page(tmp_path, beside="snyder")
-    claims = judge_figures(fits)
+    claims = report.judge_figures(fits)
     report.add_opening(page, claims, 0.01, 10)
     add_verdicts(page, claims)
     report.tabulate_figures(page, settings, fits, claims)
@@ -278,7 +265,7 @@ def test_the_parts_of_the_report_hold_their_tables_and_pictures(settings, fits, 
     report.appendix_dmdc(page, settings["pendulum"], settings["pendulum-lqr"])
     gains_of_page = PAGE.read_text(encoding="utf-8").split("## The feedbacks")[1].split("\n## ")[0]
     assert gains_of_page.strip() in page.markdown
-    assert saved == ["pendulum-eigenfunctions", "appendix-pendulum-dmdc"]
+    assert {path.stem for path in tmp_path.rglob("*.png")} == {"pendulum-eigenfunctions", "appendix-pendulum-dmdc"}
     assert [curves.columns[-1] for curves in page.curves] == ["log10 of the relative error"] * 2
     assert "| DMDc, LQR data | 2 of 3 |" in page.markdown
     assert page.markdown.count("\n| pendulum-") == 18 + 10  # lines of the figures, and claims

@@ -8,20 +8,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.control.cost import Cost
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import hide_fit_warnings
-from koopmpc.identify.fits.edmd import edmd
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.state import Constant, Monomials, State
-from koopmpc.papers.plants import CartPole, Pendulum, design_feedback, design_printed_feedback, integrate_trajectories
-from koopmpc.papers.registry import relative_error
-from koopmpc.plants.dynamics import Dynamics
-from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.predict.spectrum import amplitudes, evolution_error, reconstruct
-from koopmpc.values import Value
+import koopmpc as km
+from koopmpc import papers
+
+from ..plants import CartPole, Pendulum, design_feedback, design_printed_feedback, integrate_trajectories
 
 RESOLVED = 1e-6  # smaller errors are rounding and differ from machine to machine
 CUT = 1e-10  # "full rank" keeps the singular values above this share of the largest
@@ -33,17 +23,17 @@ DATABOOK_WEIGHTS: tuple[list[float], float] = ([1.0, 1.0, 1.0, 1.0], 1e-4)  # Br
 UP = (0.0, 0.0, np.pi, 0.0)
 TARGET = (1.0, 0.0, np.pi, 0.0)
 
-OBSERVABLES: dict[str, Lifting] = {
-    "DMD": State(),
-    "EDMD monomials 2": State() + Monomials(2) + Constant(),
-    "EDMD monomials 3": State() + Monomials(3) + Constant(),
-    "EDMD Fourier 1": State() + Fourier(1),
-    "EDMD Fourier 2": State() + Fourier(2),
+OBSERVABLES: dict[str, km.Lifting] = {
+    "DMD": km.State(),
+    "EDMD monomials 2": km.State() + km.Monomials(2) + km.Constant(),
+    "EDMD monomials 3": km.State() + km.Monomials(3) + km.Constant(),
+    "EDMD Fourier 1": km.State() + km.Fourier(1),
+    "EDMD Fourier 2": km.State() + km.Fourier(2),
 }
 
 
 @dataclass(frozen=True, eq=False)
-class Reconstruction(Value):
+class Reconstruction:
     """Reconstruction of a trajectory from its first state by z⁺ = A z, z = ψ(x): x(t) = Re Φ exp(Ωt) b.
 
     Attributes
@@ -69,7 +59,7 @@ class Reconstruction(Value):
         one with Im λ > 0; constants are left out.
     """
 
-    model: LinearPredictor
+    model: km.LinearPredictor
     X: Float[np.ndarray, "T1 nx"]
     truth: Float[np.ndarray, "T1 nx"]
     rank: int
@@ -87,7 +77,7 @@ class Reconstruction(Value):
 
 
 def fit_reconstruction(
-    trajectory: Episodes, lifting: Lifting, held_out: Episodes, rank: int | None = None
+    trajectory: km.Episodes, lifting: km.Lifting, held_out: km.Episodes, rank: int | None = None
 ) -> Reconstruction:
     """Fit ψ(x⁺) = A ψ(x) to one trajectory by truncated SVD of the unscaled snapshots, and rebuild it.
 
@@ -107,10 +97,10 @@ def fit_reconstruction(
     s = np.linalg.svd(bound(episode.X[:-1]), compute_uv=False)
     full = int(np.sum(s > CUT * s[0]))
     kept = full if rank is None else min(rank, full)
-    with hide_fit_warnings():
-        model = edmd(trajectory, bound, rank=kept)
+    with km.errors.hide_fit_warnings():
+        model = km.edmd(trajectory, bound, rank=kept)
     X = predict_episode(model, episode)
-    share = np.abs(amplitudes(model, episode.X[0])) * np.linalg.norm(model.modes, axis=0)
+    share = np.abs(km.spectrum.amplitudes(model, episode.X[0])) * np.linalg.norm(model.modes, axis=0)
     values = model.eigenvalues
     moving = (np.abs(values - 1) > _CONSTANT) & (np.imag(values) >= 0)
     return Reconstruction(
@@ -120,17 +110,17 @@ def fit_reconstruction(
         rank=kept,
         width=bound.nz,
         condition=float(s[0] / s[kept - 1]),
-        error=relative_error(X, episode.X),
-        held_out=float(np.median([relative_error(predict_episode(model, e), e.X) for e in held_out])),
-        evolution=evolution_error(model, trajectory),
+        error=papers.relative_error(X, episode.X),
+        held_out=float(np.median([papers.relative_error(predict_episode(model, e), e.X) for e in held_out])),
+        evolution=km.spectrum.evolution_error(model, trajectory),
         leading=int(np.argmax(np.where(moving, share, -1.0))),
     )
 
 
-def predict_episode(model: LinearPredictor, episode: Episode) -> Float[np.ndarray, "T1 nx"]:
+def predict_episode(model: km.LinearPredictor, episode: km.Episode) -> Float[np.ndarray, "T1 nx"]:
     """Return x(t) = Re Φ exp(Ωt) b at the times of the episode, from its first state."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return reconstruct(model, episode.X[0], np.arange(len(episode.X)) * model.dt)
+        return km.spectrum.reconstruct(model, episode.X[0], np.arange(len(episode.X)) * model.dt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +148,7 @@ class Setting:
     """
 
     title: str
-    dynamics: Dynamics
+    dynamics: km.Dynamics
     x0: Sequence[float]
     spread: Sequence[float]
     K: Float[np.ndarray, "nu nx"] | None = None
@@ -169,17 +159,17 @@ class Setting:
     others: int = 10
 
     @cached_property
-    def trajectory(self) -> Episodes:
+    def trajectory(self) -> km.Episodes:
         """The trajectory that is fitted."""
         return self._run(np.asarray([self.x0]))
 
     @cached_property
-    def held_out(self) -> Episodes:
+    def held_out(self) -> km.Episodes:
         """The held-out trajectories; their starts are reproducible."""
         away = np.random.default_rng(0).uniform(-1.0, 1.0, (self.others, len(self.x0)))
         return self._run(np.asarray(self.x0) + away * np.asarray(self.spread))
 
-    def _run(self, starts: Float[np.ndarray, "E nx"]) -> Episodes:
+    def _run(self, starts: Float[np.ndarray, "E nx"]) -> km.Episodes:
         return integrate_trajectories(
             self.dynamics, starts, dt=self.dt, steps=self.steps, K=self.K, x_ref=self.x_ref, held=self.held
         )
@@ -212,10 +202,10 @@ def measure_hold_change(settings: Mapping[str, Setting], fits: Fits) -> float:
     return max(changes)
 
 
-def centre_episodes(episodes: Episodes, x_ref: ArrayLike) -> Episodes:
+def centre_episodes(episodes: km.Episodes, x_ref: ArrayLike) -> km.Episodes:
     """Return the episodes in the coordinates x − x_ref."""
-    target = checks.vector(x_ref, "x_ref", episodes.nx)
-    return episodes.with_episodes([Episode(X=e.X - target, U=e.U, W=e.W) for e in episodes])
+    target = np.broadcast_to(np.asarray(x_ref, dtype=float), (episodes.nx,))
+    return episodes.with_episodes([km.Episode(X=e.X - target, U=e.U, W=e.W) for e in episodes])
 
 
 @dataclass(frozen=True)
@@ -319,18 +309,18 @@ class ControlTask:
         Start and target of the run.
     """
 
-    dynamics: Dynamics
+    dynamics: km.Dynamics
     x_eq: Sequence[float]
     K: str | None
     shaking: Excitement
-    cost: Cost
+    cost: km.Cost
     limit: float
     x0: Sequence[float]
     reference: Sequence[float]
 
 
-_PENDULUM_COST = Cost(*PENDULUM_WEIGHTS)
-_CART_POLE_COST = Cost(*CART_POLE_WEIGHTS)
+_PENDULUM_COST = km.Cost(*PENDULUM_WEIGHTS)
+_CART_POLE_COST = km.Cost(*CART_POLE_WEIGHTS)
 _REST = (0.0, 0.0)
 _START = (np.pi / 4, 0.0)
 _SHIFTED = (-1.0, 0.0, np.pi, 0.0)

@@ -17,27 +17,15 @@ a = −¼, and the quartic one, H = x₂²/2 + x₁⁴/4, have two inputs, B = I
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from koopmpc.control.cost import Cost
-from koopmpc.control.eigenfunction_lqr import EigenfunctionLQR
-from koopmpc.data.collect import collect
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import hide_fit_warnings
-from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.fits.eigenfunctions import eigenfunctions
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.composed import Eigenfunction
-from koopmpc.lifting.state import Constant, Expressions, Monomials, State
-from koopmpc.loop.simulate import simulate
-from koopmpc.page import Page
-from koopmpc.papers.plants import integrate_closed_loop, integrate_trajectories
-from koopmpc.papers.registry import Claim, TellPart, compare_value, draw_curves, judge_claim, make_paper, percent
-from koopmpc.plants.dynamics import RK4, Dynamics
-from koopmpc.plants.step_map import discretize
-from koopmpc.predict.predictors import LinearPredictor
+import koopmpc as km
+from koopmpc import papers
+
+from .plants import integrate_closed_loop, integrate_trajectories
 
 DT = 0.01  # sample time [s]
 KNOWN = {  # J of the pendulum in the paper by B and H_r, and the rounding of its digits
@@ -55,14 +43,14 @@ POTENTIALS: dict[str, Callable[[ca.SX], ca.SX]] = {
     "quartic well": lambda q: q**4 / 4,
 }
 MATRICES = {"[0; 1]": ((0.0,), (1.0,)), "[1; 0]": ((1.0,), (0.0,)), "I": ((1.0, 0.0), (0.0, 1.0))}
-LIBRARY = State() + Monomials(4) + Constant()
+LIBRARY = km.State() + km.Monomials(4) + km.Constant()
 
 
-def reproduce_kaiser(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_kaiser(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Control known energies, find energies in data, and control by the energies from data."""
     progress("costs of the pendulum and of the double well")
     claims, energies = _control_known_energies(page, quick)
-    draw_curves(page, "energy", "Energy of the pendulum, B = [0; 1]", DT, ("H",), energies)
+    papers.draw_curves(page, "energy", "Energy of the pendulum, B = [0; 1]", DT, ("H",), energies)
     progress("discovery")
     found = _discover_energy(page, claims)
     progress("control of what was found")
@@ -70,13 +58,13 @@ def reproduce_kaiser(page: Page, quick: bool, progress: TellPart) -> list[Claim]
     return claims
 
 
-def make_energy(name: str) -> Lifting:
+def make_energy(name: str) -> km.Lifting:
     """Return H = x₂²/2 + V(x₁) of a plant, as a lifting of one observable."""
-    return Expressions(lambda x: [x[1] ** 2 / 2 + POTENTIALS[name](x[0])], ["H"]).bind(Well.states)
+    return km.Expressions(lambda x: [x[1] ** 2 / 2 + POTENTIALS[name](x[0])], ["H"]).bind(Well.states)
 
 
 @dataclass(frozen=True)
-class Well(Dynamics):
+class Well(km.Dynamics):
     """ẋ = [x₂; −V′(x₁)] + B u, with H = x₂²/2 + V(x₁)."""
 
     states = ("x1", "x2")
@@ -96,17 +84,19 @@ class TwoInputs(Well):
     inputs = ("u0", "u1")
 
 
-def make_controller(H: Lifting, B: str, R: float = 1.0, eigenvalue: float | None = 0.0) -> EigenfunctionLQR:
+def make_controller(
+    H: km.Lifting, B: str, R: float = 1.0, eigenvalue: float | None = 0.0
+) -> km.control.EigenfunctionLQR:
     """Return the controller of H with Q = 1."""
-    return EigenfunctionLQR(H, Cost(Q=1.0, R=R, of=H), dt=DT, B=MATRICES[B], eigenvalue=eigenvalue)
+    return km.control.EigenfunctionLQR(H, km.Cost(Q=1.0, R=R, of=H), dt=DT, B=MATRICES[B], eigenvalue=eigenvalue)
 
 
-def _control_known_energies(page: Page, quick: bool) -> tuple[list[Claim], dict[str, np.ndarray]]:
+def _control_known_energies(page: papers.Page, quick: bool) -> tuple[list[papers.Claim], dict[str, np.ndarray]]:
     cases: list[tuple[str, str, Sequence[float], float, float, tuple[float, float]]] = [
         ("pendulum", B, (0.5, 0.5), target, 100.0, known) for (B, target), known in KNOWN.items()
     ]
     cases += [("double well", "[0; 1]", start, 0.0, 25.0, known) for start, known in WELLS.items()]
-    claims: list[Claim] = []
+    claims: list[papers.Claim] = []
     rows: list[tuple[object, ...]] = []
     curves: dict[str, np.ndarray] = {}
     arrivals: list[float] = []
@@ -122,7 +112,7 @@ def _control_known_energies(page: Page, quick: bool) -> tuple[list[Claim], dict[
             seconds=seconds,
         )
         where = f"{name}, B = {B}, from {[*start]}, H_r = {target:g}"
-        claims.append(compare_value(f"J: {where}", known, run.cost, spread, digits=4))
+        claims.append(papers.compare_value(f"J: {where}", known, run.cost, spread, digits=4))
         off = np.abs(H(run.X)[:, 0] - target)
         late = np.flatnonzero(off > 1e-3)
         arrived = DT * (late[-1] + 1) if len(late) and late[-1] + 1 < len(off) else np.nan
@@ -137,33 +127,35 @@ def _control_known_energies(page: Page, quick: bool) -> tuple[list[Claim], dict[
     says = "H stays within 1e-3 of H_r, from 5 to 12 s on, except for H_r = −1"
     why = f"from {min(arrivals):.1f} to {max(arrivals):.1f} s on"
     claims.append(
-        judge_claim("pendulum", says, holds=min(arrivals) > 4.5 and max(arrivals) < 12.5, why=why, required=True)
+        papers.judge_claim("pendulum", says, holds=min(arrivals) > 4.5 and max(arrivals) < 12.5, why=why, required=True)
     )
     return claims, curves
 
 
 def _simulate_sampled(
-    law: EigenfunctionLQR, plant: Well, H: Lifting, start: Sequence[float], target: float, seconds: float
+    law: km.control.EigenfunctionLQR, plant: Well, H: km.Lifting, start: Sequence[float], target: float, seconds: float
 ) -> float:
     """Return J in the library's closed loop, where the input is constant over each sample."""
-    step_map = discretize(plant, DT, RK4(2))
-    run = simulate(step_map, law, x0=start, reference=[target], steps=round(seconds / DT), cost=law.cost)
+    step_map = km.discretize(plant, DT, km.RK4(2))
+    run = km.simulate(step_map, law, x0=start, reference=[target], steps=round(seconds / DT), cost=law.cost)
     e = H(run.X)[:, 0] - target
     return DT * float(np.sum((e[1:] ** 2 + e[:-1] ** 2) / 2) + np.sum(run.U**2))
 
 
-def _discover_energy(page: Page, claims: list[Claim]) -> Eigenfunction:
+def _discover_energy(page: papers.Page, claims: list[papers.Claim]) -> Any:
     """Find H of the double well by eigenfunctions and by EDMDc of the same degree; return φ from forced data."""
     plant = Well("double well")
     one = integrate_trajectories(plant, [0.0, -2.8], dt=DT, steps=1000)
     t = DT * np.arange(1000)
     u = 2 * np.sin(0.2 * np.pi * t) * np.sin(2 * np.pi * t)
-    forced = collect(discretize(plant, DT, RK4(4)), [0.0, -2.8], lambda k, y, rng: u[[k]], episodes=1, steps=1000)
+    forced = km.collect(
+        km.discretize(plant, DT, km.RK4(4)), [0.0, -2.8], lambda k, y, rng: u[[k]], episodes=1, steps=1000
+    )
     others = integrate_trajectories(plant, np.random.default_rng(0).uniform(-1.5, 1.5, (20, 2)), dt=DT, steps=500)
     found = {
-        "differences": eigenfunctions(one, LIBRARY, by="derivatives", held_out=others)[0],
-        "steps": eigenfunctions(one, LIBRARY, held_out=others)[0],
-        "forced data": eigenfunctions(forced, LIBRARY, held_out=_add_zero_inputs(others))[0],
+        "differences": km.identify.eigenfunctions(one, LIBRARY, by="derivatives", held_out=others)[0],
+        "steps": km.identify.eigenfunctions(one, LIBRARY, held_out=others)[0],
+        "forced data": km.identify.eigenfunctions(forced, LIBRARY, held_out=_add_zero_inputs(others))[0],
     }
     names = found["steps"].lifting.names
     exact = np.zeros(len(names))
@@ -172,16 +164,18 @@ def _discover_energy(page: Page, claims: list[Claim]) -> Eigenfunction:
         c = phi.coefficients[0]
         rest = int(np.sum(c[exact == 0] != 0))
         claims += [
-            compare_value(f"φ from {name}: x₁², x₂², x₁⁴", [-1.0, 1.0, 0.5], c[exact != 0], spread, digits=4),
-            judge_claim(f"φ from {name}", "no other observable", holds=not rest, why=f"{rest} others", required=True),
+            papers.compare_value(f"φ from {name}: x₁², x₂², x₁⁴", [-1.0, 1.0, 0.5], c[exact != 0], spread, digits=4),
+            papers.judge_claim(
+                f"φ from {name}", "no other observable", holds=not rest, why=f"{rest} others", required=True
+            ),
         ]
     unit = found["differences"].coefficients[0]
     unit = unit / np.linalg.norm(unit)
     claims.append(
-        compare_value("φ from differences, of length 1", [-2 / 3, 2 / 3], unit[exact != 0][:2], 1e-5, digits=5)
+        papers.compare_value("φ from differences, of length 1", [-2 / 3, 2 / 3], unit[exact != 0][:2], 1e-5, digits=5)
     )
-    with hide_fit_warnings():
-        model = edmd(forced, LIBRARY)
+    with km.errors.hide_fit_warnings():
+        model = km.edmd(forced, LIBRARY)
     H = np.array([make_energy("double well")(e.X)[0, 0] for e in others])
     told = {"EDMDc, H = cᵀz": _predict_energy(model, others, exact)}
     told |= {f"φ from {name}": np.array([phi.values(e.X) / 2 for e in others]) for name, phi in found.items()}
@@ -197,27 +191,29 @@ def _discover_energy(page: Page, claims: list[Claim]) -> Eigenfunction:
     )
     page.table(
         ("model", *(f"after {DT * k:g} s [%]" for k in later)),
-        [(name, *map(percent, each)) for name, each in errors.items()],
+        [(name, *map(papers.percent, each)) for name, each in errors.items()],
     )
     claims.append(
-        judge_claim(
+        papers.judge_claim(
             "EDMDc of the same degree on forced data",
             "does not carry H",
             holds=errors["EDMDc, H = cᵀz"][-1] > 100 * errors["φ from forced data"][-1],
-            why=f"after 5 s H is off by {percent(errors['EDMDc, H = cᵀz'][-1])} %,"
-            f" by φ from the same data {percent(errors['φ from forced data'][-1])} %",
+            why=f"after 5 s H is off by {papers.percent(errors['EDMDc, H = cᵀz'][-1])} %,"
+            f" by φ from the same data {papers.percent(errors['φ from forced data'][-1])} %",
             required=True,
         )
     )
     return found["forced data"]
 
 
-def _add_zero_inputs(data: Episodes) -> Episodes:
+def _add_zero_inputs(data: km.Episodes) -> km.Episodes:
     """Return the episodes with an input that is 0."""
-    return Episodes([Episode(X=e.X, U=np.zeros((len(e.X) - 1, 1))) for e in data], data.dt, data.states, Well.inputs)
+    return km.Episodes(
+        [km.Episode(X=e.X, U=np.zeros((len(e.X) - 1, 1))) for e in data], data.dt, data.states, Well.inputs
+    )
 
 
-def _predict_energy(model: LinearPredictor, data: Episodes, c: np.ndarray) -> np.ndarray:
+def _predict_energy(model: km.LinearPredictor, data: km.Episodes, c: np.ndarray) -> np.ndarray:
     """Return cᵀ Aᵏ ψ(x₀) / 2 of each episode."""
     Z = model.lift(np.array([e.X[0] for e in data]))
     rows = [Z @ c / 2]
@@ -227,10 +223,10 @@ def _predict_energy(model: LinearPredictor, data: Episodes, c: np.ndarray) -> np
     return np.column_stack(rows)
 
 
-def _control_found_energies(page: Page, claims: list[Claim], phi: Eigenfunction) -> None:
+def _control_found_energies(page: papers.Page, claims: list[papers.Claim], phi: Any) -> None:
     """Control the double well by φ from forced data, and the two other wells by φ from two unforced trajectories."""
     H = phi.scaled(0.5, "H")
-    law = EigenfunctionLQR(H, Cost(Q=1.0, R=1.0, of=H), dt=DT)
+    law = km.control.EigenfunctionLQR(H, km.Cost(Q=1.0, R=1.0, of=H), dt=DT)
     run = integrate_closed_loop(
         Well("double well"),
         lambda x: law.law(x, 0.0),
@@ -239,14 +235,14 @@ def _control_found_energies(page: Page, claims: list[Claim], phi: Eigenfunction)
         dt=DT,
         seconds=25.0,
     )
-    claims.append(compare_value("J from [-2, 2.5] by φ from forced data", 11.58, run.cost, 0.05, digits=4))
+    claims.append(papers.compare_value("J from [-2, 2.5] by φ from forced data", 11.58, run.cost, 0.05, digits=4))
     curves: dict[str, np.ndarray] = {}
     for name, start, R in (("quartic well", (0.001, 0.001), 1.0), ("asymmetric well", (-1.1, 0.0), 0.05)):
         plant, other = TwoInputs(name, MATRICES["I"]), (0.3, -0.9)
         data = integrate_trajectories(Well(name), [other, (-1.0, 0.5)], dt=DT, steps=1000)
-        (H,) = eigenfunctions(data, LIBRARY)
+        (H,) = km.identify.eigenfunctions(data, LIBRARY)
         H = H.scaled(0.5 / H.coefficients[0, H.lifting.names.index("x2^2")], "H")
-        loop, step = make_controller(H, "I", R, None), discretize(plant, DT, RK4(2))
+        loop, step = make_controller(H, "I", R, None), km.discretize(plant, DT, km.RK4(2))
         top, low = (float(H([q, 0.0])[0]) for q in (SADDLE, 1.0))
         X = [np.array(start)]
         for _ in range(4000):
@@ -263,8 +259,10 @@ def _control_found_energies(page: Page, claims: list[Claim], phi: Eigenfunction)
                 f"x = [{x[0]:.3f}, {x[1]:.3f}] at the end",
             )
             holds = bool(np.linalg.norm(x - [1.0, 0.0]) < 0.1)
-        claims.append(judge_claim(f"{name}, φ from two trajectories", says, holds=holds, why=why, required=True))
-    draw_curves(page, "wells", "Asymmetric and quartic well, by their φ from data", DT, ("x₁", "x₂", "H"), curves)
+        claims.append(papers.judge_claim(f"{name}, φ from two trajectories", says, holds=holds, why=why, required=True))
+    papers.draw_curves(
+        page, "wells", "Asymmetric and quartic well, by their φ from data", DT, ("x₁", "x₂", "H"), curves
+    )
 
 
-paper = make_paper("kaiser", __doc__, reproduce_kaiser)
+paper = papers.make_paper("kaiser", __doc__, reproduce_kaiser)

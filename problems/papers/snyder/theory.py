@@ -7,19 +7,11 @@ from functools import partial
 import numpy as np
 from jaxtyping import Complex, Float
 
-from koopmpc.data.episodes import Episodes
-from koopmpc.figures.eigenvalues import eigenfunction_maps
-from koopmpc.figures.reports import CurvePanel, draw_panels
-from koopmpc.figures.series import reconstruction
-from koopmpc.figures.style import save
-from koopmpc.identify.fits.edmd import edmd
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.composed import Projected
-from koopmpc.lifting.state import Constant, State
-from koopmpc.page import Page
-from koopmpc.papers.plants import Pendulum, swing_frequency
-from koopmpc.papers.registry import Claim, judge_claim, percent, relative_error
-from koopmpc.papers.snyder_settings import (
+import koopmpc as km
+from koopmpc import papers
+
+from ..plants import Pendulum, swing_frequency
+from .settings import (
     LINEAR,
     OBSERVABLES,
     TARGET,
@@ -30,7 +22,8 @@ from koopmpc.papers.snyder_settings import (
     fit_reconstruction,
     predict_episode,
 )
-from koopmpc.predict.spectrum import amplitudes, continuous_eigenvalues, linearity_error, reconstruct
+
+percent = papers.percent
 
 CAUSES = """\
 Under LQR the state settles at (1, 0, π, 0). Its motion about that point has four eigenvalues of its own, and
@@ -75,7 +68,7 @@ class Equation:
     residual: float
 
 
-def check_equations(trajectory: Episodes, lifting: Lifting, rank: int) -> list[Equation]:
+def check_equations(trajectory: km.Episodes, lifting: km.Lifting, rank: int) -> list[Equation]:
     """Compute each equation of the paper on one trajectory by our function and by its formula in NumPy.
 
     Parameters
@@ -91,8 +84,8 @@ def check_equations(trajectory: Episodes, lifting: Lifting, rank: int) -> list[E
     bound = lifting.bind(trajectory.states)
     snapshots = trajectory.snapshots()
     Y, Y_next = bound(snapshots.X).T, bound(snapshots.X_next).T  # columns, as the paper has them
-    whole, reduced = edmd(trajectory, bound), edmd(trajectory, bound, rank=rank)
-    assert isinstance(reduced.lifting, Projected)
+    whole, reduced = km.edmd(trajectory, bound), km.edmd(trajectory, bound, rank=rank)
+    assert isinstance(reduced.lifting, km.spectrum.Projected)
     assert reduced.exact_modes is not None
     U, s, Vt = np.linalg.svd(Y, full_matrices=False)
     forward = Y_next @ Vt[:rank].T / s[:rank]  # Y′ V Σ⁻¹
@@ -100,14 +93,14 @@ def check_equations(trajectory: Episodes, lifting: Lifting, rank: int) -> list[E
     basis, modes, values = reduced.lifting.basis, reduced.exact_modes, reduced.eigenvalues
     W = reduced.eigenvectors
     t = np.arange(len(episode.X)) * trajectory.dt
-    b = amplitudes(reduced, episode.X[0])
-    exponents = np.exp(continuous_eigenvalues(reduced) * t[:, None])
+    b = km.spectrum.amplitudes(reduced, episode.X[0])
+    exponents = np.exp(km.spectrum.continuous_eigenvalues(reduced) * t[:, None])
     ahead = np.real((exponents * b) @ reduced.modes.T)
     Theta, Theta_next = Y.T, Y_next.T
     phi = whole.eigenfunctions(snapshots.X)
     xi = whole.left_eigenvectors.T  # ξ_j in column j, φ_j = Θ ξ_j
     K = np.linalg.pinv(Theta) @ Theta_next
-    worst = linearity_error(whole, trajectory)
+    worst = km.spectrum.linearity_error(whole, trajectory)
     missed = whole.eigenfunctions(snapshots.X_next) - phi * whole.eigenvalues
     by_hand = np.linalg.norm(missed, axis=0) / np.linalg.norm(phi, axis=0)
     return [
@@ -120,7 +113,7 @@ def check_equations(trajectory: Episodes, lifting: Lifting, rank: int) -> list[E
                  _gap(A @ modes, modes * values)),
         Equation("18–23", "b = Φ⁺ x₁", "amplitudes", _gap(b, np.linalg.pinv(modes) @ bound(episode.X[0]))),
         Equation("18–23", "x(t) = Φ exp(Ω t) b, Ω = ln Λ / Δt", "continuous_eigenvalues, reconstruct",
-                 _gap(reconstruct(reduced, episode.X[0], t), ahead)),
+                 _gap(km.spectrum.reconstruct(reduced, episode.X[0], t), ahead)),
         Equation("24–26", "y = Θᵀ(x), A_Y = Y′ Y⁺", "Lifting, edmd", _gap(whole.A @ Y, Y_next @ np.linalg.pinv(Y) @ Y)),
         Equation("27–31", "φ(x) = Θ(x) ξ", "LinearPredictor.eigenfunctions", _gap(phi, Theta @ xi)),
         Equation("27–31", "λ φ(x_k) = φ(x_{k+1})", "linearity_error", _gap(worst, by_hand)),
@@ -128,20 +121,20 @@ def check_equations(trajectory: Episodes, lifting: Lifting, rank: int) -> list[E
     ]  # fmt: skip
 
 
-def compare_sides(trajectory: Episodes, lifting: Lifting) -> tuple[float, float]:
+def compare_sides(trajectory: km.Episodes, lifting: km.Lifting) -> tuple[float, float]:
     """Return the medians of ‖φ(x⁺) − λ φ(x)‖ / ‖φ(x)‖ for φ = ξᴴψ with left and for φ = vᵀψ with right eigenvectors.
 
     Θ⁺Θ′ is Aᵀ, so its right eigenvectors are the left eigenvectors of A. The right eigenvectors of A are the modes;
     they define no eigenfunctions.
     """
-    model = edmd(trajectory, lifting)
+    model = km.edmd(trajectory, lifting)
     snapshots = trajectory.snapshots()
     Z, Z_next = model.lift(snapshots.X), model.lift(snapshots.X_next)
     left = _median_linearity(Z, Z_next, model.left_eigenvectors.T, model.eigenvalues)
     return left, _median_linearity(Z, Z_next, model.eigenvectors, model.eigenvalues)
 
 
-def add_frequencies(page: Page, fits: Fits) -> None:
+def add_frequencies(page: papers.Page, fits: Fits) -> None:
     """Add the eigenvalues of the pendulum's fits beside the exact frequencies."""
     plant = Pendulum()
     small, right = swing_frequency(plant, 0.0), swing_frequency(plant, np.pi / 4)
@@ -150,7 +143,7 @@ def add_frequencies(page: Page, fits: Fits) -> None:
     for method in OBSERVABLES:
         fit = fits["pendulum"][method, True]
         size = abs(fit.model.eigenvalues[fit.leading])
-        turn = abs(continuous_eigenvalues(fit.model)[fit.leading].imag)
+        turn = abs(km.spectrum.continuous_eigenvalues(fit.model)[fit.leading].imag)
         rows.append(
             (
                 method,
@@ -165,7 +158,7 @@ def add_frequencies(page: Page, fits: Fits) -> None:
     )
 
 
-def add_equations(page: Page, setting: Setting, fits: Fits) -> None:
+def add_equations(page: papers.Page, setting: Setting, fits: Fits) -> None:
     """Add each equation with the function that computes it, and a picture of the leading eigenfunction."""
     lifting = OBSERVABLES["EDMD Fourier 1"]
     width, rank = lifting.bind(setting.dynamics.states).nz, 4
@@ -180,17 +173,19 @@ def add_equations(page: Page, setting: Setting, fits: Fits) -> None:
     left, right = compare_sides(setting.trajectory, OBSERVABLES["EDMD monomials 3"])
     page.text(SIDES.format(left=percent(left), right=percent(right)))
     fit = fits["pendulum"]["EDMD monomials 3", True]
-    made = eigenfunction_maps(fit.model, fit.leading, (0, 1), ((-1.0, 1.0), (-2.0, 2.0)))
-    page.picture("pendulum-eigenfunctions", "Pendulum, monomials 3: the leading eigenfunction", partial(save, made))
+    made = km.plot.eigenfunction_maps(fit.model, fit.leading, (0, 1), ((-1.0, 1.0), (-2.0, 2.0)))
+    page.picture(
+        "pendulum-eigenfunctions", "Pendulum, monomials 3: the leading eigenfunction", partial(km.plot.save, made)
+    )
 
 
 def causes(setting: Setting) -> dict[str, Reconstruction]:
     """Return fits of the cart-pole under LQR: origin at zero or at the target, with or without a constant."""
     squares = OBSERVABLES["EDMD monomials 2"]
     cases = {
-        "DMD": (State(), False, None),
-        "DMD with a constant": (State() + Constant(), False, None),
-        "DMD on x − x_ref": (State(), True, None),
+        "DMD": (km.State(), False, None),
+        "DMD with a constant": (km.State() + km.Constant(), False, None),
+        "DMD on x − x_ref": (km.State(), True, None),
         "EDMD monomials 2, rank 4": (squares, False, 4),
         "EDMD monomials 2, rank 5": (squares, False, 5),
         "EDMD monomials 2": (squares, False, None),
@@ -203,7 +198,7 @@ def causes(setting: Setting) -> dict[str, Reconstruction]:
     return found
 
 
-def add_failure(page: Page, setting: Setting, found: Mapping[str, Reconstruction]) -> None:
+def add_failure(page: papers.Page, setting: Setting, found: Mapping[str, Reconstruction]) -> None:
     """Add the effects of the origin of the coordinates and of the truncation on the fit of the cart-pole under LQR."""
     page.text("## Why the cart-pole failed", CAUSES)
     truth = setting.trajectory[0].X
@@ -225,12 +220,12 @@ def add_failure(page: Page, setting: Setting, found: Mapping[str, Reconstruction
         name: found[name].X + (np.asarray(TARGET) if "x_ref" in name else 0.0)
         for name in ("DMD", "DMD with a constant", "DMD on x − x_ref", "EDMD monomials 2")
     }
-    made = reconstruction({setting.title: (truth, curves)}, setting.dt, setting.dynamics.states)
-    page.picture("why-cart-pole", "Cart-pole under LQR: origin and truncation", partial(save, made))
+    made = km.plot.reconstruction({setting.title: (truth, curves)}, setting.dt, setting.dynamics.states)
+    page.picture("why-cart-pole", "Cart-pole under LQR: origin and truncation", partial(km.plot.save, made))
     page.curve("why cart-pole", setting.dt, setting.dynamics.states, {"truth": truth, **curves})
 
 
-def add_caution(page: Page, settings: Mapping[str, Setting], fits: Fits) -> list[Claim]:
+def add_caution(page: papers.Page, settings: Mapping[str, Setting], fits: Fits) -> list[papers.Claim]:
     """Add errors of reconstruction and of prediction from unseen starts by horizon, and return the claim."""
     plants = ("pendulum", "pendulum-lqr", "cart-pole", "cart-pole-lqr")
     errors = {
@@ -242,14 +237,18 @@ def add_caution(page: Page, settings: Mapping[str, Setting], fits: Fits) -> list
     page.table(
         ("data", "observables", *(f"{h:g} s [%]" for h in HORIZONS)),
         [
-            (settings[name].title, method, *(f"{percent(own)} / {percent(new)}" for own, new in each))
+            (
+                settings[name].title,
+                method,
+                *(f"{percent(own)} / {percent(new)}" for own, new in each),
+            )
             for (name, method), each in errors.items()
         ],
     )
     best = min(OBSERVABLES, key=lambda method: errors["cart-pole", method][-1][1])
     missed = [each for each in errors.values() if each[-1][0] < LINEAR and each[-1][1] > 10 * max(each[-1][0], 1e-3)]
     drawn = [
-        CurvePanel(
+        papers.CurvePanel(
             "horizon [s]",
             "error [%]",
             {
@@ -263,9 +262,13 @@ def add_caution(page: Page, settings: Mapping[str, Setting], fits: Fits) -> list
         )
         for name in plants
     ]
-    page.picture("caution", "Reconstruction and prediction from unseen starts", partial(save, draw_panels(drawn)))
+    page.picture(
+        "caution",
+        "Reconstruction and prediction from unseen starts",
+        partial(km.plot.save, papers.draw_panels(drawn)),
+    )
     return [
-        judge_claim(
+        papers.judge_claim(
             "Gonzalez et al. 2021",
             "a model may rebuild a trajectory and miss the system",
             holds=bool(missed),
@@ -279,10 +282,10 @@ def add_caution(page: Page, settings: Mapping[str, Setting], fits: Fits) -> list
 def measure_by_horizon(setting: Setting, fit: Reconstruction, horizons: Sequence[float]) -> list[tuple[float, float]]:
     """Return the relative errors over the first h seconds: of the fitted trajectory, and the median of the held-out."""
 
-    def errors(data: Episodes) -> np.ndarray:
+    def errors(data: km.Episodes) -> np.ndarray:
         pairs = [(predict_episode(fit.model, e), e.X) for e in data]
         ends = [round(h / setting.dt) + 1 for h in horizons]
-        return np.array([[relative_error(X[:end], truth[:end]) for end in ends] for X, truth in pairs])
+        return np.array([[papers.relative_error(X[:end], truth[:end]) for end in ends] for X, truth in pairs])
 
     own, new = errors(setting.trajectory)[0], np.median(errors(setting.held_out), axis=0)
     return [(float(a), float(b)) for a, b in zip(own, new, strict=True)]

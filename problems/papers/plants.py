@@ -14,19 +14,13 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.special import ellipk
 
-from koopmpc import checks
-from koopmpc.control.lqr import lqr
-from koopmpc.control.riccati import Gain
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.interrupts import raise_swallowed
-from koopmpc.plants.dynamics import RK4, Dynamics, build_right_side
-from koopmpc.plants.step_map import StepMap
+import koopmpc as km
 
 SUBSTEPS = 8  # RK4 steps in a sample; in a sample of 0.01 s the error is below 1e-12
 
 
 @dataclass(frozen=True)
-class Pendulum(Dynamics):
+class Pendulum(km.Dynamics):
     """θ̈ = ∓(g/L) sin θ + u / (m L²); θ = 0 is hanging, or upright if `upright`."""
 
     states = ("theta [rad]", "omega [rad/s]")
@@ -44,7 +38,7 @@ class Pendulum(Dynamics):
 
 
 @dataclass(frozen=True)
-class CartPole(Dynamics):
+class CartPole(km.Dynamics):
     """(M + m sin²θ) v̇ = u − d v + m sin θ (L ω² + g cos θ),  L ω̇ = −v̇ cos θ − g sin θ; θ = π is upright."""
 
     states = ("position [m]", "velocity [m/s]", "theta [rad]", "omega [rad/s]")
@@ -64,12 +58,17 @@ class CartPole(Dynamics):
         return ca.vertcat(x[1], acceleration, x[3], -(acceleration * C + self.g * S) / self.L)
 
 
-@raise_swallowed()
+def build_right_side(dynamics: km.Dynamics) -> ca.Function:
+    """Return f of ẋ = f(x, u) as a CasADi function of x (nx) and u (nu)."""
+    x, u = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
+    return ca.Function("f", [x, u], [dynamics.rhs(x, u)])
+
+
 def linearize_exactly(
-    dynamics: Dynamics, x: ArrayLike
+    dynamics: km.Dynamics, x: ArrayLike
 ) -> tuple[Float[np.ndarray, "nx nx"], Float[np.ndarray, "nx nu"]]:
     """Return the exact A = ∂f/∂x and B = ∂f/∂u of ẋ = f(x, u) at (x, 0)."""
-    point = checks.array(x, "x", (dynamics.nx,))
+    point = np.asarray(x, dtype=float)
     f = build_right_side(dynamics)
     a, b = ca.SX.sym("x", dynamics.nx), ca.SX.sym("u", dynamics.nu)
     value = f(a, b)
@@ -78,16 +77,16 @@ def linearize_exactly(
     return np.array(ca.DM(A).full()), np.array(ca.DM(B).full())
 
 
-def design_feedback(dynamics: Dynamics, x: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Gain:
+def design_feedback(dynamics: km.Dynamics, x: ArrayLike, Q: ArrayLike, R: ArrayLike) -> km.control.Gain:
     """Return the continuous-time LQR of the linearisation at (x, 0)."""
-    return lqr(*linearize_exactly(dynamics, x), Q, R)
+    return km.lqr(*linearize_exactly(dynamics, x), Q, R)
 
 
-def design_printed_feedback(plant: CartPole, Q: ArrayLike, R: ArrayLike) -> Gain:
+def design_printed_feedback(plant: CartPole, Q: ArrayLike, R: ArrayLike) -> km.control.Gain:
     """Return the LQR of the Jacobian as the databook prints it, with the wrong sign of ∂v̇/∂θ at θ = π."""
     A, B = linearize_exactly(plant, [0.0, 0.0, np.pi, 0.0])
     A[1, 2] = -A[1, 2]
-    return lqr(A, B, Q, R)
+    return km.lqr(A, B, Q, R)
 
 
 def swing_frequency(plant: Pendulum, amplitude: float) -> float:
@@ -99,9 +98,8 @@ def swing_frequency(plant: Pendulum, amplitude: float) -> float:
     return float(np.pi / 2 * np.sqrt(plant.g / plant.L)) / quarter
 
 
-@raise_swallowed()
 def integrate_trajectories(
-    dynamics: Dynamics,
+    dynamics: km.Dynamics,
     starts: ArrayLike,
     *,
     dt: float,
@@ -109,7 +107,7 @@ def integrate_trajectories(
     K: ArrayLike | None = None,
     x_ref: ArrayLike = 0.0,
     held: bool = False,
-) -> Episodes:
+) -> km.Episodes:
     """Return x(k dt), k = 0 … steps, of ẋ = f(x, −K (x − x_ref)) from each start, without the inputs.
 
     Parameters
@@ -126,24 +124,24 @@ def integrate_trajectories(
         True: u = −K (x_k − x_ref) is held over a sample. False: the feedback is continuous.
     """
     nx, nu = dynamics.nx, dynamics.nu
-    rows = np.atleast_2d(checks.array(starts, "starts"))
-    target = checks.vector(x_ref, "x_ref", nx)
-    matrix = np.zeros((nu, nx)) if K is None else checks.array(K, "K").reshape(nu, nx)
+    rows = np.atleast_2d(np.asarray(starts, dtype=float))
+    target = np.broadcast_to(np.asarray(x_ref, dtype=float), (nx,))
+    matrix = np.zeros((nu, nx)) if K is None else np.asarray(K, dtype=float).reshape(nu, nx)
     x, u, none = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("none", 0)
     law = -ca.DM(matrix) @ (x - ca.DM(target))
     f = build_right_side(dynamics)
-    F = RK4(SUBSTEPS).step(f if held else ca.Function("f", [x, u], [f(x, law)]), dt)
+    F = km.RK4(SUBSTEPS).step(f if held else ca.Function("f", [x, u], [f(x, law)]), dt)
     sampled = ca.Function("F", [x, none], [F(x, law)])
-    X = StepMap(sampled, dt, states=dynamics.states, inputs=()).rollouts(rows, np.empty((len(rows), steps, 0)))
-    return Episodes([Episode(X=rows) for rows in X], dt, dynamics.states)
+    X = km.StepMap(sampled, dt, states=dynamics.states, inputs=()).rollouts(rows, np.empty((len(rows), steps, 0)))
+    return km.Episodes([km.Episode(X=rows) for rows in X], dt, dynamics.states)
 
 
-def attach_inputs(data: Episodes, names: tuple[str, ...], K: ArrayLike, x_ref: ArrayLike = 0.0) -> Episodes:
+def attach_inputs(data: km.Episodes, names: tuple[str, ...], K: ArrayLike, x_ref: ArrayLike = 0.0) -> km.Episodes:
     """Return the episodes with the inputs u_k = −K (x_k − x_ref) that drove them."""
-    matrix = checks.array(K, "K").reshape(len(names), data.nx)
-    target = checks.vector(x_ref, "x_ref", data.nx)
-    episodes = [Episode(X=e.X, U=-(e.X[:-1] - target) @ matrix.T) for e in data]
-    return Episodes(episodes, data.dt, data.states, names)
+    matrix = np.asarray(K, dtype=float).reshape(len(names), data.nx)
+    target = np.broadcast_to(np.asarray(x_ref, dtype=float), (data.nx,))
+    episodes = [km.Episode(X=e.X, U=-(e.X[:-1] - target) @ matrix.T) for e in data]
+    return km.Episodes(episodes, data.dt, data.states, names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +158,8 @@ class ClosedLoop:
         return float(self.J[-1])
 
 
-@raise_swallowed()
 def integrate_closed_loop(
-    dynamics: Dynamics,
+    dynamics: km.Dynamics,
     law: Callable[[ca.SX], ca.SX],
     stage: Callable[[ca.SX, ca.SX], ca.SX],
     x0: ArrayLike,
@@ -189,8 +186,8 @@ def integrate_closed_loop(
     x, none = ca.SX.sym("x", nx + 1), ca.SX.sym("none", 0)
     u = ca.SX(ca.vertcat(law(x[:nx])))
     rate = ca.vertcat(build_right_side(dynamics)(x[:nx], u), stage(x[:nx], u))
-    F = RK4(SUBSTEPS).step(ca.Function("f", [x, none], [rate]), dt)
-    step_map = StepMap(F, dt, states=(*dynamics.states, "J"), inputs=())
-    XJ = step_map.rollout([*checks.array(x0, "x0", (nx,)), 0.0], np.empty((round(seconds / dt), 0)))
+    F = km.RK4(SUBSTEPS).step(ca.Function("f", [x, none], [rate]), dt)
+    step_map = km.StepMap(F, dt, states=(*dynamics.states, "J"), inputs=())
+    XJ = step_map.rollout([*np.asarray(x0, dtype=float), 0.0], np.empty((round(seconds / dt), 0)))
     U = np.array(ca.Function("u", [x], [u]).map(len(XJ))(XJ.T)).T
     return ClosedLoop(XJ[:, :nx], U, XJ[:, nx])

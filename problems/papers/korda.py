@@ -29,32 +29,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import expm
 
-from koopmpc.bench.problem import load_problem
-from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Limits
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC, LinearMPC
-from koopmpc.control.move import Status
-from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import hide_fit_warnings
-from koopmpc.identify.fits.edmd import edmd
-from koopmpc.lifting.radial import ThinPlate
-from koopmpc.lifting.state import Expressions, State
-from koopmpc.loop.metrics import metrics
-from koopmpc.loop.simulate import simulate
-from koopmpc.page import Page
-from koopmpc.papers.registry import (
-    Claim,
-    TellPart,
-    compare_value,
-    draw_curves,
-    judge_claim,
-    make_paper,
-    percent,
-    relative_error,
-)
-from koopmpc.plants.step_map import StepMap, discretize
-from koopmpc.predict.predictors import LinearPredictor
+import koopmpc as km
+from koopmpc import papers
 
 DT = 0.01  # sample time of all three plants [s]
 STEPS = 300  # steps of the predictions of Van der Pol and of the closed loops of the motor
@@ -70,7 +46,7 @@ LIMIT = 0.4  # limit on |y| of the motor in the case cosine
 K = np.arange(STEPS + 1)
 STEP = np.where(K <= 150, -0.3, 0.3)  # reference of the motor in the case step
 COSINE = 0.5 * np.cos(2 * np.pi * K / STEPS)  # reference of the motor in the case cosine
-SOLVED = (Status.UNCONSTRAINED, Status.OPTIMAL)
+SOLVED = (km.Status.UNCONSTRAINED, km.Status.OPTIMAL)
 
 POINTS = 128  # points on the ring of Korteweg–de Vries
 SECONDS = 50.0  # length of its closed loop [s]
@@ -82,7 +58,7 @@ SHAPES = np.stack([np.exp(-((PLACE - np.pi / 2) ** 2)), -(np.sin(PLACE / 2) ** 2
 LEVELS = (0.5, 0.0, 0.75)  # references of the mean from t = 0, T/4 and 2T/3 on
 
 
-def reproduce_korda(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_korda(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Reproduce the three examples."""
     return [
         claim
@@ -91,27 +67,27 @@ def reproduce_korda(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     ]
 
 
-def reproduce_van_der_pol(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_van_der_pol(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Predict 3 s from 100 starts with thin plates, with local linearisations, and with Carleman's."""
     progress("Van der Pol: linear predictors")
-    plant = discretize(load_problem("van_der_pol").dynamics, DT)
+    plant = km.discretize(km.load_problem("van_der_pol").dynamics, DT)
     starts = np.random.default_rng(100).uniform(-1, 1, (STARTS, 2))
     truth = plant.rollouts(starts, np.tile(SQUARE, (STARTS, 1, 1)))
     seeds = 2 if quick else 5
     errors = np.empty((seeds, len(SIZES)))
-    model: LinearPredictor | None = None
+    model: km.LinearPredictor | None = None
     for seed in range(seeds):
         data = _collect_data(plant, np.random.default_rng(seed), 100 if quick else 1000, 200)
         centers = np.random.default_rng(1000 + seed).uniform(-1, 1, (SIZES[-1], 2))
         for j, size in enumerate(SIZES):
-            with hide_fit_warnings():
-                model = edmd(data, State() + ThinPlate(centers[:size]))
+            with km.errors.hide_fit_warnings():
+                model = km.edmd(data, km.State() + km.ThinPlate(centers[:size]))
             errors[seed, j] = _mean_error(model, truth)
     assert model is not None
-    at_rest = LinearPredictor.local(plant, [0, 0], [0])
-    local = [LinearPredictor.local(plant, x[0], [0]).rollout(x[0], SQUARE) for x in truth]
+    at_rest = km.LinearPredictor.local(plant, [0, 0], [0])
+    local = [km.LinearPredictor.local(plant, x[0], [0]).rollout(x[0], SQUARE) for x in truth]
     other = {
-        "linearisation at x₀": float(np.mean([relative_error(X, x) for X, x in zip(local, truth, strict=True)])),
+        "linearisation at x₀": float(np.mean([papers.relative_error(X, x) for X, x in zip(local, truth, strict=True)])),
         "linearisation at 0": _mean_error(at_rest, truth),
         **{f"Carleman, degree {degree}": _mean_error(linearise_carleman(plant, degree), truth) for degree in DEGREES},
     }
@@ -136,25 +112,25 @@ def reproduce_van_der_pol(page: Page, quick: bool, progress: TellPart) -> list[C
         "linearisation at x₀": _cut_far(local[at]),
         "linearisation at 0": _cut_far(at_rest.rollout(starts[at], SQUARE)),
     }
-    draw_curves(page, "van-der-pol", "Van der Pol: predictions from one start", DT, ("x₁", "x₂"), curves)
+    papers.draw_curves(page, "van-der-pol", "Van der Pol: predictions from one start", DT, ("x₁", "x₂"), curves)
     mean = 100 * errors.mean(axis=0)
     least = min(other.values())
     return [
-        judge_claim(
+        papers.judge_claim(
             "Van der Pol, N = 100",
             "24.4 % (15 to 45 % over draws of the data)",
             holds=15 <= mean[-1] <= 45,
             why=f"{mean[-1]:.1f} %",
             required=True,
         ),
-        judge_claim(
+        papers.judge_claim(
             "Van der Pol, trend",
             "the error falls from N = 5 to N = 100, from 66.5 to 24.4 %",
             holds=bool(mean[-1] < 0.6 * mean[0] and (np.diff(mean) < 5).all()),
             why=", ".join(f"{value:.0f}" for value in mean) + " %",
             required=True,
         ),
-        judge_claim(
+        papers.judge_claim(
             "Van der Pol, comparison",
             "linearisations at x₀ and 0 and Carleman's are off by hundreds of % and more",
             holds=100 * least > 300,
@@ -164,7 +140,7 @@ def reproduce_van_der_pol(page: Page, quick: bool, progress: TellPart) -> list[C
     ]
 
 
-def linearise_carleman(plant: StepMap, degree: int) -> LinearPredictor:
+def linearise_carleman(plant: km.StepMap, degree: int) -> km.LinearPredictor:
     """Return Carleman's linearisation of ẋ₁ = 2x₂, ẋ₂ = −.8x₁ + 2x₂ − 10x₁²x₂ + u on all monomials to `degree`."""
     powers = [(i, n - i) for n in range(1, degree + 1) for i in range(n, -1, -1)]
     place = {power: k for k, power in enumerate(powers)}
@@ -181,23 +157,25 @@ def linearise_carleman(plant: StepMap, degree: int) -> LinearPredictor:
     B[place[0, 1]] = 1.0
     both = expm(DT * np.block([[A, B], [np.zeros((1, len(powers) + 1))]]))
     names = [f"{i},{j}" for i, j in powers[2:]]
-    lifting = State() + Expressions(lambda x: [x[0] ** i * x[1] ** j for i, j in powers[2:]], names)
+    lifting = km.State() + km.Expressions(lambda x: [x[0] ** i * x[1] ** j for i, j in powers[2:]], names)
     assert len(powers) == comb(degree + 2, 2) - 1
     C = np.eye(2, len(powers))
-    return LinearPredictor(both[:-1, :-1], both[:-1, -1:], C, lifting, DT, plant.states, plant.inputs)
+    return km.LinearPredictor(both[:-1, :-1], both[:-1, -1:], C, lifting, DT, plant.states, plant.inputs)
 
 
-def _collect_data(plant: StepMap, rng: np.random.Generator, episodes: int, steps: int, first: int = 0) -> Episodes:
+def _collect_data(
+    plant: km.StepMap, rng: np.random.Generator, episodes: int, steps: int, first: int = 0
+) -> km.Episodes:
     """Return trajectories under inputs in ±1 from starts in [−1, 1]²; they keep the states from index `first` on."""
     U = rng.uniform(-1, 1, (episodes, steps, 1))
     X = plant.rollouts(rng.uniform(-1, 1, (episodes, 2)), U)
-    parts = [Episode(X=x[:, first:], U=u) for x, u in zip(X, U, strict=True)]
-    return Episodes(parts, DT, plant.states[first:], plant.inputs)
+    parts = [km.Episode(X=x[:, first:], U=u) for x, u in zip(X, U, strict=True)]
+    return km.Episodes(parts, DT, plant.states[first:], plant.inputs)
 
 
-def _mean_error(model: LinearPredictor, truth: Float[np.ndarray, "E T1 2"]) -> float:
+def _mean_error(model: km.LinearPredictor, truth: Float[np.ndarray, "E T1 2"]) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.mean([relative_error(model.rollout(x[0], SQUARE), x) for x in truth]))
+        return float(np.mean([papers.relative_error(model.rollout(x[0], SQUARE), x) for x in truth]))
 
 
 def _cut_far(X: Float[np.ndarray, "T1 2"]) -> Float[np.ndarray, "T1 2"]:
@@ -207,7 +185,7 @@ def _cut_far(X: Float[np.ndarray, "T1 2"]) -> Float[np.ndarray, "T1 2"]:
 
 
 def _format_large(error: float) -> str:
-    return f"{100 * error:.2g}" if error > 10 else percent(error)
+    return f"{100 * error:.2g}" if error > 10 else papers.percent(error)
 
 
 class Loop(NamedTuple):
@@ -216,7 +194,7 @@ class Loop(NamedTuple):
     y: Float[np.ndarray, " T"]
     u: Float[np.ndarray, " T"]
     cost: float
-    statuses: list[Status]
+    statuses: list[km.Status]
     time: float
 
     @property
@@ -225,20 +203,20 @@ class Loop(NamedTuple):
         return sum(status in SOLVED for status in self.statuses)
 
 
-def reproduce_motor(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_motor(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Follow a step and a cosine with lifted models of several draws of data, and with local linearisations."""
     progress("motor: models")
-    plant = discretize(load_problem("bilinear_motor").dynamics, DT)
+    plant = km.discretize(km.load_problem("bilinear_motor").dynamics, DT)
     seeds, episodes = (1, 50) if quick else (3, 200)
     models = [_fit_motor(plant, seed, episodes) for seed in range(seeds)]
     progress("motor: closed loops")
-    free = Limits(u_min=-1, u_max=1)
-    cost = Cost(Q=1.0, R=0.01, tail=0, u_target="zero")
-    on_speed = Cost(Q=1.0, R=0.01, tail=0, of=State("speed"), u_target="zero")
-    narrow = Limits(u_min=-1, u_max=1, x_min=[-LIMIT], x_max=[LIMIT], slack=None)
-    wide = Limits(u_min=-1, u_max=1, x_min=[-np.inf, -LIMIT], x_max=[np.inf, LIMIT], slack=None)
-    steps = [run_loop(plant, KoopmanMPC(m, cost, free, HORIZON), [0.0, 0.6], STEP) for m in models]
-    turns = [run_loop(plant, KoopmanMPC(m, cost, narrow, HORIZON), [-0.1, 0.1], COSINE) for m in models]
+    free = km.Limits(u_min=-1, u_max=1)
+    cost = km.Cost(Q=1.0, R=0.01, tail=0, u_target="zero")
+    on_speed = km.Cost(Q=1.0, R=0.01, tail=0, of=km.State("speed"), u_target="zero")
+    narrow = km.Limits(u_min=-1, u_max=1, x_min=[-LIMIT], x_max=[LIMIT], slack=None)
+    wide = km.Limits(u_min=-1, u_max=1, x_min=[-np.inf, -LIMIT], x_max=[np.inf, LIMIT], slack=None)
+    steps = [run_loop(plant, km.KoopmanMPC(m, cost, free, HORIZON), [0.0, 0.6], STEP) for m in models]
+    turns = [run_loop(plant, km.KoopmanMPC(m, cost, narrow, HORIZON), [-0.1, 0.1], COSINE) for m in models]
     local_step = run_loop(plant, make_local_mpc(plant, [0.0, 0.6], on_speed, free), [0.0, 0.6], STEP)
     local_turn = run_loop(plant, make_local_mpc(plant, [-0.1, 0.1], on_speed, wide), [-0.1, 0.1], COSINE)
     lost = next((k for k, status in enumerate(local_turn.statuses) if status not in SOLVED), None)
@@ -276,12 +254,12 @@ def reproduce_motor(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
             "Koopman MPC": np.column_stack([lifted.y, lifted.u]),
             "local MPC": np.column_stack([other.y, other.u]),
         }
-        draw_curves(page, name, caption, DT, ("speed y", "field u"), curves)
+        papers.draw_curves(page, name, caption, DT, ("speed y", "field u"), curves)
     totals = [one.cost for one in steps]
     spread = f"{min(totals):.3f} to {max(totals):.3f}" if seeds > 1 else f"{totals[0]:.3f}"
     widest, worst = max(float(np.abs(one.y).max()) for one in turns), min(one.kept_limits for one in turns)
     return [
-        judge_claim(
+        papers.judge_claim(
             "motor, step: cost",
             "3.31 to 3.34",
             holds=min(totals) >= 3.305 and max(totals) <= 3.345,
@@ -289,19 +267,21 @@ def reproduce_motor(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
             why=spread,
             required=True,
         ),
-        compare_value("motor, step: cost of the local MPC", 3.318, local_step.cost, 0.005, digits=4),
-        judge_claim(
+        papers.compare_value("motor, step: cost of the local MPC", 3.318, local_step.cost, 0.005, digits=4),
+        papers.judge_claim(
             "motor, cosine: solved",
             "all 300 of 300 steps",
             holds=worst == STEPS,
             why=f"{worst} of {STEPS}",
             required=True,
         ),
-        judge_claim(
+        papers.judge_claim(
             "motor, cosine: |y|", "never beyond 0.41", holds=widest <= 0.41, why=f"{widest:.4f}", required=True
         ),
-        compare_value("motor, cosine: cost", 2.36, float(np.mean([one.cost for one in turns])), 0.05 * 2.36, digits=3),
-        judge_claim(
+        papers.compare_value(
+            "motor, cosine: cost", 2.36, float(np.mean([one.cost for one in turns])), 0.05 * 2.36, digits=3
+        ),
+        papers.judge_claim(
             "motor, cosine: local MPC",
             "infeasible at about 0.2 s",
             holds=lost is not None and 0.1 <= (lost + 1) * DT <= 0.3,
@@ -309,7 +289,7 @@ def reproduce_motor(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
             why="never" if lost is None else f"at {(lost + 1) * DT:.2f} s",
             required=True,
         ),
-        judge_claim(
+        papers.judge_claim(
             "motor: time of a step",
             "6.86 ms, local MPC 103 ms",
             holds=steps[0].time < 6.86e-3 and steps[0].time < local_step.time,
@@ -318,28 +298,30 @@ def reproduce_motor(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     ]
 
 
-def make_local_mpc(plant: StepMap, x: list[float], cost: Cost, limits: Limits) -> LinearMPC:
+def make_local_mpc(plant: km.StepMap, x: list[float], cost: km.Cost, limits: km.Limits) -> km.LinearMPC:
     """Return an MPC with the motor's horizon; `run_loop` linearises it at every step."""
-    return LinearMPC(plant, x, [0.0], cost, limits, HORIZON)
+    return km.LinearMPC(plant, x, [0.0], cost, limits, HORIZON)
 
 
-def run_loop(plant: StepMap, controller: KoopmanMPC, x0: list[float], reference: Float[np.ndarray, " T1"]) -> Loop:
+def run_loop(
+    plant: km.StepMap, controller: km.KoopmanMPC, x0: list[float], reference: Float[np.ndarray, " T1"]
+) -> Loop:
     """Run 300 steps after one with u = 0, which fills the delay; the reference is constant over the horizon.
 
     A `LinearMPC` measures both states and is linearised at every step.
     """
-    local = isinstance(controller, LinearMPC)
+    local = isinstance(controller, km.LinearMPC)
     controller.reset(u_prev=[0.0])
     x, u = np.array(x0), np.zeros(1)
     if not local:
         controller(x[1:], reference[:1])
     x = plant(x, u)
-    Y, U, statuses, times = np.empty(STEPS), np.empty(STEPS), list[Status](), list[float]()
+    Y, U, statuses, times = np.empty(STEPS), np.empty(STEPS), list[km.Status](), list[float]()
     for k in range(STEPS):
         update_time = 0.0
         if local:
             start = perf_counter()
-            controller.update(LinearPredictor.local(plant, x, u))
+            controller.update(km.LinearPredictor.local(plant, x, u))
             update_time = perf_counter() - start
         move = controller(x if local else x[1:], reference[k + 1 : k + 2], applied=u)
         u = move.u
@@ -351,30 +333,30 @@ def run_loop(plant: StepMap, controller: KoopmanMPC, x0: list[float], reference:
     return Loop(Y, U, cost, statuses, float(np.median(times)))
 
 
-def _fit_motor(plant: StepMap, seed: int, episodes: int) -> LinearPredictor:
+def _fit_motor(plant: km.StepMap, seed: int, episodes: int) -> km.LinearPredictor:
     """Fit thin plates on ζ = [y_k, u_k₋₁, y_k₋₁] to the speed and the input."""
     rng = np.random.default_rng(seed)
     data = _collect_data(plant, rng, episodes, 1000, first=1)
-    with hide_fit_warnings():
-        return edmd(data, State() + ThinPlate(rng.uniform(-1, 1, (100, 3))), embedding=Delay(1))
+    with km.errors.hide_fit_warnings():
+        return km.edmd(data, km.State() + km.ThinPlate(rng.uniform(-1, 1, (100, 3))), embedding=km.Delay(1))
 
 
-def reproduce_kdv(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_kdv(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Fit [y, 1, yᵢyᵢ₊₁, y²] to data, and control the mean of the wave to three levels."""
     progress("Korteweg–de Vries: data and model")
-    problem = load_problem("kdv")
-    plant = discretize(problem.dynamics, problem.dt, problem.integrator)
+    problem = km.load_problem("kdv")
+    plant = km.discretize(problem.dynamics, problem.dt, problem.integrator)
     data = _collect_waves(40 if quick else 1000, plant.states, plant.inputs)
-    with hide_fit_warnings():
-        model = edmd(data, problem.lifting, ridge=1e-9)
+    with km.errors.hide_fit_warnings():
+        model = km.edmd(data, problem.lifting, ridge=1e-9)
     progress("Korteweg–de Vries: closed loop")
     steps = round((5.0 if quick else SECONDS) / DT)
     rows = np.searchsorted([1 / 4, 2 / 3], np.arange(steps + 1) / steps, side="right")
     reference = np.tile(np.array(LEVELS)[rows, None], (1, POINTS))
-    cost = Cost(Q=np.ones(POINTS), R=np.zeros(3), tail=0, u_target="zero")
-    mpc = KoopmanMPC(model, cost, problem.limits, WAVE_HORIZON)
-    run = simulate(plant, mpc, x0=SHAPES.mean(axis=0), reference=reference, steps=steps, preview=False, cost=cost)
-    seen = metrics(run)
+    cost = km.Cost(Q=np.ones(POINTS), R=np.zeros(3), tail=0, u_target="zero")
+    mpc = km.KoopmanMPC(model, cost, problem.limits, WAVE_HORIZON)
+    run = km.simulate(plant, mpc, x0=SHAPES.mean(axis=0), reference=reference, steps=steps, preview=False, cost=cost)
+    seen = km.metrics(run)
     mean, asked = run.X.mean(axis=1), reference[:, 0]
     bend = run.X.std(axis=1)
     late = [int(k) - 1 for k in np.flatnonzero(np.diff(rows))] + [steps]  # the last moment of each level
@@ -392,21 +374,21 @@ def reproduce_kdv(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     none = np.full((steps + 1, 4), np.nan)
     curves = {"reference": np.column_stack([asked, none]), "Koopman MPC": np.column_stack([mean, bend, held])}
     columns = ("mean of y", "standard deviation of y", *(f"u, {name.split(' [')[0]}" for name in plant.inputs))
-    draw_curves(page, "kdv", "Korteweg–de Vries: three levels of the mean", DT, columns, curves)
-    limited = np.array([status is not Status.UNCONSTRAINED for status in run.status])
+    papers.draw_curves(page, "kdv", "Korteweg–de Vries: three levels of the mean", DT, columns, curves)
+    limited = np.array([status is not km.Status.UNCONSTRAINED for status in run.status])
     time, busy = 1e3 * seen.solve_time_p50, 1e3 * float(np.median(run.solve_time[limited]))
     return [
-        judge_claim(
+        papers.judge_claim(
             "KdV: levels",
             "the mean follows .5, 0 and .75",
             holds=max(off) < 0.02,
             why="off by " + ", ".join(f"{value:.4f}" for value in off) + " at the end of each",
             required=not quick,
         ),
-        judge_claim(
+        papers.judge_claim(
             "KdV: forces", "|u| ≤ 1 in all steps", holds=float(np.abs(run.U).max()) <= 1 + 1e-9, why=f"{steps} steps"
         ),
-        judge_claim(
+        papers.judge_claim(
             "KdV: time of a step",
             "0.28 ms",
             holds=max(time, busy) <= 0.28,
@@ -430,14 +412,14 @@ def advance_wave(y: Float[np.ndarray, "E 128"], u: Float[np.ndarray, "E 3"]) -> 
     return np.fft.irfft(half * np.fft.rfft(y), POINTS)
 
 
-def _collect_waves(episodes: int, states: tuple[str, ...], inputs: tuple[str, ...], steps: int = 200) -> Episodes:
+def _collect_waves(episodes: int, states: tuple[str, ...], inputs: tuple[str, ...], steps: int = 200) -> km.Episodes:
     """Return trajectories from mixtures of the three shapes, under random forces that change at every step."""
     rng = np.random.default_rng(0)
     X, U = np.empty((steps + 1, episodes, POINTS)), rng.uniform(-1, 1, (steps, episodes, 3))
     X[0] = rng.dirichlet([1.0, 1.0, 1.0], episodes) @ SHAPES
     for k in range(steps):
         X[k + 1] = advance_wave(X[k], U[k])
-    return Episodes([Episode(X=X[:, e], U=U[:, e]) for e in range(episodes)], DT, states, inputs)
+    return km.Episodes([km.Episode(X=X[:, e], U=U[:, e]) for e in range(episodes)], DT, states, inputs)
 
 
-paper = make_paper("korda", __doc__, reproduce_korda)
+paper = papers.make_paper("korda", __doc__, reproduce_korda)

@@ -8,43 +8,21 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.control.limits import Limits
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
-from koopmpc.control.lqr import LQR
-from koopmpc.control.move import Controller
-from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
-from koopmpc.data.collect import Uniform, collect
-from koopmpc.data.episodes import Episodes
-from koopmpc.data.excitation import Feedback, Noise
-from koopmpc.errors import hide_fit_warnings
-from koopmpc.figures.series import runs as plot_runs
-from koopmpc.figures.style import save
-from koopmpc.identify.fits.dmd import dmd, dmdc
-from koopmpc.identify.fits.edmd import edmd
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.fourier import Fourier
-from koopmpc.lifting.state import Constant, Monomials, State
-from koopmpc.loop.metrics import metrics
-from koopmpc.loop.run import Run
-from koopmpc.loop.simulate import simulate
-from koopmpc.page import Page
-from koopmpc.papers.registry import percent, relative_error
-from koopmpc.papers.snyder_settings import SHAKINGS, TASKS, Excitement, Setting, centre_episodes, design_feedbacks
-from koopmpc.plants.dynamics import RK4
-from koopmpc.plants.step_map import StepMap, discretize
-from koopmpc.predict.predictors import LinearPredictor
+import koopmpc as km
+from koopmpc import papers
+
+from .settings import SHAKINGS, TASKS, Excitement, Setting, centre_episodes, design_feedbacks
 
 ORACLE = "nonlinear MPC"
 _DIVERGED = 1e3  # a closed loop has diverged if its cost is above this many times the best
-Runs = Mapping[str, Mapping[tuple[str, bool], Run]]  # by title of the task, then as `Contest.runs`
+Runs = Mapping[str, Mapping[tuple[str, bool], km.Run]]  # by title of the task, then as `Contest.runs`
 DRAWN = ("LQR, linearisation", "MPC, Fourier 1", "MPC, monomials 3", ORACLE)
 DT = 0.05  # sample time of the controllers [s]
 LASTING = 3.0  # length of an exciting episode [s]
-LIFTINGS: Mapping[str, Lifting] = {
-    "DMDc": State() + Constant(),
-    "Fourier 1": State() + Fourier(1) + Constant(),
-    "monomials 3": State() + Monomials(3) + Constant(),
+LIFTINGS: Mapping[str, km.Lifting] = {
+    "DMDc": km.State() + km.Constant(),
+    "Fourier 1": km.State() + km.Fourier(1) + km.Constant(),
+    "monomials 3": km.State() + km.Monomials(3) + km.Constant(),
 }
 
 INPUTS = """\
@@ -116,30 +94,30 @@ def predict_held_out(setting: Setting, shaking: Excitement, episodes: int) -> di
     episodes
         Number of exciting episodes to fit.
     """
-    plant = discretize(setting.dynamics, setting.dt, RK4(2))
+    plant = km.discretize(setting.dynamics, setting.dt, km.RK4(2))
     K = setting.K
     assert K is not None
     x_ref = np.broadcast_to(setting.x_ref, plant.nx)
-    law = Feedback(K, x_ref=x_ref)
-    one = centre_episodes(collect(plant, setting.x0, law, episodes=1, steps=setting.steps), x_ref)
+    law = km.Feedback(K, x_ref=x_ref)
+    one = centre_episodes(km.collect(plant, setting.x0, law, episodes=1, steps=setting.steps), x_ref)
     steps = round(LASTING / setting.dt)
     rich = centre_episodes(_collect_excited(plant, x_ref, K, shaking, episodes=episodes, steps=steps), x_ref)
-    starts = Uniform(x_ref - shaking.spread, x_ref + shaking.spread)
-    feedback = centre_episodes(collect(plant, starts, law, episodes=10, steps=200, rng=1), x_ref)
+    starts = km.Uniform(x_ref - shaking.spread, x_ref + shaking.spread)
+    feedback = centre_episodes(km.collect(plant, starts, law, episodes=10, steps=200, rng=1), x_ref)
     excited = centre_episodes(_collect_excited(plant, x_ref, K, shaking, episodes=10, steps=200, seed=2), x_ref)
     B = plant.linearize(x_ref, np.zeros(plant.nu)).B
-    with hide_fit_warnings():
+    with km.errors.hide_fit_warnings():
         models = {
-            "DMD, feedback data": dmd(one),
-            "DMDc, feedback data": dmdc(one),
-            "DMDc, exciting data": dmdc(rich),
-            "EDMDc, exciting data": edmd(rich, State() + Fourier(1)),
+            "DMD, feedback data": km.dmd(one),
+            "DMDc, feedback data": km.dmdc(one),
+            "DMDc, exciting data": km.dmdc(rich),
+            "EDMDc, exciting data": km.edmd(rich, km.State() + km.Fourier(1)),
         }
     return {name: _measure_prediction(name, model, feedback, excited, B) for name, model in models.items()}
 
 
 def _measure_prediction(
-    name: str, model: LinearPredictor, feedback: Episodes, excited: Episodes, B: Float[np.ndarray, "nx nu"]
+    name: str, model: km.LinearPredictor, feedback: km.Episodes, excited: km.Episodes, B: Float[np.ndarray, "nx nu"]
 ) -> Prediction:
     """Return the errors of `model` over whole episodes; a model without inputs ignores them.
 
@@ -159,12 +137,12 @@ def _measure_prediction(
     return Prediction(name, _median_error(model, feedback), _median_error(model, excited), share, make_paper)
 
 
-def _median_error(model: LinearPredictor, episodes: Episodes) -> float:
-    errors = [relative_error(model.rollout(e.X[0], e.U[:, : model.nu]), e.X) for e in episodes]
+def _median_error(model: km.LinearPredictor, episodes: km.Episodes) -> float:
+    errors = [papers.relative_error(model.rollout(e.X[0], e.U[:, : model.nu]), e.X) for e in episodes]
     return float(np.median(errors))
 
 
-def add_inputs(page: Page, predicted: Mapping[str, Mapping[str, Prediction]], episodes: int) -> None:
+def add_inputs(page: papers.Page, predicted: Mapping[str, Mapping[str, Prediction]], episodes: int) -> None:
     """Add a table of these predictions; `episodes` is the number of exciting episodes."""
     noise = {name.replace("-", "_"): shaking.noise for name, shaking in SHAKINGS.items()}
     page.text("## Data that show what the input does", INPUTS.format(episodes=episodes, lasting=LASTING, **noise))
@@ -174,8 +152,8 @@ def add_inputs(page: Page, predicted: Mapping[str, Mapping[str, Prediction]], ep
             (
                 plant,
                 p.name,
-                percent(p.feedback),
-                percent(p.excited),
+                papers.percent(p.feedback),
+                papers.percent(p.excited),
                 "–" if np.isnan(p.b) else f"{p.b:.4f}",
                 p.warned,
             )
@@ -202,28 +180,28 @@ class Contest:
     """
 
     title: str
-    plant: StepMap
-    models: Mapping[str, LinearPredictor]
+    plant: km.StepMap
+    models: Mapping[str, km.LinearPredictor]
     steps: int
     horizon: int
 
-    def runs(self) -> "dict[tuple[str, bool], Run]":
+    def runs(self) -> "dict[tuple[str, bool], km.Run]":
         """Return the run of each controller by its name and by whether the inputs are limited.
 
         LQR and, where inputs are limited, MPC run on each model; nonlinear MPC runs on the plant.
         """
         task = TASKS[self.title]
-        local = LinearPredictor.local(self.plant, task.x_eq, np.zeros(self.plant.nu))
-        found: dict[tuple[str, bool], Run] = {}
-        for limits in (None, Limits(u_min=-task.limit, u_max=task.limit)):
-            controllers: dict[str, Controller] = {}
+        local = km.LinearPredictor.local(self.plant, task.x_eq, np.zeros(self.plant.nu))
+        found: dict[tuple[str, bool], km.Run] = {}
+        for limits in (None, km.Limits(u_min=-task.limit, u_max=task.limit)):
+            controllers: dict[str, km.control.Controller] = {}
             for name, model in {"linearisation": local, **self.models}.items():
-                controllers[f"LQR, {name}"] = LQR(model, task.cost, limits or Limits())
+                controllers[f"LQR, {name}"] = km.LQR(model, task.cost, limits or km.Limits())
                 if limits is not None:
-                    controllers[f"MPC, {name}"] = KoopmanMPC(model, task.cost, limits, self.horizon)
-            controllers[ORACLE] = NonlinearMPC(self.plant, task.cost, limits or Limits(), self.horizon)
+                    controllers[f"MPC, {name}"] = km.KoopmanMPC(model, task.cost, limits, self.horizon)
+            controllers[ORACLE] = km.NonlinearMPC(self.plant, task.cost, limits or km.Limits(), self.horizon)
             for name, controller in controllers.items():
-                found[name, limits is not None] = simulate(
+                found[name, limits is not None] = km.simulate(
                     self.plant,
                     controller,
                     x0=task.x0,
@@ -236,9 +214,9 @@ class Contest:
         return found
 
 
-def compute_costs(runs: "Mapping[tuple[str, bool], Run]", limited: bool) -> dict[str, float]:
+def compute_costs(runs: "Mapping[tuple[str, bool], km.Run]", limited: bool) -> dict[str, float]:
     """Return dt Σ (‖x − r‖²_Q + ‖u‖²_R) of each controller; inf if the loop diverged."""
-    totals = {name: run.dt * metrics(run).cost for (name, kind), run in runs.items() if kind is limited}
+    totals = {name: run.dt * km.metrics(run).cost for (name, kind), run in runs.items() if kind is limited}
     best = totals[ORACLE]
     return {name: value if value < _DIVERGED * best else np.inf for name, value in totals.items()}
 
@@ -246,11 +224,11 @@ def compute_costs(runs: "Mapping[tuple[str, bool], Run]", limited: bool) -> dict
 def prepare_contest(title: str, steps: int, horizon: int, episodes: int) -> Contest:
     """Return one of `TASKS` as a contest, with models fitted to `episodes` exciting episodes."""
     task = TASKS[title]
-    plant = discretize(task.dynamics, DT, RK4(4))
+    plant = km.discretize(task.dynamics, DT, km.RK4(4))
     K = None if task.K is None else design_feedbacks()[task.K]
     data = _collect_excited(plant, task.x_eq, K, task.shaking, episodes=episodes, steps=round(LASTING / DT))
-    with hide_fit_warnings():
-        models = {name: edmd(data, lifting) for name, lifting in LIFTINGS.items()}
+    with km.errors.hide_fit_warnings():
+        models = {name: km.edmd(data, lifting) for name, lifting in LIFTINGS.items()}
     return Contest(title, plant, models, steps, horizon)
 
 
@@ -265,7 +243,7 @@ def compute_ratios(runs: Runs) -> dict[str, dict[str, float]]:
     return result
 
 
-def add_loops(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: int) -> None:
+def add_loops(page: papers.Page, tasks: Mapping[str, Contest], runs: Runs, episodes: int) -> None:
     """Add a table of the closed-loop costs with and without limits, the lessons, and a figure for each plant.
 
     Parameters
@@ -314,7 +292,7 @@ def add_loops(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: in
             if title.startswith(plant)
         }
         caption = f"{plant.capitalize()}: closed loops with limited inputs"
-        page.picture(f"control-{plant}", caption, partial(save, plot_runs(shown)))
+        page.picture(f"control-{plant}", caption, partial(km.plot.save, km.plot.runs(shown)))
         for title, each in shown.items():
             first = next(iter(each.values()))
             values = {name: np.hstack([run.X[:-1], run.U]) for name, run in each.items()}
@@ -322,7 +300,7 @@ def add_loops(page: Page, tasks: Mapping[str, Contest], runs: Runs, episodes: in
 
 
 def _collect_excited(
-    plant: StepMap,
+    plant: km.StepMap,
     x_ref: ArrayLike,
     K: Float[np.ndarray, "nu nx"] | None,
     shaking: Excitement,
@@ -330,13 +308,13 @@ def _collect_excited(
     episodes: int,
     steps: int,
     seed: int = 0,
-) -> Episodes:
+) -> km.Episodes:
     """Collect episodes that start in x_ref ± spread under noise, on top of the feedback if K is given."""
-    middle = checks.vector(x_ref, "x_ref", plant.nx)
-    shaken = Noise(-shaking.noise, shaking.noise, hold=max(1, round(0.05 / plant.dt)))
-    excitation = shaken if K is None else Feedback(K, shaken, x_ref=middle)
-    starts = Uniform(middle - shaking.spread, middle + shaking.spread)
-    return collect(plant, starts, excitation, episodes=episodes, steps=steps, rng=seed)
+    middle = np.broadcast_to(np.asarray(x_ref, dtype=float), (plant.nx,))
+    shaken = km.Noise(-shaking.noise, shaking.noise, hold=max(1, round(0.05 / plant.dt)))
+    excitation = shaken if K is None else km.Feedback(K, shaken, x_ref=middle)
+    starts = km.Uniform(middle - shaking.spread, middle + shaking.spread)
+    return km.collect(plant, starts, excitation, episodes=episodes, steps=steps, rng=seed)
 
 
 def _format_cost(value: float, best: float) -> str:

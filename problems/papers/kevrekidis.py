@@ -7,26 +7,10 @@ from time import perf_counter
 import casadi as ca
 import numpy as np
 
-from koopmpc.bench.problem import load_problem
-from koopmpc.data.collect import Uniform, collect
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.excitation import Noise
-from koopmpc.errors import hide_fit_warnings
-from koopmpc.figures.eigenvalues import eigenfunction_maps
-from koopmpc.figures.reports import CurvePanel, draw_panels
-from koopmpc.figures.style import save
-from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.fits.kernel import kernel_edmd
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.radial import Gaussian
-from koopmpc.lifting.state import Constant, Monomials, State
-from koopmpc.page import Page
-from koopmpc.papers.registry import Claim, TellPart, judge_claim, make_paper, percent
-from koopmpc.plants.dynamics import RK4, Dynamics
-from koopmpc.plants.step_map import discretize
-from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.synthesis.train import train
-from koopmpc.validate.scoring import score
+import koopmpc as km
+from koopmpc import papers
+
+percent = papers.percent
 
 A = np.array([[0.9, -0.04], [0.0, 0.8]])
 W = np.array([[1.0, -0.4], [0.0, 1.0]])  # rows are the left eigenvectors of A
@@ -38,7 +22,7 @@ LANDMARKS = (25, 50, 100, 200, 400)  # numbers of landmarks
 KERNEL_GAP = 1e-8  # eigenvalues of the kernel and of all monomials may differ by this
 
 
-def reproduce_williams(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_williams(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Williams et al. 2015: EDMD finds eigenvalues and eigenfunctions.
 
     M. Williams, I. Kevrekidis and C. Rowley, *A Data-Driven Approximation of the Koopman Operator: Extending
@@ -50,7 +34,7 @@ def reproduce_williams(page: Page, quick: bool, progress: TellPart) -> list[Clai
     their successors.
     """
     progress("EDMD")
-    model = edmd(_make_pairs(A, SAMPLES), _monomials(DEGREE))
+    model = km.edmd(_make_pairs(A, SAMPLES), _monomials(DEGREE))
     exact = np.array([0.9**i * 0.8**j for i, j in POWERS])
     order = [int(np.abs(model.eigenvalues - value).argmin()) for value in exact]
     found = model.eigenvalues[order]
@@ -70,20 +54,23 @@ def reproduce_williams(page: Page, quick: bool, progress: TellPart) -> list[Clai
     page.picture(
         "eigenfunctions",
         "Eigenfunctions of λ = .9, .8 and .72",
-        partial(save, eigenfunction_maps(model, [order[k] for k in (1, 2, 4)], (0, 1), ((-2.0, 2.0), (-2.0, 2.0)))),
+        partial(
+            km.plot.save,
+            km.plot.eigenfunction_maps(model, [order[k] for k in (1, 2, 4)], (0, 1), ((-2.0, 2.0), (-2.0, 2.0))),
+        ),
     )
     steps = np.arange(31)[:, None]
     curves = {"EDMD": (np.real(found) ** steps), "exact": exact**steps}
     page.curve("Powers of the eigenvalues", 1.0, [f"λ {i},{j}" for i, j in POWERS], curves)
     return [
-        judge_claim(
+        papers.judge_claim(
             "eigenvalues",
             "all 15 are .9ⁱ·.8ʲ, ± 1e-10",
             holds=gap <= 1e-10 and len(set(order)) == len(POWERS),
             why=f"farthest off by {gap:.0e}",
             required=True,
         ),
-        judge_claim(
+        papers.judge_claim(
             "eigenfunctions",
             "(w₁ᵀx)ⁱ (w₂ᵀx)ʲ, ± 1e-9 (ours)",
             holds=farthest <= 1e-9,
@@ -99,10 +86,10 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.linalg.norm(a - np.vdot(b, a) * b))
 
 
-edmd_paper = make_paper("williams", reproduce_williams.__doc__, reproduce_williams, samples=SAMPLES)
+edmd_paper = papers.make_paper("williams", reproduce_williams.__doc__, reproduce_williams, samples=SAMPLES)
 
 
-def reproduce_kernel(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_kernel(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Williams, Rowley & Kevrekidis 2015: kernel EDMD, and Nyström's approximation for many samples.
 
     M. Williams, C. Rowley and I. Kevrekidis, *A Kernel-Based Method for Data-Driven Koopman Spectral Analysis*, J.
@@ -122,31 +109,33 @@ def reproduce_kernel(page: Page, quick: bool, progress: TellPart) -> list[Claim]
     return claims + _measure_landmarks(page)
 
 
-def _collect_sampled_duffing(episodes: int, steps: int, seed: int = 0) -> Episodes:
-    plant = discretize(load_problem("duffing").dynamics, 0.1, RK4(4))
-    data = collect(plant, Uniform([-2.0, -2.0], [2.0, 2.0]), Noise(0.0, 0.0), episodes=episodes, steps=steps, rng=seed)
-    return Episodes([Episode(X=e.X) for e in data], data.dt, data.states)
+def _collect_sampled_duffing(episodes: int, steps: int, seed: int = 0) -> km.Episodes:
+    plant = km.discretize(km.load_problem("duffing").dynamics, 0.1, km.RK4(4))
+    data = km.collect(
+        plant, km.Uniform([-2.0, -2.0], [2.0, 2.0]), km.Noise(0.0, 0.0), episodes=episodes, steps=steps, rng=seed
+    )
+    return km.Episodes([km.Episode(X=e.X) for e in data], data.dt, data.states)
 
 
-def _make_pairs(matrix: np.ndarray, count: int) -> Episodes:
+def _make_pairs(matrix: np.ndarray, count: int) -> km.Episodes:
     X = np.random.default_rng(0).standard_normal((count, len(matrix)))
-    return Episodes([Episode(X=np.stack([x, matrix @ x])) for x in X], 1.0)
+    return km.Episodes([km.Episode(X=np.stack([x, matrix @ x])) for x in X], 1.0)
 
 
-def _check_kernel_law(page: Page) -> list[Claim]:
+def _check_kernel_law(page: papers.Page) -> list[papers.Claim]:
     cases = {"linear plant": _make_pairs(A, SAMPLES), "Duffing": _collect_sampled_duffing(60, 3)}
     rows: list[tuple[object, ...]] = []
     worst: dict[str, float] = {}
     for name, data in cases.items():
         for p in (1, 2, 3, 4):
-            full, kernel = edmd(data, _monomials(p)), kernel_edmd(data, "polynomial", degree=p)
+            full, kernel = km.edmd(data, _monomials(p)), km.identify.kernel_edmd(data, "polynomial", degree=p)
             gap = _distance(full.eigenvalues, kernel.eigenvalues)
             worst[name] = max(worst.get(name, 0.0), gap)
             rows.append((name, p, full.nz, kernel.nz, f"{gap:.0e}"))
     page.text("## The law", "*Apart* is the largest distance of an eigenvalue of one from the nearest of the other.")
     page.table(("data", "degree", "monomials", "coordinates of the kernel", "apart"), rows)
     return [
-        judge_claim(
+        papers.judge_claim(
             name,
             f"eigenvalues of all monomials, ± {KERNEL_GAP:g}",
             holds=gap <= KERNEL_GAP,
@@ -157,8 +146,8 @@ def _check_kernel_law(page: Page) -> list[Claim]:
     ]
 
 
-def _monomials(degree: int) -> Lifting:
-    return Constant() + State() + (Monomials(degree) if degree > 1 else Constant())
+def _monomials(degree: int) -> km.Lifting:
+    return km.Constant() + km.State() + (km.Monomials(degree) if degree > 1 else km.Constant())
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:
@@ -166,15 +155,15 @@ def _distance(a: np.ndarray, b: np.ndarray) -> float:
     return float(max(distances.min(axis=0).max(), distances.min(axis=1).max()))
 
 
-def _measure_cost(page: Page, sizes: tuple[int, ...]) -> list[Claim]:
+def _measure_cost(page: papers.Page, sizes: tuple[int, ...]) -> list[papers.Claim]:
     times: dict[str, list[float]] = {"EDMD on monomials": [], "kernel EDMD": []}
     rows: list[tuple[object, ...]] = []
     for nx in sizes:
         rng = np.random.default_rng(nx)
         data = _make_pairs(0.9 * np.linalg.qr(rng.standard_normal((nx, nx)))[0], 120)
-        with hide_fit_warnings():
-            full, first = _time_fit(lambda data=data: edmd(data, _monomials(4)))
-            kernel, second = _time_fit(lambda data=data: kernel_edmd(data, "polynomial", degree=4))
+        with km.errors.hide_fit_warnings():
+            full, first = _time_fit(lambda data=data: km.edmd(data, _monomials(4)))
+            kernel, second = _time_fit(lambda data=data: km.identify.kernel_edmd(data, "polynomial", degree=4))
         for name, value in zip(times, (first, second), strict=True):
             times[name].append(value)
         rows.append((nx, full.nz, kernel.nz, f"{1e3 * first:.3g}", f"{1e3 * second:.3g}"))
@@ -184,27 +173,27 @@ def _measure_cost(page: Page, sizes: tuple[int, ...]) -> list[Claim]:
     page.picture(
         "cost",
         "Time of a fit, degree 4, 120 samples",
-        partial(save, draw_panels([CurvePanel("states", "time [ms]", drawn, log="y")])),
+        partial(km.plot.save, papers.draw_panels([papers.CurvePanel("states", "time [ms]", drawn, log="y")])),
     )
     growth = {name: each[-1] / each[0] for name, each in times.items()}
     why = f"{growth['EDMD on monomials']:.0f} times for EDMD, {growth['kernel EDMD']:.1f} times for the kernel"
     says = f"from {sizes[0]} to {sizes[-1]} states, cost goes with the samples and not with the monomials"
     holds = growth["kernel EDMD"] < growth["EDMD on monomials"] / 4
-    return [judge_claim("cost", says, holds=holds, why=why)]
+    return [papers.judge_claim("cost", says, holds=holds, why=why)]
 
 
-def _time_fit(fit: Callable[[], LinearPredictor]) -> tuple[LinearPredictor, float]:
+def _time_fit(fit: Callable[[], km.LinearPredictor]) -> tuple[km.LinearPredictor, float]:
     start = perf_counter()
     model = fit()
     return model, perf_counter() - start
 
 
-def _measure_landmarks(page: Page) -> list[Claim]:
+def _measure_landmarks(page: papers.Page) -> list[papers.Claim]:
     train, test = _collect_sampled_duffing(100, 20), _collect_sampled_duffing(50, 20, seed=1)
     errors: list[float] = []
     for m in LANDMARKS:
-        with hide_fit_warnings():
-            model = kernel_edmd(train, "gaussian", width=1.0, landmarks=m, ridge=1e-12)
+        with km.errors.hide_fit_warnings():
+            model = km.identify.kernel_edmd(train, "gaussian", width=1.0, landmarks=m, ridge=1e-12)
         missed = np.concatenate([model.rollout(e.X[0], np.empty((10, 0)))[-1] - e.X[10] for e in test])
         errors.append(float(np.linalg.norm(missed) / np.linalg.norm([e.X[10] for e in test])))
     page.text("## Landmarks", "Relative error ten steps, 1 s, ahead on 50 episodes that were not fitted.")
@@ -214,15 +203,17 @@ def _measure_landmarks(page: Page) -> list[Claim]:
     page.picture(
         "landmarks",
         "Error after 1 s",
-        partial(save, draw_panels([CurvePanel("landmarks", "error [%]", drawn, log="y")])),
+        partial(km.plot.save, papers.draw_panels([papers.CurvePanel("landmarks", "error [%]", drawn, log="y")])),
     )
     page.curve("Error by landmarks, in the order of the table", 1.0, ("error",), {"Gaussian kernel": curve})
     says = "few landmarks of many samples suffice: the error falls with their number"
     why = f"from {percent(errors[0])} % at {LANDMARKS[0]} to {percent(errors[-1])} % at {LANDMARKS[-1]}"
-    return [judge_claim("Nyström", says, holds=errors[-1] < errors[0] / 10, in_part=errors[-1] < errors[0], why=why)]
+    return [
+        papers.judge_claim("Nyström", says, holds=errors[-1] < errors[0] / 10, in_part=errors[-1] < errors[0], why=why)
+    ]
 
 
-kernel_paper = make_paper("kernel", reproduce_kernel.__doc__, reproduce_kernel, largest=SIZES[-1])
+kernel_paper = papers.make_paper("kernel", reproduce_kernel.__doc__, reproduce_kernel, largest=SIZES[-1])
 
 
 # Settings of dictionary learning
@@ -236,7 +227,7 @@ MANY = 100  # number of Gaussians in a large dictionary
 WINDOWS = 300  # trajectories that the training reads
 
 
-class Duffing(Dynamics):
+class Duffing(km.Dynamics):
     """ẍ = −.5 ẋ + x − x³, Li et al. 2017."""
 
     states = ("x", "v")
@@ -247,7 +238,7 @@ class Duffing(Dynamics):
         return ca.vertcat(x[1], -0.5 * x[1] + x[0] - x[0] ** 3)
 
 
-def reproduce_dictionary(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_dictionary(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Dictionary learning: 25 trained Gaussians against 100 fixed ones.
 
     Q. Li, F. Dietrich, E. Bollt and I. Kevrekidis, *Extended dynamic mode decomposition with dictionary learning: a
@@ -263,7 +254,7 @@ def reproduce_dictionary(page: Page, quick: bool, progress: TellPart) -> list[Cl
     """
     seeds, iterations, count = (1, 30, 200) if quick else (3, 800, COUNT)
     data, held, unseen = (_collect_duffing(count, seed) for seed in range(3))
-    found: dict[str, list[LinearPredictor]] = {name: [] for name in ("25 fixed", "100 fixed", "25 trained")}
+    found: dict[str, list[km.LinearPredictor]] = {name: [] for name in ("25 fixed", "100 fixed", "25 trained")}
     widths: dict[str, list[float]] = {"25 fixed": [], "100 fixed": []}
     changes: list[str] = []
     for seed in range(seeds):
@@ -275,7 +266,9 @@ def reproduce_dictionary(page: Page, quick: bool, progress: TellPart) -> list[Cl
             found[name].append(fits[best])
             widths[name].append(best)
         start = _make_lifting(centers[:FEW], np.full(FEW, widths["100 fixed"][-1]))
-        trained = train(start, data, horizon=STEPS, held_out=held, ridge=RIDGE, windows=WINDOWS, iterations=iterations)
+        trained = km.train(
+            start, data, horizon=STEPS, held_out=held, ridge=RIDGE, windows=WINDOWS, iterations=iterations
+        )
         found["25 trained"].append(trained)
         assert trained.report is not None
         changes.append(trained.report.changes[-1])
@@ -299,7 +292,7 @@ def reproduce_dictionary(page: Page, quick: bool, progress: TellPart) -> list[Cl
     )
     usual = float(np.median(by_width))
     return [
-        judge_claim(
+        papers.judge_claim(
             "25 trained, 25 fixed",
             "training makes a dictionary better",
             holds=bool((errors["25 trained"] < 0.7 * errors["25 fixed"]).all()),
@@ -307,7 +300,7 @@ def reproduce_dictionary(page: Page, quick: bool, progress: TellPart) -> list[Cl
             why=f"{percent(own)} % against {percent(few)} %, medians",
             required=not quick,
         ),
-        judge_claim(
+        papers.judge_claim(
             "25 trained, 100 fixed",
             "25 trained Gaussians predict as well as 100 fixed ones",
             holds=best <= many,
@@ -315,7 +308,7 @@ def reproduce_dictionary(page: Page, quick: bool, progress: TellPart) -> list[Cl
             why=f"{percent(best)} % against {percent(many)} %, the draws that held-out data choose. The width of the "
             f"100 is chosen, too; the median of the {len(WIDTHS)} gives {percent(usual)} %",
         ),
-        judge_claim(
+        papers.judge_claim(
             "held-out data",
             "a trained dictionary is never worse than untrained (ours)",
             holds=bool((errors["25 trained"] <= errors["25 fixed"]).all()),
@@ -325,59 +318,67 @@ def reproduce_dictionary(page: Page, quick: bool, progress: TellPart) -> list[Cl
     ]
 
 
-def _draw_dictionary(page: Page, models: dict[str, LinearPredictor], unseen: Episodes) -> None:
+def _draw_dictionary(page: papers.Page, models: dict[str, km.LinearPredictor], unseen: km.Episodes) -> None:
     """Draw the error by steps ahead, the centres of the Gaussians, and one long prediction."""
     ahead = DT * np.arange(1, STEPS + 1)
     by_step = {
-        name: (ahead, np.sqrt(np.mean(score(model, unseen, STEPS).relative ** 2, axis=1)))
+        name: (ahead, np.sqrt(np.mean(km.score(model, unseen, STEPS).relative ** 2, axis=1)))
         for name, model in models.items()
     }
     spots = {name: _centers(model.lifting) for name, model in models.items() if name != "100 fixed"}
     panels = [
-        CurvePanel("time ahead [s]", "relative error", by_step, log="y", title="Unseen trajectories"),
-        CurvePanel("x", "v", {name: (c[:, 0], c[:, 1]) for name, c in spots.items()}, points=True, title="Centres"),
+        papers.CurvePanel("time ahead [s]", "relative error", by_step, log="y", title="Unseen trajectories"),
+        papers.CurvePanel(
+            "x", "v", {name: (c[:, 0], c[:, 1]) for name, c in spots.items()}, points=True, title="Centres"
+        ),
     ]
-    page.picture("errors", "Error by time ahead, and where the Gaussians stand", partial(save, draw_panels(panels)))
-    truth = discretize(Duffing(), DT).rollout([-1.6, 1.2], np.zeros((2 * STEPS, 0)))
+    page.picture(
+        "errors",
+        "Error by time ahead, and where the Gaussians stand",
+        partial(km.plot.save, papers.draw_panels(panels)),
+    )
+    truth = km.discretize(Duffing(), DT).rollout([-1.6, 1.2], np.zeros((2 * STEPS, 0)))
     curves = {"truth": truth}
     curves |= {name: model.rollout(truth[0], np.zeros((2 * STEPS, 0))) for name, model in models.items()}
     drawn = [
-        CurvePanel(
+        papers.CurvePanel(
             "time [s]", state, {name: (DT * np.arange(len(X)), X[:, i]) for name, X in curves.items()}, ylim=(-2.5, 2.5)
         )
         for i, state in enumerate(("x", "v"))
     ]
     page.picture(
-        "prediction", "A prediction over twice the horizon that was trained for", partial(save, draw_panels(drawn))
+        "prediction",
+        "A prediction over twice the horizon that was trained for",
+        partial(km.plot.save, papers.draw_panels(drawn)),
     )
     page.curve("A prediction over 5 s", DT, ("x", "v"), curves)
 
 
-def _make_lifting(centers: np.ndarray, width: float | np.ndarray) -> Lifting:
-    return State() + Constant() + Gaussian(centers, width)
+def _make_lifting(centers: np.ndarray, width: float | np.ndarray) -> km.Lifting:
+    return km.State() + km.Constant() + km.Gaussian(centers, width)
 
 
-def _centers(lifting: Lifting) -> np.ndarray:
+def _centers(lifting: km.Lifting) -> np.ndarray:
     """Return the centres of the Gaussians in a sum."""
-    (bells,) = (part for part in getattr(lifting, "parts", ()) if isinstance(part, Gaussian))
+    (bells,) = (part for part in getattr(lifting, "parts", ()) if isinstance(part, km.Gaussian))
     return bells.centers
 
 
-def _fit_gaussians(data: Episodes, centers: np.ndarray, width: float) -> LinearPredictor:
-    with hide_fit_warnings():
-        return edmd(data, _make_lifting(centers, width), ridge=RIDGE)
+def _fit_gaussians(data: km.Episodes, centers: np.ndarray, width: float) -> km.LinearPredictor:
+    with km.errors.hide_fit_warnings():
+        return km.edmd(data, _make_lifting(centers, width), ridge=RIDGE)
 
 
-def _total_error(model: LinearPredictor, episodes: Episodes) -> float:
-    return score(model, episodes, STEPS).total
+def _total_error(model: km.LinearPredictor, episodes: km.Episodes) -> float:
+    return km.score(model, episodes, STEPS).total
 
 
-def _collect_duffing(count: int, seed: int) -> Episodes:
-    plant = discretize(Duffing(), DT)
+def _collect_duffing(count: int, seed: int) -> km.Episodes:
+    plant = km.discretize(Duffing(), DT)
     X = plant.rollouts(np.random.default_rng(seed).uniform(-2, 2, (count, 2)), np.zeros((count, STEPS, 0)))
-    return Episodes([Episode(X=x) for x in X], DT, plant.states)
+    return km.Episodes([km.Episode(X=x) for x in X], DT, plant.states)
 
 
-dictionary_paper = make_paper(
+dictionary_paper = papers.make_paper(
     "dictionary", reproduce_dictionary.__doc__, reproduce_dictionary, count=COUNT, widths=", ".join(map(str, WIDTHS))
 )

@@ -9,21 +9,10 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import logm
 
-from koopmpc.bench.problem import load_problem
-from koopmpc.control.lqr import lqr
-from koopmpc.data.collect import Uniform, collect
-from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.data.excitation import Noise
-from koopmpc.errors import FitWarning, hide_fit_warnings
-from koopmpc.identify.fits.dmd import dmd, dmdc
-from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.fits.kic import InputPredictor, kic
-from koopmpc.lifting.state import Expressions, State
-from koopmpc.page import Page
-from koopmpc.papers.plants import integrate_closed_loop
-from koopmpc.papers.registry import Claim, TellPart, compare_value, draw_curves, format_values, judge_claim, make_paper
-from koopmpc.plants.dynamics import RK4
-from koopmpc.plants.step_map import discretize
+import koopmpc as km
+from koopmpc import papers
+
+from .plants import integrate_closed_loop
 
 # The slow manifold
 START = (-5.0, 5.0)
@@ -37,7 +26,7 @@ B = np.array([[1.0], [0.0]])
 FREE = np.array([1.0, 1.0])  # start of the runs without input
 
 
-def reproduce_brunton(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_brunton(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Brunton et al. 2016: the slow manifold, which three observables make linear.
 
     S. Brunton, B. Brunton, J. Proctor and N. Kutz, *Koopman Invariant Subspaces and Finite Linear Representations of
@@ -52,9 +41,9 @@ def reproduce_brunton(page: Page, quick: bool, progress: TellPart) -> list[Claim
     mu, lam = -0.1, 1.0
     A = np.array([[mu, 0.0, 0.0], [0.0, lam, -lam], [0.0, 0.0, 2 * mu]])
     B = np.array([[0.0], [1.0], [0.0]])
-    plant = load_problem("slow_manifold").dynamics
+    plant = km.load_problem("slow_manifold").dynamics
     progress("three feedbacks")
-    local, lifted = lqr(A[:2, :2], B[:2], [1.0, 1.0], 1.0).K.ravel(), lqr(A, B, [1.0, 1.0, 0.0], 1.0)
+    local, lifted = km.lqr(A[:2, :2], B[:2], [1.0, 1.0], 1.0).K.ravel(), km.lqr(A, B, [1.0, 1.0, 0.0], 1.0)
     K = lifted.K.ravel()
     gains = {  # u = −k · [x₁, x₂, x₁²]
         "LQR, linearisation": [*local, 0.0],
@@ -74,15 +63,15 @@ def reproduce_brunton(page: Page, quick: bool, progress: TellPart) -> list[Claim
     }
     curves = {name: np.column_stack([run.X, run.U, run.J]) for name, run in runs.items()}
     page.text("## The three feedbacks")
-    draw_curves(page, "costs", "States, input and cost so far", DT, ("x₁", "x₂", "u", "J"), curves)
+    papers.draw_curves(page, "costs", "States, input and cost so far", DT, ("x₁", "x₂", "u", "J"), curves)
     progress("the plant from data")
-    step_map = discretize(plant, 0.05, RK4(10))
-    data = collect(step_map, Uniform([-2.0, -2.0], [2.0, 2.0]), Noise(-1.0, 1.0), episodes=20, steps=40)
-    model = edmd(data, State() + Expressions(lambda x: [x[0] ** 2], ["x1²"]))
+    step_map = km.discretize(plant, 0.05, km.RK4(10))
+    data = km.collect(step_map, km.Uniform([-2.0, -2.0], [2.0, 2.0]), km.Noise(-1.0, 1.0), episodes=20, steps=40)
+    model = km.edmd(data, km.State() + km.Expressions(lambda x: [x[0] ** 2], ["x1²"]))
     both = np.block([[model.A, model.B], [np.zeros((1, 3)), np.ones((1, 1))]])
     found: np.ndarray = np.real(logm(both)) / data.dt
     gap = float(np.abs(found[:3] - np.hstack([A, B])).max())
-    learned = lqr(found[:3, :3], found[:3, 3:], [1.0, 1.0, 0.0], 1.0).K.ravel()
+    learned = km.lqr(found[:3, :3], found[:3, 3:], [1.0, 1.0, 0.0], 1.0).K.ravel()
     page.text(
         "## The plant from data",
         f"""EDMD on [x₁, x₂, x₁²] from {len(data)} episodes of 2 s under uniform noise, sampled at {data.dt:g} s. The
@@ -94,20 +83,20 @@ def reproduce_brunton(page: Page, quick: bool, progress: TellPart) -> list[Claim
     page.table(("eigenvalue", "exact", "from data"), rows)
     start = np.array([*START, START[0] ** 2])
     return [
-        compare_value("K of the linearisation", [0.0, 2.414214], local, 5e-7, digits=7),
-        compare_value("K of the lifted plant", [0.0, 2.414214, -1.495597], K, 5e-7, digits=7),
-        compare_value("J, LQR of the linearisation", 4485.19, runs["LQR, linearisation"].cost, 0.005),
-        compare_value("J, LQR of the lifted plant", 990.174, runs["LQR, [x₁, x₂, x₁²]"].cost, 0.0005),
-        compare_value("z₀ᵀPz₀, its endless horizon", 990.180, float(start @ lifted.P @ start), 0.0005),
-        compare_value("J, feedback linearisation", 1373.95, runs["feedback linearisation"].cost, 0.005),
-        compare_value("K from data", [0.0, 2.414214, -1.495597], learned, 5e-6, digits=7),
+        papers.compare_value("K of the linearisation", [0.0, 2.414214], local, 5e-7, digits=7),
+        papers.compare_value("K of the lifted plant", [0.0, 2.414214, -1.495597], K, 5e-7, digits=7),
+        papers.compare_value("J, LQR of the linearisation", 4485.19, runs["LQR, linearisation"].cost, 0.005),
+        papers.compare_value("J, LQR of the lifted plant", 990.174, runs["LQR, [x₁, x₂, x₁²]"].cost, 0.0005),
+        papers.compare_value("z₀ᵀPz₀, its endless horizon", 990.180, float(start @ lifted.P @ start), 0.0005),
+        papers.compare_value("J, feedback linearisation", 1373.95, runs["feedback linearisation"].cost, 0.005),
+        papers.compare_value("K from data", [0.0, 2.414214, -1.495597], learned, 5e-6, digits=7),
     ]
 
 
-brunton_paper = make_paper("brunton", reproduce_brunton.__doc__, reproduce_brunton)
+brunton_paper = papers.make_paper("brunton", reproduce_brunton.__doc__, reproduce_brunton)
 
 
-def reproduce_proctor(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_proctor(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Proctor et al. 2016: DMD with control, and why feedback hides the input.
 
     J. Proctor, S. Brunton and J. N. Kutz, *Dynamic Mode Decomposition with Control*, SIAM J. Appl. Dyn. Syst. 15
@@ -119,16 +108,16 @@ def reproduce_proctor(page: Page, quick: bool, progress: TellPart) -> list[Claim
     Beyond the paper: with small noise on the input of the same plant and feedback, the fit finds both.
     """
     progress("fits")
-    fed = Episodes([Episode(X=X, U=U)], 1.0)
+    fed = km.Episodes([km.Episode(X=X, U=U)], 1.0)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        blind = dmdc(fed)
-    said = [str(each.message) for each in caught if issubclass(each.category, FitWarning)]
+        blind = km.dmdc(fed)
+    said = [str(each.message) for each in caught if issubclass(each.category, km.FitWarning)]
     models = {
-        "DMD": dmd(Episodes([Episode(X=X)], 1.0)),
-        "DMDc, B known": dmdc(fed, B=B),
+        "DMD": km.dmd(km.Episodes([km.Episode(X=X)], 1.0)),
+        "DMDc, B known": km.dmdc(fed, B=B),
         "DMDc, B unknown": blind,
-        "DMDc, B unknown, noise on u": dmdc(_collect_noisy()),
+        "DMDc, B unknown, noise on u": km.dmdc(_collect_noisy()),
     }
     steps = 6
     truth = np.array([np.linalg.matrix_power(A, k) @ FREE for k in range(steps + 1)])
@@ -139,48 +128,55 @@ def reproduce_proctor(page: Page, quick: bool, progress: TellPart) -> list[Claim
     page.table(
         ("model", "A", "B", "ρ(A)"),
         [
-            (name, format_values(m.A, 5), format_values(m.B, 5) if m.nu else "–", f"{np.abs(m.eigenvalues).max():.4g}")
+            (
+                name,
+                papers.format_values(m.A, 5),
+                papers.format_values(m.B, 5) if m.nu else "–",
+                f"{np.abs(m.eigenvalues).max():.4g}",
+            )
             for name, m in models.items()
         ],
     )
     page.text(f"Without input from [1, 1], the plant and the models ({steps} steps):")
     free = {name: m.rollout(FREE, np.zeros((steps, m.nu))) for name, m in models.items()}
-    draw_curves(page, "free", "Without input", 1.0, ("x₁", "x₂"), {"plant": truth, **free})
+    papers.draw_curves(page, "free", "Without input", 1.0, ("x₁", "x₂"), {"plant": truth, **free})
     noisy = models["DMDc, B unknown, noise on u"]
     return [
-        compare_value("DMD, A", np.diag([0.5, 0.1]), models["DMD"].A, 1e-12),
-        compare_value("DMDc with B known, A", A, models["DMDc, B known"].A, 1e-12),
-        compare_value("DMDc with B unknown, A", np.diag([0.25, 0.1]), blind.A, 1e-12),
-        compare_value("DMDc with B unknown, B", [[-0.25], [0.0]], blind.B, 1e-12),
-        judge_claim(
+        papers.compare_value("DMD, A", np.diag([0.5, 0.1]), models["DMD"].A, 1e-12),
+        papers.compare_value("DMDc with B known, A", A, models["DMDc, B known"].A, 1e-12),
+        papers.compare_value("DMDc with B unknown, A", np.diag([0.25, 0.1]), blind.A, 1e-12),
+        papers.compare_value("DMDc with B unknown, B", [[-0.25], [0.0]], blind.B, 1e-12),
+        papers.judge_claim(
             "DMDc with B unknown",
             "A and B cannot be told apart: a warning",
             holds=any("feedback made A and B inseparable" in sentence for sentence in said),
             why=said[0].split(":")[0] if said else "no warning",
             required=True,
         ),
-        compare_value("noise on the input (ours), A and B", np.hstack([A, B]), np.hstack([noisy.A, noisy.B]), 1e-10),
+        papers.compare_value(
+            "noise on the input (ours), A and B", np.hstack([A, B]), np.hstack([noisy.A, noisy.B]), 1e-10
+        ),
     ]
 
 
-def _collect_noisy() -> Episodes:
+def _collect_noisy() -> km.Episodes:
     """Return 20 steps of the plant under u = −x₁ and noise of ±0.1."""
     noise, states, inputs = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 1)), np.zeros((21, 2)), np.zeros((20, 1))
     states[0] = X[0]
     for k in range(20):
         inputs[k] = noise[k] - states[k, 0]
         states[k + 1] = A @ states[k] + B @ inputs[k]
-    return Episodes([Episode(X=states, U=inputs)], 1.0)
+    return km.Episodes([km.Episode(X=states, U=inputs)], 1.0)
 
 
-dmdc_paper = make_paper("proctor", reproduce_proctor.__doc__, reproduce_proctor)
+dmdc_paper = papers.make_paper("proctor", reproduce_proctor.__doc__, reproduce_proctor)
 
 
 LAM = 0.9  # λ
 MU = 0.5  # μ
 DELTA = 1.0  # δ
 FEEDBACK = -0.3  # u = FEEDBACK x₁² in the data with feedback
-LIFTING = State() + Expressions(lambda x: [x[0] ** 2], ["x₁²"])  # x₁, x₂, u, x₁²
+LIFTING = km.State() + km.Expressions(lambda x: [x[0] ** 2], ["x₁²"])  # x₁, x₂, u, x₁²
 STATES = [[LAM, 0.0, 0.0, 0.0], [0.0, MU, DELTA, LAM**2 - MU]]  # rows of K
 ROWS = {"exogenous": [0.0] * 4, "constant": [0.0, 0.0, 1.0, 0.0], "state": [0.0, 0.0, 0.0, FEEDBACK * LAM**2]}
 # Input as a function of x, the constant signal of the episode, and the random generator
@@ -190,10 +186,10 @@ LAWS: dict[str, InputRule] = {
     "constant": lambda x, held, rng: held,
     "state": lambda x, held, rng: FEEDBACK * float(x[0]) ** 2,
 }
-SAF = State() + Expressions(lambda x: [x[1] - 0.2 * x[0] ** 2], ["x₂ − 0.2 x₁²"])
+SAF = km.State() + km.Expressions(lambda x: [x[1] - 0.2 * x[0] ** 2], ["x₂ − 0.2 x₁²"])
 
 
-def reproduce_kic(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_kic(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Proctor, Brunton & Kutz 2018: observables that hold inputs.
 
     J. Proctor, S. Brunton and J. N. Kutz, *Generalizing Koopman Theory to Allow for Inputs and Control*, SIAM J.
@@ -209,10 +205,10 @@ def reproduce_kic(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     sampled at 0.01 s: on [x₁, x₂, x₂ − 0.2 x₁²] its input enters linearly, and the model is exact.
     """
     progress("three kinds of input")
-    claims: list[Claim] = []
+    claims: list[papers.Claim] = []
     data = {kind: _collect_inputs(law) for kind, law in LAWS.items()}
-    with hide_fit_warnings():
-        found = {kind: kic(each, LIFTING, inputs=cast("Any", kind)) for kind, each in data.items()}
+    with km.errors.hide_fit_warnings():
+        found = {kind: km.identify.kic(each, LIFTING, inputs=cast("Any", kind)) for kind, each in data.items()}
     page.text(
         "## K",
         """Rows and columns are x₁, x₂, u, x₁². Under feedback u and x₁² are dependent, and of all K that fit the one of
@@ -221,64 +217,68 @@ def reproduce_kic(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
     rows: list[tuple[object, ...]] = []
     for kind, fit in found.items():
         exact, m = np.array([*STATES, ROWS[kind], [0.0, 0.0, 0.0, LAM**2]]), fit.model
-        rows.append((kind, format_values(m.A, 4), format_values(np.sort(np.real(m.eigenvalues)), 4)))
+        rows.append((kind, papers.format_values(m.A, 4), papers.format_values(np.sort(np.real(m.eigenvalues)), 4)))
         Z = m.lift(np.vstack([np.hstack([e.X[:-1], e.U]) for e in data[kind]]))
         missed = float(np.abs(Z @ (m.A - exact).T).max())
-        claims.append(compare_value(f"{kind}: largest misfit of K ψ on the data", 0.0, missed, 1e-10))
+        claims.append(papers.compare_value(f"{kind}: largest misfit of K ψ on the data", 0.0, missed, 1e-10))
         if kind != "state":
-            claims.append(compare_value(f"{kind}: K", exact, m.A, 1e-10))
+            claims.append(papers.compare_value(f"{kind}: K", exact, m.A, 1e-10))
     page.table(("input", "K", "eigenvalues"), rows)
     free = found["exogenous"]
     linear, exact = free.linear(), [[LAM, 0, 0, 0], [0, MU, LAM**2 - MU, DELTA], [0, 0, LAM**2, 0]]
-    claims.append(compare_value("exogenous: [A B] of z⁺ = A z + B u", exact, np.hstack([linear.A, linear.B]), 1e-10))
+    claims.append(
+        papers.compare_value("exogenous: [A B] of z⁺ = A z + B u", exact, np.hstack([linear.A, linear.B]), 1e-10)
+    )
     _predict_sine(page, free, claims)
     progress("an input that enters as it is")
     claims += _check_safedmd(page)
     return claims
 
 
-def _collect_inputs(law: InputRule) -> Episodes:
-    rng, found = np.random.default_rng(0), list[Episode]()
+def _collect_inputs(law: InputRule) -> km.Episodes:
+    rng, found = np.random.default_rng(0), list[km.Episode]()
     for _ in range(20):
         X, U, held = np.zeros((16, 2)), np.zeros((15, 1)), float(rng.uniform(-1, 1))
         X[0] = rng.uniform(-1, 1, 2)
         for k in range(15):
             U[k] = law(X[k], held, rng)
             X[k + 1] = _step_plant(X[k], U[k])
-        found.append(Episode(X=X, U=U))
-    return Episodes(found, 1.0, ("x1", "x2"), ("u",))
+        found.append(km.Episode(X=X, U=U))
+    return km.Episodes(found, 1.0, ("x1", "x2"), ("u",))
 
 
 def _step_plant(x: np.ndarray, u: np.ndarray) -> np.ndarray:
     return np.array([LAM * x[0], MU * x[1] + (LAM**2 - MU) * x[0] ** 2 + DELTA * u[0]])
 
 
-def _predict_sine(page: Page, free: InputPredictor, claims: list[Claim]) -> None:
+def _predict_sine(page: papers.Page, free: km.identify.InputPredictor, claims: list[papers.Claim]) -> None:
     """Predict the response to an input that the data do not contain."""
     U = np.sin(np.arange(40) / 4)[:, None]
     X = [np.array([1.0, -1.0])]
     for u in U:
         X.append(_step_plant(X[-1], u))
     told = free.rollout(X[0], U)
-    claims.append(compare_value("40 steps under a sine", 0.0, float(np.abs(told - X).max()), 1e-9))
-    draw_curves(page, "sine", "Under a sine, which no data held", 1.0, ("x₁", "x₂"), {"plant": np.array(X), "K": told})
+    claims.append(papers.compare_value("40 steps under a sine", 0.0, float(np.abs(told - X).max()), 1e-9))
+    papers.draw_curves(
+        page, "sine", "Under a sine, which no data held", 1.0, ("x₁", "x₂"), {"plant": np.array(X), "K": told}
+    )
 
 
-def _check_safedmd(page: Page) -> list[Claim]:
-    slow = replace(cast("Any", load_problem("slow_manifold").dynamics), mu=-2.0, lam=1.0)
-    plant = discretize(slow, 0.01, RK4(4))
-    data = collect(plant, Uniform([-1.0, -1.0], [1.0, 1.0]), Noise(-1.0, 1.0), episodes=20, steps=20)
-    model = edmd(data, SAF)
+def _check_safedmd(page: papers.Page) -> list[papers.Claim]:
+    slow = replace(cast("Any", km.load_problem("slow_manifold").dynamics), mu=-2.0, lam=1.0)
+    plant = km.discretize(slow, 0.01, km.RK4(4))
+    data = km.collect(plant, km.Uniform([-1.0, -1.0], [1.0, 1.0]), km.Noise(-1.0, 1.0), episodes=20, steps=20)
+    model = km.edmd(data, SAF)
     pairs = data.snapshots()
     missed = model.lift(pairs.X_next) - model.lift(pairs.X) @ model.A.T - pairs.U @ model.B.T
     values: np.ndarray = np.sort(np.real(model.eigenvalues))
     page.text("## The system of SafEDMD")
-    page.table(("A", "B"), [(format_values(model.A, 8), format_values(model.B, 8))])
+    page.table(("A", "B"), [(papers.format_values(model.A, 8), papers.format_values(model.B, 8))])
     return [
-        compare_value("SafEDMD: eigenvalues", [0.960789, 0.980199, 1.010050], values, 5e-7, digits=7),
-        compare_value("SafEDMD: B", [[0.0], [0.01005017], [0.01005017]], model.B, 5e-9, digits=8),
-        compare_value("SafEDMD: residual of a step", 0.0, float(np.abs(missed).max()), 1e-12),
+        papers.compare_value("SafEDMD: eigenvalues", [0.960789, 0.980199, 1.010050], values, 5e-7, digits=7),
+        papers.compare_value("SafEDMD: B", [[0.0], [0.01005017], [0.01005017]], model.B, 5e-9, digits=8),
+        papers.compare_value("SafEDMD: residual of a step", 0.0, float(np.abs(missed).max()), 1e-12),
     ]
 
 
-kic_paper = make_paper("kic", reproduce_kic.__doc__, reproduce_kic)
+kic_paper = papers.make_paper("kic", reproduce_kic.__doc__, reproduce_kic)

@@ -1,18 +1,21 @@
 """The papers that can be reproduced, their claims and verdicts, and the pages that `koopmpc reproduce` writes.
 
-A paper is a `Paper` in the module of its name or of its authors. docs/papers/ holds the pages and pictures that
-`koopmpc reproduce` writes; copy them there after a change.
+A paper is a `Paper` in a file or folder of problems/papers/, which uses `km` alone: `km.papers` serves what papers
+share. docs/papers/ holds the pages and pictures that `koopmpc reproduce` writes; copy them there after a change.
 """
 
+import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
 from inspect import cleandoc
 from pathlib import Path
 from time import perf_counter
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +32,31 @@ from koopmpc.parallel import map_tasks
 from koopmpc.recording.curves import record_curves
 from koopmpc.terminal import build_plain_table
 
+__all__ = [
+    "PAPERS",
+    "Claim",
+    "CurvePanel",
+    "Page",
+    "Paper",
+    "TellPart",
+    "Verdict",
+    "add_verdicts",
+    "compare_value",
+    "draw_curves",
+    "draw_panels",
+    "find_paper",
+    "format_values",
+    "import_paper_module",
+    "judge_claim",
+    "make_paper",
+    "make_verdict_table",
+    "percent",
+    "relative_error",
+    "reproduce_all",
+    "summarise_claims",
+]
 PAPERS = ("snyder", "brunton", "proctor", "williams", "korda", "dictionary", "kaiser", "kic", "kernel")
+_PACKAGE = "koopmpc_papers"  # name under which problems/papers/ is imported, from a checkout and from the wheel
 _MODULES = {  # papers that share a module with other papers of their authors
     **dict.fromkeys(("brunton", "kic"), "proctor"),
     **dict.fromkeys(("williams", "kernel", "dictionary"), "kevrekidis"),
@@ -223,8 +250,21 @@ def find_paper(name: str) -> Paper:
     """
     if name not in PAPERS:
         raise ProblemError(f"there is no paper {name!r}{nearest(name, PAPERS)}; there are {', '.join(PAPERS)}")
-    module = import_module(f"koopmpc.papers.{_MODULES.get(name, name)}")
+    module = import_paper_module(_MODULES.get(name, name))
     return next(value for value in vars(module).values() if isinstance(value, Paper) and value.name == name)
+
+
+def import_paper_module(name: str) -> ModuleType:
+    """Import a module of problems/papers/, as "korda" or "snyder.theory", from the checkout or from the wheel."""
+    if _PACKAGE not in sys.modules:
+        home = Path(__file__).parents[1]
+        folder = next(path for path in (home / "problems", home.parent / "problems") if path.is_dir()) / "papers"
+        spec = spec_from_file_location(_PACKAGE, folder / "__init__.py", submodule_search_locations=[str(folder)])
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[_PACKAGE] = package = module_from_spec(spec)
+        spec.loader.exec_module(package)
+    return import_module(f"{_PACKAGE}.{name}")
 
 
 class TimedReproduction(NamedTuple):

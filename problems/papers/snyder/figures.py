@@ -5,27 +5,12 @@ from functools import partial
 
 import numpy as np
 
-from koopmpc.data.collect import collect
-from koopmpc.data.excitation import Noise
-from koopmpc.errors import hide_fit_warnings
-from koopmpc.figures.series import reconstruction
-from koopmpc.figures.style import save
-from koopmpc.identify.fits.dmd import dmd, dmdc
-from koopmpc.page import Page
-from koopmpc.papers import snyder_control as control
-from koopmpc.papers import snyder_theory as theory
-from koopmpc.papers.plants import Pendulum, attach_inputs, integrate_trajectories
-from koopmpc.papers.registry import (
-    Claim,
-    Paper,
-    TellPart,
-    add_verdicts,
-    judge_claim,
-    percent,
-    relative_error,
-    summarise_claims,
-)
-from koopmpc.papers.snyder_settings import (
+import koopmpc as km
+from koopmpc import papers
+
+from ..plants import Pendulum, attach_inputs, integrate_trajectories
+from . import control, theory
+from .settings import (
     FIGURES,
     SHAKINGS,
     TASKS,
@@ -39,8 +24,8 @@ from koopmpc.papers.snyder_settings import (
     measure_hold_change,
     reconstruct_all,
 )
-from koopmpc.plants.dynamics import RK4
-from koopmpc.plants.step_map import discretize
+
+percent = papers.percent
 
 SMALL = 0.05  # two curves look equal in a picture up to this relative error
 SAME = 1.25  # errors look equal in a picture if they differ by at most this factor
@@ -96,7 +81,7 @@ GAINS = "u = −K (x − x_ref), continuous-time LQR on the exact Jacobian unles
 HEAD = ("data", "observables", "rank", "σ₁/σ_r", "error [%]", "held out [%]", "leading φ [%]", "φ within 5 %")
 
 
-def reproduce_snyder(page: Page, quick: bool, progress: TellPart) -> list[Claim]:
+def reproduce_snyder(page: papers.Page, quick: bool, progress: papers.TellPart) -> list[papers.Claim]:
     """Write the page and return all claims; `quick` shortens long computations."""
     progress("trajectories and their reconstructions")
     others = 3 if quick else 10
@@ -116,11 +101,11 @@ def reproduce_snyder(page: Page, quick: bool, progress: TellPart) -> list[Claim]
     progress("figures")
     said = judge_text(fits, causes["DMD on x − x_ref"].error, predicted, control.compute_ratios(runs))
     shown = judge_figures(fits)
-    aside = Page(page.folder, page.beside)  # the opening counts its claim, and its text follows later
+    aside = papers.Page(page.folder, page.beside)  # the opening counts its claim, and its text follows later
     warned = theory.add_caution(aside, settings, fits)
     add_opening(page, [*said, *shown, *warned], change, others)
     page.text("## What the paper says in words")
-    add_verdicts(page, said)
+    papers.add_verdicts(page, said)
     tabulate_figures(page, settings, fits, shown)
     pictures(page, settings, fits)
     appendix_dmdc(page, settings["pendulum"], settings["pendulum-lqr"])
@@ -135,7 +120,7 @@ def reproduce_snyder(page: Page, quick: bool, progress: TellPart) -> list[Claim]
     return [*said, *shown, *warned]
 
 
-def judge_figure(shown: PaperFigure, setting: str, says: str, fits: Fits) -> Claim:
+def judge_figure(shown: PaperFigure, setting: str, says: str, fits: Fits) -> papers.Claim:
     """Return the claim of one picture of the paper."""
     own, base = fits[setting][shown.method, True], fits[setting]["DMD", True]
     cut = fits[setting].get((shown.method, False), own)
@@ -143,33 +128,33 @@ def judge_figure(shown: PaperFigure, setting: str, says: str, fits: Fits) -> Cla
     where = f"{shown.name}, {setting}"
     errors = f"{percent(own.error)} % against {percent(base.error)} % of DMD"
     if says == "small error":
-        return judge_claim(where, says, holds=own.error < SMALL, why=f"{percent(own.error)} %")
+        return papers.judge_claim(where, says, holds=own.error < SMALL, why=f"{percent(own.error)} %")
     if says == "fails":
-        return judge_claim(
+        return papers.judge_claim(
             where, says, holds=own.error > 0.5, why=f"{percent(own.error)} %, where x̂ = 0 would be 100 % off"
         )
     if says == "partly captured":
         moved = _motion_error(own)
         why = f"{percent(own.error)} % of ‖x‖, which is mostly θ = π; {percent(moved)} % of the motion x − x_ref"
-        return judge_claim(where, says, holds=own.error < SMALL < moved, why=why)
+        return papers.judge_claim(where, says, holds=own.error < SMALL < moved, why=why)
     if says == "no change against DMD":
         why = f"{errors}: sin θ is odd, and products of two states are even"
-        return judge_claim(where, says, holds=1 / SAME < gain < SAME, why=why)
+        return papers.judge_claim(where, says, holds=1 / SAME < gain < SAME, why=why)
     if says == "a marginal gain on DMD":
-        return judge_claim(where, says, holds=1 < gain < MARGINAL, why=errors)
+        return papers.judge_claim(where, says, holds=1 < gain < MARGINAL, why=errors)
     if says.startswith("better"):
-        return judge_claim(where, says, holds=gain > BETTER, in_part=gain > 1, why=errors)
+        return papers.judge_claim(where, says, holds=gain > BETTER, in_part=gain > 1, why=errors)
     if says == "no gain on Fourier 1":
         first = fits[setting]["EDMD Fourier 1", True].error
         factor = first / own.error
         why = f"{percent(own.error)} % against {percent(first)} %: better by a factor of {factor:.2g}"
         why += ", at errors that a picture hardly shows" if first < SMALL else ""
-        return judge_claim(where, says, holds=factor < SAME, in_part=factor < MARGINAL, why=why)
+        return papers.judge_claim(where, says, holds=factor < SAME, in_part=factor < MARGINAL, why=why)
     why = f"at rank {cut.rank} {percent(cut.error)} %, at rank {own.rank} {errors}"
-    return judge_claim(where, says, holds=gain < SAME, in_part=cut_gain < BETTER, why=why)
+    return papers.judge_claim(where, says, holds=gain < SAME, in_part=cut_gain < BETTER, why=why)
 
 
-def judge_figures(fits: Fits) -> list[Claim]:
+def judge_figures(fits: Fits) -> list[papers.Claim]:
     """Return the claims of all pictures, in the order of `FIGURES`."""
     return [
         judge_figure(shown, setting, says, fits)
@@ -183,7 +168,7 @@ def judge_text(
     centred: float,
     predict_held_out: Mapping[str, Mapping[str, control.Prediction]],
     ratios: Mapping[str, Mapping[str, float]],
-) -> list[Claim]:
+) -> list[papers.Claim]:
     """Return the claims of abstract, results and discussion, in our words.
 
     Parameters
@@ -212,7 +197,7 @@ def judge_text(
     wins = sum(ours < theirs - PLAIN for ours, theirs in zip(lifted, local, strict=True))
     losses = sum(theirs < ours - PLAIN for ours, theirs in zip(lifted, local, strict=True))
     return [
-        judge_claim(
+        papers.judge_claim(
             "abstract",
             "DMD and EDMD give a finite-dimensional linear model of a nonlinear system",
             holds=cubic.held_out < GENERAL and box.held_out < GENERAL,
@@ -220,7 +205,7 @@ def judge_text(
             why=f"of the fitted trajectory (pendulum, monomials 3: {percent(cubic.error)} %), not of the "
             f"system: {percent(cubic.held_out)} % from other starts, for the frequency depends on the amplitude",
         ),
-        judge_claim(
+        papers.judge_claim(
             "abstract",
             "EDMD finds the leading Koopman eigenfunctions",
             holds=led < SMALL and box_led < SMALL,
@@ -228,7 +213,7 @@ def judge_text(
             why=f"pendulum, monomials 3: φ(x_k) = λᵏ φ(x₀) to {percent(led)} % over 10 s; cart-pole, "
             f"Fourier 1: {percent(box_led)} %; on one trajectory φ is known along a curve alone",
         ),
-        judge_claim(
+        papers.judge_claim(
             "abstract",
             "linear control acts on the nonlinear system without linearisation at a fixed point",
             holds=max(lifted) < GOOD and wins > losses,
@@ -237,14 +222,14 @@ def judge_text(
             f"cost of nonlinear MPC; LQR on the linearisation takes {min(local):.4f} to {max(local):.4f}: of "
             f"{len(local)} tasks the lifted model does better in {wins} and worse in {losses} by more than 0.1 %",
         ),
-        judge_claim(
+        papers.judge_claim(
             "results",
             "the pendulum is inverted",
             holds=upright.error < SMALL,
             why=f"DMD, uncontrolled: {percent(upright.error)} % upright, {percent(hanging.error)} % hanging; "
             "only θ = 0 hanging agrees with what the paper reports",
         ),
-        judge_claim(
+        papers.judge_claim(
             "results",
             "data under LQR show a controlled system, and models of them stand for it",
             holds=max(p.excited for p in paper) < GENERAL,
@@ -254,14 +239,14 @@ def judge_text(
             f"known A and B cannot be told apart: B is {_shares(blind)} times the true one. Models of exciting data "
             f"are {_join(p.excited for p in rich)} % off, and B is {_shares(rich)} times the true one",
         ),
-        judge_claim(
+        papers.judge_claim(
             "discussion",
             "truncation has to be avoided with monomials 3",
             holds=small.error > BETTER * cubic.error,
             why=f"pendulum: {percent(cubic.error)} % at rank {cubic.rank}, {percent(small.error)} % "
             f"at rank {small.rank}",
         ),
-        judge_claim(
+        papers.judge_claim(
             "discussion",
             "the cart-pole is beyond these observables",
             holds=shift.error > raw.error / SAME,
@@ -272,7 +257,7 @@ def judge_text(
             f"{percent(squares.error)} % with monomials 2 and {percent(box.error)} % with Fourier 1; monomials 3 "
             f"rebuild it to {percent(cubes.error)} %, but from other starts {_describe_outcome(cubes.held_out)}",
         ),
-        judge_claim(
+        papers.judge_claim(
             "discussion",
             "control on the lifted model is future work",
             holds=max(lifted) < GOOD,
@@ -299,7 +284,7 @@ def _shares(found: list[control.Prediction]) -> str:
     return " and ".join(f"{p.b:.3f}" for p in found)
 
 
-def add_opening(page: Page, claims: Sequence[Claim], change: float, others: int) -> None:
+def add_opening(page: papers.Page, claims: Sequence[papers.Claim], change: float, others: int) -> None:
     """Write the opening of the report: the paper, the choices that it leaves open, and a summary of the verdicts.
 
     Parameters
@@ -315,14 +300,16 @@ def add_opening(page: Page, claims: Sequence[Claim], change: float, others: int)
     """
     page.text(
         "# Snyder & Song 2021, done again",
-        OPENING.format(total=len(claims), summary=summarise_claims(claims)),
+        OPENING.format(total=len(claims), summary=papers.summarise_claims(claims)),
         SETTINGS,
         FEEDBACK.format(change=percent(change)),
         MEASURES.format(others=others),
     )
 
 
-def tabulate_figures(page: Page, settings: Mapping[str, Setting], fits: Fits, claims: Sequence[Claim]) -> None:
+def tabulate_figures(
+    page: papers.Page, settings: Mapping[str, Setting], fits: Fits, claims: Sequence[papers.Claim]
+) -> None:
     """Add a table with a line for each figure, trajectory and rank: the paper's claim, the verdict and the reason."""
     page.text("## The figures, in numbers")
     rows: list[tuple[object, ...]] = []
@@ -338,7 +325,7 @@ def tabulate_figures(page: Page, settings: Mapping[str, Setting], fits: Fits, cl
     page.table(("figure", *HEAD, "the paper", "verdict", "why"), rows)
 
 
-def pictures(page: Page, settings: Mapping[str, Setting], fits: Fits) -> None:
+def pictures(page: papers.Page, settings: Mapping[str, Setting], fits: Fits) -> None:
     """Draw the figures of the paper, those of its appendix last."""
     page.text("## The figures", LAYOUT)
     for shown in sorted(FIGURES, key=lambda shown: shown.appendix):
@@ -353,7 +340,7 @@ def pictures(page: Page, settings: Mapping[str, Setting], fits: Fits) -> None:
 
 
 def draw_case(
-    page: Page,
+    page: papers.Page,
     name: str,
     caption: str,
     cases: Mapping[str, tuple[np.ndarray, Mapping[str, np.ndarray]]],
@@ -361,7 +348,7 @@ def draw_case(
 ) -> None:
     """Draw reconstructions with a column for each case, and add a tab with the curves of each case to the recording."""
     states = setting.dynamics.states
-    page.picture(name, caption, partial(save, reconstruction(cases, setting.dt, states)))
+    page.picture(name, caption, partial(km.plot.save, km.plot.reconstruction(cases, setting.dt, states)))
     for title, (truth, curves) in cases.items():
         size = float(np.linalg.norm(truth, axis=1).max())
         table = {"truth": np.hstack([truth, np.full((len(truth), 1), np.nan)])}
@@ -371,7 +358,7 @@ def draw_case(
         page.curve(f"{name}, {title}", setting.dt, (*states, "log10 of the relative error"), table)
 
 
-def add_variants(page: Page, settings: Mapping[str, Setting], fits: Fits) -> None:
+def add_variants(page: papers.Page, settings: Mapping[str, Setting], fits: Fits) -> None:
     """Add other readings of the paper: the upright pendulum, g = 10 m/s², the databook's cart-pole."""
     page.text("## Other readings of the paper", READINGS)
     seen = {(setting, shown.method) for shown in FIGURES for setting in shown.settings}
@@ -399,7 +386,7 @@ def add_variants(page: Page, settings: Mapping[str, Setting], fits: Fits) -> Non
         draw_case(page, f"variant-{name}", caption, cases, settings[names[0]])
 
 
-def add_feedbacks(page: Page) -> None:
+def add_feedbacks(page: papers.Page) -> None:
     """Add the gains of all feedbacks."""
     page.text("## The feedbacks", GAINS)
     titles = {
@@ -416,22 +403,22 @@ def add_feedbacks(page: Page) -> None:
     )
 
 
-def appendix_dmdc(page: Page, free: Setting, driven: Setting) -> None:
+def appendix_dmdc(page: papers.Page, free: Setting, driven: Setting) -> None:
     """Add DMDc of the pendulum, with the input of the feedback and with an exciting input."""
     K = design_feedbacks()["pendulum"]
-    plant = discretize(Pendulum(), driven.dt, RK4(8))
+    plant = km.discretize(Pendulum(), driven.dt, km.RK4(8))
     held = integrate_trajectories(driven.dynamics, driven.x0, dt=driven.dt, steps=driven.steps, K=K, held=True)
     fed = attach_inputs(held, plant.inputs, K)
-    rich = collect(plant, driven.x0, Noise(-1.0, 1.0, hold=20), episodes=1, steps=driven.steps)
-    other = collect(plant, driven.x0, Noise(-1.0, 1.0, hold=20), episodes=1, steps=driven.steps, rng=1)
+    rich = km.collect(plant, driven.x0, km.Noise(-1.0, 1.0, hold=20), episodes=1, steps=driven.steps)
+    other = km.collect(plant, driven.x0, km.Noise(-1.0, 1.0, hold=20), episodes=1, steps=driven.steps, rng=1)
     B = plant.linearize([0.0, 0.0], [0.0]).B
     page.text("### Appendix: DMDc of the pendulum", DMDC)
-    with hide_fit_warnings():
+    with km.errors.hide_fit_warnings():
         models = {
-            "DMD, uncontrolled": (dmd(free.trajectory), free.trajectory),
-            "DMDc, LQR data": (dmdc(fed), fed),
-            "DMDc, LQR data, B known": (dmdc(fed, B=B), fed),
-            "DMDc, exciting input": (dmdc(rich), rich),
+            "DMD, uncontrolled": (km.dmd(free.trajectory), free.trajectory),
+            "DMDc, LQR data": (km.dmdc(fed), fed),
+            "DMDc, LQR data, B known": (km.dmdc(fed, B=B), fed),
+            "DMDc, exciting input": (km.dmdc(rich), rich),
         }
     rows: list[tuple[object, ...]] = []
     curves: dict[str, np.ndarray] = {}
@@ -444,8 +431,8 @@ def appendix_dmdc(page: Page, free: Setting, driven: Setting) -> None:
             (
                 name,
                 f"{report.rank} of {report.columns}",
-                percent(relative_error(curves[name], episode.X)),
-                "–" if elsewhere is None else percent(relative_error(elsewhere, other[0].X)),
+                percent(papers.relative_error(curves[name], episode.X)),
+                "–" if elsewhere is None else percent(papers.relative_error(elsewhere, other[0].X)),
                 "–" if not model.nu else f"{float(model.B[1, 0] / B[1, 0]):.4g}",
             )
         )
@@ -476,4 +463,4 @@ def _select_curves(method: str, found: Mapping[tuple[str, bool], Reconstruction]
     return {"full rank" if i == 0 else f"rank {fit.rank}": fit.X for i, fit in enumerate(fits)}
 
 
-paper = Paper("snyder", "Snyder & Song 2021, DMD and EDMD of pendulum and cart-pole", reproduce_snyder)
+paper = papers.Paper("snyder", "Snyder & Song 2021, DMD and EDMD of pendulum and cart-pole", reproduce_snyder)

@@ -1,0 +1,1 @@
+"""What runs whole tasks: the papers that `koopmpc reproduce` reproduces."""

@@ -1,1 +1,0 @@
-"""Papers whose published results `koopmpc reproduce` computes again."""

@@ -1,0 +1,1 @@
+"""Published results, done again with km: one file for the papers of the same authors, or a folder."""
