@@ -1,8 +1,8 @@
-"""Branch and bound over the levels of inputs: the program of a step, with some of its moves on levels.
+"""Branch and bound over the levels of inputs: one search, whatever its nodes are.
 
-Each node is the program of the step with narrower limits of these moves, solved by the same solver from its parent's
-solution. Dwell times narrow the levels of later moves before a node is solved. The search goes deep first,
-and starts at the levels of the last plan, so that it has a plan early.
+A node is the program of the step with narrower limits of the moves on levels, solved from its parent's solution; or
+beginnings of sequences, see `Sequences`. Dwell times narrow the levels of later moves before a program is solved. The
+search goes deep first, and starts at the levels of the last plan, so that it has a plan early.
 
 Land & Doig, "An automatic method of solving discrete programming problems", Econometrica 28, 1960.
 """
@@ -18,7 +18,7 @@ from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolution, SolverTurn, StepQP, StepSolver
 from koopmpc.control.stepped.levels import NEAR, HeldLevels, LevelBox, leveled_moves
-from koopmpc.control.stepped.sequences import EQUAL, LevelsProgram, SequenceSearch
+from koopmpc.control.stepped.sequences import EQUAL, Grow, Grown, LevelsProgram, Node, Plan, Sequences, plan_sequences
 
 NODES = 200_000  # nodes of one search, at most
 _NAME = "sequences"  # of the solver, where no quadratic program is solved
@@ -34,12 +34,6 @@ class Relaxed(NamedTuple):
     cost: float
     at: Float[np.ndarray, "moves leveled"]
     iterations: int
-    answer: Any
-
-
-class _Node(NamedTuple):
-    bound: float
-    box: LevelBox
     answer: Any
 
 
@@ -127,78 +121,79 @@ class LevelSearch:
 
         No node costs less than `least`, from which the gap counts.
         """
-        self.nodes, self.gap = 0, 0.0
-        best: Any = None
-        cost, iterations, unproven = np.inf, 0, np.inf
-        stack, guess = [_Node(least, root, start)], self.guess()
+
+        def grow(node: Node, most: float, left: float | None) -> Grown:
+            box, answer = node.part
+            if not self.held.tighten(box, self.blocks):
+                return Grown(Status.INFEASIBLE)
+            found = relax(box, answer, left)
+            if found.status is not Status.OPTIMAL or found.cost >= most:
+                return Grown(found.status, 1, found.iterations)
+            nearest = np.clip(np.rint(found.at), box.low, box.high).astype(np.intp)
+            place = self._choose(found.at, nearest, box)
+            if place is None:
+                plan = Plan(found.cost, nearest, found.answer)
+                return Grown(Status.OPTIMAL, 1, found.iterations, plan=plan)
+            return Grown(Status.OPTIMAL, 1, found.iterations, self._branch(box, place, found))
+
+        stack, guess = [Node(least, (root, start))], self.guess()
         if guess is not None and (root.low != root.high).any():
             last = np.clip(guess, root.low, root.high)
-            stack.append(_Node(least, LevelBox(last.copy(), last.copy()), start))
-        ended = Status.INFEASIBLE
-        while stack:
-            node = stack.pop()
-            if node.bound >= cost - EQUAL * abs(cost):
-                continue
-            if not self.held.tighten(node.box, self.blocks):
-                continue
-            left = None if deadline is None else deadline - perf_counter()
-            if (left is not None and left <= 0) or self.nodes >= NODES:
-                stack.append(node)
-                ended = Status.TIME_LIMIT if self.nodes < NODES else Status.MAX_ITERATIONS
-                break
-            found = relax(node.box, node.answer, left)
-            self.nodes += 1
-            iterations += found.iterations
-            if found.status is Status.TIME_LIMIT:
-                stack.append(node)
-                ended = Status.TIME_LIMIT
-                break
-            if found.status is not Status.OPTIMAL:
-                if found.status is not Status.INFEASIBLE:
-                    unproven, ended = min(unproven, node.bound), Status.FAILED
-                continue
-            if found.cost >= cost - EQUAL * abs(cost):
-                continue
-            nearest = np.clip(np.rint(found.at), node.box.low, node.box.high).astype(np.intp)
-            place = self._choose(found.at, nearest, node.box)
-            if place is None:
-                best, cost, self.index = found.answer, found.cost, nearest
-                continue
-            self._branch(stack, node.box, place, found)
-        worst = min([unproven, *(node.bound for node in stack)])
-        self._known = best is not None
-        if best is None:
-            return LevelsFound(None, ended, iterations)
-        self._measure_gap(cost, worst, least)
-        return LevelsFound(best, Status.OPTIMAL, iterations)
+            stack.append(Node(least, (LevelBox(last.copy(), last.copy()), start)))
+        return self._search(stack, grow, Plan(), deadline, least)
 
     def find_sequence(
         self,
-        sequences: SequenceSearch,
+        sequences: Sequences,
         start: Float[np.ndarray, "moves leveled"],
         limits: Interval,
         root: LevelBox,
         deadline: float | None,
     ) -> LevelsFound:
         """Search the sequences of levels inside `root`; the answer is the point v of the best one."""
-        self.gap = 0.0
-        found = sequences.find(start, limits, root, self.guess(), deadline, NODES)
-        self.nodes, self._known = found.nodes, found.levels is not None
-        if found.levels is None:
-            return LevelsFound(None, found.status, found.nodes)
-        self.index = found.levels
-        self._measure_gap(found.cost, found.bound, 0.0)
-        return LevelsFound(found.v, Status.OPTIMAL, found.nodes)
+        node, best, grow = sequences.begin(start, limits, root, self.guess())
+        return self._search([node], grow, best, deadline, 0.0)
+
+    def _search(self, stack: list[Node], grow: Grow, best: Plan, deadline: float | None, least: float) -> LevelsFound:
+        """Branch and bound: take the last node, leave it if it cannot beat the best plan, else put those below it."""
+        self.nodes, self.gap = int(best.answer is not None), 0.0
+        iterations, unproven, ended = self.nodes, np.inf, Status.INFEASIBLE
+        while stack:
+            node = stack.pop()
+            most = _less(best.cost)
+            if node.bound >= most:
+                continue
+            left = None if deadline is None else deadline - perf_counter()
+            if (left is not None and left <= 0) or self.nodes >= NODES:
+                stack.append(node)
+                ended = Status.TIME_LIMIT if self.nodes < NODES else Status.MAX_ITERATIONS
+                break
+            grown = grow(node, most, left)
+            self.nodes += grown.programs
+            iterations += grown.iterations
+            if grown.status is Status.TIME_LIMIT:
+                stack.append(node)
+                ended = Status.TIME_LIMIT
+                break
+            if grown.status not in (Status.OPTIMAL, Status.INFEASIBLE):
+                unproven, ended = min(unproven, node.bound), Status.FAILED
+            best = grown.plan or best
+            stack += grown.nodes
+        self._known = best.levels is not None
+        if best.levels is None:
+            return LevelsFound(None, ended, iterations)
+        self.index = best.levels
+        bound = min([unproven, *(node.bound for node in stack)])
+        if bound < _less(best.cost):
+            missed = (best.cost - max(bound, least)) / max(best.cost - least, 1e-300)
+            self.gap = float(min(max(missed, 0.0), 1.0))
+        return LevelsFound(best.answer, Status.OPTIMAL, iterations)
 
     def guess(self) -> Int[np.ndarray, "moves leveled"] | None:
         """Return the levels of the last plan, moved on by a step; None where there is none."""
         if not self._known:
             return None
         return self.index if self.repeats else np.vstack([self.index[1:], self.index[-1:]])
-
-    def _measure_gap(self, cost: float, bound: float, least: float) -> None:
-        if bound < cost - EQUAL * abs(cost):
-            self.gap = float(min(max((cost - max(bound, least)) / max(cost - least, 1e-300), 0.0), 1.0))
 
     def find_places(self) -> Int[np.ndarray, "moves leveled"]:
         """Return where the moves on levels stand in a plan, move by move."""
@@ -218,14 +213,8 @@ class LevelSearch:
         k, i = open_moves[0]
         return int(k), int(i)
 
-    def _branch(
-        self,
-        stack: list[_Node],
-        box: LevelBox,
-        place: tuple[int, int],
-        found: Relaxed,
-    ) -> None:
-        """Put the nodes of the levels below and above on the stack, the nearer one last, so that it is next."""
+    def _branch(self, box: LevelBox, place: tuple[int, int], found: Relaxed) -> list[Node]:
+        """Return the nodes of the levels below and above, the nearer one last, so that it is next."""
         low, high, value = int(box.low[place]), int(box.high[place]), float(found.at[place])
         middle = int(np.rint(value))
         if abs(value - middle) <= NEAR:
@@ -233,11 +222,18 @@ class LevelSearch:
         else:
             below, above = (low, int(np.floor(value))), (int(np.ceil(value)), high)
             ends = [below, above] if middle == above[0] else [above, below]
+        nodes: list[Node] = []
         for first, last in ends:
             if low <= first <= last <= high:
                 child = LevelBox(box.low.copy(), box.high.copy())
                 child.low[place], child.high[place] = first, last
-                stack.append(_Node(found.cost, child, found.answer))
+                nodes.append(Node(found.cost, (child, found.answer)))
+        return nodes
+
+
+def _less(cost: float) -> float:
+    """Return what a plan has to cost less than to count as cheaper."""
+    return cost - EQUAL * abs(cost) if cost < np.inf else np.inf
 
 
 class LevelSolver(StepSolver):
@@ -257,15 +253,15 @@ class LevelSolver(StepSolver):
         self._of_levels, self._factor = qp.A[self._flat], qp.scale[self._flat]
         self._is_least_distance = bool((np.eye(len(qp.q)) == qp.P).all()) and not qp.q.any()
         self._soft_rows = np.flatnonzero(np.isfinite(qp.softness.linear))
-        shape = search.index.shape
-        sequences = SequenceSearch(qp, self._rows_of, self._factor.reshape(shape), search.held, search.blocks)
-        self._sequences = sequences if sequences.applies else None
+        held, factor = search.held, self._factor.reshape(search.index.shape)
+        planned = plan_sequences(qp, self._rows_of, factor, held.levels, search.blocks)
+        self._sequences = None if planned is None else Sequences(*planned, held)
 
     def describe(self) -> LevelsProgram | None:
         """Return the search over sequences as data; None unless all inputs are on levels in all steps."""
         search = self.search
         every = search.index.shape == (len(search.blocks), search.nu)
-        return None if self._sequences is None or not every else self._sequences.describe()
+        return None if self._sequences is None or not every else self._sequences.program
 
     def reset(self) -> None:
         """Forget all earlier solves, so that a run repeats to the bit."""
