@@ -18,7 +18,16 @@ from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolution, SolverTurn, StepQP, StepSolver
 from koopmpc.control.stepped.levels import NEAR, HeldLevels, LevelBox, leveled_moves
-from koopmpc.control.stepped.sequences import EQUAL, Grow, Grown, LevelsProgram, Node, Plan, Sequences, plan_sequences
+from koopmpc.control.stepped.sequences import (
+    EQUAL,
+    Grow,
+    Grown,
+    LevelNode,
+    LevelPlan,
+    LevelsProgram,
+    Sequences,
+    plan_sequences,
+)
 
 NODES = 200_000  # nodes of one search, at most
 _NAME = "sequences"  # of the solver, where no quadratic program is solved
@@ -122,7 +131,7 @@ class LevelSearch:
         No node costs less than `least`, from which the gap counts.
         """
 
-        def grow(node: Node, most: float, left: float | None) -> Grown:
+        def grow(node: LevelNode, most: float, left: float | None) -> Grown:
             box, answer = node.part
             if not self.held.tighten(box, self.blocks):
                 return Grown(Status.INFEASIBLE)
@@ -132,15 +141,15 @@ class LevelSearch:
             nearest = np.clip(np.rint(found.at), box.low, box.high).astype(np.intp)
             place = self._choose(found.at, nearest, box)
             if place is None:
-                plan = Plan(found.cost, nearest, found.answer)
+                plan = LevelPlan(found.cost, nearest, found.answer)
                 return Grown(Status.OPTIMAL, 1, found.iterations, plan=plan)
             return Grown(Status.OPTIMAL, 1, found.iterations, self._branch(box, place, found))
 
-        stack, guess = [Node(least, (root, start))], self.guess()
+        stack, guess = [LevelNode(least, (root, start))], self.guess()
         if guess is not None and (root.low != root.high).any():
             last = np.clip(guess, root.low, root.high)
-            stack.append(Node(least, (LevelBox(last.copy(), last.copy()), start)))
-        return self._search(stack, grow, Plan(), deadline, least)
+            stack.append(LevelNode(least, (LevelBox(last.copy(), last.copy()), start)))
+        return self._search(stack, grow, LevelPlan(), deadline, least)
 
     def find_sequence(
         self,
@@ -154,7 +163,9 @@ class LevelSearch:
         node, best, grow = sequences.begin(start, limits, root, self.guess())
         return self._search([node], grow, best, deadline, 0.0)
 
-    def _search(self, stack: list[Node], grow: Grow, best: Plan, deadline: float | None, least: float) -> LevelsFound:
+    def _search(
+        self, stack: list[LevelNode], grow: Grow, best: LevelPlan, deadline: float | None, least: float
+    ) -> LevelsFound:
         """Branch and bound: take the last node, leave it if it cannot beat the best plan, else put those below it."""
         self.nodes, self.gap = int(best.answer is not None), 0.0
         iterations, unproven, ended = self.nodes, np.inf, Status.INFEASIBLE
@@ -213,7 +224,7 @@ class LevelSearch:
         k, i = open_moves[0]
         return int(k), int(i)
 
-    def _branch(self, box: LevelBox, place: tuple[int, int], found: Relaxed) -> list[Node]:
+    def _branch(self, box: LevelBox, place: tuple[int, int], found: Relaxed) -> list[LevelNode]:
         """Return the nodes of the levels below and above, the nearer one last, so that it is next."""
         low, high, value = int(box.low[place]), int(box.high[place]), float(found.at[place])
         middle = int(np.rint(value))
@@ -222,12 +233,12 @@ class LevelSearch:
         else:
             below, above = (low, int(np.floor(value))), (int(np.ceil(value)), high)
             ends = [below, above] if middle == above[0] else [above, below]
-        nodes: list[Node] = []
+        nodes: list[LevelNode] = []
         for first, last in ends:
             if low <= first <= last <= high:
                 child = LevelBox(box.low.copy(), box.high.copy())
                 child.low[place], child.high[place] = first, last
-                nodes.append(Node(found.cost, (child, found.answer)))
+                nodes.append(LevelNode(found.cost, (child, found.answer)))
         return nodes
 
 

@@ -29,14 +29,14 @@ _LATER = 1e-12  # a row depends on a move if its entry is more than this share o
 _OUTSIDE = 1e-8  # a hard row is met up to this much, by 1 + the size of its limit
 
 
-class Node(NamedTuple):
+class LevelNode(NamedTuple):
     """A part of a search: no plan in it costs less than `bound`."""
 
     bound: float
     part: Any
 
 
-class Plan(NamedTuple):
+class LevelPlan(NamedTuple):
     """A plan on levels: its cost, the levels of its moves, and what the caller makes of it; without an answer none."""
 
     cost: float = np.inf
@@ -50,11 +50,11 @@ class Grown(NamedTuple):
     status: Status
     programs: int = 0
     iterations: int = 0
-    nodes: Sequence[Node] = ()
-    plan: Plan | None = None
+    nodes: Sequence[LevelNode] = ()
+    plan: LevelPlan | None = None
 
 
-Grow = Callable[[Node, float, float | None], Grown]
+Grow = Callable[[LevelNode, float, float | None], Grown]
 """(node, cost of the best plan, seconds left) → what became of the node."""
 
 
@@ -199,7 +199,7 @@ class Sequences:
         limits: Interval,
         root: LevelBox,
         guess: Int[np.ndarray, "moves leveled"] | None,
-    ) -> tuple[Node, Plan, Grow]:
+    ) -> tuple[LevelNode, LevelPlan, Grow]:
         """Return the first node inside `root`, the plan on the levels of a guess, and what nodes become.
 
         Parameters
@@ -216,14 +216,14 @@ class Sequences:
         box = LevelBox(np.full(n, 0), program.levels.count[self._input] - 1)
         np.maximum.at(box.low, program.group, root.low.ravel())
         np.minimum.at(box.high, program.group, root.high.ravel())
-        origin, best = start.ravel()[program.free], Plan()
+        origin, best = start.ravel()[program.free], LevelPlan()
         if guess is not None:
             index = np.clip(guess.ravel()[program.free], *box)
             every = index[program.group].reshape(self._shape)
             if not self._has_dwell or held.tighten(LevelBox(every, every.copy()), program.blocks.tolist()):
                 s = self._inverse @ (index - origin)
                 cost = 0.5 * float(s @ s) + self._price(program.T @ s, limits)
-                best = Plan(cost, every, self._from_s @ s) if cost < np.inf else Plan()
+                best = LevelPlan(cost, every, self._from_s @ s) if cost < np.inf else LevelPlan()
         first = _Begun(
             0,
             np.concatenate([origin, np.zeros(len(program.rows))])[self._place][None],
@@ -234,7 +234,7 @@ class Sequences:
             held.steps[None, : self._counted],
         )
 
-        def grow(node: Node, most: float, left: float | None) -> Grown:
+        def grow(node: LevelNode, most: float, left: float | None) -> Grown:
             begun: _Begun = node.part
             better = begun.cost < most
             begun = begun if better.all() else _take(begun, np.flatnonzero(better))
@@ -245,15 +245,15 @@ class Sequences:
             if begun.move == n:
                 k = int(begun.cost.argmin())
                 index = begun.taken[k][program.group].reshape(self._shape)
-                plan = Plan(float(begun.cost[k]), index, self._from_s @ begun.s[k])
+                plan = LevelPlan(float(begun.cost[k]), index, self._from_s @ begun.s[k])
                 return Grown(Status.OPTIMAL, K, K, plan=plan)
             parts = [begun]
             if K > WIDTH:
                 order = np.argpartition(begun.cost, WIDTH)
                 parts = [_take(begun, order[WIDTH:]), _take(begun, order[:WIDTH])]
-            return Grown(Status.OPTIMAL, K, K, [Node(float(part.cost.min()), part) for part in parts])
+            return Grown(Status.OPTIMAL, K, K, [LevelNode(float(part.cost.min()), part) for part in parts])
 
-        return Node(0.0, first), best, grow
+        return LevelNode(0.0, first), best, grow
 
     def _go_on(self, begun: _Begun, levels: tuple[int, int], limits: Interval, most: float) -> _Begun:
         """Return the beginnings with one more move on each allowed level, as far as they cost less than `most`."""
