@@ -46,6 +46,10 @@ ROOMS = {  # where a name is defined → title and first sentence of its page, i
         "Problems and sweeps",
         "A problem is a plant with its data, cost, limits and cases; sweeps compare controllers on it.",
     ),
+    "apps": (
+        "Papers",
+        "`km.papers`: what the files of problems/papers/ share, and how a paper is found and reproduced.",
+    ),
     "errors": ("Errors", "Mistakes raise one of these; each is also the builtin that it refines."),
 }
 
@@ -84,7 +88,9 @@ def entries() -> list[Entry]:
 
 def _served(prefix: str, module: ModuleType) -> Iterator[Entry]:
     """Yield what a module serves from its files, or, where it has no table, what it defines."""
-    if hasattr(module, "__all__"):
+    if hasattr(module, "__all__") and not hasattr(module, "__path__"):
+        homes = dict.fromkeys(module.__all__, module.__name__)
+    elif hasattr(module, "__all__"):
         homes = {name: home for name, home in read_imports(module.__name__).items() if name in module.__all__}
     else:
         homes = {name: module.__name__ for name, value in vars(module).items() if _defined(name, value, module)}

@@ -38,7 +38,6 @@ __all__ = [
     "CurvePanel",
     "Page",
     "Paper",
-    "TellPart",
     "Verdict",
     "add_verdicts",
     "compare_value",

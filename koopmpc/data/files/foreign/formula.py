@@ -40,7 +40,7 @@ def read_formula(text: str, channel: str) -> Callable[[Values], Values]:
             raise ValueError(f"it has {len(text)} characters")
         formula = _build(ast.parse(text.strip().replace("^", "**"), mode="eval").body)
     except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError) as error:
-        reason = error.args[0] if isinstance(error, ValueError) else "it is no formula"
+        reason = error.args[0] if isinstance(error, ValueError) else "the text cannot be parsed"
         raise LogError(
             f"channel {channel!r} is converted by the formula {text[:60]!r}, which is not computed: {reason}; export "
             "the log with converted values, for only arithmetic of X and functions such as sqrt and log are computed"
