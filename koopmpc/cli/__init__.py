@@ -3,7 +3,7 @@
 import sys
 from typing import Any
 
-from koopmpc.interrupts import ENDING
+from koopmpc.cli.ending import ENDING
 
 
 def app(*arguments: Any, **options: Any) -> None:

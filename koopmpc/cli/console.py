@@ -16,8 +16,8 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from koopmpc.cli.ending import ENDING
 from koopmpc.errors import DataError, FitWarning, FullDiskError, KoopmpcError, LogError
-from koopmpc.interrupts import ENDING
 
 
 def split(names: str) -> list[str]:

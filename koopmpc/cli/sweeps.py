@@ -11,8 +11,8 @@ import typer
 from rich.text import Text
 
 from koopmpc.cli.console import bar, console, format_command, friendly, new_folder, say, say_page
+from koopmpc.cli.ending import ENDING
 from koopmpc.errors import DataError, LogError
-from koopmpc.interrupts import ENDING
 
 if TYPE_CHECKING:
     from koopmpc.bench.problem import Problem

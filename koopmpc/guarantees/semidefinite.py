@@ -19,12 +19,13 @@ Source of the method: Strässer, Schaller, Worthmann, Berberich, Allgöwer, arXi
 
 import warnings
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.interrupts import call_uninterrupted, import_whole
+from koopmpc.interrupts import call_uninterrupted
 
 _STRICT = 1e-7  # least eigenvalue that the program asks of its matrices, in scaled coordinates
 _SOLVED = ("optimal", "optimal_inaccurate")  # the solver's word is checked afterwards in either case
@@ -96,7 +97,7 @@ def solve_feedback(task: FeedbackTask, *, linear: bool = False) -> FeedbackProof
     linear
         Keep K_w = 0, so that v = K φ.
     """
-    model: Any = import_whole("cvxpy")  # slow
+    model: Any = import_module("cvxpy")  # slow
     # inside, φ = T φ̂ with E = T Tᵀ and v = g v̂ with inputs of unit effect: the ellipsoid is the unit ball
     T = _root(task.E)
     back = np.linalg.inv(T)

@@ -26,7 +26,7 @@ import numpy as np
 
 from koopmpc import disk
 from koopmpc.errors import LogError
-from koopmpc.interrupts import defer_interrupts
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.values import checksum
 
 _MARK = b"koopmpc-crc32:"  # stands before the checksum of a file
@@ -181,7 +181,7 @@ def new_recording(application: str) -> Any:
     import rerun as rr
     import rerun_bindings
 
-    with defer_interrupts():  # Python drops a Ctrl-C that comes in a deletion
+    with raise_swallowed():  # Python drops a Ctrl-C that comes in a deletion
         if rr.get_global_data_recording() is None:
             rerun_bindings.flush_and_cleanup_orphaned_recordings()
         return rr.RecordingStream(application, recording_id=uuid.uuid4())
@@ -193,7 +193,7 @@ def send_blueprint(rec: Any, application: str, layout: Any) -> None:
     import rerun_bindings
 
     _name(layout.root_container, application)
-    with defer_interrupts():
+    with raise_swallowed():
         own = rerun_bindings.new_blueprint(
             application_id=application, make_default=False, make_thread_default=False, default_enabled=True
         )

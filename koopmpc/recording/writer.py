@@ -14,7 +14,7 @@ from koopmpc import checks
 from koopmpc.control.move import Fallback
 from koopmpc.disk import path_of
 from koopmpc.errors import KoopmpcError
-from koopmpc.interrupts import defer_interrupts, raise_swallowed
+from koopmpc.interrupts import raise_swallowed
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.run import MOVE_COLUMNS, About, Plans, Run, Step, StepRows
 from koopmpc.predict.base import Predictor
@@ -148,7 +148,7 @@ class Writer:
         self._file: LogFile | None = None
         self._rec: Any = None
         try:
-            with defer_interrupts():  # no interrupt between the file and its name leaves it behind
+            with raise_swallowed():  # no interrupt between the file and its name leaves it behind
                 self._file = None if path is None else LogFile(path, growing=growing)
             self._rec = new_recording(application_of(about))
         except BaseException:  # a Ctrl-C
@@ -276,7 +276,7 @@ class Writer:
 
     def _release(self) -> None:
         """Close the recording and let go of it."""
-        with defer_interrupts():
+        with raise_swallowed():
             if self._rec is not None:
                 if not self._opened:
                     self._rec.binary_stream().read()  # else Rerun prints that it drops what no sink has taken

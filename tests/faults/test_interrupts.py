@@ -3,7 +3,6 @@
 import gc
 import os
 import random
-import re
 import signal
 import subprocess
 import sys
@@ -15,11 +14,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import rerun as rr
 
 import koopmpc as km
-from koopmpc import lazy
-from koopmpc.interrupts import clean_folder, import_whole
+from koopmpc.cli.ending import clean_folder
 from tests.bench.tiny import write
 from tests.faults.test_controllers import BUILD, controllers, models  # noqa: F401  # fixtures
 
@@ -112,33 +109,6 @@ def _ctrl_c_is_heard():
     gc.enable()
 
 
-def test_an_interrupt_waits_for_a_library_that_would_take_it_for_a_missing_part(tmp_path, monkeypatch):
-    """CVXPY catches what the import of a solver raises: a Ctrl-C in it was lost, and the solver with it."""
-    greedy = "import signal\ntry:\n    signal.raise_signal(2)\nexcept BaseException:\n    whole = False\nelse:\n    whole = True\n"
-    (tmp_path / "greedy.py").write_text(greedy)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "greedy", raising=False)
-    with pytest.raises(KeyboardInterrupt):
-        import_whole("greedy")
-    assert sys.modules["greedy"].whole
-    sources = {path.name: path.read_text() for path in Path(km.__file__).parent.rglob("*.py")}
-    assert [name for name, text in sources.items() if re.search(r"^ *(import|from) cvxpy", text, re.M)] == []
-
-
-def test_an_interrupt_that_a_first_import_hides_behind_an_error_is_raised(monkeypatch):
-    """Modules in C answer any error of what they import with ImportError, those in Rust with RuntimeError."""
-
-    def hide(name):
-        try:
-            signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt:
-            raise ImportError(f"{name} failed to import") from None
-
-    monkeypatch.setattr(lazy, "import_module", hide)
-    with pytest.raises(KeyboardInterrupt):
-        km.__getattr__("train")
-
-
 SENDER = """
 import os, random, signal, sys, time
 signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -229,30 +199,6 @@ def test_an_interrupt_in_the_last_iteration_of_a_solve_is_raised() -> None:
     _solve_uninterrupted(lambda: (library.osqp_start_interrupt_listener(), library.osqp_end_interrupt_listener()))
 
 
-@pytest.mark.parametrize(("kind", "method"), [(threading.Thread, "start"), (rr.RecordingStream, "set_sinks")])
-@pytest.mark.parametrize("begun", [False, True])
-def test_an_interrupt_while_a_log_is_opened_leaves_nothing_and_waits_for_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type, method: str, begun: bool
-) -> None:
-    record, done = _record(tmp_path), getattr(kind, method)
-
-    def interrupted(self, *arguments, **options):
-        if begun:
-            done(self, *arguments, **options)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(kind, method, interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            record()
-    assert list(tmp_path.iterdir()) == []
-    for thread in (each for each in threading.enumerate() if each.name == "koopmpc-log"):
-        thread.join(SECONDS)
-        assert not thread.is_alive()
-    record()
-    assert km.load_run(tmp_path / "run.rrd").steps == 50
-
-
 def moments(what: str, count: int) -> list[float]:
     """Return seconds after the start of a command: a third of them while it still imports."""
     rng = random.Random(what)
@@ -314,54 +260,6 @@ def test_a_command_ends_at_once_with_one_line_and_whole_files(
     assert interrupted > 0
 
 
-def test_the_program_listens_before_what_takes_milliseconds_is_imported() -> None:
-    code = """
-import signal, sys
-from koopmpc.cli import ENDING
-set_handler = signal.signal
-def shown(*handler):
-    print(*{"casadi", "numpy", "pathlib", "rich", "socket", "typer"} & set(sys.modules))
-    return set_handler(*handler)
-signal.signal = shown
-with ENDING:
-    pass
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[:2] == ["", ""]
-
-
-def test_an_interrupt_while_the_program_begins_to_listen_ends_it_with_one_line() -> None:
-    code = """
-import os, signal, threading
-from koopmpc.interrupts import ENDING
-threading.Thread.start = lambda _: os.kill(os.getpid(), signal.SIGINT)
-with ENDING:
-    print("entered")
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted; nothing was written\n")
-
-
-@pytest.mark.parametrize(("late", "code"), [(False, 130), (True, 3)], ids=["leaving", "unloading"])
-def test_an_interrupt_while_the_program_leaves_ends_it_by_a_code_and_no_signal(late: bool, code: int) -> None:
-    source = f"""
-import atexit, os, signal, sys
-from koopmpc.interrupts import ENDING
-class Sending:
-    def __del__(self, kill=os.kill, pid=os.getpid()):
-        kill(pid, 2)
-    def send(self):
-        self.__del__()
-sending = Sending()  # is deleted when modules are unloaded
-with ENDING:
-    if not {late}:
-        atexit.register(sending.send)
-    sys.exit(3)
-"""
-    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (code, "" if late else "interrupted; nothing was written\n")
-
-
 def test_what_was_kept_is_said_and_half_files_go(tmp_path: Path) -> None:
     assert clean_folder(None) == "nothing was written"
     folder = tmp_path / "logs"
@@ -377,7 +275,7 @@ def test_what_was_kept_is_said_and_half_files_go(tmp_path: Path) -> None:
 
 SOLVING = """
 import os, signal, threading
-from koopmpc.interrupts import ENDING
+from koopmpc.cli.ending import ENDING
 import casadi as ca
 with ENDING:
     x = ca.MX.sym("x", 40)

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from typing import Any, Unpack
 
 import numpy as np
@@ -17,7 +18,6 @@ from koopmpc.identify.fits.prior import Combination, Dissipation, Entries, Prior
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import build_predictor, build_result, describe_misfit, read_regression
 from koopmpc.identify.solve import RegressionRows, Ridge, check_ridge, column_norms, describe_solve, find_doubts, solve
-from koopmpc.interrupts import import_whole
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -167,7 +167,7 @@ def solve_convex_program(
     DataError
         No A and B meet the priors, or the solver gives up.
     """
-    cp: Any = import_whole("cvxpy")  # without types, and slow to import
+    cp: Any = import_module("cvxpy")  # without types, and slow to import
     n, nz = rows.P.shape[1], len(which)
     size = _replace_zeros(column_norms(rows.P))
     energy = np.sum(rows.T[:, which] ** 2, axis=0) + rows.rest[which]

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import Any, Unpack
 
 import numpy as np
@@ -31,7 +32,6 @@ from koopmpc.identify.solve import (
     project_onto,
     solve,
 )
-from koopmpc.interrupts import import_whole
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.predictors import LinearPredictor
 
@@ -202,7 +202,7 @@ def fit_lyapunov(
     Lacy & Bernstein, "Subspace identification with guaranteed stability using constrained optimization", IEEE
     Trans. Automat. Contr. 48, 2003.
     """
-    cp: Any = import_whole("cvxpy")  # without types, and slow to import
+    cp: Any = import_module("cvxpy")  # without types, and slow to import
     n = len(A0)
     values, vectors = np.linalg.eigh(G)
     root = np.sqrt(np.maximum(values, 1e-8 * values[-1]))
