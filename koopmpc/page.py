@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -137,7 +138,7 @@ h2,h3{break-after:avoid}pre{white-space:pre-wrap;overflow-wrap:anywhere;font-siz
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"  # a browser loads nothing from elsewhere
 
 
-def wrap_html(title: str, body: str) -> str:
+def _wrap_html(title: str, body: str) -> str:
     """Return a whole HTML document that needs no other file, no network and no script."""
     start = '<!doctype html><html lang="en"><head><meta charset="utf-8">'
     safe = f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
@@ -145,7 +146,7 @@ def wrap_html(title: str, body: str) -> str:
     return f"{start}{safe}{view}<style>{_STYLE}</style></head><body>{body}</body></html>\n"
 
 
-def rename_ids(picture: str, mark: str) -> str:
+def _rename_ids(picture: str, mark: str) -> str:
     """Return an SVG whose ids begin with `mark`: references would end in the first picture of a page otherwise."""
     for before in ('id="', 'href="#', "url(#"):
         picture = picture.replace(before, before + mark)
@@ -205,16 +206,21 @@ class HtmlPage:
         figures: list[str] = []
         for svg, caption in pictures:
             self._pictures += 1
-            named = rename_ids(svg, f"p{self._pictures}-").replace(
+            named = _rename_ids(svg, f"p{self._pictures}-").replace(
                 "<svg ", f'<svg role="img" aria-label="{escape(caption)}" ', 1
             )
             figures.append(f"<figure>{named}<figcaption>{escape(caption)}</figcaption></figure>")
         self.parts.append(f'<div class="grid">{"".join(figures)}</div>')
 
+    def links(self, title: str, files: Iterable[str]) -> None:
+        """Add a list of files beside the page, folded up under its title."""
+        lines = ", ".join(f'<a href="{quote(file)}">{escape(file)}</a>' for file in files)
+        self.parts.append(f"<details><summary>{escape(title)}</summary><p>{lines}</p></details>")
+
     @property
     def html(self) -> str:
         """The whole document."""
-        return wrap_html(self.title, f"<h1>{escape(self.title)}</h1>{''.join(self.parts)}")
+        return _wrap_html(self.title, f"<h1>{escape(self.title)}</h1>{''.join(self.parts)}")
 
     def write(self, path: Path) -> Path:
         """Write the document and return its path.

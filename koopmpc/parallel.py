@@ -1,45 +1,45 @@
-"""map_tasks: one function over many tasks, here, on local processes, or on a Dask cluster."""
+"""map_tasks: one function over many tasks, here, on local processes, or on a Dask cluster.
+
+Local processes are those of loky, and a Dask client has an executor of the same protocol: a window
+of futures over either yields the results in order.
+"""
 
 import os
 import pickle
-import re
-import signal
+import socket
 import threading
+import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence, Sized
 from concurrent.futures import BrokenExecutor, Future
-from contextlib import AbstractContextManager, nullcontext
-from itertools import count, islice
-from multiprocessing import Pipe, parent_process
-from multiprocessing.connection import Connection, wait
-from typing import Any, cast
-
-import cloudpickle
+from contextlib import ExitStack, contextmanager, suppress
+from functools import lru_cache
+from itertools import islice
+from typing import Any, TypeVar, cast
+from urllib.parse import urlsplit
 
 from koopmpc import checks
-from koopmpc.cluster import (
-    AHEAD,
-    ONE_THREAD,
-    QueuedTask,
-    Result,
-    Task,
-    TaskPool,
-    address_of,
-    died,
-    open_dask,
-)
-from koopmpc.errors import DataError, KoopmpcError
+from koopmpc.errors import DataError, KoopmpcError, install
 from koopmpc.interrupts import call_uninterrupted
 
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 Progress = Callable[[int, int | None], None]
 """Called with (tasks done, tasks in all)."""
 StageProgress = Callable[[str, int, int | None], None]
 """Called with (name of the stage, tasks done, tasks in all), for work in several stages."""
 
+_AHEAD = 2  # for each worker this many tasks may be under way, or wait for their turn
 _TRIES = 3  # name a task that killed its worker this many times while it ran alone
+_PATIENCE = 30.0  # raise an error if the cluster has no worker, or its scheduler no answer, for this time [s]
+_ANSWER = 10.0  # raise an error if nothing listens at the scheduler's address, or it says nothing, for this time [s]
+_LOOK = 0.5  # a worker looks this often whether its parent has ended [s]
+_SHOWN = 200  # a message shows at most this many characters of a task
+_ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_KEEP_MODELS = {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}  # loky restarts a worker whose memory grows by more [B]
+_KILLS = ": each worker that ran it died; run it with workers=1 to see why, or give the workers more memory"
 _UNSENDABLE = (AttributeError, TypeError, pickle.PicklingError)
-_WORKER_ENVIRONMENT = {**ONE_THREAD, "LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}  # a worker may keep models between its tasks
 
 
 def map_tasks(
@@ -53,13 +53,13 @@ def map_tasks(
     """Yield function(task) for each task, in the order of the tasks.
 
     Tasks are taken and results kept only a few ahead of what was yielded: memory does not grow with their number.
-    What `function` raises is raised here, once all results before it are out. A task that is under way when a worker
-    dies is done again; one that takes its worker with it three times when it is done alone is named.
+    What `function` raises is raised here, once all results before it are out. Tasks that were under way when a worker
+    died run again, each alone; one that kills its worker three times is named.
 
     Parameters
     ----------
     function
-        Of one argument. For workers: defined at the top of a module, for it crosses processes by name.
+        Of one argument. A worker gets it by name from its module, or its code where a script defines it.
     tasks
         Any iterable; for workers of what pickles.
     workers
@@ -77,22 +77,17 @@ def map_tasks(
     KoopmpcError
         A worker died on the same task each time, cannot start, or no Dask scheduler or worker answers.
     """
-    workers = _check_workers(workers, scheduler)
-    total = len(tasks) if isinstance(tasks, Sized) else None
-    if scheduler is not None:
-        results = _yield_results(open_dask(function, address_of(scheduler, workers), workers), tasks)
-    elif workers == 1:
-        results = map(function, tasks)
-    else:
-        results = _yield_results(LocalPool(workers or 1, function), tasks)
-    return results if progress is None else _report(results, progress, total)
+    pool = Workers(workers, scheduler)  # checks its arguments now, not when the first result is asked for
+
+    def run_and_close() -> Generator[Result]:
+        with pool:
+            yield from pool.run(function, tasks, progress)
+
+    return run_and_close()
 
 
 class Workers:
     """Processes that do one `map_tasks` after the other, so that they start and import once; use it with ``with``.
-
-    A worker is sent the function of a call with each of its tasks, and keeps the last one. On a Dask cluster every
-    call is one of `map_tasks`.
 
     Parameters
     ----------
@@ -101,14 +96,22 @@ class Workers:
     """
 
     def __init__(self, workers: int | None = None, scheduler: str | None = None) -> None:
-        self._workers, self._scheduler = _check_workers(workers, scheduler), scheduler
-        self._pool = LocalPool(self._workers or 1)
+        workers = 1 if workers is None and scheduler is None else workers
+        self._workers = None if workers is None else checks.count(workers, "workers")
+        self._scheduler = None if scheduler is None else check_scheduler(scheduler, workers)
+        self._opened = ExitStack()
+        self._pool: tuple[Any, Callable[[], int]] | None = None
 
     def __enter__(self) -> "Workers":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._pool.close()
+        self.close()
+
+    def close(self) -> None:
+        """End the processes, those that work too; the next task starts others."""
+        self._pool = None
+        self._opened.close()
 
     def map(
         self,
@@ -126,270 +129,239 @@ class Workers:
         order = list(range(len(tasks)))
         if size is not None:
             order.sort(key=lambda i: -size(tasks[i]))
-        sent = [tasks[i] for i in order]
-        if self._scheduler is not None or self._workers == 1:
-            results = map_tasks(function, sent, workers=self._workers, scheduler=self._scheduler, progress=progress)
-        else:
-            self._pool.set_function(function)
-            results = _yield_results(nullcontext(self._pool), sent, ahead=len(sent))
-            results = results if progress is None else _report(results, progress, len(sent))
+        results = self.run(function, [tasks[i] for i in order], progress, ahead=len(tasks))
         return [result for _, result in sorted(zip(order, results, strict=True), key=lambda pair: pair[0])]
 
+    def run(
+        self,
+        function: Callable[[Task], Result],
+        tasks: Iterable[Task],
+        progress: Progress | None = None,
+        ahead: int | None = None,
+    ) -> Generator[Result]:
+        """Yield function(task) in the order of the tasks; at most `ahead` are under way or wait for their turn."""
+        here, total = self._workers == 1 and self._scheduler is None, len(tasks) if isinstance(tasks, Sized) else None
+        if progress is not None:
+            progress(0, total)
+        for done, result in enumerate(map(function, tasks) if here else self._send(function, tasks, ahead), start=1):
+            if progress is not None:
+                progress(done, total)
+            yield result
 
-def _check_workers(workers: int | None, scheduler: str | None) -> int | None:
-    """Return the number of local processes; None leaves it to the cluster."""
-    workers = 1 if workers is None and scheduler is None else workers
-    return None if workers is None else checks.count(workers, "workers")
-
-
-def _report(results: Iterator[Result], progress: Progress, total: int | None) -> Iterator[Result]:
-    """Yield the results, and call progress after each."""
-    progress(0, total)
-    for done, result in enumerate(results, start=1):
-        progress(done, total)
-        yield result
-
-
-def _yield_results(
-    opening: AbstractContextManager[TaskPool], tasks: Iterable[Any], ahead: int | None = None
-) -> Generator[Any]:
-    """Yield the results of a pool in the order of the tasks.
-
-    At most `ahead` tasks, by default two for each worker, are under way or wait for their turn.
-    """
-    with opening as pool:
-        jobs = (QueuedTask(i, task) for i, task in enumerate(tasks))
-        queue = deque[QueuedTask[Any]]()
+    def _send(self, function: Callable[[Task], Any], tasks: Iterable[Task], ahead: int | None) -> Generator[Any]:
+        """Yield the results of the workers."""
+        code, numbered = _pickle(function, "the function"), enumerate(tasks)
+        waiting = deque[tuple[str, bytes, Future[bytes]]]()
         try:
             while True:
-                room = (AHEAD * pool.count_workers() if ahead is None else ahead) - len(queue)
-                for job in islice(jobs, max(room, 0)):
-                    queue.append(job)
-                    pool.submit(job)
-                if not queue:
+                room = (_AHEAD * self._open()[1]() if ahead is None else ahead) - len(waiting)
+                for i, task in islice(numbered, max(room, 0)):
+                    name = f"task {i}, {task!s:.{_SHOWN}}"
+                    sent = _pickle(task, name)
+                    waiting.append((name, sent, self._submit(code, sent)))
+                if not waiting:
                     return
-                result = pool.wait(queue[0])
-                queue.popleft()
-                yield result
+                name, sent, future = waiting[0]
+                succeeded, value = pickle.loads(self._wait(future, name, code, sent))
+                waiting.popleft()
+                if not succeeded:
+                    raise value
+                yield value
         finally:
-            if queue:
-                pool.abandon()
+            if waiting:  # nobody waits for the tasks under way any more
+                self.close()
 
+    def _open(self) -> tuple[Any, Callable[[], int]]:
+        """Return the executor, and what counts its workers."""
+        if self._pool is None:
+            processes = _start_processes(self._workers or 1)
+            opening = processes if self._scheduler is None else _join_cluster(self._scheduler, self._workers)
+            self._pool = self._opened.enter_context(opening)
+        return self._pool
 
-class LocalPool:
-    """Processes of loky's executor, each with one BLAS thread.
-
-    Tasks and results are pickled here rather than by the executor, so that an error names what does not pickle, and an
-    exception that does not unpickle breaks nothing. cloudpickle sends what a script defines by its code: a worker does
-    not import the script.
-    """
-
-    def __init__(self, workers: int, function: Callable[[Any], Any] | None = None) -> None:
-        self._workers, self._function, self._code = workers, function, (0, b"")
-        self._futures: dict[QueuedTask[Any], Future[Any]] = {}
-        self._executor: Any = None
-
-    def __enter__(self) -> "LocalPool":
-        if self._function is not None:
-            self.set_function(self._function)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def set_function(self, function: Callable[[Any], Any]) -> None:
-        """Send this function with all tasks from now on.
-
-        Raises
-        ------
-        DataError
-            It does not pickle.
-        """
-        if not self._code[0] or function is not self._function:
-            self._function, self._code = function, (next(_numbers), _pickle(function, "the function"))
-
-    def count_workers(self) -> int:
-        """Return the number of processes."""
-        return self._workers
-
-    def submit(self, job: QueuedTask[Any]) -> None:
-        """Send the job to the next worker that is free.
-
-        Raises
-        ------
-        DataError
-            It does not pickle.
-        """
-        self._futures[job] = self._send(_pickle(job.task, str(job)))
-
-    def wait(self, job: QueuedTask[Any]) -> Any:
-        """Return the result of the job, or raise what the task raised.
-
-        When a worker dies, it is not known whose job killed it. This job, the first that is due, is done again alone,
-        where a death is its own; the others that were lost are sent to new workers.
-
-        Raises
-        ------
-        KoopmpcError
-            Each worker died while it did this job alone, or while it started.
-        """
+    def _submit(self, code: bytes, sent: bytes) -> Future[bytes]:
         try:
-            answer = self._futures.pop(job).result()
-        except BrokenExecutor:
-            self.close()
-            answer = self._repeat(job)
-            lost = [other for other, future in self._futures.items() if future.exception() is not None]
-            for other in lost:
-                self.submit(other)
-        fine, value = pickle.loads(answer)
-        if not fine:
-            raise value
-        return value
-
-    def abandon(self) -> None:
-        """End the processes, those that work too; the next job starts others."""
-        self._futures.clear()
-        self.close()
-
-    def close(self) -> None:
-        """End the processes."""
-        executor, self._executor = self._executor, None
-        if executor is not None:
-            executor.shutdown(wait=True, kill_workers=True)
-            self._lifeline.close()
-
-    def _send(self, task: bytes) -> "Future[Any]":
-        try:
-            executor = self._executor or self._start()
-            return executor.submit(_work, task, *self._code)
-        except BrokenExecutor as error:  # another worker died meanwhile: `wait` sends the task again
-            lost = Future[Any]()
+            return self._open()[0].submit(_work, code, sent)
+        except BrokenExecutor as error:  # a worker died meanwhile: `_wait` runs the task alone
+            lost = Future[bytes]()
             lost.set_exception(error)
             return lost
 
-    def _start(self) -> Any:
-        """Return an executor whose processes have started, which inherit a blocked Ctrl-C and one BLAS thread."""
-        from loky import ProcessPoolExecutor
-
-        _quiet_tracker()
-        received, self._lifeline = Pipe(duplex=False)
-        with received:
-            self._executor = ProcessPoolExecutor(
-                self._workers, initializer=_begin, initargs=(received,), env=_WORKER_ENVIRONMENT
-            )
-            call_uninterrupted(self._send_first)
-        return self._executor
-
-    def _send_first(self) -> None:
-        self._started: Future[int] = self._executor.submit(os.getpid)  # starts the processes
-
-    def _repeat(self, job: QueuedTask[Any]) -> bytes:
-        """Return the answer of a worker that has nothing else to do."""
-        task, not_started = _pickle(job.task, str(job)), None
-        for _ in range(_TRIES):
-            with LocalPool(1) as alone:
-                alone._code = self._code
-                try:
-                    return alone._send(task).result()
-                except BrokenExecutor:
-                    not_started = alone._started.exception()
-        if not_started is None:
-            raise KoopmpcError(died(str(job), f"{_TRIES} times"))
-        codes = re.search(r"\{.+\}", str(not_started))  # loky names them in its message alone
-        raise KoopmpcError(
-            f"each worker process was killed while it started (exit codes {codes[0] if codes else 'unknown'}); "
-            "run with fewer workers, or give them more memory"
-        ) from not_started
+    def _wait(self, future: Future[bytes], name: str, code: bytes, sent: bytes) -> bytes:
+        """Return the answer; what the function raised is in it, so an exception is one of the workers."""
+        try:
+            return future.result()
+        except BrokenExecutor:
+            self.close()
+            return _run_alone(name, code, sent)
+        except Exception as error:
+            if type(error).__name__ == "KilledWorker":
+                raise KoopmpcError(f"{name}{_KILLS}") from error
+            raise KoopmpcError(
+                f"{name}: the Dask scheduler at {self._scheduler} has ended; start another one, and run again"
+            ) from error
 
 
-_dump: Callable[[object], bytes] = cast("Any", cloudpickle).dumps
-_numbers = count(1)  # of the functions that this process sends
-
-
-def _quiet_tracker() -> None:
-    """Start the process with which loky removes semaphores that are left behind, without its warnings.
-
-    After Ctrl-C it would write lines below the one with which the program ends.
-    """
-    from loky.backend import resource_tracker
-
-    before = os.environ.get("PYTHONWARNINGS")
-    os.environ["PYTHONWARNINGS"] = "ignore::UserWarning"
-    try:
-        resource_tracker.ensure_running()
-    finally:
-        del os.environ["PYTHONWARNINGS"]
-        if before is not None:
-            os.environ["PYTHONWARNINGS"] = before
-
-
-def _pickle(value: object, name: str) -> bytes:
-    """Return the bytes of what is sent to a worker.
+def check_scheduler(scheduler: str, workers: int | None) -> str:
+    """Return the scheduler's address, or ``"local"``.
 
     Raises
     ------
     DataError
-        It does not pickle.
+        It is neither; workers are asked of a cluster that has its own.
+    """
+    if scheduler != "local" and "://" not in scheduler:
+        raise DataError(
+            f'scheduler is {scheduler!r}; pass "local", or the address "tcp://host:port" of a Dask scheduler'
+        )
+    if scheduler != "local" and workers is not None:
+        raise DataError(f"the cluster at {scheduler} has its own workers; leave out workers={workers}")
+    return scheduler
+
+
+@contextmanager
+def _start_processes(workers: int) -> Generator[tuple[Any, Callable[[], int]]]:
+    """Start processes that inherit a blocked Ctrl-C, which is the parent's to answer, and one BLAS thread."""
+    from loky import ProcessPoolExecutor
+
+    executor: Any = ProcessPoolExecutor(workers, initializer=_watch_parent, env={**_ONE_THREAD, **_KEEP_MODELS})
+    try:
+        call_uninterrupted(lambda: executor.submit(os.getpid))
+        yield executor, lambda: workers
+    finally:
+        executor.shutdown(wait=True, kill_workers=True)
+
+
+def _run_alone(name: str, code: bytes, sent: bytes) -> bytes:
+    """Return the answer of a worker that has nothing else to do: if it dies, this task killed it.
+
+    Raises
+    ------
+    KoopmpcError
+        Each worker died while it ran this task, or while it started.
+    """
+    for _ in range(_TRIES):
+        with _start_processes(1) as (executor, _count):
+            try:
+                executor.submit(os.getpid).result()
+            except BrokenExecutor as error:
+                raise KoopmpcError(
+                    "each worker process was killed while it started; run with fewer workers, or give them more memory"
+                ) from error
+            with suppress(BrokenExecutor):
+                return executor.submit(_work, code, sent).result()
+    raise KoopmpcError(f"{name}{_KILLS}")
+
+
+@contextmanager
+def _join_cluster(scheduler: str, workers: int | None) -> Generator[tuple[Any, Callable[[], int]]]:
+    """Connect to a Dask cluster; a local one, which only this machine sees, is taken down after.
+
+    Raises
+    ------
+    KoopmpcError
+        Dask is not installed, no scheduler answers, or it has no worker.
     """
     try:
-        return _dump(value)
+        from dask import config
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise KoopmpcError(f"a scheduler needs Dask; install it with: {install('dask')}") from error
+    place: dict[str, Any] = {
+        "host": "127.0.0.1",
+        "dashboard_address": "127.0.0.1:0",
+        "worker_dashboard_address": "127.0.0.1:0",
+    }
+    with ExitStack() as opened:
+        try:
+            if scheduler == "local":
+                # Dask has its workers give freed memory back at once: fresh arrays then cost more than their sums
+                with config.set({"distributed.nanny.pre-spawn-environ": _ONE_THREAD}):
+                    cluster = LocalCluster(n_workers=workers or os.cpu_count(), threads_per_worker=1, **place)
+                address: Any = opened.enter_context(cast("Any", cluster))
+            else:
+                _greet(address := scheduler)
+            client: Any = opened.enter_context(Client(address, set_as_default=False, timeout=_PATIENCE))
+        except (OSError, ValueError) as error:
+            raise KoopmpcError(
+                f'no Dask scheduler answers at {scheduler}; start one with `dask scheduler`, or pass "local"'
+            ) from error
+        try:
+            client.wait_for_workers(1, timeout=_PATIENCE)
+        except TimeoutError as error:
+            raise KoopmpcError(
+                f"the cluster at {scheduler} has no worker after {_PATIENCE:g} s; start some with `dask worker ADDRESS`"
+            ) from error
+        executor = client.get_executor(pure=False)
+        opened.callback(executor.shutdown, wait=False)
+
+        def count_threads() -> int:
+            with suppress(OSError):  # the scheduler has ended: the first result that is awaited says so
+                return max(sum(client.nthreads().values()), 1)
+            return 1
+
+        yield executor, count_threads
+
+
+def _greet(address: str) -> None:
+    """Raise OSError where nothing listens, or what listens does not speak first: a Client would wait without end."""
+    place = urlsplit(address)
+    if place.scheme == "tcp":
+        with socket.create_connection((place.hostname or "", place.port or 8786), timeout=_ANSWER) as line:
+            size = line.recv(8)  # of the greeting, in bytes, the lowest first
+        if not size or any(size[4:]):
+            raise OSError("it does not greet as a Dask scheduler")
+
+
+def _pickle(value: object, name: str) -> bytes:
+    """Return the bytes of what is sent to a worker; a DataError where it does not pickle."""
+    from loky.backend import reduction
+
+    try:
+        return bytes(cast("Any", reduction).dumps(value))
     except _UNSENDABLE as error:
         raise DataError(
-            f"{name} cannot be sent to a worker: {error}; run with workers=1, or define its parts in a module"
+            f"{name} cannot be sent between processes: {error}; run with workers=1, or define its parts in a module"
         ) from error
 
 
-_received: dict[int, Callable[[Any], Any]] = {}  # of this worker: the function that it was sent last
-_parents: list[Connection] = []  # of this worker: a pipe that only its parent holds open
-
-
-def _begin(parent: Connection) -> None:
-    """Leave Ctrl-C to the parent, and end with it; this runs in the worker when it starts."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _parents.append(parent)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def is_orphan() -> bool:
-    """Return whether this is a worker whose parent has ended; it ends soon itself."""
-    if _parents:
-        return _parents[0].poll()  # nothing is ever sent: the pipe has come to its end
-    parent = parent_process()  # of a Dask worker
-    return parent is not None and not parent.is_alive()
-
-
-def _end_with_parent() -> None:
+def _watch_parent() -> None:
     """End this worker when its parent has ended, killed perhaps: it would wait for tasks for ever."""
-    wait(_parents)
-    os._exit(1)
+    parent = os.getppid()
+
+    def end_with_parent() -> None:
+        while os.getppid() == parent:
+            time.sleep(_LOOK)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-def _work(sent: bytes, number: int, code: bytes) -> bytes:
-    """Return (True, the function of the task) or (False, what it raised); this runs in the worker.
+@lru_cache(maxsize=1)
+def _unpickle_function(code: bytes) -> Callable[[Any], Any]:
+    return pickle.loads(code)
 
-    `number` names the function, and `code` is its pickle.
-    """
+
+def _work(code: bytes, sent: bytes) -> bytes:
+    """Return (True, the function of the task) or (False, what it raised); this runs in the worker."""
     task = None
     try:
-        if number not in _received:
-            _received.clear()
-            _received[number] = pickle.loads(code)
         task = pickle.loads(sent)
-        answer = (True, _received[number](task))
+        answer = (True, _unpickle_function(code)(task))
     except Exception as error:  # whatever it is, it is raised again in the parent
-        answer = (False, _portable(error))
+        answer = (False, _make_portable(error))
     try:
-        return _dump(answer)
-    except _UNSENDABLE as error:
-        return pickle.dumps((False, DataError(f"the result of {task} cannot be sent back: {error}")))
+        return _pickle(answer, f"the result of {task}")
+    except DataError as error:
+        return pickle.dumps((False, error))
 
 
-def _portable(error: Exception) -> Exception:
+def _make_portable(error: Exception) -> Exception:
     """Return the error with the worker's traceback as a note, as one that pickles."""
-    told = "".join(traceback.format_exception(error))
+    trace = "".join(traceback.format_exception(error))
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:  # an exception with a constructor of its own
         error = KoopmpcError(f"{type(error).__name__}: {error}")
-    error.add_note(f"in a worker:\n{told}")
+    error.add_note(f"in a worker:\n{trace}")
     return error

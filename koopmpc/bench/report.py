@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from markdown_it import MarkdownIt
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -23,11 +22,11 @@ from koopmpc.figures.reports import draw_attraction, draw_profiles, draw_step_ti
 from koopmpc.figures.style import render_svg
 from koopmpc.loop.metrics import Metrics
 from koopmpc.loop.run import Run
-from koopmpc.page import Page, rename_ids, wrap_html
+from koopmpc.page import HtmlPage, Page
 from koopmpc.recording.description import STATUS_WORDS
 from koopmpc.recording.reader import load_run
 from koopmpc.terminal import build_plain_table
-from koopmpc.text import format_duration, format_markdown_table
+from koopmpc.text import format_duration
 
 _SURE = (0.025, 0.975)  # the ends of an interval
 _STARTS = 10  # from which a map of starts is drawn
@@ -307,19 +306,23 @@ def write_report(folder: str | Path) -> Path:
     out = csv.writer(table)
     out.writerow([field.name for field in fields(Summary)])
     out.writerows(astuple(each) for each in found)
-    sections = list(_sections(rows, found, folder))
-    intro = Page(folder)
-    intro.text("# Sweep", *_intro(rows, about))
-    page = Page(folder, parts=[*intro.parts])
-    for each in sections:
-        page.text(f"## {each.title}")
-        page.table(each.headings, each.lines)
-        page.text(*[f"Logs: {_links(each)}"] * bool(each.logs))
+    with disk.writing(folder / "summary.csv") as stream:
+        stream.write(table.getvalue().encode())
+    page, html = Page(folder), HtmlPage("Sweep")
+    intro = _intro(rows, about)
+    page.text("# Sweep", *intro)
+    html.text(*intro)
+    for section in _sections(rows, found, folder):
+        page.text(f"## {section.title}")
+        html.heading(section.title)
+        page.table(section.headings, section.lines)
+        html.table(section.headings, section.lines, words=True)
+        html.pictures(section.pictures)
+        if section.logs:
+            page.text("Logs: " + ", ".join(f"[{log}]({log})" for log in section.logs))
+            html.links(f"{len(section.logs)} logs", section.logs)
     page.write()
-    for name, text in (("summary.csv", table.getvalue()), ("report.html", _html(intro, sections))):
-        with disk.writing(folder / name) as stream:
-            stream.write(text.encode())
-    return folder / "report.html"
+    return html.write(folder / "report.html")
 
 
 @dataclass(frozen=True)
@@ -439,24 +442,3 @@ def _intro(rows: Sequence[RunRow], about: dict[str, Any]) -> list[str]:
         lines.append(f"Step times are not to be trusted: {', and '.join(doubt)}.")
     lines += [f"{row.name} failed: {row.failure}" for row in failed[:20]]
     return [*lines, f"{len(failed) - 20} more failed."] if len(failed) > 20 else lines
-
-
-def _links(section: _Section) -> str:
-    return ", ".join(f"[{log}]({log})" for log in section.logs)
-
-
-def _html(intro: Page, sections: Sequence[_Section]) -> str:
-    """Return the Markdown of the report as one HTML page, with pictures; what looks like HTML in a text is escaped."""
-    render = MarkdownIt("commonmark", {"html": False}).enable("table").render
-    parts, number = [render(intro.markdown)], 0
-    for each in sections:
-        table = render(format_markdown_table(each.headings, each.lines))
-        parts.append(f"{render(f'## {each.title}')}<div class='wide words'>{table}</div>")
-        for picture, text in each.pictures:
-            number += 1
-            parts.append(
-                f"<figure>{rename_ids(picture, f'p{number}-')}<figcaption>{render(text)}</figcaption></figure>"
-            )
-        if each.logs:
-            parts.append(f"<details><summary>{len(each.logs)} logs</summary>{render(_links(each))}</details>")
-    return wrap_html("Sweep", "".join(parts))

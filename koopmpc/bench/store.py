@@ -27,7 +27,6 @@ from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import LogError, ProblemError
 from koopmpc.loop.metrics import Metrics, tracking_error, weigh_error
 from koopmpc.loop.run import Run
-from koopmpc.parallel import is_orphan
 from koopmpc.values import checksum
 
 MANIFEST = "sweep.json"
@@ -214,8 +213,6 @@ class Journal:
         except OSError as error:
             raise disk.explain_failure(self.path, error) from error
         _lock(self._file)
-        if is_orphan():  # a sweep that goes on may not have seen the lock
-            raise ProblemError(f"the sweep in {self.path.parent.parent} was killed")
         if self._file.tell():
             self._write(b"\n")  # the last line was torn, perhaps, when a worker was killed
         return self

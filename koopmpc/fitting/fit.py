@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from koopmpc import checks
-from koopmpc.cluster import address_of
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import FullDiskError
 from koopmpc.figures.eigenvalues import spectrum
@@ -21,7 +20,7 @@ from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.records.narx import DELAYS
 from koopmpc.lifting.state import Constant, State
 from koopmpc.page import Page
-from koopmpc.parallel import StageProgress
+from koopmpc.parallel import StageProgress, check_scheduler
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.recording.model import record_model
 from koopmpc.synthesis.leaderboard import Selection
@@ -125,7 +124,7 @@ def fit_data(
     horizon = None if horizon is None else checks.count(horizon, "horizon")
     workers = None if workers is None else checks.count(workers, "workers")
     if scheduler is not None:
-        address_of(scheduler, workers)
+        check_scheduler(scheduler, workers)
     tell = ignore_text if say is None else say
     split = read_logs(data, horizon, draw, memory, reading)
     about = describe_data(split)

@@ -10,12 +10,11 @@ import sys
 import tempfile
 import time
 
-import cloudpickle
 import numpy as np
 
 import koopmpc as km
-from koopmpc.cluster import DaskPool, QueuedTask, _Call
 from koopmpc.identify.moments.read import _ReadTask, read_part, source_of
+from koopmpc.parallel import Workers
 
 PART, PARTS, TASKS = 0.91, 1000, 200  # CPU time of 1e6 pairs with 34 observables [s], parts, tasks that are timed
 
@@ -34,24 +33,15 @@ def count_bytes() -> tuple[int, int]:
         lifting = (km.State() + km.Gaussian(rng.normal(size=(30, 3)), 1.0) + km.Constant()).bind(tuple("abc"))
         (part,) = source_of(km.data.Files(folder)).parts()
         task = _ReadTask(part, lifting, ("u",), False, None)
-        return len(cloudpickle.dumps(_Call(read_part, task))), len(pickle.dumps(read_part(task)))
+        return len(pickle.dumps(task)), len(pickle.dumps(read_part(task)))
 
 
 def time_task() -> float:
     """Return the CPU time [s] that scheduler and client, both in this process, spend on a task."""
-    from distributed import Client, LocalCluster
-
-    place = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0"}
-    with LocalCluster(n_workers=2, threads_per_worker=1, **place) as cluster, Client(cluster) as client:
-        pool, jobs = DaskPool(answer, client, "local"), [QueuedTask(i, i) for i in range(TASKS + 10)]
-        for job in jobs[:10]:
-            pool.submit(job)
-            pool.wait(job)
+    with Workers(2, "local") as pool:
+        pool.map(answer, range(10))
         start = time.process_time()
-        for job in jobs[10:]:
-            pool.submit(job)
-        for job in jobs[10:]:
-            pool.wait(job)
+        pool.map(answer, range(TASKS))
         return (time.process_time() - start) / TASKS
 
 
