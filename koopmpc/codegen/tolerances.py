@@ -1,11 +1,12 @@
 """The tolerances of C code: as in Python, and in single precision, whose rounding is 5e8 times as coarse."""
 
 from koopmpc.control.nonlinear import motion
+from koopmpc.control.nonlinear.active_limits import RANK
 from koopmpc.control.nonlinear.bilinear_mpc import SETTLED
-from koopmpc.control.nonlinear.equilibrium import PSEUDO, RANK
 from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
 from koopmpc.control.nonlinear.iteration import DIGITS, ENOUGH, PRECISE, STUCK
 from koopmpc.control.nonlinear.staged_mpc import NO_DIGITS
+from koopmpc.control.plan.row_targets import PSEUDO
 from koopmpc.control.riccati import SETTLED as RESTED
 from koopmpc.control.stepped.levels import NEAR
 from koopmpc.control.stepped.sequences import EQUAL

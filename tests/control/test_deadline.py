@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.control.test_equilibrium import row_targets
 
 
 def unstable_model():
@@ -73,16 +74,12 @@ def test_a_nonlinear_controller_with_much_time_gives_the_same_input():
         assert timed(x, [0, 0]).status is km.Status.OPTIMAL
 
 
-@pytest.mark.parametrize("kind", [km.BilinearMPC, km.NonlinearMPC])
-def test_after_the_deadline_a_step_searches_one_equilibrium_and_the_next_steps_the_others(kind):
-    cost, limits = km.Cost(Q=[1, 1], R=1e-3, u_target="equilibrium"), km.Limits(-1, 1)
-    rows = np.array([[0.5, 0.0], [-2.0, 0.0], [4.0, 0.0], [-8.0, 0.0]])
-    late, free = kind(unstable_model(), cost, limits, 3, time_limit=1e-9), kind(unstable_model(), cost, limits, 3)
-    for k in range(len(rows)):
-        assert len(late._terminal._found) == k
-        assert late([0.2, 0.1], rows).status is km.Status.TIME_LIMIT
-    late([0.2, 0.1], rows)
-    free([0.2, 0.1], rows)
-    assert late._terminal._found.keys() == free._terminal._found.keys()
-    np.testing.assert_allclose(late._targets.U, free._targets.U, atol=1e-9)
-    np.testing.assert_allclose(late._targets.m, free._targets.m, atol=1e-9)
+def test_after_the_deadline_a_step_searches_one_equilibrium_and_the_next_steps_the_others():
+    rows = [np.array([r, 0.0]) for r in (0.5, -2.0, 4.0, -8.0)]
+    late, free = (row_targets(unstable_model(), km.Limits(-1, 1), km.Cost([1, 1], 1e-3)) for _ in range(2))
+    for left in (3, 2, 1, 0):
+        targets, is_late = late.find(rows, deadline=-np.inf)
+        assert sum(not target.is_found for target in targets) == left
+        assert is_late == (left > 0)
+    for target, wanted in zip(late.find(rows)[0], free.find(rows)[0], strict=True):
+        np.testing.assert_allclose(target.u, wanted.u, atol=1e-9)

@@ -11,15 +11,17 @@ from scipy.linalg import solve_discrete_are
 
 import koopmpc as km
 from koopmpc.control.cost import state_tracking
-from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria, TerminalTargets
+from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria
 from koopmpc.control.nonlinear.problem import learned_map
+from koopmpc.control.plan.row_targets import RowTarget, RowTargets
 from koopmpc.control.riccati import one_step, stationary
+from koopmpc.control.step.rest import MovingEnd
 from tests.closed_loop.tasks import TASKS
 from tests.control.test_bilinear_mpc import UPRIGHT, pendulum
 from tests.control.test_nonlinear_mpc import pendulum as hinge
 
 COST = km.Cost(Q=[1, 0.1], R=0.1)
-BOX = km.Limits(-0.3, 0.4, x_max=[0.7, 5.0])
+BOX, WIDE = km.Limits(-0.3, 0.4, x_max=[0.7, 5.0]), km.Limits(-4, 4)
 
 
 def two_tanks() -> km.StepMap:
@@ -30,11 +32,23 @@ def two_tanks() -> km.StepMap:
 
 
 def equilibria(model, limits: km.Limits, cost: km.Cost = COST) -> Equilibria:
-    seen = state_tracking(model.states, model.inputs, cost, limits)
-    return Equilibria(learned_map(model), cost, seen)
+    return row_targets(model, limits, cost).equilibria
 
 
-SWING, TANKS = equilibria(pendulum(), BOX), equilibria(two_tanks(), km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
+def row_targets(model, limits: km.Limits = WIDE, cost: km.Cost = COST) -> RowTargets:
+    return RowTargets(learned_map(model), cost, state_tracking(model.states, model.inputs, cost, limits), 1000)
+
+
+def find(targets: RowTargets, row) -> RowTarget:
+    """Return the target of a row as the last one of a plan."""
+    ((target,), _) = targets.find([np.asarray(row, float)])
+    targets.finish_at(target)
+    return target
+
+
+TANK_BOX = km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2])
+SWING_ROWS, TANK_ROWS = row_targets(pendulum(), BOX), row_targets(two_tanks(), TANK_BOX)
+SWING, TANKS = SWING_ROWS.equilibria, TANK_ROWS.equilibria
 
 
 @settings(max_examples=40)
@@ -53,9 +67,9 @@ def test_near_a_guess_it_is_what_ipopt_finds(seed: int, tanks: bool) -> None:
     assert np.allclose(near.u, far.u, atol=1e-4)
     at = each.linearise(near.x, near.u)
     assert np.allclose(at.F + e, near.x, atol=1e-9)
-    for values, box in ((near.u, each._outputs.inputs), (at.g, each._outputs.outputs)):
-        assert (values >= box.low - 1e-8).all()
-        assert (values <= box.high + 1e-8).all()
+    values, limits = np.concatenate([near.u, at.g]), each.program()
+    assert (values >= limits.low - 1e-8).all()
+    assert (values <= limits.high + 1e-8).all()
     again = each.near(near, row, e, CLOSE)
     assert again is not None
     assert np.allclose(again.x, near.x, atol=1e-9)
@@ -63,22 +77,20 @@ def test_near_a_guess_it_is_what_ipopt_finds(seed: int, tanks: bool) -> None:
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.booleans())
-def test_steps_with_the_factors_of_earlier_ones_end_where_full_steps_do(seed: int, tanks: bool) -> None:
+def test_a_disturbance_that_rests_ends_where_full_steps_do(seed: int, tanks: bool) -> None:
     rng = np.random.default_rng(seed)
-    each = TANKS if tanks else SWING
-    nx = each.model.nx
+    targets = TANK_ROWS if tanks else SWING_ROWS
+    each, nx = targets.equilibria, targets.equilibria.model.nx
     row = rng.uniform(0.2, 0.8, nx) if tanks else np.array([rng.uniform(-0.5, 1.2), 0.0])
     e = 2e-3 * rng.standard_normal(nx)
-    each.follow(each.find(row + 1e-3), row, np.zeros(nx))  # its factors serve for what follows
-    here, exact = each.find(row), each.near(each.find(row), row, e)
-    if exact is None or here.active.any():
+    target, moving = find(targets, row), MovingEnd(targets)
+    exact = each.near(target.equilibrium, row, e)
+    if exact is None or exact.active.any():
         return
-    for _ in range(8):
-        here = each.follow(here, row, e)
-        if here is None:  # a limit has a say, or the way is too far
-            return
-    np.testing.assert_allclose(here.x, exact.x, atol=1e-9)
-    np.testing.assert_allclose(here.u, exact.u, atol=1e-9)
+    moving.at(find(targets, row + 1e-3), np.zeros(nx))  # its factors serve for what follows
+    ends = [moving.at(target, e) for _ in range(8)]
+    np.testing.assert_allclose(ends[-1].equilibrium.x, exact.x, atol=1e-9)
+    np.testing.assert_allclose(ends[-1].equilibrium.u, exact.u, atol=1e-9)
 
 
 @pytest.mark.parametrize("limits", [km.Limits(-4, 4), km.Limits(-0.35, 0.4), km.Limits(-4, 4, x_max=[0.5, np.inf])])
@@ -111,32 +123,19 @@ def test_a_target_under_a_load_is_found_without_ipopt_and_no_offset_is_left(
 
 def test_the_end_costs_the_same_at_every_turn_and_is_riccatis_near_the_target() -> None:
     plant, cost = hinge(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
-    read = state_tracking(plant.states, plant.inputs, cost, km.Limits(-2, 2))
-    target = TerminalTargets(learned_map(plant), cost, read, 300)(np.array([0.0, 1.0, 0.0]))
-
-    def end(x: np.ndarray) -> float:
-        e = target.M @ read.tracked(x).full().ravel() + target.L @ x - target.m
-        return float(e @ e)
-
-    assert np.allclose(np.sin(target.equilibrium.x[0]), 0, atol=1e-6)
-    assert np.cos(target.equilibrium.x[0]) > 0.99
+    target, price = ends(plant, cost, [0.0, 1.0, 0.0], km.Limits(-2, 2))
+    (x, u, _), nothing = target.equilibrium, np.zeros(1)
+    assert np.allclose(np.sin(x[0]), 0, atol=1e-6)
+    assert np.cos(x[0]) > 0.99
     far = np.array([1.0, 0.5])
-    assert end(far + np.array([2 * np.pi, 0])) == pytest.approx(end(far), rel=1e-9)
-    affine = plant.linearize(target.equilibrium.x, target.u)
-    P = stationary(one_step(affine.A, affine.B, np.diag([1.0, 0.1]), read.R), 300).P
+    assert price(far + np.array([2 * np.pi, 0]), nothing) == pytest.approx(price(far, nothing), rel=1e-9)
+    affine = plant.linearize(x, u)
+    P = stationary(one_step(affine.A, affine.B, np.diag([1.0, 0.1]), np.array([[0.1]])), 1000).P
     for d in np.array([[1e-3, 0], [0, 1e-3], [1e-3, -2e-3]]):
-        assert end(target.equilibrium.x + d) == pytest.approx(d @ P @ d, rel=1e-2)
-    assert end(target.equilibrium.x + np.array([np.pi, 0])) > end(
-        target.equilibrium.x + np.array([0.5, 0])
-    )  # hanging is no target
-
-
-def test_the_terminal_target_of_a_periodic_reference_is_not_the_stationary_point_at_zero() -> None:
-    """From the guess x = 0 the gradient of the distance to cos θ = −1 is zero."""
-    plant, cost = hinge(), km.Cost(Q=[1, 1, 0.1], R=0.1, of=UPRIGHT)
-    read = state_tracking(plant.states, plant.inputs, cost, km.Limits(-2, 2))
-    target = TerminalTargets(learned_map(plant), cost, read, 300)(np.array([0.0, -1.0, 0.0]))
-    assert np.cos(target.equilibrium.x[0]) < -0.99
+        assert price(x + d, nothing) == pytest.approx(d @ P @ d, rel=1e-2)
+    assert price(x + np.array([np.pi, 0]), nothing) > price(x + np.array([0.5, 0]), nothing)  # hanging is no target
+    down, _ = ends(plant, cost, [0.0, -1.0, 0.0], km.Limits(-2, 2))
+    assert np.cos(down.equilibrium.x[0]) < -0.99  # at the guess x = 0 the slope of the distance is zero
 
 
 def test_what_a_reference_says_of_states_without_weight_does_not_move_its_equilibrium():
@@ -154,49 +153,34 @@ def test_what_a_reference_says_of_states_without_weight_does_not_move_its_equili
     assert abs(silent.x[1] - 340.0) < 0.2
 
 
-def test_the_rows_of_a_reference_that_moves_are_followed_and_ipopt_is_asked_once(monkeypatch):
-    plant = two_tanks()
-    seen = state_tracking(plant.states, plant.inputs, COST, km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
-    targets = TerminalTargets(learned_map(plant), COST, seen, 300)
+def test_ipopt_is_asked_once_for_rows_that_equilibria_hold(monkeypatch):
+    targets = row_targets(two_tanks(), TANK_BOX)
     asked, own = [], targets.equilibria.find
     monkeypatch.setattr(targets.equilibria, "find", lambda row: asked.append(row) or own(row))
     t = np.linspace(0, 3, 60)
     rows = np.column_stack([0.8 + 0.6 * np.sin(t), 0.7 + 0.5 * np.cos(t)])  # some ask for more than the limits allow
-    followed = [targets(row) for row in rows]
+    followed = targets.find(rows)[0] + targets.find([np.array([0.1, 0.1])])[0]  # far from the last row, and held
     assert len(asked) == 1
-    for row, target in zip(rows, followed, strict=True):
-        alone = TerminalTargets(learned_map(plant), COST, seen, 300)(row)
+    for target in followed:
+        alone = find(row_targets(two_tanks(), TANK_BOX), target.row)
         np.testing.assert_allclose(target.u, alone.u, atol=1e-4)
         np.testing.assert_allclose(target.equilibrium.x, alone.equilibrium.x, atol=1e-4)
-    targets(np.array([0.1, 0.1]))  # far from the last row
+    find(targets, [3.0, 3.0])  # far off, and out of reach
     assert len(asked) == 2
-
-
-@pytest.mark.parametrize(("share", "goes_on"), [(0.8, True), (1.3, False)])
-def test_one_step_goes_on_as_far_as_its_error_is_small_and_no_further(share: float, goes_on: bool) -> None:
-    begin = SWING.find(np.array([0.2, 0.0]))
-    s = np.concatenate([begin.x, begin.u]) / SWING.size
-    reach = CLOSE * (1 + np.abs(s).max())
-    a_little = SWING.find(np.array([0.201, 0.0]))
-    per_radian = np.abs(np.concatenate([a_little.x, a_little.u]) / SWING.size - s).max() / 0.001
-    row = np.array([0.2 + share * reach / per_radian, 0.0])
-    assert (SWING.follow(begin, row, np.zeros(2)) is not None) == goes_on
 
 
 def test_with_another_model_the_last_target_goes_on_from_where_it_was_without_ipopt(monkeypatch):
     before, row = pendulum(), np.array([0.2, 0.0])
     after = replace(before, A=before.A * np.where(before.A == 0.05, 1.02, 1.0))  # gravity
-
-    seen = state_tracking(before.states, before.inputs, COST, km.Limits(-4, 4))
-    targets = TerminalTargets(learned_map(before), COST, seen, 300)
-    targets(np.array([0.7, 0.0]))
-    old = targets(row)
-    alone = TerminalTargets(learned_map(after), COST, seen, 300)(row)
+    targets, alone = row_targets(before), find(row_targets(after), row)
+    find(targets, [0.7, 0.0])
+    old = find(targets, row)
     monkeypatch.setattr(Equilibria, "find", None)
     targets.update(learned_map(after))
-    assert np.abs(targets(row).u - old.u).max() > 1e-4
-    np.testing.assert_allclose(targets(row).u, alone.u, atol=1e-6)
-    np.testing.assert_allclose(targets(row).equilibrium.x, alone.equilibrium.x, atol=1e-6)
+    new = find(targets, row)
+    assert np.abs(new.u - old.u).max() > 1e-4
+    np.testing.assert_allclose(new.u, alone.u, atol=1e-6)
+    np.testing.assert_allclose(new.equilibrium.x, alone.equilibrium.x, atol=1e-6)
 
 
 @pytest.mark.parametrize("each", [SWING, TANKS], ids=["swing", "tanks"])
@@ -209,13 +193,14 @@ def test_the_slope_of_an_equilibrium_is_how_its_input_moves_with_a_disturbance(e
         np.testing.assert_allclose(slope[:, i], (ahead.u - back.u) / (2 * h), rtol=1e-4, atol=1e-6)
 
 
-def ends(plant: km.StepMap, cost: km.Cost, row: np.ndarray, limits: km.Limits):
+def ends(plant: km.StepMap, cost: km.Cost, row, limits: km.Limits):
     """Return the target of a row, and what a plan that ends in x after the input u pays for its end."""
-    read = state_tracking(plant.states, plant.inputs, cost, limits)
-    target = TerminalTargets(learned_map(plant), cost, read, 1000)(row)
+    target = find(row_targets(plant, limits, cost), row)
+    tracked = state_tracking(plant.states, plant.inputs, cost, limits).tracked
+    M, L, V, m = target.end
 
     def price(x: np.ndarray, u: np.ndarray) -> float:
-        missed = target.M @ read.tracked(x).full().ravel() + target.L @ x + target.V @ u - target.m
+        missed = M @ tracked(x).full().ravel() + L @ x + V @ u - m
         return float(missed @ missed)
 
     return target, price
@@ -229,7 +214,7 @@ def test_where_states_are_tracked_the_end_costs_the_solution_of_the_riccati_equa
     plant = two_tanks()
     cost = km.Cost(Q=[1, of_b], R=[0.3, 0.5], R_delta=R_delta, u_target=u_target)
     limits = km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2])
-    target, price = ends(plant, cost, np.array([0.6, 0.5]), limits)
+    target, price = ends(plant, cost, [0.6, 0.5], limits)
     x, u = target.equilibrium.x, target.equilibrium.u
     np.testing.assert_allclose(x[: 1 + (of_b > 0)], [0.6, 0.5][: 1 + (of_b > 0)], atol=1e-5)
     np.testing.assert_allclose(plant(x, u), x, atol=1e-6)
@@ -265,47 +250,44 @@ def test_what_no_small_motion_changes_of_the_tracked_outputs_keeps_its_weight_at
 @pytest.mark.parametrize("Q_N", [None, [2.0, 5.0]])
 def test_a_disturbance_moves_the_target_to_the_equilibrium_that_it_allows(Q_N) -> None:
     plant, e, row = two_tanks(), np.array([0.01, -0.008]), np.array([0.6, 0.5])
-    cost = km.Cost(Q=[1, 2], R=0.3, Q_N=Q_N, R_delta=None if Q_N else 0.1)
-    read = state_tracking(plant.states, plant.inputs, cost, km.Limits(0, [1.0, 0.6], x_max=[1.5, 1.2]))
-    targets, last = TerminalTargets(learned_map(plant), cost, read, 1000), None
+    targets = row_targets(plant, TANK_BOX, km.Cost(Q=[1, 2], R=0.3, Q_N=Q_N, R_delta=None if Q_N else 0.1))
+    moving, target = MovingEnd(targets), find(targets, row)
     for _ in range(4):
-        last = targets.find_disturbed(row, e, last)
-    x, u = last.equilibrium.x, last.equilibrium.u
+        end = moving.at(target, e)
+    (x, u, _), (M, L, V, m) = end.equilibrium, end.cost
     np.testing.assert_allclose(plant(x, u) + e, x, atol=1e-9)
     np.testing.assert_allclose(x, row, atol=1e-5)
-    np.testing.assert_array_equal(last.u, u)
-    np.testing.assert_allclose(last.M @ x + last.L @ x + last.V @ u, last.m, atol=1e-5)
-    assert np.abs(u - targets(row).u).max() > 1e-3
+    np.testing.assert_array_equal(end.u, u)
+    np.testing.assert_allclose(M @ x + L @ x + V @ u, m, atol=1e-5)
+    assert np.abs(u - target.u).max() > 1e-3
 
 
 def test_a_row_whose_equilibrium_is_not_found_is_aimed_at_itself_until_it_is_looked_for_again(monkeypatch) -> None:
-    plant, row = two_tanks(), np.array([0.6, 0.5])
+    row = np.array([0.6, 0.5])
     for cost, weight in ((km.Cost(Q=[1, 2], R=0.3, R_delta=0.1), [1, 2]), (km.Cost(1, 0.3, Q_N=[4, 9]), [4, 9])):
-        read = state_tracking(plant.states, plant.inputs, cost, km.Limits([0.1, -1], 1))
-        targets = TerminalTargets(learned_map(plant), cost, read, 1000)
+        targets = row_targets(two_tanks(), km.Limits([0.1, -1], 1), cost)
         with monkeypatch.context() as patch:
             patch.setattr(targets.equilibria, "find", lambda *rest: None)
-            target = targets(row)
-            assert targets(row) is target
-            assert targets.find_disturbed(row, np.array([0.01, 0.0]), None) is target
-        assert targets(row) is target
+            target = find(targets, row)
+            assert MovingEnd(targets).at(target, np.array([0.01, 0.0])).cost is target.end
+        assert find(targets, row) is target
+        M, L, V, m = target.end
         for x in np.random.default_rng(0).standard_normal((3, 2)):
-            missed = target.M @ x + target.L @ x + target.V @ np.ones(2) - target.m
+            missed = M @ x + L @ x + V @ np.ones(2) - m
             assert missed @ missed == pytest.approx((x - row) ** 2 @ weight)
         np.testing.assert_array_equal(target.u, [0.1, 0.0])
-        targets.forget_missed()
-        np.testing.assert_allclose(targets(row).equilibrium.x, row, atol=1e-5)
+        targets.reset()
+        np.testing.assert_allclose(find(targets, row).equilibrium.x, row, atol=1e-5)
 
 
 def test_a_disturbance_that_allows_no_equilibrium_leaves_the_target_of_the_row() -> None:
     """A position and a speed: where the position is pushed by more than the speed may make up for, nothing rests."""
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
     cart = km.StepMap(ca.Function("F", [x, u], [ca.vertcat(x[0] + 0.2 * x[1], 0.9 * x[1] + 0.3 * u)]), 0.2)
-    read = state_tracking(cart.states, cart.inputs, COST, km.Limits(-1, 1, x_max=[np.inf, 0.4]))
-    targets, row = TerminalTargets(learned_map(cart), COST, read, 1000), np.array([0.3, 0.0])
-    slow = targets.find_disturbed(row, np.array([-0.07, 0.0]), None)
-    np.testing.assert_allclose(slow.equilibrium.x, [0.3, 0.35], atol=1e-6)
-    assert targets.find_disturbed(row, np.array([-0.09, 0.0]), slow) is targets(row)
+    targets = row_targets(cart, km.Limits(-1, 1, x_max=[np.inf, 0.4]))
+    moving, target = MovingEnd(targets), find(targets, [0.3, 0.0])
+    np.testing.assert_allclose(moving.at(target, np.array([-0.07, 0.0])).equilibrium.x, [0.3, 0.35], atol=1e-6)
+    assert moving.at(target, np.array([-0.09, 0.0])).equilibrium is target.equilibrium
 
 
 @pytest.mark.parametrize(
@@ -340,8 +322,6 @@ def test_of_all_equilibria_that_hold_a_reference_the_least_is_found() -> None:
     np.testing.assert_allclose(found.u, [0.5, 0.5], atol=1e-3)
     np.testing.assert_allclose(near.u, [0.75, 0.75], atol=1e-6)
     np.testing.assert_allclose(each.slope(each.linearise(near.x, near.u)), [[-0.5], [-0.5]], atol=1e-6)
-    followed = each.follow(near, np.array([3.001]), np.array([1e-3]))
-    np.testing.assert_allclose(followed.u, [0.75 - 0.00025, 0.75 - 0.00025], atol=1e-6)
 
 
 def test_an_equilibrium_that_was_not_found_is_looked_for_again_after_a_reset(monkeypatch):
@@ -380,11 +360,9 @@ def test_a_preview_is_searched_by_ipopt_only_where_nothing_close_is_known(monkey
     monkeypatch.setattr(Equilibria, "find", count)
     controller([0.3, 0.0], rows)
     assert 1 <= len(asked) <= most
-    terminal = controller._terminal
-    for row in rows[::5]:  # as exact as if each had been sought from afar
-        kept, sought = terminal(row).equilibrium, terminal.equilibria.find(row)
-        assert np.allclose(kept.x, sought.x, atol=1e-6)
-        assert np.allclose(kept.u, sought.u, atol=1e-6)
+    targets = controller.find_targets(rows)  # as exact as if each had been sought from afar
+    alone = [km.BilinearMPC(model, controller.cost, limits, 20).find_targets(row[None])[0] for row in rows[::5]]
+    np.testing.assert_allclose(targets[::5], alone, atol=1e-6)
 
 
 def test_of_the_inputs_that_hold_a_row_the_smallest_are_found_wherever_the_search_begins():
@@ -392,11 +370,10 @@ def test_of_the_inputs_that_hold_a_row_the_smallest_are_found_wherever_the_searc
     model = km.BilinearPredictor(
         [[-0.9]], [[-1.3, -0.25]], [[[0.13]], [[0.34]]], np.eye(1), km.State(), 0.1, ["x"], ["u0", "u1"]
     )
-    seen = state_tracking(model.states, model.inputs, km.Cost(Q=1, R=0.5), km.Limits(-1, 1))
     for row in (np.array([0.55]), np.array([-0.58])):
-        fresh, moved = (TerminalTargets(learned_map(model), km.Cost(Q=1, R=0.5), seen, 50) for _ in range(2))
-        moved(row * 0.98)
+        fresh, moved = (row_targets(model, km.Limits(-1, 1), km.Cost(Q=1, R=0.5)) for _ in range(2))
+        find(moved, row * 0.98)
         slope = np.array([-1.3, -0.25]) + row * [0.13, 0.34]
         smallest = slope * 1.9 * row / (slope @ slope)
-        assert fresh(row).u == pytest.approx(smallest, abs=1e-7)
-        assert moved(row).u == pytest.approx(smallest, abs=1e-7)
+        assert find(fresh, row).u == pytest.approx(smallest, abs=1e-7)
+        assert find(moved, row).u == pytest.approx(smallest, abs=1e-7)

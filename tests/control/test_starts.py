@@ -29,7 +29,7 @@ def made(cost=CIRCLE, limits=None, model=None, **options):
 def test_it_starts_from_rest_the_line_to_the_equilibrium_and_the_free_motion(rated):
     mpc = made(TRACKED if rated else CIRCLE)
     mpc([0.3, 0.1], [0.2, 0.0] if rated else [0, 1, 0])
-    end, x, u = mpc._preview.target.equilibrium.x, np.array([0.7, -0.2]), np.array([0.4 if rated else 0.0])
+    end, x, u = mpc._aim.end.equilibrium.x, np.array([0.7, -0.2]), np.array([0.4 if rated else 0.0])
     (rest, U), (line, V), (motion, W) = mpc._starts(x, np.array([0.4]))
     for inputs in (U, V, W):
         np.testing.assert_array_equal(inputs, np.tile(u, (N, 1)))
@@ -200,7 +200,7 @@ def test_what_a_plan_costs_is_the_cost_of_its_states_and_inputs(R_delta, latency
         before = last if not latency else mpc._iteration.X[0, 2] if R_delta else 0.0
         plan, R = mpc.plan(), rows[latency : latency + N + 1]
         if isinstance(u_target, str):
-            u_r = np.array([mpc._terminal(row).u for row in R])
+            u_r = np.array([target.u for target in mpc._aim.targets.find(list(R))[0]])
         else:
             u_r = np.array([u_target[min(k + step + latency, 2)] for k in range(N + 1)])
         total = 0.0
@@ -210,7 +210,8 @@ def test_what_a_plan_costs_is_the_cost_of_its_states_and_inputs(R_delta, latency
             total += (R_delta or 0.0) * change**2
             if k:
                 total += float((plan.X[k] - R[k]) ** 2 @ [10, 1])
-        end, x = mpc._terminal(R[-1]), plan.X[N]
+        ((target,), _), x = mpc._aim.targets.find([R[-1]]), plan.X[N]
+        end = mpc._aim.targets.weigh_end(target)
         if ahead and not isinstance(u_target, str):  # a trajectory goes on to no equilibrium: the state alone counts
             total += float((x - R[-1]) ** 2 @ [10, 1])
         else:

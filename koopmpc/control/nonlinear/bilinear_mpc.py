@@ -15,7 +15,6 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import SOFTENED, Interval, Limits
 from koopmpc.control.move import Status
-from koopmpc.control.nonlinear.equilibrium import TerminalTargets
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.level_stages import StageLevels
 from koopmpc.control.nonlinear.motion import BEYOND
@@ -57,15 +56,10 @@ _COPIED = (
     "_steps",
     "_planned",
     "_warm",
-    "_moved",
-    "_row",
     "_X",
     "_U",
-    "_reference",
-    "_target",
     "_scheduled_for",
 )  # what a copy takes over, with the plan and the targets
-_AIMED = ("_preview", "_targets")  # the same, once a step had a reference
 
 
 class BilinearMPC(StagedMPC):
@@ -184,10 +178,7 @@ class BilinearMPC(StagedMPC):
 
         Where measured disturbances multiply the state, it is that of w = 0.
         """
-        terminal = self._terminal
-        if self._scheduled_for.any():
-            terminal = TerminalTargets(self._map, self.cost, self._outputs, 10 * self._N)
-        return find_targets(terminal, self._map.nx, reference)
+        return find_targets(self._aim.targets, self._map.nx, reference)
 
     def build_program(self, reference: ArrayLike | None) -> StagedProgram:
         """Return the data of a step."""
@@ -205,7 +196,7 @@ class BilinearMPC(StagedMPC):
         if problem.ends:
             raise no_export(self, "its C has no terminal set", "a LinearMPC or a KoopmanMPC with a terminal polytope")
         estimator = publish_estimator(self._initial.observer, self._estimator, self._time_limit, "sqp_iterations=1")
-        rows, terminal, cost = reference_table(reference, len(outputs.Q)), self._terminal, self.cost
+        rows, terminal, cost = reference_table(reference, len(outputs.Q)), self._aim.targets, self.cost
         R, held = weights(problem), int((~problem.free).argmax()) * (not problem.free.all())
         return StagedProgram(
             controller=type(self).__name__,
@@ -246,9 +237,9 @@ class BilinearMPC(StagedMPC):
             sides=list_sides(problem),
             stage_sizes=problem.sizes,
             input_sizes=problem.input_sizes,
-            holds=isinstance(cost.u_target, str) and cost.u_target == "equilibrium",
+            holds=terminal.holds,
             end="given" if cost.Q_N is not None else "stage" if cost.tail == 0 else "tail",
-            beyond=BEYOND * self._N * self._goes_on,
+            beyond=BEYOND * self._N * (cost.moves_on and outputs.given is None),
             table=self.find_targets(rows) if len(rows) else np.zeros((0, 1)),
             disturbed=self._disturbed,
             rest=terminal.equilibria.program(),
@@ -268,8 +259,7 @@ class BilinearMPC(StagedMPC):
             monitor=None if self._watch is None else self._watch.monitor,
         )
         held = {name: getattr(self, name) for name in _COPIED}
-        held |= {name: self.__dict__[name] for name in _AIMED if name in self.__dict__}
-        held["terminal"] = self._terminal.memory()
+        held["_aim"] = self._aim
         iteration = self._iteration
         held["levels"] = self._levels
         held["ahead"] = None if self._keeper is None else self._keeper.ahead
@@ -287,7 +277,6 @@ class BilinearMPC(StagedMPC):
         if levels is not None:
             self._levels, self._held = levels, levels.held
             self._on_levels = StageLevels(levels, self._problem)
-        self._terminal.remember(held.pop("terminal"))
         self.__dict__.update(held)
 
     def update(self, model: ModelOrMap) -> None:
@@ -428,7 +417,7 @@ class BilinearMPC(StagedMPC):
         N, u = self._N, np.clip(u_prev if self._with_rates else np.zeros(self.nu), *self._outputs.inputs)
         U, rest = np.tile(u, (N, 1)), np.tile(x, (N + 1, 1))
         yield rest, U
-        end = (self._target or self._preview.target).equilibrium.x
+        end = self._aim.end.equilibrium.x
         yield rest + np.linspace(0.0, 1.0, N + 1)[:, None] * (end - x), U
         if not isinstance(self._map.model, StepMap):
             return

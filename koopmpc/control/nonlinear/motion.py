@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.control.nonlinear.equilibrium import Linearisation, TerminalTarget
+from koopmpc.control.nonlinear.equilibrium import Linearisation
+from koopmpc.control.plan.row_targets import TerminalCost
 
 BEYOND = 10  # horizons for which a reference goes on beyond its rows
 ORDERS = (2, 3, 4, 6)  # of linear recurrences with a constant: a ramp or a sine has 2, two sines have 4
@@ -93,20 +94,22 @@ def can_drift(
     return bool(np.linalg.norm(Q_root @ missed) <= FOLLOWS * np.linalg.norm(Q_root @ d))
 
 
-def shift_target(
-    end: TerminalTarget,
+def shift_end(
+    end: TerminalCost,
+    u: Float[np.ndarray, " nu"],
     at: Linearisation,
     weights: tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]],
     size: Float[np.ndarray, " n"],
     rows: Float[np.ndarray, "T1 nr"],
     held: Float[np.ndarray, "nu nr"] | None,
-) -> TerminalTarget:
-    """Return the target of x_N where the rows r_N, r_{N+1}, … come, by the linear tracking problem behind x_N.
+) -> TerminalCost:
+    """Return the cost of x_N where the rows r_N, r_{N+1}, … come, by the linear tracking problem behind x_N.
 
-    With x̃ = x − x_r and δ_k = r_k − of(x_r) the cost-to-go is x̃ᵀP x̃ − 2 p_Nᵀx̃ + …, so the target moves by P⁺p_N.
-    Backward from p = 0 after the last row, p_k = JᵀQ δ_k + (A − B K)ᵀ p_{k+1} − Kᵀ R v_k. v_k is the input that costs
-    nothing, from u_r on: `held` δ_k where inputs count from the one that holds a row, else −u_r. P is the end's cost.
-    `weights` are Q and R, `size` that of x and u.
+    u is the input of the equilibrium x_r. With x̃ = x − x_r and δ_k = r_k − of(x_r) the cost-to-go is
+    x̃ᵀP x̃ − 2 p_Nᵀx̃ + …, so the target moves by P⁺p_N. Backward from p = 0 after the last row,
+    p_k = JᵀQ δ_k + (A − B K)ᵀ p_{k+1} − Kᵀ R v_k. v_k is the input that costs nothing, from u_r on: `held` δ_k where
+    inputs count from the one that holds a row, else −u_r. P is the end's cost. `weights` are Q and R, `size` that of x
+    and u.
 
     References
     ----------
@@ -120,7 +123,7 @@ def shift_target(
     PB = S.T @ (S @ B)
     K: Float[np.ndarray, "nu nx"] = np.asarray(np.linalg.lstsq(R + B.T @ PB, PB.T @ A, rcond=ROUNDING)[0])
     D = rows - at.of
-    wanted = np.tile(-end.equilibrium.u / su, (len(D), 1)) if held is None else D @ (held / su[:, None]).T
+    wanted = np.tile(-u / su, (len(D), 1)) if held is None else D @ (held / su[:, None]).T
     p, closed = D @ Q @ J - wanted @ (R @ K), A - B @ K
     with np.errstate(over="ignore", invalid="ignore"):
         while len(p) > 1:  # Σ closedᵀᵏ p_k: neighbours at once

@@ -6,7 +6,7 @@ from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
@@ -16,10 +16,10 @@ from koopmpc.control.cost import Cost, data_ranges, state_tracking
 from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation
 from koopmpc.control.move import Fallback, Move, Plan, Status, alone
-from koopmpc.control.nonlinear.equilibrium import TerminalTarget, TerminalTargets
-from koopmpc.control.nonlinear.motion import BEYOND, Course, can_drift, extend_rows, shift_target
 from koopmpc.control.nonlinear.problem import ModelOrMap, StageTargets, learned_map, staged_problem
 from koopmpc.control.nonlinear.rows import StageLimits, check_rows, find_stage_limits
+from koopmpc.control.plan.row_targets import RowTargets
+from koopmpc.control.step.aim import StageAim
 from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.stepped.priorities import weigh_priorities
 from koopmpc.control.stepped.search import LevelSearch
@@ -49,21 +49,6 @@ class StagePlan(NamedTuple):
     free: Float[np.ndarray, " nu"] | None = None
 
 
-class Preview(NamedTuple):
-    """What the rows of a reference ask for, before disturbances: see `StagedMPC._aim`.
-
-    R holds the rows r_0 … r_N, U and `slopes` the reference inputs and ∂u/∂e of all but the last, `held` says which of
-    these equal the last one, and `target` is the last one's. `beyond` is how the reference goes on.
-    """
-
-    R: Float[np.ndarray, "N1 nr"]
-    U: Float[np.ndarray, "N nu"]
-    slopes: Float[np.ndarray, "N nu nx"]
-    held: Bool[np.ndarray, " N"]
-    target: TerminalTarget
-    beyond: Course
-
-
 class StagedMPC(MPCBase):
     """An MPC on x⁺ = F(x, u) + E w + d, whose solver works stage by stage; parameters as in `BilinearMPC`."""
 
@@ -73,9 +58,8 @@ class StagedMPC(MPCBase):
     _box: Interval  # limits of the inputs of the step, one for all stages or a row each
     _at_call: Limits
     _called_with: Limits | None
-    _goes_on: bool  # whether a reference that moves goes on beyond its rows
     _levels: LevelSearch | None
-    _last_root: Float[np.ndarray, "nu nu"] | None = None  # root of the weight of u_{N−1}, where it moves in time
+    _last_root: Float[np.ndarray, "nu nu"]  # root of the weight of u_{N−1}
     _steps: int  # since reset: the row of limits and of weights in time
     _timed: bool  # whether the controller's own limits move in time
     _warm: bool  # whether the next step starts from the plan of the last one
@@ -92,8 +76,7 @@ class StagedMPC(MPCBase):
         time_limit: float | None,
         monitor: StepMonitor | Episodes | None,
     ) -> None:
-        self._warm, self._moved, self._row = False, False, 0  # present row of a u_target that is given in rows
-        self._forget_targets()
+        self._warm = False
         self._map = given = learned_map(model)
         ranges = {} if isinstance(model, StepMap) else data_ranges(model)
         o = state_tracking(model.states, model.inputs, cost, limits, given.nx, ranges, in_time=True)
@@ -118,9 +101,10 @@ class StagedMPC(MPCBase):
         self._problem = staged_problem(given, o, self._moves)
         self._levels = None if self._held is None else LevelSearch(self._held, self._blocks, self.nu)
         self._keeper = None if o.limits.terminal is None else self._make_keeper(o.limits.terminal)
-        self._terminal = TerminalTargets(given, self.cost, o, 10 * self._N)
-        self._goes_on = self.cost.moves_on and o.given is None
         self._disturbed = estimator is not None or given.nw > 0
+        rows = RowTargets(given, self.cost, o, 10 * self._N)
+        self._aim = StageAim(rows, o, self._problem, latency, disturbed=self._disturbed)
+        self._last_root = o.R_root
         self._scheduled_for, self._rest = np.zeros(given.nw), np.zeros(given.nx)
         if self._timed:
             check_rows(self.limits, o, self._problem, model.inputs, None)
@@ -156,12 +140,10 @@ class StagedMPC(MPCBase):
             self._levels.reset()
         if self._keeper is not None:
             self._keeper.keep(None)
-        self._warm, self._moved, self._row = False, False, 0
-        self._forget_targets()
-        self._terminal.forget_missed()
-        if self._scheduled_for.any():
-            self._scheduled_for = np.zeros(self._map.nw)
-            self._terminal.begin_with(self._map)
+        self._warm = False
+        self._aim.restart()
+        self._aim.targets.reset()
+        self._scheduled_for = np.zeros(self._map.nw)
         self._e[:] = 0.0
         self._rest = np.zeros(self._map.nx)
 
@@ -175,16 +157,11 @@ class StagedMPC(MPCBase):
             The model is of another kind, has another lifting, dt, states, inputs or disturbances, or is a StepMap.
         """
         self._map = self._map.replace_model(model)
-        self._terminal.update(self._map)
+        self._aim.targets.update(self._map)
         self._initial.update(self._map)
         if self._watch is not None:
             self._watch.update(self._map)
-        self._forget_targets()
-
-    def _forget_targets(self) -> None:
-        """Have the next step search its targets again."""
-        self._reference: bytes | None = None
-        self._target: TerminalTarget | None = None
+        self._aim.forget()
 
     def plan(self) -> Plan | None:
         """Return the plan of the last call; None where it had none."""
@@ -263,10 +240,11 @@ class StagedMPC(MPCBase):
         target = checks.numbers(reference, "reference") + 0.0  # -0.0 and 0.0 are the same row
         if self._problem.timed:
             self._pass_weights()
-        self._terminal.deadline, self._terminal.sought, self._terminal.late = start + self._allowed, False, False
         known = np.abs(x).max() < HUGE and (not self._disturbed or self._disturb())
-        if not (known and self._aim(target)):
+        targets = self._aim.at(target, self._rest, self._last_root, start + self._allowed) if known else None
+        if targets is None:
             return self._lose(applied, Status.BAD_MEASUREMENT, 0, start)
+        self._targets = targets
         found = self._solve(s, u_prev, first, start + self._allowed)
         status, kept = Status.FAILED if self.solver_fails else found.status, False
         if self._keeper is not None:
@@ -362,7 +340,7 @@ class StagedMPC(MPCBase):
         first, o = self._steps + self._latency, self._outputs
         Q, R = self.cost.weight_rows(len(o.Q), self.nu, first, self._N + 1)
         if self._with_rates and self.cost.R_rows is not None:
-            self._last_root, self._moved = np.diag(np.sqrt(R[-2])), True
+            self._last_root = np.diag(np.sqrt(R[-2]))
         self._weigh(*((np.hstack([Q[1:], R[:-1]]), R[:-1, :0]) if self._with_rates else (Q[1:], R[:-1])))
 
     @abstractmethod
@@ -378,7 +356,6 @@ class StagedMPC(MPCBase):
         ahead = e + initial.periodic if initial.periodic.size else e
         if not np.abs(ahead).max() < HUGE:
             return False
-        self._moved = self._moved or bool((e[-1] != self._rest).any())
         self._e[:], self._rest = ahead, e[-1].copy()
         if self._map.scheduled:
             if not np.abs(initial.W).max() < HUGE:
@@ -386,81 +363,13 @@ class StagedMPC(MPCBase):
             self._schedule(initial.W)
             if (initial.W[-1] != self._scheduled_for).any():  # the last row of the preview holds at the target
                 self._scheduled_for = initial.W[-1].copy()
-                self._terminal.schedule(initial.W[-1])
-                self._forget_targets()
+                self._aim.targets.schedule(initial.W[-1])
+                self._aim.forget()
         return True
 
     @abstractmethod
     def _schedule(self, W: Float[np.ndarray, "N nw"]) -> None:
         """Take over the measured disturbances that multiply the state, a row a stage."""
-
-    def _aim(self, reference: Float[np.ndarray, "..."]) -> bool:
-        """Find the targets of a reference where it has changed; return whether it is finite."""
-        key = reference.tobytes()
-        if key == self._reference and not self._moved:
-            return True
-        if key != self._reference:
-            R = checks.reference_rows(reference, self._N, len(self._outputs.Q), self._latency)
-            self._reference = None
-            if not np.isfinite(R).all():
-                return False
-            targets = [self._terminal.find_input(row) for row in R[:-1]]
-            end = self._terminal.end_at(R[-1])
-            self._preview = Preview(
-                R,
-                np.array([target.u for target in targets]),
-                np.array([target.slope for target in targets]),
-                (R[:-1] == R[-1]).all(axis=1),
-                end,
-                extend_rows(R, BEYOND * (self._goes_on and not self._terminal.is_missed(R[-1]))),
-            )
-            self._reference = None if self._terminal.late else key  # the next step searches on
-        R, U, slopes, held, end, beyond = self._preview
-        if self._disturbed:  # the last disturbance of the preview goes on, without its periodic part
-            e = self._rest
-            end = self._target = self._terminal.find_disturbed(R[-1], e, self._target)
-            U = np.clip(U + slopes @ e, *self._outputs.inputs)
-            U[held] = end.u
-        self._moved = False
-        rows, shift, pull = self._outputs.given, self._outputs.shift, self._outputs.pull
-        ahead = np.arange(self._N + 1) + self._row + self._latency
-        if rows is not None:  # row k of a given u_target counts at the k-th step
-            given = rows[np.minimum(ahead, len(rows) - 1)]
-            U, end = given[:-1], end._replace(u=given[-1], m=end.m + end.V @ given[-1])
-        if shift is not None:
-            U = U + shift[np.minimum(ahead[:-1], len(shift) - 1)]
-        self._moved = self._row + 1 < max(len(table) for table in (rows, shift, [0]) if table is not None)
-        self._row += self._moved
-        trajectory = rows is not None and not held[-1]  # the reference goes on, so it ends at no equilibrium
-        if self.cost.Q_N is None and (trajectory or self.cost.tail == 0):
-            M, nr = np.zeros_like(end.M), len(R[-1])
-            M[:nr] = self._outputs.Q_root
-            last = R[-1] if pull is None else R[-1] + pull
-            end = end._replace(M=M, L=np.zeros_like(end.L), V=np.zeros_like(end.V), m=M @ last)
-        if len(beyond.rows):
-            point, equilibria, outputs = end.equilibrium, self._terminal.equilibria, self._outputs
-            at, rows = equilibria.linearise(point.x, point.u), np.vstack([R[-1], beyond.rows])
-            followed, nx = equilibria.follow_row(at), self._map.nx
-            if not beyond.drifts or can_drift(at, followed, outputs.Q_root, R):
-                held = followed[nx:] if self.cost.u_target == "equilibrium" else None
-                end = shift_target(end, at, (outputs.Q, outputs.R), equilibria.size, rows, held)
-        R = R[1:] if pull is None else R[1:] + pull
-        rated = self._with_rates
-        self._targets = self._add_last_input(R, U, end) if rated else StageTargets(R, U, end.M, end.L, end.m)
-        return True
-
-    def _add_last_input(
-        self, R: Float[np.ndarray, "N nr"], U: Float[np.ndarray, "N nu"], target: TerminalTarget
-    ) -> StageTargets:
-        """Return reference rows, reference inputs and a terminal target for stages whose state holds the last input."""
-        M, L, V, m = target.M, target.L, target.V, target.m
-        (n, nr), nx, nu, ns = M.shape, L.shape[1], U.shape[1], self._problem.nx
-        M_s, L_s, m_s = np.zeros((ns + nr + nu, nr + nu)), np.zeros((ns + nr + nu, ns)), np.zeros(ns + nr + nu)
-        last = slice(nx, nx + nu)
-        M_s[:n, :nr], L_s[:n, :nx], L_s[:n, last], m_s[:n] = M, L, V, m
-        root = self._outputs.R_root if self._last_root is None else self._last_root
-        L_s[n : n + nu, last], m_s[n : n + nu] = root, root @ U[-1]
-        return StageTargets(np.hstack([R, U]), np.zeros_like(U), M_s, L_s, m_s)
 
     def _first_stage(
         self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"]

@@ -10,10 +10,11 @@ from scipy.linalg import solve
 
 from koopmpc.control.cost import StateTracking
 from koopmpc.control.limits import Interval, Softness
-from koopmpc.control.nonlinear.equilibrium import RestProgram, TailProgram, TerminalTargets
+from koopmpc.control.nonlinear.equilibrium import RestProgram
 from koopmpc.control.nonlinear.problem import LearnedMap, ModelOrMap, StagedProblem
 from koopmpc.control.nonlinear.rows import StageBounds
 from koopmpc.control.nonlinear.stagewise import Sides
+from koopmpc.control.plan.row_targets import RowTargets, TailProgram
 from koopmpc.control.program import StepProgram, trace_graph
 from koopmpc.errors import DataError
 from koopmpc.estimate.observer import EstimatorProgram
@@ -121,19 +122,18 @@ class StagedProgram(StepProgram):
 
 
 def find_targets(
-    terminal: TerminalTargets, nx: int, reference: Float[np.ndarray, "rows nr"]
+    targets: RowTargets, nx: int, reference: Float[np.ndarray, "rows nr"]
 ) -> Float[np.ndarray, "found size"]:
     """Return the `table` of a StagedProgram for these reference rows, each row once."""
-    found: list[Float[np.ndarray, " size"]] = []
+    table: list[Float[np.ndarray, " size"]] = []
     for key in dict.fromkeys(map(bytes, np.ascontiguousarray(reference))):
         row = np.frombuffer(key)
-        target = terminal(row)
-        x, u, active = target.equilibrium
-        n = nx + len(row) + len(u) * (target.V.shape[0] > nx + len(row))
-        parts = (row, x, u, active, target.u, target.slope, target.M[:n], target.L[:n], target.V[:n], target.m[:n])
-        known = float(not terminal.is_missed(row))
-        found.append(np.concatenate([*(np.ravel(part) for part in parts), [known]]))
-    return np.array(found)
+        target = targets.find_still(row)
+        (x, u, active), (M, L, V, m) = target.equilibrium, targets.weigh_end(target)
+        n = nx + len(row) + len(u) * (V.shape[0] > nx + len(row))
+        parts = (row, x, u, active, target.u, target.slope, M[:n], L[:n], V[:n], m[:n], float(target.is_found))
+        table.append(np.concatenate([np.ravel(part) for part in parts]))
+    return np.array(table)
 
 
 @raise_swallowed()
@@ -182,10 +182,10 @@ def trace_functions(problem: StagedProblem, outputs: StateTracking, model: Learn
 
 
 def first_gain(
-    terminal: TerminalTargets, outputs: StateTracking, N: int, row: Float[np.ndarray, " nr"]
+    targets: RowTargets, outputs: StateTracking, N: int, row: Float[np.ndarray, " nr"]
 ) -> Float[np.ndarray, "nu nx"]:
     """Return the gain of the LQR with N steps on the linearisation at the target of a row."""
-    equilibria, rest = terminal.equilibria, terminal(row).equilibrium
+    equilibria, rest = targets.equilibria, targets.find_still(row).equilibrium
     at = equilibria.linearise(rest.x, rest.u)
     Q, R = at.J.T @ outputs.Q @ at.J, outputs.R
     P, K = Q, np.zeros((len(R), len(rest.x)))

@@ -1,0 +1,1 @@
+"""Program and reading → Move: what a controller does at each step, of arrays and numbers alone."""
