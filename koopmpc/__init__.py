@@ -103,6 +103,8 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.recording.writer import record as record
     from koopmpc.synthesis.design import design as design
     from koopmpc.synthesis.designed import load_controller as load_controller
+    from koopmpc.synthesis.options import DesignOptions as DesignOptions
+    from koopmpc.synthesis.options import SearchOptions as SearchOptions
     from koopmpc.synthesis.select import select as select
     from koopmpc.synthesis.stabilise import stabilise as stabilise
     from koopmpc.synthesis.train import train as train

@@ -8,12 +8,11 @@ import pytest
 
 import koopmpc as km
 from koopmpc.data.episodes import Episodes
-from koopmpc.synthesis.candidates import Candidate
+from koopmpc.synthesis.search.candidates import Candidate
 
-ROOM = importlib.import_module("koopmpc.synthesis.design")  # the module; the room has a function of this name
-LOOPS = importlib.import_module("koopmpc.synthesis.fresh.loops")
-NEIGHBOURS = importlib.import_module("koopmpc.synthesis.fresh.neighbours")
-ASKED = importlib.import_module("koopmpc.synthesis.asked")
+PROMISE, TASK, TRIALS = (importlib.import_module(f"koopmpc.synthesis.{file}") for file in ("promise", "task", "trials"))
+FINALISTS = importlib.import_module("koopmpc.synthesis.loops.finalists")
+NEIGHBOURS = importlib.import_module("koopmpc.synthesis.loops.neighbours")
 
 
 def propose_two(episodes: Episodes, _: object, bilinear: bool, *__: object) -> list[Candidate]:
@@ -29,11 +28,11 @@ def propose_two(episodes: Episodes, _: object, bilinear: bool, *__: object) -> l
 def short_loops() -> Iterator[None]:
     """Let designs run fewer and shorter loops, and choose the slope of nearest rows by fewer forecasts."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ROOM, "MANY", 100)
-        patch.setattr(LOOPS, "COMPARED", 20)
-        patch.setattr(LOOPS, "FURTHER", 40)
-        patch.setattr(ASKED, "LONGEST", 60)
-        patch.setattr(ASKED, "MOVING", 60)
+        patch.setattr(PROMISE, "MANY", 100)
+        patch.setattr(FINALISTS, "COMPARED", 20)
+        patch.setattr(FINALISTS, "FURTHER", 40)
+        patch.setattr(TASK, "LONGEST", 60)
+        patch.setattr(TASK, "MOVING", 60)
         patch.setattr(NEIGHBOURS, "BEGUN", 80)
         yield
 
@@ -50,6 +49,6 @@ def undrawn_pages() -> Iterator[None]:
 def small_designs() -> Iterator[None]:
     """Let designs try two models, from few starts and in short loops."""
     with short_loops(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ROOM, "propose_candidates", propose_two)
-        patch.setattr(ASKED, "STARTS", 6)
+        patch.setattr(TRIALS, "propose_candidates", propose_two)
+        patch.setattr(TASK, "STARTS", 6)
         yield

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.synthesis.fresh.drawn import LoopPool
-from koopmpc.synthesis.fresh.loops import run_fresh_loops
+from koopmpc.synthesis.loops.fresh import run_fresh_loops
+from koopmpc.synthesis.loops.pool import LoopPool
 from tests.docs.page import alike, run
 
 
@@ -49,7 +49,7 @@ def test_one_sensor_is_enough_for_a_better_loop_that_the_stand_ins_do_not_call_l
     one = km.Episodes([km.Episode(X=e.X[:, 1:], U=e.U) for e in logs], logs.dt, logs.states[1:], logs.inputs)
     limits = km.Limits(u_min=0, u_max=8, x_max=[20])
     cost = km.Cost(Q=1.0, R=0.1, R_delta=0.5)
-    design = km.design(one, cost, limits, horizon=25, reference=[10.0], bilinear=False)
+    design = km.design(one, cost, limits, horizon=25, reference=[10.0], options=km.DesignOptions(bilinear=False))
     assert "delay" in design.best.title  # past rows stand in for the level that nobody measures
     assert dict(design.expected.loops)["neighbours"] > 100
     assert np.isfinite(design.expected.fresh.cost).all()

@@ -66,11 +66,11 @@ km.record, km.export, km.select, km.design  # each is imported when its name is 
 followed("record_all", lambda: km.record(run, folder / "run.rrd"), ground=True)
 followed("export_all", lambda: km.export(mpc, folder / "c"), ground=True)
 few = [km.State() + km.Constant(), lifting]
-followed("select_all", lambda: km.select(data, candidates=few, horizon=5, delays=[0], workers=1), ground=True)
-task = dict(horizon=5, reference=[0, 0], candidates=[lifting], delays=[0], loops=60, workers=1)
+followed("select_all", lambda: km.select(data, horizon=5, options=km.SearchOptions(candidates=few, delays=[0], workers=1)), ground=True)
+options = km.DesignOptions(candidates=[lifting], delays=[0], loops=60, workers=1)
 from tests.small_designs import short_loops
 with short_loops():  # the calls are the same, and fewer
-    followed("design_all", lambda: km.design(data, cost, limits, **task), ground=True)
+    followed("design_all", lambda: km.design(data, cost, limits, reference=[0, 0], horizon=5, options=options), ground=True)
 """
 MOST = {  # files, returns
     "edmd": (8, 6),

@@ -36,6 +36,7 @@ from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor, load_
 from koopmpc.supervise.monitor import Monitor
 from koopmpc.synthesis.design import design
 from koopmpc.synthesis.designed import Design, load_controller, rebuild_controller
+from koopmpc.synthesis.options import DesignOptions
 
 
 class Prepared:
@@ -261,7 +262,7 @@ class Prepared:
                 horizon=problem.horizon,
                 reference=cases[0].reference,
                 starts=np.array([case.x0 for case in cases]),
-                angles=problem.angles,
+                options=DesignOptions(angles=problem.angles),
             )
         self._designs.append((limits, found))
         return found

@@ -12,9 +12,9 @@ from koopmpc.errors import DataError
 from koopmpc.figures.style import LIMIT, draw_legend, fit_label, line_style, make_figure, styled
 from koopmpc.lifting.base import find_state
 from koopmpc.lifting.state import State
-from koopmpc.synthesis.asked import DesignTask
 from koopmpc.synthesis.designed import Design, Evidence
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap, choose_starts_to_record, goal_box, probe_range
+from koopmpc.synthesis.loops.neighbours import NeighbourMap, choose_starts_to_record, probe_range
+from koopmpc.synthesis.task import DesignTask, goal_box
 from koopmpc.text import to_percent
 
 if TYPE_CHECKING:

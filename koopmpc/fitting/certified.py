@@ -10,8 +10,8 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError
 from koopmpc.guarantees.certify import certify
 from koopmpc.lifting.state import State
-from koopmpc.synthesis.candidates import get_model
 from koopmpc.synthesis.designed import Design
+from koopmpc.synthesis.search.recipe import get_model
 
 PAGE = "certificate.md"
 

@@ -24,11 +24,11 @@ from koopmpc.loop.run import Step
 from koopmpc.page import HtmlPage
 from koopmpc.parallel import StageProgress
 from koopmpc.plants.step_map import StepMap
-from koopmpc.synthesis.candidates import get_model
 from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign, read_controller, rebuild_controller
-from koopmpc.synthesis.fresh.loops import goal_box
-from koopmpc.synthesis.judging import read_reference, run_on_surrogate
-from koopmpc.synthesis.surrogates import explain_unreachable
+from koopmpc.synthesis.doubts import explain_unreachable
+from koopmpc.synthesis.loops.judging import read_reference, run_on_surrogate
+from koopmpc.synthesis.search.recipe import get_model
+from koopmpc.synthesis.task import goal_box
 from koopmpc.terminal import build_table, render_text
 from koopmpc.text import format_duration, to_percent
 

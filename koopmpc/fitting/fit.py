@@ -23,8 +23,9 @@ from koopmpc.page import Page
 from koopmpc.parallel import StageProgress, check_scheduler
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.recording.model import record_model
-from koopmpc.synthesis.leaderboard import Selection
-from koopmpc.synthesis.records import fit_again
+from koopmpc.synthesis.options import SearchOptions
+from koopmpc.synthesis.search.leaderboard import Selection
+from koopmpc.synthesis.search.records import fit_again
 from koopmpc.synthesis.select import select
 from koopmpc.terminal import label_lines, render_text
 from koopmpc.validate.report import TrustReport, trust
@@ -135,13 +136,15 @@ def fit_data(
         selection = select(
             split.fitted,
             horizon=split.horizon,
-            delays=None if split.delay <= (max(DELAYS) if record else PAST) else [*range(PAST + 1), split.delay],
-            bilinear=bilinear,
-            feedthrough=feedthrough,
-            workers=workers,
-            scheduler=scheduler,
-            progress=progress,
-            rng=draw,
+            options=SearchOptions(
+                delays=None if split.delay <= (max(DELAYS) if record else PAST) else [*range(PAST + 1), split.delay],
+                bilinear=bilinear,
+                feedthrough=feedthrough,
+                workers=workers,
+                scheduler=scheduler,
+                progress=progress,
+                rng=draw,
+            ),
         )
     model = place / "model.npz"
     selection.predictor.save(model)

@@ -28,10 +28,11 @@ from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
 from koopmpc.parallel import StageProgress
 from koopmpc.predict.base import load_value
-from koopmpc.synthesis.cross_validation import usual_horizon
 from koopmpc.synthesis.design import design
 from koopmpc.synthesis.designed import Design, SavedDesign, rebuild_controller
-from koopmpc.synthesis.surrogates import describe_rest
+from koopmpc.synthesis.doubts import describe_rest
+from koopmpc.synthesis.options import DesignOptions
+from koopmpc.synthesis.search.folds import usual_horizon
 from koopmpc.validate.bands import Forecast, forecast
 from koopmpc.validate.logs.summary import LogSummary
 from koopmpc.validate.report import trust
@@ -165,15 +166,17 @@ def design_data(
             asked.limits,
             horizon=asked.horizon,
             reference=asked.reference,
-            angles=asked.angles,
-            bilinear=bilinear,
-            feedthrough=feedthrough,
-            instruments=instruments,
-            coverage=asked.coverage,
-            workers=workers,
-            scheduler=scheduler,
-            progress=progress,
-            rng=draw,
+            options=DesignOptions(
+                angles=asked.angles,
+                bilinear=bilinear,
+                feedthrough=feedthrough,
+                instruments=instruments,
+                margin=asked.coverage or "errors",
+                workers=workers,
+                scheduler=scheduler,
+                progress=progress,
+                rng=draw,
+            ),
         )
     tell(str(designed))
     evidence = designed.evidence

@@ -23,8 +23,8 @@ from koopmpc.data.source import Changed, Held, Source, Subset
 from koopmpc.errors import ColumnWarning, DataError, FitWarning, NoInputWarning
 from koopmpc.fitting.suspected import bridge_spikes, decide_places
 from koopmpc.identify.records.narx import DELAYS
-from koopmpc.synthesis.cross_validation import cut_blocks, replace_glitches, take_sample, usual_horizon
-from koopmpc.synthesis.select import is_record
+from koopmpc.synthesis.search.data import is_record, replace_glitches, take_sample
+from koopmpc.synthesis.search.folds import cut_blocks, usual_horizon
 from koopmpc.text import with_unit
 from koopmpc.validate.logs.audit import Remainder, audit
 from koopmpc.validate.logs.log import LogFault, Place, list_places

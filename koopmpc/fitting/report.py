@@ -18,9 +18,9 @@ from koopmpc.loop.metrics import violation_shares
 from koopmpc.loop.run import Run
 from koopmpc.page import HtmlPage
 from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign
-from koopmpc.synthesis.fresh.neighbours import choose_starts_to_record, probe_range
-from koopmpc.synthesis.judging import read_reference, run_on_surrogate
-from koopmpc.synthesis.surrogates import describe_rest
+from koopmpc.synthesis.doubts import describe_rest
+from koopmpc.synthesis.loops.judging import read_reference, run_on_surrogate
+from koopmpc.synthesis.loops.neighbours import choose_starts_to_record, probe_range
 from koopmpc.text import shorten_observable, to_percent, with_unit
 from koopmpc.validate.logs.summary import LogExcerpt, LogSummary
 

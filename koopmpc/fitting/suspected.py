@@ -11,7 +11,7 @@ from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.synthesis.select import is_record
+from koopmpc.synthesis.search.data import is_record
 from koopmpc.validate.logs.audit import Remainder
 from koopmpc.validate.logs.log import LogFault, Place
 from koopmpc.validate.scoring import forecast_errors

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
 from koopmpc.loop.metrics import stack_limited
-from koopmpc.synthesis.candidates import get_model
 from koopmpc.synthesis.designed import Evidence
-from koopmpc.synthesis.fresh.abreast import speed_up
-from koopmpc.synthesis.fresh.drawn import KEPT, SHIFT, LoopPool, LoopResult
+from koopmpc.synthesis.loops.abreast import speed_up
+from koopmpc.synthesis.loops.pool import KEPT, SHIFT, LoopPool, LoopResult
+from koopmpc.synthesis.search.recipe import get_model
 from koopmpc.text import to_percent
 from koopmpc.validate.binomial import bound_failure_rate, count_runs_needed
 

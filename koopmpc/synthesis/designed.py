@@ -1,7 +1,6 @@
-"""Design: the controller chosen by closed loop, what to expect of it, the leaderboard, and the file that keeps it."""
+"""Design: the controller chosen by closed loop, the leaderboard, and the file that keeps it."""
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,164 +19,18 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, KoopmpcError, LogError
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.supervise.guarded import Guarded
-from koopmpc.synthesis.asked import DesignTask
-from koopmpc.synthesis.candidates import Designed, Recipe
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap, choose_starts_to_record
-from koopmpc.synthesis.fresh.promise import CoveragePromise
-from koopmpc.synthesis.fresh.verdict import FreshLoops, bound_value, cost_interval
-from koopmpc.synthesis.judging import UNSURE, is_alike
-from koopmpc.synthesis.surrogates import Surrogate
-from koopmpc.terminal import build_leaderboard, label_lines, render_text
+from koopmpc.synthesis.choice import DesignRow
+from koopmpc.synthesis.loops.neighbours import NeighbourMap, choose_starts_to_record
+from koopmpc.synthesis.loops.surrogates import Surrogate
+from koopmpc.synthesis.rates import CoveragePromise, ExpectedLoop
+from koopmpc.synthesis.search.recipe import Designed
+from koopmpc.synthesis.task import DesignTask
+from koopmpc.terminal import build_leaderboard, render_text
 from koopmpc.text import format_duration, to_percent
-from koopmpc.validate.binomial import bound_failure_rate
 from koopmpc.validate.logs.summary import LogSummary
 from koopmpc.values import Value
 
-BREAKS = 0.01  # a larger violation, as a share of the range, is less safe
-WORTH = 0.02  # a controller with an estimator may cost this share more
-WORTH_UNSTABLE = 0.05  # on an unstable plant one without an estimator may cost this share more
 AnyMPC = KoopmanMPC | BilinearMPC | NonlinearMPC
-
-
-@dataclass(frozen=True, eq=False)
-class DesignRow(Value):
-    """A line of the leaderboard: one recipe.
-
-    Attributes
-    ----------
-    recipe
-        Model and controller.
-    score
-        Mean over its runs of cost × (1 + 10 max(0, violation − 0.5 %)), over the best on the same surrogate and start.
-    worst
-        The largest of these ratios; 20 is a lost run.
-    violation
-        Largest violation of a limit in any run that was not lost, as a share of its range.
-    lost
-        Number of lost runs: they left the data by more than half of its range, or became NaN or infinite.
-    runs
-        Number of runs.
-    off
-        True if runs with inputs 20 % off are among them. Only scores of rows with equal `off` can be compared.
-    error
-        Standard error of the score's difference to the best of the rows with equal `off`, as a share of the score.
-    """
-
-    recipe: Recipe
-    score: float
-    worst: float
-    violation: float
-    lost: int
-    runs: int
-    off: bool
-    error: float = 0.0
-
-    @property
-    def title(self) -> str:
-        """The recipe in words."""
-        return str(self.recipe)
-
-
-@dataclass(frozen=True, eq=False)
-class ExpectedLoop(Value):
-    """Expected closed loop of a design, from runs on surrogates that were fitted to data unknown to its model.
-
-    The runs of `cost` and `cost_off` took part in the choice; those of `fresh` came after it, and the interval and the
-    bounds are theirs. It is an estimate from data alone and no guarantee: no surrogate shows an error that all models
-    share.
-
-    Attributes
-    ----------
-    cost
-        (runs,) cost of each run in which the inputs act as in the data; infinite where it was lost.
-    cost_off
-        (runs,) the same with inputs that act 20 % more or less.
-    violation, violation_off
-        (runs,) largest violation of a limit, as a share of its range.
-    broken
-        Share of all steps that violate a limit by more than 0.1 % of its range.
-    starts
-        (runs, nx) where the runs of `cost` began.
-    surrogate
-        (runs,) the surrogate of each run.
-    steps
-        Length of a run.
-    fresh
-        Loops after the choice; None where there are none.
-    compared
-        Number of loops of all finalists, in which the choice was confirmed or changed.
-    """
-
-    cost: Float[np.ndarray, " runs"]
-    cost_off: Float[np.ndarray, " off"]
-    violation: Float[np.ndarray, " runs"]
-    violation_off: Float[np.ndarray, " off"]
-    broken: float
-    starts: Float[np.ndarray, "runs nx"]
-    surrogate: tuple[int, ...]
-    steps: int
-    fresh: FreshLoops | None = None
-    compared: int = 0
-
-    @property
-    def cost_interval(self) -> tuple[float, float]:
-        """The interval that holds 90 % of the costs of loops like the fresh ones, lost ones infinite."""
-        return cost_interval(self._judged_runs(self.cost, self.cost_off, "cost"))
-
-    @property
-    def violation_bound(self) -> float:
-        """What the largest violation of a loop like the fresh ones exceeds in at most 5 % of them."""
-        return bound_value(self._judged_runs(self.violation, self.violation_off, "violation"))
-
-    @property
-    def lost_bound(self) -> float:
-        """Exact upper bound, at 95 %, of the probability that a loop like the fresh ones is lost."""
-        cost = self._judged_runs(self.cost, self.cost_off, "cost")
-        return bound_failure_rate(int(np.sum(~np.isfinite(cost))), len(cost))
-
-    @property
-    def loops(self) -> dict[str, int]:
-        """Number of loops of each kind: those of the choice, and the fresh ones by what stood in for the plant."""
-        chosen = {"choice": len(self.cost), "choice, inputs 20 % off": len(self.cost_off)}
-        chosen |= {"finalists": self.compared} if self.compared else {}
-        return chosen if self.fresh is None else chosen | self.fresh.counts
-
-    def _judged_runs(
-        self, near: Float[np.ndarray, " n"], off: Float[np.ndarray, " m"], name: str
-    ) -> Float[np.ndarray, " loops"]:
-        return np.concatenate([near, off]) if self.fresh is None else getattr(self.fresh, name)
-
-    @property
-    def lost(self) -> int:
-        """How many of all runs were lost."""
-        return int(np.sum(~np.isfinite(np.concatenate([self.cost, self.cost_off]))))
-
-    def __str__(self) -> str:
-        """Return what to expect in words."""
-        pairs = [
-            ("cost", _format_spread(self.cost)),
-            ("with inputs 20 % off", _format_spread(self.cost_off)),
-            (
-                "largest violation",
-                f"{_format_worst(self.violation)}; with inputs 20 % off {_format_worst(self.violation_off)}",
-            ),
-            ("steps that violate", f"{to_percent(self.broken)}, an estimate from held-out surrogates and no promise"),
-            ("lost runs", f"{self.lost} of {len(self.cost) + len(self.cost_off)}"),
-        ]
-        if self.fresh is not None:
-            low, high = self.cost_interval
-            number, lost = len(self.fresh.cost), int(np.sum(~np.isfinite(self.fresh.cost)))
-            corners = self.fresh.corner_cost
-            kinds = ", ".join(f"{count} {_PLACES.get(kind, kind)}" for kind, count in self.loops.items())
-            pairs += [
-                ("fresh loops", f"{lost} of {number} lost: below {to_percent(self.lost_bound)} at 95 %"),
-                ("cost in 90 %", f"{low:.4g} to {high:.4g}"),
-                ("violation in 95 %", f"up to {to_percent(self.violation_bound)} of the range"),
-                ("outside the data", f"{to_percent(float(self.fresh.outside.mean()))} of the steps"),
-                ("corners", f"{int(np.sum(~np.isfinite(corners)))} of {len(corners)} lost"),
-                ("loops", kinds),
-            ]
-        return render_text(label_lines(pairs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -406,82 +259,6 @@ class Design:
 
 def _list_figures(row: DesignRow) -> list[str]:
     return [f"{row.score:.3f}", f"{row.worst:.3f}", to_percent(row.violation), f"{row.lost} of {row.runs}"]
-
-
-_PLACES = {  # a kind of loops in `ExpectedLoop.loops`, as it is printed
-    "choice": "in the choice",
-    "choice, inputs 20 % off": "there with inputs 20 % off",
-    "finalists": "of all finalists",
-    "models": "fresh on learned models",
-    "neighbours": "fresh on nearest rows of the logs",
-    "corners": "from corners of the goal's range",
-}
-
-
-def _format_spread(values: Float[np.ndarray, " runs"]) -> str:
-    known = values[np.isfinite(values)]
-    if not known.size:
-        return "every run was lost"
-    return f"median {np.median(known):.4g}, from {known.min():.4g} to {known.max():.4g} over surrogates and starts"
-
-
-def _format_worst(values: Float[np.ndarray, " runs"]) -> str:
-    known = values[np.isfinite(values)]
-    return f"{to_percent(known.max())} of the range" if known.size else "unknown"
-
-
-def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: bool = False) -> int | None:
-    """Return the place of the safest, then simplest row that is as good as the best, of those judged in all conditions.
-
-    A row is as good as the best if its score is within 0.5 % of it, or within the standard error of their difference
-    where that is larger, at most 3 %. Its worst run may be at most 3 % worse: where a plant differs from its logs, one
-    run shows it before the mean does. Safer is a row with fewer lost runs, then one without a violation above 1 %.
-    Simpler is a row without weights, then one with a smaller model; a bilinear model counts twice its observables.
-    A controller with an estimator may cost 2 % more than without one, since it corrects errors that surrogates and
-    models share. So may an estimator that finds its gain, over one with a small fixed gain, which corrects them late.
-    On a plant that is `unstable` where it is used, one without an estimator may cost 5 % more, for an estimator takes
-    the model's error in a transient for a load.
-    """
-    places = [i for i, row in enumerate(rows) if row.off and kind in (None, row.recipe.candidate.kind)]
-    if not places:
-        return None
-    best = min((rows[i] for i in places), key=lambda row: (row.score, row.worst))
-    near = [i for i in places if is_alike(rows[i].score, best.score, rows[i].error)]
-    near = [i for i in near if rows[i].worst <= best.worst * (1 + UNSURE)]
-
-    def rank(i: int) -> tuple[object, ...]:
-        row, one = rows[i], rows[i].recipe
-        safe = row.lost, row.violation > BREAKS
-        return *safe, one.weighted, one.candidate.size, one.candidate.delays, one.estimator is None, row.score, i
-
-    def without_estimator(i: int) -> Recipe:
-        return replace(rows[i].recipe, estimator=None)
-
-    place = min(near, key=rank)
-    same = [i for i in places if without_estimator(i) == without_estimator(place)]
-    if unstable:
-        plain = [i for i in same if rows[i].recipe.estimator is None and rows[i].lost <= rows[place].lost]
-        return next((i for i in plain if rows[i].score <= (1 + WORTH_UNSTABLE) * rows[place].score), place)
-    if rows[place].recipe.estimator is None:
-        estimating = [
-            i for i in same if rows[i].recipe.estimator is not None and rows[i].score <= (1 + WORTH) * rows[place].score
-        ]
-        place = min(estimating, key=lambda i: (rows[i].score, i), default=place)
-    estimator, row = rows[place].recipe.estimator, rows[place]
-    if estimator is None or estimator.gain is None:
-        return place
-    own = [i for i in same if rows[i].recipe.estimator == replace(estimator, gain=None) and rows[i].lost <= row.lost]
-    own = [i for i in own if rows[i].worst <= (1 + UNSURE) * row.worst]
-    return next((i for i in own if rows[i].score <= (1 + WORTH) * row.score), place)
-
-
-def choose_estimator(scores: Sequence[float], *, unstable: bool) -> int:
-    """Return the place of the estimator that other models of the kind get; the first score is that without one.
-
-    One that costs at most 2 % more than none is taken, for it leaves no offset; none of those on an unstable plant.
-    """
-    place, some = int(np.argmin(scores)), 1 + int(np.argmin(scores[1:]))
-    return some if not unstable and scores[some] <= (1 + WORTH) * scores[place] else place
 
 
 def load_controller(path: str | Path) -> Any:

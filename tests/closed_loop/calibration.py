@@ -16,10 +16,11 @@ import numpy as np
 
 import koopmpc as km
 from koopmpc.loop.metrics import violation_shares
-from koopmpc.synthesis.designed import ExpectedLoop, read_controller, rebuild_controller
-from koopmpc.synthesis.fresh.abreast import speed_up
-from koopmpc.synthesis.fresh.drawn import LoopPool, draw_starts
-from koopmpc.synthesis.fresh.loops import run_fresh_loops
+from koopmpc.synthesis.designed import read_controller, rebuild_controller
+from koopmpc.synthesis.loops.abreast import speed_up
+from koopmpc.synthesis.loops.fresh import run_fresh_loops
+from koopmpc.synthesis.loops.pool import LoopPool, draw_starts
+from koopmpc.synthesis.rates import ExpectedLoop
 from tests.closed_loop.controllers import Parts
 from tests.closed_loop.more_tasks import ALL
 from tests.closed_loop.optimum import held
@@ -45,8 +46,7 @@ def read_or_design(task: str, seed: int, folder: Path | None) -> tuple[Any, Any]
             parts.task.limits,
             horizon=parts.task.horizon,
             reference=reference,
-            loops=0,
-            workers=1,
+            options=km.DesignOptions(loops=0, workers=1),
         )
         if path is None:
             return design.controller, design.evidence

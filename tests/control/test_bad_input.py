@@ -5,6 +5,7 @@ import pytest
 
 import koopmpc as km
 from tests.bare import shown
+from tests.searches import select
 
 A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]])
 MODEL = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("p", "v"), ("u",))
@@ -109,7 +110,7 @@ FEW = {"candidates": [km.State() + km.Constant()], "horizon": 10, "delays": [0],
 
 
 def test_select_cuts_one_episode_into_blocks_says_so_and_its_model_controls():
-    found = km.select(episodes(1, 200), **FEW)
+    found = select(episodes(1, 200), **FEW)
     assert "1 episode is too few for 5 folds: cut into" in str(found)
     mpc = km.KoopmanMPC(found.predictor, COST, km.Limits(-1, 1), 10)
     assert mpc([0.5, 0.0], [0.0, 0.0]).status in (km.Status.UNCONSTRAINED, km.Status.OPTIMAL)
@@ -119,14 +120,14 @@ def test_select_refuses_one_episode_that_is_too_short():
     with pytest.raises(
         km.errors.DataError, match=r"choice needs two of 10 steps or more, or one of 40: pass a shorter horizon"
     ):
-        km.select(episodes(1, 15), **FEW)
+        select(episodes(1, 15), **FEW)
 
 
 @pytest.mark.parametrize("still", ["p", "u"])
 @pytest.mark.filterwarnings("ignore:feedback made A and B inseparable")
 def test_select_says_which_column_is_constant_and_its_model_controls(still):
     with pytest.warns(km.FitWarning, match=f"{still} is constant in these data, so what it does cannot be learned"):
-        found = km.select(episodes(8, 40, still), **FEW)
+        found = select(episodes(8, 40, still), **FEW)
     mpc = km.KoopmanMPC(found.predictor, COST, km.Limits(-1, 1, x_max=[4, 1]), 10)
     assert np.abs(mpc([3.0, 0.5], [3.0, 0.0]).u).max() <= 1.0
 

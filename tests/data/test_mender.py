@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from tests.data.test_smoother import linear_data, noisy, pendulum_data, spread
+from tests.searches import select
 
 
 def spoilt(clean: km.Episodes, places: list[tuple[int, int, int]], size: float) -> km.Episodes:
@@ -87,10 +88,10 @@ def test_a_model_of_spoilt_data_is_nearly_that_of_sound_ones_and_the_notes_say_w
     data = spoilt(clean, [(5, 9, 0), (12, 21, 1)], 40.0)
     options: Any = {"candidates": [km.State() + km.Constant() + km.Monomials(3)], "delays": [0], "horizon": 10}
     held_out = pendulum_data(episodes=50)[40:]
-    errors = [km.score(km.select(each, **options).linear, held_out, 10).rmse.mean() for each in (clean, data)]
+    errors = [km.score(select(each, **options).linear, held_out, 10).rmse.mean() for each in (clean, data)]
     assert errors[1] < 1.1 * errors[0]
     with pytest.warns(km.FitWarning, match="run away"):
-        km.select(data, smooth=False, **options)
-    note = next(note for note in km.select(data, **options).notes if "replaced" in note)
+        select(data, smooth=False, **options)
+    note = next(note for note in select(data, **options).notes if "replaced" in note)
     assert "theta" in note
     assert "row 9 of episode 5" in note

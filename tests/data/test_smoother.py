@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from tests.example_plants import Pendulum
+from tests.searches import select
 
 
 def noisy(clean: km.Episodes, share: float, seed: int = 0) -> km.Episodes:
@@ -181,19 +182,19 @@ def test_exact_data_stay_as_they_are(clean: km.Episodes) -> None:
     """To the bit: select gives the model that it gives when it is told not to smooth."""
     assert not km.data.Smoother.of(clean).is_noisy.any()
     options: Any = {"candidates": [km.State() + km.Constant() + km.Monomials(2)], "delays": [0], "horizon": 5}
-    assert km.select(clean, **options).predictor == km.select(clean, smooth=False, **options).predictor
+    assert select(clean, **options).predictor == select(clean, smooth=False, **options).predictor
 
 
 def test_a_stream_is_smoothed_as_episodes_in_memory_are() -> None:
     data = noisy(pendulum_data(), 0.05)
     options: Any = {"candidates": [km.State() + km.Constant()], "delays": [0], "horizon": 5, "bilinear": False}
-    held = km.select(data, **options)
-    streamed = km.select(km.data.Stream([data[:25], data[25:]]), **options)
+    held = select(data, **options)
+    streamed = select(km.data.Stream([data[:25], data[25:]]), **options)
     assert any("noise" in note for note in held.notes)
     assert held.linear is not None
     assert streamed.linear is not None
     np.testing.assert_allclose(streamed.linear.A, held.linear.A, rtol=0, atol=1e-9)
-    plain = km.select(data, smooth=False, **options)
+    plain = select(data, smooth=False, **options)
     assert not any("noise" in note for note in plain.notes)
 
 
@@ -225,8 +226,8 @@ def test_a_controller_of_noisy_logs_knows_that_the_plant_is_unstable() -> None:
 
     best = price(km.LinearPredictor.local(plant, upright, [0]))
     options: Any = {"horizon": 20, "bilinear": False, "delays": [0], "candidates": [km.State() + km.Constant()]}
-    assert price(km.select(data, **options).linear) < 1.05 * best
-    assert price(km.select(data, smooth=False, **options).linear) > 100 * best
+    assert price(select(data, **options).linear) < 1.05 * best
+    assert price(select(data, smooth=False, **options).linear) > 100 * best
 
 
 def test_what_products_of_inputs_and_disturbances_do_is_no_noise():

@@ -74,7 +74,9 @@ def test_an_exact_linear_plant_of_each_timing_is_driven_as_by_the_optimum_writte
 
 def test_a_model_that_select_takes_with_feedthrough_drives_the_plant_as_its_optimum():
     found = km.select(
-        log_of(1, np.random.default_rng(0)), candidates=[PLAIN], delays=[2], horizon=5, smooth=False, feedthrough=True
+        log_of(1, np.random.default_rng(0)),
+        horizon=5,
+        options=km.SearchOptions(candidates=[PLAIN], delays=[2], smooth=False, feedthrough=True),
     )
     assert found.predictor.input_lead == 1
     assert "feedthrough=True" in str(found)
@@ -94,10 +96,10 @@ def test_a_model_that_select_takes_with_feedthrough_drives_the_plant_as_its_opti
 def test_feedthrough_without_inputs_is_refused_in_a_sentence():
     data = log_of(1, np.random.default_rng(0))
     with pytest.raises(DataError, match="feedthrough says how inputs act, and the data have none"):
-        km.select(km.Episodes([km.Episode(X=data[0].X)], 0.1), feedthrough=True)
+        km.select(km.Episodes([km.Episode(X=data[0].X)], 0.1), options=km.SearchOptions(feedthrough=True))
     (said,) = shown("""
 data = km.Episodes([km.Episode(X=np.zeros((9, 1)), U=np.ones((8, 1)))], 0.1)
-show(lambda: km.select(data, feedthrough=1))
+show(lambda: km.select(data, options=km.SearchOptions(feedthrough=1)))
 """)
     assert said.startswith("DataError feedthrough is an int")
 

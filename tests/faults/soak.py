@@ -120,7 +120,14 @@ def paced(seed: int, folder: Path) -> None:
 def designed(seed: int, _: Path) -> None:
     """Design a controller from a few episodes."""
     data = km.collect(PLANT, km.Uniform([-1, -1], [1, 1]), km.Noise(-3, 3), episodes=8, steps=20, rng=seed)
-    made = km.design(data, COST, km.Limits(u_min=-3, u_max=3), reference=[0, 0], horizon=5, rng=seed, loops=6)
+    made = km.design(
+        data,
+        COST,
+        km.Limits(u_min=-3, u_max=3),
+        reference=[0, 0],
+        horizon=5,
+        options=km.DesignOptions(rng=seed, loops=6),
+    )
     assert np.isfinite(made.controller([0.1, 0.0], [0.0, 0.0]).u).all(), "a design gives no number"
 
 

@@ -173,7 +173,12 @@ def test_no_build_calls_casadi_where_an_interrupt_would_be_lost(walks, name):
 
 @pytest.mark.slow
 def test_no_part_of_a_design_does_either(tmp_path):
-    found = walk(lambda _: km.design(data(), COST, BOX, horizon=4, reference=[0, 0], delays=[0], sample=400), tmp_path)
+    found = walk(
+        lambda _: km.design(
+            data(), COST, BOX, horizon=4, reference=[0, 0], options=km.DesignOptions(delays=[0], sample=400)
+        ),
+        tmp_path,
+    )
     assert found.files
     assert not found.unguarded
 

@@ -117,8 +117,10 @@ TAKES = {
     "integrator": lambda bad: km.discretize(PENDULUM.dynamics, 0.05, integrator=bad),
     "train embedding": lambda bad: km.train(km.Gaussian([[0.0, 0.0]], 1.0), EPISODES, embedding=bad),
     "kic episodes": lambda bad: km.identify.kic(bad, km.State()),
-    "candidates": lambda bad: km.select(EPISODES, candidates=bad, horizon=2, folds=2),
-    "delays": lambda bad: km.select(EPISODES, candidates=[km.State()], delays=bad, horizon=2, folds=2),
+    "candidates": lambda bad: km.select(EPISODES, horizon=2, folds=2, options=km.SearchOptions(candidates=bad)),
+    "delays": lambda bad: km.select(
+        EPISODES, horizon=2, folds=2, options=km.SearchOptions(candidates=[km.State()], delays=bad)
+    ),
     "smoother": lambda bad: km.data.Smoother.of(bad),
     "mender": lambda bad: km.data.Mender.of(bad),
     "episodes": lambda bad: km.score(LIFTED, bad, 3),
@@ -470,7 +472,7 @@ def test_things_of_another_kind_for_rows_solver_instruments_and_smooth_are_named
     with pytest.raises(km.errors.DataError, match="instruments is a complex"):
         km.identify.instrumental_edmd(data, km.State(), 1j)
     with pytest.raises(km.errors.DataError, match="smooth is a list"):
-        km.select(data, candidates=[km.State()], smooth=[])
+        km.select(data, options=km.SearchOptions(candidates=[km.State()], smooth=[]))
 
 
 def test_a_switch_that_is_no_bool_is_refused_by_one_name_of_a_bool():

@@ -64,8 +64,8 @@ def few(monkeypatch):
         return [one.bind(episodes.states, episodes.inputs) for one in tried]
 
     monkeypatch.setattr("koopmpc.synthesis.select.propose_candidates", usual)
-    monkeypatch.setattr("koopmpc.synthesis.records.DELAYS", (0, 1))
-    monkeypatch.setattr("koopmpc.synthesis.select.is_late", lambda _: False)
+    monkeypatch.setattr("koopmpc.synthesis.search.records.DELAYS", (0, 1))
+    monkeypatch.setattr("koopmpc.synthesis.search.prepare.is_late", lambda _: False)
     monkeypatch.setattr("koopmpc.synthesis.select.judge_hidden_states", lambda *_, **__: [])
 
 

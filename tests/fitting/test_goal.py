@@ -20,7 +20,7 @@ from koopmpc.fitting.goal import design_data, format_template, load_reading, rea
 from koopmpc.fitting.repair import read_logs, round_step
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign, read_controller
-from koopmpc.synthesis.surrogates import describe_rest
+from koopmpc.synthesis.doubts import describe_rest
 from koopmpc.text import format_duration
 from tests.fitting.mass import GOAL, NAMES, A, B, logs
 from tests.small_designs import small_designs

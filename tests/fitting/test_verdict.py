@@ -14,8 +14,8 @@ from koopmpc.fitting.check import check_controller
 from koopmpc.fitting.goal import design_data, read_goal
 from koopmpc.fitting.verdict import judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.predict.base import load_value, replace_report, save_value
-from koopmpc.synthesis.candidates import get_model
 from koopmpc.synthesis.designed import SavedDesign, rebuild_controller
+from koopmpc.synthesis.search.recipe import get_model
 from tests.fitting.mass import GOAL, NAMES, A, B, logs
 from tests.small_designs import small_designs, undrawn_pages
 

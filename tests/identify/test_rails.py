@@ -10,7 +10,7 @@ from koopmpc.errors import DataError, ShapeError
 from koopmpc.identify.fits.refinement import MultiStepError, coefficients_of_states, cut_into_segments, rows_of_states
 from koopmpc.identify.records.narx import search_structures
 from koopmpc.identify.records.structure import find_told_rows, fit_structure
-from koopmpc.synthesis.records import propose_structures
+from koopmpc.synthesis.search.records import propose_structures
 
 RAILS = np.array([[-np.inf], [0.8]])
 

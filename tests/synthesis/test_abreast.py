@@ -8,14 +8,14 @@ import pytest
 
 import koopmpc as km
 from koopmpc.codegen.compiled import Compiled
-from koopmpc.synthesis.asked import check_task
-from koopmpc.synthesis.candidates import Candidate, Recipe
-from koopmpc.synthesis.fresh.abreast import speed_up
-from koopmpc.synthesis.fresh.acting import Acting
-from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool
-from koopmpc.synthesis.fresh.loops import run_fresh_loops
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box
-from koopmpc.synthesis.surrogates import fit_surrogate
+from koopmpc.synthesis.loops.abreast import Acting, speed_up
+from koopmpc.synthesis.loops.fresh import run_fresh_loops
+from koopmpc.synthesis.loops.neighbours import NeighbourMap
+from koopmpc.synthesis.loops.pool import DrawnLoop, LoopPool
+from koopmpc.synthesis.loops.surrogates import fit_surrogate
+from koopmpc.synthesis.search.candidates import Candidate
+from koopmpc.synthesis.search.recipe import Recipe
+from koopmpc.synthesis.task import check_task, goal_box
 from tests.compiler import needs_compiler
 from tests.synthesis.test_select import episodes_of
 

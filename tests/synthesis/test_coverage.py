@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.synthesis.asked import check_task
-from koopmpc.synthesis.fresh.coverage import check_coverage, most_failures, promise_coverage
-from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool, LoopResult
-from koopmpc.synthesis.fresh.tube import find_tube, propagate_errors
+from koopmpc.synthesis.loops.margin import check_share, find_tube, most_failures, promise_coverage, propagate_errors
+from koopmpc.synthesis.loops.pool import DrawnLoop, LoopPool, LoopResult
+from koopmpc.synthesis.task import check_task
+from tests.searches import design
 
 
 def test_no_errors_inside_the_bound_leave_a_tube_and_some_reach_it():
@@ -134,9 +134,9 @@ def test_where_none_is_needed_there_is_no_margin():
 def test_the_number_of_failures_that_is_allowed_is_that_of_conformal_risk_control():
     assert [most_failures(n, 0.95) for n in (18, 19, 39, 59)] == [-1, 0, 1, 2]
     with pytest.raises(km.errors.DataError, match="needs 19 loops"):
-        check_coverage(0.95, 18)
-    with pytest.raises(km.errors.DataError, match="below 1"):
-        check_coverage(1.0, 100)
+        check_share(0.95, 18)
+    with pytest.raises(km.errors.DataError, match="between 0 and 1"):
+        km.DesignOptions(margin=1.0)
     rng, missed = np.random.default_rng(0), 0
     for _ in range(4000):  # the least threshold that at most k of 39 values exceed is exceeded by one more of 20
         values = rng.normal(size=40)
@@ -151,7 +151,7 @@ def test_a_design_with_noise_promises_what_fresh_loops_keep():
     noisy = data.with_episodes([km.Episode(X=e.X + 0.03 * rng.normal(size=e.X.shape), U=e.U) for e in data])
     limits = km.Limits(u_min=-2, u_max=2, x_min=[-np.inf, -0.5], x_max=[np.inf, 0.5])
     task = {"horizon": 10, "reference": [0.0, 0.0], "bilinear": False, "workers": 1}
-    design = km.design(noisy, km.Cost(Q=[1, 0.1], R=0.01), limits, coverage=0.9, **task)
-    assert design.promise.holds
-    assert f"for {design.promise.steps} steps" in str(design.promise)
-    assert (design.expected.fresh.violation > 0.01).mean() <= 0.2
+    made = design(noisy, km.Cost(Q=[1, 0.1], R=0.01), limits, margin=0.9, **task)
+    assert made.promise.holds
+    assert f"for {made.promise.steps} steps" in str(made.promise)
+    assert (made.expected.fresh.violation > 0.01).mean() <= 0.2

@@ -9,8 +9,9 @@ import koopmpc as km
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import second_moments
 from koopmpc.identify.records.hidden_structure import HiddenStructure
-from koopmpc.synthesis.candidates import Candidate
-from koopmpc.synthesis.cross_validation import Trial, cross_validate, fit_ridges, leave_one_out, select_fold
+from koopmpc.synthesis.search.candidates import Candidate
+from koopmpc.synthesis.search.cross_validation import Trial, cross_validate, fit_ridges, leave_one_out
+from koopmpc.synthesis.search.folds import select_fold
 
 RIDGES = (1e-7, 1e-4, 1e-2)
 FOLD, HORIZON, FIRST = (0, 1, 2, 0, 1, 2), 5, 2

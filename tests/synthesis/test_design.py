@@ -16,18 +16,20 @@ import koopmpc as km
 from koopmpc.identify.records.hidden_fit import fit_hidden
 from koopmpc.identify.records.hidden_structure import HiddenStructure
 from koopmpc.identify.records.structure import Structure
-from koopmpc.synthesis.candidates import Candidate, Recipe
-from koopmpc.synthesis.cross_validation import Tried
-from koopmpc.synthesis.designed import choose_row
-from koopmpc.synthesis.fresh.abreast import explain_python
-from koopmpc.synthesis.judging import LOST, Outcome, average_ratios, rate_runs
-from koopmpc.synthesis.surrogates import choose_surrogates
+from koopmpc.synthesis.choice import LOST, average_ratios, choose_row, rate_runs
+from koopmpc.synthesis.loops.abreast import explain_python
+from koopmpc.synthesis.loops.judging import Outcome
+from koopmpc.synthesis.loops.surrogates import choose_surrogates
+from koopmpc.synthesis.search.candidates import Candidate
+from koopmpc.synthesis.search.cross_validation import Tried
+from koopmpc.synthesis.search.recipe import Recipe
+from tests.searches import design
 from tests.small_designs import short_loops
 from tests.synthesis.test_select import PLAIN, SQUARES, episodes_of, noisy
 from tests.tiers import slow
 
 A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])  # a mass with friction; its position is free
-room = importlib.import_module("koopmpc.synthesis.design")  # the module; the room has a function of this name
+confirm, rounds = (importlib.import_module(f"koopmpc.synthesis.{file}") for file in ("confirm", "rounds"))
 COST = km.Cost(Q=[1.0, 0.1], R=0.1)
 LIMITS = km.Limits(u_min=-1, u_max=1, x_min=[-np.inf, -0.5], x_max=[np.inf, 0.5])
 
@@ -57,7 +59,7 @@ def designed(episodes, cost=COST, limits=LIMITS, **more):
     } | more
     with short_loops(), warnings.catch_warnings():
         warnings.simplefilter("ignore", km.FitWarning)
-        return km.design(episodes, cost, limits, **asked)
+        return design(episodes, cost, limits, **asked)
 
 
 @cache
@@ -274,10 +276,7 @@ def test_what_is_printed_names_the_choice_and_says_that_figures_are_estimates():
 def test_a_goal_that_no_input_holds_is_told_with_the_limit_in_the_way_and_the_nearest_that_can_be_held():
     spring = episodes_of(lambda x, u: np.array([x[0] + 0.1 * x[1], 0.8 * x[1] - 0.1 * x[0] + 0.1 * u[0]]), count=9)
     with pytest.warns(km.FitWarning, match="no input inside the limits holds") as caught:
-        found = km.design(
-            spring, km.Cost(Q=[1.0, 0.1], R=0.1), km.Limits(u_min=-0.3, u_max=0.3), horizon=8, reference=[0.5, 0.0],
-            candidates=[PLAIN], delays=[0], bilinear=False, loops=0, smooth=False,
-        )  # fmt: skip
+        found = km.design(spring, km.Cost(Q=[1.0, 0.1], R=0.1), km.Limits(u_min=-0.3, u_max=0.3), horizon=8, reference=[0.5, 0.0], options=km.DesignOptions(candidates=[PLAIN], delays=[0], bilinear=False, loops=0, smooth=False))  # fmt: skip
     said = str(caught[0].message)
     assert "u0 = 0.5, and its limit is 0.3" in said
     assert "the nearest that can be held is x0 = 0.3" in said
@@ -323,7 +322,7 @@ def test_a_moving_reference_of_an_observable_is_held_against_the_limits_of_that_
     square = km.Expressions(lambda x: [x[1] ** 2], ["speed squared"])
     limits = km.Limits(u_min=-1, u_max=1, of=square, y_max=[0.04])
     found = designed(
-        data(), km.Cost(Q=[1.0], R=0.1, of=square), limits, reference=np.linspace(0, 0.09, 12)[:, None], tighten=False
+        data(), km.Cost(Q=[1.0], R=0.1, of=square), limits, reference=np.linspace(0, 0.09, 12)[:, None], margin=None
     )
     assert any(
         sentence.startswith("the reference has speed squared = 0.09, beyond the limit speed squared = 0.04")
@@ -368,7 +367,7 @@ def test_data_without_inputs_are_refused():
 
 
 def test_limits_are_tightened_by_the_models_errors_unless_told():
-    kept, free = of_noisy_data(), designed(noisy(data(), 0.05), tighten=False)
+    kept, free = of_noisy_data(), designed(noisy(data(), 0.05), margin=None)
     margin = np.asarray(kept.controller.limits.margin)
     assert margin[0, 1] > 0.03  # smoothing takes the noise out of the data, but not out of what the loop measures
     assert (margin[:, 0] == 0).all()
@@ -415,13 +414,13 @@ def test_an_experiment_with_stronger_inputs_is_kept():
 
 
 def test_a_controller_that_turns_when_it_is_fitted_to_all_data_is_passed_over(monkeypatch):
-    confirmed, seen = room.is_confirmed, []
+    confirmed, seen = confirm.is_confirmed, []
 
     def first_fails(test, controller, outcome):
         seen.append(controller)
         return len(seen) > 1 and confirmed(test, controller, outcome)
 
-    monkeypatch.setattr(room, "is_confirmed", first_fails)
+    monkeypatch.setattr(confirm, "is_confirmed", first_fails)
     found = designed(data())
     assert found.controller is not seen[0]
     assert any(note.startswith("passed over: ") for note in found.notes)
@@ -430,7 +429,7 @@ def test_a_controller_that_turns_when_it_is_fitted_to_all_data_is_passed_over(mo
 
 def test_a_model_that_is_not_that_of_the_folds_is_not_confirmed():
     test, jobs = [], []
-    judged = room.judge_job
+    judged = rounds.judge_job
 
     def kept(one, job):
         test.append(one)
@@ -438,7 +437,7 @@ def test_a_model_that_is_not_that_of_the_folds_is_not_confirmed():
         return judged(one, job)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(room, "judge_job", kept)
+        patch.setattr(rounds, "judge_job", kept)
         found = designed(data())
     last = next(job for job in jobs if job.recipe == found.best.recipe and len(job.conditions) == 12)
     outcome = judged(test[-1], last)
@@ -446,10 +445,10 @@ def test_a_model_that_is_not_that_of_the_folds_is_not_confirmed():
     usual = [one.gain == 1.0 and np.isfinite(cost) for one, cost in zip(conditions, outcome.cost, strict=True)]
     assert 0 < sum(usual) < len(usual)  # weights of fits are around states of runs with inputs as in the data
     assert len(outcome.visited) == sum(usual) * (test[-1].asked.steps + 1)
-    assert room.is_confirmed(test[-1], found.controller, outcome)
+    assert confirm.is_confirmed(test[-1], found.controller, outcome)
     model = found.controller.predictor
     wrong = km.KoopmanMPC(replace(model, B=-model.B), COST, LIMITS, 8)
-    assert not room.is_confirmed(test[-1], wrong, outcome)
+    assert not confirm.is_confirmed(test[-1], wrong, outcome)
 
 
 def test_a_single_wrong_measurement_is_replaced_and_its_episode_kept():
@@ -486,7 +485,7 @@ def test_a_hidden_state_with_a_past_that_leaves_too_few_folds_is_left_out(monkey
         found = [Candidate(f"past {i}", km.State() + km.Constant(), km.Delay(i), False) for i in (4, 100)]
         return [one.bind(episodes.states, episodes.inputs) for one in found]
 
-    monkeypatch.setattr("koopmpc.synthesis.design.propose_hidden_states", propose)
+    monkeypatch.setattr("koopmpc.synthesis.trials.propose_hidden_states", propose)
     cost, limits = HELD_LEVEL
     found = designed(hidden_record(), cost, limits, horizon=15, delays=None, candidates=None, reference=[1.2])
     assert len(asked) == 1
@@ -536,7 +535,7 @@ def test_models_with_a_hidden_state_are_judged_in_the_loops_of_one_record(monkey
         return fit_hidden(structure, episodes, quick=quick)
 
     for module in ("candidates", "cross_validation"):
-        monkeypatch.setattr(f"koopmpc.synthesis.{module}.fit_hidden", watch)
+        monkeypatch.setattr(f"koopmpc.synthesis.search.{module}.fit_hidden", watch)
     found = designed(
         hidden_record(), cost, limits, horizon=15, delays=None, candidates=None, bilinear=True, reference=[1.2]
     )

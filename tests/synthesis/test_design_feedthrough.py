@@ -12,6 +12,7 @@ from koopmpc.errors import DataError
 from koopmpc.fitting.verdict import judge_plant_runs
 from tests.bare import shown
 from tests.estimate.test_feedthrough import PLAIN, A, B, C, D, log_of
+from tests.searches import design
 from tests.small_designs import short_loops, small_designs
 
 Q, R, GOAL, ENDS = 2.0, 0.3, 0.5, 0.3
@@ -24,16 +25,16 @@ def records(direct, count=3, steps=70):
     return km.Episodes(logs, 0.1, ["y"], ["u"])
 
 
-def design(data, **more):
+def designed(data, **more):
     asked = {"reference": [GOAL], "horizon": 15, "candidates": [PLAIN], "delays": [2], "loops": 0, "smooth": False}
     with short_loops(), warnings.catch_warnings():
         warnings.simplefilter("ignore", km.FitWarning)
-        return km.design(data, COST, LIMITS, feedthrough=True, **(asked | {"bilinear": False} | more))
+        return design(data, COST, LIMITS, feedthrough=True, **(asked | {"bilinear": False} | more))
 
 
 @cache
 def usual():
-    return design(records(1))
+    return designed(records(1))
 
 
 def steer(mpc, x, before, steps=40):
@@ -66,7 +67,7 @@ def find_least(x, steps=40):
 @pytest.mark.parametrize("bilinear", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_designed_controller_drives_a_plant_with_feedthrough_at_the_cost_of_its_optimum(bilinear, tmp_path):
     candidate = km.synthesis.Candidate("x", PLAIN, km.Delay(2), bilinear=True)
-    found = design(records(1), candidates=[candidate], bilinear=True) if bilinear else usual()
+    found = designed(records(1), candidates=[candidate], bilinear=True) if bilinear else usual()
     assert isinstance(found.controller, km.BilinearMPC if bilinear else km.KoopmanMPC)
     for x, before in ((np.zeros(2), 0.0), (np.linalg.solve(np.eye(2) - A, B[:, 0]) * -0.2, -0.2)):
         U, Y = steer(found.controller, x, before)
@@ -126,7 +127,7 @@ def test_the_inputs_of_a_late_log_are_moved_without_a_flag():
         rows = U[:400] if not late else np.concatenate([[0.0], U[:399]])
         data = km.Episodes([km.Episode(X=x[:, None], U=rows[:, None])], 0.1, ["y"], ["u"])
         with small_designs():
-            found = km.design(data, COST, LIMITS, **task)
+            found = design(data, COST, LIMITS, **task)
         assert found.controller.as_data().model.input_lead == late
         assert any("one row" in note for note in found.notes) == bool(late)
         firsts.append(found.controller([0.2], [GOAL]).u[0])
@@ -136,12 +137,12 @@ def test_the_inputs_of_a_late_log_are_moved_without_a_flag():
 def test_data_that_feedthrough_does_not_go_with_are_refused_in_a_sentence():
     data = records(1)
     with pytest.raises(DataError, match="there is nothing to control"):
-        design(km.Episodes([km.Episode(X=e.X) for e in data], 0.1))
+        designed(km.Episodes([km.Episode(X=e.X) for e in data], 0.1))
     watched = km.Episodes([km.Episode(X=e.X, U=e.U, W=e.U[::-1]) for e in data], 0.1, ["y"], ["u"], ["w"])
     with pytest.raises(DataError, match="fit the model without W"):
-        design(watched)
+        designed(watched)
     (said,) = shown("""
 data = km.Episodes([km.Episode(X=np.zeros((9, 1)), U=np.ones((8, 1)))], 0.1)
-show(lambda: km.design(data, km.Cost(Q=1, R=1), reference=[0.0], feedthrough=1))
+show(lambda: km.design(data, km.Cost(Q=1, R=1), reference=[0.0], options=km.DesignOptions(feedthrough=1)))
 """)
     assert said.startswith("DataError feedthrough is an int")

@@ -5,8 +5,9 @@ import pytest
 
 import koopmpc as km
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.synthesis.feedback import project_on_instruments, remove_feedback
+from koopmpc.synthesis.search.feedback import project_on_instruments, remove_feedback
 from tests.identify.test_instruments import TRUTH, run_loop
+from tests.searches import design
 
 
 def fit_plain(data):
@@ -83,7 +84,9 @@ def test_the_error_falls_with_the_root_of_the_length():
 
 def test_select_says_whether_it_removed_noise_that_feedback_carries():
     data, _ = run_loop(np.random.default_rng(1), 1200, sensor=0.2)
-    chosen = km.select(data, candidates=[km.State() + km.Constant()], delays=(0,), bilinear=False)
+    chosen = km.select(
+        data, options=km.SearchOptions(candidates=[km.State() + km.Constant()], delays=(0,), bilinear=False)
+    )
     assert any("as a filter sees them" in note for note in chosen.notes)
     assert np.linalg.norm(chosen.predictor.A[:2, :2] - TRUTH[:, :2]) < 0.05
 
@@ -114,7 +117,7 @@ def test_a_design_from_closed_loop_logs_is_as_good_as_one_from_open_loop_logs():
     spent = []
     for data, more in ((closed, {"instruments": signals}), (opened, {})):
         with km.errors.hide_fit_warnings():
-            made = km.design(data, cost, limits, **goal, **more)
+            made = design(data, cost, limits, **goal, **more)
         run = km.simulate(plant, made.controller, x0=[0, 0], reference=[1, 0], steps=60, cost=cost, limits=limits)
         spent.append(km.metrics(run).cost)
     assert spent[0] <= 1.05 * spent[1]
@@ -148,7 +151,7 @@ def test_logs_of_a_bent_plant_stay_though_a_linear_model_would_gain_by_a_filter(
         logs.append(km.Episode(X=np.array([*X, x]), U=np.array(U)))
     data = km.Episodes(logs, 0.05)
     assert remove_feedback(data, None).episodes is data
-    monkeypatch.setattr("koopmpc.synthesis.feedback._bend", lambda _: km.State() + km.Constant())
+    monkeypatch.setattr("koopmpc.synthesis.search.feedback._bend", lambda _: km.State() + km.Constant())
     assert "as a filter sees them" in remove_feedback(data, None).sentence
 
 

@@ -10,15 +10,13 @@ import pytest
 import koopmpc as km
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.plants.routines import find_compiler
-from koopmpc.synthesis.asked import check_task, measure_settling
-from koopmpc.synthesis.candidates import Candidate
-from koopmpc.synthesis.designed import ExpectedLoop, choose_row
-from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool, LoopResult, draw_starts
-from koopmpc.synthesis.fresh.horizon import choose_horizon
-from koopmpc.synthesis.fresh.loops import choose_finalist, find_stopping_set, is_preferable, list_finalists
-from koopmpc.synthesis.fresh.neighbours import MOST, NeighbourMap, goal_box, probe_range
-from koopmpc.synthesis.fresh.verdict import bound_value, cost_interval
-from koopmpc.synthesis.judging import measure_errors
+from koopmpc.synthesis.choice import choose_row, measure_errors
+from koopmpc.synthesis.loops.finalists import choose_finalist, find_stopping_set, is_preferable, list_finalists
+from koopmpc.synthesis.loops.neighbours import MOST, NeighbourMap, probe_range
+from koopmpc.synthesis.loops.pool import DrawnLoop, LoopPool, LoopResult, draw_starts
+from koopmpc.synthesis.rates import ExpectedLoop, bound_value, cost_interval
+from koopmpc.synthesis.search.candidates import Candidate
+from koopmpc.synthesis.task import check_task, choose_horizon, goal_box, measure_settling
 from koopmpc.validate import bound_failure_rate
 from tests.closed_loop.controllers import Parts
 from tests.closed_loop.judge import judged, kept_promises, promised
@@ -399,7 +397,7 @@ def test_a_finalist_that_is_safer_or_two_percent_cheaper_takes_the_place_of_the_
         for one, each in zip(finalists, figures, strict=True):
             fast[one] = Compiled.__new__(Compiled)
             fast[one].figures = each
-        monkeypatch.setattr("koopmpc.synthesis.fresh.loops.speed_up", fast.get)
+        monkeypatch.setattr("koopmpc.synthesis.loops.finalists.speed_up", fast.get)
         pool = CountedPool()
         place, loops, why = choose_finalist(pool, finalists, np.random.default_rng(0))
         assert loops == pool.ran == 60 * len(figures) + 480
@@ -411,7 +409,7 @@ def test_a_finalist_that_is_safer_or_two_percent_cheaper_takes_the_place_of_the_
     assert prefer((1.0, 10), (1.05, 0), (0.5, 10)) == 1
     assert prefer((1.0, 0), (0.5, 10)) == 0
     slow = [km.KoopmanMPC(model, km.Cost(1, 1), None, 2) for _ in range(2)]
-    monkeypatch.setattr("koopmpc.synthesis.fresh.loops.speed_up", lambda one: one)  # without a compiler
+    monkeypatch.setattr("koopmpc.synthesis.loops.finalists.speed_up", lambda one: one)  # without a compiler
     assert choose_finalist(CountedPool(), slow, np.random.default_rng(0)) == (0, 0, "")
 
 
@@ -425,8 +423,8 @@ def test_a_design_counts_the_loops_of_its_finalists():
 
 @pytest.mark.slow
 def test_a_linear_finalist_that_is_taken_is_the_linear_controller_of_the_design_too(monkeypatch):
-    monkeypatch.setattr("koopmpc.synthesis.design.list_finalists", lambda rows, best: [i for i in (0, 1) if i != best])
-    monkeypatch.setattr("koopmpc.synthesis.design.choose_finalist", lambda *_: (1, 0, "it is safer"))
+    monkeypatch.setattr("koopmpc.synthesis.confirm.list_finalists", lambda rows, best: [i for i in (0, 1) if i != best])
+    monkeypatch.setattr("koopmpc.synthesis.confirm.choose_finalist", lambda *_: (1, 0, "it is safer"))
     plants = episodes_of(mass, count=9, steps=30)
     found = designed(plants, candidates=[PLAIN, PLAIN + km.Monomials(2)], bilinear=False, loops=2)
     assert any("takes the place of" in note for note in found.notes)

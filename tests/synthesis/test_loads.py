@@ -5,12 +5,15 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.synthesis.asked import check_task, find_poor_logs
-from koopmpc.synthesis.candidates import Candidate, Recipe
-from koopmpc.synthesis.designed import choose_estimator
-from koopmpc.synthesis.surrogates import fit_surrogate
+from koopmpc.synthesis.choice import choose_estimator
+from koopmpc.synthesis.doubts import find_poor_logs
+from koopmpc.synthesis.loops.surrogates import fit_surrogate
+from koopmpc.synthesis.search.candidates import Candidate
+from koopmpc.synthesis.search.recipe import Recipe
+from koopmpc.synthesis.task import check_task
 from tests.closed_loop.more_tasks import ALL
 from tests.closed_loop.optimum import held, optimum
+from tests.searches import design
 
 PERIOD = 60  # steps of the sine of both tasks
 A, B = np.array([[1.0, 0.1], [-0.1, 0.96]]), np.array([0.0, 0.1])
@@ -57,7 +60,7 @@ def test_a_design_of_noisy_logs_leaves_no_offset_under_a_constant_load():
     """Without loads in its trial loops it left 0.061, for an estimator only brought noise."""
     cost, limits = km.Cost(Q=[5.0, 0.1], R=0.1), km.Limits(u_min=-3.0, u_max=3.0)
     asked = {"horizon": 10, "reference": [0.0, 0.0], "candidates": [km.State()], "loops": 0, "smooth": False}
-    found = km.design(logs(0.02), cost, limits, **asked)
+    found = design(logs(0.02), cost, limits, **asked)
     run = km.simulate(
         spring(0.3), found.controller, x0=[0.5, 0.0], reference=[0.0, 0.0], steps=150, noise=[0.02] * 2, rng=0
     )
@@ -125,10 +128,7 @@ def test_a_design_says_what_its_logs_cannot_serve():
             km.Limits(u_min=-3, u_max=3),
             horizon=8,
             reference=[0.0, 0.0],
-            candidates=[km.State() + km.Constant()],
-            delays=[0],
-            bilinear=False,
-            loops=0,
+            options=km.DesignOptions(candidates=[km.State() + km.Constant()], delays=[0], bilinear=False, loops=0),
         )
     assert sum("all 9 episodes start at p = 0.5" in sentence for sentence in found.advice) == 1
 

@@ -10,21 +10,21 @@ import koopmpc as km
 from koopmpc.errors import DataError
 from koopmpc.identify.records.hidden_structure import HiddenStructure
 from koopmpc.identify.records.structure import Structure
-from koopmpc.synthesis import hidden_states, records
-from koopmpc.synthesis.candidates import relift_model
-from koopmpc.synthesis.hidden_states import NEAR, PAYS, judge_hidden_states
-from koopmpc.synthesis.records import (
+from koopmpc.synthesis.search import hidden_states, records
+from koopmpc.synthesis.search.candidates import relift_model
+from koopmpc.synthesis.search.data import is_record
+from koopmpc.synthesis.search.free_runs import (
     FreeRun,
     choose_by_free_run,
     forecast_rows,
-    is_fed_back,
-    is_late,
     judge_finalists,
     judge_free_run,
 )
-from koopmpc.synthesis.select import is_record
+from koopmpc.synthesis.search.hidden_states import NEAR, PAYS, judge_hidden_states
+from koopmpc.synthesis.search.records import is_fed_back, is_late
 from tests.identify.test_hidden_state import saturating_record
 from tests.identify.test_neural import friction_record
+from tests.searches import select
 from tests.validate.logs.test_timing import record
 
 
@@ -52,7 +52,11 @@ def selection(late):
         if late:  # without hidden states and neurons, which take most of the time; others look at them
             patch.setattr("koopmpc.synthesis.select.judge_hidden_states", lambda *_, **__: [])
         return km.select(
-            oscillator(rows=240 if late else 420, late=late), ridges=[1e-6], horizon=10, delays=[0, 2], folds=2
+            oscillator(rows=240 if late else 420, late=late),
+            ridges=[1e-6],
+            horizon=10,
+            folds=2,
+            options=km.SearchOptions(delays=[0, 2]),
         )
 
 
@@ -148,7 +152,7 @@ def test_a_linear_model_lifted_at_each_step_is_a_bilinear_one_without_products()
 def test_smoothed_rows_are_learned_from_only_where_unseen_rows_gain():
     measured, clean = oscillator(noise=0.3), oscillator(noise=0.0)
     options = {"horizon": 10, "delays": [2], "smooth": False, "bilinear": False}
-    rows = km.select(measured, candidates=[km.State() + km.Constant()], **options).leaderboard
+    rows = select(measured, candidates=[km.State() + km.Constant()], **options).leaderboard
     (kept, *_), _, _ = judge_finalists(rows, clean, measured, 2, 10, {})
     assert not kept.rough  # the best smoother that there can be
     blurred = clean[0].X.copy()
@@ -243,7 +247,10 @@ def test_neurons_that_err_little_more_on_one_quarter_are_judged_on_all(monkeypat
 def test_a_hidden_state_is_taken_where_it_pays_on_unseen_rows():
     """Two tanks of which the second one's sensor saturates; polynomials of past rows cannot hold that."""
     data = saturating_record(np.random.default_rng(0), noise=0.005)
-    found, fresh = km.select(data, horizon=10, delays=[0, 2, 4], folds=2), saturating_record(np.random.default_rng(1))
+    found, fresh = (
+        km.select(data, horizon=10, folds=2, options=km.SearchOptions(delays=[0, 2, 4])),
+        saturating_record(np.random.default_rng(1)),
+    )
     hidden = [row for row in found.leaderboard if "hidden state" in row.title]
     others = [row.free for row in found.leaderboard if row not in hidden and np.isfinite(row.free)]
     assert "saturating sensor" in found.best.title

@@ -96,8 +96,12 @@ def test_audit_and_trust_say_it_and_are_silent_where_the_model_sees_the_past(spr
 
 def test_select_takes_a_past_where_a_hidden_state_shows(spring):
     """One hidden speed: two past rows forecast no better than one, so four are not tried; test_select has where they are."""
-    assert not km.select(spring, candidates=[km.State() + km.Constant()], horizon=10, delays=[0]).best.delays
-    found = km.select(spring, candidates=[km.State() + km.Constant()], horizon=10, bilinear=False)
+    assert not km.select(
+        spring, horizon=10, options=km.SearchOptions(candidates=[km.State() + km.Constant()], delays=[0])
+    ).best.delays
+    found = km.select(
+        spring, horizon=10, options=km.SearchOptions(candidates=[km.State() + km.Constant()], bilinear=False)
+    )
     assert {row.delays for row in found.leaderboard} == {0, 1, 2}
     assert found.best.delays
     assert any(note.startswith("a hidden state shows") for note in found.notes)

@@ -8,7 +8,7 @@ import numpy as np
 
 import koopmpc as km
 from koopmpc.loop.metrics import violation_shares
-from koopmpc.synthesis.candidates import get_model
+from koopmpc.synthesis.search.recipe import get_model
 from tests.guarantees.coverage.optimum import find_optimum, is_touched
 from tests.guarantees.coverage.plants import CoverageTask
 
@@ -86,11 +86,9 @@ def judge(task: CoverageTask) -> Row:
             horizon=task.horizon,
             reference=task.reference,
             starts=task.starts if task.delays == (0,) else None,
-            candidates=CANDIDATES,
-            delays=task.delays,
-            loops=LOOPS,
-            coverage=COVERAGE,
-            workers=1,
+            options=km.DesignOptions(
+                candidates=CANDIDATES, delays=task.delays, loops=LOOPS, margin=COVERAGE, workers=1
+            ),
         )
     asked, recipe = design.evidence.asked, design.leaderboard[design.chosen].recipe
     plain = recipe.controller(get_model(design.controller), asked.cost, task.limits, asked.horizon)

@@ -13,11 +13,9 @@ from koopmpc.control.cost import Cost, check_cost_and_limits, refuse_stage
 from koopmpc.control.limits import Limits, refuse_levels, refuse_priority
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.lifting.base import strip_unit
 from koopmpc.lifting.composed import evaluate_jacobians
 from koopmpc.lifting.state import State
 from koopmpc.loop.metrics import stack_limited
-from koopmpc.text import with_unit
 from koopmpc.values import Value
 
 RUN = 3  # length of a run in horizons
@@ -29,8 +27,6 @@ _ROWS = 400  # rows along a few records from which random starts are drawn, at m
 ROOM = 0.5  # a run may leave the data by this share of their range
 SETTLED = 0.1  # a loop has settled where its error is below this share of its first error
 TRIED = 400  # steps of the trial loop
-FAR = 1.0  # an episode is left out if it leaves the box of the others by more than this many widths
-MOST = 0.9  # share of the episodes inside this box
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,165 +238,6 @@ def _count_steps(
     return min(last, TRIED)
 
 
-def limit_margins(asked: DesignTask, data: Episodes) -> Float[np.ndarray, " nx"]:
-    """Return the largest margin of each state (nx,): half of the way from the reference to the nearest limit.
-
-    Without this bound, errors of a poor model could lead to margins that exclude the reference itself. A reference on
-    or beyond a limit, or without a weight, bounds no margin.
-    """
-    low, high = asked.limits.states(data.nx)
-    room = np.full(data.nx, np.inf)
-    for i, aims in _weighted_references(asked, data).items():
-        way = min(aims.min() - low[i], high[i] - aims.max())
-        if way > 0:
-            room[i] = way / 2
-    return room
-
-
-def find_stray_episodes(data: Episodes, asked: DesignTask) -> dict[int, str]:
-    """Return the episodes that went far away with ordinary inputs, each with a sentence that says how far.
-
-    A sensor may have jumped, or the plant fallen over; the squares of such an episode outweigh all others in fits and
-    in errors. An episode is far away if it leaves, by more than its width, the box of nine tenths of the episodes, the
-    starts, the reference and the limits. Its inputs are ordinary if they stay within half a width of those of the
-    others. Episodes with stronger inputs are kept, because they are valuable experiments.
-    """
-    low, high = asked.limits.states(data.nx)
-    low, high = np.where(np.isfinite(low), low, np.inf), np.where(np.isfinite(high), high, -np.inf)
-    low, high = np.minimum(low, asked.starts.min(axis=0)), np.maximum(high, asked.starts.max(axis=0))
-    for i, aims in _weighted_references(asked, data).items():
-        low[i], high[i] = min(low[i], aims.min()), max(high[i], aims.max())
-    X, U = [episode.X for episode in data], [episode.U for episode in data]
-    x_far, x_low, x_high = _measure_departures(X, low, high)
-    u_far, _, _ = _measure_departures(U, np.full(data.nu, np.inf), np.full(data.nu, -np.inf))
-    found: dict[int, str] = {}
-    for k in np.flatnonzero((x_far.max(axis=1) > FAR) & (u_far.max(axis=1) <= ROOM)).tolist():
-        i = int(x_far[k].argmax())
-        furthest = X[k][np.abs(X[k][:, i] - (x_low[i] + x_high[i]) / 2).argmax(), i]
-        found[k] = (
-            f"episode {k} of 0 … {len(data) - 1} is left out: it goes to "
-            f"{with_unit(data.states[i], f'= {furthest:.4g}')}, and nine in ten stay between {x_low[i]:.4g} and "
-            f"{x_high[i]:.4g} under such inputs; look at it: a sensor may have jumped, or the plant have fallen over"
-        )
-    return found
-
-
-def _measure_departures(
-    rows: Sequence[Float[np.ndarray, "_ n"]], low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, "e n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return how far each episode leaves the box of nine tenths of them, in widths (episodes, n), and the box.
-
-    The box is widened to hold `low` and `high`.
-    """
-    least, most = np.array([one.min(axis=0) for one in rows]), np.array([one.max(axis=0) for one in rows])
-    low = np.minimum(np.quantile(least, 1 - MOST, axis=0), low)
-    high = np.maximum(np.quantile(most, MOST, axis=0), high)
-    width = np.maximum(high - low, 1e-300)
-    return np.maximum(low - least, most - high) / width, low, high
-
-
-def find_outside_data(asked: DesignTask, data: Episodes, tracked: Sequence[int], free: Sequence[int]) -> list[str]:
-    """Return a sentence for each state whose start or reference lies outside the data, where no model was fitted."""
-    said: list[str] = []
-    room = 0.01 * (asked.high - asked.low)
-    targets = {i: asked.reference[:, column] for column, i in enumerate(tracked)}
-    for i, name in enumerate(data.states):
-        low, high = asked.low[i], asked.high[i]
-        for what, values in (("a start", asked.starts[:, i]), ("the reference", targets.get(i, np.zeros(0)))):
-            far = values[(values < low - room[i]) | (values > high + room[i])]
-            if far.size and i not in free:
-                said.append(
-                    f"{what} has {with_unit(name, f'= {far[np.abs(far - (low + high) / 2).argmax()]:.4g}')}, outside "
-                    f"the data, which go from {low:.4g} to {high:.4g}: no model was fitted there; collect data there, "
-                    "or ask for less"
-                )
-    return said
-
-
-def find_outside_limits(asked: DesignTask, data: Episodes) -> list[str]:
-    """Return a sentence for each limit that a start or a moving reference lies beyond.
-
-    A constant reference is not checked here; `explain_unreachable` says what can be held instead.
-    """
-    limits, states = asked.limits, data.states
-    names = states if limits.of is None else (*states, *limits.of.bind(states).names)
-    starts, box = stack_limited(limits, asked.starts, states)
-    tracked = asked.cost.of.bind(states).names
-    targets = dict(zip(tracked, asked.reference.T, strict=True)) if asked.moves else {}
-    said: list[str] = []
-    for name, start, low, high in zip(names, starts.T, *box, strict=True):
-        for what, values, meaning in (
-            ("a start", start, "no input can keep the limit from there; start inside it, or widen it"),
-            ("the reference", targets.get(name), "the loop stays at the limit there; ask for less, or widen it"),
-        ):
-            over = np.zeros(1) if values is None else np.maximum(low - values, values - high)
-            if values is not None and over.max() > 1e-9 * np.abs(values).max():
-                value = values[over.argmax()]
-                limit = with_unit(name, f"= {low if value < low else high:.4g}")
-                said.append(f"{what} has {with_unit(name, f'= {value:.4g}')}, beyond the limit {limit}: {meaning}")
-    return said
-
-
-def find_poor_logs(asked: DesignTask, data: Episodes, tracked: Sequence[int]) -> list[str]:
-    """Return sentences where logs cannot serve: outside of all limits, from a single start, slower than the reference.
-
-    A reference is too fast if half of the rows that move it move it by more than the logs move that state in any step.
-    """
-    X, said = [episode.X for episode in data], list[str]()
-    least, most = (np.array([ends(one, axis=0) for one in X]) for ends in (np.min, np.max))
-    for name, low, high, under, over in zip(
-        data.states, least.min(axis=0), most.max(axis=0), *asked.limits.states(data.nx), strict=True
-    ):
-        if low > over or high < under:
-            said.append(
-                f"the limits of {strip_unit(name)} allow {under:.4g} to {over:.4g}, and the data go from {low:.4g} to "
-                f"{high:.4g}: no log was inside these limits; record some there, or widen the limits"
-            )
-    first = np.array([one[0] for one in X])
-    if len(X) > 1 and (first == first[0]).all() and (asked.starts == first[0]).all():
-        shown = ", ".join(with_unit(name, f"= {value:.4g}") for name, value in zip(data.states, first[0], strict=True))
-        said.append(
-            f"all {len(X)} episodes start at {shown}: how the loop goes from elsewhere was tried on no such start; "
-            "record episodes from other states, or pass starts="
-        )
-    steps = np.max([np.abs(np.diff(one, axis=0)).max(axis=0) for one in X], axis=0)
-    for column, i in enumerate(tracked):
-        moved = np.abs(np.diff(asked.reference[:, column]))
-        usual = float(np.median(moved[moved > 0])) if (moved > 0).sum() > _FEW else 0.0
-        if usual > steps[i] and i in _weighted_references(asked, data):
-            said.append(
-                f"no input can follow the reference: it moves {strip_unit(data.states[i])} by {usual:.4g} in a step, "
-                f"and no log moves it by more than {steps[i]:.4g}; ask for a slower one"
-            )
-    return said
-
-
-def find_unweighted_limits(asked: DesignTask, data: Episodes) -> list[str]:
-    """Return a sentence for each limited state that the cost does not weigh."""
-    of = asked.cost.of.bind(data.states)
-    if not isinstance(of, State):
-        return []
-    weighed = _weighted_references(asked, data)
-    box = asked.limits.states(data.nx)
-    idle = [i for i in range(data.nx) if i not in weighed and (np.isfinite(box.low[i]) or np.isfinite(box.high[i]))]
-    if not idle:
-        return []
-    names = ", ".join(strip_unit(data.states[i]) for i in idle)
-    return [
-        f"{names} {'has' if len(idle) == 1 else 'have'} limits and no weight in Q: only the limit itself keeps the "
-        "loop away from it; a small weight would make it keep a distance"
-    ]
-
-
-def _weighted_references(asked: DesignTask, data: Episodes) -> dict[int, Float[np.ndarray, " T1"]]:
-    """Return the reference rows of each state that the cost weighs; none for a cost on other observables."""
-    of = asked.cost.of.bind(data.states)
-    if not isinstance(of, State):
-        return {}
-    Q, _ = asked.cost.matrices(of.nz, data.nu)
-    return {int(i): asked.reference[:, column] for column, i in enumerate(of.state_indices) if Q[column, column] > 0}
-
-
 def _first_states(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
     """Return the first states of episodes, those inside the limits alone where there are four or more."""
     points = np.unique(np.array([episode.X[0] for episode in data]), axis=0)
@@ -427,3 +264,32 @@ def _choose_spread(points: Float[np.ndarray, "n nx"]) -> Float[np.ndarray, "m nx
         apart = np.min([((Z[central] - Z[i]) ** 2).sum(axis=1) for i in picked], axis=0)
         picked.append(int(central[apart.argmax()]))
     return points[picked]
+
+
+_LEAST_PLAN = 8  # steps
+_MOST_PLAN = 40  # steps
+_SHARE = 0.5  # of the settling time; the tail of the cost stands for the rest
+
+
+def choose_horizon(data: Episodes, cost: Cost, limits: Limits | None, reference: ArrayLike) -> tuple[int, str]:
+    """Return the steps, and a sentence that says where they come from.
+
+    Half of the time in which a linear loop on the data settles, see `measure_settling`; between 8 and 40 steps, and
+    shorter than half of the episodes.
+    """
+    cost, limits = check_cost_and_limits(cost, limits, data.states, data.inputs)
+    settled = measure_settling(data, cost, limits, reference, np.array([e.X[0] for e in data]))
+    most = max(min(_MOST_PLAN, int(np.median([len(e) for e in data])) // 2), 1)
+    N = int(min(max(np.ceil(_SHARE * settled), min(_LEAST_PLAN, most)), most))
+    return N, (
+        f"the horizon is {N} steps of {data.dt:g} s: half of the {settled} steps in which a linear loop with limited "
+        "inputs settles, within 8 to 40 steps and half of the episodes"
+    )
+
+
+def goal_box(asked: DesignTask) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
+    """Return the range of the goal: what both the limits and the range of the data allow."""
+    low, high = asked.limits.states(len(asked.low))
+    low, high = np.maximum(low, asked.low), np.minimum(high, asked.high)
+    empty = low > high
+    return np.where(empty, asked.low, low), np.where(empty, asked.high, high)

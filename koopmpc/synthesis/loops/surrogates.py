@@ -14,17 +14,14 @@ from koopmpc.control.nonlinear.problem import LearnedMap, learned_map
 from koopmpc.data.episodes import Episodes
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.step_map import StepMap
-from koopmpc.synthesis.asked import DesignTask
-from koopmpc.synthesis.candidates import Recipe
-from koopmpc.synthesis.cross_validation import HALF, Tried
-from koopmpc.text import with_unit
+from koopmpc.synthesis.search.cross_validation import HALF, Tried
+from koopmpc.synthesis.search.recipe import Recipe
+from koopmpc.synthesis.task import DesignTask
 from koopmpc.validate.scoring import AnyPredictor, score
 from koopmpc.values import Value
 
 SECOND = 3.0  # the error of the second surrogate may be this many times that of the best
 INVARIANT = 0.25  # the plant ignores a state that changes increments by less than this share; models err as much
-UNHELD = 0.02  # an equilibrium may miss the reference by this share of the data's range
-HEADROOM = 0.1  # an input rests near a limit if less than this share of its range is left
 GROWN = 2.0  # a plant is unstable if a deviation grows by this factor within a horizon
 _SAMPLE = 500  # number of states on which ignored states are searched
 _FAMILIES = ("monomials", "fourier", "gaussian", "thin plate", "random fourier")
@@ -238,81 +235,3 @@ def is_unstable(surrogates: Sequence[Surrogate], asked: DesignTask) -> bool:
 def _find_family(tried: Tried) -> str:
     name = tried.candidate.name
     return next((family for family in reversed(_FAMILIES) if name.startswith(family)), name)
-
-
-def explain_unreachable(one: Surrogate, asked: DesignTask) -> list[str]:
-    """Return a sentence if no input holds a constant reference; it names the limit and the nearest equilibrium.
-
-    Outputs without a weight in the cost are ignored, and so are deviations up to 2 % of the data's range, which may be
-    errors of the surrogate.
-    """
-    if asked.moves:
-        return []
-    model, row, cost = one.model, asked.reference[0], asked.cost
-    of, nx = cost.of.bind(model.states), model.nx
-    Q, _ = cost.matrices(of.nz, model.nu)
-    ends = of(np.array([asked.low, asked.high]))
-    tolerance = np.where(np.diag(Q) > 0, np.maximum(UNHELD * np.abs(ends[1] - ends[0]), 1e-9), np.inf)
-
-    def values(at: Equilibrium) -> Float[np.ndarray, " nr"]:
-        return of(at.x[:nx])
-
-    def is_missed(at: Equilibrium) -> bool:
-        return bool((np.abs(values(at) - row) > tolerance).any())
-
-    def format_outputs(numbers: Float[np.ndarray, " nr"]) -> str:
-        weighed = np.isfinite(tolerance)
-        shown = np.where(np.abs(numbers) > 1e-3 * tolerance, numbers, 0.0)
-        return ", ".join(with_unit(of.names[i], f"= {shown[i]:.4g}") for i in np.flatnonzero(weighed))
-
-    room = UNHELD * (asked.high - asked.low)  # of the states
-
-    def list_broken(at: Equilibrium) -> list[str]:
-        ways: list[str] = []
-        for names, values, box, off in (
-            (model.inputs, at.u, asked.limits.inputs(model.nu), 1e-6 * np.abs(at.u)),
-            (model.states, at.x[:nx], asked.limits.states(nx), room),
-        ):
-            for i, (name, value, low, high) in enumerate(zip(names, values, *box, strict=True)):
-                if not low - off[i] <= value <= high + off[i]:
-                    shown = with_unit(name, f"= {value if abs(value) > 1e-3 * off[i] else 0:.4g}")
-                    ways.append(f"{shown}, and its limit is {low if value < low else high:.4g}")
-        return ways
-
-    inside = one.holding(cost, asked.limits)(row)
-    rests = not list_broken(inside)  # where no equilibrium is inside all limits, the search keeps those of inputs alone
-    if rests and not is_missed(inside):
-        return []
-    free = one.holding(cost, Limits())(row)
-    nearest = f"the nearest that can be held is {format_outputs(values(inside))}"
-    if not rests:
-        nearest = "the plant rests nowhere inside these limits: widen them"
-    if is_missed(free):
-        return [
-            f"no input holds {format_outputs(row)}: this is not an equilibrium of the plant as the data show it; "
-            f"{nearest}"
-        ]
-    ways = list_broken(free) or list_broken(inside)
-    if not ways and asked.limits.of is None:
-        return []
-    needs = "; ".join(ways) if ways else "what the limits of its observables forbid"
-    return [f"no input inside the limits holds {format_outputs(row)}: it needs {needs}; {nearest}"]
-
-
-def describe_rest(surrogates: Sequence[Surrogate], asked: DesignTask) -> str:
-    """Return at which inputs a constant reference rests, in the median of surrogates, and which are near a limit."""
-    row, names = asked.reference[0], surrogates[0].inputs
-    rest = np.median([one.holding(asked.cost, asked.limits)(row).u for one in surrogates], axis=0)
-    values, near = list[str](), list[str]()
-    for name, value, low, high in zip(names, rest, *asked.limits.inputs(len(names)), strict=True):
-        size = high - low
-        if not np.isfinite(size):
-            values.append(with_unit(name, f"= {value:.3g}"))
-            continue
-        shown = value if abs(value) > 1e-3 * size else 0.0
-        values.append(f"{with_unit(name, f'= {shown:.3g}')} of {low:.4g} … {high:.4g}")
-        for side, left in (("above", high - value), ("below", value - low)):
-            if left < HEADROOM * size:
-                near.append(f"{side} for {name.partition(' [')[0]}")
-    room = f"; less than a tenth of the range is left {' and '.join(near)}: no headroom" if near else ""
-    return f"the reference rests at {', '.join(values)}{room}"

@@ -12,8 +12,8 @@ from koopmpc.identify.records.structure import Structure
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.base import sorted_eigen
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.synthesis.candidates import Candidate
-from koopmpc.synthesis.cross_validation import EXACT, HALF, Tried
+from koopmpc.synthesis.search.candidates import Candidate
+from koopmpc.synthesis.search.cross_validation import EXACT, HALF, Tried
 from koopmpc.terminal import build_leaderboard, render_text
 from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Value

@@ -1,4 +1,4 @@
-"""NeighbourMap: a stand-in of the plant by the nearest rows of the data, a bootstrap of them for each loop."""
+"""NeighbourMap: a surrogate of the plant by the nearest rows of the data, a bootstrap of them for each loop."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.scene import Scene
-from koopmpc.synthesis.asked import DesignTask
-from koopmpc.synthesis.cross_validation import usual_horizon
+from koopmpc.synthesis.search.folds import usual_horizon
+from koopmpc.synthesis.task import DesignTask, goal_box
 from koopmpc.values import Value
 
 MOST = 6000  # rows that are kept
@@ -323,14 +323,6 @@ class NeighbourPlant:
 
     def _step(self, x: Float[np.ndarray, " n"], u: Float[np.ndarray, " nu"]) -> Float[np.ndarray, " nzeta"]:
         return self._plants.step(x[None, : len(x) - self._held], u[None], self._first)[0]
-
-
-def goal_box(asked: DesignTask) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
-    """Return the range of the goal: what both the limits and the range of the data allow."""
-    low, high = asked.limits.states(len(asked.low))
-    low, high = np.maximum(low, asked.low), np.minimum(high, asked.high)
-    empty = low > high
-    return np.where(empty, asked.low, low), np.where(empty, asked.high, high)
 
 
 def probe_range(

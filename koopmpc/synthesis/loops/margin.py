@@ -1,4 +1,4 @@
-"""promise_coverage: a margin with which a stated share of loops on stand-ins keeps its limits, chosen and verified."""
+"""choose_margin: a margin with which a stated share of loops on surrogates keeps its limits, chosen and verified."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -7,16 +7,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
 from koopmpc.control.limits import Limits
+from koopmpc.control.riccati import find_gain, one_step, stationary
 from koopmpc.errors import DataError, KoopmpcError
-from koopmpc.synthesis.asked import limit_margins
-from koopmpc.synthesis.candidates import Designed, Recipe, get_model
-from koopmpc.synthesis.fresh.abreast import speed_up
-from koopmpc.synthesis.fresh.drawn import DrawnLoop, LoopPool, LoopResult
-from koopmpc.synthesis.fresh.promise import CoveragePromise
-from koopmpc.synthesis.fresh.tube import find_tube
-from koopmpc.synthesis.judging import LoopTest
+from koopmpc.synthesis.doubts import limit_margins
+from koopmpc.synthesis.loops.abreast import speed_up
+from koopmpc.synthesis.loops.conditions import LoopTest
+from koopmpc.synthesis.loops.pool import DrawnLoop, LoopPool, LoopResult
+from koopmpc.synthesis.rates import CoveragePromise
+from koopmpc.synthesis.search.recipe import Designed, Recipe, get_model
+from koopmpc.synthesis.task import DesignTask
+from koopmpc.validate.scoring import AnyPredictor
 
 SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)  # times the tube that are tried as a margin, the least one first
 ROUND = 20  # loops that are run before their failures are counted
@@ -33,21 +34,11 @@ def most_failures(loops: int, coverage: float) -> int:
     return int(np.floor((1 - coverage) * (loops + 1) + 1e-9)) - 1
 
 
-def check_coverage(coverage: float, loops: int) -> float:
-    """Return the share, checked.
-
-    Raises
-    ------
-    DataError
-        It is not between 0 and 1, or needs more loops.
-    """
-    share = checks.positive(coverage, "coverage")
-    if share >= 1:
-        raise DataError(f"coverage is {share:g}; pass a share below 1, such as 0.95")
+def check_share(share: float, loops: int) -> None:
+    """Raise a DataError where a promise of this share needs more loops."""
     if most_failures(loops, share) < 0:
         needed = int(np.ceil(1 / (1 - share) - 1e-9)) - 1
-        raise DataError(f"coverage={share:g} needs {needed} loops or more to choose a margin; pass loops={needed}")
-    return share
+        raise DataError(f"margin={share:g} needs {needed} loops or more to choose a margin; pass loops={needed}")
 
 
 def keep_limits(
@@ -224,3 +215,58 @@ def _find_least(attempt: Callable[[float], _Attempt | None], allowed: int) -> tu
         else:
             below = (below + best.scale) / 2
     return best, last
+
+
+_ITERATIONS = 10_000  # of the Riccati equation
+_SLACK = 1e-6  # weight of the states in the feedback of the tube, as a share of 1 / range², beside those of the cost
+_RESTED = 1e-4  # the tube ends once a step widens it by less than this share
+_LONGEST = 400  # steps of a tube, at most
+
+
+def propagate_errors(
+    A: Float[np.ndarray, "n n"], error: Float[np.ndarray, " n"], steps: int
+) -> Float[np.ndarray, "steps n"]:
+    """Return half-widths of e_k, k = 1 … steps, for e_{k+1} = A e_k + w, e_0 = 0 and every |w| ≤ error.
+
+    |e_k| is at most Σ_{j<k} |Aʲ| error, and errors of these sizes with fitting signs reach it.
+    """
+    row, width, widths = np.eye(len(A)), np.zeros(len(A)), np.zeros((steps, len(A)))
+    for k in range(steps):
+        width = width + np.abs(row) @ error
+        row = row @ A
+        widths[k] = width
+    return widths
+
+
+def find_tube(
+    model: AnyPredictor,
+    asked: DesignTask,
+    error: Float[np.ndarray, " nx"],
+    x: Float[np.ndarray, " nx"],
+    u: Float[np.ndarray, " nu"],
+) -> Float[np.ndarray, "steps nx"] | None:
+    """Return half-widths of each state 1 … steps after a plan, one-step errors being at most `error` in size.
+
+    The loop around (x, u) follows the model's linearisation under the feedback of the stationary Riccati equation of
+    the cost. The tube ends where it no longer widens. Returns None for a model of past rows, and where there is no such
+    feedback.
+    """
+    if model.embedding is not None:
+        return None
+    try:
+        at = model.step_map().linearize(x, u)
+        A, B = at.A, at.B
+        n, size = len(A), np.maximum(asked.high - asked.low, 1e-12)
+        R = asked.cost.matrices(asked.reference.shape[1], B.shape[1])[1]
+        tracked = asked.weigh_states(x, model.states, B.shape[1])
+        weight = tracked + _SLACK * float(np.trace(tracked @ np.diag(size**2))) / n * np.diag(1 / size**2)
+        stage = one_step(A, B, weight, R + 1e-9 * np.eye(len(R)) * max(float(np.trace(R)), 1e-9), None)
+        K, _ = find_gain(stage, stationary(stage, _ITERATIONS).P)
+    except (KoopmpcError, np.linalg.LinAlgError):
+        return None
+    loop = A - B @ K
+    if not np.isfinite(loop).all() or np.abs(np.linalg.eigvals(loop)).max() >= 1:
+        return None
+    widths = propagate_errors(loop, error, _LONGEST)
+    still = np.flatnonzero((np.diff(widths, axis=0) <= _RESTED * widths[:-1] + 1e-300).all(axis=1))
+    return widths[: int(still[0]) + 2] if still.size else widths

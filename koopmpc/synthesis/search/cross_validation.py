@@ -1,37 +1,34 @@
-"""Cross-validation: data in folds, and a candidate fitted without each fold and rolled out over it, for all ridges.
+"""Cross-validation: a candidate is fitted without each fold and rolled out over that fold, for all ridges.
 
 This is how `select` chooses a ridge; the ``ridge="gcv"`` of a single fit is in identify/solve.py.
 """
 
-from collections.abc import Sequence, Sized
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import accumulate, islice, pairwise
+from itertools import accumulate
 from time import perf_counter
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc import checks
-from koopmpc.data.episodes import Episode, Episodes, join_sets
-from koopmpc.data.smoother import Glitch, Mender, Smoother
-from koopmpc.data.source import Changed, EpisodesMap, Held, Source
+from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.identify.moments.moments import Moments
-from koopmpc.identify.moments.read import second_moments, space_evenly
+from koopmpc.identify.moments.read import second_moments
 from koopmpc.identify.records.hidden_fit import fit_hidden
 from koopmpc.identify.records.hidden_structure import HiddenStructure
 from koopmpc.identify.records.structure import Structure, solve_structure, weigh_rows
 from koopmpc.identify.regression import Regression, build_regression
 from koopmpc.identify.solve import BilinearColumns, solve_path
-from koopmpc.lifting.base import strip_unit
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.synthesis.candidates import Candidate
-from koopmpc.text import with_unit
+from koopmpc.synthesis.search.candidates import Candidate
+from koopmpc.synthesis.search.folds import drop_fold, select_fold
 from koopmpc.validate.scoring import AnyPredictor, compare_forecasts
 from koopmpc.values import Value
 
+RIDGES = tuple(10.0**power for power in range(-9, -2))
 LEAST = 1e-9  # smallest ridge; with less, nearly dependent observables get weights beyond double precision
 _TINY = 1e-15  # stands for an error of zero in logarithms
 _ALIKE = 1.02  # the largest ridge whose errors are within this factor of the smallest ones is chosen
@@ -39,224 +36,6 @@ _STARTS = 256  # number of forecasts in a fold
 EXACT = 1e-6  # smaller relative errors are due to rounding and the smallest ridge
 HALF = 0.5  # a model with delays or fast growth must reduce the error to this share
 _DIVERGED = 100.0  # forecasts diverge if their error exceeds this many spreads of the states
-_PARTS = 16  # a sample is taken from at most this many parts of a source
-_TOLD = 3  # a note names at most this many glitches
-_AHEAD = 20  # steps of the default horizon
-
-
-class Folds(NamedTuple):
-    """Episodes, the fold of each episode, and sentences on changes of the data."""
-
-    episodes: Episodes
-    fold: tuple[int, ...]
-    notes: tuple[str, ...]
-
-    @property
-    def number(self) -> int:
-        """Number of folds."""
-        return max(self.fold) + 1
-
-
-def take_sample(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
-    """Return episodes of about `pairs` snapshot pairs at most, spread over the source, and a sentence if not all.
-
-    Raises
-    ------
-    DataError
-        The source can be read once only.
-    """
-    if not source.replayable:
-        raise DataError(
-            "a stream is read once, and a selection reads its data several times; pass Episodes, "
-            "km.data.Files(folder), or km.data.Stream of a list"
-        )
-    parts = source.parts()
-    if isinstance(parts, Sized):
-        every = list(parts)
-        chosen = [every[i] for i in space_evenly(len(every), _PARTS)] if len(every) > _PARTS else every
-        whole = len(chosen) == len(every)
-    else:
-        chosen, whole = list(islice(parts, _PARTS)), False
-    quota = max(pairs // len(chosen), 1)
-    taken: list[Episodes] = []
-    for part in chosen:
-        loaded = part.load()
-        taken.append(_thin_episodes(loaded, quota))
-        whole = whole and taken[-1] is loaded
-    result = join_sets(taken)
-    if whole:
-        return result, ()
-    steps = sum(len(episode) for episode in result)
-    count = f"{len(result)} episode{'s' * (len(result) != 1)}"
-    return result, (f"chosen on {steps} steps in {count}, evenly spread over the data, and fitted to all",)
-
-
-def replace_glitches(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple[str, ...]]:
-    """Return the source and the episodes `held` of it with glitches replaced, and a sentence if there are any."""
-    try:
-        mender = Mender.of(held)
-    except DataError:  # too few data to tell a glitch from the plant, or too many states
-        return source, held, ()
-    found = mender.glitches(held)
-    if not found:
-        return source, held, ()
-    named = [_name_glitch(one, held) for one in found[:_TOLD]]
-    rest = f", and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
-    note = f"measurements that fit neither those before nor those after were replaced: {'; '.join(named)}{rest}"
-    return *_apply_change(source, held, mender), (note,)
-
-
-def _name_glitch(glitch: Glitch, data: Episodes) -> str:
-    """Return what was measured, where, and what stands there now; where the data are of a table, by file and line."""
-    state, origin = data.states[glitch.state], data[glitch.episode].origin
-    was, place = glitch.was, f"in row {glitch.row} of episode {glitch.episode}"
-    if origin is not None:
-        number, was = origin.locate(glitch.row, state, glitch.now)
-        place = f"in {origin.place(number)}"
-    return f"{with_unit(state, f'= {was:.5g}')} {place}, now {glitch.now:.4g}"
-
-
-def smooth_data(source: Source, held: Episodes) -> tuple[Source, Episodes, tuple[str, ...], Float[np.ndarray, " nx"]]:
-    """Return source and episodes, smoothed where noise is found, a sentence that says so, and the size of the noise.
-
-    The size is the (nx,) standard deviation of what was taken out, zero where that is nothing. The smoother is found
-    on `held`; where that is not all of the source, its parts are smoothed as they are read.
-    """
-    nothing = source, held, (), np.zeros(held.nx)
-    try:
-        smoother = Smoother.of(held)
-    except DataError:
-        return nothing
-    if not smoother.is_noisy.any():
-        return nothing
-    told = ", ".join(
-        with_unit(name, f"± {size:.2g}")
-        for name, size, found in zip(held.states, smoother.noise, smoother.is_noisy, strict=True)
-        if found
-    )
-    quiet = [strip_unit(name) for name, found in zip(held.states, smoother.is_noisy, strict=True) if not found]
-    others = f"; that of {', '.join(quiet)} is too small to tell" if quiet else ""
-    note = (
-        f"the measurements hold noise (standard deviations): {told}{others}; candidates are fitted to smoothed states"
-    )
-    return *_apply_change(source, held, smoother), (note,), smoother.noise
-
-
-def _apply_change(source: Source, held: Episodes, change: EpisodesMap) -> tuple[Source, Episodes]:
-    changed = change(held)
-    if isinstance(source, Held) and source.episodes is held:
-        return Held(changed), changed
-    return Changed(source, change, held.states, held.inputs, held.disturbances), changed
-
-
-def usual_horizon(episodes: Episodes, past: int = 0) -> tuple[int, tuple[str, ...]]:
-    """Return 20 steps, or as many as whole episodes allow, and a sentence if these are fewer.
-
-    At least half of all steps are in episodes that are long enough for this and the `past` that embeddings need, so
-    that the shortest ones do not determine the horizon. A single episode is later cut into four blocks.
-    """
-    lengths = np.sort([len(episode) for episode in episodes])[::-1]
-    held = np.cumsum(lengths) >= lengths.sum() / 2
-    half = int(lengths[np.argmax(held)])  # episodes as long as this hold half of the steps
-    room = half if np.sum(lengths >= half) > 1 else half // 4
-    ahead = min(_AHEAD, max(room - past, 1))
-    if ahead == _AHEAD:
-        return ahead, ()
-    return ahead, (
-        f"judged {ahead} step{'s' * (ahead > 1)} ahead, not {_AHEAD}: episodes of {half} steps hold half of the data, "
-        "which leaves no more; a controller that looks further ahead than this needs longer episodes",
-    )
-
-
-def make_folds(episodes: Episodes, needed: int, folds: int, rng: np.random.Generator) -> Folds:
-    """Return the episodes in folds of about equal size; few long ones are first cut into blocks.
-
-    Episodes are dealt out at random. Neighbouring blocks are alike, so blocks keep their order and a fold is one
-    stretch of time.
-
-    Parameters
-    ----------
-    episodes
-        Of any length.
-    needed
-        Steps that an episode must have to be scored.
-    folds
-        Number of folds; fewer if there are fewer episodes.
-    rng
-        Deals out the episodes.
-
-    Raises
-    ------
-    DataError
-        Less than two episodes, or blocks, are long enough.
-    """
-    notes: list[str] = []
-    long = [episode for episode in episodes if len(episode) >= needed]
-    short = len(episodes) - len(long)
-    if short:
-        notes.append(
-            f"{short} of {len(episodes)} episodes are shorter than the {needed} steps that a forecast needs, and took "
-            "no part in the choice"
-        )
-    cut = 0 < len(long) < 2 * folds
-    if cut:
-        number, total = len(long), sum(map(len, long))
-        block = max(2 * needed, total // (4 * folds))
-        long = [piece for episode in long for piece in cut_blocks(episode, block)]
-        cut = len(long) > number
-        if cut:
-            notes.append(
-                f"{number} episode{'s are' if number > 1 else ' is'} too few for {folds} folds: cut into {len(long)} "
-                "blocks, and a fold is one stretch of them; neighbouring blocks are alike, so errors may be too small"
-            )
-    if len(long) < 2:
-        given = "one episode" if len(episodes) == 1 else f"{len(episodes)} episodes, the longest"
-        raise DataError(
-            f"the data have {given} of {max(map(len, episodes))} steps, and a choice needs two of {needed} steps or "
-            f"more, or one of {4 * needed}: pass a shorter horizon, or longer episodes"
-        )
-    count = min(folds, len(long))
-    lengths = np.array([len(episode) for episode in long])
-    fold = np.zeros(len(long), dtype=np.intp)
-    if cut:
-        fold[:] = np.minimum((np.cumsum(lengths) - lengths / 2) * count / lengths.sum(), count - 1)
-        fold[:] = np.unique(fold, return_inverse=True)[1]
-    else:
-        size = np.zeros(count)
-        for i in rng.permutation(len(long)):
-            fold[i] = np.argmin(size)
-            size[fold[i]] += lengths[i]
-    if fold.max() == 0:
-        raise DataError(f"all {len(long)} episodes fell into one fold; pass more of them, or a shorter horizon")
-    return Folds(episodes.with_episodes(long), tuple(fold.tolist()), tuple(notes))
-
-
-def select_fold(episodes: Episodes, fold: Sequence[int], wanted: int) -> Episodes:
-    """Return the episodes of one fold."""
-    return episodes.with_episodes([episode for episode, own in zip(episodes, fold, strict=True) if own == wanted])
-
-
-def drop_fold(episodes: Episodes, fold: Sequence[int], out: int) -> Episodes:
-    """Return the episodes of all folds but one."""
-    return episodes.with_episodes([episode for episode, own in zip(episodes, fold, strict=True) if own != out])
-
-
-def cut_blocks(episode: Episode, steps: int) -> list[Episode]:
-    """Return an episode in equal blocks of at least `steps` steps; no two blocks share a snapshot pair."""
-    count = max(len(episode) // steps, 1)
-    at = np.linspace(0, len(episode), count + 1).astype(int)
-    return [episode.cut(a, b) for a, b in pairwise(at.tolist())]
-
-
-def _thin_episodes(episodes: Episodes, quota: int) -> Episodes:
-    """Return evenly spread episodes of about `quota` steps in total; a longer episode is cut to its beginning."""
-    total = sum(len(episode) for episode in episodes)
-    if total <= quota:
-        return episodes
-    wanted = max(len(episodes) * quota // total, 1)
-    kept = [episodes[i] for i in space_evenly(len(episodes), wanted)]
-    cut = [e if len(e) <= quota else e.cut(0, quota) for e in kept]
-    return episodes.with_episodes(cut)
 
 
 @dataclass(frozen=True, eq=False)

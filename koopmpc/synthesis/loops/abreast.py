@@ -1,4 +1,4 @@
-"""Closed loops side by side: controllers in machine code and stand-ins in numpy step all loops at once."""
+"""Closed loops side by side: controllers in machine code and surrogates in numpy step all loops at once."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -14,10 +14,40 @@ from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import KoopmpcError
 from koopmpc.loop.run import Run
 from koopmpc.plants.routines import find_compiler
-from koopmpc.synthesis.asked import DesignTask
-from koopmpc.synthesis.fresh.acting import Acting
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap
-from koopmpc.synthesis.surrogates import Surrogate
+from koopmpc.synthesis.loops.neighbours import NeighbourMap
+from koopmpc.synthesis.loops.surrogates import Surrogate
+from koopmpc.synthesis.task import DesignTask
+
+
+@dataclass(frozen=True, eq=False)
+class Acting:
+    """v_k = u_0 + gain ((1 − late) u_k + late u_{k−1} − u_0), with a gain and a delay for each of E loops.
+
+    An input that comes a share `late` of a step late has this mean over the step, with that of the step before.
+
+    Attributes
+    ----------
+    middle
+        (nu,) u_0, the mean of the data's inputs.
+    gain, late
+        (E,) factors on the inputs, and delays as shares of a step.
+    """
+
+    middle: Float[np.ndarray, " nu"]
+    gain: Float[np.ndarray, " E"]
+    late: Float[np.ndarray, " E"]
+
+    def take(self, place: int) -> "Acting":
+        """Return that of one loop."""
+        return Acting(self.middle, self.gain[[place]], self.late[[place]])
+
+    def change(
+        self, U: Float[np.ndarray, "n nu"], before: Float[np.ndarray, "n nu"], which: Int[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n nu"]:
+        """Return what acts in the loops `which`; at the first step `before` is U itself."""
+        late, gain = self.late[which, None], self.gain[which, None]
+        return self.middle + gain * ((1 - late) * U + late * before - self.middle)
+
 
 # ζ⁺ of the loops `which` from their ζ (n, nzeta) and u (n, nu)
 CrowdStep = Callable[

@@ -2,133 +2,37 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError
-from koopmpc.lifting.base import strip_unit
 from koopmpc.loop.faults import Fault
 from koopmpc.loop.metrics import total_cost, violation_shares
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import StepObserver, simulate
 from koopmpc.plants.plant import SimulatedPlant, Transition
-from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor
-from koopmpc.synthesis.asked import DesignTask
-from koopmpc.synthesis.candidates import Designed, Nearness, Recipe
-from koopmpc.synthesis.cross_validation import drop_fold, select_fold
-from koopmpc.synthesis.fresh.acting import Acting
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap
-from koopmpc.synthesis.surrogates import Surrogate
+from koopmpc.synthesis.loops.abreast import Acting
+from koopmpc.synthesis.loops.conditions import Condition, LoopTest
+from koopmpc.synthesis.loops.neighbours import NeighbourMap
+from koopmpc.synthesis.loops.surrogates import Surrogate
+from koopmpc.synthesis.search.folds import drop_fold, select_fold
+from koopmpc.synthesis.search.recipe import Designed, Nearness, Recipe
+from koopmpc.synthesis.task import DesignTask
 from koopmpc.validate.scoring import AnyPredictor, score
 
-LOST = 20.0  # ratio to the best of a lost run, and the largest ratio of any run
-FREE = 0.005  # a violation up to this share of the limits' range costs nothing
-PRICE = 10.0  # each further 1 % of violation adds this many percent to the cost
 LITTLE = 0.01  # this share of the usual cost is added to all costs, because some runs start at their goal
 _WEIGHTED = 4  # a recipe with weights takes about this many times as long, since its models are fitted again
 _NINETY = 1.645  # 90 % of normal errors lie within this many standard deviations
 _BAND = 5  # limits are tightened by errors up to this many steps ahead
 CONFIRMED = 1.25  # fitted to all data, a controller may cost this factor of its cost with two folds
-ALIKE = 0.005  # scores that differ by this share are alike
-UNSURE = 0.03  # the largest standard error by which two scores are alike, and share by which two worst runs are
-LESS = 0.5  # weight of a run with inputs 20 % off; other runs have weight 1
 BROKEN = 1e-3  # a step violates a limit if it exceeds the limit by more than this share of its range
-
-
-@dataclass(frozen=True, eq=False)
-class Condition:
-    """One run of a controller whose model was fitted without a fold.
-
-    Attributes
-    ----------
-    fold
-        The fold that the model does not know.
-    surrogate
-        Number of the surrogate that is controlled; it knows that fold.
-    gain
-        Factor on the effect of the inputs; 1 is as in the data.
-    x0
-        (nx,) start.
-    first
-        Row of the reference at which the run begins.
-    u_reference
-        (T, nu) inputs without cost: those of the cost if it names them, else those that hold the reference on this
-        surrogate.
-    """
-
-    fold: int
-    surrogate: int
-    gain: float
-    x0: Float[np.ndarray, " nx"]
-    first: int
-    u_reference: Float[np.ndarray, "T nu"]
-
-
-@dataclass(frozen=True, eq=False)
-class LoopTest:
-    """The task, the data in folds, the surrogates and the conditions of all runs.
-
-    A run that leaves the box from `low` to `high` is lost. The margins of controllers to the limits are at most `room`
-    (nx,); None for no margins. `noise` is the (nx,) standard deviation of the noise that a smoother took out of the
-    data. `ignored` are states that nothing depends on, `turning` angles that make whole turns. Hidden states learn from
-    `raw`, the episodes as they were measured; None where nothing was smoothed.
-    """
-
-    asked: DesignTask
-    episodes: Episodes
-    fold: tuple[int, ...]
-    surrogates: tuple[Surrogate, ...]
-    conditions: tuple[Condition, ...]
-    low: Float[np.ndarray, " nx"]
-    high: Float[np.ndarray, " nx"]
-    room: Float[np.ndarray, " nx"] | None
-    noise: Float[np.ndarray, " nx"]
-    ignored: tuple[int, ...] = ()
-    turning: tuple[int, ...] = ()
-    raw: Episodes | None = None
-
-    def limits(self, band: Float[np.ndarray, "h nx"]) -> Limits:
-        """Return the limits of a controller whose model has these errors."""
-        if self.room is None:
-            return self.asked.limits
-        width = np.where(np.isfinite(band), band, self.asked.high - self.asked.low)
-        limits = self.asked.limits.tightened(np.minimum(width, self.room), states=self.episodes.states)
-        said = tuple(
-            f"{strip_unit(self.episodes.states[i])}: the margin is {self.room[i]:.4g}, half way from the reference to "
-            f"the limit, though the errors ask for up to {width[:, i].max():.4g}"
-            for i in np.flatnonzero((np.asarray(limits.margin) == self.room).any(axis=0))
-        )
-        return replace(limits, capped=(*limits.capped, *said))
-
-    @property
-    def nominal(self) -> list[int]:
-        """The conditions in which the inputs act as in the data."""
-        return [i for i, condition in enumerate(self.conditions) if condition.gain == 1.0]
-
-    @property
-    def weights(self) -> Float[np.ndarray, " conditions"]:
-        """The weight of each condition in a score; inputs as in the data weigh more."""
-        return np.array([1.0 if one.gain == 1.0 else LESS for one in self.conditions])
-
-    def plant(self, condition: Condition) -> StepMap:
-        """Return the plant of a condition; each plant is built once in a process."""
-        key = condition.surrogate, condition.gain
-        if key not in self._plants:
-            self._plants[key] = self.surrogates[condition.surrogate].plant(condition.gain)
-        return self._plants[key]
-
-    @cached_property
-    def _plants(self) -> dict[tuple[int, float], StepMap]:
-        return {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -380,50 +284,3 @@ def run_on_surrogate(
     return replace(
         run, X=run.X[:, : len(states)], states=states, cost=asked.cost, angles=asked.angles, u_reference=u_reference
     )
-
-
-def rate_runs(outcomes: Sequence[Outcome]) -> Float[np.ndarray, "jobs runs"]:
-    """Return cost × (1 + 10 max(0, violation − 0.5 %)) of each run over the best of its condition, at most 20.
-
-    The smallest violation of a condition is subtracted first, because from some starts no controller keeps the limits.
-    If every run of a condition is lost, all its ratios are 20.
-    """
-    cost, violation = (np.array([getattr(each, name) for each in outcomes]) for name in ("cost", "violation"))
-    least = np.where(np.isfinite(violation), violation, np.inf).min(axis=0)
-    with np.errstate(invalid="ignore"):
-        priced = cost * (1 + PRICE * np.maximum(violation - least - FREE, 0.0))
-        priced = np.where(np.isfinite(priced), priced, np.inf)
-        best = priced.min(axis=0)
-        known = best[np.isfinite(best)]
-        little = LITTLE * float(np.median(known)) if known.size else 0.0
-        ratio = (priced + little) / np.maximum(best + little, 1e-300)
-    return np.where(np.isfinite(ratio), np.minimum(ratio, LOST), LOST)
-
-
-def average_ratios(
-    ratio: Float[np.ndarray, "jobs runs"], weights: Float[np.ndarray, " runs"]
-) -> Float[np.ndarray, " jobs"]:
-    """Return the weighted geometric mean of each job's ratios.
-
-    With six runs with inputs as in the data and six with inputs 20 % off, one lost run raises the mean by 40 % or 18 %.
-    """
-    return np.exp(np.average(np.log(ratio), axis=1, weights=weights))
-
-
-def measure_errors(
-    ratio: Float[np.ndarray, "jobs runs"],
-    score: Float[np.ndarray, " jobs"],
-    weights: Float[np.ndarray, " runs"],
-) -> Float[np.ndarray, " jobs"]:
-    """Return the standard error of each job's log score less that of the best job, over the runs that both share."""
-    if not len(score):
-        return score
-    apart = np.log(ratio) - np.log(ratio[int(np.argmin(score))])
-    share = weights / weights.sum()
-    spread = ((apart - (apart @ share)[:, None]) ** 2) @ share
-    return np.sqrt(spread * (share**2).sum())
-
-
-def is_alike(score: float, best: float, error: float) -> bool:
-    """Return whether a score is as good as the best one, by the standard error of their difference."""
-    return bool(score <= best * (1 + max(ALIKE, min(error, UNSURE))))

@@ -17,9 +17,9 @@ from koopmpc.identify.records.subspace import choose_sizes
 from koopmpc.parallel import Progress
 from koopmpc.predict.base import sorted_eigen
 from koopmpc.predict.predictors import BilinearPredictor
-from koopmpc.synthesis.candidates import Candidate
-from koopmpc.synthesis.leaderboard import LeaderboardRow
-from koopmpc.synthesis.records import FreeRun, cut_pieces, forecast_rows, judge_free_run
+from koopmpc.synthesis.search.candidates import Candidate
+from koopmpc.synthesis.search.free_runs import FreeRun, cut_pieces, forecast_rows, judge_free_run
+from koopmpc.synthesis.search.leaderboard import LeaderboardRow
 from koopmpc.validate.scoring import AnyPredictor
 
 FAR = 1.2  # a kind that errs by this many times the least error is left out

@@ -1,4 +1,4 @@
-"""LoopPool: independent loops of a controller on stand-ins; each draws its stand-in, start, inputs, delay and noise."""
+"""LoopPool: independent loops of a controller; each draws its surrogate, start, inputs, delay and noise."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,12 +11,11 @@ from koopmpc.codegen.compiled import Compiled
 from koopmpc.loop.metrics import total_cost, violation_shares
 from koopmpc.loop.run import Run
 from koopmpc.plants.step_map import StepMap
-from koopmpc.synthesis.asked import DesignTask
-from koopmpc.synthesis.fresh.abreast import Crowd, CrowdStep, run_abreast
-from koopmpc.synthesis.fresh.acting import Acting
-from koopmpc.synthesis.fresh.neighbours import NeighbourMap, goal_box
-from koopmpc.synthesis.judging import read_reference, run_on_surrogate
-from koopmpc.synthesis.surrogates import Surrogate
+from koopmpc.synthesis.loops.abreast import Acting, Crowd, CrowdStep, run_abreast
+from koopmpc.synthesis.loops.judging import read_reference, run_on_surrogate
+from koopmpc.synthesis.loops.neighbours import NeighbourMap
+from koopmpc.synthesis.loops.surrogates import Surrogate
+from koopmpc.synthesis.task import DesignTask, goal_box
 
 KEPT = 0.01  # a loop keeps its limits if it violates none by more than this share of its range
 NEIGHBOURS = 2 / 3  # share of the loops on nearest neighbours; the others are on learned models

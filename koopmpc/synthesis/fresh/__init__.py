@@ -1,1 +1,0 @@
-"""Fresh loops: a stand-in that shares no observables with any candidate, and runs that took no part in a choice."""

@@ -1,0 +1,222 @@
+"""Long measured records: late input columns, sparse polynomial candidates, and their refinement."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.source import Held
+from koopmpc.errors import KoopmpcError
+from koopmpc.identify.fits.refinement import refine
+from koopmpc.identify.records.free_run import PIECE
+from koopmpc.identify.records.hidden_structure import find_rails
+from koopmpc.identify.records.narx import DELAYS, FOLDS, choose_structure, search_structures
+from koopmpc.identify.records.structure import Structure, find_forecast_horizon, fit_structure
+from koopmpc.parallel import Progress
+from koopmpc.predict.base import replace_report
+from koopmpc.predict.predictors import BilinearPredictor
+from koopmpc.synthesis.search.candidates import Candidate
+from koopmpc.synthesis.search.data import smooth_data
+from koopmpc.synthesis.search.free_runs import (
+    _PAYS,
+    _fit_quietly,
+    _is_calm,
+    _stretch_errors,
+    cut_pieces,
+    is_surely_better,
+    run_structure,
+)
+from koopmpc.synthesis.search.leaderboard import Selection
+from koopmpc.validate.scoring import AnyPredictor
+
+MARGIN = 0.8  # the input column is moved up if that lowers the error on unseen rows to this share
+FEEDBACK = 0.95  # inputs are fed back if outputs lower the error of their prediction below this share
+_STATIC = 0.1  # inputs are fed back if outputs of the same row leave less than this share of their moves open
+_PAST = 6  # rows of the past in the test for feedback
+_LAGS = range(1, _PAST + 1)
+_PASSES = 6  # weighted least squares fits for least absolute deviations
+_PROBE = (2, 4)  # past rows of the models that compare both timings of the inputs
+_PROBED = 3000  # rows of each record that these models learn from, at most
+
+
+def is_fed_back(episodes: Episodes) -> bool:
+    """Return whether an input may be a feedback of the outputs, so that nothing tells when it acts.
+
+    Either past outputs predict u_{k+1} better than its own past does, on unseen rows; or most of its moves are a
+    function of the outputs in the same rows. Both use least absolute deviations, so that a few moves of a set point do
+    not hide it. Under feedback u_{k+1} holds y_{k+1}, and a model with the inputs moved up would seem to know y_{k+1}.
+    """
+    long = [e for e in episodes if len(e) > 4 * _PAST]
+    if not long:
+        return True  # too short to tell
+    past = np.concatenate([np.hstack([e.U[_PAST - i : len(e) - i] for i in _LAGS]) for e in long])
+    outputs = np.concatenate([np.hstack([e.X[_PAST - i : len(e) - i] for i in _LAGS]) for e in long])
+    now = np.concatenate([e.U[_PAST:] for e in long])
+    move = np.concatenate([np.diff(e.U, axis=0) for e in long])
+    same = np.concatenate([np.hstack([np.diff(e.X[:-1], axis=0), e.X[1:-1]]) for e in long])
+    for target, step in zip(now.T, move.T, strict=True):
+        own, both = _miss(past, target), _miss(np.hstack([past, outputs]), target)
+        cap = 5 * float(np.median(own))
+        if np.minimum(both, cap).mean() < FEEDBACK * np.minimum(own, cap).mean():
+            return True
+        moving = step != 0
+        if moving.any() and np.median(_miss(same[moving], step[moving])) < _STATIC * np.median(np.abs(step[moving])):
+            return True
+    return False
+
+
+def _miss(P: Float[np.ndarray, "M n"], target: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
+    """Return |t − [1, P] k| on each quarter of the rows, k by least absolute deviations over the others."""
+    A = np.hstack([np.ones((len(P), 1)), P])
+    fold, missed = np.arange(len(A)) * FOLDS // len(A), np.empty(len(A))
+    for out in range(FOLDS):
+        rows = fold != out
+        weight = np.ones(int(rows.sum()))
+        k = np.zeros(A.shape[1])
+        for _ in range(_PASSES):  # least squares with weights 1 / |residual|
+            k = np.linalg.lstsq(A[rows] * weight[:, None], target[rows] * weight, rcond=None)[0]
+            gap = np.abs(target[rows] - A[rows] @ k)
+            weight = 1 / np.sqrt(np.maximum(gap, max(float(np.median(gap)), 1e-12)))
+        missed[~rows] = np.abs(target[~rows] - A[~rows] @ k)
+    return missed
+
+
+def is_late(episodes: Episodes) -> bool:
+    """Return whether the log's inputs stand a row too low: models with the inputs moved up do much better.
+
+    Polynomials of degrees 2 and 3 in a few past rows are tried with both timings. The inputs are moved up only if the
+    error on unseen rows falls to 80 %, in all but one of the blocks, and no feedback from the outputs can have made it
+    fall.
+    """
+    if not episodes.nu or is_fed_back(episodes):
+        return False
+    part = episodes.with_episodes([e.cut(0, min(len(e), _PROBED)) for e in episodes])
+    try:
+        plain, moved = (
+            min(search_structures(data, _PROBE, [2, 3], 30), key=lambda one: one.error)
+            for data in (part, part.with_inputs_advanced(1))
+        )
+    except KoopmpcError:  # too short
+        return False
+    better = int(np.sum(moved.errors < plain.errors))
+    return moved.error < MARGIN * plain.error and better >= len(plain.errors) - 1
+
+
+def propose_structures(
+    episodes: Episodes, delays: Sequence[int] | None, bilinear: bool, progress: Progress | None = None
+) -> list[Candidate]:
+    """Return the best sparse polynomial of these records and the best linear one; none where they are too short.
+
+    The linear one of least error runs over long stretches too. It is taken in place of a smaller one that is as good on
+    short pieces if it errs by a tenth less there, or alone stays near the data: of linear models only free runs tell
+    slow growth.
+    """
+
+    def ask(_: str, done: int, total: int) -> None:
+        if progress is not None:
+            progress(done, total)
+
+    try:
+        tried = DELAYS if delays is None else delays
+        found = search_structures(episodes, tried, ask=ask, rails=find_rails(episodes))
+    except KoopmpcError:  # too short for any delay
+        return []
+    kinds = (False, True) if bilinear else (False,)
+    same = ([one for one in found if one.is_nonlinear is kind] for kind in kinds)
+    chosen = [
+        _race(those, episodes) if not those[0].is_nonlinear else choose_structure(those) for those in same if those
+    ]
+    return [_make_candidate(one).bind(episodes.states, episodes.inputs) for one in chosen]
+
+
+def _race(found: Sequence[Structure], measured: Episodes) -> Structure:
+    """Return the structure that `choose_structure` takes, or the one of least error if it wins on long stretches."""
+    small, best = choose_structure(found), min(found, key=lambda one: one.error)
+    if best is small or max(map(len, measured)) <= PIECE:
+        return small
+    first, horizon = max(small.delays, best.delays), find_forecast_horizon(measured)
+    own, other = (run_structure(one, measured, first, horizon) for one in (small, best))
+    wins = other.error < _PAYS * own.error if own.calm == other.calm else other.calm
+    return best if wins else small
+
+
+def _make_candidate(structure: Structure) -> Candidate:
+    name = f"{structure.size} terms" + (f", degree {structure.degree}" if structure.is_nonlinear else "")
+    return Candidate(name, structure.lifting, structure.delay, structure.is_nonlinear, structure)
+
+
+def refine_structure(
+    structure: Structure, model: AnyPredictor, data: Episodes, first: int, horizon: int
+) -> tuple[AnyPredictor, int]:
+    """Return the model refined on forecasts of many steps, and of how many; the model and 0 where unseen rows lose.
+
+    In turn the structure is fitted without one quarter of each record and refined there, on segments of 2.5 and of 10
+    horizons. Errors on both halves of the quarters, in free run and in short forecasts, decide between the three: over
+    these eight blocks a refinement must err by more than one standard error less, and on most of them. The model of all
+    rows is then refined in the same way.
+    """
+    truth = cut_pieces(data)
+    scale = np.concatenate([episode.X for episode in truth]).std(axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    relift = isinstance(model, BilinearPredictor)
+    before, after = list[float](), dict[int, list[float]]()
+    try:
+        for fold in range(FOLDS):
+            spans = [(len(e) * fold // FOLDS, len(e) * (fold + 1) // FOLDS) for e in truth]
+            kept = [e.cut(*part) for e, span in zip(truth, spans, strict=True) for part in _sides(e, span)]
+            learned = truth.with_episodes([e for e in kept if len(e) > first])
+            start = fit_structure(structure, learned)
+            before += _stretch_errors(start, truth, spans, scale, first, horizon, relift=relift)
+            for h in _segments(truth, horizon) if not fold else tuple(after):
+                long = learned.with_episodes([e for e in learned if len(e) >= h + max(DELAYS)])
+                one = refine(start, long, horizon=h, held_out=long)
+                after.setdefault(h, []).extend(_stretch_errors(one, truth, spans, scale, first, horizon, relift=relift))
+        if not after:
+            return model, 0
+        best = min(after, key=lambda h: float(np.prod(after[h])))
+        if not is_surely_better(np.array(after[best]), np.array(before)):
+            return model, 0
+        refined = refine(model, truth, horizon=best, held_out=truth)
+    except KoopmpcError:  # a record is too short for its segments
+        return model, 0
+    calm = _is_calm(refined, truth, first, relift) or not structure.calm
+    return (refined, best) if calm else (model, 0)
+
+
+def _sides(episode: Episode, span: tuple[int, int]) -> list[tuple[int, int]]:
+    """Return the rows before and behind a span."""
+    return [(a, b) for a, b in ((0, span[0]), (span[1], len(episode))) if b > a]
+
+
+def _segments(data: Episodes, horizon: int) -> list[int]:
+    """Return the lengths of segments that fit into every record, and its past."""
+    room = min(map(len, data)) - max(DELAYS)
+    return [h for h in (5 * horizon // 2, 10 * horizon) if h <= room]
+
+
+def fit_again(selection: Selection, episodes: Episodes) -> AnyPredictor:
+    """Return the chosen model of a selection fitted to other rows: the same observables, ridge and refinement.
+
+    Parameters
+    ----------
+    selection
+        The choice.
+    episodes
+        Logs like those of the choice; their inputs are moved as the chosen model's were.
+    """
+    row, data = selection.best, selection.predictor.align(episodes)
+    if row.structure is None and not row.rough:
+        data = smooth_data(Held(data), data)[1]
+    model = _fit_quietly(row.candidate, row.ridge, data)
+    if selection.refined:
+        pieces = cut_pieces(data)
+        room = selection.refined + max(DELAYS)
+        long = pieces.with_episodes([e for e in pieces if len(e) >= room])
+        if len(long):
+            model = refine(model, long, horizon=selection.refined, held_out=long)
+    report = model.report
+    if selection.predictor.input_lead and report is not None:
+        model = replace_report(model, replace(report, input_lead=selection.predictor.input_lead))
+    return model
