@@ -19,7 +19,7 @@ from koopmpc.synthesis.confirm import choose_controller
 from koopmpc.synthesis.designed import Design
 from koopmpc.synthesis.loops.margin import check_share
 from koopmpc.synthesis.options import DesignOptions, check_options, explain_moved
-from koopmpc.synthesis.pose import Goal, pose_task
+from koopmpc.synthesis.pose import ControlGoal, pose_task
 from koopmpc.synthesis.promise import FEW, expect_loops
 from koopmpc.synthesis.rounds import build_test, judge_rounds
 from koopmpc.synthesis.trials import plan_trials
@@ -108,7 +108,7 @@ def design(
     draw, few = checks.generator(asked.rng), FEW if asked.loops is None else asked.loops
     if asked.promised is not None:
         check_share(asked.promised, few)
-    posed = pose_task(data, Goal(cost, limits, reference, horizon, starts), asked)
+    posed = pose_task(data, ControlGoal(cost, limits, reference, horizon, starts), asked)
     plan = plan_trials(posed, asked, draw)
     with Workers(asked.workers, asked.scheduler) as pool:
         results, floor = plan.run(pool, asked)

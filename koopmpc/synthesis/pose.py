@@ -23,7 +23,7 @@ MOVED = (
 
 
 @dataclass(frozen=True, eq=False)
-class Goal:
+class ControlGoal:
     """What is asked of the controller: cost, limits, reference, and the horizon and starts if these are given."""
 
     cost: Cost
@@ -58,7 +58,7 @@ class PosedTask:
     advice: tuple[str, ...]
 
 
-def pose_task(data: Episodes | Source, goal: Goal, options: DesignOptions) -> PosedTask:
+def pose_task(data: Episodes | Source, goal: ControlGoal, options: DesignOptions) -> PosedTask:
     """Return the task on these data.
 
     Raises
