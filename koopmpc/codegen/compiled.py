@@ -202,7 +202,7 @@ class Compiled:
         self._y_shape, self._row_shape, self._row = (self._ny,), (self._nr,), self._reference[0]
         self._rows_shape = self._reference.shape
         self._count, self._has_extras, self._is_double = 1, False, not single
-        self._solver = "" if self._targets is not None else "sequences" if sizes["LEVELED"] else "daqp"
+        self._solver = "" if self._targets is not None else "sequences" if sizes.get("LEVELS") else "daqp"
         if self._targets is not None:
             self._aim(np.zeros((0, self._nr)))
 
@@ -426,7 +426,7 @@ class Compiled:
         """
         misfit = (
             self._timed  # each step has limits of its own
-            or self._sizes["LEVELED"]  # each step has a gap
+            or self._sizes.get("LEVELS")  # each step has a gap
             or rows.shape[1] != self._nr
             or Y.shape[1] != self._ny
             or (W is not None and W.shape[1] != self._nw)

@@ -146,13 +146,17 @@ def _state_iterations(tables: Tables, figure: IterationBound | ObservedIteration
     proved = isinstance(figure, IterationBound)
     if proved and single:
         raise DataError('the bound is one of exact arithmetic, which single precision leaves; export "double"')
-    if proved and not tables.sizes.get("COLD_START", 0):
+    if proved and not tables.sizes.get("SETTINGS_COLD_START", 0):
         raise DataError(
             "the bound is for steps that start cold, and steps of this controller start warm; make it with "
             'settings={"cold_start": True}'
         )
     tables.sizes |= {"MOST_ITERATIONS": figure.most, "ITERATIONS_PROVED": int(proved)}
-    warm = "" if proved or tables.sizes.get("COLD_START", 0) else " Steps of this C start warm: that was not counted."
+    warm = (
+        ""
+        if proved or tables.sizes.get("SETTINGS_COLD_START", 0)
+        else " Steps of this C start warm: that was not counted."
+    )
     tables.effort = f"Iterations of the QP solver: {figure}.{warm}"
 
 
@@ -306,9 +310,9 @@ def _write_readme(tables: Tables, measured: tuple[int, int, int] | None, precisi
     rows.append(("floating-point operations of a step without active limits, at most", str(count_flops(tables))))
     if not tables.is_lqr:
         limit, what = MOST if tables.is_staged else int(tables.settings["iter_limit"]), "iteration"
-        if sizes["LEVELED"]:
+        if sizes.get("LEVELS"):
             limit, what = sizes["NODES"], "node"
-        of = "of the search over levels" if sizes["LEVELED"] else "of the QP solver in one solve"
+        of = "of the search over levels" if sizes.get("LEVELS") else "of the QP solver in one solve"
         rows += [
             (f"{what}s {of}, at most", str(limit)),
             (f"floating-point operations of one {what}, at most", str(count_iteration_flops(tables))),

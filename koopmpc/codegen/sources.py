@@ -12,51 +12,65 @@ from koopmpc.codegen.tables import CFunction, Tables
 from koopmpc.control.program import trace_graph
 from koopmpc.errors import DataError
 
-_OWN = ("koopmpc.h", "koopmpc_common.h", "koopmpc_common.c")
-_RECEDING = ("koopmpc_receding.h", "koopmpc_receding.c", "koopmpc_bounds.h", "koopmpc_levels.h")
-_QP = ("koopmpc_qp.h", "koopmpc_qp.c", "koopmpc_daqp.c")
-_STAGES = ("koopmpc_stages.h", "koopmpc_stages.c", "koopmpc_staged.c")
-_STAGED = (*_STAGES, "koopmpc_rest.c", "koopmpc_rows.c", "koopmpc_finish.c")
+_OWN = ("koopmpc.h", "koopmpc_step.h", "koopmpc_step.c", "koopmpc_observe.c")
+_QP = ("koopmpc_qp.c", "koopmpc_daqp.c")
+_STAGED = ("stages.h", "stages.c", "staged.c", "rest.c", "rows.c", "finish.c")
 _SOLVER = ("daqp.c", "auxiliary.c", "factorization.c", "constants.h", "types.h", "auxiliary.h", "daqp.h")
 _SOLVER_FILES = (*_SOLVER, "factorization.h", "LICENSE")
+_PUBLIC = {"NX", "NY", "NU", "NR", "NW", "N", "LATENCY", "HORIZON", "MOST_ITERATIONS", "ITERATIONS_PROVED", "TARGET"}
 _CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"  # for the step times of a whole run
 
 
+def list_files(tables: Tables) -> tuple[str, ...]:
+    """Return the names of the shipped files that a controller takes."""
+    sizes = tables.sizes
+    if tables.is_staged:
+        parts = {"motion.c": sizes["BEYOND"], "stage_bounds.c": sizes.get("BOUNDS")}
+        names = (*_STAGED, *(name for name, needed in parts.items() if needed))
+        return (*_OWN, *(f"koopmpc_{name}" for name in names), *(_QP if sizes["FINISH_ROWS"] else ()))
+    law = ("koopmpc_feedback.c",) if tables.is_lqr else ("koopmpc_condensed.c",)
+    parts = (f"koopmpc_{name}.c" for name in ("bounds", "levels") if sizes.get(name.upper()))
+    return (*_OWN, *_QP, "koopmpc_target.c", *law, *parts)
+
+
 def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
-    """Return the text of every file by its name: header, controller, model, numbers, solver."""
-    language = Language(single)
-    if tables.is_staged:
-        own = (*_OWN, *_RECEDING, *_STAGED, *(["koopmpc_motion.c"] if tables.sizes["BEYOND"] else ()))
-        own = (*own, *(_QP if tables.sizes["FINISH_ROWS"] else ()))
-        own = (*own, *(["koopmpc_stage_bounds.c"] if tables.sizes["BOUNDS"] else ()))
-    else:
-        law = ("koopmpc_lqr.c",) if tables.is_lqr else (*_RECEDING, "koopmpc_mpc.c")
-        law = (*law, *(["koopmpc_bounds.c"] if tables.sizes["BOUNDS"] else ()))
-        law = (*law, *(["koopmpc_levels.c"] if tables.sizes["LEVELED"] else ()))
-        own = (*_OWN, *_QP, "koopmpc_target.c", *law)
+    """Return the text of every file by its name: header, controller, model, tables, solver.
+
+    The arrays that one file alone names stand in a header of its own, so that each is compiled once.
+    """
+    language, own = Language(single), list_files(tables)
     result = {name: read_shipped("c", name) for name in own}
-    result["koopmpc_sizes.h"] = _write_sizes(tables, single=single)
-    result["koopmpc_solver.h"] = _write_solver(tables, language)
-    arrays = {
-        "limits": ("Limits of the inputs.", language.arrays(tables.limits)),
-        "observer": ("The observer's model.", language.arrays(tables.observer)),
-        "plan": ("The plan and its limits.", language.arrays(tables.plan)),
-    }
-    if tables.is_staged:
-        arrays["table"] = "Targets of reference rows.", language.arrays(tables.targets)
-    else:
-        arrays["targets"] = "Targets and their limits.", _write_targets(tables, language)
-    for name, (what, body) in arrays.items():
-        result[f"koopmpc_{name}.h"] = _write_header(name, f"{what} Matrices stand column after column.", body)
+    result["koopmpc_sizes.h"] = _write_sizes(tables, "\n".join(result.values()), single=single)
+    shared, alone = _share_arrays(tables)
+    what = "Matrices stand column after column, tables of integers row after row."
+    for name, arrays in alone.items():
+        header = f"{name.removeprefix('koopmpc_')}_tables"
+        result[f"koopmpc_{header}.h"] = _write_header(header, f"Tables of {name}.c. {what}", language.arrays(arrays))
+    body = _write_reals(tables, language) + language.arrays(shared)
+    result["koopmpc_tables.h"] = _write_header("tables", f"Tables of several files. {what}", body)
     if "koopmpc_qp.c" in own:
         result |= {f"daqp/{name}": read_shipped("daqp", name) for name in _SOLVER_FILES}
         result["koopmpc_names.h"] = _write_names()
-    header = "koopmpc_stages.h" if tables.is_staged else "koopmpc.h"
+    header = "koopmpc_stages.h" if tables.is_staged else "koopmpc_step.h"
     result["koopmpc_model.c"] = (
         "/** @file koopmpc_model.c @brief The model, written from CasADi's graph. */\n#include <math.h>\n\n"
-        f'#include "{header}"\n\n' + write_functions(tables.functions, language)
+        f'#include "{header}"\n\n'
+        + write_functions({f"koopmpc_{name}": each for name, each in tables.functions.items()}, language)
     )
     return result
+
+
+def _share_arrays(tables: Tables) -> tuple[dict[str, np.ndarray], dict[str, dict[str, np.ndarray]]]:
+    """Return the arrays that several files of a controller name, and of each other file those that it names alone."""
+    texts = {name: read_shipped("c", name) for name in list_files(tables)}
+    named = {name: set(re.findall(r"\bkoopmpc_(\w+)", text)) for name, text in texts.items()}
+    alone = {name[:-2]: dict[str, np.ndarray]() for name, text in texts.items() if f'"{name[:-2]}_tables.h"' in text}
+    shared = dict[str, np.ndarray]()
+    for path, values in tables.arrays.items():
+        users = [name for name, words in named.items() if path in words]
+        if users:
+            (alone[users[0][:-2]] if len(users) == 1 and users[0][:-2] in alone else shared)[path] = values
+    return shared, alone
 
 
 def write_one_source(tables: Tables, *, single: bool) -> str:
@@ -143,21 +157,22 @@ def count_flops(tables: Tables) -> int:
     cost = {name: count_function_flops(each.graph) for name, each in tables.functions.items()}
     nz = sizes["NZ"]
     if tables.is_lqr:
-        return cost["koopmpc_lift"] + 2 * sizes["NU"] * (nz + sizes["NW"] + sizes["NR"] + 2 * sizes["NU"])
+        return cost["lift"] + 2 * sizes["NU"] * (nz + sizes["NW"] + sizes["NR"] + 2 * sizes["NU"])
     if tables.is_staged:
-        N, ns, nr = sizes["N"], sizes["POINT"], sizes["TRACKED"]
-        stage = cost["koopmpc_slopes"] + cost["koopmpc_tracked"] + cost["koopmpc_limited"] + 2 * ns * nr * (nr + ns)
+        N, ns, nr = sizes["N"], sizes["NS"], sizes["TRACKED"]
+        stage = cost["slopes"] + cost["tracked"] + cost["limited"] + 2 * ns * nr * (nr + ns)
         end = 2 * sizes["END"] * (nr * ns + ns * ns)
         halvings = 10  # of a step, at most
-        one = N * (stage + halvings * cost["koopmpc_stage_map"]) + end + _count_sweeps(tables, 1)
-        return sizes["ITERATIONS"] * one + (sizes["LATENCY"] + sizes["ESTIMATOR"] + 1) * cost["koopmpc_map"]
+        one = N * (stage + halvings * cost["stage_map"]) + end + _count_sweeps(tables, 1)
+        return sizes["ITERATIONS"] * one + (sizes["LATENCY"] + sizes["ESTIMATOR"] + 1) * cost["map"]
     model = 2 * nz * (nz + sizes["NU"] + sizes["NW"])
-    filtered = {0: 0, 1: model + 8 * nz * sizes["NX"], 2: 4 * sizes["NS"] ** 2 * (1 + sizes.get("DELAY_Y", 0))}
+    filtered = {
+        0: 0,
+        1: model + 8 * nz * sizes["NX"],
+        2: 4 * sizes.get("ESTIMATOR_F_LENGTH", 0) ** 2 * (1 + sizes.get("ESTIMATOR_DELAY", 0)),
+    }
     return (
-        cost["koopmpc_lift"]
-        + 2 * sizes["NT"] * (sizes["KNOWN"] + 1)
-        + sizes["LATENCY"] * model
-        + filtered[sizes["ESTIMATOR"]]
+        cost["lift"] + 2 * sizes["NT"] * (sizes["KNOWN"] + 1) + sizes["LATENCY"] * model + filtered[sizes["ESTIMATOR"]]
     )
 
 
@@ -165,8 +180,8 @@ def count_iteration_flops(tables: Tables) -> int:
     """Return a bound of the floating-point operations of one iteration of the QP solver, or of one node of a search."""
     if tables.is_staged:
         return _count_sweeps(tables, 2) + 100 * tables.sizes["N"] * (tables.sizes["SIDES"] + 1)
-    if tables.sizes["LEVELED"]:
-        return 2 * tables.sizes["FREE_MOVES"] * (tables.sizes["SEARCH_ROWS"] + 4)
+    if tables.sizes.get("LEVELS"):
+        return 2 * tables.sizes["LEVELS_FREE_LENGTH"] * (tables.sizes["LEVELS_ROWS_LENGTH"] + 4)
     n, m = tables.sizes["MOVES"], tables.sizes["QP_M"]
     rank = n + tables.sizes["QP_SOFT"] + 1
     return 2 * n * m + 4 * n * rank + 4 * rank * rank
@@ -175,7 +190,7 @@ def count_iteration_flops(tables: Tables) -> int:
 def _count_sweeps(tables: Tables, gradients: int) -> int:
     """Return the operations of a Riccati factorisation of all stages, and of the sweeps for so many gradients."""
     sizes = tables.sizes
-    n, m, g = sizes["POINT"], sizes["NU"], sizes["LIMITED"]
+    n, m, g = sizes["NS"], sizes["NU"], sizes["LIMITED"]
     factor = 4 * n**3 + 8 * n * n * m + 6 * n * m * m + m**3 + 3 * n * n * (g + 1) + 22 * m
     return sizes["N"] * (factor + gradients * (8 * n * n + 16 * n * m + 4 * m * m + 4 * n * g))
 
@@ -188,8 +203,12 @@ def _write_header(name: str, what: str, body: str) -> str:
     )
 
 
-def _write_sizes(tables: Tables, *, single: bool) -> str:
-    lines = [f"#define KOOPMPC_{name} {value}" for name, value in sorted(tables.sizes.items())]
+def _write_sizes(tables: Tables, text: str, *, single: bool) -> str:
+    """Return the header of the sizes that a text names; one that the Program lacks is 0."""
+    named = set(re.findall(r"\bKOOPMPC_([A-Z][A-Z0-9_]*[A-Z0-9])\b", text)) - {"FLOAT", "FN", "SQRT", "DT", "SETTINGS"}
+    named -= set(re.findall(r"(?:#define KOOPMPC_(?=\w)|KOOPMPC_(?=\w+ = ))(\w+)", text)) | tables.reals.keys()
+    sizes = dict.fromkeys(named, 0) | {name: size for name, size in tables.sizes.items() if name in named | _PUBLIC}
+    lines = [f"#define KOOPMPC_{name} {value}" for name, value in sorted(sizes.items())]
     precision = "#define KOOPMPC_FLOAT\n#define DAQP_SINGLE_PRECISION\n" if single else ""
     functions = "#define KOOPMPC_FN(name) name##f\n" if single else "#define KOOPMPC_FN(name) name\n"
     dt = f"#define KOOPMPC_DT {tables.program.dt!r}\n"
@@ -198,34 +217,18 @@ def _write_sizes(tables: Tables, *, single: bool) -> str:
     return _write_header("sizes", "Sizes of this controller.", body)
 
 
-def _write_solver(tables: Tables, language: Language) -> str:
+def _write_reals(tables: Tables, language: Language) -> str:
     lines = [f"#define KOOPMPC_{name} {language.number(value)}" for name, value in sorted(tables.reals.items())]
     whole = {"cycle_tol", "iter_limit"}
     settings = ", ".join(
         f".{name} = {int(value) if name in whole else language.number(value)}"
         for name, value in tables.settings.items()
     )
-    if settings:
-        lines.append(f"#define KOOPMPC_SETTINGS {{{settings}}}")
-    return _write_header("solver", "Settings of the QP solver.", "\n".join(lines) + "\n")
-
-
-def _write_targets(tables: Tables, language: Language) -> str:
-    body = language.arrays(tables.targets)
-    none = "static const koopmpc_real koopmpc_target_free[1] = {0};\n"
-    entries: list[str] = []
-    for which, (n, m) in enumerate(tables.target_qps):
-        arrays = ", ".join(f"koopmpc_target_{name}_{which}" for name in ("M", "scaling", "rinv", "sense"))
-        entries.append(f"  {{{n}, {m}, 0, {arrays}, koopmpc_target_free, koopmpc_target_free}},")
-    units = ", ".join(f"koopmpc_target_unit_{which}" for which in range(len(tables.target_qps)))
-    return (
-        f"{body}{none}static const koopmpc_qp koopmpc_target_qps[2] = {{\n"
-        + "\n".join(entries)
-        + f"\n}};\nstatic const koopmpc_real *const koopmpc_target_unit[2] = {{{units}}};\n"
-    )
+    lines.append(f"#define KOOPMPC_SETTINGS {{{settings}}}")
+    return "\n".join(lines) + "\n\n"
 
 
 def count_constants(tables: Tables) -> int:
     """Return how many numbers the controller's tables hold."""
-    groups = (tables.limits, tables.observer, tables.plan, tables.targets)
-    return sum(max(1, np.size(values)) for group in groups for values in group.values())
+    shared, alone = _share_arrays(tables)
+    return sum(max(1, values.size) for group in (shared, *alone.values()) for values in group.values())

@@ -23,9 +23,14 @@ SETTINGS = (*SINGLE, "fval_bound", *_OTHERS)
 
 FLAT = 1e-6  # the least weight of a target's coordinates in single precision, whose rounding would hide Python's 1e-9
 
-OF_ALL = {"WIDER": (1e-8, 1e-5), "ACCURACY": (1e-6, 5e-3), "ROUNDING": (ROUNDING, 1e-6), "AT_REST": (AT_REST, 1e-6)}
-OF_LEVELS = {"NEAR_LEVEL": (NEAR, 1e-4), "BETTER": (1 - EQUAL, 1 - 1e-6)}
-OF_STAGES = {
+# The tolerances of C by their names there: in double precision, and in single.
+IN_C = {
+    "WIDER": (1e-8, 1e-5),
+    "ACCURACY": (1e-6, 5e-3),
+    "ROUNDING": (ROUNDING, 1e-6),
+    "AT_REST": (AT_REST, 1e-6),
+    "NEAR_LEVEL": (NEAR, 1e-4),
+    "BETTER": (1 - EQUAL, 1 - 1e-6),
     "PRECISE": (PRECISE, 1e-6),
     "ENOUGH": (ENOUGH, 1e-4),
     "DIGITS": (DIGITS, 1e-6),

@@ -32,8 +32,7 @@ from koopmpc.control.solvers.daqp import DAQPSetup, daqp_settings
 from koopmpc.control.target import Targets, Units, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.estimate.observer import Measured
-from koopmpc.plants.graph import Graph
+from koopmpc.estimate.observer import EstimatorProgram, Measured
 from koopmpc.predict.predictors import LinearPredictor
 
 _Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
@@ -131,14 +130,11 @@ class FeedbackProgram(LinearProgram):
         (nu, nz), and (nu, nu) where changes of the inputs are weighed, else (nu, 0).
     feedforward
         (nu, nw + nr + nu).
-    gate
-        Which readings are refused; None where no past of them is kept.
     """
 
     K: Float[np.ndarray, "nu nz"]
     K_rate: Float[np.ndarray, "nu rates"]
     feedforward: Float[np.ndarray, "nu driving"]
-    gate: Graph | None = None
 
 
 def feedback_program(
@@ -153,7 +149,7 @@ def feedback_program(
     *,
     K_rate: Float[np.ndarray, "nu m"] | None = None,
     given: Float[np.ndarray, "k nu"] | None = None,
-    gate: Graph | None = None,
+    estimator: EstimatorProgram | None = None,
 ) -> FeedbackProgram:
     """Return the Program of u = feedforward [w; r; u_r] − K ψ(ζ) − K_rate u_{k−1}; see `FeedbackProgram`."""
     parts = linear_parts(predictor, targets)
@@ -170,7 +166,7 @@ def feedback_program(
         K=K,
         K_rate=np.zeros((len(K), 0)) if K_rate is None else K_rate,
         feedforward=feedforward,
-        gate=gate,
+        estimator=EstimatorProgram() if estimator is None else estimator,
     )
 
 
@@ -262,7 +258,7 @@ class LQR(FeedbackLaw):
             self._v,
             K_rate=self._K_rate,
             given=self._given_rows,
-            gate=self._observer.program().gate,
+            estimator=self._observer.program(),
         )
 
     @alone

@@ -101,6 +101,8 @@ class StepProgram(Program):
         (n, nz) how z moves the planned inputs: with `sizes` it tells what single precision costs.
     settings
         All settings of DAQP.
+    estimator
+        How z and d follow from y.
     notes
         Sentences on how the C code differs from the controller.
     """
@@ -114,6 +116,7 @@ class StepProgram(Program):
     sizes: Float[np.ndarray, " nz"]
     gain: Float[np.ndarray, "moves nz"]
     settings: Mapping[str, Any]
+    estimator: EstimatorProgram
     notes: tuple[str, ...] = ()
 
     @property

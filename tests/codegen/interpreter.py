@@ -105,7 +105,7 @@ class Estimate:
         self.last, self.bridged = None, 0
         self.forget()
         self.missed, self.queue = 0, None
-        self.gate = program.gate if self.rule is None else self.rule.gate
+        self.gate = self.rule.gate
         self.memory = None if self.gate is None else np.zeros(self.gate.m - 2)
         self.refused, self.opened, self.lost, self.stood_in = False, False, False, False
         if self.kind == "FilterProgram":

@@ -73,26 +73,6 @@ typedef struct {
 } koopmpc_bounds;
 #endif
 
-#if KOOPMPC_IS_LQR
-
-/** The state of the controller between two steps. */
-typedef struct {
-  koopmpc_real last[KOOPMPC_NU]; /**< the last input */
-  koopmpc_real zeta[KOOPMPC_NZETA];
-  koopmpc_real z[KOOPMPC_NZ];
-  koopmpc_real target_reals[KOOPMPC_TARGET_REALS]; /**< memory of the solver of targets */
-  int target_ints[KOOPMPC_TARGET_INTS];
-  int seen; /**< whether zeta holds a past; only for models with delays */
-  int row;  /**< row of given input targets */
-#if KOOPMPC_GATE
-  koopmpc_real gate[KOOPMPC_GATE], w[KOOPMPC_NW1], from[KOOPMPC_NZ];
-  koopmpc_real used_w[KOOPMPC_NW1]; /**< the last w that was not wild */
-  int has_z, bridged, doubted;
-#endif
-} koopmpc_state;
-
-#else
-
 /** The state of the controller between two steps. */
 typedef struct {
   koopmpc_real known[KOOPMPC_KNOWN + 1];   /**< [z; u_{-1}; w_0 ...; d], where the plan starts */
@@ -109,14 +89,14 @@ typedef struct {
   koopmpc_real w[KOOPMPC_NW1];
   koopmpc_real zeta[KOOPMPC_NZETA];
   koopmpc_real z[KOOPMPC_NZ], d[KOOPMPC_NZ];
-  koopmpc_real scratch[2 * KOOPMPC_NS + 2];
+  koopmpc_real scratch[2 * (KOOPMPC_NZ + KOOPMPC_ESTIMATOR_F_LENGTH) + 2];
 #if KOOPMPC_ESTIMATOR == 1
   koopmpc_real newest[KOOPMPC_NZ + 2 * KOOPMPC_NX], means[KOOPMPC_NZ + 2 * KOOPMPC_NX];
   koopmpc_real sizes[KOOPMPC_NX], weights[KOOPMPC_NX], fresh, change;
   int learned, stood_in;
 #elif KOOPMPC_ESTIMATOR == 2
-  koopmpc_real s[KOOPMPC_NS];
-  koopmpc_real queue[(KOOPMPC_DELAY_Y + 1) * (KOOPMPC_NU + KOOPMPC_NW1)];
+  koopmpc_real s[KOOPMPC_ESTIMATOR_F_LENGTH];
+  koopmpc_real queue[(KOOPMPC_ESTIMATOR_DELAY + 1) * (KOOPMPC_NU + KOOPMPC_NW1)];
   koopmpc_real innovation[KOOPMPC_NY], factor[KOOPMPC_NY * KOOPMPC_NY];
   int queued, started, missed;
 #endif
@@ -126,23 +106,27 @@ typedef struct {
   koopmpc_real used_w[KOOPMPC_NW1]; /**< the last w that was not wild */
   int has_z, bridged, doubted;     /**< doubted: wild w in sequence */
 #endif
+#if !KOOPMPC_IS_STAGED
+  koopmpc_real target_reals[KOOPMPC_TARGET_REALS]; /**< memory of the solver of targets */
+  int target_ints[KOOPMPC_TARGET_INTS];
+#endif
 #if KOOPMPC_IS_STAGED
-  koopmpc_real S[(KOOPMPC_N + 1) * KOOPMPC_POINT], V[KOOPMPC_MOVES];         /**< the plan: states, inputs of stages */
-  koopmpc_real bestS[(KOOPMPC_N + 1) * KOOPMPC_POINT], bestV[KOOPMPC_MOVES]; /**< the best plan of several starts */
+  koopmpc_real S[(KOOPMPC_N + 1) * KOOPMPC_NS], V[KOOPMPC_MOVES];         /**< the plan: states, inputs of stages */
+  koopmpc_real bestS[(KOOPMPC_N + 1) * KOOPMPC_NS], bestV[KOOPMPC_MOVES]; /**< the best plan of several starts */
   koopmpc_real draftX[(KOOPMPC_N + 1) * KOOPMPC_NZ], draftU[KOOPMPC_MOVES];
   koopmpc_real R[KOOPMPC_N * KOOPMPC_TRACKED], U_r[KOOPMPC_MOVES], u_r[KOOPMPC_MOVES]; /**< targets of the stages */
-  koopmpc_real end_M[KOOPMPC_END * KOOPMPC_TRACKED], end_L[KOOPMPC_END * KOOPMPC_POINT], end_m[KOOPMPC_END];
+  koopmpc_real end_M[KOOPMPC_END * KOOPMPC_TRACKED], end_L[KOOPMPC_END * KOOPMPC_NS], end_m[KOOPMPC_END];
 #if KOOPMPC_BEYOND
   koopmpc_real beyond[KOOPMPC_BEYOND * KOOPMPC_NR]; /**< rows after those of the reference that moves */
 #endif
   koopmpc_real rest[KOOPMPC_NZ]; /**< the equilibrium that the plan leads to */
-  koopmpc_real A[KOOPMPC_N * KOOPMPC_POINT * KOOPMPC_POINT], B[KOOPMPC_MOVES * KOOPMPC_POINT]; /**< the program */
-  koopmpc_real Q[KOOPMPC_N * KOOPMPC_POINT * KOOPMPC_POINT], G[KOOPMPC_N * KOOPMPC_LIMITED1 * KOOPMPC_POINT];
-  koopmpc_real c[KOOPMPC_N * KOOPMPC_POINT], q[KOOPMPC_N * KOOPMPC_POINT], r[KOOPMPC_MOVES];
-  koopmpc_real g[KOOPMPC_N * KOOPMPC_LIMITED1], start[KOOPMPC_POINT];
-  koopmpc_real K[KOOPMPC_MOVES * KOOPMPC_POINT], half[KOOPMPC_MOVES * KOOPMPC_NU]; /**< its Riccati recursion */
-  koopmpc_real gradient[KOOPMPC_N * KOOPMPC_POINT], feed[KOOPMPC_MOVES], curvature[KOOPMPC_MOVES];
-  koopmpc_real dX[KOOPMPC_N * KOOPMPC_POINT], dU[KOOPMPC_MOVES], newX[KOOPMPC_N * KOOPMPC_POINT], newU[KOOPMPC_MOVES];
+  koopmpc_real A[KOOPMPC_N * KOOPMPC_NS * KOOPMPC_NS], B[KOOPMPC_MOVES * KOOPMPC_NS]; /**< the program */
+  koopmpc_real Q[KOOPMPC_N * KOOPMPC_NS * KOOPMPC_NS], G[KOOPMPC_N * KOOPMPC_LIMITED1 * KOOPMPC_NS];
+  koopmpc_real c[KOOPMPC_N * KOOPMPC_NS], q[KOOPMPC_N * KOOPMPC_NS], r[KOOPMPC_MOVES];
+  koopmpc_real g[KOOPMPC_N * KOOPMPC_LIMITED1], start[KOOPMPC_NS];
+  koopmpc_real K[KOOPMPC_MOVES * KOOPMPC_NS], half[KOOPMPC_MOVES * KOOPMPC_NU]; /**< its Riccati recursion */
+  koopmpc_real gradient[KOOPMPC_N * KOOPMPC_NS], feed[KOOPMPC_MOVES], curvature[KOOPMPC_MOVES];
+  koopmpc_real dX[KOOPMPC_N * KOOPMPC_NS], dU[KOOPMPC_MOVES], newX[KOOPMPC_N * KOOPMPC_NS], newU[KOOPMPC_MOVES];
   koopmpc_real t[KOOPMPC_PAIRS], lam[KOOPMPC_PAIRS], d_side[KOOPMPC_PAIRS]; /**< its limits */
   koopmpc_real gap[KOOPMPC_PAIRS], eased[KOOPMPC_PAIRS], base[KOOPMPC_PAIRS], second[KOOPMPC_PAIRS];
   koopmpc_real step_t[KOOPMPC_PAIRS], step_lam[KOOPMPC_PAIRS];
@@ -155,7 +139,7 @@ typedef struct {
   koopmpc_real low[KOOPMPC_N * (KOOPMPC_NU + KOOPMPC_LIMITED)], high[KOOPMPC_N * (KOOPMPC_NU + KOOPMPC_LIMITED)];
   koopmpc_real box_low[KOOPMPC_MOVES], box_high[KOOPMPC_MOVES]; /**< limits of the stages, and of their inputs */
 #endif
-  koopmpc_real without_limits[KOOPMPC_NU], defects[KOOPMPC_POINT], length, slack, best_slack;
+  koopmpc_real without_limits[KOOPMPC_NU], defects[KOOPMPC_NS], length, slack, best_slack;
   koopmpc_real e[KOOPMPC_PUSHES]; /**< E w + d of the stages */
 #if KOOPMPC_FINISH_ROWS
   koopmpc_real finish_M[KOOPMPC_FINISH_ROWS * KOOPMPC_FINISH_WIDTH], finish_reals[KOOPMPC_FINISH_REALS];
@@ -186,12 +170,10 @@ typedef struct {
   int spent;                   /**< the effort of the solver in this step, in interior-point steps */
   int target_count, found;     /**< number of its rows, and the row that was found last */
   int moved_on;                /**< whether the disturbance or the row of given input targets has moved */
-#else
+#elif !KOOPMPC_IS_LQR
   koopmpc_real t[KOOPMPC_NT];              /**< the plan of this step, and the extreme values of its targets */
   koopmpc_real column[KOOPMPC_NT];         /**< the reference's part of the plan */
   koopmpc_real dual[KOOPMPC_QP_M1];        /**< multipliers of the last solve, from which the next one starts */
-  koopmpc_real target_reals[KOOPMPC_TARGET_REALS]; /**< memory of the solver of targets */
-  int target_ints[KOOPMPC_TARGET_INTS];
   koopmpc_real qp_reals[KOOPMPC_QP_REALS]; /**< memory of the QP solver, and the rows that it ended with */
   int qp_ints[KOOPMPC_QP_INTS];
 #if KOOPMPC_STEEP
@@ -201,11 +183,11 @@ typedef struct {
   koopmpc_real low[KOOPMPC_NT], high[KOOPMPC_NT]; /**< limits of the plan, of its inputs, of targets */
   koopmpc_real box_low[KOOPMPC_MOVES], box_high[KOOPMPC_MOVES], rate_low[KOOPMPC_NU], rate_high[KOOPMPC_NU];
   koopmpc_real opened_low[KOOPMPC_MOVES], opened_high[KOOPMPC_MOVES];
-  koopmpc_real target_low[(KOOPMPC_N + 1) * KOOPMPC_NL], target_high[(KOOPMPC_N + 1) * KOOPMPC_NL];
+  koopmpc_real target_low[(KOOPMPC_N + 1) * KOOPMPC_NL + 1], target_high[(KOOPMPC_N + 1) * KOOPMPC_NL + 1];
   koopmpc_real unpushed; /**< no limit moves a target of rows that are no larger */
   koopmpc_real peak;     /**< the largest number of the last reference */
 #endif
-#if KOOPMPC_LEVELED
+#if KOOPMPC_LEVELS
   int level[KOOPMPC_NU], level_steps[KOOPMPC_NU]; /**< level of each input, and for how many steps it has held it */
   int level_begins;                               /**< whether no input has acted yet: the first change is free */
   int plan_levels[KOOPMPC_MOVES], has_levels;     /**< levels of the last plan */
@@ -222,8 +204,6 @@ typedef struct {
   int seen;       /**< whether zeta holds a past; only for models with delays */
   int refused;    /**< whether the last y was refused */
 } koopmpc_state;
-
-#endif
 
 /**
  * Forget all earlier steps.
@@ -276,7 +256,7 @@ void koopmpc_lift(const koopmpc_real *zeta, koopmpc_real *z);
 int koopmpc_plan_states(const koopmpc_state *s, koopmpc_real *X);
 
 /**
- * Take the targets of reference rows from another table than that of koopmpc_table.h. The target of a row that the
+ * Take the targets of reference rows from another table than koopmpc_table. The target of a row that the
  * table lacks is found by the step that meets it, from the nearest one of the table.
  * @param s       the state
  * @param targets `count` rows of KOOPMPC_TARGET numbers; the memory must stay valid

@@ -1,25 +1,20 @@
 /** @file koopmpc_bounds.c @brief Limits that move in time: the right-hand sides of a plan from rows of bounds. */
-#include "koopmpc_bounds.h"
-#include "koopmpc_limits.h"
-#include "koopmpc_plan.h"
-#include "koopmpc_qp.h"
-#include "koopmpc_receding.h"
-#include "koopmpc_solver.h"
-#include "koopmpc_targets.h"
+#include "koopmpc_bounds_tables.h"
+#include "koopmpc_step.h"
 
 #if KOOPMPC_BOUNDS
 void koopmpc_reset_bounds(koopmpc_state *s) {
   koopmpc_copy(s->low, koopmpc_low, KOOPMPC_NT);
   koopmpc_copy(s->high, koopmpc_high, KOOPMPC_NT);
   for (int j = 0; j < KOOPMPC_MOVES; j++) {
-    s->box_low[j] = koopmpc_input_low[j % KOOPMPC_NU];
-    s->box_high[j] = koopmpc_input_high[j % KOOPMPC_NU];
+    s->box_low[j] = koopmpc_inputs_low[j % KOOPMPC_NU];
+    s->box_high[j] = koopmpc_inputs_high[j % KOOPMPC_NU];
   }
-  koopmpc_copy(s->rate_low, koopmpc_rate_low, KOOPMPC_NU);
-  koopmpc_copy(s->rate_high, koopmpc_rate_high, KOOPMPC_NU);
+  koopmpc_copy(s->rate_low, koopmpc_rates_low, KOOPMPC_NU);
+  koopmpc_copy(s->rate_high, koopmpc_rates_high, KOOPMPC_NU);
   for (int k = 0; k <= KOOPMPC_N; k++) {
-    koopmpc_copy(s->target_low + k * KOOPMPC_NL, koopmpc_target_low, KOOPMPC_NL);
-    koopmpc_copy(s->target_high + k * KOOPMPC_NL, koopmpc_target_high, KOOPMPC_NL);
+    koopmpc_copy(s->target_low + k * KOOPMPC_NL, koopmpc_targets_low, KOOPMPC_NL);
+    koopmpc_copy(s->target_high + k * KOOPMPC_NL, koopmpc_targets_high, KOOPMPC_NL);
   }
   s->unpushed = KOOPMPC_UNPUSHED;
 }
@@ -49,8 +44,8 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
 #else
   for (int at = 0; at < KOOPMPC_MOVES; at++) { /* the tightest limits of the steps in which a move is held */
     koopmpc_real low = -KOOPMPC_HUGE, high = KOOPMPC_HUGE;
-    for (int k = 0; k < koopmpc_hold_count[at]; k++) {
-      const int row = (koopmpc_hold_first[at] + k) * NU + at % NU;
+    for (int k = 0; k < koopmpc_bounds_count[at]; k++) {
+      const int row = (koopmpc_bounds_first[at] + k) * NU + at % NU;
       low = u_low[row] > low ? u_low[row] : low;
       high = u_high[row] < high ? u_high[row] : high;
     }
@@ -59,35 +54,37 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
   }
 #endif
   for (int at = 0; at < KOOPMPC_MOVES; at++) {
-    s->low[at] = koopmpc_tied[at] ? -KOOPMPC_HUGE : s->box_low[at];
-    s->high[at] = koopmpc_tied[at] ? KOOPMPC_HUGE : s->box_high[at];
+    s->low[at] = koopmpc_bounds_tied[at] ? -KOOPMPC_HUGE : s->box_low[at];
+    s->high[at] = koopmpc_bounds_tied[at] ? KOOPMPC_HUGE : s->box_high[at];
   }
   for (int at = 0; at < KOOPMPC_MOVES && KOOPMPC_CHANGES; at++) {
-    const int row = LATE + koopmpc_move_start[at / NU], i = at % NU;
-    s->low[KOOPMPC_MOVES + at] = koopmpc_held[at] ? -KOOPMPC_HUGE : koopmpc_bound_of(&b->du_low, row, NU, i);
-    s->high[KOOPMPC_MOVES + at] = koopmpc_held[at] ? KOOPMPC_HUGE : koopmpc_bound_of(&b->du_high, row, NU, i);
+    const int row = LATE + koopmpc_bounds_start[at / NU], i = at % NU;
+    s->low[KOOPMPC_MOVES + at] = koopmpc_bounds_held[at] ? -KOOPMPC_HUGE : koopmpc_bound_of(&b->du_low, row, NU, i);
+    s->high[KOOPMPC_MOVES + at] = koopmpc_bounds_held[at] ? KOOPMPC_HUGE : koopmpc_bound_of(&b->du_high, row, NU, i);
   }
   for (int i = 0; i < NU && KOOPMPC_CHANGES; i++) {
     s->rate_low[i] = koopmpc_bound_of(&b->du_low, LATE, NU, i);
     s->rate_high[i] = koopmpc_bound_of(&b->du_high, LATE, NU, i);
   }
-  for (int j = 0; j < KOOPMPC_N * OUT; j++) {
-    s->low[FIRST + j] = x_low[OUT + j] + koopmpc_inwards[j];
-    s->high[FIRST + j] = x_high[OUT + j] - koopmpc_inwards[j];
-  }
-  for (int i = KOOPMPC_PLANNED; i < KOOPMPC_PLANNED + 2 * KOOPMPC_CHECKED; i++) {
+  for (int k = 0; k < KOOPMPC_N; k++)
+    for (int i = 0; i < OUT; i++) {
+      const int j = k * OUT + i;
+      s->low[FIRST + j] = x_low[OUT + j] + koopmpc_bounds_margin[i * KOOPMPC_N + k];
+      s->high[FIRST + j] = x_high[OUT + j] - koopmpc_bounds_margin[i * KOOPMPC_N + k];
+    }
+  for (int i = KOOPMPC_PLANNED; i < KOOPMPC_PLANNED + 2 * KOOPMPC_CHECKED_COUNT; i++) {
     s->low[i] = -KOOPMPC_HUGE;
     s->high[i] = KOOPMPC_HUGE;
   }
   for (int k = 0; k <= KOOPMPC_N && KOOPMPC_AIMED; k++) { /* limits of the target of this row */
     koopmpc_real *low = s->target_low + k * KOOPMPC_NL, *high = s->target_high + k * KOOPMPC_NL;
     for (int i = 0; i < NU; i++) {
-      low[i] = u_low[k * NU + i] - koopmpc_target_values[i];
-      high[i] = u_high[k * NU + i] - koopmpc_target_values[i];
+      low[i] = u_low[k * NU + i] - koopmpc_bounds_values[i];
+      high[i] = u_high[k * NU + i] - koopmpc_bounds_values[i];
     }
     for (int i = 0; i < OUT; i++) {
-      low[NU + i] = x_low[k * OUT + i] - koopmpc_target_values[NU + i];
-      high[NU + i] = x_high[k * OUT + i] - koopmpc_target_values[NU + i];
+      low[NU + i] = x_low[k * OUT + i] - koopmpc_bounds_values[NU + i];
+      high[NU + i] = x_high[k * OUT + i] - koopmpc_bounds_values[NU + i];
     }
   }
 #if KOOPMPC_AIMED
@@ -114,18 +111,18 @@ void koopmpc_set_bounds(koopmpc_state *s, const koopmpc_bounds *b) {
       below = lower[j] > below ? lower[j] : below;
       above = upper[j] < above ? upper[j] : above;
     }
-    below = koopmpc_target_shift[i] - below;
-    above -= koopmpc_target_shift[i];
+    below = koopmpc_targets_shift[i] - below;
+    above -= koopmpc_targets_shift[i];
     room = below < above ? below : above;
-    room = koopmpc_target_gain[i] > 0 ? room / koopmpc_target_gain[i] : room < 0 ? -1 : KOOPMPC_HUGE;
+    room = koopmpc_targets_gain[i] > 0 ? room / koopmpc_targets_gain[i] : room < 0 ? -1 : KOOPMPC_HUGE;
     s->unpushed = room < s->unpushed ? room : s->unpushed;
   }
-  if (!KOOPMPC_CHECKED_LIMITS && !(s->peak <= before && s->peak <= s->unpushed)) s->aimed = 0; /* else no target moves */
+  if (!KOOPMPC_DISTURBANCE_WIDTH && !(s->peak <= before && s->peak <= s->unpushed)) s->aimed = 0; /* else no target moves */
 #endif
-  for (int i = 0; i < KOOPMPC_CHECKED; i++) { /* the tightest of them, which a plan is tested by */
-    const int at = koopmpc_checked_limit[i];
-    koopmpc_real *low = s->low + KOOPMPC_PLANNED + i, *high = s->high + KOOPMPC_PLANNED + KOOPMPC_CHECKED + i;
-    const koopmpc_real reach = KOOPMPC_ROUNDING * koopmpc_target_size[at];
+  for (int i = 0; i < KOOPMPC_CHECKED_COUNT; i++) { /* the tightest of them, which a plan is tested by */
+    const int at = koopmpc_bounds_checked[i];
+    koopmpc_real *low = s->low + KOOPMPC_PLANNED + i, *high = s->high + KOOPMPC_PLANNED + KOOPMPC_CHECKED_COUNT + i;
+    const koopmpc_real reach = KOOPMPC_ROUNDING * koopmpc_targets_size[at];
     for (int k = 0; k <= KOOPMPC_N; k++) {
       const koopmpc_real below = s->target_low[k * KOOPMPC_NL + at] - reach;
       const koopmpc_real above = s->target_high[k * KOOPMPC_NL + at] + reach;
@@ -144,12 +141,12 @@ koopmpc_real koopmpc_open_rates(koopmpc_state *s) {
   for (int i = 0; i < NU; i++) {
     koopmpc_real least, most, widest = 0;
     const koopmpc_real last = s->known[KOOPMPC_U_PREV + i];
-    if (!koopmpc_hard[i]) continue;
+    if (!koopmpc_bounds_hard[i]) continue;
     least = koopmpc_clip(last + s->opened_low[i], s->box_low[i], s->box_high[i]);
     most = koopmpc_clip(last + s->opened_high[i], s->box_low[i], s->box_high[i]);
     for (int at = i + NU; at < MOVED; at += NU) { /* the inputs that can be reached inside all limits */
-      least += koopmpc_held[at] ? 0 : s->opened_low[at];
-      most += koopmpc_held[at] ? 0 : s->opened_high[at];
+      least += koopmpc_bounds_held[at] ? 0 : s->opened_low[at];
+      most += koopmpc_bounds_held[at] ? 0 : s->opened_high[at];
       if (most < s->box_low[at]) {
         s->opened_high[at] += s->box_low[at] - most;
         if (s->box_low[at] - most > widest) widest = s->box_low[at] - most;
@@ -161,7 +158,7 @@ koopmpc_real koopmpc_open_rates(koopmpc_state *s) {
       least = koopmpc_clip(least, s->box_low[at], s->box_high[at]);
       most = koopmpc_clip(most, s->box_low[at], s->box_high[at]);
     }
-    if (widest > (koopmpc_real)1e-5 * koopmpc_rate_allowance[i] && widest > conflict) conflict = widest;
+    if (widest > (koopmpc_real)1e-5 * koopmpc_bounds_allowance[i] && widest > conflict) conflict = widest;
   }
 #else
   (void)s;

@@ -7,12 +7,10 @@
  */
 #include <math.h>
 
-#include "koopmpc_plan.h"
-#include "koopmpc_solver.h"
+#include "koopmpc_finish_tables.h"
 #include "koopmpc_stages.h"
 
 #if KOOPMPC_FINISH_ROWS > 0
-#include "koopmpc_qp.h"
 
 enum {
   COUNT = KOOPMPC_FINISH_ROWS,
@@ -67,11 +65,13 @@ static int condense(koopmpc_state *s) {
     for (int j = 0; j < WIDTH; j++) row[j] /= size;
     s->finish_size[i] = size;
     s->finish_scaling[i] = 1;
-    s->finish_linear[i] = koopmpc_finish_linear[which] * size;
-    s->finish_rho[i] = 2 * koopmpc_finish_quadratic[which] * size * size;
-    if (s->finish_rho[i] < (koopmpc_real)1e-6 * s->finish_linear[i])
-      s->finish_rho[i] = (koopmpc_real)1e-6 * s->finish_linear[i];
-    s->finish_rho[i] = koopmpc_finish_sense[i] ? 1 / s->finish_rho[i] : 0;
+    s->finish_linear[i] = s->finish_rho[i] = 0;
+    if (koopmpc_finish_sense[i]) { /* half of the prices, as of the cost */
+      const koopmpc_real linear = koopmpc_softness_linear[which - NV] * size / 2;
+      const koopmpc_real curvature = koopmpc_softness_quadratic[which - NV] * size * size;
+      s->finish_linear[i] = linear;
+      s->finish_rho[i] = 1 / (curvature < (koopmpc_real)1e-6 * linear ? (koopmpc_real)1e-6 * linear : curvature);
+    }
   }
   return good;
 }
@@ -128,14 +128,14 @@ koopmpc_status koopmpc_finish(koopmpc_state *s, int *iterations) {
   deviation(s, qp.primal);
   for (int k = 0; k < STEPS; k++)
     for (int i = 0; i < SOFT; i++) {
-      const int row = koopmpc_side_row[HARD + i];
+      const int row = koopmpc_sides_row[HARD + i];
       const koopmpc_real moved = moved_by(s, k * NQ + row);
       const koopmpc_real now = row < NV ? s->V[k * NV + row] + s->dU[k * NV + row]
                                         : s->g[k * NG + row - NV] +
                                               koopmpc_dot(s->G + (k * NG + row - NV) * NS, s->dX + k * NS, NS);
       const koopmpc_real low = koopmpc_low_of(s, k, row), high = koopmpc_high_of(s, k, row);
-      const koopmpc_real past = koopmpc_side_scale[HARD + i] > 0 ? low - now - moved : now + moved - high;
-      s->eps[i * STEPS + k] = past > 0 ? past / koopmpc_side_span[HARD + i] : 0;
+      const koopmpc_real past = koopmpc_sides_scale[HARD + i] > 0 ? low - now - moved : now + moved - high;
+      s->eps[i * STEPS + k] = past > 0 ? past / koopmpc_sides_span[HARD + i] : 0;
     }
   for (int i = 0; i < STEPS * NS; i++) s->dX[i] += s->newX[i];
   for (int i = 0; i < STEPS * NV; i++) s->dU[i] += s->newU[i];

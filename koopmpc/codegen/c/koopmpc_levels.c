@@ -7,14 +7,11 @@
  */
 #include <math.h>
 
-#include "koopmpc_bounds.h"
-#include "koopmpc_levels.h"
-#include "koopmpc_limits.h"
-#include "koopmpc_plan.h"
-#include "koopmpc_solver.h"
+#include "koopmpc_levels_tables.h"
+#include "koopmpc_step.h"
 
-#if KOOPMPC_LEVELED
-enum { NU = KOOPMPC_NU, COUNT = KOOPMPC_FREE_MOVES, OTHERS = KOOPMPC_SEARCH_ROWS, OTHERS1 = OTHERS > 0 ? OTHERS : 1 };
+#if KOOPMPC_LEVELS
+enum { NU = KOOPMPC_NU, COUNT = KOOPMPC_LEVELS_FREE_LENGTH, OTHERS = KOOPMPC_LEVELS_ROWS_LENGTH, OTHERS1 = OTHERS > 0 ? OTHERS : 1 };
 enum { BLOCKS = KOOPMPC_MOVES / NU };
 
 /*
@@ -29,28 +26,28 @@ typedef struct {
   int level[(COUNT + 1) * NU], steps[(COUNT + 1) * NU];
 } search;
 
-static koopmpc_real place_of(koopmpc_real u, int i) { return (u - koopmpc_level_first[i]) / koopmpc_level_spacing[i]; }
+static koopmpc_real place_of(koopmpc_real u, int i) { return (u - koopmpc_levels_levels_first[i]) / koopmpc_levels_levels_spacing[i]; }
 
 static koopmpc_real value_of(int level, int i) {
-  return koopmpc_level_first[i] + koopmpc_level_spacing[i] * (koopmpc_real)level;
+  return koopmpc_levels_levels_first[i] + koopmpc_levels_levels_spacing[i] * (koopmpc_real)level;
 }
 
 static int clip_level(koopmpc_real place, int i) {
-  return (int)koopmpc_clip(place, 0, (koopmpc_real)(koopmpc_level_count[i] - 1));
+  return (int)koopmpc_clip(place, 0, (koopmpc_real)(koopmpc_levels_levels_count[i] - 1));
 }
 
 static int nearest_level(koopmpc_real u, int i) { return clip_level(KOOPMPC_FN(rint)(place_of(u, i)), i); }
 
 /** Steps for which input i has to hold a level. */
-static int dwell_of(int level, int i) { return koopmpc_dwell[2 * i + (level != 0)]; }
+static int dwell_of(int level, int i) { return koopmpc_levels_levels_dwell[2 * i + (level != 0)]; }
 
 /** The lowest and highest level of input i inside (low, high). */
 static void levels_inside(koopmpc_real low, koopmpc_real high, int i, int *least, int *most) {
-  const koopmpc_real last = (koopmpc_real)koopmpc_level_count[i];
+  const koopmpc_real last = (koopmpc_real)koopmpc_levels_levels_count[i];
   const koopmpc_real from = KOOPMPC_FN(ceil)(koopmpc_clip(place_of(low, i), -1, last) - KOOPMPC_NEAR_LEVEL);
   const koopmpc_real to = KOOPMPC_FN(floor)(koopmpc_clip(place_of(high, i), -1, last) + KOOPMPC_NEAR_LEVEL);
   *least = from > 0 ? (int)from : 0;
-  *most = to < last - 1 ? (int)to : koopmpc_level_count[i] - 1;
+  *most = to < last - 1 ? (int)to : koopmpc_levels_levels_count[i] - 1;
 }
 
 void koopmpc_start_levels(koopmpc_state *s, const koopmpc_real *u) {
@@ -74,10 +71,10 @@ void koopmpc_count_levels(koopmpc_state *s, const koopmpc_real *u) {
 void koopmpc_round_levels(const koopmpc_state *s, koopmpc_real *u, const koopmpc_real *before) {
   for (int i = 0; i < NU; i++) {
     int level = nearest_level(u[i], i), least, most;
-#if KOOPMPC_RATED
+#if KOOPMPC_RATES
     const koopmpc_real from = KOOPMPC_FN(ceil)(place_of(before[i] + KOOPMPC_RATES_LOW(s)[i], i) - KOOPMPC_NEAR_LEVEL);
     const koopmpc_real to = KOOPMPC_FN(floor)(place_of(before[i] + KOOPMPC_RATES_HIGH(s)[i], i) + KOOPMPC_NEAR_LEVEL);
-    if (from <= to && from < (koopmpc_real)koopmpc_level_count[i] && to >= 0)
+    if (from <= to && from < (koopmpc_real)koopmpc_levels_levels_count[i] && to >= 0)
       level = (int)koopmpc_clip((koopmpc_real)level, from, to);
 #else
     (void)before;
@@ -100,7 +97,7 @@ static int keeps_dwell(const koopmpc_state *s, const int *levels) {
         level = next;
         steps = 0;
       }
-      steps += koopmpc_block[k];
+      steps += koopmpc_levels_blocks[k];
     }
   }
   return 1;
@@ -124,15 +121,31 @@ int koopmpc_accept_levels(koopmpc_state *s) {
   return 1;
 }
 
+static int is_soft(int row) { return koopmpc_levels_linear[row] < KOOPMPC_HUGE; }
+
+/** The value of a row by the first `count` coordinates, and where a move is by those before it. */
+static koopmpc_real row_value(int row, const koopmpc_real *s, int count) {
+  koopmpc_real sum = 0;
+  for (int k = 0; k < count; k++) sum += koopmpc_levels_T[k * OTHERS + row] * s[k];
+  return sum;
+}
+
+static koopmpc_real centre_of(const koopmpc_state *s, const koopmpc_real *coordinates, int j) {
+  const int at = koopmpc_levels_free[j];
+  koopmpc_real sum = place_of(s->t[at], at % NU);
+  for (int k = 0; k < j; k++) sum += koopmpc_levels_L[k * COUNT + j] * coordinates[k];
+  return sum;
+}
+
 /** Price of the rows that are known once the moves up to j are; negative where a hard one is outside. */
 static koopmpc_real price(const search *now, const koopmpc_real *s, int j) {
   koopmpc_real sum = 0;
-  for (int r = koopmpc_row_start[j]; r < koopmpc_row_start[j + 1]; r++) {
-    const koopmpc_real value = koopmpc_dot(koopmpc_row_of + r * COUNT, s, j + 1);
+  for (int r = koopmpc_levels_first[j]; r < koopmpc_levels_first[j + 1]; r++) {
+    const koopmpc_real value = row_value(r, s, j + 1);
     const koopmpc_real over = value - now->high[r], under = now->low[r] - value, past = over > under ? over : under;
     if (!(past > 0)) continue;
-    if (!koopmpc_row_soft[r]) return -1;
-    sum += past * (koopmpc_row_linear[r] + past * koopmpc_row_quadratic[r]);
+    if (!is_soft(r)) return -1;
+    sum += past * (koopmpc_levels_linear[r] + past * koopmpc_levels_quadratic[r]);
   }
   return sum;
 }
@@ -146,17 +159,14 @@ static void guess(const koopmpc_state *s, search *now) {
     levels[at] = s->plan_levels[next];
   }
   for (int j = 0; j < COUNT; j++) {
-    const int level = levels[koopmpc_free_move[j]];
+    const int level = levels[koopmpc_levels_free[j]];
     now->index[j] = level < now->least[j] ? now->least[j] : level > now->most[j] ? now->most[j] : level;
   }
-  for (int at = 0; at < KOOPMPC_MOVES; at++) levels[at] = now->index[koopmpc_group[at]];
+  for (int at = 0; at < KOOPMPC_MOVES; at++) levels[at] = now->index[koopmpc_levels_group[at]];
   if (!keeps_dwell(s, levels)) return;
   for (int j = 0; j < COUNT; j++) {
-    const koopmpc_real *row = koopmpc_move_of_s + j * COUNT;
-    const int at = koopmpc_free_move[j];
-    const koopmpc_real centre = place_of(s->t[at], at % NU) + koopmpc_dot(row, now->s, j);
     koopmpc_real paid;
-    now->s[j] = ((koopmpc_real)now->index[j] - centre) / row[j];
+    now->s[j] = ((koopmpc_real)now->index[j] - centre_of(s, now->s, j)) / koopmpc_levels_L[j * COUNT + j];
     paid = price(now, now->s, j);
     if (paid < 0) return;
     cost += (koopmpc_real)0.5 * now->s[j] * now->s[j] + paid;
@@ -171,8 +181,7 @@ static void guess(const koopmpc_state *s, search *now) {
 
 /** Look at move j: where it is if the later coordinates are zero, and the levels around. */
 static void enter(const koopmpc_state *s, search *now, int j) {
-  const int at = koopmpc_free_move[j];
-  const koopmpc_real centre = place_of(s->t[at], at % NU) + koopmpc_dot(koopmpc_move_of_s + j * COUNT, now->s, j);
+  const koopmpc_real centre = centre_of(s, now->s, j);
   const koopmpc_real low = (koopmpc_real)(now->least[j] - 1), high = (koopmpc_real)now->most[j];
   now->centre[j] = centre;
   now->below[j] = (int)koopmpc_clip(KOOPMPC_FN(floor)(centre), low, high);
@@ -186,7 +195,7 @@ static koopmpc_real next_cost(const search *now, int j, int *level) {
   const koopmpc_real down = now->centre[j] - (koopmpc_real)below, up = (koopmpc_real)above - now->centre[j];
   koopmpc_real s;
   *level = has_below && (!has_above || down <= up) ? below : has_above ? above : now->least[j] - 1;
-  s = ((koopmpc_real)*level - now->centre[j]) / koopmpc_move_of_s[j * COUNT + j];
+  s = ((koopmpc_real)*level - now->centre[j]) / koopmpc_levels_L[j * COUNT + j];
   return now->cost[j] + (koopmpc_real)0.5 * s * s;
 }
 
@@ -200,7 +209,7 @@ static koopmpc_real look(const koopmpc_state *s, search *now, int *nodes) {
   now->cost[0] = 0;
   enter(s, now, 0);
   while (j >= 0) {
-    const int i = koopmpc_free_move[j] % NU, *level = now->level + j * NU, *steps = now->steps + j * NU;
+    const int i = koopmpc_levels_free[j] % NU, *level = now->level + j * NU, *steps = now->steps + j * NU;
     int next, *to = now->level + (j + 1) * NU, *held = now->steps + (j + 1) * NU;
     koopmpc_real cost = next_cost(now, j, &next), paid;
     if (next < now->least[j] || (now->has && cost >= now->best * KOOPMPC_BETTER)) {
@@ -222,7 +231,7 @@ static koopmpc_real look(const koopmpc_state *s, search *now, int *nodes) {
     if (next != level[i] && steps[i] < dwell_of(level[i], i)) continue;
     ++*nodes;
     now->index[j] = next;
-    now->s[j] = ((koopmpc_real)next - now->centre[j]) / koopmpc_move_of_s[j * COUNT + j];
+    now->s[j] = ((koopmpc_real)next - now->centre[j]) / koopmpc_levels_L[j * COUNT + j];
     paid = price(now, now->s, j);
     if (paid < 0) continue;
     cost += paid;
@@ -241,7 +250,7 @@ static koopmpc_real look(const koopmpc_state *s, search *now, int *nodes) {
       held[k] = steps[k];
     }
     to[i] = next;
-    held[i] = (next != level[i] ? 0 : steps[i]) + koopmpc_free_steps[j];
+    held[i] = (next != level[i] ? 0 : steps[i]) + koopmpc_levels_steps[j];
     now->cost[++j] = cost;
     enter(s, now, j);
   }
@@ -256,20 +265,20 @@ koopmpc_status koopmpc_search_levels(koopmpc_state *s, const koopmpc_real *low, 
   now.best = 0;
   now.has = 0;
   for (int r = 0; r < OTHERS; r++) {
-    const int row = koopmpc_search_row[r];
-    const koopmpc_real below = low[row] / koopmpc_unit[row], above = high[row] / koopmpc_unit[row];
+    const int row = koopmpc_levels_rows[r];
+    const koopmpc_real below = low[row] / koopmpc_solver_rows[row], above = high[row] / koopmpc_solver_rows[row];
     const koopmpc_real near = koopmpc_abs(below) < koopmpc_abs(above) ? koopmpc_abs(below) : koopmpc_abs(above);
-    const koopmpc_real reach = koopmpc_row_soft[r] ? 0 : KOOPMPC_WIDER * (1 + near);
+    const koopmpc_real reach = is_soft(r) ? 0 : KOOPMPC_WIDER * (1 + near);
     now.low[r] = below - reach;
     now.high[r] = above + reach;
   }
   for (int j = 0; j < COUNT; j++) {
     now.least[j] = 0;
-    now.most[j] = koopmpc_level_count[koopmpc_free_move[j] % NU] - 1;
+    now.most[j] = koopmpc_levels_levels_count[koopmpc_levels_free[j] % NU] - 1;
   }
 #if KOOPMPC_BOUNDS
   for (int at = 0; at < KOOPMPC_MOVES; at++) {
-    const int j = koopmpc_group[at];
+    const int j = koopmpc_levels_group[at];
     int least, most;
     levels_inside(s->box_low[at], s->box_high[at], at % NU, &least, &most);
     if (least > now.least[j]) now.least[j] = least;
@@ -288,14 +297,14 @@ koopmpc_status koopmpc_search_levels(koopmpc_state *s, const koopmpc_real *low, 
     const koopmpc_real least = bound > 0 ? bound : 0;
     report->gap = (now.best - least) / now.best;
   }
-  for (int at = 0; at < KOOPMPC_MOVES; at++) s->plan_levels[at] = now.found[koopmpc_group[at]];
+  for (int at = 0; at < KOOPMPC_MOVES; at++) s->plan_levels[at] = now.found[koopmpc_levels_group[at]];
   place_moves(s);
   for (int r = 0; r < OTHERS; r++) {
-    const int row = koopmpc_search_row[r];
-    const koopmpc_real value = koopmpc_dot(koopmpc_row_of + r * COUNT, now.best_s, COUNT);
+    const int row = koopmpc_levels_rows[r];
+    const koopmpc_real value = row_value(r, now.best_s, COUNT);
     const koopmpc_real over = value - now.high[r], under = now.low[r] - value;
-    const koopmpc_real past = (over > under ? over : under) / koopmpc_scale[row];
-    if (koopmpc_row_soft[r] && past > koopmpc_allowance[row] && past > report->slack) report->slack = past;
+    const koopmpc_real past = (over > under ? over : under) / koopmpc_qp_scale[row];
+    if (is_soft(r) && past > koopmpc_qp_softness_allowance[row] && past > report->slack) report->slack = past;
   }
   return KOOPMPC_OPTIMAL;
 }

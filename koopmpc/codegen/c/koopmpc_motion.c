@@ -4,8 +4,7 @@
  */
 #include <math.h>
 
-#include "koopmpc_plan.h"
-#include "koopmpc_solver.h"
+#include "koopmpc_motion_tables.h"
 #include "koopmpc_stages.h"
 
 #if KOOPMPC_BEYOND
@@ -98,6 +97,12 @@ static void multiply(koopmpc_real *to, const koopmpc_real *a, const koopmpc_real
     }
 }
 
+/** The transpose of a square matrix: of one that stands column after column, its rows. */
+static void transpose(koopmpc_real *to, const koopmpc_real *from, int n) {
+  for (int i = 0; i < n; i++)
+    for (int j = 0; j < n; j++) to[i * n + j] = from[j * n + i];
+}
+
 /** Whether equilibria hold what the rows move through; `by` is d(x, u)/dr and J dof/dx by the sizes of x and u. */
 static int can_drift(const koopmpc_state *s, const koopmpc_real *by, const koopmpc_real *J) {
   koopmpc_real d[RN], x[NX], missed[RN], off[RN], way[RN];
@@ -105,8 +110,8 @@ static int can_drift(const koopmpc_state *s, const koopmpc_real *by, const koopm
   multiply(x, by, d, NX, RN, 1, 0);
   multiply(missed, J, x, RN, NX, 1, 0);
   for (int j = 0; j < RN; j++) missed[j] -= d[j];
-  multiply(off, koopmpc_Q_root, missed, RN, RN, 1, 0);
-  multiply(way, koopmpc_Q_root, d, RN, RN, 1, 0);
+  multiply(off, koopmpc_Q_root, missed, RN, RN, 1, 1);
+  multiply(way, koopmpc_Q_root, d, RN, RN, 1, 1);
   return koopmpc_dot(off, off, RN) <= KOOPMPC_FOLLOWS * KOOPMPC_FOLLOWS * koopmpc_dot(way, way, RN);
 }
 
@@ -116,7 +121,7 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   koopmpc_real S[GOAL * NX], SA[GOAL * NX], SB[GOAL * NV], R[NV * NV], inner[NV * NV], inverse[NV * NV], gain[NV * NX];
   koopmpc_real K[NV * NX], BK[NX * NX], weighed[RN * NX], push[NX * RN], held[NX * RN], back[NX * GOAL];
   koopmpc_real H[LEAST * NX], T[LEAST * (RN + LEAST)], by[LEAST * RN];
-  koopmpc_real p[NX], next[NX], probe[NX], constant[NX];
+  koopmpc_real p[NX], next[NX], probe[NX], constant[NX], root_Q[RN * RN], root_R[NV * NV];
   int moves = 0, drifts = 0, steps = 1;
   for (int j = 0; j < RN; j++) moves |= !stands(s, j);
   if (!moves || !(end[TARGET_FOUND] > 0)) return;
@@ -127,7 +132,7 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   for (int i = 0; i < LEAST; i++) /* the equilibrium that comes nearest to a row, by its size */
     for (int j = 0; j < RN; j++) {
       by[i * RN + j] = 0;
-      for (int m = 0; m < RN; m++) by[i * RN + j] += T[i * (RN + LEAST) + m] * koopmpc_rest_weight[m * RN + j];
+      for (int m = 0; m < RN; m++) by[i * RN + j] += T[i * (RN + LEAST) + m] * koopmpc_rest_weight[j * RN + m];
     }
   for (int i = 0; i < NX; i++) { /* all by the sizes of x and u */
     for (int j = 0; j < NX; j++) A[i * NX + j] *= sx[j] / sx[i];
@@ -139,7 +144,8 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   for (int i = 0; i < GOAL * NX; i++) S[i] += end[TARGET_L + i] * sx[i % NX];
   multiply(SA, S, A, GOAL, NX, NX, 0);
   multiply(SB, S, B, GOAL, NX, NV, 0);
-  multiply(R, koopmpc_R_root, koopmpc_R_root, NV, NV, NV, 1);
+  transpose(root_R, koopmpc_R_root, NV);
+  multiply(R, root_R, root_R, NV, NV, NV, 1);
   multiply(inner, SB, SB, NV, GOAL, NV, 1);
   for (int i = 0; i < NV * NV; i++) {
     R[i] *= su[i / NV] * su[i % NV];
@@ -151,8 +157,9 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   multiply(BK, B, K, NX, NV, NX, 0);
   for (int i = 0; i < NX * NX; i++) A[i] -= BK[i];
   multiply(gain, R, K, NV, NV, NX, 0);
-  multiply(weighed, koopmpc_Q_root, J, RN, RN, NX, 0);
-  multiply(push, weighed, koopmpc_Q_root, NX, RN, RN, 1);
+  transpose(root_Q, koopmpc_Q_root, RN);
+  multiply(weighed, root_Q, J, RN, RN, NX, 0);
+  multiply(push, weighed, root_Q, NX, RN, RN, 1);
 #if KOOPMPC_HOLDS
   koopmpc_fill(constant, 0, NX);
   multiply(held, gain, by + NX * RN, NX, NV, RN, 1);

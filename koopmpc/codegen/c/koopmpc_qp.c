@@ -1,8 +1,6 @@
 /** @file koopmpc_qp.c @brief DAQP on memory that belongs to the caller. */
-#include "koopmpc_common.h"
 #include "koopmpc_names.h"
-#include "koopmpc_qp.h"
-#include "koopmpc_solver.h"
+#include "koopmpc_step.h"
 
 #include "daqp/daqp.h"
 
@@ -20,7 +18,7 @@ static int rounded(const DAQPWorkspace *work, int transformed) {
     if (work->D[i] < least) least = work->D[i];
     if (work->sense[work->WS[i]] & DAQP_SOFT) return 0;
   }
-  return off * off * work->fval > KOOPMPC_PRIMAL_TOL * KOOPMPC_PRIMAL_TOL * least * least;
+  return off * off * work->fval > KOOPMPC_SETTINGS_PRIMAL_TOL * KOOPMPC_SETTINGS_PRIMAL_TOL * least * least;
 }
 
 enum { ROWS_CHANGED = 2 };
@@ -59,7 +57,7 @@ koopmpc_qp_memory koopmpc_qp_on(const koopmpc_qp *qp, koopmpc_real *reals, int *
 static int marked(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_real *push, int resume) {
   const int one = DAQP_ACTIVE | DAQP_IMMUTABLE | DAQP_AUTO_EQUALITY;
   int result = 1, narrow = 0, known = 0;
-  for (int i = 0; i < qp->m; i++) narrow |= !(mem->high[i] - mem->low[i] >= KOOPMPC_ZERO_TOL);
+  for (int i = 0; i < qp->m; i++) narrow |= !(mem->high[i] - mem->low[i] >= KOOPMPC_SETTINGS_ZERO_TOL);
   if (resume && !push && !narrow) {
     for (int i = 0; i < qp->m; i++) known |= mem->sense[i];
     if (!(known & DAQP_AUTO_EQUALITY)) return 1;
@@ -69,8 +67,8 @@ static int marked(const koopmpc_qp *qp, koopmpc_qp_memory *mem, const koopmpc_re
     int sense = resume ? mem->sense[i] : qp->sense[i];
     if (push && push[i] > 0) sense |= DAQP_ACTIVE;
     if (push && push[i] < 0) sense |= DAQP_ACTIVE | DAQP_LOWER;
-    if (!(width >= -KOOPMPC_PRIMAL_TOL)) return 0;
-    if (width < KOOPMPC_ZERO_TOL && !(sense & DAQP_SOFT)) {
+    if (!(width >= -KOOPMPC_SETTINGS_PRIMAL_TOL)) return 0;
+    if (width < KOOPMPC_SETTINGS_ZERO_TOL && !(sense & DAQP_SOFT)) {
       if ((sense & one) != one) result = ROWS_CHANGED;
       sense |= one;
     } else if (sense & DAQP_AUTO_EQUALITY) {

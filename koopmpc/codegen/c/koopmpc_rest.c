@@ -7,9 +7,7 @@
  */
 #include <math.h>
 
-#include "koopmpc_limits.h"
-#include "koopmpc_plan.h"
-#include "koopmpc_solver.h"
+#include "koopmpc_rest_tables.h"
 #include "koopmpc_stages.h"
 
 enum {
@@ -98,7 +96,7 @@ static void residuals(const koopmpc_real *at, koopmpc_real *W) {
   for (int i = 0; i < ROWS_R; i++)
     for (int m = 0; m < ROWS_R; m++)
       for (int j = 0; j < NX; j++)
-        W[i * SIZE + j] += koopmpc_rest_weight[i * ROWS_R + m] * at[LOCAL_J + m * NX + j] * koopmpc_rest_size[j];
+        W[i * SIZE + j] += koopmpc_rest_weight[m * ROWS_R + i] * at[LOCAL_J + m * NX + j] * koopmpc_rest_size[j];
   for (int i = 0; i < SIZE; i++) W[(ROWS_R + i) * SIZE + i] = KOOPMPC_SMALL;
 }
 
@@ -115,7 +113,7 @@ static void holding(const koopmpc_real *at, koopmpc_real *E) {
 static void residual(const koopmpc_real *row, const koopmpc_real *of, const koopmpc_real *s, koopmpc_real *left) {
   for (int i = 0; i < ROWS_R; i++) {
     left[i] = 0;
-    for (int j = 0; j < ROWS_R; j++) left[i] += koopmpc_rest_weight[i * ROWS_R + j] * (row[j] - of[j]);
+    for (int j = 0; j < ROWS_R; j++) left[i] += koopmpc_rest_weight[j * ROWS_R + i] * (row[j] - of[j]);
   }
   for (int i = 0; i < SIZE; i++) left[ROWS_R + i] = -KOOPMPC_SMALL * s[i];
 }
@@ -223,7 +221,7 @@ static int find_hit(const koopmpc_real *value, const koopmpc_real *rows, const k
   int first = 0, farthest = 0, outside = !careful;
   for (int i = 0; i < LIMITS; i++) {
     const koopmpc_real moved = koopmpc_dot(rows + i * SIZE, step, SIZE);
-    const koopmpc_real high = koopmpc_rest_high[i] / koopmpc_rest_limit[i], low = koopmpc_rest_low[i] / koopmpc_rest_limit[i];
+    const koopmpc_real high = koopmpc_rest_high[i] / koopmpc_rest_limit_size[i], low = koopmpc_rest_low[i] / koopmpc_rest_limit_size[i];
     const koopmpc_real over = value[i] + moved - high, under = low - value[i] - moved;
     const koopmpc_real rounding = KOOPMPC_REACH * (1 + koopmpc_abs(value[i]));
     const koopmpc_real past = (over > under ? over : under) - rounding;
@@ -264,11 +262,11 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
     for (int i = 0; i < LIMITS; i++) {
       if (i < NV) {
         rows[i * SIZE + NX + i] = 1;
-        value[i] = input[i] / koopmpc_rest_limit[i];
+        value[i] = input[i] / koopmpc_rest_limit_size[i];
       } else {
-        value[i] = at[LOCAL_G + i - NV] / koopmpc_rest_limit[i];
+        value[i] = at[LOCAL_G + i - NV] / koopmpc_rest_limit_size[i];
         for (int j = 0; j < NX; j++)
-          rows[i * SIZE + j] = at[LOCAL_DG + (i - NV) * NX + j] * koopmpc_rest_size[j] / koopmpc_rest_limit[i];
+          rows[i * SIZE + j] = at[LOCAL_DG + (i - NV) * NX + j] * koopmpc_rest_size[j] / koopmpc_rest_limit_size[i];
       }
       if (held_now[i] > 0 || held_now[i] < 0) held[n++] = i;
     }
@@ -277,7 +275,7 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
     for (int i = 0; i < n; i++) {
       const koopmpc_real end = held_now[held[i]] > 0 ? koopmpc_rest_high[held[i]] : koopmpc_rest_low[held[i]];
       koopmpc_copy(E + (NX + i) * SIZE, rows + held[i] * SIZE, SIZE);
-      missed[NX + i] = value[held[i]] - end / koopmpc_rest_limit[held[i]];
+      missed[NX + i] = value[held[i]] - end / koopmpc_rest_limit_size[held[i]];
     }
     koopmpc_copy(kept, E, (NX + n) * SIZE);
     count = koopmpc_inverse(E, NX + n, SIZE, RANK, gain, null);
@@ -344,16 +342,16 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
       }
     }
     for (int i = 0; i < SIZE; i++) s[i] += step[i];
-    if (length < 1 || length > 1) close = KOOPMPC_HELD; /* steps that swing leave more than their square */
+    if (length < 1 || length > 1) close = KOOPMPC_ESTIMATOR_HELD; /* steps that swing leave more than their square */
     if (going && largest_of(whole, SIZE) <= close * reach) {
       for (int i = 0; i < NX + n; i++) {
         const koopmpc_real still = koopmpc_abs(koopmpc_dot(kept + i * SIZE, step, SIZE) + missed[i]);
         if (still > off) off = still;
       }
-      if (!(off <= KOOPMPC_HELD * reach)) return 0;
+      if (!(off <= KOOPMPC_ESTIMATOR_HELD * reach)) return 0;
       for (int i = 0; i < NX; i++) x[i] = s[i] * koopmpc_rest_size[i];
       for (int i = 0; i < NV; i++)
-        u[i] = koopmpc_clip(s[NX + i] * koopmpc_rest_size[NX + i], koopmpc_input_low[i], koopmpc_input_high[i]);
+        u[i] = koopmpc_clip(s[NX + i] * koopmpc_rest_size[NX + i], koopmpc_inputs_low[i], koopmpc_inputs_high[i]);
       koopmpc_copy(active, held_now, LIMITS);
       return 1;
     }
@@ -394,7 +392,7 @@ void koopmpc_rest(koopmpc_state *s, const koopmpc_real *target, const koopmpc_re
   koopmpc_copy(s->rest_input, target + TARGET_INPUT, NV);
   if (!found) return;
   for (int i = 0; i < NV; i++) s->rest_input[i] = KOOPMPC_HOLDS ? u[i] : 0;
-  if (!KOOPMPC_GIVEN_END) {
+  if (KOOPMPC_STAGE_END) {
     koopmpc_local(x, u KOOPMPC_AND(koopmpc_end_w(s)), at);
     for (int i = 0; i < KOOPMPC_GOAL; i++)
       s->rest_goal[i] = koopmpc_dot(target + TARGET_M + i * KOOPMPC_NR, at + LOCAL_OF, KOOPMPC_NR) +

@@ -7,11 +7,8 @@
  */
 #include <math.h>
 
-#include "koopmpc_limits.h"
-#include "koopmpc_plan.h"
-#include "koopmpc_solver.h"
+#include "koopmpc_rows_tables.h"
 #include "koopmpc_stages.h"
-#include "koopmpc_table.h"
 
 enum {
   ROW = KOOPMPC_NR,
@@ -34,7 +31,7 @@ static koopmpc_real apart(const koopmpc_real *a, const koopmpc_real *b) {
   koopmpc_real sum = 0;
   for (int i = 0; i < ROW; i++) {
     koopmpc_real part = 0;
-    for (int j = 0; j < ROW; j++) part += koopmpc_rest_weight[i * ROW + j] * (a[j] - b[j]);
+    for (int j = 0; j < ROW; j++) part += koopmpc_rest_weight[j * ROW + i] * (a[j] - b[j]);
     sum += part * part;
   }
   return sum;
@@ -69,7 +66,7 @@ int koopmpc_is_alone(const koopmpc_state *s, const koopmpc_real *row, const koop
   koopmpc_real at[KOOPMPC_LOCAL], size = apart(row, nothing);
   (void)none;
   koopmpc_local(target + TARGET_X, target + TARGET_U KOOPMPC_AND(none), at);
-  if (apart(row, at + LOCAL_OF) <= KOOPMPC_HELD * (1 + size)) return 1;
+  if (apart(row, at + LOCAL_OF) <= KOOPMPC_ESTIMATOR_HELD * (1 + size)) return 1;
   return beside && apart(row, beside) <= BESIDE * BESIDE * (size > 1 ? size : 1);
 }
 #endif
@@ -83,7 +80,7 @@ static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc
     const koopmpc_real share = done + stride < 1 ? done + stride : 1;
     for (int i = 0; i < ROW; i++) there[i] = share < 1 ? from[i] + share * (row[i] - from[i]) : row[i];
     for (int i = 0; i < KOOPMPC_NW; i++) now[i] = share * w[i];
-    if (koopmpc_near(x, u, active, there, now, none, KOOPMPC_HELD, careful)) {
+    if (koopmpc_near(x, u, active, there, now, none, KOOPMPC_ESTIMATOR_HELD, careful)) {
       done = share;
       if (!(done < 1)) return 1;
       stride *= 2;
@@ -91,7 +88,7 @@ static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc
       stride /= 2;
     }
   }
-  return careful && koopmpc_near(x, u, active, row, w, none, KOOPMPC_HELD, PATIENCE);
+  return careful && koopmpc_near(x, u, active, row, w, none, KOOPMPC_ESTIMATOR_HELD, PATIENCE);
 }
 
 /** du/de of an equilibrium without active limits. */
@@ -123,7 +120,7 @@ int koopmpc_is_free(koopmpc_state *s, const koopmpc_real *row) {
   koopmpc_real at[KOOPMPC_LOCAL];
   if (!still) return 0;
   koopmpc_local(still + TARGET_X, still + TARGET_U KOOPMPC_AND(none), at);
-  if (!(apart(row, at + LOCAL_OF) <= KOOPMPC_HELD * apart(row, nothing))) return 0; /* several may come as near */
+  if (!(apart(row, at + LOCAL_OF) <= KOOPMPC_ESTIMATOR_HELD * apart(row, nothing))) return 0; /* several may come as near */
   return !koopmpc_is_limited(still + TARGET_ACTIVE) && still[still == s->still ? TARGET_M : TARGET_FOUND] > 0;
 }
 
@@ -135,7 +132,7 @@ static int move_on(koopmpc_state *s, const koopmpc_real *row, const koopmpc_real
   for (int i = 0; i < KOOPMPC_NW; i++) moved |= w[i] < 0 || w[i] > 0;
   if (moved && s->has_last_end && is_row(s->last_end, row) && !koopmpc_is_limited(s->last_end + TARGET_ACTIVE)) {
     koopmpc_copy(own, s->last_end, TARGET_M);
-    if (koopmpc_near(own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE, row, w, none, KOOPMPC_HELD, 0) &&
+    if (koopmpc_near(own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE, row, w, none, KOOPMPC_ESTIMATOR_HELD, 0) &&
         !koopmpc_is_limited(own + TARGET_ACTIVE))
       return 1;
   }
@@ -160,7 +157,7 @@ static const koopmpc_real *make(koopmpc_state *s, const koopmpc_real *row) {
   own[TARGET_M] = (koopmpc_real)found;
   koopmpc_copy(own, row, ROW);
   for (int i = 0; i < NV; i++) {
-    if (!(own[TARGET_M] > 0)) own[TARGET_U + i] = koopmpc_clip(0, koopmpc_input_low[i], koopmpc_input_high[i]);
+    if (!(own[TARGET_M] > 0)) own[TARGET_U + i] = koopmpc_clip(0, koopmpc_inputs_low[i], koopmpc_inputs_high[i]);
     own[TARGET_INPUT + i] = KOOPMPC_HOLDS ? own[TARGET_U + i] : 0;
   }
   koopmpc_fill(own + TARGET_SLOPE, 0, NV * NX);
@@ -175,12 +172,12 @@ static const koopmpc_real *make(koopmpc_state *s, const koopmpc_real *row) {
   return from;
 }
 
-/** Weigh the end of the horizon by a matrix alone: |root (of(x_N) - r)|^2. */
-static void weigh(koopmpc_real *target, const koopmpc_real *root) {
+void koopmpc_weigh_row(koopmpc_real *target, const koopmpc_real *root) {
   koopmpc_fill(target + TARGET_M, 0, TARGET_FOUND - TARGET_M);
   for (int i = 0; i < ROW; i++) {
-    koopmpc_copy(target + TARGET_M + i * ROW, root + i * ROW, ROW);
-    target[TARGET_GOAL + i] = koopmpc_dot(root + i * ROW, target, ROW);
+    koopmpc_real *M = target + TARGET_M + i * ROW;
+    for (int j = 0; j < ROW; j++) M[j] = root[j * ROW + i];
+    target[TARGET_GOAL + i] = koopmpc_dot(M, target, ROW);
   }
 }
 
@@ -206,7 +203,7 @@ static int before(const tail_step *t, koopmpc_real *P, koopmpc_real *K) {
     }
   for (int i = 0; i < NV; i++)
     for (int j = 0; j < TAILED; j++) {
-      K[i * TAILED + j] = j >= NX ? -koopmpc_tail_D[i * NV + j - NX] : 0;
+      K[i * TAILED + j] = j >= NX ? -koopmpc_tail_R_delta[i * NV + j - NX] : 0;
       for (int m = 0; m < TAILED; m++) K[i * TAILED + j] += BP[i * TAILED + m] * t->A[m * TAILED + j];
     }
   for (int j = 0; j < NV; j++) { /* S = L L' */
@@ -242,7 +239,7 @@ static int before(const tail_step *t, koopmpc_real *P, koopmpc_real *K) {
     for (int j = 0; j < TAILED; j++) {
       koopmpc_real sum = t->Q[i * TAILED + j];
       for (int m = 0; m < TAILED; m++) sum += t->A[m * TAILED + i] * PC[m * TAILED + j];
-      for (int m = 0; m < NV && i >= NX; m++) sum += koopmpc_tail_D[(i - NX) * NV + m] * K[m * TAILED + j];
+      for (int m = 0; m < NV && i >= NX; m++) sum += koopmpc_tail_R_delta[(i - NX) * NV + m] * K[m * TAILED + j];
       P[i * TAILED + j] = sum;
     }
   for (int i = 0; i < TAILED; i++)
@@ -251,14 +248,14 @@ static int before(const tail_step *t, koopmpc_real *P, koopmpc_real *K) {
   return koopmpc_usable(P, TAILED * TAILED);
 }
 
-/** P of the whole tail: of KOOPMPC_TAIL steps, or until its gain rests. */
+/** P of the whole tail: of KOOPMPC_TAIL_STEPS steps, or until its gain rests. */
 static int sum_tail(const tail_step *t, koopmpc_real *P) {
   koopmpc_real K[NV * TAILED], last[NV * TAILED];
   int rested = 0;
   koopmpc_copy(P, t->Q, TAILED * TAILED);
   koopmpc_fill(last, 0, NV * TAILED);
-  for (int i = NX; i < TAILED && KOOPMPC_TAIL; i++) koopmpc_fill(P + i * TAILED + NX, 0, TAILED - NX);
-  for (int k = 0; k < (KOOPMPC_TAIL ? KOOPMPC_TAIL : 10 * STEPS); k++) {
+  for (int i = NX; i < TAILED && KOOPMPC_TAIL_STEPS; i++) koopmpc_fill(P + i * TAILED + NX, 0, TAILED - NX);
+  for (int k = 0; k < (KOOPMPC_TAIL_STEPS ? KOOPMPC_TAIL_STEPS : 10 * STEPS); k++) {
     koopmpc_real moved = 0, most = 0;
     if (!before(t, P, K)) return 0;
     for (int i = 0; i < NV * TAILED; i++) {
@@ -267,7 +264,7 @@ static int sum_tail(const tail_step *t, koopmpc_real *P) {
     }
     koopmpc_copy(last, K, NV * TAILED);
     rested = moved <= KOOPMPC_RESTED * most ? rested + 1 : 0;
-    if (!KOOPMPC_TAIL && rested >= RESTING) break;
+    if (!KOOPMPC_TAIL_STEPS && rested >= RESTING) break;
   }
   return 1;
 }
@@ -298,7 +295,7 @@ static int add_tail(koopmpc_real *target, const koopmpc_real *w) {
   (void)w;
   koopmpc_local(target + TARGET_X, target + TARGET_U KOOPMPC_AND(w), at);
   for (int i = 0; i < ROW; i++)
-    for (int j = 0; j < NX; j++) J[i * NX + j] = at[LOCAL_J + i * NX + j] * size[j] / koopmpc_tail_rows[i];
+    for (int j = 0; j < NX; j++) J[i * NX + j] = at[LOCAL_J + i * NX + j] * size[j] / koopmpc_tail_row_size[i];
   for (int i = 0; i < ROW; i++)
     for (int j = 0; j < NX; j++) {
       QJ[i * NX + j] = 0;
@@ -323,8 +320,8 @@ static int add_tail(koopmpc_real *target, const koopmpc_real *w) {
   for (int i = NX; i < TAILED; i++) {
     t.B[i * NV + i - NX] = 1;
     for (int j = 0; j < NV; j++) {
-      t.Q[i * TAILED + NX + j] = koopmpc_tail_D[(i - NX) * NV + j];
-      t.R[(i - NX) * NV + j] += koopmpc_tail_D[(i - NX) * NV + j];
+      t.Q[i * TAILED + NX + j] = koopmpc_tail_R_delta[(i - NX) * NV + j];
+      t.R[(i - NX) * NV + j] += koopmpc_tail_R_delta[(i - NX) * NV + j];
     }
   }
   if (!sum_tail(&t, P)) return 0;
@@ -345,7 +342,7 @@ static int add_tail(koopmpc_real *target, const koopmpc_real *w) {
     for (int r = 0; r < ROW; r++) {
       through[r] = 0;
       for (int j = 0; j < NX; j++) through[r] += S[i * TAILED + j] * back[j * ROW + r];
-      M[i * ROW + r] = scale * through[r] / koopmpc_tail_rows[r];
+      M[i * ROW + r] = scale * through[r] / koopmpc_tail_row_size[r];
     }
     for (int j = 0; j < NX; j++) {
       koopmpc_real left = S[i * TAILED + j];
@@ -356,11 +353,11 @@ static int add_tail(koopmpc_real *target, const koopmpc_real *w) {
   }
   for (int i = 0; i < ROW; i++)
     for (int r = 0; r < ROW; r++) {
-      koopmpc_real sum = koopmpc_Q_root[i * ROW + r];
+      koopmpc_real sum = koopmpc_Q_root[r * ROW + i];
       for (int b = 0; b < ROW; b++) {
         koopmpc_real through = 0;
         for (int j = 0; j < NX; j++) through += J[b * NX + j] * back[j * ROW + r];
-        sum -= koopmpc_Q_root[i * ROW + b] * koopmpc_tail_rows[b] * through / koopmpc_tail_rows[r];
+        sum -= koopmpc_Q_root[b * ROW + i] * koopmpc_tail_row_size[b] * through / koopmpc_tail_row_size[r];
       }
       M[(TAILED + i) * ROW + r] = mean * sum;
     }
@@ -391,7 +388,7 @@ const koopmpc_real *koopmpc_find_row(koopmpc_state *s, const koopmpc_real *row, 
     return target;
   }
 #endif
-  weigh(target, KOOPMPC_GIVEN_END ? koopmpc_tail_end : koopmpc_Q_root);
+  koopmpc_weigh_row(target, KOOPMPC_STAGE_END ? koopmpc_Q_root : koopmpc_tail_end);
   target[TARGET_FOUND] = found[TARGET_M];
   return target;
 }

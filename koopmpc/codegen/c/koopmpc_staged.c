@@ -7,13 +7,8 @@
  */
 #include <math.h>
 
-#include "koopmpc_bounds.h"
-#include "koopmpc_limits.h"
-#include "koopmpc_observer.h"
-#include "koopmpc_plan.h"
-#include "koopmpc_solver.h"
+#include "koopmpc_staged_tables.h"
 #include "koopmpc_stages.h"
-#include "koopmpc_table.h"
 
 enum { EACH = 12, AGAIN = 10, ENDINGS = 20, SPENT = 300, PLAN_S = (STEPS + 1) * NS, PLAN_V = STEPS * NV };
 #define NEAR_OF ((koopmpc_real)0.2)      /* F may differ from its linearisation by this share of a change */
@@ -49,7 +44,7 @@ static void enter(koopmpc_state *s, const koopmpc_real *X, const koopmpc_real *U
 #endif
     }
   for (int k = 0; k <= STEPS; k++)
-    for (int i = 0; i < KOOPMPC_SOFT_RATES; i++)
+    for (int i = 0; i < KOOPMPC_SOFT_RATES_LENGTH; i++)
       s->S[k * NS + NX + NV + i] = k ? s->V[(k - 1) * NV + koopmpc_soft_rates[i]] : 0;
   (void)u_prev;
 }
@@ -92,7 +87,7 @@ static void add_program(koopmpc_state *s, const koopmpc_real *x) {
       change = most_of(change, s->dX[k * NS + i]);
       size = most_of(size, s->S[(k + 1) * NS + i]);
     }
-    reach[i] = NEAR_OF * (change > gap[i] ? change : gap[i]) + KOOPMPC_REACH * (koopmpc_sizes[i] + size);
+    reach[i] = NEAR_OF * (change > gap[i] ? change : gap[i]) + KOOPMPC_REACH * (koopmpc_stage_sizes[i] + size);
   }
   for (s->length = 1;; s->length /= 2) {
     const koopmpc_real length = s->length;
@@ -129,8 +124,8 @@ static void add_program(koopmpc_state *s, const koopmpc_real *x) {
   s->slack = 0;
   for (int k = 0; k < STEPS; k++)
     for (int i = 0; i < SOFT; i++) {
-      const koopmpc_real past = s->eps[i * STEPS + k] * koopmpc_side_span[HARD + i];
-      if (past > koopmpc_allowance[i] && past > s->slack) s->slack = past;
+      const koopmpc_real past = s->eps[i * STEPS + k] * koopmpc_sides_span[HARD + i];
+      if (past > koopmpc_softness_allowance[koopmpc_sides_row[HARD + i] - NV] && past > s->slack) s->slack = past;
     }
 }
 
@@ -143,7 +138,7 @@ static koopmpc_real gap_of(const koopmpc_state *s) {
       if (s->S[k * NS + i] < low) low = s->S[k * NS + i];
       if (s->S[k * NS + i] > high) high = s->S[k * NS + i];
     }
-    most = most_of(most, s->defects[i] / (high - low + KOOPMPC_REACH * (koopmpc_sizes[i] + koopmpc_abs(s->S[i]))));
+    most = most_of(most, s->defects[i] / (high - low + KOOPMPC_REACH * (koopmpc_stage_sizes[i] + koopmpc_abs(s->S[i]))));
   }
   return most;
 }
@@ -153,8 +148,8 @@ static int rests(const koopmpc_state *s, koopmpc_real settled) {
   koopmpc_real moved = 0, size = 0, plan = 0, input = 0;
   for (int k = 0; k <= STEPS; k++)
     for (int i = 0; i < NS; i++) {
-      if (k) moved = most_of(moved, s->dX[(k - 1) * NS + i] / koopmpc_sizes[i]);
-      size = most_of(size, s->S[k * NS + i] / koopmpc_sizes[i]);
+      if (k) moved = most_of(moved, s->dX[(k - 1) * NS + i] / koopmpc_stage_sizes[i]);
+      size = most_of(size, s->S[k * NS + i] / koopmpc_stage_sizes[i]);
     }
   for (int k = 0; k < STEPS; k++)
     for (int i = 0; i < NV; i++) {
@@ -202,7 +197,7 @@ static int begin(koopmpc_state *s, int which, const koopmpc_real *x, const koopm
   for (int k = 0; k < STEPS; k++)
     for (int i = 0; i < NV; i++)
       U[k * NV + i] =
-          koopmpc_clip(KOOPMPC_WITH_RATES ? u_prev[i] : 0, koopmpc_input_low[i], koopmpc_input_high[i]);
+          koopmpc_clip(KOOPMPC_WITH_RATES ? u_prev[i] : 0, koopmpc_inputs_low[i], koopmpc_inputs_high[i]);
   for (int k = 0; k <= STEPS; k++)
     for (int i = 0; i < NX; i++) {
       const koopmpc_real share = (koopmpc_real)k / (koopmpc_real)STEPS;
@@ -225,12 +220,12 @@ static int runs_away(const koopmpc_state *s, const koopmpc_real *x, const koopmp
   koopmpc_real at[NX], next[NX], u[NV];
   koopmpc_copy(at, x, NX);
   for (int i = 0; i < NV; i++)
-    u[i] = koopmpc_clip(KOOPMPC_WITH_RATES ? u_prev[i] : 0, koopmpc_input_low[i], koopmpc_input_high[i]);
+    u[i] = koopmpc_clip(KOOPMPC_WITH_RATES ? u_prev[i] : 0, koopmpc_inputs_low[i], koopmpc_inputs_high[i]);
   for (int k = 0; k <= STEPS; k++) {
     for (int i = 0; i < NX; i++)
-      if (koopmpc_abs(at[i]) >= KOOPMPC_NO_DIGITS * koopmpc_sizes[i]) return 1; /* not for NaN */
+      if (koopmpc_abs(at[i]) >= KOOPMPC_NO_DIGITS * koopmpc_stage_sizes[i]) return 1; /* not for NaN */
     for (int i = 0; i < NX; i++)
-      if (!(koopmpc_abs(at[i]) < KOOPMPC_NO_DIGITS * koopmpc_sizes[i])) return 0; /* NaN, which a model may have */
+      if (!(koopmpc_abs(at[i]) < KOOPMPC_NO_DIGITS * koopmpc_stage_sizes[i])) return 0; /* NaN, which a model may have */
     if (k < STEPS) {
       koopmpc_map(at, u KOOPMPC_AND(koopmpc_w_of(s, k)), next);
       koopmpc_copy(at, next, NX);
@@ -258,10 +253,10 @@ static void restore(koopmpc_state *s) {
 static koopmpc_real past_of(const koopmpc_state *s, int k, const koopmpc_real *next, koopmpc_real past) {
   koopmpc_real outputs[NG + NG * NS + 1];
   koopmpc_limited(next, outputs);
-  for (int i = 0; i < KOOPMPC_HARD_OUTPUTS; i++) {
-    const int row = koopmpc_hard_output[i];
-    const koopmpc_real under = (koopmpc_low_of(s, k, NV + row) - outputs[row]) / koopmpc_hard_allowance[i];
-    const koopmpc_real over = (outputs[row] - koopmpc_high_of(s, k, NV + row)) / koopmpc_hard_allowance[i];
+  for (int row = 0; row < NG; row++) {
+    const koopmpc_real under = (koopmpc_low_of(s, k, NV + row) - outputs[row]) / koopmpc_softness_allowance[row];
+    const koopmpc_real over = (outputs[row] - koopmpc_high_of(s, k, NV + row)) / koopmpc_softness_allowance[row];
+    if (!koopmpc_is_hard(row)) continue;
     if (!(under <= past)) past = under;
     if (!(over <= past)) past = over;
   }
@@ -458,27 +453,20 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference) {
     if (k == STEPS - 1) trajectory_ends = KOOPMPC_GIVEN && !held;
     if (!KOOPMPC_DISTURBED) continue;
     for (int i = 0; i < NV; i++)
-      s->u_r[k * NV + i] = held ? u_end[i] : koopmpc_clip(s->u_r[k * NV + i], koopmpc_input_low[i], koopmpc_input_high[i]);
+      s->u_r[k * NV + i] = held ? u_end[i] : koopmpc_clip(s->u_r[k * NV + i], koopmpc_inputs_low[i], koopmpc_inputs_high[i]);
   }
   s->moved_on = 0;
 #if KOOPMPC_GIVEN
   for (int k = 0; k <= STEPS; k++) { /* row k of a given u_target counts at the k-th step */
-    const int row = s->row + KOOPMPC_LATENCY + k;
-    const koopmpc_real *given = koopmpc_given + NV * (row < KOOPMPC_GIVEN ? row : KOOPMPC_GIVEN - 1);
-    koopmpc_copy(k < STEPS ? s->u_r + k * NV : u_end, given, NV);
+    koopmpc_give_input(s, k, k < STEPS ? s->u_r + k * NV : u_end);
   }
   for (int i = 0; i < KOOPMPC_GOAL; i++)
     own[TARGET_GOAL + i] += koopmpc_dot(own + TARGET_V + i * NV, u_end, NV);
-  s->moved_on = s->row + 1 < KOOPMPC_GIVEN;
+  s->moved_on = s->row + 1 < KOOPMPC_GIVEN_LENGTH;
   s->row += s->moved_on;
 #endif
-  if (KOOPMPC_STAGE_END == 2 || (KOOPMPC_STAGE_END == 1 && trajectory_ends)) { /* no tail: the last row is weighed */
-    koopmpc_fill(own + TARGET_M, 0, TARGET_FOUND - TARGET_M);
-    for (int i = 0; i < KOOPMPC_NR; i++) {
-      koopmpc_copy(own + TARGET_M + i * KOOPMPC_NR, koopmpc_Q_root + i * KOOPMPC_NR, KOOPMPC_NR);
-      own[TARGET_GOAL + i] = koopmpc_dot(koopmpc_Q_root + i * KOOPMPC_NR, last, KOOPMPC_NR);
-    }
-  }
+  if (KOOPMPC_STAGE_END == 2 || (KOOPMPC_STAGE_END == 1 && trajectory_ends))
+    koopmpc_weigh_row(own, koopmpc_Q_root); /* no tail */
 #if KOOPMPC_BEYOND
   koopmpc_move_end(s, own);
 #endif
@@ -492,8 +480,8 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference) {
   }
 #if KOOPMPC_WITH_RATES
   for (int i = 0; i < NV; i++) {
-    const koopmpc_real *row = koopmpc_R_root + i * NV;
-    koopmpc_copy(s->end_L + (KOOPMPC_GOAL + i) * NS + NX, row, NV);
+    koopmpc_real *row = s->end_L + (KOOPMPC_GOAL + i) * NS + NX;
+    for (int j = 0; j < NV; j++) row[j] = koopmpc_R_root[j * NV + i];
     s->end_m[KOOPMPC_GOAL + i] = koopmpc_dot(row, s->u_r + (STEPS - 1) * NV, NV);
   }
 #endif
@@ -518,7 +506,7 @@ static int first_stage(koopmpc_state *s, const koopmpc_real *u_prev, koopmpc_rea
 #if KOOPMPC_WITH_RATES
   koopmpc_copy(stage + NX, u_prev, NV);
   for (int i = 0; i < NV; i++) {
-    const koopmpc_real low = koopmpc_change_low[i], high = koopmpc_change_high[i];
+    const koopmpc_real low = koopmpc_v_limits_low[i], high = koopmpc_v_limits_high[i];
     const koopmpc_real most = KOOPMPC_BOX_HIGH(s)[i] - u_prev[i], least = KOOPMPC_BOX_LOW(s)[i] - u_prev[i];
     const koopmpc_real reach = KOOPMPC_REACH * (koopmpc_abs(u_prev[i]) + koopmpc_input_sizes[i]);
     s->first_low[i] = low < most ? low : most;
@@ -537,7 +525,7 @@ static koopmpc_status solve(koopmpc_state *s, const koopmpc_real *stage, const k
   s->finishing = s->spent = 0;
   if (s->warm) {
     int near = 1;
-    for (int i = 0; i < NX; i++) near &= koopmpc_abs(stage[i] - s->S[NS + i]) <= FAR_OFF * koopmpc_sizes[i];
+    for (int i = 0; i < NX; i++) near &= koopmpc_abs(stage[i] - s->S[NS + i]) <= FAR_OFF * koopmpc_stage_sizes[i];
     if (near) {
       shift(s, u_prev);
       status = improve(s, stage, u_prev, KOOPMPC_ITERATIONS, KOOPMPC_SETTLED, SPENT, iterations);
@@ -553,12 +541,6 @@ static koopmpc_status solve(koopmpc_state *s, const koopmpc_real *stage, const k
 #endif
   }
   return status;
-}
-
-void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *u_prev) {
-  koopmpc_start(s, x0, u_prev);
-  s->targets = koopmpc_table;
-  s->target_count = KOOPMPC_TARGETS;
 }
 
 /** Whether the target of a row is in the table, or was found without active limits; of a scheduled w, that of w = 0. */
@@ -592,18 +574,11 @@ void koopmpc_use_targets(koopmpc_state *s, const koopmpc_real *targets, int coun
   s->found = s->made_count = s->made_next = s->has_made_end = 0;
 }
 
-void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *reference, const koopmpc_real *applied,
-                  const koopmpc_rows *w, koopmpc_real *u, koopmpc_report *report) {
-  koopmpc_report own;
+void koopmpc_decide(koopmpc_state *s, const koopmpc_rows *reference, const koopmpc_real *applied, koopmpc_real *u,
+                    koopmpc_report *report) {
   koopmpc_real stage[NS], u_prev[NV];
   koopmpc_status status = KOOPMPC_BAD_MEASUREMENT;
   int conflict, known;
-  if (!report) report = &own;
-  report->fallback = KOOPMPC_NONE;
-  report->iterations = 0;
-  report->slack = report->gap = 0;
-  koopmpc_take(s, y, applied, w);
-  report->refused = s->refused;
   koopmpc_copy(u_prev, s->given, NV);
   if (KOOPMPC_WITH_RATES) {
     if (koopmpc_usable(s->known + KOOPMPC_U_PREV, NV))
@@ -627,12 +602,11 @@ void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *r
   s->warm = 1;
   report->slack = s->slack;
   trajectory(s, s->draftX, s->kept);
-  if (KOOPMPC_HARD_RATED) {
-    koopmpc_admit_within(s->kept, koopmpc_hard_rate_low, koopmpc_hard_rate_high, u_prev, KOOPMPC_BOX_LOW(s),
-                         KOOPMPC_BOX_HIGH(s));
+  if (KOOPMPC_HARD_RATES) {
+    koopmpc_admit(s, s->kept, koopmpc_hard_rates_low, koopmpc_hard_rates_high, u_prev);
     for (int i = 0; i < NV && conflict; i++) {
       const koopmpc_real change = s->kept[i] - u_prev[i];
-      const koopmpc_real over = change - koopmpc_hard_rate_high[i], under = koopmpc_hard_rate_low[i] - change;
+      const koopmpc_real over = change - koopmpc_hard_rates_high[i], under = koopmpc_hard_rates_low[i] - change;
       if (over > report->slack) report->slack = over;
       if (under > report->slack) report->slack = under;
     }

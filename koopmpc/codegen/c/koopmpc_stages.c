@@ -8,9 +8,7 @@
  */
 #include <math.h>
 
-#include "koopmpc_bounds.h"
-#include "koopmpc_plan.h"
-#include "koopmpc_solver.h"
+#include "koopmpc_stages_tables.h"
 #include "koopmpc_stages.h"
 
 enum { STALLED = 5 }; /* a step is centred if mu has not halved in this many steps */
@@ -22,18 +20,12 @@ static koopmpc_real quantity(const koopmpc_state *s, int k, int i) {
   return i < NV ? s->V[k * NV + i] : s->g[k * NG + i - NV];
 }
 
-/** The row of the limits of stage k: where limits do not move, the last one is that of all stages after it. */
-enum { LIMIT_ROWS = KOOPMPC_BOUNDS ? STEPS : KOOPMPC_BOX_ROWS };
-static int limit_row(int k) { return (k < LIMIT_ROWS ? k : LIMIT_ROWS - 1) * NQ; }
-
 koopmpc_real koopmpc_low_of(const koopmpc_state *s, int k, int i) {
-  if (KOOPMPC_WITH_RATES && k == 0 && i < NV) return s->first_low[i];
-  return KOOPMPC_PLAN_LOW(s)[limit_row(k) + i];
+  return KOOPMPC_WITH_RATES && k == 0 && i < NV ? s->first_low[i] : KOOPMPC_PLAN_LOW(s)[i * STEPS + k];
 }
 
 koopmpc_real koopmpc_high_of(const koopmpc_state *s, int k, int i) {
-  if (KOOPMPC_WITH_RATES && k == 0 && i < NV) return s->first_high[i];
-  return KOOPMPC_PLAN_HIGH(s)[limit_row(k) + i];
+  return KOOPMPC_WITH_RATES && k == 0 && i < NV ? s->first_high[i] : KOOPMPC_PLAN_HIGH(s)[i * STEPS + k];
 }
 
 /** Derivatives at the plan: A, B, c = F - X along it, Q, q, r (Gauss-Newton in the tracked outputs), limits g and G. */
@@ -221,15 +213,15 @@ static void reach_of(koopmpc_state *s, const koopmpc_real *X, const koopmpc_real
 
 /** The pull of a soft side's row beside its multiplier, and the part of its slack in it. */
 static koopmpc_real soft_pull(const koopmpc_state *s, int i, int soft, koopmpc_real lam, koopmpc_real over) {
-  return lam - koopmpc_soft_linear[i - HARD] - koopmpc_soft_quadratic[i - HARD] * s->eps[soft] + over;
+  return lam - koopmpc_sides_linear[i - HARD] - koopmpc_sides_quadratic[i - HARD] * s->eps[soft] + over;
 }
 
 /** A Newton step to new products t lambda = centre - second, eps nu likewise; writes the step into s->step_*. */
 static void newton(koopmpc_state *s, koopmpc_real centre) {
   koopmpc_fill(s->push, 0, STEPS * NQ);
   for (int i = 0; i < SIDES; i++) {
-    const koopmpc_real scale = koopmpc_side_scale[i];
-    koopmpc_real *push = s->push + koopmpc_side_row[i] * STEPS;
+    const koopmpc_real scale = koopmpc_sides_scale[i];
+    koopmpc_real *push = s->push + koopmpc_sides_row[i] * STEPS;
     for (int k = 0; k < STEPS; k++) {
       const int at = i * STEPS + k, soft = at - HARD * STEPS;
       const koopmpc_real w = s->lam[at] / s->t[at];
@@ -245,7 +237,7 @@ static void newton(koopmpc_state *s, koopmpc_real centre) {
   sweep(s, s->push);
   reach_of(s, s->newX, s->newU);
   for (int i = 0; i < SIDES; i++) {
-    const koopmpc_real scale = koopmpc_side_scale[i], *reach = s->reach + koopmpc_side_row[i] * STEPS;
+    const koopmpc_real scale = koopmpc_sides_scale[i], *reach = s->reach + koopmpc_sides_row[i] * STEPS;
     for (int k = 0; k < STEPS; k++) {
       const int at = i * STEPS + k, soft = at - HARD * STEPS;
       const koopmpc_real far = scale * reach[k];
@@ -312,15 +304,15 @@ static koopmpc_real interior(koopmpc_state *s, koopmpc_real mu, koopmpc_real sig
   koopmpc_fill(s->barrier, 0, STEPS * NQ);
   reach_of(s, s->dX, s->dU);
   for (int i = 0; i < SIDES; i++) {
-    const koopmpc_real scale = koopmpc_side_scale[i], *reach = s->reach + koopmpc_side_row[i] * STEPS;
-    koopmpc_real *barrier = s->barrier + koopmpc_side_row[i] * STEPS;
+    const koopmpc_real scale = koopmpc_sides_scale[i], *reach = s->reach + koopmpc_sides_row[i] * STEPS;
+    koopmpc_real *barrier = s->barrier + koopmpc_sides_row[i] * STEPS;
     for (int k = 0; k < STEPS; k++) {
       const int at = i * STEPS + k, soft = at - HARD * STEPS;
       const koopmpc_real w = s->lam[at] / s->t[at];
       s->gap[at] = s->d_side[at] + scale * reach[k] - s->t[at];
       s->eased[at] = w;
       if (i >= HARD) {
-        s->kappa[soft] = 1 / (koopmpc_soft_quadratic[i - HARD] + s->nu[soft] / s->eps[soft]);
+        s->kappa[soft] = 1 / (koopmpc_sides_quadratic[i - HARD] + s->nu[soft] / s->eps[soft]);
         s->gap[at] += s->eps[soft];
         s->eased[at] = w / (1 + w * s->kappa[soft]);
       }
@@ -358,7 +350,7 @@ static koopmpc_real unit_of(const koopmpc_state *s) {
   int count = 0;
   koopmpc_copy(span, koopmpc_input_sizes, NV);
   for (int i = 0; i < SIDES; i++)
-    if (koopmpc_side_row[i] < NV) span[koopmpc_side_row[i]] = koopmpc_side_span[i];
+    if (koopmpc_sides_row[i] < NV) span[koopmpc_sides_row[i]] = koopmpc_sides_span[i];
   for (int k = 0; k < STEPS; k++)
     if (koopmpc_free[k]) {
       count += NV;
@@ -373,10 +365,10 @@ static koopmpc_real unit_of(const koopmpc_state *s) {
 static int hard_limits_are_out_of_reach(const koopmpc_state *s) {
   koopmpc_real next[NS];
   for (int i = 0; i < NS; i++) next[i] = s->c[i] + koopmpc_dot(s->A + i * NS, s->start, NS);
-  for (int h = 0; h < KOOPMPC_HARD_OUTPUTS; h++) {
-    const int row = koopmpc_hard_output[h];
+  for (int row = 0; row < NG; row++) {
     const koopmpc_real *G = s->G + row * NS;
     koopmpc_real least = s->g[row] + koopmpc_dot(G, next, NS), most = least;
+    if (!koopmpc_is_hard(row)) continue;
     for (int j = 0; j < NV; j++) {
       koopmpc_real gain = 0, one, other;
       for (int i = 0; i < NS; i++) gain += G[i] * s->B[i * NV + j];
@@ -386,8 +378,8 @@ static int hard_limits_are_out_of_reach(const koopmpc_state *s) {
       least += one < other ? one : other;
       most += one < other ? other : one;
     }
-    if (koopmpc_low_of(s, 0, NV + row) - most > koopmpc_hard_allowance[h] ||
-        least - koopmpc_high_of(s, 0, NV + row) > koopmpc_hard_allowance[h])
+    if (koopmpc_low_of(s, 0, NV + row) - most > koopmpc_softness_allowance[row] ||
+        least - koopmpc_high_of(s, 0, NV + row) > koopmpc_softness_allowance[row])
       return 1;
   }
   return 0;
@@ -401,7 +393,7 @@ static koopmpc_status limited(koopmpc_state *s, int *iterations) {
   int since = 0, enough = 0, narrow = 0;
   for (int i = 0; i < HARD; i++) /* between two equal limits there is no interior point */
     for (int k = 0; k < STEPS; k++)
-      narrow |= !(koopmpc_low_of(s, k, koopmpc_side_row[i]) < koopmpc_high_of(s, k, koopmpc_side_row[i]));
+      narrow |= !(koopmpc_low_of(s, k, koopmpc_sides_row[i]) < koopmpc_high_of(s, k, koopmpc_sides_row[i]));
 #if KOOPMPC_HARD_OUTPUTS
   if (hard_limits_are_out_of_reach(s)) return KOOPMPC_INFEASIBLE;
 #endif
@@ -412,10 +404,10 @@ static koopmpc_status limited(koopmpc_state *s, int *iterations) {
   koopmpc_fill(s->step_nu, 0, EASED);
   for (int k = 0; k < STEPS; k++)
     for (int i = 0; i < SIDES; i++) {
-      const int at = i * STEPS + k, row = koopmpc_side_row[i], up = koopmpc_side_scale[i] > 0;
+      const int at = i * STEPS + k, row = koopmpc_sides_row[i], up = koopmpc_sides_scale[i] > 0;
       const koopmpc_real end = up ? koopmpc_low_of(s, k, row) : koopmpc_high_of(s, k, row);
-      s->d_side[at] = koopmpc_side_scale[i] * (quantity(s, k, row) - end);
-      s->t[at] = koopmpc_side_scale[i] * (quantity(s, k, row) + reached(s, k, row, s->dX, s->dU) - end);
+      s->d_side[at] = koopmpc_sides_scale[i] * (quantity(s, k, row) - end);
+      s->t[at] = koopmpc_sides_scale[i] * (quantity(s, k, row) + reached(s, k, row, s->dX, s->dU) - end);
       if (s->t[at] < least) least = s->t[at];
     }
   worst = larger(-least, (koopmpc_real)1e-3);
@@ -425,7 +417,7 @@ static koopmpc_status limited(koopmpc_state *s, int *iterations) {
       const int at = i * STEPS + k, soft = at - HARD * STEPS;
       if (i >= HARD) {
         s->eps[soft] = larger(-s->t[at], start);
-        s->nu[soft] = koopmpc_soft_linear[i - HARD] + koopmpc_soft_quadratic[i - HARD] * s->eps[soft];
+        s->nu[soft] = koopmpc_sides_linear[i - HARD] + koopmpc_sides_quadratic[i - HARD] * s->eps[soft];
         price += s->nu[soft];
         s->lam[at] = s->nu[soft] /= 2;
       }
@@ -524,7 +516,8 @@ koopmpc_real koopmpc_cost(const koopmpc_state *s) {
     for (int i = 0; i < NG; i++) {
       const koopmpc_real under = koopmpc_low_of(s, k, NV + i) - limits[i];
       const koopmpc_real over = limits[i] - koopmpc_high_of(s, k, NV + i), past = under > over ? under : over;
-      if (past > 0) cost += past * (koopmpc_cost_linear[i] + koopmpc_cost_quadratic[i] * past);
+      if (past > 0 && koopmpc_softness_linear[i] < KOOPMPC_HUGE)
+        cost += past * (koopmpc_softness_linear[i] + koopmpc_softness_quadratic[i] * past);
     }
   }
   return cost;

@@ -2,12 +2,12 @@
 #ifndef KOOPMPC_STAGES_H
 #define KOOPMPC_STAGES_H
 
-#include "koopmpc_receding.h"
+#include "koopmpc_step.h"
 
 /** Sizes: the model's x, a stage's state s and input v, tracked and limited outputs, the sides of the limits, rows of the end's cost. */
 enum {
   NX = KOOPMPC_NZ,
-  NS = KOOPMPC_POINT,
+  NS = KOOPMPC_NS,
   NV = KOOPMPC_NU,
   NR = KOOPMPC_TRACKED,
   NG = KOOPMPC_LIMITED,
@@ -72,6 +72,13 @@ void koopmpc_stage(const koopmpc_real *s, const koopmpc_real *r, koopmpc_real *o
 /** F, A, B, of, J, g and G at (x, u), for the search of an equilibrium. */
 void koopmpc_local(const koopmpc_real *x, const koopmpc_real *u KOOPMPC_AND(const koopmpc_real *w), koopmpc_real *out);
 
+#if KOOPMPC_HARD_OUTPUTS
+/** Whether a limited output is hard; the first ones are inputs where their changes count. */
+static inline int koopmpc_is_hard(int row) {
+  return row >= KOOPMPC_NU * KOOPMPC_WITH_RATES && !(koopmpc_softness_linear[row] < KOOPMPC_HUGE);
+}
+#endif
+
 /** The lower and the upper limit of entry i of [v_k; g(s_{k+1})]. */
 koopmpc_real koopmpc_low_of(const koopmpc_state *s, int k, int i);
 koopmpc_real koopmpc_high_of(const koopmpc_state *s, int k, int i);
@@ -125,6 +132,9 @@ int koopmpc_is_alone(const koopmpc_state *s, const koopmpc_real *row, const koop
 /** Whether an equilibrium holds a row for w = 0 that is known, or found from a known one, without active limits. */
 int koopmpc_is_free(koopmpc_state *s, const koopmpc_real *row);
 #endif
+
+/** Weigh the end of the horizon by a matrix alone: |root (of(x_N) - r)|^2, r the row of the target. */
+void koopmpc_weigh_row(koopmpc_real *target, const koopmpc_real *root);
 
 /** Move the end's target to where a reference that goes on as it moved asks for it; one that rests moves nothing. */
 void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end);

@@ -1,5 +1,5 @@
 /**
- * @file koopmpc_mpc.c
+ * @file koopmpc_condensed.c
  * @brief A predictive controller: the unconstrained plan first, a quadratic program only where a limit is active.
  *
  * t = M [z; u_{-1}; w; d] + (a part of the reference) is the unconstrained plan. If it meets every limit it is the
@@ -7,40 +7,31 @@
  */
 #include <math.h>
 
-#include "koopmpc_bounds.h"
-#include "koopmpc_levels.h"
-#include "koopmpc_limits.h"
-#include "koopmpc_plan.h"
-#include "koopmpc_qp.h"
-#include "koopmpc_receding.h"
-#include "koopmpc_solver.h"
+#include "koopmpc_condensed_tables.h"
+#include "koopmpc_step.h"
 
 #if KOOPMPC_BOUNDS
 #define UNPUSHED(s) (s)->unpushed
+#define MOVE_LOW(s) (s)->box_low
+#define MOVE_HIGH(s) (s)->box_high
 #else
 #define UNPUSHED(s) KOOPMPC_UNPUSHED
+#define MOVE_LOW(s) koopmpc_low
+#define MOVE_HIGH(s) koopmpc_high
 #endif
 #define MOVES KOOPMPC_MOVES
 #define PLANNED KOOPMPC_PLANNED
 #define ROWS KOOPMPC_QP_M
 
 
-/** Row k of the given input targets, counted from this step. */
-#if KOOPMPC_GIVEN && !KOOPMPC_GIVEN_TABLED
-static const koopmpc_real *given_row(const koopmpc_state *s, int k) {
-  const int row = s->row + KOOPMPC_LATENCY + k;
-  return koopmpc_given + KOOPMPC_NU * (row < KOOPMPC_GIVEN ? row : KOOPMPC_GIVEN - 1);
-}
-#endif
-
-#if KOOPMPC_AIMED && (!KOOPMPC_CHECKED_LIMITS || KOOPMPC_CHECKED > 0)
+#if KOOPMPC_AIMED && (!KOOPMPC_DISTURBANCE_WIDTH || KOOPMPC_CHECKED_COUNT > 0)
 /** Coordinates of the nearest target of row k inside its limits; 1 if a limit moved it. */
 static int target_of_row(koopmpc_state *s, int k, const koopmpc_real *e, koopmpc_real *alpha) {
   const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
 #if KOOPMPC_BOUNDS
   return koopmpc_target_within(s, row, e, s->target_low + k * KOOPMPC_NL, s->target_high + k * KOOPMPC_NL, alpha);
 #else
-  return koopmpc_target(s, row, e, alpha);
+  return koopmpc_target_within(s, row, e, koopmpc_targets_low, koopmpc_targets_high, alpha);
 #endif
 }
 #endif
@@ -73,7 +64,7 @@ enum { MOVING = 1, HELD }; /* whether the rows of the last reference were the sa
  */
 static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *reach) {
   enum { NR = KOOPMPC_NR, SIZE = (KOOPMPC_N + 1) * NR };
-  const int moves_on = s->row + 1 < KOOPMPC_GIVEN;
+  const int moves_on = s->row + 1 < KOOPMPC_GIVEN_LENGTH;
   const int last = reference->count - 1, after = last - KOOPMPC_LATENCY, there = after < KOOPMPC_N ? after : KOOPMPC_N;
   int good = 1, same = 1, held = 1; /* held: all rows are the same */
   int first_alone = 0, rests = s->aimed == HELD && reference->count == 1;
@@ -110,22 +101,25 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *re
       else
         koopmpc_add(s->column, koopmpc_from_reference, PLANNED, s->reference, (KOOPMPC_N + 1) * KOOPMPC_NR);
 #if KOOPMPC_GIVEN && !KOOPMPC_GIVEN_TABLED
-      for (int k = 0; k <= KOOPMPC_N; k++)
-        koopmpc_add(s->column, koopmpc_from_given + k * KOOPMPC_NU * PLANNED, PLANNED, given_row(s, k), KOOPMPC_NU);
+      for (int k = 0; k <= KOOPMPC_N; k++) {
+        koopmpc_real given[KOOPMPC_NU];
+        koopmpc_give_input(s, k, given);
+        koopmpc_add(s->column, koopmpc_from_given + k * KOOPMPC_NU * PLANNED, PLANNED, given, KOOPMPC_NU);
+      }
 #endif
 #if KOOPMPC_AIMED
-      koopmpc_real nearest[KOOPMPC_NA];
-#if !KOOPMPC_CHECKED_LIMITS
-      koopmpc_real alpha[KOOPMPC_NA];
+      koopmpc_real nearest[KOOPMPC_NA + 1];
+#if !KOOPMPC_DISTURBANCE_WIDTH
+      koopmpc_real alpha[KOOPMPC_NA + 1];
       int moved = 0; /* whether a limit moves the target of this row, which the column holds as if there were none */
 #endif
       /* no limit moves a target of rows as small as this */
-      const int rows = !KOOPMPC_CHECKED_LIMITS && peak <= UNPUSHED(s) ? 0 : KOOPMPC_N + 1;
+      const int rows = !KOOPMPC_DISTURBANCE_WIDTH && peak <= UNPUSHED(s) ? 0 : KOOPMPC_N + 1;
       for (int k = 0; k < rows; k++) {
         const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
         int repeated = k > 0;
         for (int i = 0; i < KOOPMPC_NR && repeated; i++) repeated = row[i] == row[i - KOOPMPC_NR];
-#if KOOPMPC_CHECKED_LIMITS /* checked when the disturbance is known */
+#if KOOPMPC_DISTURBANCE_WIDTH /* checked when the disturbance is known */
         if (!repeated) koopmpc_nearest(row, 0, nearest);
 #else
         if ((KOOPMPC_BOUNDS || !repeated) && (moved = target_of_row(s, k, 0, alpha))) {
@@ -134,12 +128,17 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *re
         }
         if (moved) koopmpc_add(s->column, koopmpc_from_target + k * KOOPMPC_NA * PLANNED, PLANNED, alpha, KOOPMPC_NA);
 #endif
-        for (int i = 0; i < KOOPMPC_CHECKED; i++) {
-          koopmpc_real value = 0, *lowest = s->column + PLANNED + i, *highest = lowest + KOOPMPC_CHECKED;
-          for (int j = 0; j < KOOPMPC_NA; j++) value += koopmpc_checked[i * KOOPMPC_NA + j] * nearest[j];
-          *lowest = k > 0 && *lowest < value ? *lowest : value;
-          *highest = k > 0 && *highest > value ? *highest : value;
+#if KOOPMPC_CHECKED_COUNT
+        koopmpc_real value[KOOPMPC_NL] = {0}, *lowest = s->column + PLANNED, *highest = lowest + KOOPMPC_CHECKED_COUNT;
+        koopmpc_add(value, koopmpc_targets_rows, KOOPMPC_NL, nearest, KOOPMPC_NA);
+        for (int i = 0; i < KOOPMPC_NL; i++) {
+          if (!koopmpc_checked[i]) continue;
+          *lowest = k > 0 && *lowest < value[i] ? *lowest : value[i];
+          *highest = k > 0 && *highest > value[i] ? *highest : value[i];
+          lowest++;
+          highest++;
         }
+#endif
       }
 #endif
     }
@@ -158,7 +157,7 @@ static int within(const koopmpc_state *s, int first, int last) {
 
 static void evaluate(koopmpc_state *s) {
   koopmpc_copy(s->t, s->column, KOOPMPC_NT);
-  koopmpc_add(s->t, koopmpc_map, KOOPMPC_NT, s->known, KOOPMPC_KNOWN);
+  koopmpc_add(s->t, koopmpc_M, KOOPMPC_NT, s->known, KOOPMPC_KNOWN);
 }
 
 #if KOOPMPC_FIRST_ALONE
@@ -209,7 +208,7 @@ static void keep(koopmpc_state *s, koopmpc_real *u, koopmpc_report *report, koop
 }
 
 /** Whether a plan that meets all limits is on levels, where its inputs have some. */
-#if KOOPMPC_LEVELED
+#if KOOPMPC_LEVELS
 static int rests(koopmpc_state *s) { return koopmpc_accept_levels(s); }
 #else
 static int rests(const koopmpc_state *s) { return (void)s, 1; }
@@ -222,15 +221,15 @@ static void unconstrained(koopmpc_state *s, koopmpc_real *u, koopmpc_report *rep
 
 #if KOOPMPC_QP_M > 0
 
-static const koopmpc_qp problem = {MOVES,           ROWS,         KOOPMPC_QP_SOFT, koopmpc_M,
-                                   koopmpc_scaling, 0,            koopmpc_sense,   koopmpc_linear,
-                                   koopmpc_rho};
+static const koopmpc_qp problem = {MOVES,           ROWS,         KOOPMPC_QP_SOFT, koopmpc_solver_M,
+                                   koopmpc_solver_scaling, 0,            koopmpc_solver_sense,   koopmpc_solver_linear,
+                                   koopmpc_solver_rho};
 
 /** The limits of row i of the QP. */
 #if KOOPMPC_BOUNDS
 static koopmpc_real row_limit(const koopmpc_real *plan, const koopmpc_real *opened, int i) {
-  const int at = koopmpc_source[i], change = KOOPMPC_CHANGES && at >= MOVES && at < 2 * MOVES;
-  return (change ? opened[at - MOVES] : plan[at]) * koopmpc_scale[i];
+  const int at = koopmpc_qp_source[i], change = KOOPMPC_CHANGES && at >= MOVES && at < 2 * MOVES;
+  return (change ? opened[at - MOVES] : plan[at]) * koopmpc_qp_scale[i];
 }
 static koopmpc_real row_low(const koopmpc_state *s, int i) { return row_limit(s->low, s->opened_low, i); }
 static koopmpc_real row_high(const koopmpc_state *s, int i) { return row_limit(s->high, s->opened_high, i); }
@@ -243,31 +242,32 @@ static koopmpc_real row_high(const koopmpc_state *s, int i) { return (void)s, ko
 static koopmpc_real set_limits(const koopmpc_state *s, koopmpc_qp_memory *qp, int hard_alone) {
   koopmpc_real conflict = 0;
   for (int i = 0; i < ROWS; i++) {
-    const koopmpc_real moved = s->t[koopmpc_source[i]] * koopmpc_scale[i];
-    koopmpc_real low = row_low(s, i), high = row_high(s, i);
-    const int which = KOOPMPC_HARD_RATED ? koopmpc_rate_input[i] : -1;
-    if (which >= 0) { /* the first change of an input, hard: the input limit has precedence */
-      const koopmpc_real last = s->known[KOOPMPC_U_PREV + which];
-      const koopmpc_real highest = (KOOPMPC_BOX_HIGH(s)[which] - last) * koopmpc_scale[i];
-      const koopmpc_real lowest = (KOOPMPC_BOX_LOW(s)[which] - last) * koopmpc_scale[i];
-      koopmpc_real past = 0;
-      if (highest < low) past += low - highest, low = highest;
-      if (lowest > high) past += lowest - high, high = lowest;
-      past /= koopmpc_scale[i];
-      if (past > (koopmpc_real)1e-5 * koopmpc_allowance[i] && past > conflict) conflict = past;
-    }
-    if (hard_alone && koopmpc_sense[i]) {
-      qp->low[i] = -KOOPMPC_HUGE;
-      qp->high[i] = KOOPMPC_HUGE;
-    } else {
-      qp->low[i] = koopmpc_clip(low - moved, -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_unit[i];
-      qp->high[i] = koopmpc_clip(high - moved, -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_unit[i];
-    }
+    qp->low[i] = row_low(s, i);
+    qp->high[i] = row_high(s, i);
+  }
+#if KOOPMPC_HARD_RATES
+  for (int j = 0; j < KOOPMPC_QP_RATE_ROWS_LENGTH; j++) { /* hard, but the limit of the input has precedence */
+    const int i = koopmpc_qp_rate_rows[j], which = koopmpc_qp_rate_inputs[j];
+    const koopmpc_real last = s->known[KOOPMPC_U_PREV + which], scale = koopmpc_qp_scale[i];
+    const koopmpc_real highest = (KOOPMPC_BOX_HIGH(s)[which] - last) * scale;
+    const koopmpc_real lowest = (KOOPMPC_BOX_LOW(s)[which] - last) * scale;
+    koopmpc_real past = 0;
+    if (highest < qp->low[i]) past += qp->low[i] - highest, qp->low[i] = highest;
+    if (lowest > qp->high[i]) past += lowest - qp->high[i], qp->high[i] = lowest;
+    past /= scale;
+    if (past > (koopmpc_real)1e-5 * koopmpc_qp_softness_allowance[i] && past > conflict) conflict = past;
+  }
+#endif
+  for (int i = 0; i < ROWS; i++) {
+    const koopmpc_real moved = s->t[koopmpc_qp_source[i]] * koopmpc_qp_scale[i];
+    const int off = hard_alone && koopmpc_solver_sense[i];
+    qp->low[i] = off ? -KOOPMPC_HUGE : koopmpc_clip(qp->low[i] - moved, -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_solver_rows[i];
+    qp->high[i] = off ? KOOPMPC_HUGE : koopmpc_clip(qp->high[i] - moved, -KOOPMPC_HUGE, KOOPMPC_HUGE) * koopmpc_solver_rows[i];
   }
   return conflict;
 }
 
-#if KOOPMPC_LEVELED
+#if KOOPMPC_LEVELS
 /** Put the plan on the best sequence of levels; writes how far a limit gave way. */
 static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_report *report) {
 #if KOOPMPC_BOUNDS
@@ -306,7 +306,7 @@ static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const ko
   koopmpc_real *M = s->eased, *scaling = M + ROWS * MOVES, *linear = scaling + ROWS, *rho = linear + ROWS;
   koopmpc_real *rows = rho + ROWS, weight = (koopmpc_real)1e7, least = 0, missed = KOOPMPC_HUGE, unit = 1;
   koopmpc_real stretch[MOVES], centre[MOVES], pull[MOVES], a[MOVES];
-  const koopmpc_qp eased = {MOVES, ROWS, KOOPMPC_QP_SOFT, M, scaling, 0, koopmpc_sense, linear, rho};
+  const koopmpc_qp eased = {MOVES, ROWS, KOOPMPC_QP_SOFT, M, scaling, 0, koopmpc_solver_sense, linear, rho};
   koopmpc_status status = KOOPMPC_INFEASIBLE;
   int active = 0;
   koopmpc_copy(rows, push, ROWS);
@@ -315,19 +315,19 @@ static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const ko
     koopmpc_qp_end end = {0, 0};
     unit = 1 + weight;
     for (int j = 0; j < MOVES; j++) {
-      stretch[j] = KOOPMPC_SQRT(unit / (1 + weight * koopmpc_lambda[j]));
-      pull[j] = -stretch[j] * weight * koopmpc_lambda[j] * centre[j] / unit;
+      stretch[j] = KOOPMPC_SQRT(unit / (1 + weight * koopmpc_solver_lambda[j]));
+      pull[j] = -stretch[j] * weight * koopmpc_solver_lambda[j] * centre[j] / unit;
     }
     for (int i = 0; i < ROWS; i++) {
       koopmpc_real square = 0;
       for (int j = 0; j < MOVES; j++) {
-        M[i * MOVES + j] = koopmpc_MV[i * MOVES + j] * stretch[j];
+        M[i * MOVES + j] = koopmpc_solver_MV[i * MOVES + j] * stretch[j];
         square += M[i * MOVES + j] * M[i * MOVES + j];
       }
       scaling[i] = square < (koopmpc_real)1e-11 ? 1 : 1 / KOOPMPC_SQRT(square);
       for (int j = 0; j < MOVES; j++) M[i * MOVES + j] *= scaling[i];
-      linear[i] = koopmpc_linear[i] / unit;
-      rho[i] = koopmpc_rho[i] * unit;
+      linear[i] = koopmpc_solver_linear[i] / unit;
+      rho[i] = koopmpc_solver_rho[i] * unit;
     }
     for (int wider = 0; wider < 2 && end.flag <= 0; wider++) {
       (void)set_limits(s, qp, 0);
@@ -346,12 +346,12 @@ static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const ko
       for (int i = 0; i < MOVES; i++) {
         koopmpc_real x = 0, moved = 0, pushed = 0;
         for (int j = 0; j < MOVES; j++) {
-          x += koopmpc_V[i * MOVES + j] * a[j];
-          moved += koopmpc_V[i * MOVES + j] * koopmpc_lambda[j] * (a[j] - centre[j]);
+          x += koopmpc_solver_V[i * MOVES + j] * a[j];
+          moved += koopmpc_solver_V[i * MOVES + j] * koopmpc_solver_lambda[j] * (a[j] - centre[j]);
         }
         for (int k = 0; k < ROWS; k++)
           if (qp->dual[k] < 0 || qp->dual[k] > 0)
-            pushed += qp->dual[k] * unit * koopmpc_M[k * MOVES + i] / koopmpc_scaling[k];
+            pushed += qp->dual[k] * unit * koopmpc_solver_M[k * MOVES + i] / koopmpc_solver_scaling[k];
         qp->primal[i] = x;
         if (koopmpc_abs(moved) > missed) missed = koopmpc_abs(moved);
         if (koopmpc_abs(x) > size) size = koopmpc_abs(x);
@@ -372,7 +372,7 @@ static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const ko
   for (int i = 0; i < ROWS; i++) {
     qp->dual[i] *= unit;
     active += qp->dual[i] < 0 || qp->dual[i] > 0;
-    qp->product[i] = koopmpc_dot(koopmpc_M + i * MOVES, qp->primal, MOVES) / koopmpc_scaling[i];
+    qp->product[i] = koopmpc_dot(koopmpc_solver_M + i * MOVES, qp->primal, MOVES) / koopmpc_solver_scaling[i];
   }
   s->far = status == KOOPMPC_OPTIMAL && 2 * active > MOVES;
   return status;
@@ -381,7 +381,7 @@ static koopmpc_status approach(koopmpc_state *s, koopmpc_qp_memory *qp, const ko
 
 /** The multiplier of row i in the last answer, shifted by one step. */
 static koopmpc_real shifted(const koopmpc_state *s, int i) {
-  return s->warm && koopmpc_shift[i] < ROWS ? s->dual[koopmpc_shift[i]] : 0;
+  return s->warm && koopmpc_qp_shift_dual[i] < ROWS ? s->dual[koopmpc_qp_shift_dual[i]] : 0;
 }
 
 /** Whether few rows are active, or few change where a step moves them on; then DAQP goes on from those that it holds. */
@@ -404,13 +404,13 @@ static void meet_limits(koopmpc_state *s, const koopmpc_real *dual) {
   koopmpc_real change[MOVES] = {0};
   int known[MOVES] = {0}, follows[MOVES] = {0};
   for (int i = 0; i < ROWS; i++) {
-    const int at = koopmpc_source[i];
+    const int at = koopmpc_qp_source[i];
     if (!(dual[i] < 0 || dual[i] > 0)) continue;
     if (at < MOVES) {
       s->t[at] = (dual[i] > 0 ? KOOPMPC_PLAN_HIGH(s) : KOOPMPC_PLAN_LOW(s))[at];
       known[at] = 1;
-    } else if (KOOPMPC_HARD_RATED && at < 2 * MOVES && !koopmpc_sense[i]) {
-      change[at - MOVES] = (dual[i] > 0 ? row_high(s, i) : row_low(s, i)) / koopmpc_scale[i];
+    } else if (KOOPMPC_HARD_RATES && at < 2 * MOVES && !koopmpc_solver_sense[i]) {
+      change[at - MOVES] = (dual[i] > 0 ? row_high(s, i) : row_low(s, i)) / koopmpc_qp_scale[i];
       follows[at - MOVES] = 1;
     }
   }
@@ -433,7 +433,7 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   const int resume = s->warm && s->resumes && lasts(s);
   koopmpc_status status;
   int good = 0;
-#if KOOPMPC_COLD_START
+#if KOOPMPC_SETTINGS_COLD_START
   s->far = s->unmet = 0;
 #endif
   s->resumes = 0;
@@ -469,17 +469,17 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
   report->slack = conflict > opened ? conflict : opened;
   for (int i = 0; i < ROWS; i++) {
     const koopmpc_real dual = qp->dual[i];
-    if (koopmpc_sense[i] && (dual < 0 || dual > 0) && koopmpc_abs(dual) >= (1 - KOOPMPC_ROUNDING) * koopmpc_linear[i]) {
-      const koopmpc_real unit = koopmpc_unit[i] * koopmpc_scale[i];
-      const koopmpc_real value = qp->product[i] / unit + s->t[koopmpc_source[i]];
-      const koopmpc_real over = value - row_high(s, i) / koopmpc_scale[i];
-      const koopmpc_real under = row_low(s, i) / koopmpc_scale[i] - value;
+    if (koopmpc_solver_sense[i] && (dual < 0 || dual > 0) && koopmpc_abs(dual) >= (1 - KOOPMPC_ROUNDING) * koopmpc_solver_linear[i]) {
+      const koopmpc_real unit = koopmpc_solver_rows[i] * koopmpc_qp_scale[i];
+      const koopmpc_real value = qp->product[i] / unit + s->t[koopmpc_qp_source[i]];
+      const koopmpc_real over = value - row_high(s, i) / koopmpc_qp_scale[i];
+      const koopmpc_real under = row_low(s, i) / koopmpc_qp_scale[i] - value;
       const koopmpc_real past = over > under ? over : under;
-      if (past > koopmpc_allowance[i] && past > report->slack) report->slack = past;
+      if (past > koopmpc_qp_softness_allowance[i] && past > report->slack) report->slack = past;
     }
   }
   koopmpc_copy(s->dual, qp->dual, ROWS);
-  s->warm = !KOOPMPC_COLD_START;
+  s->warm = !KOOPMPC_SETTINGS_COLD_START;
   return KOOPMPC_OPTIMAL;
 }
 #endif
@@ -496,9 +496,9 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
     koopmpc_fail(s, 0, applied, u, report, KOOPMPC_BAD_MEASUREMENT);
     return;
   }
-#if KOOPMPC_CHECKED > 0
+#if KOOPMPC_CHECKED_COUNT
   if (!within(s, PLANNED, KOOPMPC_NT)) { /* the disturbance moves a target outside its limits: take the nearest one inside */
-    koopmpc_real e[KOOPMPC_NZ], alpha[KOOPMPC_NA], nearest[KOOPMPC_NA];
+    koopmpc_real e[KOOPMPC_NZ], alpha[KOOPMPC_NA + 1], nearest[KOOPMPC_NA + 1];
     koopmpc_fill(e, 0, KOOPMPC_NZ);
     koopmpc_add(e, koopmpc_disturbance, KOOPMPC_NZ, s->known + KOOPMPC_PREVIEW, KOOPMPC_DRIVEN);
     for (int k = 0; k <= KOOPMPC_N; k++) {
@@ -529,24 +529,22 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
       koopmpc_fail(s, free_input, applied, u, report, status);
       return;
     }
-#if KOOPMPC_LEVELED
+#if KOOPMPC_LEVELS
     keep(s, u, report, report->gap > 0 ? KOOPMPC_TIME_LIMIT : report->slack > 0 ? KOOPMPC_SOFTENED : KOOPMPC_OPTIMAL);
     return;
 #else
     koopmpc_add(s->t, koopmpc_deviation, MOVES, qp.primal, MOVES);
     if (report->slack > 0) meet_limits(s, qp.dual);
-#if KOOPMPC_BOUNDS
+    for (int i = 0; i < MOVES; i++) s->t[i] = koopmpc_clip(s->t[i], MOVE_LOW(s)[i], MOVE_HIGH(s)[i]);
+#if KOOPMPC_HARD_RATES && KOOPMPC_BOUNDS
     koopmpc_real low[KOOPMPC_NU], high[KOOPMPC_NU];
-    for (int i = 0; i < MOVES; i++) s->t[i] = koopmpc_clip(s->t[i], s->box_low[i], s->box_high[i]);
     for (int i = 0; i < KOOPMPC_NU; i++) {
-      low[i] = KOOPMPC_CHANGES && koopmpc_hard[i] ? s->rate_low[i] : -KOOPMPC_HUGE;
-      high[i] = KOOPMPC_CHANGES && koopmpc_hard[i] ? s->rate_high[i] : KOOPMPC_HUGE;
+      low[i] = koopmpc_bounds_hard[i] ? s->rate_low[i] : -KOOPMPC_HUGE;
+      high[i] = koopmpc_bounds_hard[i] ? s->rate_high[i] : KOOPMPC_HUGE;
     }
-    if (KOOPMPC_HARD_RATED)
-      koopmpc_admit_within(s->t, low, high, s->known + KOOPMPC_U_PREV, s->box_low, s->box_high);
-#else
-    for (int i = 0; i < MOVES; i++) s->t[i] = koopmpc_clip(s->t[i], koopmpc_low[i], koopmpc_high[i]);
-    if (KOOPMPC_HARD_RATED) koopmpc_admit(s->t, koopmpc_hard_rate_low, koopmpc_hard_rate_high, s->known + KOOPMPC_U_PREV);
+    koopmpc_admit(s, s->t, low, high, s->known + KOOPMPC_U_PREV);
+#elif KOOPMPC_HARD_RATES
+    koopmpc_admit(s, s->t, koopmpc_hard_rates_low, koopmpc_hard_rates_high, s->known + KOOPMPC_U_PREV);
 #endif
     keep(s, u, report, report->slack > 0 ? KOOPMPC_SOFTENED : KOOPMPC_OPTIMAL);
 #endif
@@ -556,23 +554,11 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
 #endif
 }
 
-void koopmpc_init(koopmpc_state *s, const koopmpc_real *x0, const koopmpc_real *u_prev) {
-  koopmpc_start(s, x0, u_prev);
-}
-
-void koopmpc_step(koopmpc_state *s, const koopmpc_real *y, const koopmpc_rows *reference, const koopmpc_real *applied,
-                  const koopmpc_rows *w, koopmpc_real *u, koopmpc_report *report) {
-  koopmpc_report own;
+void koopmpc_decide(koopmpc_state *s, const koopmpc_rows *reference, const koopmpc_real *applied, koopmpc_real *u,
+                    koopmpc_report *report) {
   koopmpc_real reach;
-  int first_alone;
-  if (!report) report = &own;
-  report->fallback = KOOPMPC_NONE;
-  report->iterations = 0;
-  report->slack = report->gap = 0;
-  first_alone = aim(s, reference, &reach);
-  koopmpc_take(s, y, applied, w);
-  report->refused = s->refused;
-#if KOOPMPC_LEVELED
+  const int first_alone = aim(s, reference, &reach);
+#if KOOPMPC_LEVELS
   koopmpc_count_levels(s, applied && !KOOPMPC_LATENCY && koopmpc_usable(applied, KOOPMPC_NU) ? applied : s->given);
 #endif
   evaluate(s);
