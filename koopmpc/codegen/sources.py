@@ -69,7 +69,8 @@ def _share_arrays(tables: Tables) -> tuple[dict[str, np.ndarray], dict[str, dict
     for path, values in tables.arrays.items():
         users = [name for name, words in named.items() if path in words]
         if users:
-            (alone[users[0][:-2]] if len(users) == 1 and users[0][:-2] in alone else shared)[path] = values
+            only = users[0][:-2] if len(users) == 1 and users[0].endswith(".c") else ""
+            alone.get(only, shared)[path] = values
     return shared, alone
 
 

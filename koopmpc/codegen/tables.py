@@ -178,6 +178,9 @@ def make_tables(program: StepProgram, *, single: bool, room: int = 0) -> Tables:
         _derive_condensed(tables, program, room)
     elif isinstance(program, StagedProgram):
         _derive_staged(tables, program)
+    twice = sorted(tables.sizes.keys() & tables.reals.keys())
+    if twice:
+        raise ValueError(f"the C code has two constants of the name {twice[0]}; give one of them another name")
     return tables
 
 
@@ -211,9 +214,9 @@ def write_fields(tables: Tables, path: str, value: Any, *, single: bool) -> None
     elif isinstance(value, float):
         tables.reals[name] = value
     elif isinstance(value, np.ndarray):
-        whole = value.dtype.kind in "biu"
-        tables.arrays[path] = value.astype(np.intc).ravel() if whole else np.asarray(value).T.ravel()
-        tables.sizes |= {name: 1, f"{name}_LENGTH": len(value), f"{name}_WIDTH": value.shape[-1]}
+        array = cast("np.ndarray", value)
+        tables.arrays[path] = array.astype(np.intc).ravel() if array.dtype.kind in "biu" else array.T.ravel()
+        tables.sizes |= {name: 1, f"{name}_LENGTH": len(array), f"{name}_WIDTH": array.shape[-1]}
     elif isinstance(value, Graph):
         tables.sizes[name] = value.m
         tables.functions[path] = CFunction(_round_gate(value) if single else value, {}, "")
@@ -224,15 +227,15 @@ def write_fields(tables: Tables, path: str, value: Any, *, single: bool) -> None
 
 
 @singledispatch
-def convert(value: Any, single: bool) -> Mapping[str, Any]:
+def convert(value: object, single: bool) -> Mapping[str, Any]:
     """Return the entries of a value by their names; single precision may need other ones."""
     del single
     if isinstance(value, Mapping):
         return cast("Mapping[str, Any]", value)
     if dataclasses.is_dataclass(value):
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if not f.name.startswith("_")}
-    named = getattr(value, "_asdict", None)  # of a NamedTuple
-    return named() if named else {str(i): entry for i, entry in enumerate(value)}
+    entries = cast("tuple[Any, ...]", value)
+    return dict(zip(getattr(value, "_fields", map(str, range(len(entries)))), entries, strict=True))
 
 
 @convert.register
@@ -274,8 +277,8 @@ def _(setup: DAQPSetup, single: bool) -> Mapping[str, Any]:
     squares = (M**2).sum(axis=1)
     scaling = np.where(squares < _ZERO_ROW, 1.0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)))
     arrays: dict[str, Any] = {
-        "n": len(H),
-        "m": len(M),
+        "variables": len(H),
+        "count": len(M),
         "M": (M * scaling[:, None]).ravel(),
         "scaling": scaling,
         "rinv": rinv,
@@ -301,13 +304,17 @@ def _add_sizes(tables: Tables, program: StepProgram) -> None:
     model, estimator, sizes = program.model, program.estimator, tables.sizes
     embedding = None if isinstance(model, StepMap) else model.embedding
     steps, inputs_too = (0, 0) if embedding is None else (embedding.steps, int(embedding.inputs))
-    staged, rates = isinstance(program, StagedProgram), getattr(program, "K_rate", np.zeros(0))
-    nx, nw = (program.ny, program.E.shape[1]) if staged else (model.nx, getattr(model, "nw", 0))
+    rates: np.ndarray = getattr(program, "K_rate", np.zeros(0))
+    nx, nw = model.nx, 0
+    if isinstance(program, StagedProgram):
+        nx, nw = program.ny, program.E.shape[1]
+    elif isinstance(model, LinearPredictor):
+        nw = model.nw
     N, latency = (1, 0) if tables.is_lqr else (sizes["N"], sizes["LATENCY"])
     bounds: BoundsProgram | None = getattr(program, "bounds", None)
     sizes |= {
         "IS_LQR": int(tables.is_lqr),
-        "IS_STAGED": int(staged),
+        "IS_STAGED": int(tables.is_staged),
         "ESTIMATOR": {EstimatorProgram: 0, DisturbanceProgram: 1, FilterProgram: 2}[type(estimator)],
         "GATE": 0 if estimator.gate is None else estimator.gate.m - 2,
         "NU": model.nu,
@@ -329,7 +336,7 @@ def _add_sizes(tables: Tables, program: StepProgram) -> None:
         "NL": sizes.get("TARGETS_ROWS_LENGTH", 0),
         "MOVES": model.nu,  # of a feedback law
         "KNOWN": program.lifting.m + nw,
-        "CHANGES": int(bounds is not None and not staged and program.rates is not None),
+        "CHANGES": int(bounds is not None and not tables.is_staged and program.rates is not None),
         "BRIDGED": BRIDGED,
         "NODES": NODES,
         "FREE": FREE,
@@ -352,7 +359,9 @@ def _add_sizes(tables: Tables, program: StepProgram) -> None:
         counts = {argument: inside[argument] for argument in arguments if inside[argument]}
         functions[name] = CFunction(graph, counts, result)
     tables.functions = functions
-    _add_memory(sizes, "TARGET", [(sizes[f"{name}_N"], sizes[f"{name}_M"], 0) for name in _target_solvers(sizes)])
+    _add_memory(
+        sizes, "TARGET", [(sizes[f"{name}_VARIABLES"], sizes[f"{name}_COUNT"], 0) for name in _target_solvers(sizes)]
+    )
 
 
 def _target_solvers(sizes: Mapping[str, int]) -> list[str]:

@@ -50,17 +50,17 @@ static void advance(koopmpc_real *next, const koopmpc_real *z, const koopmpc_rea
                     const koopmpc_real *d) {
 #if KOOPMPC_IS_STAGED
   koopmpc_map(z, u KOOPMPC_AND(w), next);
+  if (KOOPMPC_NW) koopmpc_add(next, koopmpc_E, KOOPMPC_NZ, w, KOOPMPC_NW);
 #else
   koopmpc_fill(next, 0, KOOPMPC_NZ);
   koopmpc_add(next, koopmpc_model_A, KOOPMPC_NZ, z, KOOPMPC_NZ);
   koopmpc_add(next, koopmpc_model_B, KOOPMPC_NZ, u, KOOPMPC_NU);
-#endif
   if (KOOPMPC_NW) koopmpc_add(next, koopmpc_model_E, KOOPMPC_NZ, w, KOOPMPC_NW);
+#endif
   if (d)
     for (int i = 0; i < KOOPMPC_NZ; i++) next[i] += d[i];
 }
 #endif
-
 
 #if KOOPMPC_GATE && KOOPMPC_ESTIMATOR < 2
 /** The states of z. */
@@ -99,8 +99,10 @@ static void move(koopmpc_state *s, koopmpc_real *state, const koopmpc_real *driv
 
 /** expected <- M s + h. */
 static void show(const koopmpc_real *state, koopmpc_real *expected) {
-  koopmpc_copy(expected, koopmpc_estimator_h, KOOPMPC_NY);
-  koopmpc_add(expected, koopmpc_estimator_M, KOOPMPC_NY, state, FILTERED);
+  for (int i = 0; i < KOOPMPC_NY; i++) {
+    expected[i] = koopmpc_estimator_h[i];
+    for (int j = 0; j < FILTERED; j++) expected[i] += koopmpc_estimator_M[j * KOOPMPC_NY + i] * state[j];
+  }
 }
 
 static void predict(koopmpc_state *s, const koopmpc_real *u, const koopmpc_real *w, koopmpc_real *z,

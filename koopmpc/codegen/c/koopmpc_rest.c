@@ -342,13 +342,13 @@ int koopmpc_near(koopmpc_real *x, koopmpc_real *u, koopmpc_real *active, const k
       }
     }
     for (int i = 0; i < SIZE; i++) s[i] += step[i];
-    if (length < 1 || length > 1) close = KOOPMPC_ESTIMATOR_HELD; /* steps that swing leave more than their square */
+    if (length < 1 || length > 1) close = KOOPMPC_HELD; /* steps that swing leave more than their square */
     if (going && largest_of(whole, SIZE) <= close * reach) {
       for (int i = 0; i < NX + n; i++) {
         const koopmpc_real still = koopmpc_abs(koopmpc_dot(kept + i * SIZE, step, SIZE) + missed[i]);
         if (still > off) off = still;
       }
-      if (!(off <= KOOPMPC_ESTIMATOR_HELD * reach)) return 0;
+      if (!(off <= KOOPMPC_HELD * reach)) return 0;
       for (int i = 0; i < NX; i++) x[i] = s[i] * koopmpc_rest_size[i];
       for (int i = 0; i < NV; i++)
         u[i] = koopmpc_clip(s[NX + i] * koopmpc_rest_size[NX + i], koopmpc_inputs_low[i], koopmpc_inputs_high[i]);

@@ -66,7 +66,7 @@ int koopmpc_is_alone(const koopmpc_state *s, const koopmpc_real *row, const koop
   koopmpc_real at[KOOPMPC_LOCAL], size = apart(row, nothing);
   (void)none;
   koopmpc_local(target + TARGET_X, target + TARGET_U KOOPMPC_AND(none), at);
-  if (apart(row, at + LOCAL_OF) <= KOOPMPC_ESTIMATOR_HELD * (1 + size)) return 1;
+  if (apart(row, at + LOCAL_OF) <= KOOPMPC_HELD * (1 + size)) return 1;
   return beside && apart(row, beside) <= BESIDE * BESIDE * (size > 1 ? size : 1);
 }
 #endif
@@ -80,7 +80,7 @@ static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc
     const koopmpc_real share = done + stride < 1 ? done + stride : 1;
     for (int i = 0; i < ROW; i++) there[i] = share < 1 ? from[i] + share * (row[i] - from[i]) : row[i];
     for (int i = 0; i < KOOPMPC_NW; i++) now[i] = share * w[i];
-    if (koopmpc_near(x, u, active, there, now, none, KOOPMPC_ESTIMATOR_HELD, careful)) {
+    if (koopmpc_near(x, u, active, there, now, none, KOOPMPC_HELD, careful)) {
       done = share;
       if (!(done < 1)) return 1;
       stride *= 2;
@@ -88,7 +88,7 @@ static int walk(const koopmpc_real *from, const koopmpc_real *row, const koopmpc
       stride /= 2;
     }
   }
-  return careful && koopmpc_near(x, u, active, row, w, none, KOOPMPC_ESTIMATOR_HELD, PATIENCE);
+  return careful && koopmpc_near(x, u, active, row, w, none, KOOPMPC_HELD, PATIENCE);
 }
 
 /** du/de of an equilibrium without active limits. */
@@ -120,7 +120,7 @@ int koopmpc_is_free(koopmpc_state *s, const koopmpc_real *row) {
   koopmpc_real at[KOOPMPC_LOCAL];
   if (!still) return 0;
   koopmpc_local(still + TARGET_X, still + TARGET_U KOOPMPC_AND(none), at);
-  if (!(apart(row, at + LOCAL_OF) <= KOOPMPC_ESTIMATOR_HELD * apart(row, nothing))) return 0; /* several may come as near */
+  if (!(apart(row, at + LOCAL_OF) <= KOOPMPC_HELD * apart(row, nothing))) return 0; /* several may come as near */
   return !koopmpc_is_limited(still + TARGET_ACTIVE) && still[still == s->still ? TARGET_M : TARGET_FOUND] > 0;
 }
 
@@ -132,7 +132,7 @@ static int move_on(koopmpc_state *s, const koopmpc_real *row, const koopmpc_real
   for (int i = 0; i < KOOPMPC_NW; i++) moved |= w[i] < 0 || w[i] > 0;
   if (moved && s->has_last_end && is_row(s->last_end, row) && !koopmpc_is_limited(s->last_end + TARGET_ACTIVE)) {
     koopmpc_copy(own, s->last_end, TARGET_M);
-    if (koopmpc_near(own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE, row, w, none, KOOPMPC_ESTIMATOR_HELD, 0) &&
+    if (koopmpc_near(own + TARGET_X, own + TARGET_U, own + TARGET_ACTIVE, row, w, none, KOOPMPC_HELD, 0) &&
         !koopmpc_is_limited(own + TARGET_ACTIVE))
       return 1;
   }

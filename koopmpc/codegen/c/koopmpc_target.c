@@ -5,9 +5,9 @@
 #if KOOPMPC_TARGET_SOLVERS
 /* inside all limits, or inside those of the inputs alone */
 static const koopmpc_qp qps[2] = {
-    {KOOPMPC_TARGET_SOLVERS_0_N, KOOPMPC_TARGET_SOLVERS_0_M, 0, koopmpc_target_solvers_0_M, koopmpc_target_solvers_0_scaling,
+    {KOOPMPC_TARGET_SOLVERS_0_VARIABLES, KOOPMPC_TARGET_SOLVERS_0_COUNT, 0, koopmpc_target_solvers_0_M, koopmpc_target_solvers_0_scaling,
      KOOPMPC_TARGET_SOLVERS_0_RINV_LENGTH ? koopmpc_target_solvers_0_rinv : 0, koopmpc_target_solvers_0_sense, 0, 0},
-    {KOOPMPC_TARGET_SOLVERS_1_N, KOOPMPC_TARGET_SOLVERS_1_M, 0, koopmpc_target_solvers_1_M, koopmpc_target_solvers_1_scaling,
+    {KOOPMPC_TARGET_SOLVERS_1_VARIABLES, KOOPMPC_TARGET_SOLVERS_1_COUNT, 0, koopmpc_target_solvers_1_M, koopmpc_target_solvers_1_scaling,
      KOOPMPC_TARGET_SOLVERS_1_RINV_LENGTH ? koopmpc_target_solvers_1_rinv : 0, koopmpc_target_solvers_1_sense, 0, 0}};
 static const koopmpc_real *const units[2] = {koopmpc_target_solvers_0_rows, koopmpc_target_solvers_1_rows};
 #endif
