@@ -19,6 +19,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import singledispatch
+from numbers import Integral
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
@@ -209,7 +210,7 @@ def write_fields(tables: Tables, path: str, value: Any, *, single: bool) -> None
     if value is None or isinstance(value, str):
         return
     name = path.upper()
-    if isinstance(value, bool | int | np.integer | np.bool_):
+    if isinstance(value, Integral | np.bool_):
         tables.sizes[name] = int(value)
     elif isinstance(value, float):
         tables.reals[name] = value
