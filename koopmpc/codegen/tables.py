@@ -211,7 +211,7 @@ def write_fields(tables: Tables, path: str, value: Any, *, single: bool) -> None
         return
     name = path.upper()
     if isinstance(value, Integral | np.bool_):
-        tables.sizes[name] = int(value)
+        tables.sizes[name] = int(cast("int", value))
     elif isinstance(value, float):
         tables.reals[name] = value
     elif isinstance(value, np.ndarray):
