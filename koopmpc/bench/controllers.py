@@ -23,7 +23,7 @@ from koopmpc.control.kinds import BenchEntry, list_bench
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.equilibrium import Equilibria
-from koopmpc.control.nonlinear.problem import learned_map
+from koopmpc.control.nonlinear.learned_map import learned_map
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError, ProblemError, hide_fit_warnings

@@ -2,9 +2,9 @@
 
 from koopmpc.control.nonlinear import motion
 from koopmpc.control.nonlinear.active_limits import RANK
-from koopmpc.control.nonlinear.bilinear_mpc import SETTLED
 from koopmpc.control.nonlinear.equilibrium import SETTLED as HELD
 from koopmpc.control.nonlinear.iteration import DIGITS, ENOUGH, PRECISE, STUCK
+from koopmpc.control.nonlinear.real_time_solver import SETTLED
 from koopmpc.control.nonlinear.staged_mpc import NO_DIGITS
 from koopmpc.control.plan.row_targets import PSEUDO
 from koopmpc.control.riccati import SETTLED as RESTED

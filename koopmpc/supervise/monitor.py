@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.base import InitialCondition
-from koopmpc.control.nonlinear.problem import LearnedMap
+from koopmpc.control.nonlinear.learned_map import LearnedMap
 from koopmpc.control.watching import StepMonitor, register_monitor
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError

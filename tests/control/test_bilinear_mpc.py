@@ -383,7 +383,7 @@ def test_a_step_that_has_spent_its_iterations_begins_no_further_start(monkeypatc
     cost, limits = km.Cost(Q=[10, 10, 1], R=0.1, of=UPRIGHT), km.Limits(-2, 2)
     statuses, iterations = [], []
     for spent in (300, 1):
-        monkeypatch.setattr("koopmpc.control.nonlinear.bilinear_mpc.SPENT", spent)
+        monkeypatch.setattr("koopmpc.control.nonlinear.real_time_solver.SPENT", spent)
         move = km.BilinearMPC(plant, cost, limits, 20)([3.0, 0.0], [0, 1, 0])
         statuses.append(move.status)
         iterations.append(move.iterations)

@@ -12,7 +12,7 @@ from scipy.linalg import solve_discrete_are
 import koopmpc as km
 from koopmpc.control.cost import state_tracking
 from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria
-from koopmpc.control.nonlinear.problem import learned_map
+from koopmpc.control.nonlinear.learned_map import learned_map
 from koopmpc.control.plan.row_targets import RowTarget, RowTargets
 from koopmpc.control.riccati import one_step, stationary
 from koopmpc.control.step.rest import MovingEnd

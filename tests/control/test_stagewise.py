@@ -10,7 +10,8 @@ import pytest
 import koopmpc as km
 from koopmpc.control.cost import state_tracking
 from koopmpc.control.limits import SOFTENED
-from koopmpc.control.nonlinear.problem import StagedProblem, learned_map, staged_problem
+from koopmpc.control.nonlinear.learned_map import learned_map
+from koopmpc.control.nonlinear.problem import StagedProblem, staged_problem
 from koopmpc.control.nonlinear.stagewise import (
     RiccatiSweeps,
     interior_step,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.nonlinear import bilinear_mpc
+from koopmpc.control.nonlinear import real_time_solver
 from koopmpc.control.nonlinear.iteration import RealTimeIteration, StageStep
 from tests.control.test_bilinear_mpc import CIRCLE
 from tests.control.test_nonlinear_mpc import pendulum
@@ -25,12 +25,22 @@ def made(cost=CIRCLE, limits=None, model=None, **options):
     return km.BilinearMPC(model or pendulum(), cost, limits or km.Limits(-1, 1), N, **options)
 
 
+def start(mpc, x, u_prev, deadline=np.inf):
+    """Return where a plan starts from a state, with the targets of the last step."""
+    mpc._initial.take(x, np.asarray(u_prev), None, None)
+    mpc._given = np.asarray(u_prev)
+    if mpc._initial.u_prev.size:
+        mpc._initial.u_prev[:] = u_prev
+    begin = mpc._begin(np.array([0.2, 0.0] if mpc._aim.targets.equilibria.of_state else [0.0, 1.0, 0.0]), 0.0)
+    return begin._replace(deadline=deadline)
+
+
 @pytest.mark.parametrize("rated", [False, True])
 def test_it_starts_from_rest_the_line_to_the_equilibrium_and_the_free_motion(rated):
     mpc = made(TRACKED if rated else CIRCLE)
     mpc([0.3, 0.1], [0.2, 0.0] if rated else [0, 1, 0])
     end, x, u = mpc._aim.end.equilibrium.x, np.array([0.7, -0.2]), np.array([0.4 if rated else 0.0])
-    (rest, U), (line, V), (motion, W) = mpc._starts(x, np.array([0.4]))
+    (rest, U), (line, V), (motion, W) = mpc._solver._starts(start(mpc, x, [0.4]))
     for inputs in (U, V, W):
         np.testing.assert_array_equal(inputs, np.tile(u, (N, 1)))
     np.testing.assert_array_equal(rest, np.tile(x, (N + 1, 1)))
@@ -41,7 +51,7 @@ def test_it_starts_from_rest_the_line_to_the_equilibrium_and_the_free_motion(rat
     np.testing.assert_allclose(motion, wanted, atol=1e-12)
     model = made(model=learned())
     model([0.3, 0.1], [0, 1, 0])
-    assert len(list(model._starts(x, u))) == 2  # a learned model may invent a motion
+    assert len(list(model._solver._starts(start(model, x, u)))) == 2  # a learned model may invent a motion
 
 
 @pytest.mark.parametrize("moves", [None, 3])
@@ -51,8 +61,8 @@ def test_the_next_step_starts_from_the_plan_moved_on_by_one_step_of_the_model(mo
         mpc(x, [0.2, 0.0])
     before, e = mpc.plan(), mpc._e[-1].copy()
     assert np.abs(e).max() > 1e-3
-    mpc._shift(before.U[0])
-    X, U = mpc._trajectory(mpc._iteration.X, mpc._iteration.U)
+    mpc._solver._shift(start(mpc, before.X[0], before.U[0])._replace(e=np.tile(e, (N, 1))))
+    X, U = mpc._problem.leave(mpc._iteration.X, mpc._iteration.U, mpc._limits_now.inputs)
     wanted = np.vstack([before.U[1:], before.U[-1:]])[mpc._problem.held_from[:, 0]]
     np.testing.assert_allclose(U, wanted, atol=1e-12)
     np.testing.assert_allclose(X[:-1], before.X[1:], atol=1e-12)
@@ -76,9 +86,9 @@ def test_of_the_plans_that_follow_the_model_the_cheapest_is_taken(monkeypatch, e
     mpc, now, asked = made(), {}, []
     monkeypatch.setattr(RealTimeIteration, "gap", property(lambda _: now["gap"]))
     monkeypatch.setattr(RealTimeIteration, "cost", lambda _: now["cost"])
-    monkeypatch.setattr(mpc, "_starts", lambda x, u: [(i, i) for i in range(3)])
+    monkeypatch.setattr(mpc._solver, "_starts", lambda start: [(i, i) for i in range(3)])
 
-    def improve(s, u_prev, most, deadline, settled=bilinear_mpc.SETTLED, begin=None, until=None):
+    def improve(start, most, settled=real_time_solver.SETTLED, begin=None, until=None):
         asked.append((most, settled, begin))
         if begin is None:
             now["before"] = mpc._iteration.X[0, 0]
@@ -88,11 +98,11 @@ def test_of_the_plans_that_follow_the_model_the_cheapest_is_taken(monkeypatch, e
         mpc._iteration.X[:], mpc._iteration.U[:], mpc._iteration.slack = begin[0], begin[0], float(begin[0])
         return found, 1
 
-    monkeypatch.setattr(mpc, "_improve", improve)
-    found, iterations = mpc._begin_anew(np.zeros(2), np.zeros(1), np.inf)
+    monkeypatch.setattr(mpc._solver, "_improve", improve)
+    found, iterations = mpc._solver._begin_anew(start(mpc, [0.0, 0.0], [0.0]))
     good = any(end[0] not in (FAILED, km.Status.INFEASIBLE) for end in ends)
     assert [each[0] for each in asked] == [12, 12, 12] + [10] * good
-    assert {each[1] for each in asked[:3]} == {bilinear_mpc.NEARLY}
+    assert {each[1] for each in asked[:3]} == {real_time_solver.NEARLY}
     assert found is status
     assert iterations == (103 if good else 3)
     if good:
@@ -101,7 +111,7 @@ def test_of_the_plans_that_follow_the_model_the_cheapest_is_taken(monkeypatch, e
         assert polished is OPTIMAL or (taken == mpc._iteration.U).all()
         assert mpc._iteration.slack == taken
     asked.clear()
-    found, iterations = mpc._begin_anew(np.zeros(2), np.zeros(1), -np.inf)  # no time for more than one
+    found, iterations = mpc._solver._begin_anew(start(mpc, [0.0, 0.0], [0.0], -np.inf))  # no time for more than one
     assert len(asked) == 1
     assert found is ends[0][0]
     assert iterations == 1
@@ -147,8 +157,8 @@ GOOD, HARD = (OPTIMAL, 1.0, 0.0, 0.0), (OPTIMAL, 1.0, 0.0, 0.3)
 def test_iterations_end_where_the_plan_rests_or_one_of_them_has_no_good_end(script, rests, status, taken):
     mpc = made(sqp_iterations=2)
     mpc([0.1, 0.0], [0, 1, 0])
-    mpc._iteration = steps = Steps(*script, rests=rests)
-    found, iterations = mpc._improve(np.zeros(2), np.zeros(1), 3, np.inf, 0.5)
+    mpc._solver.iteration = steps = Steps(*script, rests=rests)
+    found, iterations = mpc._solver._improve(start(mpc, [0.0, 0.0], [0.0]), 3, 0.5)
     assert found is status
     assert steps.count == taken
     assert iterations == sum(range(1, taken + 1))
@@ -159,9 +169,9 @@ def test_iterations_end_where_the_plan_rests_or_one_of_them_has_no_good_end(scri
 def test_iterations_end_at_the_deadline_with_the_plan_so_far():
     mpc = made()
     mpc([0.1, 0.0], [0, 1, 0])
-    mpc._iteration = steps = Steps(GOOD, GOOD)
+    mpc._solver.iteration = steps = Steps(GOOD, GOOD)
     begin = np.full((N + 1, 2), 5.0), np.zeros((N, 1))
-    found, _ = mpc._improve(np.zeros(2), np.zeros(1), 2, -np.inf, begin=begin)
+    found, _ = mpc._solver._improve(start(mpc, [0.0, 0.0], [0.0], -np.inf), 2, begin=begin)
     assert found is OPTIMAL
     assert steps.count == 1
     assert (steps.X == 6.0).all()
@@ -169,8 +179,8 @@ def test_iterations_end_at_the_deadline_with_the_plan_so_far():
 
 def test_a_state_far_from_the_expected_one_begins_anew_and_the_last_plan_goes_on_elsewhere(monkeypatch):
     mpc, anew = made(limits=km.Limits(-1, 1, x_min=[-4, -2], x_max=[4, 2])), []
-    own = mpc._begin_anew
-    monkeypatch.setattr(mpc, "_begin_anew", lambda *rest: anew.append(1) or own(*rest))
+    own = mpc._solver._begin_anew
+    monkeypatch.setattr(mpc._solver, "_begin_anew", lambda *rest: anew.append(1) or own(*rest))
     mpc([0.1, 0.0], [0, 1, 0])
     assert len(anew) == 1  # there is no plan
     sizes = mpc._problem.sizes
@@ -225,12 +235,13 @@ def test_what_a_plan_costs_is_the_cost_of_its_states_and_inputs(R_delta, latency
 @pytest.mark.parametrize("rated", [False, True])
 def test_a_plan_is_the_same_in_stages_but_for_inputs_that_are_held_or_beyond_their_limits(moves, rated):
     mpc, rng = made(TRACKED if rated else CIRCLE, km.Limits(-1, 1), moves=moves), np.random.default_rng(0)
+    problem, box = mpc._problem, mpc._limits_now.inputs
     X, U, last = rng.standard_normal((N + 1, 2)), rng.standard_normal((N, 1)), np.array([0.3])
-    back, inputs = mpc._trajectory(*mpc._stages(X, U, last))
+    back, inputs = problem.leave(*problem.enter(X, U, last, box), box)
     np.testing.assert_array_equal(back, X)
     held = [0, 1, 2, 3, 4] if moves is None else [0, 1, 1, 1, 1]
     np.testing.assert_allclose(inputs, np.clip(U, -1, 1)[held], atol=1e-12)
     if rated or moves:
-        S, V = mpc._stages(X, U, last)
+        S, V = problem.enter(X, U, last, box)
         np.testing.assert_allclose(S[:, 2], [0.3, *inputs[:, 0]], atol=1e-12)
         np.testing.assert_allclose(V[:, 0], np.diff([0.3, *inputs[:, 0]]), atol=1e-12)

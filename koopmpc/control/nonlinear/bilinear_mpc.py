@@ -1,8 +1,7 @@
 """BilinearMPC: real-time iteration on a bilinear predictor, or on any map, in the dimension of the state."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -10,17 +9,15 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.checks import HUGE
 from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
-from koopmpc.control.limits import SOFTENED, Interval, Limits
-from koopmpc.control.move import Status
-from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
-from koopmpc.control.nonlinear.level_stages import StageLevels
+from koopmpc.control.limits import Limits
+from koopmpc.control.nonlinear.iteration import RealTimeIteration
+from koopmpc.control.nonlinear.learned_map import ModelOrMap
 from koopmpc.control.nonlinear.motion import BEYOND
-from koopmpc.control.nonlinear.problem import ModelOrMap
-from koopmpc.control.nonlinear.rows import StageLimits, describe_stage_bounds
-from koopmpc.control.nonlinear.staged_mpc import GOOD, StagedMPC, StagePlan
+from koopmpc.control.nonlinear.real_time_solver import RealTimeSolver
+from koopmpc.control.nonlinear.rows import describe_stage_bounds
+from koopmpc.control.nonlinear.staged_mpc import StagedMPC
 from koopmpc.control.nonlinear.staged_program import StagedProgram, find_targets, first_gain, trace_functions
 from koopmpc.control.nonlinear.stagewise import list_sides, weights
 from koopmpc.control.program import no_export, publish_estimator, reference_table, trace_lifting
@@ -33,26 +30,15 @@ from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.estimate.observer import Estimator
 from koopmpc.interrupts import raise_swallowed
-from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor
 
-EACH = 12  # linearisations from each start of a first step, at most
-FIRST = 10  # further linearisations of the best of these plans, at most
-SPENT = 300  # after so much effort of the solver no further start, and no further linearisation from one, begins
-FOLLOWED = 0.02  # a plan follows the model whose defects are below this share of the range of their state
-SETTLED = (
-    1e-6  # a plan is a solution when no input and no state moves by more than this share of its size and the plan's
-)
-FAR = 3.0  # begin a new plan if y is more than this many state sizes from the expected state
-MET = 1e-8  # a plan ends in its terminal set if the value of the set is at most this much above 1
-ENDINGS = 20  # further linearisations, at most, of a plan that breaks a hard limit or misses its terminal set
-NEARLY = 1e-2  # the same for a plan that is compared with others
 _COPIED = (
     "_initial",
     "_kept",
     "_age",
     "_given",
     "_rest",
+    "_e",
     "_steps",
     "_planned",
     "_warm",
@@ -156,11 +142,10 @@ class BilinearMPC(StagedMPC):
         super().__init__(model, cost, limits, horizon, moves, estimator, latency, time_limit, monitor)
         self._sqp_iterations = checks.count(sqp_iterations, "sqp_iterations")
         self._iteration = RealTimeIteration(self._problem, compiles_model=self._compiles_model)
-        self._iteration.set_theta(self._map.theta)
-        self._affine, self._spent = self._problem.affine, 0  # effort of the solver in this step
-        self._e = self._iteration.e[:, : self._map.nx]
+        self._solver = RealTimeSolver(
+            self._iteration, self._map, self._outputs.inputs, self._sqp_iterations, self._levels
+        )
         self._X, self._U = self._iteration.X[:, : self._map.nx], np.zeros((self._N, self.nu))
-        self._on_levels = None if self._levels is None else StageLevels(self._levels, self._problem)
 
     def _made_of(self) -> tuple[str, ModelOrMap, dict[str, Any]]:
         return "BilinearMPC", self.model, {"sqp_iterations": self._sqp_iterations}
@@ -211,7 +196,7 @@ class BilinearMPC(StagedMPC):
             settings=daqp_settings(),
             functions=trace_functions(problem, outputs, model),
             N=self._N,
-            affine=self._affine,
+            affine=problem.affine,
             latency=self._latency,
             iterations=self._sqp_iterations,
             nx=model.nx,
@@ -276,213 +261,8 @@ class BilinearMPC(StagedMPC):
             self._keeper.ahead = ahead
         if levels is not None:
             self._levels, self._held = levels, levels.held
-            self._on_levels = StageLevels(levels, self._problem)
+            self._solver = RealTimeSolver(iteration, self._map, self._outputs.inputs, self._sqp_iterations, levels)
         self.__dict__.update(held)
-
-    def update(self, model: ModelOrMap) -> None:
-        """Go on with new A, B, N, C and E of the same lifting: the plan and the last input are kept.
-
-        Raises
-        ------
-        DataError
-            The model is of another kind, has another lifting, dt, states, inputs or disturbances, or is a StepMap.
-        """
-        super().update(model)
-        self._iteration.set_theta(self._map.theta)
-
-    def _limit(self, limits: StageLimits | None) -> None:
-        low, high = self._problem.stage_limits if limits is None else limits.stages
-        self._iteration.low[:], self._iteration.high[:] = low, high
-
-    def _weigh(self, Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N m"]) -> None:
-        self._iteration.set_weights(Q, R)
-
-    def _schedule(self, W: Float[np.ndarray, "N nw"]) -> None:
-        self._iteration.W[:] = W
-
-    def _solve(
-        self,
-        s: Float[np.ndarray, " ns"],
-        u_prev: Float[np.ndarray, " nu"],
-        first: Interval,
-        deadline: float,
-    ) -> StagePlan:
-        iteration, self._spent = self._iteration, 0
-        iteration.multipliers = None
-        if self._with_rates:
-            iteration.low[0, : self.nu], iteration.high[0, : self.nu] = first
-        status, iterations = Status.FAILED, 0
-        nx = self._map.nx
-        jump = np.abs(s[:nx] - iteration.X[1, :nx]) / self._problem.sizes[:nx]  # from the state that was expected
-        if self._warm and jump.max() <= FAR:
-            self._shift(u_prev)
-            status, iterations = self._improve(s, u_prev, self._sqp_iterations, deadline)
-            if iteration.limits_outputs:
-                status, more = self._meet_limits(status, s, u_prev, deadline)
-                iterations += more
-        if status not in GOOD and status is not Status.TIME_LIMIT:  # there is no plan, or it has lost the plant
-            status, more = self._begin_anew(s, u_prev, deadline)
-            iterations += more
-            if iteration.limits_outputs:
-                status, more = self._meet_limits(status, s, u_prev, deadline)
-                iterations += more
-        if self._problem.ends and status in GOOD:
-            status, more = self._meet_end(status, s, u_prev, deadline)
-            iterations += more
-        if self._on_levels is not None and status in GOOD and not self._rests_on_levels(iteration.X, iteration.U):
-            status, more = self._on_levels.improve(iteration, s, self._targets, deadline)
-            iterations += more
-        free = iteration.without_limits + (u_prev if self._with_rates else 0.0)
-        return StagePlan(iteration.X, iteration.U, status, iterations, iteration.slack, free)
-
-    def _meet_limits(
-        self, status: Status, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], deadline: float
-    ) -> tuple[Status, int]:
-        """Linearise on until the plan keeps its hard limits; return how it ended, and the solver's iterations."""
-        iteration, total = self._iteration, 0
-        for _ in range(ENDINGS):
-            if status not in GOOD or iteration.excess() <= 1 or perf_counter() > deadline:
-                return status, total
-            status, more = self._improve(s, u_prev, 1, deadline)
-            total += more
-        return (status if status not in GOOD or iteration.excess() <= 1 else Status.MAX_ITERATIONS), total
-
-    def _meet_end(
-        self, status: Status, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], deadline: float
-    ) -> tuple[Status, int]:
-        """Linearise on until the plan ends in its terminal set; return how it ended, and the solver's iterations."""
-        iteration, total, before = self._iteration, 0, np.inf
-        hard = bool(np.isinf(self._problem.softness.linear[-1]))
-        for _ in range(ENDINGS):
-            excess = iteration.end_excess()
-            if excess <= MET or (not hard and excess >= 0.9 * before) or perf_counter() > deadline:
-                break
-            before = excess
-            ended, more = self._improve(s, u_prev, 1, deadline)
-            total += more
-            if ended not in GOOD:
-                return ended, total
-            status = ended
-        excess = iteration.end_excess()
-        if hard and excess > MET:
-            return Status.TIME_LIMIT if perf_counter() > deadline else Status.INFEASIBLE, total
-        if excess > SOFTENED:
-            iteration.slack = max(iteration.slack, excess)
-            return Status.SOFTENED, total
-        return status, total
-
-    def _begin_anew(
-        self, s: Float[np.ndarray, " ns"], u_prev: Float[np.ndarray, " nu"], deadline: float
-    ) -> tuple[Status, int]:
-        """Take the cheapest of the plans to which several starts lead; return how it ended, and all iterations.
-
-        Plans that follow the model come before those that do not yet. After an effort of SPENT no further linearisation
-        begins, and no further start. None does either where the problem is affine and a plan was found: all starts lead
-        to that one.
-        """
-        iteration, total, best, done, until = self._iteration, 0, (3, 0.0), False, self._spent + SPENT
-        status, kept = Status.FAILED, (iteration.X.copy(), iteration.U.copy(), 0.0)
-        for X, U in self._starts(s[: self._map.nx], u_prev):
-            ended, iterations = self._improve(s, u_prev, EACH, deadline, NEARLY, (X, U), until)
-            total += iterations
-            rank = (2, 0.0)
-            if ended in GOOD:
-                gap = iteration.gap
-                broken = SOFTENED * iteration.excess() if iteration.limits_outputs else 0.0
-                followed = gap < FOLLOWED and broken <= FOLLOWED
-                rank = (0, iteration.cost()) if followed else (1, max(gap, broken))
-            if rank < best:
-                best, status, kept = rank, ended, (iteration.X.copy(), iteration.U.copy(), iteration.slack)
-            done = self._spent >= until or (self._affine and best[0] == 0)
-            if done or perf_counter() > deadline:
-                break
-        iteration.X[:], iteration.U[:], iteration.slack = kept
-        if status not in GOOD or done or perf_counter() > deadline:
-            return status, total
-        most = max(FIRST, self._sqp_iterations)
-        polished, iterations = self._improve(s, u_prev, most, deadline, until=until)
-        if polished not in GOOD:
-            iteration.X[:], iteration.U[:], iteration.slack = kept
-            polished = status
-        return polished, total + iterations
-
-    def _starts(
-        self, x: Float[np.ndarray, " nx"], u_prev: Float[np.ndarray, " nu"]
-    ) -> Iterator[tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]]]:
-        """Yield states and inputs to start from: rest at x, the line from x to the equilibrium, the motion from x.
-
-        No input acts in them, or the last one where its changes count. The motion is that of given equations only: a
-        learned model may invent one that leaves its data, and a plan there that looks cheaper than any real one.
-        """
-        N, u = self._N, np.clip(u_prev if self._with_rates else np.zeros(self.nu), *self._outputs.inputs)
-        U, rest = np.tile(u, (N, 1)), np.tile(x, (N + 1, 1))
-        yield rest, U
-        end = self._aim.end.equilibrium.x
-        yield rest + np.linspace(0.0, 1.0, N + 1)[:, None] * (end - x), U
-        if not isinstance(self._map.model, StepMap):
-            return
-        motion = rest.copy()
-        for k in range(N):
-            motion[k + 1] = self._map.step(motion[k], u, self._initial.W[k]) + self._e[k]
-        if np.abs(motion).max() < HUGE:
-            yield motion, U
-
-    def _improve(
-        self,
-        s: Float[np.ndarray, " ns"],
-        u_prev: Float[np.ndarray, " nu"],
-        most: int,
-        deadline: float,
-        settled: float = SETTLED,
-        begin: tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]] | None = None,
-        until: float = np.inf,
-    ) -> tuple[Status, int]:
-        """Return how the last of at most this many iterations ended, and the solver's iterations of all.
-
-        The first one begins at the states and inputs `begin`, by default at the plan. They end early where no more than
-        a share `settled` of the plan moves, where F is nowhere near its linearisation, and at the deadline; then the
-        plan found so far is used, and the step is late.
-        """
-        total, status, iteration, until = 0, Status.FAILED, self._iteration, min(self._spent + SPENT, until)
-        if begin is not None:
-            self._enter(*begin, u_prev)
-        for k in range(most):
-            if k and (self._spent >= until or perf_counter() > deadline):
-                break
-            found = iteration.step(s, self._targets, deadline)
-            total += found.iterations
-            self._spent += found.effort
-            if found.status not in GOOD:
-                return (status, total) if k and found.status is Status.TIME_LIMIT else (found.status, total)
-            iteration.take(s, found)
-            if iteration.length == 0.0:
-                return (found.status if iteration.gap < NEAR else Status.FAILED), total
-            self._enter(*self._trajectory(iteration.X, iteration.U), u_prev)
-            status = Status.SOFTENED if iteration.slack else found.status
-            whole = self._affine and iteration.length == 1.0  # then the plan solves the problem itself
-            if k + 1 < most and (whole or iteration.rests(found, settled)):
-                break
-        return status, total
-
-    def _enter(
-        self,
-        X: Float[np.ndarray, "N1 nx"],
-        U: Float[np.ndarray, "N nu"],
-        u_prev: Float[np.ndarray, " nu"],
-    ) -> None:
-        """Make these states and inputs the plan."""
-        self._iteration.X[:], self._iteration.U[:] = self._stages(X, U, u_prev)
-
-    def _go_on_from(self, S: Float[np.ndarray, "N1 ns"], V: Float[np.ndarray, "N nu"]) -> None:
-        self._iteration.X[:], self._iteration.U[:] = S, V
-
-    def _shift(self, u_prev: Float[np.ndarray, " nu"]) -> None:
-        """Make the plan of the last step the start of this one; its last stage is one step of the model."""
-        X, U = self._trajectory(self._iteration.X, self._iteration.U)
-        X = X.copy()
-        X[:-1], U[:-1] = X[1:], U[1:]
-        X[-1] = self._map.step(X[-2], U[-1], self._initial.W[-1]) + self._e[-1]
-        self._enter(X, U, u_prev)
 
 
 class BriefMPC(BilinearMPC):

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from koopmpc.control.cost import Cost, StateTracking
 from koopmpc.control.limits import SOFTENED, Interval
 from koopmpc.control.nonlinear.active_limits import RANK, GaussNewtonStep, exchange_limits, find_length, invert
-from koopmpc.control.nonlinear.problem import LearnedMap, point_sizes
+from koopmpc.control.nonlinear.learned_map import LearnedMap, point_sizes
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.state import State
 from koopmpc.plants.routines import Buffered

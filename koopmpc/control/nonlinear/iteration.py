@@ -14,11 +14,12 @@ from typing import NamedTuple, Protocol, cast, runtime_checkable
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from koopmpc.checks import HUGE
 from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.move import Status
+from koopmpc.control.nonlinear.condensed_stages import Deviation, Stages, least_deviation
 from koopmpc.control.nonlinear.convex_stage import ConvexStage
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.stagewise import (
@@ -32,10 +33,6 @@ from koopmpc.control.nonlinear.stagewise import (
     solve_unconstrained,
     weights,
 )
-from koopmpc.control.riccati import Stage, step
-from koopmpc.control.solvers import FINISHER
-from koopmpc.control.solvers.base import QP
-from koopmpc.errors import DefinitenessError
 from koopmpc.plants.routines import Routine
 
 FINISHED = 150  # about as many interior-point steps take as long as an active-set method
@@ -73,12 +70,12 @@ class SearchesLevels(Protocol):
 
     def solve(
         self,
-        stages: "Stages",
+        stages: Stages,
         free: Float[np.ndarray, "N nq"],
         limits: Interval,
         softness: Softness,
         deadline: float,
-    ) -> "Deviation | None":
+    ) -> Deviation | None:
         """Return the least deviation from the solution without limits; None where it has no digits left."""
         ...
 
@@ -98,7 +95,7 @@ class RealTimeIteration:
     """
 
     def __init__(self, problem: StagedProblem, *, compiles_model: bool = True) -> None:
-        N, nx, nu = len(problem.free), problem.nx, problem.F.size1_in(1)
+        self.problem, N, nx, nu = problem, len(problem.free), problem.nx, problem.F.size1_in(1)
         nr, ng = len(problem.Q), len(problem.box.low)
         self._shape = N, nx, nu, ng
         self._sides, cost, R = list_sides(problem), plan_cost(problem), weights(problem)
@@ -180,7 +177,7 @@ class RealTimeIteration:
         x: Float[np.ndarray, " nx"],
         targets: StageTargets,
         deadline: float,
-        levels: "SearchesLevels | None" = None,
+        levels: SearchesLevels | None = None,
     ) -> StageStep:
         """Return the solution of the quadratic program for the measured state x and these targets along the plan.
 
@@ -403,7 +400,7 @@ class RealTimeIteration:
         free: Float[np.ndarray, "N nq"],
         dX: Float[np.ndarray, "N nx"],
         dU: Float[np.ndarray, "N nu"],
-        found: "Deviation",
+        found: Deviation,
         iterations: int,
     ) -> StageStep:
         """Return the solution without limits, (δX, δU) with the values `free`, and the deviation from it."""
@@ -457,87 +454,3 @@ def _views(shapes: list[tuple[int, ...]]) -> tuple[Float[np.ndarray, " n"], list
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
     whole = np.zeros(int(ends[-1]))
     return whole, [part.reshape(shape) for part, shape in zip(np.split(whole, ends[:-1]), shapes, strict=True)]
-
-
-class Stages(NamedTuple):
-    """What the program consists of: x̃_{k+1} = A_k x̃_k + B_k ũ_k from x̃_0 = 0, weights, and G of the limited outputs.
-
-    CasADi writes matrices by columns, so that A[k], B[k] and G[k] are the transposed ones.
-    """
-
-    A: Float[np.ndarray, "N nx nx"]
-    B: Float[np.ndarray, "N nu nx"]
-    Q: Float[np.ndarray, "N nx nx"]
-    R: Float[np.ndarray, "N nu nu"]
-    G: Float[np.ndarray, "N nx ng"]
-    free: Bool[np.ndarray, " N"]
-
-
-class Deviation(NamedTuple):
-    """What is added to the solution without limits, δX and δU; multipliers of the rows, and how DAQP ended."""
-
-    X: Float[np.ndarray, "N nx"]
-    U: Float[np.ndarray, "N nu"]
-    multipliers: Float[np.ndarray, " m"]
-    status: Status
-    iterations: int
-
-
-def condense_stages(
-    stages: Stages,
-) -> tuple[Float[np.ndarray, "N1 nx n"], Float[np.ndarray, "N nu n"], Float[np.ndarray, "N nq n"]] | None:
-    """Return x̃_k, ũ_k and [ũ_k; G_k x̃_{k+1}] as matrices on w; None where the recursion has no digits left."""
-    A, B, Q, R, G, free = stages
-    N, nu, nx = len(B), B.shape[1], B.shape[2]
-    K, spread = np.zeros((N, nu, nx)), np.zeros((N, nu, nu))
-    P, nothing = Q[-1], np.zeros((nx, nx))
-    for k in reversed(range(N)):
-        weight = Q[k - 1] if k else nothing  # of x̃_k; that of x̃_N is where P begins
-        if not free[k]:
-            P = weight + A[k] @ P @ A[k].T
-            continue
-        try:
-            K[k], L, P = step(Stage(A[k].T, B[k].T, weight, None, R[k]), P)
-        except (DefinitenessError, np.linalg.LinAlgError):
-            return None
-        spread[k] = np.linalg.inv(L).T
-    at = np.cumsum(free) - free
-    n = nu * np.count_nonzero(free)
-    X, U = np.zeros((N + 1, nx, n)), np.zeros((N, nu, n))
-    for k in range(N):
-        if free[k]:
-            U[k] = -K[k] @ X[k]
-            U[k][:, nu * at[k] : nu * at[k] + nu] += spread[k]
-        X[k + 1] = A[k].T @ X[k] + B[k].T @ U[k]
-    rows = np.concatenate([U, G.transpose(0, 2, 1) @ X[1:]], axis=1)
-    return X, U, rows
-
-
-def least_deviation(
-    stages: Stages,
-    room: Interval,
-    softness: Softness,
-    multipliers: Float[np.ndarray, " m"] | None,
-    seconds: float,
-) -> Deviation | None:
-    """Return the least deviation within `room`, the limits of [ũ_k; G_k x̃_{k+1}] of each stage (N, nu + ng).
-
-    A row costs linear ε + quadratic ε² where it gives way by ε. DAQP starts from the rows that
-    these multipliers push to, and has so many seconds. Returns None where the recursion has no digits left.
-    """
-    condensed = condense_stages(stages)
-    if condensed is None:
-        return None
-    X, U, rows = condensed
-    (N, nu, n), free = U.shape, stages.free
-    low, high = room
-    kept = np.isfinite(low) | np.isfinite(high)
-    kept[~free, :nu] = False
-    if not np.isfinite(rows).all():
-        return None
-    linear, quadratic, allowance = (np.tile(part, (N, 1))[kept] for part in softness)
-    none = np.zeros((n,))
-    qp = QP(np.eye(n), none, rows[kept], low[kept], high[kept], Softness(linear, quadratic, allowance))
-    y = np.zeros(len(linear)) if multipliers is None else multipliers
-    found = FINISHER(qp).solve(none, y, seconds if np.isfinite(seconds) else None)
-    return Deviation(X[1:] @ found.v, U @ found.v, found.y, found.status, found.iterations)

@@ -52,7 +52,7 @@ class LevelRollouts:
     ) -> None:
         self._problem, self._held, self._blocks = problem, held, blocks
         self._theta = theta[: len(theta) - problem.scheduled]
-        self._moved = problem.nx - problem.with_rates * (len(problem.R) + len(problem.soft_rates))
+        self._moved = problem.moved
 
     def find(
         self, s: Float[np.ndarray, " ns"], stages: StageData, root: LevelBox, guess: Int[np.ndarray, "moves nu"] | None

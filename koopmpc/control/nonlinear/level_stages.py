@@ -5,7 +5,8 @@ from jaxtyping import Float, Int
 
 from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.move import Status
-from koopmpc.control.nonlinear.iteration import Deviation, RealTimeIteration, Stages, condense_stages
+from koopmpc.control.nonlinear.condensed_stages import Deviation, Stages, condense_stages
+from koopmpc.control.nonlinear.iteration import RealTimeIteration
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.base import SolverTurn, StepQP

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from koopmpc.control.cost import StateTracking
 from koopmpc.control.in_time.bounds import refuse_crossed_rows
-from koopmpc.control.in_time.preview import require_preview
+from koopmpc.control.in_time.preview import check_bounds_alone, require_preview
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.nonlinear.problem import StagedProblem
 from koopmpc.errors import DataError
@@ -39,10 +39,64 @@ class StageBounds(Value):
 
 
 class StageLimits(NamedTuple):
-    """The limits of a plan: of its inputs (N, nu), and of [v_k; g(s_{k+1})] as an iteration reads them."""
+    """Limits of a plan: of its inputs, (nu,) or a row a stage, and (N, n) of [v_k; g(s_{k+1})]."""
 
     inputs: Interval
     stages: Interval
+
+    @property
+    def first(self) -> Interval:
+        """Limits of the first input."""
+        low, high = self.inputs
+        return self.inputs if low.ndim == 1 else Interval(low[0], high[0])
+
+
+class MovingLimits:
+    """Step and limits of a call → StageLimits: the same object while none of them moves.
+
+    Parameters
+    ----------
+    latency
+        Steps until the first input of a plan acts.
+
+    Raises
+    ------
+    DataError, ShapeError
+        See `check_rows`.
+    """
+
+    def __init__(
+        self, outputs: StateTracking, problem: StagedProblem, states: Sequence[str], inputs: Sequence[str], latency: int
+    ) -> None:
+        self._own, self._outputs, self._problem, self._latency = outputs.limits, outputs, problem, latency
+        self._names, self._called_with = (tuple(states), tuple(inputs)), None
+        self._fixed = StageLimits(outputs.inputs, problem.stage_limits)
+        if self._own.in_time:
+            check_rows(self._own, outputs, problem, inputs, None)
+
+    def at(self, step: int, limits: Limits | None) -> StageLimits:
+        """Return the limits of a step: those of the call, or the controller's own."""
+        if limits is None and not self._own.in_time:
+            return self._fixed
+        if limits is None:
+            return self._find(self._own, step)
+        if limits is not self._called_with:
+            self._at_call = self.read(limits)
+            self.check(self._at_call)
+            self._called_with = limits
+        return self._find(self._at_call, 0)
+
+    def read(self, limits: Limits) -> Limits:
+        """Return the limits of a call with arrays in place of names; DataError where more than bounds differ."""
+        return check_bounds_alone(limits, self._own, *self._names)
+
+    def check(self, limits: Limits) -> None:
+        """Raise where limits of a call cross, have no row in the stages, or too few rows."""
+        preview = len(self._problem.free) + self._latency
+        check_rows(limits, self._outputs, self._problem, self._names[1], preview)
+
+    def _find(self, limits: Limits, step: int) -> StageLimits:
+        return find_stage_limits(limits, self._outputs, self._problem, step + self._latency, self._fixed.stages)
 
 
 def check_rows(

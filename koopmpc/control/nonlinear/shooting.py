@@ -110,7 +110,7 @@ class Shooting:
     ) -> None:
         p, N = problem, len(problem.free)
         nx, nu, nr, ng = p.nx, p.F.size1_in(1), len(p.Q), len(p.box.low)
-        moved = nx - p.with_rates * (nu + len(p.soft_rates))  # entries of s that a disturbance moves
+        moved = p.moved
         x, u = ca.MX.sym("x", nx), ca.MX.sym("u", nu)
         w = ca.MX.sym("w", p.scheduled)
         matrices = ca.vertcat(ca.MX(ca.DM(theta[: len(theta) - p.scheduled])), w)

@@ -11,7 +11,8 @@ from scipy.linalg import solve
 from koopmpc.control.cost import StateTracking
 from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.nonlinear.equilibrium import RestProgram
-from koopmpc.control.nonlinear.problem import LearnedMap, ModelOrMap, StagedProblem
+from koopmpc.control.nonlinear.learned_map import LearnedMap, ModelOrMap
+from koopmpc.control.nonlinear.problem import StagedProblem
 from koopmpc.control.nonlinear.rows import StageBounds
 from koopmpc.control.nonlinear.stagewise import Sides
 from koopmpc.control.plan.row_targets import RowTargets, TailProgram

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.cost import Cost, StateTracking
 from koopmpc.control.nonlinear.equilibrium import SETTLED, Equilibria, Equilibrium
-from koopmpc.control.nonlinear.problem import LearnedMap
+from koopmpc.control.nonlinear.learned_map import LearnedMap
 from koopmpc.control.riccati import one_step, stationary
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import ShapeError

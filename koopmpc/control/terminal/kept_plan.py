@@ -8,7 +8,8 @@ from jaxtyping import Float
 
 from koopmpc.checks import HUGE
 from koopmpc.control.limits import Interval
-from koopmpc.control.nonlinear.problem import LearnedMap, StagedProblem, StageTargets
+from koopmpc.control.nonlinear.learned_map import LearnedMap
+from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.stagewise import plan_cost
 from koopmpc.control.terminal.sets import TerminalSet, terminal_feedback
 

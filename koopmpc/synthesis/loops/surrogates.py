@@ -10,7 +10,7 @@ from jaxtyping import Float
 from koopmpc.control.cost import Cost, state_tracking
 from koopmpc.control.limits import Limits
 from koopmpc.control.nonlinear.equilibrium import Equilibria, Equilibrium
-from koopmpc.control.nonlinear.problem import LearnedMap, learned_map
+from koopmpc.control.nonlinear.learned_map import LearnedMap, learned_map
 from koopmpc.data.episodes import Episodes
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.step_map import StepMap

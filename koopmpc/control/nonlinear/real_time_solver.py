@@ -1,0 +1,248 @@
+"""The plan of a BilinearMPC: linearisations of the last plan, or of the cheapest of several starts."""
+
+from collections.abc import Iterator
+from time import perf_counter
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.checks import HUGE
+from koopmpc.control.limits import SOFTENED, Interval
+from koopmpc.control.move import Status
+from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
+from koopmpc.control.nonlinear.learned_map import LearnedMap
+from koopmpc.control.nonlinear.level_stages import StageLevels
+from koopmpc.control.nonlinear.plan_solver import GOOD, PlanSolver, PlanStart, StagePlan
+from koopmpc.control.stepped.search import LevelSearch
+from koopmpc.plants.step_map import StepMap
+
+EACH = 12  # linearisations from each start of a first step, at most
+FIRST = 10  # further linearisations of the best of these plans, at most
+SPENT = 300  # after so much effort of the solver no further start, and no further linearisation from one, begins
+FOLLOWED = 0.02  # a plan follows the model whose defects are below this share of the range of their state
+SETTLED = (
+    1e-6  # a plan is a solution when no input and no state moves by more than this share of its size and the plan's
+)
+FAR = 3.0  # begin a new plan if y is more than this many state sizes from the expected state
+MET = 1e-8  # a plan ends in its terminal set if the value of the set is at most this much above 1
+ENDINGS = 20  # further linearisations, at most, of a plan that breaks a hard limit or misses its terminal set
+NEARLY = 1e-2  # the same for a plan that is compared with others
+
+
+class RealTimeSolver(PlanSolver):
+    """Real-time iteration from the last plan, moved on by a step; from several starts where that has lost the plant.
+
+    Parameters
+    ----------
+    iteration, model
+        One linearisation and its quadratic program, and the map.
+    inputs
+        The widest limits of the inputs.
+    sqp_iterations
+        Linearisations a step.
+    levels
+        The search over levels, where inputs have some.
+    """
+
+    def __init__(
+        self,
+        iteration: RealTimeIteration,
+        model: LearnedMap,
+        inputs: Interval,
+        sqp_iterations: int,
+        levels: LevelSearch | None,
+    ) -> None:
+        self.iteration, self._problem, self._inputs, self._sqp_iterations = (
+            iteration,
+            iteration.problem,
+            inputs,
+            sqp_iterations,
+        )
+        self._spent = 0  # effort of the solver in this step
+        self._on_levels = None if levels is None else StageLevels(levels, iteration.problem)
+        self.update(model)
+
+    def update(self, model: LearnedMap) -> None:
+        """Go on with another θ."""
+        self._map = model
+        self.iteration.set_theta(model.theta)
+
+    def limit(self, stages: Interval) -> None:
+        """Take over the limits (N, n) of [v_k; limited(s_{k+1})]."""
+        self.iteration.low[:], self.iteration.high[:] = stages
+
+    def weigh(self, Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N m"]) -> None:
+        """Take over the diagonals that weigh the tracked outputs of s_1 … s_N, and v_0 … v_{N−1} without rates."""
+        self.iteration.set_weights(Q, R)
+
+    def go_on_from(self, S: Float[np.ndarray, "N1 ns"], V: Float[np.ndarray, "N nu"]) -> None:
+        """Make this the plan from which the next step starts."""
+        self.iteration.X[:], self.iteration.U[:] = S, V
+
+    def solve(self, start: PlanStart) -> StagePlan:
+        """Return the plan from a start: by linearisations of the last plan, or of several starts."""
+        iteration, self._spent, nx = self.iteration, 0, self._map.nx
+        iteration.multipliers, iteration.e[:, :nx] = None, start.e
+        if self._map.scheduled:
+            iteration.W[:] = start.W
+        if self._problem.with_rates:
+            nu = len(start.u_prev)
+            iteration.low[0, :nu], iteration.high[0, :nu] = start.first
+        status, iterations = Status.FAILED, 0
+        jump = np.abs(start.s[:nx] - iteration.X[1, :nx]) / self._problem.sizes[:nx]  # from the state that was expected
+        if start.warm and jump.max() <= FAR:
+            self._shift(start)
+            status, iterations = self._improve(start, self._sqp_iterations)
+            if iteration.limits_outputs:
+                status, more = self._meet_limits(status, start)
+                iterations += more
+        if status not in GOOD and status is not Status.TIME_LIMIT:  # there is no plan, or it has lost the plant
+            status, more = self._begin_anew(start)
+            iterations += more
+            if iteration.limits_outputs:
+                status, more = self._meet_limits(status, start)
+                iterations += more
+        if self._problem.ends and status in GOOD:
+            status, more = self._meet_end(status, start)
+            iterations += more
+        if self._on_levels is not None and status in GOOD and not self._rests_on_levels(start.box):
+            status, more = self._on_levels.improve(iteration, start.s, start.targets, start.deadline)
+            iterations += more
+        free = iteration.without_limits + (start.u_prev if self._problem.with_rates else 0.0)
+        return StagePlan(iteration.X, iteration.U, status, iterations, iteration.slack, free)
+
+    def _rests_on_levels(self, box: Interval) -> bool:
+        """Return whether the plan is on levels although it was found without them."""
+        U = self._problem.leave(self.iteration.X, self.iteration.U, box)[1]
+        return self._on_levels is not None and self._on_levels.search.accepts(U[self._problem.free].ravel())
+
+    def _meet_limits(self, status: Status, start: PlanStart) -> tuple[Status, int]:
+        """Linearise on until the plan keeps its hard limits; return how it ended, and the solver's iterations."""
+        iteration, total = self.iteration, 0
+        for _ in range(ENDINGS):
+            if status not in GOOD or iteration.excess() <= 1 or perf_counter() > start.deadline:
+                return status, total
+            status, more = self._improve(start, 1)
+            total += more
+        return (status if status not in GOOD or iteration.excess() <= 1 else Status.MAX_ITERATIONS), total
+
+    def _meet_end(self, status: Status, start: PlanStart) -> tuple[Status, int]:
+        """Linearise on until the plan ends in its terminal set; return how it ended, and the solver's iterations."""
+        iteration, total, before = self.iteration, 0, np.inf
+        hard = bool(np.isinf(self._problem.softness.linear[-1]))
+        for _ in range(ENDINGS):
+            excess = iteration.end_excess()
+            if excess <= MET or (not hard and excess >= 0.9 * before) or perf_counter() > start.deadline:
+                break
+            before = excess
+            ended, more = self._improve(start, 1)
+            total += more
+            if ended not in GOOD:
+                return ended, total
+            status = ended
+        excess = iteration.end_excess()
+        if hard and excess > MET:
+            return Status.TIME_LIMIT if perf_counter() > start.deadline else Status.INFEASIBLE, total
+        if excess > SOFTENED:
+            iteration.slack = max(iteration.slack, excess)
+            return Status.SOFTENED, total
+        return status, total
+
+    def _begin_anew(self, start: PlanStart) -> tuple[Status, int]:
+        """Take the cheapest of the plans to which several starts lead; return how it ended, and all iterations.
+
+        Plans that follow the model come before those that do not yet. After an effort of SPENT no further linearisation
+        begins, and no further start. None does either where the problem is affine and a plan was found: all starts lead
+        to that one.
+        """
+        iteration, total, best, done, until = self.iteration, 0, (3, 0.0), False, self._spent + SPENT
+        status, kept = Status.FAILED, (iteration.X.copy(), iteration.U.copy(), 0.0)
+        for X, U in self._starts(start):
+            ended, iterations = self._improve(start, EACH, NEARLY, (X, U), until)
+            total += iterations
+            rank = (2, 0.0)
+            if ended in GOOD:
+                gap = iteration.gap
+                broken = SOFTENED * iteration.excess() if iteration.limits_outputs else 0.0
+                followed = gap < FOLLOWED and broken <= FOLLOWED
+                rank = (0, iteration.cost()) if followed else (1, max(gap, broken))
+            if rank < best:
+                best, status, kept = rank, ended, (iteration.X.copy(), iteration.U.copy(), iteration.slack)
+            done = self._spent >= until or (self._problem.affine and best[0] == 0)
+            if done or perf_counter() > start.deadline:
+                break
+        iteration.X[:], iteration.U[:], iteration.slack = kept
+        if status not in GOOD or done or perf_counter() > start.deadline:
+            return status, total
+        most = max(FIRST, self._sqp_iterations)
+        polished, iterations = self._improve(start, most, until=until)
+        if polished not in GOOD:
+            iteration.X[:], iteration.U[:], iteration.slack = kept
+            polished = status
+        return polished, total + iterations
+
+    def _starts(self, start: PlanStart) -> Iterator[tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]]]:
+        """Yield states and inputs to start from: rest at x, the line from x to the equilibrium, the motion from x.
+
+        No input acts in them, or the last one where its changes count. The motion is that of given equations only: a
+        learned model may invent one that leaves its data, and a plan there that looks cheaper than any real one.
+        """
+        N, x = len(start.e), start.s[: self._map.nx]
+        u = np.clip(start.u_prev if self._problem.with_rates else np.zeros_like(start.u_prev), *self._inputs)
+        U, rest = np.tile(u, (N, 1)), np.tile(x, (N + 1, 1))
+        yield rest, U
+        yield rest + np.linspace(0.0, 1.0, N + 1)[:, None] * (start.rest - x), U
+        if not isinstance(self._map.model, StepMap):
+            return
+        motion = rest.copy()
+        for k in range(N):
+            motion[k + 1] = self._map.step(motion[k], u, start.W[k]) + start.e[k]
+        if np.abs(motion).max() < HUGE:
+            yield motion, U
+
+    def _improve(
+        self,
+        start: PlanStart,
+        most: int,
+        settled: float = SETTLED,
+        begin: tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]] | None = None,
+        until: float = np.inf,
+    ) -> tuple[Status, int]:
+        """Return how the last of at most this many iterations ended, and the solver's iterations of all.
+
+        The first one begins at the states and inputs `begin`, by default at the plan. They end early where no more than
+        a share `settled` of the plan moves, where F is nowhere near its linearisation, and at the deadline; then the
+        plan found so far is used, and the step is late.
+        """
+        total, status, iteration, until = 0, Status.FAILED, self.iteration, min(self._spent + SPENT, until)
+        if begin is not None:
+            self._enter(*begin, start)
+        for k in range(most):
+            if k and (self._spent >= until or perf_counter() > start.deadline):
+                break
+            found = iteration.step(start.s, start.targets, start.deadline)
+            total += found.iterations
+            self._spent += found.effort
+            if found.status not in GOOD:
+                return (status, total) if k and found.status is Status.TIME_LIMIT else (found.status, total)
+            iteration.take(start.s, found)
+            if iteration.length == 0.0:
+                return (found.status if iteration.gap < NEAR else Status.FAILED), total
+            self._enter(*self._problem.leave(iteration.X, iteration.U, start.box), start)
+            status = Status.SOFTENED if iteration.slack else found.status
+            whole = self._problem.affine and iteration.length == 1.0  # then the plan solves the problem itself
+            if k + 1 < most and (whole or iteration.rests(found, settled)):
+                break
+        return status, total
+
+    def _enter(self, X: Float[np.ndarray, "N1 nx"], U: Float[np.ndarray, "N nu"], start: PlanStart) -> None:
+        """Make these states and inputs the plan."""
+        self.iteration.X[:], self.iteration.U[:] = self._problem.enter(X, U, start.u_prev, start.box)
+
+    def _shift(self, start: PlanStart) -> None:
+        """Make the plan of the last step the start of this one; its last stage is one step of the model."""
+        X, U = self._problem.leave(self.iteration.X, self.iteration.U, start.box)
+        X = X.copy()
+        X[:-1], U[:-1] = X[1:], U[1:]
+        X[-1] = self._map.step(X[-2], U[-1], start.W[-1]) + start.e[-1]
+        self._enter(X, U, start)

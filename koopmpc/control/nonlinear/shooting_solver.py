@@ -1,0 +1,184 @@
+"""The plan of a NonlinearMPC: a nonlinear program from the last solution, or from several guesses."""
+
+from collections.abc import Mapping, Sequence
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.checks import HUGE
+from koopmpc.control.limits import Interval
+from koopmpc.control.move import Status
+from koopmpc.control.nonlinear.learned_map import LearnedMap
+from koopmpc.control.nonlinear.level_rollouts import LevelRollouts, StageData
+from koopmpc.control.nonlinear.plan_solver import PlanSolver, PlanStart, StagePlan
+from koopmpc.control.nonlinear.problem import StagedProblem
+from koopmpc.control.nonlinear.shooting import NLPSolution, NLPSolver, Shooting
+from koopmpc.control.nonlinear.shooting import Start as Begin
+from koopmpc.control.stepped.levels import LevelBox
+from koopmpc.control.stepped.search import LevelSearch, Relaxed
+
+Guess = tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]]  # states and inputs
+_HOLD = 5  # steps for which a random guess holds an input
+_WIDE = 1.0  # the range of random inputs where they have no limit
+
+
+class ShootingSolver(PlanSolver):
+    """Multiple shooting from the last solution, moved on by a step; from several guesses where there is none.
+
+    Parameters
+    ----------
+    problem, model
+        The stages, and the map.
+    inputs
+        The widest limits of the inputs.
+    options
+        The solver, its settings, and whether it looks at the time.
+    starts
+        Guesses of a first step.
+    levels, blocks
+        The search over levels, where inputs have some, and the steps of each move.
+    """
+
+    def __init__(
+        self,
+        problem: StagedProblem,
+        model: LearnedMap,
+        inputs: Interval,
+        options: tuple[NLPSolver, Mapping[str, Any], bool],
+        starts: int,
+        levels: LevelSearch | None,
+        blocks: Sequence[int],
+    ) -> None:
+        self._problem, self._inputs, self._options, self._starts = problem, inputs, options, starts
+        self._levels, self._blocks = levels, blocks
+        self.update(model)
+
+    def update(self, model: LearnedMap) -> None:
+        """Build the nonlinear program, and the search over sequences where all inputs are on levels in all steps."""
+        self._map, p, levels = model, self._problem, self._levels
+        self._shooting = Shooting(p, model.theta, *self._options)
+        self._rollouts: LevelRollouts | None = None
+        self._stage_limits = p.stage_limits  # of this step
+        if levels is not None and levels.index.shape == (len(self._blocks), model.nu) and not p.own:
+            self._rollouts = LevelRollouts(p, model.theta, levels.held, self._blocks)
+
+    def limit(self, stages: Interval) -> None:
+        """Take over the limits (N, n) of [v_k; limited(s_{k+1})]."""
+        self._stage_limits = stages
+        (low, high), nu = stages, self._map.nu
+        self._shooting.set_limits(Interval(low[:, :nu], high[:, :nu]), Interval(low[:, nu:], high[:, nu:]))
+
+    def weigh(self, Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N m"]) -> None:
+        """Take over the diagonals that weigh the tracked outputs of s_1 … s_N, and v_0 … v_{N−1} without rates."""
+        self._shooting.weights = Q, R
+
+    def go_on_from(self, S: Float[np.ndarray, "N1 ns"], V: Float[np.ndarray, "N nu"]) -> None:
+        """Make this the plan from which the next step starts."""
+        self._next = self._shooting.at(np.vstack([S[2:], S[-1:]]), np.vstack([V[1:], V[-1:]]))
+
+    def solve(self, start: PlanStart) -> StagePlan:
+        """Return the plan from a start: from the last solution, or the best from several guesses."""
+        s, deadline = start.s, start.deadline
+        begins = [self._next] if start.warm else self._guess(start)
+        solved: list[NLPSolution] = []
+        for begin in begins:
+            solved.append(self._shoot(start, begin, start.first))
+            if perf_counter() > deadline:
+                break
+        good = [found for found in solved if found.status is Status.OPTIMAL]
+        if not good and perf_counter() < deadline:  # once more from where inputs at rest lead, which leaves no gaps
+            U = np.tile(np.clip(np.zeros_like(start.u_prev), *self._inputs), (len(start.e), 1))
+            solved += [
+                self._shoot(start, begin, start.first) for begin in self._list_begins(self._roll_out(start, U), start)
+            ]
+            good = [found for found in solved if found.status is Status.OPTIMAL]
+        iterations = sum(found.iterations for found in solved)
+        found = min(good, key=lambda each: each.cost) if good else solved[0]
+        if good and self._levels is not None and not self._rests_on_levels(found, start):
+            found, more = self._search_levels(found, start)
+            iterations += more
+            good = good if found.status is Status.OPTIMAL else []
+        self._next = found.start
+        slack = float(found.slacks[found.slacks > self._shooting.allowance].max(initial=0.0))
+        status = Status.SOFTENED if good and slack else found.status
+        return StagePlan(np.vstack([s, found.X]), found.U, status, iterations, slack)
+
+    def _shoot(self, start: PlanStart, begin: Begin, first: Interval) -> NLPSolution:
+        W = start.W if self._problem.scheduled else start.W[:, :0]
+        return self._shooting.solve(start.s, start.targets, start.e, begin, first, start.deadline, W)
+
+    def _rests_on_levels(self, found: NLPSolution, start: PlanStart) -> bool:
+        """Return whether a plan that was found without levels is on them."""
+        U = self._problem.leave(np.vstack([start.s, found.X]), found.U, start.box)[1]
+        return self._levels is not None and self._levels.accepts(U[self._problem.free].ravel())
+
+    def _search_levels(self, relaxed: NLPSolution, start: PlanStart) -> tuple[NLPSolution, int]:
+        """Return the best plan on levels, and all iterations.
+
+        Where all inputs are on levels and sequences are few, it is the best of all. Otherwise branch and bound over
+        nonlinear programs finds it; a node is a local optimum, so that a plan is the best one as far as these are.
+        """
+        search, shooting, (N, nu), deadline = self._levels, self._shooting, relaxed.U.shape, start.deadline
+        assert search is not None, "only asked where inputs have levels"
+        levels, starts = search.held.levels, np.flatnonzero(self._problem.free)
+        low, high = (np.broadcast_to(end, (N, nu)) for end in start.box)
+        inside = levels.inside(
+            Interval(np.maximum.reduceat(low, starts, axis=0), np.minimum.reduceat(high, starts, axis=0))
+        )
+        count = len(search.index)
+        root = LevelBox(inside.low[:count].copy(), inside.high[:count].copy())
+        if (root.low > root.high).any():
+            return relaxed._replace(status=Status.INFEASIBLE), 0
+        blocks = self._blocks[:count]
+        steps, rated = sum(blocks), self._problem.with_rates
+
+        def relax(box: LevelBox, answer: NLPSolution, left: float | None) -> Relaxed:
+            least, most = low.copy(), high.copy()
+            for end, index in ((least, box.low), (most, box.high)):
+                end[:steps, levels.which] = levels.values(np.repeat(index, blocks, axis=0))
+            shooting.set_moves(least, most)
+            here = start.first if rated else Interval(least[0], most[0])
+            found = self._shoot(start, answer.start_here, here)
+            late = left is not None and perf_counter() > deadline
+            status = Status.TIME_LIMIT if late and found.status is not Status.OPTIMAL else found.status
+            _, U = self._problem.leave(np.vstack([start.s, found.X]), found.U, start.box)
+            return Relaxed(status, found.cost, levels.indices(U[starts[:count]]), found.iterations, found)
+
+        end, found = None if np.isinf(deadline) else deadline, None
+        if self._rollouts is not None:
+            stages = StageData(start.targets, start.e, start.W, shooting.weights, self._stage_limits, start.first)
+            best = self._rollouts.find(start.s, stages, root, search.guess())
+            if best is not None:
+                found = search.find(relax, LevelBox(best, best.copy()), relaxed, end, relaxed.cost)
+        if found is None or (found.answer is None and found.status is not Status.TIME_LIMIT):
+            found = search.find(relax, root, relaxed, end, relaxed.cost)
+        unlimited = np.full((N, nu), np.inf)
+        shooting.set_moves(*((-unlimited, unlimited) if rated else (low, high)))
+        if found.answer is None:
+            return relaxed._replace(status=found.status), found.iterations
+        return found.answer, found.iterations
+
+    def _guess(self, start: PlanStart) -> list[Begin]:
+        """Return the guesses of a first step: rest at x_0, then where random held inputs lead."""
+        N, nu, x = len(start.e), len(start.u_prev), start.s[: self._map.nx]
+        rest = np.clip(np.zeros(nu), *self._inputs)
+        guesses: list[Guess] = [(np.tile(x, (N + 1, 1)), np.tile(rest, (N, 1)))]
+        rng = np.random.default_rng(0)
+        low, high = np.maximum(self._inputs.low, rest - _WIDE), np.minimum(self._inputs.high, rest + _WIDE)
+        for _ in range(self._starts - 1):
+            U = np.repeat(rng.uniform(low, high, (-(-N // _HOLD), nu)), _HOLD, axis=0)[:N]
+            guesses += self._roll_out(start, U)
+        return self._list_begins(guesses, start)
+
+    def _roll_out(self, start: PlanStart, U: Float[np.ndarray, "N nu"]) -> list[Guess]:
+        """Return the states to which U leads, and U; nothing where they overflow, or a step has no solution."""
+        X = [start.s[: self._map.nx]]
+        for u, e, w in zip(U, start.e, start.W, strict=True):
+            X.append(self._map.step(X[-1], u, w) + e)
+        return [(np.array(X), U)] if np.abs(X).max() < HUGE else []  # False for NaN
+
+    def _list_begins(self, guesses: list[Guess], start: PlanStart) -> list[Begin]:
+        stages = [self._problem.enter(X, U, start.u_prev, start.box) for X, U in guesses]
+        return [self._shooting.at(S[1:], V) for S, V in stages]
