@@ -1,10 +1,11 @@
 """The errors of koopmpc: one root, and each class is also the builtin that it refines."""
 
 import warnings
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 
 def install(extra: str) -> str:
@@ -53,6 +54,10 @@ class ThreadError(KoopmpcError, RuntimeError):
     """Two threads entered one controller at once."""
 
 
+class WorkerError(KoopmpcError, RuntimeError):
+    """A task killed each worker process that ran it."""
+
+
 class FullDiskError(LogError):
     """There is no room for a file; what stood at its path before is as it was."""
 
@@ -78,6 +83,14 @@ class NoInputWarning(FitWarning):
 
 class SourcesOnlyWarning(UserWarning):
     """A Functional Mock-up Unit that was written holds no machine code, for want of a C compiler."""
+
+
+def refuse_moved(keywords: Mapping[str, object], options: Any, name: str) -> None:
+    """Raise a TypeError where there is a keyword, which says that it is a field of the dataclass `options` now."""
+    for word in keywords:
+        if word in {field.name for field in fields(options)}:
+            raise TypeError(f"{word}= is a field of the options now: pass options={name}({word}=…)")
+        raise TypeError(f"there is no argument {word}=")
 
 
 class Hint:

@@ -20,7 +20,7 @@ from typing import Any, TypeVar, cast
 from urllib.parse import urlsplit
 
 from koopmpc import checks
-from koopmpc.errors import DataError, KoopmpcError, install
+from koopmpc.errors import DataError, KoopmpcError, WorkerError, install
 from koopmpc.interrupts import call_uninterrupted
 
 Task = TypeVar("Task")
@@ -196,7 +196,7 @@ class Workers:
             return _run_alone(name, code, sent)
         except Exception as error:
             if type(error).__name__ == "KilledWorker":
-                raise KoopmpcError(f"{name}{_KILLS}") from error
+                raise WorkerError(f"{name}{_KILLS}") from error
             raise KoopmpcError(
                 f"{name}: the Dask scheduler at {self._scheduler} has ended; start another one, and run again"
             ) from error
@@ -250,7 +250,7 @@ def _run_alone(name: str, code: bytes, sent: bytes) -> bytes:
                 ) from error
             with suppress(BrokenExecutor):
                 return executor.submit(_work, code, sent).result()
-    raise KoopmpcError(f"{name}{_KILLS}")
+    raise WorkerError(f"{name}{_KILLS}")
 
 
 @contextmanager

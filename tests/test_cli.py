@@ -42,7 +42,7 @@ def test_run_takes_a_path_and_leaves_a_log_a_run_and_the_table(call, tmp_path):
     (folder,) = folders(tmp_path)
     assert folder.name.endswith("-tiny")
     names = {path.name for path in folder.iterdir()}
-    assert names == {"results.parquet", "sweep.json", "rows", "models"} | {
+    assert names == {"results.parquet", "sweep.sqlite", "models"} | {
         f"tiny-{case}-{name}.rrd" for case in ("near", "far") for name in ("lqr", "koopman-mpc")
     }
     assert "tiny:near" in result.stdout
@@ -136,7 +136,7 @@ def test_run_takes_a_name_in_problems_and_one_case(call, tmp_path):
     result = call("run", "tiny:far", "-c", "lqr", "--logs", tmp_path / "elsewhere")
     assert result.exit_code == 0, result.output
     (folder,) = (tmp_path / "elsewhere").iterdir()
-    assert {path.name for path in folder.iterdir()} == {"results.parquet", "sweep.json", "rows", "tiny-far-lqr.rrd"}
+    assert {path.name for path in folder.iterdir()} == {"results.parquet", "sweep.sqlite", "tiny-far-lqr.rrd"}
 
 
 def test_two_calls_in_one_second_have_a_folder_each(call, tmp_path):

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from koopmpc.bench.inspect import compared as compared
     from koopmpc.bench.inspect import inspected as inspected
     from koopmpc.bench.inspect import worst_moments as worst_moments
+    from koopmpc.bench.options import SweepOptions as SweepOptions
     from koopmpc.bench.problem import list_problems as list_problems
     from koopmpc.bench.problem import new_problem as new_problem
     from koopmpc.bench.problem import shipped as shipped

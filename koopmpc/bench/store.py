@@ -1,22 +1,21 @@
-"""The store of a sweep: what was asked for, a line for each finished run, its `RunRow`, and the table of all rows.
+"""The store of a sweep: an SQLite file of what was asked for and of a row for each finished run, and the table of all.
 
-A worker writes the line of a run when the run ends, by one system call: kill -9 loses only runs that are under way.
-It holds its file locked meanwhile: a sweep that goes on waits for workers which outlive the sweep that was killed.
-Each line, and the manifest, holds a checksum of the rest: a line that does not match is reported and left out. The
-table, results.parquet, is a copy of the lines; it is written now and then and at the end, and renamed when complete.
+The process that sweeps writes alone, a transaction a run: kill -9 loses only runs that are under way. It always has a
+transaction open, so that a second sweep in the folder is refused, while others may read. The journal is SQLite's
+rollback journal, for a write-ahead log needs memory that network folders do not share. Each text is kept with its
+checksum: a row that does not match is reported and left out. The table, results.parquet, is a copy of the rows; it is
+written now and then and at the end, and renamed when complete.
 """
 
-import errno
 import json
 import os
 import platform
-import time
+import sqlite3
 import warnings
-from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, fields
 from importlib.metadata import version
-from io import FileIO
 from pathlib import Path
 from typing import Any, cast, get_type_hints
 
@@ -24,21 +23,19 @@ import numpy as np
 
 from koopmpc import disk
 from koopmpc.control.move import Fallback, Status
-from koopmpc.errors import LogError, ProblemError
+from koopmpc.errors import FullDiskError, LogError, ProblemError
 from koopmpc.loop.metrics import Metrics, tracking_error, weigh_error
 from koopmpc.loop.run import Run
 from koopmpc.values import checksum
 
-MANIFEST = "sweep.json"
-ROWS = "rows"  # folder of the lines of finished runs
-FORMAT = "koopmpc-sweep-1"
-_LINE = json.JSONEncoder()
-_SEAL = "crc32"  # key of a line's checksum
-_OUTLIVES = 2.0  # time that a worker gets to end after the sweep that it works for [s]
+STORE = "sweep.sqlite"
+OLD_MANIFEST = "sweep.json"  # of an edition before 0.1.0, which wrote a file of lines for each batch of runs
 RESULTS = "results.parquet"  # beside the logs of the runs
 ORACLE = "nonlinear-mpc"
 REACHED = 0.05  # the band around the reference, as a share of the first weighted error
 KEY = ("problem", "case", "controller", "fault", "noise", "wrong", "seed", "start")
+_ASKED = "asked"  # name of the text that says what was asked for; the other texts are rows of runs
+_TABLE = "CREATE TABLE IF NOT EXISTS texts (name TEXT PRIMARY KEY, text TEXT NOT NULL, checksum INTEGER NOT NULL)"
 
 
 @dataclass(frozen=True)
@@ -197,103 +194,68 @@ def parse_row(record: Mapping[str, Any], folder: Path) -> RunRow:
 _OWN = tuple(field.name for field in fields(RunRow) if field.name not in ("metrics", "log", "x0"))
 
 
-class Journal:
-    """The lines of one batch of runs: that a run begins, and what came out of it."""
+class Store:
+    """The open store of a sweep; `asked` and `machine` say what was asked for, and where."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        lines = list(_lines(path))
-        self.rows = {row.key: row for _, row in lines if row is not None}
-        self._begun = [line["begins"] for line, row in lines if row is None]
+    def __init__(self, file: sqlite3.Connection, path: Path) -> None:
+        self._file, self._path, self._folder = file, path, path.parent
+        texts = _read_texts(file, path)
+        self.about: dict[str, Any] | None = texts.pop(_ASKED, None)
+        self.rows = {row.key: row for row in (parse_row(text, path.parent) for text in texts.values())}
 
-    def __enter__(self) -> "Journal":
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self.path.open("ab", buffering=0)
-        except OSError as error:
-            raise disk.explain_failure(self.path, error) from error
-        _lock(self._file)
-        if self._file.tell():
-            self._write(b"\n")  # the last line was torn, perhaps, when a worker was killed
-        return self
+    def write(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a text, and keep the transaction that tells other sweeps that this one is at work."""
+        text = json.dumps(content)
+        with _translate_errors(self._path):
+            values = (name, text, checksum(name.encode(), text.encode()))
+            self._file.execute("INSERT OR REPLACE INTO texts VALUES (?, ?, ?)", values)
+            self._file.execute("COMMIT")
+            self._file.execute("BEGIN IMMEDIATE")
 
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        self._file.close()
-
-    def turn(self, done: RunRow | None, following: RunRow | None) -> int:
-        """Write what came out of a run, and that the next begins; return how often that has begun in this batch before.
-
-        Both are one system call.
-        """
-        told = [] if done is None else [record_of(done)]
-        told += [] if following is None else [{"begins": following.name}]
-        self._write("".join(f"{_LINE.encode(_seal(each))}\n" for each in told).encode())
-        return 0 if following is None or not self._begun else self._begun.count(following.name)
-
-    def _write(self, line: bytes) -> None:
-        try:
-            _whole(self._file, line)
-        except OSError as error:
-            raise disk.explain_failure(self.path, error) from error
+    def add(self, row: RunRow) -> RunRow:
+        """Write a finished run, and return its row as it is read back."""
+        record = record_of(row)
+        self.write(row.name, record)
+        self.rows[row.key] = parse_row(record, self._folder)
+        return self.rows[row.key]
 
 
-def _whole(file: FileIO, data: bytes) -> None:
-    """Write all of the data by one system call; raise where the disk takes a part of it."""
-    if file.write(data) != len(data):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-def _seal(content: dict[str, Any]) -> dict[str, Any]:
-    """Return the content with the checksum of its text."""
-    return {**content, _SEAL: checksum(_LINE.encode(content).encode())}
-
-
-def _unseal(text: bytes) -> dict[str, Any]:
-    """Return the content of a text that holds its checksum.
+@contextmanager
+def open_sweep(folder: Path, asked: Mapping[str, Any]) -> Generator[Store]:
+    """Claim the folder for the sweep that is asked for, and yield its store; a sweep that was broken off goes on.
 
     Raises
     ------
-    ValueError
-        The text is cut, no longer what was written, or of an edition that wrote no checksums.
+    ProblemError
+        The folder holds another sweep, or another process is at work in it.
     """
-    content: object = json.loads(text)
-    if not isinstance(content, dict):
-        raise ValueError("it is not a JSON object")
-    content = cast("dict[str, Any]", content)
-    if _SEAL not in content:
-        raise ValueError("it has no checksum: it is of an edition before 0.1.0; run the sweep again")
-    if content.pop(_SEAL) != checksum(_LINE.encode(content).encode()):
-        raise ValueError("it no longer holds what was written")
-    return content
-
-
-def _lines(path: Path) -> Iterator[tuple[dict[str, Any], RunRow | None]]:
-    """Yield each whole line, and the row of a run that it holds.
-
-    A line that was torn is left out, for its run is done again, and so is a damaged one, with a warning.
-    """
+    path = folder / STORE
+    asked = json.loads(json.dumps(asked))
+    _refuse_old(folder, ProblemError)
     try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        return
-    damaged = 0
-    for line in filter(None, data.split(b"\n")):
-        try:
-            found = _unseal(line)
-            yield found, None if "begins" in found else parse_row(found, path.parent.parent)
-        except (LookupError, TypeError, ValueError):
-            damaged += _SEAL.encode() in line or line.endswith(b"}")
-    if damaged:
-        warnings.warn(
-            f"{path}: {damaged} lines are damaged and were left out; the same sweep in this folder does their runs "
-            "again",
-            UserWarning,
-            stacklevel=3,
-        )
-
-
-def _rows_in(path: Path) -> list[RunRow]:
-    return [row for _, row in _lines(path) if row is not None]
+        folder.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    except OSError as error:
+        raise disk.explain_failure(path, error) from error
+    with closing(sqlite3.connect(path, timeout=0, isolation_level=None)) as file:
+        with _translate_errors(path):
+            try:
+                file.execute("BEGIN IMMEDIATE")
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY:
+                    raise ProblemError(
+                        f"another process runs a sweep in {folder}; wait for it, or pass another folder"
+                    ) from error
+                raise
+            file.execute(_TABLE)
+            store = Store(file, path)
+        if store.about is not None and store.about["asked"] != asked:
+            names = [name for name in asked if store.about["asked"].get(name) != asked[name]]
+            raise ProblemError(f"{folder} holds another sweep, of other {', '.join(names)}; pass another folder")
+        if store.about is None:
+            store.about = {"asked": asked, "machine": machine()}
+            store.write(_ASKED, store.about)
+        yield store
 
 
 def load_rows(folder: str | Path) -> list[RunRow]:
@@ -304,87 +266,7 @@ def load_rows(folder: str | Path) -> list[RunRow]:
     LogError
         The folder holds no sweep.
     """
-    folder = Path(folder)
-    if not (folder / MANIFEST).is_file():
-        raise LogError(f"{folder} holds no sweep: there is no {MANIFEST} in it; pass the folder of `koopmpc bench`")
-    found: dict[tuple[Any, ...], RunRow] = {}
-    for path in sorted((folder / ROWS).glob("*.jsonl")):
-        for row in _rows_in(path):
-            found.setdefault(row.key, row)
-    return list(found.values())
-
-
-def next_batch(folder: Path) -> int:
-    """Return the first number that no batch of this folder has."""
-    return 1 + max((int(path.stem) for path in (folder / ROWS).glob("*.jsonl") if path.stem.isdigit()), default=-1)
-
-
-@contextmanager
-def open_sweep(folder: Path, asked: Mapping[str, Any]) -> Generator[dict[str, Any]]:
-    """Claim the folder for the sweep that is asked for, and yield its manifest; a sweep that was broken off goes on.
-
-    Raises
-    ------
-    ProblemError
-        The folder holds another sweep, or another process is at work in it.
-    """
-    path = folder / MANIFEST
-    asked = json.loads(json.dumps(asked))
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = path.open("a+b", buffering=0)
-    except OSError as error:
-        raise disk.explain_failure(path, error) from error
-    with file:
-        _claim(file, folder)
-        file.seek(0)
-        text = file.read()
-        try:
-            known = _unseal(text) if text.strip() else {}
-        except ValueError as error:
-            raise ProblemError(f"{path} is damaged; pass another folder, or remove it: {error}") from error
-        if known and known["asked"] != asked:
-            names = [name for name in asked if known["asked"].get(name) != asked[name]]
-            raise ProblemError(f"{folder} holds another sweep, of other {', '.join(names)}; pass another folder")
-        if not known:
-            known = {"format": FORMAT, "asked": asked, "machine": machine()}
-            file.truncate(0)
-            try:
-                _whole(file, json.dumps(_seal(known), indent=1).encode())
-            except OSError as error:
-                file.truncate(0)
-                raise disk.explain_failure(path, error) from error
-        yield known
-
-
-def _claim(manifest: FileIO, folder: Path) -> None:
-    """Lock the manifest, as long as this process lives, once the workers of a sweep that was killed have ended.
-
-    Raises
-    ------
-    ProblemError
-        Another sweep is at work in the folder, or a worker of one.
-    """
-    busy, ends = not _lock(manifest), time.monotonic() + _OUTLIVES
-    for path in sorted((folder / ROWS).glob("*.jsonl")):
-        with path.open("ab", buffering=0) as file:
-            while not busy and not _lock(file):
-                time.sleep(0.01)
-                busy = time.monotonic() >= ends
-    if busy:
-        raise ProblemError(f"another process runs a sweep in {folder}; wait for it, or pass another folder")
-
-
-def _lock(file: FileIO) -> bool:
-    """Lock the file until it is closed, and return whether no other process has it locked."""
-    with suppress(ImportError):  # Windows has no fcntl
-        import fcntl
-
-        try:
-            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return False
-    return True
+    return list(read_store(_find_store(Path(folder))).rows.values())
 
 
 def manifest_of(folder: str | Path) -> dict[str, Any]:
@@ -395,13 +277,66 @@ def manifest_of(folder: str | Path) -> dict[str, Any]:
     LogError
         The folder holds no sweep, or the file is damaged.
     """
-    path = Path(folder) / MANIFEST
+    about = read_store(_find_store(Path(folder))).about
+    if about is None:
+        raise LogError(f"{folder} holds no sweep: what was asked for is missing or damaged in {STORE}")
+    return about
+
+
+def _find_store(folder: Path) -> Path:
+    _refuse_old(folder, LogError)
+    path = folder / STORE
+    if not path.is_file():
+        raise LogError(f"{folder} holds no sweep: there is no {STORE} in it; pass the folder of `koopmpc bench`")
+    return path
+
+
+def read_store(path: Path) -> Store:
+    """Return what the file of a sweep holds; it may be written meanwhile."""
+    with _translate_errors(path), closing(sqlite3.connect(path.resolve().as_uri() + "?mode=ro", uri=True)) as file:
+        return Store(file, path)
+
+
+def _refuse_old(folder: Path, kind: type[Exception]) -> None:
+    if (folder / OLD_MANIFEST).is_file() and not (folder / STORE).exists():
+        raise kind(
+            f"{folder} holds a sweep of an edition before 0.1.0, in {OLD_MANIFEST}; run it again in another folder"
+        )
+
+
+def _read_texts(file: sqlite3.Connection, path: Path) -> dict[str, dict[str, Any]]:
+    """Return the texts whose checksums are right; warn of the others, and of a file whose parts do not fit."""
+    contents: dict[str, dict[str, Any]] = {}
+    damaged = 0
+    for name, text, check in file.execute("SELECT name, text, checksum FROM texts"):
+        if isinstance(name, str) and isinstance(text, str) and checksum(name.encode(), text.encode()) == check:
+            contents[name] = json.loads(text)
+        else:
+            damaged += 1
+    if damaged or file.execute("PRAGMA integrity_check(1)").fetchone() != ("ok",):
+        warnings.warn(
+            f"{path}: {damaged or 'some'} rows are damaged and were left out; the same sweep in this folder does their "
+            "runs again",
+            UserWarning,
+            stacklevel=4,
+        )
+    return contents
+
+
+@contextmanager
+def _translate_errors(path: Path) -> Generator[None]:
+    """Turn errors of SQLite into those of koopmpc."""
     try:
-        return _unseal(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise LogError(
-            f"{folder} holds no sweep: {MANIFEST} is missing or damaged; pass that of `koopmpc bench`"
-        ) from error
+        yield
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # the other bytes are details
+        if code in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
+            raise FullDiskError(
+                f"{path} cannot be written: {error}; the finished runs are kept, make room and run it again"
+            ) from error
+        if code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM):
+            raise LogError(f"{path} cannot be written or read: {error}; pass another folder") from error
+        raise LogError(f"{path} is damaged ({error}); pass another folder, or remove it") from error
 
 
 def machine() -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import fields, replace
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,88 +11,70 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
+from koopmpc.bench.options import SweepOptions
 from koopmpc.cli.console import bar, console, format_command, friendly, new_folder, say, say_page
 from koopmpc.cli.ending import ENDING
-from koopmpc.errors import DataError, LogError
+from koopmpc.cli.options import take_options
+from koopmpc.errors import LogError
 
 if TYPE_CHECKING:
     from koopmpc.bench.problem import Problem
     from koopmpc.bench.store import RunRow
 
 _PROBLEM = "A name that `koopmpc list` shows, or the path of a problem file; `:case` after it keeps one case."
-Live = Annotated[
-    bool, typer.Option("--live", help="Stream each run to the viewer that is up, to one that is opened, or to a page.")
-]
-InRealTime = Annotated[
-    bool, typer.Option("--paced", help="Let each run take as long as its plant would, to be watched.")
-]
 Logs = Annotated[Path, typer.Option("--logs", help="Where the folder of this call is made.")]
-Watched = Annotated[
-    bool, typer.Option("--monitor", help="Count the steps at which a learned model is beyond its data.")
-]
-Faults = Annotated[bool, typer.Option("--faults", help="Run each case again with sensors, actuator or solver broken.")]
 Controllers = Annotated[
     list[str] | None,
     typer.Option("--controller", "-c", help="One of the ten; may be repeated. Default: those that suit any plant."),
 ]
 
 
+@take_options(SweepOptions, ("faults", "monitor", "live", "paced"))
 def run_problem(
     problem: Annotated[str, typer.Argument(help=_PROBLEM)],
+    options: SweepOptions,
     controller: Controllers = None,
-    faults: Faults = False,
-    monitor: Watched = False,
-    live: Live = False,
-    paced: InRealTime = False,
     logs: Logs = Path("logs"),
 ) -> None:
     """Run controllers in closed loop on one problem; one log a run, and a table."""
+    from koopmpc.bench.controllers import controller_names
     from koopmpc.bench.problem import load_problem
 
-    with friendly(), _page(live):
+    with friendly(), _page(options.live):
         loaded = load_problem(problem)
-        _sweep([loaded], controller, None, logs, loaded.name, faults=faults, monitor=monitor, live=live, paced=paced)
+        controller_names(controller)  # raises before a folder is made
+        _sweep([loaded], controller, new_folder(logs, loaded.name), options)
 
 
+@take_options(SweepOptions, {field.name for field in fields(SweepOptions)} - {"log_starts"})
 def bench(
+    options: SweepOptions,
     problems: Annotated[list[str] | None, typer.Argument(help=_PROBLEM + " Default: five, see --all.")] = None,
     every: Annotated[bool, typer.Option("--all", help="Run all problems that come with koopmpc.")] = False,
     controller: Controllers = None,
-    starts: Annotated[int, typer.Option("--starts", help="Initial states of each case, its own among them.")] = 1,
-    seeds: Annotated[int, typer.Option("--seeds", help="Sets of training data.")] = 1,
-    noise: Annotated[str, typer.Option("--noise", help="Shares of each output's spread: 0,0.01")] = "0",
-    wrong: Annotated[str, typer.Option("--wrong", help="How wrong the plant's parameters are: 0,0.2")] = "0",
-    faults: Faults = False,
-    monitor: Watched = False,
-    compiled: Annotated[
-        bool, typer.Option("--compiled", help="Run in C the controllers that C is written for.")
-    ] = False,
-    workers: Annotated[int | None, typer.Option("--workers", help="Local processes.")] = None,
-    scheduler: Annotated[str | None, typer.Option("--scheduler", help="tcp://host:port of a Dask cluster.")] = None,
-    live: Live = False,
-    paced: InRealTime = False,
     logs: Logs = Path("logs"),
     name: Annotated[str, typer.Option("--name", help="Ends the name of the folder.")] = "bench",
     resume: Annotated[Path | None, typer.Option("--resume", help="Go on with the sweep in this folder.")] = None,
 ) -> None:
     """Compare the controllers that each problem names, else the eight that suit any, from one start or many."""
+    from koopmpc.bench.controllers import controller_names
     from koopmpc.bench.problem import DEFAULT, load_problem, shipped
     from koopmpc.bench.store import manifest_of
 
-    with friendly(), _page(live):
-        where: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "live": live, "paced": paced}
-        if resume is not None:
+    with friendly(), _page(options.live):
+        if resume is None:
+            loaded = [load_problem(problem) for problem in (shipped() if every else problems or DEFAULT)]
+            controller_names(controller)
+            resume = new_folder(logs, name)
+        else:
             asked: dict[str, Any] = manifest_of(resume)["asked"]
             loaded = [
                 load_problem(each["file"] if len(each["cases"]) > 1 else f"{each['file']}:{each['cases'][0]}")
                 for each in asked.pop("problems")
             ]
-            _sweep(loaded, asked.pop("controllers"), resume, logs, name, **asked, **where)
-            return
-        loaded = [load_problem(problem) for problem in (shipped() if every else problems or DEFAULT)]
-        where |= {"noise": _shares(noise, "--noise"), "wrong": _shares(wrong, "--wrong"), "starts": starts}
-        where |= {"seeds": seeds, "faults": faults, "monitor": monitor, "compiled": compiled}
-        _sweep(loaded, controller, None, logs, name, **where)
+            controller = asked.pop("controllers")
+            options = replace(options, **asked)
+        _sweep(loaded, controller, resume, options)
 
 
 def report(folder: Annotated[Path, typer.Argument(help="The folder of a sweep.")]) -> None:
@@ -178,26 +161,15 @@ def _page(live: bool) -> Generator[None]:
                 Event().wait()
 
 
-def _sweep(
-    problems: "Sequence[Problem]",
-    controllers: list[str] | None,
-    folder: Path | None,
-    logs: Path,
-    what: str,
-    **asked: Any,
-) -> None:
+def _sweep(problems: "Sequence[Problem]", controllers: list[str] | None, folder: Path, options: "SweepOptions") -> None:
     """Sweep with a progress bar, print the tables, and exit with 1 where a run did not end as it should."""
-    from koopmpc.bench.controllers import controller_names
     from koopmpc.bench.report import build_summary_table, case_table, explain_results, write_report
     from koopmpc.bench.single import find_time_unit
     from koopmpc.bench.store import row_to_view
     from koopmpc.bench.sweep import sweep
 
-    controller_names(controllers)
-    folder = new_folder(logs, what) if folder is None else folder
     ENDING.folder = folder
-    single = asked.get("starts", 1) == asked.get("seeds", 1) == 1
-    single &= all(share == 0 for name in ("noise", "wrong") for share in asked.get(name, ()))
+    single = options.is_single
     units = {problem.name: find_time_unit(problem) for problem in problems}
     with bar("", rate=True) as progress:
 
@@ -205,7 +177,7 @@ def _sweep(
             if single:
                 progress.print(case_table(runs, units[runs[0].problem]))
 
-        rows = sweep(problems, controllers, folder=folder, progress=progress, on_case=show_case, **asked)
+        rows = sweep(problems, controllers, folder=folder, options=options, progress=progress, on_case=show_case)
     console().print(explain_results(rows) if single else build_summary_table(rows))
     if not single:
         say(f"\nreport: {write_report(folder)}")
@@ -215,10 +187,3 @@ def _sweep(
         say(f"look at a run: {format_command('view', best.log)}")
     if any(row.failure is not None for row in rows):
         raise typer.Exit(1)
-
-
-def _shares(text: str, option: str) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError as error:
-        raise DataError(f"{option} is {text!r}; pass numbers with commas between them, such as 0,0.01") from error

@@ -15,8 +15,11 @@ def swept(tmp_path_factory):
     folder = tmp_path_factory.mktemp("inspected")
     problem = km.load_problem(write(folder))
     names, logs = ["lqr", "koopman-mpc"], folder / "logs"
-    rows = km.sweep([problem], names, folder=logs / "starts", starts=2, log_starts=2)
-    return [*rows, *km.sweep([problem.select("near")], names, folder=logs / "faults", faults=True)], folder
+    rows = km.sweep([problem], names, folder=logs / "starts", options=km.bench.SweepOptions(starts=2, log_starts=2))
+    return [
+        *rows,
+        *km.sweep([problem.select("near")], names, folder=logs / "faults", options=km.bench.SweepOptions(faults=True)),
+    ], folder
 
 
 def test_a_log_says_what_ran_and_its_metrics_by_itself(swept):

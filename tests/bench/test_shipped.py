@@ -76,7 +76,10 @@ def test_all_eight_controllers_end_as_they_should_on_all_cases(tmp_path):
 def test_a_payload_that_grows_leaves_an_error_to_those_who_neither_learn_nor_estimate(tmp_path):
     problem = replace(km.load_problem("drifting_arm"), scene=lambda x, u: [])
     names = ["lqr", "koopman-mpc", "offset-free", "bilinear-mpc", "adaptive"]
-    rows = {(row.case, row.controller): row for row in km.sweep([problem], names, folder=tmp_path, monitor=True)}
+    rows = {
+        (row.case, row.controller): row
+        for row in km.sweep([problem], names, folder=tmp_path, options=km.bench.SweepOptions(monitor=True))
+    }
     assert {row.failure for row in rows.values()} == {None}
     assert [name for (case, name), row in rows.items() if case == "drift" and row.reached] == [
         "offset-free",

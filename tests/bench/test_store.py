@@ -1,6 +1,8 @@
 """A sweep's store: many starts, seeds and noises, workers, kill -9, and two sweeps that do not mix."""
 
 import shutil
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +31,7 @@ def problem(tmp_path_factory):
 @pytest.fixture(scope="module")
 def whole(problem, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
-    return km.sweep([problem], TWO, folder=folder, **GRID), folder
+    return km.sweep([problem], TWO, folder=folder, options=km.bench.SweepOptions(**GRID)), folder
 
 
 def test_every_combination_runs_once_and_what_learns_nothing_has_one_seed(whole):
@@ -70,7 +72,7 @@ def test_runs_of_a_seed_share_a_model_of_their_own_data(whole):
 
 
 def test_workers_give_what_one_process_gives_and_learn_once(problem, whole, tmp_path):
-    rows = km.sweep([problem], TWO, folder=tmp_path, workers=2, **GRID)
+    rows = km.sweep([problem], TWO, folder=tmp_path, options=km.bench.SweepOptions(workers=2, **GRID))
     assert figures(rows) == figures(whole[0])
     assert [row.key for row in rows] == [row.key for row in whole[0]]
     assert len({row.training_time for row in rows if row.controller == "koopman-mpc" and row.seed == 0}) == 1
@@ -90,30 +92,47 @@ def test_what_is_finished_is_not_run_again(problem, whole, tmp_path, monkeypatch
     original = room.measure_run
     monkeypatch.setattr("koopmpc.bench.sweep.measure_run", counted)
     with pytest.raises(KeyboardInterrupt):
-        km.sweep([problem], TWO, folder=tmp_path, **GRID)
+        km.sweep([problem], TWO, folder=tmp_path, options=km.bench.SweepOptions(**GRID))
     assert pq.read_table(tmp_path / "results.parquet").num_rows <= 20 == len(km.bench.load_rows(tmp_path))
     ran.append(None)
-    rows = km.sweep([problem], TWO, folder=tmp_path, **GRID)
+    rows = km.sweep([problem], TWO, folder=tmp_path, options=km.bench.SweepOptions(**GRID))
     assert figures(rows) == figures(whole[0])
     assert len(ran) - 1 == len(set(ran) - {None}) == len(rows)
 
 
-def test_a_torn_line_is_run_again_and_nothing_else(problem, whole, tmp_path):
-    folder = shutil.copytree(whole[1], tmp_path / "torn")
-    journal = sorted((folder / "rows").glob("*.jsonl"))[-1]
-    journal.write_bytes(journal.read_bytes()[:-40])
-    assert len(km.bench.load_rows(folder)) == len(whole[0]) - 1
-    assert figures(km.sweep([problem], TWO, folder=folder, **GRID)) == figures(whole[0])
+def test_a_damaged_row_is_told_and_run_again_and_nothing_else(problem, whole, tmp_path):
+    folder = shutil.copytree(whole[1], tmp_path / "damaged")
+    with closing(sqlite3.connect(folder / "sweep.sqlite")) as file, file:
+        (name,) = file.execute("SELECT name FROM texts WHERE name LIKE '%lqr%x3'").fetchone()
+        file.execute("UPDATE texts SET text = replace(text, 'tiny', 'tony') WHERE name = ?", (name,))
+    with pytest.warns(UserWarning, match=r"sweep.sqlite: 1 rows are damaged and were left out; the same sweep in this"):
+        assert len(km.bench.load_rows(folder)) == len(whole[0]) - 1
+    with pytest.warns(UserWarning, match="1 rows are damaged"):
+        again = km.sweep([problem], TWO, folder=folder, options=km.bench.SweepOptions(**GRID))
+    assert figures(again) == figures(whole[0])
+    assert len(km.bench.load_rows(folder)) == len(whole[0])
+
+
+def test_a_sweep_of_an_older_edition_is_refused_with_advice(problem, tmp_path):
+    (tmp_path / "sweep.json").write_text("{}")
+    for use in (km.bench.load_rows, lambda folder: km.sweep([problem], TWO, folder=folder)):
+        with pytest.raises(km.KoopmpcError, match=r"holds a sweep of an edition before 0.1.0.*run it again in another"):
+            use(tmp_path)
+
+
+def test_an_old_keyword_says_where_it_went(problem, tmp_path):
+    with pytest.raises(TypeError, match=r"starts= is a field of the options now: pass options=km.bench.SweepOptions\("):
+        km.sweep([problem], TWO, folder=tmp_path, starts=3)
 
 
 def test_another_sweep_is_refused_in_the_same_folder(problem, whole, tmp_path):
     with pytest.raises(
         km.errors.ProblemError, match=r"holds another sweep, of other controllers, starts; pass another"
     ):
-        km.sweep([problem], ["lqr"], folder=whole[1], **{**GRID, "starts": 3})
+        km.sweep([problem], ["lqr"], folder=whole[1], options=km.bench.SweepOptions(**{**GRID, "starts": 3}))
     changed = km.load_problem(write(tmp_path, "tiny", **{"Q=1.0": "Q=2.0"}))
     with pytest.raises(km.errors.ProblemError, match=r"holds another sweep, of other problems; pass another folder"):
-        km.sweep([changed], TWO, folder=whole[1], **GRID)
+        km.sweep([changed], TWO, folder=whole[1], options=km.bench.SweepOptions(**GRID))
 
 
 @pytest.mark.parametrize(
@@ -136,17 +155,22 @@ def test_a_problem_that_was_changed_in_memory_is_another_one(part, problem, tmp_
 
 def test_wrong_parameters_move_the_plant_and_no_controller(tmp_path):
     problem = km.load_problem("pendulum:upright")
-    rows = km.sweep([problem], TWO, folder=tmp_path, wrong=[0.0, 0.1], starts=2)
+    rows = km.sweep([problem], TWO, folder=tmp_path, options=km.bench.SweepOptions(wrong=[0.0, 0.1], starts=2))
     costs = {row.key: row.metrics.cost for row in rows}
     assert all(cost != costs[(*key[:5], 0.1, *key[6:])] for key, cost in costs.items() if key[5] == 0.0)
     with pytest.raises(km.errors.ProblemError, match="its plant has no numbers as fields"):
-        km.sweep([km.load_problem(write(tmp_path))], ["lqr"], folder=tmp_path / "none", wrong=[0.1])
+        km.sweep(
+            [km.load_problem(write(tmp_path))],
+            ["lqr"],
+            folder=tmp_path / "none",
+            options=km.bench.SweepOptions(wrong=[0.1]),
+        )
 
 
 def test_a_problem_that_cannot_be_sent_says_so(problem, tmp_path):
     local = replace(problem, scene=lambda x, u: [])
     with pytest.raises(km.errors.ProblemError, match=r"cannot be sent to worker processes .* save it in a file"):
-        km.sweep([local], ["lqr"], folder=tmp_path, workers=2)
+        km.sweep([local], ["lqr"], folder=tmp_path, options=km.bench.SweepOptions(workers=2))
 
 
 def test_the_interval_of_a_median_holds_it_as_often_as_it_says():
@@ -193,7 +217,7 @@ def test_a_sweep_is_no_regression_of_itself_and_a_worse_one_is(problem, whole, t
     assert not same.regressions
     assert {pair.ratio for pair in same.pairs} == {1.0}
     worse = replace(problem, limits=km.Limits(u_min=-0.3, u_max=0.3)).of_file(problem.file)
-    km.sweep([worse], TWO, folder=tmp_path, **GRID)
+    km.sweep([worse], TWO, folder=tmp_path, options=km.bench.SweepOptions(**GRID))
     found = km.bench.compared(whole[1], tmp_path)
     assert {pair.what.split()[1] for pair in found.regressions} >= {"near"}
     assert all(pair.p < 0.05 or pair.lost for pair in found.regressions)

@@ -305,7 +305,9 @@ def test_a_live_run_leaves_the_same_log(swept, tmp_path, monkeypatch):
     problem, rows, _, _ = swept
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
     monkeypatch.setattr("koopmpc.bench.single.Recorder", Unseen)
-    (row,) = km.sweep([problem.select("far")], ["koopman-mpc"], folder=tmp_path, live=True)
+    (row,) = km.sweep(
+        [problem.select("far")], ["koopman-mpc"], folder=tmp_path, options=km.bench.SweepOptions(live=True)
+    )
     assert row.failure is None
     live = km.load_run(row.log)
     kept = km.load_run(next(r.log for r in rows if (r.case, r.controller) == ("far", "koopman-mpc")))
@@ -317,7 +319,7 @@ def test_a_live_run_leaves_the_same_log(swept, tmp_path, monkeypatch):
 def test_a_paced_run_takes_as_long_as_its_plant_and_is_the_same(swept, tmp_path):
     problem, rows, _, _ = swept
     begin = time.monotonic()
-    (row,) = km.sweep([problem.select("far")], ["lqr"], folder=tmp_path, paced=True)
+    (row,) = km.sweep([problem.select("far")], ["lqr"], folder=tmp_path, options=km.bench.SweepOptions(paced=True))
     assert time.monotonic() - begin > 5 * problem.dt
     assert row.metrics.cost == next(r.metrics.cost for r in rows if (r.case, r.controller) == ("far", "lqr"))
 
@@ -350,7 +352,9 @@ def test_live_without_a_viewer_or_a_display_serves_a_page_while_runs_go_on(tmp_p
 def test_no_viewer_costs_one_warning_and_no_run(swept, tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: None)
     with pytest.warns(UserWarning, match="no Rerun viewer listens at") as caught:
-        rows = km.sweep([swept[0].select("far")], ["lqr", "koopman-mpc"], folder=tmp_path, live=True)
+        rows = km.sweep(
+            [swept[0].select("far")], ["lqr", "koopman-mpc"], folder=tmp_path, options=km.bench.SweepOptions(live=True)
+        )
     assert len(caught) == 1
     assert [row.failure for row in rows] == [None, None]
 
@@ -395,8 +399,13 @@ def test_a_case_that_comes_twice_is_refused_before_anything_runs(swept, tmp_path
 @pytest.fixture(scope="module")
 def faulty(swept, tmp_path_factory):
     folder = tmp_path_factory.mktemp("faulty")
-    rows = km.sweep([swept[0].select("near")], KINDS, folder=folder, faults=True)
-    short = km.sweep([swept[0].select("far")], ["lqr", "koopman-mpc"], folder=folder / "far", faults=True)
+    rows = km.sweep([swept[0].select("near")], KINDS, folder=folder, options=km.bench.SweepOptions(faults=True))
+    short = km.sweep(
+        [swept[0].select("far")],
+        ["lqr", "koopman-mpc"],
+        folder=folder / "far",
+        options=km.bench.SweepOptions(faults=True),
+    )
     return [*rows, *short], folder
 
 
@@ -449,7 +458,12 @@ def test_all_controllers_meet_the_same_faults(faulty):
 def test_a_live_faulty_run_leaves_the_same_log(swept, faulty, tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.bench.sweep.find_viewer", lambda: "somewhere")
     monkeypatch.setattr("koopmpc.bench.single.Recorder", Unseen)
-    rows = km.sweep([swept[0].select("far")], ["koopman-mpc"], folder=tmp_path, live=True, faults=True)
+    rows = km.sweep(
+        [swept[0].select("far")],
+        ["koopman-mpc"],
+        folder=tmp_path,
+        options=km.bench.SweepOptions(live=True, faults=True),
+    )
     assert [row.failure for row in rows] == [None] * (1 + len(km.bench.FAULTS))
     for row in rows:
         same = (row.case, row.controller, row.fault)
@@ -462,7 +476,7 @@ def test_a_live_faulty_run_leaves_the_same_log(swept, faulty, tmp_path, monkeypa
 )
 def test_an_actuator_without_a_range_has_none_to_lose(swept, tmp_path, limits, loses):
     problem = replace(swept[0].select("near"), limits=km.Limits(**limits))
-    rows = km.sweep([problem], ["lqr"], folder=tmp_path, faults=True)
+    rows = km.sweep([problem], ["lqr"], folder=tmp_path, options=km.bench.SweepOptions(faults=True))
     assert [row.fault for row in rows] == [
         None,
         *(name for name in km.bench.FAULTS if loses or name != "actuator-loss"),
@@ -480,7 +494,7 @@ def test_a_monitor_counts_unknown_steps_of_learned_mpc_in_rows_logs_and_table(tm
     problem = km.load_problem(write(tmp_path))
     problem = replace(problem, cases={"near": problem.cases["near"]})
     names = ["lqr", "koopman-mpc", "offset-free", "bilinear-mpc", "bilinear-offset", "adaptive"]
-    rows = km.sweep([problem], names, folder=tmp_path / "logs", monitor=True)
+    rows = km.sweep([problem], names, folder=tmp_path / "logs", options=km.bench.SweepOptions(monitor=True))
     assert [row.failure for row in rows] == [None] * 6
     assert [row.metrics.unknown is None for row in rows] == [name == "lqr" for name in names]
     assert (km.load_run(rows[1].log).known >= 0).all()

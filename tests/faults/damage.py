@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import koopmpc as km
-from koopmpc.bench.store import MANIFEST, Journal, RunRow, manifest_of, open_sweep, record_of, write_results
+from koopmpc.bench.store import RunRow, open_sweep, read_store, record_of, write_results
 from koopmpc.page import Curves, Page
 from koopmpc.plants import routines
 from koopmpc.recording.curves import record_curves
@@ -64,11 +64,11 @@ def texts(rows: Iterable[RunRow]) -> list[str]:
     return [repr(record_of(row)) for row in rows]
 
 
-def journal(path: Path) -> None:
-    """Write the lines of these runs, as they end."""
-    with Journal(path) as lines:
+def store(path: Path) -> None:
+    """Write the store of these runs, as they end."""
+    with open_sweep(path.parent, {"problems": ["a"], "controllers": ["lqr"], "seed": 1}) as sweep:
         for row in rows():
-            lines.turn(row, None)
+            sweep.add(row)
 
 
 def results(path: Path) -> None:
@@ -130,7 +130,7 @@ READERS: dict[str, tuple[Callable[[], Any], Callable[[Path], Any]]] = {
     "episodes.npz": (episodes, km.load_episodes),
     "episodes.parquet": (episodes, km.load_episodes),
     "run.rrd": (lambda: make_run(T=60), km.load_run),
-    "rows.jsonl": (lambda: texts(rows()), lambda path: texts(Journal(path).rows.values())),
+    "sweep.sqlite": (lambda: texts(rows()), lambda path: texts(read_store(path).rows.values())),
 }
 """Each kind of file that is read: what was written, and what reads it."""
 
@@ -198,18 +198,6 @@ def parts_of_model_log(path: Path) -> Any:
     return dict(log.facts), log.states, log.dt, [error.tobytes() for error in log.errors]
 
 
-def sweep(path: Path) -> None:
-    with open_sweep(path.parent / "swept", {"problems": ["a"], "controllers": ["lqr"], "seed": 1}):
-        pass
-    path.write_bytes((path.parent / "swept" / MANIFEST).read_bytes())
-
-
-def sweep_of(path: Path) -> Any:
-    (path.parent / "asked").mkdir(exist_ok=True)
-    (path.parent / "asked" / MANIFEST).write_bytes(path.read_bytes())
-    return manifest_of(path.parent / "asked")["asked"]
-
-
 _CODE = "double koopmpc_twice(double x) { return 2 * x; }\n"
 
 
@@ -245,7 +233,6 @@ FORMATS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "certified.npz": (lambda path: certificate().controller().save(path), saved),
     "certificate.npz": (lambda path: certificate().save(path), km.guarantees.load_certificate),
     "model.rrd": (WRITERS["model.rrd"], parts_of_model_log),
-    "manifest.json": (sweep, sweep_of),
     "code.so": (code, code_of),
     # What others write has no checksums: values may be others in silence.
     "columns.dat": (lambda path: column_file(path, " "), columns_of),

@@ -23,10 +23,10 @@ import numpy as np
 from scipy import stats
 
 import koopmpc as km
-from tests.faults.damage import READERS, WRITERS, journal
+from tests.faults.damage import READERS, WRITERS, store
 from tests.faults.test_controllers import BUILD, COST, PLANT
 
-MAKERS = WRITERS | {"rows.jsonl": journal}
+MAKERS = WRITERS | {"sweep.sqlite": store}
 _SLOPE, _SETTLED = 5.0, 10.0  # [MB/h], and minutes until memory is at rest
 
 
@@ -60,7 +60,7 @@ def loops(seed: int, _: Path) -> None:
 def files(seed: int, folder: Path) -> None:
     rng, name = random.Random(seed), random.Random(seed).choice(list(READERS))
     written, read = READERS[name][0](), READERS[name][1]
-    (folder / name).unlink(missing_ok=True)  # a journal is written on, and would grow with each round
+    (folder / name).unlink(missing_ok=True)  # a sweep goes on in its store
     MAKERS[name](folder / name)
     data = bytearray((folder / name).read_bytes())
     bit = rng.randrange(8 * len(data))

@@ -18,7 +18,7 @@ import pytest
 import koopmpc as km
 from koopmpc import disk
 from koopmpc.data.files.foreign.hdf5 import _require_sound_heaps
-from tests.faults.damage import FORMATS, PLAIN, READERS, WRITERS, damaged, episodes, journal, model, recorded, room_for
+from tests.faults.damage import FORMATS, PLAIN, READERS, WRITERS, damaged, episodes, model, recorded, room_for, store
 from tests.recording.runs import make_run
 from tests.tiers import few
 
@@ -143,7 +143,7 @@ def flipped(data: bytes, rng: random.Random) -> bytes:
 def test_no_flipped_bit_is_read_as_other_data(tmp_path: Path, name: str, count: int) -> None:
     written, read = READERS[name][0](), READERS[name][1]
     path, bad = tmp_path / name, tmp_path / f"bad {name}"
-    (WRITERS | {"rows.jsonl": journal})[name](path)
+    (WRITERS | {"sweep.sqlite": store})[name](path)
     data, rng, refused = path.read_bytes(), random.Random(count), 0
     few = name == "run.rrd" and count < 1000  # damaged logs are read in a child process, half a second each
     for _ in range(4 if few else count):
@@ -158,7 +158,7 @@ def test_no_flipped_bit_is_read_as_other_data(tmp_path: Path, name: str, count: 
         refused += found is None or bool(caught)
         if found is None:
             assert str(bad) in said
-        elif name == "rows.jsonl":  # a line that is damaged is told, and the others are read
+        elif name == "sweep.sqlite":  # a line that is damaged is told, and the others are read
             assert [row for row in written if row in found] == found
             assert len(found) == len(written) or str(bad) in str(caught[0].message)
         else:

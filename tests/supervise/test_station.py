@@ -283,7 +283,7 @@ def test_a_plain_function_and_a_pid_run_in_a_sweep(tmp_path):
     km.bench.register_law("half", lambda y, r: 4.0)
     try:
         tanks = km.load_problem("two_tanks:fill")
-        rows = km.sweep([tanks], ["half", "pid"], folder=tmp_path, log_starts=0)
+        rows = km.sweep([tanks], ["half", "pid"], folder=tmp_path, options=km.bench.SweepOptions(log_starts=0))
     finally:
         del km.bench.CONTROLLERS["half"]
     assert [(row.controller, row.failure) for row in rows] == [("half", None), ("pid", None)]
