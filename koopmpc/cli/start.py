@@ -42,6 +42,7 @@ EXTRAS = (
     Extra(("h5py",), "hdf5", "logs in .h5 and MATLAB's v7.3 files"),
     Extra(("asammdf",), "mdf", "logs in .mf4"),
     Extra(("rosbags", "mcap"), "ros", "logs in .mcap and .db3"),
+    Extra(("piqp",), "piqp", "long plans solved over their stages"),
     Extra(("asyncua",), "opcua", "plants behind an OPC UA server"),
 )
 
