@@ -10,10 +10,8 @@ import secrets
 import shutil
 import stat
 import tempfile
-import time
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
-from functools import cache
 from multiprocessing.util import Finalize
 from os import PathLike
 from pathlib import Path
@@ -28,8 +26,7 @@ from koopmpc.interrupts import raise_swallowed
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _DEFLATED = 1100  # deflate makes a member at most 1032 times smaller
 _PIECE = 1 << 22  # bytes that are read at once
-_SHELF = "koopmpc-"  # begins the name of a process's folder of temporary files
-_LOCK = ".lock"  # ends the name of the file beside it
+PART = ".part"  # ends the name of a file that is being written
 
 
 def path_of(path: object, advice: str = "pass text or a pathlib.Path") -> Path:
@@ -71,7 +68,6 @@ def writing(path: str | PathLike[str]) -> Generator[BinaryIO]:
             part = beside(file)
             try:  # before the file is there, so that no interrupt leaves it
                 stream = _Stream(part, "wb" if part == file else "xb")
-                _lock(stream.fileno())
                 with io.BufferedWriter(stream) as buffered:
                     yield cast("BinaryIO", buffered)
                     buffered.flush()
@@ -109,47 +105,7 @@ def beside(file: Path) -> Path:
     """Return the path of a new file beside this one; a device or a pipe itself."""
     if file.exists() and not file.is_file():
         return file
-    for part in _list_parts(file.parent):
-        if part.name[: -len(PART) - 9] == f".{file.name[:80]}":
-            _remove_abandoned(part)
     return file.with_name(f".{file.name[:80]}.{secrets.token_hex(4)}{PART}")
-
-
-PART = ".part"  # ends the name of a file that is being written
-_ABANDONED = 3600.0  # [s] after which one that no process holds and nobody has written to is what a killed one left
-
-
-_PARTS = f".*.{'[0-9a-f]' * 8}{PART}"
-_CALLS = "????-??-??T??-??-??-*"  # folders of calls
-
-
-def remove_abandoned(logs: Path) -> None:
-    """Remove what killed processes left in the folders of calls in this one; folders that are then empty go too."""
-    parts: list[Path] = []
-    with suppress(OSError):  # another call may remove its folder at this moment
-        parts.extend(logs.glob(f"{_CALLS}/**/{_PARTS}"))
-    for part in parts:
-        if _remove_abandoned(part):
-            folder = part.parent
-            with suppress(OSError):  # the first that is not empty stays, and all above it
-                while folder != logs:
-                    folder.rmdir()
-                    folder = folder.parent
-
-
-def _remove_abandoned(part: Path) -> bool:
-    """Remove the unfinished file if a killed process left it; return whether it did."""
-    with suppress(OSError), part.open("rb") as stream:
-        if time.time() - part.stat().st_mtime > _ABANDONED and _lock(stream.fileno()):
-            part.unlink()
-            return True
-    return False
-
-
-@cache
-def _list_parts(folder: Path) -> tuple[Path, ...]:
-    """Return the unfinished files that this process found in a folder at its first save: a sweep saves thousands."""
-    return tuple(folder.glob(_PARTS))
 
 
 def settle(part: Path, file: Path, number: int) -> None:
@@ -281,43 +237,7 @@ def memory() -> int | None:
 
 
 def make_temporary_folder() -> Path:
-    """Return a new folder for what this process needs until it ends; it is removed then.
-
-    What a process left that was killed goes when another one that uses such folders ends.
-    """
-    return Path(tempfile.mkdtemp(dir=_open_shelf(os.getpid())))
-
-
-@cache
-def _open_shelf(process: int) -> Path:
-    """Return the folder of this process, whose folders of temporary files lie in it; `process` is its id.
-
-    A lock on the file beside it tells other processes that this one lives.
-    """
-    lock, name = tempfile.mkstemp(_LOCK, _SHELF)  # open, and locked, until the process ends
-    _lock(lock)
-    shelf = Path(name.removesuffix(_LOCK))
-    shelf.mkdir(mode=0o700)
-    Finalize(None, _remove_shelves, (shelf,), exitpriority=0)  # worker processes do not run atexit
-    return shelf
-
-
-def _lock(file: int) -> bool:
-    """Lock an open file for this process; return whether it was free. Windows has no such lock: none is free."""
-    with suppress(ImportError, OSError):
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return True
-    return False
-
-
-def _remove_shelves(own: Path) -> None:
-    """Remove the folder of this process, and those of processes that were killed."""
-    shutil.rmtree(own, ignore_errors=True)
-    Path(f"{own}{_LOCK}").unlink(missing_ok=True)
-    for mark in own.parent.glob(f"{_SHELF}*{_LOCK}"):
-        with suppress(OSError), mark.open() as stream:
-            if _lock(stream.fileno()):
-                shutil.rmtree(mark.with_suffix(""), ignore_errors=True)
-                mark.unlink()
+    """Return a new folder for what this process needs until it ends; it is removed then."""
+    folder = tempfile.mkdtemp(prefix="koopmpc-")
+    Finalize(None, shutil.rmtree, (folder, True), exitpriority=0)  # worker processes do not run atexit
+    return Path(folder)

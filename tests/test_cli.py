@@ -63,21 +63,6 @@ def test_calls_that_share_a_second_make_a_folder_each(tmp_path, monkeypatch):
     assert [new_folder(tmp_path, "tiny").name for _ in range(3)] == [stem, f"{stem}-1", f"{stem}-2"]
 
 
-def test_a_new_folder_takes_away_what_killed_calls_left_in_others(tmp_path):
-    killed, other = tmp_path / "2026-11-27T01-02-03-tiny", tmp_path / "thesis"
-    kept = [killed / "run.rrd", killed / ".fresh.rrd.0123abcd.part", other / ".own.rrd.0123abcd.part"]
-    gone = [
-        killed / ".run.rrd.0123abcd.part",
-        tmp_path / "2026-11-27T01-02-04-tiny" / "near" / ".run.rrd.0123abcd.part",
-    ]
-    for path in (*kept, *gone):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(b"half")
-        os.utime(path, None if "fresh" in path.name else (0, 0))
-    made = new_folder(tmp_path, "next")
-    assert {*tmp_path.rglob("*")} == {made, killed, other, *kept}
-
-
 def test_a_folder_that_another_call_removes_meanwhile_does_not_end_this_one(tmp_path, monkeypatch):
     scan = os.scandir
 

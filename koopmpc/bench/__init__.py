@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from koopmpc.bench.controllers import CONTROLLERS as CONTROLLERS
     from koopmpc.bench.controllers import Prepared as Prepared
     from koopmpc.bench.controllers import register_law as register_law
-    from koopmpc.bench.inspect import Where as Where
     from koopmpc.bench.inspect import compared as compared
     from koopmpc.bench.inspect import inspected as inspected
     from koopmpc.bench.inspect import worst_moments as worst_moments
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from koopmpc.bench.report import median_interval as median_interval
     from koopmpc.bench.report import results_table as results_table
     from koopmpc.bench.report import write_report as write_report
+    from koopmpc.bench.row_filter import RowFilter as RowFilter
     from koopmpc.bench.single import FAULTS as FAULTS
     from koopmpc.bench.single import failures as failures
     from koopmpc.bench.single import replayed as replayed
@@ -28,4 +28,6 @@ if TYPE_CHECKING:
     from koopmpc.bench.store import reached as reached
     from koopmpc.bench.store import row_to_view as row_to_view
 else:
-    __getattr__, __dir__, __all__ = attach(__name__)
+    __getattr__, __dir__, __all__ = attach(
+        __name__, hints={"Where": 'it is RowFilter now: km.bench.RowFilter("violation > 0.01").holds(values)'}
+    )

@@ -1,11 +1,9 @@
 """What finished runs say: `inspected`, a log and its worst moments; `compared`, what got worse from A to B."""
 
-import ast
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import groupby
-from operator import eq, ge, gt, le, lt, ne
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +12,10 @@ from jaxtyping import Float
 from rich.table import Table
 
 from koopmpc import checks
+from koopmpc.bench.row_filter import RowFilter
 from koopmpc.bench.store import RunRow, load_rows, reached
 from koopmpc.control.move import Fallback, Status
-from koopmpc.errors import DataError, KoopmpcError, LogError
+from koopmpc.errors import KoopmpcError, LogError
 from koopmpc.loop.metrics import Metrics, beyond, find_late, metrics
 from koopmpc.loop.run import Run
 from koopmpc.recording.model import ModelLog, load_model_log
@@ -82,7 +81,7 @@ def inspected(logs: Sequence[str | Path], where: str | None = None, *, repair: b
     LogError
         There is no log.
     """
-    wanted = None if where is None else Where(where)
+    wanted = None if where is None else RowFilter(where)
     paths = [
         path for given in map(Path, logs) for path in (sorted(given.rglob("*.rrd")) if given.is_dir() else [given])
     ]
@@ -218,64 +217,6 @@ def inspection_table(found: Sequence[Inspected]) -> Table:
             cells = (f"{own.cost:.5g}", f"{own.violation:.2g}", str(own.late), str(each.values["fallbacks"]))
             lines.add_row(name, *cells, format_duration(own.solve_time_max), "cut" if each.cut else "")
     return lines
-
-
-class Where:
-    """Comparisons of figures and names with numbers and texts, joined by and, or, not; no code is run.
-
-    Raises
-    ------
-    DataError
-        The text is something else.
-    """
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-        try:
-            self._tree = ast.parse(text, mode="eval").body
-        except (SyntaxError, ValueError) as error:
-            raise DataError(f'--where "{text}" is not a comparison; write for example "violation > 0.01"') from error
-
-    def holds(self, values: Mapping[str, Any]) -> bool:
-        """Return whether it holds for these figures."""
-        return bool(self._value(self._tree, values))
-
-    def _value(self, node: ast.expr, values: Mapping[str, Any]) -> Any:
-        match node:
-            case ast.Constant(value=value):
-                return value
-            case ast.Name(id=name):
-                if name not in values:
-                    raise DataError(
-                        f'--where "{self.text}": there is no figure {name!r}; there are {", ".join(values)}'
-                    )
-                return values[name]
-            case ast.UnaryOp(op=ast.Not(), operand=inner):
-                return not self._value(inner, values)
-            case ast.UnaryOp(op=ast.USub(), operand=inner):
-                return -self._value(inner, values)
-            case ast.BoolOp(op=op, values=parts):
-                every = (bool(self._value(part, values)) for part in parts)
-                return all(every) if isinstance(op, ast.And) else any(every)
-            case ast.Compare(left=left, ops=ops, comparators=rest):
-                sides = [self._value(each, values) for each in (left, *rest)]
-                return all(self._compare(op, *pair) for op, *pair in zip(ops, sides[:-1], sides[1:], strict=True))
-            case _:
-                raise DataError(f'--where "{self.text}" holds more than comparisons, and, or, not')
-
-    def _compare(self, op: ast.cmpop, left: Any, right: Any) -> bool:
-        how = _COMPARISONS.get(type(op))
-        try:
-            if how is not None:
-                return how(left, right)
-        except TypeError as error:
-            raise DataError(f'--where "{self.text}" compares {left!r} with {right!r}') from error
-        raise DataError(f'--where "{self.text}" holds more than comparisons, and, or, not')
-
-
-_COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
-    ast.Lt: lt, ast.LtE: le, ast.Gt: gt, ast.GtE: ge, ast.Eq: eq, ast.NotEq: ne,
-}  # fmt: skip
 
 
 class Pairs(NamedTuple):

@@ -117,8 +117,6 @@ def say(text: str, style: str = "") -> None:
 def new_folder(logs: Path, what: str) -> Path:
     """Make and return logs/<time>-<what>; a number follows where two calls share a second.
 
-    Unfinished files that killed calls left in such folders are removed.
-
     Raises
     ------
     LogError
@@ -140,9 +138,6 @@ def new_folder(logs: Path, what: str) -> Path:
             ) from error
         else:
             ENDING.folder = folder
-            from koopmpc.disk import remove_abandoned
-
-            remove_abandoned(logs)
             return folder
 
 

@@ -59,7 +59,7 @@ def test_conditions_choose_logs(swept):
         each.path for each in km.bench.inspected([folder / "logs"], "cost > 2 and controller == 'lqr' or not reached")
     }
     assert chosen == {row.log for row in rows if (row.metrics.cost > 2 and row.controller == "lqr") or not row.reached}
-    assert km.bench.Where("0 < -cost <= 3").holds({"cost": -2.0})
+    assert km.bench.RowFilter("0 < -cost <= 3").holds({"cost": -2.0})
     for bad, said in (
         ("cost >", "is not a comparison"),
         ("price > 1", "there is no figure 'price'"),
@@ -68,7 +68,7 @@ def test_conditions_choose_logs(swept):
         ("cost + 1 > 2", "holds more than comparisons"),
     ):
         with pytest.raises(km.errors.DataError, match=said):
-            km.bench.Where(bad).holds({"cost": 1.0})
+            km.bench.RowFilter(bad).holds({"cost": 1.0})
 
 
 def record_pendulum(path, steps):
