@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.bench.problem import Case as Case
     from koopmpc.bench.problem import Problem as Problem
     from koopmpc.bench.problem import Training as Training
-    from koopmpc.bench.problem import load_problem as load_problem
+    from koopmpc.bench.problem_files import load_problem as load_problem
     from koopmpc.bench.sweep import sweep as sweep
     from koopmpc.codegen.compiled import compiled as compiled
     from koopmpc.codegen.export import export as export

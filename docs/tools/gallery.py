@@ -19,7 +19,7 @@ from standings import format_goals, format_standings
 import koopmpc as km
 from koopmpc.bench.controllers import Prepared, is_learned
 from koopmpc.bench.measured import find_baseline, find_best_learned, read_standings
-from koopmpc.bench.problem import shipped
+from koopmpc.bench.problem_files import shipped
 from koopmpc.bench.single import find_time_unit, run_closed_loop
 from koopmpc.bench.store import RunRow
 from koopmpc.page import Page

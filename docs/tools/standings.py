@@ -16,7 +16,8 @@ import numpy as np
 from koopmpc import disk
 from koopmpc.bench.controllers import is_learned
 from koopmpc.bench.measured import PATH, Standing, find_baseline, find_best_learned
-from koopmpc.bench.problem import Problem, load_problem, shipped
+from koopmpc.bench.problem import Problem
+from koopmpc.bench.problem_files import load_problem, shipped
 from koopmpc.bench.store import ORACLE, RunRow
 from koopmpc.bench.sweep import sweep
 

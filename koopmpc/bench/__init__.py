@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from koopmpc.bench.inspect import inspected as inspected
     from koopmpc.bench.inspect import worst_moments as worst_moments
     from koopmpc.bench.options import SweepOptions as SweepOptions
-    from koopmpc.bench.problem import list_problems as list_problems
-    from koopmpc.bench.problem import new_problem as new_problem
-    from koopmpc.bench.problem import shipped as shipped
+    from koopmpc.bench.problem_files import list_problems as list_problems
+    from koopmpc.bench.problem_files import new_problem as new_problem
+    from koopmpc.bench.problem_files import shipped as shipped
     from koopmpc.bench.report import build_summary_table as build_summary_table
     from koopmpc.bench.report import median_interval as median_interval
     from koopmpc.bench.report import results_table as results_table

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from koopmpc.bench.controllers import is_learned
-from koopmpc.bench.problem import Problem, list_problems, load_problem
+from koopmpc.bench.problem import Problem
+from koopmpc.bench.problem_files import list_problems, load_problem
 from koopmpc.bench.store import ORACLE
 from koopmpc.errors import KoopmpcError
 

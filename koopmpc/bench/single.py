@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 
 from koopmpc import disk
 from koopmpc.bench.controllers import Prepared, is_learned
-from koopmpc.bench.problem import Problem, load_problem
+from koopmpc.bench.problem import Problem
+from koopmpc.bench.problem_files import load_problem
 from koopmpc.bench.store import RunRow, reached
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.codegen.compiled import compiled as built

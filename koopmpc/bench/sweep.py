@@ -18,7 +18,8 @@ import numpy as np
 from koopmpc import checks, disk
 from koopmpc.bench.controllers import Prepared, controller_names, is_learned
 from koopmpc.bench.options import SweepOptions
-from koopmpc.bench.problem import Problem, load_problem
+from koopmpc.bench.problem import Problem
+from koopmpc.bench.problem_files import load_problem
 from koopmpc.bench.single import FAULTS, log_run, measure_run
 from koopmpc.bench.store import RESULTS, RunRow, Store, open_sweep, write_results
 from koopmpc.control.limits import Limits

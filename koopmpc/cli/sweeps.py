@@ -38,7 +38,7 @@ def run_problem(
 ) -> None:
     """Run controllers in closed loop on one problem; one log a run, and a table."""
     from koopmpc.bench.controllers import controller_names
-    from koopmpc.bench.problem import load_problem
+    from koopmpc.bench.problem_files import load_problem
 
     with friendly(), _page(options.live):
         loaded = load_problem(problem)
@@ -58,7 +58,7 @@ def bench(
 ) -> None:
     """Compare the controllers that each problem names, else the eight that suit any, from one start or many."""
     from koopmpc.bench.controllers import controller_names
-    from koopmpc.bench.problem import DEFAULT, load_problem, shipped
+    from koopmpc.bench.problem_files import DEFAULT, load_problem, shipped
     from koopmpc.bench.store import manifest_of
 
     with friendly(), _page(options.live):

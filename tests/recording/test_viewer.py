@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 import koopmpc as km
-from koopmpc.bench.problem import shipped
+from koopmpc.bench.problem_files import shipped
 from koopmpc.cli.app import app
 from koopmpc.recording import viewer
 from koopmpc.recording.viewer import find_viewer, free_port, has_display, is_up, start_viewer
