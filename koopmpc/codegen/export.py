@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.codegen.functions import Language
+from koopmpc.codegen.programs import make_tables, read_program
 from koopmpc.codegen.sources import (
     count_constants,
     count_flops,
@@ -21,7 +22,7 @@ from koopmpc.codegen.sources import (
     write_plant_functions,
     write_sources,
 )
-from koopmpc.codegen.tables import Precision, Tables, make_tables, read_program
+from koopmpc.codegen.tables import Precision, Tables
 from koopmpc.codegen.unit import write_unit
 from koopmpc.control.linear.condensed_program import CondensedProgram
 from koopmpc.control.move import Controller

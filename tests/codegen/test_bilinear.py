@@ -12,7 +12,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.codegen import tolerances
-from koopmpc.codegen.tables import make_tables, read_program
+from koopmpc.codegen.programs import make_tables, read_program
 from tests.compiler import find_compiler, needs_compiler
 from tests.synthesis.test_abreast import make
 from tests.tiers import few

@@ -67,11 +67,10 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *re
   const int moves_on = s->row + 1 < KOOPMPC_GIVEN_LENGTH;
   const int last = reference->count - 1, after = last - KOOPMPC_LATENCY, there = after < KOOPMPC_N ? after : KOOPMPC_N;
   int good = 1, same = 1, held = 1; /* held: all rows are the same */
-  int first_alone = 0, rests = s->aimed == HELD && reference->count == 1;
+  int first_alone = 0;
   koopmpc_real peak, ahead[SIZE];
   *reach = 0;
-  for (int i = 0; i < NR; i++) rests &= reference->values[i] == s->reference[i];
-  if (rests) return 0;
+  if (s->aimed == HELD && reference->count == 1 && koopmpc_same(reference->values, s->reference, NR)) return 0;
   for (int j = 0; j < (there + 1) * NR; j++) ahead[j] = reference->values[KOOPMPC_LATENCY * NR + j];
   for (int k = there < 0 ? 0 : there + 1; k <= KOOPMPC_N; k++)
     koopmpc_copy(ahead + k * NR, reference->values + last * NR, NR);
@@ -117,8 +116,7 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference, koopmpc_real *re
       const int rows = !KOOPMPC_DISTURBANCE_WIDTH && peak <= UNPUSHED(s) ? 0 : KOOPMPC_N + 1;
       for (int k = 0; k < rows; k++) {
         const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
-        int repeated = k > 0;
-        for (int i = 0; i < KOOPMPC_NR && repeated; i++) repeated = row[i] == row[i - KOOPMPC_NR];
+        const int repeated = k > 0 && koopmpc_same(row, row - NR, NR);
 #if KOOPMPC_DISTURBANCE_WIDTH /* checked when the disturbance is known */
         if (!repeated) koopmpc_nearest(row, 0, nearest);
 #else
@@ -270,11 +268,7 @@ static koopmpc_real set_limits(const koopmpc_state *s, koopmpc_qp_memory *qp, in
 #if KOOPMPC_LEVELS
 /** Put the plan on the best sequence of levels; writes how far a limit gave way. */
 static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_report *report) {
-#if KOOPMPC_BOUNDS
   const koopmpc_real opened = koopmpc_open_rates(s);
-#else
-  const koopmpc_real opened = 0;
-#endif
   const koopmpc_real conflict = set_limits(s, qp, 0);
   report->slack = conflict > opened ? conflict : opened;
   return koopmpc_search_levels(s, qp->low, qp->high, report);
@@ -438,11 +432,7 @@ static koopmpc_status solve(koopmpc_state *s, koopmpc_qp_memory *qp, koopmpc_rep
 #endif
   s->resumes = 0;
   for (int i = 0; i < ROWS; i++) push[i] = resume ? 0 : shifted(s, i);
-#if KOOPMPC_BOUNDS
   const koopmpc_real opened = koopmpc_open_rates(s);
-#else
-  const koopmpc_real opened = 0;
-#endif
   if (!resume && s->unmet && contradictory(s, qp)) return KOOPMPC_INFEASIBLE;
   conflict = set_limits(s, qp, 0);
   if (!resume && s->far) {
@@ -503,8 +493,7 @@ static void limited(koopmpc_state *s, const koopmpc_real *applied, koopmpc_real 
     koopmpc_add(e, koopmpc_disturbance, KOOPMPC_NZ, s->known + KOOPMPC_PREVIEW, KOOPMPC_DRIVEN);
     for (int k = 0; k <= KOOPMPC_N; k++) {
       const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
-      int repeated = k > 0;
-      for (int i = 0; i < KOOPMPC_NR && repeated; i++) repeated = row[i] == row[i - KOOPMPC_NR];
+      const int repeated = k > 0 && koopmpc_same(row, row - KOOPMPC_NR, KOOPMPC_NR);
       if (KOOPMPC_BOUNDS || !repeated) {
         koopmpc_nearest(row, e, nearest);
         target_of_row(s, k, e, alpha);

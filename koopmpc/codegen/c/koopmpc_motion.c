@@ -87,16 +87,6 @@ static int extend(koopmpc_state *s, int j, int *drifts) {
   return 0;
 }
 
-/** to (m, n) = a b, or a' b if `turned`; a is (m, k), or (k, m), and b (k, n), all row after row. */
-static void multiply(koopmpc_real *to, const koopmpc_real *a, const koopmpc_real *b, int m, int k, int n, int turned) {
-  for (int i = 0; i < m; i++)
-    for (int j = 0; j < n; j++) {
-      koopmpc_real sum = 0;
-      for (int q = 0; q < k; q++) sum += (turned ? a[q * m + i] : a[i * k + q]) * b[q * n + j];
-      to[i * n + j] = sum;
-    }
-}
-
 /** The transpose of a square matrix: of one that stands column after column, its rows. */
 static void transpose(koopmpc_real *to, const koopmpc_real *from, int n) {
   for (int i = 0; i < n; i++)
@@ -107,11 +97,11 @@ static void transpose(koopmpc_real *to, const koopmpc_real *from, int n) {
 static int can_drift(const koopmpc_state *s, const koopmpc_real *by, const koopmpc_real *J) {
   koopmpc_real d[RN], x[NX], missed[RN], off[RN], way[RN];
   for (int j = 0; j < RN; j++) d[j] = s->reference[STEPS * RN + j] - s->reference[j];
-  multiply(x, by, d, NX, RN, 1, 0);
-  multiply(missed, J, x, RN, NX, 1, 0);
+  koopmpc_multiply(x, by, d, NX, RN, 1, 0);
+  koopmpc_multiply(missed, J, x, RN, NX, 1, 0);
   for (int j = 0; j < RN; j++) missed[j] -= d[j];
-  multiply(off, koopmpc_Q_root, missed, RN, RN, 1, 1);
-  multiply(way, koopmpc_Q_root, d, RN, RN, 1, 1);
+  koopmpc_multiply(off, koopmpc_Q_root, missed, RN, RN, 1, 1);
+  koopmpc_multiply(way, koopmpc_Q_root, d, RN, RN, 1, 1);
   return koopmpc_dot(off, off, RN) <= KOOPMPC_FOLLOWS * KOOPMPC_FOLLOWS * koopmpc_dot(way, way, RN);
 }
 
@@ -129,44 +119,42 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
     if (!extend(s, j, &drifts)) return;
   koopmpc_local(end + TARGET_X, end + TARGET_U KOOPMPC_AND(koopmpc_end_w(s)), at);
   koopmpc_factors(at, H, T);
+  transpose(root_Q, koopmpc_rest_weight, RN);
   for (int i = 0; i < LEAST; i++) /* the equilibrium that comes nearest to a row, by its size */
-    for (int j = 0; j < RN; j++) {
-      by[i * RN + j] = 0;
-      for (int m = 0; m < RN; m++) by[i * RN + j] += T[i * (RN + LEAST) + m] * koopmpc_rest_weight[j * RN + m];
-    }
+    koopmpc_multiply(by + i * RN, T + i * (RN + LEAST), root_Q, 1, RN, RN, 0);
   for (int i = 0; i < NX; i++) { /* all by the sizes of x and u */
     for (int j = 0; j < NX; j++) A[i * NX + j] *= sx[j] / sx[i];
     for (int j = 0; j < NV; j++) B[i * NV + j] *= su[j] / sx[i];
     for (int j = 0; j < RN; j++) J[j * NX + i] *= sx[i];
   }
   if (drifts && !can_drift(s, by, J)) return;
-  multiply(S, end + TARGET_M, J, GOAL, RN, NX, 0);
+  koopmpc_multiply(S, end + TARGET_M, J, GOAL, RN, NX, 0);
   for (int i = 0; i < GOAL * NX; i++) S[i] += end[TARGET_L + i] * sx[i % NX];
-  multiply(SA, S, A, GOAL, NX, NX, 0);
-  multiply(SB, S, B, GOAL, NX, NV, 0);
+  koopmpc_multiply(SA, S, A, GOAL, NX, NX, 0);
+  koopmpc_multiply(SB, S, B, GOAL, NX, NV, 0);
   transpose(root_R, koopmpc_R_root, NV);
-  multiply(R, root_R, root_R, NV, NV, NV, 1);
-  multiply(inner, SB, SB, NV, GOAL, NV, 1);
+  koopmpc_multiply(R, root_R, root_R, NV, NV, NV, 1);
+  koopmpc_multiply(inner, SB, SB, NV, GOAL, NV, 1);
   for (int i = 0; i < NV * NV; i++) {
     R[i] *= su[i / NV] * su[i % NV];
     inner[i] += R[i];
   }
   (void)koopmpc_inverse(inner, NV, NV, KOOPMPC_FLAT, inverse, 0);
-  multiply(gain, SB, SA, NV, GOAL, NX, 1);
-  multiply(K, inverse, gain, NV, NV, NX, 0);
-  multiply(BK, B, K, NX, NV, NX, 0);
+  koopmpc_multiply(gain, SB, SA, NV, GOAL, NX, 1);
+  koopmpc_multiply(K, inverse, gain, NV, NV, NX, 0);
+  koopmpc_multiply(BK, B, K, NX, NV, NX, 0);
   for (int i = 0; i < NX * NX; i++) A[i] -= BK[i];
-  multiply(gain, R, K, NV, NV, NX, 0);
+  koopmpc_multiply(gain, R, K, NV, NV, NX, 0);
   transpose(root_Q, koopmpc_Q_root, RN);
-  multiply(weighed, root_Q, J, RN, RN, NX, 0);
-  multiply(push, weighed, root_Q, NX, RN, RN, 1);
+  koopmpc_multiply(weighed, root_Q, J, RN, RN, NX, 0);
+  koopmpc_multiply(push, weighed, root_Q, NX, RN, RN, 1);
 #if KOOPMPC_HOLDS
   koopmpc_fill(constant, 0, NX);
-  multiply(held, gain, by + NX * RN, NX, NV, RN, 1);
+  koopmpc_multiply(held, gain, by + NX * RN, NX, NV, RN, 1);
 #else
   koopmpc_real rest_input[NV];
   for (int i = 0; i < NV; i++) rest_input[i] = end[TARGET_U + i] / su[i];
-  multiply(constant, gain, rest_input, NX, NV, 1, 1);
+  koopmpc_multiply(constant, gain, rest_input, NX, NV, 1, 1);
   koopmpc_fill(held, 0, NX * RN);
 #endif
   for (int i = 0; i < NX * RN; i++) push[i] -= held[i];
@@ -174,14 +162,14 @@ void koopmpc_move_end(koopmpc_state *s, koopmpc_real *end) {
   koopmpc_fill(probe, 1, NX);
   while (steps < FURTHER + 1) steps *= 2;
   for (int k = steps - 1; k >= 0; k--) { /* p = push (r - of) + constant + (A - B K)' p */
-    multiply(next, A, p, NX, NX, 1, 1);
+    koopmpc_multiply(next, A, p, NX, NX, 1, 1);
     for (int i = 0; i < NX && k <= FURTHER; i++) {
       const koopmpc_real *row = k ? s->beyond + (k - 1) * RN : last;
       next[i] += constant[i];
       for (int j = 0; j < RN; j++) next[i] += push[i * RN + j] * (row[j] - at[LOCAL_OF + j]);
     }
     koopmpc_copy(p, next, NX);
-    multiply(next, A, probe, NX, NX, 1, 1);
+    koopmpc_multiply(next, A, probe, NX, NX, 1, 1);
     koopmpc_copy(probe, next, NX);
   }
   if (!koopmpc_usable(p, NX)) return;

@@ -148,22 +148,15 @@ int koopmpc_is_limited(const koopmpc_real *active) {
 }
 
 void koopmpc_factors(const koopmpc_real *at, koopmpc_real *H, koopmpc_real *T) {
-  koopmpc_real E[MOST_ROWS * SIZE], gain[SIZE * MOST_ROWS], null[SIZE * SIZE], W[LEFT * SIZE];
+  koopmpc_real E[MOST_ROWS * SIZE], gain[SIZE * MOST_ROWS], null[SIZE * SIZE], W[LEFT * SIZE], through[LEFT * NX];
   int count;
   holding(at, E);
   count = koopmpc_inverse(E, NX, SIZE, RANK, gain, null);
   residuals(at, W);
   least(W, null, count, T);
-  for (int j = 0; j < NX; j++)
-    for (int i = 0; i < SIZE; i++) {
-      koopmpc_real sum = -gain[i * NX + j];
-      for (int m = 0; m < LEFT; m++) {
-        koopmpc_real through = 0;
-        for (int n = 0; n < SIZE; n++) through += W[m * SIZE + n] * gain[n * NX + j];
-        sum += T[i * LEFT + m] * through;
-      }
-      H[i * NX + j] = sum;
-    }
+  koopmpc_multiply(through, W, gain, LEFT, SIZE, NX, 0);
+  koopmpc_multiply(H, T, through, SIZE, LEFT, NX, 0);
+  for (int i = 0; i < SIZE * NX; i++) H[i] -= gain[i];
 }
 
 #if KOOPMPC_DISTURBED

@@ -21,9 +21,7 @@ enum {
 
 /** Whether a target is that of this row. */
 static int is_row(const koopmpc_real *target, const koopmpc_real *row) {
-  int same = 1;
-  for (int i = 0; i < ROW && same; i++) same = !(target[i] < row[i] || target[i] > row[i]);
-  return same;
+  return koopmpc_same(target, row, ROW);
 }
 
 /** The squared distance of two rows by the weights of the cost. */
@@ -190,57 +188,24 @@ typedef struct {
 
 /** P of the step before, and its gain K; 0 if R + B'PB is not positive definite. */
 static int before(const tail_step *t, koopmpc_real *P, koopmpc_real *K) {
-  koopmpc_real BP[NV * TAILED], S[NV * NV], closed[TAILED * TAILED], PC[TAILED * TAILED];
-  for (int i = 0; i < NV; i++)
-    for (int j = 0; j < TAILED; j++) {
-      BP[i * TAILED + j] = 0;
-      for (int m = 0; m < TAILED; m++) BP[i * TAILED + j] += t->B[m * NV + i] * P[m * TAILED + j];
-    }
-  for (int i = 0; i < NV; i++)
-    for (int j = 0; j < NV; j++) {
-      S[i * NV + j] = t->R[i * NV + j];
-      for (int m = 0; m < TAILED; m++) S[i * NV + j] += BP[i * TAILED + m] * t->B[m * NV + j];
-    }
-  for (int i = 0; i < NV; i++)
-    for (int j = 0; j < TAILED; j++) {
-      K[i * TAILED + j] = j >= NX ? -koopmpc_tail_R_delta[i * NV + j - NX] : 0;
-      for (int m = 0; m < TAILED; m++) K[i * TAILED + j] += BP[i * TAILED + m] * t->A[m * TAILED + j];
-    }
-  for (int j = 0; j < NV; j++) { /* S = L L' */
-    for (int m = 0; m < j; m++) S[j * NV + j] -= S[j * NV + m] * S[j * NV + m];
-    if (!(S[j * NV + j] > 0)) return 0;
-    S[j * NV + j] = KOOPMPC_SQRT(S[j * NV + j]);
-    for (int i = j + 1; i < NV; i++) {
-      for (int m = 0; m < j; m++) S[i * NV + j] -= S[i * NV + m] * S[j * NV + m];
-      S[i * NV + j] /= S[j * NV + j];
-    }
+  koopmpc_real BP[NV * TAILED], S[NV * NV], L[NV * NV], closed[TAILED * TAILED], PC[TAILED * TAILED];
+  koopmpc_multiply(BP, t->B, P, NV, TAILED, TAILED, 1);
+  koopmpc_multiply(S, BP, t->B, NV, TAILED, NV, 0);
+  koopmpc_multiply(K, BP, t->A, NV, TAILED, TAILED, 0);
+  for (int i = 0; i < NV; i++) {
+    for (int j = 0; j < NV; j++) S[i * NV + j] += t->R[i * NV + j];
+    for (int j = NX; j < TAILED; j++) K[i * TAILED + j] -= koopmpc_tail_R_delta[i * NV + j - NX];
   }
-  for (int j = 0; j < TAILED; j++) {
-    for (int i = 0; i < NV; i++) {
-      for (int m = 0; m < i; m++) K[i * TAILED + j] -= S[i * NV + m] * K[m * TAILED + j];
-      K[i * TAILED + j] /= S[i * NV + i];
-    }
-    for (int i = NV - 1; i >= 0; i--) {
-      for (int m = i + 1; m < NV; m++) K[i * TAILED + j] -= S[m * NV + i] * K[m * TAILED + j];
-      K[i * TAILED + j] /= S[i * NV + i];
-    }
-  }
+  if (!koopmpc_divide(S, L, K, NV, TAILED)) return 0;
+  koopmpc_multiply(closed, t->B, K, TAILED, NV, TAILED, 0);
+  for (int i = 0; i < TAILED * TAILED; i++) closed[i] = t->A[i] - closed[i];
+  koopmpc_multiply(PC, P, closed, TAILED, TAILED, TAILED, 0);
+  koopmpc_multiply(P, t->A, PC, TAILED, TAILED, TAILED, 1);
   for (int i = 0; i < TAILED; i++)
     for (int j = 0; j < TAILED; j++) {
-      closed[i * TAILED + j] = t->A[i * TAILED + j];
-      for (int m = 0; m < NV; m++) closed[i * TAILED + j] -= t->B[i * NV + m] * K[m * TAILED + j];
-    }
-  for (int i = 0; i < TAILED; i++)
-    for (int j = 0; j < TAILED; j++) {
-      PC[i * TAILED + j] = 0;
-      for (int m = 0; m < TAILED; m++) PC[i * TAILED + j] += P[i * TAILED + m] * closed[m * TAILED + j];
-    }
-  for (int i = 0; i < TAILED; i++)
-    for (int j = 0; j < TAILED; j++) {
-      koopmpc_real sum = t->Q[i * TAILED + j];
-      for (int m = 0; m < TAILED; m++) sum += t->A[m * TAILED + i] * PC[m * TAILED + j];
-      for (int m = 0; m < NV && i >= NX; m++) sum += koopmpc_tail_R_delta[(i - NX) * NV + m] * K[m * TAILED + j];
-      P[i * TAILED + j] = sum;
+      P[i * TAILED + j] += t->Q[i * TAILED + j];
+      for (int m = 0; m < NV && i >= NX; m++)
+        P[i * TAILED + j] += koopmpc_tail_R_delta[(i - NX) * NV + m] * K[m * TAILED + j];
     }
   for (int i = 0; i < TAILED; i++)
     for (int j = 0; j < i; j++)
@@ -288,6 +253,7 @@ static void root_of(const koopmpc_real *P, koopmpc_real *S) {
 static int add_tail(koopmpc_real *target, const koopmpc_real *w) {
   koopmpc_real at[KOOPMPC_LOCAL], J[ROW * NX], QJ[ROW * NX], work[ROW * NX], back[NX * ROW], seen[NX * NX];
   koopmpc_real inverse[NX * NX], copied[NX * NX], P[TAILED * TAILED], S[TAILED * TAILED], mean = 0;
+  koopmpc_real reached[ROW * ROW];
   koopmpc_real *M = target + TARGET_M, *L = target + TARGET_L, *V = target + TARGET_V;
   const koopmpc_real *size = koopmpc_rest_size, scale = KOOPMPC_SQRT((koopmpc_real)KOOPMPC_TAIL_SCALE);
   tail_step t;
@@ -296,16 +262,8 @@ static int add_tail(koopmpc_real *target, const koopmpc_real *w) {
   koopmpc_local(target + TARGET_X, target + TARGET_U KOOPMPC_AND(w), at);
   for (int i = 0; i < ROW; i++)
     for (int j = 0; j < NX; j++) J[i * NX + j] = at[LOCAL_J + i * NX + j] * size[j] / koopmpc_tail_row_size[i];
-  for (int i = 0; i < ROW; i++)
-    for (int j = 0; j < NX; j++) {
-      QJ[i * NX + j] = 0;
-      for (int m = 0; m < ROW; m++) QJ[i * NX + j] += koopmpc_tail_Q[i * ROW + m] * J[m * NX + j];
-    }
-  for (int i = 0; i < NX; i++)
-    for (int j = 0; j < NX; j++) {
-      seen[i * NX + j] = 0;
-      for (int m = 0; m < ROW; m++) seen[i * NX + j] += J[m * NX + i] * QJ[m * NX + j];
-    }
+  koopmpc_multiply(QJ, koopmpc_tail_Q, J, ROW, ROW, NX, 0);
+  koopmpc_multiply(seen, J, QJ, NX, ROW, NX, 1);
   koopmpc_fill(t.A, 0, TAILED * TAILED);
   koopmpc_fill(t.B, 0, TAILED * NV);
   koopmpc_fill(t.Q, 0, TAILED * TAILED);
@@ -338,27 +296,19 @@ static int add_tail(koopmpc_real *target, const koopmpc_real *w) {
   mean = KOOPMPC_SQRT(mean > 1 ? mean : 1);
   koopmpc_fill(M, 0, TARGET_FOUND - TARGET_M);
   for (int i = 0; i < TAILED; i++) {
-    koopmpc_real through[ROW];
-    for (int r = 0; r < ROW; r++) {
-      through[r] = 0;
-      for (int j = 0; j < NX; j++) through[r] += S[i * TAILED + j] * back[j * ROW + r];
-      M[i * ROW + r] = scale * through[r] / koopmpc_tail_row_size[r];
-    }
-    for (int j = 0; j < NX; j++) {
-      koopmpc_real left = S[i * TAILED + j];
-      for (int r = 0; r < ROW; r++) left -= through[r] * J[r * NX + j];
-      L[i * NX + j] = scale * left / size[j];
-    }
+    koopmpc_real through[ROW], shown[NX];
+    koopmpc_multiply(through, S + i * TAILED, back, 1, NX, ROW, 0);
+    koopmpc_multiply(shown, through, J, 1, ROW, NX, 0);
+    for (int r = 0; r < ROW; r++) M[i * ROW + r] = scale * through[r] / koopmpc_tail_row_size[r];
+    for (int j = 0; j < NX; j++) L[i * NX + j] = scale * (S[i * TAILED + j] - shown[j]) / size[j];
     for (int j = NX; j < TAILED; j++) V[i * NV + j - NX] = scale * S[i * TAILED + j] / size[j];
   }
+  koopmpc_multiply(reached, J, back, ROW, NX, ROW, 0);
   for (int i = 0; i < ROW; i++)
     for (int r = 0; r < ROW; r++) {
       koopmpc_real sum = koopmpc_Q_root[r * ROW + i];
-      for (int b = 0; b < ROW; b++) {
-        koopmpc_real through = 0;
-        for (int j = 0; j < NX; j++) through += J[b * NX + j] * back[j * ROW + r];
-        sum -= koopmpc_Q_root[b * ROW + i] * koopmpc_tail_row_size[b] * through / koopmpc_tail_row_size[r];
-      }
+      for (int b = 0; b < ROW; b++)
+        sum -= koopmpc_Q_root[b * ROW + i] * koopmpc_tail_row_size[b] * reached[b * ROW + r] / koopmpc_tail_row_size[r];
       M[(TAILED + i) * ROW + r] = mean * sum;
     }
   for (int i = 0; i < KOOPMPC_GOAL; i++)

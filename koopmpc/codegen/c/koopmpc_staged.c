@@ -335,12 +335,6 @@ static koopmpc_status begin_anew(koopmpc_state *s, const koopmpc_real *x, const 
 }
 
 #if KOOPMPC_SCHEDULED
-static int differ(const koopmpc_real *a, const koopmpc_real *b, int n) {
-  int found = 0;
-  for (int i = 0; i < n; i++) found |= a[i] < b[i] || a[i] > b[i];
-  return found;
-}
-
 /** Have the targets found for another w, which holds at the end of the horizon. */
 static void aim_at(koopmpc_state *s, const koopmpc_real *w) {
   koopmpc_copy(s->aimed_w, w, KOOPMPC_NW);
@@ -368,9 +362,9 @@ static int disturb(koopmpc_state *s) {
   if (!good) return 0;
   koopmpc_copy(last, s->e + (STEPS - 1) * NX, NX);
   koopmpc_copy(s->e, s->draftX, STEPS * NX);
-  for (int i = 0; i < NX; i++) s->moved_on |= last[i] < s->e[(STEPS - 1) * NX + i] || last[i] > s->e[(STEPS - 1) * NX + i];
+  s->moved_on |= !koopmpc_same(last, s->e + (STEPS - 1) * NX, NX);
 #if KOOPMPC_SCHEDULED
-  if (differ(s->aimed_w, koopmpc_w_of(s, STEPS - 1), KOOPMPC_NW)) aim_at(s, koopmpc_w_of(s, STEPS - 1));
+  if (!koopmpc_same(s->aimed_w, koopmpc_w_of(s, STEPS - 1), KOOPMPC_NW)) aim_at(s, koopmpc_w_of(s, STEPS - 1));
 #endif
 #else
   (void)s;
@@ -382,9 +376,7 @@ static int disturb(koopmpc_state *s) {
 static const koopmpc_real *find_in_table(koopmpc_state *s, const koopmpc_real *row) {
   for (int tried = 0; tried < s->target_count; tried++) {
     const koopmpc_real *target = s->targets + s->found * KOOPMPC_TARGET;
-    int same = 1;
-    for (int i = 0; i < KOOPMPC_NR && same; i++) same = target[i] == row[i];
-    if (same) return target;
+    if (koopmpc_same(target, row, KOOPMPC_NR)) return target;
     s->found = s->found + 1 < s->target_count ? s->found + 1 : 0;
   }
   return 0;
@@ -395,7 +387,7 @@ static const koopmpc_real *target_of(koopmpc_state *s, const koopmpc_real *row, 
   const koopmpc_real *target = 0;
 #if KOOPMPC_SCHEDULED
   const koopmpc_real none[KOOPMPC_NW1] = {0};
-  if (!differ(s->aimed_w, none, KOOPMPC_NW))
+  if (koopmpc_same(s->aimed_w, none, KOOPMPC_NW))
 #endif
     target = find_in_table(s, row);
   return target ? target : koopmpc_find_row(s, row, whole);
@@ -408,18 +400,15 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference) {
   int same = s->aimed, trajectory_ends = 0;
   for (int k = 0; k <= STEPS; k++) {
     const koopmpc_real *row = koopmpc_row(reference, k + KOOPMPC_LATENCY, KOOPMPC_NR);
-    for (int i = 0; i < KOOPMPC_NR; i++) {
-      same &= s->reference[k * KOOPMPC_NR + i] == row[i];
-      s->reference[k * KOOPMPC_NR + i] = row[i];
-    }
+    same &= koopmpc_same(s->reference + k * KOOPMPC_NR, row, KOOPMPC_NR);
+    koopmpc_copy(s->reference + k * KOOPMPC_NR, row, KOOPMPC_NR);
   }
   if (same && !s->moved_on) return 1;
   s->aimed = 0;
   if (!koopmpc_usable(s->reference, (STEPS + 1) * KOOPMPC_NR)) return 0;
   for (int k = 0; k <= STEPS; k++) {
     const koopmpc_real *row = s->reference + k * KOOPMPC_NR;
-    int repeated = k > 0;
-    for (int i = 0; i < KOOPMPC_NR && repeated; i++) repeated = row[i] == row[i - KOOPMPC_NR];
+    const int repeated = k > 0 && koopmpc_same(row, row - KOOPMPC_NR, KOOPMPC_NR);
     if (k < STEPS && !KOOPMPC_HOLDS) { /* only the last row counts */
       koopmpc_fill(s->u_r + k * NV, 0, NV);
       continue;
@@ -448,8 +437,7 @@ static int aim(koopmpc_state *s, const koopmpc_rows *reference) {
   koopmpc_copy(s->rest, end + TARGET_X, NX);
 #endif
   for (int k = 0; k < STEPS; k++) {
-    int held = 1;
-    for (int i = 0; i < KOOPMPC_NR && held; i++) held = s->reference[k * KOOPMPC_NR + i] == last[i];
+    const int held = koopmpc_same(s->reference + k * KOOPMPC_NR, last, KOOPMPC_NR);
     if (k == STEPS - 1) trajectory_ends = KOOPMPC_GIVEN && !held;
     if (!KOOPMPC_DISTURBED) continue;
     for (int i = 0; i < NV; i++)
@@ -550,12 +538,9 @@ static int is_found(koopmpc_state *s, const koopmpc_real *row, int whole) {
   return find_in_table(s, row) || koopmpc_is_free(s, row);
 #else
   const koopmpc_real *target = target_of(s, row, whole), *known = s->targets + s->target_count * KOOPMPC_TARGET;
-  int free = 1;
-  if (target >= s->targets && target < known) return 1;
-  for (int i = 0; i < NV + KOOPMPC_BOX && target; i++)
-    free &= !(target[TARGET_ACTIVE + i] < 0 || target[TARGET_ACTIVE + i] > 0);
-  free = target && free && target[target == s->made_end ? TARGET_FOUND : TARGET_M] > 0;
-  return free && koopmpc_is_alone(s, row, target);
+  if (!target || (target >= s->targets && target < known)) return target != 0;
+  return !koopmpc_is_limited(target + TARGET_ACTIVE) &&
+         target[target == s->made_end ? TARGET_FOUND : TARGET_M] > 0 && koopmpc_is_alone(s, row, target);
 #endif
 }
 

@@ -116,22 +116,7 @@ static void factor(koopmpc_state *s, const koopmpc_real *barrier) {
       if (barrier) H[i * NV + i] += barrier[i * STEPS + k];
       s->curvature[k * NV + i] = H[i * NV + i];
     }
-    for (int i = 0; i < NV; i++) { /* the lower factor of H, then K = H^-1 B'PA */
-      for (int j = 0; j <= i; j++) {
-        koopmpc_real sum = (H[i * NV + j] + H[j * NV + i]) / 2;
-        for (int m = 0; m < j; m++) sum -= half[i * NV + m] * half[j * NV + m];
-        half[i * NV + j] = i == j ? KOOPMPC_SQRT(sum) : sum / half[j * NV + j];
-      }
-      for (int j = 0; j < NS; j++) {
-        for (int m = 0; m < i; m++) K[i * NS + j] -= half[i * NV + m] * K[m * NS + j];
-        K[i * NS + j] /= half[i * NV + i];
-      }
-    }
-    for (int i = NV - 1; i >= 0; i--)
-      for (int j = 0; j < NS; j++) {
-        for (int m = i + 1; m < NV; m++) K[i * NS + j] -= half[m * NV + i] * K[m * NS + j];
-        K[i * NS + j] /= half[i * NV + i];
-      }
+    (void)koopmpc_divide(H, half, K, NV, NS);
     for (int i = 0; i < NS; i++) /* P (A - B K) */
       for (int m = 0; m < NV; m++)
         for (int j = 0; j < NS; j++) WA[i * NS + j] -= WB[i * NV + m] * K[m * NS + j];

@@ -2,6 +2,8 @@
 #ifndef KOOPMPC_STAGES_H
 #define KOOPMPC_STAGES_H
 
+#include <math.h>
+
 #include "koopmpc_step.h"
 
 /** Sizes: the model's x, a stage's state s and input v, tracked and limited outputs, the sides of the limits, rows of the end's cost. */
@@ -42,6 +44,40 @@ enum {
   LOCAL_DG = LOCAL_G + KOOPMPC_BOX,
   KOOPMPC_LOCAL = LOCAL_DG + KOOPMPC_BOX * KOOPMPC_NZ
 };
+
+/** to (m, n) = a b, or a' b if `turned`; a is (m, k), or (k, m), and b (k, n), all row after row. */
+static inline void koopmpc_multiply(koopmpc_real *to, const koopmpc_real *a, const koopmpc_real *b, int m, int k, int n,
+                                    int turned) {
+  for (int i = 0; i < m; i++)
+    for (int j = 0; j < n; j++) {
+      koopmpc_real sum = 0;
+      for (int q = 0; q < k; q++) sum += (turned ? a[q * m + i] : a[i * k + q]) * b[q * n + j];
+      to[i * n + j] = sum;
+    }
+}
+
+/** K (n, m) <- H^-1 K by the lower factor of H, which is written to L; 0 if H is not positive definite. */
+static inline int koopmpc_divide(const koopmpc_real *H, koopmpc_real *L, koopmpc_real *K, int n, int m) {
+  int good = 1;
+  for (int i = 0; i < n; i++) {
+    for (int j = 0; j <= i; j++) {
+      koopmpc_real sum = (H[i * n + j] + H[j * n + i]) / 2;
+      for (int k = 0; k < j; k++) sum -= L[i * n + k] * L[j * n + k];
+      L[i * n + j] = i == j ? KOOPMPC_SQRT(sum) : sum / L[j * n + j];
+      if (i == j) good &= sum > 0;
+    }
+    for (int j = 0; j < m; j++) {
+      for (int k = 0; k < i; k++) K[i * m + j] -= L[i * n + k] * K[k * m + j];
+      K[i * m + j] /= L[i * n + i];
+    }
+  }
+  for (int i = n - 1; i >= 0; i--)
+    for (int j = 0; j < m; j++) {
+      for (int k = i + 1; k < n; k++) K[i * m + j] -= L[k * n + i] * K[k * m + j];
+      K[i * m + j] /= L[i * n + i];
+    }
+  return good;
+}
 
 /** Slopes: A and B of a stage, row after row, and its next state. Stage map: the next state alone. */
 void koopmpc_slopes(const koopmpc_real *s, const koopmpc_real *v KOOPMPC_AND(const koopmpc_real *w), koopmpc_real *out);

@@ -30,6 +30,13 @@ static inline void koopmpc_fill(koopmpc_real *to, koopmpc_real value, int n) {
   for (int i = 0; i < n; i++) to[i] = value;
 }
 
+/** Whether all entries are equal; NaN equals nothing. */
+static inline int koopmpc_same(const koopmpc_real *a, const koopmpc_real *b, int n) {
+  int same = 1;
+  for (int i = 0; i < n; i++) same &= a[i] == b[i];
+  return same;
+}
+
 static inline koopmpc_real koopmpc_clip(koopmpc_real a, koopmpc_real low, koopmpc_real high) {
   a = a < low ? low : a;
   return a > high ? high : a;
@@ -134,6 +141,7 @@ static inline koopmpc_real koopmpc_bound_of(const koopmpc_rows *rows, int k, int
 /** Widen hard rates of later moves as far as the limits of the inputs need; return by how much at most. */
 koopmpc_real koopmpc_open_rates(koopmpc_state *s);
 #else
+static inline koopmpc_real koopmpc_open_rates(koopmpc_state *s) { return (void)s, (koopmpc_real)0; }
 #define KOOPMPC_RATES_LOW(s) koopmpc_rates_low
 #define KOOPMPC_RATES_HIGH(s) koopmpc_rates_high
 #endif

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc.codegen.compiled import Compiled, NoCompilerWarning, compiled
-from koopmpc.codegen.tables import make_tables, read_program
+from koopmpc.codegen.programs import make_tables, read_program
 from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import KoopmpcError
 from koopmpc.loop.run import Run
