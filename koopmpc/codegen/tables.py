@@ -147,8 +147,7 @@ def _(estimator: FilterProgram, single: bool) -> Mapping[str, Any]:
 
 @convert.register
 def _(sides: Sides, single: bool) -> Mapping[str, Any]:
-    del single
-    return {**sides._asdict(), "scale": sides.sign / sides.span}
+    return {**convert.dispatch(object)(sides, single), "scale": sides.sign / sides.span}
 
 
 @convert.register
