@@ -46,7 +46,7 @@ class LiftedDisturbance(Value):
     within L steps leave c' at zero.
 
     A reading at a rail of its sensor, as the model's `Delay` has them, teaches nothing if the prediction is beyond it.
-    A reading far from its prediction is refused: A z + B u + E w + d stands in for at most five steps, and nothing is
+    A reading far from its prediction is refused: A z + B u + E w + d stands in for at most six steps, and nothing is
     learned. Once readings are used again, all means start again.
 
     Parameters
@@ -211,7 +211,7 @@ class DisturbanceObserver(Viewing, Measured):
     def program(self) -> DisturbanceProgram:
         """Return the data with which z and d are found."""
         return DisturbanceProgram(
-            self.gain, self.reach, self._known, self._to_y.copy(), gate=gate_graph(self.ny, self._remembers)
+            self.gain, self.reach, self._known, self._to_y.copy(), gate=gate_graph(self.ny, leaps=True)
         )
 
     def update(self, model: LinearPredictor | StateModel) -> None:

@@ -35,7 +35,7 @@ class ExtendedKalman(Value):
     disturbance of the outputs, one for each, so that a controller leaves no offset.
 
     Entries of y that are NaN are left out. A reading at a rail of its sensor with a prediction at it or beyond is left
-    out too: it tells nothing more. A reading far from its prediction is refused, for at most five steps in sequence.
+    out too: it tells nothing more. A reading far from its prediction is refused, for at most six steps in sequence.
 
     Of a StepMap y is its own output h(x), which may be less than the state; then d is zero, and an offset may remain.
 

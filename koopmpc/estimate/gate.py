@@ -13,22 +13,16 @@ from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import bind_interpreter
 from koopmpc.values import Viewing
 
-# A reading is refused if an innovation exceeds this many times the running 0.9 quantile of its size. Of Gaussian
-# innovations the bound is about ten standard deviations: where the running quantile rests it is above 1.64.
-BEYOND = 5.0
-BRIDGED = 5  # refused readings in sequence for which a prediction stands in; the next one is used, an absurd one
-LONG = 10  # only after so many
-FEW = 10  # the bound counts once so many innovations of a run have come; before,
-ABSURD = 1e4  # a reading, or a prediction, is absurd if off by this many times all that its output has shown
-RISE = 1.4  # an innovation above the running quantile multiplies it by this,
-FALL = RISE ** (-1 / 9)  # and one below it by this: nine of ten are below where the quantile rests
-WIDEN = 4.0  # while all readings are used, the quantile follows the last innovation by at most this factor a step,
-NARROW = 0.7  # and downwards by this one
-LEAST = 0.01  # the quantile counts as at least this share of the largest step that the output has made
+BEYOND = 8.0  # a reading is refused if its innovation exceeds so many standard deviations: χ² = 64
+REFUSALS = 6  # refused readings in sequence for which a prediction stands in; so many have to agree before one is wild
+BRIDGED = 5  # missed readings in sequence, or doubted disturbances, for which a prediction stands in
+SURE = 2  # readings have to agree before an absurd one is refused
+LEAP = 10.0  # until readings agree, the observer starts again from one that leaps by so many largest steps
+ABSURD = 1e4  # or by so many, where not all states are measured; a reading is absurd if off by so many times all shown
+WEIGHT = 0.1  # weight of the newest square of an innovation in the running S
+NARROW = 0.7  # until readings agree, the standard deviation falls to the last innovation by this factor a step
+LEAST = 0.01  # the standard deviation counts as at least this share of the largest step that the output has made
 ROUNDING = 1e-9  # and as this share of the reading's and the prediction's size: what is smaller is rounding
-SUSPECTS = 2  # the first readings, and those after a reading that leaps, may be left behind so many times
-LEAP = 10.0  # with `leaps`: a reading leaps if it and its misfit are beyond so many largest steps
-LEAPS = 6  # the first readings before one that leaps may be left behind so many times
 FADING = 0.8  # what a predicted step allows fades by this factor a step
 
 _NO_W = np.zeros(0)
@@ -39,94 +33,63 @@ _NO_W = np.zeros(0)
 def gate_function(ny: int, leaps: bool = False) -> ca.Function:
     """Return (y, prediction, memory) → [whether y is refused; 1 if the gate has opened, 2 if all is lost; the memory].
 
-    y is refused if |yᵢ − ŷᵢ| > 5 qᵢ + ρ Sᵢ for any of its entries. qᵢ is the running 0.9 quantile of |yᵢ − ŷᵢ|, and
-    counts and goes on as at least 0.01 Sᵢ and 1e-9 of yᵢ and ŷᵢ, so that rounding decides nothing. Sᵢ is the largest
-    step of this output that was used. ρ is the largest predicted step of all outputs, each in units of its S, and fades
-    by 0.8 a step: in a transient a model may err by as much as the outputs move. After five refused readings in
-    sequence the gate opens, and all readings are used until one is inside the bound. Before the tenth reading only one
-    is refused that is off by 1e4 times all that its output has shown, |last| + max(q, S); the bound counts from there.
-    Such a reading opens the gate after ten refused ones only. Without a prediction it is refused if it is so far from
-    the last one that was used. Entries that are NaN are not judged.
+    y is refused if (|ν| − ρ s)²/S > χ² for any of its innovations ν = y − ŷ. S = n σ²: σ² is the running mean of ν²,
+    and n the readings since one was used. s is the largest step of this output that was used, ρ the largest predicted
+    step of all outputs in units of their s, which fades by 0.8 a step: in a transient a model may err by as much as the
+    outputs move. σ counts as at least 0.01 s, and as 1e-9 of y and ŷ, so that rounding decides nothing. After six
+    refused readings in sequence the next one is used, and σ is its innovation. Entries that are NaN are not judged.
 
-    Among the first readings, and while the gate is open, a wild one may be used. Where a prediction is then off by more
-    than 1e4 (S + |y|), and y itself is not absurd, the estimate is lost: the observer starts again from y. A plant that
-    does not move, whatever is predicted, looks alike. After the first readings this is done once, if an output has
-    moved or a wild reading was left behind, and again when an absurd reading was used. It is done wherever an output
-    falls to a tenth of its last used value, but not to zero. Once wild readings were left behind, S is forgotten too.
+    At the start, and after a reading that was used so, nobody knows whether y or ŷ is wild, until six readings agreed
+    with their predictions. Until then one is refused only after two that agreed, if it is absurd: |y − last| and |ν|
+    are beyond 1e4 times all that its output has shown. A reading leaps if both are beyond 10 times the largest step,
+    used or predicted, without `leaps` beyond 1e4 times. Then what came before was wild, or this reading is, and the
+    next one will leap back: the observer starts again from y, at most twelve times until readings agree. So it does
+    where |ν| > 1e4 (s + |y|), or where an output falls to less than 1e-4 of its last value and of ν, though not to
+    zero.
 
-    Several wild ones in a row hide each other so. While the gate is open, an output may fall to less than 1e-4 of its
-    last used value, but not to zero. If its prediction is off by more than 1e4 times what it falls to, the readings
-    before were wild: the observer starts again from y, and S is forgotten. This is done twice, and twice again after a
-    reading off by 1e4 times all that its output had shown was used.
-
-    With `leaps`, where a disturbance is learned or a filter reads all states, smaller ones are left behind too. While
-    the gate is open, a reading leaps if |y − last| and |y − ŷ| are both beyond 10 times the largest step, used or
-    predicted. An absurd one does not, nor the fifth or a later one before any step. The observer starts again from y,
-    up to six times.
-
-    The memory is q, S, the predicted steps, the last used values, a count, whether the observer has started again
-    since, and how often it has left wild readings behind. Below a count of 10 the gate is open, and 10 less the count
-    are the least number of readings until it may close; from 10 on the refused ones are added.
+    The memory is σ, s, the predicted steps, the last used values, how many readings agreed, how many were refused or
+    leapt in sequence, and whether one has come.
     """
     y, predicted, memory = (ca.SX.sym(name, n) for name, n in (("y", ny), ("predicted", ny), ("memory", 4 * ny + 3)))
     ends = [0, ny, 2 * ny, 3 * ny, 4 * ny, 4 * ny + 1, 4 * ny + 2, 4 * ny + 3]
-    quantile, largest, ahead, last, count, restarted, left = ca.vertsplit(memory, ends)
-    known, foreseen = ca.fabs(y) < HUGE, ca.fabs(predicted) < HUGE  # False for NaN
-    came = ca.logic_and(known, foreseen)
-    error = ca.if_else(came, ca.fabs(y - predicted), 0)
-    ahead_new = ca.fmax(ca.if_else(ca.logic_and(came, count > 0), ca.fabs(predicted - last), 0), FADING * ahead)
-    size = ca.fmax(largest, ahead_new)
-    moving = ca.fmax(size, ca.if_else(came, ROUNDING * ca.fmin(ca.fabs(predicted), ca.fabs(last)), 0))
-    share = ca.mmax(ahead_new / ca.if_else(moving > 0, moving, 1))
-    least = ca.fmax(LEAST * largest, ca.if_else(came, ROUNDING * ca.fmin(ca.fabs(predicted), ca.fabs(y)), 0))
-    wide = ca.fmax(quantile, least)
-    inside = error <= BEYOND * wide + share * size
-    judged, good, closed = ca.mmax(came), ca.mmin(inside), count >= FEW
-    shown = ca.fmax(quantile, size) + ca.fabs(last)
-    jump = ca.if_else(foreseen, error, ca.if_else(known, ca.fabs(y - last), 0))
-    leapt = ca.mmax(ca.logic_and(shown > 0, jump > ABSURD * shown))
-    far = ca.logic_and(leapt, count > 1)
-    moved = ca.logic_or(largest > 0, left > 0)  # leaving wild readings behind forgets S
-    dropped = ca.logic_and(ca.logic_and(known, y != 0), ca.fabs(last) > LEAP * (largest + ca.fabs(y)))
-    may_restart = ca.logic_or(ca.logic_or(count <= 2, ca.mmax(dropped)), ca.logic_and(moved, ca.logic_not(restarted)))
-    astray = ca.logic_and(error > ABSURD * (largest + ca.fabs(y)), may_restart)
-    fell = ca.logic_and(ca.logic_and(known, y != 0), ca.fabs(last) > ABSURD * ca.fabs(y))
-    missed = ca.if_else(foreseen, error > ABSURD * ca.fabs(y), 1)
-    suspected, apart = ca.mmax(ca.logic_and(fell, missed)), ca.SX(0)
-    if leaps:
-        ahead_first = ca.if_else(came, ca.fabs(predicted - last), 0)
-        rounded = ca.if_else(came, ROUNDING * ca.fmax(ca.fabs(last), ca.fmax(ca.fabs(predicted), ca.fabs(y))), 0)
-        steps, way = ca.fmax(size, ahead_first), ca.if_else(came, ca.fmin(error, ca.fabs(y - last)), 0)
-        leap = ca.logic_and(ca.logic_and(steps > rounded, way > LEAP * steps), ca.logic_or(largest > 0, count <= 2))
-        apart = ca.logic_and(ca.mmax(leap), ca.logic_not(far))
-        suspected = ca.logic_or(suspected, apart)
-    back = ca.logic_and(suspected, ca.logic_and(left < (LEAPS if leaps else SUSPECTS), ca.logic_not(closed)))
-    away = ca.mmax(ca.logic_and(known, ca.fabs(y - last) > ABSURD * shown))  # else the prediction is absurd, not y
-    lost = ca.logic_or(ca.logic_and(ca.mmax(astray), ca.logic_not(ca.logic_and(far, away))), back)
-    absurd = ca.logic_and(far, ca.logic_not(ca.logic_and(judged, closed)))
-    wild = ca.logic_and(ca.logic_and(judged, closed), ca.logic_not(good))
-    patient = count < FEW + ca.if_else(far, LONG, BRIDGED)
-    refused = ca.logic_and(ca.logic_and(ca.logic_or(wild, absurd), patient), ca.logic_not(lost))
-    opened = ca.logic_and(wild, ca.logic_not(refused))
-    used = ca.if_else(refused, predicted, y)
+    sigma, largest, ahead, last, agreed, denied, begun = ca.vertsplit(memory, ends)
+    known = ca.fabs(y) < HUGE
+    came = ca.logic_and(known, ca.fabs(predicted) < HUGE)  # False for NaN
+    innovation = ca.if_else(came, ca.fabs(y - predicted), 0)
+    ahead_new = ca.fmax(ca.if_else(ca.logic_and(came, begun), ca.fabs(predicted - last), 0), FADING * ahead)
+    least = ca.fmin(ca.fabs(last), ca.fmin(ca.fabs(predicted), ca.fabs(y)))
+    rounding = ca.if_else(came, ROUNDING * least, 0)
+    step = ca.fmax(largest, ahead_new)
+    moving = ca.fmax(step, rounding)
+    transient = ca.mmax(ahead_new / ca.if_else(moving > 0, moving, 1)) * step
+    wide = ca.fmax(sigma, ca.fmax(LEAST * largest, rounding))
+    judged, sure, patient = ca.mmax(came), agreed >= REFUSALS, denied < REFUSALS
+    good = ca.mmin(innovation <= BEYOND * wide * ca.sqrt(1 + ca.if_else(sure, denied, 0)) + transient)
+    moved = ca.if_else(came, ca.fabs(y - last), 0)
+    leapt = ca.logic_and(step > rounding, ca.fmin(innovation, moved) > (LEAP if leaps else ABSURD) * step)
+    absurd = ca.logic_and(agreed >= SURE, ca.mmax(ca.fmin(innovation, moved) > ABSURD * (step + ca.fabs(last))))
+    wild = ca.logic_and(ca.logic_or(ca.logic_and(judged, sure), absurd), ca.logic_not(good))
+    missed = ca.fmax(innovation / ABSURD - largest, ca.fmin(innovation, ca.fabs(last)) / ABSURD)
+    fell = ca.logic_and(ca.mmax(ca.logic_and(y != 0, missed > ca.fabs(y))), ca.logic_or(ca.logic_not(sure), wild))
+    leaps_off = ca.logic_and(ca.mmax(leapt), ca.logic_not(ca.logic_or(sure, absurd)))
+    lost = ca.logic_and(ca.logic_or(leaps_off, fell), denied < 2 * REFUSALS)
+    refused, opened = ca.logic_and(wild, patient), ca.logic_and(wild, ca.logic_not(patient))
     learned = ca.logic_and(came, ca.logic_not(refused))
-    follows = ca.if_else(wide > 0, ca.fmin(ca.fmax(error, NARROW * wide), WIDEN * wide), error)
-    tracks = wide * ca.if_else(error > wide, RISE, FALL)
-    step = ca.if_else(ca.logic_and(ca.logic_and(learned, inside), count > 0), ca.fabs(y - last), 0)
-    waited = ca.if_else(count < FEW - 1, count + 1, ca.if_else(good, FEW, FEW - 1))
-    counted = ca.if_else(refused, ca.fmax(count, FEW) + 1, ca.if_else(opened, FEW - 1, ca.if_else(closed, FEW, waited)))
+    share = ca.fmin(innovation / ca.if_else(wide > 0, wide, 1), 1 / ROUNDING)  # no square overflows a float
+    running = wide * ca.sqrt(1 + WEIGHT * (share**2 - 1))
+    sigma_new = ca.if_else(ca.logic_and(sure, good), running, ca.fmax(innovation, NARROW * wide))
+    used = ca.if_else(refused, predicted, y)
+    agreed_new = ca.if_else(opened, 0, ca.fmin(agreed + ca.logic_and(judged, ca.logic_not(refused)), REFUSALS))
     after = ca.vertcat(
-        ca.if_else(learned, ca.if_else(ca.logic_and(closed, good), tracks, follows), quantile),
-        ca.fmax(largest, step),
+        ca.if_else(learned, sigma_new, sigma),
+        ca.if_else(ca.logic_and(ca.logic_and(learned, begun), ca.logic_not(opened)), ca.fmax(largest, moved), largest),
         ahead_new,
         ca.if_else(ca.fabs(used) < HUGE, used, last),
-        ca.if_else(ca.logic_or(judged, refused), counted, count),
-        ca.logic_and(restarted, ca.logic_or(ca.logic_not(far), refused)),
-        ca.if_else(ca.logic_and(leapt, ca.logic_not(refused)), 0, left),
+        agreed_new,
+        ca.if_else(refused, denied + 1, ca.if_else(ca.logic_or(opened, agreed_new >= REFUSALS), 0, denied)),
+        ca.logic_or(begun, ca.mmax(known)),
     )
-    none = ca.SX(ny, 1)
-    first = ca.vertcat(none, ca.if_else(ca.logic_or(back, left > 0), none, largest), none, ca.if_else(known, y, last))
-    anew = ca.vertcat(first, ca.fmin(count, 2 - apart) + 1, ca.logic_and(count > 2, ca.logic_not(back)), left + back)
+    anew = ca.vertcat(ca.SX(3 * ny, 1), ca.if_else(known, y, last), 0, denied + 1, 1)
     result = ca.vertcat(refused, ca.if_else(lost, 2, opened), ca.if_else(lost, anew, after))
     return ca.Function("gate", [y, predicted, memory], [ca.densify(result)], {"cse": True})
 
@@ -155,7 +118,7 @@ class ReadingGate(Viewing):
     ny
         Number of entries of a reading.
     leaps
-        Whether a leap among the first readings starts the observer again, see `gate_function`.
+        Whether all states are measured, so that a leap of the first readings shows in them, see `gate_function`.
     """
 
     _VIEWS = ("_y", "_predicted", "_after", "_evaluate", "_buffer")
@@ -189,7 +152,7 @@ class ReadingGate(Viewing):
         """Return what this w predicts, or where it is wild what the last w that was used predicts.
 
         w is wild if its prediction, as a reading, would be refused beside that of the last one, and y would not. A step
-        of w that the reading shows is used at once: no w is doubted while all |yᵢ − ŷᵢ| ≤ 5 qᵢ, see `gate_function`.
+        of w that the reading shows is used at once: no w is doubted while all |yᵢ − ŷᵢ| ≤ 8 σᵢ, see `gate_function`.
         After five wild ones in sequence w is used whatever it predicts.
 
         Parameters
@@ -212,11 +175,9 @@ class ReadingGate(Viewing):
 
     def _agrees(self, y: Float[np.ndarray, " ny"], predicted: Float[np.ndarray, " ny"]) -> bool:
         """Return whether y is as near to this prediction as readings that are not refused are to theirs at rest."""
-        quantiles = self._memory[: self._ny].tolist()
-        for measured, foreseen, q in zip(y.tolist(), predicted.tolist(), quantiles, strict=True):
-            if abs(measured - foreseen) > BEYOND * q:  # False for NaN
-                return False
-        return True
+        deviations = self._memory[: self._ny].tolist()
+        pairs = zip(y.tolist(), predicted.tolist(), deviations, strict=True)
+        return not any(abs(measured - foreseen) > BEYOND * sigma for measured, foreseen, sigma in pairs)  # NaN agrees
 
     def _is_beyond(self, y: Float[np.ndarray, " ny"], predicted: Float[np.ndarray, " ny"]) -> bool:
         """Return whether y would be refused, or would start the observer again."""

@@ -412,7 +412,7 @@ class LiftedKalman(Value):
     exactly. The loop has no offset if all tracked outputs are measured, and if there are no more of them than inputs.
     The Constant is known, and not estimated. A state's reading at a rail of its sensor, which the model's `Delay` has,
     corrects nothing where the prediction lies at it or beyond. A y that is far from its prediction is refused, for at
-    most five steps in sequence: the filter only predicts.
+    most six steps in sequence: the filter only predicts.
 
     Parameters
     ----------

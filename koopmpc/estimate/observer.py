@@ -213,7 +213,7 @@ class Measured:
         self._model = model = state_model(model)
         self._history = None if model.embedding is None else History(model.embedding)
         self.ny = model.ny
-        self._gate = ReadingGate(model.ny, self._remembers) if self._remembers or model.embedding is not None else None
+        self._gate = ReadingGate(model.ny, leaps=True) if self._remembers or model.embedding is not None else None
         self._nothing, self._known_z = np.full(model.ny, np.nan), False
         self._nothing_z = np.full(model.nz, np.nan)
         self._foreseen, self._acted = self._nothing_z, np.zeros(model.nu)
@@ -244,7 +244,7 @@ class Measured:
 
     def program(self) -> EstimatorProgram:
         """Return the data with which z and d are found."""
-        return EstimatorProgram(gate=None if self._gate is None else gate_graph(self.ny, self._remembers))
+        return EstimatorProgram(gate=None if self._gate is None else gate_graph(self.ny, leaps=True))
 
     def update(self, model: LinearPredictor | StateModel) -> None:
         """Go on with another model; d takes as long to follow as it took to come."""

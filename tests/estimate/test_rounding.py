@@ -17,7 +17,7 @@ def test_a_gate_refuses_what_it_would_refuse_of_predictions_that_differ_in_their
     """A model that is exact, an output that moves, one that rests away from zero, and at times a real misfit."""
     rng, gates = np.random.default_rng(seed), [ReadingGate(2, leaps) for _ in range(3)]
     judged = []
-    for k in range(60):
+    for k in range(150):
         y = np.array([np.sin(0.3 * k) + 1.5, 5.0])
         misfit = rng.normal(size=2) * (rng.choice([0.0, 3.0, 50.0], p=[0.8, 0.15, 0.05]) if k > 2 else 0.0)
         bits = BIT * rng.integers(-1, 2, 2)
