@@ -31,7 +31,7 @@ from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.program import StepProgram
 from koopmpc.disk import path_of, writing
 from koopmpc.errors import DataError
-from koopmpc.estimate.kalman import FilterProgram
+from koopmpc.estimate.filter import FilterProgram
 from koopmpc.guarantees.step_effort import IterationBound, ObservedIterations
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.routines import find_compiler

@@ -22,8 +22,8 @@ from koopmpc.control.stepped.levels import FREE
 from koopmpc.control.stepped.search import NODES
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import EXACT, DisturbanceProgram
+from koopmpc.estimate.filter import FilterProgram
 from koopmpc.estimate.gate import BEYOND, BRIDGED
-from koopmpc.estimate.kalman import FilterProgram
 from koopmpc.estimate.observer import EstimatorProgram
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import LinearPredictor

@@ -30,7 +30,7 @@ from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.nonlinear.stagewise import Sides
 from koopmpc.control.program import StepProgram
 from koopmpc.control.solvers.daqp import DAQPSetup
-from koopmpc.estimate.kalman import FilterProgram
+from koopmpc.estimate.filter import FilterProgram
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor

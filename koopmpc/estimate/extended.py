@@ -12,7 +12,8 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import GAIN
-from koopmpc.estimate.gate import ReadingGate
+from koopmpc.estimate.filter import find_gain
+from koopmpc.estimate.gate import Gated, ReadingGate
 from koopmpc.estimate.kalman import NOT_TOGETHER
 from koopmpc.estimate.observer import StateModel
 from koopmpc.plants.step_map import StepMap
@@ -104,7 +105,7 @@ class ExtendedKalman(Value):
         return ExtendedObserver(self, model, max(GAIN, min(4.0 / horizon, 1.0)))
 
 
-class ExtendedObserver:
+class ExtendedObserver(Gated):
     """The observer of an `ExtendedKalman`.
 
     Parameters
@@ -116,6 +117,8 @@ class ExtendedObserver:
     gain
         Share of an innovation that d takes over in a step, about.
     """
+
+    _gate: ReadingGate
 
     def __init__(self, rule: ExtendedKalman, model: StateModel, gain: float) -> None:
         self._rule, self._settle = rule, gain
@@ -167,16 +170,6 @@ class ExtendedObserver:
         if given is None:
             return usual
         return np.broadcast_to(checks.array(given, "a variance"), usual.shape).astype(np.float64)
-
-    @property
-    def refused(self) -> bool:
-        """Whether the last y was refused: the filter only predicted."""
-        return self._gate.refused
-
-    @property
-    def stand_in_w(self) -> Float[np.ndarray, " nw"] | None:
-        """The w to plan with, if the last one was wild."""
-        return self._gate.stand_in
 
     def reset(self, x0: ArrayLike | None = None) -> None:
         """Forget everything; the run starts at x0, where it is known, or at the first reading."""
@@ -249,9 +242,7 @@ class ExtendedObserver:
         gap: Float[np.ndarray, " m"],
     ) -> tuple[Float[np.ndarray, " ns"], Float[np.ndarray, "ns ns"]]:
         """Return s and P after a reading, in Joseph's form."""
-        S = H @ P @ H.T + R
-        size = np.sqrt(S.diagonal())
-        K = np.linalg.solve(S / np.outer(size, size), (H @ P) / size[:, None]).T / size
+        K = find_gain(P, H, R)
         kept = np.eye(len(s)) - K @ H
         return s + K @ gap, kept @ P @ kept.T + K @ R @ K.T
 

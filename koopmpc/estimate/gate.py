@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -67,7 +68,9 @@ def gate_function(ny: int, leaps: bool = False) -> ca.Function:
     good = ca.mmin(innovation <= BEYOND * wide * ca.sqrt(1 + ca.if_else(sure, denied, 0)) + transient)
     moved = ca.if_else(came, ca.fabs(y - last), 0)
     leapt = ca.logic_and(step > rounding, ca.fmin(innovation, moved) > (LEAP if leaps else ABSURD) * step)
-    absurd = ca.logic_and(agreed >= SURE, ca.mmax(ca.fmin(innovation, moved) > ABSURD * (step + ca.fabs(last))))
+    shown = step + ca.fabs(last)
+    beyond = ca.logic_and(shown > 0, ca.fmin(innovation, moved) > ABSURD * shown)
+    absurd = ca.logic_and(agreed >= SURE, ca.mmax(beyond))
     wild = ca.logic_and(ca.logic_or(ca.logic_and(judged, sure), absurd), ca.logic_not(good))
     missed = ca.fmax(innovation / ABSURD - largest, ca.fmin(innovation, ca.fabs(last)) / ABSURD)
     fell = ca.logic_and(ca.mmax(ca.logic_and(y != 0, missed > ca.fabs(y))), ca.logic_or(ca.logic_not(sure), wild))
@@ -198,3 +201,19 @@ class ReadingGate(Viewing):
         self._memory[:] = after[2:]
         self.refused, self.opened, self.lost = bool(after[0]), after[1] == 1, after[1] == 2
         return self.refused
+
+
+class Gated:
+    """An observer with a gate of readings; None where it remembers no reading."""
+
+    _gate: Any
+
+    @property
+    def refused(self) -> bool:
+        """Whether the last y was refused, and its prediction stood in."""
+        return self._gate is not None and self._gate.refused
+
+    @property
+    def stand_in_w(self) -> Float[np.ndarray, " nw"] | None:
+        """The w to plan with, if the last one was wild."""
+        return None if self._gate is None else self._gate.stand_in

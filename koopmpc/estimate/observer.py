@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.errors import DataError
-from koopmpc.estimate.gate import BRIDGED, ReadingGate, gate_graph
+from koopmpc.estimate.gate import BRIDGED, Gated, ReadingGate, gate_graph
 from koopmpc.lifting.base import Lifting, buffer_lifting
 from koopmpc.plants.graph import Graph
 from koopmpc.predict.predictors import LinearPredictor
@@ -194,7 +194,7 @@ class History:
         return zeta
 
 
-class Measured:
+class Measured(Gated):
     """The observer without an estimator: z = ψ(ζ) of the measured y, or ζ itself; d is zero, or what it is set to.
 
     ζ is y, or under an embedding y with its past. Then a reading far from its prediction does not enter the past: the
@@ -231,16 +231,6 @@ class Measured:
         self._known_z, self._bridged = False, 0
         if self._history is not None:
             self._history.reset()
-
-    @property
-    def refused(self) -> bool:
-        """Whether the last y was refused, and its prediction stood in."""
-        return self._gate is not None and self._gate.refused
-
-    @property
-    def stand_in_w(self) -> Float[np.ndarray, " nw"] | None:
-        """The w to plan with, if the last one was wild."""
-        return None if self._gate is None else self._gate.stand_in
 
     def program(self) -> EstimatorProgram:
         """Return the data with which z and d are found."""
