@@ -4,8 +4,8 @@ import dataclasses
 import json
 import re
 import unicodedata
-from collections.abc import Mapping
-from enum import StrEnum
+from collections.abc import Iterable, Mapping
+from enum import Enum, StrEnum
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, cast
@@ -19,9 +19,9 @@ from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import LogError
 from koopmpc.lifting.base import Lifting
 from koopmpc.loop.metrics import Metrics
-from koopmpc.loop.run import About, bind_outputs
+from koopmpc.loop.run import About, StepRows, bind_outputs
 from koopmpc.text import format_markdown_table
-from koopmpc.values import from_data, to_data
+from koopmpc.values import checksum, from_data, to_data
 
 _FORMAT = "koopmpc-log-2"
 
@@ -48,7 +48,7 @@ class Entity(StrEnum):
     PLAN_STATES = "prediction/x"  # the planned states of a step, flat; "last_width" is nx
     PLAN_INPUTS = "prediction/u"  # the planned inputs of a step, flat; "last_width" is nu
     FALLBACKS = "log"  # text: a line where a fallback sets in
-    METRICS = "metrics"  # static, at the end: a page, "steps", "cost", "effort", "violation", checksums of all columns
+    METRICS = "metrics"  # static, at the end: a page, "steps", "cost", "effort", "violation", "digest", "check"
 
 
 DRAWN = (Entity.INPUT_LIMITS, Entity.DEADLINE, Entity.FALLBACKS)  # for people who look; `load_run` needs all others
@@ -122,6 +122,25 @@ def from_json(text: str) -> tuple[About, int | None]:
     if not isinstance(about, About):
         raise LogError(f"the description holds {checks.article(about)} in place of the description of a run")
     return about, steps
+
+
+def sum_plans(steps: Iterable[int], X: np.ndarray, U: np.ndarray) -> dict[int, int]:
+    """Return a checksum of each plan by its step; a plan without a number has none."""
+    held = ~(np.isnan(X).all(axis=(1, 2)) & np.isnan(U).all(axis=(1, 2)))
+    return {k: checksum(x.tobytes(), u.tobytes()) for k, x, u, some in zip(steps, X, U, held, strict=True) if some}
+
+
+def digest(rows: StepRows, description: str, plans: Mapping[int, int]) -> dict[str, int]:
+    """Return a checksum of everything that `load_run` returns, by name; `plans` are those of `sum_plans`."""
+    sums = {Entity.DESCRIPTION.value: checksum(description.encode())}
+    for name, values in rows.columns().items():
+        if isinstance(values, np.ndarray):
+            sums[name] = checksum(np.ascontiguousarray(cast("np.ndarray", values)).data)
+        else:
+            words: list[str] = [value.name if isinstance(value, Enum) else str(value) for value in values]
+            sums[name] = checksum("\n".join(words).encode())
+    whole = {k: value for k, value in sorted(plans.items()) if k < len(rows.U)}
+    return sums | {"plans": checksum(json.dumps(whole).encode())}
 
 
 def to_markdown(about: About) -> str:

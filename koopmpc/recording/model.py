@@ -30,7 +30,7 @@ from koopmpc.recording.blueprint import (
 )
 from koopmpc.recording.description import Entity, drawable, written_with
 from koopmpc.recording.reader import naming, read_columns
-from koopmpc.recording.rrd import CHECK, file_recording, is_intact, times
+from koopmpc.recording.rrd import CHECK, file_recording, times
 from koopmpc.scene import Color
 from koopmpc.text import format_markdown_table, shorten_observable
 from koopmpc.validate.bands import Forecast, forecast
@@ -349,7 +349,7 @@ def load_model_log(path: str | Path) -> ModelLog:
     path = Path(path)
     log = read_columns(path, (f"/{Entity.DESCRIPTION}", "/error/**", "/rollout/**", "/checksum"))
     with naming(path):
-        if log.static("checksum", "check") not in (None, CHECK) and not is_intact(path):
+        if log.static("checksum", "check") not in (None, CHECK) and not log.intact:
             raise LogError(f"{path} is damaged: it no longer holds what was written; take another copy")
         if log.torn:
             warnings.warn(f"{path}: its end is cut; take another copy, curves may lack rows", UserWarning, stacklevel=2)

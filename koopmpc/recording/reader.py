@@ -3,7 +3,7 @@
 
 import json
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -17,21 +17,20 @@ from koopmpc.data.files.sampling import Signals, episodes_from
 from koopmpc.disk import path_of
 from koopmpc.errors import DataError, LogError
 from koopmpc.loop.run import MOVE_COLUMNS, About, MoveColumn, Plans, Run
-from koopmpc.recording.description import DRAWN, NO_WORD, Entity, from_json
-from koopmpc.recording.rrd import Column, check_log, read
-from koopmpc.values import checksum
+from koopmpc.recording.description import DRAWN, NO_WORD, Entity, digest, from_json, sum_plans
+from koopmpc.recording.rrd import Contents, check_log, read
 
 
 class LogColumns:
     """The columns of a recording: rows in order of their step, by (entity, component).
 
-    `torn` says that the file ends within a message.
+    `torn` says that the file ends within a message, `intact` that it is to the bit what was written.
     """
 
-    def __init__(self, columns: Iterable[Column], entities: tuple[str, ...], torn: bool) -> None:
-        self._entities, self.torn = entities, torn
+    def __init__(self, contents: Contents) -> None:
+        self.torn, self.intact = contents.torn, contents.intact
         self._parts: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
-        for entity, component, k, values in columns:
+        for entity, component, k, values in contents.columns:
             steps = None if k is None else k.to_numpy(zero_copy_only=False).astype(np.int64)
             self._parts.setdefault((entity, component), []).append((steps, values))
 
@@ -87,26 +86,6 @@ class LogColumns:
         k, widths, values = self.rows(entity, component)
         return _fill(column, k[widths > 0], np.array(values))
 
-    def find_changed(self) -> list[str]:
-        """Return the columns that differ from the checksums at the end of the log."""
-        sums, places = (
-            cast("dict[str, int]", json.loads(self.static(Entity.METRICS, name))) for name in ("sums", "places")
-        )
-        names = {key: key.split(":") for key in sums | places}
-        read = {key: self.rows(entity, name) for key, (entity, name) in names.items() if entity in self._entities}
-        bad = [key for key in sums if key in read and checksum(_bytes(read[key][2])) != sums[key]]
-        good = [key for key in places if key in read and key not in bad]
-        return bad + [key for key in good if checksum(_bytes(read[key][0])) != places[key]]
-
-
-def _bytes(values: Any) -> Any:
-    """Return the bytes of a column for its checksum."""
-    import pyarrow as pa
-
-    if isinstance(values, pa.StringArray):
-        return "".join(values.to_pylist()).encode()
-    return np.ascontiguousarray(values).data
-
 
 def _fill(rows: np.ndarray, k: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return a copy of `rows` with these values in its rows k; what lies beyond its end is left out."""
@@ -128,13 +107,7 @@ def read_columns(path: Path, entities: tuple[str, ...]) -> LogColumns:
         The file is missing, no .rrd, or damaged beyond a torn end.
     """
     check_log(path)
-    try:
-        columns, torn = read(path, entities)
-        return LogColumns(columns, entities, torn)
-    except LogError:
-        raise
-    except Exception as error:  # Rerun's reader raises exceptions of many kinds
-        raise LogError(f"{path} is not a log, or is damaged: {error}") from error
+    return LogColumns(read(path, entities))
 
 
 @contextmanager
@@ -194,12 +167,8 @@ def _run(log: LogColumns, path: Path) -> Run:
         )
     elif end is None or log.torn:
         warnings.warn(f"{path}: its end is cut, all {steps} steps are there", UserWarning, stacklevel=3)
-    if end is not None and log.static(Entity.METRICS, "places") is None:
-        raise LogError(f"{path} is of an edition before 0.1.0, without checksums of its rows; read it by that edition")
-    if end == steps and (changed := log.find_changed()):
-        raise LogError(f"{path} is damaged: {', '.join(changed)} no longer hold what was written; take another copy")
     status, fallback = _statuses(log, steps, path)
-    return Run(
+    run = Run(
         X=X[: steps + 1],
         Y=_read_measurements(log, X)[: steps + 1],
         U=U[:steps] if len(U) else np.empty((steps, 0)),
@@ -213,6 +182,25 @@ def _run(log: LogColumns, path: Path) -> Run:
         **{column.name: _move_column(log, column, steps) for column in MOVE_COLUMNS if column.log},
         **about.about(),
     )
+    if end == steps:
+        _check_digest(log, run, path)
+    return run
+
+
+def _check_digest(log: LogColumns, run: Run, path: Path) -> None:
+    """Raise where the run is not the one whose digest stands at the end of the log.
+
+    Logs of before 0.1.0 have no digest: they are read while they are to the bit what was written.
+    """
+    text = log.static(Entity.METRICS, "digest")
+    if text is None and not log.intact:
+        raise LogError(f"{path} is damaged, or of an edition before 0.1.0 and changed since; take another copy")
+    plans = run.plans
+    sums = {} if plans is None else sum_plans(range(run.steps), plans.X, plans.U)
+    found = digest(run, log.static(Entity.DESCRIPTION, "json"), sums)
+    written = found if text is None else cast("dict[str, int]", json.loads(text))
+    if changed := [name for name in written | found if written.get(name) != found.get(name)]:
+        raise LogError(f"{path} is damaged: {', '.join(changed)} no longer hold what was written; take another copy")
 
 
 def about_of(log: LogColumns, path: Path) -> tuple[About, int | None]:

@@ -1,11 +1,8 @@
 # pyright: basic
-"""The .rrd file of a log: Rerun's recordings written into it to the last byte or not at all, and its columns read back.
+"""The .rrd file of a log: Rerun's stream of bytes written into it to the last byte or not at all, and read back.
 
-Rerun's own file writer stops at the first error, and waits for ever for what it could not write. It therefore writes
-into a pipe. A thread takes the bytes out and writes them; after an error it still takes them, and drops them.
-
-Rerun's reader may end the process on a damaged file: such a file is read in a child process. Run as a module, this
-file is that child: it reads a log and writes its columns to its standard output.
+A damaged file may end the process that reads it (Rerun 0.41): a file that is not, to the bit, the one that was written
+is tried in a child process first.
 """
 
 import os
@@ -15,11 +12,9 @@ import subprocess
 import sys
 import tempfile
 import uuid
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from itertools import count
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from threading import Thread
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -32,20 +27,15 @@ from koopmpc.values import checksum
 _MARK = b"koopmpc-crc32:"  # stands before the checksum of a file
 _BLANK = b"x7k2q9zp"  # holds the place of the checksum until the file is closed
 _CHECK = re.compile(rb"koopmpc-crc32:([0-9a-f]{8})")
-_PIECE = 1 << 20  # bytes
-_PIPED = 1 << 16  # bytes that a pipe holds; each thread's heap would keep the room of larger pieces for ever
-_CLOSING = 10.0  # longest wait for the thread to end once Rerun has closed the pipe [s]
-_WRITING = 10.0  # longest wait for a file that is written at once [s]
-_PIPES = Path("/dev/fd")  # where a process opens a pipe of its own by name; Windows has no such folder
 _MAGIC = b"RRF2"  # first bytes of a file
 _FOOTER = b"RRF2FOOT"  # a closed file ends with these and 4 bytes more
 _FILE_HEADER = 12  # bytes before the first message
 _MESSAGE_HEADER = 16  # bytes: kind and length of a message
-_END = 0  # kind of the message that ends a file
-_LAST_KIND = 3  # largest kind of a message
-_REFUSED = 3  # exit code of a child whose reader said why
-_READING = 60.0  # longest wait for a child that reads an empty file [s]
-_RATE = 1e6  # a child that reads slower than this ends in an error [bytes/s]
+_LAST_KIND = 3  # largest kind of a message; 0 is that of the end
+_TRIAL = (
+    "import os, sys, rerun.chunk as c; "
+    "[chunk.to_record_batch() for chunk in c.RrdReader(sys.argv[1]).stream().to_chunks()]; os._exit(0)"
+)
 
 # What follows the checksum keeps the compression of a chunk from taking its last digits for a repetition.
 CHECK = (_MARK + _BLANK).decode() + "~Qj5wK"
@@ -53,7 +43,7 @@ CHECK = (_MARK + _BLANK).decode() + "~Qj5wK"
 
 
 class LogFile:
-    """A file that a Rerun recording is written to.
+    """A file that takes the bytes of a Rerun recording.
 
     Parameters
     ----------
@@ -74,44 +64,27 @@ class LogFile:
         self.path, self.growing = disk.target(path), growing
         if Path(path).suffix.lower() != ".rrd":
             raise LogError(f"{path} would be a Rerun log under another name; name it {Path(path).stem}.rrd")
-        try:
+        with self._explaining():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             if not growing:
                 self.part = disk.beside(self.path)
             else:
                 self.part = self.path.with_name(f"{self.path.name}{disk.PART}") if self.path.exists() else self.path
             self._file: BinaryIO = self.part.open("wb", buffering=0)
-        except OSError as error:
-            raise disk.explain_failure(self.path, error) from error
-        self._failure: OSError | None = None
+        self._stream: Any = None
         self._sum = self._length = 0
-        self._place: int | None = None  # of the checksum
-        self._tail = b""
-        self._thread: Thread | None = None
 
-    def attach(self, rec: Any, *more: Any) -> None:
-        """Make this file the sink of a recording, beside other sinks."""
-        import rerun as rr
+    def attach(self, rec: Any) -> None:
+        """Make this file the sink of a recording."""
+        self._stream = rec.binary_stream()
 
-        if not _PIPES.is_dir():
-            rec.set_sinks(rr.FileSink(self.part), *more)
-            return
-        end, begin = os.pipe()
-        try:
-            thread = Thread(target=self._pump, args=(end,), name="koopmpc-log", daemon=True)
-            thread.start()
-            self._thread = thread  # which is waited for only where it runs: an interrupt may come while it starts
-            rec.set_sinks(rr.FileSink(f"{_PIPES}/{begin}"), *more)
-        finally:
-            os.close(begin)  # Rerun holds one of its own
-
-    def check(self) -> None:
-        """Raise LogError where something could not be written."""
-        if self._failure is not None:
-            raise disk.explain_failure(self.path, self._failure) from self._failure
+    def save(self) -> None:
+        """Write what the recording holds by now, where the file grows; Rerun would end a file with each piece."""
+        if self.growing:
+            self._write(_strip(self._stream.read(), first=not self._length))
 
     def close(self) -> None:
-        """Finish the file, once the recording is disconnected.
+        """Write the rest and the checksum, and put the file in its place.
 
         Raises
         ------
@@ -119,16 +92,12 @@ class LogFile:
             Something could not be written.
         """
         try:
-            self._join()
-            self.check()
-            if self._place is not None:
-                self._file.seek(self._place)
-                self._file.write(f"{self._sum:08x}".encode())
+            rest = self._stream.read()
+            rest = _strip(rest, first=not self._length) if self.growing else rest
+            self._write(rest.replace(_MARK + _BLANK, _MARK + b"%08x" % checksum(rest, start=self._sum)))
             if self.part != self.path:
-                disk.settle(self.part, self.path, self._file.fileno())
-        except OSError as error:
-            self.discard()
-            raise error if isinstance(error, LogError) else disk.explain_failure(self.path, error) from error
+                with self._explaining():
+                    disk.settle(self.part, self.path, self._file.fileno())
         except BaseException:
             self.discard()
             raise
@@ -136,40 +105,47 @@ class LogFile:
 
     def discard(self) -> None:
         """Give up: a growing file is left as far as it was written, any other is removed."""
-        with suppress(OSError):
-            self._join()
-            self._file.close()
+        if self._stream is not None:
+            self._stream.read()  # else Rerun prints that it drops what nobody has read
+        self._file.close()
         if self.part.is_file() and not (self.growing and self._length):
             self.part.unlink(missing_ok=True)
 
-    def _join(self) -> None:
-        if self._thread is not None:
-            self._thread.join(_CLOSING)
-            if self._thread.is_alive():
-                raise LogError(f"{self.path} cannot be written: Rerun did not end within {_CLOSING:g} s")
+    def _write(self, data: bytes) -> None:
+        self._sum = checksum(data, start=self._sum)
+        rest = memoryview(data)
+        with self._explaining():
+            while rest:
+                count = self._file.write(rest)
+                self._length += count
+                rest = rest[count:]
 
-    def _pump(self, end: int) -> None:
-        """Take all bytes out of the pipe, until Rerun closes it."""
-        with os.fdopen(end, "rb", buffering=0) as pipe:
-            while piece := pipe.read(_PIPED):
-                if self._failure is not None:
-                    continue
-                try:
-                    self._write(piece)
-                except OSError as error:
-                    self._failure = error
+    @contextmanager
+    def _explaining(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise disk.explain_failure(self.path, error) from error
 
-    def _write(self, piece: bytes) -> None:
-        rest = memoryview(piece)
-        while rest:
-            rest = rest[self._file.write(rest) :]
-        known = self._tail + piece
-        found = known.rfind(_MARK + _BLANK)
-        if found >= 0:
-            self._place = self._length - len(self._tail) + found + len(_MARK)
-        self._length += len(piece)
-        self._sum = checksum(piece, start=self._sum)
-        self._tail = known[-len(_MARK + _BLANK) + 1 :]
+
+def _strip(data: bytes | None, *, first: bool) -> bytes:
+    """Return the messages of a piece without the end of a file, and without its header unless it is the first."""
+    end = 0 if data is None else _find_end(len(data), lambda at: data[at : at + _MESSAGE_HEADER])
+    return (data or b"")[0 if first else _FILE_HEADER : end]
+
+
+def _find_end(size: int, read_header: Any) -> int:
+    """Return where the last whole message of a file ends; `read_header(at)` returns the header of a message.
+
+    An .rrd is a header of 12 bytes and then messages, each with a header of 16 bytes (kind and length, little-endian).
+    """
+    end = _FILE_HEADER
+    while end + _MESSAGE_HEADER <= size:
+        kind, length = struct.unpack("<QQ", read_header(end))
+        if not 0 < kind <= _LAST_KIND or end + _MESSAGE_HEADER + length > size:
+            break
+        end += _MESSAGE_HEADER + length
+    return end
 
 
 def new_recording(application: str) -> Any:
@@ -192,7 +168,6 @@ def send_blueprint(rec: Any, application: str, layout: Any) -> None:
     import rerun as rr
     import rerun_bindings
 
-    _name(layout.root_container, application)
     with raise_swallowed():
         own = rerun_bindings.new_blueprint(
             application_id=application, make_default=False, make_thread_default=False, default_enabled=True
@@ -203,31 +178,6 @@ def send_blueprint(rec: Any, application: str, layout: Any) -> None:
         rerun_bindings.send_blueprint(stream.memory_recording().storage, False, True, recording=rec.to_native())
         stream.disconnect()  # else what it holds and the stream hold each other
         del stream
-
-
-def _name(root: Any, application: str) -> None:
-    """Give the parts of a layout the same ids in every log: Rerun keeps each id that it has met, 300 bytes, for ever.
-
-    An id stands for the place and the kind of a part, because a viewer keeps what it knows of a view by its id.
-    """
-    from rerun.blueprint import Container, VisualizableArchetype, Visualizer
-
-    number = count()
-
-    def give(part: Any) -> Any:
-        kind = getattr(part, "class_identifier", type(part).__name__)
-        part.id = uuid.uuid5(uuid.NAMESPACE_OID, f"koopmpc {application} {next(number)} {kind}")
-        return part
-
-    parts = [root]
-    while parts:
-        part = give(parts.pop())
-        if isinstance(part, Container):
-            parts.extend(part.contents)
-            continue
-        for entity, shown in part.visualizer_overrides.items():
-            each = [one.visualizer() if isinstance(one, VisualizableArchetype) else one for one in shown]
-            part.visualizer_overrides[entity] = [give(one) if isinstance(one, Visualizer) else one for one in each]
 
 
 @contextmanager
@@ -251,14 +201,13 @@ def file_recording(path: str | Path, application: str, layout: Any) -> Generator
         send_blueprint(rec, application, layout)
         yield rec
         rec.log("checksum", rr.AnyValues(check=CHECK), static=True)
-        rec.flush(timeout_sec=_WRITING)
-        rec.disconnect()
         file.close()
     except BaseException:
-        if rec is not None:
-            rec.disconnect()
         file.discard()
         raise
+    finally:
+        if rec is not None:
+            rec.disconnect()
 
 
 def times(k: np.ndarray, dt: float) -> list[Any]:
@@ -297,35 +246,45 @@ class Column(NamedTuple):
     values: Any
 
 
-def read(path: Path, entities: tuple[str, ...]) -> tuple[list[Column], bool]:
-    """Return the columns of these entities, and whether the file ends within a message.
+class Contents(NamedTuple):
+    """The columns of a file, whether it ends within a message, and whether it is to the bit what was written."""
+
+    columns: list[Column]
+    torn: bool
+    intact: bool
+
+
+def read(path: Path, entities: tuple[str, ...]) -> Contents:
+    """Return the columns of these entities.
 
     Raises
     ------
     LogError
-        Rerun's reader refuses the file, or ended the child that read it.
+        Rerun's reader refuses the file, or ends the child that tried it.
     """
-    if is_intact(path):
-        return _read_here(path, entities), False
+    intact = is_intact(path)
     with _whole_messages(path) as (whole, torn):
-        return _read_in_child(whole, entities, path), torn
+        if intact is False:
+            _try(whole, path)
+        try:
+            return Contents(_read_columns(whole, entities), torn, bool(intact))
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:  # Rerun raises exceptions of many kinds; a panic derives from this one alone
+            said = str(error).partition("\n")[0].replace(str(whole), str(path))
+            raise LogError(f"{path} is not a log, or is damaged: {said}") from error
 
 
-def is_intact(path: Path) -> bool:
-    """Return whether the file is, to the bit, the one that was written: its checksum stands in it and is right."""
-    from mmap import ACCESS_READ, mmap
-
-    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
-        start = data.rfind(_MARK)
-        found = None if start < 0 else _CHECK.match(data, start)
-        if found is None:
-            return False
-        total, place = 0, start + len(_MARK)
-        for begin, stop in ((0, place), (place + len(_BLANK), len(data))):
-            for first in range(begin, stop, _PIECE):
-                total = checksum(data[first : min(first + _PIECE, stop)], start=total)
-            total = checksum(_BLANK, start=total) if begin == 0 else total
-        return total == int(found.group(1), 16)
+def is_intact(path: Path) -> bool | None:
+    """Return whether the checksum in the file is that of the file; None where it holds none, for it was not closed."""
+    data = path.read_bytes()
+    start = data.rfind(_MARK)
+    found = None if start < 0 else _CHECK.match(data, start)
+    if found is None:
+        return None
+    place = start + len(_MARK)
+    rest = memoryview(data)[place + len(_BLANK) :]
+    return checksum(memoryview(data)[:place], _BLANK, rest) == int(found.group(1), 16)
 
 
 @contextmanager
@@ -333,20 +292,17 @@ def _whole_messages(path: Path) -> Iterator[tuple[Path, bool]]:
     """Yield a file that ends with a whole message, and whether `path` ends within one.
 
     It is `path` itself, or a copy without its last, torn message.
-
-    An .rrd is a header of 12 bytes and then messages, each with a header of 16 bytes (kind and length, little-endian).
     """
-    size, end = path.stat().st_size, _FILE_HEADER
+    size = path.stat().st_size
     with path.open("rb") as file:
-        file.seek(max(size - 12, 0))
-        closed = file.read(8) == _FOOTER
-        while not closed and end + _MESSAGE_HEADER <= size:
-            file.seek(end)
-            kind, length = struct.unpack("<QQ", file.read(_MESSAGE_HEADER))
-            if not _END < kind <= _LAST_KIND or end + _MESSAGE_HEADER + length > size:
-                break
-            end += _MESSAGE_HEADER + length
-        if closed or end == size:
+
+        def read_header(at: int) -> bytes:
+            file.seek(at)
+            return file.read(_MESSAGE_HEADER)
+
+        closed = size >= 12 and read_header(size - 12)[:8] == _FOOTER
+        end = size if closed else _find_end(size, read_header)
+        if end == size:
             yield path, False
             return
         file.seek(0)
@@ -357,14 +313,30 @@ def _whole_messages(path: Path) -> Iterator[tuple[Path, bool]]:
         yield copy, True
 
 
-def _read_here(path: Path, entities: tuple[str, ...]) -> list[Column]:
-    """Return the columns of these entities, read in this process."""
+def _try(path: Path, told: Path) -> None:
+    """Read the file in a child process; raise LogError about `told` where that ends the child."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", _TRIAL, str(path)],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(place for place in sys.path if place)},
+    )
+    if done.returncode == 1:  # an exception, whose last line says why
+        said = done.stderr.decode(errors="replace").strip().rpartition("\n")[2].replace(str(path), str(told))
+        raise LogError(f"{told} is not a log, or is damaged: {said}")
+    if done.returncode:
+        raise LogError(f"{told} is damaged, beyond what can be read: the process that read it ended on it")
+
+
+def _read_columns(path: Path, entities: tuple[str, ...]) -> list[Column]:
+    """Return the columns of these entities."""
     import warnings
 
     import pyarrow as pa
     from rerun.chunk import RrdReader
 
-    found: list[Column] = []
+    columns: list[Column] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # load_run itself warns of a missing end
         for chunk in RrdReader(path).stream().filter(content=list(entities)).to_chunks():
@@ -375,85 +347,5 @@ def _read_here(path: Path, entities: tuple[str, ...]) -> list[Column]:
             for name in batch.schema.names:
                 metadata = batch.schema.field(name).metadata or {}
                 if metadata.get(b"rerun:kind") == b"data":
-                    found.append(Column(chunk.entity_path, name.split(":")[-1], k, batch.column(name)))
-    return found
-
-
-def _read_in_child(path: Path, entities: tuple[str, ...], told: Path) -> list[Column]:
-    """Return the columns of these entities, read in a child process; messages call the file `told`.
-
-    Raises
-    ------
-    LogError
-        Rerun's reader refuses the file, or ended the child.
-    """
-    import pyarrow as pa
-
-    command = [sys.executable, "-P", "-m", __name__, str(path), *entities]
-    places = [str(Path(place).absolute()) for place in sys.path if place]
-    patience = _READING + path.stat().st_size / _RATE
-    try:
-        done = subprocess.run(
-            command,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=patience,
-            check=False,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(places)},
-        )
-    except subprocess.TimeoutExpired as error:
-        raise LogError(f"{told} is damaged: reading it did not end within {patience:.0f} s") from error
-    if done.returncode == _REFUSED:
-        said = done.stdout.decode(errors="replace").replace(str(path), str(told))
-        raise LogError(f"{told} is not a log, or is damaged: {said}")
-    if done.returncode:
-        raise LogError(f"{told} is damaged, beyond what can be read: the process that read it ended on it")
-    try:
-        return list(_read_batches(done.stdout))
-    except (pa.ArrowException, KeyError, IndexError) as error:
-        raise LogError(f"{told} is damaged: {error}") from error
-
-
-def _send(columns: Sequence[Column], out: Any) -> None:
-    """Write one Arrow stream for each column."""
-    import pyarrow as pa
-
-    for column in columns:
-        arrays = {"values": column.values} if column.k is None else {"values": column.values, "k": column.k}
-        batch = pa.record_batch(arrays, metadata={"entity": column.entity, "component": column.component})
-        with pa.ipc.new_stream(out, batch.schema) as stream:
-            stream.write_batch(batch)
-
-
-def _read_batches(data: bytes) -> Iterator[Column]:
-    import pyarrow as pa
-
-    source = pa.BufferReader(data)
-    while source.tell() < len(data):
-        with pa.ipc.open_stream(source) as stream:
-            batch = stream.read_next_batch()
-            stream.read_all()
-        about = batch.schema.metadata
-        k = batch.column("k") if "k" in batch.schema.names else None
-        yield Column(about[b"entity"].decode(), about[b"component"].decode(), k, batch.column("values"))
-
-
-def _main() -> int:
-    """Answer on a copy of the standard output: what a library prints goes elsewhere."""
-    out = os.fdopen(os.dup(1), "wb")
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    path, *entities = sys.argv[1:]
-    try:
-        columns = _read_here(Path(path), tuple(entities))
-    except BaseException as error:  # a panic of the reader in Rerun derives from BaseException alone
-        out.write(str(error).partition("\n")[0].encode())
-        out.flush()
-        return _REFUSED
-    _send(columns, out)
-    out.flush()
-    return 0
-
-
-if __name__ == "__main__":
-    code = _main()
-    os._exit(code)  # threads of the reader may not end
+                    columns.append(Column(chunk.entity_path, name.split(":")[-1], k, batch.column(name)))
+    return columns

@@ -35,9 +35,11 @@ from koopmpc.recording.description import (
     NO_WORD,
     Entity,
     application_of,
+    digest,
     drawable,
     metrics_to_markdown,
     status_words,
+    sum_plans,
     title_of,
     to_json,
     to_markdown,
@@ -45,7 +47,6 @@ from koopmpc.recording.description import (
 from koopmpc.recording.rrd import CHECK, LogFile, new_recording, send_blueprint, times
 from koopmpc.recording.scenes import Drawing, Scenes
 from koopmpc.scene import Scene
-from koopmpc.values import checksum
 
 _FLUSH = 3.0  # longest wait for a sink of a running loop [s]
 _NO_PLANS = Plans(np.empty((0, 0, 0)), np.empty((0, 0, 0)))
@@ -130,9 +131,11 @@ class Writer:
 
         A `growing` log is there while it is written, any other takes its place at the end.
         """
+        import rerun as rr
+
         self._about, self._model, self._scenes = about, model, Scenes(about, scene)
         self._page, self._json = to_markdown(about), to_json(about, steps)  # raises where the metadata cannot be saved
-        self._viewer, self._steps = viewer, steps
+        self._steps = steps
         self._opened = False
         self._spans: dict[str, list[float]] = {}
         self._horizon, self._nr = 0, 0  # of the plans, 0 where there is none; of the reference
@@ -142,8 +145,7 @@ class Writer:
         self._looks: dict[str, Any] = {}  # styles of the curves, by entity
         self._looked = -1  # the horizon that they were made for, −1 before any
         self._styled: set[str] = set()
-        self._sums: dict[str, int] = {}  # a checksum of each column: no damaged log reads as a whole one
-        self._places: dict[str, int] = {}  # a checksum of the steps of its rows
+        self._plan_sums: dict[int, int] = {}  # a checksum of each plan, for the digest at the end
         self._plans: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # plans that look beyond what is written
         self._file: LogFile | None = None
         self._rec: Any = None
@@ -151,6 +153,10 @@ class Writer:
             with raise_swallowed():  # no interrupt between the file and its name leaves it behind
                 self._file = None if path is None else LogFile(path, growing=growing)
             self._rec = new_recording(application_of(about))
+            if self._file is not None:
+                self._file.attach(self._rec)
+            else:
+                self._rec.set_sinks(rr.GrpcSink(viewer))
         except BaseException:  # a Ctrl-C
             self.discard()
             raise
@@ -190,6 +196,7 @@ class Writer:
                 self._style(entity, drawing.style)
             self._send(entity, k, drawing.columns)
         if len(rows.planned):
+            self._plan_sums |= sum_plans(rows.planned.tolist(), rows.plan_X, rows.plan_U)
             self._vectors(Entity.PLAN_STATES, rows.planned, rows.plan_X)
             self._vectors(Entity.PLAN_INPUTS, rows.planned, rows.plan_U)
         self._plots(rows, k)
@@ -229,18 +236,16 @@ class Writer:
             ("iterations", rows.iterations, rows.iterations != 0),
         ):
             values = np.ascontiguousarray(column[held])
-            self._sum(f"/{Entity.SOLVER}:{name}", values.data)
             if held.any():
                 columns += _where(held, "koopmpc.Solver", name, values)
         columns += _where(timed, VIEW, LOG_TIME, np.log10(rows.solve_time[timed]).astype(np.float32))
-        self._sum(f"/{Entity.SOLVER}:scalars", ms.data, k)
         self._send(Entity.SOLVER, k, columns)
 
     def flush(self) -> None:
-        """Wait until the sinks have what was written; raise where the disk has refused it."""
+        """Hand on what was written, to a viewer within three seconds; raise where the disk refuses it."""
         self._rec.flush(timeout_sec=_FLUSH)
         if self._file is not None:
-            self._file.check()
+            self._file.save()
 
     def end(self, run: Run | None) -> None:
         """Write the metrics of the whole `run` and close; the log says from now on that it is complete."""
@@ -249,7 +254,7 @@ class Writer:
         numbers: dict[str, Any] = {"steps": 0}
         text = "No step was recorded."
         if run is not None:
-            numbers["steps"] = run.steps
+            numbers |= {"steps": run.steps, "digest": json.dumps(digest(run, self._json, self._plan_sums))}
             try:
                 with np.errstate(all="ignore"):
                     found = metrics(run)
@@ -259,42 +264,33 @@ class Writer:
                 text = f"The metrics cannot be computed: {error}"
         if not self._opened:
             self._open()
-        numbers |= {"sums": json.dumps(self._sums), "places": json.dumps(self._places), "check": CHECK}
-        write_page(self._rec, Entity.METRICS, text, rr.AnyValues(**numbers))
         if self._scenes.extent.ranges() != self._shown:
             self._lay_out()
-        self.flush()
-        self._release()
+        write_page(self._rec, Entity.METRICS, text, rr.AnyValues(**numbers, check=CHECK))
+        self._rec.flush(timeout_sec=_FLUSH)
         if self._file is not None:
             self._file.close()
+        self._release()
 
     def discard(self) -> None:
         """Close without an end: of a growing log what was written stays, any other file is removed."""
-        self._release()
         if self._file is not None:
             self._file.discard()
+        self._release()
 
     def _release(self) -> None:
         """Close the recording and let go of it."""
         with raise_swallowed():
             if self._rec is not None:
-                if not self._opened:
-                    self._rec.binary_stream().read()  # else Rerun prints that it drops what no sink has taken
                 self._rec.disconnect()
             self._rec = None
 
     def _open(self) -> None:
-        """Open the sinks, once the first drawings say how large the animation is, and write what is static."""
+        """Write what is static, once the first drawings say how large the animation is."""
         import rerun as rr
 
-        sinks = [] if self._viewer is None else [rr.GrpcSink(self._viewer)]
-        if self._file is None:
-            self._rec.set_sinks(*sinks)
-        else:
-            self._file.attach(self._rec, *sinks)
         self._opened = True
         self._rec.send_recording_name(drawable(title_of(self._about)))
-        self._sum(f"/{Entity.DESCRIPTION}:json", self._json.encode())
         write_page(self._rec, Entity.DESCRIPTION, self._page, rr.AnyValues(json=self._json))
         write_page(self._rec, "title", f"**{title_of(self._about)}**")
         self.flush()  # a log that is cut says what it was
@@ -329,10 +325,7 @@ class Writer:
             return
         width = values[0].size
         columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition(np.full(len(k), width))
-        self._sum(f"/{entity}:scalars", np.ascontiguousarray(values).data, k)
         if values.ndim > 2:
-            if entity not in self._styled:
-                self._sum(f"/{entity}:last_width", np.array([values.shape[-1]], dtype=np.int64).data)
             self._style(entity, rr.AnyValues(last_width=values.shape[-1]))
         if alone and len(self._about.states) <= SEPARATE:
             with np.errstate(over="ignore"):
@@ -404,13 +397,6 @@ class Writer:
         X[..., [i for i, _ in both]] = rows.plan_X[..., [j for _, j in both]]
         return list(zip(rows.planned.tolist(), X, rows.plan_U, strict=True))
 
-    def _sum(self, column: str, data: Any, k: np.ndarray | None = None) -> None:
-        """Take data of a column, and the steps k of its rows, into their checksums."""
-        self._sums[column] = checksum(data, start=self._sums.get(column, 0))
-        if k is not None:
-            steps = np.ascontiguousarray(k, dtype=np.int64)
-            self._places[column] = checksum(steps.data, start=self._places.get(column, 0))
-
     def _style(self, entity: str, style: Any) -> None:
         """Log a static archetype of the entity, once."""
         if entity not in self._styled:
@@ -441,7 +427,6 @@ class Writer:
         self._last[entity] = words[-1]
         if changed:
             told, k = [words[i] for i in changed], first + np.array(changed)
-            self._sum(f"/{entity}:state", "".join(told).encode(), k)
             self._send(entity, k, rr.StateChange.columns(state=told))
         return changed
 

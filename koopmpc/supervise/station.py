@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
-from typing import Any, Literal, cast, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -16,17 +16,17 @@ from koopmpc.control.in_time.preview import InputRows
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
-from koopmpc.control.program import Program, Published, SavedController, no_export
+from koopmpc.control.program import SavedController
 from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.errors import DataError
 from koopmpc.loop.simulate import count_disturbances
-from koopmpc.supervise.parts import join_start_sizes, reset_parts
+from koopmpc.supervise.parts import ControllerPair, plan_of, rows_of
 
 Mode = Literal["manual", "automatic", "standby"]
 _BUMP = 0.01  # after a switch u moves by this share of its range a step, unless the controller takes over exactly
 
 
-class Station(Published):
+class Station(ControllerPair):
     """A manual/automatic station: a hand value, a primary controller, or a standby one acts, inside the limits.
 
     All controllers are called at every step with the input that was applied, so that their estimators go on. Where one
@@ -95,17 +95,8 @@ class Station(Published):
         ramp: ArrayLike | None = None,
         patience: int = 3,
     ) -> None:
-        needed = ("dt", "nu", "horizon", "reset")
-        checks.members(controller, "the controller", needed, "pass a KoopmanMPC, an LQR or another Controller")
-        self.controller, self.dt, self.nu = controller, controller.dt, controller.nu
-        self.standby = None if standby is None else as_controller(standby, self.dt, self.nu)
-        if self.standby is not None:
-            checks.members(self.standby, "the standby", needed, "pass a PID, an LQR, or a function u = f(y, r)")
-            for name in ("dt", "nu"):
-                mine, other = getattr(controller, name), getattr(self.standby, name)
-                if mine != other:
-                    raise DataError(f"the controller has {name} = {mine:g}, the standby {other:g}; they must agree")
-        self.horizon = max(controller.horizon, 0 if self.standby is None else self.standby.horizon)
+        checks.members(controller, "the controller", ("dt", "nu"), "pass a KoopmanMPC, an LQR or another Controller")
+        super().__init__(controller, None if standby is None else as_controller(standby, controller.dt, controller.nu))
         if limits is not None:
             checks.kind(limits, "limits", Limits, "pass km.Limits(u_min=…, u_max=…)")
         self.limits = limits or Limits()
@@ -137,51 +128,20 @@ class Station(Published):
         DataError
             A controller in it is not of koopmpc.
         """
-        options: dict[str, Any] = {
-            "mode": self._first_mode,
-            "hand": self._first_hand,
-            "bump": self.bump,
-            "ramp": self.ramp,
-            "patience": self._patience,
-            "standby": None,
-        }
-        for name, part in (("controller", self.controller), ("standby", self.standby)):
-            if part is None:
-                continue
-            if not isinstance(part, Published):
-                raise DataError(f"{checks.article(part)} is not a controller of koopmpc and cannot be saved as data")
-            options[name] = part.as_data()
-        return SavedController("Station", None, limits=self.limits, options=options)
-
-    @classmethod
-    def from_data(cls, saved: SavedController) -> "Station":
-        """Return the station that is made of these data, in which the parts are controllers again."""
-        options = dict(saved.options)
-        return cls(options.pop("controller"), options.pop("standby"), limits=saved.limits, **options)
-
-    def build_program(self, reference: ArrayLike | None) -> Program:
-        """Raise the DataError that says why no C code can be generated."""
-        raise no_export(self, "it holds several controllers", "each of them")
+        return self.save_parts(
+            mode=self._first_mode,
+            hand=self._first_hand,
+            bump=self.bump,
+            ramp=self.ramp,
+            patience=self._patience,
+            limits=self.limits,
+        )
 
     @property
     def nw(self) -> int | None:
         """Measured disturbances that its controllers know; None where none of them has a model."""
-        counts = map(count_disturbances, self._parts)
+        counts = map(count_disturbances, self._both)
         return max((count for count in counts if count is not None), default=None)
-
-    @property
-    def _parts(self) -> list[Controller]:
-        return [self.controller] if self.standby is None else [self.controller, self.standby]
-
-    @property
-    def start_sizes(self) -> frozenset[int]:
-        """Numbers of states of its controllers' models; `reset` takes an x0 of one of these lengths."""
-        return join_start_sizes(self._parts)
-
-    @property
-    def predictor(self) -> Any:
-        """The model of the primary controller; None where it has none."""
-        return getattr(self.controller, "predictor", None)
 
     def _check_hand(self, u: ArrayLike) -> Float[np.ndarray, " nu"]:
         return checks.vector(u, "hand", self.nu)
@@ -218,7 +178,7 @@ class Station(Published):
         self.actor: str = ""
         self._ill, self._replaced, self._approaching = 0, False, False
         self._set_point: Float[np.ndarray, " nr"] | None = None
-        reset_parts(self._parts, x0, u_prev)
+        self.reset_parts(x0, u_prev)
 
     def _present_limits(self) -> tuple[Interval, Interval | None]:
         """Return the limits of the inputs, and of their changes, in this step."""
@@ -229,8 +189,7 @@ class Station(Published):
 
     def plan(self) -> Plan | None:
         """Return the plan behind the last move; None where it had none."""
-        look = cast("Callable[[], Plan | None] | None", getattr(self.controller, "plan", None))
-        return look() if look is not None and self.actor == "automatic" and not self._approaching else None
+        return plan_of(self.controller) if self.actor == "automatic" and not self._approaching else None
 
     def __call__(
         self, y: ArrayLike, reference: ArrayLike, applied: ArrayLike | None = None, w: ArrayLike | None = None
@@ -244,10 +203,10 @@ class Station(Published):
         last = self._last
         if self._held is not None:
             self._held.take(last)
-        first = self.controller(measured, _rows_of(rows, self.controller), last, self._select_w(self.controller, w))
+        first = self.controller(measured, rows_of(rows, self.controller), last, self._select_w(self.controller, w))
         second = None
         if self.standby is not None:
-            second = self.standby(measured, _rows_of(rows, self.standby), last, self._select_w(self.standby, w))
+            second = self.standby(measured, rows_of(rows, self.standby), last, self._select_w(self.standby, w))
         actor = self._choose(first)
         begins, self.actor = actor != self.actor and self.actor != "", actor
         move = self._ask(actor, begins, first, second, measured, rows, w)
@@ -304,7 +263,7 @@ class Station(Published):
             take_over = getattr(acting, "take_over", None)
             self._approaching = take_over is None
             if take_over is not None:
-                own = _rows_of(rows, acting)
+                own = rows_of(rows, acting)
                 take_over(y, own, self._last)
                 return acting(y, own, self._last, self._select_w(acting, w))
         return move
@@ -335,11 +294,6 @@ def _check_mode(mode: str) -> Mode:
     if mode not in get_args(Mode):
         raise DataError(f'mode is {mode!r}; pass "manual", "automatic" or "standby"')
     return cast("Mode", mode)
-
-
-def _rows_of(rows: Float[np.ndarray, "..."], controller: Controller) -> Float[np.ndarray, "..."]:
-    """Return the rows of the reference that this controller reads."""
-    return rows if rows.ndim == 1 else rows[: controller.horizon + 1]
 
 
 register_controller(ControllerKind(Station))

@@ -259,19 +259,6 @@ def test_members_that_nobody_needs_are_not_read(tmp_path: Path) -> None:
     assert peak < 20e6
 
 
-def test_a_log_is_written_in_small_pieces(tmp_path: Path) -> None:
-    """The heap of each thread keeps the room of the largest piece that it took."""
-    import tracemalloc
-
-    run = make_run()
-    km.record(run, tmp_path / "run.rrd")  # what is loaded once is no part of it
-    tracemalloc.start()
-    km.record(run, tmp_path / "run.rrd")
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 6e5
-
-
 def test_a_reader_that_ends_its_process_ends_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A log that is not as it was written is read apart; here the child is killed as an abort would kill it."""
     path = tmp_path / "run.rrd"

@@ -14,7 +14,7 @@ import pytest
 import koopmpc as km
 from koopmpc.recording.description import Entity
 from koopmpc.recording.reader import LogColumns
-from koopmpc.recording.rrd import Column
+from koopmpc.recording.rrd import Column, Contents
 from tests.recording.runs import about, make_run, steps_of
 from tests.tiers import slow
 
@@ -223,7 +223,7 @@ def test_a_changed_number_is_not_read_as_the_run(tmp_path: Path, column: str) ->
         else:
             assert same  # what is only drawn is no part of the run
     assert said
-    damage = r"run\.rrd is damaged: /\w+.* no longer hold what was written; take another copy"
+    damage = r"run\.rrd is damaged: \w+.* no longer hold what was written; take another copy"
     assert all(re.search(damage, sentence) for sentence in said), said
 
 
@@ -268,7 +268,7 @@ def test_rows_come_in_order_of_their_steps_whatever_that_of_their_batches(seed: 
         for entity, rows in (("/a", values), ("/s", [[each[0]] if told[k] else [] for k, each in enumerate(values)])):
             lists = pa.array([list(rows[k]) for k in part], pa.list_(pa.float64()))
             columns.append(Column(entity, "scalars", pa.array(part), lists))
-    log, there = LogColumns(columns, ("/a", "/s"), torn=False), sorted(order.tolist())
+    log, there = LogColumns(Contents(columns, torn=False, intact=True)), sorted(order.tolist())
     for steps, rows in (log.matrix("a"), log.lists("a", "scalars")):
         assert steps.tolist() == there
         np.testing.assert_array_equal(rows, values[there])

@@ -16,7 +16,6 @@ import koopmpc as km
 from koopmpc.loop.run import About, StepRows
 from koopmpc.recording.description import _FORMAT, DRAWN, drawable, from_json, title_of, to_json, to_markdown
 from koopmpc.recording.reader import LogColumns, read_columns
-from koopmpc.recording.rrd import file_recording
 from koopmpc.recording.scenes import ReferenceScenes
 from koopmpc.recording.writer import block_of_run, blocks
 from tests.control.models import step_map
@@ -42,21 +41,6 @@ def test_a_log_without_the_solvers_of_its_steps_reads_as_before(tmp_path: Path) 
     assert "/solver/qp" not in read_columns(tmp_path / "run.rrd", ("/solver/qp", "/state")).entities()
     assert km.load_run(tmp_path / "run.rrd") == run
     assert km.metrics(run).solver == {}
-
-
-def test_logs_of_a_problem_name_the_parts_of_their_layouts_alike(tmp_path: Path) -> None:
-    """Rerun keeps every name of an entity for ever: a process that writes many logs would grow with each."""
-    from rerun.chunk import RrdReader
-
-    names: list[list[str]] = []
-    for i in range(2):
-        km.record(make_run(N=3), tmp_path / f"{i}.rrd")
-        reader = RrdReader(tmp_path / f"{i}.rrd")
-        chunks = reader.stream(store=reader.blueprints()[0])
-        names.append(sorted(chunk.entity_path for chunk in chunks))
-    assert names[0] == names[1]
-    parts = {name.split("/")[2] for name in names[0] if name.startswith(("/view/", "/container/"))}
-    assert len(parts) > 10, "parts of a layout share an id"
 
 
 def test_a_run_whose_scene_fails_costs_no_line_of_rerun(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -155,7 +139,6 @@ def test_a_log_without_the_status_of_its_first_step_is_refused(lost: int, tmp_pa
         return tuple(each[lost:] for each in found) if entity == "solver/status" else found
 
     monkeypatch.setattr(LogColumns, "rows", shortened)
-    monkeypatch.setattr(LogColumns, "find_changed", lambda log: [])
     with pytest.raises(km.errors.LogError, match="lacks the status of its first step"):
         km.load_run(tmp_path / "run.rrd")
 
@@ -374,13 +357,3 @@ def test_a_run_has_a_title_of_its_own(tmp_path: Path) -> None:
     assert title_of(km.load_run(tmp_path / "run.rrd")) == "bench 3, new valve"
     problem = {"title": "Pendulum: driven upright.", "problem": "pendulum", "case": "hang", "controller": "lqr"}
     assert title_of(About(**make_run(metadata=problem).about())) == "pendulum · hang · lqr"
-
-
-def test_a_recording_that_cannot_begin_says_why_and_leaves_no_file(tmp_path: Path, monkeypatch) -> None:
-    def fail(application: str) -> None:
-        raise MemoryError(application)
-
-    monkeypatch.setattr("koopmpc.recording.rrd.new_recording", fail)
-    with pytest.raises(MemoryError, match="mine"), file_recording(tmp_path / "a.rrd", "mine", None):
-        pass
-    assert not any(tmp_path.iterdir())
