@@ -126,8 +126,11 @@ def from_json(text: str) -> tuple[About, int | None]:
 
 def sum_plans(steps: Iterable[int], X: np.ndarray, U: np.ndarray) -> dict[int, int]:
     """Return a checksum of each plan by its step; a plan without a number has none."""
-    held = ~(np.isnan(X).all(axis=(1, 2)) & np.isnan(U).all(axis=(1, 2)))
-    return {k: checksum(x.tobytes(), u.tobytes()) for k, x, u, some in zip(steps, X, U, held, strict=True) if some}
+    sums: dict[int, int] = {}
+    for i, k in enumerate(steps):
+        if not (np.isnan(X[i]).all() and np.isnan(U[i]).all()):
+            sums[k] = checksum(X[i].tobytes(), U[i].tobytes())
+    return sums
 
 
 def digest(rows: StepRows, description: str, plans: Mapping[int, int]) -> dict[str, int]:
