@@ -1,14 +1,14 @@
 """`certify`: a feedback with a proof of stability, from a bilinear or linear lifted model and pairs of data."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.limits import Limits, refuse_levels
+from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import CertificateError, DataError
 from koopmpc.guarantees.certificate import Certificate
@@ -23,19 +23,52 @@ from koopmpc.guarantees.error_bounds import (
     sizes_of,
     split_pairs,
 )
-from koopmpc.guarantees.search import DECAY, Found, Room, prove
+from koopmpc.guarantees.search import DECAY, Corners, Found, find_room, prove
 from koopmpc.guarantees.statement import Refused, explain_refusal
-from koopmpc.lifting.base import find_observables
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 _SCALES = (1.0, 0.7, 0.5, 0.35, 0.25, 0.12, 0.06)  # shares of the box that are tried
 _WORSE = 2  # stop after this many smaller boxes in sequence gave smaller regions
 _MOST = 16  # with more observables than this only the states are tried
 _LEAST_PAIRS = 30  # a box with fewer pairs is not tried
-_BEYOND = 0.05  # share of the sampled width by which a region may be wider; it is cut there
 _PROBES = 4000  # states at which the slope of the lifting is measured for noise
 
-Corners = tuple[ArrayLike, ArrayLike]
+
+@dataclass(frozen=True, eq=False)
+class CertifyOptions:
+    """What is known, and what is seldom asked: `km.certify(…, options=km.guarantees.CertifyOptions(estimated=True))`.
+
+    Attributes
+    ----------
+    estimated
+        Whether the set point is not exactly an equilibrium. Then the error has a constant part c_0, u is found by
+        least squares on the model, and what is proved is a ball that is reached.
+    region
+        (low, high), a box in place of that of the sampled states; inside it but for a bound that is given.
+    error
+        (c_x, c_u) where they are known: then S, D and d are identities, and the proof rests on them.
+    lipschitz
+        L with ‖D⁻¹(r − r′)‖ ≤ L (‖(x − x′)/d_x‖ + ‖(u − u′)/d‖) in the box, where it is known; d_x are the sizes D of
+        the states. Then c_x = c_u = L. If `estimated`, the constants come from the pairs and L by a covering of the
+        box: a proof, given L, of a ball that is smaller the denser the data are.
+    noise
+        (nx,) or a number: largest error of each measured state. The certificate is then a ball.
+    decay
+        ρ: V falls by this factor at least in every step. By default it is 0.9999, and searched where c_0 > 0.
+    confidence
+        Of a scenario bound, which is used without `error` and `lipschitz`.
+    rng
+        Which half of the episodes sets the box and the sizes, and which of the others make the bound or check it.
+    """
+
+    estimated: bool = False
+    region: Corners | None = None
+    error: tuple[float, float] | None = None
+    lipschitz: float | None = None
+    noise: ArrayLike | None = None
+    decay: float | None = None
+    confidence: float = 0.95
+    rng: np.random.Generator | int = 0
 
 
 def certify(
@@ -45,14 +78,8 @@ def certify(
     *,
     x: ArrayLike = 0.0,
     u: ArrayLike = 0.0,
-    estimated: bool = False,
-    region: Corners | None = None,
-    error: tuple[float, float] | None = None,
-    lipschitz: float | None = None,
-    noise: ArrayLike | None = None,
-    decay: float | None = None,
-    confidence: float = 0.95,
-    rng: np.random.Generator | int = 0,
+    options: CertifyOptions | None = None,
+    **moved: Any,
 ) -> Certificate:
     """Return a feedback u = κ(x) and a region {V ≤ 1} that it keeps, and in which V falls at every step.
 
@@ -73,26 +100,9 @@ def certify(
     limits
         Limits of inputs, states and of observables of the lifting; limits of changes are refused.
     x, u
-        The set point (x_s, u_s). It is an equilibrium of the plant unless `estimated`.
-    estimated
-        Whether the set point is not exactly an equilibrium. Then the error has a constant part c_0, u is found by
-        least squares on the model, and what is proved is a ball that is reached.
-    region
-        (low, high), a box in place of that of the sampled states; inside it but for a bound that is given.
-    error
-        (c_x, c_u) where they are known: then S, D and d are identities, and the proof rests on them.
-    lipschitz
-        L with ‖D⁻¹(r − r′)‖ ≤ L (‖(x − x′)/d_x‖ + ‖(u − u′)/d‖) in the box, where it is known; d_x are the sizes D of
-        the states. Then c_x = c_u = L. If `estimated`, the constants come from the pairs and L by a covering of the
-        box: a proof, given L, of a ball that is smaller the denser the data are.
-    noise
-        (nx,) or a number: largest error of each measured state. The certificate is then a ball.
-    decay
-        ρ: V falls by this factor at least in every step. By default it is 0.9999, and searched where c_0 > 0.
-    confidence
-        Of a scenario bound, which is used without `error` and `lipschitz`.
-    rng
-        Which half of the episodes sets the box and the sizes, and which of the others make the bound or check it.
+        The set point (x_s, u_s). It is an equilibrium of the plant unless the options say that it is estimated.
+    options
+        What is known of the error, noise, the decay: see `km.guarantees.CertifyOptions`.
 
     Returns
     -------
@@ -124,34 +134,22 @@ def certify(
     >>> certificate.ball, bool(certificate.value([0.0, 0.0]) == 0.0)
     (0.0, True)
     """
-    source = checks.generator(rng)
-    given = _check_constants(error, lipschitz, estimated)
+    checks.refuse_moved(moved, CertifyOptions, "km.certify(…, options=km.guarantees.CertifyOptions({}))")
+    asked = _check_options(CertifyOptions() if options is None else options, model.nx)
     deviation = deviate(model, x, u)
-    if estimated:
+    if asked.estimated:
         deviation = deviate(model, x, _estimate_input(deviation))
-    seed = int(source.integers(2**32))
-    level = 1 - (1 - checks.positive(confidence, "confidence")) / (2 * len(_SCALES))  # one of so many bounds is chosen
-    if not 0 < level < 1:
-        raise DataError(f"confidence is {confidence}; it must be above 0 and below 1")
-    reach = np.zeros(model.nx) if noise is None else checks.vector(noise, "noise", model.nx)
-    if (reach < 0).any():
-        raise DataError(f"noise is {noise}; an error of measurement is 0 or above")
-    if decay is not None and not checks.positive(decay, "decay") < 1:
-        raise DataError(f"decay is {decay:g}, and V has to fall; pass a number below 1")
-    if lipschitz is not None and estimated and reach.any():
-        raise DataError("a covering needs exact pairs; leave noise out, or leave lipschitz out")
-    asked = _Asked(data, limits, region, given, estimated, reach, decay, level, seed)
-    whole = _Search(deviation, asked)
-    best = whole.run() if len(deviation.kept) <= _MOST and is_stabilisable(deviation, decay or DECAY) else None
-    few = None
-    if not given and len(deviation.kept) > model.nx:
-        few = _Search(reduce_to_states(deviation), asked)
+    whole, few = _Search(deviation, data, limits, asked), None
+    provable = len(deviation.kept) <= _MOST and is_stabilisable(deviation, asked.decay or DECAY)
+    best = whole.run() if provable else None
+    if not asked.constants and len(deviation.kept) > model.nx:
+        few = _Search(reduce_to_states(deviation), data, limits, asked)
         other = few.run()
         if other is not None and (best is None or other.size > best.size):
             best, deviation = other, few.model
     if best is None:
         raise CertificateError(explain_refusal((few or whole).describe_failure()))
-    low, high, room, pairs = whole.low, whole.high, whole.room, whole.pairs
+    bound = best.bound if asked.constants else replace(best.bound, confidence=asked.confidence)  # whichever was chosen
     return Certificate(
         deviation=deviation,
         P=best.P,
@@ -159,51 +157,76 @@ def certify(
         K_w=best.K_w,
         decay=best.decay,
         ball=best.ball,
-        error=best.bound if given else replace(best.bound, confidence=float(confidence)),  # whichever was chosen
-        low=deviation.x + best.scale * (low - deviation.x),
-        high=deviation.x + best.scale * (high - deviation.x),
-        v_max=room.inputs,
+        error=bound,
+        low=deviation.x + best.scale * (whole.low - deviation.x),
+        high=deviation.x + best.scale * (whole.high - deviation.x),
+        v_max=whole.room.inputs,
         margin=best.margin,
-        estimated=estimated,
-        noise=reach,
+        estimated=asked.estimated,
+        noise=asked.noise,
         dt=model.dt,
         states=tuple(model.states),
         inputs=tuple(model.inputs),
-        sampled=(pairs.X.min(axis=0), pairs.X.max(axis=0)),
+        sampled=(whole.pairs.X.min(axis=0), whole.pairs.X.max(axis=0)),
         limits=limits,
     )
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """The arguments of `certify` that a search needs; `given` are two constants, one or none, `level` a confidence."""
+    """The options of `certify`, checked; `constants` are two, one or none; `level` is the confidence of one bound."""
 
-    data: Episodes
-    limits: Limits | None
-    region: Corners | None
-    given: tuple[float, ...]
+    constants: tuple[float, ...]
     estimated: bool
+    region: Corners | None
     noise: Float[np.ndarray, " nx"]
     decay: float | None
+    confidence: float
     level: float
     seed: int
+
+
+def _check_options(options: CertifyOptions, nx: int) -> _Asked:
+    checks.kind(options, "options", CertifyOptions, "pass km.guarantees.CertifyOptions(…)")
+    source = checks.generator(options.rng)
+    constants = _check_constants(options.error, options.lipschitz, options.estimated)
+    confidence = checks.positive(options.confidence, "confidence")
+    if not confidence < 1:
+        raise DataError(f"confidence is {confidence}; it must be above 0 and below 1")
+    noise = np.zeros(nx) if options.noise is None else checks.vector(options.noise, "noise", nx)
+    if (noise < 0).any():
+        raise DataError(f"noise is {options.noise}; an error of measurement is 0 or above")
+    if options.decay is not None and not checks.positive(options.decay, "decay") < 1:
+        raise DataError(f"decay is {options.decay:g}, and V has to fall; pass a number below 1")
+    if options.lipschitz is not None and options.estimated and noise.any():
+        raise DataError("a covering needs exact pairs; leave noise out, or leave lipschitz out")
+    return _Asked(
+        constants=constants,
+        estimated=options.estimated,
+        region=options.region,
+        noise=noise,
+        decay=options.decay,
+        confidence=float(confidence),
+        level=1 - (1 - confidence) / (2 * len(_SCALES)),  # one of so many bounds is chosen
+        seed=int(source.integers(2**32)),
+    )
 
 
 class _Search:
     """The search over shares of the box, for one set of observables."""
 
-    def __init__(self, model: DeviationModel, asked: _Asked) -> None:
+    def __init__(self, model: DeviationModel, data: Episodes, limits: Limits | None, asked: _Asked) -> None:
         self.model, self.asked = model, asked
-        self.pairs = _read_pairs(model, asked.data)
-        sampled = len(asked.given) != 2
+        self.pairs = _read_pairs(model, data)
+        sampled = len(asked.constants) != 2
         self.sizing = self.pairs
-        if not asked.given:  # a scenario bound takes box, sizes and shape as given: they are of other episodes
+        if not asked.constants:  # a scenario bound takes box, sizes and shape as given: they are of other episodes
             self.sizing, self.bounding = split_pairs(self.pairs, np.random.default_rng(asked.seed), share=0.5)
-        self.room, self.low, self.high = _find_room(
-            model, self.sizing, asked.limits, asked.region, sampled=sampled, scenario=not asked.given
+        self.room, self.low, self.high = find_room(
+            model, self.sizing, limits, asked.region, sampled=sampled, scenario=not asked.constants
         )
         inside = self.sizing.within(self.low, self.high)
-        if not asked.given and len(inside.phi) < _LEAST_PAIRS:
+        if not asked.constants and len(inside.phi) < _LEAST_PAIRS:
             raise DataError(
                 f"{len(inside.phi)} pairs of the data lie in the box, {_LEAST_PAIRS} are needed; collect more there"
             )
@@ -214,7 +237,7 @@ class _Search:
 
     def find_bound(self, scale: float) -> ErrorBound | None:
         """Return the bound on this share of the box, None where there are too few pairs."""
-        model, asked, given = self.model, self.asked, self.asked.given
+        model, asked, given = self.model, self.asked, self.asked.constants
         if len(given) == 2:
             n, m = len(model.kept), len(model.u)
             return ErrorBound("given", given[0], given[1], 0.0, np.eye(n), np.full(n, 1.0), np.full(m, 1.0))
@@ -261,7 +284,7 @@ class _Search:
         tried = {scale: self.find_bound(scale) for scale in _SCALES}
         bounds = {scale: bound for scale, bound in tried.items() if bound is not None}
         noise = self.find_noise(next(iter(bounds.values()))) if bounds else 0.0
-        pairs = None if self.asked.given else self.bounding
+        pairs = None if self.asked.constants else self.bounding
         return Refused(self.model, self.room, bounds, self.asked.decay, noise, pairs, len(bounds) < len(tried))
 
     def run(self) -> Found | None:
@@ -313,86 +336,6 @@ def _read_pairs(model: DeviationModel, data: Episodes) -> ErrorPairs:
     names = np.repeat(np.arange(len(data.episodes), dtype=np.float64), [len(episode.U) for episode in data.episodes])
     phi, v = model.lift(X), U - model.u
     return ErrorPairs(phi, v, model.lift(X_next) - model.advance(phi, v), X, U, names)
-
-
-def _find_room(
-    model: DeviationModel,
-    pairs: ErrorPairs,
-    limits: Limits | None,
-    region: Corners | None,
-    *,
-    sampled: bool,
-    scenario: bool,
-) -> tuple[Room, Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
-    """Return where the region and the inputs may be, and the box of states that the bound of the error is on."""
-    nx, nu = len(model.x), len(model.u)
-    names = model.lifting.bound_states
-    allowed = Limits() if limits is None else limits
-    checks.kind(allowed, "limits", Limits, "or None for none")
-    refuse_levels(allowed, "a certificate")
-    if allowed.du_max is not None or allowed.du_min is not None:
-        raise DataError("limits of changes of the inputs are not part of a certificate; pass limits without du_max")
-    low, high = pairs.X.min(axis=0), pairs.X.max(axis=0)
-    if region is not None:
-        corners = checks.vector(region[0], "region", nx), checks.vector(region[1], "region", nx)
-        low, high = _stay_inside(corners, (low, high), names) if scenario else corners
-    x_low, x_high = allowed.states(nx)
-    where = "the sampled box" if region is None else "the region"
-    for box_low, box_high, what in ((low, high, where), (x_low, x_high, "the limits")):
-        outside = np.flatnonzero((model.x <= box_low) | (model.x >= box_high))
-        if outside.size:
-            i = int(outside[0])
-            raise DataError(
-                f"the set point has {names[i]} = {model.x[i]:g}, which is not inside {what},"
-                f" {box_low[i]:g} … {box_high[i]:g}; move the set point, or widen the box"
-            )
-    widths = np.minimum(np.minimum(model.x - low, high - model.x), np.minimum(model.x - x_low, x_high - model.x))
-    rows: list[Float[np.ndarray, " n"]] = []
-    if allowed.of is not None:
-        wanted = allowed.of.bind(names)
-        y_low, y_high = allowed.outputs(wanted.nz)
-        y = wanted(model.x)
-        half = np.minimum(y - y_low, y_high - y)
-        if (half <= 0).any():
-            raise DataError("the limits y_min … y_max exclude the set point; move it, or widen them")
-        place = {int(kept): i for i, kept in enumerate(model.kept)}
-        for index, h in zip(find_observables(model.lifting, wanted), half, strict=True):
-            if np.isfinite(h) and int(index) in place:
-                rows.append(np.eye(len(model.kept))[place[int(index)]] / h)
-    u_low, u_high = allowed.inputs(nu)
-    if sampled:  # a bound that is given holds for all inputs that the limits allow
-        u_low, u_high = np.maximum(u_low, pairs.U.min(axis=0)), np.minimum(u_high, pairs.U.max(axis=0))
-    if ((model.u <= u_low) | (model.u >= u_high)).any():
-        raise DataError(
-            f"the input of the set point is {model.u.tolist()}, which is not inside both the limits and the sampled"
-            f" inputs, {u_low.tolist()} … {u_high.tolist()}; sample inputs on both sides of it"
-        )
-    inputs = np.minimum(model.u - u_low, u_high - model.u)
-    table = np.array(rows).reshape(-1, len(model.kept))
-    return Room(widths, table, inputs), low, high
-
-
-def _stay_inside(
-    region: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
-    sampled: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
-    names: Sequence[str],
-) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
-    """Return the part of a region that was sampled; a bound that is made of samples says nothing of the rest.
-
-    Raises
-    ------
-    DataError
-        More of it than rounding was not sampled.
-    """
-    (low, high), (first, last) = region, sampled
-    beyond = np.maximum(first - low, high - last) / np.maximum(last - first, 1e-300)
-    i = int(np.argmax(beyond))
-    if beyond[i] > _BEYOND:
-        raise DataError(
-            f"the region has {names[i]} = {low[i]:g} … {high[i]:g}, and the data have {first[i]:g} … {last[i]:g}; a"
-            " bound of the error from data holds where they are: pass a region inside, or collect data in it"
-        )
-    return np.maximum(low, first), np.minimum(high, last)
 
 
 def _noise_in_lifting(

@@ -1,14 +1,19 @@
 """The search for the largest region that a certificate can be found for: over its scale, its ellipsoid, its decay."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
+from koopmpc import checks
+from koopmpc.control.limits import Limits, refuse_levels
+from koopmpc.errors import DataError
 from koopmpc.guarantees.deviation import DeviationModel
-from koopmpc.guarantees.error_bounds import ErrorBound
+from koopmpc.guarantees.error_bounds import ErrorBound, ErrorPairs
 from koopmpc.guarantees.semidefinite import FeedbackProof, FeedbackTask, solve_feedback
+from koopmpc.lifting.base import find_observables
 
 ROUNDING = 1e-10  # products v ⊗ φ with smaller entries than this share of A are rounding: the model is linear
 _SHRINK = 0.03  # factor of the first ellipsoid from try to try
@@ -17,7 +22,11 @@ _GROWTH = (2.0, 1.3, 1.1)  # factors by which the next ellipsoid may exceed the 
 _ROUNDS = 5  # times that the ellipsoid follows the region
 _GAIN = 0.05  # stop where log det grows by less
 DECAY = 1 - 1e-4  # V falls by this factor a step at least, where the error vanishes at the set point
+_BEYOND = 0.05  # share of the sampled width by which a region may be wider; it is cut there
 _FASTER = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.25)  # 1 − ρ tried where it does not
+
+
+Corners = tuple[ArrayLike, ArrayLike]
 
 
 @dataclass(frozen=True)
@@ -34,6 +43,90 @@ class Room:
     def scale_by(self, scale: float) -> "Room":
         """Return the room with this share of the box of states; limits stay."""
         return replace(self, widths=scale * self.widths)
+
+
+def find_room(
+    model: DeviationModel,
+    pairs: ErrorPairs,
+    limits: Limits | None,
+    region: Corners | None,
+    *,
+    sampled: bool,
+    scenario: bool,
+) -> tuple[Room, Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
+    """Return where the region and the inputs may be, and the box of states that the bound of the error is on."""
+    nx, nu = len(model.x), len(model.u)
+    names = model.lifting.bound_states
+    allowed = Limits() if limits is None else limits
+    checks.kind(allowed, "limits", Limits, "or None for none")
+    refuse_levels(allowed, "a certificate")
+    if allowed.du_max is not None or allowed.du_min is not None:
+        raise DataError("limits of changes of the inputs are not part of a certificate; pass limits without du_max")
+    low, high = pairs.X.min(axis=0), pairs.X.max(axis=0)
+    if region is not None:
+        corners = checks.vector(region[0], "region", nx), checks.vector(region[1], "region", nx)
+        low, high = _stay_inside(corners, (low, high), names) if scenario else corners
+    x_low, x_high = allowed.states(nx)
+    where = "the sampled box" if region is None else "the region"
+    for box_low, box_high, what in ((low, high, where), (x_low, x_high, "the limits")):
+        outside = np.flatnonzero((model.x <= box_low) | (model.x >= box_high))
+        if outside.size:
+            i = int(outside[0])
+            raise DataError(
+                f"the set point has {names[i]} = {model.x[i]:g}, which is not inside {what},"
+                f" {box_low[i]:g} … {box_high[i]:g}; move the set point, or widen the box"
+            )
+    widths = np.minimum(np.minimum(model.x - low, high - model.x), np.minimum(model.x - x_low, x_high - model.x))
+    rows = _limit_observables(model, allowed, names)
+    u_low, u_high = allowed.inputs(nu)
+    if sampled:  # a bound that is given holds for all inputs that the limits allow
+        u_low, u_high = np.maximum(u_low, pairs.U.min(axis=0)), np.minimum(u_high, pairs.U.max(axis=0))
+    if ((model.u <= u_low) | (model.u >= u_high)).any():
+        raise DataError(
+            f"the input of the set point is {model.u.tolist()}, which is not inside both the limits and the sampled"
+            f" inputs, {u_low.tolist()} … {u_high.tolist()}; sample inputs on both sides of it"
+        )
+    inputs = np.minimum(model.u - u_low, u_high - model.u)
+    return Room(widths, rows, inputs), low, high
+
+
+def _limit_observables(model: DeviationModel, limits: Limits, names: Sequence[str]) -> Float[np.ndarray, "p n"]:
+    """Return the rows h of limits of observables, |h φ| ≤ 1."""
+    if limits.of is None:
+        return np.empty((0, len(model.kept)))
+    wanted = limits.of.bind(tuple(names))
+    y_low, y_high = limits.outputs(wanted.nz)
+    y = wanted(model.x)
+    half = np.minimum(y - y_low, y_high - y)
+    if (half <= 0).any():
+        raise DataError("the limits y_min … y_max exclude the set point; move it, or widen them")
+    place = {int(kept): i for i, kept in enumerate(model.kept)}
+    pairs = zip(find_observables(model.lifting, wanted), half, strict=True)
+    limited = [(place[int(index)], h) for index, h in pairs if np.isfinite(h) and int(index) in place]
+    return np.array([np.eye(len(model.kept))[i] / h for i, h in limited]).reshape(-1, len(model.kept))
+
+
+def _stay_inside(
+    region: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
+    sampled: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
+    names: Sequence[str],
+) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
+    """Return the part of a region that was sampled; a bound that is made of samples says nothing of the rest.
+
+    Raises
+    ------
+    DataError
+        More of it than rounding was not sampled.
+    """
+    (low, high), (first, last) = region, sampled
+    beyond = np.maximum(first - low, high - last) / np.maximum(last - first, 1e-300)
+    i = int(np.argmax(beyond))
+    if beyond[i] > _BEYOND:
+        raise DataError(
+            f"the region has {names[i]} = {low[i]:g} … {high[i]:g}, and the data have {first[i]:g} … {last[i]:g}; a"
+            " bound of the error from data holds where they are: pass a region inside, or collect data in it"
+        )
+    return np.maximum(low, first), np.minimum(high, last)
 
 
 @dataclass(frozen=True)

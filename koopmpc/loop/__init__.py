@@ -10,5 +10,6 @@ if TYPE_CHECKING:
     from koopmpc.loop.realtime import in_real_time as in_real_time
     from koopmpc.loop.run import Plans as Plans
     from koopmpc.loop.run import Step as Step
+    from koopmpc.loop.simulate import LoopOptions as LoopOptions
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -40,6 +40,48 @@ HOW = (
 _MOVE = tuple(f.name for f in fields(Move) if f.default is MISSING)  # what a user's own move needs
 
 
+@dataclass(frozen=True, eq=False)
+class LoopOptions:
+    """What is seldom asked of a loop: `simulate(…, options=km.loop.LoopOptions(noise=0.01, rng=3))`.
+
+    Attributes
+    ----------
+    noise
+        n_k, (ny,) standard deviations of white noise, (steps+1, ny) values, or a function of (k, rng).
+    disturbance
+        d_k, (nx,) or (steps, nx), or a function of (k, rng), added to the next state. Needs a simulated plant.
+    faults
+        What breaks, see `km.faults`. A signal passes through them in order, y_k after its noise. Run.Y is what the
+        controller got. Run.U is what the plant got, which the controller is told at the next step. The metadata
+        list the faults under "faults".
+    rng
+        Seed of noise, disturbance and faults. Each fault has its own random generator, so noise and disturbance are
+        the same with and without faults.
+    preview
+        Whether the controller gets the references and measured disturbances of the steps ahead.
+    plans
+        Keep the plan of every step.
+    u_reference
+        (nu,) or (steps, nu): the inputs that hold the reference. The metrics charge ‖u_k − u_reference_k‖²_R, so
+        staying at the reference costs nothing. By default they are those of the cost's u_target if that is given as
+        numbers, else zero. Only the metrics use them; the controller does not see them.
+    angles
+        Indices of states whose errors wrap at ±π in the metrics.
+    metadata
+        Names, numbers and lists that the Run and its log keep.
+    """
+
+    noise: Signal | None = None
+    disturbance: Signal | None = None
+    faults: Sequence[Fault] = ()
+    rng: np.random.Generator | int = 0
+    preview: bool = True
+    plans: bool = False
+    u_reference: ArrayLike | None = None
+    angles: Sequence[int] = ()
+    metadata: Mapping[str, Any] | None = None
+
+
 def simulate(
     plant: StepMap | Plant,
     controller: Controller | Excitation | Callable[..., Any],
@@ -49,17 +91,10 @@ def simulate(
     steps: int,
     cost: Cost | None = None,
     limits: Limits | None = None,
-    u_reference: ArrayLike | None = None,
-    disturbance: Signal | None = None,
-    noise: Signal | None = None,
     measured: ArrayLike | None = None,
-    faults: Sequence[Fault] = (),
-    rng: np.random.Generator | int = 0,
     observers: Sequence[StepObserver] = (),
-    plans: bool = False,
-    preview: bool = True,
-    angles: Sequence[int] = (),
-    metadata: Mapping[str, Any] | None = None,
+    options: LoopOptions | None = None,
+    **moved: Any,
 ) -> Run:
     """Run u_k = controller(y_k, r_k … r_{k+N}), x_{k+1} = F(x_k, u_k, w_k) + d_k, y_k = h(x_k) + n_k for `steps` steps.
 
@@ -73,7 +108,7 @@ def simulate(
         (nx,) initial state; None: the plant chooses its own initial state.
     reference
         (nr,) held throughout, or (steps+1, nr): row k belongs to x_k. The controller gets rows k … k+horizon, the
-        last one repeated; with ``preview=False`` it gets row k repeated over its horizon. Of (steps+1+horizon, nr) the
+        last one repeated; without a preview it gets row k repeated over its horizon. Of (steps+1+horizon, nr) the
         last rows are seen ahead, in place of that last one, and never reached.
     steps
         Number of steps T. If the plant ends the episode earlier, as a `GymPlant` may, the run ends there with a
@@ -81,37 +116,16 @@ def simulate(
     cost, limits
         What the run is judged by; kept in the Run. Limits in time have rows for all its steps. The controller has
         limits of its own, whose rows move along with the run.
-    u_reference
-        (nu,) or (steps, nu): the inputs that hold the reference. The metrics charge ‖u_k − u_reference_k‖²_R, so
-        staying at the reference costs nothing. By default they are those of the cost's u_target if that is given as
-        numbers, else zero. Only the metrics use them; the controller does not see them.
-    disturbance
-        d_k, (nx,) or (steps, nx), or a function of (k, rng), added to the next state. Needs a simulated plant.
-    noise
-        n_k, (ny,) standard deviations of white noise, (steps+1, ny) values, or a function of (k, rng).
     measured
         w_k, (nw,) or (steps, nw): disturbances that the controller is told as `w`, rows k … k+horizon−1, the last
-        one repeated; with ``preview=False`` it gets row k alone, to hold over its horizon. A plant that has measured
+        one repeated; without a preview it gets row k alone, to hold over its horizon. A plant that has measured
         disturbances of its own needs them, and a controller whose model has none is then not told. Any other plant is
-        not moved by them: pass their effect as `disturbance`, for example ``disturbance=W @ E.T``. The metadata keep
-        them under "measured".
-    faults
-        What breaks, see `km.faults`. A signal passes through them in order, y_k after its noise. Run.Y is what the
-        controller got. Run.U is what the plant got, which the controller is told at the next step. The metadata
-        list the faults under "faults".
-    rng
-        Seed of noise, disturbance and faults. Each fault has its own random generator, so noise and disturbance are
-        the same with and without faults.
+        not moved by them: pass their effect as a disturbance, for example ``LoopOptions(disturbance=W @ E.T)``. The
+        metadata keep them under "measured".
     observers
         Called once a step with a Step.
-    plans
-        Keep the plan of every step.
-    preview
-        Whether the controller gets the references and measured disturbances of the steps ahead.
-    angles
-        Indices of states whose errors wrap at ±π in the metrics.
-    metadata
-        Names, numbers and lists that the Run and its log keep.
+    options
+        Noise, disturbances, faults, plans and what else is seldom asked: see `km.loop.LoopOptions`.
 
     Raises
     ------
@@ -128,47 +142,32 @@ def simulate(
     >>> run.X.shape, run.U.shape, bool(abs(run.X[-1, 0]) < 0.01)
     ((101, 2), (100, 1), True)
     """
-    steps, rng = checks.count(steps, "steps"), checks.generator(rng)
+    checks.refuse_moved(moved, LoopOptions, "simulate(…, options=km.loop.LoopOptions({}))")
+    asked = LoopOptions() if options is None else options
+    checks.kind(asked, "options", LoopOptions, "pass km.loop.LoopOptions(…)")
+    steps, x0 = checks.count(steps, "steps"), None if x0 is None else checks.array(x0, "x0", (None,))
     if limits is not None:  # the cost is checked with the reference
         checks.kind(limits, "limits", Limits, "pass km.Limits(u_min=…, u_max=…), or leave it out")
         require_preview(limits.resolve(plant.states, plant.inputs), steps, "the run")
-    x0 = None if x0 is None else checks.array(x0, "x0", (None,))
     if not hasattr(controller, "reset") and hasattr(plant, "dt") and hasattr(plant, "inputs"):
         controller = as_controller(controller, plant.dt, len(plant.inputs))
-    controller = _require_match(plant, controller, angles)
-    nx, nu, N, model = len(plant.states), controller.nu, controller.horizon, predictor_of(controller)
+    controller = _require_match(plant, controller, asked.angles)
     start = start_for(controller, x0)
     wiring = _Wiring(
         plant=plant,
         controller=controller,
         steps=steps,
-        reference=_tracked_rows(reference, cost, plant, steps, N),
-        u_reference=_reference_inputs(u_reference, cost, steps, nu),
-        measured=None if measured is None else rows_ahead(measured, "measured", "nw", steps, N, "steps"),
-        preview=preview,
-        disturbance=_signal(disturbance, "disturbance", steps, nx),
-        rng=rng,
+        reference=_tracked_rows(reference, cost, plant, steps, controller.horizon),
+        u_reference=_reference_inputs(asked.u_reference, cost, steps, controller.nu),
+        measured=None if measured is None else rows_ahead(measured, "measured", "nw", steps, controller.horizon, "steps"),
+        preview=asked.preview,
+        disturbance=_signal(asked.disturbance, "disturbance", steps, len(plant.states)),
+        rng=checks.generator(asked.rng),
     )
-    y0, state = wiring.start_plant(x0)
-    wiring.noise = None if noise is None else _noise(noise, steps, len(y0))
-    if faults:
-        box = (limits or Limits()).resolve(plant.states, plant.inputs).base.inputs(nu)
-        wiring.faults = Injections(faults, Wiring(len(y0), box), rng)
-    rows = LoopRows(
-        wiring.sense(0, y0),
-        np.full(nx, np.nan) if state is None else state,
-        wiring.reference,
-        wiring.u_reference,
-        sees_state=wiring.sees_state,
-        plans=plans,
-    )
+    rows = wiring.begin(x0, asked, limits)
     controller.reset(start)
-    metadata = {"controller": type(controller).__name__, **(metadata or {})}
-    if wiring.measured is not None:
-        metadata["measured"] = wiring.measured[:steps].tolist()
-    if faults:
-        metadata["faults"] = [str(fault) for fault in faults]
-    if observers or plans or not _run_at_once(wiring, rows):
+    metadata = wiring.describe(asked)
+    if observers or asked.plans or not _run_at_once(wiring, rows):
         ended = _step_through(wiring, rows, observers)
         if ended:
             metadata["ended"] = ended
@@ -183,10 +182,10 @@ def simulate(
         states=tuple(plant.states),
         inputs=tuple(plant.inputs),
         outputs=tuple(plant.outputs),
-        angles=tuple(angles),
+        angles=tuple(asked.angles),
         metadata=metadata,
         scene=getattr(plant, "scene", None),
-        model=model,
+        model=predictor_of(controller),
     )
 
 
@@ -225,6 +224,31 @@ class _Wiring:
         """Whether y_k is x_k."""
         whole = isinstance(self.plant, StepMap) and self.plant.measures_all
         return whole and self.noise is None and self.faults is None
+
+    def begin(self, x0: Float[np.ndarray, " nx"] | None, asked: LoopOptions, limits: Limits | None) -> LoopRows:
+        """Start the plant, the noise and the faults; return the rows of the run, with the first measurement in them."""
+        y0, state = self.start_plant(x0)
+        self.noise = None if asked.noise is None else _noise(asked.noise, self.steps, len(y0))
+        if asked.faults:
+            box = (limits or Limits()).resolve(self.plant.states, self.plant.inputs).base.inputs(self.controller.nu)
+            self.faults = Injections(asked.faults, Wiring(len(y0), box), self.rng)
+        return LoopRows(
+            self.sense(0, y0),
+            np.full(len(self.plant.states), np.nan) if state is None else state,
+            self.reference,
+            self.u_reference,
+            sees_state=self.sees_state,
+            plans=asked.plans,
+        )
+
+    def describe(self, asked: LoopOptions) -> dict[str, Any]:
+        """Return the metadata of the run."""
+        metadata = {"controller": type(self.controller).__name__, **(asked.metadata or {})}
+        if self.measured is not None:
+            metadata["measured"] = self.measured[: self.steps].tolist()
+        if asked.faults:
+            metadata["faults"] = [str(fault) for fault in asked.faults]
+        return metadata
 
     def start_plant(
         self, x0: Float[np.ndarray, " nx"] | None

@@ -7,6 +7,7 @@ from koopmpc.lazy import attach
 if TYPE_CHECKING:
     from koopmpc.recording.model import record_model as record_model
     from koopmpc.recording.reader import run_episodes as run_episodes
+    from koopmpc.recording.recorder import RecorderOptions as RecorderOptions
     from koopmpc.recording.viewer import view as view
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Event, Thread
@@ -85,6 +86,32 @@ _PATIENCE_FILE = 60.0  # longest wait at the end for a file [s]
 _PATIENCE_VIEWER = 5.0  # longest wait at the end for a viewer [s]
 
 
+@dataclass(frozen=True, eq=False)
+class RecorderOptions:
+    """What is seldom asked of a Recorder: `km.Recorder(…, options=km.recording.RecorderOptions(scene=draw))`.
+
+    Attributes
+    ----------
+    outputs
+        Names of what is measured; by default the states.
+    angles
+        Indices of states whose errors wrap at ±π in the metrics.
+    metadata
+        Names, numbers and texts that the log keeps.
+    scene, model
+        What is drawn of each state, and the predictor whose eigenvalues are shown, as in `record`.
+    port
+        Where the viewer listens.
+    """
+
+    outputs: Sequence[str] | None = None
+    angles: Sequence[int] = ()
+    metadata: Mapping[str, Any] | None = None
+    scene: Scene | None = None
+    model: Predictor | None = None
+    port: int = PORT
+
+
 class Recorder:
     """A context manager that writes a log while a loop runs; call it once a step, with a `Step`.
 
@@ -100,14 +127,12 @@ class Recorder:
     ----------
     path
         The .rrd to write; None for a viewer alone.
+    dt, states, inputs, cost, limits
+        As in a Run.
     live
         Write to a viewer too.
-    dt, states, inputs, outputs, cost, limits, angles, metadata
-        As in a Run; outputs are the states by default.
-    scene, model
-        As in `record`.
-    port
-        Where the viewer listens.
+    options
+        Names of outputs, the scene and what else is seldom asked: see `km.recording.RecorderOptions`.
 
     Raises
     ------
@@ -124,33 +149,32 @@ class Recorder:
         dt: float,
         states: Sequence[str],
         inputs: Sequence[str],
-        outputs: Sequence[str] | None = None,
         cost: Cost | None = None,
         limits: Limits | None = None,
-        angles: Sequence[int] = (),
-        metadata: Mapping[str, Any] | None = None,
-        scene: Scene | None = None,
-        model: Predictor | None = None,
         live: bool = False,
-        port: int = PORT,
+        options: RecorderOptions | None = None,
+        **moved: Any,
     ) -> None:
+        checks.refuse_moved(moved, RecorderOptions, "km.Recorder(…, options=km.recording.RecorderOptions({}))")
         checks.kind(live, "live", (bool, np.bool_), "pass True or False")
         if path is None and not live:
             raise DataError("a Recorder needs somewhere to write: pass a path, live=True, or both")
-        if not isinstance(cast(object, metadata), Mapping | None):
-            raise DataError(f"metadata is {checks.article(metadata)}; pass names with numbers and texts")
+        asked = RecorderOptions() if options is None else options
+        checks.kind(asked, "options", RecorderOptions, "pass km.recording.RecorderOptions(…)")
+        if not isinstance(cast(object, asked.metadata), Mapping | None):
+            raise DataError(f"metadata is {checks.article(asked.metadata)}; pass names with numbers and texts")
         self._about = About(
             cost=cost,
             limits=limits,
             dt=checks.positive(dt, "dt", "s"),
             states=checks.texts(states, "states"),
             inputs=checks.texts(inputs, "inputs"),
-            outputs=checks.texts(states if outputs is None else outputs, "outputs"),
-            angles=tuple(angles),
-            metadata=dict(metadata or {}),
+            outputs=checks.texts(states if asked.outputs is None else asked.outputs, "outputs"),
+            angles=tuple(asked.angles),
+            metadata=dict(asked.metadata or {}),
         )
-        self._path, self._live, self._port = None if path is None else path_of(path), live, port
-        self._scene, self._model = scene, model
+        self._path, self._live, self._port = None if path is None else path_of(path), live, asked.port
+        self._scene, self._model = asked.scene, asked.model
         self._writers: dict[str, BackgroundWriter] = {}
         self._open = False
 
