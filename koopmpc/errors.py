@@ -7,6 +7,31 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn
 
+__all__ = [
+    "CertificateError",
+    "ColumnWarning",
+    "DataError",
+    "DefinitenessError",
+    "FitWarning",
+    "FullDiskError",
+    "Hint",
+    "KoopmpcError",
+    "LogError",
+    "NoInputWarning",
+    "ObservableError",
+    "ProblemError",
+    "ShapeError",
+    "SourcesOnlyWarning",
+    "ThreadError",
+    "hide_fit_warnings",
+    "install",
+]
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return __all__
+
 
 def install(extra: str) -> str:
     """Return the command that installs an extra: from the folder of a clone, else by name.

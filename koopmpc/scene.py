@@ -10,6 +10,22 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float, Real
 
+__all__ = [
+    "Box",
+    "Color",
+    "Disk",
+    "Line",
+    "Point",
+    "Scene",
+    "Shape",
+]
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return __all__
+
+
 Point = Sequence[float] | Real[np.ndarray, " d"]
 Color = tuple[int, int, int]
 

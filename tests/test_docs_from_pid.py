@@ -26,7 +26,7 @@ def test_the_way_from_a_pid_leads_to_a_better_loop_without_a_bump(tmp_path):
         names["twin"],
         names["design"].controller,
         x0=[2.56, 4],
-        **names["how"] | {"preview": True},
+        **names["how"] | {"options": km.loop.LoopOptions(noise=[0.05, 0.05])},
         reference=names["steps"],
     )
     assert np.sqrt(np.mean((ahead.X[:, 1] - wanted) ** 2)) < 0.5 * error["PID as it is"]

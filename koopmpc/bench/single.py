@@ -22,6 +22,7 @@ from koopmpc.codegen.compiled import Compiled
 from koopmpc.codegen.compiled import compiled as built
 from koopmpc.control.move import Controller
 from koopmpc.errors import DataError, FullDiskError, LogError, ProblemError
+from koopmpc.loop.controllers import count_disturbances, predictor_of
 from koopmpc.loop.faults import (
     ActuatorDelay,
     ActuatorLoss,
@@ -33,11 +34,12 @@ from koopmpc.loop.faults import (
 )
 from koopmpc.loop.metrics import metrics
 from koopmpc.loop.realtime import in_real_time
-from koopmpc.loop.run import MOVE_COLUMNS, SECONDS, Run, columns_of_moves
-from koopmpc.loop.simulate import StepObserver, count_disturbances, predictor_of, simulate
+from koopmpc.loop.rows import MOVE_COLUMNS, columns_of_moves
+from koopmpc.loop.run import SECONDS, Run
+from koopmpc.loop.simulate import LoopOptions, StepObserver, simulate
 from koopmpc.plants.step_map import StepMap
 from koopmpc.recording.reader import load_run
-from koopmpc.recording.recorder import Recorder
+from koopmpc.recording.recorder import Recorder, RecorderOptions
 from koopmpc.recording.writer import record
 
 _TIME_UNITS = {"milliseconds": "ms", "minutes": "min", "hours": "h", "days": "d"}
@@ -169,9 +171,8 @@ def run_closed_loop(
     monitored = {"monitor": True} if parts.monitor_data is not None else {}
     injected = () if row.fault is None else (FAULTS[row.fault],)
     _warm_up(controller, parts, row.case)
+    judged: dict[str, Any] = {"cost": problem.cost, "limits": problem.limits_of(row.case)}
     about: dict[str, Any] = {
-        "cost": problem.cost,
-        "limits": problem.limits_of(row.case),
         "angles": tuple(problem.angles),
         "metadata": _metadata(parts, row, injected) | in_c | monitored,
     }
@@ -188,21 +189,20 @@ def run_closed_loop(
             x0=row.x0,
             reference=case.reference,
             steps=case.steps,
-            u_reference=held,
-            noise=noise,
+            options=LoopOptions(
+                u_reference=held, noise=noise, faults=(*case.faults, *injected), rng=row.start, plans=plans, **about
+            ),
             measured=problem.measured_of(row.case),
-            faults=(*case.faults, *injected),
-            rng=row.start,
             observers=(*observers, *pace),
-            plans=plans,
-            **about,
+            **judged,
         )
         return replace(run, scene=scene)
 
     if not live:
         return simulate_with()
-    names: dict[str, Any] = {"dt": plant.dt, "states": plant.states, "inputs": plant.inputs, "outputs": plant.outputs}
-    with Recorder(live=True, **names, **about, scene=scene, model=predictor_of(controller)) as viewer:
+    names: dict[str, Any] = {"dt": plant.dt, "states": plant.states, "inputs": plant.inputs}
+    options = RecorderOptions(outputs=plant.outputs, scene=scene, model=predictor_of(controller), **about)
+    with Recorder(live=True, **names, **judged, options=options) as viewer:
         return simulate_with(viewer)
 
 

@@ -14,8 +14,6 @@ from jaxtyping import Float, UInt8
 from koopmpc import disk
 from koopmpc.errors import DataError, LogError, install
 
-_MARGIN = 0.06  # margin around the drawing, as a share of its size
-_GIF_COLORS = 48  # number of colours of a .gif
 _VIEW = np.deg2rad((-65.0, 25.0))  # direction to the eye [rad]: azimuth from the x-axis, elevation above the horizon
 
 
@@ -53,7 +51,7 @@ def draw_frames(
     from matplotlib.figure import Figure
 
     size = np.maximum(high - low, 1e-9)
-    pad = _MARGIN * size.max()
+    pad = 0.06 * size.max()  # margin around the drawing, as a share of its size
     box = size + 2 * pad
     caption = max(18, width // 22)
     height = int(np.clip(width * box[1] / box[0], 0.3 * width, 1.5 * width)) + caption
@@ -131,7 +129,7 @@ def _save_gif(pictures: Iterator[UInt8[np.ndarray, "height width 3"]], path: str
 
     images = [Image.fromarray(picture) for picture in pictures]
     sample = Image.fromarray(np.concatenate([np.asarray(image) for image in images[:: max(1, len(images) // 8)]]))
-    palette = sample.quantize(_GIF_COLORS, dither=Image.Dither.NONE)
+    palette = sample.quantize(48, dither=Image.Dither.NONE)  # number of colours of a .gif
     flat = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     with disk.writing(path) as file:
         flat[0].save(

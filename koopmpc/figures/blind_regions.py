@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _BLIND = "#d55e00"
-_MOST_POINTS = 3000  # rows of the data that are drawn
 
 
 def blindness(design: Design, axes: tuple[int | str, int | str] | None = None, record: int = 6) -> "Figure":
@@ -74,7 +73,7 @@ def draw_blindness(
     drawing, grid = make_figure(1, width="one column", height=3.6)
     panel = grid[0, 0]
     rows = neighbours.points
-    points = rows[:: max(1, len(rows) // _MOST_POINTS)]
+    points = rows[:: max(1, len(rows) // 3000)]  # rows of the data that are drawn
     panel.plot(*points[:, [i, j]].T, ".", color="#9a9a9a", markersize=1.2, label="data")
     panel.plot(*X[away][:, [i, j]].T, "x", color=_BLIND, markersize=2.6, alpha=0.6, label="range without data")
     low, high = (end[[i, j]] for end in goal_box(asked))

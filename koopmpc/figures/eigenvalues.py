@@ -22,9 +22,6 @@ from koopmpc.values import Value
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_LEAST_RESIDUAL = 1e-12  # smaller residuals are rounding, and are drawn with this value
-_MOST_RESIDUAL = 1e3  # larger residuals are drawn with this value
-_CROWDED = 0.35  # draw a second, closer panel if the eigenvalues fill less than this share of the first
 _BLOCK_ROWS = 4096  # states that are lifted in one block
 _CUT = 0.8 * np.pi  # [rad] lines of equal phase end here, because the phase jumps at ±π
 _EDGE = 0.08  # keep labels away from each side by this share of the width, so that they are not cut
@@ -64,7 +61,8 @@ def spectrum(predictor: AnyPredictor, residuals: ResidualDMD | ArrayLike | None 
     whole = 1.12 * max(1.0, float(np.abs(values).max(initial=0.0)))
     views = [(0.0, 0.0, whole)]
     middle, half = _find_square(values)
-    if half < _CROWDED * whole:
+    # draw a second, closer panel if the eigenvalues fill less than this share of the first
+    if half < 0.35 * whole:
         views.append((middle.real, middle.imag, 1.4 * half + 1e-3))
     drawing, grid = make_figure(1, len(views), width="one column" if len(views) == 1 else "two columns", height=3.1)
     turn = np.linspace(0, 2 * np.pi, 721)
@@ -101,7 +99,8 @@ def _draw_residuals(axes: Any, values: Any, checked: ResidualDMD) -> Any:
     import matplotlib as mpl
     from matplotlib.colors import ListedColormap, LogNorm
 
-    shown = np.clip(checked.residuals, _LEAST_RESIDUAL, _MOST_RESIDUAL)
+    # smaller residuals are rounding, and are drawn with this value
+    shown = np.clip(checked.residuals, 1e-12, 1e3)  # larger residuals are drawn with this value
     low, high = min(float(shown.min()), checked.tolerance / 10), max(float(shown.max()), checked.tolerance * 10)
     norm = LogNorm(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
     sizes = 12.0 + 40.0 * (1.0 - np.asarray(norm(shown)))

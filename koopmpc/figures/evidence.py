@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 _HEIGHT = 2.2  # height of a figure [in]
 _ROOM = 0.6  # the axis shows a value up to this share of the sound values' span outside of them
-_LOGS = 40  # starts of logs are drawn up to this number
 _OUT: dict[str, Any] = {"color": "#8c1d18", "alpha": 0.22, "linewidth": 0.0}
 _DOUBT: dict[str, Any] = {"color": "#c28e00", "alpha": 0.22, "linewidth": 0.0}
 
@@ -69,7 +68,8 @@ def draw_log(excerpt: LogExcerpt, column: int) -> "Figure":
             low, high = min(low, cells[inside, 2].min()), max(high, cells[inside, 2].max())
             panel.plot(cells[inside, 0], cells[inside, 2], "x", color="#8c1d18", markersize=5, label="replaced")
         panel.plot(cells[:, 0], cells[:, 3], "o", color="#000000", markersize=2.5, label="now")
-    if 1 < len(excerpt.starts) <= _LOGS:
+    # starts of logs are drawn up to this number
+    if 1 < len(excerpt.starts) <= 40:
         for start in excerpt.starts[1:]:
             panel.axvline(start, color="#999999", linewidth=0.5)
     panel.set(xlabel="time, one log after another [s]", xlim=(t[0], t[-1]), ylim=(low, high))

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _GRID = 301  # points along each axis
-_MOST_POINTS = 4000  # states of the data that are drawn
-_BEYOND = 0.15  # the axes show this share of the box beyond it
 
 
 @styled
@@ -61,7 +59,7 @@ def certificate(
     drawing, grid = make_figure(1, width="one column", height=3.4)
     panel = grid[0, 0]
     low, high = certified.low, certified.high
-    pad = _BEYOND * (high - low)
+    pad = 0.15 * (high - low)  # the axes show this share of the box beyond it
     x, y = (np.linspace(low[k] - pad[k], high[k] + pad[k], _GRID) for k in (i, j))
     X = np.tile(certified.deviation.x, (_GRID * _GRID, 1))
     X[:, i], X[:, j] = np.repeat(x, _GRID), np.tile(y, _GRID)
@@ -85,7 +83,7 @@ def certificate(
     panel.plot(*(low[[i, j]] + corners * (high - low)[[i, j]]).T, **LIMIT, label="box of the bound")
     if data is not None:
         points = np.vstack([episode.X[:-1] for episode in data.episodes])[:, [i, j]]
-        every = max(1, len(points) // _MOST_POINTS)
+        every = max(1, len(points) // 4000)  # states of the data that are drawn
         panel.plot(*points[::every].T, ".", color="#9a9a9a", markersize=1.2, zorder=0, label="data")
     for k, run in enumerate(runs):
         panel.plot(run.X[:, i], run.X[:, j], **TRUTH, label="closed loops" if k == 0 else None)

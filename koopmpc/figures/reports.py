@@ -17,7 +17,6 @@ from koopmpc.loop.run import Run
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_ROW_HEIGHT = 2.1  # height of a row of panels [in]
 _MOST_RATIO = 10.0  # a performance profile ends at this ratio of costs
 _ROW_PANELS = 3  # number of regions of attraction in a row
 
@@ -69,8 +68,9 @@ def draw_panels(panels: Sequence[CurvePanel], columns: int = 2) -> "Figure":
         raise DataError("there is no panel to draw; pass at least one")
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
+    # height of a row of panels [in]
     drawing, grid = make_figure(
-        rows, columns, width="two columns" if columns > 1 else "one column", height=0.5 + _ROW_HEIGHT * rows
+        rows, columns, width="two columns" if columns > 1 else "one column", height=0.5 + 2.1 * rows
     )
     names = list(dict.fromkeys(name for panel in panels for name in panel.curves))
     for axes, panel in zip(grid.flat, panels, strict=False):

@@ -37,12 +37,9 @@ if TYPE_CHECKING:
 
 _STATE_HEIGHT = 1.05  # height of the panel of a state [in]
 _INPUT_HEIGHT = 0.75  # height of the panel of an input [in]
-_BEYOND_TRUTH = 1.0  # the axis shows a prediction up to this many spans of the truth outside the truth
-_BEYOND_BEST = 3.5  # the axis shows errors of other models up to this many spans of the best model's errors outside
 _BEYOND_MEDIAN = 0.5  # the axis shows a curve up to this many spans outside the truth or the median run
 _LEAST_ERROR = 1e-13  # smaller relative errors are rounding, and are drawn with this value
 _MOST_ERROR = 1e3  # the axis of the relative error ends here
-_MOST_TICKS = 5  # largest number of ticks of the relative error
 _WIDE_TRUTH: dict[str, Any] = TRUTH | {"linewidth": 2.4}  # visible on both sides of a curve that covers it
 
 
@@ -85,7 +82,8 @@ def rollout(
             draw_band(panel, t, *_mask_infinite(ahead.low[:, i], ahead.high[:, i]), 0, ahead.band)
         panel.plot(t, ahead.truth[:, i], **TRUTH, label="truth")
         panel.plot(t, ahead.predicted[:, i], **line_style(0, len(t)), label="prediction")
-        ylim = follow_truth(ahead.truth[:, i], [ahead.predicted[:, i]], _BEYOND_TRUTH)
+        # the axis shows a prediction up to this many spans of the truth outside the truth
+        ylim = follow_truth(ahead.truth[:, i], [ahead.predicted[:, i]], 1.0)
         panel.set_ylim(ylim)
         panel.set_ylabel(**fit_label(ahead.states[i], _STATE_HEIGHT))
     for panel, name, u in zip(axes[len(chosen) :], ahead.inputs, ahead.U.T, strict=True):
@@ -256,7 +254,8 @@ def _choose_error_axis(extents: list[tuple[float, float]]) -> tuple[float, float
     lowest, highest = min(low for low, _ in extents), max(high for _, high in extents)
     if low == high:  # a model without errors sets no scale
         return limit_axis(lowest, highest, lowest, highest, 0.0)
-    return limit_axis(low, high, lowest, highest, _BEYOND_BEST)
+    # the axis shows errors of other models up to this many spans of the best model's errors outside
+    return limit_axis(low, high, lowest, highest, 3.5)
 
 
 @styled
@@ -389,7 +388,7 @@ def _draw_relative_errors(
     highest = max(float(relative.max()) for relative in errors)
     low, high = (float(np.log10(np.clip(v, _LEAST_ERROR, _MOST_ERROR))) for v in (usual, highest))
     panel.set_ylim(10.0 ** np.floor(low), 10.0 ** max(np.ceil(high), np.floor(low) + 2))
-    panel.yaxis.set_major_locator(LogLocator(numticks=_MOST_TICKS))
+    panel.yaxis.set_major_locator(LogLocator(numticks=5))  # largest number of ticks of the relative error
     panel.yaxis.set_minor_locator(NullLocator())
 
 

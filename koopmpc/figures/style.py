@@ -34,8 +34,6 @@ CYCLIC = "twilight"  # colour map for phases; it ends with its first colour
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#7b3294", "#c28e00", "#5a5a5a")  # distinct for colour-blind readers
 _DASHES = ((0, (5, 1.5)), "-", (0, (1, 1)), "-.", (0, (3, 1, 1, 1, 1, 1)), (0, (8, 2)))
 _MARKERS = ("o", "s", "^", "D", "v", "x")
-_LETTERS = 17.0  # letters of 8 pt in an inch
-_WIDE = 2  # letters by which the lines of a broken name are shorter, since letters may be wide
 _LINES = 4  # lines of a label that keep its size
 _MOST_STATES = 12  # largest number of states in one figure
 _SUFFIXES = (".png", ".pdf", ".svg")
@@ -143,11 +141,12 @@ def fit_label(name: str, height: float, size: float = 8.0) -> dict[str, Any]:
     Long names are broken at blanks and underscores, the unit first; what is still too long gets a smaller font. A $ is
     a letter of the name, and begins no formula.
     """
-    room = max(int(height * _LETTERS * 8.0 / size), 6)
+    room = max(int(height * 17.0 * 8.0 / size), 6)  # letters of 8 pt in an inch
     short, bracket, unit = name.partition(" [")
     lines = [name]
     if len(name) > room:
-        words = textwrap.wrap(short.replace("_", "_ "), max(room - _WIDE, 6), break_long_words=False)
+        # letters by which the lines of a broken name are shorter, since letters may be wide
+        words = textwrap.wrap(short.replace("_", "_ "), max(room - 2, 6), break_long_words=False)
         lines = [line.replace("_ ", "_") for line in words] or [short]
         lines += [f"[{unit}"] * bool(bracket)
     longest = max(map(len, lines))

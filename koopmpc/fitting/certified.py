@@ -8,7 +8,7 @@ from jaxtyping import Float
 from koopmpc import disk
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import KoopmpcError
-from koopmpc.guarantees.certify import certify
+from koopmpc.guarantees.certify import CertifyOptions, certify
 from koopmpc.lifting.state import State
 from koopmpc.synthesis.designed import Design
 from koopmpc.synthesis.search.recipe import get_model
@@ -34,7 +34,7 @@ def describe_certificate(
             limits,
             x=np.asarray(rest.x)[: model.nx],
             u=np.asarray(rest.u),
-            estimated=True,
+            options=CertifyOptions(estimated=True),
         )
     except KoopmpcError as error:
         return f"{str(error)[0].upper()}{str(error)[1:]}."

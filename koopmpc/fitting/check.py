@@ -20,7 +20,7 @@ from koopmpc.fitting.report import OFF, write_design_report
 from koopmpc.fitting.verdict import PlantVerdict, RateVerdict, judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.loop.faults import ActuatorLoss, DroppedSamples, Fault, FrozenSensor, NaNSensor, SensorDelay, SolverFailure
 from koopmpc.loop.metrics import total_cost, tracking_error, violation_shares
-from koopmpc.loop.run import Step
+from koopmpc.loop.rows import Step
 from koopmpc.page import HtmlPage
 from koopmpc.parallel import StageProgress
 from koopmpc.plants.step_map import StepMap

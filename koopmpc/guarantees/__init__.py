@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from koopmpc.guarantees.certificate import Certificate as Certificate
     from koopmpc.guarantees.certificate import CertifiedFeedback as CertifiedFeedback
     from koopmpc.guarantees.certificate import load_certificate as load_certificate
+    from koopmpc.guarantees.certify import CertifyOptions as CertifyOptions
     from koopmpc.guarantees.certify import certify as certify
     from koopmpc.guarantees.invariant_set import InvariantPolytope as InvariantPolytope
     from koopmpc.guarantees.invariant_set import find_invariant_set as find_invariant_set

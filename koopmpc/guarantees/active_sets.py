@@ -23,11 +23,8 @@ from koopmpc.errors import CertificateError
 
 THIN = 1e-7  # a part of the box of ±1 without a ball of this radius is left out: rounding decides there
 _SAMPLES = 2000  # points of the box that show at once which ways are taken
-_DEPENDENT = 1e-6  # least eigenvalue of G below which DAQP refines its factors
-_SINGULAR = 1e-10  # least eigenvalue of G of dependent rows
 _STILL = 1e-12  # entry of a direction below which a multiplier does not move
 _LONGEST = 1000  # iterations of one way
-_HARD = 1e20  # a linear price from here is that of a hard row
 
 AffineRows = Float[np.ndarray, "k p1"]  # rows of [θ; 1]
 AffineRow = Float[np.ndarray, " p1"]
@@ -119,7 +116,7 @@ class _Search:
         self.problem = problem
         m, p1 = problem.low.shape
         self.gram = problem.A @ problem.A.T
-        self.soft = problem.linear < _HARD
+        self.soft = problem.linear < 1e20  # a linear price from here is that of a hard row
         self.sides = np.repeat([1.0, -1.0], m)
         self.limits = np.concatenate([problem.high, problem.low])
         self.one = np.eye(p1)[-1]
@@ -130,8 +127,9 @@ class _Search:
             return self.add(node, node.part, node.multipliers)
         G = self.curvature(node.W, node.side, node.free)
         values, vectors = np.linalg.eigh(G)
-        singular = bool(values[0] < _SINGULAR)
-        if not singular and values[0] < _DEPENDENT:
+        singular = bool(values[0] < 1e-10)  # least eigenvalue of G of dependent rows
+        # least eigenvalue of G below which DAQP refines its factors
+        if not singular and values[0] < 1e-6:
             raise CertificateError(
                 "active rows are so near to dependent that rounding decides how many iterations a step takes; use "
                 "km.guarantees.observe_iterations, or blocked moves"

@@ -28,10 +28,7 @@ from koopmpc.guarantees.statement import Refused, explain_refusal
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 _SCALES = (1.0, 0.7, 0.5, 0.35, 0.25, 0.12, 0.06)  # shares of the box that are tried
-_WORSE = 2  # stop after this many smaller boxes in sequence gave smaller regions
-_MOST = 16  # with more observables than this only the states are tried
 _LEAST_PAIRS = 30  # a box with fewer pairs is not tried
-_PROBES = 4000  # states at which the slope of the lifting is measured for noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +137,8 @@ def certify(
     if asked.estimated:
         deviation = deviate(model, x, _estimate_input(deviation))
     whole, few = _Search(deviation, data, limits, asked), None
-    provable = len(deviation.kept) <= _MOST and is_stabilisable(deviation, asked.decay or DECAY)
+    # with more observables than this only the states are tried
+    provable = len(deviation.kept) <= 16 and is_stabilisable(deviation, asked.decay or DECAY)
     best = whole.run() if provable else None
     if not asked.constants and len(deviation.kept) > model.nx:
         few = _Search(reduce_to_states(deviation), data, limits, asked)
@@ -292,7 +290,8 @@ class _Search:
         best: Found | None = None
         worse = 0
         for scale in _SCALES:
-            bound = self.find_bound(scale) if worse < _WORSE else None
+            # stop after this many smaller boxes in sequence gave smaller regions
+            bound = self.find_bound(scale) if worse < 2 else None
             found = None if bound is None else self.prove(bound, scale)
             if found is not None and (best is None or found.size > best.size):
                 best, worse = found, 0
@@ -346,6 +345,6 @@ def _noise_in_lifting(
     rng: np.random.Generator,
 ) -> Float[np.ndarray, " n"]:
     """Return the largest |ψ(x + n) − ψ(x)| of each observable that was seen for |n| ≤ noise in the box."""
-    X = rng.uniform(low, high, (_PROBES, len(low)))
+    X = rng.uniform(low, high, (4000, len(low)))  # states at which the slope of the lifting is measured for noise
     moved = X + noise * rng.choice([-1.0, 1.0], X.shape)
     return 1.1 * np.abs(model.lift(moved) - model.lift(X)).max(axis=0)

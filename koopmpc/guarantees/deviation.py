@@ -15,7 +15,6 @@ from koopmpc.lifting.state import State
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.values import Value
 
-_UNREACHED = 1e-9  # a mode with a smaller singular value, as a share of A, is out of reach of the inputs
 _EXACT = 1e-8  # x has to be C ψ(x) up to this share of its size
 
 
@@ -152,7 +151,8 @@ def find_stray_mode(model: DeviationModel, decay: float) -> str:
         if abs(values[i]) ** 2 < decay:
             break
         least = np.linalg.svd(np.hstack([A - values[i] * np.eye(len(A)), reach]), compute_uv=False)[-1]
-        if least < _UNREACHED * size:
+        # a mode with a smaller singular value, as a share of A, is out of reach of the inputs
+        if least < 1e-9 * size:
             name = model.lifting.names[int(model.kept[int(np.argmax(np.abs(modes[:, i])))])]
             return f"|λ| = {abs(values[i]):.4g}, largest in {name}"
     return ""

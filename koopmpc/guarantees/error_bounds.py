@@ -12,10 +12,7 @@ from koopmpc.validate.binomial import bound_failure_rate
 from koopmpc.values import Value
 
 _LEAST = 1e-9  # constants below are rounding of exact data and count as this
-_THIN = 1e-6  # the shape of the error has eigenvalues of at least this share of the largest
-_FEW = 10  # fewer calibration episodes bound nothing
 _CELLS = 10_000  # of the grid of a covering
-_WORTH = 3.0  # weight of the constant part of a covering, which sets the ball, beside those of the others
 _NEAR = 16  # nearest pairs that bound the error on a cell; any pair is a bound
 
 
@@ -122,7 +119,8 @@ def shape_of(pairs: ErrorPairs, phi_size: Float[np.ndarray, " n"]) -> Float[np.n
     largest = float(np.linalg.eigvalsh(moment)[-1]) if len(r) else 0.0
     if not largest > 0:
         return np.diag(phi_size**2)
-    S = moment / largest + _THIN * np.eye(len(phi_size))
+    # the shape of the error has eigenvalues of at least this share of the largest
+    S = moment / largest + 1e-6 * np.eye(len(phi_size))
     return S * np.outer(phi_size, phi_size)
 
 
@@ -147,7 +145,8 @@ def bound_by_scenario(
     the `sizing` pairs, which have to be of other episodes.
     """
     episodes = len(np.unique(pairs.episode))
-    if episodes < _FEW:
+    # fewer calibration episodes bound nothing
+    if episodes < 10:
         return None
     bound = ErrorBound("scenario", 0.0, 0.0, 0.0, shape, phi_size, v_size)
     size, phi, v = bound.norms(sizing)
@@ -260,7 +259,8 @@ def bound_by_covering(
     away = middle - center / size
     least = np.stack([np.linalg.norm(away[:, :nx], axis=1), np.linalg.norm(away[:, nx:], axis=1)], axis=1) - reach
     rows = np.hstack([np.maximum(least, 0.0), np.ones((len(middle), 1))])
-    worth = rows.mean(axis=0) * [1.0, 1.0, _WORTH]
+    # weight of the constant part of a covering, which sets the ball, beside those of the others
+    worth = rows.mean(axis=0) * [1.0, 1.0, 3.0]
     found = linprog(worth, A_ub=-rows, b_ub=-most, bounds=(0, None), method="highs")
     if found.status != 0:
         return None

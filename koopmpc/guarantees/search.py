@@ -16,13 +16,8 @@ from koopmpc.guarantees.semidefinite import FeedbackProof, FeedbackTask, solve_f
 from koopmpc.lifting.base import find_observables
 
 ROUNDING = 1e-10  # products v ⊗ φ with smaller entries than this share of A are rounding: the model is linear
-_SHRINK = 0.03  # factor of the first ellipsoid from try to try
-_TRIES = 2  # ellipsoids tried before a program counts as infeasible
 _GROWTH = (2.0, 1.3, 1.1)  # factors by which the next ellipsoid may exceed the last region
-_ROUNDS = 5  # times that the ellipsoid follows the region
-_GAIN = 0.05  # stop where log det grows by less
 DECAY = 1 - 1e-4  # V falls by this factor a step at least, where the error vanishes at the set point
-_BEYOND = 0.05  # share of the sampled width by which a region may be wider; it is cut there
 _FASTER = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.25)  # 1 − ρ tried where it does not
 
 
@@ -121,7 +116,8 @@ def _stay_inside(
     (low, high), (first, last) = region, sampled
     beyond = np.maximum(first - low, high - last) / np.maximum(last - first, 1e-300)
     i = int(np.argmax(beyond))
-    if beyond[i] > _BEYOND:
+    # share of the sampled width by which a region may be wider; it is cut there
+    if beyond[i] > 0.05:
         raise DataError(
             f"the region has {names[i]} = {low[i]:g} … {high[i]:g}, and the data have {first[i]:g} … {last[i]:g}; a"
             " bound of the error from data holds where they are: pass a region inside, or collect data in it"
@@ -174,21 +170,24 @@ def make_task(model: DeviationModel, bound: ErrorBound, room: Room, decay: float
 def grow(task: FeedbackTask, *, linear: bool = False) -> FeedbackProof | None:
     """Return the proof with the largest region that is found by letting the ellipsoid E follow the region."""
     best = solve_feedback(task, linear=linear)
-    for _ in range(_TRIES):
+    # ellipsoids tried before a program counts as infeasible
+    for _ in range(2):
         if best is not None:
             break
-        task = replace(task, E=_SHRINK * task.E)
+        task = replace(task, E=0.03 * task.E)  # factor of the first ellipsoid from try to try
         best = solve_feedback(task, linear=linear)
     if best is None or task.N is None:
         return best
-    for _ in range(_ROUNDS):
+    # times that the ellipsoid follows the region
+    for _ in range(5):
         before = best.size
         for factor in _GROWTH:
             tried = solve_feedback(replace(task, E=factor * best.P), linear=linear)
             if tried is not None and tried.size > best.size:
                 best = tried
                 break
-        if best.size < before + _GAIN:
+        # stop where log det grows by less
+        if best.size < before + 0.05:
             break
     return best
 

@@ -97,97 +97,104 @@ def solve_feedback(task: FeedbackTask, *, linear: bool = False) -> FeedbackProof
     linear
         Keep K_w = 0, so that v = K φ.
     """
-    model: Any = import_module("cvxpy")  # slow
-    # inside, φ = T φ̂ with E = T Tᵀ and v = g v̂ with inputs of unit effect: the ellipsoid is the unit ball
-    T = _root(task.E)
-    back = np.linalg.inv(T)
-    g = 1 / np.maximum(np.linalg.norm(back @ task.B, axis=0), 1e-9)
-    A, B, S = back @ task.A @ T, back @ task.B * g, back @ task.S @ back.T
-    N = None if task.N is None else back @ task.N @ np.kron(np.diag(g), T)
-    n, m = B.shape
-    P: Any = model.Variable((n, n), symmetric=True)
-    L: Any = model.Variable((m, n))
-    tau_x, tau_u = model.Variable(nonneg=True), model.Variable(nonneg=True)
-    lam: Any = model.Variable((m, m), symmetric=True) if N is not None else model.Constant(np.eye(m))
-    products = 0 if N is None else m * n
-    eye_n, eye_m = np.eye(n), np.eye(m)
+    program = _Program(task, linear)
+    return check_feedback(task, *program.solution()) if program.solve() else None
 
-    def zeros(*shape: int) -> Any:
-        return np.zeros(shape)
 
-    moved, fed = [A @ P + B @ L], [L]  # φ⁺ and v as rows on the scaled [φ; w]
-    diagonal = [task.decay * P]
-    if N is not None:
-        L_w: Any = zeros(m, products) if linear else model.Variable((m, products))
-        moved.append(N @ model.kron(lam, eye_n) + B @ L_w)
-        fed.append(L_w)
-        diagonal.append(model.kron(lam, eye_n))
-    else:
-        L_w = zeros(m, 0)
-    first = sum(n if i == 0 else products for i in range(len(diagonal)))
-    top = (
-        diagonal[0] if N is None else model.bmat([[diagonal[0], zeros(n, products)], [zeros(products, n), diagonal[1]]])
-    )
-    v, next_state = model.hstack(fed), model.hstack(moved)
-    held = model.hstack([P, zeros(n, first - n)]) if first > n else P
-    c = max(task.c_x, task.c_u)
-    unit = np.sqrt(c) if c > 0 else 1.0  # τ = c θ, and rows divided by √c: all entries are then of one size
-    below = [next_state, np.diag(task.c_u / unit * g) @ v, task.c_x / unit * T @ held]
-    corner = [P - c * (tau_x + tau_u) * S, tau_u * eye_m, tau_x * eye_n]
-    if N is not None:
-        below.append(v)
-        corner.append(lam)
-    exact = task.c_x == 0 and task.c_u == 0
-    keep = [0, *([] if exact else [1, 2]), *([3] if N is not None else [])]
-    below, corner = [below[i] for i in keep], [corner[i] for i in keep]
-    if exact:
-        corner[0] = P
-    sizes = [part.shape[0] for part in corner]
-    rows = [[top, *(part.T for part in below)]]
-    for i, part in enumerate(below):
-        rows.append([part, *(corner[i] if i == j else zeros(sizes[i], sizes[j]) for j in range(len(below)))])
-    F = model.bmat(rows)
-    constraints = [
-        (F + F.T) / 2 >> _STRICT * np.eye(first + sum(sizes)),
-        P >> _STRICT * eye_n,
-    ]
-    if N is not None:
-        constraints += [eye_n - P >> 0, lam >> _STRICT * eye_m]
-    for row in task.rows @ T:
-        constraints.append(row @ P @ row <= 1)
-    for i in np.flatnonzero(np.isfinite(task.inputs)):
-        width = np.array([[(task.inputs[i] / g[i]) ** 2]])
-        if N is None:
-            G = model.bmat([[P, L[[i]].T], [L[[i]], width]])
-        else:
-            G = model.bmat(
-                [
-                    [top, v[[i]].T, v.T],
-                    [v[[i]], width, zeros(1, m)],
-                    [v, zeros(m, 1), lam],
-                ]
-            )
-        constraints.append((G + G.T) / 2 >> 0)
-    C = task.volume @ T
-    problem: Any = model.Problem(model.Maximize(model.log_det(C @ P @ C.T)), constraints)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # an inaccurate solution is checked below, as every other one
-        try:
-            call_uninterrupted(lambda: problem.solve(solver=model.CLARABEL))
-        except (model.error.SolverError, ValueError, ArithmeticError):
-            return None
-    if problem.status not in _SOLVED or P.value is None:
-        return None
-    found, Lambda = _symmetric(P.value), _symmetric(lam.value)
-    if min(np.linalg.eigvalsh(found)[0], np.linalg.eigvalsh(Lambda)[0]) <= 0:
-        return None
-    K = g[:, None] * (L.value @ np.linalg.inv(found)) @ back
-    K_w = np.zeros((m, n * m))
-    if N is not None and not isinstance(L_w, np.ndarray):
-        K_w = g[:, None] * (L_w.value @ np.kron(np.linalg.inv(Lambda), eye_n)) @ np.kron(np.diag(1 / g), back)
-    found, Lambda = _symmetric(T @ found @ T.T), g[:, None] * Lambda * g
-    taus = (0.0, 0.0) if exact else (c * float(tau_x.value), c * float(tau_u.value))
-    return check_feedback(task, found, K, K_w, Lambda, *taus)
+class _Program:
+    """The program in coordinates φ = T φ̂ with E = T Tᵀ and v = g v̂ with inputs of unit effect.
+
+    The ellipsoid E is the unit ball there. `v` and `next` are v̂ and φ̂⁺ as rows on [φ̂; ŵ], scaled by `top`.
+    """
+
+    def __init__(self, task: FeedbackTask, linear: bool) -> None:
+        model: Any = import_module("cvxpy")  # slow
+        self.task, self.model = task, model
+        self.T = _root(task.E)
+        self.back = np.linalg.inv(self.T)
+        self.g = 1 / np.maximum(np.linalg.norm(self.back @ task.B, axis=0), 1e-9)
+        A, B = self.back @ task.A @ self.T, self.back @ task.B * self.g
+        (n, m), self.exact = B.shape, task.c_x == 0 and task.c_u == 0
+        self.P: Any = model.Variable((n, n), symmetric=True)
+        self.L: Any = model.Variable((m, n))
+        self.tau_x, self.tau_u = model.Variable(nonneg=True), model.Variable(nonneg=True)
+        c = max(task.c_x, task.c_u)
+        self.c, self.unit = c, np.sqrt(c) if c > 0 else 1.0  # τ = c θ, rows over √c: all entries are of one size
+        self.next, self.v, self.held = A @ self.P + B @ self.L, self.L, self.P
+        self.top: Any = task.decay * self.P
+        self.lam: Any = None
+        self.L_w: Any = None
+        if task.N is not None:
+            N, nothing = self.back @ task.N @ np.kron(np.diag(self.g), self.T), np.zeros((n, m * n))
+            self.lam = model.Variable((m, m), symmetric=True)
+            self.L_w = np.zeros((m, m * n)) if linear else model.Variable((m, m * n))
+            products = model.kron(self.lam, np.eye(n))
+            self.next = model.hstack([self.next, N @ products + B @ self.L_w])
+            self.v, self.held = model.hstack([self.L, self.L_w]), model.hstack([self.P, nothing])
+            self.top = model.bmat([[self.top, nothing], [nothing.T, products]])
+
+    def _arrow(self, top: Any, rows: list[tuple[Any, Any]]) -> Any:
+        """Return the symmetric matrix of a block, of rows below it, and of the block on the diagonal of each row."""
+        sizes = [part.shape[0] for part, _ in rows]
+        blocks = [[top, *(part.T for part, _ in rows)]]
+        for i, (part, corner) in enumerate(rows):
+            blocks.append([part, *(corner if i == j else np.zeros((sizes[i], sizes[j])) for j in range(len(rows)))])
+        F = self.model.bmat(blocks)
+        return (F + F.T) / 2
+
+    def decrease(self) -> Any:
+        """Return the matrix that is positive where V falls by the factor ρ."""
+        task, (n, m) = self.task, self.task.B.shape
+        S = self.back @ task.S @ self.back.T
+        rows = [(self.next, self.P if self.exact else self.P - self.c * (self.tau_x + self.tau_u) * S)]
+        if not self.exact:
+            rows.append((np.diag(task.c_u / self.unit * self.g) @ self.v, self.tau_u * np.eye(m)))
+            rows.append((task.c_x / self.unit * self.T @ self.held, self.tau_x * np.eye(n)))
+        if self.lam is not None:
+            rows.append((self.v, self.lam))
+        return self._arrow(self.top, rows)
+
+    def constraints(self) -> list[Any]:
+        """Return the decrease of V, the ellipsoid inside E, and the limits of states and inputs."""
+        task, P, lam = self.task, self.P, self.lam
+        F, (n, m) = self.decrease(), task.B.shape
+        found = [F >> _STRICT * np.eye(F.shape[0]), P >> _STRICT * np.eye(n)]
+        if lam is not None:
+            found += [np.eye(n) - P >> 0, lam >> _STRICT * np.eye(m)]
+        found += [row @ P @ row <= 1 for row in task.rows @ self.T]
+        for i in np.flatnonzero(np.isfinite(task.inputs)):
+            width = np.array([[(task.inputs[i] / self.g[i]) ** 2]])
+            rows = [(self.v[[i]], width)] if lam is None else [(self.v[[i]], width), (self.v, lam)]
+            found.append(self._arrow(P if lam is None else self.top, rows) >> 0)
+        return found
+
+    def solve(self) -> bool:
+        """Return whether the solver gave an answer with P ≻ 0 and Λ ≻ 0."""
+        model, C = self.model, self.task.volume @ self.T
+        problem: Any = model.Problem(model.Maximize(model.log_det(C @ self.P @ C.T)), self.constraints())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an inaccurate solution is checked as every other one
+            try:
+                call_uninterrupted(lambda: problem.solve(solver=model.CLARABEL))
+            except (model.error.SolverError, ValueError, ArithmeticError):
+                return False
+        if problem.status not in _SOLVED or self.P.value is None:
+            return False
+        values = [self.P.value] if self.lam is None else [self.P.value, self.lam.value]
+        return all(np.linalg.eigvalsh(_symmetric(value))[0] > 0 for value in values)
+
+    def solution(self) -> tuple[Any, Any, Any, Any, float, float]:
+        """Return P, K, K_w, Λ, τ_x and τ_u in the coordinates of the task."""
+        g, T, back, (n, m) = self.g, self.T, self.back, self.task.B.shape
+        P = _symmetric(self.P.value)
+        Lambda = np.eye(m) if self.lam is None else _symmetric(self.lam.value)
+        K = g[:, None] * (self.L.value @ np.linalg.inv(P)) @ back
+        K_w = np.zeros((m, n * m))
+        if self.L_w is not None and not isinstance(self.L_w, np.ndarray):
+            products = np.kron(np.linalg.inv(Lambda), np.eye(n))
+            K_w = g[:, None] * (self.L_w.value @ products) @ np.kron(np.diag(1 / g), back)
+        taus = (0.0, 0.0) if self.exact else (self.c * float(self.tau_x.value), self.c * float(self.tau_u.value))
+        return _symmetric(T @ P @ T.T), K, K_w, g[:, None] * Lambda * g, *taus
 
 
 def check_feedback(

@@ -19,7 +19,6 @@ from koopmpc.validate.binomial import bound_failure_rate
 from koopmpc.values import Value
 
 _NO_LIMIT = 1e20  # there is no limit from here on
-_ZERO_ROW = 3.2e-6  # DAQP leaves shorter rows as they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,16 +106,8 @@ def bound_iterations(
     (5, True)
     """
     checks.kind(controller, "controller", KoopmanMPC, "a KoopmanMPC or a LinearMPC")
-    model, program = controller.predictor, cast("CondensedProgram", controller.program())
-    if program.M.shape[1] > model.nz + model.nu * program.with_rates or program.latency or model.embedding is not None:
-        raise DataError(
-            "the bound is for controllers without an estimator, delays, measured disturbances and latency; use "
-            "km.guarantees.observe_iterations"
-        )
-    if program.levels is not None:
-        raise DataError("the bound is of quadratic programs; with inputs on levels a step searches sequences")
-    if controller.solver != "daqp" or not np.array_equal(program.solver.H, np.eye(len(program.solver.H))):
-        raise DataError('the bound is for solver="daqp"; pass it to the controller')
+    program = _require_plain(controller)
+    model = controller.predictor
     Z, z0 = _lift_affine(model)
     x_low, x_high = _read_box(states, "states", Z.shape[1])
     r_low, r_high = _read_box(references, "references", program.targets.from_reference.shape[1])
@@ -125,18 +116,11 @@ def bound_iterations(
     low, high = np.concatenate([x_low, u_low[:nu], r_low]), np.concatenate([x_high, u_high[:nu], r_high])
     if not np.isfinite(low).all() or not np.isfinite(high).all():
         raise DataError("the box is not finite; pass last_inputs=(low, high), since the inputs have no limits")
-    corners = np.array(np.meshgrid(*np.stack([r_low, r_high], axis=1))).reshape(len(r_low), -1).T
-    targets = program.targets
-    values = targets.nearest(corners) @ targets.rows.T
-    slack = ROUNDING * (np.abs(values) + targets.size)
-    if program.aimed and ((values < targets.low - slack) | (values > targets.high + slack)).any():
-        raise DataError("a reference of the box has its target outside the limits; take a smaller box of references")
+    _check_targets(program, r_low, r_high)
     n, nr = len(program.offset), len(r_low)
     held = program.from_reference.reshape(n, -1, nr).sum(axis=1)
     M = program.M[:n]
     offset = program.offset + M[:, : model.nz] @ z0
-    if program.given is not None:
-        raise DataError("the cost has a given u_target; use km.guarantees.observe_iterations")
     plan = np.hstack([M[:, : model.nz] @ Z, M[:, model.nz :], held])  # of [x; u_prev; r]
     middle, half = (low + high) / 2, (high - low) / 2
     moving = np.flatnonzero(half > 0)
@@ -159,6 +143,34 @@ def bound_iterations(
     return IterationBound(most, len(ways), x, r, u_prev, attained, cold)
 
 
+def _require_plain(controller: KoopmanMPC) -> CondensedProgram:
+    """Return the controller's program; raise where it has a part that the analysis does not know."""
+    model, program = controller.predictor, cast("CondensedProgram", controller.program())
+    moving = model.nz + model.nu * program.with_rates
+    if program.M.shape[1] > moving or program.latency or model.embedding is not None:
+        raise DataError(
+            "the bound is for controllers without an estimator, delays, measured disturbances and latency; use "
+            "km.guarantees.observe_iterations"
+        )
+    if program.levels is not None:
+        raise DataError("the bound is of quadratic programs; with inputs on levels a step searches sequences")
+    if controller.solver != "daqp" or not np.array_equal(program.solver.H, np.eye(len(program.solver.H))):
+        raise DataError('the bound is for solver="daqp"; pass it to the controller')
+    if program.given is not None:
+        raise DataError("the cost has a given u_target; use km.guarantees.observe_iterations")
+    return program
+
+
+def _check_targets(program: CondensedProgram, low: Float[np.ndarray, " nr"], high: Float[np.ndarray, " nr"]) -> None:
+    """Raise where a reference of the box has its target outside the limits."""
+    corners = np.array(np.meshgrid(*np.stack([low, high], axis=1))).reshape(len(low), -1).T
+    targets = program.targets
+    values = targets.nearest(corners) @ targets.rows.T
+    slack = ROUNDING * (np.abs(values) + targets.size)
+    if program.aimed and ((values < targets.low - slack) | (values > targets.high + slack)).any():
+        raise DataError("a reference of the box has its target outside the limits; take a smaller box of references")
+
+
 def _lift_affine(model: LinearPredictor) -> tuple[Float[np.ndarray, "nz n"], Float[np.ndarray, " nz"]]:
     """Return Z, z0 of z = Z x + z0; the identity where the lifting is not affine."""
     x = ca.SX.sym("x", model.nx)
@@ -175,7 +187,7 @@ def _build_problem(program: CondensedProgram, plan: Float[np.ndarray, "n p1"]) -
     """Return the QP in DAQP's units, of a plan that is affine in [θ; 1]."""
     qp, solver = program.qp, program.solver
     lengths = np.linalg.norm(solver.M, axis=1)
-    norms = np.where(lengths > _ZERO_ROW, lengths, 1.0)
+    norms = np.where(lengths > 3.2e-6, lengths, 1.0)  # DAQP leaves shorter rows as they are
     factor = (solver.rows / norms)[:, None]
     moved = qp.scale[:, None] * plan[qp.source]
     one = np.eye(plan.shape[1])[-1]

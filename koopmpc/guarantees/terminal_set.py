@@ -19,7 +19,6 @@ from koopmpc.predict.predictors import LinearPredictor
 
 MOST_COORDINATES = 12  # beyond that a polytope has too many rows to find in a minute
 _ITERATIONS = 10_000  # of the Riccati equation
-_INSIDE = 1e-9  # share of a limit that a set point has to be inside it
 
 
 class TailLoop(NamedTuple):
@@ -206,6 +205,7 @@ def _list_limits(
     H, h = H[limited], h[limited]
     if not len(h):
         raise DataError("there are no limits, so every plan may end anywhere; leave the terminal set out")
-    if (h <= _INSIDE * (1 + np.abs(h).max())).any():
+    # share of a limit that a set point has to be inside it
+    if (h <= 1e-9 * (1 + np.abs(h).max())).any():
         raise DataError("the set point of this reference is not strictly inside the limits; move it, or widen them")
     return H, h

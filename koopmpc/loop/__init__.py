@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     from koopmpc.loop.metrics import Metrics as Metrics
     from koopmpc.loop.realtime import Paced as Paced
     from koopmpc.loop.realtime import in_real_time as in_real_time
-    from koopmpc.loop.run import Plans as Plans
-    from koopmpc.loop.run import Step as Step
+    from koopmpc.loop.rows import Plans as Plans
+    from koopmpc.loop.rows import Step as Step
     from koopmpc.loop.simulate import LoopOptions as LoopOptions
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -13,6 +13,25 @@ from koopmpc import checks
 from koopmpc.control.limits import Interval
 from koopmpc.errors import DataError
 
+__all__ = [
+    "ActuatorDelay",
+    "ActuatorLoss",
+    "DroppedSamples",
+    "Fault",
+    "FrozenSensor",
+    "Injection",
+    "Injections",
+    "NaNSensor",
+    "SensorDelay",
+    "SolverFailure",
+    "Wiring",
+]
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return __all__
+
 
 class Wiring(NamedTuple):
     """The facts of the loop that a fault may use: the number of measurements, and the input limits."""

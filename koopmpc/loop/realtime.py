@@ -24,16 +24,14 @@ from koopmpc.control.function import ExcitationController, as_controller
 from koopmpc.control.move import Controller, Move, Status
 from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, KoopmpcError
-from koopmpc.loop.run import Step
-from koopmpc.loop.simulate import CONTROLLER, HOW, checked_input, rows_ahead, start_for
+from koopmpc.loop.controllers import CONTROLLER, HOW, checked_input, start_for
+from koopmpc.loop.rows import Step
+from koopmpc.loop.signals import rows_ahead
 from koopmpc.plants.plant import Plant, read_measurement, require_plant
 
 Late = Literal["skip", "hold"]
 _SPIN = 3e-4  # the last part of a wait keeps the processor busy, because a sleep ends up to 0.2 ms late [s]
-_NAP = 0.05  # longest sleep, after which signals and the watchdog are looked at [s]
-_SWITCH = 1e-4  # a thread that writes a log gives way to the loop after so long; Python's own 5 ms delay steps [s]
 _KEPT = 100_000  # steps whose jitter is kept
-_JOIN = 1.0  # longest wait for the watchdog's thread at the end [s]
 
 
 @dataclass(eq=False)
@@ -101,7 +99,7 @@ class _Watchdog:
     def close(self) -> str:
         """End the thread, give the plant its safe input unless it has it, and return why it could not get it."""
         self._end.set()
-        self._thread.join(_JOIN)
+        self._thread.join(1.0)  # longest wait for the watchdog's thread at the end [s]
         return self._make_safe()
 
     def _watch(self) -> None:
@@ -261,7 +259,8 @@ class _Loop:
                 self.paced.jitter.append(-left)
                 return True
             if left > _SPIN:
-                time.sleep(min(left - _SPIN, _NAP))
+                # longest sleep, after which signals and the watchdog are looked at [s]
+                time.sleep(min(left - _SPIN, 0.05))
         return False
 
     def _step(self, k: int, deadline: float) -> bool:
@@ -328,7 +327,8 @@ def in_real_time(dt: float) -> Callable[[Step], None]:
 def _quick_switches() -> Generator[None]:
     """Let other threads give way to the loop soon."""
     before = sys.getswitchinterval()
-    sys.setswitchinterval(min(before, _SWITCH))
+    # a thread that writes a log gives way to the loop after so long; Python's own 5 ms delay steps [s]
+    sys.setswitchinterval(min(before, 1e-4))
     try:
         yield
     finally:

@@ -5,8 +5,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
-from math import isfinite
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,23 +20,15 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Fallible, Move, Plan
 from koopmpc.data.excitation import Excitation
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.loop.controllers import checked_input, count_disturbances, predictor_of, require_match, start_for
 from koopmpc.loop.faults import Fault, Injections, Wiring
-from koopmpc.loop.run import LoopRows, Run, Step, bind_outputs
-from koopmpc.plants.plant import Plant, SimulatedPlant, read_measurement, require_plant
+from koopmpc.loop.rows import LoopRows, Step
+from koopmpc.loop.run import Run
+from koopmpc.loop.signals import Draw, Signal, find_reference_inputs, make_noise, make_signal, rows_ahead, tracked_rows
+from koopmpc.plants.plant import Plant, SimulatedPlant, read_measurement
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.base import Predictor
 
-Signal = ArrayLike | Callable[[int, np.random.Generator], ArrayLike]
 StepObserver = Callable[[Step], None]
-_Draw = Callable[[int, np.random.Generator], Float[np.ndarray, " n"]]  # (k, rng) → a signal at step k
-
-CONTROLLER = ("dt", "nu", "horizon", "reset", "__call__")
-HOW = (
-    "a Controller has dt [s], nu, horizon (0 if it reads no preview), reset(x0, u_prev), and is called as "
-    "controller(y, reference, applied) -> Move; make it a class, see km.control.Controller, or pass its law "
-    "as a function u = f(y, r)"
-)
-_MOVE = tuple(f.name for f in fields(Move) if f.default is MISSING)  # what a user's own move needs
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,17 +142,19 @@ def simulate(
         require_preview(limits.resolve(plant.states, plant.inputs), steps, "the run")
     if not hasattr(controller, "reset") and hasattr(plant, "dt") and hasattr(plant, "inputs"):
         controller = as_controller(controller, plant.dt, len(plant.inputs))
-    controller = _require_match(plant, controller, asked.angles)
+    controller = require_match(plant, controller, asked.angles)
     start = start_for(controller, x0)
     wiring = _Wiring(
         plant=plant,
         controller=controller,
         steps=steps,
-        reference=_tracked_rows(reference, cost, plant, steps, controller.horizon),
-        u_reference=_reference_inputs(asked.u_reference, cost, steps, controller.nu),
-        measured=None if measured is None else rows_ahead(measured, "measured", "nw", steps, controller.horizon, "steps"),
+        reference=tracked_rows(reference, cost, plant, steps, controller.horizon),
+        u_reference=find_reference_inputs(asked.u_reference, cost, steps, controller.nu),
+        measured=None
+        if measured is None
+        else rows_ahead(measured, "measured", "nw", steps, controller.horizon, "steps"),
         preview=asked.preview,
-        disturbance=_signal(asked.disturbance, "disturbance", steps, len(plant.states)),
+        disturbance=make_signal(asked.disturbance, "disturbance", steps, len(plant.states)),
         rng=checks.generator(asked.rng),
     )
     rows = wiring.begin(x0, asked, limits)
@@ -204,9 +197,9 @@ class _Wiring:
     u_reference: Float[np.ndarray, "T nu"]
     measured: Float[np.ndarray, "wrows nw"] | None
     preview: bool
-    disturbance: _Draw | None
+    disturbance: Draw | None
     rng: np.random.Generator
-    noise: _Draw | None = None
+    noise: Draw | None = None
     faults: Injections | None = None
     driving: Float[np.ndarray, "wrows nw"] | None = field(init=False)  # the rows of w that move the plant
     told: Float[np.ndarray, "wrows nw"] | None = field(init=False)  # those that the controller gets
@@ -228,7 +221,7 @@ class _Wiring:
     def begin(self, x0: Float[np.ndarray, " nx"] | None, asked: LoopOptions, limits: Limits | None) -> LoopRows:
         """Start the plant, the noise and the faults; return the rows of the run, with the first measurement in them."""
         y0, state = self.start_plant(x0)
-        self.noise = None if asked.noise is None else _noise(asked.noise, self.steps, len(y0))
+        self.noise = None if asked.noise is None else make_noise(asked.noise, self.steps, len(y0))
         if asked.faults:
             box = (limits or Limits()).resolve(self.plant.states, self.plant.inputs).base.inputs(self.controller.nu)
             self.faults = Injections(asked.faults, Wiring(len(y0), box), self.rng)
@@ -359,57 +352,6 @@ def _refuse_plan() -> Plan | None:
     raise DataError("the controller has gone on: read step.plan while the observer is called, or pass plans=True")
 
 
-def checked_input(move: Move, nu: int, k: int) -> Float[np.ndarray, " nu"]:
-    """Return the input of what a controller returned at step k; raise if the result is not a Move, or u not finite."""
-    if type(move) is not Move:
-        checks.members(move, "what the controller returned", _MOVE, "return a km.Move")
-    u = np.asarray(move.u, dtype=np.float64)
-    if u.shape != (nu,):
-        raise ShapeError(f"the controller returned u of shape {u.shape} at step {k}, expected ({nu},)")
-    for value in u.tolist():  # for a few inputs four times as fast as numpy
-        if not isfinite(value):
-            raise DataError(f"the controller returned u = {u} at step {k}; every input must be finite")
-    return u
-
-
-def _require_match(plant: StepMap | Plant, controller: Any, angles: Sequence[int]) -> Controller:
-    """Return the controller; raise where plant and controller lack a member, or do not fit each other."""
-    checks.members(controller, "the controller", CONTROLLER, HOW)
-    if not isinstance(plant, StepMap):
-        require_plant(plant)
-    if abs(plant.dt - controller.dt) > 1e-12 * plant.dt:
-        raise DataError(f"the controller has dt = {controller.dt:g} s, the plant {plant.dt:g} s; use one dt for both")
-    inputs, nx = tuple(plant.inputs), len(plant.states)
-    if controller.nu != len(inputs):
-        raise ShapeError(f"the controller returns {controller.nu} inputs, the plant takes {len(inputs)} ({inputs})")
-    outside = [i for i in angles if not 0 <= i < nx]
-    if outside:
-        raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
-    return controller
-
-
-def _tracked_rows(
-    reference: ArrayLike, cost: Cost | None, plant: StepMap | Plant, steps: int, horizon: int
-) -> Float[np.ndarray, "rows nr"]:
-    """Return the rows of the reference, one column for each output that the cost tracks."""
-    rows = rows_ahead(reference, "reference", "nr", steps + 1, horizon, "steps+1")
-    if cost is not None:
-        checks.kind(cost, "cost", Cost, "pass km.Cost(Q=…, R=…)")
-        states, outputs = list(plant.states), list(plant.outputs)
-        tracked = bind_outputs(cost.of, states)
-        names, given = states if tracked is None else list(tracked.names), rows.shape[1]
-        if given != len(names):
-            likely = outputs if len(outputs) == given and set(outputs) <= set(states) else states[:given]
-            chosen = ", ".join(repr(name.split(" [")[0]) for name in likely)
-            chosen = chosen if len(likely) == 1 else f"[{chosen}]"
-            fewer = f", or track fewer by Cost(of=km.State({chosen}), …)" if given < len(names) else ""
-            raise ShapeError(
-                f"reference has {given} column{'s' * (given != 1)}, and the cost tracks {len(names)}: "
-                f"{', '.join(names)}; pass a column for each{fewer}"
-            )
-    return rows
-
-
 def _check_measured(
     plant: StepMap | Plant, measured: Float[np.ndarray, "rows nw"] | None
 ) -> Float[np.ndarray, "rows nw"] | None:
@@ -422,90 +364,3 @@ def _check_measured(
     if measured.shape[1] != nw:
         raise ShapeError(f"measured has {measured.shape[1]} columns, the plant {nw} disturbances: {names}")
     return measured
-
-
-def count_disturbances(controller: object) -> int | None:
-    """Return how many measured disturbances the model of a controller has; None where it has no model."""
-    count: int | None = getattr(controller, "nw", None)  # a station knows those of its parts
-    if count is not None:
-        return count
-    model = predictor_of(controller) or getattr(controller, "step_map", None)
-    return None if model is None else getattr(model, "nw", 0)
-
-
-def predictor_of(controller: object) -> Predictor | None:
-    """Return the predictor that a controller holds, None where it has none."""
-    held = (getattr(controller, name, None) for name in ("predictor", "model"))
-    return next((each for each in held if isinstance(each, Predictor)), None)
-
-
-def start_sizes(controller: object) -> frozenset[int]:
-    """Return the numbers of states of the models that a controller holds; none where it has no model."""
-    sizes: frozenset[int] | None = getattr(controller, "start_sizes", None)  # of several controllers in one
-    if sizes is not None:
-        return sizes
-    states = getattr(predictor_of(controller) or getattr(controller, "step_map", None), "states", None)
-    return frozenset() if states is None else frozenset({len(states)})
-
-
-def start_for(controller: object, x0: Float[np.ndarray, " nx"] | None) -> Float[np.ndarray, " nx"] | None:
-    """Return the start that a controller can know: None where x0 has other states than its model."""
-    sizes = start_sizes(controller)
-    return x0 if x0 is None or not sizes or len(x0) in sizes else None
-
-
-def rows_ahead(
-    values: ArrayLike, name: str, columns: str, count: int, horizon: int, counted: str
-) -> Float[np.ndarray, "T n"]:
-    """Return `count` rows of a signal that is previewed, and `horizon` rows after them: given ones, or the last one."""
-    rows = np.atleast_1d(checks.array(values, name))
-    if rows.ndim == 1:
-        rows = np.broadcast_to(rows, (count, len(rows)))
-    if rows.ndim == 2 and len(rows) == count + horizon:
-        return rows.copy()
-    if rows.ndim != 2 or len(rows) != count:
-        expected = f"({columns},) or ({counted}, {columns}) = ({count}, {columns})"
-        raise ShapeError(f"{name} has shape {rows.shape}, expected {expected}")
-    return np.vstack([rows, np.broadcast_to(rows[-1], (horizon, rows.shape[1]))])
-
-
-def _reference_inputs(
-    u_reference: ArrayLike | None, cost: Cost | None, steps: int, nu: int
-) -> Float[np.ndarray, "T nu"]:
-    """Return the reference input of each step, for the metrics.
-
-    It is `u_reference` if given, else the cost's u_target if that is given as numbers, else zero.
-    """
-    if u_reference is None:
-        given = None if cost is None or isinstance(cost.u_target, str) else cost.given_inputs(nu)
-        if given is None:
-            return np.zeros((steps, nu))
-        if 1 < len(given) < steps:
-            raise ShapeError(f"u_target has {len(given)} rows, the run {steps} steps; pass one row, or one a step")
-        return np.array(np.broadcast_to(given, (steps, nu)) if len(given) == 1 else given[:steps])
-    values = checks.array(u_reference, "u_reference")
-    if values.ndim < 2:
-        return np.tile(checks.vector(values, "u_reference", nu), (steps, 1))
-    return checks.array(values, "u_reference", (steps, nu))
-
-
-def _signal(signal: Signal | None, name: str, rows: int, n: int) -> _Draw | None:
-    """Return the signal as a function of (k, rng); None where there is none."""
-    if signal is None:
-        return None
-    if callable(signal):
-        return lambda k, rng: checks.array(signal(k, rng), name, (n,))
-    values = checks.array(signal, name)
-    if values.ndim < 2:
-        constant = checks.vector(values, name, n)
-        return lambda k, rng: constant
-    values = checks.array(values, name, (rows, n))
-    return lambda k, rng: values[k]
-
-
-def _noise(noise: Signal, steps: int, ny: int) -> _Draw | None:
-    """Return the measurement noise as a function of (k, rng); a vector holds standard deviations."""
-    if callable(noise) or np.ndim(noise) == 2:
-        return _signal(noise, "noise", steps + 1, ny)
-    deviation = checks.vector(noise, "noise", ny)
-    return lambda k, rng: deviation * rng.standard_normal(ny)

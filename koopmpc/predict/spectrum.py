@@ -19,6 +19,20 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Projected
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
+__all__ = [
+    "amplitudes",
+    "continuous_eigenvalues",
+    "evolution_error",
+    "linearity_error",
+    "reconstruct",
+]
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return __all__
+
+
 _ROUNDING = float(np.finfo(float).eps)
 _ROWS = 4096  # evaluate the eigenfunctions of so many states at once, to bound the memory
 _FITTED = "pass one that edmd returned"

@@ -31,19 +31,12 @@ _MEASURED: Color = (120, 126, 138)
 _STEP_TIME = "Time of a step, logarithm to base 10 of seconds: -6 is 1 µs, -3 is 1 ms"
 _FASTEST = -6.2
 _TICKS = 5.0, 8.0  # as many as have numbers, in a low plot and in a high one
-_LINKED = 50.0  # length of a run whose plots are moved together [s]
-_ENDLESS = 1e100  # a span that no axis shows
-_CROWDED = 3  # plots of states from which on their titles are left out
 _AHEAD = 16  # at most so many stages of a plan are drawn into the plots
-_DISTANCE = 0.75  # of the eye from the middle of a scene in space, in its diagonals
 SEPARATE = 4  # up to so many states have a plot each
 VIEW = "koopmpc.View"  # components that plots alone show, beside the numbers of an entity, in single precision
 LOG_TIME = "log10_seconds"  # the one of them that solver/time_ms and solver/deadline_ms have
-_WIDEST = 3.0  # largest half width of the picture of eigenvalues
-_CLOSE = 0.35  # share of the picture below which the eigenvalues get one of their own
 _BELOW = 1e-2  # residual over tolerance that gets the darkest shade
 _ABOVE = 1e1  # residual over tolerance that gets the lightest shade
-_LIGHT = 0.85  # share of the colour scale in use; the rest is too light for points
 
 _STATUS_COLORS: dict[Status, Color] = {
     Status.UNCONSTRAINED: (46, 160, 120),
@@ -275,7 +268,8 @@ def blueprint(
         )
 
     rows = panels(about, nr)
-    roomy = len(rows) < _CROWDED  # else the legends alone name the states, and the plots get the room of the titles
+    # plots of states from which on their titles are left out
+    roomy = len(rows) < 3  # else the legends alone name the states, and the plots get the room of the titles
     axes = [readable(spans.get(row.entity, []), _TICKS[roomy]) for row in rows]
     parts = [_draw_panel(row) for row in rows]
     shown = [plot(row.entity, row.title, part, axis) for row, axis, part in zip(rows, axes, parts, strict=True)]
@@ -324,7 +318,8 @@ def shared_time(length: float | None) -> Any:
     import rerun as rr
     import rerun.blueprint as rrb
 
-    if length is None or length <= _LINKED:
+    # length of a run whose plots are moved together [s]
+    if length is None or length <= 50.0:
         return rrb.TimeAxis(link="LinkToGlobal")
     begin, end = (rrb.TimeRangeBoundary.absolute(seconds=t) for t in (0.0, length))
     return rrb.TimeAxis(view_range=rr.TimeRange(start=begin, end=end))
@@ -351,7 +346,8 @@ def _animation(extent: Extent) -> Any:
         from koopmpc.figures.animation import project
 
         low, high = np.array(ranges).T
-        middle, away = (low + high) / 2, _DISTANCE * float(np.linalg.norm(high - low))
+        # of the eye from the middle of a scene in space, in its diagonals
+        middle, away = (low + high) / 2, 0.75 * float(np.linalg.norm(high - low))
         eye = rrb.EyeControls3D(position=middle + away * project(np.eye(3))[:, 2], look_target=middle, eye_up=(0, 0, 1))
         return rrb.Spatial3DView(
             origin="world", name=name, background=list(BACKGROUND), line_grid=False, eye_controls=eye
@@ -376,7 +372,8 @@ def readable(values: Sequence[float], ticks: float) -> Any:
     import rerun.blueprint as rrb
 
     low, high = min(values, default=0.0), max(values, default=0.0)
-    if not 1e-9 * max(abs(low), abs(high), 1e-9) < high - low < _ENDLESS:
+    # a span that no axis shows
+    if not 1e-9 * max(abs(low), abs(high), 1e-9) < high - low < 1e100:
         return None
     tick = 10.0 ** math.floor(math.log10(high - low))
     if high - low > ticks * tick:
@@ -415,7 +412,8 @@ def draw_eigenvalues(model: Predictor, residuals: "ResidualDMD | None" = None) -
         labels = [f"{label}, residual {r:.2g}" for label, r in zip(labels, residuals.residuals, strict=True)]
         share = np.clip(residuals.residuals / residuals.tolerance, _BELOW, _ABOVE)
         level = np.log(share / _BELOW) / np.log(_ABOVE / _BELOW)
-        colors = map_colors(_LIGHT * level, SEQUENTIAL)
+        # share of the colour scale in use; the rest is too light for points
+        colors = map_colors(0.85 * level, SEQUENTIAL)
     drawn = {
         "model/axes": rr.LineStrips2D(axes, radii=rr.Radius.ui_points(0.5), colors=[205, 210, 216], draw_order=1),
         "model/circle": rr.LineStrips2D(
@@ -438,7 +436,8 @@ def draw_eigenvalues(model: Predictor, residuals: "ResidualDMD | None" = None) -
 def _reach(model: Predictor) -> float:
     """Return the half width of the picture, which holds the unit circle and the eigenvalues up to |λ| = 2.6."""
     values = np.asarray(model.eigenvalues)
-    return min(1.15 * max(1.0, float(np.abs(values).max(initial=0.0))), _WIDEST)
+    # largest half width of the picture of eigenvalues
+    return min(1.15 * max(1.0, float(np.abs(values).max(initial=0.0))), 3.0)
 
 
 def eigenvalue_views(model: Predictor, *, residuals: bool = False) -> list[Any]:
@@ -448,7 +447,8 @@ def eigenvalue_views(model: Predictor, *, residuals: bool = False) -> list[Any]:
     told = "Closer; rings may be spurious" if residuals else "Closer"
     re, im = np.real(values), np.imag(values)
     half = max(np.ptp(re), np.ptp(im)) / 2
-    if half < _CLOSE * size:
+    # share of the picture below which the eigenvalues get one of their own
+    if half < 0.35 * size:
         views.append(_around(told, (re.min() + re.max()) / 2, 1.3 * half + 1e-3))
     return views
 

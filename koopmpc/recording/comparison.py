@@ -27,8 +27,6 @@ from koopmpc.recording.reader import load_run
 from koopmpc.recording.rrd import file_recording
 from koopmpc.text import format_markdown_table
 
-_MOST = 8  # plots of states and inputs in one column
-
 
 @raise_swallowed()  # Python drops a Ctrl-C that comes while a recording is deleted
 def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
@@ -62,7 +60,7 @@ def record_comparison(logs: Sequence[str | Path], path: str | Path) -> None:
     costs = [_cost(run) for run in runs]
     plots = [(f"state/{i}", name, _curves(runs, name, "states", "X")) for i, name in enumerate(states)]
     plots += [(f"input/{j}", name, _curves(runs, name, "inputs", "U")) for j, name in enumerate(inputs)]
-    plots = plots[:_MOST]
+    plots = plots[:8]  # plots of states and inputs in one column
     plots += [("cost", "Cost so far", costs)] if any(values is not None for values in costs) else []
     longest = max(run.steps * run.dt for run in runs)
     layout = rrb.Horizontal(

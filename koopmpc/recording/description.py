@@ -19,7 +19,8 @@ from koopmpc.control.move import Fallback, Status
 from koopmpc.errors import LogError
 from koopmpc.lifting.base import Lifting
 from koopmpc.loop.metrics import Metrics
-from koopmpc.loop.run import About, StepRows, bind_outputs
+from koopmpc.loop.rows import StepRows
+from koopmpc.loop.run import About, bind_outputs
 from koopmpc.text import format_markdown_table
 from koopmpc.values import checksum, from_data, to_data
 

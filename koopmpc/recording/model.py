@@ -42,7 +42,6 @@ _PREDICTED = color(0)
 _BAND: Color = (70, 125, 185)
 _STYLE_SIGNS = re.compile(r"([*_`])")  # Markdown would read these signs as style: each gets a backslash
 _SHOWN = 6  # plots of states in one column
-_EIGENFUNCTIONS = 2  # drawn unless told
 _FORMAT = "koopmpc-model-1"
 _INK: Color = (250, 250, 250)  # of the words around a picture
 
@@ -243,7 +242,7 @@ def _leading(predictor: LinearPredictor, report: TrustReport | None) -> list[int
         near = np.abs(values[:, None] - report.residuals.eigenvalues).argmin(axis=1)
         order = np.argsort(report.residuals.residuals[near], kind="stable")
     moving = [int(j) for j in order if values[j].imag >= 0 and abs(values[j] - 1) > 1e-9]  # λ = 1: often φ = 1
-    return moving[:_EIGENFUNCTIONS] or [0]
+    return moving[:2] or [0]  # drawn unless told
 
 
 def _page(predictor: AnyPredictor, report: TrustReport | None, note: str) -> str:

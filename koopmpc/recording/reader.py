@@ -16,7 +16,8 @@ from koopmpc.data.files.formats import LogFormat, register_format
 from koopmpc.data.files.sampling import Signals, episodes_from
 from koopmpc.disk import path_of
 from koopmpc.errors import DataError, LogError
-from koopmpc.loop.run import MOVE_COLUMNS, About, MoveColumn, Plans, Run
+from koopmpc.loop.rows import MOVE_COLUMNS, MoveColumn, Plans
+from koopmpc.loop.run import About, Run
 from koopmpc.recording.description import DRAWN, NO_WORD, Entity, digest, from_json, sum_plans
 from koopmpc.recording.rrd import Contents, check_log, read
 

@@ -17,13 +17,12 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.move import Plan
 from koopmpc.disk import path_of
 from koopmpc.errors import DataError
-from koopmpc.loop.run import About, Run, Step, StepRows
+from koopmpc.loop.rows import Step, StepRows
+from koopmpc.loop.run import About, Run
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.viewer import PORT, find_viewer, is_up, quiet, why_none
 from koopmpc.recording.writer import Writer, block_of_steps
 from koopmpc.scene import Scene
-
-_BATCH = 0.2  # time between two batches [s]
 
 
 class BackgroundWriter:
@@ -52,7 +51,8 @@ class BackgroundWriter:
         last: list[Step] = []  # held back, because the state after the last step is written with that step
         closing = False
         while not closing:
-            closing = self._closing.wait(_BATCH)  # the thread looks at the queue five times a second
+            # time between two batches [s]
+            closing = self._closing.wait(0.2)  # the thread looks at the queue five times a second
             steps = last + self._drain()
             if self._failure is not None:
                 continue

@@ -31,7 +31,6 @@ _MAGIC = b"RRF2"  # first bytes of a file
 _FOOTER = b"RRF2FOOT"  # a closed file ends with these and 4 bytes more
 _FILE_HEADER = 12  # bytes before the first message
 _MESSAGE_HEADER = 16  # bytes: kind and length of a message
-_LAST_KIND = 3  # largest kind of a message; 0 is that of the end
 _TRIAL = (
     "import os, sys, rerun.chunk as c; "
     "[chunk.to_record_batch() for chunk in c.RrdReader(sys.argv[1]).stream().to_chunks()]; os._exit(0)"
@@ -142,7 +141,8 @@ def _find_end(size: int, read_header: Any) -> int:
     end = _FILE_HEADER
     while end + _MESSAGE_HEADER <= size:
         kind, length = struct.unpack("<QQ", read_header(end))
-        if not 0 < kind <= _LAST_KIND or end + _MESSAGE_HEADER + length > size:
+        # largest kind of a message; 0 is that of the end
+        if not 0 < kind <= 3 or end + _MESSAGE_HEADER + length > size:
             break
         end += _MESSAGE_HEADER + length
     return end

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from koopmpc import checks
 from koopmpc.errors import DataError
-from koopmpc.loop.run import About, StepRows, bind_outputs
+from koopmpc.loop.rows import StepRows
+from koopmpc.loop.run import About, bind_outputs
 from koopmpc.scene import Box, Color, Disk, Line, Scene, Shape
 
 _STROKES = np.linspace(-1.0, 1.0, 5)  # places of the strokes that fill a box
@@ -121,8 +122,6 @@ def line_radius(shape: Shape) -> float:
 BACKGROUND: Color = (247, 248, 250)
 _FAR = 0.25  # margin for predictions, which may diverge, as a share of the size of the drawn shapes
 _AIM: Color = (188, 193, 201)  # of the reference
-_DRAWN = 1e30  # the viewer draws in float32
-_AIMS = 2000  # states of so many different references are looked for
 _STAGES = 4  # how many future stages of a plan are drawn
 
 
@@ -313,13 +312,15 @@ class ReferenceScenes:
         """Return x with of(x) = r, of least size; None where r is not finite, or there is no such x."""
         key = reference.tobytes()
         if key not in self._known:
-            self._known[key] = self._find_state(reference) if len(self._known) < _AIMS else None
+            # states of so many different references are looked for
+            self._known[key] = self._find_state(reference) if len(self._known) < 2000 else None
         return self._known[key]
 
     def _find_state(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
         assert self._about.cost is not None
         of = bind_outputs(self._about.cost.of, self._about.states)
-        if not (np.abs(reference) < _DRAWN).all():
+        # the viewer draws in float32
+        if not (np.abs(reference) < 1e30).all():
             return None
         if of is None or of.names == self._about.states:
             return reference.copy()

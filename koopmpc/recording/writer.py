@@ -16,7 +16,8 @@ from koopmpc.disk import path_of
 from koopmpc.errors import KoopmpcError
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.loop.metrics import metrics
-from koopmpc.loop.run import MOVE_COLUMNS, About, Plans, Run, Step, StepRows
+from koopmpc.loop.rows import MOVE_COLUMNS, Plans, Step, StepRows
+from koopmpc.loop.run import About, Run
 from koopmpc.predict.base import Predictor
 from koopmpc.recording.blueprint import (
     LOG_TIME,

@@ -23,11 +23,7 @@ from koopmpc.identify.fits.online import OnlineEDMD
 from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.validate.drift import DriftReport, exceeds_usual, find_drift
 
-_BETTER = 1 / 3  # of the error of the model in use that a new one may have on pairs that neither has seen
-_SHORTEST = 20  # pairs that the memory holds by default, where the horizon is shorter
-_WORSE = 1.25  # times the error of an earlier model from which on the model in use is given up for it
 _PERSISTENT = 3  # samples in sequence that are off before they count as a change of the plant
-_RECALLED = 500  # learned pairs that are compared with the data of a design
 _KEPT = 5  # earlier models that can be gone back to
 
 
@@ -111,9 +107,11 @@ class Adaptive(Published):
         self._every, self._outlier = checks.count(every, "every"), checks.positive(outlier, "outlier")
         self._first = model
         self._usual = None if model.report is None else model.report.residual
-        held = max(self.horizon, _SHORTEST) if memory is None else checks.count(memory, "memory")
+        # pairs that the memory holds by default, where the horizon is shorter
+        held = max(self.horizon, 20) if memory is None else checks.count(memory, "memory")
         self._memory: deque[LearnedPair] = deque(maxlen=held)
-        self._recent: deque[LearnedPair] = deque(maxlen=_RECALLED)
+        # learned pairs that are compared with the data of a design
+        self._recent: deque[LearnedPair] = deque(maxlen=500)
         self._clear()
 
     def as_data(self) -> SavedController:
@@ -266,7 +264,8 @@ class Adaptive(Published):
         candidate, before = self._on_trial
         if self.learned - before >= cast("int", self._memory.maxlen):
             self._on_trial = None
-            if self._error(candidate, pairs) < _BETTER * error and self._use(candidate):
+            # of the error of the model in use that a new one may have on pairs that neither has seen
+            if self._error(candidate, pairs) < (1 / 3) * error and self._use(candidate):
                 self._good.append(used)
                 self.renewed += 1
                 return
@@ -274,7 +273,8 @@ class Adaptive(Published):
         earlier = [self._first, *self._good]
         errors = [self._error(model, pairs) for model in earlier]
         best = int(np.argmin(errors))
-        if earlier[best] is not used and error > _WORSE * errors[best] and self._use(earlier[best]):
+        # times the error of an earlier model from which on the model in use is given up for it
+        if earlier[best] is not used and error > 1.25 * errors[best] and self._use(earlier[best]):
             self.returned += 1
 
     def _suffices(self, model: LinearPredictor, pairs: list[LearnedPair]) -> bool:
@@ -303,13 +303,11 @@ class Adaptive(Published):
         return True
 
 
-_FORGETTING = 0.98  # in the bench a pair of 35 steps ago counts by half
-
-
 def _build_learning(parts: Any, limits: Limits) -> Adaptive:
     problem = parts.problem
     mpc = KoopmanMPC(parts.model, problem.cost, limits, problem.horizon, monitor=parts.monitor_data)
-    return Adaptive(mpc, OnlineEDMD.start(parts.data, problem.lifting, forgetting=_FORGETTING, ridge=problem.ridge))
+    # in the bench a pair of 35 steps ago counts by half
+    return Adaptive(mpc, OnlineEDMD.start(parts.data, problem.lifting, forgetting=0.98, ridge=problem.ridge))
 
 
 register_controller(

@@ -17,9 +17,6 @@ from koopmpc.lifting.base import Lifting, buffer_lifting
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.validate.scoring import embed_episodes, forecast_errors
 
-_THIN = 1e-9  # share of the widest direction of the data below which a direction counts as this wide
-_EXACT = 1e-9  # share of a state's size that a prediction may always be off
-
 
 @dataclass(frozen=True, eq=False)
 class Monitor(StepMonitor):
@@ -80,7 +77,8 @@ class Monitor(StepMonitor):
                 f"the data have {len(V)} rows, at least {int(np.ceil(level / (1 - level) - 1e-9))} are needed for a "
                 f"level of {level:g}; pass more data, or a lower level"
             )
-        return cls(_bounds(V, 0.0, V, rank), _bounds(E, _EXACT, X, rank), level, model.lifting)
+        # share of a state's size that a prediction may always be off
+        return cls(_bounds(V, 0.0, V, rank), _bounds(E, 1e-9, X, rank), level, model.lifting)
 
     def watch(self, model: LinearPredictor | StateModel, latency: int) -> "Watch":
         """Return the watch of one closed loop, whose inputs act `latency` steps late."""
@@ -96,7 +94,8 @@ def _bounds(
     norm = np.where(norm > 0, norm, 1.0)
     scaled = rows / norm
     values, Q = np.linalg.eigh(scaled.T @ scaled / len(rows) + np.diag((floor / norm) ** 2))
-    G = (Q / np.sqrt(np.maximum(values, _THIN * values.max()))).T / norm  # mean ‖G v‖² = n
+    # share of the widest direction of the data below which a direction counts as this wide
+    G = (Q / np.sqrt(np.maximum(values, 1e-9 * values.max()))).T / norm  # mean ‖G v‖² = n
     bound = max(np.sort(((rows @ G.T) ** 2).sum(axis=1))[rank - 1], ((G * floor) ** 2).sum(axis=0).max())
     return G / np.sqrt(bound) if bound > 0 else G
 

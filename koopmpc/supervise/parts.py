@@ -11,7 +11,7 @@ from koopmpc import checks
 from koopmpc.control.move import Controller, Plan
 from koopmpc.control.program import Program, Published, SavedController, no_export
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.loop.simulate import start_for, start_sizes
+from koopmpc.loop.controllers import start_for, start_sizes
 
 _NEEDED = ("dt", "nu", "horizon", "reset")
 

@@ -19,11 +19,10 @@ from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
 from koopmpc.control.program import SavedController
 from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.errors import DataError
-from koopmpc.loop.simulate import count_disturbances
+from koopmpc.loop.controllers import count_disturbances
 from koopmpc.supervise.parts import ControllerPair, plan_of, rows_of
 
 Mode = Literal["manual", "automatic", "standby"]
-_BUMP = 0.01  # after a switch u moves by this share of its range a step, unless the controller takes over exactly
 
 
 class Station(ControllerPair):
@@ -105,7 +104,8 @@ class Station(ControllerPair):
         self._rows = InputRows(self.limits, self.nu) if self.limits.in_time else None
         self._latency = int(getattr(controller, "latency", 0))  # an input acts, and is limited, so many steps later
         width = np.where(np.isfinite(self.inputs.high - self.inputs.low), self.inputs.high - self.inputs.low, np.inf)
-        self.bump = _BUMP * width if bump is None else checks.vector(bump, "bump", self.nu, infinite=True)
+        # after a switch u moves by this share of its range a step, unless the controller takes over exactly
+        self.bump = 0.01 * width if bump is None else checks.vector(bump, "bump", self.nu, infinite=True)
         levels = base.input_levels(self.nu)
         self._held = None if levels is None else HeldLevels(levels)
         if levels is not None:  # an input on levels moves by a level or not at all

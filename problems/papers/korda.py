@@ -355,7 +355,15 @@ def reproduce_kdv(page: papers.Page, quick: bool, progress: papers.TellPart) -> 
     reference = np.tile(np.array(LEVELS)[rows, None], (1, POINTS))
     cost = km.Cost(Q=np.ones(POINTS), R=np.zeros(3), tail=0, u_target="zero")
     mpc = km.KoopmanMPC(model, cost, problem.limits, WAVE_HORIZON)
-    run = km.simulate(plant, mpc, x0=SHAPES.mean(axis=0), reference=reference, steps=steps, preview=False, cost=cost)
+    run = km.simulate(
+        plant,
+        mpc,
+        x0=SHAPES.mean(axis=0),
+        reference=reference,
+        steps=steps,
+        options=km.loop.LoopOptions(preview=False),
+        cost=cost,
+    )
     seen = km.metrics(run)
     mean, asked = run.X.mean(axis=1), reference[:, 0]
     bend = run.X.std(axis=1)

@@ -139,13 +139,17 @@ def test_a_run_of_your_own_replays_with_the_plant_and_the_controller_that_ran(tm
     plant = km.discretize(problem.dynamics, problem.dt)
     mpc = km.LinearMPC(plant, *problem.equilibrium, problem.cost, problem.limits, 20)
     about = {"x0": [0.5, 0], "reference": [0, 0], "steps": 60}
-    km.record(km.simulate(plant, mpc, **about, noise=[0.01, 0.01], limits=problem.limits), log)
+    km.record(
+        km.simulate(plant, mpc, **about, options=km.loop.LoopOptions(noise=[0.01, 0.01]), limits=problem.limits), log
+    )
     assert km.bench.replayed(log, plant=plant, controller=mpc).differences == ()
     slower = km.LinearMPC(plant, *problem.equilibrium, problem.cost, problem.limits, 3)
     heavier = km.discretize(replace(problem.dynamics, m=1.01 * problem.dynamics.m), problem.dt)
     assert [each.split()[0] for each in km.bench.replayed(log, plant=heavier).differences] == ["X"]
     assert "U from step 0 on" in km.bench.replayed(log, controller=slower).differences
-    km.record(km.simulate(plant, mpc, **about, faults=[km.faults.DroppedSamples(0.2)]), log)
+    km.record(
+        km.simulate(plant, mpc, **about, options=km.loop.LoopOptions(faults=[km.faults.DroppedSamples(0.2)])), log
+    )
     with pytest.raises(km.errors.LogError, match="is of a run with faults, DroppedSamples"):
         km.bench.replayed(log, controller=mpc)
 

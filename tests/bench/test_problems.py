@@ -104,8 +104,7 @@ def test_each_controller_runs_on_each_problem_and_keeps_its_hard_limits(path: Pa
                 steps=STEPS,
                 cost=problem.cost,
                 limits=limits,
-                noise=case.noise,
-                faults=case.faults,
+                options=km.loop.LoopOptions(noise=case.noise, faults=case.faults),
                 measured=None if W is None else W[:STEPS],
             )
             assert np.isfinite(run.U).all(), (name, controller)

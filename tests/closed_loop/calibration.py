@@ -85,9 +85,9 @@ def measure_design(task: Task, seed: int, controller: Any, evidence: Any) -> dic
             steps=asked.steps,
             cost=km.Cost(Q=task.Q, R=task.R, of=task.of),
             limits=task.limits,
-            u_reference=held(task.name, None)[: asked.steps],
-            noise=noise,
-            rng=int(rng.integers(2**31)),
+            options=km.loop.LoopOptions(
+                u_reference=held(task.name, None)[: asked.steps], noise=noise, rng=int(rng.integers(2**31))
+            ),
         )
         seen_states = run.X[:, seen]
         lost = not ((seen_states >= evidence.low) & (seen_states <= evidence.high)).all()

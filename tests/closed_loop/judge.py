@@ -109,7 +109,7 @@ def judged(parts: Parts, name: str, start: int, u_target: UTarget | None = None)
                 steps=task.steps,
                 cost=km.Cost(Q=task.Q, R=task.R, of=task.of),
                 limits=task.limits,
-                u_reference=held(task.name, u_target),
+                options=km.loop.LoopOptions(u_reference=held(task.name, u_target)),
                 measured=task.weather,
                 observers=(watch,),
             )

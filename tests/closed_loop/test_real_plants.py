@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.gathered import of_loop
 
 pytestmark = pytest.mark.slow
 
@@ -39,7 +40,7 @@ def model(logs):
 def drive(mpc, cost=COST, limits=BOX, x0=REST[0], **options):
     """The run, and its cost."""
     task = {"reference": [10.0], "steps": STEPS, "cost": cost, "limits": limits}
-    run = km.simulate(PLANT, mpc, x0=x0, **task, **options)
+    run = km.simulate(PLANT, mpc, x0=x0, **task, **of_loop(**options))
     return run, km.metrics(run).cost
 
 
@@ -136,6 +137,14 @@ def test_a_disturbance_that_repeats_itself(linear, model):
     for kind, learned in ((km.KoopmanMPC, linear), (km.BilinearMPC, model)):
         for told in (km.LiftedDisturbance(), km.LiftedDisturbance(period=90.0)):
             mpc = kind(learned, cost, BOX, HORIZON, estimator=told)
-            run = km.simulate(PLANT, mpc, x0=REST[0], reference=[10.0], steps=400, cost=cost, disturbance=draw)
+            run = km.simulate(
+                PLANT,
+                mpc,
+                x0=REST[0],
+                reference=[10.0],
+                steps=400,
+                cost=cost,
+                options=km.loop.LoopOptions(disturbance=draw),
+            )
             errors[kind, told.period] = np.abs(run.X[-100:, 1] - 10).max()
         assert errors[kind, 90.0] < 0.3 * errors[kind, None]

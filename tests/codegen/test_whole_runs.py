@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.gathered import of_loop
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
 LIMITS = km.Limits(u_min=-25.0, u_max=25.0, x_max=[0.6, 0.4])
@@ -22,7 +23,15 @@ def test_a_run_in_c_is_that_of_python(pendulum, controllers, preview):
     phase = 0.05 * np.arange(121)
     reference = np.column_stack([0.5 * np.sin(phase), np.zeros(121)])
     first, second = (
-        km.simulate(plant, one, x0=[0.8, 0.0], reference=reference, steps=120, cost=COST, preview=preview)
+        km.simulate(
+            plant,
+            one,
+            x0=[0.8, 0.0],
+            reference=reference,
+            steps=120,
+            cost=COST,
+            options=km.loop.LoopOptions(preview=preview),
+        )
         for one in controllers
     )
     np.testing.assert_allclose(second.X, first.X, atol=1e-6)
@@ -42,7 +51,9 @@ def test_what_needs_python_between_two_steps_gets_it(pendulum, controllers):
     assert len(seen) == 5
     again = km.simulate(plant, fast, x0=[0.8, 0.0], reference=[0.0, 0.0], steps=5)
     np.testing.assert_allclose(again.X, run.X, atol=1e-12)
-    noisy = km.simulate(plant, fast, x0=[0.8, 0.0], reference=[0.0, 0.0], steps=5, noise=[0.1, 0.1])
+    noisy = km.simulate(
+        plant, fast, x0=[0.8, 0.0], reference=[0.0, 0.0], steps=5, options=km.loop.LoopOptions(noise=[0.1, 0.1])
+    )
     assert not np.array_equal(noisy.Y, run.Y)
 
 
@@ -57,7 +68,7 @@ def test_what_needs_python_between_two_steps_gets_it(pendulum, controllers):
 )
 def test_what_disturbs_a_run_disturbs_that_of_a_compiled_controller_as_much(pendulum, controllers, signal):
     told = {"x0": [0.3, 0.0], "reference": [0.0, 0.0], "steps": 8}
-    slow, fast = (km.simulate(pendulum[0], one, **told, **signal, rng=0) for one in controllers)
+    slow, fast = (km.simulate(pendulum[0], one, **told, **of_loop(**signal, rng=0)) for one in controllers)
     np.testing.assert_allclose(fast.Y, slow.Y, atol=1e-6)
     assert np.abs(fast.Y - km.simulate(pendulum[0], controllers[1], **told).Y).max() > 1e-3
 

@@ -144,7 +144,15 @@ def test_simulate_tells_them_what_is_measured(kind):
     for mpc in (built(kind, model, R_DELTA, km.Limits(**BOX)), km.KoopmanMPC(model, R_DELTA, km.Limits(**BOX), N)):
         x0, push = [0.3, -0.2, 0.1], W @ E.T
         runs.append(
-            km.simulate(model.step_map(), mpc, x0=x0, reference=[0, 0, 0], steps=15, measured=W, disturbance=push)
+            km.simulate(
+                model.step_map(),
+                mpc,
+                x0=x0,
+                reference=[0, 0, 0],
+                steps=15,
+                measured=W,
+                options=km.loop.LoopOptions(disturbance=push),
+            )
         )
     np.testing.assert_allclose(runs[0].X, runs[1].X, atol=1e-5)
 
@@ -209,8 +217,7 @@ def test_on_a_true_model_the_plan_happens_late(kind):
         x0=[0.5, 0],
         reference=[0, 0],
         steps=60,
-        faults=(km.faults.ActuatorDelay(2),),
-        plans=True,
+        options=km.loop.LoopOptions(faults=(km.faults.ActuatorDelay(2),), plans=True),
     )
     for k in (0, 4, 10):
         np.testing.assert_allclose(run.plans.X[k][0], run.X[k + 2], atol=1e-6)
@@ -332,12 +339,14 @@ def test_half_an_actuator_is_told_by_applied():
         reference=[0, 0],
         steps=60,
         limits=km.Limits(-2, 2, du_max=0.4),
-        faults=(
-            km.faults.ActuatorLoss(0.5, begin=3),
-            km.faults.NaNSensor(probability=0.1),
-            km.faults.SolverFailure(0.2),
+        options=km.loop.LoopOptions(
+            faults=(
+                km.faults.ActuatorLoss(0.5, begin=3),
+                km.faults.NaNSensor(probability=0.1),
+                km.faults.SolverFailure(0.2),
+            ),
+            rng=1,
         ),
-        rng=1,
     )
     assert np.abs(run.U).max() <= 2
 

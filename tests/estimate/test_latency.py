@@ -50,13 +50,27 @@ def test_on_a_true_model_the_plan_is_what_happens(estimator):
     cost, limits = km.Cost([1.0, 0.1], 0.1), km.Limits(-2, 2)
     mpc = km.KoopmanMPC(model, cost, limits, 20, latency=1, estimator=estimator, settings=PRECISE)
     run = km.simulate(
-        model.step_map(), mpc, x0=[1, 0], reference=[0, 0], steps=80, limits=limits, faults=LATE, plans=True
+        model.step_map(),
+        mpc,
+        x0=[1, 0],
+        reference=[0, 0],
+        steps=80,
+        limits=limits,
+        options=km.loop.LoopOptions(faults=LATE, plans=True),
     )
     for k in (0, 3, 10):
         np.testing.assert_allclose(run.plans.X[k][:2], run.X[k + 1 : k + 3], atol=1e-6)
     np.testing.assert_allclose(run.X[-1], 0, atol=1e-3)
     ignorant = km.KoopmanMPC(model, cost, limits, 20)
-    other = km.simulate(model.step_map(), ignorant, x0=[1, 0], reference=[0, 0], steps=80, limits=limits, faults=LATE)
+    other = km.simulate(
+        model.step_map(),
+        ignorant,
+        x0=[1, 0],
+        reference=[0, 0],
+        steps=80,
+        limits=limits,
+        options=km.loop.LoopOptions(faults=LATE),
+    )
     assert _cost(run) < _cost(other)
 
 
@@ -80,7 +94,15 @@ def test_offset_free_with_latency():
     model = linear(A, B, [0.0, 0.0])
     for estimator in (km.LiftedDisturbance(), km.LiftedKalman(("x0", "x1"))):
         mpc = km.KoopmanMPC(model, km.Cost([1, 0], 0.1), km.Limits(-5, 5), 15, latency=1, estimator=estimator)
-        run = km.simulate(true, mpc, x0=[0, 0], reference=[0.7, 0], steps=150, limits=km.Limits(-5, 5), faults=LATE)
+        run = km.simulate(
+            true,
+            mpc,
+            x0=[0, 0],
+            reference=[0.7, 0],
+            steps=150,
+            limits=km.Limits(-5, 5),
+            options=km.loop.LoopOptions(faults=LATE),
+        )
         assert abs(run.X[-1, 0] - 0.7) < 1e-6
 
 

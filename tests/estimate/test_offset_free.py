@@ -98,7 +98,15 @@ BOTH = pytest.mark.parametrize("estimator", [km.LiftedDisturbance(), km.LiftedKa
 def loop(estimator, limits, reference, steps=200, faults=(), **settings):
     mpc = km.KoopmanMPC(KNOWN, POSITION, limits, 15, estimator=estimator, **settings)
     seen = 2 if isinstance(estimator, km.LiftedDisturbance) else 1
-    return km.simulate(plant(seen=seen), mpc, x0=[0, 0], reference=reference, steps=steps, limits=limits, faults=faults)
+    return km.simulate(
+        plant(seen=seen),
+        mpc,
+        x0=[0, 0],
+        reference=reference,
+        steps=steps,
+        limits=limits,
+        options=km.loop.LoopOptions(faults=faults),
+    )
 
 
 @BOTH
@@ -137,7 +145,7 @@ def test_what_the_plant_really_got_is_what_the_estimator_uses(estimator):
         reference=[1.0],
         steps=40,
         limits=km.Limits(-1, 1),
-        faults=[km.faults.ActuatorLoss(0.5)],
+        options=km.loop.LoopOptions(faults=[km.faults.ActuatorLoss(0.5)]),
         observers=[look],
     )
     assert max(largest) < 1e-12

@@ -283,7 +283,9 @@ def test_the_run_of_a_loop_holds_which_readings_were_refused():
             return km.faults.Injection(measured=lambda k, y: y + 1e6 * (20 <= k < 23))
 
     mpc = built("KoopmanMPC, disturbance")
-    run = km.simulate(TRUE, mpc, x0=[0.4, 0.0], reference=[0.0, 0.0], steps=40, faults=[Wild()])
+    run = km.simulate(
+        TRUE, mpc, x0=[0.4, 0.0], reference=[0.0, 0.0], steps=40, options=km.loop.LoopOptions(faults=[Wild()])
+    )
     assert np.flatnonzero(run.refused).tolist() == [20, 21, 22]
     assert run.refused.dtype == np.int64
 

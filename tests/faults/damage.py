@@ -180,7 +180,11 @@ def certificate() -> Any:
     from tests.guarantees.plants import INVARIANT, Invariant, published_data
 
     data = published_data(Invariant(), [-1, -1], [1, 1], 100, 0.0)[1]
-    return km.certify(km.bilinear_edmd(data, INVARIANT), data, error=(3e-4, 3e-4), region=(-12, 12))
+    return km.certify(
+        km.bilinear_edmd(data, INVARIANT),
+        data,
+        options=km.guarantees.CertifyOptions(error=(3e-4, 3e-4), region=(-12, 12)),
+    )
 
 
 def pid() -> Any:

@@ -51,7 +51,15 @@ def loops(seed: int, _: Path) -> None:
     for name, controller, limits in controllers(seed):
         chosen = rng.sample(faults, rng.randrange(len(faults) + 1))
         x0 = [rng.uniform(-2, 2), rng.uniform(-2, 2)]
-        run = km.simulate(PLANT, controller, x0=x0, reference=[0, 0], steps=20, cost=COST, faults=chosen, rng=seed)
+        run = km.simulate(
+            PLANT,
+            controller,
+            x0=x0,
+            reference=[0, 0],
+            steps=20,
+            cost=COST,
+            options=km.loop.LoopOptions(faults=chosen, rng=seed),
+        )
         low, high = limits.inputs(1)
         assert np.isfinite(run.U).all(), name
         assert ((low <= run.U) & (high >= run.U)).all(), name

@@ -93,7 +93,13 @@ BUILDS = {
     "export": lambda folder: km.export(km.KoopmanMPC(linear(), COST, BOX, 6), folder, plant=plant()),
     "save": lambda folder: linear().save(folder / "model.npz"),
     "simulate": lambda _: km.simulate(
-        plant(), km.KoopmanMPC(linear(), COST, BOX, 6), x0=[0.1, 0], reference=[0, 0], steps=3, cost=COST, plans=True
+        plant(),
+        km.KoopmanMPC(linear(), COST, BOX, 6),
+        x0=[0.1, 0],
+        reference=[0, 0],
+        steps=3,
+        cost=COST,
+        options=km.loop.LoopOptions(plans=True),
     ),
 }
 

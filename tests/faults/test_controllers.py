@@ -109,9 +109,7 @@ def run_of(controller, limits, faults, seed, x0):
         steps=STEPS,
         cost=COST,
         limits=limits,
-        faults=faults,
-        noise=[0.01, 0.02],
-        rng=seed,
+        options=km.loop.LoopOptions(faults=faults, noise=[0.01, 0.02], rng=seed),
     )
 
 

@@ -11,7 +11,12 @@ from tests.guarantees.plants import library_task
 def manifold():
     """Return a bilinear model its limits, and a certificate of it."""
     _, model, data, limits, x, u = library_task("slow_manifold", episodes=400)
-    return model, limits, km.certify(model, data, limits, x=x, u=u, decay=0.995), x
+    return (
+        model,
+        limits,
+        km.certify(model, data, limits, x=x, u=u, options=km.guarantees.CertifyOptions(decay=0.995)),
+        x,
+    )
 
 
 def test_a_lifted_certificate_is_an_end_and_bilinear_and_nonlinear_plans_agree(manifold):

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 import koopmpc as km
 from tests.bare import shown
 from tests.example_plants import Swing
+from tests.gathered import of_loop
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
 LIMITS = km.Limits(u_min=-3.0, u_max=5.0)
@@ -89,8 +90,7 @@ def closed_loop(controller, faults, *, steps=12, x0=(0.9, 0.0), limits=LIMITS, *
         steps=steps,
         cost=COST,
         limits=limits,
-        faults=faults,
-        **rest,
+        **of_loop(faults=faults, **rest),
     )
 
 
@@ -373,7 +373,7 @@ import casadi as ca
 x, u = ca.SX.sym("x"), ca.SX.sym("u")
 plant = km.StepMap(ca.Function("F", [x, u], [x + u]), 0.1, states=("x",), inputs=("u",))
 mpc = km.LinearMPC(plant, [0], [0], km.Cost(1, 1))
-run = lambda faults: km.simulate(plant, mpc, x0=[1], reference=[0], steps=2, faults=faults)
+run = lambda faults: km.simulate(plant, mpc, x0=[1], reference=[0], steps=2, options=km.loop.LoopOptions(faults=faults))
 show(lambda: run(km.faults.SensorDelay(1)))
 show(lambda: run([km.faults.SensorDelay]))
 """

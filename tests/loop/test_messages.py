@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.gathered import of_loop
 from tests.loop.test_faults import ramp
 from tests.loop.test_metrics import random_run
 from tests.loop.test_simulate import A, B, Outside, Recorded, Told, step_map
@@ -26,7 +27,7 @@ class Says(Recorded):
 def run(plant=None, controller=None, steps=5, reference=(0, 0), x0=(0, 0), **more):
     plant = step_map(A, B) if plant is None else plant
     controller = Recorded() if controller is None else controller
-    km.simulate(plant, controller, x0=x0, reference=reference, steps=steps, **more)
+    km.simulate(plant, controller, x0=x0, reference=reference, steps=steps, **of_loop(**more))
 
 
 def slow():

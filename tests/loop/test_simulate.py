@@ -3,6 +3,7 @@ import pytest
 
 import koopmpc as km
 from tests.control.models import linear, step_map
+from tests.gathered import of_loop
 
 A, B = np.array([[1.02, 0.1], [0.05, 1.01]]), np.array([[0.005], [0.1]])
 
@@ -42,7 +43,7 @@ def test_simulate_is_the_loop_that_one_would_write():
         steps=steps,
         cost=cost,
         limits=limits,
-        plans=True,
+        options=km.loop.LoopOptions(plans=True),
     )
     x, plans = np.array([0.5, -0.2]), []
     ahead = np.vstack([reference, np.tile(reference[-1], (6, 1))])
@@ -74,7 +75,14 @@ def test_simulate_is_the_loop_that_one_would_write():
 def test_the_controller_gets_the_references_ahead_and_what_was_applied(preview):
     controller = Recorded()
     reference = np.arange(12.0).reshape(6, 2)
-    run = km.simulate(step_map(A, B), controller, x0=[1, 2], reference=reference, steps=5, preview=preview)
+    run = km.simulate(
+        step_map(A, B),
+        controller,
+        x0=[1, 2],
+        reference=reference,
+        steps=5,
+        options=km.loop.LoopOptions(preview=preview),
+    )
     np.testing.assert_array_equal(controller.resets, [[1.0, 2.0]])
     assert len(controller.calls) == 5
     for k, (y, rows, applied) in enumerate(controller.calls):
@@ -107,7 +115,14 @@ def test_one_reference_is_held_throughout():
 
 def test_noise_is_on_the_measurement_alone_and_comes_from_the_seed():
     def noisy(rng, noise):
-        return km.simulate(step_map(A, B), mpc(), x0=[0.5, 0], reference=[0, 0], steps=60, noise=noise, rng=rng)
+        return km.simulate(
+            step_map(A, B),
+            mpc(),
+            x0=[0.5, 0],
+            reference=[0, 0],
+            steps=60,
+            options=km.loop.LoopOptions(noise=noise, rng=rng),
+        )
 
     run, same = noisy(3, [0.1, 0.0]), noisy(np.random.default_rng(3), [0.1, 0.0])
     np.testing.assert_array_equal(run.Y, same.Y)
@@ -127,7 +142,14 @@ def test_a_disturbance_is_added_to_the_next_state(kind):
     rows = 0.01 * np.arange(20.0).reshape(10, 2)
     disturbance = {"constant": [0.1, -0.2], "rows": rows, "function": lambda k, rng: rows[k]}[kind]
     expected = np.tile([0.1, -0.2], (10, 1)) if kind == "constant" else rows
-    run = km.simulate(step_map(A, B), Recorded(), x0=[1, 2], reference=[0, 0], steps=10, disturbance=disturbance)
+    run = km.simulate(
+        step_map(A, B),
+        Recorded(),
+        x0=[1, 2],
+        reference=[0, 0],
+        steps=10,
+        options=km.loop.LoopOptions(disturbance=disturbance),
+    )
     np.testing.assert_allclose(run.X[1:] - run.X[:-1] @ A.T - run.U @ B.T, expected, atol=1e-12)
 
 
@@ -147,7 +169,7 @@ def test_observers_see_each_step_once():
         x0=[0.5, 0],
         reference=reference,
         steps=6,
-        noise=0.01,
+        options=km.loop.LoopOptions(noise=0.01),
         observers=[lambda step: seen.append((step, step.plan))],
     )
     assert [step.k for step, _ in seen] == list(range(6))
@@ -176,7 +198,7 @@ def test_the_inputs_that_hold_the_reference_are_kept_and_shown(given):
         x0=[0.5, 0],
         reference=[0, 0],
         steps=6,
-        u_reference=given,
+        options=km.loop.LoopOptions(u_reference=given),
         observers=[seen.append],
     )
     expected = np.broadcast_to(0.0 if given is None else given, (6, 1))
@@ -201,7 +223,9 @@ def test_a_plan_is_found_where_somebody_asks_for_it():
     assert controller.asked == 0
     km.simulate(step_map(A, B), controller, **loop, observers=[lambda step: step.plan if step.k == 3 else None])
     assert controller.asked == 1
-    run = km.simulate(step_map(A, B), controller, **loop, plans=True, observers=[lambda step: step.plan])
+    run = km.simulate(
+        step_map(A, B), controller, **loop, options=km.loop.LoopOptions(plans=True), observers=[lambda step: step.plan]
+    )
     assert controller.asked == 7
     assert run.plans.X.shape == (6, 7, 2)
 
@@ -212,7 +236,7 @@ def test_a_plan_that_nobody_asked_for_in_time_is_refused_and_not_another():
     km.simulate(step_map(A, B), mpc(), **loop, observers=[late.append])
     with pytest.raises(km.errors.DataError, match="the controller has gone on: read"):
         late[0].plan.U  # noqa: B018
-    run = km.simulate(step_map(A, B), mpc(), **loop, observers=[kept.append], plans=True)
+    run = km.simulate(step_map(A, B), mpc(), **loop, observers=[kept.append], options=km.loop.LoopOptions(plans=True))
     for k, step in enumerate(kept):
         np.testing.assert_array_equal(step.plan.X, run.plans.X[k])
     km.simulate(step_map(A, B), Recorded(), **loop, observers=[late.append])
@@ -223,8 +247,8 @@ def test_a_step_map_runs_as_the_plant_that_remembers_its_state():
     loop = {"x0": [0.5, 0], "reference": [0, 0], "steps": 9, "rng": 3}
     more = {"noise": 0.01, "disturbance": lambda k, rng: 0.01 * rng.standard_normal(2)}
     for own in ({}, more, {**more, "faults": [km.faults.NaNSensor(probability=0.2)]}):
-        one = km.simulate(step_map(A, B), Recorded(), **loop, **own)
-        other = km.simulate(km.plants.SimulatedPlant(step_map(A, B)), Recorded(), **loop, **own)
+        one = km.simulate(step_map(A, B), Recorded(), **of_loop(**loop, **own))
+        other = km.simulate(km.plants.SimulatedPlant(step_map(A, B)), Recorded(), **of_loop(**loop, **own))
         assert one == other
         assert np.array_equal(one.X, one.Y) == (not own)
 
@@ -243,7 +267,9 @@ class Careless(Recorded):
 def test_a_controller_that_writes_into_its_arguments_moves_neither_plant_nor_record():
     for noise in (None, 0.01):
         careful, careless = (
-            km.simulate(step_map(A, B), each, x0=[0.5, 0], reference=[0, 0], steps=6, noise=noise)
+            km.simulate(
+                step_map(A, B), each, x0=[0.5, 0], reference=[0, 0], steps=6, options=km.loop.LoopOptions(noise=noise)
+            )
             for each in (Recorded(), Careless())
         )
         np.testing.assert_array_equal(careless.X, careful.X)
@@ -268,7 +294,9 @@ class Outside:
 
 
 def test_a_sensor_that_fails_does_not_stop_the_loop():
-    run = km.simulate(Outside(), mpc(), x0=[0.5, 0], reference=[0, 0], steps=12, plans=True)
+    run = km.simulate(
+        Outside(), mpc(), x0=[0.5, 0], reference=[0, 0], steps=12, options=km.loop.LoopOptions(plans=True)
+    )
     bad = [status is km.Status.BAD_MEASUREMENT for status in run.status]
     assert bad == [3 <= k < 6 for k in range(12)]
     assert [run.fallback[k] for k in (3, 4, 5)] == [km.control.Fallback.SHIFTED_PLAN] * 3
@@ -337,8 +365,7 @@ def test_a_disturbance_that_is_told_ahead_costs_less():
             reference=[0.0, 0.0],
             steps=steps,
             cost=cost,
-            disturbance=W @ E.T,
-            **more,
+            **of_loop(disturbance=W @ E.T, **more),
         )
         costs.append(km.metrics(result).cost)
     assert costs[2] < costs[1] < costs[0]

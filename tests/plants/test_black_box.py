@@ -19,7 +19,8 @@ def test_a_function_is_a_plant_whose_data_and_runs_are_those_of_the_step_map_in_
     assert km.collect(box, begin, pushes, **asked) == km.collect(km.plants.SimulatedPlant(MAP), begin, pushes, **asked)
     cost = km.Cost(Q=[5, 10, 50, 5], R=0.01)
     mpc = km.LinearMPC(MAP, np.zeros(4), [0.0], cost, km.Limits(u_min=-40, u_max=40), 20)
-    loop = {"x0": [0, 0, 0.2, 0], "reference": [0.1, 0, 0, 0], "steps": 30, "disturbance": [0, 0.01, 0, 0]}
+    loop = {"x0": [0, 0, 0.2, 0], "reference": [0.1, 0, 0, 0], "steps": 30}
+    loop["options"] = km.loop.LoopOptions(disturbance=[0, 0.01, 0, 0])
     one, other = km.simulate(box, mpc, **loop), km.simulate(MAP, mpc, **loop)
     assert one.X.tobytes() == other.X.tobytes()
     assert one.U.tobytes() == other.U.tobytes()

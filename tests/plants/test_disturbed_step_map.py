@@ -8,6 +8,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.errors import DataError, ShapeError
+from tests.gathered import of_loop
 
 COST, LIMITS = km.Cost(Q=[1.0, 0.0], R=0.01), km.Limits(u_min=-2, u_max=2)
 
@@ -112,7 +113,7 @@ def test_controllers_on_the_equations_use_the_preview_of_w(plant, kind):
     def spend(model, **options):
         mpc = kind(model, COST, LIMITS, 12)
         task = {"x0": [0.2, 0.2], "reference": [0.2, 0.0], "steps": 50, "cost": COST, "limits": LIMITS}
-        run = km.simulate(plant, mpc, measured=W, **task, **options)
+        run = km.simulate(plant, mpc, measured=W, **task, **of_loop(**options))
         assert {each.name for each in run.fallback} == {"NONE"}
         return km.metrics(run).cost
 

@@ -122,7 +122,8 @@ def steps_of(run: km.Run) -> list[km.loop.Step]:
     ]
 
 
-def about(run: km.Run) -> dict:
-    """Return what a Recorder is told about `run` beforehand."""
-    names = ("dt", "states", "inputs", "outputs", "cost", "limits", "angles", "metadata")
-    return {name: getattr(run, name) for name in names}
+def about(run: km.Run, **options) -> dict:
+    """Return what a Recorder is told about `run` beforehand, with further options."""
+    told = {name: getattr(run, name) for name in ("outputs", "angles", "metadata")} | options
+    names = ("dt", "states", "inputs", "cost", "limits")
+    return {name: getattr(run, name) for name in names} | {"options": km.recording.RecorderOptions(**told)}

@@ -24,8 +24,14 @@ def pendulum_run(**named: str) -> km.Run:
     plant = km.discretize(problem.dynamics, 0.05)
     model = km.LinearPredictor.local(plant, [0, 0], [0])
     mpc = km.KoopmanMPC(model, problem.cost, problem.limits, 10)
-    loop = {"reference": [0.2, 0], "steps": 20, "cost": problem.cost, "limits": problem.limits, "metadata": named}
-    return km.simulate(plant, mpc, x0=[0.4, 0], plans=True, **loop)
+    loop = {
+        "reference": [0.2, 0],
+        "steps": 20,
+        "cost": problem.cost,
+        "limits": problem.limits,
+        "options": km.loop.LoopOptions(metadata=named),
+    }
+    return km.simulate(plant, mpc, x0=[0.4, 0], options=km.loop.LoopOptions(plans=True), **loop)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.loop.run import About, StepRows
+from koopmpc.loop.rows import StepRows
+from koopmpc.loop.run import About
 from koopmpc.recording.description import _FORMAT, DRAWN, drawable, from_json, title_of, to_json, to_markdown
 from koopmpc.recording.reader import LogColumns, read_columns
 from koopmpc.recording.scenes import ReferenceScenes
@@ -118,7 +119,7 @@ def test_plans_of_a_model_of_the_outputs_are_recorded_and_drawn_where_the_plant_
     hidden = km.StepMap(whole.F, whole.dt, ca.Function("h", [x], [x[1]]), ("x0", "x1"), ("u0",), ("x1",))
     model = km.LinearPredictor(A[1:, 1:], B[1:], np.eye(1), km.State().bind(("x1",)), 0.1, ("x1",), ("u0",))
     mpc = km.KoopmanMPC(model, km.Cost(1, 0.1), km.Limits(-1, 1), 5)
-    run = km.simulate(hidden, mpc, x0=[0.3, 0.5], reference=[0.0], steps=12, plans=True)
+    run = km.simulate(hidden, mpc, x0=[0.3, 0.5], reference=[0.0], steps=12, options=km.loop.LoopOptions(plans=True))
     assert run.plans.X.shape == (12, 6, 1)
     for name, scene in (("plain", None), ("drawn", lambda x, u: [km.scene.Disk("bob", (float(x[0]), 0.0), 1.0)])):
         km.record(run, tmp_path / f"{name}.rrd", scene=scene)
@@ -264,7 +265,15 @@ def test_a_log_draws_the_plants_scene_the_controllers_eigenvalues_and_the_refere
     plant = km.discretize(problem.dynamics, 0.05)
     model = km.LinearPredictor.local(plant, [0, 0], [0])
     mpc = km.KoopmanMPC(model, problem.cost, problem.limits, 10)
-    run = km.simulate(plant, mpc, x0=[0.4, 0], reference=[0.2, 0], steps=12, cost=problem.cost, plans=True)
+    run = km.simulate(
+        plant,
+        mpc,
+        x0=[0.4, 0],
+        reference=[0.2, 0],
+        steps=12,
+        cost=problem.cost,
+        options=km.loop.LoopOptions(plans=True),
+    )
     km.record(run, tmp_path / "run.rrd")
     log = read_columns(tmp_path / "run.rrd", ("/world/**", "/model/**", "/plots/**", "/title"))
     drawn = {entity for entity, _ in log._parts}
@@ -352,7 +361,9 @@ def test_the_description_is_exact_data() -> None:
 def test_a_run_has_a_title_of_its_own(tmp_path: Path) -> None:
     plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
     told = {"title": "bench 3, new valve"}
-    run = km.simulate(plant, lambda y, r: [0.0], x0=[0.5, 0], reference=[0, 0], steps=5, metadata=told)
+    run = km.simulate(
+        plant, lambda y, r: [0.0], x0=[0.5, 0], reference=[0, 0], steps=5, options=km.loop.LoopOptions(metadata=told)
+    )
     km.record(run, tmp_path / "run.rrd")
     assert title_of(km.load_run(tmp_path / "run.rrd")) == "bench 3, new valve"
     problem = {"title": "Pendulum: driven upright.", "problem": "pendulum", "case": "hang", "controller": "lqr"}

@@ -25,7 +25,8 @@ def test_a_recorder_and_record_write_the_same_run(tmp_path: Path) -> None:
     for i, run in enumerate((make_run(nu=2, odd=1.0), make_run(N=None, ny=1, cost=False), make_run(T=1))):
         path = tmp_path / f"{i}.rrd"
         with km.Recorder(
-            path, **about(run), scene=lambda x, u: [km.scene.Disk("d", (float(x[0]), 0.0), 1.0)]
+            path,
+            **about(run, scene=lambda x, u: [km.scene.Disk("d", (float(x[0]), 0.0), 1.0)]),
         ) as recorder:
             for step in steps_of(run):
                 recorder(step)
@@ -94,9 +95,9 @@ def test_no_viewer_costs_one_warning_and_no_step(tmp_path: Path, monkeypatch: py
     run, port = make_run(), free_port()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        with km.Recorder(tmp_path / "run.rrd", live=True, port=port, **about(run)) as recorder:
+        with km.Recorder(tmp_path / "run.rrd", live=True, **about(run, port=port)) as recorder:
             feed(recorder, run)
-        with km.Recorder(live=True, port=port, **about(run)) as recorder:
+        with km.Recorder(live=True, **about(run, port=port)) as recorder:
             feed(recorder, run)
     assert [w.category for w in caught] == [UserWarning, UserWarning]
     listens = f"no Rerun viewer listens at 127.0.0.1:{port}, and there is no display to open one on"
@@ -111,7 +112,7 @@ def test_a_viewer_that_fails_to_start_is_told(tmp_path: Path, monkeypatch: pytes
     run = make_run()
     told = r"and the one that was opened did not start; run `.*rerun.*` to see what it says; the log is written"
     with pytest.warns(UserWarning, match=told):  # noqa: SIM117
-        with km.Recorder(tmp_path / "run.rrd", live=True, port=free_port(), **about(run)) as recorder:
+        with km.Recorder(tmp_path / "run.rrd", live=True, **about(run, port=free_port())) as recorder:
             feed(recorder, run)
     assert km.load_run(tmp_path / "run.rrd") == run
 
@@ -133,7 +134,7 @@ def test_a_viewer_that_is_up_gets_the_whole_run(tmp_path: Path, monkeypatch: pyt
     viewer = start_viewer("--save", str(seen), port=port)
     assert viewer is not None, "the viewer does not listen"
     try:
-        with km.Recorder(live=True, port=port, **about(run)) as recorder:
+        with km.Recorder(live=True, **about(run, port=port)) as recorder:
             feed(recorder, run)
         end = time.monotonic() + 30
         while (lacks := missing(seen, run)) and viewer.poll() is None and time.monotonic() < end:
@@ -156,7 +157,7 @@ run = make_run(T=40)
 viewer = start_viewer("--serve-grpc", port={port})
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
-    with km.Recorder({path!r}, live=True, port={port}, **about(run)) as recorder:
+    with km.Recorder({path!r}, live=True, **about(run, port={port})) as recorder:
         for step in steps_of(run):
             recorder(step)
             time.sleep(0.02)
@@ -198,7 +199,7 @@ def test_a_scene_that_raises_is_told_and_does_not_reach_the_loop(tmp_path: Path)
 
     run = make_run()
     with pytest.warns(UserWarning, match=r"run\.rrd is not complete: no such place"):  # noqa: SIM117
-        with km.Recorder(tmp_path / "run.rrd", scene=scene, **about(run)) as recorder:
+        with km.Recorder(tmp_path / "run.rrd", **about(run, scene=scene)) as recorder:
             feed(recorder, run)
 
 

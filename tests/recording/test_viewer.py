@@ -121,7 +121,7 @@ def test_what_a_loop_streams_is_served_to_a_browser_of_this_machine(monkeypatch:
         assert port == data
         assert address == f"http://127.0.0.1:{web}?url=rerun%2Bhttp://127.0.0.1:{data}/proxy"
         assert b"<html" in page.read()
-        with km.Recorder(live=True, port=data, **about(run)) as recorder:
+        with km.Recorder(live=True, **about(run, port=data)) as recorder:
             for step in steps_of(run):
                 recorder(step)
     assert not is_up(data)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.gathered import of_loop
 
 pytestmark = pytest.mark.speed
 
@@ -30,7 +31,7 @@ def test_a_simulated_step_against_controller_and_plant_alone(benchmark):
             x = plant(x, u)
 
     def simulated(**more):
-        return km.simulate(plant, mpc, x0=[0.1, 0.0], reference=[0.0, 0.0], steps=STEPS, **more)
+        return km.simulate(plant, mpc, x0=[0.1, 0.0], reference=[0.0, 0.0], steps=STEPS, **of_loop(**more))
 
     loops = {
         "bare": bare,

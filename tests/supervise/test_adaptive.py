@@ -58,8 +58,8 @@ def test_nothing_is_learned_from_spikes_nan_or_a_frozen_sensor(model, train):
     noise = np.zeros((401, 2))
     noise[[60, 130, 200]] = [3.0, 20.0]
     found = km.simulate(
-        DriftingArm(payloads(0.0)), mpc, x0=[0, 0], reference=reference(), steps=400, noise=noise,
-        faults=[km.faults.FrozenSensor(begin=250, end=270), km.faults.NaNSensor(begin=90, end=91)], cost=COST, limits=LIMITS,
+        DriftingArm(payloads(0.0)), mpc, x0=[0, 0], reference=reference(), steps=400, options=km.loop.LoopOptions(noise=noise, faults=[km.faults.FrozenSensor(begin=250, end=270), km.faults.NaNSensor(begin=90, end=91)]),
+        cost=COST, limits=LIMITS,
     )  # fmt: skip
     assert mpc.skipped >= 3 * 2 + 2 + 19
     errors = km.score(mpc.online.predictor(), data(1.0, 1), 1).rmse[0] / km.score(model, data(1.0, 1), 1).rmse[0]

@@ -111,7 +111,9 @@ def test_a_push_is_unknown_when_it_comes_and_for_that_step_alone(model, data):
     step_map, mpc = km.discretize(Pendulum(), DT), km.KoopmanMPC(model, COST, LIMITS, 15, monitor=data)
     push = np.zeros((40, 2))
     push[20, 1] = 1.0
-    run = km.simulate(step_map, mpc, x0=[0.5, 0], reference=[0, 0], steps=40, disturbance=push)
+    run = km.simulate(
+        step_map, mpc, x0=[0.5, 0], reference=[0, 0], steps=40, options=km.loop.LoopOptions(disturbance=push)
+    )
     assert np.flatnonzero(run.known == 0).tolist() == [21]
     assert km.metrics(run).unknown == 1
     assert "unknown steps             1" in str(km.metrics(run))
@@ -134,7 +136,7 @@ def test_a_measurement_that_is_nan_is_unknown_and_the_next_step_but_one_is_known
         x0=[0.5, 0],
         reference=[0, 0],
         steps=8,
-        faults=[km.faults.NaNSensor(begin=4, end=5)],
+        options=km.loop.LoopOptions(faults=[km.faults.NaNSensor(begin=4, end=5)]),
     )
     assert run.known.tolist() == [1, 1, 1, 1, 0, 0, 1, 1]
 
@@ -148,12 +150,20 @@ def test_the_estimated_disturbance_and_the_input_that_was_applied_count_in_the_p
     """A constant push is unknown at first, and known once it is estimated."""
     step_map = km.discretize(Pendulum(), DT)
     mpc = km.KoopmanMPC(model, COST, LIMITS, 15, estimator=km.LiftedDisturbance(), monitor=data)
-    run = km.simulate(step_map, mpc, x0=[0.1, 0], reference=[0, 0], steps=150, disturbance=[0.0, 0.1])
+    run = km.simulate(
+        step_map, mpc, x0=[0.1, 0], reference=[0, 0], steps=150, options=km.loop.LoopOptions(disturbance=[0.0, 0.1])
+    )
     assert (run.known[1:3] == 0).all()
     assert (run.known[100:] == 1).all()
     plain = km.KoopmanMPC(model, COST, LIMITS, 15, monitor=data)
     broken = km.simulate(
-        step_map, plain, x0=[1.0, 0], reference=[0, 0], steps=60, limits=LIMITS, faults=[km.faults.ActuatorLoss(0.5)]
+        step_map,
+        plain,
+        x0=[1.0, 0],
+        reference=[0, 0],
+        steps=60,
+        limits=LIMITS,
+        options=km.loop.LoopOptions(faults=[km.faults.ActuatorLoss(0.5)]),
     )
     assert broken.known.mean() > 0.95  # the loop tells the controller what was applied
 
@@ -182,7 +192,14 @@ def test_a_bilinear_mpc_knows_likewise(data):
     mpc = km.BilinearMPC(bilinear, COST, LIMITS, 10, monitor=data)
     push = np.zeros((30, 2))
     push[20, 1] = 1.0
-    run = km.simulate(km.discretize(Pendulum(), DT), mpc, x0=[0.3, 0], reference=[0, 0], steps=30, disturbance=push)
+    run = km.simulate(
+        km.discretize(Pendulum(), DT),
+        mpc,
+        x0=[0.3, 0],
+        reference=[0, 0],
+        steps=30,
+        options=km.loop.LoopOptions(disturbance=push),
+    )
     assert run.known[21] == 0
     assert np.delete(run.known, 21).mean() > 0.9
     again = copy.copy(mpc)

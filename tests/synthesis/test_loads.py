@@ -62,7 +62,12 @@ def test_a_design_of_noisy_logs_leaves_no_offset_under_a_constant_load():
     asked = {"horizon": 10, "reference": [0.0, 0.0], "candidates": [km.State()], "loops": 0, "smooth": False}
     found = design(logs(0.02), cost, limits, **asked)
     run = km.simulate(
-        spring(0.3), found.controller, x0=[0.5, 0.0], reference=[0.0, 0.0], steps=150, noise=[0.02] * 2, rng=0
+        spring(0.3),
+        found.controller,
+        x0=[0.5, 0.0],
+        reference=[0.0, 0.0],
+        steps=150,
+        options=km.loop.LoopOptions(noise=[0.02] * 2, rng=0),
     )
     assert abs(run.X[-50:, 0].mean()) < 0.02
     assert found.best.recipe.estimator is not None

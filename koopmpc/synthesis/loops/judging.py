@@ -15,7 +15,7 @@ from koopmpc.errors import KoopmpcError
 from koopmpc.loop.faults import Fault
 from koopmpc.loop.metrics import total_cost, violation_shares
 from koopmpc.loop.run import Run
-from koopmpc.loop.simulate import StepObserver, simulate
+from koopmpc.loop.simulate import LoopOptions, StepObserver, simulate
 from koopmpc.plants.plant import SimulatedPlant, Transition
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.synthesis.loops.abreast import Acting
@@ -272,12 +272,10 @@ def run_on_surrogate(
             x0=np.concatenate([start, surrogate.middle]) if surrogate.feedthrough else start,
             reference=reference,
             steps=len(u_reference),
-            noise=noise * surrogate.noise,
+            options=LoopOptions(noise=noise * surrogate.noise, faults=faults, rng=rng),
             measured=surrogate.w if len(surrogate.w) else None,
             limits=asked.limits,
-            faults=faults,
             observers=observers,
-            rng=rng,
         )
     except LostError:
         return None

@@ -209,7 +209,7 @@ class Contest:
                     steps=self.steps,
                     cost=task.cost,
                     limits=limits,
-                    metadata={"problem": self.title, "controller": name},
+                    options=km.loop.LoopOptions(metadata={"problem": self.title, "controller": name}),
                 )
         return found
 

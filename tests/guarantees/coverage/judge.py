@@ -63,9 +63,7 @@ def _run(task: CoverageTask, controller, x0, sizes, seed):
             steps=task.steps,
             cost=task.cost,
             limits=task.limits,
-            u_reference=task.held,
-            noise=task.noise,
-            rng=seed,
+            options=km.loop.LoopOptions(u_reference=task.held, noise=task.noise, rng=seed),
         )
     except km.errors.KoopmpcError:
         return np.inf, False, None
