@@ -12,12 +12,8 @@ from jaxtyping import Float, Real
 
 __all__ = [
     "Box",
-    "Color",
     "Disk",
     "Line",
-    "Point",
-    "Scene",
-    "Shape",
 ]
 
 
