@@ -328,7 +328,7 @@ class Told:
 
 
 def told_run(controller, **more):
-    return km.simulate(step_map(P, Q), controller, x0=[0.0, 0.0], reference=[0.0, 0.0], steps=6, **more)
+    return km.simulate(step_map(P, Q), controller, x0=[0.0, 0.0], reference=[0.0, 0.0], steps=6, **of_loop(**more))
 
 
 def test_a_controller_is_told_the_measured_disturbances_ahead():
