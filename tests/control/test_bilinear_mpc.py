@@ -3,6 +3,7 @@
 import copy
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 
 import casadi as ca
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from koopmpc.control.nonlinear.iteration import RealTimeIteration
+from koopmpc.control.nonlinear.real_time_solver import EFFORT
 from tests.compiler import avoid_compiling, needs_compiler
 from tests.tiers import slow
 
@@ -383,7 +385,7 @@ def test_a_step_that_has_spent_its_iterations_begins_no_further_start(monkeypatc
     cost, limits = km.Cost(Q=[10, 10, 1], R=0.1, of=UPRIGHT), km.Limits(-2, 2)
     statuses, iterations = [], []
     for spent in (300, 1):
-        monkeypatch.setattr("koopmpc.control.nonlinear.real_time_solver.SPENT", spent)
+        monkeypatch.setattr("koopmpc.control.nonlinear.real_time_solver.EFFORT", replace(EFFORT, spent=spent))
         move = km.BilinearMPC(plant, cost, limits, 20)([3.0, 0.0], [0, 1, 0])
         statuses.append(move.status)
         iterations.append(move.iterations)

@@ -7,7 +7,8 @@ import pytest
 
 import koopmpc as km
 from koopmpc.control.nonlinear import iteration
-from koopmpc.control.nonlinear.iteration import RealTimeIteration, StageStep
+from koopmpc.control.nonlinear.condensed_stages import StageStep
+from koopmpc.control.nonlinear.iteration import RealTimeIteration
 from koopmpc.control.nonlinear.problem import StageTargets
 from koopmpc.control.nonlinear.stagewise import linearisation
 from tests.control.test_stagewise import PROBLEMS, Plan, slope

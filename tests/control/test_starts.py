@@ -5,7 +5,8 @@ import pytest
 
 import koopmpc as km
 from koopmpc.control.nonlinear import real_time_solver
-from koopmpc.control.nonlinear.iteration import RealTimeIteration, StageStep
+from koopmpc.control.nonlinear.condensed_stages import StageStep
+from koopmpc.control.nonlinear.iteration import RealTimeIteration
 from tests.control.test_bilinear_mpc import CIRCLE
 from tests.control.test_nonlinear_mpc import pendulum
 from tests.control.test_staged_mpc import TRACKED
@@ -102,7 +103,7 @@ def test_of_the_plans_that_follow_the_model_the_cheapest_is_taken(monkeypatch, e
     found, iterations = mpc._solver._begin_anew(start(mpc, [0.0, 0.0], [0.0]))
     good = any(end[0] not in (FAILED, km.Status.INFEASIBLE) for end in ends)
     assert [each[0] for each in asked] == [12, 12, 12] + [10] * good
-    assert {each[1] for each in asked[:3]} == {real_time_solver.NEARLY}
+    assert {each[1] for each in asked[:3]} == {real_time_solver.EFFORT.nearly}
     assert found is status
     assert iterations == (103 if good else 3)
     if good:

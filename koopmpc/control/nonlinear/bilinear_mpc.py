@@ -1,7 +1,6 @@
 """BilinearMPC: real-time iteration on a bilinear predictor, or on any map, in the dimension of the state."""
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from koopmpc.control.nonlinear.stagewise import list_sides, weights
 from koopmpc.control.program import no_export, publish_estimator, reference_table, trace_lifting
 from koopmpc.control.solvers.daqp import daqp_settings
 from koopmpc.control.stepped.blocks import Moves
-from koopmpc.control.stepped.search import LevelSearch
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import DataError
@@ -31,21 +29,6 @@ from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.estimate.observer import Estimator
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.predict.predictors import BilinearPredictor
-
-_COPIED = (
-    "_initial",
-    "_kept",
-    "_age",
-    "_given",
-    "_rest",
-    "_e",
-    "_steps",
-    "_planned",
-    "_warm",
-    "_X",
-    "_U",
-    "_scheduled_for",
-)  # what a copy takes over, with the plan and the targets
 
 
 class BilinearMPC(StagedMPC):
@@ -165,21 +148,29 @@ class BilinearMPC(StagedMPC):
         """
         return find_targets(self._aim.targets, self._map.nx, reference)
 
+    def _refuse_export(self) -> None:
+        """Raise a DataError where the controller has what its C does not know."""
+        problem, outputs = self._problem, self._outputs
+        priced = outputs.shift is not None or outputs.pull is not None
+        levels = "its inputs are on levels, and the search over them has no C code"
+        for obstacle, why, instead in (
+            (priced, "its cost has a price, which its C does not know", "one without a price"),
+            (problem.timed, "its weights move in time, and its C keeps one set", "one without Q_rows and R_rows"),
+            (
+                problem.stage is not None,
+                "its cost has a stage of its own, which its C does not know",
+                "one without a stage",
+            ),
+            (self._levels is not None, levels, "one without levels"),
+            (problem.ends > 0, "its C has no terminal set", "a LinearMPC or a KoopmanMPC with a terminal polytope"),
+        ):
+            if obstacle:
+                raise no_export(self, why, instead)
+
     def build_program(self, reference: ArrayLike | None) -> StagedProgram:
         """Return the data of a step."""
         problem, outputs, model = self._problem, self._outputs, self._map
-        if outputs.shift is not None or outputs.pull is not None:
-            raise no_export(self, "its cost has a price, which its C does not know", "one without a price")
-        if problem.timed:
-            raise no_export(self, "its weights move in time, and its C keeps one set", "one without Q_rows and R_rows")
-        if problem.stage is not None:
-            raise no_export(self, "its cost has a stage of its own, which its C does not know", "one without a stage")
-        if self._levels is not None:
-            raise no_export(
-                self, "its inputs are on levels, and the search over them has no C code", "one without levels"
-            )
-        if problem.ends:
-            raise no_export(self, "its C has no terminal set", "a LinearMPC or a KoopmanMPC with a terminal polytope")
+        self._refuse_export()
         estimator = publish_estimator(self._initial.observer, self._estimator, self._time_limit, "sqp_iterations=1")
         rows, terminal, cost = reference_table(reference, len(outputs.Q)), self._aim.targets, self.cost
         R, held = weights(problem), int((~problem.free).argmax()) * (not problem.free.all())
@@ -232,37 +223,6 @@ class BilinearMPC(StagedMPC):
             estimator=estimator,
             bounds=describe_stage_bounds(outputs, problem) if self.limits.in_time or self.limits.rows else None,
         )
-
-    def __reduce__(self) -> tuple[Callable[..., "BilinearMPC"], tuple[Any, ...], dict[str, Any]]:
-        build = partial(
-            BilinearMPC,
-            sqp_iterations=self._sqp_iterations,
-            estimator=self._estimator,
-            latency=self._latency,
-            moves=self._blocks,
-            time_limit=self._time_limit,
-            monitor=None if self._watch is None else self._watch.monitor,
-        )
-        held = {name: getattr(self, name) for name in _COPIED}
-        held["_aim"] = self._aim
-        iteration = self._iteration
-        held["levels"] = self._levels
-        held["ahead"] = None if self._keeper is None else self._keeper.ahead
-        held["plan"] = iteration.X.copy(), iteration.U.copy(), iteration.e.copy()
-        return build, (self.model, self.cost, self.limits, self._N), held
-
-    def __setstate__(self, held: dict[str, Any]) -> None:
-        """Go on where the original was."""
-        iteration = self._iteration
-        iteration.X[:], iteration.U[:], iteration.e[:] = held.pop("plan")
-        levels: LevelSearch | None = held.pop("levels")
-        ahead = held.pop("ahead")
-        if self._keeper is not None:
-            self._keeper.ahead = ahead
-        if levels is not None:
-            self._levels, self._held = levels, levels.held
-            self._solver = RealTimeSolver(iteration, self._map, self._outputs.inputs, self._sqp_iterations, levels)
-        self.__dict__.update(held)
 
 
 class BriefMPC(BilinearMPC):

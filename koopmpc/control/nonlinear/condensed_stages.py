@@ -4,7 +4,7 @@ Its variables w are defined by δx = δx_free + x̃ and δu_k = δu_free,k − K
 S_k = R + BᵀP_{k+1}B = L_k L_kᵀ. The cost is that of the program without limits plus ½ ‖w‖².
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -15,6 +15,8 @@ from koopmpc.control.riccati import Stage, step
 from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.base import QP
 from koopmpc.errors import DefinitenessError
+
+FINISHED = 150  # about as many interior-point steps take as long as an active-set method
 
 
 class Stages(NamedTuple):
@@ -39,6 +41,38 @@ class Deviation(NamedTuple):
     multipliers: Float[np.ndarray, " m"]
     status: Status
     iterations: int
+
+
+class StageStep(NamedTuple):
+    """The step (δX, δU), how far each soft limit gave way, how the solver ended, and after how many iterations."""
+
+    X: Float[np.ndarray, "N nx"]
+    U: Float[np.ndarray, "N nu"]
+    slacks: Float[np.ndarray, "N nsoft"]
+    status: Status
+    iterations: int
+    finished: bool = False  # by an active-set method, whose iterations rounding decides
+
+    @property
+    def effort(self) -> int:
+        """What the program cost, in interior-point steps; rounding decides nothing of it."""
+        return FINISHED if self.finished else self.iterations
+
+
+@runtime_checkable
+class SearchesLevels(Protocol):
+    """What solves the program of the stages with inputs on levels."""
+
+    def solve(
+        self,
+        stages: Stages,
+        free: Float[np.ndarray, "N nq"],
+        limits: Interval,
+        softness: Softness,
+        deadline: float,
+    ) -> Deviation | None:
+        """Return the least deviation from the solution without limits; None where it has no digits left."""
+        ...
 
 
 def condense_stages(

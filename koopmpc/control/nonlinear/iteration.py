@@ -9,17 +9,18 @@ Diehl, Bock & Schlöder, "A real-time iteration scheme for nonlinear optimizatio
 J. Control Optim. 43, 2005.
 """
 
+from functools import partial
 from time import perf_counter
-from typing import NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
 from koopmpc.checks import HUGE
-from koopmpc.control.limits import Interval, Softness
+from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
-from koopmpc.control.nonlinear.condensed_stages import Deviation, Stages, least_deviation
+from koopmpc.control.nonlinear.condensed_stages import Deviation, SearchesLevels, Stages, StageStep, least_deviation
 from koopmpc.control.nonlinear.convex_stage import ConvexStage
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.stagewise import (
@@ -27,6 +28,7 @@ from koopmpc.control.nonlinear.stagewise import (
     interior_step,
     linearisation,
     list_hard_outputs,
+    list_prices,
     list_sides,
     plan_cost,
     simulation,
@@ -35,7 +37,6 @@ from koopmpc.control.nonlinear.stagewise import (
 )
 from koopmpc.plants.routines import Routine
 
-FINISHED = 150  # about as many interior-point steps take as long as an active-set method
 MOST = 40  # interior-point steps, before an active-set method finishes the program
 STALLED = 5  # after this many steps without half the μ, one step only returns to the central path
 CENTRING = 0.3  # that step aims at this share of μ for every pair
@@ -46,38 +47,6 @@ DIGITS = 1e-13  # share of the largest multiplier that rounding leaves in μ
 NEAR = 0.2  # of a change: how far F may be from its linearisation
 SHORTEST = 0.001  # of a step
 STUCK = 1e-9  # a step this short leads nowhere
-
-
-class StageStep(NamedTuple):
-    """The step (δX, δU), how far each soft limit gave way, how the solver ended, and after how many iterations."""
-
-    X: Float[np.ndarray, "N nx"]
-    U: Float[np.ndarray, "N nu"]
-    slacks: Float[np.ndarray, "N nsoft"]
-    status: Status
-    iterations: int
-    finished: bool = False  # by an active-set method, whose iterations rounding decides
-
-    @property
-    def effort(self) -> int:
-        """What the program cost, in interior-point steps; rounding decides nothing of it."""
-        return FINISHED if self.finished else self.iterations
-
-
-@runtime_checkable
-class SearchesLevels(Protocol):
-    """What solves the program of the stages with inputs on levels."""
-
-    def solve(
-        self,
-        stages: Stages,
-        free: Float[np.ndarray, "N nq"],
-        limits: Interval,
-        softness: Softness,
-        deadline: float,
-    ) -> Deviation | None:
-        """Return the least deviation from the solution without limits; None where it has no digits left."""
-        ...
 
 
 class RealTimeIteration:
@@ -99,32 +68,25 @@ class RealTimeIteration:
         nr, ng = len(problem.Q), len(problem.box.low)
         self._shape = N, nx, nu, ng
         self._sides, cost, R = list_sides(problem), plan_cost(problem), weights(problem)
-        linear, quadratic, allowance = problem.softness
-        none = np.zeros(nu)  # half of the prices, as of the cost
-        prices = [np.full(nu, np.inf), 0.5 * linear], [none, 0.5 * quadratic], [none, allowance]
-        self._softness = Softness(*(np.concatenate(pair) for pair in prices))
-        self._sizes, self._input_sizes = problem.sizes, problem.input_sizes
+        self._softness, self._compiles = list_prices(problem), compiles_model
         sweeps, simulate, linearise = RiccatiSweeps(nx, nu, N), simulation(problem), linearisation(problem)
         own = problem.stage is not None or problem.timed  # then R changes from program to program
         free = solve_unconstrained(sweeps, None if own else R)
         interior = interior_step(sweeps, None if own else R, self._sides, ng) if len(self._sides.row) else None
         self.low, self.high = problem.stage_limits
-        self._free_stages, self._ends, self._limited = problem.free, problem.ends, problem.limited
         ns, nsoft = len(self._sides.row), self._sides.soft
         zeros = np.zeros
         soft = self._sides.row[len(self._sides.row) - self._sides.soft :]
         self._allowance = problem.softness.allowance[soft - nu]
         self._hard = list_hard_outputs(problem.softness, nu * problem.with_rates)
-        self._hard_allowance = allowance[self._hard]
+        self._hard_allowance = problem.softness.allowance[self._hard]
         self.limits_outputs = bool(len(self._hard))
         self._outputs = problem.limited.map(N)
-        self._step_of = problem.F
         self.length, self._defects = 1.0, zeros(nx)  # of the last step, and the defects that it has left
         self.slack = 0.0  # of the soft limit that the plan breaks most, where that is more than its allowance
         self.multipliers: Float[np.ndarray, " m"] | None = None  # of a program that the active-set method has finished
         self.X, self.U = zeros((N + 1, nx)), zeros((N, nu))
         self.theta, self.e = zeros(problem.theta_size), zeros((N, nx))
-        self._scheduled = problem.scheduled
         self.W = self.theta[len(self.theta) - N * problem.scheduled :].reshape(N, problem.scheduled)
         self._R, self._U_r = zeros((N, nr)), zeros((N, nu))
         self._targets: StageTargets | None = None  # those that the routines have
@@ -162,6 +124,14 @@ class RealTimeIteration:
             interior, [*stages, self._G, self._d, self._centring, *state], [*after, self._measures]
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Make a copy anew, for its routines hold pointers to its own arrays; it has the plan and θ."""
+        build = partial(RealTimeIteration, compiles_model=self._compiles)
+        return build, (self.problem,), (self.X.copy(), self.U.copy(), self.theta.copy())
+
+    def __setstate__(self, state: tuple[np.ndarray, ...]) -> None:
+        self.X[:], self.U[:], self.theta[:] = state
+
     @property
     def stage_is_convex(self) -> bool:
         """Whether a custom stage cost was convex along the plan of the last program."""
@@ -193,15 +163,16 @@ class RealTimeIteration:
             (Q, R), (q, r) = self._quadratic, self._gradients
             R[:] = self._base_R
             self._own_stage.add(Q, q, R, r)
-        if self._ends:  # a terminal set limits the last stage alone
-            self._g[:-1, -self._ends :], self._G[:-1, :, -self._ends :] = 0.0, 0.0
+        if self.problem.ends:  # a terminal set limits the last stage alone
+            self._g[:-1, -self.problem.ends :], self._G[:-1, :, -self.problem.ends :] = 0.0, 0.0
         np.subtract(self._F, self.X[1:], out=self._c)
         self._c += self.e
         np.subtract(x, self.X[0], out=self._x0)
         self._free.call()
         self.without_limits = self.U[0] + self._dU[0]
-        y = self._quantities()
-        free = np.concatenate([self.U + self._dU, y[:, self._shape[2] :] + self._move_outputs()], axis=1)
+        y = np.concatenate([self.U, self._g], axis=1)
+        moved = np.matmul(self._dX[:, None, :], self._G)[:, 0]
+        free = np.concatenate([self.U + self._dU, self._g + moved], axis=1)
         nothing = np.zeros_like(self._eps)
         if levels is not None:
             limits = Interval(self.low, self.high)
@@ -229,7 +200,7 @@ class RealTimeIteration:
         left = self._c.copy()
         left[0] += self._x0 @ self._A[0]  # δx_0 is taken whole
         change = np.maximum(np.abs(found.X).max(axis=0), np.abs(left).max(axis=0))
-        reach = NEAR * change + 1e-9 * (self._sizes + np.abs(X).max(axis=0))
+        reach = NEAR * change + 1e-9 * (self.problem.sizes + np.abs(X).max(axis=0))
         length = 1.0
         while True:
             X_new, U_new = X + length * found.X, U + length * found.U
@@ -251,7 +222,7 @@ class RealTimeIteration:
         """Return the largest distance of a planned state from the model's, as a share of its size."""
         self._ahead[0][:], self._ahead[1][:] = self.X[:-1], self.U
         self._simulate.call()
-        return float((np.abs(self._trial + self.e - self.X[1:]) / self._sizes).max())
+        return float((np.abs(self._trial + self.e - self.X[1:]) / self.problem.sizes).max())
 
     def note_slack(self, found: StageStep) -> float:
         """Keep and return the violation of the soft limit that a step breaks most, above its allowance."""
@@ -260,19 +231,19 @@ class RealTimeIteration:
 
     def rests(self, found: StageStep, settled: float) -> bool:
         """Return whether no input and no state moved by more than this share of its size and the plan's."""
-        u, x = self._input_sizes, self._sizes
+        u, x = self.problem.input_sizes, self.problem.sizes
         moved = (found.U / u, self.U / u), (found.X / x, self.X / x)
         return all(bool(np.abs(d).max() <= settled * (1 + np.abs(v).max())) for d, v in moved)
 
     @property
     def gap(self) -> float:
         """The largest defect that the last step has left, as a share of the range of its state in the plan."""
-        return float((self._defects / (np.ptp(self.X, axis=0) + 1e-9 * (self._sizes + np.abs(self.X[0])))).max())
+        return float((self._defects / (np.ptp(self.X, axis=0) + 1e-9 * (self.problem.sizes + np.abs(self.X[0])))).max())
 
     def end_excess(self) -> float:
         """Return by how much the plan's end leaves its terminal set, whose values are at most 1."""
-        values = np.array(cast(ca.DM, self._limited(self.X[-1])), dtype=np.float64).ravel()
-        return float(values[len(values) - self._ends :].max(initial=1.0)) - 1
+        values = np.array(cast(ca.DM, self.problem.limited(self.X[-1])), dtype=np.float64).ravel()
+        return float(values[len(values) - self.problem.ends :].max(initial=1.0)) - 1
 
     def excess(self) -> float:
         """Return by how much the inputs break a hard limit on the model, in units of what counts as broken.
@@ -281,7 +252,7 @@ class RealTimeIteration:
         """
         states = self.X.copy()
         for k, u in enumerate(self.U):
-            states[k + 1] = np.array(cast(ca.DM, self._step_of(states[k], u, self._theta_of(k)))).ravel() + self.e[k]
+            states[k + 1] = np.array(cast(ca.DM, self.problem.F(states[k], u, self._theta_of(k)))).ravel() + self.e[k]
             if not np.abs(states[k + 1]).max() < HUGE:
                 return np.inf
         past = self._past(states)
@@ -291,7 +262,7 @@ class RealTimeIteration:
 
     def _theta_of(self, k: int) -> Float[np.ndarray, " nt"]:
         """Return θ of stage k."""
-        if not self._scheduled:
+        if not self.problem.scheduled:
             return self.theta
         return np.concatenate([self.theta[: len(self.theta) - self.W.size], self.W[k]])
 
@@ -304,7 +275,7 @@ class RealTimeIteration:
 
     def set_theta(self, theta: Float[np.ndarray, " nt"]) -> None:
         """Set the θ of a model; the w of all stages stay."""
-        n = len(theta) - self._scheduled
+        n = len(theta) - self.problem.scheduled
         self.theta[:n] = theta[:n]
 
     def _past(self, X: Float[np.ndarray, "N1 nx"]) -> float:
@@ -312,8 +283,8 @@ class RealTimeIteration:
         values = np.array(self._outputs(X[1:].T), dtype=np.float64).T[:, self._hard]
         rows = self._shape[2] + self._hard
         past = np.maximum(self.low[:, rows] - values, values - self.high[:, rows])
-        if self._ends:
-            past[:-1, self._hard >= self._shape[3] - self._ends] = 0.0
+        if self.problem.ends:
+            past[:-1, self._hard >= self._shape[3] - self.problem.ends] = 0.0
         return float((past / self._hard_allowance).max())
 
     def cost(self) -> float:
@@ -334,12 +305,14 @@ class RealTimeIteration:
         unlimited = self._dX.copy(), self._dU.copy()
         if self._hard_limits_are_out_of_reach():
             return StageStep(*unlimited, np.zeros_like(self._eps), Status.INFEASIBLE, 0)
-        if self.multipliers is not None or not self._roomy():
+        hard = rows[: len(rows) - s.soft]
+        roomy = (self.low[:, hard] < self.high[:, hard]).all()  # else there is no interior
+        if self.multipliers is not None or not roomy:
             return self._finish(free, *unlimited, deadline, 0)
         bound = np.where(s.sign > 0, self.low[:, rows], self.high[:, rows])
         self._d[:] = s.sign * (y[:, rows] - bound) / s.span
         distance = s.sign * (free[:, rows] - bound) / s.span
-        hard = self._d.shape[1] - s.soft
+        hard = len(rows) - s.soft
         unit = self._unit()
         worst = max(-float(distance.min()), 1e-3)
         start = min(worst, 1.0)
@@ -429,24 +402,13 @@ class RealTimeIteration:
         past = np.maximum(low - at - reach[1], at + reach[0] - high)
         return bool((past > self._hard_allowance).any())
 
-    def _roomy(self) -> bool:
-        """Return whether there is room between all hard limits, without which there is no interior."""
-        hard = self._sides.row[: len(self._sides.row) - self._sides.soft]
-        return bool((self.low[:, hard] < self.high[:, hard]).all())
-
-    def _quantities(self) -> Float[np.ndarray, "N nq"]:
-        return np.concatenate([self.U, self._g], axis=1)
-
-    def _move_outputs(self) -> Float[np.ndarray, "N ng"]:
-        return np.matmul(self._dX[:, None, :], self._G)[:, 0]
-
     def _unit(self) -> float:
         """Return the mean curvature of the cost along the span of an input, or its size where it has no limits."""
         s, nu = self._sides, self._shape[2]
-        span = self._input_sizes.copy()
+        span = self.problem.input_sizes.copy()
         mine = s.row < nu
         span[s.row[mine]] = s.span[mine]
-        return max(float(np.mean(self._curvature[self._free_stages] * span**2)), 1e-300)
+        return max(float(np.mean(self._curvature[self.problem.free] * span**2)), 1e-300)
 
 
 def _views(shapes: list[tuple[int, ...]]) -> tuple[Float[np.ndarray, " n"], list[Float[np.ndarray, "..."]]]:

@@ -1,6 +1,5 @@
 """NonlinearMPC: multiple shooting and a nonlinear program a step; the oracle that others are measured against."""
 
-import pickle
 from collections.abc import Mapping
 from typing import Any
 
@@ -122,10 +121,6 @@ class NonlinearMPC(StagedMPC):
             "it uses ipopt or a CasADi solver",
             "a KoopmanMPC, or a BilinearMPC of the same model",
         )
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "NonlinearMPC":
-        """Return a copy with solvers of its own: CasADi's copies share one, and two threads in one end the process."""
-        return pickle.loads(pickle.dumps(self))
 
 
 def _build_oracle(parts: Any, limits: Limits) -> NonlinearMPC:

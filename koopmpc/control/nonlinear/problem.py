@@ -185,13 +185,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks)
     plain = plain._replace(affine=wanted is None and _is_affine(plain))
     if not o.with_rates and len(blocks) == N and not moves.own:
         return plain if wanted is None else _add_end(plain, wanted, model, o)
-    unlimited = Interval(np.full(nu, -np.inf), np.full(nu, np.inf))
-    rates = unlimited if o.rates is None else o.rates
-    given = np.isfinite(rates.low) | np.isfinite(rates.high)
-    soft = np.flatnonzero(given & np.isfinite(o.rate_softness.linear))
-    low, high = rates.low.copy(), rates.high.copy()
-    low[soft], high[soft] = -np.inf, np.inf
-
+    rates, soft, moves_alone = _split_rates(o, nu)
     ns = nx + nu + len(soft)
     sym, v, theta = ca.MX.sym("s", ns), ca.MX.sym("v", nu), ca.MX.sym("theta", F.size1_in(2))
     u = sym[nx : nx + nu] + v
@@ -205,7 +199,7 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks)
         limited=ca.Function("limited", [s], [ca.vertcat(last, s[nx + nu :], o.limited(x))]),
         Q=block_diag(o.Q, o.R),
         R=np.zeros((nu, nu)) if o.R_delta is None else o.R_delta,
-        inputs=Interval(low, high),
+        inputs=moves_alone,
         box=Interval(*(np.concatenate([o.inputs[i], rates[i][soft], o.outputs[i]]) for i in (0, 1))),
         softness=Softness(*(np.concatenate([hard[i], o.rate_softness[i][soft], o.softness[i]]) for i in (0, 1, 2))),
         with_rates=True,
@@ -215,6 +209,16 @@ def staged_problem(model: LearnedMap, outputs: StateTracking, moves: MoveBlocks)
         stage=_stage_function(o.cost, model, ns, with_rates=True),
     )
     return rated if wanted is None else _add_end(rated, wanted, model, o)
+
+
+def _split_rates(o: StateTracking, nu: int) -> tuple[Interval, Int[np.ndarray, " nsoft"], Interval]:
+    """Return the limits of changes, which of them are soft, and those of v, which are hard."""
+    rates = Interval(np.full(nu, -np.inf), np.full(nu, np.inf)) if o.rates is None else o.rates
+    given = np.isfinite(rates.low) | np.isfinite(rates.high)
+    soft = np.flatnonzero(given & np.isfinite(o.rate_softness.linear))
+    low, high = rates.low.copy(), rates.high.copy()
+    low[soft], high[soft] = -np.inf, np.inf
+    return rates, soft, Interval(low, high)
 
 
 def _is_affine(problem: StagedProblem) -> bool:

@@ -1,6 +1,7 @@
 """The plan of a BilinearMPC: linearisations of the last plan, or of the cheapest of several starts."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
@@ -16,17 +17,42 @@ from koopmpc.control.nonlinear.plan_solver import GOOD, PlanSolver, PlanStart, S
 from koopmpc.control.stepped.search import LevelSearch
 from koopmpc.plants.step_map import StepMap
 
-EACH = 12  # linearisations from each start of a first step, at most
-FIRST = 10  # further linearisations of the best of these plans, at most
-SPENT = 300  # after so much effort of the solver no further start, and no further linearisation from one, begins
-FOLLOWED = 0.02  # a plan follows the model whose defects are below this share of the range of their state
-SETTLED = (
-    1e-6  # a plan is a solution when no input and no state moves by more than this share of its size and the plan's
-)
-FAR = 3.0  # begin a new plan if y is more than this many state sizes from the expected state
-MET = 1e-8  # a plan ends in its terminal set if the value of the set is at most this much above 1
-ENDINGS = 20  # further linearisations, at most, of a plan that breaks a hard limit or misses its terminal set
-NEARLY = 1e-2  # the same for a plan that is compared with others
+SETTLED = 1e-6  # a plan is a solution when no input and no state moves by more than this share of its size
+
+
+@dataclass(frozen=True)
+class _Effort:
+    """How long plans are improved, and when one is good.
+
+    Attributes
+    ----------
+    each, first
+        Linearisations from each start of a first step, and further ones of the best of these plans, at most.
+    spent
+        After so much effort of the solver no further start, and no further linearisation from one, begins.
+    endings
+        Further linearisations, at most, of a plan that breaks a hard limit or misses its terminal set.
+    nearly
+        `SETTLED` of a plan that is compared with others.
+    followed
+        A plan follows the model whose defects are below this share of the range of their state.
+    far
+        Begin a new plan if y is more than this many state sizes from the expected state.
+    met
+        A plan ends in its terminal set if the value of the set is at most this much above 1.
+    """
+
+    each: int = 12
+    first: int = 10
+    spent: int = 300
+    endings: int = 20
+    nearly: float = 1e-2
+    followed: float = 0.02
+    far: float = 3.0
+    met: float = 1e-8
+
+
+EFFORT = _Effort()
 
 
 class RealTimeSolver(PlanSolver):
@@ -90,7 +116,7 @@ class RealTimeSolver(PlanSolver):
             iteration.low[0, :nu], iteration.high[0, :nu] = start.first
         status, iterations = Status.FAILED, 0
         jump = np.abs(start.s[:nx] - iteration.X[1, :nx]) / self._problem.sizes[:nx]  # from the state that was expected
-        if start.warm and jump.max() <= FAR:
+        if start.warm and jump.max() <= EFFORT.far:
             self._shift(start)
             status, iterations = self._improve(start, self._sqp_iterations)
             if iteration.limits_outputs:
@@ -119,7 +145,7 @@ class RealTimeSolver(PlanSolver):
     def _meet_limits(self, status: Status, start: PlanStart) -> tuple[Status, int]:
         """Linearise on until the plan keeps its hard limits; return how it ended, and the solver's iterations."""
         iteration, total = self.iteration, 0
-        for _ in range(ENDINGS):
+        for _ in range(EFFORT.endings):
             if status not in GOOD or iteration.excess() <= 1 or perf_counter() > start.deadline:
                 return status, total
             status, more = self._improve(start, 1)
@@ -130,9 +156,9 @@ class RealTimeSolver(PlanSolver):
         """Linearise on until the plan ends in its terminal set; return how it ended, and the solver's iterations."""
         iteration, total, before = self.iteration, 0, np.inf
         hard = bool(np.isinf(self._problem.softness.linear[-1]))
-        for _ in range(ENDINGS):
+        for _ in range(EFFORT.endings):
             excess = iteration.end_excess()
-            if excess <= MET or (not hard and excess >= 0.9 * before) or perf_counter() > start.deadline:
+            if excess <= EFFORT.met or (not hard and excess >= 0.9 * before) or perf_counter() > start.deadline:
                 break
             before = excess
             ended, more = self._improve(start, 1)
@@ -141,7 +167,7 @@ class RealTimeSolver(PlanSolver):
                 return ended, total
             status = ended
         excess = iteration.end_excess()
-        if hard and excess > MET:
+        if hard and excess > EFFORT.met:
             return Status.TIME_LIMIT if perf_counter() > start.deadline else Status.INFEASIBLE, total
         if excess > SOFTENED:
             iteration.slack = max(iteration.slack, excess)
@@ -151,20 +177,20 @@ class RealTimeSolver(PlanSolver):
     def _begin_anew(self, start: PlanStart) -> tuple[Status, int]:
         """Take the cheapest of the plans to which several starts lead; return how it ended, and all iterations.
 
-        Plans that follow the model come before those that do not yet. After an effort of SPENT no further linearisation
-        begins, and no further start. None does either where the problem is affine and a plan was found: all starts lead
-        to that one.
+        Plans that follow the model come before those that do not yet. After an effort of `spent` no further
+        linearisation begins, and no further start. None does either where the problem is affine and a plan was found:
+        all starts lead to that one.
         """
-        iteration, total, best, done, until = self.iteration, 0, (3, 0.0), False, self._spent + SPENT
+        iteration, total, best, done, until = self.iteration, 0, (3, 0.0), False, self._spent + EFFORT.spent
         status, kept = Status.FAILED, (iteration.X.copy(), iteration.U.copy(), 0.0)
         for X, U in self._starts(start):
-            ended, iterations = self._improve(start, EACH, NEARLY, (X, U), until)
+            ended, iterations = self._improve(start, EFFORT.each, EFFORT.nearly, (X, U), until)
             total += iterations
             rank = (2, 0.0)
             if ended in GOOD:
                 gap = iteration.gap
                 broken = SOFTENED * iteration.excess() if iteration.limits_outputs else 0.0
-                followed = gap < FOLLOWED and broken <= FOLLOWED
+                followed = gap < EFFORT.followed and broken <= EFFORT.followed
                 rank = (0, iteration.cost()) if followed else (1, max(gap, broken))
             if rank < best:
                 best, status, kept = rank, ended, (iteration.X.copy(), iteration.U.copy(), iteration.slack)
@@ -174,7 +200,7 @@ class RealTimeSolver(PlanSolver):
         iteration.X[:], iteration.U[:], iteration.slack = kept
         if status not in GOOD or done or perf_counter() > start.deadline:
             return status, total
-        most = max(FIRST, self._sqp_iterations)
+        most = max(EFFORT.first, self._sqp_iterations)
         polished, iterations = self._improve(start, most, until=until)
         if polished not in GOOD:
             iteration.X[:], iteration.U[:], iteration.slack = kept
@@ -214,7 +240,7 @@ class RealTimeSolver(PlanSolver):
         a share `settled` of the plan moves, where F is nowhere near its linearisation, and at the deadline; then the
         plan found so far is used, and the step is late.
         """
-        total, status, iteration, until = 0, Status.FAILED, self.iteration, min(self._spent + SPENT, until)
+        total, status, iteration, until = 0, Status.FAILED, self.iteration, min(self._spent + EFFORT.spent, until)
         if begin is not None:
             self._enter(*begin, start)
         for k in range(most):

@@ -1,7 +1,9 @@
 """What BilinearMPC and NonlinearMPC share: a step from the measurement, over the targets of its stages, to a Move."""
 
+import pickle
 from dataclasses import replace
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -98,6 +100,10 @@ class StagedMPC(MPCBase):
         return (
             PlanKeeper(problem, self._map, end) if problem.free.all() and not (problem.own or problem.timed) else None
         )
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "StagedMPC":
+        """Return a copy with solvers of its own: CasADi's copies share one, and two threads in one end the process."""
+        return pickle.loads(pickle.dumps(self))
 
     @property
     def model(self) -> ModelOrMap:

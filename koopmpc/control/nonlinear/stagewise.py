@@ -65,6 +65,14 @@ def list_sides(problem: StagedProblem) -> Sides:
     )
 
 
+def list_prices(problem: StagedProblem) -> Softness:
+    """Return half of the prices of [v_k; limited(s_{k+1})], as of the cost; inputs are hard."""
+    linear, quadratic, allowance = problem.softness
+    none = np.zeros(len(problem.R))
+    prices = [none + np.inf, 0.5 * linear], [none, 0.5 * quadratic], [none, allowance]
+    return Softness(*(np.concatenate(pair) for pair in prices))
+
+
 def linearisation(problem: StagedProblem) -> ca.Function:
     """Return (X, U, R, U_r, M, L, m, θ) → (A, B, F, Q, q, r, g, G), stage beside stage.
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc import checks
 from koopmpc.control.cost import Cost, StateTracking
-from koopmpc.control.nonlinear.equilibrium import SETTLED, Equilibria, Equilibrium
+from koopmpc.control.nonlinear.equilibrium import MISSED, Equilibria, Equilibrium
 from koopmpc.control.nonlinear.learned_map import LearnedMap
 from koopmpc.control.riccati import one_step, stationary
 from koopmpc.control.terminal_cost import tail_of, tail_stage
@@ -229,7 +229,7 @@ class RowTargets:
             return False
         weight, of = self.equilibria.weight, self.equilibria.linearise(equilibrium.x, equilibrium.u).of
         missed, size = weight @ (row - of), weight @ row
-        return bool(missed @ missed <= SETTLED * (1 + size @ size))
+        return bool(missed @ missed <= MISSED * (1 + size @ size))
 
     def _move_with(self, w: Float[np.ndarray, " nw"], row: Float[np.ndarray, " nr"]) -> Equilibrium | None:
         """Return the equilibrium of a row under w, moved there from that of the last step, or of w = 0."""
