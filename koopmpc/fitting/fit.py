@@ -15,7 +15,7 @@ from koopmpc.errors import FullDiskError
 from koopmpc.figures.eigenvalues import spectrum
 from koopmpc.figures.series import error, rollout
 from koopmpc.figures.style import save
-from koopmpc.fitting.repair import IN_MEMORY, PAST, Data, DividedData, collect_notes, read_logs
+from koopmpc.fitting.logs import IN_MEMORY, PAST, Data, DividedData, collect_notes, read_logs
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.records.narx import DELAYS
 from koopmpc.lifting.state import Constant, State

@@ -21,7 +21,7 @@ from koopmpc.data.files.load import load_episodes
 from koopmpc.errors import DataError, KoopmpcError, LogError
 from koopmpc.fitting.certified import describe_certificate
 from koopmpc.fitting.fit import Say, describe_data, ignore_text
-from koopmpc.fitting.repair import IN_MEMORY, Data, DividedData, collect_notes, read_logs
+from koopmpc.fitting.logs import IN_MEMORY, Data, DividedData, collect_notes, read_logs
 from koopmpc.fitting.report import write_design_report
 from koopmpc.fitting.set_points import take_set_points
 from koopmpc.identify.fits.edmd import edmd

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.files.columns import drop_unit
 from koopmpc.errors import DataError
-from koopmpc.fitting.repair import DividedData
+from koopmpc.fitting.logs import DividedData
 
 
 def take_set_points(

@@ -228,24 +228,14 @@ def _whiten(errors: Float[np.ndarray, "steps m nx"]) -> Float[np.ndarray, "nx nx
     return vectors.T / np.sqrt(np.maximum(values, max(values[-1] * _EXACT, np.finfo(float).tiny)))[:, None]
 
 
-def measure_feedback(episodes: Episodes) -> Float[np.ndarray, " nu"]:
-    """Return the share of each input that readings explain, beyond what past inputs do: it is fed back.
-
-    States also explain an input of an open loop that is held for some rows, for they followed it; its next move they do
-    not know. 0 where there are too few rows to tell.
-    """
-    _, alone, both = _explain_inputs(episodes)
-    return 1 - np.divide(both, alone, out=np.ones(len(alone)), where=alone > 0) ** 2
-
-
 def _check_set_point(episodes: Episodes) -> None:
     """Raise DataError where an input is a function of past readings and inputs: nothing but noise moves the loop."""
-    for name, size, alone, both in zip(episodes.inputs, *_explain_inputs(episodes), strict=True):
+    for name, size, alone, both in zip(episodes.inputs, *explain_by_readings(episodes), strict=True):
         if both < _FEEDBACK * size < alone:
             raise DataError(f"{_NOT_IDENTIFIABLE}: {name} {RESTS}; move the set point, or add a test signal")
 
 
-def _explain_inputs(episodes: Episodes) -> tuple[Float[np.ndarray, " nu"], ...]:
+def explain_by_readings(episodes: Episodes) -> tuple[Float[np.ndarray, " nu"], ...]:
     """Return the spread of the inputs, what past inputs leave of it, and what these and the readings leave."""
     long = [e for e in episodes if len(e) > 4 * _PAST]
     columns = (_PAST - 1) * episodes.nu + _PAST * episodes.nx

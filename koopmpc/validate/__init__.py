@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from koopmpc.validate.bands import forecast as forecast
     from koopmpc.validate.binomial import bound_failure_rate as bound_failure_rate
     from koopmpc.validate.binomial import count_runs_needed as count_runs_needed
+    from koopmpc.validate.closed_loop import feedback_share as feedback_share
     from koopmpc.validate.drift import DriftReport as DriftReport
     from koopmpc.validate.drift import find_drift as find_drift
     from koopmpc.validate.logs.audit import AuditReport as AuditReport
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from koopmpc.validate.sufficiency import Coverage as Coverage
     from koopmpc.validate.sufficiency import Persistency as Persistency
     from koopmpc.validate.sufficiency import coverage as coverage
-    from koopmpc.validate.sufficiency import feedback_share as feedback_share
     from koopmpc.validate.sufficiency import persistency as persistency
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

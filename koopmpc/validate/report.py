@@ -17,6 +17,7 @@ from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.terminal import build_table, label_lines, render_text
 from koopmpc.text import shorten_observable, to_percent, with_unit
 from koopmpc.validate.bands import BandCoverage, ConformalBand, conformal, cut_record
+from koopmpc.validate.closed_loop import explain_beyond_past, explain_inputs
 from koopmpc.validate.memory import Memory, find_hidden_state
 from koopmpc.validate.residuals import Invariance, ResidualDMD, compute_moments, measure_eigenpairs, measure_invariance
 from koopmpc.validate.scoring import AnyPredictor, Score, score
@@ -24,8 +25,6 @@ from koopmpc.validate.sufficiency import (
     Coverage,
     Persistency,
     coverage,
-    explain_beyond_past,
-    explain_inputs,
     persistency,
 )
 from koopmpc.values import Value

@@ -1,4 +1,4 @@
-"""Checks that data suffice for a fit: coverage of the state space, excitation of the inputs, feedback in the inputs."""
+"""Checks that data suffice for a fit: coverage of the state space, excitation of the inputs."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,16 +10,10 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.data.delay import Delay, name_past
 from koopmpc.data.episodes import Episodes, episodes_of
-from koopmpc.data.source import Source
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.moments.moments import Moments, both_sides
-from koopmpc.identify.solve import column_norms, orthonormal_basis, project_onto, scale_to_unit_norm
-from koopmpc.lifting.base import Lifting
+from koopmpc.identify.solve import scale_to_unit_norm
 from koopmpc.text import with_unit
-from koopmpc.validate.residuals import compute_moments
-from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.values import Value
 
 _BLOCK_ROWS = 4096  # samples that are binned in one block
@@ -27,8 +21,6 @@ _MOST_BINS = 10  # default number of bins of a coordinate, if the data are enoug
 _CELL_SAMPLES = 10  # the default number of bins leaves on average this many samples in a cell of a pair
 _MOST_PAIRED = 40  # count cells of pairs up to this number of coordinates
 _BLOCK_WINDOWS = 4096  # windows of the inputs in one block
-_MOST_ROWS = 20_000  # rows on which outputs and past inputs are compared
-_EXACT = 1e-9  # share of an input's energy below which its past determines it
 _NOTABLE = 0.05  # report an empty rectangle if its share of the pair's box is at least this
 
 
@@ -353,87 +345,3 @@ def persistency(episodes: Episodes, order: int) -> Persistency:
             break
         conditions[L - 1] = s[0] / s[-1]
     return Persistency(int(np.isfinite(conditions).sum()), order, conditions, windows)
-
-
-def feedback_share(
-    episodes: Episodes | Source, lifting: Lifting | AnyPredictor, *, embedding: Delay | None = None
-) -> Float[np.ndarray, " nu"]:
-    """Return for each input the share R², 0 … 1, of its energy that a linear function of ψ(x) explains.
-
-    At 1 the input was a feedback u = K ψ(x), and the data cannot separate A from B. If ψ contains a Constant, the
-    energy is that around the mean; if ψ contains past inputs, only what they leave open counts, for a smooth input is
-    no feedback. An input of few frequencies is near 1 in open loop too unless ψ contains two of its past rows for each
-    of them: it excites too little to separate A from B, see `persistency`.
-
-    Parameters
-    ----------
-    episodes
-        Episodes with inputs, or a source of them; measured disturbances count as further inputs after u.
-    lifting
-        ψ; or a predictor, for its lifting and embedding.
-    embedding
-        The delay embedding that a lifting ψ acts on.
-
-    Raises
-    ------
-    ShapeError, DataError
-        The episodes and the predictor differ in states, inputs, disturbances or dt.
-    """
-    return explain_inputs(compute_moments(episodes, lifting, embedding=embedding))
-
-
-def explain_inputs(total: Moments) -> Float[np.ndarray, " nu"]:
-    """Return the result of `feedback_share` from moments, in the order of their inputs."""
-    P, _, cut = both_sides(total)
-    nz, nu = total.nz, len(total.inputs)
-    names, constant = total.lifting.names, total.lifting.constant_index
-    always = [] if constant is None else [constant]
-    past = _name_past_inputs(total)
-    known = [*always, *(i for i, name in enumerate(names) if name in past)]
-    U = P[:, nz : nz + nu]
-    moves = _residual_norms(U, P[:, always], cut) > cut * column_norms(U)
-    variation = _residual_norms(U, P[:, known], cut)
-    unexplained = _residual_norms(U, P[:, :nz], cut)
-    varies = variation > cut * column_norms(U)
-    rest = np.divide(unexplained**2, variation**2, out=1.0 * moves, where=varies)
-    return 1.0 - rest
-
-
-def explain_beyond_past(episodes: Episodes, predictor: AnyPredictor) -> Float[np.ndarray, " nu"]:
-    """Return for each input the share R² that ψ explains of what its two rows before, and those of others, leave open.
-
-    A slow input is not feedback: outputs that answer to it tell no more of the next row than its own past does. At 1
-    where the past leaves less than a billionth, as a wave and an exact law do.
-    """
-    before, psi, u = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-    for episode in predictor.embed(episodes):
-        U = episode.U[:_MOST_ROWS]
-        before.append(np.hstack([U[1:-1], U[:-2], np.ones((max(len(U) - 2, 0), 1))]))
-        psi.append(predictor.lifting(episode.X[2 : len(U)]))
-        u.append(U[2:])
-        if sum(map(len, u)) >= _MOST_ROWS:
-            break
-    past, targets = np.concatenate(before), np.concatenate(u)
-    left = column_norms(targets - project_onto(past, targets))
-    both = np.hstack([past, np.concatenate(psi)])
-    rest = column_norms(targets - project_onto(both, targets))
-    varies = left > np.sqrt(_EXACT) * column_norms(targets - targets.mean(axis=0))
-    return np.where(varies, 1.0 - (rest / np.where(varies, left, 1.0)) ** 2, 1.0)
-
-
-def _name_past_inputs(total: Moments) -> set[str]:
-    """Return the names that past inputs have among the entries of ζ."""
-    past = total.embedding
-    if past is None or not past.inputs:
-        return set()
-    return {name_past(name, i) for i in range(1, past.steps + 1) for name in total.inputs}
-
-
-def _residual_norms(
-    U: Float[np.ndarray, "m nu"], columns: Float[np.ndarray, "m n"], cut: float
-) -> Float[np.ndarray, " nu"]:
-    """Return the norm of each column of U after projection onto the complement of the span of `columns`."""
-    if columns.shape[1] == 0:
-        return column_norms(U)
-    basis = orthonormal_basis(columns, cut)
-    return column_norms(U - basis @ (basis.T @ U))

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 from koopmpc.cli.app import app
-from koopmpc.fitting.repair import read_logs
+from koopmpc.fitting.logs import read_logs
 
 
 def write(path, rows=1200, **columns):

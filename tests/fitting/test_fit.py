@@ -18,7 +18,8 @@ from koopmpc.bench.store import RESULTS
 from koopmpc.cli.app import app
 from koopmpc.figures import style
 from koopmpc.fitting.fit import fit_data
-from koopmpc.fitting.repair import describe_guesses, divide_files, find_repairs, read_logs, shorten_notes
+from koopmpc.fitting.logs import describe_guesses, divide_files, read_logs, shorten_notes
+from koopmpc.fitting.repair import find_repairs
 from tests import tiers
 from tests.bench.tiny import write
 

@@ -17,7 +17,7 @@ from koopmpc.cli.app import app
 from koopmpc.control.base import MPCBase
 from koopmpc.fitting.check import RunKind, check_controller
 from koopmpc.fitting.goal import design_data, format_template, load_reading, read_goal, write_template
-from koopmpc.fitting.repair import read_logs, round_step
+from koopmpc.fitting.logs import read_logs, round_step
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign, read_controller
 from koopmpc.synthesis.doubts import describe_rest

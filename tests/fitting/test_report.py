@@ -14,7 +14,7 @@ from koopmpc.figures.evidence import draw_forecast, draw_log, draw_loops
 from koopmpc.figures.style import render_svg
 from koopmpc.fitting.check import check_controller
 from koopmpc.fitting.goal import design_data
-from koopmpc.fitting.repair import read_logs
+from koopmpc.fitting.logs import read_logs
 from koopmpc.fitting.report import _SHOWN, _add_goal, _choose_columns
 from koopmpc.page import HtmlPage
 from koopmpc.predict.base import load_value

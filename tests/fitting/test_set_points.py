@@ -5,7 +5,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.fitting.goal import design_data
-from koopmpc.fitting.repair import IN_MEMORY, read_logs
+from koopmpc.fitting.logs import IN_MEMORY, read_logs
 from koopmpc.fitting.set_points import take_set_points
 from koopmpc.synthesis.search.feedback import remove_feedback
 from tests.fitting.mass import GOAL, A, B

@@ -21,7 +21,8 @@ from koopmpc.synthesis.search.free_runs import (
     judge_free_run,
 )
 from koopmpc.synthesis.search.hidden_states import NEAR, PAYS, judge_hidden_states
-from koopmpc.synthesis.search.records import is_fed_back, is_late
+from koopmpc.synthesis.search.records import is_late
+from koopmpc.validate.closed_loop import is_fed_back
 from tests.identify.test_hidden_state import saturating_record
 from tests.identify.test_neural import friction_record
 from tests.searches import select

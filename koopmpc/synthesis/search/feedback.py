@@ -1,14 +1,4 @@
-"""Logs of closed loops before a choice of models: noise is projected out by the set points where unseen rows gain.
-
-Four tests find feedback in logs, for four questions:
-
-- `feedback_share`: how much of u_k is a function of ψ(x_k), so that A and B cannot be separated? Also that of an
-  input which is held until the states have followed it.
-- `measure_feedback`: what do readings tell of u_k beyond past inputs, so that their noise comes back by the input?
-- `validate.logs.alignment.find_feedback`: is the law near enough to exact to be a fault of the log? Both at once.
-- `records.is_fed_back`: does u_{k+1} hold y_{k+1}, if input columns may be a row late? Past outputs and moves only, on
-  unseen rows, by least absolute deviations, so that moves of a set point do not hide it.
-"""
+"""Logs of closed loops before a choice of models: noise is projected out by the set points where unseen rows gain."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,15 +13,15 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.smoother import Mender
 from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.innovations import RESTS, filter_states, fit_with_gain, measure_feedback
+from koopmpc.identify.innovations import RESTS, filter_states, fit_with_gain
 from koopmpc.identify.instruments import check_instruments, instrumental_edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Standardized
 from koopmpc.lifting.radial import ThinPlate
 from koopmpc.lifting.state import Constant, State
 from koopmpc.text import to_percent
+from koopmpc.validate.closed_loop import feedback_share, measure_feedback
 from koopmpc.validate.scoring import score
-from koopmpc.validate.sufficiency import feedback_share
 
 FEEDBACK = 0.05  # logs hold feedback where the states explain this share of an input, and of what its past leaves
 _LAGS = 40  # rows of the set point that the projection sees: a loop should settle within them

@@ -30,57 +30,11 @@ from koopmpc.synthesis.search.free_runs import (
 )
 from koopmpc.synthesis.search.leaderboard import Selection
 from koopmpc.validate.scoring import AnyPredictor
+from koopmpc.validate.closed_loop import is_fed_back
 
 MARGIN = 0.8  # the input column is moved up if that lowers the error on unseen rows to this share
-FEEDBACK = 0.95  # inputs are fed back if outputs lower the error of their prediction below this share
-_STATIC = 0.1  # inputs are fed back if outputs of the same row leave less than this share of their moves open
-_PAST = 6  # rows of the past in the test for feedback
-_LAGS = range(1, _PAST + 1)
-_PASSES = 6  # weighted least squares fits for least absolute deviations
 _PROBE = (2, 4)  # past rows of the models that compare both timings of the inputs
 _PROBED = 3000  # rows of each record that these models learn from, at most
-
-
-def is_fed_back(episodes: Episodes) -> bool:
-    """Return whether an input may be a feedback of the outputs, so that nothing tells when it acts.
-
-    Either past outputs predict u_{k+1} better than its own past does, on unseen rows; or most of its moves are a
-    function of the outputs in the same rows. Both use least absolute deviations, so that a few moves of a set point do
-    not hide it. Under feedback u_{k+1} holds y_{k+1}, and a model with the inputs moved up would seem to know y_{k+1}.
-    """
-    long = [e for e in episodes if len(e) > 4 * _PAST]
-    if not long:
-        return True  # too short to tell
-    past = np.concatenate([np.hstack([e.U[_PAST - i : len(e) - i] for i in _LAGS]) for e in long])
-    outputs = np.concatenate([np.hstack([e.X[_PAST - i : len(e) - i] for i in _LAGS]) for e in long])
-    now = np.concatenate([e.U[_PAST:] for e in long])
-    move = np.concatenate([np.diff(e.U, axis=0) for e in long])
-    same = np.concatenate([np.hstack([np.diff(e.X[:-1], axis=0), e.X[1:-1]]) for e in long])
-    for target, step in zip(now.T, move.T, strict=True):
-        own, both = _miss(past, target), _miss(np.hstack([past, outputs]), target)
-        cap = 5 * float(np.median(own))
-        if np.minimum(both, cap).mean() < FEEDBACK * np.minimum(own, cap).mean():
-            return True
-        moving = step != 0
-        if moving.any() and np.median(_miss(same[moving], step[moving])) < _STATIC * np.median(np.abs(step[moving])):
-            return True
-    return False
-
-
-def _miss(P: Float[np.ndarray, "M n"], target: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
-    """Return |t − [1, P] k| on each quarter of the rows, k by least absolute deviations over the others."""
-    A = np.hstack([np.ones((len(P), 1)), P])
-    fold, missed = np.arange(len(A)) * FOLDS // len(A), np.empty(len(A))
-    for out in range(FOLDS):
-        rows = fold != out
-        weight = np.ones(int(rows.sum()))
-        k = np.zeros(A.shape[1])
-        for _ in range(_PASSES):  # least squares with weights 1 / |residual|
-            k = np.linalg.lstsq(A[rows] * weight[:, None], target[rows] * weight, rcond=None)[0]
-            gap = np.abs(target[rows] - A[rows] @ k)
-            weight = 1 / np.sqrt(np.maximum(gap, max(float(np.median(gap)), 1e-12)))
-        missed[~rows] = np.abs(target[~rows] - A[~rows] @ k)
-    return missed
 
 
 def is_late(episodes: Episodes) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.lifting.base import strip_unit
-from koopmpc.text import to_percent
+from koopmpc.validate.closed_loop import stack_past_inputs
 from koopmpc.validate.logs.log import Log, LogFault, compute_information, fit_residuals
 
 _LATEST = 8  # try shifts of a signal up to this many steps
@@ -342,12 +342,6 @@ def _refine_limits(log: Log, aligned: AlignedRows, j: int, low: float, high: flo
     return low, high
 
 
-_PAST = 10  # number of past inputs that may predict the next one
-_FEEDBACK = 0.8  # an input is feedback if the state of the same row explains more than this share of it, and
-_INNOVATION = 0.02  # explains more than this share of the part that past inputs do not predict, and
-_UNPREDICTED = 1e-4  # past inputs leave more than this share of the input unpredicted
-
-
 def find_dependent_inputs(log: Log) -> Iterator[LogFault]:
     """Find inputs that follow from the other inputs."""
     U = log.U
@@ -370,7 +364,7 @@ def find_inputs_without_effect(log: Log) -> Iterator[LogFault]:
     aligned = align_rows(log, margin=6)
     if not nu or len(aligned.X) < max(_LEAST_ROWS, 4 * aligned.regressors(log).shape[1]):
         return
-    V = np.concatenate([_stack_past(e.U, 6, len(e) - 6, 6) for e in log.data if len(e) >= 15])[: len(aligned.X)]
+    V = np.concatenate([stack_past_inputs(e.U, 6, len(e) - 6, 6) for e in log.data if len(e) >= 15])[: len(aligned.X)]
     base = [log.regressors(aligned.X), (aligned.before - log.center) / log.size]
     Y = (aligned.after - aligned.X) / log.size
     for j in range(nu):
@@ -387,49 +381,5 @@ def find_inputs_without_effect(log: Log) -> Iterator[LogFault]:
                 "input without effect",
                 f"{name} moves, and no state follows within 6 steps",
                 f"check that {name} was applied and is in the right column; excite it more strongly; else leave it out",
-                (log.data.inputs[j],),
-            )
-
-
-def _stack_past(U: np.ndarray, first: int, last: int, count: int) -> np.ndarray:
-    """Return rows [u_k, u_{k−1}, …, u_{k−count+1}] for k = first + 1 … last − 1."""
-    k = np.arange(first + 1, last)
-    return np.hstack([U[k - lag] for lag in range(count)])
-
-
-def find_feedback(log: Log) -> Iterator[LogFault]:
-    """Find inputs u_k that follow from the state x_k of the same row.
-
-    If the plant is much faster than the changes of the input, the state predicts a freely chosen input too. A feedback
-    u = K x shows two further signs. x_k explains more of u_k than of u_{k−1}, which has already acted on the plant. And
-    x_k explains a part of u_k that earlier inputs do not predict.
-    """
-    long, nu = [e for e in log.data if len(e) > 2 * _PAST], log.data.nu
-    if not long or not nu:
-        return
-    now = np.concatenate([e.U[_PAST + 1 :] for e in long])
-    past = np.concatenate([_stack_past(e.U, _PAST, len(e), _PAST + 1)[:, nu:] for e in long])
-    state = np.concatenate([e.X[_PAST + 1 : -1] for e in long])
-    if len(now) < max(_LEAST_ROWS, 4 * (past.shape[1] + state.shape[1])):
-        return
-    V = (now - log.input_center) / log.input_size
-    history = (past - np.tile(log.input_center, _PAST)) / np.tile(log.input_size, _PAST)
-    ones, Z = np.ones((len(V), 1)), (state - log.center) / log.size
-    by_past = (fit_residuals(np.hstack([ones, history]), V) ** 2).mean(axis=0)
-    by_both = (fit_residuals(np.hstack([ones, history, Z]), V) ** 2).mean(axis=0)
-    targets = np.hstack([V, history[:, :nu]])  # u_k and u_{k−1}
-    by_state, previous = np.split((fit_residuals(np.hstack([ones, Z]), targets) ** 2).mean(axis=0), 2)
-    variance = np.maximum((V**2).mean(axis=0) - V.mean(axis=0) ** 2, 1e-300)
-    for j in np.flatnonzero(variance > 1e-12):
-        innovation = 1 - by_both[j] / max(by_past[j], 1e-300)
-        exact = by_state[j] < 1e-8 * variance[j]
-        explained = by_state[j] < (1 - _FEEDBACK) * variance[j] and by_state[j] < previous[j]
-        if exact or (explained and innovation > _INNOVATION and by_past[j] > _UNPREDICTED * variance[j]):
-            name = strip_unit(log.data.inputs[j])
-            yield LogFault(
-                "feedback",
-                f"the states explain {to_percent(1 - by_state[j] / variance[j])} of {name}: it was a feedback, so the "
-                "data cannot separate A from B",
-                f"add noise to {name} while logging: km.Feedback(K, km.Noise(…))",
                 (log.data.inputs[j],),
             )

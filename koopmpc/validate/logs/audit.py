@@ -12,24 +12,32 @@ from koopmpc.data.episodes import Episode, Episodes, episodes_of
 from koopmpc.errors import DataError
 from koopmpc.terminal import label_lines, render_text
 from koopmpc.text import to_percent
+from koopmpc.validate.closed_loop import find_feedback
 from koopmpc.validate.drift import DriftReport, find_drift
 from koopmpc.validate.logs import values
 from koopmpc.validate.logs.alignment import (
     find_dependent_inputs,
-    find_feedback,
     find_inputs_without_effect,
     find_late_signals,
     find_saturated_actuators,
 )
 from koopmpc.validate.logs.changes import find_changes
-from koopmpc.validate.logs.log import Log, LogFault, Place, find_stretches, list_places
+from koopmpc.validate.logs.log import (
+    Log,
+    LogFault,
+    Place,
+    Repair,
+    find_stretches,
+    list_checks,
+    list_places,
+    register_check,
+)
 from koopmpc.validate.logs.timing import InputTiming, Timing, find_same_row_inputs, measure_timing
 from koopmpc.validate.memory import Memory, find_hidden_state
 from koopmpc.values import Value
 
 DELAYS = "Fit with delays (embedding=km.Delay(2)) or with a hidden state (km.identify.subspace), or measure that state"
-Check = Callable[[Log], Iterator[LogFault]]
-_VALUE_CHECKS: tuple[Check, ...] = (
+for _check in (
     values.find_repeated_columns,
     values.find_repeated_episodes,
     values.find_coarse_sensors,
@@ -39,13 +47,10 @@ _VALUE_CHECKS: tuple[Check, ...] = (
     values.find_saturated_sensors,
     values.find_held_samples,
     values.find_outliers,
-)
-_INPUT_CHECKS: tuple[Check, ...] = (
-    values.find_constant_inputs,
-    find_dependent_inputs,
-    values.find_low_excitation,
-    find_feedback,
-)
+):
+    register_check(_check)
+for _check in (values.find_constant_inputs, find_dependent_inputs, values.find_low_excitation, find_feedback):
+    register_check(_check, of_inputs=True)
 _HIDDEN = "rows at the sensor's limit are missing, and it is the output that chose them"
 _MOST_STEPS = 200_000  # check at most this many steps, those of the first episodes
 
@@ -162,7 +167,7 @@ def audit(data: Episodes, *, times: Sequence[ArrayLike] | None = None, against: 
         checks.kind(times, "times", (tuple, list), "pass one array of times an episode")
     faults = [] if times is None else list(find_clock_faults(data, times))
     log = Log(data)
-    for check in (*_VALUE_CHECKS, *(_INPUT_CHECKS if data.nu else ())):
+    for check in (*list_checks(of_inputs=False), *(list_checks(of_inputs=True) if data.nu else ())):
         faults += check(log)
     kinds = {fault.name for fault in faults}
     whole = Remainder.of(_unwrap_angles(data, values.find_whole_turns(log)))
@@ -277,6 +282,7 @@ def find_clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[Lo
             f"the clock goes back or stands still {len(resets)} times: {list_places(resets)}",
             "cut the episodes there: load_episodes does where it goes back",
             places=resets,
+            repair=Repair.LEAVE_OUT,
         )
     gaps = _find_steps(steps, lambda d: d > _GAP * dt)
     other = [e for e, d in enumerate(steps) if abs(np.median(d) - dt) > _OTHER_RATE * dt]
@@ -287,6 +293,7 @@ def find_clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[Lo
             f"{len(other)} of {len(data)} episodes have another step than {dt:.4g} s: {shown}",
             f"bring them to one step: load_episodes(…, resample={dt:.4g})",
             places=tuple(Place(e, 0, len(steps[e]) + 1) for e in other),
+            repair=Repair.LEAVE_OUT,
         )
     gaps = tuple(p for p in gaps if p.episode not in other)
     if gaps:
@@ -295,6 +302,7 @@ def find_clock_faults(data: Episodes, times: Sequence[ArrayLike]) -> Iterator[Lo
             f"rows are missing {len(gaps)} times, by the clock: {list_places(gaps)}",
             "cut the episodes there: load_episodes does",
             places=gaps,
+            repair=Repair.LEAVE_OUT,
         )
     usual = [d for e, d in enumerate(steps) if e not in other]
     usual = np.concatenate(usual) if usual else np.zeros(0)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.lifting.base import strip_unit
-from koopmpc.validate.logs.log import Log, LogFault, Place, name_episodes, solve_weights
+from koopmpc.validate.logs.log import Log, LogFault, Place, Repair, name_episodes, solve_weights
 
 _SEGMENTS = 40  # cut the log into about this many segments
 _SHORTEST = 30  # a segment has at least this many rows
@@ -133,6 +133,7 @@ def find_changes(log: Log) -> Iterator[LogFault]:
         "undo it there, or leave these episodes out",
         change.columns,
         places,
+        repair=Repair.LEAVE_OUT if change.kind == "mixed sampling" else Repair.TRY_WITHOUT,
     )
 
 

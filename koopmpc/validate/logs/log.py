@@ -1,6 +1,8 @@
 """The data that every check of the audit reads: columns, places of faults, and one-step regressions."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from enum import Enum
 from functools import cache, cached_property
 from itertools import combinations_with_replacement
 
@@ -32,9 +34,20 @@ class Place:
         return f"episode {self.episode}, {rows}"
 
 
+class Repair(Enum):
+    """What `koopmpc fit` does about a fault before a model is fitted."""
+
+    COLUMN = "the column is left out, or unwrapped"
+    LEAVE_OUT = "its rows are left out"
+    BRIDGE = "single rows of a record are replaced by the line between their neighbours; others are left out"
+    TRY_WITHOUT = "its rows are left out of episodes; of a record only where models forecast better without them"
+
+
 @dataclass(frozen=True, eq=False)
 class LogFault(Value):
-    """One fault of the logs.
+    """One fault of the logs: what was found, the sentence that says it, and how it is repaired.
+
+    A function that takes a `Log` and yields faults is registered with `register_check`.
 
     Attributes
     ----------
@@ -50,6 +63,8 @@ class LogFault(Value):
         Rows that no model should be fitted to; empty if the fault affects the whole log.
     steps
         Steps by which a signal is late; 0 for other kinds.
+    repair
+        What is done about it before a fit.
     """
 
     name: str
@@ -58,6 +73,22 @@ class LogFault(Value):
     columns: tuple[str, ...] = ()
     places: tuple[Place, ...] = ()
     steps: int = 0
+    repair: Repair = Repair.TRY_WITHOUT
+
+
+Check = Callable[["Log"], Iterator[LogFault]]
+_CHECKS: dict[Check, bool] = {}  # in the order of registration; whether it is of logs with inputs alone
+
+
+def register_check(check: Check, *, of_inputs: bool = False) -> Check:
+    """Have `audit` look for this fault too; `of_inputs` says that it is looked for in logs with inputs alone."""
+    _CHECKS[check] = of_inputs
+    return check
+
+
+def list_checks(*, of_inputs: bool) -> list[Check]:
+    """Return the checks that need inputs, or those that do not."""
+    return [check for check, needs in _CHECKS.items() if needs is of_inputs]
 
 
 @dataclass(frozen=True, eq=False)

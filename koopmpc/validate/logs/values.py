@@ -12,7 +12,7 @@ from jaxtyping import Float
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.lifting.base import strip_unit
 from koopmpc.text import to_percent
-from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, find_stretches, list_places, name_episodes
+from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, Repair, find_stretches, list_places, name_episodes
 from koopmpc.validate.sufficiency import persistency
 
 _GRID_SHARE = 0.95  # a sensor has a grid if at least this share of its values are multiples of one step
@@ -44,6 +44,7 @@ def find_repeated_columns(log: Log) -> Iterator[LogFault]:
                         f"{second} is {factor:.6g} times {first}, up to a constant: one signal under two names",
                         f"leave {second} out: load_episodes(…, states=[…])",
                         (log.data.states[j],),
+                        repair=Repair.COLUMN,
                     )
                     break
 
@@ -73,6 +74,7 @@ def find_repeated_episodes(log: Log) -> Iterator[LogFault]:
             + ("" if len(originals) == 1 else " and others"),
             "keep one of them: a model would be judged by rows that it was fitted to",
             places=tuple(places),
+            repair=Repair.LEAVE_OUT,
         )
 
 
@@ -332,6 +334,7 @@ def find_outliers(log: Log) -> Iterator[LogFault]:
                 f"{value:.6g} marks a lost sample: leave these rows out",
                 (log.data.states[i],),
                 places,
+                repair=Repair.BRIDGE,
             )
             continue
         places = tuple(_find_spikes(log, i, changes))
@@ -342,6 +345,7 @@ def find_outliers(log: Log) -> Iterator[LogFault]:
                 "leave these rows out",
                 (log.data.states[i],),
                 places,
+                repair=Repair.BRIDGE,
             )
 
 
@@ -420,6 +424,7 @@ def find_wrapped_angles(log: Log) -> Iterator[LogFault]:
             f"{strip_unit(log.data.states[i])} jumps by {'360' if turn == 360 else '2π'} {count} times: it is wrapped",
             f"unwrap it along each episode (koopmpc fit does), or lift it by km.Fourier(2, states=[{i}]) alone",
             (log.data.states[i],),
+            repair=Repair.COLUMN,
         )
 
 
@@ -448,6 +453,7 @@ def find_jumps(log: Log) -> Iterator[LogFault]:
             f"the states go on from elsewhere {len(places)} times: {list_places(tuple(places))}",
             "rows are missing there, or a new run begins: cut the episode in two",
             places=tuple(places),
+            repair=Repair.LEAVE_OUT,
         )
 
 
@@ -460,6 +466,7 @@ def find_constant_inputs(log: Log) -> Iterator[LogFault]:
             f"{name} is {log.U[0, j]:.4g} throughout: its effect cannot be learned",
             f"excite {name}, with km.Noise or km.PRBS, or leave it out",
             (log.data.inputs[j],),
+            repair=Repair.COLUMN,
         )
 
 
