@@ -233,7 +233,7 @@ def build_predictor(regression: Regression, result: FitResult, *, warn: bool = T
         regression.states,
         regression.inputs[:nu],
         build_report(regression, result, warn=warn),
-        result.modes,
+        exact_modes=result.modes,
         E=result.B[:, nu:],
         disturbances=regression.disturbances,
         embedding=regression.embedding,

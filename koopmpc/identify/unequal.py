@@ -205,7 +205,9 @@ def _build_model(
         )
     N, S, M = model.N.copy(), model.S.copy(), model.M.copy()
     N[:, places], S[:, places], M[:, places] = parts.N[:, places], parts.S[:, places], parts.M[:, places]
-    return BilinearPredictor(A, B, N, *about, model.embedding, model.scale, E, S, model.disturbances, M)
+    return BilinearPredictor(
+        A, B, N, *about, embedding=model.embedding, scale=model.scale, E=E, S=S, M=M, disturbances=model.disturbances
+    )
 
 
 def _fit_from(

@@ -8,29 +8,32 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
-import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 from scipy.linalg.blas import dgemv
 
 from koopmpc import checks
-from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode
 from koopmpc.errors import DataError, ShapeError
-from koopmpc.interrupts import raise_swallowed
-from koopmpc.lifting.base import Lifting, bind_lifting
+from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant, State
 from koopmpc.plants.step_map import StepMap
 from koopmpc.predict import hidden_state as hidden_state  # a file names its class, which must be known by then
 from koopmpc.predict.base import FitReport, Predictor, load_value
+from koopmpc.predict.parts import (
+    BilinearParts,
+    LinearParts,
+    build_step_map,
+    check_drift,
+    refuse_unknown,
+    store_fields,
+)
 from koopmpc.predict.state_space import build_system, read_state_space
 from koopmpc.values import freeze
-
-_LARGEST = 1e300  # refuse an A with a larger entry: sums of its entries would overflow
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -77,26 +80,18 @@ class LinearPredictor(Predictor):
         states: Sequence[str],
         inputs: Sequence[str],
         report: FitReport | None = None,
-        exact_modes: Complex[np.ndarray, "nl nz"] | None = None,
-        E: ArrayLike | None = None,
-        disturbances: Sequence[str] | None = None,
-        embedding: Delay | None = None,
-        scale: ArrayLike | None = None,
+        **parts: Unpack[LinearParts],
     ) -> None:
-        _store_fields(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
-        modes = exact_modes
+        refuse_unknown(parts, LinearParts)
+        store_fields(self, (A, B, C), lifting, dt, (states, inputs), report, parts)
+        modes = parts.get("exact_modes")
         if modes is not None:
             if not isinstance(self.lifting, Projected) or modes.shape != self.lifting.basis.shape:
                 raise ShapeError(
                     f"exact_modes has shape {modes.shape}; it needs a Projected lifting with a basis of that shape"
                 )
             modes = np.array(modes, dtype=np.complex128, order="C")
-        drift = np.zeros((self.nz, 0)) if E is None else checks.bounded(E, "E", (self.nz, None))
-        nw = drift.shape[1]
-        names = tuple(f"w{i}" for i in range(nw)) if disturbances is None else tuple(disturbances)
-        if len(names) != nw:
-            raise ShapeError(f"disturbances has {len(names)} names and E {nw} columns; give one name each")
-        freeze(self, exact_modes=modes, E=drift, disturbances=names, nw=nw)
+        freeze(self, exact_modes=modes, **check_drift(self.nz, parts))
 
     def rollout(
         self, x0: ArrayLike, U: ArrayLike, W: ArrayLike | None = None, *, history: Episode | None = None
@@ -133,7 +128,7 @@ class LinearPredictor(Predictor):
 
         With an embedding it is a map of ζ: ζ⁺ = [C (A ψ(ζ) + B u + E w), u, ζ without its oldest step].
         """
-        return _build_step_map(self, self.E, self.disturbances)
+        return build_step_map(self, self.E, self.disturbances)
 
     @cached_property
     def modes(self) -> Complex[np.ndarray, "nx nz"]:
@@ -256,24 +251,15 @@ class BilinearPredictor(Predictor):
         states: Sequence[str],
         inputs: Sequence[str],
         report: FitReport | None = None,
-        embedding: Delay | None = None,
-        scale: ArrayLike | None = None,
-        E: ArrayLike | None = None,
-        S: ArrayLike | None = None,
-        disturbances: Sequence[str] | None = None,
-        M: ArrayLike | None = None,
+        **parts: Unpack[BilinearParts],
     ) -> None:
-        _store_fields(self, A, B, C, lifting, dt, states, inputs, report, embedding, scale)
-        nz = self.nz
-        drift = np.zeros((nz, 0)) if E is None else checks.bounded(E, "E", (nz, None))
-        nw = drift.shape[1]
-        names = tuple(f"w{i}" for i in range(nw)) if disturbances is None else tuple(disturbances)
-        if len(names) != nw:
-            raise ShapeError(f"disturbances has {len(names)} names and E {nw} columns; give one name each")
+        refuse_unknown(parts, BilinearParts)
+        store_fields(self, (A, B, C), lifting, dt, (states, inputs), report, parts)
+        nz, nu, drift, S, M = self.nz, self.nu, check_drift(self.nz, parts), parts.get("S"), parts.get("M")
+        nw = drift["nw"]
         schedule = np.zeros((nw, nz, nz)) if S is None else checks.bounded(S, "S", (nw, nz, nz))
-        nu = len(inputs)
         steer = np.zeros((nw, nz, nu)) if M is None else checks.bounded(M, "M", (nw, nz, nu))
-        freeze(self, N=checks.bounded(N, "N", (nu, nz, nz)), E=drift, S=schedule, M=steer, disturbances=names, nw=nw)
+        freeze(self, N=checks.bounded(N, "N", (nu, nz, nz)), S=schedule, M=steer, **drift)
 
     @property
     def is_scheduled(self) -> bool:
@@ -301,8 +287,9 @@ class BilinearPredictor(Predictor):
             raise DataError("a constant w pushes the state, which needs a Constant; add km.Constant() to the lifting")
         if constant is not None:
             A[:, constant] += push
-        about = (self.C, self.lifting, self.dt, self.states, self.inputs, self.report, self.embedding, self.scale)
-        return BilinearPredictor(A, self.B + np.tensordot(values, self.M, 1), self.N, *about)
+        about = (self.C, self.lifting, self.dt, self.states, self.inputs, self.report)
+        B = self.B + np.tensordot(values, self.M, 1)
+        return BilinearPredictor(A, B, self.N, *about, embedding=self.embedding, scale=self.scale)
 
     def rollout(
         self, x0: ArrayLike, U: ArrayLike, W: ArrayLike | None = None, *, history: Episode | None = None
@@ -338,7 +325,7 @@ class BilinearPredictor(Predictor):
 
         With an embedding it is a map of ζ, whose past w does not move.
         """
-        return _build_step_map(self, self.E, self.disturbances, self.N, self.S, self.M)
+        return build_step_map(self, self.E, self.disturbances, self.N, self.S, self.M)
 
 
 def relift_rollout(
@@ -360,85 +347,3 @@ def load_model(path: str | Path) -> LinearPredictor | BilinearPredictor:
         The file is missing, damaged, or does not hold a predictor.
     """
     return load_value(path, LinearPredictor, BilinearPredictor)
-
-
-def _store_fields(
-    predictor: Predictor,
-    A: ArrayLike,
-    B: ArrayLike,
-    C: ArrayLike,
-    lifting: Lifting,
-    dt: float,
-    states: Sequence[str],
-    inputs: Sequence[str],
-    report: FitReport | None,
-    embedding: Delay | None,
-    scale: ArrayLike | None,
-) -> None:
-    """Check the fields that all predictors share and store them."""
-    states, inputs = checks.texts(states, "states"), checks.texts(inputs, "inputs")
-    if embedding is not None:
-        checks.kind(embedding, "embedding", Delay, "pass km.Delay(steps)")
-    bound_embedding = None if embedding is None else embedding.bind(states, inputs)
-    bound = bind_lifting(lifting, states if bound_embedding is None else bound_embedding.names)
-    nz, nx, nu = bound.nz, len(states), len(inputs)
-    transition = checks.array(A, "A")
-    largest = float(np.abs(transition).max(initial=0.0))
-    if largest > _LARGEST:
-        raise DataError(f"A holds {largest:.3g}, so products with A overflow; scale the states, or fit again")
-    if transition.shape != (nz, nz):
-        raise ShapeError(
-            f"A has shape {transition.shape}, but the lifting returns {nz} observables; "
-            "pass the lifting used in the fit"
-        )
-    freeze(
-        predictor,
-        A=transition,
-        B=checks.bounded(B, "B", (nz, nu)),
-        C=checks.bounded(C, "C", (nx, nz)),
-        lifting=bound,
-        dt=checks.positive(dt, "dt", "s"),
-        states=states,
-        inputs=inputs,
-        report=report,
-        embedding=bound_embedding,
-        scale=None if scale is None else _check_scale(scale, nz),
-        nx=nx,
-        nu=nu,
-        nz=nz,
-    )
-
-
-def _check_scale(scale: ArrayLike, nz: int) -> Float[np.ndarray, "nz nz"]:
-    """Return the scale as an array; raise if it is not upper triangular or has a zero on its diagonal."""
-    R = checks.array(scale, "scale", (nz, nz))
-    if np.tril(R, -1).any() or not R.diagonal().all():
-        raise DataError(
-            "scale is not upper triangular with a nonzero diagonal; pass the triangular factor of the lifted "
-            "data, np.linalg.qr(Z, mode='r') / sqrt(len(Z)), or leave it out"
-        )
-    return R
-
-
-@raise_swallowed()
-def _build_step_map(
-    predictor: Predictor,
-    E: Float[np.ndarray, "nz nw"],
-    disturbances: tuple[str, ...],
-    N: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray = (),
-    S: Sequence[Float[np.ndarray, "nz nz"]] | np.ndarray = (),
-    M: Sequence[Float[np.ndarray, "nz nu"]] | np.ndarray = (),
-) -> StepMap:
-    """Return x⁺ = C ((A + Σ uᵢ Nᵢ + Σ wⱼ Sⱼ) ψ(x) + (B + Σ wⱼ Mⱼ) u + E w) as a StepMap of x, or of ζ."""
-    x, u, w = (ca.SX.sym(*each) for each in (("x", len(predictor.point_names)), ("u", predictor.nu), ("w", E.shape[1])))
-    C, z = predictor.C, predictor.lifting.symbolic(x)
-    x_next = ca.DM(C @ predictor.A) @ z + ca.DM(C @ predictor.B) @ u
-    for factor, products, of in ((u, N, z), (w, S, z), (w, M, u)):
-        for i, each in enumerate(products):
-            x_next += factor[i] * (ca.DM(C @ each) @ of)
-    if disturbances:
-        x_next += ca.DM(C @ E) @ w
-    point_next = x_next if predictor.embedding is None else predictor.embedding.symbolic(x, u, x_next)
-    arguments, names = ([x, u, w], ["x", "u", "w"]) if disturbances else ([x, u], ["x", "u"])
-    F = ca.Function("F", arguments, [ca.densify(point_next)], names, ["x_next"], {"cse": True})
-    return StepMap(F, predictor.dt, states=predictor.point_names, inputs=predictor.inputs, disturbances=disturbances)

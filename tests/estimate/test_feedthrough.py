@@ -34,8 +34,10 @@ def learn(direct, kind="linear"):
     model = km.edmd(data, PLAIN, embedding=km.Delay(1 + direct), route="qr")
     if kind == "linear":
         return model
-    about = model.C, model.lifting, model.dt, model.states, model.inputs, model.report, model.embedding, model.scale
-    return km.BilinearPredictor(model.A, model.B, np.zeros((1, model.nz, model.nz)), *about)
+    about = model.C, model.lifting, model.dt, model.states, model.inputs, model.report
+    return km.BilinearPredictor(
+        model.A, model.B, np.zeros((1, model.nz, model.nz)), *about, embedding=model.embedding, scale=model.scale
+    )
 
 
 def controller(kind, direct, horizon=N):

@@ -165,12 +165,12 @@ def bilinear_edmd(
         regression.states,
         source.inputs,
         build_report(regression, result),
-        regression.embedding,
-        compute_scale_factor(P[:, :r], rows.samples),
-        parts.E,
-        parts.S,
-        source.disturbances,
-        parts.M,
+        embedding=regression.embedding,
+        scale=compute_scale_factor(P[:, :r], rows.samples),
+        E=parts.E,
+        S=parts.S,
+        M=parts.M,
+        disturbances=source.disturbances,
     )
 
 

@@ -201,7 +201,15 @@ def from_standard(
     output = np.zeros((ny, nz))
     output[:, : n + 1] = C
     return BilinearPredictor(
-        whole, driven, products, output, lifting, *about, report, embedding, compute_scale_factor(Z, len(Z))
+        whole,
+        driven,
+        products,
+        output,
+        lifting,
+        *about,
+        report,
+        embedding=embedding,
+        scale=compute_scale_factor(Z, len(Z)),
     )
 
 

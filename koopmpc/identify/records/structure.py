@@ -316,8 +316,8 @@ def _build_model(
         regression.states,
         regression.inputs,
         build_report(regression, result),
-        regression.embedding,
-        compute_scale(regression, regression.lifting),
+        embedding=regression.embedding,
+        scale=compute_scale(regression, regression.lifting),
     )
 
 

@@ -127,8 +127,8 @@ def relift_model(model: LinearPredictor) -> BilinearPredictor:
         sentence = "N = 0: it forecasts better if it is lifted at each step, as bilinear models are used"
         report = replace(report, changes=(*report.changes, sentence))
     N = np.zeros((model.nu, model.nz, model.nz))
-    about = (model.C, model.lifting, model.dt, model.states, model.inputs, report, model.embedding, model.scale)
-    return BilinearPredictor(model.A, model.B, N, *about)
+    about = (model.C, model.lifting, model.dt, model.states, model.inputs, report)
+    return BilinearPredictor(model.A, model.B, N, *about, embedding=model.embedding, scale=model.scale)
 
 
 def check_delays(delays: Sequence[int]) -> list[int]:
