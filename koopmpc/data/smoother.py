@@ -26,16 +26,31 @@ from koopmpc.data.state_space import (
 from koopmpc.errors import DataError
 from koopmpc.values import Value
 
-_LARGEST = 30  # entries of x_k … x_{k−d}: the work grows with their third power
-_WINDOW = 60  # a model is fitted to stretches of at most this many steps
-_WINDOWS = 100  # and to at most this many stretches
-_BLOCK = 1000  # episodes of twice this many rows or more are smoothed in parts of about this length
-_OVERLAP = 200  # each part sees this many rows more at either end
-_EACH = 10  # snapshot pairs for each regressor, at least
-_BETTER = 0.05  # more delays must raise the log-likelihood a number by this: prediction errors 5 % smaller
-_PASSES = 4  # the products are those of the smoothed states, which the first pass does not have
-_SMALL = 1e-4  # noise below this share of a state's spread counts as rounding
-_SHARE = 0.5  # noise below this share of the model's one-step error cannot be distinguished from that error
+
+@dataclass(frozen=True)
+class _Limits:
+    """Sizes and limits of the smoother."""
+
+    largest: int = 30  # entries of x_k … x_{k−d}: the work grows with their third power
+    window: int = 60  # a model is fitted to stretches of at most this many steps
+    windows: int = 100  # and to at most this many stretches
+    block: int = 1000  # episodes of twice this many rows or more are smoothed in parts of about this length
+    overlap: int = 200  # each part sees this many rows more at either end
+    each: int = 10  # snapshot pairs for each regressor, at least
+    better: float = 0.05  # more delays must raise the log-likelihood a number by this: prediction errors 5 % smaller
+    passes: int = 4  # the products are those of the smoothed states, which the first pass does not have
+    small: float = 1e-4  # noise below this share of a state's spread counts as rounding
+    share: float = 0.5  # noise below this share of the model's one-step error cannot be distinguished from that error
+    size: float = 8.0  # standard deviations of what the others say of a measurement
+    far: float = 0.5  # of a state's spread: what is less far off spoils no fit
+    beside: int = 3  # rows around a glitch that miss by it too
+    solved: float = 0.3  # of a glitch that may be left in the rows around it once it is replaced
+    rounds: int = 6  # of finding the largest ones and going on without them
+    fits: int = 3  # of the model, each to data without the glitches that the one before found
+    floor: float = 0.01  # of V: the least variance of the measurements
+
+
+_LIMITS = _Limits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +167,7 @@ class Smoother(Value):
     @property
     def is_noisy(self) -> Bool[np.ndarray, " nx"]:
         """(nx,) True for each state with noise that can be told from what the model misses, and from rounding."""
-        return (self.noise > _SHARE * self.missed) & (self.noise > _SMALL * self.scale[: len(self.noise)])
+        return (self.noise > _LIMITS.share * self.missed) & (self.noise > _LIMITS.small * self.scale[: len(self.noise)])
 
     def __call__(self, episodes: Episodes) -> Episodes:
         """Return the episodes with smoothed states; an episode of d steps or fewer stays as it is."""
@@ -168,7 +183,7 @@ class Smoother(Value):
         """Return E[s_k | all measurements]; products are those of the smoothed states."""
         model = self.model
         gains, states = gains_of(model, given.X.shape[1] - self.delays), stack_delays(given.X, self.delays)
-        for _ in range(_PASSES if self.products else 1):
+        for _ in range(_LIMITS.passes if self.products else 1):
             states = smooth(model, gains, given, model.drive(states, given.U))
         return states
 
@@ -224,17 +239,17 @@ def _state_space(
     for delays in DELAYS:
         size = data.nx * (delays + 1)
         linear = size + data.nu * (delays + 1) + 1
-        if size > _LARGEST or pairs < _EACH * linear:
+        if size > _LIMITS.largest or pairs < _LIMITS.each * linear:
             continue
-        enough = pairs >= _EACH * (linear + data.nx * (data.nx + 1) // 2 + data.nx * data.nu)
+        enough = pairs >= _LIMITS.each * (linear + data.nx * (data.nx + 1) // 2 + data.nx * data.nu)
         fits.append(fit_state_space(windows, delays, products=products and enough))
     if not fits:
         raise DataError(
-            f"{pairs} steps of {data.nx} states are too few for a smoother: it needs {_EACH} steps for each "
-            f"regressor and takes {_LARGEST} states at most"
+            f"{pairs} steps of {data.nx} states are too few for a smoother: it needs {_LIMITS.each} steps for each "
+            f"regressor and takes {_LIMITS.largest} states at most"
         )
     best = max(likelihood for likelihood, _ in fits)
-    return next(model for likelihood, model in fits if likelihood > best - _BETTER)
+    return next(model for likelihood, model in fits if likelihood > best - _LIMITS.better)
 
 
 def _windows(data: Episodes, mean: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"]) -> Stretches:
@@ -244,13 +259,13 @@ def _windows(data: Episodes, mean: Float[np.ndarray, " n"], scale: Float[np.ndar
     """
     lengths = np.sort([len(episode) for episode in data])[::-1]
     half = int(lengths[np.argmax(np.cumsum(lengths) >= lengths.sum() / 2)])
-    steps = min(half, _WINDOW)
+    steps = min(half, _LIMITS.window)
     if steps < 2 * max(DELAYS) + 2:
         raise DataError(
             f"episodes of {half} steps hold half of the data; a smoother needs {2 * max(DELAYS) + 2} steps or more"
         )
     places = [(i, k) for i, e in enumerate(data) for k in range(0, len(e) - steps + 1, steps)]
-    count = min(len(places), _WINDOWS)
+    count = min(len(places), _LIMITS.windows)
     chosen = [places[(len(places) - 1) * i // max(count - 1, 1)] for i in range(count)]
     X = np.array([data[i].X[k : k + steps + 1] for i, k in chosen])
     U = np.array([data[i].U[k : k + steps] for i, k in chosen])
@@ -264,21 +279,12 @@ def _alike(lengths: Sequence[int], delays: int) -> Iterator[list[_Passage]]:
     for i, length in enumerate(lengths):
         if length <= delays:
             continue
-        count = 1 if length < 2 * _BLOCK else length // _BLOCK
+        count = 1 if length < 2 * _LIMITS.block else length // _LIMITS.block
         ends = [(length + 1) * k // count for k in range(count + 1)]
         for low, high in pairwise(ends):
-            piece = _Passage(i, max(low - _OVERLAP, 0), min(high + _OVERLAP, length + 1), low, high)
+            piece = _Passage(i, max(low - _LIMITS.overlap, 0), min(high + _LIMITS.overlap, length + 1), low, high)
             groups.setdefault((piece.last - piece.first).bit_length(), []).append(piece)
     yield from groups.values()
-
-
-_SIZE = 8.0  # standard deviations of what the others say of a measurement
-_FAR = 0.5  # of a state's spread: what is less far off spoils no fit
-_BESIDE = 3  # rows around a glitch that miss by it too
-_SOLVED = 0.3  # of a glitch that may be left in the rows around it once it is replaced
-_ROUNDS = 6  # of finding the largest ones and going on without them
-_FITS = 3  # of the model, each to data without the glitches that the one before found
-_FLOOR = 0.01  # of V: the least variance of the measurements
 
 
 class Glitch(NamedTuple):
@@ -345,11 +351,11 @@ class Mender(Value):
         def fit_without(found: list[Glitch]) -> Mender:
             """Return the mender by a model of the data without these glitches."""
             model = _state_space(_replace(data, found), middle, scale, products=False)
-            model = model._replace(R=np.maximum(model.R, _FLOOR * np.diag(model.V)))
+            model = model._replace(R=np.maximum(model.R, _LIMITS.floor * np.diag(model.V)))
             return cls(Smoother.from_model(model, middle, scale))
 
         mender, found = fit_without([]), list[Glitch]()
-        for _ in range(_FITS - 1):
+        for _ in range(_LIMITS.fits - 1):
             before, found = found, mender.glitches(data)
             if [one[:3] for one in found] == [one[:3] for one in before]:
                 break
@@ -384,12 +390,15 @@ class Mender(Value):
             return left_out(model, gains, now, self.smoother.states(now))
 
         gap, size = measure_gaps()
-        for _ in range(_ROUNDS):
+        for _ in range(_LIMITS.rounds):
             largest, fresh = size.max(axis=2), False
-            for row, k in np.argwhere(largest > _SIZE).tolist():
+            for row, k in np.argwhere(largest > _LIMITS.size).tolist():
                 piece, i = pieces[row], int(size[row, k].argmax())
-                counts = piece.low <= piece.first + k < piece.high and abs(gap[row, k, i]) > _FAR
-                if counts and largest[row, k] >= largest[row, max(k - _BESIDE, 0) : k + _BESIDE + 1].max():
+                counts = piece.low <= piece.first + k < piece.high and abs(gap[row, k, i]) > _LIMITS.far
+                if (
+                    counts
+                    and largest[row, k] >= largest[row, max(k - _LIMITS.beside, 0) : k + _LIMITS.beside + 1].max()
+                ):
                     Y[row, k, i] -= gap[row, k, i]
                     replaced.add((row, k, i))
                     fresh = True
@@ -399,8 +408,8 @@ class Mender(Value):
         return [
             (row, k, i, float(Y[row, k, i]))
             for row, k, i in sorted(replaced)
-            if np.abs(gap[row, max(k - _BESIDE, 0) : k + _BESIDE + 1]).max()
-            <= _SOLVED * abs(given.X[row, k, i] - Y[row, k, i])
+            if np.abs(gap[row, max(k - _LIMITS.beside, 0) : k + _LIMITS.beside + 1]).max()
+            <= _LIMITS.solved * abs(given.X[row, k, i] - Y[row, k, i])
         ]
 
 

@@ -11,6 +11,7 @@
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -28,17 +29,25 @@ from koopmpc.validate.logs.log import Log, LogFault, fit_residuals
 from koopmpc.validate.residuals import compute_moments
 from koopmpc.validate.scoring import AnyPredictor
 
-_MOST_ROWS = 20_000  # rows on which outputs and past inputs are compared
-_EXACT = 1e-9  # share of an input's energy below which its past determines it
-_LEAST_ROWS = 200  # a law is looked for only if the log has at least this many rows
-_PAST = 10  # number of past inputs that may predict the next one
-_FEEDBACK = 0.8  # an input is feedback if the state of the same row explains more than this share of it, and
-_INNOVATION = 0.02  # explains more than this share of the part that past inputs do not predict, and
-_UNPREDICTED = 1e-4  # past inputs leave more than this share of the input unpredicted
-_PREDICTED = 0.95  # inputs are fed back if outputs lower the error of their prediction below this share
-_STATIC = 0.1  # inputs are fed back if outputs of the same row leave less than this share of their moves open
-_BEHIND = 6  # rows of the past in the test for a late column
-_PASSES = 6  # weighted least squares fits for least absolute deviations
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits beyond which an input counts as a feedback."""
+
+    most_rows: int = 20_000  # rows on which outputs and past inputs are compared
+    exact: float = 1e-9  # share of an input's energy below which its past determines it
+    least_rows: int = 200  # a law is looked for only if the log has at least this many rows
+    past: int = 10  # number of past inputs that may predict the next one
+    feedback: float = 0.8  # an input is feedback if the state of the same row explains more than this share of it, and
+    innovation: float = 0.02  # explains more than this share of the part that past inputs do not predict, and
+    unpredicted: float = 1e-4  # past inputs leave more than this share of the input unpredicted
+    predicted: float = 0.95  # inputs are fed back if outputs lower the error of their prediction below this share
+    static: float = 0.1  # inputs are fed back if outputs of the same row leave less than this share of their moves open
+    behind: int = 6  # rows of the past in the test for a late column
+    passes: int = 6  # weighted least squares fits for least absolute deviations
+
+
+_LIMITS = _Limits()
 
 
 def feedback_share(
@@ -93,17 +102,17 @@ def explain_beyond_past(episodes: Episodes, predictor: AnyPredictor) -> Float[np
     """
     before, psi, u = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
     for episode in predictor.embed(episodes):
-        U = episode.U[:_MOST_ROWS]
+        U = episode.U[: _LIMITS.most_rows]
         before.append(np.hstack([U[1:-1], U[:-2], np.ones((max(len(U) - 2, 0), 1))]))
         psi.append(predictor.lifting(episode.X[2 : len(U)]))
         u.append(U[2:])
-        if sum(map(len, u)) >= _MOST_ROWS:
+        if sum(map(len, u)) >= _LIMITS.most_rows:
             break
     past, targets = np.concatenate(before), np.concatenate(u)
     left = column_norms(targets - project_onto(past, targets))
     both = np.hstack([past, np.concatenate(psi)])
     rest = column_norms(targets - project_onto(both, targets))
-    varies = left > np.sqrt(_EXACT) * column_norms(targets - targets.mean(axis=0))
+    varies = left > np.sqrt(_LIMITS.exact) * column_norms(targets - targets.mean(axis=0))
     return np.where(varies, 1.0 - (rest / np.where(varies, left, 1.0)) ** 2, 1.0)
 
 
@@ -142,16 +151,16 @@ def find_feedback(log: Log) -> Iterator[LogFault]:
     u = K x shows two further signs. x_k explains more of u_k than of u_{k−1}, which has already acted on the plant. And
     x_k explains a part of u_k that earlier inputs do not predict.
     """
-    long, nu = [e for e in log.data if len(e) > 2 * _PAST], log.data.nu
+    long, nu = [e for e in log.data if len(e) > 2 * _LIMITS.past], log.data.nu
     if not long or not nu:
         return
-    now = np.concatenate([e.U[_PAST + 1 :] for e in long])
-    past = np.concatenate([stack_past_inputs(e.U, _PAST, len(e), _PAST + 1)[:, nu:] for e in long])
-    state = np.concatenate([e.X[_PAST + 1 : -1] for e in long])
-    if len(now) < max(_LEAST_ROWS, 4 * (past.shape[1] + state.shape[1])):
+    now = np.concatenate([e.U[_LIMITS.past + 1 :] for e in long])
+    past = np.concatenate([stack_past_inputs(e.U, _LIMITS.past, len(e), _LIMITS.past + 1)[:, nu:] for e in long])
+    state = np.concatenate([e.X[_LIMITS.past + 1 : -1] for e in long])
+    if len(now) < max(_LIMITS.least_rows, 4 * (past.shape[1] + state.shape[1])):
         return
     V = (now - log.input_center) / log.input_size
-    history = (past - np.tile(log.input_center, _PAST)) / np.tile(log.input_size, _PAST)
+    history = (past - np.tile(log.input_center, _LIMITS.past)) / np.tile(log.input_size, _LIMITS.past)
     ones, Z = np.ones((len(V), 1)), (state - log.center) / log.size
     by_past = (fit_residuals(np.hstack([ones, history]), V) ** 2).mean(axis=0)
     by_both = (fit_residuals(np.hstack([ones, history, Z]), V) ** 2).mean(axis=0)
@@ -161,8 +170,8 @@ def find_feedback(log: Log) -> Iterator[LogFault]:
     for j in np.flatnonzero(variance > 1e-12):
         innovation = 1 - by_both[j] / max(by_past[j], 1e-300)
         exact = by_state[j] < 1e-8 * variance[j]
-        explained = by_state[j] < (1 - _FEEDBACK) * variance[j] and by_state[j] < previous[j]
-        if exact or (explained and innovation > _INNOVATION and by_past[j] > _UNPREDICTED * variance[j]):
+        explained = by_state[j] < (1 - _LIMITS.feedback) * variance[j] and by_state[j] < previous[j]
+        if exact or (explained and innovation > _LIMITS.innovation and by_past[j] > _LIMITS.unpredicted * variance[j]):
             name = strip_unit(log.data.inputs[j])
             yield LogFault(
                 "feedback",
@@ -186,21 +195,27 @@ def is_fed_back(episodes: Episodes) -> bool:
     function of the outputs in the same rows. Both use least absolute deviations, so that a few moves of a set point do
     not hide it. Under feedback u_{k+1} holds y_{k+1}, and a model with the inputs moved up would seem to know y_{k+1}.
     """
-    long = [e for e in episodes if len(e) > 4 * _BEHIND]
+    long = [e for e in episodes if len(e) > 4 * _LIMITS.behind]
     if not long:
         return True  # too short to tell
-    past = np.concatenate([np.hstack([e.U[_BEHIND - i : len(e) - i] for i in range(1, _BEHIND + 1)]) for e in long])
-    outputs = np.concatenate([np.hstack([e.X[_BEHIND - i : len(e) - i] for i in range(1, _BEHIND + 1)]) for e in long])
-    now = np.concatenate([e.U[_BEHIND:] for e in long])
+    past = np.concatenate(
+        [np.hstack([e.U[_LIMITS.behind - i : len(e) - i] for i in range(1, _LIMITS.behind + 1)]) for e in long]
+    )
+    outputs = np.concatenate(
+        [np.hstack([e.X[_LIMITS.behind - i : len(e) - i] for i in range(1, _LIMITS.behind + 1)]) for e in long]
+    )
+    now = np.concatenate([e.U[_LIMITS.behind :] for e in long])
     move = np.concatenate([np.diff(e.U, axis=0) for e in long])
     same = np.concatenate([np.hstack([np.diff(e.X[:-1], axis=0), e.X[1:-1]]) for e in long])
     for target, step in zip(now.T, move.T, strict=True):
         own, both = _miss(past, target), _miss(np.hstack([past, outputs]), target)
         cap = 5 * float(np.median(own))
-        if np.minimum(both, cap).mean() < _PREDICTED * np.minimum(own, cap).mean():
+        if np.minimum(both, cap).mean() < _LIMITS.predicted * np.minimum(own, cap).mean():
             return True
         moving = step != 0
-        if moving.any() and np.median(_miss(same[moving], step[moving])) < _STATIC * np.median(np.abs(step[moving])):
+        if moving.any() and np.median(_miss(same[moving], step[moving])) < _LIMITS.static * np.median(
+            np.abs(step[moving])
+        ):
             return True
     return False
 
@@ -213,7 +228,7 @@ def _miss(P: Float[np.ndarray, "M n"], target: Float[np.ndarray, " M"]) -> Float
         rows = fold != out
         weight = np.ones(int(rows.sum()))
         k = np.zeros(A.shape[1])
-        for _ in range(_PASSES):  # least squares with weights 1 / |residual|
+        for _ in range(_LIMITS.passes):  # least squares with weights 1 / |residual|
             k = np.linalg.lstsq(A[rows] * weight[:, None], target[rows] * weight, rcond=None)[0]
             gap = np.abs(target[rows] - A[rows] @ k)
             weight = 1 / np.sqrt(np.maximum(gap, max(float(np.median(gap)), 1e-12)))

@@ -24,27 +24,36 @@ from koopmpc.lifting.base import strip_unit
 from koopmpc.text import to_percent
 from koopmpc.values import Value
 
-_PAST = (8, 4, 2)  # past rows of the second model: the most that the episodes allow
-_FEW = 2  # past rows of a smaller second model
-_LEFT = 0.6  # share of the rows that must have so many rows before them
-_ROWS = 2500  # read at most about this many rows
-_LEAST = 120  # rows, below which nothing can be told
-_EACH = 10  # rows for each radial function
-_CENTRES = 100  # radial functions at most
-_KNOTS = 10  # hinge functions of each state and input
-_SIGNALS = 10  # states and inputs at most
-_PASSES = 12  # of extended least squares for the innovations
-_ROUNDS = 2  # of fitting the nonlinear model with the innovations of the fit before
-_ROUGH = 1e-4  # weight of its radial functions there
-_RIDGES = (1e-8, 1e-6, 1e-4, 1e-2)  # weights on columns of unit size
-_FOLDS = 4
-_BLOCKS = 16  # of rows, for the standard error of the gain
-_SURE = 4.0  # standard errors
-_GAIN = 0.4  # share of the squared error on unseen rows that past rows must remove
-_BEYOND = 2.0  # times as much as twice the rows and radial functions remove, in logarithms
-_SEEN = 0.15  # errors below this share of a usual change from row to row may be the lifting's, and do little harm
-_EXTREME = 0.99  # larger errors than this quantile count as it
-_TINY = 1e-300
+
+@dataclass(frozen=True)
+class _Limits:
+    """Sizes and limits of the search for a hidden state."""
+
+    past: tuple[int, ...] = (8, 4, 2)  # past rows of the second model: the most that the episodes allow
+    few: int = 2  # past rows of a smaller second model
+    left: float = 0.6  # share of the rows that must have so many rows before them
+    rows: int = 2500  # read at most about this many rows
+    least: int = 120  # rows, below which nothing can be told
+    each: int = 10  # rows for each radial function
+    centres: int = 100  # radial functions at most
+    knots: int = 10  # hinge functions of each state and input
+    signals: int = 10  # states and inputs at most
+    passes: int = 12  # of extended least squares for the innovations
+    rounds: int = 2  # of fitting the nonlinear model with the innovations of the fit before
+    rough: float = 1e-4  # weight of its radial functions there
+    ridges: tuple[float, ...] = (1e-8, 1e-6, 1e-4, 1e-2)  # weights on columns of unit size
+    folds: int = 4
+    blocks: int = 16  # of rows, for the standard error of the gain
+    sure: float = 4.0  # standard errors
+    gain: float = 0.4  # share of the squared error on unseen rows that past rows must remove
+    beyond: float = 2.0  # times as much as twice the rows and radial functions remove, in logarithms
+    # errors below this share of a usual change from row to row may be the lifting's, and do little harm
+    seen: float = 0.15
+    extreme: float = 0.99  # larger errors than this quantile count as it
+    tiny: float = 1e-300
+
+
+_LIMITS = _Limits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +86,8 @@ class Memory(Value):
     @property
     def evidence(self) -> np.ndarray:
         """(nx,) True for each state whose next value a hidden state moves."""
-        beyond = np.log1p(-self.gain) < _BEYOND * np.log1p(-np.maximum(self.lifting, 0.0))
-        return (self.gain > _GAIN) & (self.sure > _SURE) & beyond & (self.error > _SEEN)
+        beyond = np.log1p(-self.gain) < _LIMITS.beyond * np.log1p(-np.maximum(self.lifting, 0.0))
+        return (self.gain > _LIMITS.gain) & (self.sure > _LIMITS.sure) & beyond & (self.error > _LIMITS.seen)
 
     @property
     def shows_hidden_state(self) -> bool:
@@ -154,10 +163,10 @@ def _stack_rows(data: Episodes) -> _Rows | None:
     """Return the rows of evenly spread stretches; None where the episodes are too short, or have too many signals."""
     X, U = (np.concatenate(parts) for parts in zip(*((e.X[:-1], e.U) for e in data), strict=True))
     moving = np.ptp(U, axis=0) > 0
-    if data.nx + int(moving.sum()) > _SIGNALS:
+    if data.nx + int(moving.sum()) > _LIMITS.signals:
         return None
     lengths = np.array([len(e) for e in data])
-    fitting = [d for d in _PAST if np.maximum(lengths - d, 0).sum() >= _LEFT * lengths.sum()]
+    fitting = [d for d in _LIMITS.past if np.maximum(lengths - d, 0).sum() >= _LIMITS.left * lengths.sum()]
     if not fitting:
         return None
     past = fitting[0]
@@ -165,7 +174,7 @@ def _stack_rows(data: Episodes) -> _Rows | None:
     wide = np.flatnonzero(np.ptp(X, axis=0) > 2 * np.pi)
     u_mean, u_size = U[:, moving].mean(axis=0), U[:, moving].std(axis=0)
     long = [e for e in data if len(e) > past]
-    share = max(sum(len(e) for e in long) / _ROWS, 1.0)
+    share = max(sum(len(e) for e in long) / _LIMITS.rows, 1.0)
     parts: list[tuple[np.ndarray, ...]] = []
     count = 0
     for e in long if len(long) < 50 else long[:: int(np.ceil(share))]:
@@ -180,11 +189,11 @@ def _stack_rows(data: Episodes) -> _Rows | None:
             before = np.hstack([column for i in range(1, past + 1) for column in (Z[k - i], V[k - i])])
             parts.append((Z[k], Z[k + 1], V[k], before, np.r_[-1, np.arange(count, count + len(k) - 1)]))
             count += len(k)
-    if count < _LEAST:
+    if count < _LIMITS.least:
         return None
     now, after, inputs, before, follows = (np.concatenate(column) for column in zip(*parts, strict=True))
     width = data.nx + int(moving.sum())
-    return _Rows(now, after, inputs, before, wide, x_mean, x_size, follows, min(_FEW, past) * width)
+    return _Rows(now, after, inputs, before, wide, x_mean, x_size, follows, min(_LIMITS.few, past) * width)
 
 
 def _find_innovations(rows: _Rows) -> tuple[Float[np.ndarray, "M nx"], Float[np.ndarray, " nx"]]:
@@ -193,7 +202,7 @@ def _find_innovations(rows: _Rows) -> tuple[Float[np.ndarray, "M nx"], Float[np.
     base = np.hstack([np.ones((len(rows.now), 1)), rows.now, rows.inputs])
     last = np.zeros_like(rows.now)
     K = np.zeros((base.shape[1] + nx, nx))
-    for _ in range(_PASSES):
+    for _ in range(_LIMITS.passes):
         P = np.hstack([base, last])
         G = P.T @ P
         K = np.linalg.solve(G + 1e-8 * np.diag(np.maximum(np.diag(G), 1e-8)), P.T @ rows.after)
@@ -214,17 +223,19 @@ class _Fit:
         innovations: Float[np.ndarray, "M nx"],
         turning: Int[np.ndarray, " t"],
     ) -> None:
-        self._rows, centres, known = rows, min(_CENTRES, len(rows.now) // _EACH), rows.follows >= 0
-        for done in range(_ROUNDS + 1):
+        self._rows, centres, known = rows, min(_LIMITS.centres, len(rows.now) // _LIMITS.each), rows.follows >= 0
+        for done in range(_LIMITS.rounds + 1):
             self._F, self._ends = _stack_features(rows, rows.now + innovations * lag, innovations, centres, turning)
-            if done < _ROUNDS:
+            if done < _LIMITS.rounds:
                 F, ends = self._F[:, : self._ends.whole], self._ends
                 G, H = _products(F, rows.after)
-                light = np.where(np.arange(ends.whole) < ends.light, 1e-9, _ROUGH) * len(F)
+                light = np.where(np.arange(ends.whole) < ends.light, 1e-9, _LIMITS.rough) * len(F)
                 left = rows.after - F @ np.linalg.solve(G + np.diag(light + 1e-10 * len(F)), H)
                 innovations = np.where(known[:, None], left[rows.follows], 0.0)
-        fold = np.arange(len(rows.now)) * _BLOCKS // len(rows.now) % _FOLDS
-        self._places = [np.flatnonzero(fold == out) for out in range(_FOLDS)]  # blocks in turn: unseen rows lie among
+        fold = np.arange(len(rows.now)) * _LIMITS.blocks // len(rows.now) % _LIMITS.folds
+        self._places = [
+            np.flatnonzero(fold == out) for out in range(_LIMITS.folds)
+        ]  # blocks in turn: unseen rows lie among
         self._sums = [_products(self._F[place], rows.after[place]) for place in self._places]  # those of the fit
         self.whole = self._log_errors(self._ends.whole).mean(axis=0)
 
@@ -236,7 +247,7 @@ class _Fit:
         return Memory(
             states,
             1 - np.exp(-gaps.mean(axis=0)),
-            gaps.mean(axis=0) / np.maximum(gaps.std(axis=0, ddof=1) / np.sqrt(_BLOCKS), _TINY),
+            gaps.mean(axis=0) / np.maximum(gaps.std(axis=0, ddof=1) / np.sqrt(_LIMITS.blocks), _LIMITS.tiny),
             1 - np.exp(whole.mean(axis=0) - self._log_errors(ends.half, half=True).mean(axis=0)),
             np.exp(whole.mean(axis=0) / 2) / np.maximum(change, 1e-12),
             rows.past.shape[1] // (rows.now.shape[1] + rows.inputs.shape[1]),
@@ -251,25 +262,25 @@ class _Fit:
         used = [place[:: 2 if half else 1] for place in self._places]
         sums = [_products(F[place], targets[place]) for place in used] if half else self._sums
         light = np.where(np.arange(columns) < self._ends.light, 1e-9, 1.0)
-        errors = np.empty((len(_RIDGES), *targets.shape))
+        errors = np.empty((len(_LIMITS.ridges), *targets.shape))
         for out, place in enumerate(self._places):
-            rest = [f for f in range(_FOLDS) if f != out]
+            rest = [f for f in range(_LIMITS.folds) if f != out]
             G = np.sum([sums[f][0][:columns, :columns] for f in rest], axis=0)
             H = np.sum([sums[f][1][:columns] for f in rest], axis=0)
             count, unseen = sum(len(used[f]) for f in rest), F[place]
-            for r, ridge in enumerate(_RIDGES):
+            for r, ridge in enumerate(_LIMITS.ridges):
                 K: Float[np.ndarray, "p nx"] = np.asarray(
                     np.linalg.solve(G + np.diag((ridge * light + 1e-10) * count), H), dtype=np.float64
                 )
                 errors[r, place] = (targets[place] - unseen @ K) ** 2
-        capped = np.minimum(errors, np.quantile(errors, _EXTREME, axis=1, keepdims=True))
+        capped = np.minimum(errors, np.quantile(errors, _LIMITS.extreme, axis=1, keepdims=True))
         chosen = capped.mean(axis=1).argmin(axis=0)
         return _log_blocks(np.stack([capped[r, :, i] for i, r in enumerate(chosen)], axis=1))
 
 
 def _log_blocks(errors: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "blocks nx"]:
     """Return the logarithm of each block's mean: few blocks in which a model extrapolates do not decide."""
-    return np.log([np.maximum(part.mean(axis=0), _TINY) for part in np.array_split(errors, _BLOCKS)])
+    return np.log([np.maximum(part.mean(axis=0), _LIMITS.tiny) for part in np.array_split(errors, _LIMITS.blocks)])
 
 
 class _Ends(NamedTuple):
@@ -303,7 +314,9 @@ def _stack_features(
     width = np.sqrt(point.shape[1]) * np.where(np.arange(count) % 4 < 2, 0.8, 2.0)
     distance = (point**2).sum(axis=1)[:, None] - 2 * point @ centres.T + (centres**2).sum(axis=1)
     radial = np.exp(-np.maximum(distance, 0.0) / (2 * width**2))
-    knots = np.quantile(point, np.linspace(0, 1, 2 * _KNOTS + 1)[1:-1:2], axis=0)  # of friction, rails, dead zones
+    knots = np.quantile(
+        point, np.linspace(0, 1, 2 * _LIMITS.knots + 1)[1:-1:2], axis=0
+    )  # of friction, rails, dead zones
     hinges = np.maximum(point[:, None, :] - knots, 0.0)
     even, odd = (hinges[:, start::2].reshape(M, -1) for start in (0, 1))
     i, j = np.triu_indices(point.shape[1])

@@ -29,19 +29,30 @@ from koopmpc.validate.sufficiency import (
 )
 from koopmpc.values import Value
 
-_MOST_ORDER = 20  # test persistency of excitation up to this order
-_MOST_REGIONS = 3  # list at most this many empty regions
-_USABLE = 0.2  # forecasts are trusted while the band of the errors is within this share of the state's range
-_SMALL = 0.05  # above this share of the range, the errors must also be smaller than those of x̂ = x_k
-_INVARIANT = 0.1  # above this one-step error of an observable, as a share of its size, the dictionary is not invariant
-_OVERFIT = 2.0  # above this ratio of held-out to training error, a model is overfitted
-_UNSEEN = 0.05  # above this share of held-out samples in cells without training data, the report asks for care
-_FORGOTTEN = 1e-9  # an eigenvalue below this belongs to observables whose next values the model does not forecast
-_NOTABLE_GROWTH = 2.0  # mention a spurious eigenfunction that grows by more than this factor over the horizon
-_FEEDBACK = 0.9  # if ψ(x) explains a larger share of an input's energy, the input counts as feedback …
-_BEYOND = 0.1  # … unless it explains a smaller share than this of what the input's own past leaves open
-_EPISODES = 36  # with so many `koopmpc fit` has a band of 90 %: a third is held out, and 9 of these calibrate
-_MOST_NAMES = 3  # list at most this many names in one sentence
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits beyond which the report doubts a model, and sizes of what it shows."""
+
+    most_order: int = 20  # test persistency of excitation up to this order
+    most_regions: int = 3  # list at most this many empty regions
+    usable: float = 0.2  # forecasts are trusted while the band of the errors is within this share of the state's range
+    small: float = 0.05  # above this share of the range, the errors must also be smaller than those of x̂ = x_k
+    # above this one-step error of an observable, as a share of its size, the dictionary is not invariant
+    invariant: float = 0.1
+    overfit: float = 2.0  # above this ratio of held-out to training error, a model is overfitted
+    # above this share of held-out samples in cells without training data, the report asks for care
+    unseen: float = 0.05
+    # an eigenvalue below this belongs to observables whose next values the model does not forecast
+    forgotten: float = 1e-9
+    notable_growth: float = 2.0  # mention a spurious eigenfunction that grows by more than this factor over the horizon
+    feedback: float = 0.9  # if ψ(x) explains a larger share of an input's energy, the input counts as feedback …
+    beyond: float = 0.1  # … unless it explains a smaller share than this of what the input's own past leaves open
+    episodes: int = 36  # with so many `koopmpc fit` has a band of 90 %: a third is held out, and 9 of these calibrate
+    most_names: int = 3  # list at most this many names in one sentence
+
+
+_LIMITS = _Limits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +146,7 @@ class TrustReport(Value):
         A step counts if its error is at most 5 % of the range, or at most 20 % and smaller than that of x̂ = x_k.
         """
         better = self.score.rmse < self.holding.rmse
-        good = (self.error <= _SMALL) | ((self.error <= _USABLE) & better)
+        good = (self.error <= _LIMITS.small) | ((self.error <= _LIMITS.usable) & better)
         return np.cumprod(good, axis=0).sum(axis=0)
 
     @property
@@ -274,7 +285,7 @@ def trust(
     covered = coverage(judged) if train is None else coverage(judged, low=low, high=high)
     judged_total = total if train is None else compute_moments(train, predictor)
     driven = judged if isinstance(predictor, BilinearPredictor) and not predictor.nw else judged.driven()
-    order = min(_MOST_ORDER, max(len(episode) for episode in driven))
+    order = min(_LIMITS.most_order, max(len(episode) for episode in driven))
     return TrustReport(
         score=errors,
         holding=score(_constant_predictor(predictor), held_out, horizon),
@@ -302,10 +313,10 @@ def _find_feedback(
 ) -> Float[np.ndarray, " nu"]:
     """Return the shares of inputs that ψ explains; of slow ones the share of what their own past leaves open."""
     nu = predictor.nu
-    if not (shares[:nu] > _FEEDBACK).any():
+    if not (shares[:nu] > _LIMITS.feedback).any():
         return shares
     beyond = explain_beyond_past(episodes, predictor)
-    slow = (shares[:nu] > _FEEDBACK) & (beyond < _BEYOND)
+    slow = (shares[:nu] > _LIMITS.feedback) & (beyond < _LIMITS.beyond)
     return np.append(np.where(slow, beyond, shares[:nu]), shares[nu:])
 
 
@@ -342,9 +353,9 @@ def _check_errors(report: TrustReport) -> Iterator[tuple[str, str]]:
         f"{to_percent(error[steps])} of its range at step {steps + 1} and {to_percent(error[-1])} at step {horizon}"
     )
     says = f"the errors of {strip_unit(name)} reach {reached} (5 % and 95 % quantiles)"
-    if error[steps] <= _USABLE:
+    if error[steps] <= _LIMITS.usable:
         says += ", and the guess that nothing changes is at least as accurate"
-    if report.unseen is not None and report.unseen > _UNSEEN:
+    if report.unseen is not None and report.unseen > _LIMITS.unseen:
         do = "collect data where the model will be used"
     elif _is_overfitted(report):
         do = "collect more data, take fewer observables or a larger ridge"
@@ -357,12 +368,12 @@ def _check_spectrum(report: TrustReport) -> Iterator[tuple[str, str]]:
     pairs = report.residuals
     bad = pairs.spurious
     if report.band.relift:  # a forecast that is lifted at each step never reads what the model forgets at once
-        bad = bad & (np.abs(pairs.eigenvalues) > _FORGOTTEN)
+        bad = bad & (np.abs(pairs.eigenvalues) > _LIMITS.forgotten)
     if not bad.any():
         return
     with np.errstate(over="ignore"):
         growth = np.abs(pairs.eigenvalues) ** report.score.horizon
-    growing = bad & (growth > _NOTABLE_GROWTH)
+    growing = bad & (growth > _LIMITS.notable_growth)
     worst = int(np.argmax(np.where(growing, growth, 0.0) if growing.any() else pairs.residuals))
     value = _format_complex(complex(pairs.eigenvalues[worst]))
     pair = f"λ = {value} (residual {to_percent(float(pairs.residuals[worst]))})"
@@ -379,13 +390,16 @@ def _check_spectrum(report: TrustReport) -> Iterator[tuple[str, str]]:
 
 def _check_dictionary(report: TrustReport) -> Iterator[tuple[str, str]]:
     names, errors = report.invariance.names, report.invariance.errors
-    bad = np.flatnonzero(errors > _INVARIANT)
+    bad = np.flatnonzero(errors > _LIMITS.invariant)
     if bad.size:
         worst: list[int] = bad[np.argsort(-errors[bad], kind="stable")].tolist()
-        named = ", ".join(f"{shorten_observable(names[i])} {to_percent(float(errors[i]))}" for i in worst[:_MOST_NAMES])
+        named = ", ".join(
+            f"{shorten_observable(names[i])} {to_percent(float(errors[i]))}" for i in worst[: _LIMITS.most_names]
+        )
+        more = ", …" if bad.size > _LIMITS.most_names else ""
         yield (
             f"the dictionary is not invariant: the next value of {bad.size} of {len(errors)} observables is off by "
-            f"more than {to_percent(_INVARIANT)} of its size ({named}{', …' if bad.size > _MOST_NAMES else ''})",
+            f"more than {to_percent(_LIMITS.invariant)} of its size ({named}{more})",
             "for a longer horizon add observables that their next values depend on; compare scores before dropping one",
         )
 
@@ -395,8 +409,8 @@ def _check_fit(report: TrustReport) -> Iterator[tuple[str, str]]:
         ratio = report.score.total / max(report.train_score.total, np.finfo(float).tiny)
         says = f"errors on held-out episodes are {ratio:.3g} times those on the training episodes"
         yield says, "collect more data, take fewer observables or a larger ridge"
-    if report.unseen is not None and report.unseen > _UNSEEN:
-        regions = "; ".join(region.where for region in report.coverage.empty[:_MOST_NAMES])
+    if report.unseen is not None and report.unseen > _LIMITS.unseen:
+        regions = "; ".join(region.where for region in report.coverage.empty[: _LIMITS.most_names])
         says = f"{to_percent(report.unseen)} of the held-out samples lie where there are no training data"
         yield (
             says + (f", such as {regions}" if regions else ""),
@@ -409,9 +423,9 @@ def _check_inputs(report: TrustReport) -> Iterator[tuple[str, str]]:
         says = f"the inputs are exciting to order {report.persistency.order} only, so B cannot be identified"
         yield says, "excite every input, with noise or PRBS"
     if report.feedback is not None:
-        bad = np.flatnonzero(report.feedback > _FEEDBACK).tolist()
+        bad = np.flatnonzero(report.feedback > _LIMITS.feedback).tolist()
         names = ", ".join(
-            f"{to_percent(report.feedback[i])} of {strip_unit(report.inputs[i])}" for i in bad[:_MOST_NAMES]
+            f"{to_percent(report.feedback[i])} of {strip_unit(report.inputs[i])}" for i in bad[: _LIMITS.most_names]
         )
         if bad:
             yield (
@@ -434,8 +448,8 @@ def _check_band(report: TrustReport) -> Iterator[tuple[str, str]]:
     else:
         reason = f"there are {band.episodes} calibration episodes, at least {band.needed} are needed"
         more = (
-            f"record more episodes, or cut long files into several: `koopmpc fit` holds out enough of {_EPISODES} in "
-            "all for a level of 90 %"
+            f"record more episodes, or cut long files into several: `koopmpc fit` holds out enough of "
+            f"{_LIMITS.episodes} in all for a level of 90 %"
             if report.divisible
             else f"record more rows, or judge fewer than {report.score.horizon} steps ahead"
         )
@@ -459,7 +473,7 @@ def _check_closed_loop(report: TrustReport) -> Iterator[tuple[str, str]]:
 
 def _is_overfitted(report: TrustReport) -> bool:
     train = report.train_score
-    return train is not None and report.score.total > max(_OVERFIT * train.total, 1e-6)
+    return train is not None and report.score.total > max(_LIMITS.overfit * train.total, 1e-6)
 
 
 def _format_complex(value: complex) -> str:
@@ -520,7 +534,7 @@ def _list_evidence(report: TrustReport) -> Iterator[tuple[str, str]]:
     if report.unseen is not None:
         text += f"; {to_percent(report.unseen)} of the held-out samples lie where there are no training samples"
     yield "coverage", text
-    for region in covered.empty[:_MOST_REGIONS]:
+    for region in covered.empty[: _LIMITS.most_regions]:
         yield "", f"{region} ({to_percent(region.share)} of the area)"
     if report.persistency is not None and report.feedback is not None:
         order, asked = report.persistency.order, report.persistency.asked

@@ -35,16 +35,25 @@ from koopmpc.identify.solve import (
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.predictors import LinearPredictor
 
-_SMALL = 20  # solve the matrix inequality too for at most so many observables
-_LEAST = 1e-3  # smallest eigenvalue of P in that inequality, as a share of the mean eigenvalue
-_HELP = 1e-10  # second ridge to try if columns are nearly dependent: the descent then converges
-_MUCH = 0.5  # warn if the relative misfit of the stable model is above this: it hardly describes the data
-_ROUNDING = 1e-9  # a plain fit is stable if its spectral radius exceeds the radius by at most this
-_MARGINS = (1e-3, 1e-2, 1e-1)  # margins of a start's metric, shares of the radius: the first well conditioned one
-_TRIAL = 60  # descent steps from each start
-_STEPS = 600  # further descent steps from the best of these runs
-_STALL = 30  # stop the descent if so many steps …
-_GAIN = 1e-3  # … reduce the misfit by less than this share
+
+@dataclass(frozen=True)
+class _Limits:
+    """Settings of the search for a stable model."""
+
+    small: int = 20  # solve the matrix inequality too for at most so many observables
+    least: float = 1e-3  # smallest eigenvalue of P in that inequality, as a share of the mean eigenvalue
+    help: float = 1e-10  # second ridge to try if columns are nearly dependent: the descent then converges
+    much: float = 0.5  # warn if the relative misfit of the stable model is above this: it hardly describes the data
+    rounding: float = 1e-9  # a plain fit is stable if its spectral radius exceeds the radius by at most this
+    # margins of a start's metric, shares of the radius: the first well conditioned one
+    margins: tuple[float, ...] = (1e-3, 1e-2, 1e-1)
+    trial: int = 60  # descent steps from each start
+    steps: int = 600  # further descent steps from the best of these runs
+    stall: int = 30  # stop the descent if so many steps …
+    gain: float = 1e-3  # … reduce the misfit by less than this share
+
+
+_LIMITS = _Limits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +130,7 @@ def stable_edmd(
     before = spectral_radius(K[np.ix_(moving, moving)].T)
     changes = [f"spectral radius {before:.6g}, not above {rho:g}: the plain fit stays"]
     rule = describe_solve(rows, ridge, weight)
-    if before > rho + _ROUNDING:
+    if before > rho + _LIMITS.rounding:
         stable = _stabilise(rows, K, moving, rho, weight)
         after = spectral_radius(stable[np.ix_(moving, moving)].T)
         rule = f"|λ| ≤ {rho:g} by descent over A = S⁻¹ X S, {rule}"
@@ -136,7 +145,7 @@ def stable_edmd(
 
 def _doubt_misfit(before: float, after: float) -> list[str]:
     """Return a warning if the stable model misses the data much more than the plain fit does, else an empty list."""
-    if after < max(_MUCH, 2 * before):
+    if after < max(_LIMITS.much, 2 * before):
         return []
     return [
         f"stability costs much: the stable model misses {after:.0%} of the observables a step, the plain fit "
@@ -172,8 +181,10 @@ def _stabilise(
 
     plain = misfit(K, ridge)
     candidates = [_find_nearest(plain, rho)]
-    if ridge < _HELP and np.linalg.cond(plain.G) > 1 / _HELP:  # the descent converges slowly in a narrow valley
-        candidates.append(_find_nearest(misfit(solve(rows, ridge=_HELP).K, _HELP), rho))
+    if (
+        ridge < _LIMITS.help and np.linalg.cond(plain.G) > 1 / _LIMITS.help
+    ):  # the descent converges slowly in a narrow valley
+        candidates.append(_find_nearest(misfit(solve(rows, ridge=_LIMITS.help).K, _LIMITS.help), rho))
     choices = [_refit(rows, K, moving, A / scale, rho, ridge) for A in candidates]
     return min(choices, key=lambda K: relative_misfit(rows, K))
 
@@ -181,7 +192,7 @@ def _stabilise(
 def _find_nearest(misfit: Misfit, rho: float) -> Float[np.ndarray, "m m"]:
     """Return the stable A with the smallest misfit among those that the descent finds from its starts."""
     starts = [clip_eigenvalues(misfit.A0, rho)]
-    if len(misfit.A0) <= _SMALL:
+    if len(misfit.A0) <= _LIMITS.small:
         start = fit_lyapunov(misfit.A0, misfit.G, rho)
         starts += [] if start is None else [scale_inside(start, rho)]
     return find_nearest_stable(misfit, rho, starts)
@@ -209,7 +220,7 @@ def fit_lyapunov(
     H, inverse = (vectors * root) @ vectors.T, (vectors / root) @ vectors.T
     Y, P = cp.Variable((n, n)), cp.Variable((n, n), symmetric=True)
     M = cp.bmat([[radius**2 * P, Y], [Y.T, P]])
-    constraints = [0.5 * (M + M.T) >> 0, P - _LEAST * np.eye(n) >> 0, cp.trace(P) == n]
+    constraints = [0.5 * (M + M.T) >> 0, P - _LIMITS.least * np.eye(n) >> 0, cp.trace(P) == n]
     misfit = cp.norm((H / root[-1]) @ (Y - inverse @ A0 @ H @ P), "fro")
     problem = cp.Problem(cp.Minimize(misfit), constraints)
     with warnings.catch_warnings():
@@ -279,9 +290,9 @@ def find_nearest_stable(
         S = _find_metric(start, radius)
         runs.append(_Descent(misfit, radius, S, S @ start @ np.linalg.inv(S)))
     for run in runs:
-        run.go(_TRIAL)
+        run.go(_LIMITS.trial)
     best = min(runs, key=lambda run: run.value)
-    best.go(_STEPS)
+    best.go(_LIMITS.steps)
     candidates = [scale_inside(A, radius) for A in (best.A, *starts)]
     return min(candidates, key=misfit)
 
@@ -316,7 +327,7 @@ class _Descent:
             if not self._advance():
                 return
             history.append(self.value)
-            if len(history) > _STALL and history[-_STALL] - self.value <= _GAIN * self.value:
+            if len(history) > _LIMITS.stall and history[-_LIMITS.stall] - self.value <= _LIMITS.gain * self.value:
                 return
 
     def _advance(self) -> bool:
@@ -360,7 +371,7 @@ def _project_on_ball(X: Float[np.ndarray, "n n"], radius: float) -> Float[np.nda
 def _find_metric(A: Float[np.ndarray, "n n"], radius: float) -> Float[np.ndarray, "n n"]:
     """Return S = P^½ with AᵀP A ⪯ (ρ (1 + margin))² P, for the smallest margin that gives a well conditioned P."""
     S = np.eye(len(A))
-    for margin in _MARGINS:
+    for margin in _LIMITS.margins:
         P = solve_discrete_lyapunov((A / (radius * (1 + margin))).T, np.eye(len(A)))
         values, vectors = np.linalg.eigh(0.5 * (P + P.T))
         if values[0] > 0 and values[-1] < 1e6 * values[0]:

@@ -17,21 +17,37 @@ from koopmpc.lifting.base import strip_unit
 from koopmpc.validate.closed_loop import stack_past_inputs
 from koopmpc.validate.logs.log import Log, LogFault, compute_information, fit_residuals
 
-_LATEST = 8  # try shifts of a signal up to this many steps
-_LEAST_ROWS = 200  # look for lags and effects only if the log has at least this many rows
-_MOST_ROWS = 5_000  # read at most about this many rows
-_GAIN = 0.02  # nats a sample that a hypothesis must gain
-_SURE = 30.0  # nats over all rows that a hypothesis must gain
-_PEAK = 0.95  # reject a late input if one step more or less gains this share too: a smooth input gains by any delay
-_PREFERENCE = 1.15  # weight on the gain of a late input against that of a late sensor, which is rarer
-_SENSOR = 0.2  # nats a sample that all states must gain by the shift of a sensor, in a log of noise only
-_OWN = 0.3  # nats a sample that a late sensor must gain in its own residual; 600 clean logs gained at most 0.18
-_OWN_ONE_ROW = 0.5  # the same limit for the law that reads no earlier row
-_EVEN = 0.25  # share of this gain that every part of the log must show; clean logs gain in a few parts only
-_ONE_ROW_LATEST = 5  # that law tries shifts up to this many steps; up to 8, a smooth clean log gained 0.75
-_CLEAR = 0.75  # another shift may reach at most this share of the gain of a late sensor
-_CLEAR_OWN = 0.5  # the same share if only the sensor's own residual gains
-_BLOCKS = 8  # all but one of this many parts of the log must agree
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of the checks in this file, found on the corpus of tests/validate/logs; gains are in nats a sample."""
+
+    latest: int = 8  # try shifts of a signal up to this many steps
+    least_rows: int = 200  # look for lags and effects only if the log has at least this many rows
+    most_rows: int = 5_000  # read at most about this many rows
+    gain: float = 0.02  # nats a sample that a hypothesis must gain
+    sure: float = 30.0  # nats over all rows that a hypothesis must gain
+    # reject a late input if one step more or less gains this share too: a smooth input gains by any delay
+    peak: float = 0.95
+    preference: float = 1.15  # weight on the gain of a late input against that of a late sensor, which is rarer
+    sensor: float = 0.2  # nats a sample that all states must gain by the shift of a sensor, in a log of noise only
+    # nats a sample that a late sensor must gain in its own residual; 600 clean logs gained at most 0.18
+    own: float = 0.3
+    own_one_row: float = 0.5  # the same limit for the law that reads no earlier row
+    even: float = 0.25  # share of this gain that every part of the log must show; clean logs gain in a few parts only
+    one_row_latest: int = 5  # that law tries shifts up to this many steps; up to 8, a smooth clean log gained 0.75
+    clear: float = 0.75  # another shift may reach at most this share of the gain of a late sensor
+    clear_own: float = 0.5  # the same share if only the sensor's own residual gains
+    blocks: int = 8  # all but one of this many parts of the log must agree
+    # try these quantiles of an input as its limits
+    limit_quantiles: tuple[float, ...] = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)
+    powers: tuple[int, ...] = (2, 3, 4, 5)  # a clipped input must predict better than these powers of the input
+    # nats over all rows by which it must; if inputs act through tanh, the powers win by 50 or more
+    sharper: float = 3.0
+    left_over: float = 0.1  # reject a limit if the clipped part adds more than this share of the gain
+
+
+_LIMITS = _Limits()
 
 
 @dataclass(frozen=True)
@@ -70,7 +86,7 @@ class AlignedRows:
         return fit_residuals(log.stack_regressors(self.X, self.U), (self.after - self.X) / log.size)
 
 
-def align_rows(log: Log, shifts: tuple[Shift, ...] = (), margin: int = _LATEST) -> AlignedRows:
+def align_rows(log: Log, shifts: tuple[Shift, ...] = (), margin: int = _LIMITS.latest) -> AlignedRows:
     """Return the rows of all episodes that are `margin` away from both ends, with every signal moved by its shifts."""
     nx, nu = log.data.nx, log.data.nu
     states, inputs, offsets = np.arange(nx), np.arange(nu), np.zeros(nx + nu, dtype=np.intp)
@@ -86,7 +102,7 @@ def align_rows(log: Log, shifts: tuple[Shift, ...] = (), margin: int = _LATEST) 
         X, U = np.hsplit(indices, [nx])
         parts.append((episode.X[X, states], episode.U[U, inputs], episode.X[X - 1, states], episode.X[X + 1, states]))
         count += len(indices)
-        if count > _MOST_ROWS:
+        if count > _LIMITS.most_rows:
             break
     return AlignedRows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
@@ -96,11 +112,13 @@ def compute_gain(log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray
     return float((compute_information(other, log.fine) - compute_information(E, log.fine)).min())
 
 
-def is_better(log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"], least: float = _GAIN) -> bool:
+def is_better(
+    log: Log, E: Float[np.ndarray, "M nx"], other: Float[np.ndarray, "M nx"], least: float = _LIMITS.gain
+) -> bool:
     """Return True if `other` predicts better than `E` by more than chance, and in nearly all parts of the log."""
-    parts = zip(np.array_split(E, _BLOCKS), np.array_split(other, _BLOCKS), strict=True)
+    parts = zip(np.array_split(E, _LIMITS.blocks), np.array_split(other, _LIMITS.blocks), strict=True)
     agree = sum(compute_gain(log, a, b) > 0 for a, b in parts)
-    return compute_gain(log, E, other) > max(least, _SURE / len(E)) and agree >= _BLOCKS - 1
+    return compute_gain(log, E, other) > max(least, _LIMITS.sure / len(E)) and agree >= _LIMITS.blocks - 1
 
 
 def find_late_signals(log: Log) -> Iterator[LogFault]:
@@ -109,7 +127,7 @@ def find_late_signals(log: Log) -> Iterator[LogFault]:
     if not data.nu and nx < 2:
         return
     aligned = align_rows(log)
-    if len(aligned.X) < max(_LEAST_ROWS, 8 * aligned.regressors(log).shape[1]):
+    if len(aligned.X) < max(_LIMITS.least_rows, 8 * aligned.regressors(log).shape[1]):
         return
     accepted: tuple[Shift, ...] = ()
     E = aligned.residuals(log)
@@ -134,13 +152,13 @@ def _find_best_shift(
 ) -> tuple[tuple[Shift, ...], Float[np.ndarray, "M nx"], list[int]] | None:
     """Return the shift that predicts best, its residuals, and the sensors that explain it as well; None if unsure."""
     nx = log.data.nx
-    if compute_gain(log, E, 0 * E) < _GAIN:
+    if compute_gain(log, E, 0 * E) < _LIMITS.gain:
         return None
     errors = {shift: align_rows(log, (*accepted, *shift)).residuals(log) for shift in _list_shifts(log, accepted)}
     scores = {shift: _score_shift(log, shift[0], E, other) for shift, other in errors.items()}
     if not scores:  # the only signal that can be late has its shift
         return None
-    best = max(scores, key=lambda shift: scores[shift] * (_PREFERENCE if shift[0].column >= nx else 1.0))
+    best = max(scores, key=lambda shift: scores[shift] * (_LIMITS.preference if shift[0].column >= nx else 1.0))
     rivals = {shift: score for shift, score in scores.items() if shift[0].column != best[0].column}
     if best[0].column >= nx and not _replaces_present_input(log, accepted, best, errors[best]):
         sensors = {shift: score for shift, score in scores.items() if shift[0].column < nx}
@@ -154,8 +172,8 @@ def _find_best_shift(
     else:
         neighbours = [tuple(Shift(part.column, part.steps + step) for part in best) for step in (-1, 1)]
         neighbour_scores = [scores[shift] for shift in neighbours if shift in scores]
-        sure = is_better(log, E, errors[best]) and max(neighbour_scores, default=0.0) < _PEAK * scores[best]
-    alike = {shift[0].column for shift, score in rivals.items() if score > _CLEAR * scores[best]}
+        sure = is_better(log, E, errors[best]) and max(neighbour_scores, default=0.0) < _LIMITS.peak * scores[best]
+    alike = {shift[0].column for shift, score in rivals.items() if score > _LIMITS.clear * scores[best]}
     return (best, errors[best], sorted(i for i in alike if i < nx)) if sure else None
 
 
@@ -192,14 +210,16 @@ def _is_sensor_late(
     """
     misfit = float(np.subtract(*compute_information(E, log.fine)))
     gain = _score_shift(log, shift, E, other)
-    if gain <= 0 or rival_score > _CLEAR * gain:
+    if gain <= 0 or rival_score > _LIMITS.clear * gain:
         return False
-    if rival_gain <= _CLEAR * compute_gain(log, E, other) and is_better(log, E, other, _SENSOR * (1 + misfit)):
+    if rival_gain <= _LIMITS.clear * compute_gain(log, E, other) and is_better(
+        log, E, other, _LIMITS.sensor * (1 + misfit)
+    ):
         return True
-    if gain < _OWN or rival_score > _CLEAR_OWN * gain or (shift.steps == 1 and misfit > 1):
+    if gain < _LIMITS.own or rival_score > _LIMITS.clear_own * gain or (shift.steps == 1 and misfit > 1):
         return False
-    parts = zip(np.array_split(E, _BLOCKS), np.array_split(other, _BLOCKS), strict=True)
-    return all(_compute_own_gain(log, shift, a, b) > _EVEN * gain for a, b in parts)
+    parts = zip(np.array_split(E, _LIMITS.blocks), np.array_split(other, _LIMITS.blocks), strict=True)
+    return all(_compute_own_gain(log, shift, a, b) > _LIMITS.even * gain for a, b in parts)
 
 
 def _find_shift_by_one_row(log: Log) -> Shift | None:
@@ -215,14 +235,14 @@ def _find_shift_by_one_row(log: Log) -> Shift | None:
     aligned = align_rows(log)
     E = aligned.one_row_residuals(log)
     without_inputs = fit_residuals(log.regressors(aligned.X), (aligned.after - aligned.X) / log.size)
-    if compute_gain(log, without_inputs, E) < _GAIN:
+    if compute_gain(log, without_inputs, E) < _LIMITS.gain:
         return None
-    best, most = None, _OWN_ONE_ROW
-    for i, steps in product(range(log.data.nx), range(1, _ONE_ROW_LATEST + 1)):
+    best, most = None, _LIMITS.own_one_row
+    for i, steps in product(range(log.data.nx), range(1, _LIMITS.one_row_latest + 1)):
         other = align_rows(log, (Shift(i, steps),)).one_row_residuals(log)
-        pairs = zip(np.array_split(E[:, i], _BLOCKS), np.array_split(other[:, i], _BLOCKS), strict=True)
+        pairs = zip(np.array_split(E[:, i], _LIMITS.blocks), np.array_split(other[:, i], _LIMITS.blocks), strict=True)
         gains = [0.5 * float(np.log((np.mean(a**2) + 1e-20) / (np.mean(b**2) + 1e-20))) for a, b in pairs]
-        if np.median(gains) > most and min(gains) > _EVEN * np.median(gains):
+        if np.median(gains) > most and min(gains) > _LIMITS.even * np.median(gains):
             best, most = Shift(i, steps), float(np.median(gains))
     return best
 
@@ -231,7 +251,7 @@ def _list_shifts(log: Log, accepted: tuple[Shift, ...]) -> Iterator[tuple[Shift,
     """Yield the shifts of one signal, or of all inputs together, for signals that have no accepted shift yet."""
     nx, nu = log.data.nx, log.data.nu
     taken = {shift.column for shift in accepted}
-    for steps in range(1, _LATEST + 1):
+    for steps in range(1, _LIMITS.latest + 1):
         if nu > 1 and not taken.intersection(range(nx, nx + nu)):
             yield tuple(Shift(nx + j, -steps) for j in range(nu))
         for j in range(nu):
@@ -267,16 +287,10 @@ def _describe_shift(log: Log, shift: tuple[Shift, ...], alike: list[int]) -> Log
     return LogFault("late sensor", says, f"move its column by {count}, or {remedy}", names, steps=steps)
 
 
-_LIMIT_QUANTILES = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # try these quantiles of an input as its limits
-_POWERS = (2, 3, 4, 5)  # a clipped input must predict better than these powers of the input
-_SHARPER = 3.0  # nats over all rows by which it must; if inputs act through tanh, the powers win by 50 or more
-_LEFT_OVER = 0.1  # reject a limit if the clipped part adds more than this share of the gain
-
-
 def find_saturated_actuators(log: Log) -> Iterator[LogFault]:
     """Find inputs that have no further effect beyond some value, because the actuator is at its limit."""
     aligned = align_rows(log, margin=1)
-    if not log.data.nu or len(aligned.X) < max(_LEAST_ROWS, 8 * aligned.regressors(log).shape[1]):
+    if not log.data.nu or len(aligned.X) < max(_LIMITS.least_rows, 8 * aligned.regressors(log).shape[1]):
         return
     E = aligned.residuals(log)
     for j in range(log.data.nu):
@@ -292,11 +306,11 @@ def find_saturated_actuators(log: Log) -> Iterator[LogFault]:
         clipped = _clip_input(aligned, j, low, high)
         rest = (column - clipped.U[:, j])[:, None] / log.input_size[j]
         inside = clipped.residuals(log)
-        if compute_gain(log, inside, clipped.residuals(log, rest)) > _LEFT_OVER * compute_gain(log, E, inside):
+        if compute_gain(log, inside, clipped.residuals(log, rest)) > _LIMITS.left_over * compute_gain(log, E, inside):
             continue
         v = (aligned.U[:, [j]] - log.input_center[j]) / log.input_size[j]
-        smooth = aligned.residuals(log, np.hstack([v**power for power in _POWERS]))
-        if compute_gain(log, smooth, inside) < _SHARPER / len(smooth):
+        smooth = aligned.residuals(log, np.hstack([v**power for power in _LIMITS.powers]))
+        if compute_gain(log, smooth, inside) < _LIMITS.sharper / len(smooth):
             continue  # a smooth curve predicts as well: the plant is nonlinear, and the actuator has no limit there
         name = strip_unit(log.data.inputs[j])
         ends = [f"below {low:.3g}"] * bool(low > column.min()) + [f"above {high:.3g}"] * bool(high < column.max())
@@ -311,7 +325,7 @@ def find_saturated_actuators(log: Log) -> Iterator[LogFault]:
 
 def _list_limits(column: Float[np.ndarray, " M"]) -> Iterator[tuple[float, float]]:
     """Yield low and high limits at quantiles of the input, on both sides or on one."""
-    for side, q in product(("both", "high", "low"), _LIMIT_QUANTILES):
+    for side, q in product(("both", "high", "low"), _LIMITS.limit_quantiles):
         low = float(np.quantile(column, q)) if side != "high" else float(column.min())
         high = float(np.quantile(column, 1 - q)) if side != "low" else float(column.max())
         if low < high and (low > column.min() or high < column.max()):
@@ -362,7 +376,7 @@ def find_inputs_without_effect(log: Log) -> Iterator[LogFault]:
     """Find inputs that move and change no state within a few steps."""
     nu = log.data.nu
     aligned = align_rows(log, margin=6)
-    if not nu or len(aligned.X) < max(_LEAST_ROWS, 4 * aligned.regressors(log).shape[1]):
+    if not nu or len(aligned.X) < max(_LIMITS.least_rows, 4 * aligned.regressors(log).shape[1]):
         return
     V = np.concatenate([stack_past_inputs(e.U, 6, len(e) - 6, 6) for e in log.data if len(e) >= 15])[: len(aligned.X)]
     base = [log.regressors(aligned.X), (aligned.before - log.center) / log.size]

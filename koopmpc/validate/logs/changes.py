@@ -20,20 +20,29 @@ from jaxtyping import Float
 from koopmpc.lifting.base import strip_unit
 from koopmpc.validate.logs.log import Log, LogFault, Place, Repair, name_episodes, solve_weights
 
-_SEGMENTS = 40  # cut the log into about this many segments
-_SHORTEST = 30  # a segment has at least this many rows
-_SHARE = 0.6  # the consensus consists of this share of the segments
-_RESTARTS = 12  # random starts of the search for the consensus, beside two fixed ones
-_OFFSET_SEGMENTS = 4  # fit the offset of a state to at most this many segments
-_GAIN = 0.5  # nats a row and state that a segment must gain if a change is undone
-_OFFSET_GAIN = 0.8  # the same for an offset; it is fitted, and may gain 0.75 in a segment with a misfit
-_GAIN_SHARE = 0.5  # a segment must gain at least this share of the most that it can gain
-_NO_OFFSET = 0.05  # [rad] a smaller offset of an angle is not a fault
-_NO_TURN = 0.3  # [rad] an offset of an angle this close to whole turns is not a fault
-_OFFSET_ROUNDS = 9  # rounds of the search for an offset; each narrows it by a factor of six
-_SURE = 40.0  # nats over all rows that a segment must gain
-_BACK = 0.7  # after a change is undone, a segment may be this many nats a row and state worse than the consensus
-_FLOOR = 1e-8  # a residual below this share of a state's size counts as rounding
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of the search for changes, found on the corpus of tests/validate/logs."""
+
+    segments: int = 40  # cut the log into about this many segments
+    shortest: int = 30  # a segment has at least this many rows
+    share: float = 0.6  # the consensus consists of this share of the segments
+    restarts: int = 12  # random starts of the search for the consensus, beside two fixed ones
+    offset_segments: int = 4  # fit the offset of a state to at most this many segments
+    gain: float = 0.5  # nats a row and state that a segment must gain if a change is undone
+    offset_gain: float = 0.8  # the same for an offset; it is fitted, and may gain 0.75 in a segment with a misfit
+    gain_share: float = 0.5  # a segment must gain at least this share of the most that it can gain
+    no_offset: float = 0.05  # [rad] a smaller offset of an angle is not a fault
+    no_turn: float = 0.3  # [rad] an offset of an angle this close to whole turns is not a fault
+    offset_rounds: int = 9  # rounds of the search for an offset; each narrows it by a factor of six
+    sure: float = 40.0  # nats over all rows that a segment must gain
+    # after a change is undone, a segment may be this many nats a row and state worse than the consensus
+    back: float = 0.7
+    floor: float = 1e-8  # a residual below this share of a state's size counts as rounding
+
+
+_LIMITS = _Limits()
 _FACTORS = {
     "180/π": 180 / np.pi,
     "1000": 1e3,
@@ -70,7 +79,7 @@ class OneStepLaw:
     def rate_residuals(self, E: Float[np.ndarray, "T nx"]) -> Float[np.ndarray, " nx"]:
         """Return the result of `errors` from residuals of the next rows."""
         E = np.nan_to_num(E / self.log.size, nan=1e6, posinf=1e6, neginf=-1e6)
-        return 0.5 * np.log((E**2).mean(axis=0) + _FLOOR**2) - self.level
+        return 0.5 * np.log((E**2).mean(axis=0) + _LIMITS.floor**2) - self.level
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +108,7 @@ def find_changes(log: Log) -> Iterator[LogFault]:
     errors = np.array([law.errors(*segment) for segment in segments])
     spread = np.quantile(errors[sorted(agreeing)].max(axis=1), 0.9)
     most = (np.clip(errors, spread, None) - spread).mean(axis=1)  # the most that a change can gain
-    apart = [s for s in range(len(segments)) if s not in agreeing and most[s] > _GAIN]
+    apart = [s for s in range(len(segments)) if s not in agreeing and most[s] > _LIMITS.gain]
     if not apart:
         return
     apart = sorted(sorted(apart, key=lambda s: -errors[s].max())[:12])
@@ -109,9 +118,9 @@ def find_changes(log: Log) -> Iterator[LogFault]:
         for s in apart:
             undone = change.errors(law, *segments[s])
             gain = float((np.clip(errors[s], spread, None) - np.clip(undone, spread, None)).mean())
-            follows = undone.max() < spread + _BACK + change.allowance and gain > _GAIN_SHARE * most[s]
-            least = _OFFSET_GAIN if change.kind == "offset change" else _GAIN
-            if gain > least and follows and gain * len(segments[s][1]) > _SURE:
+            follows = undone.max() < spread + _LIMITS.back + change.allowance and gain > _LIMITS.gain_share * most[s]
+            least = _LIMITS.offset_gain if change.kind == "offset change" else _LIMITS.gain
+            if gain > least and follows and gain * len(segments[s][1]) > _LIMITS.sure:
                 total += gain * len(segments[s][1])
                 explained.append(s)
         if len(explained) == 1 and change.tuned:
@@ -138,13 +147,13 @@ def find_changes(log: Log) -> Iterator[LogFault]:
 
 
 def _cut_segments(log: Log) -> list[Place]:
-    longest = max(_SHORTEST, log.steps // _SEGMENTS)
+    longest = max(_LIMITS.shortest, log.steps // _LIMITS.segments)
     places: list[Place] = []
     for e, episode in enumerate(log.data):
         count = max(len(episode) // longest, 1)
         edges = np.linspace(0, len(episode), count + 1).astype(int)
         places += [Place(e, int(a), int(b)) for a, b in pairwise(edges)]
-    return [place for place in places if place.last - place.first >= _SHORTEST]
+    return [place for place in places if place.last - place.first >= _LIMITS.shortest]
 
 
 def _read_segment(log: Log, place: Place) -> Segment:
@@ -163,19 +172,19 @@ def _fit_consensus(log: Log, segments: list[Place]) -> tuple[OneStepLaw | None, 
         moments.append((P.T @ P, P.T @ Y, (Y**2).sum(axis=0), len(Y)))
     grams, crosses = np.array([m[0] for m in moments]), np.array([m[1] for m in moments])
     squares, counts = np.array([m[2] for m in moments]), np.array([m[3] for m in moments])
-    count = max(round(_SHARE * len(segments)), 3)
-    if counts.sum() * _SHARE < 3 * grams.shape[1]:
+    count = max(round(_LIMITS.share * len(segments)), 3)
+    if counts.sum() * _LIMITS.share < 3 * grams.shape[1]:
         return None, set()
     rng = np.random.default_rng(0)
     indices = np.arange(len(segments))
-    starts = [indices[:count], indices[-count:], *(rng.permutation(indices)[:count] for _ in range(_RESTARTS))]
+    starts = [indices[:count], indices[-count:], *(rng.permutation(indices)[:count] for _ in range(_LIMITS.restarts))]
     best: tuple[float, np.ndarray, np.ndarray] | None = None
     for chosen in starts:
         W, level = np.zeros_like(crosses[0]), np.zeros(len(segments))
         for _ in range(8):
             W = solve_weights(grams[chosen].sum(axis=0), crosses[chosen].sum(axis=0))
             missed = squares - 2 * (crosses * W).sum(axis=1) + np.einsum("pi,spq,qi->si", W, grams, W)
-            level = 0.5 * np.log(np.maximum(missed, 0) / counts[:, None] + _FLOOR**2).mean(axis=1)
+            level = 0.5 * np.log(np.maximum(missed, 0) / counts[:, None] + _LIMITS.floor**2).mean(axis=1)
             closest = np.sort(np.argsort(level)[:count])
             if np.array_equal(closest, chosen):
                 break
@@ -227,9 +236,9 @@ def _list_changes(log: Log, law: OneStepLaw, segments: list[Segment]) -> Iterato
                     "unit change", (name,), f"{strip_unit(name)} is {text}", partial(_rescale_input, j, 1 / up)
                 )
     for i, name in enumerate(data.states):
-        b = _find_offset(log, law, segments[:_OFFSET_SEGMENTS], i)
+        b = _find_offset(log, law, segments[: _LIMITS.offset_segments], i)
         turns = round(b / (2 * np.pi))
-        if i in log.angles and abs(b - 2 * np.pi * turns) < (_NO_TURN if turns else _NO_OFFSET):
+        if i in log.angles and abs(b - 2 * np.pi * turns) < (_LIMITS.no_turn if turns else _LIMITS.no_offset):
             continue
         yield Change("offset change", (name,), f"{strip_unit(name)} is {b:+.3g} off", partial(_shift_state, i, -b))
     for r in (2, 3, 4):  # a disturbance moves a speed r times as far in r steps, and a position r² times
@@ -304,7 +313,7 @@ def _find_offset(log: Log, law: OneStepLaw, segments: list[Segment], i: int) -> 
 
     width = 4.0 * float(log.size[i])
     low, high = -width, width
-    for _ in range(_OFFSET_ROUNDS):
+    for _ in range(_LIMITS.offset_rounds):
         tries = np.linspace(low, high, 13)
         best = int(np.argmin([rate_offset(float(b)) for b in tries]))
         step = float(tries[1] - tries[0])

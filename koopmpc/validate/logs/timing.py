@@ -39,24 +39,35 @@ from koopmpc.lifting.base import strip_unit
 from koopmpc.validate.logs.log import Log, LogFault
 from koopmpc.values import Value
 
-_LAGS = 8  # rows of states that the past holds at most
-_INPUT_LAGS = 24  # rows of inputs that the past holds at most
-_EACH = 12  # rows of the log for each column of the past
-_MOST_ROWS = 10_000  # read at most about this many rows
-_SURE = 7.0  # standard errors by which the coefficient of u_{k+1} must differ from zero
-_LATER = 0.5  # reject if u_{k+2} has more than this share of the t value of u_{k+1}
-_FRESH = 1e-3  # share of an input's variance that its past must leave open
-_BLOCKS = 8  # in all but one of this many parts of the log the coefficient must have the same sign
-_SHORT = 3  # rows of the input beside which a few outputs must not predict it better
-_STATE_ROWS = 4  # rows of these outputs
-_REPEATED = 0.3  # an input that keeps its exact value in this share of the rows does not follow a noisy output
-_WEAK = 2.5  # below this t value the coefficient is taken for zero
-_INSTRUMENTS = 1e-4  # significance at which a proportional feedback is rejected
-_LAW = 1e-4  # significance at which the law of a controller is rejected, if
-_MISSED = 0.08  # it leaves open this share more than all rows: set points are known up to an error
-_EXACT = 1e-6  # share of an input's variance that an exact law leaves open, at most
-_TELLS = 0.5  # standard errors by which the plant's gain must show that a controller would drive the output away
-_STRONG = 0.1  # squared partial correlation of u_{k+1} and y_{k+1} above which a feedback must be strong, thus seen
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of the test of timing, found on the corpus of tests/validate/logs."""
+
+    lags: int = 8  # rows of states that the past holds at most
+    input_lags: int = 24  # rows of inputs that the past holds at most
+    each: int = 12  # rows of the log for each column of the past
+    most_rows: int = 10_000  # read at most about this many rows
+    sure: float = 7.0  # standard errors by which the coefficient of u_{k+1} must differ from zero
+    later: float = 0.5  # reject if u_{k+2} has more than this share of the t value of u_{k+1}
+    fresh: float = 1e-3  # share of an input's variance that its past must leave open
+    blocks: int = 8  # in all but one of this many parts of the log the coefficient must have the same sign
+    short: int = 3  # rows of the input beside which a few outputs must not predict it better
+    state_rows: int = 4  # rows of these outputs
+    # an input that keeps its exact value in this share of the rows does not follow a noisy output
+    repeated: float = 0.3
+    weak: float = 2.5  # below this t value the coefficient is taken for zero
+    instruments: float = 1e-4  # significance at which a proportional feedback is rejected
+    law: float = 1e-4  # significance at which the law of a controller is rejected, if
+    missed: float = 0.08  # it leaves open this share more than all rows: set points are known up to an error
+    exact: float = 1e-6  # share of an input's variance that an exact law leaves open, at most
+    # standard errors by which the plant's gain must show that a controller would drive the output away
+    tells: float = 0.5
+    # squared partial correlation of u_{k+1} and y_{k+1} above which a feedback must be strong, thus seen
+    strong: float = 0.1
+
+
+_LIMITS = _Limits()
 
 
 class _Strictness(NamedTuple):
@@ -136,14 +147,14 @@ def measure_timing(log: Log) -> tuple[InputTiming, ...]:
     past = _find_basis(np.hstack([rows.states, rows.inputs, rows.products]))
     fresh, left = _leave_out(past, rows.same), _leave_out(past, rows.change)
     share = (fresh**2).mean(axis=0) / np.maximum((rows.same**2).mean(axis=0), 1e-300)
-    moving = share > _FRESH
+    moving = share > _LIMITS.fresh
     t = np.zeros((nu, log.data.nx))
     later = np.zeros_like(t)
     if moving.any():
         t[moving], signs = _test_coefficients(fresh[:, moving], left)
         more = _find_basis(np.hstack([rows.states, rows.inputs, rows.products, rows.same]))
         beyond = _leave_out(more, rows.later)
-        known = moving & ((beyond**2).mean(axis=0) > _FRESH * (rows.same**2).mean(axis=0))
+        known = moving & ((beyond**2).mean(axis=0) > _LIMITS.fresh * (rows.same**2).mean(axis=0))
         if known.any():
             later[known], _ = _test_coefficients(beyond[:, known], _leave_out(more, rows.change))
     else:
@@ -155,19 +166,19 @@ def measure_timing(log: Log) -> tuple[InputTiming, ...]:
         if not moving[j]:
             found.append(InputTiming(name, Timing.UNKNOWN, value, "its past predicts it, so no row shows its effect"))
             continue
-        agree = signs[np.flatnonzero(moving).tolist().index(j), i] >= _BLOCKS - 1
-        strong = value**2 > _STRONG * (len(rows.same) + value**2)
-        limits = _USUAL if strong or abs(value) <= _WEAK else _STRICT
+        agree = signs[np.flatnonzero(moving).tolist().index(j), i] >= _LIMITS.blocks - 1
+        strong = value**2 > _LIMITS.strong * (len(rows.same) + value**2)
+        limits = _USUAL if strong or abs(value) <= _LIMITS.weak else _STRICT
         if not (strong and _amplifies(rows, j, value)) and (why := _explain_feedback(rows, j, value, limits)):
             found.append(InputTiming(name, Timing.UNKNOWN, value, why, feedback=True))
-        elif abs(value) < _WEAK:
+        elif abs(value) < _LIMITS.weak:
             found.append(InputTiming(name, Timing.NEXT_ROW, value, "its own row does not hold its effect"))
-        elif abs(value) < _SURE:
+        elif abs(value) < _LIMITS.sure:
             found.append(InputTiming(name, Timing.UNKNOWN, value, f"its own row may hold its effect (t = {value:.3g})"))
-        elif not agree or np.abs(later[j]).max() > max(_LATER * abs(value), _WEAK):
+        elif not agree or np.abs(later[j]).max() > max(_LIMITS.later * abs(value), _LIMITS.weak):
             why = "rows before it seem to hold its effect too" if agree else "parts of the log disagree"
             found.append(InputTiming(name, Timing.UNKNOWN, value, why))
-        elif _follows_law(rows, j) and not _score_gain(rows, j, value) > _TELLS:
+        elif _follows_law(rows, j) and not _score_gain(rows, j, value) > _LIMITS.tells:
             why = "a PID controller that answers to disturbances would move it in the same way"
             found.append(InputTiming(name, Timing.UNKNOWN, value, why, feedback=True))
         else:
@@ -193,9 +204,9 @@ def _stack_rows(log: Log) -> _Rows | None:
     """Return the rows of the test, or None if the log is too short."""
     nx, nu = log.data.nx, log.data.nu
     usual = sorted(len(e) for e in log.data)[len(log.data) // 2]
-    total = min(log.steps, _MOST_ROWS)
-    lags = int(np.clip(min((usual - 4) // 3, total // (_EACH * 3 * nx)), 1, _LAGS))
-    input_lags = int(np.clip(min((usual - 4) // 2, total // (_EACH * 2 * nu)), 1, _INPUT_LAGS))
+    total = min(log.steps, _LIMITS.most_rows)
+    lags = int(np.clip(min((usual - 4) // 3, total // (_LIMITS.each * 3 * nx)), 1, _LIMITS.lags))
+    input_lags = int(np.clip(min((usual - 4) // 2, total // (_LIMITS.each * 2 * nu)), 1, _LIMITS.input_lags))
     margin = max(lags, input_lags)
     parts: list[tuple[np.ndarray, ...]] = []
     count = 0
@@ -218,7 +229,7 @@ def _stack_rows(log: Log) -> _Rows | None:
             )
         )
         count += len(k)
-        if count > _MOST_ROWS:
+        if count > _LIMITS.most_rows:
             break
     if not parts:
         return None
@@ -259,7 +270,7 @@ def _test_coefficients(
     weights = W @ inverse
     errors = np.sqrt(np.einsum("mj,mi->ji", weights**2, e**2))
     agree = np.zeros_like(b)
-    for part, other in zip(np.array_split(W, _BLOCKS), np.array_split(E, _BLOCKS), strict=True):
+    for part, other in zip(np.array_split(W, _LIMITS.blocks), np.array_split(E, _LIMITS.blocks), strict=True):
         agree += np.sign(np.linalg.pinv(part) @ other) == np.sign(b)
     floor = 1e-12 * np.abs(b)
     return b / np.maximum(errors, np.maximum(floor, 1e-300)), agree
@@ -277,7 +288,7 @@ def _amplifies(rows: _Rows, j: int, t: float) -> bool:
     past = np.hstack([rows.states, rows.inputs])
     alone, both = (float(np.sum(_leave_out(_find_basis(P), rows.after) ** 2)) for P in (rows.states, past))
     more, free = rows.inputs.shape[1], len(past) - past.shape[1] - 1
-    if fdtrc(more, free, (alone - both) / more / max(both / free, 1e-300)) > _INSTRUMENTS:
+    if fdtrc(more, free, (alone - both) / more / max(both / free, 1e-300)) > _LIMITS.instruments:
         return False
     without = np.linalg.lstsq(past, rows.after, rcond=1e-9)[0][:, 0]
     beside = np.linalg.lstsq(np.hstack([past, rows.same]), rows.after, rcond=1e-9)[0][: past.shape[1], 0]
@@ -309,9 +320,9 @@ def _follows_law(rows: _Rows, j: int) -> bool:
         short = _find_basis(np.hstack([rows.after, rows.states[:, : nx * earlier], set_points[:, :earlier]]))
         rest = float((_leave_out(short, target) ** 2).sum())
         more, free = whole.shape[1] - short.shape[1], len(u) - whole.shape[1] - 1
-        if rest < max(_EXACT * float((u**2).sum()), (1 + _MISSED) * left):
+        if rest < max(_LIMITS.exact * float((u**2).sum()), (1 + _LIMITS.missed) * left):
             return True
-        if fdtrc(more, free, (rest - left) / more / (left / free)) > _LAW:
+        if fdtrc(more, free, (rest - left) / more / (left / free)) > _LIMITS.law:
             return True
     return False
 
@@ -367,7 +378,7 @@ def _split_by_age(rows: _Rows, j: int) -> Float[np.ndarray, "M ages"]:
 def _explain_feedback(rows: _Rows, j: int, t: float, limits: _Strictness) -> str:
     """Return why input j may be a feedback of the states, or an empty text."""
     u, ones = rows.same[:, [j]], len(rows.same)
-    past = rows.inputs if abs(t) > _SURE else np.hstack([rows.inputs, _split_by_age(rows, j)])
+    past = rows.inputs if abs(t) > _LIMITS.sure else np.hstack([rows.inputs, _split_by_age(rows, j)])
     both = _find_basis(np.hstack([past, rows.states]))
     alone, joint = (float((_leave_out(Q, u) ** 2).sum()) for Q in (_find_basis(past), both))
     if joint < 1e-9 * float((u**2).sum()):
@@ -375,13 +386,13 @@ def _explain_feedback(rows: _Rows, j: int, t: float, limits: _Strictness) -> str
     if _tells_more(rows.states, past, u, limits.significance):
         return "past outputs predict it, so it may be a feedback"
     nx, nu = rows.after.shape[1], rows.same.shape[1]
-    if rows.repeated[j] < _REPEATED:
-        short = _find_basis(rows.inputs[:, : nu * _SHORT])
-        few = _find_basis(np.hstack([rows.inputs[:, : nu * _SHORT], rows.states[:, : nx * _STATE_ROWS]]))
+    if rows.repeated[j] < _LIMITS.repeated:
+        short = _find_basis(rows.inputs[:, : nu * _LIMITS.short])
+        few = _find_basis(np.hstack([rows.inputs[:, : nu * _LIMITS.short], rows.states[:, : nx * _LIMITS.state_rows]]))
         base, proxy = (float((_leave_out(Q, u) ** 2).sum()) for Q in (short, few))
         more, free = few.shape[1] - short.shape[1], ones - few.shape[1] - 1
         explained = base - proxy > limits.share * (base - alone)
-        if more > 0 and explained and fdtrc(more, free, (base - proxy) / more / (proxy / free)) < _INSTRUMENTS:
+        if more > 0 and explained and fdtrc(more, free, (base - proxy) / more / (proxy / free)) < _LIMITS.instruments:
             return "outputs predict it as well as its own past does, so it may be a feedback"
     # two-stage least squares of u = −K y + r with the past as instruments: r must not follow from the past
     predicted = both @ (both.T @ rows.after)
@@ -392,6 +403,6 @@ def _explain_feedback(rows: _Rows, j: int, t: float, limits: _Strictness) -> str
     if not (np.abs(K[:, 0]) > limits.gain * errors).any():
         return ""
     explained = float(((both.T @ r) ** 2).sum()) / max(rest / ones, 1e-300)
-    if chdtrc(both.shape[1] - nx, explained) > _INSTRUMENTS:
+    if chdtrc(both.shape[1] - nx, explained) > _LIMITS.instruments:
         return "its past follows from the outputs as under a proportional feedback"
     return ""

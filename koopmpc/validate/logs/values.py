@@ -5,6 +5,7 @@ A live sensor has noise and never repeats a number; a faulty sensor does.
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -15,16 +16,24 @@ from koopmpc.text import to_percent
 from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, Repair, find_stretches, list_places, name_episodes
 from koopmpc.validate.sufficiency import persistency
 
-_GRID_SHARE = 0.95  # a sensor has a grid if at least this share of its values are multiples of one step
-_COARSE = 0.3  # a grid is coarse if its step exceeds this share of a usual change from row to row
-_STUCK_ROWS = 12  # a sensor is stuck if it repeats a number for this many rows
-_LIMIT_ROWS = 8  # a sensor is at its limit if at least this many rows have the same extreme value
-_REST = 0.1  # a constant state is at rest if the one-step law predicts it to this share of a usual change
-_OVERLAP = 10  # two episodes repeat one another if they share this many successive rows
-_NEAR_STEPS = 3  # rows that change by at most so many steps of a display say how many repeat by chance
-_FAR = 3.0  # a spike is larger than this many times the largest usual change
-_JUMP = 1.5  # a jump is larger than this many times the largest usual change from row to row
-_OFF = 10.0  # at a jump the residual is larger than this many times the largest usual residual
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of the checks of single values, found on the corpus of tests/validate/logs."""
+
+    grid_share: float = 0.95  # a sensor has a grid if at least this share of its values are multiples of one step
+    coarse: float = 0.3  # a grid is coarse if its step exceeds this share of a usual change from row to row
+    stuck_rows: int = 12  # a sensor is stuck if it repeats a number for this many rows
+    limit_rows: int = 8  # a sensor is at its limit if at least this many rows have the same extreme value
+    rest: float = 0.1  # a constant state is at rest if the one-step law predicts it to this share of a usual change
+    overlap: int = 10  # two episodes repeat one another if they share this many successive rows
+    near_steps: int = 3  # rows that change by at most so many steps of a display say how many repeat by chance
+    far: float = 3.0  # a spike is larger than this many times the largest usual change
+    jump: float = 1.5  # a jump is larger than this many times the largest usual change from row to row
+    off: float = 10.0  # at a jump the residual is larger than this many times the largest usual residual
+
+
+_LIMITS = _Limits()
 
 
 def find_repeated_columns(log: Log) -> Iterator[LogFault]:
@@ -57,12 +66,12 @@ def find_repeated_episodes(log: Log) -> Iterator[LogFault]:
     for e, episode in enumerate(log.data):
         rows = np.ascontiguousarray(np.hstack([episode.X[:-1], episode.U]))
         moves = np.concatenate([np.ptp(episode.X, axis=0) > 0, np.ptp(episode.U, axis=0) > 0])
-        if len(rows) < _OVERLAP or not moves.any():
+        if len(rows) < _LIMITS.overlap or not moves.any():
             continue
         keys = [row.tobytes() for row in rows]
         repeated = np.array([key in seen and seen[key][0] != e for key in keys])
         for a, b in find_stretches(repeated):
-            if b - a >= _OVERLAP and (np.ptp(rows[a:b], axis=0) > 0).any():
+            if b - a >= _LIMITS.overlap and (np.ptp(rows[a:b], axis=0) > 0).any():
                 places.append(Place(e, a, b + 1))
                 originals.add(seen[keys[a]][0])
         for k, key in enumerate(keys):
@@ -90,7 +99,7 @@ def find_grid_step(column: Float[np.ndarray, " M"]) -> float:
     step = float(np.quantile(gaps, 0.02))
     multiples = gaps / step
     off = np.abs(multiples - np.round(multiples))
-    return step if np.mean(off < 0.01) >= _GRID_SHARE else 0.0
+    return step if np.mean(off < 0.01) >= _LIMITS.grid_share else 0.0
 
 
 def find_coarse_sensors(log: Log) -> Iterator[LogFault]:
@@ -114,7 +123,7 @@ def find_coarse_states(log: Log) -> dict[int, float]:
         step = find_grid_step(log.X[:, i])
         if step > 0:
             changes = np.abs(log.changes[:, i])
-            if step > _COARSE * float(np.quantile(changes, 0.75)) or np.mean(changes == 0) > 0.2:
+            if step > _LIMITS.coarse * float(np.quantile(changes, 0.75)) or np.mean(changes == 0) > 0.2:
                 steps[i] = step
     return steps
 
@@ -156,7 +165,9 @@ def find_stuck_sensors(log: Log) -> Iterator[LogFault]:
     at_end: dict[int, list[Place]] = {}
     low, high = log.X.min(axis=0), log.X.max(axis=0)
     moving = [i for i in range(log.data.nx) if i not in lazy and low[i] != high[i]]
-    longest = {i: max(_STUCK_ROWS, 6 * _usual_stay(log, i)) if i in rough else _STUCK_ROWS for i in moving}
+    longest = {
+        i: max(_LIMITS.stuck_rows, 6 * _usual_stay(log, i)) if i in rough else _LIMITS.stuck_rows for i in moving
+    }
     for e, episode in enumerate(log.data):
         for i in moving:
             others = np.delete(episode.X, i, axis=1) / np.delete(log.size, i)
@@ -200,7 +211,7 @@ def find_sensor_limits(log: Log) -> dict[int, tuple[float, ...]]:
             continue
         for end in (low, high):
             stays = [b - a for e in log.data for a, b in find_stretches(e.X[:, i] == end)]
-            often = sum(stays) >= max(_LIMIT_ROWS, 0.002 * len(log.X)) and len(stays) > 1
+            often = sum(stays) >= max(_LIMITS.limit_rows, 0.002 * len(log.X)) and len(stays) > 1
             if often and np.mean(np.array(stays) > 1) > 0.2 and not _is_at_rest(log, i, end):
                 ends[i] = (*ends.get(i, ()), end)
     return ends
@@ -211,7 +222,7 @@ def _is_at_rest(log: Log, i: int, end: float) -> bool:
     stays = [(e.X[1:, i] == end) & (e.X[:-1, i] == end) for e in log.data]
     residuals = np.concatenate([E[stay, i] for E, stay in zip(log.residuals, stays, strict=True)])
     changes = log.changes[:, i] / log.size[i]
-    return bool((residuals**2).sum() < _REST**2 * len(residuals) * (changes**2).mean())
+    return bool((residuals**2).sum() < _LIMITS.rest**2 * len(residuals) * (changes**2).mean())
 
 
 def find_saturated_sensors(log: Log) -> Iterator[LogFault]:
@@ -292,8 +303,8 @@ def _repeat_by_chance(log: Log, live: list[int]) -> bool:
     same = (changes == 0).all(axis=1)
     repeated = np.concatenate([e.X[1:, live] for e in log.data])[same]
     steps = np.array([_find_decimal_step(column) for column in repeated.T])
-    near = int((np.abs(changes) < (_NEAR_STEPS + 0.5) * steps).all(axis=1).sum() - same.sum())
-    expected = near / ((2 * _NEAR_STEPS + 1) ** len(live) - 1)
+    near = int((np.abs(changes) < (_LIMITS.near_steps + 0.5) * steps).all(axis=1).sum() - same.sum())
+    expected = near / ((2 * _LIMITS.near_steps + 1) ** len(live) - 1)
     return bool(same.sum() <= expected + 3 * np.sqrt(expected))
 
 
@@ -368,7 +379,7 @@ def _find_loss_mark(log: Log, i: int, changes: np.ndarray) -> tuple[float, tuple
                 places.append(Place(e, a, b))
                 sizes.append(min(abs(value - before), abs(value - after)))
         rows = sum(p.last - p.first for p in places)
-        if len(places) >= 3 and rows < 0.2 * len(log.X) and np.median(sizes) > 2 * _FAR * usual:
+        if len(places) >= 3 and rows < 0.2 * len(log.X) and np.median(sizes) > 2 * _LIMITS.far * usual:
             return float(value), tuple(places)
     return None
 
@@ -383,7 +394,7 @@ def _find_spikes(log: Log, i: int, changes: np.ndarray) -> Iterator[Place]:
     all_heights = np.concatenate(heights)
     if not len(all_heights):
         return
-    far = max(_FAR * float(np.quantile(changes, 0.97)), 5 * float(np.quantile(all_heights, 0.97)))
+    far = max(_LIMITS.far * float(np.quantile(changes, 0.97)), 5 * float(np.quantile(all_heights, 0.97)))
     if far <= 0:
         return
     other_steps = [np.abs(np.diff(e.X[:, i])) for e in log.data]
@@ -437,8 +448,8 @@ def find_jumps(log: Log) -> Iterator[LogFault]:
     for e, episode in enumerate(log.data):
         d = np.diff(episode.X, axis=0)
         off = np.where(log.leverage[e] < ALONE, (np.abs(log.residuals[e]) / usual).max(axis=1), 0.0)
-        wide = (np.abs(d) > _JUMP * widest) & (widest > 0)
-        for k in 1 + np.flatnonzero(((off > _OFF) & wide.any(axis=1))[1:]):
+        wide = (np.abs(d) > _LIMITS.jump * widest) & (widest > 0)
+        for k in 1 + np.flatnonzero(((off > _LIMITS.off) & wide.any(axis=1))[1:]):
             if not (np.abs(log.residuals[e][k]) * log.size > 0.5 * np.abs(d[k]))[wide[k]].any():
                 continue
             i = int(np.argmax(np.abs(d[k]) / np.where(widest > 0, widest, np.inf)))
