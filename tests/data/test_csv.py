@@ -10,7 +10,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.data.episodes import find_lines
 
 
 def text(file: Path, content: str, encoding: str = "utf-8") -> Path:
@@ -338,15 +337,6 @@ def test_what_several_files_share_is_one_sentence_that_names_them(tmp_path: Path
     with pytest.warns(km.FitWarning) as caught, pytest.raises(km.errors.LogError):
         km.load_episodes(files[0], files[1], tmp_path / "none.csv", resample=1.0)  # what was found is said all the same
     assert len(caught) == 2
-
-
-def test_a_row_is_named_by_the_line_that_an_editor_shows(tmp_path: Path) -> None:
-    named = text(tmp_path / "named.csv", "# plant A\n\ntime [s],x,u\n0,1,0\n\n0.1,2,0\n0.2,3,0\n")
-    plain = text(tmp_path / "plain.csv", "0,1,0\n1e-1,nan,0\n\n0.2,3,0\n")
-    assert find_lines(str(named), [1, 2, 3]) == ("line", [4, 6, 7])
-    assert find_lines(str(plain), [1, 2, 3]) == ("line", [1, 2, 4])
-    assert find_lines(str(plain), [4]) == ("row", [4])  # not there
-    assert find_lines("a DataFrame", [4, 5]) == ("row", [4, 5])
 
 
 @pytest.mark.parametrize(("unit", "per_second"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])

@@ -8,9 +8,8 @@ import pytest
 
 import koopmpc as km
 from koopmpc.data.files.columns import TableSettings, find_roles, is_label
-from koopmpc.data.files.sampling import Signals, episodes_from, resample, restarts, sample_time
-from koopmpc.data.files.tables import _number_episodes, _plausible
-from koopmpc.errors import ColumnWarning
+from koopmpc.data.files.sampling import Signals, episodes_from, resample
+from koopmpc.data.files.tables import _plausible
 
 
 def signals(time, X=None, U=None, first=1):
@@ -28,48 +27,8 @@ def said(action):
     return found, [str(warning.message) for warning in caught]
 
 
-def test_the_sample_time_is_the_median_of_steps_ahead_to_six_digits():
-    assert sample_time([np.array([0, 1, 2, 10.0]), np.array([5.0, 4.0, np.nan, 7.0, 8.0])], "f") == 1.0
-    assert sample_time([np.array([0, 0.1234567891])], "f") == 0.123457
-    assert sample_time([np.array([0, 0, 0, 3.0])], "f") == 3.0  # time that stands is no step
-    for times in ([], [np.zeros(0)], [np.array([1.0])], [np.array([2.0, 2.0, 1.0])]):
-        with pytest.raises(
-            km.errors.DataError, match="f: time does not advance in any two rows; sort the rows by time"
-        ):
-            sample_time(times, "f")
-
-
-def test_a_step_back_in_time_begins_a_part_and_one_to_another_time_than_the_first_is_told():
-    time = [0, 1, 2, 0.5, 1.5, 0, 1, 2, 3]
-    parts, words = said(lambda: restarts(signals(time), "f"))
-    assert [part.rows.tolist() for part in parts] == [[1, 2, 3], [4, 5], [6, 7, 8, 9]]
-    assert not words  # a start anew is within twice the usual step of the first time
-    parts, words = said(
-        lambda: restarts(signals([0, 1, 2, 3, 4, 5, 2.1, 3.1, 4.1, 1.9, 2.9, 3.9, 2.5, 9, 3, 9, 2.2]), "f")
-    )
-    assert len(parts) == 6
-    assert words == ["f: the clock is set back 4 times, before row 7, 13, 15, …; an episode ends there"]
-    parts, words = said(lambda: restarts(signals([0, 1, 2, 3, 4, 5, 2.1, 3, 2.2, 3, 2.3, 3]), "f"))
-    assert words == ["f: the clock is set back 3 times, before row 7, 9, 11; an episode ends there"]
-    whole = signals(None, X=[1, 2, 3])
-    assert restarts(whole, "f") == [whole]
-    assert [part.rows.tolist() for part in restarts(signals([4.0]), "f")] == [[1]]
-    assert [part.rows.tolist() for part in restarts(signals([4.0, 4.0, 5.0]), "f")] == [[1, 2, 3]]
-
-
 def on_grid(part, dt):
     return said(lambda: resample([part], dt, "f"))[0]
-
-
-def test_states_are_interpolated_and_inputs_held_on_a_grid_from_the_first_time():
-    (part,) = on_grid(signals([3, 4, 4, 5, 6], X=[0, 10, 99, 30, 40], U=[1, 2, 3, 4, 5]), 0.5)
-    np.testing.assert_allclose(part.time, np.arange(3, 6.1, 0.5))
-    np.testing.assert_allclose(part.X[:, 0], [0, 5, 10, 20, 30, 35, 40])
-    np.testing.assert_array_equal(part.U[:, 0], [1, 1, 2, 2, 4, 4, 5])  # of rows at one time the first counts
-    np.testing.assert_array_equal(part.W, part.U)
-    np.testing.assert_array_equal(part.rows, [1, 1, 2, 2, 4, 4, 5])
-    (part,) = on_grid(signals([0, 1, 2]), 0.75)
-    np.testing.assert_allclose(part.time, [0, 0.75, 1.5])
 
 
 def test_resampling_leaves_missing_rows_out_and_cuts_at_gaps():
@@ -205,15 +164,6 @@ def test_two_columns_of_one_name_are_refused_where_they_would_be_guessed_from():
         find_roles(names, names, TableSettings(states=["v"]), "f")
 
 
-def test_what_a_caller_knows_is_nothing_only_where_all_of_it_is():
-    assert TableSettings().nothing
-    assert not TableSettings(dt=0.1).nothing
-    assert TableSettings(states=["a"], inputs=["b"], disturbances=["c"]).named == {"a", "b", "c"}
-    for name in ("dt", "resample"):
-        with pytest.raises(km.errors.DataError, match=f"{name} is -1 s"):
-            TableSettings(**{name: -1.0})
-
-
 @pytest.mark.parametrize(
     ("count", "largest", "refused"),
     [(100, 0.99e6, False), (100, -1.01e6, True), (99, 1.01e6, False), (200, 1.01e6, True)],
@@ -231,24 +181,6 @@ def test_a_cell_a_million_times_larger_than_usual_is_refused_with_its_row(count,
             _plausible(column, "x", "f")
     else:
         _plausible(column, "x", "f")
-
-
-def test_a_column_that_is_mostly_zero_or_empty_is_plausible_and_one_that_nobody_could_compute_with_is_not():
-    _plausible(np.append(np.zeros(200), 1e9), "x", "f")
-    _plausible(np.full(200, np.nan), "x", "f")
-    with pytest.raises(km.errors.DataError, match=r"f: 'x' is 1e\+31 in row 201"):
-        _plausible(np.append(np.zeros(200), 1e31), "x", "f")
-    with pytest.raises(km.errors.DataError, match=r"in row 1, where"):
-        _plausible(np.full(200, 1e31), "x", "f")
-
-
-def test_episodes_are_numbered_in_the_order_in_which_they_first_come(tmp_path):
-    file = tmp_path / "f"
-    assert _number_episodes(np.array(["b", "a", "b", "c"], dtype=object), file).tolist() == [0, 1, 0, 2]
-    assert _number_episodes(np.array([7.0, 3.0, 3.0, 9.0, 7.0]), file).tolist() == [0, 1, 1, 2, 0]
-    for bad in (np.array([1.0, np.nan]), np.array(["a", None], dtype=object)):
-        with pytest.raises(km.errors.DataError, match="has rows whose episode is null"):
-            _number_episodes(bad, file)
 
 
 def test_more_rows_than_memory_holds_are_refused_before_they_are_made(tmp_path, monkeypatch):
@@ -271,10 +203,14 @@ def test_a_column_is_doubted_once_where_it_is_constant_or_repeats_an_earlier_one
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         km.load_episodes(tmp_path / "log.csv", resample=1.0)
-    words = [str(w.message).split(": ", 1)[1].split(";")[0] for w in caught if issubclass(w.category, ColumnWarning)]
+    words = [
+        str(w.message).split(": ", 1)[1].split(";")[0]
+        for w in caught
+        if issubclass(w.category, km.errors.ColumnWarning)
+    ]
     assert words == ["'y' repeats 'x'", "'z' repeats 'x'", "'z' repeats 'y'", "'c' is 4 throughout"]
     with warnings.catch_warnings():
-        warnings.simplefilter("error", ColumnWarning)
+        warnings.simplefilter("error", km.errors.ColumnWarning)
         with pytest.warns(km.FitWarning, match="gap"):
             km.load_episodes(tmp_path / "log.csv", states=["x", "y", "c"], inputs=["u"])  # told, not guessed
 

@@ -9,8 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.fits.constrained import largest_violation
-from koopmpc.identify.fits.prior import build_entries
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
 from tests.roundtrip import returned
 
@@ -258,15 +256,6 @@ def test_parts_of_a_prior_are_checked_where_they_are_made() -> None:
         km.identify.constrained_edmd(random_episodes(0, [40], 2, 1), LIFTING, prior=km.identify.Prior(), ridge=-1)
 
 
-def test_columns_that_depend_on_each_other_are_doubted_unless_a_ridge_was_asked_for() -> None:
-    data = random_episodes(0, [60], 2, 1)
-    double = km.Episodes([km.Episode(X=np.column_stack([e.X, 2 * e.X[:, 0]]), U=e.U) for e in data], 0.1)
-    prior = km.identify.Prior(lower_A=-100.0)
-    with pytest.warns(km.FitWarning, match="1 of 3 observables are linear functions of others"):
-        km.identify.constrained_edmd(double, km.State(), prior=prior)
-    assert not km.identify.constrained_edmd(double, km.State(), prior=prior, ridge=1e-3).report.warnings
-
-
 def test_a_symmetry_that_the_plain_fit_has_needs_no_program() -> None:
     data = linear(np.array([[0.9, 0.2], [0.2, -0.7]]), np.ones((2, 1)))
     model = km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(symmetric=True))
@@ -304,123 +293,3 @@ def test_the_report_counts_what_is_known_and_what_stands_at_a_bound_and_names_wh
         changes = km.identify.constrained_edmd(data, km.State(), prior=km.identify.Prior(**some)).report.changes
         assert changes[0] == words
         assert len(changes) == 2
-
-
-@pytest.mark.parametrize("share", [-1e-3, 0.0, 0.5, 1.0, 1.001])
-def test_a_violation_is_how_far_a_combination_lies_outside_its_limits(share: float) -> None:
-    A, B = np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[5.0], [6.0]])
-    total = 1.0 * A[0, 1] - 2 * A[1, 0] + 3 * B[1, 0]
-    each = km.identify.Combination(total - share, total - share + 1, A=[[0, 1], [-2, 0]], B=[[0], [3]])
-    own = largest_violation(km.identify.Prior(combinations=[each]), A, B, np.ones(3))
-    assert own == pytest.approx(max(-share, share - 1, 0.0), abs=1e-12)
-
-
-def test_a_violation_of_symmetry_and_of_dissipation_is_relative_to_what_is_there() -> None:
-    A, B = np.array([[1.0, 0.5], [0.3, 0.2]]), np.zeros((2, 1))
-    for size in (1e-6, 1.0, 1e6):
-        own = largest_violation(km.identify.Prior(symmetric=True), size * A, B, np.ones(3))
-        assert own == pytest.approx(0.2)
-        contraction = km.identify.Prior(dissipation=km.identify.Dissipation(np.diag([2.0, 1.0]) / size**2, decay=0.9))
-        L = np.diag(np.sqrt([2.0, 1.0]))  # in units of the sizes and of the largest energy
-        M = np.block([[0.81 * L @ L / 2, (L @ A).T / np.sqrt(2)], [L @ A / np.sqrt(2), np.eye(2)]])
-        found = largest_violation(contraction, A, B, np.array([size, size, 1.0]))
-        assert found == pytest.approx(-np.linalg.eigvalsh(M)[0], rel=1e-9)
-    assert (
-        largest_violation(
-            km.identify.Prior(dissipation=km.identify.Dissipation(np.eye(2))), 0.5 * np.eye(2), B, np.ones(3)
-        )
-        == 0
-    )
-
-
-PSI, U = ("a [m]", "b [m/s]"), ("u [N]", "v [N]", "w")
-
-
-def entries(**parts):
-    return build_entries(km.identify.Prior(**parts), PSI, U)
-
-
-def test_without_parts_all_is_free():
-    own = entries()
-    assert own.known.shape == own.low.shape == own.high.shape == (2, 5)
-    assert np.isnan(own.known).all()
-    assert (own.low == -INF).all()
-    assert (own.high == INF).all()
-
-
-def test_each_part_stands_in_its_place():
-    own = entries(
-        A=[[1.0, NAN], [NAN, NAN]],
-        B=[[NAN, NAN, NAN], [7.0, NAN, NAN]],
-        mask_A=[[1, 1], [0, 1]],
-        mask_B=[[1, 0, 1], [1, 1, 1]],
-        lower_A=-2.0,
-        upper_A=[[3.0, 4.0], [5.0, INF]],
-        lower_B=[[-6.0, -INF, 0.5], [0.0, 0.0, 0.0]],
-        upper_B=9.0,
-    )
-    np.testing.assert_array_equal(own.known, [[1, NAN, NAN, 0, NAN], [0, NAN, 7, NAN, NAN]])
-    np.testing.assert_array_equal(own.low, [[-2, -2, -6, -INF, 0.5], [-2, -2, 0, 0, 0]])
-    np.testing.assert_array_equal(own.high, [[3, 4, 9, 9, 9], [5, INF, 9, 9, 9]])
-
-
-def test_a_row_by_name_is_zero_in_what_it_does_not_name():
-    for name, others in (("b [m/s]", ("a [m]", "v [N]")), ("b", ("a", "v"))):
-        own = entries(rows={name: dict(zip(others, (2.0, 3.0), strict=True))})
-        np.testing.assert_array_equal(own.known, [[NAN] * 5, [2, 0, 0, 3, 0]])
-    agreed = entries(rows={"b": {"a": 2.0}}, A=[[NAN, NAN], [2.0, NAN]], mask_A=[[1, 1], [1, 0]])
-    np.testing.assert_array_equal(agreed.known[1], [2, 0, 0, 0, 0])
-    at_its_bounds = entries(rows={"a": {"a": 1.0}}, lower_A=[[1.0, 0.0], [-1, -1]], upper_A=1.0)
-    assert at_its_bounds.known[0, 0] == 1.0
-
-
-@pytest.mark.parametrize(
-    ("parts", "text"),
-    [
-        ({"rows": {"c": {}}}, r"rows names 'c'; it can name a \[m\], b \[m/s\]"),
-        ({"rows": {"u": {}}}, r"rows names 'u'; it can name a \[m\], b \[m/s\]$"),  # an input has no row
-        ({"rows": {"a": {"z": 1.0}}}, r"rows names 'z'; it can name a \[m\], b \[m/s\], u \[N\], v \[N\], w"),
-        ({"A": [[NAN, INF], [NAN, NAN]]}, "Prior.A holds infinite entries; use NaN where an entry is free"),
-        ({"rows": {"b": {"a": 2.0}}, "A": [[NAN, NAN], [2.5, NAN]]}, r"rows\['b'\] says 2 at \(0, 0\), where another prior says 2.5"),
-        ({"mask_B": [[1, 1, 1], [1, 0, 1]], "B": [[NAN] * 3, [NAN, 4.0, NAN]]}, r"Prior.B says 4 at \(1, 1\), where another prior says 0"),
-        ({"A": [[NAN, NAN], [NAN, 2.0]], "upper_A": 1.9}, r"contradict each other at 'b \[m/s\]' from 'b \[m/s\]': known 2, bounds -inf … 1.9"),
-        ({"B": [[NAN] * 3, [NAN, NAN, 2.0]], "lower_B": 2.1}, r"contradict each other at 'b \[m/s\]' from 'w': known 2, bounds 2.1 … inf"),
-        ({"lower_B": [[0, 0, 0], [3.0, 0, 0]], "upper_B": 2.0}, r"at 'b \[m/s\]' from 'u \[N\]': known nan, bounds 3 … 2"),
-    ],
-)  # fmt: skip
-def test_contradictions_and_unknown_names_are_told(parts, text):
-    with pytest.raises(km.errors.DataError, match=text):
-        entries(**parts)
-
-
-@pytest.mark.parametrize(
-    ("parts", "text"),
-    [
-        ({"upper_A": np.ones((2, 3))}, r"upper_A has shape \(2, 3\), expected \(2, 2\)"),
-        ({"upper_B": np.ones((2, 2))}, r"upper_B has shape \(2, 2\), expected \(2, 3\)"),
-        ({"mask_A": np.ones((3, 2))}, r"mask_A has shape \(3, 2\), expected \(2, 2\)"),
-        ({"B": np.ones((3, 2))}, r"Prior.B has shape \(3, 2\), expected \(2, 3\)"),
-        ({"combinations": [km.identify.Combination(0, 1, A=np.eye(2), B=np.ones((2, 2)))]}, r"Combination.B has shape \(2, 2\), expected \(2, 3\)"),
-        ({"dissipation": km.identify.Dissipation(np.eye(2), C=np.ones((2, 2)))}, r"Dissipation.C has shape \(2, 2\), expected \(3, 2\)"),
-        ({"dissipation": km.identify.Dissipation(np.eye(2), C=np.ones((3, 2)), D=np.eye(2))}, r"Dissipation.D has shape \(2, 2\), expected \(3, 3\)"),
-        ({"dissipation": km.identify.Dissipation(np.eye(3))}, r"Dissipation.P has shape \(3, 3\), expected \(2, 2\)"),
-    ],
-)  # fmt: skip
-def test_a_part_for_other_sizes_is_told(parts, text):
-    with pytest.raises(km.errors.ShapeError, match=text):
-        entries(**parts)
-
-
-def test_what_fits_is_taken():
-    entries(
-        combinations=[km.identify.Combination(0, 0, B=np.ones((2, 3)))],
-        dissipation=km.identify.Dissipation(np.eye(2), C=np.ones((3, 2)), D=np.eye(3)),
-    )
-    for prior, couples in (
-        (km.identify.Prior(), False),
-        (km.identify.Prior(lower_A=0.0, rows={"a": {}}), False),
-        (km.identify.Prior(symmetric=True), True),
-        (km.identify.Prior(combinations=[km.identify.Combination(0, 1, A=np.eye(2))]), True),
-        (km.identify.Prior(dissipation=km.identify.Dissipation(np.eye(2))), True),
-    ):
-        assert prior.couples_rows == couples

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError, ShapeError
 from tests.identify.test_hidden_state import saturating_record
 from tests.identify.test_subspace import linear_plant, record_of
 
@@ -77,9 +76,9 @@ def test_what_tells_no_start_is_refused_in_a_sentence():
     rng = np.random.default_rng(0)
     data = record_of(linear_plant(rng, 2), rng, steps=200)
     model = km.identify.subspace(data, 2, delays=3)
-    with pytest.raises(DataError, match="no row of X is whole"):
+    with pytest.raises(km.errors.DataError, match="no row of X is whole"):
         km.identify.estimate_start(model, [[np.nan], [np.nan]], [[0.0]])
-    with pytest.raises(DataError, match="no row of X is whole"):
+    with pytest.raises(km.errors.DataError, match="no row of X is whole"):
         km.identify.estimate_start(model, np.zeros((0, 1)), np.zeros((0, 1)))
-    with pytest.raises(ShapeError, match="U has shape"):
+    with pytest.raises(km.errors.ShapeError, match="U has shape"):
         km.identify.estimate_start(model, [[0.0], [0.0]], [[0.0], [0.0]])

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError, FitWarning, ShapeError
 
 A, B = np.array([[0.9, 0.1], [-0.1, 0.8]]), np.array([[0.0], [0.2]])
 TRUTH = np.hstack([A, B])
@@ -73,30 +72,30 @@ def test_the_bias_over_100_records_stays_within_three_standard_errors_which_fall
 
 def test_a_constant_set_point_is_refused():
     data, r = run_loop(np.random.default_rng(4), 400, sensor=0.1, moves=False)
-    with pytest.raises(DataError, match="not identifiable from these logs"):
+    with pytest.raises(km.errors.DataError, match="not identifiable from these logs"):
         fit(data, r)
 
 
 def test_a_signal_that_does_not_act_on_the_loop_is_refused():
     rng = np.random.default_rng(5)
     data, _ = run_loop(rng, 400, sensor=0.1)
-    with pytest.raises(DataError, match="not identifiable"):
+    with pytest.raises(km.errors.DataError, match="not identifiable"):
         fit(data, [rng.standard_normal((400, 1))])
 
 
 def test_a_short_record_with_much_noise_is_called_weak():
     data, r = run_loop(np.random.default_rng(7), 150, sensor=0.4)
-    with pytest.warns(FitWarning, match="the instruments are weak"):
+    with pytest.warns(km.errors.FitWarning, match="the instruments are weak"):
         fit(data, r)
 
 
 def test_set_points_of_other_lengths_are_refused():
     data, r = run_loop(np.random.default_rng(6), 50)
-    with pytest.raises(ShapeError, match="pass one an episode"):
+    with pytest.raises(km.errors.ShapeError, match="pass one an episode"):
         fit(data, [])
-    with pytest.raises(ShapeError, match=r"instruments\[0\] has 40 rows for 50 steps"):
+    with pytest.raises(km.errors.ShapeError, match=r"instruments\[0\] has 40 rows for 50 steps"):
         fit(data, [r[0][:40]])
-    with pytest.raises(DataError, match="fewer than lags"):
+    with pytest.raises(km.errors.DataError, match="fewer than lags"):
         fit(data, r, lags=51)
 
 

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.moments.moments import both_sides
-from koopmpc.identify.moments.rows import ROWS, lift_chunks, row_columns, split_chunks
+from koopmpc.identify.moments.rows import ROWS
 from koopmpc.identify.solve import solve
 from tests.identify.plants import brute_force, random_episodes
 
@@ -37,22 +36,6 @@ def test_moments_are_the_products_of_the_rows_of_each_episode(
     D = brute_force(data, LIFTING.bind(data.states))
     assert m.samples == sum(lengths) == len(D)
     assert close(gram(m), D.T @ D)
-
-
-@given(LENGTHS, st.integers(1, 7), st.integers(0, 999))
-def test_chunks_hold_each_pair_once_in_order(lengths: list[int], rows: int, seed: int) -> None:
-    data = random_episodes(seed, lengths, 2, 1)
-    pieces = split_chunks(data, rows)
-    assert all(sum(p.last - p.first for p in chunk) == rows for chunk in pieces[:-1])
-    pairs = [(p.episode, k) for chunk in pieces for p in chunk for k in range(p.first, p.last)]
-    assert pairs == [(i, k) for i, length in enumerate(lengths) for k in range(length)]
-
-
-def test_lifted_chunks_hold_the_rows_of_all_pairs() -> None:
-    data = random_episodes(0, [500, 1, 2000, 30], 2, 1)
-    lifting = km.State().bind(data.states)
-    every = lift_chunks(data, row_columns(lifting, data.inputs, bilinear=False))
-    assert np.array_equal(np.vstack([chunk.pairs() for chunk in every]), brute_force(data, lifting))
 
 
 def test_each_chunk_is_lifted_once_where_gram_sums_serve(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,16 +171,6 @@ def test_data_that_turn_out_worse_than_the_pilot_are_read_again() -> None:
     m = km.moments.second_moments(spoiled, km.State())
     assert m.condition > 1e6
     assert m.route == "qr"
-
-
-@pytest.mark.parametrize("route", ["gram", "qr"])
-@pytest.mark.parametrize("lengths", [[2], [900, 40]])
-def test_the_cut_of_singular_values_is_that_of_matrix_rank_on_all_rows(route: str, lengths: list[int]) -> None:
-    """Gram sums have half the digits."""
-    total = km.moments.second_moments(random_episodes(0, lengths, 2, 1), LIFTING, route=route)
-    m, n = total.samples, len(total.columns.regressors) + total.nz
-    rank_cut = max(m, n) * np.finfo(float).eps  # numpy.linalg.matrix_rank, as a share of the largest
-    assert both_sides(total).cut == pytest.approx(rank_cut if route == "qr" else rank_cut**0.5, rel=1e-12)
 
 
 def test_columns_are_scaled_before_they_are_judged() -> None:

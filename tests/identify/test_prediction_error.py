@@ -4,9 +4,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.fits.refinement import cut_into_segments
-from koopmpc.identify.innovations import InnovationsError, filter_states, fit_with_gain
 from tests.identify.test_instruments import TRUTH, run_loop
 
 
@@ -18,25 +15,6 @@ def fit(data):
 def fit_plain(data):
     model = km.edmd(data, km.State())
     return np.hstack([model.A, model.B])
-
-
-@pytest.mark.parametrize("kind", [km.edmd, km.bilinear_edmd])
-def test_the_gradient_is_that_of_finite_differences(kind):
-    data, _ = run_loop(np.random.default_rng(0), 120, sensor=0.1, process=0.05)
-    model = kind(data, km.State() + km.Monomials(2) + km.Constant())
-    segments = cut_into_segments(model, data, 40, "")
-    error = InnovationsError(model, np.array([[2.0, 0.0], [0.5, 1.5]]))
-    rng = np.random.default_rng(1)
-    theta = np.hstack(
-        [np.hstack([model.A[:2], model.B[:2], *getattr(model, "N", np.zeros((0, 2, 1)))[:, :2]]), rng.random((2, 2))]
-    )
-    slope = error.derivatives(theta, segments)[0]
-    for i in range(theta.size):
-        step = np.zeros(theta.size)
-        step[i] = 1e-6
-        step = step.reshape(theta.shape)
-        difference = (error.evaluate(theta + step, segments) - error.evaluate(theta - step, segments)) / 4e-6
-        assert slope[i] == pytest.approx(difference, rel=1e-5, abs=1e-7)
 
 
 def test_noisy_sensors_bias_least_squares_and_not_the_direct_method():
@@ -81,19 +59,11 @@ def test_exact_readings_keep_the_model():
     assert km.identify.prediction_error(model, data) is model
 
 
-def test_the_filter_is_a_kalman_filter_once_settled():
-    """Its states obey x̃⁺ = A x̃ + B u + L (y⁺ − A x̃ − B u), by a loop that shares nothing with the code."""
-    data, _ = run_loop(np.random.default_rng(4), 400, sensor=0.1, process=0.05)
-    model, gain = fit_with_gain(km.edmd(data, km.State()), data)
-    X, e = filter_states(model, gain, data)[0].X, data[0]
-    ahead = X[:-1] @ model.A.T + e.U @ model.B.T
-    weight = gain + (np.eye(2) - gain)[None] / (np.arange(len(ahead)) + 2)[:, None, None]
-    np.testing.assert_allclose(X[1:], ahead + np.einsum("kij,kj->ki", weight, e.X[1:] - ahead), atol=1e-12)
-
-
 def test_logs_that_identify_nothing_are_refused():
     resting, _ = run_loop(np.random.default_rng(4), 400, sensor=0.1, moves=False)
-    with pytest.raises(DataError, match="not identifiable from these logs: u0 follows from the readings alone"):
+    with pytest.raises(
+        km.errors.DataError, match="not identifiable from these logs: u0 follows from the readings alone"
+    ):
         fit(resting)
 
 
@@ -105,8 +75,8 @@ def test_too_few_rows_do_not_make_an_input_follow_from_the_readings():
 
 def test_models_that_it_does_not_know_are_refused():
     data, _ = run_loop(np.random.default_rng(6), 200, sensor=0.1)
-    with pytest.raises(DataError, match="has past rows"):
+    with pytest.raises(km.errors.DataError, match="has past rows"):
         km.identify.prediction_error(km.edmd(data, km.State(), embedding=km.Delay(1)), data)
     other = km.Episodes([km.Episode(X=data[0].X[:, :1], U=data[0].U)], dt=0.1)
-    with pytest.raises(ShapeError):
+    with pytest.raises(km.errors.ShapeError):
         km.identify.prediction_error(km.edmd(data, km.State()), other)

@@ -6,35 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.fits.edmd import (
-    choose_rank,
-    known_noise_threshold,
-    leading_directions,
-    median_threshold,
-    truncation_loss,
-)
-from koopmpc.identify.solve import RegressionRows
 from tests.bare import shown
 from tests.identify.plants import one_step_pairs, random_episodes
 
 LIFTING = km.Constant() + km.State() + km.Monomials(2)
-
-
-def test_the_factors_are_those_that_are_printed() -> None:
-    # Gavish & Donoho 2014: λ(1) = 4/√3, ω(1) ≈ 2.858, and the cubic fit of ω, good to 0.02
-    assert known_noise_threshold(1.0) == pytest.approx(4 / np.sqrt(3), abs=1e-14)
-    assert median_threshold(1.0) == pytest.approx(2.858, abs=5e-4)
-    for beta in np.linspace(0.02, 1, 50):
-        cubic = 0.56 * beta**3 - 0.95 * beta**2 + 1.82 * beta + 1.43
-        assert median_threshold(beta) == pytest.approx(cubic, abs=0.02)
-
-
-@pytest.mark.parametrize(("rows", "columns"), [(600, 600), (900, 90), (300, 600)])
-def test_the_median_is_that_of_noise(rows: int, columns: int) -> None:
-    beta = min(rows, columns) / max(rows, columns)
-    noise = np.random.default_rng(0).standard_normal((rows, columns)) / np.sqrt(max(rows, columns))
-    median = known_noise_threshold(beta) / median_threshold(beta)
-    assert np.median(np.linalg.svd(noise, compute_uv=False)) == pytest.approx(median, rel=0.02)
 
 
 def waves(seed: int, nx: int, steps: int, noise: float, count: int = 2) -> km.Episodes:
@@ -53,16 +28,6 @@ def test_the_hard_threshold_finds_the_rank_in_white_noise(seed: int, count: int,
     assert model.nz == 2 * count
     assert "the singular values above the hard threshold" in model.report.route
     assert np.allclose(np.abs(model.eigenvalues), 1, atol=0.05)
-
-
-@pytest.mark.parametrize("given_values", [2, 3, 5, 8])
-def test_the_hard_threshold_is_that_of_all_singular_values_whether_given_or_zero(given_values: int) -> None:
-    every = np.array([20.0, 9.0, 0.3, 0.2, 0.1])
-    s = np.pad(every, (0, 3))[:given_values]
-    median = np.median(np.where(np.arange(5) < given_values, every, 0.0))
-    count, words = choose_rank("hard-threshold", s, samples=5, nz=40)
-    assert words.endswith(f"{median_threshold(5 / 40) * median:.3g}")
-    assert count == 2
 
 
 def test_pure_noise_has_no_rank() -> None:
@@ -173,44 +138,3 @@ def test_a_rank_that_cannot_be_kept_is_refused() -> None:
     code = 'data = km.Episodes([km.Episode(X=np.eye(4))], 0.1)\nshow(lambda: km.dmd(data, rank="soft"))'
     said = "DataError rank is 'soft'; pass a whole number, a share of energy in (0, 1), or \"hard-threshold\""
     assert shown(code) == [said]
-
-
-@pytest.mark.parametrize("share", [0.0, 1.0, -0.1, 1.5])
-def test_a_share_of_energy_that_is_none_is_refused(share: float) -> None:
-    with pytest.raises(km.errors.DataError, match=f"rank is {share:g}; .*a share of energy between 0 and 1"):
-        choose_rank(share, np.array([2.0, 1.0]), 9, 2)
-
-
-@pytest.mark.parametrize(("share", "rank"), [(0.1, 1), (16 / 21, 1), (0.77, 2), (20 / 21, 2), (0.96, 3), (0.999, 3)])
-def test_the_least_number_of_directions_that_hold_the_share_is_kept(share: float, rank: int) -> None:
-    assert choose_rank(share, np.array([4.0, 2.0, 1.0]), 9, 3)[0] == rank
-
-
-def test_a_rank_is_at_most_the_number_of_observables() -> None:
-    assert choose_rank(2, np.ones(2), 9, 2) == (2, "")
-    with pytest.raises(km.errors.DataError, match="rank is 3, but the lifting has 2 observables"):
-        choose_rank(3, np.ones(2), 9, 2)
-
-
-@pytest.mark.parametrize("decoded", [False, True])
-def test_what_a_truncation_loses_is_the_part_outside_its_basis(decoded: bool) -> None:
-    rng = np.random.default_rng(0)
-    Z, basis = rng.normal(size=(30, 5)), np.linalg.qr(rng.normal(size=(5, 2)))[0]
-    C = rng.normal(size=(3, 5)) if decoded else None
-    gap = Z @ (np.eye(5) - basis @ basis.T)
-    expected = np.sqrt(np.sum((gap if C is None else gap @ C.T) ** 2, axis=0) / 90)
-    np.testing.assert_allclose(truncation_loss(Z, basis, C, 90), expected)
-
-
-@pytest.mark.parametrize("rows", [40, 3])
-def test_the_leading_directions_are_those_of_the_singular_value_decomposition(rows: int) -> None:
-    rng, sentences = np.random.default_rng(1), list[str]()
-    P = rng.normal(size=(rows, 7)) * np.logspace(0, 1, 7)
-    U, words = leading_directions(RegressionRows(P, P[:, :1], np.zeros(1), rows), 5, 2, sentences)
-    exact = np.linalg.svd(P[:, :5])[2][:2].T
-    np.testing.assert_allclose(U @ U.T, exact @ exact.T, atol=1e-10)
-    assert "at rank 2" in words
-    assert not sentences
-    held = min(rows, 5)
-    U, words = leading_directions(RegressionRows(P, P[:, :1], np.zeros(1), rows), 5, 5, sentences)
-    assert (U.shape[1], len(sentences)) == (held, int(held < 5))

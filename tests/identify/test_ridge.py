@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.linalg import hadamard
 
 import koopmpc as km
-from koopmpc.identify.solve import choose_ridge
 from tests.bare import shown
 from tests.identify.plants import brute_force, one_step_pairs, random_episodes
 
@@ -188,31 +187,3 @@ def test_what_a_ridge_pulls_to_is_checked() -> None:
         km.edmd(data, LIFTING, ridge=1e-6, towards=cast("Any", "dmd"))
     with pytest.raises(km.KoopmpcError, match="rank mixes them; pass one of the two"):
         km.edmd(data, LIFTING, ridge=1e-6, rank=2, towards="affine")
-
-
-@given(st.integers(0, 99), st.floats(1e-6, 1e6))
-def test_the_ridge_scales_with_the_singular_values_and_not_with_the_targets(seed: int, size: float) -> None:
-    rng = np.random.default_rng(seed)
-    s, shares, outside = np.sort(rng.uniform(0.01, 2, 6))[::-1], rng.normal(size=(6, 3)), rng.uniform(0, 1, 3)
-    ridge = choose_ridge(s, shares, outside, 40, 1e-12)
-    assert choose_ridge(size * s, shares, outside, 40, 1e-12) == pytest.approx(size**2 * ridge, rel=1e-3)
-    units = np.array([1e-5, 1.0, 1e5])
-    assert choose_ridge(s, shares * units, outside * units**2, 40, 1e-12) == pytest.approx(ridge, rel=1e-6)
-
-
-def test_where_nothing_can_be_told_the_ridge_is_the_largest_and_where_all_is_exact_it_is_none() -> None:
-    s, none = np.array([2.0, 1.0]), np.zeros((2, 1))
-    assert choose_ridge(s, none, np.ones(1), 40, 1e-12) == pytest.approx(1e3 * 4, rel=1e-3)
-    assert choose_ridge(s, np.ones((2, 1)), np.zeros(1), 40, 1e-12) == 0.0
-    assert choose_ridge(s, np.ones((2, 1)), np.full(1, 1e-3), 40, 1e-12) > 0.0
-    assert choose_ridge(s, np.ones((2, 1)), np.zeros(1), 2, 1e-12) > 0.0  # as many pairs as coefficients say nothing
-    assert choose_ridge(np.zeros(2), none, np.ones(1), 40, 1e-12) == 0.0
-    lost = np.array([[1.0], [1e-3]])  # what lies along a direction that is rounding is not reached
-    assert choose_ridge(np.array([1.0, 1e-15]), lost, np.zeros(1), 40, 1e-12) > 0.0
-
-
-def test_a_ridge_is_looked_for_far_below_the_smallest_direction() -> None:
-    """Both directions are told exactly, the second with a singular value of 1e-13: any ridge that counts there is bad."""
-    s = np.array([1.0, 1e-13])
-    ridge = choose_ridge(s, np.ones((2, 1)), np.full(1, 1e-6), 40, 1e-16)
-    assert 0 < ridge < 1e-6 * s[1] ** 2

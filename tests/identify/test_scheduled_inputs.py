@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.validate.scoring import compare_forecasts, forecast_errors
 
 M = np.array([[[0.0, 0.3], [0.0, 0.0]], [[0.0, 0.0], [-0.02, 0.0]]])
 
@@ -52,18 +50,6 @@ def test_scores_files_and_models_of_constant_w_know_the_products(logs, plant, tm
     assert km.score(plain, logs, 5).rmse.max() > 0.02
 
 
-@pytest.mark.parametrize("relift", [False, True])
-def test_models_with_and_without_the_products_are_compared_at_once(logs, relift):
-    lifting = km.State() + km.Constant()
-    models = [km.bilinear_edmd(logs, lifting, scheduled_inputs=each) for each in (True, False)]
-    starts = [np.arange(0, 30, 7)] * len(logs)
-    ((gaps, _),) = compare_forecasts(models, logs, starts, 6, relift=relift)
-    for model, together in zip(models, gaps, strict=True):
-        ((alone, _),) = forecast_errors(model, logs, starts, 6, relift=relift)
-        np.testing.assert_allclose(together, alone, atol=1e-12)
-    assert np.abs(gaps[0]).max() < 1e-9 < 1e-3 < np.abs(gaps[1]).max()
-
-
 def test_a_loop_of_the_learned_model_is_that_of_the_equations(logs, plant):
     """Both states are tracked, so that the equilibrium is one and the same for both."""
     cost, limits = km.Cost(Q=[1.0, 0.3], R=[0.01, 0.01], u_target="zero", tail=0), km.Limits(u_min=-2, u_max=2)
@@ -81,10 +67,10 @@ def test_a_loop_of_the_learned_model_is_that_of_the_equations(logs, plant):
 def test_what_cannot_be_multiplied_is_refused(logs):
     without = km.Episodes([km.Episode(X=e.X, U=e.U) for e in logs], logs.dt)
     for data, options in ((without, {}), (logs, {"rank": 2})):
-        with pytest.raises(DataError, match="scheduled_inputs multiply inputs by measured disturbances"):
+        with pytest.raises(km.errors.DataError, match="scheduled_inputs multiply inputs by measured disturbances"):
             km.bilinear_edmd(data, km.State(), scheduled_inputs=True, **options)
     model = km.bilinear_edmd(logs, km.State())
-    with pytest.raises(ShapeError, match="M has shape"):
+    with pytest.raises(km.errors.ShapeError, match="M has shape"):
         km.BilinearPredictor(
             model.A, model.B, model.N, model.C, km.State(), 0.1, ["a", "b"], ["u", "v"], E=model.E, M=np.eye(2)
         )

@@ -3,13 +3,9 @@
 import cvxpy as cp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.identify.fits.sparse import lasso
 from koopmpc.identify.solve import RegressionRows, solve
-from koopmpc.lifting.composed import Picked
 from tests.bare import shown
 from tests.identify.plants import brute_force, one_step_pairs
 
@@ -29,38 +25,6 @@ def slow_manifold(noise: float = 0.0, seed: int = 0, count: int = 600) -> km.Epi
         return ahead + noise * rng.standard_normal(2)
 
     return one_step_pairs(step, 2, 1, count, seed)
-
-
-@given(st.integers(0, 999), st.booleans(), st.floats(0.01, 3.0), st.integers(1, 3))
-@settings(max_examples=6)
-def test_the_lasso_solver_agrees_with_cvxpy(seed: int, grouped: bool, penalty: float, targets: int) -> None:
-    rng = np.random.default_rng(seed)
-    P, T = rng.standard_normal((30, 6)), rng.standard_normal((30, targets))
-    P[:, 5] = P[:, 0] + 0.1 * P[:, 5]
-    weights = penalty * rng.uniform(0.5, 2, (6, 1)) * np.ones((1, targets))
-    found = lasso(P.T @ P, P.T @ T, weights, grouped=grouped)
-    K = cp.Variable((6, targets))
-    price = (
-        sum(w * cp.norm(k) for w, k in zip(weights[:, 0], K, strict=True))
-        if grouped
-        else cp.sum(cp.multiply(weights, cp.abs(K)))
-    )
-    cp.Problem(cp.Minimize(0.5 * cp.sum_squares(T - P @ K) + price)).solve(
-        solver=cp.CLARABEL, tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9
-    )
-    assert np.allclose(found.K, K.value, rtol=0, atol=1e-3)
-    # the optimality conditions, which no solver's tolerance blurs
-    slope = P.T @ (T - P @ found.K)
-    if grouped:
-        size = np.linalg.norm(found.K, axis=1)
-        zero = size == 0
-        assert (np.linalg.norm(slope[zero], axis=1) <= weights[zero, 0] * (1 + 1e-9)).all()
-        pull = found.K[~zero] / size[~zero, None] * weights[~zero]
-    else:
-        zero = found.K == 0
-        assert (np.abs(slope[zero]) <= weights[zero] * (1 + 1e-9)).all()
-        pull = np.sign(found.K[~zero]) * weights[~zero]
-    assert np.allclose(slope[~zero], pull, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize(("noise", "penalty"), [(0.0, 1e-6), (0.02, 1e-3), (0.1, 1e-2)])
@@ -140,7 +104,7 @@ def test_a_wrong_penalty_or_lifting_is_refused() -> None:
     with pytest.raises(km.errors.DataError, match="the lifting lacks the state 'x0'"):
         km.identify.sparse_edmd(data, km.Monomials(2), penalty=1)
     with pytest.raises(km.errors.DataError, match="which holds 9"):
-        Picked(km.State(), (9,)).bind(("a", "b"))
+        km.lifting.Picked(km.State(), (9,)).bind(("a", "b"))
 
 
 @pytest.mark.parametrize("over", ["observables", "entries"])
@@ -183,15 +147,3 @@ def test_a_state_that_is_zero_throughout_is_kept_and_said_to_be() -> None:
     assert model.lifting.names[:2] == ("x0", "x1")
     assert np.isfinite(model.A).all()
     assert not model.A[1].any()
-
-
-def test_a_lasso_that_stops_early_says_by_how_much_it_missed(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(0)
-    P, T = rng.standard_normal((30, 6)), rng.standard_normal((30, 1))
-    G, H, weights = P.T @ P, P.T @ T, np.full((6, 1), 2.0)
-    assert lasso(G, H, weights, grouped=False).missed <= 1e-10 * np.abs(H).max()
-    monkeypatch.setattr("koopmpc.identify.fits.sparse._STEPS", 3)
-    assert lasso(G, H, weights, grouped=False).missed > 1e-3
-    with pytest.warns(km.FitWarning, match="the LASSO met its optimality conditions only to .*; raise the penalty"):
-        model = km.identify.sparse_edmd(slow_manifold(0.02), SMALL)
-    assert len(model.report.warnings) == 1

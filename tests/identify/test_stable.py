@@ -5,18 +5,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import approx_fprime
 
 import koopmpc as km
 from koopmpc.identify.fits.stable import (
-    Misfit,
-    _Descent,
-    _find_metric,
-    _project_on_ball,
     clip_eigenvalues,
-    find_nearest_stable,
     fit_lyapunov,
-    scale_inside,
     spectral_radius,
 )
 from tests.identify.plants import brute_force, random_episodes
@@ -84,30 +77,6 @@ def test_one_observable_moves_to_the_circle() -> None:
     x = 1.2 ** np.arange(10)[:, None]
     model = km.identify.stable_edmd(km.Episodes([km.Episode(X=x)], 0.1), km.State(), radius=0.9)
     assert np.allclose(model.A, 0.9, rtol=0, atol=1e-9)
-
-
-def test_normal_A_under_white_data_has_the_closed_form() -> None:
-    # A₀ symmetric and G = I: the nearest contraction clips eigenvalues, and no stable matrix is nearer
-    rng = np.random.default_rng(0)
-    Q = np.linalg.qr(rng.standard_normal((5, 5)))[0]
-    A0 = (Q * [1.5, 1.1, 0.5, -0.3, -1.2]) @ Q.T
-    best = (Q * [1.0, 1.0, 0.5, -0.3, -1.0]) @ Q.T
-    found = find_nearest_stable(Misfit(A0, np.eye(5)), 1.0, [clip_eigenvalues(A0, 1.0)])
-    assert Misfit(A0, np.eye(5))(found) <= Misfit(A0, np.eye(5))(best) * (1 + 1e-9)
-    assert spectral_radius(found) <= 1 + 1e-9
-
-
-def test_the_misfit_never_exceeds_that_of_the_matrix_inequality() -> None:
-    rng = np.random.default_rng(1)
-    for n in (2, 5, 8):
-        A0 = rng.standard_normal((n, n))
-        A0 *= 1.1 / spectral_radius(A0)
-        Z = rng.standard_normal((40, n)) * np.logspace(0, -2, n)
-        misfit = Misfit(A0, Z.T @ Z)
-        convex = fit_lyapunov(A0, misfit.G, 1.0)
-        assert convex is not None
-        assert spectral_radius(convex) <= 1 + 1e-6
-        assert misfit(find_nearest_stable(misfit, 1.0, [convex])) <= misfit(convex) * (1 + 1e-5)
 
 
 def test_the_matrix_inequality_is_solved_to_its_optimum() -> None:
@@ -256,92 +225,3 @@ def test_a_wrong_radius_or_ridge_is_refused() -> None:
         km.identify.stable_edmd(data, km.State(), radius=np.nan)
     with pytest.raises(km.errors.DataError, match="ridge is -1"):
         km.identify.stable_edmd(data, km.State(), ridge=-1)
-
-
-def test_the_size_of_the_data_does_not_change_how_near_the_descent_comes() -> None:
-    rng = np.random.default_rng(3)
-    A0, Z = 0.9 * rng.standard_normal((4, 4)), rng.standard_normal((30, 4))
-    misfit, start = Misfit(A0, Z.T @ Z), clip_eigenvalues(A0, 1.0)
-    least = misfit(find_nearest_stable(misfit, 1.0, [start]))
-    assert least < 0.8 * misfit(start)
-    for size in (1e-12, 1e12):
-        assert misfit(find_nearest_stable(Misfit(A0, size * Z.T @ Z), 1.0, [start])) == pytest.approx(least, rel=0.02)
-
-
-def test_the_nearest_matrix_in_a_ball_has_its_singular_values_clipped() -> None:
-    rng = np.random.default_rng(0)
-    for radius in (0.5, 1.0, 3.0, 100.0):
-        X = rng.standard_normal((5, 5))
-        U, s, Vt = np.linalg.svd(X)
-        assert np.allclose(_project_on_ball(X, radius), (U * np.minimum(s, radius)) @ Vt, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("radius", [0.5, 1.0, 2.0])
-def test_in_the_metric_of_a_stable_matrix_it_is_a_contraction(radius: float) -> None:
-    rng = np.random.default_rng(1)
-    A = rng.standard_normal((4, 4))
-    for share in (0.3, 0.9, 0.999):
-        stable = A * share * radius / spectral_radius(A)
-        S = _find_metric(stable, radius)
-        assert np.linalg.norm(S @ stable @ np.linalg.inv(S), 2) <= radius * 1.1 * (1 + 1e-9)
-        assert np.linalg.cond(S) <= 1.001e3
-        if share == 0.3:  # the least margin that is tried
-            assert np.linalg.norm(S @ stable @ np.linalg.inv(S), 2) <= radius * 1.001 * (1 + 1e-9)
-
-
-def test_clipping_moves_the_eigenvalues_that_are_outside_and_no_other() -> None:
-    rng = np.random.default_rng(2)
-    V = rng.standard_normal((4, 4))
-    A = V @ np.diag([1.5, -2.0, 0.7, 0.0]) @ np.linalg.inv(V)
-    assert np.allclose(clip_eigenvalues(A, 0.9), V @ np.diag([0.9, -0.9, 0.7, 0.0]) @ np.linalg.inv(V), atol=1e-12)
-    turning = 1.3 * np.array([[np.cos(1), -np.sin(1)], [np.sin(1), np.cos(1)]])
-    assert np.allclose(clip_eigenvalues(turning, 0.9), turning * 0.9 / 1.3, atol=1e-12)
-    jordan = np.array([[2.0, 1.0], [0.0, 2.0]])
-    assert np.allclose(clip_eigenvalues(jordan, 0.5), jordan / 4, atol=1e-12)
-
-
-def test_what_is_inside_stays_and_what_is_not_is_scaled_onto_the_circle() -> None:
-    A = np.array([[0.5, 3.0], [0.0, 0.8]])
-    assert np.array_equal(scale_inside(A, 0.8), A)
-    for radius in (0.3, 0.7999):
-        assert spectral_radius(scale_inside(A, radius)) <= radius
-        assert np.allclose(scale_inside(A, radius), A * radius / 0.8, rtol=1e-12)
-
-
-def test_a_step_of_the_descent_goes_against_the_gradient_and_lowers_the_misfit() -> None:
-    rng = np.random.default_rng(3)
-    A0, Z = rng.standard_normal((3, 3)), rng.standard_normal((20, 3))
-    misfit = Misfit(A0, Z.T @ Z)
-    S, X = np.eye(3) + 0.2 * rng.standard_normal((3, 3)), 0.4 * rng.standard_normal((3, 3))
-    run = _Descent(misfit, 50.0, S, X)  # no ball is in the way
-    assert run.value == pytest.approx(misfit(np.linalg.inv(S) @ X @ S))
-    run._step = 1e-9
-    assert run._try(S, X)
-
-    def value(p: np.ndarray) -> float:
-        T = p[:9].reshape(3, 3)
-        return misfit(np.linalg.inv(T) @ p[9:].reshape(3, 3) @ T)
-
-    gradient = approx_fprime(np.concatenate([S.ravel(), X.ravel()]), value, 1e-7)
-    moved = np.concatenate([(S - run._S).ravel(), (X - run._X).ravel()]) / 1e-9
-    assert np.allclose(moved, gradient, rtol=0, atol=1e-4 * np.abs(gradient).max())
-    far = _Descent(misfit, 50.0, S, X)
-    far._step = 1e3  # too far: it is halved until the misfit falls
-    assert far._advance()
-    assert far.value < run.value
-    limited = _Descent(misfit, 0.5, S, X)
-    values = [limited.value]
-    for _ in range(50):
-        limited.go(1)
-        values.append(limited.value)
-        assert np.linalg.norm(limited._X, 2) <= 0.5 + 1e-12
-        assert np.allclose(limited.A, np.linalg.inv(limited._S) @ limited._X @ limited._S)
-        assert limited.value == pytest.approx(misfit(limited.A))
-    assert (np.diff(values) <= 0).all()
-    assert values[-1] < 0.9 * values[0]
-
-
-def test_the_misfit_of_a_matrix_is_the_weighted_distance() -> None:
-    rng = np.random.default_rng(4)
-    A0, A, Z = rng.standard_normal((3, 3)), rng.standard_normal((3, 3)), rng.standard_normal((20, 3))
-    assert Misfit(A0, Z.T @ Z)(A) == pytest.approx(np.linalg.norm(Z @ (A - A0).T) ** 2)

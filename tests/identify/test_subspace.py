@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError
 from tests.compiler import needs_compiler
 
 
@@ -133,8 +132,8 @@ def test_c_of_a_controller_on_a_hidden_state_gives_the_inputs_of_python(estimato
 def test_what_cannot_be_fitted_is_refused_in_a_sentence():
     rng = np.random.default_rng(0)
     short = record_of(linear_plant(rng, 1), rng, steps=6)
-    with pytest.raises(DataError, match="past rows"):
+    with pytest.raises(km.errors.DataError, match="past rows"):
         km.identify.subspace(short, delays=[8, 12])
     still = km.Episodes([km.Episode(X=np.ones((50, 1)), U=rng.uniform(-1, 1, (49, 1)))], 0.1, ["y"], ["u"])
-    with pytest.raises(DataError, match="no output moves"):
+    with pytest.raises(km.errors.DataError, match="no output moves"):
         km.identify.subspace(still, 2, delays=3)

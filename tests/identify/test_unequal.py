@@ -34,14 +34,6 @@ def test_an_exact_linear_plant_is_recovered_from_every_tenth_row(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(12, 40))
-def test_more_exact_linear_plants_are_recovered(seed):
-    A, B, data = draw(seed)
-    model = km.identify.unequal_rates(data, km.State())
-    np.testing.assert_allclose(np.hstack([model.A, model.B]), np.hstack([A, B]), atol=1e-6)
-
-
-@pytest.mark.slow
 def test_the_error_falls_with_the_noise():
     errors = []
     for noise in (1e-2, 1e-4):
@@ -57,16 +49,6 @@ def test_units_change_nothing():
     scaled = km.data.PartialEpisodes(X=[x * size for x in data.X], U=data.U, dt=0.1)
     model = km.identify.unequal_rates(scaled, km.State())
     np.testing.assert_allclose(model.A / size[:, None] * size, A, atol=1e-6)
-
-
-@pytest.mark.parametrize(("of_states", "of_inputs"), [(1e6, 1.0), (1e-6, 1e9)])
-def test_units_change_no_step_of_the_fit(of_states, of_inputs):
-    _, _, data = draw(0, noise=0.02, keep=3, runs=1, T=30)
-    X, U = [x * of_states for x in data.X], [u * of_inputs for u in data.U]
-    scaled = km.data.PartialEpisodes(X=X, U=U, dt=0.1)
-    usual, model = (km.identify.unequal_rates(each, km.State(), iterations=1, horizon=10) for each in (data, scaled))
-    np.testing.assert_allclose(model.A, usual.A, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(model.B / of_states * of_inputs, usual.B, rtol=1e-6, atol=1e-9)
 
 
 def test_a_nonlinear_plant_is_recovered_too():

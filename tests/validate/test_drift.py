@@ -5,7 +5,6 @@ import pytest
 from scipy.linalg import expm
 
 import koopmpc as km
-from koopmpc.validate.drift import exceeds_usual
 
 SIGMA = 0.005  # noise of the sensors as a share of the states' spread
 
@@ -121,18 +120,6 @@ def test_logs_of_other_signals_or_steps_are_refused(old):
         km.validate.find_drift(old, km.Episodes(list(old), 0.2))
     with pytest.raises(km.errors.DataError, match="too few rows"):
         km.validate.find_drift(km.Episodes([km.Episode(X=old[0].X[:9], U=old[0].U[:8])], 0.1), old)
-
-
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_the_gate_of_adaptive_keeps_its_level(share):
-    """Errors that are white, and those of white noise of the sensors of a slow plant, v_{k+1} − v_k."""
-    rng = np.random.default_rng(0)
-    usual = np.array([1.0, 2.0])
-    noise = rng.standard_normal((2000, 21, 2))
-    errors = usual * (noise[:, 1:] - share * noise[:, :-1]) / np.sqrt(1 + share**2)
-    assert sum(exceeds_usual(one, usual) for one in errors) == 0
-    assert exceeds_usual(2.5 * usual * rng.standard_normal((20, 2)), usual)
-    assert exceeds_usual(np.full((3, 2), np.nan), usual)
 
 
 @pytest.mark.slow
