@@ -6,6 +6,7 @@ import pytest
 
 import koopmpc as km
 from koopmpc.identify.solve import RegressionRows, solve
+from koopmpc.lifting.composed import Picked
 from tests.bare import shown
 from tests.identify.plants import brute_force, one_step_pairs
 
@@ -104,7 +105,7 @@ def test_a_wrong_penalty_or_lifting_is_refused() -> None:
     with pytest.raises(km.errors.DataError, match="the lifting lacks the state 'x0'"):
         km.identify.sparse_edmd(data, km.Monomials(2), penalty=1)
     with pytest.raises(km.errors.DataError, match="which holds 9"):
-        km.lifting.Picked(km.State(), (9,)).bind(("a", "b"))
+        Picked(km.State(), (9,)).bind(("a", "b"))
 
 
 @pytest.mark.parametrize("over", ["observables", "entries"])

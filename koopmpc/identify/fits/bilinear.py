@@ -11,7 +11,8 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.errors import DataError, ObservableError
-from koopmpc.identify.fits.edmd import Rank, leading_directions, truncation_loss
+from koopmpc.identify.doubts import find_doubts
+from koopmpc.identify.fits.rank import Rank, leading_directions, truncation_loss
 from koopmpc.identify.moments.moments import Moments
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.regression import FitResult, build_regression, build_report, compute_scale_factor
@@ -21,7 +22,6 @@ from koopmpc.identify.solve import (
     Ridge,
     check_ridge,
     describe_solve,
-    find_doubts,
     solve,
 )
 from koopmpc.lifting.base import Lifting

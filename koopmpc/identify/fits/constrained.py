@@ -14,10 +14,11 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
+from koopmpc.identify.doubts import find_doubts
 from koopmpc.identify.fits.prior import Combination, Dissipation, Entries, Prior, build_entries
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import build_predictor, build_result, describe_misfit, read_regression
-from koopmpc.identify.solve import RegressionRows, Ridge, check_ridge, column_norms, describe_solve, find_doubts, solve
+from koopmpc.identify.solve import RegressionRows, Ridge, check_ridge, column_norms, describe_solve, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.predict.predictors import LinearPredictor
 

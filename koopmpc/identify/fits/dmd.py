@@ -10,7 +10,8 @@ from koopmpc import checks
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Held, Source, source_of
 from koopmpc.errors import DataError
-from koopmpc.identify.fits.edmd import Method, Rank, fit_regression
+from koopmpc.identify.fits.edmd import Method, fit_regression
+from koopmpc.identify.fits.rank import Rank
 from koopmpc.identify.moments.read import ReadOptions, second_moments
 from koopmpc.identify.moments.rows import concatenate_parts
 from koopmpc.identify.regression import Regression, build_predictor

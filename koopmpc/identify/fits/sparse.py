@@ -11,11 +11,12 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.errors import DataError
+from koopmpc.identify.doubts import find_doubts
 from koopmpc.identify.fits.constrained import solve_free_entries
 from koopmpc.identify.fits.prior import Entries
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import build_predictor, build_result, describe_misfit, read_regression
-from koopmpc.identify.solve import RegressionRows, column_norms, find_doubts, project_onto, solve
+from koopmpc.identify.solve import RegressionRows, column_norms, project_onto, solve
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Picked
 from koopmpc.predict.predictors import LinearPredictor

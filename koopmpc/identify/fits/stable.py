@@ -13,6 +13,7 @@ from koopmpc import checks
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
+from koopmpc.identify.doubts import find_doubts
 from koopmpc.identify.moments.read import ReadOptions
 from koopmpc.identify.regression import (
     Regression,
@@ -28,7 +29,6 @@ from koopmpc.identify.solve import (
     check_ridge,
     column_norms,
     describe_solve,
-    find_doubts,
     project_onto,
     solve,
 )

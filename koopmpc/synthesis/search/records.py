@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Held
@@ -29,8 +28,8 @@ from koopmpc.synthesis.search.free_runs import (
     run_structure,
 )
 from koopmpc.synthesis.search.leaderboard import Selection
-from koopmpc.validate.scoring import AnyPredictor
 from koopmpc.validate.closed_loop import is_fed_back
+from koopmpc.validate.scoring import AnyPredictor
 
 MARGIN = 0.8  # the input column is moved up if that lowers the error on unseen rows to this share
 _PROBE = (2, 4)  # past rows of the models that compare both timings of the inputs
