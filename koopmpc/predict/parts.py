@@ -18,7 +18,7 @@ from koopmpc.predict.base import FitReport, Predictor
 from koopmpc.values import freeze
 
 
-class BilinearParts(TypedDict, total=False):
+class BilinearFields(TypedDict, total=False):
     """Further fields of a predictor, which most models leave out.
 
     Attributes
@@ -41,8 +41,8 @@ class BilinearParts(TypedDict, total=False):
     M: ArrayLike | None
 
 
-class LinearParts(TypedDict, total=False):
-    """Further fields of a linear predictor: those of `BilinearParts` without S and M, and `exact_modes`."""
+class LinearFields(TypedDict, total=False):
+    """Further fields of a linear predictor: those of `BilinearFields` without S and M, and `exact_modes`."""
 
     embedding: Delay | None
     scale: ArrayLike | None
@@ -58,7 +58,7 @@ def refuse_unknown(parts: Mapping[str, object], kind: type) -> None:
         raise TypeError(f"a predictor has no {', '.join(sorted(unknown))}; it has {', '.join(kind.__annotations__)}")
 
 
-def check_drift(nz: int, parts: BilinearParts | LinearParts) -> dict[str, Any]:
+def check_drift(nz: int, parts: BilinearFields | LinearFields) -> dict[str, Any]:
     """Return E, the names of the disturbances, and how many there are."""
     E, given = parts.get("E"), parts.get("disturbances")
     drift = np.zeros((nz, 0)) if E is None else checks.bounded(E, "E", (nz, None))
@@ -76,7 +76,7 @@ def store_fields(
     dt: float,
     names: tuple[Sequence[str], Sequence[str]],
     report: FitReport | None,
-    parts: BilinearParts | LinearParts,
+    parts: BilinearFields | LinearFields,
 ) -> None:
     """Check the fields that all predictors share and store them."""
     (A, B, C), embedding, scale = matrices, parts.get("embedding"), parts.get("scale")

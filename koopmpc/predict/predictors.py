@@ -25,8 +25,8 @@ from koopmpc.plants.step_map import StepMap
 from koopmpc.predict import hidden_state as hidden_state  # a file names its class, which must be known by then
 from koopmpc.predict.base import FitReport, Predictor, load_value
 from koopmpc.predict.parts import (
-    BilinearParts,
-    LinearParts,
+    BilinearFields,
+    LinearFields,
     build_step_map,
     check_drift,
     refuse_unknown,
@@ -80,9 +80,9 @@ class LinearPredictor(Predictor):
         states: Sequence[str],
         inputs: Sequence[str],
         report: FitReport | None = None,
-        **parts: Unpack[LinearParts],
+        **parts: Unpack[LinearFields],
     ) -> None:
-        refuse_unknown(parts, LinearParts)
+        refuse_unknown(parts, LinearFields)
         store_fields(self, (A, B, C), lifting, dt, (states, inputs), report, parts)
         modes = parts.get("exact_modes")
         if modes is not None:
@@ -251,9 +251,9 @@ class BilinearPredictor(Predictor):
         states: Sequence[str],
         inputs: Sequence[str],
         report: FitReport | None = None,
-        **parts: Unpack[BilinearParts],
+        **parts: Unpack[BilinearFields],
     ) -> None:
-        refuse_unknown(parts, BilinearParts)
+        refuse_unknown(parts, BilinearFields)
         store_fields(self, (A, B, C), lifting, dt, (states, inputs), report, parts)
         nz, nu, drift, S, M = self.nz, self.nu, check_drift(self.nz, parts), parts.get("S"), parts.get("M")
         nw = drift["nw"]
