@@ -14,7 +14,7 @@ LAYERS: list[str] = next(c for c in SETTINGS["tool"]["importlinter"]["contracts"
 RANK = {room: -i for i, room in enumerate(LAYERS)}
 MODULES = {".".join(["koopmpc", *file.with_suffix("").parts]).removesuffix(".__init__"): file for file in texts()}
 FRONT_DOOR = ("koopmpc", "koopmpc.__main__")
-BY_NAME = ("koopmpc.interrupts", "koopmpc.lazy", "koopmpc.apps.papers")  # import modules by names that they compute
+BY_NAME = ("koopmpc.lazy", "koopmpc.apps.papers")  # import modules by names that they compute
 
 
 def room(module: str) -> str:

@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     from koopmpc.bench.controllers import CONTROLLERS as CONTROLLERS
     from koopmpc.bench.controllers import Prepared as Prepared
     from koopmpc.bench.controllers import register_law as register_law
-    from koopmpc.bench.inspect import compared as compared
-    from koopmpc.bench.inspect import inspected as inspected
+    from koopmpc.bench.inspect import compare_runs as compare_runs
+    from koopmpc.bench.inspect import inspect_logs as inspect_logs
     from koopmpc.bench.inspect import worst_moments as worst_moments
     from koopmpc.bench.options import SweepOptions as SweepOptions
     from koopmpc.bench.problem_files import list_problems as list_problems
@@ -22,12 +22,18 @@ if TYPE_CHECKING:
     from koopmpc.bench.row_filter import RowFilter as RowFilter
     from koopmpc.bench.single import FAULTS as FAULTS
     from koopmpc.bench.single import failures as failures
-    from koopmpc.bench.single import replayed as replayed
+    from koopmpc.bench.single import replay_log as replay_log
     from koopmpc.bench.store import RunRow as RunRow
     from koopmpc.bench.store import load_rows as load_rows
     from koopmpc.bench.store import reached as reached
     from koopmpc.bench.store import row_to_view as row_to_view
 else:
     __getattr__, __dir__, __all__ = attach(
-        __name__, hints={"Where": 'it is RowFilter now: km.bench.RowFilter("violation > 0.01").holds(values)'}
+        __name__,
+        hints={
+            "Where": 'it is km.bench.RowFilter("violation > 0.01") now',
+            "inspected": "it is km.bench.inspect_logs now",
+            "compared": "it is km.bench.compare_runs now",
+            "replayed": "it is km.bench.replay_log now",
+        },
     )

@@ -1,4 +1,4 @@
-"""What finished runs say: `inspected`, a log and its worst moments; `compared`, what got worse from A to B."""
+"""What finished runs say: `inspect_logs`, a log and its worst moments; `compare_runs`, what got worse from A to B."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -62,7 +62,7 @@ class Inspected:
         return "\n".join([*lines, "", "worst moments", *map(str, self.moments)])
 
 
-def inspected(logs: Sequence[str | Path], where: str | None = None, *, repair: bool = False) -> Iterator[Inspected]:
+def inspect_logs(logs: Sequence[str | Path], where: str | None = None, *, repair: bool = False) -> Iterator[Inspected]:
     """Yield what each log holds, folders by their .rrd files.
 
     Parameters
@@ -237,7 +237,7 @@ class Pairs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """What `compared` found; `regressions` are the pairs in which B is worse."""
+    """What `compare_runs` found; `regressions` are the pairs in which B is worse."""
 
     pairs: tuple[Pairs, ...]
     threshold: float
@@ -270,7 +270,7 @@ class Compared:
         return f"{worse} of {compared} {'is' if worse == 1 else 'are'} worse by more than {self.threshold:.1%}{alone}"
 
 
-def compared(a: str | Path, b: str | Path, *, threshold: float = 0.02, times: bool = False) -> Compared:
+def compare_runs(a: str | Path, b: str | Path, *, threshold: float = 0.02, times: bool = False) -> Compared:
     """Compare the runs that two sweeps, or two logs, have in common; two logs of one case may be of two controllers.
 
     B is worse where the median of its cost over A's exceeds 1 + threshold, and a two-sided Wilcoxon signed-rank test

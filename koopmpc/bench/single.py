@@ -282,7 +282,7 @@ class Replayed:
         return "not the same: " + "\n".join(self.differences)
 
 
-def replayed(log: str | Path, *, plant: StepMap | None = None, controller: Controller | None = None) -> Replayed:
+def replay_log(log: str | Path, *, plant: StepMap | None = None, controller: Controller | None = None) -> Replayed:
     """Run again what a log holds, and compare to the bit.
 
     A log of `koopmpc run`, `koopmpc bench` or `km.sweep` names all that ran: problem, data, start, noise and faults. Of
@@ -305,7 +305,7 @@ def replayed(log: str | Path, *, plant: StepMap | None = None, controller: Contr
     if not {"problem", "case", "controller"} <= known.keys() or "training" not in known:
         raise LogError(
             f"{log} does not say which problem, case and controller ran; logs of `koopmpc run` and `koopmpc bench` do. "
-            "In Python pass what ran: km.bench.replayed(log, plant=…, controller=…)"
+            "In Python pass what ran: km.bench.replay_log(log, plant=…, controller=…)"
         )
     file = str(known.get("file", ""))
     problem = load_problem(f"{file if Path(file).is_file() else known['problem']}:{known['case']}")

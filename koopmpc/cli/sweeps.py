@@ -92,10 +92,10 @@ def compare(
     times: Annotated[bool, typer.Option("--times", help="Step times count too, not only costs.")] = False,
 ) -> None:
     """Compare two sweeps, or two logs, run by run; exit 1 where B is worse than A by more than the threshold."""
-    from koopmpc.bench.inspect import compared
+    from koopmpc.bench.inspect import compare_runs
 
     with friendly():
-        found = compared(a, b, threshold=threshold, times=times)
+        found = compare_runs(a, b, threshold=threshold, times=times)
     console().print(found.table)
     console().print(Text(str(found)))
     if found.regressions:
@@ -108,10 +108,10 @@ def inspect(
     repair: Annotated[bool, typer.Option("--repair", help="Write <name>.repaired.rrd of a log that was cut.")] = False,
 ) -> None:
     """Say what ran, recompute its metrics from the log alone, and name its worst moments with their times."""
-    from koopmpc.bench.inspect import inspected, inspection_table
+    from koopmpc.bench.inspect import inspect_logs, inspection_table
 
     with friendly():
-        found = list(inspected(logs, where, repair=repair))
+        found = list(inspect_logs(logs, where, repair=repair))
         if len(found) == 1 and found[0].refused is not None:
             raise LogError(found[0].refused)
     shown = [each for each in found if each.refused is None]
@@ -132,10 +132,10 @@ def inspect(
 
 def replay(log: Annotated[Path, typer.Argument(help="A log of `koopmpc run` or `koopmpc bench`.")]) -> None:
     """Run again what a log holds, and say whether it is the same to the bit; exit 1 where it is not."""
-    from koopmpc.bench.single import replayed
+    from koopmpc.bench.single import replay_log
 
     with friendly():
-        found = replayed(log)
+        found = replay_log(log)
     say(str(found))
     if found.differences:
         raise typer.Exit(1)

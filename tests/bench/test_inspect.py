@@ -24,7 +24,7 @@ def swept(tmp_path_factory):
 
 def test_a_log_says_what_ran_and_its_metrics_by_itself(swept):
     rows, folder = swept
-    found = {each.path: each for each in km.bench.inspected([folder / "logs"])}
+    found = {each.path: each for each in km.bench.inspect_logs([folder / "logs"])}
     assert set(found) == {row.log for row in rows}
     for row in rows:
         own = found[row.log]
@@ -56,7 +56,8 @@ def test_the_worst_moments_are_where_they_happened(swept):
 def test_conditions_choose_logs(swept):
     rows, folder = swept
     chosen = {
-        each.path for each in km.bench.inspected([folder / "logs"], "cost > 2 and controller == 'lqr' or not reached")
+        each.path
+        for each in km.bench.inspect_logs([folder / "logs"], "cost > 2 and controller == 'lqr' or not reached")
     }
     assert chosen == {row.log for row in rows if (row.metrics.cost > 2 and row.controller == "lqr") or not row.reached}
     assert km.bench.RowFilter("0 < -cost <= 3").holds({"cost": -2.0})
@@ -84,7 +85,7 @@ def test_a_cut_log_is_repaired_as_far_as_it_is_whole(tmp_path, monkeypatch):
     run = record_pendulum(tmp_path / "cut.rrd", 600)
     data = (tmp_path / "cut.rrd").read_bytes()
     (tmp_path / "cut.rrd").write_bytes(data[: int(0.4 * len(data))])
-    (cut,) = km.bench.inspected([tmp_path], repair=True)
+    (cut,) = km.bench.inspect_logs([tmp_path], repair=True)
     assert "ends after step" in cut.cut
     assert 0 < cut.values["steps"] < 600
     np.testing.assert_array_equal(km.load_run(cut.repaired).X, run.X[: cut.values["steps"] + 1])
@@ -96,7 +97,7 @@ def test_a_log_that_was_cut_is_read_and_repaired_and_one_that_is_none_is_refused
     data = (tmp_path / "whole.rrd").read_bytes()
     (tmp_path / "cut.rrd").write_bytes(data[: int(0.4 * len(data))])
     (tmp_path / "none.rrd").write_bytes(b"RRF2" + bytes(100))
-    found = {each.path.name: each for each in km.bench.inspected([tmp_path], repair=True)}
+    found = {each.path.name: each for each in km.bench.inspect_logs([tmp_path], repair=True)}
     assert found["whole.rrd"].cut is None
     assert found["none.rrd"].refused is not None
     cut = found["cut.rrd"]
@@ -104,18 +105,18 @@ def test_a_log_that_was_cut_is_read_and_repaired_and_one_that_is_none_is_refused
     assert 0 < cut.values["steps"] < 600
     repaired = km.load_run(cut.repaired)
     np.testing.assert_array_equal(repaired.X, run.X[: repaired.steps + 1])
-    (again,) = km.bench.inspected([cut.repaired])
+    (again,) = km.bench.inspect_logs([cut.repaired])
     assert again.cut is None
     assert again.metrics == cut.metrics
     with pytest.raises(km.errors.LogError, match="there is no log in"):
-        list(km.bench.inspected([tmp_path / "missing" / ".."])) if (tmp_path / "missing").mkdir() else list(
-            km.bench.inspected([tmp_path / "missing"])
+        list(km.bench.inspect_logs([tmp_path / "missing" / ".."])) if (tmp_path / "missing").mkdir() else list(
+            km.bench.inspect_logs([tmp_path / "missing"])
         )
 
 
 def test_every_run_of_a_sweep_replays_to_the_bit(swept):
     for row in swept[0]:
-        found = km.bench.replayed(row.log)
+        found = km.bench.replay_log(row.log)
         assert found.differences == (), row.name
         assert str(found).startswith("the same to the bit: ")
 
@@ -123,7 +124,7 @@ def test_every_run_of_a_sweep_replays_to_the_bit(swept):
 def test_a_problem_that_has_changed_since_is_told(swept, tmp_path):
     rows = km.sweep([km.load_problem(write(tmp_path))], ["lqr"], folder=tmp_path / "logs")
     write(tmp_path, **{"Q=1.0": "Q=3.0"})
-    found = km.bench.replayed(rows[0].log)
+    found = km.bench.replay_log(rows[0].log)
     differences = found.differences
     assert str(found) == "not the same: " + "\n".join(differences)
     assert any(each.startswith("U from step 0") for each in differences)
@@ -131,7 +132,7 @@ def test_a_problem_that_has_changed_since_is_told(swept, tmp_path):
     run = km.load_run(rows[0].log)
     km.record(replace(run, metadata={}), tmp_path / "own.rrd")
     with pytest.raises(km.errors.LogError, match="does not say which problem, case and controller ran"):
-        km.bench.replayed(tmp_path / "own.rrd")
+        km.bench.replay_log(tmp_path / "own.rrd")
 
 
 def test_a_run_of_your_own_replays_with_the_plant_and_the_controller_that_ran(tmp_path):
@@ -142,16 +143,16 @@ def test_a_run_of_your_own_replays_with_the_plant_and_the_controller_that_ran(tm
     km.record(
         km.simulate(plant, mpc, **about, options=km.loop.LoopOptions(noise=[0.01, 0.01]), limits=problem.limits), log
     )
-    assert km.bench.replayed(log, plant=plant, controller=mpc).differences == ()
+    assert km.bench.replay_log(log, plant=plant, controller=mpc).differences == ()
     slower = km.LinearMPC(plant, *problem.equilibrium, problem.cost, problem.limits, 3)
     heavier = km.discretize(replace(problem.dynamics, m=1.01 * problem.dynamics.m), problem.dt)
-    assert [each.split()[0] for each in km.bench.replayed(log, plant=heavier).differences] == ["X"]
-    assert "U from step 0 on" in km.bench.replayed(log, controller=slower).differences
+    assert [each.split()[0] for each in km.bench.replay_log(log, plant=heavier).differences] == ["X"]
+    assert "U from step 0 on" in km.bench.replay_log(log, controller=slower).differences
     km.record(
         km.simulate(plant, mpc, **about, options=km.loop.LoopOptions(faults=[km.faults.DroppedSamples(0.2)])), log
     )
     with pytest.raises(km.errors.LogError, match="is of a run with faults, DroppedSamples"):
-        km.bench.replayed(log, controller=mpc)
+        km.bench.replay_log(log, controller=mpc)
 
 
 def test_the_log_of_a_model_says_what_it_is_and_where_its_forecasts_are_worst(tmp_path, swept):
@@ -159,7 +160,7 @@ def test_the_log_of_a_model_says_what_it_is_and_where_its_forecasts_are_worst(tm
     data = km.Episodes([km.Episode(X=rng.normal(size=(30, 2)), U=rng.normal(size=(29, 1))) for _ in range(4)], 0.1)
     model, log = km.edmd(data, km.State() + km.Constant()), tmp_path / "model.rrd"
     km.recording.record_model(model, data, log, horizon=5, rollouts=2)
-    (found,) = km.bench.inspected([log])
+    (found,) = km.bench.inspect_logs([log])
     errors = km.score(model, data, 5).rmse
     said = str(found)
     assert found.title == f"model of {', '.join(model.states)}"
@@ -170,7 +171,7 @@ def test_the_log_of_a_model_says_what_it_is_and_where_its_forecasts_are_worst(tm
         r = int(np.argmax([gap.max() for gap in gaps]))
         k = int(np.argmax(gaps[r]))
         assert (k, f"largest error of {state}: {gaps[r][k]:.4g}, episode {r}") in [(m.k, m.what) for m in found.moments]
-    assert [each.path for each in km.bench.inspected([tmp_path], "spectral_radius > 0")] == [log]
-    assert list(km.bench.inspected([tmp_path], "violation > 0")) == []
+    assert [each.path for each in km.bench.inspect_logs([tmp_path], "spectral_radius > 0")] == [log]
+    assert list(km.bench.inspect_logs([tmp_path], "violation > 0")) == []
     with pytest.raises(km.errors.LogError, match="koopmpc-model-1"):
         km.load_run(log)

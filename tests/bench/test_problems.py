@@ -168,7 +168,7 @@ def test_a_problem_with_measured_disturbances_is_learned_told_recorded_and_repla
     assert runs["front"].U[8] > runs["still"].U[8] + 0.01  # the cold is known before it comes
     km.record(runs["front"], tmp_path / "run.rrd")
     mpc = parts.controller("linear-mpc", "front")
-    again = km.bench.replayed(tmp_path / "run.rrd", plant=parts.step_map, controller=mpc)
+    again = km.bench.replay_log(tmp_path / "run.rrd", plant=parts.step_map, controller=mpc)
     assert again.differences == ()
 
 

@@ -213,26 +213,26 @@ def test_a_report_is_one_file_with_every_case_and_controller(whole):
 
 
 def test_a_sweep_is_no_regression_of_itself_and_a_worse_one_is(problem, whole, tmp_path):
-    same = km.bench.compared(whole[1], whole[1])
+    same = km.bench.compare_runs(whole[1], whole[1])
     assert not same.regressions
     assert {pair.ratio for pair in same.pairs} == {1.0}
     worse = replace(problem, limits=km.Limits(u_min=-0.3, u_max=0.3)).of_file(problem.file)
     km.sweep([worse], TWO, folder=tmp_path, options=km.bench.SweepOptions(**GRID))
-    found = km.bench.compared(whole[1], tmp_path)
+    found = km.bench.compare_runs(whole[1], tmp_path)
     assert {pair.what.split()[1] for pair in found.regressions} >= {"near"}
     assert all(pair.p < 0.05 or pair.lost for pair in found.regressions)
-    assert not km.bench.compared(tmp_path, whole[1]).regressions
-    assert not km.bench.compared(whole[1], tmp_path, threshold=1e6).regressions or any(
+    assert not km.bench.compare_runs(tmp_path, whole[1]).regressions
+    assert not km.bench.compare_runs(whole[1], tmp_path, threshold=1e6).regressions or any(
         p.lost for p in found.regressions
     )
 
 
 def test_two_logs_are_compared_and_strangers_are_refused(whole):
     log = whole[1] / "tiny-near-lqr.rrd"
-    assert str(km.bench.compared(log, log)) == "no regression beyond 2.0% in 1 comparison"
+    assert str(km.bench.compare_runs(log, log)) == "no regression beyond 2.0% in 1 comparison"
     other = whole[1] / next(row.log.name for row in whole[0] if row.log and row.key[:3] == ("tiny", "near", TWO[1]))
-    (pair,) = km.bench.compared(log, other, threshold=1e6).pairs
+    (pair,) = km.bench.compare_runs(log, other, threshold=1e6).pairs
     assert pair.what == f"tiny near {TWO[1]} / lqr"
     assert pair.ratio == pytest.approx(km.metrics(km.load_run(other)).cost / km.metrics(km.load_run(log)).cost)
     with pytest.raises(km.errors.LogError, match="have no run in common"):
-        km.bench.compared(log, whole[1] / "tiny-far-lqr.rrd")
+        km.bench.compare_runs(log, whole[1] / "tiny-far-lqr.rrd")

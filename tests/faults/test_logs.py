@@ -175,7 +175,7 @@ def test_a_log_cut_at_a_random_byte_is_read_and_repaired_or_refused(
     for end in np.random.default_rng(0).integers(0, len(data), (count + 1) // 2).tolist():
         path.write_bytes(data[:end])
         repaired.unlink(missing_ok=True)
-        (found,) = km.bench.inspected([path], repair=True)
+        (found,) = km.bench.inspect_logs([path], repair=True)
         if found.refused is not None:
             assert str(path) in found.refused
             assert not repaired.exists()
