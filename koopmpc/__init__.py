@@ -35,9 +35,9 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.codegen.compiled import compiled as compiled
     from koopmpc.codegen.export import export as export
     from koopmpc.control.cost import Cost as Cost
+    from koopmpc.control.kinds.koopman_mpc import KoopmanMPC as KoopmanMPC
+    from koopmpc.control.kinds.koopman_mpc import LinearMPC as LinearMPC
     from koopmpc.control.limits import Limits as Limits
-    from koopmpc.control.linear.koopman_mpc import KoopmanMPC as KoopmanMPC
-    from koopmpc.control.linear.koopman_mpc import LinearMPC as LinearMPC
     from koopmpc.control.lqr import LQR as LQR
     from koopmpc.control.lqr import dlqr as dlqr
     from koopmpc.control.lqr import lqr as lqr
@@ -127,7 +127,7 @@ else:
         },
         core=(
             "bench.problem",
-            "control.linear.koopman_mpc",
+            "control.kinds.koopman_mpc",
             "control.lqr",
             "control.nonlinear.bilinear_mpc",
             "control.nonlinear.nonlinear_mpc",
@@ -150,7 +150,7 @@ else:
             "controllers": (
                 "control.lqr",
                 "control.eigenfunction_lqr",
-                "control.linear.koopman_mpc",
+                "control.kinds.koopman_mpc",
                 "control.nonlinear.bilinear_mpc",
                 "control.nonlinear.nonlinear_mpc",
                 "control.pid",

@@ -17,6 +17,7 @@ from typing import (
     Any,
     ClassVar,
     Literal,
+    NamedTuple,
     Protocol,
     Union,
     cast,
@@ -29,7 +30,7 @@ from typing import (
 from zlib import crc32
 
 import numpy as np
-from jaxtyping import jaxtyped  # pyright: ignore[reportUnknownVariableType]
+from jaxtyping import Float, jaxtyped  # pyright: ignore[reportUnknownVariableType]
 from numpy.typing import NDArray
 
 from koopmpc.errors import DataError, LogError
@@ -38,6 +39,13 @@ from koopmpc.lazy import find_public
 Array = NDArray[Any]
 Arrays = dict[str, Array]
 LINE = 8  # floats in a line of the cache
+
+
+class Interval(NamedTuple):
+    """low ≤ v ≤ high, entry by entry; ±inf where there is no limit."""
+
+    low: Float[np.ndarray, "*rows n"]
+    high: Float[np.ndarray, "*rows n"]
 
 
 @runtime_checkable

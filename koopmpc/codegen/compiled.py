@@ -18,10 +18,10 @@ from koopmpc.codegen.runs import FALLBACKS, STATUSES, CompiledLoops, TargetTable
 from koopmpc.codegen.sources import write_one_source
 from koopmpc.codegen.tables import Precision
 from koopmpc.control.limits import Limits
-from koopmpc.control.linear.condensed_program import CondensedProgram
-from koopmpc.control.linear.plan import planned_states
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, alone, busy
 from koopmpc.control.nonlinear.staged_program import StagedProgram
+from koopmpc.control.plan.condensed import planned_states
+from koopmpc.control.plan.condensed_program import CondensedProgram
 from koopmpc.control.program import StepProgram
 from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.errors import DataError, ShapeError

@@ -24,10 +24,10 @@ from koopmpc.codegen.sources import (
 )
 from koopmpc.codegen.tables import Precision, Tables
 from koopmpc.codegen.unit import write_unit
-from koopmpc.control.linear.condensed_program import CondensedProgram
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.iteration import MOST
 from koopmpc.control.nonlinear.staged_program import StagedProgram
+from koopmpc.control.plan.condensed_program import CondensedProgram
 from koopmpc.control.program import StepProgram
 from koopmpc.disk import path_of, writing
 from koopmpc.errors import DataError

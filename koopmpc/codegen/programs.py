@@ -10,12 +10,12 @@ from jaxtyping import Float
 from koopmpc import checks
 from koopmpc.codegen import tolerances
 from koopmpc.codegen.tables import CFunction, Tables, write_fields
-from koopmpc.control.linear.condensed_program import BoundsProgram, CondensedProgram
 from koopmpc.control.lqr import FeedbackProgram
 from koopmpc.control.nonlinear import motion
 from koopmpc.control.nonlinear.iteration import MOST
 from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.nonlinear.stagewise import list_hard_outputs
+from koopmpc.control.plan.condensed_program import BoundsProgram, CondensedProgram
 from koopmpc.control.program import Published, StepProgram, no_export
 from koopmpc.control.solvers.daqp import FEW, MOVED
 from koopmpc.control.stepped.levels import FREE
@@ -72,13 +72,13 @@ def read_program(controller: object, reference: Any = None) -> StepProgram:
     Raises
     ------
     DataError
-        No C code can be generated; the message is the Program's `obstacle`.
+        No C code can be generated; the message says why.
     """
     if not isinstance(controller, Published):
         raise no_export(controller)
-    program = controller.program(reference)
+    program = controller.build_program(reference)
     if not isinstance(program, StepProgram):
-        raise DataError(program.obstacle)
+        raise no_export(controller)
     return program
 
 

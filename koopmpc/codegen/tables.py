@@ -28,7 +28,7 @@ from koopmpc.codegen import tolerances
 from koopmpc.control.lqr import FeedbackProgram
 from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.nonlinear.stagewise import Sides
-from koopmpc.control.program import StepProgram
+from koopmpc.control.program import LinearProgram, StepProgram
 from koopmpc.control.solvers.daqp import DAQPSetup
 from koopmpc.estimate.filter import FilterProgram
 from koopmpc.plants.graph import Graph
@@ -121,6 +121,14 @@ def convert(value: object, single: bool) -> Mapping[str, Any]:
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if not f.name.startswith("_")}
     entries = cast("tuple[Any, ...]", value)
     return dict(zip(getattr(value, "_fields", map(str, range(len(entries)))), entries, strict=True))
+
+
+@convert.register
+def _(program: LinearProgram, single: bool) -> Mapping[str, Any]:
+    """Leave out what Python's step alone needs, and add what is computed."""
+    fields = convert.dispatch(object)(program, single)
+    kept = {name: value for name, value in fields.items() if name not in program.IN_PYTHON}
+    return kept | {name: getattr(program, name) for name in program.COMPUTED}
 
 
 @convert.register

@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from koopmpc.control.kinds import ControllerKind as ControllerKind
     from koopmpc.control.kinds import list_kinds as list_kinds
     from koopmpc.control.kinds import register_controller as register_controller
-    from koopmpc.control.linear.condensed_program import CondensedProgram as CondensedProgram
     from koopmpc.control.lqr import FeedbackProgram as FeedbackProgram
     from koopmpc.control.move import Controller as Controller
     from koopmpc.control.move import Fallback as Fallback
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from koopmpc.control.move import Plan as Plan
     from koopmpc.control.nonlinear.staged_program import StagedProgram as StagedProgram
     from koopmpc.control.pid import PID as PID
+    from koopmpc.control.plan.condensed_program import CondensedProgram as CondensedProgram
     from koopmpc.control.program import Program as Program
     from koopmpc.control.program import SavedController as SavedController
     from koopmpc.control.riccati import Gain as Gain

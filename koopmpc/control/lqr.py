@@ -1,8 +1,8 @@
 """Feedback without a plan: LQR, u = −K ψ(x) + feedforward in limits; the gains `lqr`, `dlqr`."""
 
 import copy
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, TypeVar
 
@@ -23,13 +23,12 @@ from koopmpc.control.program import (
     LinearProgram,
     Published,
     SavedController,
-    linear_parts,
     no_export,
     reference_table,
 )
 from koopmpc.control.riccati import Gain
-from koopmpc.control.solvers.daqp import DAQPSetup, daqp_settings
-from koopmpc.control.target import Targets, Units, targets_of
+from koopmpc.control.solvers.daqp import daqp_settings
+from koopmpc.control.target import Units, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import EstimatorProgram, Measured
@@ -130,44 +129,20 @@ class FeedbackProgram(LinearProgram):
         (nu, nz), and (nu, nu) where changes of the inputs are weighed, else (nu, 0).
     feedforward
         (nu, nw + nr + nu).
+    estimator
+        How z follows from y.
     """
 
     K: Float[np.ndarray, "nu nz"]
     K_rate: Float[np.ndarray, "nu rates"]
     feedforward: Float[np.ndarray, "nu driving"]
+    estimator: EstimatorProgram = field(default_factory=EstimatorProgram)
+    settings: Mapping[str, Any] = field(default_factory=daqp_settings)
 
-
-def feedback_program(
-    controller: object,
-    predictor: LinearPredictor,
-    targets: Targets,
-    inputs: Interval,
-    rates: Interval | None,
-    reference: Float[np.ndarray, "rows nr"],
-    K: Float[np.ndarray, "nu nz"],
-    feedforward: Float[np.ndarray, "nu n"],
-    *,
-    K_rate: Float[np.ndarray, "nu m"] | None = None,
-    given: Float[np.ndarray, "k nu"] | None = None,
-    estimator: EstimatorProgram | None = None,
-) -> FeedbackProgram:
-    """Return the Program of u = feedforward [w; r; u_r] − K ψ(ζ) − K_rate u_{k−1}; see `FeedbackProgram`."""
-    parts = linear_parts(predictor, targets)
-    solvers: tuple[DAQPSetup, ...] = parts["target_solvers"]
-    return FeedbackProgram(
-        controller=type(controller).__name__,
-        **parts,
-        inputs=inputs,
-        rates=rates,
-        given=given,
-        reference=reference,
-        gain=-K,
-        settings=solvers[0].settings if solvers else daqp_settings(),
-        K=K,
-        K_rate=np.zeros((len(K), 0)) if K_rate is None else K_rate,
-        feedforward=feedforward,
-        estimator=EstimatorProgram() if estimator is None else estimator,
-    )
+    @property
+    def gain(self) -> Float[np.ndarray, "nu nz"]:
+        """How z moves the input."""
+        return -self.K
 
 
 class LQR(FeedbackLaw):
@@ -247,19 +222,21 @@ class LQR(FeedbackLaw):
         """Return the data of a step."""
         if self._rows is not None:
             raise no_export(self, "its limits have rows in time, and its C keeps one set", "one with limits.at(step)")
-        return feedback_program(
-            self,
-            self.predictor,
-            self._targets,
-            self.inputs,
-            self.rates,
-            reference_table(reference, self._nr),
-            self._K,
-            self._v,
-            K_rate=self._K_rate,
+        program = FeedbackProgram(
+            controller=type(self).__name__,
+            model=self.predictor,
+            targets=self._targets,
+            inputs=self.inputs,
+            rates=self.rates,
             given=self._given_rows,
+            reference=reference_table(reference, self._nr),
+            K=self._K,
+            K_rate=self._K_rate,
+            feedforward=self._v,
             estimator=self._observer.program(),
         )
+        _ = program.lifting  # it may be code that cannot be written in C
+        return program
 
     @alone
     def reset(self, x0: ArrayLike | None = None, u_prev: ArrayLike | None = None) -> None:

@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 import casadi as ca
 import numpy as np
@@ -65,18 +66,21 @@ class SavedController(Value):
 
 @dataclass(frozen=True, eq=False)
 class Program(Value):
-    """The data that a step of a controller needs, and no function: C code is generated from it alone.
+    """The data that a step of a controller needs: C code is generated from it alone.
 
     Attributes
     ----------
     controller
         The class of the controller.
-    obstacle
-        Why no C code can be generated, in a sentence; then nothing else is known. Empty otherwise.
     """
 
     controller: str
-    obstacle: str = ""
+
+    def __call__(self, reference: object = None) -> Any:
+        """Raise the DataError that says what took the place of a call."""
+        raise DataError(
+            "controller.program is data, and no function: read its fields; km.export says why there is no C"
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -87,14 +91,14 @@ class StepProgram(Program):
     ----------
     model
         The model of the controller: sizes, names, dt, and A, B, C, E where it is linear.
-    lifting
-        ζ → z.
     inputs, rates
         The limits to which an input is clipped; `rates` is None where nothing limits its changes.
     given
         (k, nu) rows of a given u_target, the last one held; None where the target is found.
     reference
         (rows, nr) the reference rows for which the Program was made.
+    lifting
+        ζ → z.
     sizes
         (nz,) root mean squares of z in the data, ones where they are not known.
     gain
@@ -108,16 +112,17 @@ class StepProgram(Program):
     """
 
     model: LinearPredictor | BilinearPredictor | StepMap
-    lifting: Graph
     inputs: Interval
     rates: Interval | None
     given: Float[np.ndarray, "given_rows nu"] | None
     reference: Float[np.ndarray, "rows nr"]
-    sizes: Float[np.ndarray, " nz"]
-    gain: Float[np.ndarray, "moves nz"]
     settings: Mapping[str, Any]
-    estimator: EstimatorProgram
     notes: tuple[str, ...] = ()
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Return `lifting`, `sizes`, `gain` or `estimator`: fields of some programs, computed in others."""
 
     @property
     def dt(self) -> float:
@@ -138,13 +143,33 @@ class LinearProgram(StepProgram):
     ----------
     targets
         Equilibria z = z₀ + Z α, u = u₀ + W α, and α of a reference.
-    target_solvers
-        The QP that moves α inside all limits, and the one for the limits of the inputs alone; none without equilibria.
     """
+
+    COMPUTED: ClassVar[tuple[str, ...]] = ("lifting", "sizes", "gain", "target_solvers")
+    """What C needs besides the fields."""
+    IN_PYTHON: ClassVar[frozenset[str]] = frozenset()
+    """Fields that C has no use for."""
 
     model: LinearPredictor
     targets: Targets
-    target_solvers: tuple[DAQPSetup, ...]
+
+    @cached_property
+    def lifting(self) -> Graph:
+        """ζ → z; DataError where that cannot be written as a graph."""
+        model = self.model
+        return trace_lifting(model.lifting.symbolic, len(model.lifting.bound_states), model.embedding, model.nu)
+
+    @property
+    def sizes(self) -> Float[np.ndarray, " nz"]:
+        """Root mean squares of z in the data, ones where they are not known."""
+        scale = self.model.scale
+        return np.ones(self.model.nz) if scale is None else np.linalg.norm(scale, axis=0)
+
+    @property
+    def target_solvers(self) -> tuple[DAQPSetup, ...]:
+        """The QP that moves α inside all limits, and the one for the limits of the inputs alone."""
+        counts = (len(self.targets.rows), self.targets.hard) if self.targets.Z.shape[1] else ()
+        return tuple(self.targets.solver(count).setup for count in counts)
 
 
 def describe_controller(controller: Any) -> str:
@@ -238,26 +263,29 @@ class Published:
         """
         save_value(self.as_data(), path)
 
-    def program(self, reference: ArrayLike | None = None) -> Program:
-        """Return the data of a step; its `obstacle` says why no C code can be generated.
+    @property
+    def program(self) -> Program:
+        """The data of a step.
+
+        Raises
+        ------
+        DataError
+            The controller has no such data.
+        """
+        return self.build_program(None)
+
+    def build_program(self, reference: ArrayLike | None) -> Program:
+        """Return the data of a step from which C code is generated.
 
         Parameters
         ----------
         reference
             Rows (k, nr) of the reference that will come, by default one of zeros: a BilinearMPC finds their targets.
-        """
-        try:
-            return self.build_program(reference)
-        except DataError as error:
-            return Program(type(self).__name__, str(error))
-
-    def build_program(self, reference: ArrayLike | None) -> Program:
-        """Return the data of a step.
 
         Raises
         ------
         DataError
-            No C code can be generated; the message says why, and becomes the `obstacle` of the Program.
+            No C code can be generated; the message says why.
         """
         del reference
         raise no_export(self)
@@ -271,6 +299,21 @@ def no_export(
     """Return the error that says why no C code can be generated for a controller."""
     name = type(controller).__name__
     return DataError(f"a {name} cannot be exported: {why}; export {instead}")
+
+
+def refuse_time_limit(time_limit: float | None, bound: str) -> None:
+    """Raise where a controller has a time_limit; `bound` are the arguments that bound its iterations instead.
+
+    Raises
+    ------
+    DataError
+        It has one.
+    """
+    if time_limit is not None:
+        raise DataError(
+            "the controller has a time_limit, and C has no clock; make it without one and bound the iterations: "
+            + bound
+        )
 
 
 def publish_estimator(
@@ -290,11 +333,7 @@ def publish_estimator(
     DataError
         The controller has a time_limit, or an estimator for which no C code can be generated.
     """
-    if time_limit is not None:
-        raise DataError(
-            "the controller has a time_limit, and C has no clock; make it without one and bound the iterations: "
-            + bound
-        )
+    refuse_time_limit(time_limit, bound)
     return estimator_program(observer, estimator)
 
 
@@ -341,16 +380,3 @@ def trace_lifting(lift: Callable[[ca.SX], ca.SX], nzeta: int, embedding: Delay |
         raise DataError("the embedding holds other inputs than the predictor; fit both on the same data to export it")
     zeta = ca.SX.sym("zeta", nzeta)
     return trace_graph(ca.Function("lifting", [zeta], [ca.densify(lift(zeta))], {"cse": True}), "the lifting")
-
-
-def linear_parts(predictor: LinearPredictor, targets: Targets) -> dict[str, Any]:
-    """Return the fields of a `LinearProgram` that only its predictor and its targets decide."""
-    scale, lifting = predictor.scale, predictor.lifting
-    counts = (len(targets.rows), targets.hard) if targets.Z.shape[1] else ()
-    return {
-        "model": predictor,
-        "lifting": trace_lifting(lifting.symbolic, len(lifting.bound_states), predictor.embedding, predictor.nu),
-        "sizes": np.ones(predictor.nz) if scale is None else np.linalg.norm(scale, axis=0),
-        "targets": targets,
-        "target_solvers": tuple(targets.solver(count).setup for count in counts),
-    }

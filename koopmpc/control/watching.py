@@ -14,7 +14,7 @@ from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Value
 
 if TYPE_CHECKING:
-    from koopmpc.control.base import InitialCondition
+    from koopmpc.control.step.observe import InitialCondition
 
 
 @runtime_checkable

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc import checks
-from koopmpc.control.linear.condensed_program import CondensedProgram
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
+from koopmpc.control.plan.condensed_program import CondensedProgram
 from koopmpc.control.target import ROUNDING
 from koopmpc.errors import DataError
 from koopmpc.guarantees.active_sets import ParametricQP, list_ways

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.checks import HUGE, numbers
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
+from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
 from koopmpc.control.limits import Limits
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.move import Move, Plan
 from koopmpc.control.program import Program, Published, SavedController, no_export
 from koopmpc.data.episodes import Episode, Episodes

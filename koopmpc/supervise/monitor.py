@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc import checks
-from koopmpc.control.base import InitialCondition
+from koopmpc.control.step.observe import InitialCondition
 from koopmpc.control.watching import StepMonitor, register_monitor
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.errors import DataError

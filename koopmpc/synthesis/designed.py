@@ -11,7 +11,7 @@ from rich.console import RenderableType
 
 from koopmpc import checks
 from koopmpc.control.kinds import build_controller
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.program import SavedController

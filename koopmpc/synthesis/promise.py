@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from koopmpc.codegen.compiled import Compiled
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
+from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.synthesis.choice import (
     DesignRow,

@@ -227,4 +227,5 @@ def test_in_c_weights_stand_for_priorities(make):
 
 def test_four_priorities_are_too_many_for_c():
     limits = km.Limits(x_max=0.3, of=km.State(), y_max=0.2, priority=[0, 1, 2, 3])
-    assert "can tell 3 apart" in km.KoopmanMPC(MODEL, COST, limits, 6).program().obstacle
+    with pytest.raises(km.errors.DataError, match="can tell 3 apart"):
+        km.KoopmanMPC(MODEL, COST, limits, 6).build_program(None)

@@ -255,7 +255,7 @@ def test_an_unstable_plant_whose_hard_rows_are_nearly_dependent_is_solved_alike(
     A, B = np.array([[growth, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.5]])
     model = km.LinearPredictor(A, B, np.eye(2), km.State(), 0.1, ("p", "q"), ("u",))
     controller = km.KoopmanMPC(model, km.Cost([1.0, 1.0], 0.1), km.Limits(-1, 1, **more), horizon, solver="daqp")
-    assert controller._qps._solvers[0]._steep()
+    assert controller._step.solver.qps._solvers[0]._steep()
     twin, rng, seen = km.compiled(controller), np.random.default_rng(0), set()
     for k in range(60):
         x = rng.uniform(-1, 1, 2) * [0.3, 1.0] * (0.5 if k % 3 else 2.0)

@@ -102,8 +102,7 @@ def test_a_program_in_a_plain_loop_gives_the_inputs_of_the_controller_and_of_its
     turned = isinstance(controller, km.BilinearMPC)
     goals = rng.uniform(-0.2, 0.2, 2)
     rows = np.array([[np.sin(a), np.cos(a), 0.0] if turned else [a, 0.0] for a in goals])
-    program = controller.program(rows)
-    assert program.obstacle == ""
+    program = controller.build_program(rows)
     twin, plain = km.compiled(controller), Interpreter(program)
     controller.reset()
     twin.reset()
@@ -172,10 +171,11 @@ def test_each_kind_without_c_code_says_why_and_export_raises_that_sentence(model
         "C has no clock.*sqp_iterations": km.BilinearMPC(bilinear, CIRCLE, limits, 5, time_limit=1.0),
     }
     for sentence, controller in refused.items():
-        obstacle = controller.program().obstacle
+        with pytest.raises(km.errors.DataError) as refusal:
+            controller.build_program(None)
         with pytest.raises(km.errors.DataError, match=sentence) as error:
             km.export(controller, tmp_path / "c")
-        assert str(error.value) == obstacle
+        assert str(error.value) == str(refusal.value)
         assert str(error.value).count("export ") <= 1  # one remedy
         assert f"export a {type(controller).__name__}" not in str(error.value)  # which was refused
         assert "C code cannot be generated" not in str(error.value)  # it begins with that

@@ -1,9 +1,11 @@
 """Small systems, and the finite-horizon problem written a second and a third time: dense, and in CVXPY."""
 
 import numpy as np
+import pytest
 import scipy.linalg
 
 import koopmpc as km
+from koopmpc.control.solvers import SOLVERS
 from tests.example_plants import linear as linear
 from tests.example_plants import random_pair as random_pair
 from tests.example_plants import step_map as step_map
@@ -123,5 +125,12 @@ def dense_plan(model, cost, z0, rows, targets, C=None):
 
 
 def in_coordinates(wanted, controller=km.KoopmanMPC):
-    """The class of controller whose QP is in these coordinates, whatever is usually chosen; None leaves the choice."""
-    return controller if wanted is None else type(controller.__name__, (controller,), {"_wanted": wanted})
+    """Return what makes a controller whose QP is in these coordinates, whatever is usually chosen; None leaves the choice."""
+
+    def build(*arguments, **options):
+        with pytest.MonkeyPatch.context() as patch:
+            for solver in SOLVERS.values() if wanted else ():
+                patch.setattr(solver, "coordinates", wanted)
+            return controller(*arguments, **options)
+
+    return build

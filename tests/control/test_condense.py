@@ -137,7 +137,7 @@ def test_in_inputs_the_QP_is_curved_alike_along_each_of_them():
     model, N = linear(np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0, 0.3], [0.2, 0.0]])), 8
     mpc = km.KoopmanMPC(model, km.Cost([1, 1], [2, 30]), km.Limits([-1, -50], [1, 50]), N, solver="osqp")
     assert mpc.coordinates == "plain"
-    np.testing.assert_allclose(np.diag(mpc._map.qp.P).reshape(N, 2).mean(axis=0), [1, 1], rtol=1e-12)
+    np.testing.assert_allclose(np.diag(mpc.program.qp.P).reshape(N, 2).mean(axis=0), [1, 1], rtol=1e-12)
 
 
 def test_an_input_without_limits_between_others_acts_as_one_with_limits_that_nothing_meets():

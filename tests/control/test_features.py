@@ -474,7 +474,7 @@ def test_a_step_that_starts_from_the_last_one_moved_on_takes_half_of_the_iterati
         taken.append(0)
         for k in range(40):
             if cold:
-                mpc._qps.cool()
+                mpc._step.solver.qps.cool()
             move = mpc(x, [1.5 * (-1) ** (k // 10), 0, 0])
             taken[-1] += move.iterations
             x = A @ x + B @ move.u + 0.01 * rng.standard_normal(3)

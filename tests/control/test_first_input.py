@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from koopmpc.control.step.first_input import FirstInput
 from tests.control.models import linear
 
 A, B = np.array([[1.0, 0.1], [0.15, 0.98]]), np.array([[0.005], [0.1]])
 TWO = np.array([[0.005, 0.01], [0.1, -0.02]])  # two inputs
 N, STEPS = 20, 60
-LONG = "koopmpc.control.linear.plan._LONG"
+LONG = "koopmpc.control.step.condensed.LONG"
 TIMES = np.arange(float(STEPS + N + 3))
 SIGNAL = 0.2 * np.sin(0.2 * TIMES)[:, None] * [1.0, 0.0]
 ENDS = 6 + 2 * np.sin(0.1 * TIMES)[:, None]
@@ -33,24 +34,38 @@ CASES = {
 }
 
 
+@pytest.fixture
+def alone(monkeypatch):
+    """Previews count as long; the fixture lists of each step whether its first input was found alone."""
+    monkeypatch.setattr(LONG, 0)
+    found, find = [], FirstInput.find
+
+    def watched(*arguments):
+        answer = find(*arguments)
+        found.append(answer is not None)
+        return answer
+
+    monkeypatch.setattr(FirstInput, "find", watched)
+    return found
+
+
 def make(case):
     gain, cost, limits, _, options = CASES[case]
     return km.KoopmanMPC(linear(A, gain), cost, limits, N, **options)
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_first_input_and_the_plan_are_those_of_the_whole_product(case, monkeypatch):
-    whole = make(case)
-    monkeypatch.setattr(LONG, 0)
+def test_the_first_input_and_the_plan_are_those_of_the_whole_product(case, alone, monkeypatch):
     mpc, (gain, *_, signal, _) = make(case), CASES[case]
-    rng, x, owed = np.random.default_rng(0), signal[0] + [0.5, 0.0], 0
+    monkeypatch.setattr(LONG, np.inf)
+    whole = make(case)
+    rng, x = np.random.default_rng(0), signal[0] + [0.5, 0.0]
     for k in range(STEPS):
         reference = signal[k : k + mpc.horizon + 1].copy()
         y = np.full(2, np.nan) if k in (20, 21, 40) else x
         if k == 30:
             reference[5, 0] = np.nan
         move, other = mpc(y, reference), whole(y, reference)
-        owed += mpc._owes
         assert (move.status, move.fallback) == (other.status, other.fallback)
         np.testing.assert_allclose(move.u, other.u, rtol=0, atol=1e-9)
         plan, expected = mpc.plan() if k % 3 else None, whole.plan()
@@ -59,19 +74,18 @@ def test_the_first_input_and_the_plan_are_those_of_the_whole_product(case, monke
             np.testing.assert_allclose(plan.U, expected.U, rtol=0, atol=1e-9)
             np.testing.assert_allclose(plan.X, expected.X, rtol=0, atol=1e-9)
         x = A @ x + gain @ move.u + 0.002 * rng.normal(size=2) * (20 if k % 25 == 24 else 1)
-    assert owed > STEPS / 3
+    assert sum(alone) > STEPS / 3
 
 
 @pytest.mark.parametrize("ends", [(-4, 9), (-9, 4), (-6, 6)])
-def test_first_inputs_are_found_alone_as_far_as_limits_reach_on_either_side(ends, monkeypatch):
+def test_first_inputs_are_found_alone_as_far_as_limits_reach_on_either_side(ends, alone, monkeypatch):
+    mpc, met = km.KoopmanMPC(linear(A, B), COST, km.Limits(*ends), N), 0
+    monkeypatch.setattr(LONG, np.inf)
     whole = km.KoopmanMPC(linear(A, B), COST, km.Limits(*ends), N)
-    monkeypatch.setattr(LONG, 0)
-    mpc, alone, met = km.KoopmanMPC(linear(A, B), COST, km.Limits(*ends), N), [], 0
     for sign in (1, -1):
         for k, rate in enumerate(np.linspace(0, 3, 61)):  # up to the limit, and beyond
             y, reference = [0.15, sign * rate], 0.02 * SIGNAL[k % STEPS : k % STEPS + N + 1]
             move, other = mpc(y, reference), whole(y, reference)
-            alone.append(mpc._owes)
             met += other.u[0] in ends
             assert move.u == pytest.approx(other.u, abs=1e-9)
     assert np.mean(alone) > 0.4
@@ -106,17 +120,3 @@ def test_a_model_that_is_updated_has_a_bound_of_its_own(monkeypatch):
     for k in range(3, 6):
         expected = other([0.1, 0.0], SIGNAL[k : k + N + 1]).u
         np.testing.assert_allclose(mpc([0.1, 0.0], SIGNAL[k : k + N + 1]).u, expected, rtol=0, atol=1e-9)
-
-
-def test_a_run_after_one_that_ended_at_once_begins_as_the_first(monkeypatch):
-    """A miss of the last run is no reason to take limits and the reference of this one's second step."""
-    monkeypatch.setattr(LONG, 0)
-    mpc, far = make("far from 0"), CASES["far from 0"][3]
-    found = []
-    for _ in range(3):
-        mpc.reset()
-        found.append([])
-        for k in range(2):
-            mpc([3.0, 0.0], far[k : k + N + 1])
-            found[-1].append(mpc._owes)
-    assert found[0] == found[1] == found[2]

@@ -131,8 +131,8 @@ def test_quadratic_programs_and_sequences_find_the_same_plans(seed, monkeypatch)
     moves = [None, 4, {"u0": (1, 1, 2, 2)}][seed % 3]
     model, cost, limits = draw_model(rng, nu), km.Cost(Q=1.0, R=0.05, R_delta=0.02), km.Limits(**limits)
     by_sequences, by_programs = (km.KoopmanMPC(model, cost, limits, 6, moves=moves) for _ in range(2))
-    monkeypatch.setattr(by_programs._qps, "_sequences", None)
-    assert by_sequences._qps._sequences is not None
+    monkeypatch.setattr(by_programs._step.solver.qps, "_sequences", None)
+    assert by_sequences._step.solver.qps._sequences is not None
     x, statuses = rng.standard_normal(3), set()
     for _ in range(12):
         one, other = (mpc(x, np.ones(3)) for mpc in (by_sequences, by_programs))

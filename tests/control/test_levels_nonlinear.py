@@ -166,4 +166,5 @@ def test_limits_in_time_bound_the_levels():
 
 def test_c_code_of_levels_is_refused():
     mpc = km.BilinearMPC(MODEL, km.Cost(**COST), km.Limits(levels=[[-1, 0, 1]]), 4)
-    assert "levels" in mpc.program().obstacle
+    with pytest.raises(km.errors.DataError, match="levels"):
+        mpc.build_program(None)

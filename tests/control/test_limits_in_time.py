@@ -364,17 +364,6 @@ def test_a_controller_in_words_says_its_widest_limits_and_that_they_move():
     assert "rows in time" in repr(mpc)
 
 
-def test_a_page_of_limits_reads_the_rows_of_its_steps_alone():
-    limits = moving_limits(4, rates=0.5)
-    window = km.KoopmanMPC(linear(A, B), COST, limits, N)._rows_of_limits
-    assert np.shares_memory(window.table, window.table.reshape(-1))  # else each page copies the rows of the whole run
-    for pages in (window.plan_pages, window.moving_pages, window.single_pages):
-        for k in (0, 7, T):
-            low, high = pages.fill(k)
-            both = window.table.reshape(-1)[k * window.table.shape[1] + pages.entries]
-            np.testing.assert_array_equal(np.concatenate([low, high]), both)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_further_calls_with_new_limits_are_those_of_a_controller_that_meets_them_first(seed):
     """A second call takes over numbers alone: the same inputs and statuses, and the same sentences."""

@@ -1,4 +1,4 @@
-"""A reference that moves enters the plan by one product with it, or part by part: both give the same inputs."""
+"""A reference that moves: the plan is the one that is computed afresh, whatever was computed before."""
 
 import copy
 import pickle
@@ -28,33 +28,6 @@ LIMITS = {"wide": km.Limits(-50, 50), "narrow": km.Limits(-1, 1, x_min=[-0.5, -5
 def preview(kind, k):
     rows = 0.6 * np.sin(0.3 * (k + np.arange(N + 2)))[:, None] * [1.0, 0.0]
     return {"rows": rows, "few rows": rows[:3], "many rows": np.vstack([rows, rows]), "one row": rows[0]}[kind]
-
-
-@pytest.mark.parametrize("offset_free", [False, True])
-@pytest.mark.parametrize("latency", [0, 1])
-@pytest.mark.parametrize("limits", LIMITS)
-@pytest.mark.parametrize("cost", COSTS)
-def test_one_product_gives_the_inputs_of_its_parts(cost, limits, latency, offset_free, monkeypatch):
-    options = {"estimator": km.LiftedDisturbance() if offset_free else None, "latency": latency}
-    at_once = km.KoopmanMPC(linear(A, B), COSTS[cost], LIMITS[limits], N, **options)
-    monkeypatch.setattr("koopmpc.control.linear.moving._LARGEST", 0)
-    by_parts = km.KoopmanMPC(linear(A, B), COSTS[cost], LIMITS[limits], N, **options)
-    assert at_once._map.moving is not None
-    assert by_parts._map.moving is None
-    rng, statuses = np.random.default_rng(0), []
-    for kind in ("rows", "few rows", "many rows", "one row"):
-        x = np.array([0.2, 0.0])
-        for mpc in (at_once, by_parts):
-            mpc.reset(x)
-        for k in range(20):
-            reference = preview(kind, k // 2)  # each row stays for two steps
-            move, other = at_once(x, reference), by_parts(x, reference)
-            assert move.status is other.status
-            np.testing.assert_allclose(move.u, other.u, atol=1e-9)
-            statuses.append(move.status)
-            x = A @ x + B @ move.u + 0.002 * rng.normal(size=2)
-    assert (km.Status.UNCONSTRAINED in statuses) or limits == "narrow"
-    assert limits == "wide" or len(set(statuses)) > 1
 
 
 def test_a_moving_reference_that_is_not_finite_ends_in_bad_measurement():
@@ -151,8 +124,7 @@ def test_steps_of_a_copy_and_of_its_original_do_not_meet(duplicate, rows):
 
 
 @pytest.mark.parametrize("duplicate", [copy.copy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
-def test_a_copy_turns_the_pages_of_limits_on_its_own(duplicate, monkeypatch):
-    monkeypatch.setattr("koopmpc.control.linear.windows._PAGE", 4 * 2 * N)  # four steps a page
+def test_a_copy_reads_rows_of_limits_on_its_own(duplicate):
     ends = 0.2 + 0.01 * np.arange(12.0)[:, None]
     alone, mpc = (km.KoopmanMPC(linear(A, B), COSTS["no target"], km.Limits(-ends, ends), N) for _ in range(2))
     for _ in range(2):

@@ -237,7 +237,6 @@ def test_update_goes_on_with_the_tail_of_the_new_model():
     for controller in (mpc, fresh):
         u = controller(x, rows).u
         fresh.reset(u_prev=u)
-        fresh._given_row = 1
     fresh.reset()
     mpc.reset()
     mpc.update(new)

@@ -190,4 +190,5 @@ def test_laws_that_do_not_know_rows_refuse_them():
     ):
         km.LQR(MODEL, km.Cost(Q=1, R=1, Q_rows=[[1, 2]]))
     for kind in (km.BilinearMPC, km.KoopmanMPC):
-        assert "weights move in time" in make(kind, Q_rows=[[1, 2]]).program().obstacle
+        with pytest.raises(km.errors.DataError, match="weights move in time"):
+            make(kind, Q_rows=[[1, 2]]).build_program(None)

@@ -65,7 +65,7 @@ def time_loop(family: str, title: str, controllers: dict[str, Any], calls: list[
                 lost[name] += move.status not in (km.Status.UNCONSTRAINED, km.Status.OPTIMAL, km.Status.SOFTENED)
     if not solved.any():
         return None
-    rows, variables = controllers["daqp"]._qps.qp.A.shape
+    rows, variables = controllers["daqp"]._step.solver.qps.qp.A.shape
     auto = controllers["auto"].solver
     times = {name: least[name][solved] for name in NAMES}
     return Timing(

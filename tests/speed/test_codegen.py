@@ -66,7 +66,7 @@ def test_c_step_with_limits_active_against_daqp(benchmark):
         for _ in range(40):
             states.append(x)
             x = CHAIN @ x + B @ slow(x, np.zeros(4)).u
-    qp = slow._qps.qp
+    qp = slow._step.solver.qps.qp
     bare = daqp.Model()
     bare.setup(qp.P, qp.q, qp.A, np.minimum(qp.high, 1e30), np.maximum(qp.low, -1e30))
     rows, zero = [], np.zeros(4)
@@ -79,7 +79,7 @@ def test_c_step_with_limits_active_against_daqp(benchmark):
             assert move.status is other.status
             if move.status is not km.Status.OPTIMAL:
                 continue
-            by = slow._qps._moved
+            by = slow._step.solver.qps._moved
             start = time.perf_counter()
             bare.update(bupper=np.minimum(qp.high - by, 1e30), blower=np.maximum(qp.low - by, -1e30))
             info = bare.solve()[3]
@@ -137,7 +137,7 @@ def test_c_steps_of_the_cart_pole_of_other_generators(benchmark, N):
     rows[:, 0] = np.where(np.arange(len(rows)) < 250, 1.0, -0.5)
     X, U, ours, alone = np.zeros((steps + 1, 4)), np.zeros((steps, 1)), [], []
     X[0, 2] = 0.2
-    solver = slow._qps.first
+    solver = slow._step.solver.qps.first
     solver._model = TimedSolver(solver._model)
     for _ in range(5):
         fast.reset()

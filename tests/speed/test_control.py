@@ -160,11 +160,11 @@ BARE = {"osqp": bare_osqp, "daqp": bare_daqp}
 def beside_the_bare_solver(mpc, name, states, rounds):
     """Return seconds of whole steps, of the bare solver on their QPs, one after the other, and the iterations."""
     asked, reference = [], np.zeros(len(states[0]))
-    solves = mpc._qps._solvers
+    solves = mpc._step.solver.qps._solvers
     figures = []
     for _ in range(rounds):
         own = list(solves)  # the bare solvers start afresh, too
-        solves[:] = [None if solver is None else Kept(solver, mpc._qps.qp, asked) for solver in own]
+        solves[:] = [None if solver is None else Kept(solver, mpc._step.solver.qps.qp, asked) for solver in own]
         mpc.reset()
         questions = []
         for x in states:
@@ -241,7 +241,7 @@ def test_whole_step_against_the_bare_solver(benchmark, name, N, outputs):
         for _ in range(40):
             states.append(x)
             x = CHAIN @ x + B @ mpc(x, np.zeros(4)).u
-    rows = len(mpc._qps.qp.low)
+    rows = len(mpc._step.solver.qps.qp.low)
     assert rows == N * (1 + outputs)
     ours, theirs, iterations = beside_the_bare_solver(mpc, name, states, 5)
     free = [timed(mpc, np.array([0.01, 0, 0, 0]), np.zeros(4))[0] for _ in range(2000)]

@@ -9,17 +9,11 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.in_time.bounds import BoundByName
 from koopmpc.errors import DataError, ShapeError
+from koopmpc.values import Interval as Interval
 
 SOFTENED = 1e-4  # a slack above this share of the size of its limit is reported
 Slack = tuple[ArrayLike, ArrayLike]
 Bound = ArrayLike | BoundByName | None  # of a limit, as a user writes it
-
-
-class Interval(NamedTuple):
-    """low ≤ v ≤ high, entry by entry; ±inf where there is no limit."""
-
-    low: Float[np.ndarray, " n"]
-    high: Float[np.ndarray, " n"]
 
 
 class Softness(NamedTuple):

@@ -77,7 +77,6 @@ class StagedMPC(MPCBase):
             estimator,
             latency,
             time_limit,
-            stagewise=True,
             monitor=None if monitor is None else find_monitor(monitor, model),
         )
         self._levels = None if self._held is None else LevelSearch(self._held, self._blocks, self.nu)

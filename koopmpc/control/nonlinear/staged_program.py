@@ -83,6 +83,9 @@ class StagedProgram(StepProgram):
     """
 
     model: ModelOrMap
+    lifting: Graph
+    sizes: Float[np.ndarray, " nz"]
+    gain: Float[np.ndarray, "moves nz"]
     functions: Mapping[str, Graph]
     N: int
     latency: int

@@ -35,6 +35,11 @@ class Ball:
     quadratic: float
     inner: float
 
+    def contains(self, plan: Float[np.ndarray, " nv"]) -> bool:
+        """Return whether a plan ends in the ball."""
+        y = plan[self.rows]
+        return bool(y.dot(y) <= 1.0)
+
 
 def make_ball(softness: Softness, D: Float[np.ndarray, "nv nw"], unit: float, first: int) -> Ball:
     """Return the ball of the last entries of a plan that moves by D w, from entry `first` on."""
@@ -74,11 +79,6 @@ class BallSolver(StepSolver):
         """Go on with new matrices of the same size; the warm start is kept."""
         self.update(qp)
         self._set_ball(ball)
-
-    def contains(self, plan: Float[np.ndarray, " nv"]) -> bool:
-        """Return whether a plan ends in the ball."""
-        y = plan[self.ball.rows]
-        return bool(y.dot(y) <= 1.0)
 
     def solve(
         self,

@@ -9,8 +9,8 @@ from scipy.spatial import KDTree
 
 from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import kind_for
+from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
 from koopmpc.control.limits import Limits
-from koopmpc.control.linear.koopman_mpc import KoopmanMPC
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source

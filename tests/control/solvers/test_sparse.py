@@ -88,7 +88,7 @@ def test_copies_and_restored_controllers_go_on_alike(monkeypatch, tmp_path):
     mpc.save(tmp_path / "mpc.npz")
     again = km.load_controller(tmp_path / "mpc.npz")
     assert again(x, r).solver == "piqp"
-    assert mpc.program().solver.settings == controller("daqp", 60).program().solver.settings
+    assert mpc.build_program(None).solver.settings == controller("daqp", 60).build_program(None).solver.settings
 
 
 def test_what_has_no_solution_is_left_to_the_condensed_qp(monkeypatch):

@@ -1,1 +1,0 @@
-"""Predictive control on lifted linear models."""

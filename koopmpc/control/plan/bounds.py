@@ -1,0 +1,451 @@
+"""Limits of a plan, step by step: those that hold, and those that rows in time, or a call, bring."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.lib.stride_tricks import sliding_window_view
+
+from koopmpc.checks import HUGE
+from koopmpc.control.cost import LiftedTracking
+from koopmpc.control.in_time.bounds import refuse_crossed_rows
+from koopmpc.control.in_time.preview import check_bounds_alone, require_movable, require_preview
+from koopmpc.control.limits import BOUNDS, Limits, preview_margin
+from koopmpc.control.target import ROUNDING, Targets
+from koopmpc.control.terminal.inclusion import EndReach, measure_reach, require_inside
+from koopmpc.control.terminal.sets import EndRows
+from koopmpc.values import Interval, Value
+
+_SHARE = 1e-5  # a rate that gives way by more than this share of its allowance is reported
+
+
+class StepBounds(NamedTuple):
+    """low ≤ t ≤ high in one step, and the largest |r| of a preview for which no limit moves a target."""
+
+    low: Float[np.ndarray, " nt"]
+    high: Float[np.ndarray, " nt"]
+    reach: float
+
+
+class PlanBounds(Protocol):
+    """The limits of a plan in step after step."""
+
+    def at(self, k: int) -> StepBounds:
+        """Return the limits of step k."""
+        ...
+
+    def place(self, k: int) -> int:
+        """Return the row that step k reads: steps with the same one have the same limits."""
+        ...
+
+    def first(self, k: int) -> tuple[Interval, Interval | None]:
+        """Return the box of the input that acts first in step k, and that of its change."""
+        ...
+
+    def hard_rates(self, k: int) -> Interval | None:
+        """Return the hard limits of the first change in step k, ±inf in place of the others; None without any."""
+        ...
+
+    def moves(self, k: int) -> Interval:
+        """Return the limits of all moves of step k, one after the other."""
+        ...
+
+    def targets(self, k: int) -> Interval | None:
+        """Return the limits (N+1, nl) of the targets of the preview of step k; None for those of `Targets`."""
+        ...
+
+    def open_rates(self, k: int, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval | None, float]:
+        """Return the limits of a plan after u_prev, None where they do not move, and how far rates had to give way."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantBounds(Value):
+    """Limits that hold: each step has the same; see `PlanBounds`."""
+
+    step: StepBounds
+    inputs: Interval
+    rates: Interval | None
+    hard: Interval | None
+    all_moves: Interval
+
+    def at(self, k: int) -> StepBounds:
+        """Return the limits of any step."""
+        return self.step
+
+    def place(self, k: int) -> int:
+        """Return 0, the only row."""
+        return 0
+
+    def first(self, k: int) -> tuple[Interval, Interval | None]:
+        """Return the box of the first input, and that of its change."""
+        return self.inputs, self.rates
+
+    def hard_rates(self, k: int) -> Interval | None:
+        """Return the hard limits of the first change."""
+        return self.hard
+
+    def moves(self, k: int) -> Interval:
+        """Return the limits of all moves."""
+        return self.all_moves
+
+    def targets(self, k: int) -> Interval | None:
+        """Return None: targets have limits of their own."""
+        return None
+
+    def open_rates(self, k: int, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval | None, float]:
+        """Return None, for limits do not move."""
+        return None, 0.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BoundsProgram(Value):
+    """How rows of limits in time become the limits of a plan.
+
+    Attributes
+    ----------
+    first, count
+        (moves, nu) the first step of what holds the value of a move, and for how many steps it does.
+    start
+        (moves,) the first step of each move.
+    held, tied
+        Which moves keep the value of the one before; which of them have no limits of their own, one after the other.
+    margin
+        (N, outputs) by how much each stage moves the limits of outputs inwards.
+    values
+        What the limits of targets count from.
+    checked
+        The limits of targets that a plan is tested by.
+    hard, allowance
+        Which rates are hard, and by how much one may give way before that is reported.
+    outputs
+        Which of the states and observables have a limit, or may get one.
+    """
+
+    first: Int[np.ndarray, "moves nu"]
+    count: Int[np.ndarray, "moves nu"]
+    start: Int[np.ndarray, " moves"]
+    held: Bool[np.ndarray, "moves nu"]
+    tied: Bool[np.ndarray, " all_moves"]
+    margin: Float[np.ndarray, "N outputs"]
+    values: Float[np.ndarray, " nl"]
+    checked: Int[np.ndarray, " nc"]
+    hard: Bool[np.ndarray, " nu"]
+    allowance: Float[np.ndarray, " nu"]
+    outputs: Bool[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanShape(Value):
+    """What of a plan its limits depend on.
+
+    Attributes
+    ----------
+    track, targets
+        What is tracked and limited, and the equilibria.
+    blocks, held, tied
+        Lengths of the blocks of held inputs; moves that keep the value of the one before, and those without limits.
+    end, end_box
+        The rows of a terminal set, and their limits, which do not move.
+    aims_inside, checked
+        Whether limits move the targets of a plan; the limits of targets that a plan is tested by.
+    states, inputs
+        Names of the model.
+    """
+
+    track: LiftedTracking
+    targets: Targets
+    blocks: tuple[int, ...]
+    held: Bool[np.ndarray, "moves nu"]
+    tied: Bool[np.ndarray, " all_moves"]
+    end: EndRows | None
+    end_box: Interval
+    aims_inside: bool
+    checked: Bool[np.ndarray, " nl"]
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+
+
+def describe_bounds(shape: PlanShape) -> BoundsProgram:
+    """Return how rows of limits become the limits of a plan."""
+    track, held, blocks = shape.track, shape.held, np.array(shape.blocks)
+    start = np.cumsum([0, *blocks[:-1]])
+    origin = np.maximum.accumulate(np.where(held, 0, np.arange(len(blocks))[:, None]), axis=0)
+    count = np.array([np.bincount(own, blocks, len(blocks))[own] for own in origin.T], dtype=np.intp).T
+    return BoundsProgram(
+        first=start[origin],
+        count=count,
+        start=start,
+        held=held,
+        tied=shape.tied,
+        margin=preview_margin(track.margin, sum(shape.blocks)),
+        values=shape.targets.values,
+        checked=np.flatnonzero(shape.checked),
+        hard=np.isinf(track.rate_softness.linear),
+        allowance=track.rate_softness.allowance,
+        outputs=track.movable.outputs,
+    )
+
+
+class BoundRows:
+    """Reads rows of limits for the plans of a controller: where each limit of a plan stands in a table of these rows.
+
+    The table has a row for each step: inputs, inputs over each length of a block, their changes, outputs, a column
+    without limits, and the terminal set.
+
+    Parameters
+    ----------
+    shape
+        What of a plan its limits depend on.
+    latency
+        Steps until the first input of a plan acts.
+    """
+
+    def __init__(self, shape: PlanShape, latency: int) -> None:
+        self.shape, self.latency, self.N = shape, latency, sum(shape.blocks)
+        track, targets = shape.track, shape.targets
+        self.program = rows = describe_bounds(shape)
+        self.nu, self.rated, outs = len(track.inputs.low), track.rates is not None, len(track.outputs.low)
+        self.names = [*shape.states, *(() if track.limits.of is None else track.limits.of.bind(shape.states).names)]
+        self.kept = np.flatnonzero(track.movable.outputs)
+        self.lengths = sorted({1, *rows.count.ravel().tolist()})  # the first one is 1
+        nu, ends, blocked = self.nu, len(shape.end_box.low), self.lengths[1:]
+        widths = [nu, *([nu] * len(blocked)), nu * self.rated, outs, 1, ends]
+        first = np.cumsum([0, *widths]).tolist()
+        W, (change, output, free, end) = first[-1], first[-5:-1]
+        column = dict(zip(self.lengths, first, strict=False))
+        moves = rows.first * W + np.vectorize(column.__getitem__, otypes=[np.intp])(rows.count) + np.arange(nu)
+        places: list[np.ndarray] = [np.where(shape.tied, free, moves.ravel())]
+        if self.rated:
+            changes: Int[np.ndarray, "moves nu"] = rows.start[:, None] * W + change + np.arange(nu)
+            changes[shape.held] = free
+            places.append(changes.ravel())
+        places.append((np.arange(1, self.N + 1)[:, None] * W + output + np.arange(outs)).ravel())
+        places.append(end + np.arange(ends))
+        self.places, self.moves = np.concatenate(places).astype(np.intp), moves.ravel()
+        stop = len(self.places) - ends
+        self.outputs = slice(stop - self.N * outs, stop)
+        self.margin = rows.margin.ravel() if track.margin.any() else None
+        self.most = track.margin.max(axis=0, initial=0.0)
+        self.limited = np.concatenate([track.movable.inputs, np.ones(outs, np.bool_)])
+        self.rounding = ROUNDING * targets.size[self.limited]
+        self.K = targets.rows[self.limited] @ targets.from_reference
+        self.shift = targets.rows[self.limited] @ targets.offset
+        self.checked = np.flatnonzero(shape.checked[self.limited])
+        self.reach: EndReach | None = None  # the extremes on the terminal set, once they are asked for
+
+    def read(self, limits: Limits, *, at_call: bool) -> "BoundsInTime":
+        """Return the limits of each step; `at_call` says that row 0 is that of the present step, and the only one.
+
+        Raises
+        ------
+        DataError
+            A limit has no row in the plan; limits cross in some step; the terminal set leaves limits of later rows.
+        ShapeError
+            A bound has too few rows for the plan, or as many signals as it should not.
+        """
+        shape, track, nx = self.shape, self.shape.track, len(self.shape.states)
+        if at_call:
+            require_preview(limits, self.N + self.latency)
+        steps = 1 if at_call else max(limits.count_rows().values(), default=1)
+        count = steps + self.latency + self.N
+        box, change = limits.input_rows(self.nu, 0, count), limits.rate_rows(self.nu, 0, count)
+        every = limits.output_rows(nx, len(self.names) - nx, 0, count)
+        require_movable(track.movable, (box, change, every), shape.inputs, self.names, nx)
+        outputs = Interval(every.low[:, self.kept], every.high[:, self.kept])
+        swept = {b: sweep_rows(box, b) for b in self.lengths}
+        for b, rows in swept.items():
+            used = (self.program.count == b).any(axis=0) | (b == 1)
+            self._require_inputs(rows, used, f" within a block of {b} held steps" if b > 1 else "")
+        refuse_crossed_rows(*change, "rate", shape.inputs)
+        why, shown = " once tightened by the margin" if self.most.any() else "", [self.names[i] for i in self.kept]
+        tight = Interval(outputs.low + self.most, outputs.high - self.most)
+        refuse_crossed_rows(*tight, "state and output", shown, why=why)
+        if shape.end is not None:
+            self._require_end(shape.end, limits, (box, change, tight), shown)
+        return BoundsInTime(self, steps, [swept[b] for b in self.lengths], change, outputs)
+
+    def _require_inputs(self, box: Interval, used: Bool[np.ndarray, " nu"], why: str) -> None:
+        """Raise where limits of inputs cross, or an input on levels has none between them, of the inputs in use."""
+        limits, inputs = self.shape.track.limits, self.shape.inputs
+        levels = None if limits.levels is None else limits.base.input_levels(len(inputs))
+        low, high = np.where(used, box.low, -np.inf), np.where(used, box.high, np.inf)
+        if levels is not None:
+            levels.refuse_missing(Interval(low, high), inputs, why)
+        refuse_crossed_rows(low, high, "input", inputs, why=why)
+
+    def _require_end(
+        self, end: EndRows, limits: Limits, rows: tuple[Interval, Interval, Interval], shown: Sequence[str]
+    ) -> None:
+        """Raise where the terminal set leaves limits of the inputs, their changes or the outputs after a plan's end."""
+        (box, change, outputs), inputs, first = rows, self.shape.inputs, self.N + self.latency
+        if self.reach is None:
+            self.reach = measure_reach(end.of, end.places, self.shape.track.limited, end.constant)
+        require_inside("state and output", self.reach.outputs, outputs, first + 1, shown, moved=True)
+        for what, reach, field, bounds in (
+            ("input", self.reach.inputs, "u_", box),
+            ("rate", self.reach.rates, "du_", change),
+        ):
+            moved = any(name.startswith(field) for name in limits.count_rows())
+            require_inside(what, reach, bounds, first, inputs, moved=moved)
+
+
+class BoundsInTime:
+    """Limits that move: each step takes them from a table of checked rows; see `PlanBounds` and `BoundRows`."""
+
+    def __init__(
+        self, rows: BoundRows, steps: int, boxes: Sequence[Interval], change: Interval, outputs: Interval
+    ) -> None:
+        self._rows, self._last, self._box = rows, steps - 1, boxes[0]
+        shape, count = rows.shape, len(change.low)
+        self._rates = change if rows.rated else None
+        targets = shape.targets
+        self._targets = Interval(*(np.hstack([a, b]) - targets.values for a, b in zip(boxes[0], outputs, strict=True)))
+        tables: list[np.ndarray] = []
+        for i, free in enumerate((-HUGE, HUGE)):
+            parts = [box[i] for box in boxes] + ([change[i]] if rows.rated else []) + [outputs[i]]
+            ends = np.broadcast_to(shape.end_box[i], (count, len(shape.end_box[i])))
+            tables.append(np.clip(np.hstack([*parts, np.full((count, 1), free), ends]), -HUGE, HUGE))
+        self._low, self._high, self._width = tables[0].ravel(), tables[1].ravel(), tables[0].shape[1]
+        self._reaches: list[float] | None = None
+        if shape.aims_inside or len(rows.checked):
+            first = slice(rows.latency, rows.latency + steps)
+            limited = Interval(*(end[:, rows.limited] for end in self._targets))
+            swept = sweep_rows(limited, rows.N + 1)
+            self._tight = Interval(swept.low[first] - rows.rounding, swept.high[first] + rows.rounding)
+            if shape.aims_inside:
+                tight = (end - rows.shift for end in self._tight)
+                self._reaches = find_reach(rows.K, *tight).tolist()
+
+    def place(self, k: int) -> int:
+        """Return the row of the table that step k begins with."""
+        return min(k, self._last) + self._rows.latency
+
+    def at(self, k: int) -> StepBounds:
+        """Return the limits of step k."""
+        k, rows = min(k, self._last), self._rows
+        places = rows.places + (k + rows.latency) * self._width
+        low, high = self._low.take(places), self._high.take(places)
+        if rows.margin is not None:
+            low[rows.outputs] += rows.margin
+            high[rows.outputs] -= rows.margin
+        if len(rows.checked):
+            free = np.full(len(rows.checked), HUGE)
+            low = np.concatenate([low, np.maximum(self._tight.low[k, rows.checked], -HUGE), -free])
+            high = np.concatenate([high, free, np.minimum(self._tight.high[k, rows.checked], HUGE)])
+        return StepBounds(low, high, HUGE if self._reaches is None else self._reaches[k])
+
+    def first(self, k: int) -> tuple[Interval, Interval | None]:
+        """Return the box of the input that acts first in step k, and that of its change."""
+        row, rates = self.place(k), self._rates
+        change = None if rates is None else Interval(rates.low[row], rates.high[row])
+        return Interval(self._box.low[row], self._box.high[row]), change
+
+    def hard_rates(self, k: int) -> Interval | None:
+        """Return the hard limits of the first change in step k, ±inf in place of the others; None without any."""
+        hard, rates = self._rows.program.hard, self.first(k)[1]
+        if rates is None or not hard.any():
+            return None
+        return Interval(np.where(hard, rates.low, -np.inf), np.where(hard, rates.high, np.inf))
+
+    def moves(self, k: int) -> Interval:
+        """Return the limits of all moves of step k, one after the other."""
+        places = self._rows.moves + self.place(k) * self._width
+        return Interval(self._low.take(places), self._high.take(places))
+
+    def targets(self, k: int) -> Interval:
+        """Return the (N+1, nl) limits of the targets of the preview of step k."""
+        ahead = slice(self.place(k), self.place(k) + self._rows.N + 1)
+        return Interval(self._targets.low[ahead], self._targets.high[ahead])
+
+    def open_rates(self, k: int, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval, float]:
+        """Return the limits of a plan after u_prev, and by how much rates ahead are wider than theirs.
+
+        Where the limits of an input move by more than its hard rate, they win. The inputs that can be reached inside
+        all limits are followed from move to move; the rates of the first move are left as they are.
+        """
+        (low, high, _), rows, program = self.at(k), self._rows, self._rows.program
+        planned, hard, held = Interval(low, high), program.hard, program.held
+        if not (rows.rated and hard.any()):
+            return planned, 0.0
+        n = held.size
+        below, above = (end.reshape(held.shape) for end in self.moves(k))
+        falls, rises = low[n : 2 * n].reshape(held.shape), high[n : 2 * n].reshape(held.shape)
+        fits = (below[1:] - below[:-1] <= rises[1:]) & (above[1:] - above[:-1] >= falls[1:])
+        if (fits | held[1:] | ~hard).all():
+            return planned, 0.0
+        least, most = (np.clip(u_prev + change[0], below[0], above[0]) for change in (falls, rises))
+        conflict = np.zeros(held.shape[1])
+        for j in range(1, len(held)):
+            least, most = least + np.where(held[j], 0.0, falls[j]), most + np.where(held[j], 0.0, rises[j])
+            short, long = hard & (most < below[j]), hard & (least > above[j])
+            missing = np.where(short, below[j] - most, 0.0) + np.where(long, least - above[j], 0.0)
+            rises[j] += np.where(short, missing, 0.0)
+            falls[j] -= np.where(long, missing, 0.0)
+            conflict = np.maximum(conflict, missing)
+            least, most = np.clip(least, below[j], above[j]), np.clip(most, below[j], above[j])
+        return planned, float(conflict[conflict > _SHARE * program.allowance].max(initial=0.0))
+
+
+class CallBounds:
+    """Reads the limits of calls: those that `with_bounds` of the controller's own made by their numbers alone.
+
+    Parameters
+    ----------
+    rows
+        Reads rows of limits for the controller.
+    """
+
+    def __init__(self, rows: BoundRows) -> None:
+        self._rows, self._limits = rows, rows.shape.track.limits
+        self._last: tuple[Limits, BoundsInTime] | None = None
+
+    def read(self, limits: Limits) -> BoundsInTime:
+        """Return the limits of a call.
+
+        Raises
+        ------
+        DataError
+            They differ from the controller's own in more than bounds, cross, or have no row in the plan.
+        ShapeError
+            A bound has too few rows for the plan.
+        """
+        if self._last is None or self._last[0] is not limits:
+            shape, known = self._rows.shape, limits
+            if not has_fields_of(limits, self._limits):
+                known = check_bounds_alone(limits, self._limits, shape.states, shape.inputs)
+            self._last = limits, self._rows.read(known, at_call=True)
+        return self._last[1]
+
+
+def has_fields_of(limits: object, own: Limits) -> bool:
+    """Return whether limits were made by `with_bounds` of these, or of others like them: all but bounds is the same."""
+    if not isinstance(limits, Limits):
+        return False
+    mine = vars(own)
+    return all(
+        not isinstance(value, Mapping) if name in BOUNDS else value is mine[name]
+        for name, value in vars(limits).items()
+    )
+
+
+def find_reach(
+    K: Float[np.ndarray, "nl nr"], low: Float[np.ndarray, "T nl"], high: Float[np.ndarray, "T nl"]
+) -> Float[np.ndarray, " T"]:
+    """Return the largest a for which low ≤ K r ≤ high wherever no |r_i| is above a; below 0 where there is none."""
+    room, size = np.minimum(high, -low), np.abs(K).sum(axis=1)
+    moved = size > 0
+    reach = np.where(moved, room / np.where(moved, size, 1.0), np.where(room >= 0, HUGE, -1.0))
+    return np.minimum(reach.min(axis=-1, initial=HUGE), HUGE)
+
+
+def sweep_rows(rows: Interval, steps: int) -> Interval:
+    """Return the tightest limits over so many steps from each one on; the last row is held."""
+    if steps == 1:
+        return rows
+    low, high = (np.vstack([end, np.broadcast_to(end[-1], (steps - 1, end.shape[1]))]) for end in rows)
+    return Interval(
+        sliding_window_view(low, steps, axis=0).max(axis=-1), sliding_window_view(high, steps, axis=0).min(axis=-1)
+    )

@@ -1,0 +1,134 @@
+"""ControlTask: what a controller on a linear model is asked to do, checked, with names and units resolved."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from koopmpc import checks
+from koopmpc.control.cost import Cost, LiftedTracking, lifted_tracking
+from koopmpc.control.horizon import Coordinates
+from koopmpc.control.limits import Limits
+from koopmpc.control.solvers import order
+from koopmpc.control.stepped.blocks import MoveBlocks, Moves, find_move_blocks
+from koopmpc.control.stepped.priorities import weigh_priorities
+from koopmpc.errors import DataError
+from koopmpc.estimate.observer import Estimator
+from koopmpc.predict.predictors import LinearPredictor
+
+_LIKE = ("lifting", "dt", "states", "inputs", "disturbances")  # of a predictor that takes the place of another one
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlTask:
+    """What is asked of a controller.
+
+    Attributes
+    ----------
+    predictor, track
+        The model, and what is tracked and limited.
+    moves, latency
+        The blocks of held inputs, and steps until an input acts.
+    estimator, time_limit
+        Those of the controller; `None` without.
+    periodic
+        Whether the estimator forecasts a periodic disturbance.
+    solver, settings
+        The solver that is asked first, by name, and its own settings.
+    auto
+        Whether the solver was left to the rule, so that a sparse one may be asked, too.
+    coordinates
+        Variables of the QP.
+    by_weights
+        Whether weights stand for priorities, as in C.
+    """
+
+    predictor: LinearPredictor
+    track: LiftedTracking
+    moves: MoveBlocks
+    latency: int
+    estimator: Estimator | None
+    time_limit: float | None
+    periodic: bool
+    solver: str
+    settings: Mapping[str, Any]
+    auto: bool
+    coordinates: Coordinates
+    by_weights: bool = False
+
+    @property
+    def N(self) -> int:
+        """Steps of the plan."""
+        return sum(self.moves.lengths)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether a solver may want the QP before condensing, a stage a step."""
+        return self.solver == order.SPARSE or self.N >= order.LONG
+
+    def with_predictor(self, predictor: LinearPredictor) -> "ControlTask":
+        """Return the task on another predictor of the same lifting.
+
+        Raises
+        ------
+        DataError
+            The predictor has another lifting, dt, other states, inputs or disturbances than the last one.
+        """
+        checks.kind(predictor, "predictor", LinearPredictor, "it replaces another LinearPredictor")
+        for name in _LIKE:
+            if getattr(predictor, name) != getattr(self.predictor, name):
+                raise DataError(f"the predictor has another {name} than the controller's; make a new controller")
+        track = _track(predictor, self.track.cost, self.track.limits, by_weights=self.by_weights)
+        return replace(self, predictor=predictor, track=track)
+
+    def for_c(self, solver: str) -> "ControlTask":
+        """Return the task as C solves it: by the finisher, in Riccati coordinates, with weights for priorities."""
+        weighed = self.track.limits.priority is not None
+        track = _track(self.predictor, self.track.cost, self.track.limits, by_weights=True) if weighed else self.track
+        settings: Mapping[str, Any] = self.settings if self.solver == solver else {}
+        return replace(
+            self, track=track, solver=solver, settings=settings, auto=False, coordinates="riccati", by_weights=weighed
+        )
+
+
+def read_task(
+    predictor: LinearPredictor,
+    cost: Cost,
+    limits: Limits | None,
+    horizon: int,
+    moves: Moves,
+    latency: int,
+    solver: str,
+    settings: Mapping[str, Any],
+) -> ControlTask:
+    """Return the task of a controller without an estimator.
+
+    Raises
+    ------
+    ObservableError
+        The cost or a limit is on an observable that the lifting lacks.
+    DataError, ShapeError
+        There is no such solver; a horizon below 1, crossed limits, sizes that do not fit.
+    """
+    first = order.order_solvers(solver, settings)[0].solver
+    return ControlTask(
+        predictor=predictor,
+        track=_track(predictor, cost, limits, by_weights=False),
+        moves=find_move_blocks(moves, checks.count(horizon, "horizon"), predictor.inputs),
+        latency=checks.count(latency, "latency", 0),
+        estimator=None,
+        time_limit=None,
+        periodic=False,
+        solver=first.name,
+        settings=settings,
+        auto=solver == "auto",
+        coordinates=first.coordinates,
+    )
+
+
+def _track(predictor: LinearPredictor, cost: Cost, limits: Limits | None, *, by_weights: bool) -> LiftedTracking:
+    """Return what is tracked and limited; beside levels, and in C, weights stand for priorities."""
+    track = lifted_tracking(predictor, cost, limits, in_time=True)
+    if track.limits.priority is None or not (by_weights or track.limits.levels is not None):
+        return track
+    who = "its C code" if by_weights else "a KoopmanMPC with levels"
+    return replace(track, softness=weigh_priorities(track.softness, track.limits, predictor.states, who))

@@ -1,0 +1,184 @@
+"""InitialCondition: where the plan of a step starts, from y, the inputs that acted and the measured disturbances."""
+
+from collections import deque
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from koopmpc import checks
+from koopmpc.checks import HUGE, numbers
+from koopmpc.errors import DataError, ShapeError
+from koopmpc.estimate.observer import Measured, StateObserver, state_model
+
+
+class InitialCondition:
+    """known = [z; u_{−1}; w_0 … w_{N−1}; d] of the step at which an input computed now acts, L steps from now.
+
+    z is predicted over these L steps, z ← F(z, u) + E w + d with the inputs that are still to act. u_{−1} is there
+    where the change of inputs counts, d where it is estimated. Where the observer forecasts a periodic disturbance,
+    w_k is [w_k; p_k] in `known`.
+
+    Parameters
+    ----------
+    model, observer
+        The model, a predictor or a `StateModel`, predicts; the observer gives z and d of the step of y.
+    N, latency
+        Steps of the plan; L ≥ 0.
+    with_rates, estimated
+        Whether u_{−1} is needed, and whether the observer finds d.
+    """
+
+    def __init__(
+        self, model: Any, observer: StateObserver, N: int, latency: int, *, with_rates: bool, estimated: bool
+    ) -> None:
+        model = state_model(model)
+        self._model, self.observer, self._latency, self._N = model, observer, latency, N
+        self._nz, self._nw, self._estimated = model.nz, model.nw, estimated
+        more = estimated or latency or with_rates or model.nw or model.embedding is not None
+        self._measured = None if more or not isinstance(observer, Measured) else observer  # set if z depends on y alone
+        self._shape = (observer.ny,)
+        self._np = model.nz if hasattr(observer, "forecast") else 0  # entries of a periodic disturbance
+        self._first = model.nz + model.nu * with_rates  # where the disturbances begin
+        self._d = self._first + N * (model.nw + self._np)  # where d begins
+        self.known = np.zeros(self._d + model.nz * estimated)
+        self.refused = False  # whether the observer refused the last y
+        self._ahead = np.zeros((latency + 1, model.nw))
+        self._sent: deque[Float[np.ndarray, " nu"]] = deque(maxlen=latency + 1)
+
+    @property
+    def z(self) -> Float[np.ndarray, " nz"]:
+        """The state at which the plan starts."""
+        return self.known[: self._nz]
+
+    @property
+    def u_prev(self) -> Float[np.ndarray, " nu"]:
+        """The input before the plan's first one; empty where it does not count."""
+        return self.known[self._nz : self._first]
+
+    @property
+    def drive(self) -> Float[np.ndarray, " ng"]:
+        """All disturbances of the plan, one after the other."""
+        return self.known[self._first :]
+
+    @property
+    def d(self) -> Float[np.ndarray, " nd"]:
+        """The estimated disturbance; empty where none is."""
+        return self.known[self._d :]
+
+    @property
+    def W(self) -> Float[np.ndarray, "N nw"]:
+        """The measured disturbances w_0 … w_{N−1}."""
+        return self._pushes[:, : self._nw]
+
+    @property
+    def periodic(self) -> Float[np.ndarray, "N np"]:
+        """The forecast of a periodic disturbance; without columns where there is none."""
+        return self._pushes[:, self._nw :]
+
+    @property
+    def _pushes(self) -> Float[np.ndarray, "N nw_np"]:
+        return self.known[self._first : self._d].reshape(self._N, -1)
+
+    def reset(self, x0: ArrayLike | None, last: Float[np.ndarray, " nu"]) -> None:
+        """Start at x0, where it is known, with the input `last` acting until the first one arrives."""
+        x0 = checks.start(x0, self._model.ny)
+        self.refused = False
+        if self._measured is None:  # else there is nothing that it remembers
+            self.observer.reset(x0)
+        self.drive[:] = 0.0
+        self._sent.extend([last.copy()] * (self._latency + 1))
+        self._w = np.zeros(self._nw)
+
+    def update(self, model: Any) -> None:
+        """Go on with another model of the same sizes."""
+        self._model = state_model(model)
+        self.observer.update(model)
+
+    def take(
+        self, y: ArrayLike, last: Float[np.ndarray, " nu"], applied: ArrayLike | None, w: ArrayLike | None
+    ) -> None:
+        """Take y_k and store where the plan starts; z is NaN where y cannot be used.
+
+        Parameters
+        ----------
+        last
+            The input that was computed last.
+        applied
+            The input that acted since the last call; if it is missing or not finite, the input that was computed L + 1
+            calls ago.
+        w
+            (nw,), or rows w_k … w_{k+L+N−1}, the last repeated; zero by default.
+        """
+        measured, observer = numbers(y, "y"), self.observer
+        got = None if applied is None else numbers(applied, "applied")
+        if got is not None and got.shape != last.shape:
+            raise ShapeError(f"applied has shape {got.shape}, expected {last.shape}")
+        plain = self._measured
+        if plain is not None and w is None and measured.shape == self._shape:
+            lift = plain.lift
+            if lift is None:
+                self.known[:] = measured
+            else:
+                lift.arguments[0][:] = measured
+                lift.evaluate()
+                self.known[:] = lift.results[0]
+            plain.z = self.known
+            return
+        if measured.shape != self._shape:
+            what = "measurement of the estimator" if self._estimated else "state"
+            raise ShapeError(f"y has shape {measured.shape}, expected {self._shape}, one value a {what}")
+        if got is not None and not (np.abs(got) < HUGE).all():
+            got = None
+        if self._first > self._nz:  # what acts before the plan's first input
+            self.u_prev[:] = last if got is None or self._latency else got
+        if self._nw or w is not None:
+            self._preview(w)
+        acted = last
+        if self._latency:
+            self._sent.append(last.copy())
+            acted = self._sent[0]
+        if got is not None:
+            acted = got
+        good = observer.observe(measured, acted, self._w)
+        self.refused = getattr(observer, "refused", False)
+        if self._nw:  # a disturbance that is not finite keeps its last value
+            self._w = np.where(np.abs(self._ahead[0]) < HUGE, self._ahead[0], self._w)
+            stand_in = getattr(observer, "stand_in_w", None)
+            if stand_in is not None:
+                self._hold(stand_in, w is None or np.ndim(w) == 1 or len(np.asarray(w)) == 1)
+        z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
+        p = np.zeros((self._latency, 1))
+        if self._np:
+            forecast: np.ndarray = cast("Any", observer).forecast(self._latency + self._N)
+            p, self.periodic[:] = forecast[: self._latency], forecast[self._latency :]
+        for i in range(self._latency):
+            z = self._model.advance(z, self._sent[i + 1], self._ahead[i], d + p[i])
+        self.z[:] = z
+        if self._estimated:
+            self.d[:] = d
+
+    def _hold(self, w: Float[np.ndarray, " nw"], constant: bool) -> None:
+        """Plan with this w, the last one that was not wild; of a preview only its first row changes."""
+        count = None if constant else 1
+        self._ahead[:count] = w
+        if constant or not self._latency:
+            self.W[:count] = w
+
+    def _preview(self, w: ArrayLike | None) -> None:
+        """Store the preview of the measured disturbances."""
+        if w is None:
+            self.W[:] = self._ahead[:] = 0.0
+            return
+        rows, nw = numbers(w, "w"), self._nw
+        if nw == 0:
+            raise DataError("w was passed, but the predictor has no E; fit it on episodes that hold W")
+        steps = self._N + self._latency
+        if rows.shape != (nw,) and (rows.ndim != 2 or rows.shape[1] != nw or len(rows) == 0):
+            raise ShapeError(f"w has shape {rows.shape}, expected ({nw},), or rows of {nw} for steps k … k+{steps - 1}")
+        if rows.ndim == 2 and len(rows) != steps:
+            rows = rows[np.minimum(np.arange(steps), len(rows) - 1)]
+        rows = np.where(np.abs(rows) < HUGE, rows, np.nan)  # products with inf, or of what is larger, would warn
+        self._ahead[:] = rows if rows.ndim == 1 else rows[: self._latency + 1]
+        self.W[:] = rows if rows.ndim == 1 else rows[self._latency :]
