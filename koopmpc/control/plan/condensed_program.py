@@ -126,20 +126,10 @@ class CondensedProgram(CondensedPlan, LinearProgram):
 
     COMPUTED: ClassVar[tuple[str, ...]] = (*LinearProgram.COMPUTED, "solver", "estimator", "levels")
     IN_PYTHON: ClassVar[frozenset[str]] = frozenset(
-        [
-            "blocks",
-            "plans",
-            "step_bounds",
-            "input_levels",
-            "priority",
-            "rule",
-            "time_limit",
-            "solver_name",
-            "solver_settings",
-            "coordinates",
-            "ball",
-            "from_held",
-        ]
+        (
+            *("blocks", "plans", "step_bounds", "input_levels", "priority", "rule", "time_limit", "solver_name"),
+            *("solver_settings", "coordinates", "ball", "from_held"),
+        )
     )
 
     N: int
