@@ -1,7 +1,6 @@
 """The most solver iterations of a step: proved by `bound_iterations`, or observed by `observe_iterations`."""
 
 from dataclasses import dataclass
-from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -145,7 +144,7 @@ def bound_iterations(
 
 def _require_plain(controller: KoopmanMPC) -> CondensedProgram:
     """Return the controller's program; raise where it has a part that the analysis does not know."""
-    model, program = controller.predictor, cast("CondensedProgram", controller.program())
+    model, program = controller.predictor, controller.build_program(None)
     moving = model.nz + model.nu * program.with_rates
     if program.M.shape[1] > moving or program.latency or model.embedding is not None:
         raise DataError(
