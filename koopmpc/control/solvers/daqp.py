@@ -103,7 +103,8 @@ def daqp_settings(settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
     DataError
         DAQP has no such setting, or the value is out of range.
     """
-    return dict(_model(settings or {}).settings)
+    known = settings or {}
+    return {**_model(known).settings, _COLD: bool(known.get(_COLD, False))}
 
 
 class DAQP(QPSolver):
