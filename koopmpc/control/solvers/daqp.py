@@ -188,15 +188,6 @@ class DAQP(QPSolver):
         """Go on with another QP of the same size: DAQP's setup is one factorisation."""
         self.__init__(qp, self._settings)
 
-    def exchange_row(self, i: int, row: Float[np.ndarray, " n"]) -> None:
-        """Go on with another row i, which is written into the QP's own A; its limits and its price stay."""
-        A = self._qp.A
-        A[i] = row
-        self._M[i] = row * self._columns * self._rows[i]
-        self._model.update(A=self._M)
-        self._hard, self._is_steep, self._unmet, self.resumes = None, None, False, False
-        self._lighter.clear()
-
     def _forget(self) -> None:
         """Forget how hard the last solve was: a solve starts from its y alone."""
         self._far = False
