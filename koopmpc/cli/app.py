@@ -1,6 +1,7 @@
 """The command line: each command parses, calls one function, and prints; and the words that `explain` knows."""
 
 from contextlib import suppress
+from dataclasses import fields, replace
 from pathlib import Path
 from threading import Event
 from typing import Annotated, Any, cast
@@ -21,15 +22,21 @@ from koopmpc.cli.console import (
     new_folder,
     say,
     say_page,
-    split,
     split_columns,
 )
 from koopmpc.cli.explain import explain
+from koopmpc.cli.options import take_options
 from koopmpc.cli.sweeps import Logs
 from koopmpc.errors import DataError, KoopmpcError, ProblemError
+from koopmpc.fitting.options import FitOptions
 
 app = typer.Typer(name="koopmpc", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
+IN_SHELL = [field.name for field in fields(FitOptions) if field.name != "reading"]
+FIT_HELP = {  # of the lists that a shell writes with commas
+    "inputs": 'Columns that are inputs: u,v,… or 2; "" where there are none.',
+    "columns": "Names to use: old=new,old=new,…; or of all columns: a,b,…",
+}
 LogFiles = Annotated[list[Path], typer.Argument(help="Logs that koopmpc wrote.")]
 
 
@@ -80,66 +87,30 @@ def new(name: Annotated[str, typer.Argument(help="Name of the problem; the file 
 
 
 @app.command()
+@take_options(FitOptions, IN_SHELL, help=FIT_HELP)
 def fit(
     data: Annotated[
         list[Path],
         typer.Argument(help="A folder of logs, or files: .csv, .parquet, .npz, .rrd, .mat, .h5, .mf4, .mcap, .db3."),
     ],
-    states: Annotated[
-        str | None, typer.Option("--states", help="Columns of a table that are states or outputs: a,b,… or 3,4.")
-    ] = None,
-    inputs: Annotated[
-        str | None, typer.Option("--inputs", help='Columns that are inputs: u,v,… or 2; "" where there are none.')
-    ] = None,
-    columns: Annotated[
-        str | None, typer.Option("--columns", help="Names to use: old=new,old=new,…; or of all columns: a,b,…")
-    ] = None,
-    dt: Annotated[float | None, typer.Option("--dt", help="Sample time in s, where no column tells it.")] = None,
-    resample: Annotated[
-        float | None, typer.Option("--resample", help="Sample time in s to bring unequal steps to.")
-    ] = None,
-    horizon: Annotated[
-        int | None, typer.Option("--horizon", help="Steps ahead that the model is chosen and judged by.")
-    ] = None,
-    linear: Annotated[bool, typer.Option("--linear", help="Try linear models only.")] = False,
-    feedthrough: Annotated[
-        bool, typer.Option("--feedthrough", help="Inputs act on the outputs of their own row: y = h(x, u).")
-    ] = False,
-    workers: Annotated[
-        int | None, typer.Option("--workers", help="Local processes, or those of --scheduler local.")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", help='tcp://host:port of a Dask cluster, or "local".')
-    ] = None,
+    *,
+    options: FitOptions,
     logs: Logs = Path("logs"),
     name: Annotated[str, typer.Option("--name", help="Ends the name of the folder.")] = "fit",
     goal: Annotated[Path | None, typer.Option("--goal", help="A goal file: design a controller that keeps it.")] = None,
-    coverage: Annotated[
-        float | None, typer.Option("--coverage", help="With a goal: share of loops that are to keep their limits.")
-    ] = None,
-    certify: Annotated[
-        bool, typer.Option("--certify", help="With a goal: seek a certificate of stability, and write its page.")
-    ] = False,
     goal_template: Annotated[
         bool, typer.Option("--goal-template", help="Write goal.toml for these logs, to be changed, and stop.")
     ] = False,
-    set_point: Annotated[
-        str | None,
-        typer.Option("--set-point", help="With --goal: columns with set points of the loop that made the logs, r,s,…"),
-    ] = None,
 ) -> None:
     """Choose a model for logged data, fit it, and say whether to trust it; with a goal, design a controller."""
+    from koopmpc.fitting.designing import design_data
     from koopmpc.fitting.fit import fit_data
-    from koopmpc.fitting.goal import design_data, write_template
+    from koopmpc.fitting.goal import write_template
 
     source: Any = data[0] if len(data) == 1 else data
-    reading: dict[str, Any] = {
-        "dt": dt,
-        "states": None if states is None else split(states),
-        "inputs": None if inputs is None else split(inputs),
-        "resample": resample,
-        "columns": None if columns is None else split_columns(columns),
-    }
+    with friendly():
+        if options.columns is not None:
+            options = replace(options, columns=split_columns(",".join(options.columns)))
 
     def say_line(text: str) -> None:
         notes = (as_options(line) if line.startswith("! ") else line for line in text.split("\n"))
@@ -147,56 +118,36 @@ def fit(
 
     if goal_template:
         with friendly():
-            path = new_file(Path("goal.toml"), write_template(source, horizon=horizon, say=say_line, **reading))
+            path = new_file(Path("goal.toml"), write_template(source, options, say=say_line))
         say(f"written: {path}; say in it what you want")
-        more = ["--linear"] * linear + ["--feedthrough"] * feedthrough
+        more = ["--linear"] * options.linear + ["--feedthrough"] * options.feedthrough
         for option, value, usual in (
-            ("--workers", workers, None),
-            ("--scheduler", scheduler, None),
+            ("--workers", options.workers, None),
+            ("--scheduler", options.scheduler, None),
             ("--logs", logs, Path("logs")),
             ("--name", name, "fit"),
         ):
             more += [option, str(value)] * (value != usual)
         say(f"then: {format_command('fit', *data, '--goal', path, *more)}")
-        return
-
-    how: dict[str, Any] = {
-        "bilinear": not linear,
-        "workers": workers,
-        "scheduler": scheduler,
-        "say": say_line,
-        **reading,
-    }
-    if goal is not None:
+    elif goal is not None:
         with friendly():
-            if horizon is not None:
+            if (horizon := options.horizon) is not None:
                 raise DataError(f"--horizon {horizon} is of no use with --goal; write horizon = {horizon} into {goal}")
         with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
-            designed = design_data(
-                source,
-                goal,
-                folder,
-                feedthrough=feedthrough,
-                coverage=coverage,
-                certify=certify,
-                progress=progress,
-                set_points=() if set_point is None else split(set_point),
-                **how,
-            )
+            designed = design_data(source, goal, folder, options, say=say_line, progress=progress)
         say(f"controller: {designed.controller}, report: {designed.page}")
         say(f"check it: {format_command('check', designed.controller)}\nuse it:\n{designed.usage}")
-        return
-    if coverage is not None or certify:
+    else:
         with friendly():
-            raise DataError("--coverage and --certify are for a controller; pass --goal, too")
-    with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
-        done = fit_data(source, folder, horizon=horizon, feedthrough=feedthrough, progress=progress, **how)
-    for failure in done.failures:
-        Console(stderr=True).print(Text.assemble(("not made: ", "yellow"), failure), soft_wrap=True)
-    say(f"model, report and pictures: {folder}")
-    if done.recording is not None:
-        say(f"look at it: {format_command('view', done.recording)}")
-    say(f"use it:\n{done.usage}")
+            options.refuse_design()
+        with friendly(), folder_of(logs, name) as folder, bar("reading") as progress:
+            done = fit_data(source, folder, options, say=say_line, progress=progress)
+        for failure in done.failures:
+            Console(stderr=True).print(Text.assemble(("not made: ", "yellow"), failure), soft_wrap=True)
+        say(f"model, report and pictures: {folder}")
+        if done.recording is not None:
+            say(f"look at it: {format_command('view', done.recording)}")
+        say(f"use it:\n{done.usage}")
 
 
 @app.command()
@@ -290,8 +241,6 @@ def run_export(
 
 def _read_rows(text: str) -> list[list[float]]:
     """Return the numbers of rows such as "0,0; 0.5,0"."""
-    from koopmpc.errors import DataError
-
     try:
         return [[float(word) for word in row.split(",")] for row in text.split(";") if row.strip()]
     except ValueError as error:

@@ -12,13 +12,23 @@ from jaxtyping import Float
 
 from koopmpc import checks
 from koopmpc.control.limits import Interval
-from koopmpc.control.move import Status
 from koopmpc.data.episodes import Episodes
 from koopmpc.errors import LogError
-from koopmpc.fitting.changed import ComparedLogs, compare_logs
-from koopmpc.fitting.report import OFF, write_design_report
-from koopmpc.fitting.verdict import PlantVerdict, RateVerdict, judge_plant_runs, judge_rate, plan_verdict
-from koopmpc.loop.faults import ActuatorLoss, DroppedSamples, Fault, FrozenSensor, NaNSensor, SensorDelay, SolverFailure
+from koopmpc.fitting.changed import compare_logs
+from koopmpc.fitting.checked import (
+    _GOOD,
+    _VERDICTS,
+    ALLOWED_OFF,
+    Checked,
+    Figures,
+    RunKind,
+    _explain_cost,
+    _list_headings,
+    _row,
+    kinds,
+)
+from koopmpc.fitting.report import write_design_report
+from koopmpc.fitting.verdict import judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.loop.metrics import total_cost, tracking_error, violation_shares
 from koopmpc.loop.rows import Step
 from koopmpc.page import HtmlPage
@@ -29,170 +39,11 @@ from koopmpc.synthesis.doubts import explain_unreachable
 from koopmpc.synthesis.loops.judging import read_reference, run_on_surrogate
 from koopmpc.synthesis.search.recipe import get_model
 from koopmpc.synthesis.task import goal_box
-from koopmpc.terminal import build_table, render_text
 from koopmpc.text import format_duration, to_percent
 
-ALLOWED = 0.01  # allowed violation, as a share of the range, in runs as in the data
-ALLOWED_OFF = 0.05  # the same where noise or inputs differ from the data
 ARRIVED = 0.05  # error over the last tenth of a run, as a share of the data's range
 LONGER = 3  # times the runs of the design that there is for arriving at a reference: a start may be far, a limit slow
 UNKNOWN = 0.1  # share of steps outside the data above which the verdict is "cannot say"
-LOUD = 3.0  # noise is this many times that of the data
-_GOOD = (Status.UNCONSTRAINED, Status.OPTIMAL, Status.SOFTENED)
-
-
-@dataclass(frozen=True)
-class RunKind:
-    """A kind of run: how inputs and noise differ from the data, what breaks, and which violation is allowed."""
-
-    name: str
-    gain: float = 1.0
-    noise: float = 1.0
-    faults: tuple[Fault, ...] = ()
-    allowed: float = ALLOWED_OFF
-
-
-def kinds(horizon: int, *, bounded: bool) -> list[RunKind]:
-    """Return the kinds of runs; faults last for half of a horizon. Actuators are broken where inputs have limits."""
-    begin, end = horizon // 4, horizon // 4 + max(horizon // 2, 1)
-    broken: dict[str, Fault] = {
-        "sensor frozen": FrozenSensor(begin=begin, end=end),
-        "sensor NaN": NaNSensor(begin=begin, end=end),
-        "half of the samples dropped": DroppedSamples(0.5, begin=begin, end=end),
-        "measurements a step late": SensorDelay(1),
-        "half of the solves fail": SolverFailure(0.5, begin=begin, end=end),
-    }
-    if bounded:
-        broken["inputs lose 30 %"] = ActuatorLoss(0.3, begin=begin, end=end)
-    return [
-        RunKind("as in the data", allowed=ALLOWED),
-        RunKind(f"noise × {LOUD:g}", noise=LOUD),
-        RunKind("inputs 20 % weaker", gain=1 - OFF),
-        RunKind("inputs 20 % stronger", gain=1 + OFF),
-        *(RunKind(name, faults=(fault,)) for name, fault in broken.items()),
-    ]
-
-
-@dataclass(frozen=True)
-class Figures:
-    """The result of the runs of a kind.
-
-    `lost` of `runs` left the data, or their states became NaN or infinite. `violation` is the worst one, as a share of
-    the range; `error` is the largest over the last tenth of a run, as a share of the data's range, and `closest`
-    that of the run that ends nearest to the reference. `bad` counts steps without a good status, `outside` those whose
-    input is NaN or beyond a limit.
-    """
-
-    kind: RunKind
-    runs: int
-    lost: int
-    cost: float
-    violation: float
-    error: float
-    closest: float
-    statuses: tuple[tuple[str, int], ...]
-    bad: int
-    outside: int
-
-
-@dataclass(frozen=True)
-class Checked:
-    """The verdict, with the figures of each kind of run; `print` shows it.
-
-    Attributes
-    ----------
-    kept
-        Whether the goal is kept, and known to be: the verdict is "kept".
-    reasons
-        Sentences that say why it is not kept.
-    doubts
-        Sentences that say where nobody can say whether it is kept, for there are no data.
-    remarks
-        Sentences on runs that end off the reference with other noise or inputs than in the data; they do not count.
-    rate
-        Exact bound on the share of fresh independent loops that break a limit or are lost.
-    plant
-        The same of logged runs on the plant, where they were given.
-    broken
-        Sentences that say what happened in runs with faults; among the reasons too, where these were asked to count.
-    figures
-        What was measured in each kind of run.
-    cold, hot
-        Time of the first step of a fresh controller, and the 99 % quantile of all others [s].
-    dt
-        Sampling time [s].
-    cost_steps
-        A cost is the sum over so many steps, the first of a run.
-    page
-        Path of the report.
-    compared
-        What new logs say, where they are given.
-    """
-
-    kept: bool
-    reasons: tuple[str, ...]
-    broken: tuple[str, ...]
-    figures: tuple[Figures, ...]
-    cold: float
-    hot: float
-    dt: float
-    page: Path
-    doubts: tuple[str, ...] = ()
-    compared: ComparedLogs | None = None
-    rate: RateVerdict | None = None
-    plant: PlantVerdict | None = None
-    remarks: tuple[str, ...] = ()
-    cost_steps: int = 0
-
-    @property
-    def verdict(self) -> str:
-        """One of three values: "kept", "not kept", "cannot say"."""
-        return "not kept" if self.reasons else "cannot say" if self.doubts else "kept"
-
-    def __str__(self) -> str:
-        """Return the verdict and a line for each kind of run."""
-        verdict = _VERDICTS[self.verdict]
-        rows = [_row(one) for one in self.figures]
-        hot, cold, dt = map(format_duration, (self.hot, self.cold, self.dt))
-        times = f"a step takes {hot} (99 %), the first one {cold}; dt is {dt}"
-        aside = [f"- {one}" for one in self.broken if one not in self.reasons]
-        aside = ["with faults, which do not count (--faults counts them):", *aside] if aside else []
-        reasons = [f"- {reason}" for reason in (*self.reasons, *self.doubts, *self.remarks)]
-        if self.compared is not None and self.compared.holds:
-            aside = [*aside, f"new logs: {self.compared.sentence}"]
-        verdicts = [each for each in (self.rate, self.plant) if each is not None]
-        bound = ["", *(f"- {sentence}" for each in verdicts for sentence in each.list_sentences())]
-        table = build_table(("kind of run", *_list_headings(self.cost_steps)), rows)
-        return render_text(verdict, *reasons, *aside, "", table, "", _explain_cost(self), times, *bound)
-
-
-_VERDICTS = {
-    "kept": "the goal is kept",
-    "not kept": "THE GOAL IS NOT KEPT",
-    "cannot say": "NOBODY CAN SAY WHETHER THE GOAL IS KEPT: the logs do not show it",
-}
-
-
-def _explain_cost(checked: Checked) -> str:
-    steps, figures = checked.cost_steps, checked.figures
-    return (
-        f"A cost is the sum over the first {steps} steps ({format_duration(steps * checked.dt)}) of a run. That of the "
-        "design is over as many, from other starts and on other stand-ins. Of a run of your own, compare the first "
-        f"{steps} steps: km.metrics(run.take_first({steps})).cost."
-        + " A step whose measurement is missing has no good status, too."
-        * any(f.bad and f.kind.faults for f in figures)
-    )
-
-
-def _list_headings(steps: int) -> list[str]:
-    cost = f"median cost,\n{steps} steps"
-    return ["lost", cost, "worst\nviolation", "error\nat the end", "steps without\na good status"]
-
-
-def _row(one: Figures) -> list[str]:
-    lost = f"{one.lost} of {one.runs}"
-    numbers = [f"{one.cost:.4g}", to_percent(one.violation), to_percent(one.error)]
-    return [one.kind.name, lost, *(numbers if one.lost < one.runs else ["-"] * 3), str(one.bad)]
 
 
 def check_controller(
@@ -296,11 +147,23 @@ def check_controller(
     told = None if progress is None else partial(progress, "fresh loops")
     verdict = judge_rate(evidence, controller, rate, draw, told)
     plant = None if on_plant is None else judge_plant_runs(evidence, controller, on_plant)
-    page = Path(folder, "report.html")
-    kept = not (reasons or doubts)
-    said = tuple(reasons), tuple(broken), tuple(figures)
-    verdicts = tuple(doubts), compared, verdict, plant, tuple(_list_remarks(evidence, figures)), asked.steps
-    result = Checked(kept, *said, cold, hot, controller.dt, page, *verdicts)
+    result = Checked(
+        kept=not (reasons or doubts),
+        reasons=tuple(reasons),
+        broken=tuple(broken),
+        figures=tuple(figures),
+        cold=cold,
+        hot=hot,
+        dt=controller.dt,
+        page=Path(folder, "report.html"),
+        doubts=tuple(doubts),
+        compared=compared,
+        rate=verdict,
+        plant=plant,
+        remarks=tuple(_list_remarks(evidence, figures)),
+        cost_steps=asked.steps,
+        wished=rate,
+    )
     _write_page(result, path, saved, controller)
     return result
 
@@ -518,7 +381,7 @@ def _write_page(result: Checked, path: str | Path, saved: SavedDesign, controlle
         page.text(_explain_cost(result))
         if result.rate is not None:
             page.heading("How often it fails", 3)
-            page.text(f"Said before the loops: {plan_verdict(result.rate.wished)}.")
+            page.text(f"Said before the loops: {plan_verdict(result.wished)}.")
             plant = [] if result.plant is None else result.plant.list_sentences()
             page.items([*result.rate.list_sentences(), *plant])
         page.heading("With faults", 3)

@@ -16,11 +16,12 @@ from koopmpc.figures.eigenvalues import spectrum
 from koopmpc.figures.series import error, rollout
 from koopmpc.figures.style import save
 from koopmpc.fitting.logs import IN_MEMORY, PAST, Data, DividedData, collect_notes, read_logs
+from koopmpc.fitting.options import FitOptions
 from koopmpc.identify.fits.edmd import edmd
 from koopmpc.identify.records.narx import DELAYS
 from koopmpc.lifting.state import Constant, State
 from koopmpc.page import Page
-from koopmpc.parallel import StageProgress, check_scheduler
+from koopmpc.parallel import StageProgress
 from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.recording.model import record_model
 from koopmpc.synthesis.options import SearchOptions
@@ -75,17 +76,12 @@ class FittedData:
 def fit_data(
     data: Data,
     folder: str | PathLike[str],
+    options: FitOptions | None = None,
     *,
-    horizon: int | None = None,
-    bilinear: bool = True,
-    feedthrough: bool = False,
-    workers: int | None = None,
-    scheduler: str | None = None,
     memory: int = IN_MEMORY,
     say: Say | None = None,
     progress: StageProgress | None = None,
     rng: np.random.Generator | int = 0,
-    **reading: Any,
 ) -> FittedData:
     """Read data, hold some out, choose and fit a model, judge it, and write model.npz, report.md and model.rrd.
 
@@ -95,14 +91,9 @@ def fit_data(
         A folder of .npz, .parquet, .csv and .rrd files, or files. Of a folder of runs only the .rrd logs are read.
     folder
         Where everything is written; it is made if need be.
-    horizon
-        Steps ahead; `select` says what it is by default.
-    bilinear
-        Try bilinear models too; if one is chosen, the best linear one goes to linear.npz.
-    feedthrough
-        Outputs answer to inputs at once, y = h(x, u), as in `select`.
-    workers, scheduler
-        As in `koopmpc.parallel.map_tasks`.
+    options
+        How the logs are read, and which models are tried, see `FitOptions`. If a bilinear model is chosen, the best
+        linear one goes to linear.npz.
     memory
         Bytes of files up to which they are read as a whole; beyond, the fit reads them part by part.
     say
@@ -111,8 +102,6 @@ def fit_data(
         As in `select`.
     rng
         Draws the held-out episodes, and all that `select` draws.
-    reading
-        Keywords of `load_episodes` for plain tables: ``dt=``, ``states=``, ``inputs=``, ``resample=``, ….
 
     Raises
     ------
@@ -122,12 +111,8 @@ def fit_data(
         The data are not of one plant, or too few.
     """
     place, draw = Path(folder), checks.generator(rng)
-    horizon = None if horizon is None else checks.count(horizon, "horizon")
-    workers = None if workers is None else checks.count(workers, "workers")
-    if scheduler is not None:
-        check_scheduler(scheduler, workers)
-    tell = ignore_text if say is None else say
-    split = read_logs(data, horizon, draw, memory, reading)
+    asked, tell = options or FitOptions(), ignore_text if say is None else say
+    split = read_logs(data, asked.horizon, draw, memory, asked.list_reading())
     about = describe_data(split)
     tell(about)
     doubts: list[str] = []
@@ -138,10 +123,10 @@ def fit_data(
             horizon=split.horizon,
             options=SearchOptions(
                 delays=None if split.delay <= (max(DELAYS) if record else PAST) else [*range(PAST + 1), split.delay],
-                bilinear=bilinear,
-                feedthrough=feedthrough,
-                workers=workers,
-                scheduler=scheduler,
+                bilinear=not asked.linear,
+                feedthrough=asked.feedthrough,
+                workers=asked.workers,
+                scheduler=asked.scheduler,
                 progress=progress,
                 rng=draw,
             ),
@@ -160,7 +145,6 @@ def fit_data(
     verdict = f"{report}\n\n{_compare_with_plain(report.score, plain)}"
     tell(verdict)
     failures: list[str] = []
-    pictures = list_pictures(selection, judged, report, plain, held_out)
     recording = place / "model.rrd"
     try:
         record_model(judged, held_out, recording, report=report)
@@ -168,8 +152,29 @@ def fit_data(
         raise
     except Exception as failure:  # a log that cannot be written must not cost the model
         failures.append(f"{recording.name}: {type(failure).__name__}: {failure}")
-    usage = _format_usage(selection, model)
-    page = Page(place)
+    usage, pictures = _format_usage(selection, model), list_pictures(selection, judged, report, plain, held_out)
+    page = _write_page(Page(place), (verdict, usage, about, chosen), pictures, failures)
+    return FittedData(
+        selection=selection,
+        report=report,
+        plain=plain,
+        held_out=held_out,
+        model=model,
+        recording=recording if recording.exists() else None,
+        page=page,
+        usage=usage,
+        failures=tuple(failures),
+    )
+
+
+def _write_page(
+    page: Page,
+    texts: tuple[str, str, str, str],
+    pictures: Iterator[tuple[str, str, Callable[[], Any]]],
+    failures: list[str],
+) -> Path:
+    """Write the report of verdict, usage, data and choice, with its pictures; add those that fail to `failures`."""
+    verdict, usage, about, chosen = texts
     page.text("# Model report", verdict.partition("\n")[0])
     page.code(usage, "python")
     page.text("## Data")
@@ -188,17 +193,7 @@ def fit_data(
     if failures:
         page.text("## What could not be made")
         page.items(failures)
-    return FittedData(
-        selection=selection,
-        report=report,
-        plain=plain,
-        held_out=held_out,
-        model=model,
-        recording=recording if recording.exists() else None,
-        page=page.write(),
-        usage=usage,
-        failures=tuple(failures),
-    )
+    return page.write()
 
 
 def _format_usage(selection: Selection, path: Path) -> str:

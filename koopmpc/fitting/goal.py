@@ -1,10 +1,9 @@
-"""The goal of a controller: a file that a person writes for the plant of some logs, and the design from both."""
+"""The goal of a controller: a file that a person writes for the plant of some logs, and its template."""
 
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from inspect import Parameter, signature
 from os import PathLike
 from pathlib import Path
@@ -18,28 +17,15 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.load import load_episodes
-from koopmpc.errors import DataError, KoopmpcError, LogError
-from koopmpc.fitting.certified import describe_certificate
+from koopmpc.errors import DataError, LogError
 from koopmpc.fitting.fit import Say, describe_data, ignore_text
-from koopmpc.fitting.logs import IN_MEMORY, Data, DividedData, collect_notes, read_logs
-from koopmpc.fitting.report import write_design_report
-from koopmpc.fitting.set_points import take_set_points
-from koopmpc.identify.fits.edmd import edmd
-from koopmpc.lifting.state import Constant, State
-from koopmpc.parallel import StageProgress
-from koopmpc.predict.base import load_value
-from koopmpc.synthesis.design import design
-from koopmpc.synthesis.designed import Design, SavedDesign, rebuild_controller
-from koopmpc.synthesis.doubts import describe_rest
-from koopmpc.synthesis.options import DesignOptions
+from koopmpc.fitting.logs import IN_MEMORY, Data, read_logs
+from koopmpc.fitting.options import FitOptions
+from koopmpc.lifting.state import State
 from koopmpc.synthesis.search.folds import usual_horizon
-from koopmpc.validate.bands import Forecast, forecast
-from koopmpc.validate.logs.summary import LogSummary
-from koopmpc.validate.report import trust
-from koopmpc.validate.scoring import score
 
-_SHORT = "record more episodes, or longer ones"  # what to do where logs are too few
-_TOP = {"horizon", "coverage", "certify", "logs", "states", "inputs"}
+SHORT = "record more episodes, or longer ones"  # what to do where logs are too few
+_TOP = {"horizon", "margin", "certify", "logs", "states", "inputs"}
 _READING = {
     name for name, argument in signature(load_episodes).parameters.items() if argument.kind is Parameter.KEYWORD_ONLY
 }
@@ -59,7 +45,7 @@ class Goal:
         (nr,) or rows (T+1, nr) of the states that the cost weighs.
     angles
         Indices of states whose errors wrap.
-    coverage
+    margin
         Share of loops on stand-ins that are to keep their limits; None asks for no promise.
     certify
         Whether a certificate of stability is sought at the reference.
@@ -70,213 +56,22 @@ class Goal:
     horizon: int
     reference: Float[np.ndarray, "..."]
     angles: tuple[int, ...]
-    coverage: float | None = None
+    margin: float | None = None
     certify: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class DesignedData:
-    """The design that was made, and the files that were written.
-
-    Attributes
-    ----------
-    design
-        The controller with its evidence.
-    goal
-        The goal that was read.
-    controller, page
-        Paths of the controller file, and of the report, one HTML page that needs no other file.
-    usage
-        Lines of Python that load the controller.
-    """
-
-    design: Design
-    goal: Goal
-    controller: Path
-    page: Path
-    usage: str
-
-
-def design_data(
-    data: Data,
-    goal: str | PathLike[str],
-    folder: str | PathLike[str],
-    *,
-    bilinear: bool = True,
-    feedthrough: bool = False,
-    coverage: float | None = None,
-    certify: bool = False,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    memory: int = IN_MEMORY,
-    say: Say | None = None,
-    progress: StageProgress | None = None,
-    rng: np.random.Generator | int = 0,
-    set_points: Sequence[str] = (),
-    **reading: Any,
-) -> DesignedData:
-    """Read data and a goal, design a controller, and write controller.npz and report.html.
-
-    The data are read and repaired as by `fit_data`; the other arguments are the same as there.
-
-    Parameters
-    ----------
-    data, folder
-        As for `fit_data`.
-    goal
-        A file as `write_template` writes it.
-    coverage, certify
-        Replace those of the goal: a promised share of loops that keep their limits, and a certificate of stability,
-        whose page is certificate.md. A refused certificate is a sentence of the report.
-    bilinear, feedthrough, workers, scheduler, memory, say, progress, rng
-        As for `fit_data`.
-    set_points
-        Columns with the set points of the loop that made the logs: instruments of `design`.
-    reading
-        Keywords of `load_episodes` for plain tables, which replace those in the section [logs] of the goal. Without
-        ``inputs`` the inputs of the goal are inputs.
-
-    Raises
-    ------
-    LogError
-        A file cannot be read, or the folder not written.
-    DataError
-        The data are not of one plant, or too few; the goal names what the data do not have.
-    """
-    place, draw = Path(folder), checks.generator(rng)
-    tell = ignore_text if say is None else say
-    pushed = list_goal_inputs(goal)
-    reading = load_reading(goal) | {name: value for name, value in reading.items() if value is not None}
-    if set_points:
-        reading["disturbances"] = [*reading.get("disturbances", ()), *set_points]
-    split = _read_for(goal, data, draw, memory, reading, ask=not pushed)
-    missed = tuple(name for name in pushed if name in split.seen.states)
-    if missed and "inputs" not in reading:  # the goal knows inputs that no name in the logs shows
-        reading["inputs"] = (*split.seen.inputs, *missed)
-        split = _read_for(goal, data, draw, memory, reading)
-    split, instruments = take_set_points(split, set_points)
-    about = describe_data(split)
-    tell(about)
-    asked = read_goal(goal, split.seen)
-    asked = replace(asked, coverage=coverage or asked.coverage, certify=certify or asked.certify)
-    with collect_notes([]):  # its advice says the same
-        designed = design(
-            split.fitted,
-            asked.cost,
-            asked.limits,
-            horizon=asked.horizon,
-            reference=asked.reference,
-            options=DesignOptions(
-                angles=asked.angles,
-                bilinear=bilinear,
-                feedthrough=feedthrough,
-                instruments=instruments,
-                margin=asked.coverage or "errors",
-                workers=workers,
-                scheduler=scheduler,
-                progress=progress,
-                rng=draw,
-            ),
-        )
-    tell(str(designed))
-    evidence = designed.evidence
-    if evidence.goal_can_be_held:
-        tell(describe_rest(evidence.surrogates, evidence.asked))
-    certified = ""
-    if asked.certify:
-        unseen = split.held_out if split.learned is None else None
-        certified = describe_certificate(designed, asked.reference, unseen, place)
-        tell(certified)
-    file = place / "controller.npz"
-    summary = _summarise_logs(split, designed, about, Path(goal).read_text(), draw)
-    designed.save(file, logs=replace(summary, certified=certified))
-    usage = f'import koopmpc as km\ncontroller = km.load_controller("{file.as_posix()}")'
-    saved = load_value(file, SavedDesign)
-    page = write_design_report(saved, rebuild_controller(saved, file), place / "report.html", file.as_posix())
-    return DesignedData(designed, asked, file, page, usage)
-
-
-def _read_for(
-    goal: str | PathLike[str],
-    data: Data,
-    rng: np.random.Generator,
-    memory: int,
-    reading: Mapping[str, Any],
-    *,
-    ask: bool = True,
-) -> DividedData:
-    """Read logs to judge a model over the horizon of a goal, or over the usual one where they are too short for it."""
-    wished = _load_toml(Path(goal)).get("horizon")
-    if not isinstance(wished, int) or wished < 1:  # none is given, or read_goal refuses it in a sentence
-        return read_logs(data, None, rng, memory, reading, _SHORT, ask=ask)
-    with suppress(DataError):
-        return read_logs(data, wished, rng, memory, reading, _SHORT, ask=ask)
-    split = read_logs(data, None, rng, memory, reading, _SHORT, ask=ask)
-    note = f"the logs are too short to judge a model over the {wished} steps of the goal"
-    return replace(split, notes=(*split.notes, note))
-
-
-_FORECASTS = 3  # held-out stretches whose forecasts a report may draw
-
-
-def _summarise_logs(
-    split: DividedData,
-    designed: Design,
-    about: str,
-    goal: str,
-    rng: np.random.Generator,
-) -> LogSummary:
-    """Return what a report shows of the logs, with forecasts of rows that the chosen model did not learn from."""
-    assert split.excerpt is not None, "divide_files makes it"
-    model, horizon = designed.controller.as_data().model, split.ahead
-    assert model is not None, "every design has a model"
-    align = model.align
-    forecasts, findings = list[Forecast](), list[str]()
-    error = plain = np.zeros((0, model.nx))
-    with collect_notes([]):  # the fits repeat the doubts of the design
-        try:
-            if split.learned is not None:  # a record: the controller's model knows its end
-                model = designed.best.recipe.fit(align(split.learned))
-            seen, held_out = (align(data) for data in (split.seen, split.held_out))
-            report = trust(model, held_out, horizon, rng=rng)
-            verdict, error = str(report).partition("\n")[0], report.score.rmse
-            findings = [f"{finding.says}; {finding.do}" for finding in report.findings]
-            plain = score(edmd(seen, State() + Constant()), held_out, horizon).rmse
-            bands = report.band if np.isfinite(report.band.width).all() else report.score
-            relift = report.band.relift
-            forecasts = [forecast(model, e, horizon, bands=bands, relift=relift) for e in list(held_out)[:_FORECASTS]]
-        except KoopmpcError as failure:  # the report is to say so, and a design is not to be lost for it
-            verdict = f"Its forecasts could not be judged: {failure}"
-    return LogSummary(
-        excerpt=split.excerpt,
-        about=about.partition("\n! ")[0],
-        notes=(*split.notes, *designed.notes),
-        verdict=verdict,
-        findings=tuple(findings),
-        forecasts=tuple(forecasts),
-        error=error,
-        plain=plain,
-        title=designed.best.title,
-        advice=designed.advice,
-        choice=str(designed),
-        goal=goal,
-    )
 
 
 _EVENED = "  # nobody asked for it: steps of the logs are unequal; states are interpolated to so many s, inputs held"
 
 
 def write_template(
-    data: Data, *, horizon: int | None = None, memory: int = IN_MEMORY, say: Say | None = None, **reading: Any
+    data: Data, options: FitOptions | None = None, *, memory: int = IN_MEMORY, say: Say | None = None
 ) -> str:
     """Return the text of a goal file for the plant of some logs, with the ranges found and how the logs are read.
 
     Parameters
     ----------
-    data, memory, reading
-        As for `fit_data`.
-    horizon
-        Steps ahead that the controller looks; by default it follows from the lengths of the episodes.
+    data, options, memory
+        As for `fit_data`. Without a horizon it follows from the lengths of the episodes.
     say
         Called with what was understood of the logs: which columns are states and inputs, and what is wrong with them.
 
@@ -285,14 +80,15 @@ def write_template(
     DataError
         No column is an input.
     """
-    split = read_logs(data, horizon, checks.generator(0), memory, reading, _SHORT)
+    wished = options or FitOptions()
+    split = read_logs(data, wished.horizon, checks.generator(0), memory, wished.list_reading(), SHORT)
     if not split.seen.nu:
         advice = "the logs have no input, so nothing can be controlled; pass --inputs u,v"
         raise DataError("\n".join([advice, *split.notes]))
     (ignore_text if say is None else say)(describe_data(split))
     both = split.seen.with_episodes([*split.seen, *split.held_out])
-    evened = "resample" in split.reading and reading.get("resample") is None
-    return format_template(both, horizon=horizon, reading=split.reading, evened=evened)
+    evened = "resample" in split.reading and "resample" not in wished.list_reading()
+    return format_template(both, horizon=wished.horizon, reading=split.reading, evened=evened)
 
 
 def format_template(
@@ -319,7 +115,7 @@ def format_template(
         "# about half of the time in which the closed loop is to settle; a shorter one sees limits and overshoot late.",
         "",
         f"horizon = {horizon}  # steps of {data.dt:g} s that the controller looks ahead",
-        "# coverage = 0.95  # share of loops on learned stand-ins that are to keep the limits; verified on fresh ones",
+        "# margin = 0.95  # share of loops on learned stand-ins that are to keep the limits; verified on fresh ones",
         "# certify = true  # seek a certificate of stability at the reference, from logs that the model has not seen",
     ]
     if reading:
@@ -355,7 +151,7 @@ def format_template(
 
 def list_goal_inputs(path: str | PathLike[str]) -> tuple[str, ...]:
     """Return the names of the inputs that a goal file has sections for."""
-    given = _load_toml(Path(path)).get("inputs", {})
+    given = load_toml(Path(path)).get("inputs", {})
     return tuple(cast("dict[str, Any]", given)) if isinstance(given, dict) else ()
 
 
@@ -368,7 +164,7 @@ def load_reading(path: str | PathLike[str]) -> dict[str, Any]:
         It is no section, or has a key that is no such keyword.
     """
     file = Path(path)
-    given = _load_toml(file).get("logs", {})
+    given = load_toml(file).get("logs", {})
     if not isinstance(given, dict):
         raise DataError(f"{file}: logs is {given!r}; write a section [logs] with keys {', '.join(sorted(_READING))}")
     reading = cast("dict[str, Any]", given)
@@ -376,7 +172,7 @@ def load_reading(path: str | PathLike[str]) -> dict[str, Any]:
     return reading
 
 
-def _load_toml(file: Path) -> dict[str, Any]:
+def load_toml(file: Path) -> dict[str, Any]:
     """Return the content of a TOML file.
 
     Raises
@@ -407,17 +203,55 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
         state with a weight.
     """
     file = Path(path)
-    tree = _load_toml(file)
+    tree = load_toml(file)
+    if "coverage" in tree:
+        raise DataError(f"{file}: coverage is called margin now; write margin = {tree['coverage']}")
     _check_keys(tree, _TOP, str(file))
     states = _find_sections(tree, "states", data.states, _STATE, file)
     inputs = _find_sections(tree, "inputs", data.inputs, _INPUT, file)
-    nx, nu = data.nx, data.nu
-    Q, R, R_delta = np.zeros(nx), np.zeros(nu), np.zeros(nu)
-    low, high = np.full(nx, -np.inf), np.full(nx, np.inf)
-    u_low, u_high, change = np.full(nu, -np.inf), np.full(nu, np.inf), np.full(nu, np.inf)
-    angles: list[int] = []
-    rows: dict[int, Float[np.ndarray, ...]] = {}
-    for i, (name, section) in enumerate(zip(data.states, states, strict=True)):
+    Q, x_low, x_high, angles, rows = _read_states(states, data.states, file)
+    R, R_delta, u_low, u_high, change = _read_inputs(inputs, data.inputs, file)
+    tracked = [i for i in range(data.nx) if Q[i] > 0]
+    if not tracked:
+        raise DataError(f"{file} gives no state a weight above 0, so nothing is asked; set one")
+    lengths = {len(np.atleast_1d(rows[i])) for i in tracked} - {1}
+    if len(lengths) > 1:
+        raise DataError(f"{file} has references of {sorted(lengths)} values; write lists of one length, or numbers")
+    steps = lengths.pop() if lengths else 1
+    reference = np.column_stack([np.broadcast_to(rows[i], steps) for i in tracked])
+    horizon, certify = tree.get("horizon", usual_horizon(data)[0]), tree.get("certify", False)
+    if not isinstance(horizon, int) or isinstance(horizon, bool) or horizon < 1:
+        raise DataError(
+            f"{file} gives a horizon of {horizon!r}; write a whole number of steps of {data.dt:g} s, 1 or more"
+        )
+    if certify not in (True, False):
+        raise DataError(f"{file}: certify is {certify!r}; write true or false")
+    margin = _read_number(tree, "margin", 0.0, str(file))
+    if "margin" in tree and not 0 < margin < 1:
+        raise DataError(f"{file}: margin is {margin:g}; write a share between 0 and 1, such as 0.95")
+    of = State() if len(tracked) == data.nx else State([data.states[i] for i in tracked])
+    limited = change if np.isfinite(change).any() else None
+    return Goal(
+        cost=Cost(Q=Q[tracked], R=R, R_delta=R_delta if R_delta.any() else None, of=of),
+        limits=Limits(u_min=u_low, u_max=u_high, x_min=x_low, x_max=x_high, du_max=limited),
+        horizon=horizon,
+        reference=reference[0] if steps == 1 else reference,
+        angles=tuple(angles),
+        margin=margin or None,
+        certify=bool(certify),
+    )
+
+
+Column = Float[np.ndarray, " n"]
+
+
+def _read_states(
+    sections: Sequence[Mapping[str, Any]], names: Sequence[str], file: Path
+) -> tuple[Column, Column, Column, list[int], dict[int, Float[np.ndarray, "..."]]]:
+    """Return weights, lower and upper limits, angles, and the reference of each state that has one."""
+    Q, low, high = np.zeros(len(names)), np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    angles, rows = list[int](), dict[int, Float[np.ndarray, "..."]]()
+    for i, (name, section) in enumerate(zip(names, sections, strict=True)):
         where = f"{file}, {name}"
         Q[i] = _read_number(section, "weight", 0.0, where)
         low[i], high[i] = _read_limits(section, where)
@@ -428,45 +262,23 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
             rows[i] = checks.array(_check_numbers(section["reference"], f"{where}: reference"), f"{where}: reference")
         elif Q[i] > 0:
             raise DataError(f"{where} has a weight and no reference; give its target value, or set weight = 0")
-    for i, (name, section) in enumerate(zip(data.inputs, inputs, strict=True)):
+    return Q, low, high, angles, rows
+
+
+def _read_inputs(
+    sections: Sequence[Mapping[str, Any]], names: Sequence[str], file: Path
+) -> tuple[Column, Column, Column, Column, Column]:
+    """Return weights, weights of changes, lower and upper limits, and limits of changes."""
+    nu = len(names)
+    R, R_delta, change = np.zeros(nu), np.zeros(nu), np.full(nu, np.inf)
+    low, high = np.full(nu, -np.inf), np.full(nu, np.inf)
+    for i, (name, section) in enumerate(zip(names, sections, strict=True)):
         where = f"{file}, {name}"
         R[i] = _read_number(section, "weight", 0.0, where)
         R_delta[i] = _read_number(section, "change_weight", 0.0, where)
         change[i] = _read_number(section, "change", np.inf, where)
-        u_low[i], u_high[i] = _read_limits(section, where)
-    tracked = [i for i in range(nx) if Q[i] > 0]
-    if not tracked:
-        raise DataError(f"{file} gives no state a weight above 0, so nothing is asked; set one")
-    lengths = {len(np.atleast_1d(rows[i])) for i in tracked} - {1}
-    if len(lengths) > 1:
-        raise DataError(f"{file} has references of {sorted(lengths)} values; write lists of one length, or numbers")
-    steps = lengths.pop() if lengths else 1
-    reference = np.column_stack([np.broadcast_to(rows[i], steps) for i in tracked])
-    horizon = tree.get("horizon", usual_horizon(data)[0])
-    if not isinstance(horizon, int) or isinstance(horizon, bool) or horizon < 1:
-        raise DataError(
-            f"{file} gives a horizon of {horizon!r}; write a whole number of steps of {data.dt:g} s, 1 or more"
-        )
-    limited, certify = np.isfinite(change).any(), tree.get("certify", False)
-    if certify not in (True, False):
-        raise DataError(f"{file}: certify is {certify!r}; write true or false")
-    coverage = _read_number(tree, "coverage", 0.0, str(file))
-    if "coverage" in tree and not 0 < coverage < 1:
-        raise DataError(f"{file}: coverage is {coverage:g}; write a share between 0 and 1, such as 0.95")
-    return Goal(
-        cost=Cost(
-            Q=Q[tracked],
-            R=R,
-            R_delta=R_delta if R_delta.any() else None,
-            of=State() if len(tracked) == nx else State([data.states[i] for i in tracked]),
-        ),
-        limits=Limits(u_min=u_low, u_max=u_high, x_min=low, x_max=high, du_max=change if limited else None),
-        horizon=horizon,
-        reference=reference[0] if steps == 1 else reference,
-        angles=tuple(angles),
-        coverage=coverage or None,
-        certify=bool(certify),
-    )
+        low[i], high[i] = _read_limits(section, where)
+    return R, R_delta, low, high, change
 
 
 def _find_sections(

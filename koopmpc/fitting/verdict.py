@@ -1,7 +1,6 @@
-"""RateVerdict: an exact bound on the share of loops that break a limit, from fresh independent loops on stand-ins."""
+"""judge_rate, judge_plant_runs: how often a controller fails, on surrogates of its plant and on the plant itself."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,60 +11,15 @@ from koopmpc.errors import DataError
 from koopmpc.loop.metrics import stack_limited
 from koopmpc.synthesis.designed import Evidence
 from koopmpc.synthesis.loops.abreast import speed_up
-from koopmpc.synthesis.loops.pool import KEPT, SHIFT, LoopPool, LoopResult
+from koopmpc.synthesis.loops.pool import LoopPool, LoopResult
+from koopmpc.synthesis.rates import KEPT, LoopRate
 from koopmpc.synthesis.search.recipe import get_model
 from koopmpc.text import to_percent
-from koopmpc.validate.binomial import bound_failure_rate, count_runs_needed
+from koopmpc.validate.binomial import count_runs_needed
 
-CONFIDENCE = 0.95  # of the bound
 SAME = 0.02  # a logged input is the controller's if it differs by at most this share of the input's range
 OWN = 0.9  # least share of logged inputs that are the controller's
 ROUND = 50  # loops between two reports of progress
-
-
-@dataclass(frozen=True)
-class RateVerdict:
-    """The result of fresh independent loops.
-
-    Attributes
-    ----------
-    wished
-        The bound that the number of loops was chosen for.
-    loops, broken, lost
-        Number of loops, of those that broke a limit by more than 1 % of its range, and of those that were lost.
-    on_rows, on_models
-        How many loops were on nearest neighbours of the logged rows, and on learned models.
-    """
-
-    wished: float
-    loops: int
-    broken: int
-    lost: int
-    on_rows: int
-    on_models: int
-
-    @property
-    def failures(self) -> int:
-        """How many loops broke a limit or were lost."""
-        return self.broken + self.lost
-
-    @property
-    def failure_bound(self) -> float:
-        """Exact upper bound, at 95 %, of the probability that a loop drawn like these fails (Clopper and Pearson)."""
-        return bound_failure_rate(self.failures, self.loops, confidence=CONFIDENCE)
-
-    def list_sentences(self) -> list[str]:
-        """Return what was found, on what, and what that is worth."""
-        starts = f"a start of the design moved by up to {to_percent(SHIFT)} of the data's range"
-        return [
-            f"{self.broken} of {self.loops} fresh loops broke a limit by more than {to_percent(KEPT)} of its range and "
-            f"{self.lost} were lost: with {to_percent(CONFIDENCE)} confidence at most "
-            f"{to_percent(self.failure_bound)} of loops drawn like these do either",
-            f"each loop drew {starts}, its noise, and its stand-in: {self.on_rows} were on nearest neighbours of the "
-            f"logged rows, {self.on_models} on models learned from them",
-            "all stand-ins come from the same logs: where the logs are blind, so are they, and the bound does not hold "
-            "for the plant",
-        ]
 
 
 def plan_verdict(rate: float) -> str:
@@ -83,7 +37,7 @@ def judge_rate(
     rate: float,
     rng: np.random.Generator,
     report: Callable[[int, int], None] | None = None,
-) -> RateVerdict:
+) -> LoopRate:
     """Return the verdict of as many fresh loops as a bound of `rate` needs when none fails.
 
     The number is fixed before the loops: a number that grows until the bound is met loses the confidence.
@@ -99,48 +53,10 @@ def judge_rate(
     lost = sum(result.run is None for result in results)
     broken = sum(result.run is not None and not result.keeps for result in results)
     rows = sum(loop.place < 0 for loop in drawn)
-    return RateVerdict(rate, count, broken, lost, rows, count - rows)
+    return LoopRate(count, broken, lost, on_rows=rows)
 
 
-@dataclass(frozen=True)
-class PlantVerdict:
-    """The result of logged runs of the controller on the plant.
-
-    Attributes
-    ----------
-    runs, failures
-        Number of runs, and of those that broke a limit by more than 1 % of its range.
-    own
-        Share of the logged inputs that the controller asks for in the logged states.
-    """
-
-    runs: int
-    failures: int
-    own: float
-
-    @property
-    def failure_bound(self) -> float:
-        """Exact upper bound, at 95 %, of the probability that a run drawn like these fails (Clopper and Pearson)."""
-        return bound_failure_rate(self.failures, self.runs, confidence=CONFIDENCE)
-
-    @property
-    def next_fails(self) -> float:
-        """(k + 1) / (n + 1): at most so probably the next run fails, on average over starts and sets of runs."""
-        return (self.failures + 1) / (self.runs + 1)
-
-    def list_sentences(self) -> list[str]:
-        """Return what was found, and what it is worth."""
-        return [
-            f"on the plant {self.failures} of {self.runs} logged runs broke a limit by more than {to_percent(KEPT)} of "
-            f"its range: with {to_percent(CONFIDENCE)} confidence at most "
-            f"{to_percent(self.failure_bound)} of runs drawn like these do",
-            f"the next run from a start drawn like theirs keeps its limits with a probability of "
-            f"{to_percent(1 - self.next_fails)} or more, on average over starts; {to_percent(CONFIDENCE)} needs "
-            f"{round(1 / (1 - CONFIDENCE)) - 1} runs without a failure",
-        ]
-
-
-def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> PlantVerdict:
+def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> LoopRate:
     """Return the verdict of logged runs of this controller on its plant, in rows timed as those of the design's logs.
 
     With feedthrough each row holds the reading h(x, u) of the input before, which the controller had.
@@ -177,4 +93,4 @@ def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> Pla
         values, box = stack_limited(asked.limits, episode.X[1:], logs.states)
         over = np.maximum(box.low - values, values - box.high) / asked.limit_sizes
         failures += bool(over.max(initial=0.0) > KEPT)
-    return PlantVerdict(len(logs), failures, own)
+    return LoopRate(len(logs), failures, own=own)

@@ -18,9 +18,8 @@ from koopmpc.synthesis.loops.conditions import LoopTest
 from koopmpc.synthesis.loops.finalists import compare_longer_horizon
 from koopmpc.synthesis.loops.fresh import describe_outside, find_blind_range, find_blind_reference, run_fresh_loops
 from koopmpc.synthesis.loops.judging import Outcome
-from koopmpc.synthesis.loops.pool import KEPT
 from koopmpc.synthesis.options import DesignOptions
-from koopmpc.synthesis.rates import ExpectedLoop
+from koopmpc.synthesis.rates import KEPT, ExpectedLoop
 from koopmpc.text import to_percent
 
 MANY = 600  # fresh loops of a controller in machine code

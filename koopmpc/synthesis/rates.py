@@ -11,8 +11,72 @@ from koopmpc.text import to_percent
 from koopmpc.validate.binomial import bound_failure_rate
 from koopmpc.values import Value
 
+KEPT = 0.01  # a loop keeps its limits if it violates none by more than this share of its range
+SHIFT = 0.05  # a fresh start is a start of the task moved by up to this share of the data's range
 SURE = 0.95  # confidence of one-sided bounds
 INSIDE = 0.9  # share of loops whose cost lies inside the two-sided interval
+
+
+@dataclass(frozen=True)
+class LoopRate:
+    """How many of some independent loops, or logged runs on the plant, failed, and what that says of others like them.
+
+    Attributes
+    ----------
+    runs, broken, lost
+        Number of runs, of those that broke a limit by more than 1 % of its range, and of those that were lost.
+    on_rows
+        How many of them were on nearest neighbours of the logged rows; the others were on learned models.
+    own
+        On the plant: share of the logged inputs that the controller asks for in the logged states; None elsewhere.
+    """
+
+    runs: int
+    broken: int
+    lost: int = 0
+    on_rows: int = 0
+    own: float | None = None
+
+    @property
+    def failures(self) -> int:
+        """How many runs broke a limit or were lost."""
+        return self.broken + self.lost
+
+    @property
+    def failure_bound(self) -> float:
+        """Exact upper bound, at 95 %, of the probability that a run drawn like these fails (Clopper and Pearson)."""
+        return bound_failure_rate(self.failures, self.runs, confidence=SURE)
+
+    @property
+    def next_fails(self) -> float:
+        """(k + 1) / (n + 1): at most so probably the next run fails, on average over starts and sets of runs."""
+        return (self.failures + 1) / (self.runs + 1)
+
+    def refutes(self, share: float) -> bool:
+        """Return whether so many failures have a probability below 5 % if this share of runs keeps the limits."""
+        n, k = self.runs, self.failures
+        return bool(k and betainc(k, n - k + 1, 1 - share) < 1 - SURE)
+
+    def list_sentences(self) -> list[str]:
+        """Return what was found, on what, and what that is worth."""
+        sure, bound = to_percent(SURE), to_percent(self.failure_bound)
+        if self.own is not None:
+            return [
+                f"on the plant {self.failures} of {self.runs} logged runs broke a limit by more than "
+                f"{to_percent(KEPT)} of its range: with {sure} confidence at most {bound} of runs drawn like these do",
+                f"the next run from a start drawn like theirs keeps its limits with a probability of "
+                f"{to_percent(1 - self.next_fails)} or more, on average over starts; {sure} needs "
+                f"{round(1 / (1 - SURE)) - 1} runs without a failure",
+            ]
+        return [
+            f"{self.broken} of {self.runs} fresh loops broke a limit by more than {to_percent(KEPT)} of its range and "
+            f"{self.lost} were lost: with {sure} confidence at most {bound} of loops drawn like these do either",
+            f"each loop drew a start of the design moved by up to {to_percent(SHIFT)} of the data's range, its noise, "
+            f"and its stand-in: {self.on_rows} were on nearest neighbours of the logged rows, "
+            f"{self.runs - self.on_rows} on models learned from them",
+            "all stand-ins come from the same logs: where the logs are blind, so are they, and the bound does not hold "
+            "for the plant",
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +136,6 @@ def cost_interval(values: Float[np.ndarray, " n"], inside: float = INSIDE) -> tu
     return -bound_value(-values, side), bound_value(values, side)
 
 
-REFUTED = 0.05  # the promise is refuted if so many failures on fresh loops are less probable than this
-
-
 @dataclass(frozen=True, eq=False)
 class CoveragePromise(Value):
     """What a design promises of loops on stand-ins drawn like its own, and how it was found.
@@ -118,14 +179,12 @@ class CoveragePromise(Value):
     @property
     def is_refuted(self) -> bool:
         """Whether so many failures have a probability below 5 % if the promise is true."""
-        if not self.failures:
-            return False
-        return bool(betainc(self.failures, self.verified_on - self.failures + 1, 1 - self.coverage) < REFUTED)
+        return self.rate.refutes(self.coverage)
 
     @property
-    def failure_bound(self) -> float:
-        """Exact upper bound, at 95 %, of the probability that a loop drawn like these fails."""
-        return bound_failure_rate(self.failures, self.verified_on)
+    def rate(self) -> LoopRate:
+        """How many loops of the verification failed."""
+        return LoopRate(self.verified_on, self.failures)
 
     def __str__(self) -> str:
         """Return the promise, or why there is none."""
@@ -134,7 +193,7 @@ class CoveragePromise(Value):
         how = "without a margin" if self.shape == "none" else f"with a {self.shape} margin of {self.scale:.3g} tubes"
         seen = (
             f"{self.failures} of {self.verified_on} loops that took no part in the choice failed, so that at most "
-            f"{to_percent(self.failure_bound)} of loops do, with 95 % confidence"
+            f"{to_percent(self.rate.failure_bound)} of loops do, with 95 % confidence"
         )
         if not self.found:
             return (
@@ -204,7 +263,7 @@ class ExpectedLoop(Value):
     def lost_bound(self) -> float:
         """Exact upper bound, at 95 %, of the probability that a loop like the fresh ones is lost."""
         cost = self._judged_runs(self.cost, self.cost_off, "cost")
-        return bound_failure_rate(int(np.sum(~np.isfinite(cost))), len(cost))
+        return LoopRate(len(cost), 0, int(np.sum(~np.isfinite(cost)))).failure_bound
 
     @property
     def loops(self) -> dict[str, int]:

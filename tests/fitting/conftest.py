@@ -4,7 +4,8 @@ from contextlib import nullcontext
 
 import pytest
 
-from koopmpc.fitting.goal import design_data
+from koopmpc.fitting.designing import design_data
+from koopmpc.fitting.options import FitOptions
 from tests.fitting.mass import GOAL, logs
 from tests.small_designs import small_designs, undrawn_pages
 
@@ -15,7 +16,7 @@ def made(tmp_path_factory):
     logs().save(folder / "logs.npz")
     (folder / "goal.toml").write_text(GOAL)
     with small_designs(), undrawn_pages():
-        return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", bilinear=False)
+        return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", FitOptions(linear=True))
 
 
 @pytest.fixture(autouse=True)

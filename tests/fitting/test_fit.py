@@ -19,6 +19,7 @@ from koopmpc.cli.app import app
 from koopmpc.figures import style
 from koopmpc.fitting.fit import fit_data
 from koopmpc.fitting.logs import describe_guesses, divide_files, read_logs, shorten_notes
+from koopmpc.fitting.options import FitOptions
 from koopmpc.fitting.repair import find_repairs
 from tests import tiers
 from tests.bench.tiny import write
@@ -148,7 +149,7 @@ def test_the_report_is_of_episodes_that_no_fit_saw(tmp_path):
         made.append(km.Episode(X=X, U=U))
     data = km.Episodes(made, 0.1)
     data.save(tmp_path / "data.npz")
-    found = fit_data(tmp_path / "data.npz", tmp_path / "out", horizon=10)
+    found = fit_data(tmp_path / "data.npz", tmp_path / "out", FitOptions(horizon=10))
     held = {e.X.tobytes() for e in found.held_out}
     assert len(held) == 6
     assert held < {e.X.tobytes() for e in data}
@@ -167,13 +168,7 @@ def test_what_memory_does_not_hold_is_fitted_part_by_part_on_processes(tmp_path,
         data[2 * i : 2 * i + 2].save(tmp_path / "in" / f"{i:02d}.npz")
     told = []
     found = fit_data(
-        tmp_path / "in",
-        tmp_path / "out",
-        horizon=10,
-        memory=1000,
-        workers=2,
-        bilinear=False,
-        say=told.append,
+        tmp_path / "in", tmp_path / "out", FitOptions(horizon=10, workers=2, linear=True), memory=1000, say=told.append
     )
     assert "read in 12 parts: 1 of them is held out" in told[0]
     assert found.selection.predictor.report.samples == 22 * 40
@@ -191,7 +186,9 @@ def test_the_end_of_one_long_log_is_held_out_and_that_is_said(tmp_path):
     data = cart_pole(1, steps=500)
     write_csv(data, tmp_path / "csv")
     told = []
-    found = fit_data(tmp_path / "csv" / "00.csv", tmp_path / "out", horizon=10, bilinear=False, say=told.append)
+    found = fit_data(
+        tmp_path / "csv" / "00.csv", tmp_path / "out", FitOptions(horizon=10, linear=True), say=told.append
+    )
     assert re.search(r"the last fifth of the record is held out, in \d+ blocks", told[0])
     assert len(found.held_out) >= 4
     last = np.concatenate([e.X[:-1] for e in found.held_out])
@@ -247,7 +244,9 @@ def test_columns_that_say_nothing_are_left_out_and_wrapped_angles_unwrapped_and_
         U = np.column_stack([e.U, np.zeros(len(e))])
         km.Episodes([km.Episode(X=X, U=U)], 0.02, names, ["force", "brake"]).save(tmp_path / "in" / f"{i:02d}.npz")
     told = []
-    found = fit_data(tmp_path / "in", tmp_path / "out", horizon=10, memory=memory, bilinear=False, say=told.append)
+    found = fit_data(
+        tmp_path / "in", tmp_path / "out", FitOptions(horizon=10, linear=True), memory=memory, say=told.append
+    )
     for words in (
         "left out: temp is 7 throughout",
         "left out: again repeats x",
@@ -273,7 +272,7 @@ def test_a_folder_of_runs_is_data_though_their_table_is_in_it(tmp_path):
     km.sweep([problem], ["lqr"], folder=tmp_path / "runs")
     assert (tmp_path / "runs" / RESULTS).exists()
     told = []
-    found = fit_data(tmp_path / "runs", tmp_path / "out", horizon=1, say=told.append)
+    found = fit_data(tmp_path / "runs", tmp_path / "out", FitOptions(horizon=1), say=told.append)
     assert "2 files" in told[0]
     assert found.selection.predictor.states == problem.dynamics.states
 
@@ -284,7 +283,7 @@ def test_gaps_are_told(tmp_path):
     lines = (folder / "03.csv").read_text().splitlines()
     (folder / "03.csv").write_text("\n".join(lines[:20] + lines[25:]) + "\n")
     told = []
-    fit_data(folder, tmp_path / "out", horizon=10, say=told.append)
+    fit_data(folder, tmp_path / "out", FitOptions(horizon=10), say=told.append)
     assert re.search(r"! .*03\.csv.*gap", told[0])
 
 
@@ -386,7 +385,7 @@ def test_what_files_have_in_common_is_said_once_and_no_column_of_one_file_is_jud
             lines.append(",".join("" if np.isnan(c) else repr(float(c)) for c in cells))
         (tmp_path / f"{i:02d}.csv").write_text("\n".join(lines))
     told = []
-    found = fit_data(tmp_path, tmp_path / "out", horizon=10, bilinear=False, say=told.append)
+    found = fit_data(tmp_path, tmp_path / "out", FitOptions(horizon=10, linear=True), say=told.append)
     (gaps,) = [line for line in told[0].splitlines() if " gap" in line]
     every_other = ", ".join(f"{i:02d}.csv" for i in range(2, 24, 2))
     assert gaps.startswith(f"! 12 files ({tmp_path / '00.csv'}, {every_other}): 1 gap (after line 11)")
@@ -412,7 +411,7 @@ def test_logs_are_audited_and_what_is_safe_is_done_and_said(tmp_path):
     (tmp_path / "in").mkdir()
     data.with_episodes(made).save(tmp_path / "in" / "late.npz")
     told = []
-    found = fit_data(tmp_path / "in", tmp_path / "out", horizon=10, bilinear=False, say=told.append)
+    found = fit_data(tmp_path / "in", tmp_path / "out", FitOptions(horizon=10, linear=True), say=told.append)
     assert re.search(
         r"! spikes: theta leaves its path and returns, 20 times: .*these rows were left out", told[0], re.S
     )
@@ -432,7 +431,7 @@ def test_a_clock_that_jitters_is_evened_and_that_is_said(tmp_path):
             tmp_path / "csv" / f"{i:02d}.csv", rows, delimiter=",", header="time [s],x,theta,v,omega,force", comments=""
         )
     told = []
-    fit_data(tmp_path / "csv", tmp_path / "out", horizon=10, bilinear=False, say=told.append)
+    fit_data(tmp_path / "csv", tmp_path / "out", FitOptions(horizon=10, linear=True), say=told.append)
     unequal = r"sampling is unequal in 16 files, interpolated to 0\.0\d+ s; steps that differ by more than 2 %: "
     assert re.search(unequal + r"\S*00\.csv \(\d+ of 40, from line \d+\), 01\.csv \(", " ".join(told[0].split()))
     with pytest.raises(km.errors.DataError, match="sampling is unequal"):

@@ -15,9 +15,12 @@ from typer.testing import CliRunner
 import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.control.base import MPCBase
-from koopmpc.fitting.check import RunKind, check_controller
-from koopmpc.fitting.goal import design_data, format_template, load_reading, read_goal, write_template
+from koopmpc.fitting.check import check_controller
+from koopmpc.fitting.checked import RunKind
+from koopmpc.fitting.designing import design_data
+from koopmpc.fitting.goal import format_template, load_reading, read_goal, write_template
 from koopmpc.fitting.logs import read_logs, round_step
+from koopmpc.fitting.options import FitOptions
 from koopmpc.predict.base import load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign, read_controller
 from koopmpc.synthesis.doubts import describe_rest
@@ -43,12 +46,12 @@ def test_inputs_that_only_the_goal_file_names_are_inputs(tmp_path, monkeypatch):
     told = []
 
     def stop(data, *_, **how):
-        told.append((data.states, data.inputs, how["feedthrough"]))
+        told.append((data.states, data.inputs, how["options"].feedthrough))
         raise km.KoopmpcError("read")
 
-    monkeypatch.setattr("koopmpc.fitting.goal.design", stop)
+    monkeypatch.setattr("koopmpc.fitting.designing.design", stop)
     with pytest.raises(km.KoopmpcError, match="read"):
-        design_data(".", "goal.toml", "out", bilinear=False)
+        design_data(".", "goal.toml", "out", FitOptions(linear=True))
     assert CliRunner().invoke(app, ["fit", ".", "--goal", "goal.toml", "--feedthrough"]).exit_code
     assert told == [(NAMES[0], ("push [V]",), flag) for flag in (False, True)]
 
@@ -83,10 +86,10 @@ def test_the_line_that_a_template_prints_reads_logs_and_goal_as_the_template_was
     assert result.exit_code == 0, result.output
 
     def stop(data, *_, **options):
-        asked.append((data.states, data.inputs, data.dt, options["horizon"], options["bilinear"]))
+        asked.append((data.states, data.inputs, data.dt, options["horizon"], options["options"].bilinear))
         raise km.KoopmpcError("read")
 
-    monkeypatch.setattr("koopmpc.fitting.goal.design", stop)
+    monkeypatch.setattr("koopmpc.fitting.designing.design", stop)
     line = shlex.split(result.stdout.partition("then: ")[2])
     assert "read" in CliRunner().invoke(app, line[line.index("fit") :]).stderr
     assert asked == [(("level [cm]", "temperature [degC]"), ("inflow [l/s]", "heater [kW]"), 1.0, 8, False)]
@@ -156,9 +159,9 @@ def test_a_goal_file_keeps_every_keyword_that_reads_the_logs_and_a_call_replaces
         asked.update(arguments[4])
         raise km.KoopmpcError("read")
 
-    monkeypatch.setattr("koopmpc.fitting.goal.read_logs", stop)
+    monkeypatch.setattr("koopmpc.fitting.designing.read_logs", stop)
     with pytest.raises(km.KoopmpcError, match="read"):
-        design_data("logs", path, tmp_path, dt=0.25, inputs=None)
+        design_data("logs", path, tmp_path, FitOptions(dt=0.25, inputs=None))
     assert asked == given | {"dt": 0.25}
     for wrong, words in (
         ("logs = 3", "logs is 3; write a section"),
@@ -178,7 +181,7 @@ def test_a_model_is_judged_over_the_horizon_of_the_goal_where_the_logs_are_long_
 
     logs().save(tmp_path / "logs.npz")
     (tmp_path / "goal.toml").write_text(GOAL.replace("horizon = 15", f"horizon = {horizon}"))
-    monkeypatch.setattr("koopmpc.fitting.goal.design", stop)
+    monkeypatch.setattr("koopmpc.fitting.designing.design", stop)
     told = []
     with pytest.raises(km.KoopmpcError, match="read"):
         design_data(tmp_path / "logs.npz", tmp_path / "goal.toml", tmp_path, say=told.append)
@@ -210,7 +213,7 @@ def test_a_goal_file_keeps_the_step_that_an_uneven_clock_was_brought_to(tmp_path
     told: list[list[str]] = []
     for reading in ({}, {"resample": 0.1}):
         said: list[str] = []
-        text = write_template(tmp_path, say=said.append, **reading)
+        text = write_template(tmp_path, FitOptions(**reading), say=said.append)
         (tmp_path / "goal.toml").write_text(text)
         step = load_reading(tmp_path / "goal.toml")["resample"]
         assert step == pytest.approx(0.1, rel=0.05)
@@ -247,7 +250,7 @@ def quick(request, monkeypatch):
     if not {"page", "told"} & {*request.node.name.split("_")}:
         monkeypatch.setattr("koopmpc.fitting.check.write_design_report", lambda *_, **__: None)
     if "made" not in request.fixturenames:
-        monkeypatch.setattr("koopmpc.fitting.goal.write_design_report", lambda *arguments: arguments[2])
+        monkeypatch.setattr("koopmpc.fitting.designing.write_design_report", lambda *arguments: arguments[2])
     with small_designs():
         yield
 
@@ -313,7 +316,7 @@ def test_a_controller_that_misses_its_goal_fails_the_check_with_the_reason(tmp_p
     logs().save(tmp_path / "logs.npz")
     text = GOAL.replace("weight = 0.01", "weight = 1000.0")  # an input so dear that nothing is reached
     (tmp_path / "goal.toml").write_text(text)
-    made = design_data(tmp_path / "logs.npz", tmp_path / "goal.toml", tmp_path / "out", bilinear=False)
+    made = design_data(tmp_path / "logs.npz", tmp_path / "goal.toml", tmp_path / "out", FitOptions(linear=True))
     done = check_controller(made.controller, tmp_path, runs=3, rate=0.5)
     assert not done.kept
     assert any("off its reference, 5 % are allowed" in reason for reason in done.reasons)

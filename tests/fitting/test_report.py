@@ -13,8 +13,9 @@ import koopmpc as km
 from koopmpc.figures.evidence import draw_forecast, draw_log, draw_loops
 from koopmpc.figures.style import render_svg
 from koopmpc.fitting.check import check_controller
-from koopmpc.fitting.goal import design_data
+from koopmpc.fitting.designing import design_data
 from koopmpc.fitting.logs import read_logs
+from koopmpc.fitting.options import FitOptions
 from koopmpc.fitting.report import _SHOWN, _add_goal, _choose_columns
 from koopmpc.page import HtmlPage
 from koopmpc.predict.base import load_value
@@ -83,7 +84,7 @@ def made(tmp_path_factory):
     write_tank(folder / "logs")
     (folder / "goal.toml").write_text(GOAL)
     with small_designs():
-        return design_data(folder / "logs", folder / "goal.toml", folder / "out", bilinear=False)
+        return design_data(folder / "logs", folder / "goal.toml", folder / "out", FitOptions(linear=True))
 
 
 SECTIONS = [

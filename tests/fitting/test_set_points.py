@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.fitting.goal import design_data
+from koopmpc.fitting.designing import design_data
 from koopmpc.fitting.logs import IN_MEMORY, read_logs
+from koopmpc.fitting.options import FitOptions
 from koopmpc.fitting.set_points import take_set_points
 from koopmpc.synthesis.search.feedback import remove_feedback
 from tests.fitting.mass import GOAL, A, B
@@ -47,9 +48,13 @@ def test_set_points_in_a_table_are_instruments_of_the_design(tmp_path):
     data = km.load_episodes(tmp_path / "loop.csv", states=["position", "speed"], inputs=["force"])
     assert remove_feedback(data, None).episodes is data
     (tmp_path / "goal.toml").write_text(PLAIN)
-    made = design_data(tmp_path / "loop.csv", tmp_path / "goal.toml", tmp_path, set_points=["goal"], bilinear=False)
+    made = design_data(
+        tmp_path / "loop.csv", tmp_path / "goal.toml", tmp_path, FitOptions(set_point=["goal"], linear=True)
+    )
     assert any("rows of the set point explain" in note for note in made.design.notes), made.design.notes
     model = made.design.controller.predictor
     assert model.states == ("position", "speed")
     with pytest.raises(km.KoopmpcError, match="wish"):
-        design_data(tmp_path / "loop.csv", tmp_path / "goal.toml", tmp_path, set_points=["wish"], bilinear=False)
+        design_data(
+            tmp_path / "loop.csv", tmp_path / "goal.toml", tmp_path, FitOptions(set_point=["wish"], linear=True)
+        )

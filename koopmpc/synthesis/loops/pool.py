@@ -15,11 +15,10 @@ from koopmpc.synthesis.loops.abreast import Acting, Crowd, CrowdStep, run_abreas
 from koopmpc.synthesis.loops.judging import read_reference, run_on_surrogate
 from koopmpc.synthesis.loops.neighbours import NeighbourMap
 from koopmpc.synthesis.loops.surrogates import Surrogate
+from koopmpc.synthesis.rates import KEPT, SHIFT
 from koopmpc.synthesis.task import DesignTask, goal_box
 
-KEPT = 0.01  # a loop keeps its limits if it violates none by more than this share of its range
 NEIGHBOURS = 2 / 3  # share of the loops on nearest neighbours; the others are on learned models
-SHIFT = 0.05  # a fresh start is a start of the task moved by up to this share of the data's range
 GAIN = 0.1  # in fresh loops inputs act by up to this share more or less
 LATE = 0.1  # and up to this share of a step late
 ABREAST = 256  # loops that run side by side, at most: their controllers need about 0.1 MB each
