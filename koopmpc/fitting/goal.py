@@ -242,12 +242,12 @@ def read_goal(path: str | PathLike[str], data: Episodes) -> Goal:
     )
 
 
-Column = Float[np.ndarray, " n"]
+SignalColumn = Float[np.ndarray, " n"]
 
 
 def _read_states(
     sections: Sequence[Mapping[str, Any]], names: Sequence[str], file: Path
-) -> tuple[Column, Column, Column, list[int], dict[int, Float[np.ndarray, "..."]]]:
+) -> tuple[SignalColumn, SignalColumn, SignalColumn, list[int], dict[int, Float[np.ndarray, "..."]]]:
     """Return weights, lower and upper limits, angles, and the reference of each state that has one."""
     Q, low, high = np.zeros(len(names)), np.full(len(names), -np.inf), np.full(len(names), np.inf)
     angles, rows = list[int](), dict[int, Float[np.ndarray, "..."]]()
@@ -267,7 +267,7 @@ def _read_states(
 
 def _read_inputs(
     sections: Sequence[Mapping[str, Any]], names: Sequence[str], file: Path
-) -> tuple[Column, Column, Column, Column, Column]:
+) -> tuple[SignalColumn, SignalColumn, SignalColumn, SignalColumn, SignalColumn]:
     """Return weights, weights of changes, lower and upper limits, and limits of changes."""
     nu = len(names)
     R, R_delta, change = np.zeros(nu), np.zeros(nu), np.full(nu, np.inf)
