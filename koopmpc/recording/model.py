@@ -19,16 +19,9 @@ from koopmpc.figures.eigenvalues import Axes, Plane, evaluate_eigenfunctions, ma
 from koopmpc.figures.style import CYCLIC, SEQUENTIAL, map_colors
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.recording.blueprint import (
-    color,
-    draw_eigenvalues,
-    eigenvalue_views,
-    frame_views,
-    plane_view,
-    shared_time,
-    write_page,
-)
+from koopmpc.recording.blueprint import color, frame_views, shared_time, write_page
 from koopmpc.recording.description import Entity, drawable, written_with
+from koopmpc.recording.eigenvalues import draw_eigenvalues, eigenvalue_views, plane_view
 from koopmpc.recording.reader import naming, read_columns
 from koopmpc.recording.rrd import CHECK, file_recording, times
 from koopmpc.scene import Color

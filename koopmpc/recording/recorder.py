@@ -20,8 +20,9 @@ from koopmpc.errors import DataError
 from koopmpc.loop.rows import Step, StepRows
 from koopmpc.loop.run import About, Run
 from koopmpc.predict.base import Predictor
+from koopmpc.recording.blocks import block_of_steps
 from koopmpc.recording.viewer import PORT, find_viewer, is_up, quiet, why_none
-from koopmpc.recording.writer import Writer, block_of_steps
+from koopmpc.recording.writer import Writer
 from koopmpc.scene import Scene
 
 

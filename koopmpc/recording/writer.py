@@ -3,12 +3,10 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from koopmpc import checks
 from koopmpc.control.move import Fallback
@@ -16,16 +14,16 @@ from koopmpc.disk import path_of
 from koopmpc.errors import KoopmpcError
 from koopmpc.interrupts import raise_swallowed
 from koopmpc.loop.metrics import metrics
-from koopmpc.loop.rows import MOVE_COLUMNS, Plans, Step, StepRows
+from koopmpc.loop.rows import MOVE_COLUMNS
 from koopmpc.loop.run import About, Run
 from koopmpc.predict.base import Predictor
+from koopmpc.recording.blocks import LogBlock, block_of_run, blocks, find_differing, match_plans, take_where
 from koopmpc.recording.blueprint import (
     LOG_TIME,
     SEPARATE,
     VIEW,
     ahead,
     blueprint,
-    draw_eigenvalues,
     limit_lines,
     panels,
     status_value,
@@ -45,69 +43,12 @@ from koopmpc.recording.description import (
     to_json,
     to_markdown,
 )
+from koopmpc.recording.eigenvalues import draw_eigenvalues
 from koopmpc.recording.rrd import CHECK, LogFile, new_recording, send_blueprint, times
 from koopmpc.recording.scenes import Drawing, Scenes
 from koopmpc.scene import Scene
 
 _FLUSH = 3.0  # longest wait for a sink of a running loop [s]
-_NO_PLANS = Plans(np.empty((0, 0, 0)), np.empty((0, 0, 0)))
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LogBlock(StepRows):
-    """Rows k, k+1, … of a run, and the plans of those steps that have one.
-
-    Attributes
-    ----------
-    k
-        The step of the first row.
-    planned
-        (p,) steps that have a plan.
-    plan_X, plan_U
-        (p, N+1, nx) and (p, N, nu) their plans.
-    """
-
-    k: int
-    planned: Int[np.ndarray, " p"]
-    plan_X: Float[np.ndarray, "p N1 nx_plan"]
-    plan_U: Float[np.ndarray, "p N nu_plan"]
-
-    @property
-    def horizon(self) -> int:
-        """Length of the plans, 0 where there is none."""
-        return self.plan_U.shape[1] if len(self.planned) else 0
-
-    def cut(self, first: int, last: int) -> "LogBlock":
-        """Return rows first … last − 1, counted from this block's own first row."""
-        rows, p = self.part(first, last), slice(*np.searchsorted(self.planned, [self.k + first, self.k + last]))
-        plans: dict[str, Any] = {"planned": self.planned[p], "plan_X": self.plan_X[p], "plan_U": self.plan_U[p]}
-        return LogBlock(**rows.columns(), k=self.k + first, **plans)
-
-
-def block_of_run(run: Run) -> LogBlock:
-    """Return the whole of `run` as one block."""
-    plans = run.plans or _NO_PLANS
-    return LogBlock(**run.columns(), k=0, planned=np.arange(len(plans.X)), plan_X=plans.X, plan_U=plans.U)
-
-
-def block_of_steps(steps: Sequence[Step], nx: int, *, end: bool) -> LogBlock:
-    """Return consecutive steps as a block; with `end`, the state that the last one led to follows."""
-    plans = [(step.k, plan) for step in steps if (plan := step.plan) is not None]
-    planned = np.array([k for k, _ in plans], dtype=np.int64)
-    rows, whole = StepRows.of(steps, nx, end=end), Plans.of([plan for _, plan in plans]) or _NO_PLANS
-    return LogBlock(**rows.columns(), k=steps[0].k, planned=planned, plan_X=whole.X, plan_U=whole.U)
-
-
-def blocks(rows: LogBlock, least: int = 100, most: int = 5) -> list[LogBlock]:
-    """Return `rows` as consecutive blocks of at least `least` steps, at most `most` of them.
-
-    The state that the last move led to belongs to the last block.
-    """
-    moves = len(rows.U)
-    size = max(least, -(-moves // most))
-    starts = range(0, moves - size + 1, size) if moves > size else range(1)
-    ends = [*starts[1:], len(rows.X)]
-    return [rows.cut(a, b) for a, b in zip(starts, ends, strict=True)]
 
 
 class Writer:
@@ -201,7 +142,7 @@ class Writer:
             self._vectors(Entity.PLAN_STATES, rows.planned, rows.plan_X)
             self._vectors(Entity.PLAN_INPUTS, rows.planned, rows.plan_U)
         self._plots(rows, k)
-        measured, shown = _differ(rows.X, rows.Y), panels(self._about, self._nr)
+        measured, shown = find_differing(rows.X, rows.Y), panels(self._about, self._nr)
         if len(measured):
             self._style(Entity.MEASUREMENT, self._looks[Entity.MEASUREMENT])
         self._vectors(Entity.MEASUREMENT, k[measured], rows.Y[measured], [i for p in shown for i in p.measured])
@@ -216,7 +157,7 @@ class Writer:
         import rerun as rr
 
         self._vectors(Entity.INPUT, k, rows.U)
-        held = _differ(np.zeros_like(rows.u_reference), rows.u_reference)
+        held = find_differing(np.zeros_like(rows.u_reference), rows.u_reference)
         self._vectors(Entity.INPUT_REFERENCE, k[held], rows.u_reference[held])
         for column in MOVE_COLUMNS:
             if column.log and column.dtype is not None:
@@ -238,8 +179,8 @@ class Writer:
         ):
             values = np.ascontiguousarray(column[held])
             if held.any():
-                columns += _where(held, "koopmpc.Solver", name, values)
-        columns += _where(timed, VIEW, LOG_TIME, np.log10(rows.solve_time[timed]).astype(np.float32))
+                columns += take_where(held, "koopmpc.Solver", name, values)
+        columns += take_where(timed, VIEW, LOG_TIME, np.log10(rows.solve_time[timed]).astype(np.float32))
         self._send(Entity.SOLVER, k, columns)
 
     def flush(self) -> None:
@@ -386,17 +327,8 @@ class Writer:
         self._plans = {step: plan for step, plan in self._plans.items() if step + N > k[-1]}
 
     def _plans_of(self, rows: LogBlock) -> list[tuple[int, np.ndarray, np.ndarray]]:
-        """Return the step, the states and the inputs of each plan; NaN for a state that the plan does not hold.
-
-        A model may have other states than the plant: those of its outputs. States of one name are the same.
-        """
-        states, width = self._about.states, rows.plan_X.shape[-1]
-        known = [() if self._model is None else self._model.states, states, self._about.outputs]
-        names = next((each for each in known if len(each) == width), ())
-        X = np.full((*rows.plan_X.shape[:-1], len(states)), np.nan)
-        both = [(i, names.index(name)) for i, name in enumerate(states) if name in names]
-        X[..., [i for i, _ in both]] = rows.plan_X[..., [j for _, j in both]]
-        return list(zip(rows.planned.tolist(), X, rows.plan_U, strict=True))
+        model = () if self._model is None else self._model.states
+        return match_plans(rows, self._about.states, (model, self._about.states, self._about.outputs))
 
     def _style(self, entity: str, style: Any) -> None:
         """Log a static archetype of the entity, once."""
@@ -430,22 +362,6 @@ class Writer:
             told, k = [words[i] for i in changed], first + np.array(changed)
             self._send(entity, k, rr.StateChange.columns(state=told))
         return changed
-
-
-def _where(held: np.ndarray, archetype: str, component: str, values: np.ndarray) -> Any:
-    """Return the columns of a component that only some rows have: a value for each of those."""
-    import rerun as rr
-
-    return rr.DynamicArchetype.columns(archetype, components={component: values}).partition(held.astype(np.int64))
-
-
-def _differ(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
-    """Return the rows of Y that are not, to the bit, those of X."""
-    if X.shape != Y.shape or not X.size:
-        return np.arange(len(Y))
-    return np.flatnonzero(
-        (np.ascontiguousarray(X).view(np.int64) != np.ascontiguousarray(Y).view(np.int64)).any(axis=1)
-    )
 
 
 @raise_swallowed()  # Rerun's own code may swallow a Ctrl-C

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 import koopmpc as km
 from koopmpc.loop.rows import StepRows
 from koopmpc.loop.run import About
+from koopmpc.recording.blocks import block_of_run, blocks
 from koopmpc.recording.description import _FORMAT, DRAWN, drawable, from_json, title_of, to_json, to_markdown
 from koopmpc.recording.reader import LogColumns, read_columns
 from koopmpc.recording.scenes import ReferenceScenes
-from koopmpc.recording.writer import block_of_run, blocks
 from tests.control.models import step_map
 from tests.fixtures.logs.make import FOLDER as LOGS
 from tests.fixtures.logs.make import made

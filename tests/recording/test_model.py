@@ -10,7 +10,7 @@ import pytest
 import koopmpc as km
 from koopmpc.figures.eigenvalues import evaluate_eigenfunctions, make_plane
 from koopmpc.figures.style import SEQUENTIAL
-from koopmpc.recording.blueprint import draw_eigenvalues
+from koopmpc.recording.eigenvalues import draw_eigenvalues
 from koopmpc.recording.model import load_model_log
 from koopmpc.recording.reader import LogColumns, read_columns
 from tests.figures.models import DT, INPUTS, STATES, episodes, turning

@@ -246,7 +246,7 @@ with km.Recorder({path!r}, **about(run)) as recorder:
 def test_a_file_that_takes_in_no_more_is_told_after_the_patience_for_files(tmp_path: Path, monkeypatch) -> None:
     goes_on, write, run = threading.Event(), writer.Writer.write, make_run(T=3, N=None)
 
-    def wait(self: writer.Writer, rows: writer.LogBlock) -> None:
+    def wait(self: writer.Writer, rows) -> None:
         goes_on.wait()
         write(self, rows)
 
