@@ -12,7 +12,7 @@ from koopmpc import checks
 from koopmpc.checks import HUGE
 from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import GAIN
-from koopmpc.estimate.filter import find_gain
+from koopmpc.estimate.filter import find_kalman_gain
 from koopmpc.estimate.gate import Gated, ReadingGate
 from koopmpc.estimate.kalman import NOT_TOGETHER
 from koopmpc.estimate.observer import StateModel
@@ -242,7 +242,7 @@ class ExtendedObserver(Gated):
         gap: Float[np.ndarray, " m"],
     ) -> tuple[Float[np.ndarray, " ns"], Float[np.ndarray, "ns ns"]]:
         """Return s and P after a reading, in Joseph's form."""
-        K = find_gain(P, H, R)
+        K = find_kalman_gain(P, H, R)
         kept = np.eye(len(s)) - K @ H
         return s + K @ gap, kept @ P @ kept.T + K @ R @ K.T
 

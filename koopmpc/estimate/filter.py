@@ -20,7 +20,7 @@ from koopmpc.predict.predictors import LinearPredictor
 from koopmpc.values import Viewing
 
 
-def find_gain(
+def find_kalman_gain(
     P: Float[np.ndarray, "n n"], M: Float[np.ndarray, "m n"], R: Float[np.ndarray, "m m"]
 ) -> Float[np.ndarray, "n m"]:
     """Return K = P Mᵀ(M P Mᵀ + R)⁻¹; the outputs are scaled first, so that their units do not decide its accuracy."""
@@ -309,7 +309,7 @@ class KalmanFilter(Gated, Viewing):
         """Return the gain of those measurements that have come."""
         key = came.tobytes()
         if key not in self._gains:
-            self._gains[key] = find_gain(self._P, self._system.M[came], self._R[np.ix_(came, came)])
+            self._gains[key] = find_kalman_gain(self._P, self._system.M[came], self._R[np.ix_(came, came)])
         return self._gains[key]
 
 

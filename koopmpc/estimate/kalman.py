@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.errors import DataError, ObservableError, ShapeError
 from koopmpc.estimate.disturbance import GAIN
-from koopmpc.estimate.filter import Augmented, FilterModel, KalmanFilter, PeriodicFilter, find_gain
+from koopmpc.estimate.filter import Augmented, FilterModel, KalmanFilter, PeriodicFilter, find_kalman_gain
 from koopmpc.estimate.observer import StateModel
 from koopmpc.estimate.periodic import find_harmonics
 from koopmpc.lifting.base import Lifting, strip_unit
@@ -316,7 +316,7 @@ def _settling(
     known[:nz, :nz] = process
     for row, drift in zip(left, DRIFTS, strict=True):
         P = _stationary(F, M, known + drift * drifting, R)
-        K = find_gain(P, M, R)
+        K = find_kalman_gain(P, M, R)
         row[:] = np.abs(np.linalg.matrix_power(F - F @ K @ M, whole).diagonal()[nz:])
     enough = left <= exp(-whole / steps)
     return DRIFTS[np.where(enough.any(axis=0), enough.argmax(axis=0), left.argmin(axis=0))]

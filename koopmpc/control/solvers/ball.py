@@ -56,7 +56,7 @@ class BallSolver(StepSolver):
         self._set_ball(ball)
 
     def _set_ball(self, ball: Ball) -> None:
-        """Write the cone program of x = [w; slacks of soft rows; slack of a soft ball], but for its bounds.
+        """Write the cone program of x = [w; slacks of soft rows; slack of a soft ball] without its bounds.
 
         Its rows are A w − slacks ≤ high, −A w − slacks ≤ −low, slacks ≥ 0, and the cone ‖y_0 + D w‖ ≤ 1 + slack.
         """
