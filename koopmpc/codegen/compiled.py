@@ -229,6 +229,36 @@ class Compiled(CompiledLoops):
             self._at_call, self._passed = None, self._fill_bounds(self.limits, 0, 1)
         self._frame.bounds = None if self._passed is None else self._passed.at(0)
 
+    def _choose_limits(self, limits: Limits | None) -> None:
+        """Pass the limits of this step, and count it: those of the call, of the row in time, or C's own again."""
+        frame = self._frame
+        if limits is not None or (self._at_call is not None and not self._timed):
+            self._move_limits(limits)
+            self._step += 1
+        elif self._timed:
+            page, step, self._at_call = self._page, self._step, None
+            if page is None or not 0 <= step - page.first < _PAGE:
+                page = self._turn_page()
+            frame.bounds, self._step = page.at(step), step + 1
+        else:  # C has the limits of the last call
+            frame.bounds = self._passed = None
+
+    def _read_reference(self, reference: ArrayLike) -> None:
+        """Write the rows of a reference into the frame, and find the targets of new ones."""
+        target = numbers(reference, "reference")
+        if target.shape == self._row_shape:
+            self._row[:] = target
+            count = 1
+        elif target.shape == self._rows_shape:  # not by a method, for it costs a tenth of the step
+            self._reference[:] = target
+            count = len(target)
+        else:
+            count = self._copy_rows(target, self._reference, self._nr, "reference")
+        if count != self._count:  # writing a field takes as long as the C step
+            self._frame.reference.count = self._count = count
+        if self._targets is not None and target.tobytes() != self._last_rows:
+            self._aim_next(target)
+
     def __call__(
         self,
         y: ArrayLike,
@@ -252,31 +282,11 @@ class Compiled(CompiledLoops):
             if measured.shape != self._y_shape:
                 raise ShapeError(f"y has shape {measured.shape}, expected {self._y_shape}")
             self._y[:] = measured
-            target = numbers(reference, "reference")
-            if target.shape == self._row_shape:
-                self._row[:] = target
-                count = 1
-            elif target.shape == self._rows_shape:  # not by a method, for it costs a tenth of the step
-                self._reference[:] = target
-                count = len(target)
-            else:
-                count = self._copy_rows(target, self._reference, self._nr, "reference")
-            if count != self._count:  # writing a field takes as long as the C step
-                frame.reference.count = self._count = count
-            if self._targets is not None and target.tobytes() != self._last_rows:
-                self._aim_next(target)
+            self._read_reference(reference)
             if applied is not None or w is not None or self._has_extras:
                 self._pass_extras(applied, w)
-            if limits is not None or (self._at_call is not None and not self._timed):
-                self._move_limits(limits)
-                self._step += 1
-            elif self._timed:
-                page, step, self._at_call = self._page, self._step, None
-                if page is None or not 0 <= step - page.first < _PAGE:
-                    page = self._turn_page()
-                frame.bounds, self._step = page.at(step), step + 1
-            elif self._passed is not None:  # C has the limits of the last call, which are its own again
-                frame.bounds = self._passed = None
+            if limits is not None or self._timed or self._at_call is not None or self._passed is not None:
+                self._choose_limits(limits)
             self._call(self._pointer)
             u = self._u.copy() if self._is_double else self._u.astype(np.float64)
             if not frame.status and not frame.refused:

@@ -296,9 +296,11 @@ def _measure_objects(root: Path, name: str) -> tuple[int, int, int] | None:
     return flash, state, stack
 
 
-def _write_readme(tables: Tables, measured: tuple[int, int, int] | None, precision: Precision) -> str:
-    """Return the README of the folder: how to build and call the controller, its memory and its operations."""
-    sizes, model, single = tables.sizes, tables.program.model, precision == "float"
+def _list_measures(
+    tables: Tables, measured: tuple[int, int, int] | None, precision: Precision
+) -> list[tuple[str, str]]:
+    """Return what a controller takes, each with its value: memory, operations, digits."""
+    sizes, single = tables.sizes, precision == "float"
     numbers_held = count_constants(tables) * (4 if single else 8)
     rows = [("constants", f"{numbers_held} bytes")]
     if measured is not None:
@@ -322,7 +324,13 @@ def _write_readme(tables: Tables, measured: tuple[int, int, int] | None, precisi
     rows.append(
         (f"change of an input by rounding in {precision} precision, at most", f"{100 * rounding:.2g} % of its range")
     )
-    table = "\n".join(f"| {what} | {value} |" for what, value in rows)
+    return rows
+
+
+def _write_readme(tables: Tables, measured: tuple[int, int, int] | None, precision: Precision) -> str:
+    """Return the README of the folder: how to build and call the controller, its memory and its operations."""
+    sizes, model = tables.sizes, tables.program.model
+    table = "\n".join(f"| {what} | {value} |" for what, value in _list_measures(tables, measured, precision))
     notes = "".join(f"- {note}\n" for note in filter(None, [*tables.notes, tables.effort]))
     solver = (
         "`daqp/` holds sources of DAQP 0.11.0 by Daniel Arnström, unchanged, under the MIT licence in `daqp/LICENSE`.\n"

@@ -184,18 +184,23 @@ def _add_sizes(tables: Tables, program: StepProgram) -> None:
             tables.arrays.setdefault(f"{name}_{end}", np.zeros(model.nu))
     if bounds is not None:
         tables.notes.append(_BOUNDS_NOTE)
-    inside = {"zeta": program.lifting.n, "y": sizes["NY"], "predicted": sizes["NY"], "memory": sizes["GATE"]}
-    inside |= {"x": program.lifting.n, "u": model.nu, "v": model.nu, "w": nw * sizes.get("SCHEDULED", 0)}
-    inside |= {"s": sizes.get("NS", 0), "r": sizes.get("Q_LENGTH", 0)}
+    _name_functions(tables, program)
+    _add_memory(
+        sizes, "TARGET", [(sizes[f"{name}_VARIABLES"], sizes[f"{name}_COUNT"], 0) for name in _target_solvers(sizes)]
+    )
+
+
+def _name_functions(tables: Tables, program: StepProgram) -> None:
+    """Give each function its name in C and its arguments."""
+    sizes, n, nu = tables.sizes, program.lifting.n, program.model.nu
+    inside = {"zeta": n, "y": sizes["NY"], "predicted": sizes["NY"], "memory": sizes["GATE"], "x": n, "u": nu, "v": nu}
+    inside |= {"w": sizes["NW"] * sizes.get("SCHEDULED", 0), "s": sizes.get("NS", 0), "r": sizes.get("Q_LENGTH", 0)}
     functions: dict[str, CFunction] = {}
     for path, (graph, _, _) in tables.functions.items():
         name, result, arguments = ARGUMENTS[path]
         counts = {argument: inside[argument] for argument in arguments if inside[argument]}
         functions[name] = CFunction(graph, counts, result)
     tables.functions = functions
-    _add_memory(
-        sizes, "TARGET", [(sizes[f"{name}_VARIABLES"], sizes[f"{name}_COUNT"], 0) for name in _target_solvers(sizes)]
-    )
 
 
 def _target_solvers(sizes: Mapping[str, int]) -> list[str]:

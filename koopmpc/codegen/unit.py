@@ -139,59 +139,68 @@ _BUILD = """<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
+_WHOLE = (("status", _STATUS), ("fallback", _FALLBACK), ("iterations", "iterations of the QP solver"))
+
+
+def _list_variables_2(reals: list[_Real]) -> list[str]:
+    """Return the elements of all variables by FMI 2."""
+    rows: list[str] = []
+    for i, each in enumerate(reals):
+        kind = "fixed" if each.cause == "parameter" else "discrete"
+        exact = ' initial="exact"' if each.cause != "input" else ""
+        unit = f" unit={quoteattr(each.unit)}" if each.unit else ""
+        rows.append(
+            f'    <ScalarVariable name="{each.name}" valueReference="{i}" causality="{each.cause}" '
+            f'variability="{kind}"{exact} description={quoteattr(each.what)}>'
+            f'<Real start="0"{unit}/></ScalarVariable>'
+        )
+    for i, (word, what) in enumerate(_WHOLE, len(reals)):
+        rows.append(
+            f'    <ScalarVariable name="{word}" valueReference="{i}" causality="output" variability="discrete" '
+            f'initial="exact" description={quoteattr(what)}><Integer start="0"/></ScalarVariable>'
+        )
+    return rows
+
+
+def _list_variables_3(reals: list[_Real]) -> list[str]:
+    """Return the elements of all variables by FMI 3, time among them."""
+    rows: list[str] = []
+    for i, each in enumerate(reals):
+        kind = ' variability="fixed"' if each.cause == "parameter" else ' variability="discrete"'
+        kind += ' initial="exact"' if each.cause != "input" else ""
+        unit = f" unit={quoteattr(each.unit)}" if each.unit else ""
+        rows.append(
+            f'    <Float64 name="{each.name}" valueReference="{i}" causality="{each.cause}"{kind} start="0"{unit} '
+            f"description={quoteattr(each.what)}/>"
+        )
+    for i, (word, what) in enumerate(_WHOLE, len(reals)):
+        rows.append(
+            f'    <Int32 name="{word}" valueReference="{i}" causality="output" variability="discrete" '
+            f'initial="exact" start="0" description={quoteattr(what)}/>'
+        )
+    time = len(reals) + len(_WHOLE)
+    rows.append(f'    <Float64 name="time" valueReference="{time}" causality="independent" variability="continuous"/>')
+    return rows
+
+
 def _describe(tables: Tables, name: str, token: str, version: FMIVersion) -> str:
     """Return modelDescription.xml."""
     reals, dt = _list_reals(tables), repr(float(tables.program.dt))
-    whole = (("status", _STATUS), ("fallback", _FALLBACK), ("iterations", "iterations of the QP solver"))
     units = sorted({each.unit for each in reals if each.unit})
     outputs = [i for i, each in enumerate(reals) if each.cause == "output"]
-    outputs += range(len(reals), len(reals) + len(whole))
+    outputs += range(len(reals), len(reals) + len(_WHOLE))
     definitions = "".join(f"<Unit name={quoteattr(unit)}/>" for unit in units)
     definitions = f"  <UnitDefinitions>{definitions}</UnitDefinitions>\n" if units else ""
     experiment = f'  <DefaultExperiment startTime="0" stepSize="{dt}"/>\n'
     head = f"modelName={quoteattr(name)} description={quoteattr(tables.program.controller + ' of koopmpc. ' + _ORDER)}"
     head += ' generationTool="koopmpc" variableNamingConvention="structured"'
-    rows: list[str] = []
-    if version == 3:
-        for i, each in enumerate(reals):
-            kind = ' variability="fixed"' if each.cause == "parameter" else ' variability="discrete"'
-            kind += ' initial="exact"' if each.cause != "input" else ""
-            unit = f" unit={quoteattr(each.unit)}" if each.unit else ""
-            what = quoteattr(each.what)
-            rows.append(
-                f'    <Float64 name="{each.name}" valueReference="{i}" causality="{each.cause}"{kind} start="0"{unit} '
-                f"description={what}/>"
-            )
-        for i, (word, what) in enumerate(whole, len(reals)):
-            rows.append(
-                f'    <Int32 name="{word}" valueReference="{i}" causality="output" variability="discrete" '
-                f'initial="exact" start="0" description={quoteattr(what)}/>'
-            )
-        rows.append(
-            f'    <Float64 name="time" valueReference="{len(reals) + len(whole)}" causality="independent" '
-            'variability="continuous"/>'
-        )
-        structure = "".join(f'<Output valueReference="{i}"/>' for i in outputs)
-        opening = f'fmiVersion="3.0" instantiationToken="{token}"'
-        interface = (
-            f'  <CoSimulation modelIdentifier="{name}" canHandleVariableCommunicationStepSize="false" '
-            f'fixedInternalStepSize="{dt}"/>\n'
-        )
-    else:
-        for i, each in enumerate(reals):
-            kind = "fixed" if each.cause == "parameter" else "discrete"
-            exact = ' initial="exact"' if each.cause != "input" else ""
-            unit = f" unit={quoteattr(each.unit)}" if each.unit else ""
-            rows.append(
-                f'    <ScalarVariable name="{each.name}" valueReference="{i}" causality="{each.cause}" '
-                f'variability="{kind}"{exact} description={quoteattr(each.what)}>'
-                f'<Real start="0"{unit}/></ScalarVariable>'
-            )
-        for i, (word, what) in enumerate(whole, len(reals)):
-            rows.append(
-                f'    <ScalarVariable name="{word}" valueReference="{i}" causality="output" variability="discrete" '
-                f'initial="exact" description={quoteattr(what)}><Integer start="0"/></ScalarVariable>'
-            )
+    structure = "".join(f'<Output valueReference="{i}"/>' for i in outputs)
+    opening = f'fmiVersion="3.0" instantiationToken="{token}"'
+    interface = (
+        f'  <CoSimulation modelIdentifier="{name}" canHandleVariableCommunicationStepSize="false" '
+        f'fixedInternalStepSize="{dt}"/>\n'
+    )
+    if version == 2:
         structure = "".join(f'<Unknown index="{i + 1}"/>' for i in outputs)
         structure = f"<Outputs>{structure}</Outputs>"
         opening = f'fmiVersion="2.0" guid="{token}"'
@@ -199,7 +208,7 @@ def _describe(tables: Tables, name: str, token: str, version: FMIVersion) -> str
             f'  <CoSimulation modelIdentifier="{name}" canHandleVariableCommunicationStepSize="false">\n'
             f'    <SourceFiles><File name="{name}.c"/></SourceFiles>\n  </CoSimulation>\n'
         )
-    variables = "\n".join(rows)
+    variables = "\n".join((_list_variables_3 if version == 3 else _list_variables_2)(reals))
     return (
         f'<?xml version="1.0" encoding="UTF-8"?>\n<fmiModelDescription {opening} {head}>\n{interface}{definitions}'
         f"{experiment}  <ModelVariables>\n{variables}\n  </ModelVariables>\n"
