@@ -70,13 +70,13 @@ class MovingLimits:
     ) -> None:
         self._own, self._outputs, self._problem, self._latency = outputs.limits, outputs, problem, latency
         self._names, self._called_with = (tuple(states), tuple(inputs)), None
-        self._fixed = StageLimits(outputs.inputs, problem.stage_limits)
-        if self._own.in_time:
+        self._fixed, self._timed = StageLimits(outputs.inputs, problem.stage_limits), self._own.in_time
+        if self._timed:
             check_rows(self._own, outputs, problem, inputs, None)
 
     def at(self, step: int, limits: Limits | None) -> StageLimits:
         """Return the limits of a step: those of the call, or the controller's own."""
-        if limits is None and not self._own.in_time:
+        if limits is None and not self._timed:
             return self._fixed
         if limits is None:
             return self._find(self._own, step)
