@@ -22,6 +22,7 @@ from koopmpc.validate.logs.alignment import (
     find_saturated_actuators,
 )
 from koopmpc.validate.logs.changes import find_changes
+from koopmpc.validate.logs.inputs import find_constant_inputs, find_low_excitation
 from koopmpc.validate.logs.log import (
     Log,
     LogFault,
@@ -49,7 +50,7 @@ for _check in (
     values.find_outliers,
 ):
     register_check(_check)
-for _check in (values.find_constant_inputs, find_dependent_inputs, values.find_low_excitation, find_feedback):
+for _check in (find_constant_inputs, find_dependent_inputs, find_low_excitation, find_feedback):
     register_check(_check, of_inputs=True)
 _HIDDEN = "rows at the sensor's limit are missing, and it is the output that chose them"
 _MOST_STEPS = 200_000  # check at most this many steps, those of the first episodes

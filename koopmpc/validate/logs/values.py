@@ -1,4 +1,4 @@
-"""Faults in single values: numbers that repeat or stand still while the plant moves, spikes, jumps and constant inputs.
+"""Faults in single values: numbers that repeat or stand still while the plant moves, spikes and jumps.
 
 A live sensor has noise and never repeats a number; a faulty sensor does.
 """
@@ -10,11 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.lifting.base import strip_unit
 from koopmpc.text import to_percent
 from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, Repair, find_stretches, list_places, name_episodes
-from koopmpc.validate.sufficiency import persistency
 
 
 @dataclass(frozen=True)
@@ -466,36 +464,3 @@ def find_jumps(log: Log) -> Iterator[LogFault]:
             places=tuple(places),
             repair=Repair.LEAVE_OUT,
         )
-
-
-def find_constant_inputs(log: Log) -> Iterator[LogFault]:
-    """Find inputs that never move."""
-    for j in np.flatnonzero(np.ptp(log.U, axis=0) == 0):
-        name = strip_unit(log.data.inputs[j])
-        yield LogFault(
-            "constant input",
-            f"{name} is {log.U[0, j]:.4g} throughout: its effect cannot be learned",
-            f"excite {name}, with km.Noise or km.PRBS, or leave it out",
-            (log.data.inputs[j],),
-            repair=Repair.COLUMN,
-        )
-
-
-def find_low_excitation(log: Log) -> Iterator[LogFault]:
-    """Find inputs that are exciting of a lower order than the plant has states."""
-    order = log.data.nx + 1
-    for j in np.flatnonzero(np.ptp(log.U, axis=0) > 0):
-        long = [e for e in log.data if len(e) > order + 1]
-        if not long:
-            continue
-        # use differences: a constant level would raise the order by one without exciting the plant
-        differences = Episodes([Episode(X=e.X[1:], U=np.diff(e.U[:, [j]], axis=0)) for e in long], log.data.dt)
-        good = int((persistency(differences, order).conditions < 1e7).sum())
-        if good < min(order, 3):
-            name = strip_unit(log.data.inputs[j])
-            yield LogFault(
-                "little excitation",
-                f"{name} excites to order {good} only, and {log.data.nx} states ask for {order}: a sine, or rare steps",
-                f"excite {name} with km.Noise, km.PRBS or km.Multisine",
-                (log.data.inputs[j],),
-            )
