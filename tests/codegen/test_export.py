@@ -11,10 +11,6 @@ from typer.testing import CliRunner
 
 import koopmpc as km
 from koopmpc.cli.app import app
-from koopmpc.codegen.functions import EXPRESSIONS, Language, write_function
-from koopmpc.codegen.tables import CFunction
-from koopmpc.plants.graph import OPERATIONS, Graph
-from koopmpc.plants.routines import load_library
 from tests.faults.damage import room_for
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)
@@ -156,30 +152,6 @@ def test_a_bench_in_c_says_of_each_controller_whether_it_was(tmp_path):
     runs = {path.stem.split("-", 2)[2]: km.load_run(path) for path in tmp_path.rglob("*.rrd")}
     assert runs["koopman-mpc"].metadata["compiled"] is True
     assert runs["nonlinear-mpc"].metadata["compiled"] is False
-
-
-def test_every_operation_of_a_graph_is_the_same_in_c():
-    assert set(EXPRESSIONS) == set(OPERATIONS)
-    a, b = ca.SX.sym("a"), ca.SX.sym("b")
-    results, names = [], []
-    for name, operation in OPERATIONS.items():
-        bounded = ca.sin(a) if name in ("asin", "acos", "atanh") else ca.fabs(a) + 0.1
-        first = bounded + 1 if name == "acosh" else bounded if name in ("log", "log1p", "sqrt", "pow") else a
-        first = bounded if name in ("asin", "acos", "atanh", "constpow") else first
-        results.append(operation.symbol(*(first, b)[: operation.operands]))
-        names.append(name)
-    graph = Graph.trace(ca.Function("all", [a, b], [ca.vertcat(*results)]))
-    text = "#include <math.h>\ntypedef double koopmpc_real;\n#define KOOPMPC_FN(name) name\n"
-    function = CFunction(graph, {"a": 1, "b": 1}, "y")
-    code = load_library(text + write_function(function, "all_of_them", Language()), ["cc"], None)
-    rows = np.random.default_rng(0).normal(size=(50, 2)) * 2
-    expected = graph.evaluate(rows)
-    import ctypes
-
-    for row, want in zip(rows, expected, strict=True):
-        got, first, second = np.zeros(len(names)), row[:1].copy(), row[1:].copy()
-        code.all_of_them(*(ctypes.c_void_p(x.ctypes.data) for x in (first, second, got)))
-        np.testing.assert_allclose(got, want, rtol=1e-13, atol=1e-15)
 
 
 def test_two_controllers_link_into_one_program(pendulum, tmp_path):
