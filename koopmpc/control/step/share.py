@@ -81,7 +81,7 @@ class ReferenceShare:
         matrix = plan.from_held if len(rows) == 1 else plan.from_reference
         share = matrix.dot(rows.reshape(-1))
         share += plan.offset
-        if not plan.checked.any():
+        if len(share) == len(plan.M):
             return share
         values = (self._targets.nearest(rows) @ self._targets.rows.T)[:, plan.checked]
         return np.concatenate([share, values.min(axis=0), values.max(axis=0)])
