@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-import koopmpc.codegen.tables
+import koopmpc.codegen.programs
 from tests.compiler import find_compiler, needs_compiler
 from tests.control.test_levels import COST, TANK, draw_model
 
@@ -115,7 +115,7 @@ def test_a_search_that_meets_its_bound_in_c_says_what_its_plan_may_miss(monkeypa
     for _ in range(3):
         mpc = km.KoopmanMPC(draw_model(rng, 1), COST, km.Limits(levels=[[-1, 1]]), 9)
         best = km.compiled(mpc)
-        monkeypatch.setattr(koopmpc.codegen.tables, "NODES", 9)
+        monkeypatch.setattr(koopmpc.codegen.programs, "NODES", 9)
         cut = km.compiled(mpc)
         monkeypatch.undo()
         x = rng.standard_normal(3)
