@@ -159,7 +159,7 @@ def test_each_kind_without_c_code_says_why_and_export_raises_that_sentence(model
     refused = {
         "it uses ipopt or a CasADi solver": km.NonlinearMPC(plant, COST, limits, 5),
         "its model changes while it runs": km.supervise.Adaptive(km.KoopmanMPC(model, COST, limits, 5), online),
-        "it holds two controllers": km.supervise.Guarded(watched, feedback),
+        "a Guarded.*it holds several controllers": km.supervise.Guarded(watched, feedback),
         "it holds several controllers": km.supervise.Station(watched, feedback),
         "levels.*; export one whose": km.KoopmanMPC(model, COST, km.Limits(levels=[[-8, 0, 8]], level_steps=2), 5),
         "stage of its own": km.BilinearMPC(bilinear, replace(CIRCLE, stage=lambda x, u: x[0] ** 2), limits, 5),
