@@ -4,7 +4,6 @@ import inspect
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
 from difflib import get_close_matches
 from itertools import chain
 from typing import Any, cast
@@ -261,23 +260,6 @@ def kind(value: object, name: str, wanted: type | tuple[type, ...], advice: str)
         classes = wanted if isinstance(wanted, tuple) else (wanted,)
         names = " or ".join(dict.fromkeys(_article(each.__name__) for each in classes))  # NumPy has a bool, too
         raise DataError(f"{name} is {article(value)}, expected {names}; {advice}")
-
-
-def refuse_moved(given: Iterable[str], options: type, place: str) -> None:
-    """Raise where a call was given a keyword that is a field of its options now, or that it does not know.
-
-    Raises
-    ------
-    DataError
-        `place` says where a field of `options` is passed now; its braces take the keyword.
-    TypeError
-        The keyword is unknown.
-    """
-    known = [field.name for field in fields(options)]
-    for name in given:
-        if name in known:
-            raise DataError(f"{name}= has moved: write {place.format(f'{name}=…')}")
-        raise TypeError(f"got an unexpected keyword argument {name!r}{nearest(name, known)}")
 
 
 def takes(function: Callable[..., object], name: str, count: int, advice: str) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from koopmpc import checks
 from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import CertificateError, DataError
+from koopmpc.errors import CertificateError, DataError, refuse_moved
 from koopmpc.guarantees.certificate import Certificate
 from koopmpc.guarantees.deviation import DeviationModel, deviate, is_stabilisable, reduce_to_states
 from koopmpc.guarantees.error_bounds import (
@@ -131,7 +131,7 @@ def certify(
     >>> certificate.ball, bool(certificate.value([0.0, 0.0]) == 0.0)
     (0.0, True)
     """
-    checks.refuse_moved(moved, CertifyOptions, "km.certify(…, options=km.guarantees.CertifyOptions({}))")
+    refuse_moved(moved, CertifyOptions, "km.guarantees.CertifyOptions")
     asked = _check_options(CertifyOptions() if options is None else options, model.nx)
     deviation = deviate(model, x, u)
     if asked.estimated:

@@ -19,7 +19,7 @@ from koopmpc.control.in_time.preview import require_preview
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Fallible, Move, Plan
 from koopmpc.data.excitation import Excitation
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.errors import DataError, ShapeError, refuse_moved
 from koopmpc.loop.controllers import checked_input, count_disturbances, predictor_of, require_match, start_for
 from koopmpc.loop.faults import Fault, Injections, Wiring
 from koopmpc.loop.rows import LoopRows, Step
@@ -133,7 +133,7 @@ def simulate(
     >>> run.X.shape, run.U.shape, bool(abs(run.X[-1, 0]) < 0.01)
     ((101, 2), (100, 1), True)
     """
-    checks.refuse_moved(moved, LoopOptions, "simulate(…, options=km.loop.LoopOptions({}))")
+    refuse_moved(moved, LoopOptions, "km.loop.LoopOptions")
     asked = LoopOptions() if options is None else options
     checks.kind(asked, "options", LoopOptions, "pass km.loop.LoopOptions(…)")
     steps, x0 = checks.count(steps, "steps"), None if x0 is None else checks.array(x0, "x0", (None,))

@@ -16,7 +16,7 @@ from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Plan
 from koopmpc.disk import path_of
-from koopmpc.errors import DataError
+from koopmpc.errors import DataError, refuse_moved
 from koopmpc.loop.rows import Step, StepRows
 from koopmpc.loop.run import About, Run
 from koopmpc.predict.base import Predictor
@@ -156,7 +156,7 @@ class Recorder:
         options: RecorderOptions | None = None,
         **moved: Any,
     ) -> None:
-        checks.refuse_moved(moved, RecorderOptions, "km.Recorder(…, options=km.recording.RecorderOptions({}))")
+        refuse_moved(moved, RecorderOptions, "km.recording.RecorderOptions")
         checks.kind(live, "live", (bool, np.bool_), "pass True or False")
         if path is None and not live:
             raise DataError("a Recorder needs somewhere to write: pass a path, live=True, or both")
