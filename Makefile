@@ -55,8 +55,8 @@ embedded: $(VENV)/installed-dev
 
 # In an environment of its own, the lowest versions that pyproject.toml allows; warnings of newer neighbours of old packages
 # are no errors here.
-LOWEST := tests/test_front_door.py tests/test_checks.py tests/test_values.py tests/test_cli.py tests/figures tests/lifting \
-	tests/control tests/identify tests/codegen tests/predict tests/loop tests/validate tests/guarantees
+LOWEST := tests/test_front_door.py tests/test_checks.py tests/test_values.py tests/test_cli.py tests/views tests/lifting \
+	tests/control tests/models tests/codegen tests/models tests/loop tests/validate tests/guarantees
 lowest: $(VENV)/lowest/bin/python
 	$(PYTHON) -m tests.lowest > $(VENV)/lowest/constraints.txt
 	$< -m pip install --quiet --disable-pip-version-check -c $(VENV)/lowest/constraints.txt -e ".[dask,gym,sklearn]" \

@@ -7,31 +7,31 @@ This file is the table of contents: names of daily work here, the rest one level
 
 from typing import TYPE_CHECKING
 
-from koopmpc.lazy import attach
+from koopmpc.base.lazy import attach
 
 if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, and attach serves its names
-    import koopmpc.figures
-    from koopmpc import bench as bench
+    import koopmpc.loop
+    import koopmpc.models
+    import koopmpc.views.figures
     from koopmpc import control as control
     from koopmpc import data as data
-    from koopmpc import errors as errors
     from koopmpc import estimate as estimate
     from koopmpc import guarantees as guarantees
-    from koopmpc import identify as identify
     from koopmpc import loop as loop
     from koopmpc import plants as plants
-    from koopmpc import predict as predict
-    from koopmpc import recording as recording
-    from koopmpc import scene as scene
-    from koopmpc import supervise as supervise
     from koopmpc import synthesis as synthesis
     from koopmpc import validate as validate
+    from koopmpc.apps import bench as bench
     from koopmpc.apps import papers as papers
-    from koopmpc.bench.problem import Case as Case
-    from koopmpc.bench.problem import Problem as Problem
-    from koopmpc.bench.problem import Training as Training
-    from koopmpc.bench.problem_files import load_problem as load_problem
-    from koopmpc.bench.sweep import sweep as sweep
+    from koopmpc.apps.bench.problem import Case as Case
+    from koopmpc.apps.bench.problem import Problem as Problem
+    from koopmpc.apps.bench.problem import Training as Training
+    from koopmpc.apps.bench.problem_files import load_problem as load_problem
+    from koopmpc.apps.bench.sweep import sweep as sweep
+    from koopmpc.base import errors as errors
+    from koopmpc.base import scene as scene
+    from koopmpc.base.errors import FitWarning as FitWarning
+    from koopmpc.base.errors import KoopmpcError as KoopmpcError
     from koopmpc.codegen.compiled import compiled as compiled
     from koopmpc.codegen.export import export as export
     from koopmpc.control.cost import Cost as Cost
@@ -56,18 +56,10 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.data.excitation import Multisine as Multisine
     from koopmpc.data.excitation import Noise as Noise
     from koopmpc.data.files.load import load_episodes as load_episodes
-    from koopmpc.errors import FitWarning as FitWarning
-    from koopmpc.errors import KoopmpcError as KoopmpcError
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
     from koopmpc.estimate.extended import ExtendedKalman as ExtendedKalman
     from koopmpc.estimate.kalman import LiftedKalman as LiftedKalman
     from koopmpc.guarantees.certify import certify as certify
-    from koopmpc.identify import moments as moments
-    from koopmpc.identify.fits.bilinear import bilinear_edmd as bilinear_edmd
-    from koopmpc.identify.fits.dmd import dmd as dmd
-    from koopmpc.identify.fits.dmd import dmdc as dmdc
-    from koopmpc.identify.fits.edmd import edmd as edmd
-    from koopmpc.identify.fits.online import OnlineEDMD as OnlineEDMD
     from koopmpc.lifting.base import Lifting as Lifting
     from koopmpc.lifting.composed import Standardized as Standardized
     from koopmpc.lifting.fourier import Fourier as Fourier
@@ -84,6 +76,16 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.loop.realtime import realtime as realtime
     from koopmpc.loop.run import Run as Run
     from koopmpc.loop.simulate import simulate as simulate
+    from koopmpc.models import moments as moments
+    from koopmpc.models import spectrum as spectrum
+    from koopmpc.models.fits.bilinear import bilinear_edmd as bilinear_edmd
+    from koopmpc.models.fits.dmd import dmd as dmd
+    from koopmpc.models.fits.dmd import dmdc as dmdc
+    from koopmpc.models.fits.edmd import edmd as edmd
+    from koopmpc.models.fits.online import OnlineEDMD as OnlineEDMD
+    from koopmpc.models.predictors import BilinearPredictor as BilinearPredictor
+    from koopmpc.models.predictors import LinearPredictor as LinearPredictor
+    from koopmpc.models.predictors import load_model as load_model
     from koopmpc.plants.dynamics import CVODES as CVODES
     from koopmpc.plants.dynamics import RK4 as RK4
     from koopmpc.plants.dynamics import Collocation as Collocation
@@ -94,13 +96,6 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.plants.plant import black_box as black_box
     from koopmpc.plants.step_map import StepMap as StepMap
     from koopmpc.plants.step_map import discretize as discretize
-    from koopmpc.predict import spectrum as spectrum
-    from koopmpc.predict.predictors import BilinearPredictor as BilinearPredictor
-    from koopmpc.predict.predictors import LinearPredictor as LinearPredictor
-    from koopmpc.predict.predictors import load_model as load_model
-    from koopmpc.recording.reader import load_run as load_run
-    from koopmpc.recording.recorder import Recorder as Recorder
-    from koopmpc.recording.writer import record as record
     from koopmpc.synthesis.design import design as design
     from koopmpc.synthesis.designed import load_controller as load_controller
     from koopmpc.synthesis.options import DesignOptions as DesignOptions
@@ -110,8 +105,15 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.synthesis.train import train as train
     from koopmpc.validate.report import trust as trust
     from koopmpc.validate.scoring import score as score
+    from koopmpc.views import recording as recording
+    from koopmpc.views.recording.reader import load_run as load_run
+    from koopmpc.views.recording.recorder import Recorder as Recorder
+    from koopmpc.views.recording.writer import record as record
 
-    plot = koopmpc.figures
+    identify = koopmpc.models
+    plot = koopmpc.views.figures
+    predict = koopmpc.models
+    supervise = koopmpc.loop
 else:
     _NO_PLANS = (
         "experiments are no longer planned: design.advice says what to record; random steps from many starts serve"
@@ -119,21 +121,28 @@ else:
     __getattr__, __dir__, __all__ = attach(
         __name__,
         modules={
+            "bench": "apps.bench",
+            "errors": "base.errors",
             "faults": "loop.faults",
-            "moments": "identify.moments",
+            "identify": "models",
+            "moments": "models.moments",
             "papers": "apps.papers",
-            "plot": "figures",
-            "spectrum": "predict.spectrum",
+            "plot": "views.figures",
+            "predict": "models",
+            "recording": "views.recording",
+            "scene": "base.scene",
+            "spectrum": "models.spectrum",
+            "supervise": "loop",
         },
         core=(
-            "bench.problem",
+            "apps.bench.problem",
             "control.kinds.koopman_mpc",
             "control.lqr",
             "control.nonlinear.bilinear_mpc",
             "control.nonlinear.nonlinear_mpc",
             "data.collect",
-            "identify.fits.bilinear",
-            "identify.fits.edmd",
+            "models.fits.bilinear",
+            "models.fits.edmd",
             "loop.simulate",
         ),
         joints={
@@ -145,7 +154,7 @@ else:
                 "data.files.foreign.hdf5",
                 "data.files.foreign.mdf",
                 "data.files.foreign.ros",
-                "recording.reader",
+                "views.recording.reader",
             ),
             "controllers": (
                 "control.lqr",
@@ -154,12 +163,12 @@ else:
                 "control.nonlinear.bilinear_mpc",
                 "control.nonlinear.nonlinear_mpc",
                 "control.pid",
-                "supervise.adaptive",
-                "supervise.guarded",
-                "supervise.station",
+                "loop.adaptive",
+                "loop.guarded",
+                "loop.station",
                 "guarantees.certificate",
             ),
-            "monitor": ("supervise.monitor",),
+            "monitor": ("loop.monitor",),
         },
         hints={
             "next_experiment": _NO_PLANS,

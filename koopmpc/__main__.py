@@ -1,5 +1,5 @@
 """``python -m koopmpc`` is ``koopmpc``."""
 
-from koopmpc.cli import app
+from koopmpc.apps.cli import app
 
 app(prog_name="koopmpc")

@@ -3,7 +3,7 @@
 from click.testing import Result
 from typer.testing import CliRunner
 
-from koopmpc.cli.app import app
+from koopmpc.apps.cli.app import app
 
 
 def koopmpc(*arguments: object) -> Result:

@@ -103,7 +103,7 @@ def _every_qp_meets_kkt():
     if MODE == "bare":
         yield
         return
-    import koopmpc.bench.single
+    import koopmpc.apps.bench.single
     import koopmpc.control.target
     from koopmpc.control import solvers
     from tests.control.kkt import CheckedDAQP, CheckedOSQP
@@ -112,5 +112,5 @@ def _every_qp_meets_kkt():
         patch.setitem(solvers.SOLVERS, "osqp", CheckedOSQP)
         patch.setitem(solvers.SOLVERS, "daqp", CheckedDAQP)
         patch.setattr(koopmpc.control.target, "FINISHER", CheckedDAQP)
-        patch.setattr(koopmpc.bench.single, "_COLD_STEPS", 2)  # a sleep before each of 25 is half of a short run
+        patch.setattr(koopmpc.apps.bench.single, "_COLD_STEPS", 2)  # a sleep before each of 25 is half of a short run
         yield

@@ -2,8 +2,8 @@
 
 import json
 
-from koopmpc.values import from_data as from_data
-from koopmpc.values import to_data as to_data
+from koopmpc.base.values import from_data as from_data
+from koopmpc.base.values import to_data as to_data
 
 
 def returned(value):

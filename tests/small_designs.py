@@ -41,7 +41,7 @@ def short_loops() -> Iterator[None]:
 def undrawn_pages() -> Iterator[None]:
     """Let pages of designs and checks hold no pictures, whose rendering takes longer than a check with few runs."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("koopmpc.fitting.report.render_svg", lambda _: "<svg></svg>")
+        patch.setattr("koopmpc.apps.fitting.report.render_svg", lambda _: "<svg></svg>")
         yield
 
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import koopmpc as km
-from koopmpc import checks
+from koopmpc.base import checks
 from tests.bare import shown
 
 
@@ -143,7 +143,7 @@ def test_what_is_no_number_at_all():
     """What the type hook of the tests would catch first, as users see it."""
     lines = shown(
         """
-from koopmpc import checks
+from koopmpc.base import checks
 show(lambda: checks.array(None, "x0"))
 show(lambda: checks.array({}, "x0"))
 show(lambda: checks.count(2.0, "steps"))

@@ -15,12 +15,12 @@ from types import SimpleNamespace
 import pytest
 
 import koopmpc as km
-from koopmpc.cli.console import find_program, new_folder
+from koopmpc.apps.cli.console import find_program, new_folder
 from koopmpc.loop.run import About
-from koopmpc.recording.description import table_figures, to_markdown
-from tests.bench.tiny import write
+from koopmpc.views.recording.description import table_figures, to_markdown
+from tests.apps.tiny import write
 from tests.commands import koopmpc
-from tests.recording.runs import make_run
+from tests.views.runs import make_run
 
 TWO = ["-c", "lqr", "-c", "koopman-mpc"]
 
@@ -58,7 +58,9 @@ def test_run_takes_a_path_and_leaves_a_log_a_run_and_the_table(call, tmp_path):
 
 
 def test_calls_that_share_a_second_make_a_folder_each(tmp_path, monkeypatch):
-    monkeypatch.setattr("koopmpc.cli.console.datetime", SimpleNamespace(now=lambda: datetime(2026, 11, 27, 1, 2, 3)))
+    monkeypatch.setattr(
+        "koopmpc.apps.cli.console.datetime", SimpleNamespace(now=lambda: datetime(2026, 11, 27, 1, 2, 3))
+    )
     stem = "2026-11-27T01-02-03-tiny"
     assert [new_folder(tmp_path, "tiny").name for _ in range(3)] == [stem, f"{stem}-1", f"{stem}-2"]
 
@@ -257,7 +259,7 @@ def test_list_shows_names_titles_cases_and_what_is_broken(call, tmp_path):
 
 def test_view_opens_all_logs_in_one_viewer(call, monkeypatch):
     opened = []
-    monkeypatch.setattr("koopmpc.recording.viewer.view", opened.append)
+    monkeypatch.setattr("koopmpc.views.recording.viewer.view", opened.append)
     assert call("view", "a.rrd", "b.rrd").exit_code == 0
     assert [[path.name for path in paths] for paths in opened] == [["a.rrd", "b.rrd"]]
 
@@ -268,7 +270,7 @@ def test_without_a_display_view_names_the_line_that_serves_with_the_options_it_w
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("sys.platform", "linux")
-    monkeypatch.setattr("koopmpc.recording.comparison.record_comparison", lambda *_: None)
+    monkeypatch.setattr("koopmpc.views.recording.comparison.record_comparison", lambda *_: None)
     for options in ([], ["--compare"]):
         result = call("view", *options, "a.rrd", "b.rrd")
         assert result.exit_code == 2
@@ -312,8 +314,8 @@ def test_new_writes_a_problem_that_runs_as_it_stands(call, tmp_path):
 
 
 def test_a_word_of_the_tables_is_explained_and_a_wrong_one_finds_its_neighbour(call):
-    from koopmpc.bench.controllers import CONTROLLERS
-    from koopmpc.recording.description import STATUS_WORDS
+    from koopmpc.apps.bench.controllers import CONTROLLERS
+    from koopmpc.views.recording.description import STATUS_WORDS
 
     for word in [*STATUS_WORDS.values(), *CONTROLLERS, "cost", "ratio", "settles", "off", "over", "p50", "p99", "lost"]:
         assert call("explain", *word.split()).exit_code == 0, word
@@ -372,7 +374,7 @@ def test_a_case_is_explained_with_what_controllers_are_not_told(call, tmp_path):
 def test_logs_are_served_to_this_machine_alone_until_the_server_is_stopped(call, tmp_path):
     from urllib.request import urlopen
 
-    from koopmpc.recording.viewer import free_port, is_up, serve
+    from koopmpc.views.recording.viewer import free_port, is_up, serve
 
     call("run", f"{write(tmp_path)}:far", "-c", "lqr", "--logs", "l")
     (log,) = (tmp_path / "l").glob("*/*.rrd")
@@ -403,7 +405,7 @@ def test_the_doctor_names_what_is_missing_and_how_it_is_had(call, monkeypatch):
     assert version("casadi") in well.stdout
     monkeypatch.setenv("PATH", "/nowhere")
     monkeypatch.delenv("CC", raising=False)
-    monkeypatch.setattr("koopmpc.cli.start.find_spec", lambda name: None)
+    monkeypatch.setattr("koopmpc.apps.cli.start.find_spec", lambda name: None)
     ill = " ".join(call("doctor").stdout.split())
     assert "none of $CC, cc, gcc, clang" in ill
     for extra in tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"][
@@ -422,8 +424,8 @@ def test_the_doctor_names_what_is_missing_and_how_it_is_had(call, monkeypatch):
 )
 def test_the_doctor_says_whether_a_log_can_be_opened(call, monkeypatch, tmp_path, display, program, said):
     (tmp_path / "there").touch()
-    monkeypatch.setattr("koopmpc.recording.viewer.program", lambda: tmp_path / (program or "gone"))
-    monkeypatch.setattr("koopmpc.cli.start.sys.platform", "linux")
+    monkeypatch.setattr("koopmpc.views.recording.viewer.program", lambda: tmp_path / (program or "gone"))
+    monkeypatch.setattr("koopmpc.apps.cli.start.sys.platform", "linux")
     monkeypatch.setenv("DISPLAY", display)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     told = " ".join(call("doctor").stdout.split())
@@ -442,7 +444,7 @@ def test_the_doctor_tries_the_compiler_and_says_what_it_said(call, monkeypatch, 
 
 
 def test_the_doctor_says_what_is_missing_where_half_an_extra_is_installed(call, monkeypatch):
-    monkeypatch.setattr("koopmpc.cli.start.find_spec", lambda name: None if name == "mcap" else name)
+    monkeypatch.setattr("koopmpc.apps.cli.start.find_spec", lambda name: None if name == "mcap" else name)
     assert "[ros]'" in " ".join(call("doctor").stdout.split())
 
 

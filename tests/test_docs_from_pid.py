@@ -12,7 +12,7 @@ from tests.docs.page import alike, run
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::koopmpc.errors.FitWarning")
+@pytest.mark.filterwarnings("ignore::koopmpc.base.errors.FitWarning")
 def test_the_way_from_a_pid_leads_to_a_better_loop_without_a_bump(tmp_path):
     names, pairs = run("how/from_pid.md", tmp_path)
     for shown, printed in pairs:
@@ -41,7 +41,7 @@ def test_the_way_from_a_pid_leads_to_a_better_loop_without_a_bump(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::koopmpc.errors.FitWarning")
+@pytest.mark.filterwarnings("ignore::koopmpc.base.errors.FitWarning")
 def test_one_sensor_is_enough_for_a_better_loop_that_the_stand_ins_do_not_call_lost(tmp_path):
     """The log of one level in closed loop: a design failed on it, and then called about a fifth of its loops lost."""
     names, _ = run("how/from_pid.md", tmp_path)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import pytest
 
-from koopmpc.lazy import load_joint
+from koopmpc.base.lazy import load_joint
 from tests.sources import ROOT, nodes, texts
 
 SETTINGS = tomllib.loads((ROOT.parent / "pyproject.toml").read_text(encoding="utf-8"))
@@ -14,7 +14,7 @@ LAYERS: list[str] = next(c for c in SETTINGS["tool"]["importlinter"]["contracts"
 RANK = {room: -i for i, room in enumerate(LAYERS)}
 MODULES = {".".join(["koopmpc", *file.with_suffix("").parts]).removesuffix(".__init__"): file for file in texts()}
 FRONT_DOOR = ("koopmpc", "koopmpc.__main__")
-BY_NAME = ("koopmpc.lazy", "koopmpc.apps.papers")  # import modules by names that they compute
+BY_NAME = ("koopmpc.base.lazy", "koopmpc.apps.papers")  # import modules by names that they compute
 
 
 def room(module: str) -> str:
@@ -65,14 +65,14 @@ def test_modules_are_imported_by_computed_names_in_three_files_alone() -> None:
     [
         "from koopmpc.loop.run import Run",
         "def f():\n    from koopmpc import recording",
-        "if TYPE_CHECKING:\n    import koopmpc.cli.app",
-        "import_module('koopmpc.recording.reader')",
+        "if TYPE_CHECKING:\n    import koopmpc.apps.cli.app",
+        "import_module('koopmpc.views.recording.reader')",
         "import koopmpc",
     ],
 )
 def test_each_way_up_is_seen(source: str) -> None:
     assert len(upward("koopmpc.data.episodes", ast.walk(ast.parse(source)))) == 1
-    downward = ast.walk(ast.parse("from koopmpc.values import Value"))
+    downward = ast.walk(ast.parse("from koopmpc.base.values import Value"))
     assert upward("koopmpc.data.episodes", downward) == []
 
 

@@ -15,7 +15,7 @@ from tests.sources import trees
 
 ROOT = Path(km.__file__).parent
 SERVING = ["koopmpc", *(f"koopmpc.{room.name}" for room in ROOT.iterdir() if (room / "__init__.py").exists())]
-SERVING = [name for name in SERVING if hasattr(importlib.import_module(name), "__all__")] + ["koopmpc.identify.moments"]
+SERVING = [name for name in SERVING if hasattr(importlib.import_module(name), "__all__")] + ["koopmpc.models.moments"]
 
 
 def test_the_daily_names_are_few() -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 import koopmpc as km
-from koopmpc.parallel import Workers, map_tasks
+from koopmpc.base.parallel import Workers, map_tasks
 from tests import tasks
 from tests.cluster import scheduler_process, two_workers
 from tests.tiers import few
@@ -156,7 +156,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     parent = run_script(
         tmp_path / "script.py",
         f"""
-        from koopmpc.parallel import map_tasks
+        from koopmpc.base.parallel import map_tasks
         from tests import tasks
         list(map_tasks(tasks.sleep, [({str(folder)!r}, 300)] * 4, workers=2))
         """,
@@ -172,9 +172,9 @@ def test_ctrl_c_ends_the_program_with_130_and_one_line_and_leaves_no_worker(tmp_
     program = run_script(
         tmp_path / "script.py",
         f"""
-        from koopmpc.cli.ending import ENDING
+        from koopmpc.apps.cli.ending import ENDING
         with ENDING:
-            from koopmpc.parallel import map_tasks
+            from koopmpc.base.parallel import map_tasks
             from tests import tasks
             list(map_tasks(tasks.sleep, [({str(folder)!r}, 300)] * 4, workers=2))
         """,
@@ -227,7 +227,7 @@ def test_a_local_cluster_is_made_and_taken_down() -> None:
 
 
 def test_a_service_that_does_not_greet_as_a_scheduler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("koopmpc.parallel._ANSWER", 0.5)
+    monkeypatch.setattr("koopmpc.base.parallel._ANSWER", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(km.KoopmpcError, match=rf"no Dask scheduler answers at {address}; start one"):
@@ -256,7 +256,7 @@ def test_no_task_is_no_result() -> None:
 
 def test_a_script_needs_no_guard_and_sends_functions_of_its_own(tmp_path: Path) -> None:
     script = """
-        from koopmpc.parallel import map_tasks
+        from koopmpc.base.parallel import map_tasks
         shift = 3
         def add(x):
             return x + shift
@@ -309,7 +309,7 @@ def test_what_is_no_number_of_workers_or_no_scheduler_is_refused() -> None:
 
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("koopmpc.parallel._ANSWER", 0.5)
+    monkeypatch.setattr("koopmpc.base.parallel._ANSWER", 0.5)
     with pytest.raises(km.KoopmpcError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9; start one"):
         list(map_tasks(tasks.square, [1], scheduler="tcp://127.0.0.1:9"))
 
@@ -329,7 +329,7 @@ def test_a_cluster_is_reached_by_its_address_and_one_without_workers_is_told(
         address = cluster.scheduler_address
         assert list(map_tasks(tasks.square, range(3), scheduler=address)) == [0, 1, 4]
         cluster.scale(0)
-        monkeypatch.setattr("koopmpc.parallel._PATIENCE", 1.0)
+        monkeypatch.setattr("koopmpc.base.parallel._PATIENCE", 1.0)
         with pytest.raises(km.KoopmpcError, match=r"the cluster at .* has no worker after 1 s; start some"):
             list(map_tasks(tasks.square, [5], scheduler=address))
 

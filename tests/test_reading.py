@@ -6,8 +6,8 @@ from tests.bare import shown
 
 FOLLOWED = """
 import inspect, pathlib, sys, tempfile
-GROUND = ("errors.py", "checks.py", "values.py", "__init__.py")
-DECORATOR = "interrupts.py"  # @raise_swallowed() wraps a function, and no reader opens its file to follow the call
+GROUND = ("base/errors.py", "base/checks.py", "base/values.py", "__init__.py")
+DECORATOR = "base/interrupts.py"  # @raise_swallowed() wraps a function, and no reader opens its file to follow the call
 root = str(pathlib.Path(km.__file__).parent) + "/"
 rng = np.random.default_rng(0)
 episodes = []

@@ -126,7 +126,7 @@ def test_a_file_from_before_the_third_house_reads_in_a_fresh_process(opened, wha
 def test_every_class_that_a_room_serves_is_found_in_a_fresh_process():
     ran = fresh(
         "import koopmpc\n"
-        "from koopmpc.values import Value, class_of\n"
+        "from koopmpc.base.values import Value, class_of\n"
         "assert not Value._kinds, 'nothing is imported yet'\n"
         "assert class_of('TrustReport').__module__.startswith('koopmpc.validate')\n"
         "assert class_of('Selection').__module__.startswith('koopmpc.synthesis')\n"

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.values import Value, from_data, same, to_data
+from koopmpc.base.values import Value, from_data, same, to_data
 
 STATES = ("theta [rad]", "omega [rad/s]")
 
@@ -295,7 +295,7 @@ def test_a_fresh_process_knows_every_class_that_a_saved_model_or_controller_may_
     values = [each for each in served if isinstance(each, type) and issubclass(each, Value)]
     names = sorted({cls.__name__ for cls in families + values if not isabstract(cls)})
     assert {"Eigenfunction", "LiftedKalman", "Feedback"} <= set(names)
-    code = f"from koopmpc.values import class_of; print([name for name in {names} if class_of(name) is None])"
+    code = f"from koopmpc.base.values import class_of; print([name for name in {names} if class_of(name) is None])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -17,13 +17,13 @@ from drawn import stamp
 from standings import format_goals, format_standings
 
 import koopmpc as km
-from koopmpc.bench.controllers import Prepared, is_learned
-from koopmpc.bench.measured import find_baseline, find_best_learned, read_standings
-from koopmpc.bench.problem_files import shipped
-from koopmpc.bench.single import find_time_unit, run_closed_loop
-from koopmpc.bench.store import RunRow
-from koopmpc.page import Page
-from koopmpc.recording.video import export_video
+from koopmpc.apps.bench.controllers import Prepared, is_learned
+from koopmpc.apps.bench.measured import find_baseline, find_best_learned, read_standings
+from koopmpc.apps.bench.problem_files import shipped
+from koopmpc.apps.bench.single import find_time_unit, run_closed_loop
+from koopmpc.apps.bench.store import RunRow
+from koopmpc.base.page import Page
+from koopmpc.views.recording.video import export_video
 
 DOCS = Path(__file__).parents[1]
 FOLDER = DOCS / "problems"

@@ -13,11 +13,11 @@ import numpy as np
 from drawn import stamp
 
 import koopmpc as km
-from koopmpc.bench.controllers import Prepared
-from koopmpc.bench.single import run_closed_loop
-from koopmpc.bench.store import RunRow
-from koopmpc.figures.style import LIMIT, REFERENCE, TRUTH, draw_legend, line_style, make_figure, styled
-from koopmpc.recording.video import export_video
+from koopmpc.apps.bench.controllers import Prepared
+from koopmpc.apps.bench.single import run_closed_loop
+from koopmpc.apps.bench.store import RunRow
+from koopmpc.views.figures.style import LIMIT, REFERENCE, TRUTH, draw_legend, line_style, make_figure, styled
+from koopmpc.views.recording.video import export_video
 
 DOCS = Path(__file__).parents[1]
 

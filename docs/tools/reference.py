@@ -12,45 +12,70 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import typer
 
 import koopmpc as km
-from koopmpc.cli.app import app
-from koopmpc.lazy import read_imports
+from koopmpc.apps.cli.app import app
+from koopmpc.base.lazy import read_imports
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
 
-ROOMS = {  # where a name is defined → title and first sentence of its page, in the order of the data
-    "plants": ("Plants", "Equations, step functions and Gymnasium environments become x⁺ = F(x, u)."),
-    "data": ("Data and excitation", "Episodes of states and inputs: collected from a plant, or read from files."),
-    "lifting": ("Liftings", "Observables z = ψ(x). `a + b` joins two families, `a * b` is all products."),
-    "identify": ("Fits", "From episodes to a model, each fit a regression on the same moments."),
-    "predict": ("Models", "z⁺ = A z + B u with x ≈ C z, its bilinear kin, their files and their spectrum."),
-    "validate": ("Whether to trust", "Is a model good, and where: before a controller stands on it."),
-    "estimate": ("Estimators", "What the sensors do not show, and what the model lacks."),
-    "control": ("Controllers", "One `Cost`, one `Limits`; every call gives a `Move` with a status."),
+ROOMS = {
+    "plants": (
+        "Plants",
+        "Equations, step functions and Gymnasium environments become x⁺ = F(x, u).",
+    ),
+    "data": (
+        "Data and excitation",
+        "Episodes of states and inputs: collected from a plant, or read from files.",
+    ),
+    "lifting": (
+        "Liftings",
+        "Observables z = ψ(x). `a + b` joins two families, `a * b` is all products.",
+    ),
+    "models": (
+        "Models and fits",
+        "z⁺ = A z + B u with x ≈ C z, its bilinear kin, their spectrum; fits on the same moments.",
+    ),
+    "validate": (
+        "Whether to trust",
+        "Is a model good, and where: before a controller stands on it.",
+    ),
+    "estimate": (
+        "Estimators",
+        "What the sensors do not show, and what the model lacks.",
+    ),
+    "control": (
+        "Controllers",
+        "One `Cost`, one `Limits`; every call gives a `Move` with a status.",
+    ),
     "loop": (
         "Closed loops",
-        "`simulate` drives a plant by a controller and returns a `Run`; faults break it on purpose.",
+        "`simulate` drives a plant by a controller; faults break it; `km.supervise` watches and hands over.",
     ),
-    "supervise": (
-        "What watches a controller",
-        "Does the model know this step; learn on while it runs; hand over to a fallback.",
+    "guarantees": (
+        "Guarantees",
+        "What is proved, with its assumptions; what is promised, with its probability.",
     ),
-    "guarantees": ("Guarantees", "What is proved, with its assumptions; what is promised, with its probability."),
-    "synthesis": ("From data to a controller", "Choose a model, choose a controller, with evidence from closed loops."),
-    "codegen": ("C code", "The same controller as C99 without a heap, in a folder or behind Python's protocol."),
-    "figures": ("Figures", "`km.plot`: Matplotlib figures of models and runs."),
-    "recording": ("Logs and the viewer", "A run as one .rrd file: written, read back to the bit, looked at in Rerun."),
-    "scene": ("Scenes", "`km.scene`: the shapes that an animation is drawn with."),
-    "bench": (
-        "Problems and sweeps",
-        "A problem is a plant with its data, cost, limits and cases; sweeps compare controllers on it.",
+    "synthesis": (
+        "From data to a controller",
+        "Choose a model, choose a controller, with evidence from closed loops.",
+    ),
+    "codegen": (
+        "C code",
+        "The same controller as C99 without a heap, in a folder or behind Python's protocol.",
+    ),
+    "views": (
+        "Figures, logs and the viewer",
+        "`km.plot`: Matplotlib figures; a run as one .rrd file, written, read back and looked at in Rerun.",
     ),
     "apps": (
-        "Papers",
-        "`km.papers`: what the files of problems/papers/ share, and how a paper is found and reproduced.",
+        "Problems, sweeps and papers",
+        "A problem is a plant with its data, cost, limits and cases; sweeps compare controllers on it.",
     ),
-    "errors": ("Errors", "Mistakes raise one of these; each is also the builtin that it refines."),
+    "base": (
+        "Errors and scenes",
+        "Mistakes raise one of `km.errors`, each also a builtin; `km.scene`: the shapes of an animation.",
+    ),
 }
 
 
@@ -58,7 +83,7 @@ class Entry(NamedTuple):
     """A public name, where it is defined, and the object itself."""
 
     name: str  # as users write it: km.edmd, km.faults.NaNSensor
-    path: str  # koopmpc.identify.fits.edmd.edmd
+    path: str  # koopmpc.models.fits.edmd.edmd
     found: Any
 
     @property

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from koopmpc import disk
-from koopmpc.bench.controllers import is_learned
-from koopmpc.bench.measured import PATH, Standing, find_baseline, find_best_learned
-from koopmpc.bench.problem import Problem
-from koopmpc.bench.problem_files import load_problem, shipped
-from koopmpc.bench.store import ORACLE, RunRow
-from koopmpc.bench.sweep import sweep
+from koopmpc.apps.bench.controllers import is_learned
+from koopmpc.apps.bench.measured import PATH, Standing, find_baseline, find_best_learned
+from koopmpc.apps.bench.problem import Problem
+from koopmpc.apps.bench.problem_files import load_problem, shipped
+from koopmpc.apps.bench.store import ORACLE, RunRow
+from koopmpc.apps.bench.sweep import sweep
+from koopmpc.base import disk
 
 OVER = 0.005  # a run breaks a limit if it violates one by this share of its range more than the baseline
 COST_SHARE = 1.05  # a frugal controller costs at most this share of nonlinear MPC

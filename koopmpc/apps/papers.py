@@ -23,14 +23,14 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from rich.table import Table
 
-from koopmpc.checks import nearest
-from koopmpc.errors import ProblemError
-from koopmpc.figures.reports import CurvePanel, draw_panels
-from koopmpc.figures.style import save
-from koopmpc.page import Page
-from koopmpc.parallel import map_tasks
-from koopmpc.recording.curves import record_curves
-from koopmpc.terminal import build_plain_table
+from koopmpc.base.checks import nearest
+from koopmpc.base.errors import ProblemError
+from koopmpc.base.page import Page
+from koopmpc.base.parallel import map_tasks
+from koopmpc.base.terminal import build_plain_table
+from koopmpc.views.figures.reports import CurvePanel, draw_panels
+from koopmpc.views.figures.style import save
+from koopmpc.views.recording.curves import record_curves
 
 __all__ = [
     "PAPERS",

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.checks import numbers
+from koopmpc.base import checks
+from koopmpc.base.checks import numbers
+from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.codegen.door import BoundPage, Frame, Rows, SingleFrame, point_to
 from koopmpc.codegen.programs import make_tables, read_program
 from koopmpc.codegen.runs import FALLBACKS, STATUSES, CompiledLoops, TargetTable
@@ -24,10 +25,9 @@ from koopmpc.control.plan.condensed import planned_states
 from koopmpc.control.plan.condensed_program import CondensedProgram
 from koopmpc.control.program import StepProgram
 from koopmpc.control.stepped.levels import HeldLevels
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.models.predictors import LinearPredictor
 from koopmpc.plants.routines import find_compiler, find_private_cache, load_library
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.predictors import LinearPredictor
 
 _ROOM = 2**20  # numbers of a table of given input targets: 8 MB
 _PAGE = 1024  # steps whose limits are made at once, which takes one of them 0.1 ms

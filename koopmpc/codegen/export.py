@@ -10,7 +10,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.disk import path_of, writing
+from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.codegen.functions import Language
 from koopmpc.codegen.programs import make_tables, read_program
 from koopmpc.codegen.sources import (
@@ -29,14 +32,11 @@ from koopmpc.control.nonlinear.iteration import MOST
 from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.plan.condensed_program import CondensedProgram
 from koopmpc.control.program import StepProgram
-from koopmpc.disk import path_of, writing
-from koopmpc.errors import DataError
 from koopmpc.estimate.filter import FilterProgram
 from koopmpc.guarantees.step_effort import IterationBound, ObservedIterations
-from koopmpc.interrupts import raise_swallowed
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.routines import find_compiler
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 _BUILT = (".o", ".a", ".su")  # endings of the files of a build
 _PROGRAMS = ("example", "sanitized")

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
 from koopmpc.codegen import tolerances
 from koopmpc.codegen.tables import CFunction, Tables, write_fields
 from koopmpc.control.lqr import FeedbackProgram
@@ -20,13 +21,12 @@ from koopmpc.control.program import Published, StepProgram, no_export
 from koopmpc.control.solvers.daqp import FEW, MOVED
 from koopmpc.control.stepped.levels import FREE
 from koopmpc.control.stepped.search import NODES
-from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import EXACT, DisturbanceProgram
 from koopmpc.estimate.filter import FilterProgram
 from koopmpc.estimate.gate import BEYOND, BRIDGED
 from koopmpc.estimate.observer import EstimatorProgram
+from koopmpc.models.predictors import LinearPredictor
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.predictors import LinearPredictor
 
 _LONG = 2**11  # numbers in the reference's share of a plan from which on a step first asks for its first input alone
 _TABLE_NOTE = (

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.codegen.door import AbreastStep, gather_run, point_to
 from koopmpc.codegen.functions import Language
 from koopmpc.codegen.sources import write_plant_functions
 from koopmpc.control.move import Fallback, Status, Token, alone
-from koopmpc.errors import DataError, ShapeError
 from koopmpc.plants.routines import find_compiler, find_private_cache, load_library
 from koopmpc.plants.step_map import StepMap
 

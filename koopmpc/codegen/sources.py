@@ -7,10 +7,10 @@ from importlib.resources import files
 import casadi as ca
 import numpy as np
 
+from koopmpc.base.errors import DataError
 from koopmpc.codegen.functions import Language, count_function_flops, write_functions
 from koopmpc.codegen.tables import CFunction, Tables
 from koopmpc.control.program import trace_graph
-from koopmpc.errors import DataError
 
 _OWN = ("koopmpc.h", "koopmpc_step.h", "koopmpc_step.c", "koopmpc_observe.c")
 _QP = ("koopmpc_qp.c", "koopmpc_daqp.c")

@@ -31,9 +31,9 @@ from koopmpc.control.nonlinear.stagewise import Sides
 from koopmpc.control.program import LinearProgram, StepProgram
 from koopmpc.control.solvers.daqp import DAQPSetup
 from koopmpc.estimate.filter import FilterProgram
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 Precision = Literal["double", "float"]
 

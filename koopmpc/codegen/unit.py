@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 from xml.sax.saxutils import quoteattr
 
+from koopmpc.base.disk import writing
+from koopmpc.base.errors import SourcesOnlyWarning
+from koopmpc.base.values import fingerprint
 from koopmpc.codegen.sources import join_sources, read_shipped, rename_symbols
 from koopmpc.codegen.tables import Tables
-from koopmpc.disk import writing
-from koopmpc.errors import SourcesOnlyWarning
 from koopmpc.plants.routines import build_library, find_compiler
-from koopmpc.values import fingerprint
 
 FMIVersion = Literal[2, 3]
 

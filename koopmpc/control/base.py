@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.values import Interval, Value
 from koopmpc.control.cost import Tracking
 from koopmpc.control.move import Fallback, Move, Status, Token
 from koopmpc.control.program import Published, SavedController
@@ -18,11 +20,9 @@ from koopmpc.control.step.observe import InitialCondition
 from koopmpc.control.stepped.blocks import MoveBlocks, Moves, find_move_blocks
 from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.control.watching import StepMonitor, StepWatch
-from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator, StateModel, StateObserver
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.values import Interval, Value
 
 _Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 

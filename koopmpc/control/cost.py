@@ -9,18 +9,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Value
 from koopmpc.control.bounds.boxes import Bound
 from koopmpc.control.bounds.stage_cost import StageCost, trace_stage
 from koopmpc.control.in_time import bounds
 from koopmpc.control.limits import Interval, Limits, Movable, Softness, half_width, magnitude
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import Lifting, find_observables
 from koopmpc.lifting.state import State
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.graph import Graph
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.values import Value
 
 _CONSTANT = 1e-12  # share of the mean square below which a variance is rounding
 Read = TypeVar("Read", np.ndarray, ca.Function)

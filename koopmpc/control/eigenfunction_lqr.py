@@ -8,16 +8,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.cost import Cost, check_cost_and_limits, refuse_stage, refuse_steps
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.limits import Limits, refuse_levels
 from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import SavedController
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Eigenfunction
 from koopmpc.plants.graph import Graph

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.control.move import Controller, Fallback, Move, Status
 from koopmpc.data.excitation import Excitation
-from koopmpc.errors import DataError, ShapeError
 
 _LONGEST = 100_000  # steps of an excitation that stands for a controller; it holds the last input then
 MEMBERS = ("dt", "nu", "horizon", "reset")

@@ -25,7 +25,7 @@ from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.riccati import Law, Stage
 from koopmpc.control.target import Targets, Units
 from koopmpc.control.terminal.sets import EndRows
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.predictors import LinearPredictor
 
 Coordinates = Literal["auto", "riccati", "plain"]
 # cond(H) up to which OSQP in plain coordinates is as fast. Measured on random plants: limits on inputs alone take

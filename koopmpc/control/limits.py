@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import Value
 from koopmpc.control.bounds.boxes import SOFTENED as SOFTENED
 from koopmpc.control.bounds.boxes import Bound as Bound
 from koopmpc.control.bounds.boxes import Interval as Interval
@@ -35,9 +37,7 @@ from koopmpc.control.stepped.levels import (
     check_levels,
 )
 from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set
-from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import Lifting, strip_unit
-from koopmpc.values import Value
 
 LINEAR = 1e4  # default linear weight of a slack as a share of its limit's size, times the scale of the cost
 QUADRATIC = 1e2  # the quadratic weight, in the same unit

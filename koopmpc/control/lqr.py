@@ -11,8 +11,9 @@ import scipy.linalg
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.control.cost import Cost, check_cost_and_limits, lifted_tracking
 from koopmpc.control.horizon import horizon_of
 from koopmpc.control.in_time.preview import InputRows
@@ -30,9 +31,8 @@ from koopmpc.control.riccati import Gain
 from koopmpc.control.solvers.daqp import daqp_settings
 from koopmpc.control.target import Units, targets_of
 from koopmpc.control.terminal_cost import tail_of, tail_stage
-from koopmpc.errors import DataError, ShapeError
 from koopmpc.estimate.observer import EstimatorProgram, Measured
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.predictors import LinearPredictor
 
 _Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 

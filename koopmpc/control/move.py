@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc.errors import ThreadError
-from koopmpc.values import Value
+from koopmpc.base.errors import ThreadError
+from koopmpc.base.values import Value
 
 TurnTaker = TypeVar("TurnTaker", bound=Callable[..., Any])
 # One thread at a time: each controller, and each copy of one, has a token of its own: a list of one element, [0].

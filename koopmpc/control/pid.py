@@ -12,16 +12,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.control.cost import Cost, check_cost_and_limits, lifted_tracking
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Limits, refuse_levels
 from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import SavedController
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.predictors import LinearPredictor
 
 _Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 _RESPONSE = 20_000  # longest step response that is looked at, in steps

@@ -11,23 +11,23 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, Hint
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Value
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.solvers.daqp import DAQPSetup
 from koopmpc.control.target import Targets
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.delay import Delay
-from koopmpc.errors import DataError, Hint
 from koopmpc.estimate.observer import Estimator, EstimatorProgram, StateObserver, estimator_program
-from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import strip_unit
+from koopmpc.models.base import save_value
+from koopmpc.models.hidden_state import HiddenState
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.base import save_value
-from koopmpc.predict.hidden_state import HiddenState
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.values import Value
 
 _Restored = TypeVar("_Restored")  # a class of controller that is made again of its data
 

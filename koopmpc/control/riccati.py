@@ -10,8 +10,8 @@ from jaxtyping import Float
 from scipy.linalg import block_diag, solve_triangular
 from scipy.linalg.lapack import dgesv, dpotrf, dpotrs
 
-from koopmpc.checks import root
-from koopmpc.errors import DataError, DefinitenessError
+from koopmpc.base.checks import root
+from koopmpc.base.errors import DataError, DefinitenessError
 
 DIGITS = 1e-9  # use the root of P if a step may lose more than this share of P
 LOST = 1e-6  # use the root of P if P is indefinite by more than this share of its size

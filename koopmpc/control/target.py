@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag, null_space, solve_triangular
 
-from koopmpc import checks
+from koopmpc.base import checks
 from koopmpc.control.cost import Cost, LiftedTracking, Sizes
 from koopmpc.control.limits import Interval, magnitude
 from koopmpc.control.move import Status
 from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.daqp import DAQP
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.predictors import LinearPredictor
 
 TOLERANCE = 1e-8  # singular values of [A − I, B] below this share of the largest span the equilibria
 ROUNDING = 1e-9  # by how much of its value and its limit a target may stand outside before it is moved

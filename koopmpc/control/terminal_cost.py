@@ -9,8 +9,9 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.errors import ShapeError
 from koopmpc.control.cost import Cost
 from koopmpc.control.horizon import Horizon, Terminal, input_target
 from koopmpc.control.riccati import (
@@ -27,9 +28,8 @@ from koopmpc.control.riccati import (
     stationary,
 )
 from koopmpc.control.target import Targets
-from koopmpc.errors import ShapeError
 from koopmpc.lifting.state import State
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.predictors import LinearPredictor
 
 ITERATIONS = 10_000  # end an infinite tail after this many steps, settled or not
 EXACT = 1e-14  # the feedforward rests when it moves by less, relative to its size

@@ -1,4 +1,4 @@
-"""StepWatch: what a controller asks at each step, whether its model knows it. `koopmpc.supervise` answers."""
+"""StepWatch: what a controller asks at each step, whether its model knows it. `koopmpc.loop` answers."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -7,11 +7,11 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
+from koopmpc.base.lazy import load_joint
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import StateModel
-from koopmpc.lazy import load_joint
-from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.values import Value
+from koopmpc.models.predictors import LinearPredictor
 
 if TYPE_CHECKING:
     from koopmpc.control.step.observe import InitialCondition

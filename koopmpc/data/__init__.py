@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from koopmpc.lazy import attach
+from koopmpc.base.lazy import attach
 
 if TYPE_CHECKING:
     from koopmpc.data.episodes import Snapshots as Snapshots

@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Value, freeze
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Excitation, OpenLoop, Policy
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.plant import Plant, read_measurement, require_plant
 from koopmpc.plants.step_map import StepMap
-from koopmpc.values import Value, freeze
 
 # u = function(k, y, rng): a user's own excitation
 InputFunction = Callable[[int, Float[np.ndarray, " ny"], np.random.Generator], ArrayLike]

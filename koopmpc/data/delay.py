@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.lib.stride_tricks import sliding_window_view
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, FitWarning, ShapeError
+from koopmpc.base.values import Value, freeze
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Changed, Source
-from koopmpc.errors import DataError, FitWarning, ShapeError
-from koopmpc.values import Value, freeze
 
 
 @dataclass(frozen=True, eq=False)

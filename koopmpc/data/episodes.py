@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.values import Named, Value, freeze
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import Named, Value, freeze
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.values import Value, freeze
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import Value, freeze
 
 Policy = Callable[[int, Float[np.ndarray, " ny"]], Float[np.ndarray, " nu"]]
 

@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from koopmpc.base.errors import DataError
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.data.state_space import (
     DELAYS,
@@ -23,8 +25,6 @@ from koopmpc.data.state_space import (
     stack_delays,
     unstack_delays,
 )
-from koopmpc.errors import DataError
-from koopmpc.values import Value
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from functools import partial
 from itertools import chain
 from typing import cast
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.values import Named
 from koopmpc.data.episodes import Episodes, PlantSignature, explain_wrong_data, join_sets, name_drives
-from koopmpc.errors import DataError
-from koopmpc.values import Named
 
 EpisodesMap = Callable[[Episodes], Episodes]
 

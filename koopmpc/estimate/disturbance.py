@@ -8,16 +8,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
-from koopmpc.errors import DataError
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Value, Viewing
 from koopmpc.estimate.gate import BRIDGED, ROUNDING, gate_graph
 from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
 from koopmpc.estimate.periodic import PeriodicObserver, find_harmonics
-from koopmpc.interrupts import raise_swallowed
+from koopmpc.models.predictors import LinearPredictor
 from koopmpc.plants.routines import bind_interpreter
-from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.values import Value, Viewing
 
 EXACT = 0.99  # where a misfit hardly changes to this degree, the last one is nearer than any mean
 GAIN = 0.1  # the least gain that a horizon gives: d forgets within twenty steps, however long the plan

@@ -8,18 +8,18 @@ import scipy.linalg
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
-from koopmpc.errors import DataError
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.errors import DataError
+from koopmpc.base.values import Value
 from koopmpc.estimate.disturbance import GAIN
 from koopmpc.estimate.filter import find_kalman_gain
 from koopmpc.estimate.gate import Gated, ReadingGate
 from koopmpc.estimate.kalman import NOT_TOGETHER
 from koopmpc.estimate.observer import StateModel
+from koopmpc.models.hidden_state import HiddenState
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.hidden_state import HiddenState
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.values import Value
 
 PROCESS = 1e-4  # default variance of the process noise, as a share of that of the outputs
 LEAST = 1e-8  # variance of the noise of y, as a share of that of the outputs, where a fit leaves no residual

@@ -10,14 +10,14 @@ import scipy.linalg
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
-from koopmpc.errors import DataError
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.errors import DataError
+from koopmpc.base.values import Viewing
 from koopmpc.estimate.gate import Gated, ReadingGate, gate_graph
 from koopmpc.estimate.observer import EstimatorProgram
 from koopmpc.estimate.periodic import NO_CODE
-from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.values import Viewing
+from koopmpc.models.predictors import LinearPredictor
 
 
 def find_kalman_gain(

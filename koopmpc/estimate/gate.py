@@ -8,11 +8,11 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.checks import HUGE
-from koopmpc.interrupts import raise_swallowed
+from koopmpc.base.checks import HUGE
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Viewing
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import bind_interpreter
-from koopmpc.values import Viewing
 
 BEYOND = 8.0  # a reading is refused if its innovation exceeds so many standard deviations: χ² = 64
 REFUSALS = 6  # refused readings in sequence for which a prediction stands in; so many have to agree before one is wild

@@ -14,15 +14,15 @@ import scipy.linalg
 from jaxtyping import Complex, Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ObservableError, ShapeError
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ObservableError, ShapeError
+from koopmpc.base.values import Value
 from koopmpc.estimate.disturbance import GAIN
 from koopmpc.estimate.filter import Augmented, FilterModel, KalmanFilter, PeriodicFilter, find_kalman_gain
 from koopmpc.estimate.observer import StateModel
 from koopmpc.estimate.periodic import find_harmonics
 from koopmpc.lifting.base import Lifting, strip_unit
-from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.values import Value
+from koopmpc.models.predictors import LinearPredictor
 
 PROCESS = 1e-4  # default variance of the process noise, in the model's units
 NOISE = 1e-4  # default variance of the measurement noise, in the model's units

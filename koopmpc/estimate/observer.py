@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.values import Value
 from koopmpc.data.delay import Delay
-from koopmpc.errors import DataError
 from koopmpc.estimate.gate import BRIDGED, Gated, ReadingGate, gate_graph
 from koopmpc.lifting.base import Lifting, buffer_lifting
+from koopmpc.models.predictors import LinearPredictor
 from koopmpc.plants.graph import Graph
-from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.values import Value
 
 
 @runtime_checkable

@@ -7,13 +7,13 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.special import fdtrc
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.errors import DataError
 from koopmpc.data.episodes import Episodes, episodes_of
-from koopmpc.errors import DataError
 from koopmpc.estimate.gate import BRIDGED
 from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.predictors import LinearPredictor
 
 PERIODS = 3.0  # harmonics are learned over the last so many periods
 SHORTEST = 20.0  # and over at least so many steps

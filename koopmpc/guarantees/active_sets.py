@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from koopmpc.base.errors import CertificateError
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.daqp import DAQP
-from koopmpc.errors import CertificateError
 
 THIN = 1e-7  # a part of the box of ±1 without a ball of this radius is left out: rounding decides there
 _SAMPLES = 2000  # points of the box that show at once which ways are taken

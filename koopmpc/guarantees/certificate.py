@@ -8,8 +8,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.errors import CertificateError, DataError
+from koopmpc.base.text import format_markdown_table
+from koopmpc.base.values import Value
 from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.limits import Interval, Limits, refuse_levels
@@ -17,14 +20,11 @@ from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import Program, SavedController, no_export
 from koopmpc.control.terminal.sets import TerminalFeedback, TerminalSet
-from koopmpc.errors import CertificateError, DataError
 from koopmpc.guarantees.deviation import DeviationModel
 from koopmpc.guarantees.error_bounds import ErrorBound
 from koopmpc.lifting.base import find_observables
+from koopmpc.models.base import load_value, save_value
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.base import load_value, save_value
-from koopmpc.text import format_markdown_table
-from koopmpc.values import Value
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import CertificateError, DataError, refuse_moved
 from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import CertificateError, DataError, refuse_moved
 from koopmpc.guarantees.certificate import Certificate
 from koopmpc.guarantees.deviation import DeviationModel, deviate, is_stabilisable, reduce_to_states
 from koopmpc.guarantees.error_bounds import (
@@ -25,7 +25,7 @@ from koopmpc.guarantees.error_bounds import (
 )
 from koopmpc.guarantees.search import DECAY, Corners, Found, find_room, prove
 from koopmpc.guarantees.statement import Refused, explain_refusal
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 
 _SCALES = (1.0, 0.7, 0.5, 0.35, 0.25, 0.12, 0.06)  # shares of the box that are tried
 _LEAST_PAIRS = 30  # a box with fewer pairs is not tried

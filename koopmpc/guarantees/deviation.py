@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError
-from koopmpc.interrupts import raise_swallowed
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Value
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.values import Value
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 
 _EXACT = 1e-8  # x has to be C ψ(x) up to this share of its size
 

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.errors import DataError
+from koopmpc.base.errors import DataError
+from koopmpc.base.values import Value
 from koopmpc.validate.binomial import bound_failure_rate
-from koopmpc.values import Value
 
 _LEAST = 1e-9  # constants below are rounding of exact data and count as this
 _CELLS = 10_000  # of the grid of a covering

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
 from koopmpc.control.limits import Limits, refuse_levels
-from koopmpc.errors import DataError
 from koopmpc.guarantees.deviation import DeviationModel
 from koopmpc.guarantees.error_bounds import ErrorBound, ErrorPairs
 from koopmpc.guarantees.semidefinite import FeedbackProof, FeedbackTask, solve_feedback

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.interrupts import call_uninterrupted
+from koopmpc.base.interrupts import call_uninterrupted
 
 _STRICT = 1e-7  # least eigenvalue that the program asks of its matrices, in scaled coordinates
 _SOLVED = ("optimal", "optimal_inaccurate")  # the solver's word is checked afterwards in either case

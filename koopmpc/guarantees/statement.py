@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from koopmpc.base.text import format_markdown_table, to_percent
 from koopmpc.guarantees.certificate import Certificate
 from koopmpc.guarantees.deviation import DeviationModel, find_stray_mode, is_stabilisable
 from koopmpc.guarantees.error_bounds import ErrorBound, ErrorPairs
 from koopmpc.guarantees.search import DECAY, Room, find_largest, prove
-from koopmpc.text import format_markdown_table, to_percent
 
 _METHODS = {
     "given": "You gave the constants. The proof rests on them.",

@@ -6,16 +6,16 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.values import Value
 from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
 from koopmpc.control.plan.condensed_program import CondensedProgram
 from koopmpc.control.target import ROUNDING
-from koopmpc.errors import DataError
 from koopmpc.guarantees.active_sets import ParametricQP, list_ways
 from koopmpc.guarantees.certify import Corners
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.predictors import LinearPredictor
 from koopmpc.validate.binomial import bound_failure_rate
-from koopmpc.values import Value
 
 _NO_LIMIT = 1e20  # there is no limit from here on
 

@@ -7,15 +7,15 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import CertificateError, DataError
 from koopmpc.control.cost import Cost, LiftedTracking, lifted_tracking
 from koopmpc.control.limits import Limits
 from koopmpc.control.riccati import Stage, find_gain, one_step, stationary
 from koopmpc.control.target import targets_of
 from koopmpc.control.terminal.sets import TerminalFeedback, TerminalSet
-from koopmpc.errors import CertificateError, DataError
 from koopmpc.guarantees.invariant_set import find_invariant_set
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.predictors import LinearPredictor
 
 MOST_COORDINATES = 12  # beyond that a polytope has too many rows to find in a minute
 _ITERATIONS = 10_000  # of the Riccati equation

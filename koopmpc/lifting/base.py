@@ -18,13 +18,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
-from koopmpc.errors import DataError, ObservableError, ShapeError
-from koopmpc.interrupts import raise_swallowed
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.errors import DataError, ObservableError, ShapeError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Value
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Buffered
-from koopmpc.values import Value
 
 Indices = Int[np.ndarray, " n"]
 CONSTANT = "1"  # the name of the observable that is always 1

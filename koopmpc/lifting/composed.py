@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import checksum, freeze
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.base import CONSTANT, Indices, Lifting, check_lifting, strip_unit
 from koopmpc.plants.graph import Graph
-from koopmpc.values import checksum, freeze
 
 
 @dataclass(frozen=True, eq=False)

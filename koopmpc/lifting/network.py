@@ -8,13 +8,13 @@ from typing import Any, cast
 
 import casadi as ca
 
-from koopmpc import checks
-from koopmpc.errors import DataError, LogError, ShapeError
-from koopmpc.interrupts import raise_swallowed
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, LogError, ShapeError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Value, freeze
 from koopmpc.lifting.base import Lifting, StateChoice, Traced, find_states, freeze_choice
 from koopmpc.lifting.onnx_layers import replace_layers
 from koopmpc.plants.graph import Graph
-from koopmpc.values import Value, freeze
 
 _MOST = 200_000  # operations of a network: C code and columns of more take minutes to compile
 

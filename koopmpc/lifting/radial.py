@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import freeze
 from koopmpc.lifting.base import Lifting
-from koopmpc.values import freeze
 
 _CANCELS = 1e-3  # sum ‖x − c‖² again if it is below this share of ‖x‖² + ‖c‖²: it has then lost three digits
 

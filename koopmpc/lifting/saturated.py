@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import checksum, freeze
 from koopmpc.lifting.base import CONSTANT, Lifting, check_lifting
-from koopmpc.values import checksum, freeze
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -10,12 +10,12 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
-from koopmpc.errors import DataError
-from koopmpc.interrupts import raise_swallowed
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Value, freeze
 from koopmpc.lifting.base import CONSTANT, Lifting, StateChoice, Traced, find_states, freeze_choice, strip_unit
 from koopmpc.plants.graph import Graph
-from koopmpc.values import Value, freeze
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.control.move import Controller, Move
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.models.base import Predictor
 from koopmpc.plants.plant import Plant, require_plant
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.base import Predictor
 
 CONTROLLER = ("dt", "nu", "horizon", "reset", "__call__")
 

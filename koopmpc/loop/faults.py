@@ -9,9 +9,9 @@ from typing import NamedTuple, cast
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
 from koopmpc.control.limits import Interval
-from koopmpc.errors import DataError
 
 __all__ = [
     "ActuatorDelay",

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import ShapeError
+from koopmpc.base.text import format_duration
+from koopmpc.base.values import Value
 from koopmpc.control.bounds.stage_cost import evaluate_stage
 from koopmpc.control.cost import Cost, Sizes
 from koopmpc.control.limits import SOFTENED, Interval, Limits
 from koopmpc.control.stepped.levels import NEAR
-from koopmpc.errors import ShapeError
 from koopmpc.loop.run import SECONDS, Run, bind_outputs
-from koopmpc.text import format_duration
-from koopmpc.values import Value
 
 SETTLED = 0.02  # the band of the settling time, as a share of the first error
 

@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, KoopmpcError
 from koopmpc.control.function import ExcitationController, as_controller
 from koopmpc.control.move import Controller, Move, Status
 from koopmpc.data.excitation import Excitation
-from koopmpc.errors import DataError, KoopmpcError
 from koopmpc.loop.controllers import CONTROLLER, HOW, checked_input, start_for
 from koopmpc.loop.rows import Step
 from koopmpc.loop.signals import rows_ahead

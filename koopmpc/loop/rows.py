@@ -12,10 +12,10 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.values import Value
 from koopmpc.control.move import Fallback, Move, Plan, Status
-from koopmpc.errors import DataError
-from koopmpc.values import Value
 
 
 @dataclass(slots=True)

@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import Hint
+from koopmpc.base.scene import Scene
+from koopmpc.base.values import Value
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Interval, Limits
 from koopmpc.control.move import Status
 from koopmpc.data.files.frames import build_frame
-from koopmpc.errors import Hint
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
 from koopmpc.loop.rows import OF_STATES, Plans, StepRows
-from koopmpc.predict.base import Predictor
-from koopmpc.scene import Scene
-from koopmpc.values import Value
+from koopmpc.models.base import Predictor
 
 SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}  # in a unit of `metadata["time unit"]`
 

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import ShapeError
 from koopmpc.control.cost import Cost
-from koopmpc.errors import ShapeError
 from koopmpc.loop.run import bind_outputs
 from koopmpc.plants.plant import Plant
 from koopmpc.plants.step_map import StepMap

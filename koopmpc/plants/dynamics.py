@@ -9,11 +9,11 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.interrupts import raise_swallowed
-from koopmpc.scene import Scene, Shape
-from koopmpc.values import Named
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.scene import Scene, Shape
+from koopmpc.base.values import Named
 
 _Symbol = Any  # ca.SX of equations, ca.MX of foreign code
 _Pair = tuple[ca.SX, ca.SX]  # the type of x and u for checkers: both kinds have the same operations

@@ -14,13 +14,13 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.disk import make_temporary_folder
-from koopmpc.errors import DataError, LogError
+from koopmpc.base.disk import make_temporary_folder
+from koopmpc.base.errors import DataError, LogError
+from koopmpc.base.scene import Scene
+from koopmpc.base.values import fingerprint, freeze
 from koopmpc.plants.dynamics import Integrator
 from koopmpc.plants.fmu_files import StartValue, UnitDescription, UnitVariable, collect_limits, read_description
 from koopmpc.plants.step_map import StepMap
-from koopmpc.scene import Scene
-from koopmpc.values import fingerprint, freeze
 
 _LATER = 1234.5  # time [s] at which ẋ is compared with that at 0, to see whether it depends on time
 

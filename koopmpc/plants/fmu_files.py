@@ -14,9 +14,9 @@ from typing import Any, Literal, cast
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
-from koopmpc.disk import path_of
-from koopmpc.errors import DataError, KoopmpcError, LogError, install
+from koopmpc.base import checks
+from koopmpc.base.disk import path_of
+from koopmpc.base.errors import DataError, KoopmpcError, LogError, install
 
 Interface = Literal["model exchange", "co-simulation"]
 INTERFACES: Mapping[Interface, str] = {"model exchange": "modelExchange", "co-simulation": "coSimulation"}

@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.disk import make_temporary_folder
-from koopmpc.errors import DataError, LogError
+from koopmpc.base import checks
+from koopmpc.base.disk import make_temporary_folder
+from koopmpc.base.errors import DataError, LogError
+from koopmpc.base.scene import Scene
 from koopmpc.plants.dynamics import RK4, Integrator, check_integrator
 from koopmpc.plants.fmu_equations import FMUStepMap, read_equations
 from koopmpc.plants.fmu_files import (
@@ -27,7 +28,6 @@ from koopmpc.plants.fmu_files import (
     read_description,
     require_numbers,
 )
-from koopmpc.scene import Scene
 
 _ROUNDING = 1e-9  # share by which the state after a reset may differ from x0
 # FMPy knows one logger for all units of FMI 2 in a process, the last one, and calls it also after its unit was freed.

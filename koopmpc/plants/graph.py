@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.interrupts import raise_swallowed
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Value
 from koopmpc.plants.routines import make_dense
-from koopmpc.values import Value
 
 Columns = np.ndarray | float
 

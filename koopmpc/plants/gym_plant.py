@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError, install
-from koopmpc.scene import Scene
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, install
+from koopmpc.base.scene import Scene
 
 try:
     import gymnasium

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.scene import Scene
+from koopmpc.base.values import Named
 from koopmpc.plants.dynamics import Dynamics
-from koopmpc.scene import Scene
-from koopmpc.values import Named
 
 StepFunction = Callable[[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]], ArrayLike]
 MeasureFunction = Callable[[Float[np.ndarray, " nx"]], ArrayLike]

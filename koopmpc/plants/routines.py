@@ -23,8 +23,8 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.interrupts import raise_swallowed
-from koopmpc.values import fingerprint
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import fingerprint
 
 Kernel = Callable[[Float[np.ndarray, "E rows nx"], Float[np.ndarray, "E T nu"]], None]
 

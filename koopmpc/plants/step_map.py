@@ -12,9 +12,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.interrupts import raise_swallowed
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.scene import Scene
+from koopmpc.base.values import Named, Value, freeze
 from koopmpc.plants import routines
 from koopmpc.plants.dynamics import (
     RK4,
@@ -28,8 +30,6 @@ from koopmpc.plants.dynamics import (
 )
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Buffered, make_dense
-from koopmpc.scene import Scene
-from koopmpc.values import Named, Value, freeze
 
 _WORTH_COMPILING = 20_000  # compile F for a batch of at least so many steps: interpreting them takes as long, 0.2 s
 _LONGEST = 5_000  # do not compile an F of more operations: the compiler's time grows faster than the code

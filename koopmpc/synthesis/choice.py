@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.values import Value
 from koopmpc.synthesis.loops.judging import LITTLE, Outcome
 from koopmpc.synthesis.search.recipe import Recipe
-from koopmpc.values import Value
 
 BREAKS = 0.01  # a larger violation, as a share of the range, is less safe
 WORTH = 0.02  # a controller with an estimator may cost this share more

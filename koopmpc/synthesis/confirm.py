@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from koopmpc.base.errors import DataError
 from koopmpc.data.source import source_of
-from koopmpc.errors import DataError
 from koopmpc.synthesis.choice import DesignRow, choose_row
 from koopmpc.synthesis.loops.finalists import choose_finalist, find_room_to_stop, list_finalists, watch_data
 from koopmpc.synthesis.loops.judging import is_confirmed

@@ -8,13 +8,13 @@ import warnings
 
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import FitWarning
+from koopmpc.base.parallel import Workers
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
-from koopmpc.errors import FitWarning
-from koopmpc.parallel import Workers
 from koopmpc.synthesis.confirm import choose_controller
 from koopmpc.synthesis.designed import Design
 from koopmpc.synthesis.loops.margin import check_share

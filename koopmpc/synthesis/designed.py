@@ -9,26 +9,26 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import RenderableType
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, KoopmpcError, LogError
+from koopmpc.base.terminal import build_leaderboard, render_text
+from koopmpc.base.text import format_duration, to_percent
+from koopmpc.base.values import Value
 from koopmpc.control.kinds import build_controller
 from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.control.nonlinear.nonlinear_mpc import NonlinearMPC
 from koopmpc.control.program import SavedController
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError, KoopmpcError, LogError
-from koopmpc.predict.base import load_value, save_value
-from koopmpc.supervise.guarded import Guarded
+from koopmpc.loop.guarded import Guarded
+from koopmpc.models.base import load_value, save_value
 from koopmpc.synthesis.choice import DesignRow
 from koopmpc.synthesis.loops.neighbours import NeighbourMap, choose_starts_to_record
 from koopmpc.synthesis.loops.surrogates import Surrogate
 from koopmpc.synthesis.rates import CoveragePromise, ExpectedLoop
 from koopmpc.synthesis.search.recipe import Designed
 from koopmpc.synthesis.task import DesignTask
-from koopmpc.terminal import build_leaderboard, render_text
-from koopmpc.text import format_duration, to_percent
 from koopmpc.validate.logs.summary import LogSummary
-from koopmpc.values import Value
 
 AnyMPC = KoopmanMPC | BilinearMPC | NonlinearMPC
 

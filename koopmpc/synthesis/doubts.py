@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.text import with_unit
 from koopmpc.control.limits import Limits
 from koopmpc.control.nonlinear.equilibrium import Equilibrium
 from koopmpc.data.episodes import Episodes
@@ -13,7 +14,6 @@ from koopmpc.lifting.state import State
 from koopmpc.loop.metrics import stack_limited
 from koopmpc.synthesis.loops.surrogates import Surrogate
 from koopmpc.synthesis.task import _FEW, ROOM, DesignTask
-from koopmpc.text import with_unit
 
 FAR = 1.0  # an episode is left out if it leaves the box of the others by more than this many widths
 MOST = 0.9  # share of the episodes inside this box

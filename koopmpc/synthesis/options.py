@@ -8,10 +8,10 @@ from typing import Literal, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.parallel import StageProgress
 from koopmpc.lifting.base import Lifting
-from koopmpc.parallel import StageProgress
 from koopmpc.synthesis.search.candidates import Candidate
 
 Options = TypeVar("Options")
@@ -51,7 +51,7 @@ class SearchOptions:
     sample
         Snapshot pairs to choose on, about.
     workers, scheduler
-        As in `koopmpc.parallel.map_tasks`: a task is a candidate, a controller with all its runs, a part of the source.
+        As in `koopmpc.base.parallel.map_tasks`: a task is a candidate, a controller with its runs, a part of the source.
     progress
         Called with the name of a stage, how many of its tasks are done, and how many there are, None where that is not
         known.

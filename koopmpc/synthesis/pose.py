@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
 from koopmpc.control.cost import Cost
 from koopmpc.control.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError
 from koopmpc.estimate.kalman import NOT_TOGETHER
 from koopmpc.synthesis.doubts import find_stray_episodes, find_unweighted_limits
 from koopmpc.synthesis.options import DesignOptions

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from koopmpc.base.text import to_percent
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
 from koopmpc.data.episodes import Episode, Episodes
@@ -20,7 +21,6 @@ from koopmpc.synthesis.loops.fresh import describe_outside, find_blind_range, fi
 from koopmpc.synthesis.loops.judging import Outcome
 from koopmpc.synthesis.options import DesignOptions
 from koopmpc.synthesis.rates import KEPT, ExpectedLoop
-from koopmpc.text import to_percent
 
 MANY = 600  # fresh loops of a controller in machine code
 FEW = 60  # fresh loops of one in Python

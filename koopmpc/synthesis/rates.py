@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import betainc
 
-from koopmpc.terminal import label_lines, render_text
-from koopmpc.text import to_percent
+from koopmpc.base.terminal import label_lines, render_text
+from koopmpc.base.text import to_percent
+from koopmpc.base.values import Value
 from koopmpc.validate.binomial import bound_failure_rate
-from koopmpc.values import Value
 
 KEPT = 0.01  # a loop keeps its limits if it violates none by more than this share of its range
 SHIFT = 0.05  # a fresh start is a start of the task moved by up to this share of the data's range

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.parallel import Workers
 from koopmpc.estimate.disturbance import LiftedDisturbance
-from koopmpc.parallel import Workers
 from koopmpc.synthesis.choice import DesignRow, average_ratios, choose_estimator, is_alike, measure_errors, rate_runs
 from koopmpc.synthesis.loops.conditions import LoopTest, prepare_test
 from koopmpc.synthesis.loops.judging import Job, Outcome, judge_job

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import FitWarning
+from koopmpc.base.parallel import map_tasks
 from koopmpc.data.angles import count_wraps
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
-from koopmpc.errors import FitWarning
-from koopmpc.identify.moments.read import ReadOptions
-from koopmpc.identify.records.structure import Structure, find_forecast_horizon
-from koopmpc.parallel import map_tasks
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.moments.read import ReadOptions
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.records.structure import Structure, find_forecast_horizon
 from koopmpc.synthesis.options import SearchOptions, check_options, explain_moved
 from koopmpc.synthesis.search.candidates import (
     Candidate,

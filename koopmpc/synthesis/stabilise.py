@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, FitWarning, KoopmpcError, ShapeError
+from koopmpc.base.values import Value
 from koopmpc.control.lqr import dlqr
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.excitation import Excitation, Feedback, Noise
-from koopmpc.errors import DataError, FitWarning, KoopmpcError, ShapeError
 from koopmpc.plants.plant import Plant, SimulatedPlant, require_plant
 from koopmpc.plants.step_map import StepMap
-from koopmpc.values import Value
 
 FIRST = 0.05  # share of `reach` from which the first episodes start
 WIDEST = 0.5  # share of `reach` from which the last ones may start

@@ -8,15 +8,15 @@ import scipy.linalg
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import Value
 from koopmpc.control.cost import Cost, check_cost_and_limits, refuse_stage
 from koopmpc.control.limits import Limits, refuse_levels, refuse_priority
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.composed import evaluate_jacobians
 from koopmpc.lifting.state import State
 from koopmpc.loop.metrics import stack_limited
-from koopmpc.values import Value
 
 RUN = 3  # length of a run in horizons
 MOVING = 120  # steps of a run with a moving reference, at least: three short horizons show the way there, no tracking

@@ -7,15 +7,15 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, hide_fit_warnings
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, hide_fit_warnings
-from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.variable_projection import TunableLifting, VariableProjection, Windows
 from koopmpc.lifting.base import Lifting, check_lifting
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.fits.edmd import edmd
+from koopmpc.models.predictors import LinearPredictor
+from koopmpc.models.shared.variable_projection import TunableLifting, VariableProjection, Windows
 from koopmpc.validate.scoring import score
 
 _GAIN = 0.01  # share by which the held-out error must fall; less is chance

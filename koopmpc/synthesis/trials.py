@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from koopmpc.base.errors import DataError
+from koopmpc.base.parallel import Workers
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError
 from koopmpc.lifting.composed import Present
 from koopmpc.lifting.state import State
-from koopmpc.parallel import Workers
 from koopmpc.synthesis.loops.conditions import FOLDS
 from koopmpc.synthesis.options import DesignOptions
 from koopmpc.synthesis.pose import PosedTask

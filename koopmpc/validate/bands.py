@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.predict.predictors import relift_rollout
+from koopmpc.models.predictors import relift_rollout
 from koopmpc.validate.scoring import AnyPredictor, Score, embed_episodes, forecast_errors, score
-from koopmpc.values import Value
 
 Rng = np.random.Generator | int
 

@@ -2,8 +2,8 @@
 
 from scipy.special import bdtr, betaincinv
 
-from koopmpc import checks
-from koopmpc.errors import DataError
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
 
 _MOST_RUNS = 10**9  # refuse bounds that would need more runs than this
 

@@ -16,15 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.text import to_percent
 from koopmpc.data.delay import Delay, name_past
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
-from koopmpc.identify.innovations import explain_by_readings
-from koopmpc.identify.moments.moments import Moments, both_sides
-from koopmpc.identify.records.narx import FOLDS
-from koopmpc.identify.solve import column_norms, orthonormal_basis, project_onto
 from koopmpc.lifting.base import Lifting, strip_unit
-from koopmpc.text import to_percent
+from koopmpc.models.innovations import explain_by_readings
+from koopmpc.models.moments.moments import Moments, both_sides
+from koopmpc.models.moments.solve import column_norms, orthonormal_basis, project_onto
+from koopmpc.models.records.narx import FOLDS
 from koopmpc.validate.logs.log import Log, LogFault, fit_residuals
 from koopmpc.validate.residuals import compute_moments
 from koopmpc.validate.scoring import AnyPredictor

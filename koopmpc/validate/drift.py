@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import chdtri
 
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.terminal import label_lines, render_text
+from koopmpc.base.text import to_percent
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episodes, episodes_of
-from koopmpc.errors import DataError, ShapeError
 from koopmpc.lifting.base import strip_unit
-from koopmpc.terminal import label_lines, render_text
-from koopmpc.text import to_percent
 from koopmpc.validate.logs.log import Log, solve_weights
-from koopmpc.values import Value
 
 SURE = 5.0  # a change must be this many times its spread among parts of the old data
 LEAST = 0.1  # smaller changes than this share are not named

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.values import Value
 from koopmpc.validate.bands import BandCoverage, ConformalBand
 from koopmpc.validate.memory import Memory
 from koopmpc.validate.residuals import Invariance, ResidualDMD
@@ -13,7 +14,6 @@ from koopmpc.validate.sufficiency import (
     Coverage,
     Persistency,
 )
-from koopmpc.values import Value
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from rich.table import Table
 
+from koopmpc.base.terminal import build_table
+from koopmpc.base.text import shorten_observable, to_percent, with_unit
+from koopmpc.base.values import Value
 from koopmpc.lifting.base import strip_unit
-from koopmpc.terminal import build_table
-from koopmpc.text import shorten_observable, to_percent, with_unit
 from koopmpc.validate.evidence import LIMITS, TrustEvidence
-from koopmpc.values import Value
 
 
 @dataclass(frozen=True, eq=False)

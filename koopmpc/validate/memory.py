@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc.base.text import to_percent
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episodes, episodes_of
 from koopmpc.lifting.base import strip_unit
-from koopmpc.text import to_percent
-from koopmpc.values import Value
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.terminal import label_lines, render_text
 from koopmpc.data.episodes import Episodes, episodes_of
-from koopmpc.errors import DataError
 from koopmpc.lifting.state import State
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.terminal import label_lines, render_text
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.validate.bands import conformal, cut_record
 from koopmpc.validate.closed_loop import explain_beyond_past, explain_inputs
 from koopmpc.validate.evidence import LIMITS, TrustEvidence

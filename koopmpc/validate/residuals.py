@@ -9,20 +9,20 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import Value
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.moments.moments import Moments, both_sides
-from koopmpc.identify.moments.read import second_moments
-from koopmpc.identify.solve import column_norms, orthonormal_basis
 from koopmpc.lifting.base import Lifting
-from koopmpc.predict.base import sorted_eigen
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.predict.spectrum import check_same_names
+from koopmpc.models.base import sorted_eigen
+from koopmpc.models.moments.moments import Moments, both_sides
+from koopmpc.models.moments.read import second_moments
+from koopmpc.models.moments.solve import column_norms, orthonormal_basis
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.spectrum import check_same_names
 from koopmpc.validate.scoring import AnyPredictor
-from koopmpc.values import Value
 
 _SPURIOUS = 0.05  # an eigenpair with a larger one-step residual is spurious, unless the caller sets a tolerance
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
-from koopmpc.errors import DataError
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.predict.spectrum import check_same_names
-from koopmpc.values import Value
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.spectrum import check_same_names
 
 AnyPredictor = LinearPredictor | BilinearPredictor
 

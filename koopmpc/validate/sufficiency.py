@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.text import with_unit
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episodes, episodes_of
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.solve import scale_to_unit_norm
-from koopmpc.text import with_unit
-from koopmpc.values import Value
+from koopmpc.models.moments.solve import scale_to_unit_norm
 
 _BLOCK_ROWS = 4096  # samples that are binned in one block
 _MOST_BINS = 10  # default number of bins of a coordinate, if the data are enough

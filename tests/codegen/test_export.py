@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import koopmpc as km
-from koopmpc.cli.app import app
+from koopmpc.apps.cli.app import app
 from tests.faults.damage import room_for
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)

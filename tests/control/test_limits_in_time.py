@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import StateSpace
 
 import koopmpc as km
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.base.errors import DataError, ShapeError
 from tests.control.models import PRECISE, Told, linear
 from tests.control.oracle import oracle
 

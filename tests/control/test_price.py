@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError
+from koopmpc.base.errors import DataError
 from tests.control.models import linear
 from tests.control.oracle import targets_of, weighed
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.base.errors import DataError, ShapeError
 
 DT = 0.1
 A = np.array([[0.95, 0.1], [-0.1, 0.9]])

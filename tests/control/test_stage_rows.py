@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.base.errors import DataError, ShapeError
 from tests.control.models import linear
 from tests.control.oracle import oracle
 from tests.control.test_limits_in_time import REFERENCES, constant, moving_limits

@@ -187,7 +187,7 @@ def test_more_rows_than_memory_holds_are_refused_before_they_are_made(tmp_path, 
     (tmp_path / "log.csv").write_text("t,x,u\n0,1,1\n1,2,3\n9,3,2\n10,4,1\n0,5,6\n1,7,7\n")
     needed = 16 * 2 * (10 + 1) / 0.01  # bytes of two columns over eleven seconds
     for free, fits in ((1.01 * needed, True), (0.99 * needed, False), (None, True)):
-        monkeypatch.setattr("koopmpc.disk.memory", lambda free=free: free)
+        monkeypatch.setattr("koopmpc.base.disk.memory", lambda free=free: free)
         if fits:
             with pytest.warns(km.FitWarning, match=r"1 gap \(after line 3\) cut 2 episodes into 3; 0 of 6 rows"):
                 assert len(km.load_episodes(tmp_path / "log.csv", resample=0.01)) == 3

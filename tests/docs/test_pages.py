@@ -16,7 +16,7 @@ ELSEWHERE = {  # pages whose claims are tested beyond what they print, and where
     "adaptive.md": "tests/test_docs_adaptive.py",
     "controllers.md": "tests/test_docs_controllers.py",
     "design-from-data.md": "tests/test_docs_design_from_data.py",
-    "faults.md": "tests/bench/test_docs.py",
+    "faults.md": "tests/apps/test_docs.py",
     "how/compiled.md": "tests/test_docs_on_the_machine.py",
     "how/from_pid.md": "tests/test_docs_from_pid.py",
     "how/fmu.md": "tests/test_docs_plants.py",
@@ -25,15 +25,15 @@ ELSEWHERE = {  # pages whose claims are tested beyond what they print, and where
     "how/onnx.md": "tests/lifting/test_onnx.py",
     "how/opcua.md": "tests/loop/test_live.py",
     "how/own_step_function.md": "tests/test_docs_plants.py",
-    "how/peers.md": "tests/predict/test_peers.py",
+    "how/peers.md": "tests/models/test_peers.py",
     "how/ros2.md": "tests/loop/test_live.py",
     "how/trust.md": "tests/test_docs_identification.py",
     "offset_free.md": "tests/estimate/test_docs.py",
     "on_the_machine.md": "tests/test_docs_on_the_machine.py",
-    "problems.md": "tests/bench/test_docs.py",
+    "problems.md": "tests/apps/test_docs.py",
     "realtime.md": "tests/loop/test_realtime.py",
     "start.md": "tests/docs/test_pages.py",  # as the notebook
-    "sweeps.md": "tests/bench/test_docs.py",
+    "sweeps.md": "tests/apps/test_docs.py",
 }
 PACKAGES = {
     "gym": "gymnasium",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError
+from koopmpc.base.errors import DataError
 from koopmpc.estimate.extended import ExtendedObserver
 
 

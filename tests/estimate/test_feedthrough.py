@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError
+from koopmpc.base.errors import DataError
 from tests.bare import shown
 from tests.compiler import needs_compiler
 

@@ -13,13 +13,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import koopmpc as km
-from koopmpc.bench.store import RunRow, open_sweep, read_store, record_of, write_results
-from koopmpc.page import Curves, Page
+from koopmpc.apps.bench.store import RunRow, open_sweep, read_store, record_of, write_results
+from koopmpc.base.page import Curves, Page
 from koopmpc.plants import routines
-from koopmpc.recording.curves import record_curves
 from koopmpc.synthesis.designed import SavedDesign, read_controller
-from tests.recording.runs import make_run
+from koopmpc.views.recording.curves import record_curves
 from tests.synthesis.test_design import usual
+from tests.views.runs import make_run
 
 TEMPLATE = Path(km.__file__).parent / "bench" / "template.txt"
 
@@ -92,7 +92,7 @@ def figure(path: Path) -> None:
 
 def recorded(path: Path) -> None:
     """Write a log while its loop runs."""
-    from tests.recording.runs import about, steps_of
+    from tests.views.runs import about, steps_of
 
     run = make_run(T=60)
     with km.Recorder(path, **about(run)) as recorder:
@@ -196,7 +196,7 @@ def spare() -> Any:
 
 
 def parts_of_model_log(path: Path) -> Any:
-    from koopmpc.recording.model import load_model_log
+    from koopmpc.views.recording.model import load_model_log
 
     log = load_model_log(path)
     return dict(log.facts), log.states, log.dt, [error.tobytes() for error in log.errors]

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc import disk
+from koopmpc.base import disk
 from koopmpc.data.files.foreign.hdf5 import _require_sound_heaps
 from tests.faults.damage import FORMATS, PLAIN, READERS, WRITERS, damaged, episodes, model, recorded, room_for, store
-from tests.recording.runs import make_run
 from tests.tiers import few
+from tests.views.runs import make_run
 
 UNCHANGED = b"what was there before"
 

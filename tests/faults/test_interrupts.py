@@ -16,8 +16,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import koopmpc as km
-from koopmpc.cli.ending import clean_folder
-from tests.bench.tiny import write
+from koopmpc.apps.cli.ending import clean_folder
+from tests.apps.tiny import write
 from tests.faults.test_controllers import BUILD, controllers, models  # noqa: F401  # fixtures
 
 SECONDS = 180.0  # of patience of a test on a busy machine; on a quiet one each command ends within one
@@ -275,7 +275,7 @@ def test_what_was_kept_is_said_and_half_files_go(tmp_path: Path) -> None:
 
 SOLVING = """
 import os, signal, threading
-from koopmpc.cli.ending import ENDING
+from koopmpc.apps.cli.ending import ENDING
 import casadi as ca
 with ENDING:
     x = ca.MX.sym("x", 40)

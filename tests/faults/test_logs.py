@@ -12,11 +12,11 @@ import pyarrow as pa
 import pytest
 
 import koopmpc as km
-from koopmpc.recording.description import Entity
-from koopmpc.recording.reader import LogColumns
-from koopmpc.recording.rrd import Column, Contents
-from tests.recording.runs import about, make_run, steps_of
+from koopmpc.views.recording.description import Entity
+from koopmpc.views.recording.reader import LogColumns
+from koopmpc.views.recording.rrd import Column, Contents
 from tests.tiers import slow
+from tests.views.runs import about, make_run, steps_of
 
 
 def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:

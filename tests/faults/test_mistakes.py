@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.fitting.goal import read_goal
-from koopmpc.predict import spectrum
+from koopmpc.apps.fitting.goal import read_goal
+from koopmpc.models import spectrum
 from tests.faults.garbage import foreign
 from tests.tiers import slow
 

@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import koopmpc as km
-from tests.bench.test_store import TWO, figures
-from tests.bench.tiny import write
+from tests.apps.test_store import TWO, figures
+from tests.apps.tiny import write
 from tests.cluster import two_workers
 
 GRID = {"starts": 4, "seeds": 2, "noise": [0.0, 0.05]}
@@ -161,7 +161,7 @@ def test_a_disk_that_fills_ends_a_sweep_with_one_error_and_it_goes_on_when_there
         ended = subprocess.run([sys.executable, script], stderr=subprocess.PIPE, text=True, timeout=200)
         ends.append(ended.returncode)
         if ended.returncode:
-            assert "koopmpc.errors.FullDiskError: " in ended.stderr, (size, ended)
+            assert "koopmpc.base.errors.FullDiskError: " in ended.stderr, (size, ended)
     assert ends[0] == 1
     rows = km.sweep([problem], TWO, folder=folder, options=km.bench.SweepOptions(**GRID))
     assert figures(rows) == figures(peace)

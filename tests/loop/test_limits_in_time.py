@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import ShapeError
+from koopmpc.base.errors import ShapeError
 
 STEPS = 60
 U_MAX = np.where(np.arange(STEPS + 1) < 30, 25.0, 6.0)[:, None]

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import koopmpc as km
+from koopmpc.base.values import fingerprint
 from koopmpc.plants import routines, step_map
 from koopmpc.plants.graph import Graph
 from koopmpc.plants.routines import Routine
-from koopmpc.values import fingerprint
 from tests.compiler import avoid_compiling, needs_compiler
 from tests.example_plants import CartPole, Pendulum
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.base.errors import DataError, ShapeError
 from tests.gathered import of_loop
 
 COST, LIMITS = km.Cost(Q=[1.0, 0.0], R=0.01), km.Limits(u_min=-2, u_max=2)

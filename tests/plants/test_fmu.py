@@ -281,7 +281,7 @@ def test_units_that_cannot_be_a_plant_say_why(folder, pendulum, pendulum3, tanks
 HELD = """
 import os, sys, tempfile
 import koopmpc as km
-from koopmpc.parallel import map_tasks
+from koopmpc.base.parallel import map_tasks
 
 def run(unit):
     noise = km.Noise(-1, 1)

@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 
 import koopmpc as km
-from koopmpc.figures.style import save
+from koopmpc.views.figures.style import save
 from tests.real.judge import names, records_of
 
 ROWS = 400  # rows that a picture shows, at most

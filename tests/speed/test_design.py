@@ -7,7 +7,7 @@ import pytest
 
 import koopmpc as km
 
-pytestmark = [pytest.mark.speed, pytest.mark.filterwarnings("ignore::koopmpc.errors.FitWarning")]
+pytestmark = [pytest.mark.speed, pytest.mark.filterwarnings("ignore::koopmpc.base.errors.FitWarning")]
 
 
 def record(name: str, steps: int, each: int) -> tuple[km.Problem, km.Episodes]:

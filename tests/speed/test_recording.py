@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 import koopmpc as km
-from tests.recording.runs import about, make_run, steps_of
+from tests.views.runs import about, make_run, steps_of
 
 pytestmark = pytest.mark.speed
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.identify.moments.moments import Moments
-from koopmpc.identify.moments.read import second_moments
-from koopmpc.identify.records.hidden_structure import HiddenStructure
+from koopmpc.models.moments.moments import Moments
+from koopmpc.models.moments.read import second_moments
+from koopmpc.models.records.hidden_structure import HiddenStructure
 from koopmpc.synthesis.search.candidates import Candidate
 from koopmpc.synthesis.search.cross_validation import Trial, cross_validate, fit_ridges, leave_one_out
 from koopmpc.synthesis.search.folds import select_fold

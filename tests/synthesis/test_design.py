@@ -13,9 +13,9 @@ from scipy.optimize import lsq_linear
 from scipy.signal import dlsim
 
 import koopmpc as km
-from koopmpc.identify.records.hidden_fit import fit_hidden
-from koopmpc.identify.records.hidden_structure import HiddenStructure
-from koopmpc.identify.records.structure import Structure
+from koopmpc.models.records.hidden_fit import fit_hidden
+from koopmpc.models.records.hidden_structure import HiddenStructure
+from koopmpc.models.records.structure import Structure
 from koopmpc.synthesis.choice import LOST, average_ratios, choose_row, rate_runs
 from koopmpc.synthesis.loops.abreast import explain_python
 from koopmpc.synthesis.loops.judging import Outcome

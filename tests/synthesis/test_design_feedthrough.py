@@ -8,8 +8,8 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import koopmpc as km
-from koopmpc.errors import DataError
-from koopmpc.fitting.verdict import judge_plant_runs
+from koopmpc.apps.fitting.verdict import judge_plant_runs
+from koopmpc.base.errors import DataError
 from tests.bare import shown
 from tests.estimate.test_feedthrough import PLAIN, A, B, C, D, log_of
 from tests.searches import design

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.synthesis.search.feedback import project_on_instruments, remove_feedback
-from tests.identify.test_instruments import TRUTH, run_loop
+from tests.models.test_instruments import TRUTH, run_loop
 from tests.searches import design
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.errors import DataError
-from koopmpc.identify.records.hidden_structure import HiddenStructure
-from koopmpc.identify.records.structure import Structure
+from koopmpc.base.errors import DataError
+from koopmpc.models.records.hidden_structure import HiddenStructure
+from koopmpc.models.records.structure import Structure
 from koopmpc.synthesis.search import hidden_states, records
 from koopmpc.synthesis.search.candidates import relift_model
 from koopmpc.synthesis.search.data import is_record
@@ -23,8 +23,8 @@ from koopmpc.synthesis.search.free_runs import (
 from koopmpc.synthesis.search.hidden_states import NEAR, PAYS, judge_hidden_states
 from koopmpc.synthesis.search.records import is_late
 from koopmpc.validate.closed_loop import is_fed_back
-from tests.identify.test_hidden_state import saturating_record
-from tests.identify.test_neural import friction_record
+from tests.models.test_hidden_state import saturating_record
+from tests.models.test_neural import friction_record
 from tests.searches import select
 from tests.validate.logs.test_timing import record
 

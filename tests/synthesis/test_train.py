@@ -12,7 +12,7 @@ from scipy.optimize import approx_fprime
 
 import koopmpc as km
 from koopmpc.data.source import source_of
-from koopmpc.identify.variable_projection import TunableLifting, VariableProjection, Windows
+from koopmpc.models.shared.variable_projection import TunableLifting, VariableProjection, Windows
 from koopmpc.synthesis.train import _draw_pieces
 
 PLANT = km.black_box(

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import Interval as Interval
 from koopmpc.control.in_time.bounds import BoundByName
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.values import Interval as Interval
 
 SOFTENED = 1e-4  # a slack above this share of the size of its limit is reported
 Slack = tuple[ArrayLike, ArrayLike]

@@ -7,8 +7,8 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.interrupts import raise_swallowed
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.plants.graph import Graph
 
 StageCost: TypeAlias = Callable[[ca.SX, ca.SX], Any] | Graph

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
 
 BoundByName = Mapping[str, ArrayLike]  # of each signal a number, or one a step
 

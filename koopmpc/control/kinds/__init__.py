@@ -4,13 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, LogError
+from koopmpc.base.lazy import load_joint
 from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller
 from koopmpc.control.program import Published, SavedController
-from koopmpc.errors import DataError, LogError
-from koopmpc.lazy import load_joint
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class BenchEntry:
         What it plans with: the problem's "equations", or the "linear" or "bilinear" model that was learned from data;
         "designed" where `design` chooses.
     build
-        (parts, limits) → controller. `parts` is a `koopmpc.bench.Prepared`: it has `problem`, `step_map`, `model`,
+        (parts, limits) → controller. `parts` is a `koopmpc.apps.bench.Prepared`: it has `problem`, `step_map`, `model`,
         `local_model`, `bilinear`, `data`, and `monitor_data`, the data for a monitor.
     on_request
         Whether it runs only where it is named.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
 from koopmpc.control.base import PredictiveController
 from koopmpc.control.cost import Cost
 from koopmpc.control.in_time.preview import check_bounds_alone
@@ -27,8 +27,8 @@ from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.estimate.observer import Estimator, start_observer
+from koopmpc.models.predictors import LinearPredictor
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.predictors import LinearPredictor
 
 
 class KoopmanMPC(PredictiveController):

@@ -7,7 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Limits
@@ -24,11 +26,9 @@ from koopmpc.control.solvers.daqp import daqp_settings
 from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.estimate.observer import Estimator
-from koopmpc.interrupts import raise_swallowed
-from koopmpc.predict.predictors import BilinearPredictor
+from koopmpc.models.predictors import BilinearPredictor
 
 
 class BilinearMPC(StagedMPC):

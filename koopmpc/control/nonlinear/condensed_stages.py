@@ -9,12 +9,12 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
+from koopmpc.base.errors import DefinitenessError
 from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.riccati import Stage, step
 from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.base import QP
-from koopmpc.errors import DefinitenessError
 
 FINISHED = 150  # about as many interior-point steps take as long as an active-set method
 

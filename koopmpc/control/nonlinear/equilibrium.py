@@ -11,14 +11,14 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Value
 from koopmpc.control.cost import Cost, StateTracking
 from koopmpc.control.limits import SOFTENED, Interval
 from koopmpc.control.nonlinear.active_limits import RANK, GaussNewtonStep, exchange_limits, find_length, invert
 from koopmpc.control.nonlinear.learned_map import LearnedMap, point_sizes
-from koopmpc.interrupts import raise_swallowed
 from koopmpc.lifting.state import State
 from koopmpc.plants.routines import Buffered
-from koopmpc.values import Value
 
 SETTLED = 1e-10  # the last Gauss–Newton step is at most this share of the size of (x, u)
 CLOSE = 1e-2  # steps below this share of the size of (x, u) leave an error of the square of this share

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.checks import HUGE
+from koopmpc.base.checks import HUGE
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.condensed_stages import Deviation, SearchesLevels, Stages, StageStep, least_deviation

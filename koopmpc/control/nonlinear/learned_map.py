@@ -8,14 +8,14 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.cost import StateTracking
 from koopmpc.data.delay import Delay
-from koopmpc.errors import DataError
-from koopmpc.interrupts import raise_swallowed
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.routines import Buffered
 from koopmpc.plants.step_map import StepMap
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
 
 ModelOrMap = BilinearPredictor | LinearPredictor | StepMap
 _SHARED = ("lifting", "embedding", "dt", "states", "inputs", "disturbances")

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
+from koopmpc.base import checks
 from koopmpc.control.nonlinear.equilibrium import Linearisation
 from koopmpc.control.plan.row_targets import TerminalCost
 

@@ -5,7 +5,9 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.limits import Limits
@@ -17,9 +19,7 @@ from koopmpc.control.program import Program, no_export
 from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator
-from koopmpc.interrupts import raise_swallowed
 
 
 class NonlinearMPC(StagedMPC):

@@ -7,7 +7,7 @@ from time import perf_counter
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.checks import HUGE
+from koopmpc.base.checks import HUGE
 from koopmpc.control.limits import SOFTENED, Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration

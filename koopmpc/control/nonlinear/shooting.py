@@ -8,13 +8,13 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.limits import SOFTENED, Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.ranges import find_undefined_operation
 from koopmpc.control.nonlinear.stagewise import weight_symbols
-from koopmpc.errors import DataError
-from koopmpc.interrupts import raise_swallowed
 
 NLPSolver = Literal["ipopt", "fatrop", "sqpmethod"]
 OPTIONS: Mapping[str, Mapping[str, Any]] = {

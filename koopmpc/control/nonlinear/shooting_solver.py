@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.checks import HUGE
+from koopmpc.base.checks import HUGE
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.learned_map import LearnedMap

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import solve
 
+from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.control.cost import StateTracking
 from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.nonlinear.equilibrium import RestProgram
@@ -17,9 +19,7 @@ from koopmpc.control.nonlinear.rows import StageBounds
 from koopmpc.control.nonlinear.stagewise import Sides
 from koopmpc.control.plan.row_targets import RowTargets, TailProgram
 from koopmpc.control.program import StepProgram, trace_graph
-from koopmpc.errors import DataError
 from koopmpc.estimate.observer import EstimatorProgram
-from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.graph import Graph
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 
-from koopmpc.checks import HUGE
+from koopmpc.base.checks import HUGE
+from koopmpc.base.values import Interval, Value
 from koopmpc.control.cost import LiftedTracking
 from koopmpc.control.in_time.bounds import refuse_crossed_rows
 from koopmpc.control.in_time.preview import check_bounds_alone, require_movable, require_preview
@@ -16,7 +17,6 @@ from koopmpc.control.limits import BOUNDS, Limits, preview_margin
 from koopmpc.control.target import ROUNDING, Targets
 from koopmpc.control.terminal.inclusion import EndReach, measure_reach, require_inside
 from koopmpc.control.terminal.sets import EndRows
-from koopmpc.values import Interval, Value
 
 _SHARE = 1e-5  # a rate that gives way by more than this share of its allowance is reported
 

@@ -6,8 +6,9 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.errors import DataError
 from koopmpc.control.cost import add_held
 from koopmpc.control.horizon import Condensed, Horizon, Terminal, WeightRows, build_stages, condense, horizon_of
 from koopmpc.control.limits import Interval
@@ -27,8 +28,7 @@ from koopmpc.control.stepped.priorities import spread_priorities
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
 from koopmpc.control.terminal.sets import EndRows, read_end
 from koopmpc.control.terminal_cost import terminal_of
-from koopmpc.errors import DataError
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.predictors import LinearPredictor
 
 
 def plan_condensed(task: ControlTask) -> CondensedProgram:

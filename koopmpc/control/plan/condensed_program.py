@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from koopmpc.base.values import Value
 from koopmpc.control.limits import Interval
 from koopmpc.control.plan.bounds import BoundsProgram, PlanBounds
 from koopmpc.control.program import LinearProgram
@@ -19,7 +20,6 @@ from koopmpc.control.stepped.levels import HeldLevels, InputLevels
 from koopmpc.control.stepped.search import LevelSearch, LevelSolver
 from koopmpc.control.stepped.sequences import LevelsProgram
 from koopmpc.estimate.observer import Estimator, EstimatorProgram, estimator_program, start_observer
-from koopmpc.values import Value
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

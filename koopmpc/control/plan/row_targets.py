@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import ShapeError
+from koopmpc.base.values import Value
 from koopmpc.control.cost import Cost, StateTracking
 from koopmpc.control.nonlinear.equilibrium import MISSED, Equilibria, Equilibrium
 from koopmpc.control.nonlinear.learned_map import LearnedMap
 from koopmpc.control.riccati import one_step, stationary
 from koopmpc.control.terminal_cost import tail_of, tail_stage
-from koopmpc.errors import ShapeError
-from koopmpc.values import Value
 
 PSEUDO = 1e-9  # singular values of the tracked outputs' slopes below this share of the largest count as zero
 _BESIDE = 0.3  # rows are close to each other within this share of a row's size

@@ -4,16 +4,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
 from koopmpc.control.cost import Cost, LiftedTracking, lifted_tracking
 from koopmpc.control.horizon import Coordinates
 from koopmpc.control.limits import Limits
 from koopmpc.control.solvers import order
 from koopmpc.control.stepped.blocks import MoveBlocks, Moves, find_move_blocks
 from koopmpc.control.stepped.priorities import weigh_priorities
-from koopmpc.errors import DataError
 from koopmpc.estimate.observer import Estimator
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.predictors import LinearPredictor
 
 _LIKE = ("lifting", "dt", "states", "inputs", "disturbances")  # of a predictor that takes the place of another one
 

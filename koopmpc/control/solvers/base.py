@@ -9,11 +9,11 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.control.limits import Interval, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.stages import QPStages
-from koopmpc.errors import DataError, ShapeError
 
 INFINITY = 1e30  # OSQP and DAQP read a limit of this size as none
 

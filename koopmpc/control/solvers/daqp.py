@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.values import Value
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver, StepQP
-from koopmpc.errors import DataError
-from koopmpc.values import Value
 
 # eta_prox: DAQP's own 1e-6 is all that remains of its accuracy where P is singular.
 DEFAULTS: Mapping[str, Any] = {"primal_tol": 1e-8, "eta_prox": 1e-9}

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
 from koopmpc.control.solvers.base import QPSolver, SolverTurn, StepQP
 from koopmpc.control.solvers.daqp import DAQP
 from koopmpc.control.solvers.osqp import OSQP
 from koopmpc.control.solvers.piqp import PIQP, has_piqp
-from koopmpc.errors import DataError
 
 SOLVERS: dict[str, type[QPSolver]] = {"osqp": OSQP, "daqp": DAQP, "piqp": PIQP}
 

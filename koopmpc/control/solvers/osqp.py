@@ -19,11 +19,11 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
+from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import call_uninterrupted
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolution, QPSolver
-from koopmpc.errors import DataError
-from koopmpc.interrupts import call_uninterrupted
 
 # sigma: plans of an unstable plant that saturate for many steps take half the iterations that OSQP's 1e-6 needs.
 # eps_prim_inf: with OSQP's 1e-4, 5 % of feasible degenerate problems are called infeasible, and 18 % of badly scaled

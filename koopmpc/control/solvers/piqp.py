@@ -15,12 +15,12 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.interrupts import call_uninterrupted
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver, StepQP
-from koopmpc.errors import DataError
-from koopmpc.interrupts import call_uninterrupted
 
 DEFAULTS: Mapping[str, Any] = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 60}
 _PUSHES = 1e-7  # multipliers below this share of the largest are those of rows that do not push

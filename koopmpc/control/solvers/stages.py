@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
-from koopmpc.values import Value
+from koopmpc.base.values import Value
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

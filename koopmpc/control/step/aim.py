@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from koopmpc import checks
+from koopmpc.base import checks
 from koopmpc.control.cost import StateTracking
 from koopmpc.control.nonlinear.motion import BEYOND, Course, can_drift, extend_rows, shift_end
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets

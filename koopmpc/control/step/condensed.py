@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc.checks import HUGE
+from koopmpc.base.checks import HUGE
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.plan.bounds import PlanBounds, StepBounds
 from koopmpc.control.plan.condensed_program import CondensedPlan, CondensedProgram, ConstantPlans

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.checks import HUGE
+from koopmpc.base.checks import HUGE
+from koopmpc.base.values import Interval
 from koopmpc.control.bounds.boxes import clip_input
 from koopmpc.control.move import Status
 from koopmpc.control.plan.bounds import PlanBounds
@@ -16,7 +17,6 @@ from koopmpc.control.solvers.base import StepSolver
 from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.control.stepped.priorities import PrioritySolver
 from koopmpc.control.stepped.search import LevelSearch, LevelSolver
-from koopmpc.values import Interval
 
 _FAR = 1e12  # length² of multipliers above which rounding shows in an input, 1 moving it to its limit
 

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.checks import HUGE
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE
+from koopmpc.base.values import Interval
 from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.stepped.levels import HeldLevels
-from koopmpc.values import Interval
 
 
 class LatePlan(Protocol):

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
-from koopmpc.checks import HUGE, numbers
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE, numbers
+from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.estimate.observer import Measured, StateObserver, state_model
 
 

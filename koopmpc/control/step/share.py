@@ -6,12 +6,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 from scipy.linalg.blas import idamax
 
-from koopmpc import checks
-from koopmpc.checks import HUGE, numbers
+from koopmpc.base import checks
+from koopmpc.base.checks import HUGE, numbers
+from koopmpc.base.values import Interval
 from koopmpc.control.plan.bounds import PlanBounds
 from koopmpc.control.plan.condensed_program import CondensedPlan
 from koopmpc.control.target import Targets
-from koopmpc.values import Interval
 
 _TABLE = 2**20  # entries of a table of GivenInputs: 8 MB
 

@@ -6,8 +6,8 @@ from typing import NamedTuple, cast
 import numpy as np
 from jaxtyping import Bool, Int
 
-from koopmpc import checks
-from koopmpc.errors import DataError
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
 
 Blocking = int | Sequence[int]
 Moves = Blocking | Mapping[str, Blocking] | None

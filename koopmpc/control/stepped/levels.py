@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import Value
 from koopmpc.control.bounds.boxes import Interval
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.values import Value
 
 LevelsByInput = Mapping[str, ArrayLike] | Sequence[ArrayLike | None]
 DwellByInput = Mapping[str, Any] | Sequence[Any]

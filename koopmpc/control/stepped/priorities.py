@@ -8,11 +8,11 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.control.limits import Interval, Limits, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolution, QPSolver, SolverTurn, StepQP, StepSolver
-from koopmpc.errors import DataError, ShapeError
 
 WEIGHT = 1e3  # where weights stand for priorities, a limit costs this many times one of the priority below
 MOST = 3  # priorities that weights tell apart: more would exhaust double precision

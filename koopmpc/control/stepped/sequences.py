@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import solve_triangular
 
+from koopmpc.base.values import Value
 from koopmpc.control.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.stepped.levels import HeldLevels, InputLevels, LevelBox
-from koopmpc.values import Value
 
 WIDTH = 128  # beginnings that go on at once
 EQUAL = 1e-9  # a plan is worse than the best one unless it costs less by more than this share

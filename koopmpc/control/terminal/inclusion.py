@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.errors import DataError
 from koopmpc.control.limits import Interval
 from koopmpc.control.terminal.sets import TerminalSet
-from koopmpc.errors import DataError
 
 _TOLERANCE = 1e-7  # a limit is kept if it is exceeded by at most this share of 1 + its size
 _HELD = 1e-9  # what an output has besides the coordinates of the set, as a share of it

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.checks import HUGE
+from koopmpc.base.checks import HUGE
 from koopmpc.control.limits import Interval
 from koopmpc.control.nonlinear.learned_map import LearnedMap
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets

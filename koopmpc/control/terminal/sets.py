@@ -9,12 +9,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from koopmpc import checks
-from koopmpc.errors import DataError, ShapeError
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import Value
 from koopmpc.lifting.base import Lifting, find_observables
 from koopmpc.lifting.state import State
-from koopmpc.predict.predictors import LinearPredictor
-from koopmpc.values import Value
+from koopmpc.models.predictors import LinearPredictor
 
 _ADVICE = "make one with km.guarantees.find_terminal_set, or pass a Certificate"
 

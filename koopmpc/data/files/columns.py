@@ -4,8 +4,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from koopmpc import checks
-from koopmpc.errors import DataError
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
 
 _EPISODE = re.compile(r"episode|run|trial|trajectory")
 _DISTURBANCE = re.compile(r"w\d*|w_.*|disturbance([\W_\d].*)?")

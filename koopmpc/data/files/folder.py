@@ -8,13 +8,13 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from koopmpc import disk
+from koopmpc.base import disk
+from koopmpc.base.errors import DataError, FitWarning, KoopmpcError, LogError
 from koopmpc.data.episodes import Episodes, PlantSignature, join_sets
 from koopmpc.data.files.formats import find_format, list_suffixes
 from koopmpc.data.files.frames import is_frame
 from koopmpc.data.files.load import load_episodes
 from koopmpc.data.source import Part, Source
-from koopmpc.errors import DataError, FitWarning, KoopmpcError, LogError
 
 EpisodesReader = Callable[[Path], Episodes]
 _PART = 8_000_000  # bytes of a part of several files

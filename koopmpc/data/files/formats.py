@@ -13,11 +13,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import disk
+from koopmpc.base import disk
+from koopmpc.base.errors import DataError, LogError, install
+from koopmpc.base.lazy import load_joint
 from koopmpc.data.episodes import Episodes, PlantSignature
 from koopmpc.data.source import Part
-from koopmpc.errors import DataError, LogError, install
-from koopmpc.lazy import load_joint
 
 ADVICE = "pass a file that Episodes.save wrote, or a table as .csv or .parquet"
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, KoopmpcError, install
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.columns import TableSettings
 from koopmpc.data.files.formats import LogTable
 from koopmpc.data.files.tables import read_table
-from koopmpc.errors import DataError, KoopmpcError, install
 
 _FRAME = Path("the DataFrame")  # its place in messages
 _TIME = "time [s]"  # name of the clock

@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
 
-from koopmpc import disk
+from koopmpc.base import disk
+from koopmpc.base.errors import DataError
 from koopmpc.data.episodes import Episodes, PlantSignature, join_sets
 from koopmpc.data.files.columns import TableSettings
 from koopmpc.data.files.formats import LogTable, find_format, read_log
@@ -13,7 +14,6 @@ from koopmpc.data.files.frames import is_frame, read_frame
 from koopmpc.data.files.notes import join_warnings
 from koopmpc.data.files.recording import read_recording
 from koopmpc.data.files.tables import read_table
-from koopmpc.errors import DataError
 
 
 def save_episodes(episodes: Episodes, path: str | PathLike[str]) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from koopmpc.errors import FitWarning
+from koopmpc.base.errors import FitWarning
 
 _NAMED = 12  # files of a sentence that are named, unless they are the whole sequence
 

@@ -6,10 +6,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from koopmpc import disk
+from koopmpc.base import disk
+from koopmpc.base.errors import LogError
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.files.formats import ADVICE, LogFormat, register_format
-from koopmpc.errors import LogError
 
 
 def describe_episodes(episodes: Episodes) -> str:

@@ -13,13 +13,13 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from koopmpc.base.disk import affordable
+from koopmpc.base.errors import DataError, LogError
+from koopmpc.base.values import checksum
 from koopmpc.data.episodes import Episode, Episodes, PlantSignature
 from koopmpc.data.files.formats import ADVICE, LogFormat, LogTable, register_format
 from koopmpc.data.files.npz import describe_episodes, split_rows, stack_episodes
 from koopmpc.data.source import Part
-from koopmpc.disk import affordable
-from koopmpc.errors import DataError, LogError
-from koopmpc.values import checksum
 
 _KEY = b"koopmpc.episodes"  # metadata of the file: sample time and names
 _CHECK = b"koopmpc.check"  # metadata of the file: checksums of its groups of rows

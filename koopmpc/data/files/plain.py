@@ -7,11 +7,11 @@ from typing import BinaryIO
 
 import numpy as np
 
+from koopmpc.base.errors import DataError, KoopmpcError, LogError
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.columns import TableSettings, find_roles
 from koopmpc.data.files.formats import LogFormat, LogTable, register_format
 from koopmpc.data.files.tables import SAVED, is_a_number, pick_driving
-from koopmpc.errors import DataError, KoopmpcError, LogError
 
 _UTF8 = "utf-8-sig"
 _LATIN = "latin-1"

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from koopmpc.base.errors import DataError, FitWarning
 from koopmpc.data.episodes import Episodes, PlantSignature
 from koopmpc.data.files.columns import ColumnRoles, TableSettings, find_roles
 from koopmpc.data.files.formats import LogTable, Recording, Samples
 from koopmpc.data.files.tables import read_table
 from koopmpc.data.source import Part
-from koopmpc.errors import DataError, FitWarning
 
 TIME = "time [s]"  # name of the common clock in the table of a recording
 GUESSED = 20  # with more channels than this their roles are not guessed from the names

@@ -7,10 +7,10 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from koopmpc.base.errors import DataError, FitWarning
 from koopmpc.data.episodes import Episode, Origin, find_lines
 from koopmpc.data.files.columns import ColumnRoles
 from koopmpc.data.files.notes import ResampledWarning
-from koopmpc.errors import DataError, FitWarning
 
 _YEAR_2000 = 946_684_800.0  # [s] since 1970
 _YEAR_2100 = 4_102_444_800.0  # [s] since 1970

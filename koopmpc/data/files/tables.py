@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks, disk
+from koopmpc.base import checks, disk
+from koopmpc.base.errors import ColumnWarning, DataError, FitWarning, KoopmpcError, LogError, NoInputWarning
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.columns import ColumnRoles, TableSettings, drop_unit, find_roles, is_label
 from koopmpc.data.files.formats import LogTable
 from koopmpc.data.files.sampling import Signals, episodes_from, read_clock, resample, restarts, sample_time
-from koopmpc.errors import ColumnWarning, DataError, FitWarning, KoopmpcError, LogError, NoInputWarning
 
 SAVED = ("episode", "step", "time [s]")
 """First columns of a table that `Episodes.save` wrote, in which an empty last row tells the inputs of an episode."""

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from koopmpc.base.errors import KoopmpcError
 from koopmpc.codegen.compiled import Compiled, NoCompilerWarning, compiled
 from koopmpc.codegen.programs import make_tables, read_program
 from koopmpc.control.move import Fallback, Status
-from koopmpc.errors import KoopmpcError
 from koopmpc.loop.run import Run
 from koopmpc.plants.routines import find_compiler
 from koopmpc.synthesis.loops.neighbours import NeighbourMap

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.parallel import Workers
 from koopmpc.control.limits import Limits
 from koopmpc.data.angles import find_angles
 from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.base import strip_unit
 from koopmpc.lifting.state import State
-from koopmpc.parallel import Workers
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.doubts import (
     explain_unreachable,

@@ -8,14 +8,15 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import bdtr
 
+from koopmpc.base.errors import DataError, KoopmpcError, hide_fit_warnings
+from koopmpc.base.text import to_percent
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.control.limits import Limits
 from koopmpc.control.terminal.sets import TerminalSet
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
-from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.fits.edmd import edmd
+from koopmpc.models.predictors import LinearPredictor
 from koopmpc.synthesis.choice import UNSURE, DesignRow
 from koopmpc.synthesis.loops.abreast import speed_up
 from koopmpc.synthesis.loops.fresh import DRAWN, _draw_corners
@@ -23,7 +24,6 @@ from koopmpc.synthesis.loops.judging import LITTLE
 from koopmpc.synthesis.loops.pool import LoopPool, LoopResult
 from koopmpc.synthesis.rates import KEPT
 from koopmpc.synthesis.search.recipe import Designed, Recipe, get_model
-from koopmpc.text import to_percent
 from koopmpc.validate.scoring import AnyPredictor
 
 COMPARED = 60  # fresh loops in which horizons, or finalists, are compared in machine code

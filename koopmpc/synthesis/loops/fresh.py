@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.text import to_percent
 from koopmpc.data.angles import find_angles
 from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.base import strip_unit
@@ -14,7 +15,6 @@ from koopmpc.synthesis.loops.neighbours import NeighbourMap, probe_range
 from koopmpc.synthesis.loops.pool import DrawnLoop, LoopPool
 from koopmpc.synthesis.rates import FreshLoops
 from koopmpc.synthesis.task import DesignTask, goal_box
-from koopmpc.text import to_percent
 
 CORNERS = 8  # corners of the goal's range from which loops run, at most
 DRAWN = 400  # states outside the data that are kept for a picture, at most

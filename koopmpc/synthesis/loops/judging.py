@@ -8,16 +8,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from koopmpc.base.errors import KoopmpcError
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import KoopmpcError
 from koopmpc.loop.faults import Fault
 from koopmpc.loop.metrics import total_cost, violation_shares
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import LoopOptions, StepObserver, simulate
+from koopmpc.models.predictors import BilinearPredictor
 from koopmpc.plants.plant import SimulatedPlant, Transition
-from koopmpc.predict.predictors import BilinearPredictor
 from koopmpc.synthesis.loops.abreast import Acting
 from koopmpc.synthesis.loops.conditions import Condition, LoopTest
 from koopmpc.synthesis.loops.neighbours import NeighbourMap

@@ -10,12 +10,12 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
+from koopmpc.base.scene import Scene
+from koopmpc.base.values import Value
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
-from koopmpc.scene import Scene
 from koopmpc.synthesis.search.folds import usual_horizon
 from koopmpc.synthesis.task import DesignTask, goal_box
-from koopmpc.values import Value
 
 MOST = 6000  # rows that are kept
 NEAR = 3  # neighbours for each coefficient say whether a row is inside the data

@@ -7,18 +7,18 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.values import Value
 from koopmpc.control.cost import Cost, state_tracking
 from koopmpc.control.limits import Limits
 from koopmpc.control.nonlinear.equilibrium import Equilibria, Equilibrium
 from koopmpc.control.nonlinear.learned_map import LearnedMap, learned_map
 from koopmpc.data.episodes import Episodes
-from koopmpc.interrupts import raise_swallowed
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.search.cross_validation import HALF, Tried
 from koopmpc.synthesis.search.recipe import Recipe
 from koopmpc.synthesis.task import DesignTask
 from koopmpc.validate.scoring import AnyPredictor, score
-from koopmpc.values import Value
 
 SECOND = 3.0  # the error of the second surrogate may be this many times that of the best
 INVARIANT = 0.25  # the plant ignores a state that changes increments by less than this share; models err as much

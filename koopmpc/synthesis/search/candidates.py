@@ -8,27 +8,27 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.base.values import Arrays, Value, from_data, to_data
 from koopmpc.data.angles import find_angles
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, ShapeError
-from koopmpc.identify.fits.bilinear import bilinear_edmd
-from koopmpc.identify.fits.edmd import Towards, edmd
-from koopmpc.identify.moments.read import ReadOptions
-from koopmpc.identify.records.hidden_fit import fit_hidden
-from koopmpc.identify.records.hidden_structure import HiddenStructure
-from koopmpc.identify.records.narx import source_episodes
-from koopmpc.identify.records.structure import Structure, fit_structure
 from koopmpc.lifting.base import Lifting, check_lifting, strip_unit
 from koopmpc.lifting.composed import Standardized, Sum
 from koopmpc.lifting.fourier import Fourier, RandomFourier
 from koopmpc.lifting.radial import Gaussian, ThinPlate
 from koopmpc.lifting.state import Constant, Monomials, State
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.fits.bilinear import bilinear_edmd
+from koopmpc.models.fits.edmd import Towards, edmd
+from koopmpc.models.moments.read import ReadOptions
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.records.hidden_fit import fit_hidden
+from koopmpc.models.records.hidden_structure import HiddenStructure
+from koopmpc.models.records.narx import source_episodes
+from koopmpc.models.records.structure import Structure, fit_structure
 from koopmpc.validate.scoring import AnyPredictor
-from koopmpc.values import Arrays, Value, from_data, to_data
 
 MOST = 120  # observables of a lifting that is tried unasked
 _REGRESSORS = 260  # [ψ(x) u u⊗ψ(x)] of a model that is tried unasked

@@ -12,21 +12,21 @@ from time import perf_counter
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, KoopmpcError, hide_fit_warnings
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
-from koopmpc.identify.moments.moments import Moments
-from koopmpc.identify.moments.read import second_moments
-from koopmpc.identify.records.hidden_fit import fit_hidden
-from koopmpc.identify.records.hidden_structure import HiddenStructure
-from koopmpc.identify.records.structure import Structure, solve_structure, weigh_rows
-from koopmpc.identify.regression import Regression, build_regression
-from koopmpc.identify.solve import BilinearColumns, solve_path
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.moments.moments import Moments
+from koopmpc.models.moments.read import second_moments
+from koopmpc.models.moments.solve import BilinearColumns, solve_path
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.records.hidden_fit import fit_hidden
+from koopmpc.models.records.hidden_structure import HiddenStructure
+from koopmpc.models.records.structure import Structure, solve_structure, weigh_rows
+from koopmpc.models.shared.regression import Regression, build_regression
 from koopmpc.synthesis.search.candidates import Candidate
 from koopmpc.synthesis.search.folds import drop_fold, select_fold
 from koopmpc.validate.scoring import AnyPredictor, compare_forecasts
-from koopmpc.values import Value
 
 RIDGES = tuple(10.0**power for power in range(-9, -2))
 LEAST = 1e-9  # smallest ridge; with less, nearly dependent observables get weights beyond double precision

@@ -7,13 +7,13 @@ from operator import methodcaller
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.errors import DataError
+from koopmpc.base.text import with_unit
 from koopmpc.data.episodes import Episodes, join_sets
 from koopmpc.data.smoother import Glitch, Mender, Smoother
 from koopmpc.data.source import Changed, EpisodesMap, Held, Source
-from koopmpc.errors import DataError
-from koopmpc.identify.moments.read import space_evenly
 from koopmpc.lifting.base import strip_unit
-from koopmpc.text import with_unit
+from koopmpc.models.moments.read import space_evenly
 
 _PARTS = 16  # a sample is taken from at most this many parts of a source
 _TOLD = 3  # a note names at most this many glitches

@@ -8,18 +8,18 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, KoopmpcError, hide_fit_warnings
+from koopmpc.base.text import to_percent
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.smoother import Mender
-from koopmpc.errors import DataError, KoopmpcError, hide_fit_warnings
-from koopmpc.identify.fits.edmd import edmd
-from koopmpc.identify.innovations import RESTS, filter_states, fit_with_gain
-from koopmpc.identify.instruments import check_instruments, instrumental_edmd
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Standardized
 from koopmpc.lifting.radial import ThinPlate
 from koopmpc.lifting.state import Constant, State
-from koopmpc.text import to_percent
+from koopmpc.models.fits.edmd import edmd
+from koopmpc.models.innovations import RESTS, filter_states, fit_with_gain
+from koopmpc.models.instruments import check_instruments, instrumental_edmd
 from koopmpc.validate.closed_loop import feedback_share, measure_feedback
 from koopmpc.validate.scoring import score
 

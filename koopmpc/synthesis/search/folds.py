@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from koopmpc.base.errors import DataError
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import DataError
 
 _AHEAD = 20  # steps of the default horizon
 

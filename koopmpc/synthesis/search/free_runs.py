@@ -8,18 +8,18 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from koopmpc.base.errors import hide_fit_warnings
+from koopmpc.base.parallel import Progress
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episode, Episodes
-from koopmpc.errors import hide_fit_warnings
-from koopmpc.identify.moments.read import ReadOptions
-from koopmpc.identify.records.free_run import HELD, PIECE, ROWS
-from koopmpc.identify.records.hidden_structure import HiddenStructure
-from koopmpc.identify.records.narx import FOLDS, is_worse
-from koopmpc.identify.records.structure import EXACT, Structure, fit_structure
-from koopmpc.parallel import Progress
+from koopmpc.models.moments.read import ReadOptions
+from koopmpc.models.records.free_run import HELD, PIECE, ROWS
+from koopmpc.models.records.hidden_structure import HiddenStructure
+from koopmpc.models.records.narx import FOLDS, is_worse
+from koopmpc.models.records.structure import EXACT, Structure, fit_structure
 from koopmpc.synthesis.search.candidates import Candidate, fit_candidate
 from koopmpc.synthesis.search.leaderboard import LeaderboardRow, choose_model
 from koopmpc.validate.scoring import AnyPredictor, forecast_errors
-from koopmpc.values import Value
 
 _GAIN = 0.98  # keep a refinement if it lowers the error on unseen rows to less than this share
 _PAYS = 0.9  # take a hidden state if it lowers the error on unseen rows to less than this share

@@ -7,16 +7,16 @@ from time import perf_counter
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.errors import KoopmpcError, hide_fit_warnings
+from koopmpc.base.parallel import Progress
 from koopmpc.data.episodes import Episodes
-from koopmpc.errors import KoopmpcError, hide_fit_warnings
-from koopmpc.identify.records.hidden_fit import fit_hidden
-from koopmpc.identify.records.hidden_structure import HiddenStructure, choose_hidden, find_rails
-from koopmpc.identify.records.narx import FOLDS
-from koopmpc.identify.records.state_space import search_hidden, search_neural
-from koopmpc.identify.records.subspace import choose_sizes
-from koopmpc.parallel import Progress
-from koopmpc.predict.base import sorted_eigen
-from koopmpc.predict.predictors import BilinearPredictor
+from koopmpc.models.base import sorted_eigen
+from koopmpc.models.predictors import BilinearPredictor
+from koopmpc.models.records.hidden_fit import fit_hidden
+from koopmpc.models.records.hidden_structure import HiddenStructure, choose_hidden, find_rails
+from koopmpc.models.records.narx import FOLDS
+from koopmpc.models.records.state_space import search_hidden, search_neural
+from koopmpc.models.records.subspace import choose_sizes
 from koopmpc.synthesis.search.candidates import Candidate
 from koopmpc.synthesis.search.free_runs import FreeRun, cut_pieces, forecast_rows, judge_free_run
 from koopmpc.synthesis.search.leaderboard import LeaderboardRow

@@ -6,17 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from rich.console import RenderableType
 
+from koopmpc.base.terminal import build_leaderboard, render_text
+from koopmpc.base.values import Value
 from koopmpc.data.delay import Delay
-from koopmpc.identify.records.hidden_structure import HiddenStructure
-from koopmpc.identify.records.structure import Structure
 from koopmpc.lifting.base import Lifting
-from koopmpc.predict.base import sorted_eigen
-from koopmpc.predict.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.base import sorted_eigen
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.records.hidden_structure import HiddenStructure
+from koopmpc.models.records.structure import Structure
 from koopmpc.synthesis.search.candidates import Candidate
 from koopmpc.synthesis.search.cross_validation import EXACT, HALF, Tried
-from koopmpc.terminal import build_leaderboard, render_text
 from koopmpc.validate.scoring import AnyPredictor
-from koopmpc.values import Value
 
 PLAIN = "linear: x, 1"  # z = [x, 1], the model that the others have to beat
 _WORTH = 0.01  # share of a linear model's error that a bilinear one may reach to be taken in its place

@@ -7,14 +7,14 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.errors import DataError, hide_fit_warnings
+from koopmpc.base.parallel import Progress, StageProgress
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.errors import DataError, hide_fit_warnings
-from koopmpc.identify.fits.edmd import edmd
 from koopmpc.lifting.state import Constant, State
-from koopmpc.parallel import Progress, StageProgress
-from koopmpc.predict.base import replace_report
+from koopmpc.models.base import replace_report
+from koopmpc.models.fits.edmd import edmd
 from koopmpc.synthesis.options import SearchOptions
 from koopmpc.synthesis.search.candidates import check_delays
 from koopmpc.synthesis.search.data import advance_inputs, is_record, replace_glitches, smooth_data, take_sample

@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+from koopmpc.base.errors import hide_fit_warnings
+from koopmpc.base.values import Value
 from koopmpc.control.cost import Cost
 from koopmpc.control.kinds import kind_for
 from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
@@ -14,16 +16,14 @@ from koopmpc.control.limits import Limits
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source
-from koopmpc.errors import hide_fit_warnings
 from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.estimate.extended import ExtendedKalman
 from koopmpc.estimate.kalman import LiftedKalman
 from koopmpc.estimate.observer import Estimator
-from koopmpc.identify.moments.read import ReadOptions
-from koopmpc.predict.predictors import LinearPredictor
+from koopmpc.models.moments.read import ReadOptions
+from koopmpc.models.predictors import LinearPredictor
 from koopmpc.synthesis.search.candidates import Candidate, fit_candidate
 from koopmpc.validate.scoring import AnyPredictor
-from koopmpc.values import Value
 
 _FLOOR = 1e-3  # weight of data that are far from every visited state
 _NEAR = 0.3  # this quantile of the squared distances is the square of the weights' width

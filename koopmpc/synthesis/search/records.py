@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from koopmpc.base.errors import KoopmpcError
+from koopmpc.base.parallel import Progress
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Held
-from koopmpc.errors import KoopmpcError
-from koopmpc.identify.fits.refinement import refine
-from koopmpc.identify.records.free_run import PIECE
-from koopmpc.identify.records.hidden_structure import find_rails
-from koopmpc.identify.records.narx import DELAYS, FOLDS, choose_structure, search_structures
-from koopmpc.identify.records.structure import Structure, find_forecast_horizon, fit_structure
-from koopmpc.parallel import Progress
-from koopmpc.predict.base import replace_report
-from koopmpc.predict.predictors import BilinearPredictor
+from koopmpc.models.base import replace_report
+from koopmpc.models.fits.refinement import refine
+from koopmpc.models.predictors import BilinearPredictor
+from koopmpc.models.records.free_run import PIECE
+from koopmpc.models.records.hidden_structure import find_rails
+from koopmpc.models.records.narx import DELAYS, FOLDS, choose_structure, search_structures
+from koopmpc.models.records.structure import Structure, find_forecast_horizon, fit_structure
 from koopmpc.synthesis.search.candidates import Candidate
 from koopmpc.synthesis.search.data import smooth_data
 from koopmpc.synthesis.search.free_runs import (

@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from koopmpc import checks
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.terminal import label_lines, render_text
+from koopmpc.base.text import to_percent
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
-from koopmpc.errors import DataError
-from koopmpc.terminal import label_lines, render_text
-from koopmpc.text import to_percent
 from koopmpc.validate.closed_loop import find_feedback
 from koopmpc.validate.drift import DriftReport, find_drift
 from koopmpc.validate.logs import values
@@ -35,7 +36,6 @@ from koopmpc.validate.logs.log import (
 )
 from koopmpc.validate.logs.timing import InputTiming, Timing, find_same_row_inputs, measure_timing
 from koopmpc.validate.memory import Memory, find_hidden_state
-from koopmpc.values import Value
 
 DELAYS = "Fit with delays (embedding=km.Delay(2)) or with a hidden state (km.identify.subspace), or measure that state"
 for _check in (

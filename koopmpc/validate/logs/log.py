@@ -9,8 +9,8 @@ from itertools import combinations_with_replacement
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episodes
-from koopmpc.values import Value
 
 _MOST_SQUARED = 6  # up to this number of states, products of two states are regressors
 _MOST_CUBED = 3  # up to this number of states, products of three states are regressors

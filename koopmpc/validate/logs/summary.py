@@ -7,10 +7,10 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episodes
 from koopmpc.validate.bands import Forecast
 from koopmpc.validate.logs.log import Place
-from koopmpc.values import Value
 
 MOST = 4000  # rows that are kept for a picture
 

@@ -35,9 +35,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import chdtrc, fdtrc
 
+from koopmpc.base.values import Value
 from koopmpc.lifting.base import strip_unit
 from koopmpc.validate.logs.log import Log, LogFault
-from koopmpc.values import Value
 
 
 @dataclass(frozen=True)

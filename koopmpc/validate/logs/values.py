@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base.text import to_percent
 from koopmpc.lifting.base import strip_unit
-from koopmpc.text import to_percent
 from koopmpc.validate.logs.log import ALONE, Log, LogFault, Place, Repair, find_stretches, list_places, name_episodes
 
 

@@ -8,8 +8,8 @@ import pytest
 import scipy.linalg
 
 import koopmpc as km
+from koopmpc.base.errors import DataError
 from koopmpc.control.solvers import order, piqp
-from koopmpc.errors import DataError
 
 pytest.importorskip("piqp", reason="an extra")
 

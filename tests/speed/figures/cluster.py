@@ -13,8 +13,8 @@ import time
 import numpy as np
 
 import koopmpc as km
-from koopmpc.identify.moments.read import _ReadTask, read_part, source_of
-from koopmpc.parallel import Workers
+from koopmpc.base.parallel import Workers
+from koopmpc.models.moments.read import _ReadTask, read_part, source_of
 
 PART, PARTS, TASKS = 0.91, 1000, 200  # CPU time of 1e6 pairs with 34 observables [s], parts, tasks that are timed
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from koopmpc.base.errors import DataError, FitWarning
 from koopmpc.data.files.formats import LogTable
-from koopmpc.errors import DataError, FitWarning
 
 _SAMPLE_TIMES = ("dt", "ts", "sample_time", "sampletime", "tsample")  # names of a scalar that is the sample time [s]
 _RATES = ("fs", "sample_rate", "samplerate", "sampling_rate", "sampling_frequency")  # of one that is 1/dt [Hz]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.errors import LogError
+from koopmpc.base.errors import LogError
 
 _LONGEST = 1000  # characters of a formula; a conversion is one short line
 _NAMES = {"inf": np.inf, "nan": np.nan, "pi": np.pi}  # asammdf turns each x into X, so case says nothing

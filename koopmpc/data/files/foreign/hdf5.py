@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from koopmpc.base.disk import affordable
+from koopmpc.base.errors import KoopmpcError, LogError
 from koopmpc.data.files.foreign.arrays import tabulate_arrays
 from koopmpc.data.files.formats import LogFormat, LogTable, register_format
-from koopmpc.disk import affordable
-from koopmpc.errors import KoopmpcError, LogError
 
 EXTRA = "hdf5"
 _HEAP = b"GCOL\x01\0\0\0"  # begins a heap of texts

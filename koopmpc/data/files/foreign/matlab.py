@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from koopmpc.base.errors import DataError, LogError
 from koopmpc.data.files.foreign.arrays import tabulate_arrays
 from koopmpc.data.files.foreign.hdf5 import EXTRA, load_datasets
 from koopmpc.data.files.formats import LogFormat, LogTable, register_format
-from koopmpc.errors import DataError, LogError
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"  # begins an HDF5 file; MATLAB 7.3 writes it after 512 bytes of its own
 

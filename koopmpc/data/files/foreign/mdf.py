@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from koopmpc.base.errors import KoopmpcError, LogError
 from koopmpc.data.files.foreign.formula import read_formula
 from koopmpc.data.files.formats import Channel, LogFormat, Recording, Samples, register_format
 from koopmpc.data.files.recording import split_recording
-from koopmpc.errors import KoopmpcError, LogError
 
 EXTRA = "mdf"
 _STEP = 100_000  # records that are read at once

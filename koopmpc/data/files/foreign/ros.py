@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from koopmpc.base.errors import DataError, KoopmpcError, LogError
 from koopmpc.data.files.formats import Channel, LogFormat, Recording, Samples, register_format
 from koopmpc.data.files.recording import split_recording
-from koopmpc.errors import DataError, KoopmpcError, LogError
 
 EXTRA = "ros"
 _NS = 1e-9  # seconds of a nanosecond

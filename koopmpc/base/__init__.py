@@ -1,0 +1,1 @@
+"""Plain services of all rooms: errors, checks, values, text, disk, processes."""

@@ -1,0 +1,309 @@
+"""Predictors with a hidden state and the same models in standard units, one from the other; segments of records."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.base.errors import DataError
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episodes
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.composed import Projected, Sum
+from koopmpc.lifting.neurons import Neurons
+from koopmpc.lifting.saturated import Saturated
+from koopmpc.lifting.state import Constant, Monomials, State
+from koopmpc.models.base import FitReport
+from koopmpc.models.hidden_state import HiddenState, hidden_names
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.models.records.forward import list_terms
+from koopmpc.models.records.free_run import embed_rows
+from koopmpc.models.records.hidden import HiddenModel, RecordSegments, join_segments, read_features, start_states
+from koopmpc.models.shared.regression import compute_scale_factor
+
+_OBSERVED = 0.999  # an observer's spectral radius is below this
+_RATIOS = tuple(10.0**power for power in range(-6, 5))  # variances of process noise beside that of the sensors
+_FOLLOWED = 40  # steps in which readings correct the state
+_FORECAST = 20  # steps of the forecasts behind them, which judge
+_SEGMENTS = 200  # of the records that judge, about
+_ALIKE = 1.05  # squared errors within this factor are alike
+_FAR = 1e3  # a state stays within this many spreads
+_PASSES = 300  # steps of the Riccati equation
+
+
+@dataclass(frozen=True, eq=False)
+class SignalUnits:
+    """Means and standard deviations of [y u], the rails of y in these units, and the number of outputs."""
+
+    mean: Float[np.ndarray, " nv"]
+    scale: Float[np.ndarray, " nv"]
+    rails: Float[np.ndarray, "2 ny"] | None
+    ny: int
+
+    @classmethod
+    def of(cls, episodes: Episodes, rails: Float[np.ndarray, "2 ny"] | None) -> "SignalUnits":
+        """Return the units of these records."""
+        X, U = np.concatenate([e.X for e in episodes]), np.concatenate([e.U for e in episodes])
+        mean = np.concatenate([X.mean(axis=0), U.mean(axis=0)])
+        scale = np.concatenate([X.std(axis=0), U.std(axis=0)])
+        scale = np.where(scale > 1e-12 * np.abs(mean), scale, 1.0)
+        ny = X.shape[1]
+        return cls(mean, scale, None if rails is None else (rails - mean[:ny]) / scale[:ny], ny)
+
+    def zeta(self, delays: int) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Return mean and scale of ζ."""
+
+        def repeat(v: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " n"]:
+            return np.concatenate([v[: self.ny], np.tile(np.roll(v, len(v) - self.ny), delays)])
+
+        return repeat(self.mean), repeat(self.scale)
+
+
+def is_hidden(model: LinearPredictor | BilinearPredictor) -> bool:
+    """Return whether the model has a hidden state that `HiddenModel` can hold: [T ζ, 1], or a `HiddenState`."""
+    if isinstance(model.embedding, HiddenState):
+        return isinstance(model, BilinearPredictor)
+    lifting = model.lifting
+    return (
+        isinstance(model, LinearPredictor)
+        and model.nw == 0
+        and model.embedding is not None
+        and model.embedding.inputs
+        and isinstance(lifting, Sum)
+        and len(lifting.parts) == 2
+        and isinstance(lifting.parts[0], Projected)
+        and isinstance(lifting.parts[0].lifting, State)
+        and lifting.parts[0].lifting.selects_all
+        and isinstance(lifting.parts[1], Constant)
+    )
+
+
+def to_standard(model: LinearPredictor | BilinearPredictor, units: SignalUnits) -> HiddenModel:
+    """Return a model with a hidden state in standard units; z itself is not scaled."""
+    embedding, nu, ny = model.embedding, model.nu, model.nx
+    assert embedding is not None, "a hidden state begins with past rows"
+    mean_u, scale_u = units.mean[ny:], units.scale[ny:]
+    if isinstance(embedding, HiddenState):
+        n, psi = embedding.order, embedding.lifting
+        A, B, N, T = embedding.A, embedding.B, embedding.N, embedding.encoder
+        C = np.hstack([embedding.C, embedding.c[:, None]])
+    else:
+        assert isinstance(model.lifting, Sum)
+        assert isinstance(model.lifting.parts[0], Projected)
+        n, psi = model.nz - 1, model.lifting
+        A, B, N, C = model.A[:n], model.B[:n], np.zeros((nu, n, n + 1)), model.C
+        T = np.hstack([model.lifting.parts[0].basis.T, np.zeros((n, 1))])
+    # in standard units z⁺ = (A + Σ ūᵢ Nᵢ) ψ + B ū + Σ v (scale B + scale N ψ), ψ = [z, 1, monomials]
+    A = A + np.einsum("i,inz->nz", mean_u, N)
+    A[:, n] += B @ mean_u
+    V = _weights_of(psi)
+    q = 0 if V is None else len(V)
+    last = psi.nz - q
+    degree = 1 if last == n + 1 else max(map(_degree_of, psi.names[n + 1 : last]))
+    E = np.hstack([A[:, n : n + 1], A[:, :n], A[:, n + 1 : last]])
+    blocks = [np.hstack([(B[:, i : i + 1] + N[i][:, n : n + 1]), N[i][:, :n], N[i][:, n + 1 : last]]) * s
+              for i, s in enumerate(scale_u)]  # fmt: skip
+    terms = list_terms(n, nu, degree)
+    width = (len(terms) - (E.shape[1] - 1)) // max(nu, 1)  # products of an input: those of lower degree
+    E = np.hstack([E, *(block[:, :width] for block in blocks), A[:, last:]])
+    mean, scale = units.zeta(embedding.steps)
+    encoder = np.hstack([T[:, :-1] * scale, (T[:, -1] + T[:, :-1] @ mean)[:, None]])
+    H = C / units.scale[:ny, None]
+    H[:, -1] -= units.mean[:ny] / units.scale[:ny]
+    bound = np.full(n, np.inf)
+    if isinstance(embedding, HiddenState):
+        bound = embedding.reach
+    return HiddenModel(terms, E, H, encoder, bound, V)
+
+
+def _weights_of(lifting: Lifting) -> Float[np.ndarray, "q n1"] | None:
+    """Return the weights of the neurons that end a lifting; None without any."""
+    last = lifting.parts[-1] if isinstance(lifting, Sum) else lifting
+    return last.weights if isinstance(last, Neurons) else None
+
+
+def _degree_of(name: str) -> int:
+    """Return the total degree of a monomial by its name."""
+    return sum(int(factor.partition("^")[2] or 1) for factor in name.partition("|")[0].split("*"))
+
+
+def from_standard(
+    found: HiddenModel, units: SignalUnits, episodes: Episodes, delays: int, report: FitReport | None
+) -> LinearPredictor | BilinearPredictor:
+    """Return the predictor: a linear one on [T ζ, 1], a nonlinear one with a `HiddenState`."""
+    n, ny, nu = found.order, units.ny, episodes.nu
+    mean_u, scale_u = units.mean[ny:], units.scale[ny:]
+    mean, scale = units.zeta(delays)
+    T = found.T[:, :-1] / scale
+    t = found.T[:, -1] - T @ mean
+    C = np.hstack([found.H[:, :-1], found.H[:, -1:]]) * units.scale[:ny, None]
+    C[:, -1] += units.mean[:ny]
+    rails = None if units.rails is None else units.rails * units.scale[:ny] + units.mean[:ny]
+    degree = found.terms.shape[1]
+    lifting: Lifting = State() + Constant()
+    if degree > 1:
+        monomials: Lifting = Monomials(degree, states=hidden_names(n))
+        if np.isfinite(found.bound).all():
+            high = np.concatenate([np.full(ny, np.inf), found.bound])
+            monomials = Saturated(monomials, -high, high)
+        lifting = State(hidden_names(n)) + Constant() + monomials
+    elif found.V is not None:
+        lifting = State(hidden_names(n)) + Constant()
+    if found.V is not None:
+        lifting = lifting + Neurons(found.V, states=hidden_names(n))
+    nz, q = 1 + len(list_terms(n, 0, degree)), len(found.neurons)
+    last = found.E.shape[1] - q
+    A = np.hstack([found.E[:, 1 : 1 + n], found.E[:, :1], found.E[:, 1 + n : nz], found.E[:, last:]])
+    N, B = np.zeros((nu, n, nz + q)), np.zeros((n, nu))
+    width = (last - nz) // max(nu, 1)
+    for i in range(nu):
+        block = found.E[:, nz + i * width : nz + (i + 1) * width] / scale_u[i]
+        B[:, i] = block[:, 0]
+        N[i][:, :n] = block[:, 1 : 1 + n] if degree > 1 else 0.0
+        N[i][:, n + 1 : width] = block[:, 1 + n :] if degree > 1 else 0.0
+    A = A - np.einsum("i,inz->nz", mean_u, N)
+    A[:, n] -= B @ mean_u
+    about = episodes.dt, episodes.states, episodes.inputs
+    if degree == 1 and not q:
+        # z = T ζ without an offset: z − t takes the place of z
+        A[:, n] += A[:, :n] @ t - t
+        C[:, -1] += C[:, :-1] @ t
+        transition = np.vstack([A, np.eye(1, n + 1, n)])
+        delay = Delay(delays, rails=rails).bind(episodes.states, episodes.inputs)
+        psi = (Projected(State(), np.ascontiguousarray(T.T)) + Constant()).bind(delay.names)
+        Z = np.concatenate([psi(e.X[:-1]) for e in delay(episodes)])
+        factor = compute_scale_factor(Z, len(Z))
+        return LinearPredictor(
+            transition, np.vstack([B, np.zeros((1, nu))]), C, psi, *about, report, embedding=delay, scale=factor
+        )
+    nz += q
+    whole = np.zeros((nz, nz))
+    whole[:n], whole[n, n] = A, 1.0
+    driven, products = np.vstack([B, np.zeros((nz - n, nu))]), np.zeros((nu, nz, nz))
+    products[:, :n] = N
+    names = (*episodes.states, *hidden_names(n))
+    embedding = HiddenState(
+        delays,
+        rails=rails,
+        bound=(episodes.states, episodes.inputs),
+        lifting=lifting.bind(names),
+        A=A,
+        B=B,
+        N=N,
+        C=C[:, :-1],
+        c=C[:, -1],
+        encoder=np.hstack([T, t[:, None]]),
+        reach=found.bound,
+        gain=_fit_gain(found, units, episodes, delays) / units.scale[:ny],
+    )
+    Z = np.concatenate([embedding.lifting(e.X[:-1]) for e in embedding(episodes)])
+    output = np.zeros((ny, nz))
+    output[:, : n + 1] = C
+    return BilinearPredictor(
+        whole,
+        driven,
+        products,
+        output,
+        lifting,
+        *about,
+        report,
+        embedding=embedding,
+        scale=compute_scale_factor(Z, len(Z)),
+    )
+
+
+def _fit_gain(found: HiddenModel, units: SignalUnits, episodes: Episodes, delays: int) -> Float[np.ndarray, "n ny"]:
+    """Return the fastest L of z + L (y − ŷ) after which the records are forecast as well as with any.
+
+    Candidates are steady Kalman gains of the linear part, for process noise from far below to far above that of the
+    sensors. Each follows segments of the records for 40 steps; the error of the next 20 steps decides.
+    """
+    n, ny, A, C = found.order, units.ny, found.E[:, 1 : 1 + found.order], found.H[:, :-1]
+    gains = [_steady_gain(A, C, ratio) for ratio in _RATIOS]
+    gains = [one for one in gains if np.abs(np.linalg.eigvals(A - one @ C @ A)).max() < _OBSERVED]
+    if not gains:
+        return np.zeros((n, ny))
+    steps = max(min(_FOLLOWED + _FORECAST, max(map(len, episodes)) - delays), 1)
+    apart = max(steps // 2, sum(map(len, episodes)) // _SEGMENTS, 1)
+    part = join_segments(cut_segments(episodes, units, delays, steps, apart))
+    followed = steps - min(_FORECAST, -(-steps // 3))
+    errors: list[float] = []
+    for gain in gains:
+        z, total = start_states(found, part.points), 0.0
+        for k, (u, y) in enumerate(zip(part.inputs, part.outputs, strict=True)):
+            z = np.clip(read_features(found, z, u) @ found.E.T, -_FAR, _FAR)
+            shown = z @ C.T + found.H[:, -1]
+            if units.rails is not None:
+                shown = np.clip(shown, *units.rails)
+            if k < followed:
+                z = z + (y - shown) @ gain.T
+            else:
+                total += float(np.sum((y - shown) ** 2))
+        errors.append(total)
+    return gains[max(i for i, error in enumerate(errors) if error <= _ALIKE * min(errors))]
+
+
+def _steady_gain(A: Float[np.ndarray, "n n"], C: Float[np.ndarray, "ny n"], ratio: float) -> Float[np.ndarray, "n ny"]:
+    """Return the steady Kalman gain for process noise of this variance and sensors with noise of variance one."""
+    n, ny = len(A), len(C)
+    P, gain = ratio * np.eye(n), np.zeros((n, ny))
+    for _ in range(_PASSES):
+        gain = np.linalg.solve(C @ P @ C.T + np.eye(ny), C @ P).T
+        P = A @ (P - gain @ C @ P) @ A.T + ratio * np.eye(n)
+    return gain
+
+
+def _standard_rows(
+    episodes: Episodes, units: SignalUnits, delays: int, *, last: bool = False
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return of each long record the points ζ, the inputs and the outputs that follow, in standard units.
+
+    With `last` the points are those that follow, ζ_{k+1}.
+    """
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    ny = units.ny
+    for e in episodes:
+        if len(e) <= delays:
+            continue
+        Y, U = (e.X - units.mean[:ny]) / units.scale[:ny], (e.U - units.mean[ny:]) / units.scale[ny:]
+        V, ahead = embed_rows(Y, U, delays)
+        n = ny + delays * len(units.mean)
+        zeta = V[:, 1 : 1 + n]
+        if last:
+            begun = embed_rows(np.vstack([Y, Y[-1:]]), np.vstack([U, U[-1:]]), delays)[0][1:, 1 : 1 + n]
+            found.append((begun, U[delays:], ahead))
+        else:
+            found.append((zeta, U[delays:], ahead))
+    return found
+
+
+def cut_segments(
+    episodes: Episodes,
+    units: SignalUnits,
+    delays: int,
+    horizon: int,
+    apart: int,
+    spans: Sequence[tuple[int, int]] | None = None,
+) -> list[RecordSegments]:
+    """Return segments of `horizon` steps that begin every `apart` rows, inside of the spans of rows."""
+    found: list[RecordSegments] = []
+    spans = [(0, len(e)) for e in episodes] if spans is None else spans
+    for e, (a, b) in zip(episodes, spans, strict=True):
+        first = max(a - delays, 0)
+        if b - max(a, delays) < max(horizon, 1):
+            continue
+        ((zeta, U, Y),) = _standard_rows(episodes.with_episodes([e.cut(first, b)]), units, delays)
+        starts = np.arange(0, len(zeta) - horizon + 1, apart)
+        rows = np.arange(horizon)[:, None] + starts
+        outputs = Y[rows]
+        low = high = None
+        if units.rails is not None:
+            low, high = outputs <= units.rails[0] + 1e-9, outputs >= units.rails[1] - 1e-9
+        found.append(RecordSegments(zeta[starts], U[rows], outputs, low, high))
+    if not found:
+        raise DataError(
+            f"no record has the {horizon + delays} rows of a segment and its past; pass a shorter horizon, fewer "
+            "delays, or longer records"
+        )
+    return found

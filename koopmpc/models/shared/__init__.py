@@ -1,0 +1,1 @@
+"""What regressions share: the frame of a fit, Levenberg-Marquardt, variable projection."""

@@ -1,0 +1,276 @@
+"""The regression of ψ(x⁺) on [ψ(x) u]: its rows, its result, and the predictor and the report made of them."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from inspect import currentframe
+from typing import NamedTuple, Unpack
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+from scipy.linalg import qr
+
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, FitWarning
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episodes
+from koopmpc.data.source import Source, source_of
+from koopmpc.lifting.base import CONSTANT, Lifting
+from koopmpc.lifting.composed import Projected
+from koopmpc.models.base import FitReport
+from koopmpc.models.moments.moments import Moments
+from koopmpc.models.moments.read import ReadOptions, second_moments
+from koopmpc.models.moments.solve import RegressionRows, column_norms, scaled_rank
+from koopmpc.models.predictors import LinearPredictor
+
+_HALF = float(
+    np.sqrt(np.finfo(float).eps)
+)  # added to unit-norm columns: a scale then keeps at least half of the digits
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """The regression of ψ(x⁺) on [ψ(x) u], before it is solved.
+
+    Attributes
+    ----------
+    method, route
+        Name of the fit, and how the data were read, as in the report.
+    rows
+        P = [ψ(x) u]; T begins with ψ(x⁺).
+    x_next
+        The columns of T that hold x⁺.
+    lifting, states, inputs, dt
+        As in the predictor.
+    C, state_residual
+        (nx, nz), or None if ψ(x) is x; and the root-mean-square of x − C ψ(x).
+    disturbances
+        Names of the measured disturbances w, the last of the inputs.
+    B
+        (nz, nu) if it is known; None if it is fitted.
+    scaled
+        True if the regression is solved on columns of unit norm.
+    embedding
+        As in the predictor.
+    """
+
+    method: str
+    route: str
+    rows: RegressionRows
+    x_next: Int[np.ndarray, " nx"]
+    lifting: Lifting
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    dt: float
+    C: Float[np.ndarray, "nx nz"] | None
+    state_residual: Float[np.ndarray, " nx"]
+    B: Float[np.ndarray, "nz nu"] | None = None
+    scaled: bool = True
+    embedding: Delay | None = None
+    disturbances: tuple[str, ...] = ()
+
+    @property
+    def columns(self) -> int:
+        """Number of regressors."""
+        return self.rows.P.shape[1] - (0 if self.B is None else self.B.shape[1])
+
+    @property
+    def affine_columns(self) -> list[int]:
+        """The columns of P that hold states, the Constant and inputs: those of x⁺ = A x + B u + c."""
+        names = self.lifting.names
+        affine = [i for i, name in enumerate(names) if name == CONSTANT or name in self.states]
+        return [*affine, *range(len(names), self.rows.P.shape[1])]
+
+    def decode(self, K: Float[np.ndarray, "n nz"]) -> Float[np.ndarray, "n nx"]:
+        """Return K Cᵀ, the coefficients of C ψ(x⁺)."""
+        return K if self.C is None else K @ self.C.T
+
+
+def read_regression(
+    episodes: Episodes | Source,
+    lifting: Lifting,
+    embedding: Delay | None,
+    method: str,
+    *,
+    noisy: bool = False,
+    **options: Unpack[ReadOptions],
+) -> Regression:
+    """Return the regression on [ψ(x) u w] of these episodes; `second_moments` explains the options."""
+    if "bilinear" in options:  # which second_moments takes, and no fit on [ψ(x) u w]
+        raise DataError(f"{method} fits a linear model; km.bilinear_edmd fits a bilinear one")
+    source = source_of(episodes)
+    if embedding is not None:
+        checks.kind(embedding, "embedding", Delay, "pass km.Delay(2), or leave it out")
+    bound_embedding = None if embedding is None else embedding.match(source.states, source.inputs)
+    total = second_moments(source.driven(), lifting, embedding=bound_embedding, **options)
+    return build_regression(total, method, noisy=noisy, disturbances=source.disturbances)
+
+
+def build_regression(
+    total: Moments, method: str, *, noisy: bool = False, disturbances: tuple[str, ...] = ()
+) -> Regression:
+    """Return the regression of ψ(x⁺) on [ψ(x) u] with these moments, and its C.
+
+    With `noisy`, for methods that treat noise in x and x⁺ alike, the rows hold all of ψ(x⁺), not only its projection
+    on ψ(x) and u.
+    """
+    columns, states = total.columns, total.states
+    place = {name: i for i, name in enumerate(columns.full.names)}
+    where = np.array([place[name] for name in states])
+    C, residual = total.decoder(where)
+    return Regression(
+        method=method,
+        route=total.route,
+        rows=(total.complete_rows if noisy else total.rows)(columns.regressors, columns.targets),
+        x_next=where,
+        lifting=total.lifting,
+        states=states,
+        inputs=total.inputs,
+        dt=total.dt,
+        C=C,
+        state_residual=residual,
+        embedding=total.embedding,
+        disturbances=disturbances,
+    )
+
+
+class FitResult(NamedTuple):
+    """The result of a fit: z⁺ = A z + B u, where B has the columns of w too, and the entries of its report.
+
+    Attributes
+    ----------
+    rule
+        How the regression was solved, in words.
+    doubts, changes
+        Sentences of the report: its warnings, and the changes by a prior, a limit or a penalty.
+    """
+
+    A: Float[np.ndarray, "nz nz"]
+    B: Float[np.ndarray, "nz nu"]
+    C: Float[np.ndarray, "nx nz"]
+    lifting: Lifting
+    residual: Float[np.ndarray, " nx"]
+    state_residual: Float[np.ndarray, " nx"]
+    rank: int
+    condition: float
+    rule: str
+    ridge: float = 0.0
+    doubts: Sequence[str] = ()
+    changes: Sequence[str] = ()
+    modes: Complex[np.ndarray, "nl nz"] | None = None
+
+
+def build_result(
+    regression: Regression,
+    K: Float[np.ndarray, "n nz"],
+    *,
+    rule: str,
+    rank: int | None = None,
+    condition: float = np.inf,
+    ridge: float = 0.0,
+    doubts: Sequence[str] = (),
+    changes: Sequence[str] = (),
+) -> FitResult:
+    """Return the result for K = [A B E]ᵀ, in the lifting of the regression.
+
+    Rank and condition number are those of the regressors; this computes them if no rank is passed.
+    """
+    nz = regression.lifting.nz
+    if rank is None:
+        rank, condition = scaled_rank(regression.rows, regression.rows.P)
+    return FitResult(
+        A=K[:nz].T,
+        B=K[nz:].T,
+        C=np.eye(nz) if regression.C is None else regression.C,
+        lifting=regression.lifting,
+        residual=regression.rows.residual(regression.x_next, regression.decode(K)),
+        state_residual=regression.state_residual,
+        rank=rank,
+        condition=condition,
+        rule=rule,
+        ridge=ridge,
+        doubts=doubts,
+        changes=changes,
+    )
+
+
+def build_report(regression: Regression, result: FitResult, *, warn: bool = True) -> FitReport:
+    """Return the report. Each doubt in it also becomes a FitWarning at the user's line that called the fit."""
+    for sentence in result.doubts if warn else ():
+        warnings.warn(sentence, FitWarning, stacklevel=_level_outside())
+    return FitReport(
+        method=regression.method,
+        route=f"{regression.route}, {result.rule}",
+        samples=regression.rows.samples,
+        condition=result.condition,
+        rank=result.rank,
+        columns=regression.columns,
+        ridge=result.ridge,
+        residual=result.residual,
+        state_residual=result.state_residual,
+        warnings=tuple(result.doubts),
+        changes=tuple(result.changes),
+    )
+
+
+def _level_outside() -> int:
+    """Return the stacklevel by which a warning of the caller points at the first line outside of koopmpc."""
+    frame, level = currentframe(), 0
+    while frame is not None and frame.f_globals.get("__name__", "").startswith("koopmpc."):
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def build_predictor(regression: Regression, result: FitResult, *, warn: bool = True) -> LinearPredictor:
+    """Return z⁺ = A z + B u + E w with its report; `warn` makes each doubt in it a FitWarning."""
+    nu = len(regression.inputs) - len(regression.disturbances)
+    return LinearPredictor(
+        result.A,
+        result.B[:, :nu],
+        result.C,
+        result.lifting,
+        regression.dt,
+        regression.states,
+        regression.inputs[:nu],
+        build_report(regression, result, warn=warn),
+        exact_modes=result.modes,
+        E=result.B[:, nu:],
+        disturbances=regression.disturbances,
+        embedding=regression.embedding,
+        scale=compute_scale(regression, result.lifting),
+    )
+
+
+def compute_scale(regression: Regression, lifting: Lifting) -> Float[np.ndarray, "nz nz"]:
+    """Return the upper triangular R with RᵀR = Σ w z zᵀ / Σ w, where z is the lifted data of the regression."""
+    Z = regression.rows.P[:, : regression.lifting.nz]
+    if lifting is not regression.lifting and isinstance(lifting, Projected):
+        Z = Z @ lifting.basis
+    return compute_scale_factor(Z, regression.rows.samples)
+
+
+def compute_scale_factor(P: Float[np.ndarray, "m n"], samples: int) -> Float[np.ndarray, "n n"]:
+    """Return the upper triangular R with RᵀR = PᵀP / M and a positive diagonal, so that P R⁻¹ has orthogonal columns.
+
+    R is invertible even if columns are dependent: on columns of unit norm eps is added to PᵀP, so that R and R⁻¹
+    together lose at most half of the digits. A column of zeros counts as one of size 1.
+    """
+    size = column_norms(P)
+    live = size > 0
+    size = np.where(live, size, np.sqrt(samples))
+    R = np.asarray(qr(np.vstack([P / size, np.diag(np.where(live, _HALF, 1.0))]), mode="r")[0])[: len(size)]
+    return np.ascontiguousarray(np.where(R.diagonal() < 0, -1.0, 1.0)[:, None] * R * (size / np.sqrt(samples)))
+
+
+def describe_misfit(rows: RegressionRows, K: Float[np.ndarray, "n nz"], plain: Float[np.ndarray, "n nz"]) -> str:
+    """Return a sentence with the one-step errors of K and of the plain fit, relative to each observable's size."""
+    before, after = relative_misfit(rows, plain), relative_misfit(rows, K)
+    return f"relative one-step misfit of the observables {after:.3g}, of the plain fit {before:.3g}"
+
+
+def relative_misfit(rows: RegressionRows, K: Float[np.ndarray, "n nz"]) -> float:
+    """Return the root-mean-square over observables i of ‖tᵢ − P kᵢ‖ / ‖tᵢ‖."""
+    which = np.arange(len(K.T))
+    energy = (np.sum(rows.T[:, which] ** 2, axis=0) + rows.rest[which]) / rows.samples
+    error = rows.residual(which, K) ** 2
+    return float(np.sqrt(np.mean(error / np.where(energy > 0, energy, 1.0))))

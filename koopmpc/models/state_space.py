@@ -1,0 +1,89 @@
+"""State-space systems of scipy.signal and python-control as predictors, and back."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+
+_MATRICES = ("A", "B", "C", "D")
+
+
+class SystemMatrices(NamedTuple):
+    """The matrices of x⁺ = A x + B u, y = C x, the sample time and the names of a system."""
+
+    A: Float[np.ndarray, "nx nx"]
+    B: Float[np.ndarray, "nx nu"]
+    C: Float[np.ndarray, "ny nx"]
+    dt: float
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+
+
+def is_state_space(given: object) -> bool:
+    """Return whether an object has the four matrices of a state-space system."""
+    return all(hasattr(given, name) for name in _MATRICES) and not hasattr(given, "lifting")
+
+
+def read_state_space(
+    system: Any,
+    dt: float | None = None,
+    states: Sequence[str] | None = None,
+    inputs: Sequence[str] | None = None,
+) -> SystemMatrices:
+    """Return the matrices of a system of scipy.signal (``StateSpace``, ``dlti``) or python-control (``ss``).
+
+    A continuous system is discretised by a zero-order hold of `dt` seconds.
+
+    Raises
+    ------
+    DataError
+        It is no state-space system; it has feedthrough (D is not zero); it is continuous and dt is missing; it is
+        discrete and dt is another, or its own is not stated.
+    """
+    if not is_state_space(system) and hasattr(system, "to_ss"):
+        system = system.to_ss()
+    if not is_state_space(system):
+        raise DataError(f"system is {checks.article(system)}; pass scipy.signal.StateSpace or control.ss")
+    A, B, C, D = (checks.array(getattr(system, name), name, (None, None)) for name in _MATRICES)
+    if D.any():
+        raise DataError("D is not zero: the input acts on the output of its own step, and a predictor has none of that")
+    own = getattr(system, "dt", None)
+    if own is None or own == 0:
+        if own is None and not hasattr(system, "to_discrete"):
+            raise DataError("the system does not say whether it is continuous; give it dt=0, or its sample time")
+        if dt is None:
+            raise DataError("the system is continuous; pass dt=, the sample time in seconds")
+        step = checks.positive(dt, "dt", "s")
+        from scipy.signal import cont2discrete  # slow to import
+
+        A, B, *_ = cont2discrete((A, B, C, D), step)
+    elif own is True:
+        step = checks.positive(1.0 if dt is None else dt, "dt", "s")
+    else:
+        step = float(own)
+        if dt is not None and not np.isclose(dt, step):
+            raise DataError(f"the system has dt = {step:g} s, but dt= is {dt:g} s; leave dt out")
+    state_names = getattr(system, "state_labels", None) if states is None else states
+    input_names = getattr(system, "input_labels", None) if inputs is None else inputs
+    return SystemMatrices(
+        np.asarray(A, dtype=np.float64),
+        np.asarray(B, dtype=np.float64),
+        C,
+        step,
+        checks.names(state_names, "states", "x", len(A)),
+        checks.names(input_names, "inputs", "u", B.shape[1]),
+    )
+
+
+def build_system(
+    A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"], C: Float[np.ndarray, "nx nz"], dt: float
+) -> Any:
+    """Return z⁺ = A z + B u, x = C z as a scipy.signal.dlti in state-space form."""
+    from scipy.signal import dlti  # slow to import
+
+    make: Any = dlti  # its stubs call it abstract
+    return make(A, B, C, np.zeros((len(C), B.shape[1])), dt=dt)

@@ -1,0 +1,302 @@
+"""unequal_rates: a model of runs in which sensors measured at rates of their own, fitted to measured cells."""
+
+from dataclasses import replace
+from typing import Literal, NamedTuple, overload
+
+import numpy as np
+from jaxtyping import Float
+
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.data.delay import Delay
+from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.partial import PartialEpisodes
+from koopmpc.lifting.base import Lifting
+from koopmpc.lifting.state import State
+from koopmpc.models.fits.bilinear import bilinear_edmd
+from koopmpc.models.fits.edmd import edmd
+from koopmpc.models.measured_cells import Cells, MeasuredError, ModelColumns, cut_cells
+from koopmpc.models.moments.solve import column_norms
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
+
+_GAPS = 4  # a segment has this many measurements of the slowest sensor for each of its unknown rows
+_SHORT = 20  # a segment has at least so many steps
+_CONVERGED = 1e-13  # stop where a step lowers the error by less than this share
+_EXACT = 1e-16  # at this mean squared error in spreads no other start is tried
+_LEAST = 1e-24  # stop at this mean squared error in spreads: rounding
+_DAMPING = 1e-3  # damping of the first step, as a share of the diagonal
+_RANK = 1e-8  # singular values of the simulated columns below this share of the largest are modes that nothing excites
+_TRIALS = 12  # times that the damping grows before the fit ends
+
+
+class _Found(NamedTuple):
+    """The end of one minimisation: its error, iterations and Θ, and the segments as the model simulates them."""
+
+    value: float
+    steps: int
+    theta: Float[np.ndarray, "nx nphi"]
+    simulated: Episodes
+
+
+@overload
+def unequal_rates(
+    data: PartialEpisodes,
+    lifting: Lifting,
+    *,
+    embedding: Delay | None = None,
+    bilinear: Literal[False] = False,
+    scheduled_inputs: bool = False,
+    horizon: int | None = None,
+    iterations: int = 100,
+) -> LinearPredictor: ...
+@overload
+def unequal_rates(
+    data: PartialEpisodes,
+    lifting: Lifting,
+    *,
+    embedding: Delay | None = None,
+    bilinear: Literal[True],
+    scheduled_inputs: bool = False,
+    horizon: int | None = None,
+    iterations: int = 100,
+) -> BilinearPredictor: ...
+def unequal_rates(
+    data: PartialEpisodes,
+    lifting: Lifting,
+    *,
+    embedding: Delay | None = None,
+    bilinear: bool = False,
+    scheduled_inputs: bool = False,
+    horizon: int | None = None,
+    iterations: int = 100,
+) -> LinearPredictor | BilinearPredictor:
+    """Fit z⁺ = A z + B u + E w to runs whose sensors measured at rates of their own: residuals at measured cells alone.
+
+    min over Θ = C [A B E] and the first state of each segment of Σ ((x̂_k − x_k) / σ)² over the cells that were
+    measured, x̂_{k+1} = Θ [ψ(x̂_k); u_k; w_k] lifted afresh. Levenberg-Marquardt with exact derivatives; first states
+    are eliminated segment by segment. It starts at least squares on rows whose gaps are bridged by straight lines, by
+    held values, and by the mean, and takes the least error of the three; only the start depends on them. Segments
+    become longer in two steps. Where several Θ make the same rows, as with delays to spare, the smallest is taken:
+    others may hold unstable modes that nothing excited. Rows of observables other than the states come from `edmd`, or
+    `bilinear_edmd`, on the states that the model itself simulates.
+
+    Parameters
+    ----------
+    data
+        Runs with NaN where a state was not measured.
+    lifting
+        Observables that hold the states, `State() + …`.
+    embedding
+        ψ acts on the state and its past d rows, as in `edmd`; then the first d + 1 states of a segment are unknown.
+    bilinear
+        Also fit Σ uᵢ Nᵢ z + Σ wⱼ Sⱼ z, as `bilinear_edmd` does.
+    scheduled_inputs
+        Of a bilinear model also Σ wⱼ Mⱼ u.
+    horizon
+        Steps of a segment; by default four times the longest gap for each of its d + 1 unknown rows, at least 20.
+    iterations
+        Levenberg-Marquardt steps, at most.
+
+    Raises
+    ------
+    DataError
+        No run has a segment; fewer cells were measured than there are unknowns; the lifting lacks a state; a bilinear
+        model of runs without inputs; scheduled_inputs without W or of a linear model; an embedding with rails.
+
+    References
+    ----------
+    Ljung, "System Identification: Theory for the User", 2nd ed., 1999, section 14.2: missing data as parameters of the
+    prediction error.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> import numpy as np
+    >>> rng, A, x = np.random.default_rng(0), np.array([[0.9, 0.2], [-0.1, 0.8]]), [np.zeros(2)]
+    >>> U = rng.standard_normal((300, 1))
+    >>> for u in U:
+    ...     x.append(A @ x[-1] + np.array([0.0, 0.5]) * u)
+    >>> X = np.array(x)
+    >>> X[np.arange(301) % 10 > 0, 1] = np.nan  # the second sensor measures every tenth row
+    >>> model = km.identify.unequal_rates(km.data.PartialEpisodes(X=[X], U=[U], dt=0.1), km.State())
+    >>> bool(np.abs(model.A - A).max() < 1e-6)
+    True
+    """
+    checks.kind(data, "data", PartialEpisodes, "pass km.data.PartialEpisodes(X=[…], U=[…], dt=…)")
+    checks.kind(lifting, "lifting", Lifting, "for example km.State()")
+    iterations = checks.count(iterations, "iterations")
+    columns = _find_columns(data, lifting, embedding, bilinear=bilinear, crossed=scheduled_inputs)
+    longest, past = max(map(len, data.U)), columns.past
+    wanted = (
+        max(_GAPS * data.find_gap() * (past + 1), _SHORT) + past
+        if horizon is None
+        else checks.count(horizon, "horizon")
+    )
+    if horizon is not None and horizon > longest:
+        raise DataError(
+            f"no run has the {horizon} steps of a segment; the longest has {longest}, pass a shorter horizon"
+        )
+    wanted = min(wanted, longest)
+    if wanted <= past:
+        raise DataError(
+            f"a segment has {wanted} steps, and the embedding keeps {past}; pass longer runs or a longer horizon"
+        )
+    size = np.nanstd(np.concatenate(data.X), axis=0)
+    error = MeasuredError(columns, np.where(size > 0, size, 1.0))
+    lengths = sorted({max(wanted // 2, past + 1), wanted})
+    best: _Found | None = None
+    for kind in ("line", "held", "mean"):
+        found = _fit_from(data, error, _bridge(data, kind), lengths, iterations)
+        best = found if best is None or found.value < best.value else best
+        if best.value < _EXACT:
+            break
+    assert best is not None, "there are three starts"
+    measured = int(data.count_measured().sum())
+    sentence = (
+        f"fitted to {measured} measured cells of {sum(x.size for x in data.X)} by simulation over {wanted} steps, "
+        f"{best.steps} iterations; their error is {np.sqrt(best.value):.3g} spreads"
+    )
+    return _build_model(columns, best, lifting, measured, sentence)
+
+
+def _find_columns(
+    data: PartialEpisodes, lifting: Lifting, embedding: Delay | None, *, bilinear: bool, crossed: bool
+) -> ModelColumns:
+    """Return what the model is linear in."""
+    nu, nw = len(data.inputs), len(data.disturbances)
+    if bilinear and not nu:
+        raise DataError("the runs have no inputs, so nothing multiplies the state; leave bilinear out")
+    if crossed and not (bilinear and nw):
+        raise DataError("scheduled_inputs multiply inputs by measured disturbances; pass W, and bilinear=True")
+    if embedding is not None:
+        checks.kind(embedding, "embedding", Delay, "pass km.Delay(steps)")
+        if embedding.rails is not None:
+            raise DataError("the embedding has rails, which this fit does not know; pass km.Delay without them")
+        embedding = embedding.bind(data.states, data.inputs)
+    bound = lifting.bind(data.states if embedding is None else embedding.names)
+    if not set(State().bind(data.states).names) <= set(bound.names):
+        raise DataError(f"the lifting lacks a state; pass km.State() + … of {', '.join(data.states)}")
+    return ModelColumns(bound, len(data.states), nu, nw, embedding, bilinear, crossed)
+
+
+def _build_model(
+    columns: ModelColumns, found: _Found, lifting: Lifting, measured: int, sentence: str
+) -> LinearPredictor | BilinearPredictor:
+    """Return the model whose rows of the states are Θ, and the others those of EDMD on what it simulates."""
+    delays = None if columns.embedding is None else Delay(columns.past, columns.embedding.inputs)
+    simulated = found.simulated
+    if columns.bilinear:
+        model = bilinear_edmd(simulated, lifting, embedding=delays, scheduled_inputs=columns.crossed)
+    else:
+        model = edmd(simulated, lifting, embedding=delays)
+    places = np.argmax(model.C, axis=1)
+    K = np.zeros((found.theta.shape[1], model.nz))
+    K[:, places] = found.theta.T
+    parts = columns.parts.split(K, columns.factors)
+    A, B, E = model.A.copy(), model.B.copy(), model.E.copy()
+    A[places], B[places], E[places] = parts.A[places], parts.B[places], parts.E[places]
+    report = model.report
+    if report is not None:
+        report = replace(report, method="unequal_rates", samples=measured, changes=(*report.changes, sentence))
+    about = (model.C, model.lifting, model.dt, model.states, model.inputs, report)
+    if isinstance(model, LinearPredictor):
+        return LinearPredictor(
+            A, B, *about, embedding=model.embedding, scale=model.scale, E=E, disturbances=model.disturbances
+        )
+    N, S, M = model.N.copy(), model.S.copy(), model.M.copy()
+    N[:, places], S[:, places], M[:, places] = parts.N[:, places], parts.S[:, places], parts.M[:, places]
+    return BilinearPredictor(
+        A, B, N, *about, embedding=model.embedding, scale=model.scale, E=E, S=S, M=M, disturbances=model.disturbances
+    )
+
+
+def _fit_from(
+    data: PartialEpisodes, error: MeasuredError, bridged: Episodes, lengths: list[int], iterations: int
+) -> _Found:
+    """Return where the minimisation ends that starts at one-step least squares on the bridged rows."""
+    columns = error.columns
+    phi, norms, after = _pairs(columns, bridged)
+    theta, steps = (np.asarray(np.linalg.lstsq(phi, after, rcond=None)[0]) / norms[:, None]).T, 0
+    cells, starts = cut_cells(data, bridged, lengths[-1], columns.past)
+    unknowns = theta.size + starts.size
+    if cells.measured.sum() < unknowns:
+        raise DataError(
+            f"{int(cells.measured.sum())} cells were measured, and the fit has {unknowns} unknowns; measure longer,"
+            " or pass a longer horizon, which has fewer first states"
+        )
+    value = np.inf
+    for length in lengths:
+        cells, starts = cut_cells(data, bridged, length, columns.past)
+        theta, starts, value, taken = _minimise(error, theta, starts, cells, iterations)
+        steps += taken
+    X = error.simulate(theta, starts, cells)
+    episodes = [Episode(X=X[:, i], U=cells.U[:, i], W=cells.W[:, i]) for i in range(X.shape[1])]
+    simulated = Episodes(episodes, data.dt, data.states, data.inputs, data.disturbances)
+    least = _least_norm(columns, simulated)
+    if error.evaluate(least, starts, cells) <= max(value, _EXACT):
+        theta = least
+    return _Found(value, steps, theta, simulated)
+
+
+def _pairs(
+    columns: ModelColumns, rows: Episodes
+) -> tuple[Float[np.ndarray, "m nphi"], Float[np.ndarray, " nphi"], Float[np.ndarray, "m nx"]]:
+    """Return the columns of φ by their norms, these norms, and the states that follow."""
+    points = rows if columns.embedding is None else columns.embedding(rows)
+    Z, U = np.concatenate([e.X[:-1] for e in points]), np.concatenate([e.U for e in points])
+    phi = columns.evaluate(Z, U, np.concatenate([e.W for e in points]))
+    norms = column_norms(phi)
+    norms[norms == 0] = 1.0
+    return phi / norms, norms, np.concatenate([e.X[1:, : columns.nx] for e in points])
+
+
+def _least_norm(columns: ModelColumns, simulated: Episodes) -> Float[np.ndarray, "nx nphi"]:
+    """Return the smallest Θ that makes the simulated rows: it has no unstable modes that nothing excited."""
+    phi, norms, after = _pairs(columns, simulated)
+    return (np.asarray(np.linalg.lstsq(phi, after, rcond=_RANK)[0]) / norms[:, None]).T
+
+
+def _minimise(
+    error: MeasuredError,
+    theta: Float[np.ndarray, "nx nphi"],
+    starts: Float[np.ndarray, "m ns"],
+    cells: Cells,
+    iterations: int,
+) -> tuple[Float[np.ndarray, "nx nphi"], Float[np.ndarray, "m ns"], float, int]:
+    """Return Θ, the first states, the error there, and the iterations."""
+    value, damping, steps = error.evaluate(theta, starts, cells), _DAMPING, 0
+    for _ in range(iterations):
+        if not np.isfinite(value) or value < _LEAST:
+            break
+        slopes, lower = error.derivatives(theta, starts, cells), np.inf
+        for _trial in range(_TRIALS):
+            move, moved = slopes.solve(damping)
+            trial = theta + move.reshape(theta.shape), starts + moved * error.start_size
+            lower = error.evaluate(*trial, cells)
+            if lower < value:
+                (theta, starts), damping = trial, max(damping / 10, 1e-15)
+                break
+            damping *= 10
+        if not lower < value * (1 - _CONVERGED):
+            break
+        value, steps = lower, steps + 1
+    return theta, starts, value, steps
+
+
+def _bridge(data: PartialEpisodes, kind: str) -> Episodes:
+    """Return the runs with their gaps bridged by lines, held values or the mean: where a fit starts, nothing else."""
+    found: list[Episode] = []
+    for x, u, w in zip(data.X, data.U, data.W, strict=True):
+        whole, rows = x.copy(), np.arange(len(x))
+        for i, column in enumerate(x.T):
+            known = np.isfinite(column)
+            mean = float(np.nanmean(np.concatenate([each[:, i] for each in data.X])))
+            if kind == "line" and known.any():
+                whole[:, i] = np.interp(rows, rows[known], column[known])
+            elif kind == "held" and known.any():
+                last = np.maximum.accumulate(np.where(known, rows, rows[known][0]))
+                whole[:, i] = column[last]
+            else:
+                whole[~known, i] = mean
+        found.append(Episode(X=whole, U=u, W=w))
+    return Episodes(found, data.dt, data.states, data.inputs, data.disturbances)

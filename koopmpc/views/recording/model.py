@@ -1,0 +1,359 @@
+# pyright: basic
+"""record_model: a predictor and how far it can be trusted, as one Rerun log."""
+
+import json
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError, LogError
+from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.base.scene import Color
+from koopmpc.base.text import format_markdown_table, shorten_observable
+from koopmpc.data.episodes import Episodes
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
+from koopmpc.validate.bands import Forecast, forecast
+from koopmpc.validate.report import TrustReport
+from koopmpc.validate.scoring import AnyPredictor, Score, score
+from koopmpc.views.figures.eigenvalues import Axes, Plane, evaluate_eigenfunctions, make_plane
+from koopmpc.views.figures.style import CYCLIC, SEQUENTIAL, map_colors
+from koopmpc.views.recording.blueprint import color, frame_views, shared_time, write_page
+from koopmpc.views.recording.description import Entity, drawable, written_with
+from koopmpc.views.recording.eigenvalues import draw_eigenvalues, eigenvalue_views, plane_view
+from koopmpc.views.recording.reader import naming, read_columns
+from koopmpc.views.recording.rrd import CHECK, file_recording, times
+
+_TRUTH: Color = (225, 228, 232)
+_PREDICTED = color(0)
+_BAND: Color = (70, 125, 185)
+_STYLE_SIGNS = re.compile(r"([*_`])")  # Markdown would read these signs as style: each gets a backslash
+_SHOWN = 6  # plots of states in one column
+_FORMAT = "koopmpc-model-1"
+_INK: Color = (250, 250, 250)  # of the words around a picture
+
+Curve = tuple[str, Color, float, np.ndarray]  # name, colour, width [points], one value a step
+Picture = tuple[str, str, dict[str, Any]]  # entity, title, archetypes by entity
+
+
+@raise_swallowed()  # Python drops a Ctrl-C that comes while a recording is deleted
+def record_model(
+    predictor: AnyPredictor,
+    episodes: Episodes,
+    path: str | Path,
+    *,
+    report: TrustReport | None = None,
+    horizon: int | None = None,
+    rollouts: int = 3,
+    which: Sequence[int] | None = None,
+    plane: Axes = (0, 1),
+    at: ArrayLike | None = None,
+) -> None:
+    """Write spectrum, eigenfunctions, forecasts, error by horizon and the report of a predictor to one .rrd.
+
+    Series stand over `sim_time`, the time ahead of the forecast's start. The data are in the log to the bit.
+
+    Parameters
+    ----------
+    predictor
+        Linear or bilinear; a bilinear one has no eigenfunctions.
+    episodes
+        Held out of the fit; the first ones are forecast from their start.
+    path
+        The .rrd to write; its folders are made.
+    report
+        The report of `trust`, whose residuals, errors, bands and text are shown.
+    horizon
+        Steps ahead; the report's by default, else as long as the shortest episode.
+    rollouts
+        How many episodes are forecast.
+    which
+        Eigenfunctions, in the order of ``predictor.eigenvalues``; by default the first two, those with the
+        smallest residuals where there is a report, and one of each conjugate pair.
+    plane
+        Two states, by index or name; the ranges are those of the episodes.
+    at
+        (nx,) values of the other states; the median of the episodes by default.
+
+    Raises
+    ------
+    DataError
+        The horizon is longer than an episode; there is no such state or eigenfunction.
+    LogError
+        The path cannot be written.
+    """
+    import rerun as rr
+
+    if horizon is None:
+        horizon = min(len(episode) for episode in predictor.embed(episodes)) if report is None else report.score.horizon
+    relift = isinstance(predictor, BilinearPredictor) if report is None else report.band.relift
+    errors = score(predictor, episodes, horizon, relift=relift) if report is None else report.score
+    bands = errors if report is None else report.band
+    count = checks.count(rollouts, "rollouts")
+    ahead = [forecast(predictor, episode, horizon, bands=bands, relift=relift) for episode in list(episodes)[:count]]
+    residuals = None if report is None else report.residuals
+    pictures, surface, note = _pictures(predictor, episodes, report, which, plane, at)
+    layout = _blueprint(predictor, ahead, pictures, surface, told=residuals is not None)
+    with file_recording(path, "koopmpc-model", layout) as rec:
+        rec.send_recording_name(drawable(f"model of {', '.join(predictor.states)}"))
+        write_page(rec, "report", _page(predictor, report, note))
+        facts = _facts(predictor) | {"horizon": horizon, "band": ahead[0].band if ahead else ""}
+        about = {"format": _FORMAT, "written_with": written_with(), "dt": predictor.dt, "facts": facts}
+        about |= {"states": list(predictor.states), "forecasts": len(ahead)}
+        rec.log(Entity.DESCRIPTION, rr.AnyValues(json=json.dumps(about, ensure_ascii=False)), static=True)
+        drawn = draw_eigenvalues(predictor, residuals)
+        for entity, archetype in [*drawn.items(), *(pair for *_, parts in pictures for pair in parts.items())]:
+            rec.log(entity, archetype, static=True)
+        for r, one in enumerate(ahead):
+            for i in range(predictor.nx):
+                _send(rec, f"rollout/{r}/state/{i}", _forecast_curves(one, i), predictor.dt)
+            if predictor.nu:
+                inputs = [(name, color(1 + j), 2.0, one.U[:, j]) for j, name in enumerate(one.inputs)]
+                _send(rec, f"rollout/{r}/inputs", inputs, predictor.dt, interpolation_mode="StepAfter")
+        for i in range(predictor.nx):
+            _send(rec, f"error/{i}", _error_curves(errors, i), predictor.dt, first=1)
+
+
+def _forecast_curves(ahead: Forecast, i: int) -> list[Curve]:
+    """Return truth, prediction and, where it is finite, the band of the i-th state."""
+    curves: list[Curve] = [("prediction", _PREDICTED, 3.0, ahead.predicted[:, i])]
+    known = np.isfinite(ahead.predicted[:, i])
+    if ahead.band and np.isfinite(ahead.low[known, i]).all() and np.isfinite(ahead.high[known, i]).all():
+        curves += [
+            (f"{ahead.band}, low", _BAND, 1.0, ahead.low[:, i]),
+            (f"{ahead.band}, high", _BAND, 1.0, ahead.high[:, i]),
+        ]
+    return [*curves, ("truth", _TRUTH, 1.2, ahead.truth[:, i])]  # thin, and over the prediction
+
+
+def _error_curves(score: Score, i: int) -> list[Curve]:
+    """Return the root-mean-square error of the i-th state and the 5 and 95 % quantiles of its errors."""
+    return [
+        ("RMSE", _PREDICTED, 2.5, score.rmse[:, i]),
+        ("5 % of the errors", _BAND, 1.0, score.low[:, i]),
+        ("95 % of the errors", _BAND, 1.0, score.high[:, i]),
+    ]
+
+
+def _send(rec: Any, entity: str, curves: Sequence[Curve], dt: float, *, first: int = 0, **style: Any) -> None:
+    """Write curves over the steps first, first + 1, … as one entity: their style once, and their columns."""
+    import rerun as rr
+
+    names, colors, widths, columns = (list(part) for part in zip(*curves, strict=True))
+    drawn = [drawable(name) for name in names]
+    rec.log(entity, rr.SeriesLines(names=drawn, colors=colors, widths=widths, **style), static=True)
+    values = np.column_stack(columns)
+    scalars = rr.Scalars.columns(scalars=values.ravel()).partition([len(names)] * len(values))
+    rec.send_columns(entity, times(first + np.arange(len(values)), dt), scalars)
+
+
+def _pictures(
+    predictor: AnyPredictor,
+    episodes: Episodes,
+    report: TrustReport | None,
+    which: Sequence[int] | None,
+    plane: Axes,
+    at: ArrayLike | None,
+) -> tuple[list[Picture], Plane | None, str]:
+    """Return pictures of eigenfunctions, their plane, and the reason where there are none."""
+    if not isinstance(predictor, LinearPredictor) or (predictor.nx < 2 and which is None):
+        why = "has no eigenfunctions" if predictor.nx > 1 else "has one state: there is no plane to draw them on"
+        if which is not None:
+            raise DataError("a bilinear predictor has no eigenfunctions; leave `which` out")
+        return [], None, f"The predictor {why}."
+    surface = make_plane(predictor.point_names, plane, predictor.embed(episodes), at, points=181)
+    chosen = _leading(predictor, report) if which is None else list(which)
+    try:
+        return _eigenfunctions(predictor, chosen, surface), surface, ""
+    except DataError as error:
+        if which is not None:
+            raise
+        return [], None, f"No eigenfunctions are drawn: {error}."
+
+
+def _eigenfunctions(predictor: LinearPredictor, which: Sequence[int], plane: Plane) -> list[Picture]:
+    """Return the pictures of eigenfunctions: of a real one itself, of a complex one its magnitude and its phase."""
+    pictures: list[Picture] = []
+    for j, phi in zip(which, evaluate_eigenfunctions(predictor, which, plane), strict=True):
+        value = predictor.eigenvalues[j]
+        if value.imag == 0:
+            low, high = float(phi.real.min()), float(phi.real.max())
+            level = (phi.real - low) / ((high - low) or 1.0)
+            shown = {"value": (f"φ{j}, λ = {value.real:.4g}", map_colors(level, SEQUENTIAL))}
+        else:
+            title = f"|φ{j}|, λ = {value.real:.4g} {'+' if value.imag > 0 else '−'} {abs(value.imag):.4g}i"
+            turns = np.angle(phi) / (2 * np.pi) + 0.5  # dark at 0, blue below, red above, light at ±π
+            shown = {
+                "magnitude": (title, map_colors(np.abs(phi), SEQUENTIAL)),
+                "phase": (f"Phase of φ{j}", map_colors(turns, CYCLIC)),
+            }
+        for part, (title, pixels) in shown.items():
+            entity = f"eigenfunction/{j}/{part}"
+            pictures.append((entity, title, _picture(entity, pixels, plane)))
+    return pictures
+
+
+def _picture_view(entity: str, title: str, plane: Plane) -> Any:
+    """Return the view of one picture, with room for the words around it."""
+    n, m = len(plane.across), len(plane.up)
+    return plane_view(entity, drawable(title), [-0.3 * n, 1.1 * n], [-0.08 * m, 1.25 * m])
+
+
+def _picture(entity: str, pixels: np.ndarray, plane: Plane) -> dict[str, Any]:
+    """Return the picture, rows from the top down, and its axes in words."""
+    import rerun as rr
+
+    m, n = pixels.shape[:2]
+    (x, y), across, up = map(drawable, plane.names), plane.across, plane.up
+    words = {
+        (0.04 * n, 1.06 * m): f"{across[0]:.3g}",
+        (0.5 * n, 1.14 * m): x,
+        (1.0 * n, 1.06 * m): f"{across[-1]:.3g}",
+        (-0.09 * n, 0.96 * m): f"{up[0]:.3g}",
+        (-0.15 * n, 0.5 * m): y,
+        (-0.09 * n, 0.04 * m): f"{up[-1]:.3g}",
+    }
+    return {
+        f"{entity}/picture": rr.Image(np.ascontiguousarray(pixels[::-1])),
+        f"{entity}/axes": rr.Points2D(
+            list(words), labels=list(words.values()), radii=0.0, colors=_INK, show_labels=True, draw_order=40
+        ),
+    }
+
+
+def _leading(predictor: LinearPredictor, report: TrustReport | None) -> list[int]:
+    """Return a few eigenpairs, one of each conjugate pair: the most trusted, or the slowest."""
+    values = predictor.eigenvalues
+    order = np.arange(len(values))
+    if report is not None:
+        near = np.abs(values[:, None] - report.residuals.eigenvalues).argmin(axis=1)
+        order = np.argsort(report.residuals.residuals[near], kind="stable")
+    moving = [int(j) for j in order if values[j].imag >= 0 and abs(values[j] - 1) > 1e-9]  # λ = 1: often φ = 1
+    return moving[:2] or [0]  # drawn unless told
+
+
+def _page(predictor: AnyPredictor, report: TrustReport | None, note: str) -> str:
+    """Return the page beside the plots: the report of `trust`, a note on pictures, and a table of the model."""
+    lines = [f"# Model of {', '.join(predictor.states)}", ""]
+    if report is not None:
+        lines += ["```", str(report), "```", ""]
+    lines += [
+        note or "Eigenfunctions: dark is the least value, light the largest; of a phase, dark is 0, light ±π.",
+        "",
+    ]
+    table = format_markdown_table(
+        ("model", ""), [(key, _STYLE_SIGNS.sub(r"\\\1", value)) for key, value in _facts(predictor).items()]
+    )
+    return "\n".join([*lines, table])
+
+
+def _facts(predictor: AnyPredictor) -> dict[str, str]:
+    """Return what the model is, and how it was fitted, in words."""
+    rows = {
+        "kind": type(predictor).__name__,
+        "inputs": ", ".join(predictor.inputs) or "none",
+        "sampling time": f"{predictor.dt:g} s",
+        "observables": f"{predictor.nz}: {', '.join(map(shorten_observable, predictor.lifting.names[:12]))}"
+        + (" …" if predictor.nz > 12 else ""),
+        "spectral radius": f"{abs(predictor.eigenvalues[0]):.6g}",
+    }
+    if predictor.report is not None:
+        fit = predictor.report
+        rows |= {
+            "fit": f"{fit.method}, {fit.route}",
+            "snapshots": f"{fit.samples}",
+            "condition": f"{fit.condition:.3g}",
+        }
+        rows |= {f"doubt {i + 1}": doubt for i, doubt in enumerate(fit.warnings)}
+    return rows
+
+
+def _blueprint(
+    predictor: AnyPredictor,
+    ahead: Sequence[Forecast],
+    pictures: Sequence[Picture],
+    surface: Plane | None,
+    *,
+    told: bool,
+) -> Any:
+    import rerun.blueprint as rrb
+
+    def plot(origin: str, name: str, *, legend: bool) -> Any:
+        corner = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
+        return rrb.TimeSeriesView(origin=origin, name=drawable(name), axis_x=shared_time(length), plot_legend=corner)
+
+    length = max((len(one.truth) for one in ahead), default=1) * predictor.dt
+    states = list(enumerate(predictor.states))[:_SHOWN]
+    tabs = []
+    for r in range(len(ahead)):
+        plots = [plot(f"rollout/{r}/state/{i}", name, legend=i == 0) for i, name in states]
+        if predictor.nu:
+            plots.append(plot(f"rollout/{r}/inputs", ", ".join(predictor.inputs), legend=predictor.nu > 1))
+        tabs.append(rrb.Vertical(*plots, name=f"Forecast of episode {r}"))
+    errors = [plot(f"error/{i}", f"Error of {name}, by time ahead", legend=i == 0) for i, name in states]
+    left = rrb.Tabs(*tabs, rrb.Vertical(*errors, name="Error by time ahead"))
+    text = rrb.TextDocumentView(origin="report", name="Report")
+    rows: list[Any] = [rrb.Horizontal(*eigenvalue_views(predictor, residuals=told))]
+    if surface is not None:
+        views = [_picture_view(entity, title, surface) for entity, title, _ in pictures]
+        rows.append(rrb.Grid(*views, grid_columns=min(len(views), 2)))
+    return frame_views(
+        rrb.Horizontal(
+            left, rrb.Vertical(*rows, text, row_shares=[*[3.0, 4.0][: len(rows)], 3.0]), column_shares=[1.0, 1.2]
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ModelLog:
+    """What the log of a model holds: `facts` in words, and curves.
+
+    `errors` has the root-mean-square error of each state 1, 2, … steps ahead. By the numbers of an episode and a state,
+    `forecasts` has the prediction, the truth and, where there is one, the band (T+1, 2).
+    """
+
+    facts: Mapping[str, str]
+    states: tuple[str, ...]
+    dt: float
+    errors: tuple[np.ndarray, ...]
+    forecasts: Mapping[tuple[int, int], tuple[np.ndarray, np.ndarray, np.ndarray | None]]
+
+
+def load_model_log(path: str | Path) -> ModelLog:
+    """Return what `record_model` wrote about a model.
+
+    Raises
+    ------
+    LogError
+        The file is missing or damaged, or no log of a model whose format this version knows.
+
+    Warns
+    -----
+    UserWarning
+        The end of the file is cut.
+    """
+    path = Path(path)
+    log = read_columns(path, (f"/{Entity.DESCRIPTION}", "/error/**", "/rollout/**", "/checksum"))
+    with naming(path):
+        if log.static("checksum", "check") not in (None, CHECK) and not log.intact:
+            raise LogError(f"{path} is damaged: it no longer holds what was written; take another copy")
+        if log.torn:
+            warnings.warn(f"{path}: its end is cut; take another copy, curves may lack rows", UserWarning, stacklevel=2)
+        text = log.static(Entity.DESCRIPTION, "json")
+        about: dict[str, Any] = {} if text is None else json.loads(text)
+        if about.get("format") != _FORMAT:
+            raise LogError(f"{path} holds no model that this koopmpc reads: its format is {about.get('format')!r}")
+        errors = [log.matrix(f"error/{i}")[1][:, 0] for i in range(len(about["states"]))]
+        forecasts = {}
+        for r in range(about["forecasts"]):
+            for i in range(len(about["states"])):
+                curves = log.matrix(f"rollout/{r}/state/{i}")[1]
+                forecasts[r, i] = curves[:, 0], curves[:, -1], curves[:, 1:3] if curves.shape[1] > 2 else None
+        facts = {name: str(value) for name, value in about["facts"].items() if value != ""}
+        return ModelLog(facts, tuple(about["states"]), float(about["dt"]), tuple(errors), forecasts)

@@ -1,0 +1,389 @@
+# pyright: basic
+"""Scenes: the shapes that scene(x, u) returns over time, as Rerun draws them."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, fields
+from math import isfinite
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from koopmpc.base import checks
+from koopmpc.base.errors import DataError
+from koopmpc.base.scene import Box, Color, Disk, Line, Scene, Shape
+from koopmpc.loop.rows import StepRows
+from koopmpc.loop.run import About, bind_outputs
+
+_STROKES = np.linspace(-1.0, 1.0, 5)  # places of the strokes that fill a box
+_FACES = (
+    np.array(  # of the cube of size 1, each a way around four corners
+        [
+            np.roll([(s, a, b) for a, b in [(-1, -1), (1, -1), (1, 1), (-1, 1)]], i, axis=1)
+            for i in range(3)
+            for s in (-1, 1)
+        ]
+    )
+    * 0.5
+)
+
+
+class Drawing(NamedTuple):
+    """One entity of a scene: a static archetype, if any, and columns over time."""
+
+    style: Any
+    columns: Any
+
+
+def drawing_of(kind: type[Shape] | None, rows: Sequence[Sequence[tuple[Shape, Color]]], order: float) -> Drawing:
+    """Return one entity: of any shapes in the plane (None), of one kind in space; each row holds any number of them.
+
+    In the plane all are line strips with round ends: Rerun draws points as shaded balls, and a disk is a line without
+    length. There `order` says what lies above what.
+    """
+    import rerun as rr
+
+    shapes: list[Any] = [s for row in rows for s, _ in row]
+    colors = np.array([c for row in rows for _, c in row], dtype=np.uint8).reshape(-1, 3)
+    radii = np.array([line_radius(s) for s in shapes], dtype=np.float32)
+    style = None
+    with np.errstate(over="ignore"):
+        if kind is None:
+            style = rr.LineStrips2D.from_fields(draw_order=order)
+            strips = [(outline(s) * (1.0, -1.0)).astype(np.float32) for s in shapes]  # Rerun's y points down
+            even = len({len(strip) for strip in strips}) == 1  # Rerun takes one array faster than a list of arrays
+            columns = rr.LineStrips2D.columns(strips=np.stack(strips) if even else strips, radii=radii, colors=colors)
+        elif kind is Line:
+            strips = [outline(s).reshape(-1, 3).astype(np.float32) for s in shapes]
+            columns = rr.LineStrips3D.columns(strips=strips, radii=radii, colors=colors)
+        elif kind is Disk:
+            columns = rr.Points3D.columns(positions=_rows(3, [s.center for s in shapes]), radii=radii, colors=colors)
+        else:
+            style = rr.Boxes3D.from_fields(fill_mode="solid")
+            columns = rr.Boxes3D.columns(
+                centers=_rows(3, [s.center for s in shapes]),
+                half_sizes=_rows(3, [s.size for s in shapes]) / 2,
+                quaternions=_rows(4, [find_rotation(s).as_quat() for s in shapes]),
+                colors=colors,
+            )
+    return Drawing(style, columns.partition([len(row) for row in rows]))
+
+
+def _rows(n: int, values: Sequence[Any]) -> Float[np.ndarray, "rows n"]:
+    return np.array(values, dtype=np.float32).reshape(-1, n)
+
+
+def find_rotation(box: Box) -> Rotation:
+    """Return how a box in space is turned."""
+    angle = np.ravel(box.angle)
+    return Rotation.from_rotvec([0.0, 0.0, angle[0]] if len(angle) == 1 else angle)
+
+
+def faces(center: Any, size: Any, turn: Rotation) -> Float[np.ndarray, "6 4 3"]:
+    """Return the faces of a box in space, each by its corners."""
+    return turn.apply((_FACES * size).reshape(-1, 3)).reshape(6, 4, 3) + center
+
+
+def outline(shape: Shape) -> Float[np.ndarray, "n d"]:
+    """Return the line that draws a shape, y up; a box is a line there and back, a disk almost a point.
+
+    Of a box in space it is a line through the corners.
+    """
+    if isinstance(shape, Line):
+        points = np.asarray(shape.points, dtype=np.float64)
+        return points if points.size else points.reshape(0, 2)
+    if isinstance(shape, Disk):
+        (x, *rest), length = shape.center, 1e-4 * shape.radius
+        return np.array([(x - length, *rest), (x + length, *rest)])
+    if len(shape.size) == 3:
+        return faces(shape.center, shape.size, find_rotation(shape)).reshape(-1, 3)
+    width, height = shape.size
+    r, upright = line_radius(shape), height > width
+    along, across = max(shape.size) / 2 - r, min(shape.size) / 2 - r
+    rim = [(-along, -across), (along, -across), (along, across), (-along, across), (-along, -across)]
+    fill = [((-1) ** ((i + 1) // 2) * along, y * across) for i, y in enumerate(np.repeat(_STROKES, 2))]
+    path = np.array(rim + fill)
+    c, s = np.cos(shape.angle), np.sin(shape.angle)
+    return (path[:, ::-1] if upright else path) @ np.array([[c, s], [-s, c]]) + np.asarray(shape.center)
+
+
+def line_radius(shape: Shape) -> float:
+    """Return half the width of the line that draws a shape; 0 of a box in space, which is drawn by its faces."""
+    match shape:
+        case Line():
+            return shape.width / 2
+        case Disk():
+            return shape.radius
+        case Box():
+            return min(shape.size) / 8 if len(shape.size) == 2 else 0.0
+
+
+BACKGROUND: Color = (247, 248, 250)
+_FAR = 0.25  # margin for predictions, which may diverge, as a share of the size of the drawn shapes
+_AIM: Color = (188, 193, 201)  # of the reference
+_STAGES = 4  # how many future stages of a plan are drawn
+
+
+@dataclass
+class Bounds:
+    """The least box around some points in the plane or in space [m], their last coordinate up; empty at first."""
+
+    low: Float[np.ndarray, "..."] = field(default_factory=lambda: np.array(np.inf))
+    high: Float[np.ndarray, "..."] = field(default_factory=lambda: np.array(-np.inf))
+
+    def include(self, scenes: Iterable[Sequence[Shape]]) -> None:
+        """Widen the box by all shapes."""
+        for shape in (shape for scene in scenes for shape in scene):
+            points = outline(shape)
+            if len(points) and np.isfinite(points).all():
+                self.low = np.minimum(self.low, points.min(axis=0) - line_radius(shape))
+                self.high = np.maximum(self.high, points.max(axis=0) + line_radius(shape))
+
+
+@dataclass
+class Extent:
+    """The box that the animation shows: all drawn shapes, and predicted shapes that are not far from them."""
+
+    drawn: Bounds = field(default_factory=Bounds)
+    predicted: Bounds = field(default_factory=Bounds)
+
+    @property
+    def in_space(self) -> bool:
+        """Whether what was drawn has three coordinates."""
+        return self.drawn.low.size == 3
+
+    def ranges(self) -> list[list[float]] | None:
+        """Return the range of each of Rerun's coordinates, with a margin; None before anything was drawn.
+
+        Rerun's y points down in the plane, and its z up in space.
+        """
+        low, high = self.drawn.low, self.drawn.high
+        if not np.isfinite(low).all():
+            return None
+        size = float((high - low).max())
+        low = np.minimum(low, np.maximum(self.predicted.low, low - _FAR * size)) - 0.06 * size - 1e-9
+        high = np.maximum(high, np.minimum(self.predicted.high, high + _FAR * size)) + 0.06 * size + 1e-9
+        found = np.column_stack([low, high])
+        if not self.in_space:
+            found[1] = -found[1, ::-1]
+        return found.tolist()
+
+
+class Names:
+    """The names of a scene's shapes, in their order, and their kinds; empty before the first scene."""
+
+    def __init__(self) -> None:
+        self._kinds: dict[str, type[Shape]] | None = None
+        self._coordinates: set[int] = set()  # how many a point has
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._kinds or {})
+
+    def kind(self, name: str) -> type[Shape] | None:
+        """Return the kind of shape that a name stands for in space, None in the plane."""
+        return self._kinds[name] if self._kinds and 3 in self._coordinates else None
+
+    def check(self, scene: Sequence[Shape], step: int) -> list[Shape]:
+        """Return the shapes of `scene`.
+
+        Raises
+        ------
+        DataError
+            A shape is at NaN, came or went since the first scene, or lies in space while another lies in the plane.
+        """
+        own = {shape.name: type(shape) for shape in scene}
+        for shape in scene:
+            self._coordinates.update(len(at) if isinstance(at, tuple) else np.size(at) for at in _places(shape))
+            if len(self._coordinates) > 1 or not self._coordinates <= {2, 3}:
+                many = " and ".join(str(n) for n in sorted(self._coordinates))
+                raise DataError(
+                    f"the scene of step {step} draws points with {many} coordinates, the last one of {shape.name!r}; "
+                    "all points and sizes of a scene have two, (x, y), or all have three, (x, y, z)"
+                )
+            if not _is_finite(shape):
+                raise DataError(
+                    f"the scene of step {step} draws {shape.name!r} at NaN or inf; every x and u needs a place"
+                )
+        self._kinds = own if self._kinds is None else self._kinds
+        for name in own.keys() ^ self._kinds.keys():
+            what = "has a new shape" if name in own else "lacks the shape"
+            raise DataError(
+                f"the scene of step {step} {what} {name!r}; a scene returns the same names for every x and u"
+            )
+        for shape in scene:
+            if (kind := self.kind(shape.name)) not in (None, type(shape)):
+                raise DataError(
+                    f"the scene of step {step} draws {shape.name!r} as {checks.article(shape)} and as a "
+                    f"{kind.__name__}; in space a name stands for one kind of shape"
+                )
+        return list(scene)
+
+
+def _places(shape: Shape) -> Any:
+    """Return what of a shape has a number for each coordinate."""
+    if isinstance(shape, Line):
+        return shape.points
+    if isinstance(shape, Disk):
+        return (shape.center,)
+    return (shape.center, shape.size, *([shape.angle] if np.ndim(shape.angle) else []))
+
+
+def _is_finite(shape: Shape) -> bool:
+    """Return whether all places and sizes of a shape are finite; a finite sum has finite terms."""
+    if isinstance(shape, Line):
+        total = shape.width + sum(map(sum, shape.points))
+    elif isinstance(shape, Disk):
+        total = shape.radius + sum(shape.center)
+    else:
+        total = float(np.sum(shape.angle)) + sum(shape.center) + sum(shape.size)
+    if isfinite(total):
+        return True
+    numbers = (getattr(shape, part.name) for part in fields(shape) if part.name not in ("name", "color"))
+    return all(np.isfinite(np.asarray(value, dtype=np.float64)).all() for value in numbers)
+
+
+def draw(names: Names, scenes: Sequence[Sequence[Shape]], extent: Extent) -> dict[str, Drawing]:
+    """Return a drawing by name for one scene a row; an empty scene clears what was there."""
+    extent.drawn.include(scenes)
+    return {
+        name: drawing_of(
+            names.kind(name), [[(s, s.color) for s in scene if s.name == name] for scene in scenes], 30.0 + i
+        )
+        for i, name in enumerate(names)
+    }
+
+
+def draw_ahead(
+    names: Names, scenes: Sequence[Sequence[Shape]], ahead: Sequence[Sequence[Sequence[Shape]]], extent: Extent
+) -> dict[str, Drawing]:
+    """Return a drawing by name for the predicted scenes of each row, the later the fainter.
+
+    A shape that does not move within the plan is not drawn again.
+    """
+    extent.predicted.include(scene for row in ahead for scene in row)
+    drawings: dict[str, Drawing] = {}
+    for name in names:
+        rows: list[list[tuple[Shape, Color]]] = []
+        for now, futures in zip(scenes, ahead, strict=True):
+            here = [s for s in now if s.name == name]
+            later = [(i, s) for i, scene in enumerate(futures) for s in scene if s.name == name and s not in here]
+            rows.append([(s, _fade(s.color, (i + 1) / (len(futures) + 1))) for i, s in reversed(later)])
+        drawings[name] = drawing_of(names.kind(name), rows, 10.0)
+    return drawings
+
+
+def draw_reference(
+    names: Names, scenes: Sequence[Sequence[Shape]], aims: Sequence[Sequence[Shape]], extent: Extent
+) -> dict[str, Drawing]:
+    """Return a drawing by name, in grey below all others, for the scene of the reference of each row.
+
+    In space nothing lies below: a shape at its reference is not drawn twice.
+    """
+    extent.drawn.include(aims)
+    if extent.in_space:
+        aims = [[s for s in aim if s not in now] for now, aim in zip(scenes, aims, strict=True)]
+    return {
+        name: drawing_of(names.kind(name), [[(s, _AIM) for s in aim if s.name == name] for aim in aims], 2.0)
+        for name in names
+    }
+
+
+class ReferenceScenes:
+    """The scene at the state that a reference names; no shapes where it names none."""
+
+    def __init__(self, about: About) -> None:
+        self._about = about
+        self._known: dict[bytes, Float[np.ndarray, " nx"] | None] = {}
+
+    def of(self, rows: StepRows, scene: Scene) -> list[list[Shape]]:
+        """Return the shapes of each row's reference."""
+        if self._about.cost is None or not len(rows.U):
+            return [[] for _ in rows.X]
+        moves = [rows.u_reference[min(i, len(rows.U) - 1)] for i in range(len(rows.X))]
+        states = [self._state(r) for r in rows.reference]
+        drawn: dict[tuple[bytes, bytes], list[Shape]] = {}  # most references stay for many rows
+        for x, u in zip(states, moves, strict=True):
+            if x is not None and (x.tobytes(), u.tobytes()) not in drawn:
+                drawn[x.tobytes(), u.tobytes()] = list(scene(x, u))
+        return [[] if x is None else drawn[x.tobytes(), u.tobytes()] for x, u in zip(states, moves, strict=True)]
+
+    def _state(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
+        """Return x with of(x) = r, of least size; None where r is not finite, or there is no such x."""
+        key = reference.tobytes()
+        if key not in self._known:
+            # states of so many different references are looked for
+            self._known[key] = self._find_state(reference) if len(self._known) < 2000 else None
+        return self._known[key]
+
+    def _find_state(self, reference: Float[np.ndarray, " nr"]) -> Float[np.ndarray, " nx"] | None:
+        assert self._about.cost is not None
+        of = bind_outputs(self._about.cost.of, self._about.states)
+        # the viewer draws in float32
+        if not (np.abs(reference) < 1e30).all():
+            return None
+        if of is None or of.names == self._about.states:
+            return reference.copy()
+        from scipy.optimize import least_squares
+
+        least = None
+        for first in (0.01, 2.0, -2.0):  # an angle from its sine and cosine has flat places between
+            fit = least_squares(lambda x: of(x) - reference, np.full(len(self._about.states), first))
+            if fit.cost < 1e-10 and (least is None or np.abs(fit.x).sum() < np.abs(least).sum()):
+                least = fit.x
+        return least
+
+
+class Scenes:
+    """The drawings of a run, row by row: scene(x, u) of its states, of a few stages of its plans, of its reference.
+
+    `extent` holds all that was drawn; without a scene nothing is.
+    """
+
+    def __init__(self, about: About, scene: Scene | None) -> None:
+        self.scene, self.extent = scene, Extent()
+        self._names, self._reference = Names(), ReferenceScenes(about)
+        self._u: np.ndarray | None = None  # the last input
+        self._ahead = False  # a plan was drawn before
+
+    def draw_rows(
+        self, first: int, rows: StepRows, plans: Sequence[tuple[int, np.ndarray, np.ndarray]]
+    ) -> dict[str, Drawing]:
+        """Return the drawings of rows first, first + 1, … by entity; `plans` are steps with their planned X and U."""
+        scene = self.scene
+        if scene is None:
+            return {}
+        ahead: dict[int, list[list[Shape]]] = {}
+        for k, X, U in plans:
+            if np.isfinite(X).all() and np.isfinite(U).all():
+                later = ((X[i], U[min(i, len(U) - 1)]) for i in stages(len(U)))
+                ahead[k] = [self._names.check(scene(x, u), k) for x, u in later]
+        now: list[list[Shape]] = []
+        for i, (x, y) in enumerate(zip(rows.X, rows.Y, strict=True)):
+            self._u = rows.U[i] if i < len(rows.U) else self._u
+            x = y if np.isnan(x).any() and len(y) == len(x) else x
+            shapes = None if self._u is None or not np.isfinite(x).all() else scene(x, self._u)
+            now.append([] if shapes is None else self._names.check(shapes, first + i))
+        layers = {"world": draw(self._names, now, self.extent)}
+        if ahead or self._ahead:
+            self._ahead = True
+            futures = [ahead.get(first + i, []) for i in range(len(now))]
+            layers["world/prediction"] = draw_ahead(self._names, now, futures, self.extent)
+        aims = self._reference.of(rows, scene)
+        if any(aims):
+            for aim in filter(None, aims):
+                self._names.check(aim, first)
+            layers["world/reference"] = draw_reference(self._names, now, aims, self.extent)
+        return {f"{layer}/{name}": drawing for layer, drawn in layers.items() for name, drawing in drawn.items()}
+
+
+def stages(horizon: int) -> list[int]:
+    """Return the few stages of a plan that are drawn, the last one among them."""
+    return sorted({round(horizon * (i + 1) / _STAGES) for i in range(_STAGES)} - {0})
+
+
+def _fade(color: Color, share: float) -> Color:
+    """Return `color` mixed with the background: Rerun draws lines without transparency."""
+    weight = 0.45 + 0.5 * share
+    r, g, b = (round((1 - weight) * c + weight * d) for c, d in zip(color, BACKGROUND, strict=True))
+    return r, g, b
