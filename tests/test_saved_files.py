@@ -140,20 +140,3 @@ def test_the_fixtures_are_small_and_listed():
     assert sum(file.stat().st_size for file in FOLDER.iterdir()) < 200_000
     listed = {*MODELS, *(f"controller {name}" for name in CONTROLLERS), "design", "run"}
     assert {*json.loads((FOLDER / "expected.json").read_text())} >= listed
-
-
-def test_what_a_killed_writer_left_goes_with_the_next_save_and_what_one_holds_stays(tmp_path):
-    fcntl = pytest.importorskip("fcntl")
-    import koopmpc as km
-
-    old, held, fresh, other = (
-        tmp_path / f".model.npz.{name}.part" for name in ("0123abcd", "1123abcd", "2123abcd", "notahexa")
-    )
-    for part in (old, held, fresh, other):
-        part.write_bytes(b"half")
-    for part in (old, held, other):
-        os.utime(part, (0, 0))
-    with held.open("rb") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
-        km.LinearPredictor([[0.5]], [[1.0]], [[1.0]], km.State(), 0.1, ["x"], ["u"]).save(tmp_path / "model.npz")
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([held.name, fresh.name, other.name, "model.npz"])

@@ -21,7 +21,7 @@ _PUBLIC = {"NX", "NY", "NU", "NR", "NW", "N", "LATENCY", "HORIZON", "MOST_ITERAT
 _CLOCK = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"  # for the step times of a whole run
 
 
-def list_files(tables: Tables) -> tuple[str, ...]:
+def list_sources(tables: Tables) -> tuple[str, ...]:
     """Return the names of the shipped files that a controller takes."""
     sizes = tables.sizes
     if tables.is_staged:
@@ -38,7 +38,7 @@ def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
 
     The arrays that one file alone names stand in a header of its own, so that each is compiled once.
     """
-    language, own = Language(single), list_files(tables)
+    language, own = Language(single), list_sources(tables)
     result = {name: read_shipped("c", name) for name in own}
     result["koopmpc_sizes.h"] = _write_sizes(tables, "\n".join(result.values()), single=single)
     shared, alone = _share_arrays(tables)
@@ -62,7 +62,7 @@ def write_sources(tables: Tables, *, single: bool) -> dict[str, str]:
 
 def _share_arrays(tables: Tables) -> tuple[dict[str, np.ndarray], dict[str, dict[str, np.ndarray]]]:
     """Return the arrays that several files of a controller name, and of each other file those that it names alone."""
-    texts = {name: read_shipped("c", name) for name in list_files(tables)}
+    texts = {name: read_shipped("c", name) for name in list_sources(tables)}
     named = {name: set(re.findall(r"\bkoopmpc_(\w+)", text)) for name, text in texts.items()}
     alone = {name[:-2]: dict[str, np.ndarray]() for name, text in texts.items() if f'"{name[:-2]}_tables.h"' in text}
     shared = dict[str, np.ndarray]()

@@ -1,15 +1,15 @@
 """From a `Program` to the tables of its C code: one loop over its fields, and a form for each type.
 
-A field `a` of the Program is ``koopmpc_a`` in C, the field `b` of its field `a` is ``koopmpc_a_b``:
+A field `a` of the Program is ``koopmpc_a`` in C, the field `b` of its field `a` is ``koopmpc_a_b``.
 
 | type | in C |
 |---|---|
 | int, bool, float | a macro, ``KOOPMPC_A`` |
 | array of numbers | an array; a matrix stands column after column |
-| array of integers, of booleans | an array of int, row after row |
+| array of integers, of booleans | an array of int; a matrix stands row after row |
 | any array | ``KOOPMPC_A_LENGTH`` and ``KOOPMPC_A_WIDTH``, the sizes of its axes |
-| Graph | a function, with the arguments in `ARGUMENTS` |
-| dataclass, NamedTuple, mapping, tuple | the same of each entry, after `convert` |
+| Graph | a function; its arguments are in `ARGUMENTS` |
+| dataclass, NamedTuple, mapping, tuple | these forms for each entry, after `convert` |
 | what is not None | ``KOOPMPC_A`` is at least 1 |
 
 What no C file of the controller names is left out; a macro that C names and a Program lacks is 0.

@@ -52,7 +52,7 @@ class LinearFields(TypedDict, total=False):
 
 
 def refuse_unknown(parts: Mapping[str, object], kind: type) -> None:
-    """Raise TypeError, as Python does, where a keyword is none of the predictor's."""
+    """Raise TypeError, as Python does, where the predictor has no such keyword."""
     unknown = parts.keys() - kind.__annotations__.keys()
     if unknown:
         raise TypeError(f"a predictor has no {', '.join(sorted(unknown))}; it has {', '.join(kind.__annotations__)}")

@@ -51,7 +51,8 @@ class SearchOptions:
     sample
         Snapshot pairs to choose on, about.
     workers, scheduler
-        As in `koopmpc.base.parallel.map_tasks`: a task is a candidate, one with its runs, a part of the source.
+        As in `koopmpc.base.parallel.map_tasks`: a task is a candidate, a controller with its runs, a part of
+        the source.
     progress
         Called with the name of a stage, how many of its tasks are done, and how many there are, None where that is not
         known.

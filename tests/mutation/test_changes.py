@@ -166,12 +166,12 @@ def test_other_seeds_draw_from_every_room_and_every_kind_of_change() -> None:
     sources = {
         name: text
         for name, text in read_sources(4).items()
-        if "/cli/" in name or "/loop/" in name or name.endswith(".c")
+        if "/apps/" in name or "/loop/" in name or name.endswith(".c")
     }
     everything = list_changes(sources)
     drawn = drawn_of(everything, 4, 60)
     rooms = Counter(room_of(mutant.file) for mutant in drawn)
-    assert set(rooms) == {"cli", "loop", "c"}
+    assert set(rooms) == {"apps", "loop", "c"}
     assert max(rooms.values()) - min(rooms.values()) <= 1
     assert len({mutant.operator for mutant in drawn}) >= 10
     assert not any("daqp/" in name for name in read_sources(4))

@@ -55,7 +55,7 @@ class SweepOptions:
     paced: bool = False
 
     def __post_init__(self) -> None:
-        from koopmpc import checks  # the command line reads this class, and waits for no numpy
+        from koopmpc.base import checks  # the command line reads this class, and waits for no numpy
 
         checks.count(self.starts, "starts")
         checks.count(self.seeds, "seeds")

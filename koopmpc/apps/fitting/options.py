@@ -62,7 +62,7 @@ class FitOptions:
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def __post_init__(self) -> None:
-        from koopmpc import checks  # the shell reads the fields of this class before it imports anything slow
+        from koopmpc.base import checks  # the shell reads the fields of this class before it imports anything slow
         from koopmpc.base.parallel import check_scheduler
 
         for name in ("horizon", "workers"):

@@ -153,7 +153,7 @@ class Equilibria:
     def residuals(
         self, at: Linearisation, row: Float[np.ndarray, " nr"], s: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " m"]:
-        """Return what is left of a row, and of (x, u) at next to no weight, s in their sizes."""
+        """Return the residuals of a row, and those of (x, u) at next to no weight, s in their sizes."""
         return np.concatenate([self.weight @ (row - at.of), -SMALL * s])
 
     def respond(self, at: Linearisation) -> Response:

@@ -125,7 +125,7 @@ class RealTimeIteration:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Make a copy anew, for its routines hold pointers to its own arrays; it has the plan and θ."""
+        """Build a copy from the problem, since routines hold pointers to their own arrays; it has the plan and θ."""
         build = partial(RealTimeIteration, compiles_model=self._compiles)
         return build, (self.problem,), (self.X.copy(), self.U.copy(), self.theta.copy())
 

@@ -80,7 +80,7 @@ def limit_plan(
 
 
 def _list_held(held: Bool[np.ndarray, "moves nu"], track: LiftedTracking) -> Int[np.ndarray, " n"]:
-    """Return the entries of inputs that keep their value, but for those that a search over levels needs, and rates."""
+    """Return the entries of inputs that keep their value, except those that a search over levels needs, and rates."""
     searched = np.zeros(held.shape[1], dtype=np.bool_)
     levels = track.limits.base.input_levels(held.shape[1]) if held.any() else None
     if levels is not None:

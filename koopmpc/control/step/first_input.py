@@ -33,7 +33,7 @@ class FirstInputPlan:
 class FirstInput:
     """The first input of t = M known + f + F r for rows r of a preview, where all of t meets its limits.
 
-    For the middle c of the rows, t = M known + f + F c + F (r − c), and entry i of the last part is at most
+    For the middle c of the rows, t = M known + f + F c + F (r − c). Entry i of the last part is at most
     Σ_j S_ij max|r_j − c_j|, S_ij the sum of |F| over the steps. Where the limits leave so much room, all of them are
     met. Then F is multiplied for the first input alone, and the plan is computed when it is asked for.
 
