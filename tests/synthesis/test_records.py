@@ -23,8 +23,7 @@ from koopmpc.synthesis.search.free_runs import (
 from koopmpc.synthesis.search.hidden_states import NEAR, PAYS, judge_hidden_states
 from koopmpc.synthesis.search.records import is_late
 from koopmpc.validate.closed_loop import is_fed_back
-from tests.models.test_hidden_state import saturating_record
-from tests.models.test_neural import friction_record
+from tests.models.test_hidden_state import friction_record, saturating_record
 from tests.searches import select
 from tests.validate.logs.test_timing import record
 
