@@ -7,6 +7,7 @@ of futures over either yields the results in order.
 import os
 import pickle
 import socket
+import sys
 import threading
 import time
 import traceback
@@ -109,9 +110,9 @@ class Workers:
         self.close()
 
     def close(self) -> None:
-        """End the processes, those that work too; the next task starts others."""
+        """End the processes, under an exception those that work too; the next task starts others."""
         self._pool = None
-        self._opened.close()
+        self._opened.__exit__(*sys.exc_info())
 
     def map(
         self,
@@ -228,8 +229,10 @@ def _start_processes(workers: int) -> Generator[tuple[Any, Callable[[], int]]]:
     try:
         call_uninterrupted(lambda: executor.submit(os.getpid))
         yield executor, lambda: workers
-    finally:
+    except BaseException:  # nobody waits for the tasks under way
         executor.shutdown(wait=True, kill_workers=True)
+        raise
+    executor.shutdown(wait=True)  # a worker that is not killed removes its temporary files
 
 
 def _run_alone(name: str, code: bytes, sent: bytes) -> bytes:

@@ -21,7 +21,7 @@ from koopmpc.apps.fitting.goal import format_template, load_reading, read_goal, 
 from koopmpc.apps.fitting.logs import read_logs, round_step
 from koopmpc.apps.fitting.options import FitOptions
 from koopmpc.base.text import format_duration
-from koopmpc.control.base import MPCBase
+from koopmpc.control.step.fallback import PlanMemory
 from koopmpc.models.base import load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign, read_controller
 from koopmpc.synthesis.doubts import describe_rest
@@ -346,14 +346,14 @@ def test_runs_with_weaker_inputs_that_end_off_the_reference_are_named_beside_the
 
 
 def test_an_input_beyond_its_limits_under_a_fault_fails_the_check(made, tmp_path, monkeypatch):
-    ours = MPCBase._fail
+    ours = PlanMemory.fall_back
 
-    def careless(self, *arguments):
-        move = ours(self, *arguments)
+    def careless(self, *arguments, **keywords):
+        move = ours(self, *arguments, **keywords)
         move.u = move.u + 10.0
         return move
 
-    monkeypatch.setattr(MPCBase, "_fail", careless)
+    monkeypatch.setattr(PlanMemory, "fall_back", careless)
     done = check_controller(made.controller, tmp_path, runs=2, rate=0.5)
     outside = {one.kind.name: one.outside for one in done.figures}
     assert outside["sensor NaN"] > 0

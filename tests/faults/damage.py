@@ -21,7 +21,7 @@ from koopmpc.views.recording.curves import record_curves
 from tests.synthesis.test_design import usual
 from tests.views.runs import make_run
 
-TEMPLATE = Path(km.__file__).parent / "bench" / "template.txt"
+TEMPLATE = Path(km.__file__).parent / "apps" / "bench" / "template.txt"
 
 
 def episodes(seed: int = 0, steps: int = 30) -> km.Episodes:
