@@ -9,7 +9,7 @@ A field `a` of the Program is ``koopmpc_a`` in C, the field `b` of its field `a`
 | array of integers, of booleans | an array of int; a matrix stands row after row |
 | any array | ``KOOPMPC_A_LENGTH`` and ``KOOPMPC_A_WIDTH``, the sizes of its axes |
 | Graph | a function; its arguments are in `ARGUMENTS` |
-| dataclass, NamedTuple, mapping, tuple | these forms for each entry, after `convert` |
+| dataclass, NamedTuple, mapping, tuple | these forms for each entry; `convert` comes first |
 | what is not None | ``KOOPMPC_A`` is at least 1 |
 
 What no C file of the controller names is left out; a macro that C names and a Program lacks is 0.
