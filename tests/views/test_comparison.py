@@ -29,9 +29,9 @@ def pendulum_run(**named: str) -> km.Run:
         "steps": 20,
         "cost": problem.cost,
         "limits": problem.limits,
-        "options": km.loop.LoopOptions(metadata=named),
+        "options": km.loop.LoopOptions(metadata=named, plans=True),
     }
-    return km.simulate(plant, mpc, x0=[0.4, 0], options=km.loop.LoopOptions(plans=True), **loop)
+    return km.simulate(plant, mpc, x0=[0.4, 0], **loop)
 
 
 @pytest.fixture(scope="module")
