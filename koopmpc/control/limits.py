@@ -27,7 +27,7 @@ from koopmpc.control.bounds.boxes import magnitude as magnitude
 from koopmpc.control.bounds.boxes import measure_violation as measure_violation
 from koopmpc.control.bounds.boxes import preview_margin as preview_margin
 from koopmpc.control.in_time import bounds
-from koopmpc.control.in_time.bounds import hold_rows
+from koopmpc.control.in_time.bounds import write_rows
 from koopmpc.control.stepped.levels import (
     DwellByInput,
     InputLevels,
@@ -256,39 +256,40 @@ class Limits(Value):
 
     def count_rows(self) -> dict[str, int]:
         """Return the number of rows of each bound that has some."""
-        return {end: len(getattr(self, end)) for end in BOUNDS if np.ndim(getattr(self, end)) == 2}
+        bound = ((end, getattr(self, end)) for end in BOUNDS)
+        return {end: len(value) for end, value in bound if isinstance(value, np.ndarray) and value.ndim == 2}
 
     def input_rows(self, nu: int, first: int, count: int) -> Interval:
         """Return the boxes (count, nu) of the inputs u_first …, from level to level where they have some."""
-        box = self._hold("u", nu, first, count)
-        levels = None if self.levels is None else self.base.input_levels(nu)
-        if levels is None:
-            return box
-        inside, low, high = levels.inside(box), box.low.copy(), box.high.copy()
-        for end, index in ((low, inside.low), (high, inside.high)):
-            end[:, levels.which] = np.where(inside.low <= inside.high, levels.values(index), end[:, levels.which])
-        return Interval(low, high)
+        box = np.empty((2, count, nu))
+        self.write_rows("u", box, first)
+        return Interval(*box)
 
     def rate_rows(self, nu: int, first: int, count: int) -> Interval:
         """Return the boxes (count, nu) of u_k − u_{k−1} from k = first on; the last row is held."""
-        box = self._hold("du", nu, first, count)
-        if self.du_min is None and self.du_max is not None:
-            return Interval(-box.high, box.high)
-        return box
+        box = np.empty((2, count, nu))
+        self.write_rows("du", box, first)
+        return Interval(*box)
 
     def output_rows(self, nx: int, ny: int, first: int, count: int) -> Interval:
         """Return the boxes (count, nx + ny) of [x_k; of(x_k)] from k = first on; ny is 0 without `of`."""
-        parts = [self._hold("x", nx, first, count)]
+        box = np.empty((2, count, nx + ny))
+        self.write_rows("x", box[:, :, :nx], first)
         if ny:
-            parts.append(self._hold("y", ny, first, count))
-        return Interval(*(np.hstack(each) for each in zip(*parts, strict=True)))
+            self.write_rows("y", box[:, :, nx:], first)
+        return Interval(*box)
 
-    def _hold(self, what: str, n: int, first: int, count: int) -> Interval:
-        low, high = f"{what}_min", f"{what}_max"
-        return Interval(
-            hold_rows(getattr(self, low), low, n, first, count, -np.inf),
-            hold_rows(getattr(self, high), high, n, first, count, np.inf),
-        )
+    def write_rows(self, what: Literal["u", "du", "x", "y"], to: Float[np.ndarray, "2 count n"], first: int) -> None:
+        """Write the lower and the upper limits of u, Δu, x or y from step `first` on; the last row is held."""
+        for rows, end, omitted in ((to[0], f"{what}_min", -np.inf), (to[1], f"{what}_max", np.inf)):
+            write_rows(rows, getattr(self, end), end, first, omitted)
+        if what == "du" and self.du_min is None and self.du_max is not None:
+            np.negative(to[1], out=to[0])
+        levels = None if what != "u" or self.levels is None else self.base.input_levels(to.shape[2])
+        if levels is not None:
+            inside = levels.inside(Interval(*to))
+            for end, index in zip(to, inside, strict=True):
+                end[:, levels.which] = np.where(inside.low <= inside.high, levels.values(index), end[:, levels.which])
 
     def _declares(self, what: str) -> bool:
         return f"{what}_min" in self.rows or f"{what}_max" in self.rows

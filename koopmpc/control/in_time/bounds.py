@@ -82,15 +82,25 @@ def hold_rows(
     ShapeError
         Its rows have another number of signals.
     """
+    rows = np.empty((count, n))
+    write_rows(rows, bound, end, first, omitted)
+    return rows
+
+
+def write_rows(to: Float[np.ndarray, "count n"], bound: ArrayLike | None, end: str, first: int, omitted: float) -> None:
+    """Write the rows of a bound from row `first` on as `hold_rows` returns them."""
+    count, n = to.shape
     if bound is None:
-        return np.broadcast_to(omitted, (count, n))
-    value = checks.array(bound, end, infinite=True)
+        to[:] = omitted
+        return
+    value = bound if isinstance(bound, np.ndarray) else checks.array(bound, end, infinite=True)
     if value.ndim < 2:
-        return np.broadcast_to(checks.vector(value, end, n, infinite=True), (count, n))
+        to[:] = value if value.shape in ((), (n,)) else checks.vector(value, end, n, infinite=True)
+        return
     if value.shape[1] not in (1, n):
         raise ShapeError(f"{end} has shape {value.shape}; pass rows of {n}, one value each, or one for all")
-    rows = value[np.minimum(np.arange(first, first + count), len(value) - 1)]
-    return np.broadcast_to(rows, (count, n))
+    rows = value[first : first + count]
+    to[: len(rows)], to[len(rows) :] = rows, value[-1]
 
 
 def narrow(bound: Float[np.ndarray, " n"]) -> Float[np.ndarray, "..."]:

@@ -1,12 +1,11 @@
 """Limits of a plan, step by step: those that hold, and those that rows in time, or a call, bring."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.lib.stride_tricks import sliding_window_view
 
 from koopmpc.base.checks import HUGE
 from koopmpc.base.values import Interval, Value
@@ -18,6 +17,7 @@ from koopmpc.control.target import ROUNDING, Targets
 from koopmpc.control.terminal.inclusion import EndReach, measure_reach, require_inside
 from koopmpc.control.terminal.sets import EndRows
 
+_ENDS = frozenset(BOUNDS)
 _SHARE = 1e-5  # a rate that gives way by more than this share of its allowance is reported
 
 
@@ -192,8 +192,8 @@ def describe_bounds(shape: PlanShape) -> BoundsProgram:
 class BoundRows:
     """Reads rows of limits for the plans of a controller: where each limit of a plan stands in a table of these rows.
 
-    The table has a row for each step: inputs, inputs over each length of a block, their changes, outputs, a column
-    without limits, and the terminal set.
+    The table has a row for each step: inputs, their changes, outputs, a column without limits, the terminal set, and
+    inputs over each length of a block.
 
     Parameters
     ----------
@@ -209,18 +209,26 @@ class BoundRows:
         self.program = rows = describe_bounds(shape)
         self.nu, self.rated, outs = len(track.inputs.low), track.rates is not None, len(track.outputs.low)
         self.names = [*shape.states, *(() if track.limits.of is None else track.limits.of.bind(shape.states).names)]
-        self.kept = np.flatnonzero(track.movable.outputs)
-        self.lengths = sorted({1, *rows.count.ravel().tolist()})  # the first one is 1
-        nu, ends, blocked = self.nu, len(shape.end_box.low), self.lengths[1:]
-        widths = [nu, *([nu] * len(blocked)), nu * self.rated, outs, 1, ends]
-        first = np.cumsum([0, *widths]).tolist()
-        W, (change, output, free, end) = first[-1], first[-5:-1]
-        column = dict(zip(self.lengths, first, strict=False))
+        movable = track.movable
+        read = np.concatenate([np.ones(self.nu, np.bool_), np.full(self.nu, self.rated), movable.outputs])
+        self.read_columns, self.targeted = np.flatnonzero(read), np.flatnonzero(np.delete(read, self._changes))
+        self.targeted[self.nu :] += self.nu
+        self.fixed = np.flatnonzero(~np.concatenate(movable))
+        self.kept = np.flatnonzero(movable.outputs)
+        self.shown = [self.names[i] for i in self.kept]
+        lengths = sorted({1, *rows.count.ravel().tolist()})
+        self.used = {b: (rows.count == b).any(axis=0) | (b == 1) for b in lengths}  # the first one is 1
+        nu, ends = self.nu, len(shape.end_box.low)
+        change, output = nu, nu * (1 + self.rated)
+        self.free = output + outs
+        end, self.blocked = self.free + 1, self.free + 1 + ends
+        self.width = W = self.blocked + nu * (len(lengths) - 1)
+        column = dict(zip(lengths, (0, *range(self.blocked, W, nu)), strict=True))
         moves = rows.first * W + np.vectorize(column.__getitem__, otypes=[np.intp])(rows.count) + np.arange(nu)
-        places: list[np.ndarray] = [np.where(shape.tied, free, moves.ravel())]
+        places: list[np.ndarray] = [np.where(shape.tied, self.free, moves.ravel())]
         if self.rated:
             changes: Int[np.ndarray, "moves nu"] = rows.start[:, None] * W + change + np.arange(nu)
-            changes[shape.held] = free
+            changes[shape.held] = self.free
             places.append(changes.ravel())
         places.append((np.arange(1, self.N + 1)[:, None] * W + output + np.arange(outs)).ravel())
         places.append(end + np.arange(ends))
@@ -229,12 +237,17 @@ class BoundRows:
         self.outputs = slice(stop - self.N * outs, stop)
         self.margin = rows.margin.ravel() if track.margin.any() else None
         self.most = track.margin.max(axis=0, initial=0.0)
-        self.limited = np.concatenate([track.movable.inputs, np.ones(outs, np.bool_)])
+        self.limited = np.concatenate([movable.inputs, np.ones(outs, np.bool_)])
         self.rounding = ROUNDING * targets.size[self.limited]
-        self.K = targets.rows[self.limited] @ targets.from_reference
+        self.size = np.abs(targets.rows[self.limited] @ targets.from_reference).sum(axis=1)
         self.shift = targets.rows[self.limited] @ targets.offset
         self.checked = np.flatnonzero(shape.checked[self.limited])
         self.reach: EndReach | None = None  # the extremes on the terminal set, once they are asked for
+
+    @property
+    def _changes(self) -> slice:
+        """Where changes of inputs stand in rows of all limits: inputs, their changes, states and observables."""
+        return slice(self.nu, 2 * self.nu)
 
     def read(self, limits: Limits, *, at_call: bool) -> "BoundsInTime":
         """Return the limits of each step; `at_call` says that row 0 is that of the present step, and the only one.
@@ -246,32 +259,44 @@ class BoundRows:
         ShapeError
             A bound has too few rows for the plan, or as many signals as it should not.
         """
-        shape, track, nx = self.shape, self.shape.track, len(self.shape.states)
+        nu, nx = self.nu, len(self.shape.states)
         if at_call:
             require_preview(limits, self.N + self.latency)
         steps = 1 if at_call else max(limits.count_rows().values(), default=1)
-        count = steps + self.latency + self.N
-        box, change = limits.input_rows(self.nu, 0, count), limits.rate_rows(self.nu, 0, count)
-        every = limits.output_rows(nx, len(self.names) - nx, 0, count)
-        require_movable(track.movable, (box, change, every), shape.inputs, self.names, nx)
-        outputs = Interval(every.low[:, self.kept], every.high[:, self.kept])
-        swept = {b: sweep_rows(box, b) for b in self.lengths}
-        for b, rows in swept.items():
-            used = (self.program.count == b).any(axis=0) | (b == 1)
-            self._require_inputs(rows, used, f" within a block of {b} held steps" if b > 1 else "")
-        refuse_crossed_rows(*change, "rate", shape.inputs)
-        why, shown = " once tightened by the margin" if self.most.any() else "", [self.names[i] for i in self.kept]
-        tight = Interval(outputs.low + self.most, outputs.high - self.most)
-        refuse_crossed_rows(*tight, "state and output", shown, why=why)
-        if shape.end is not None:
-            self._require_end(shape.end, limits, (box, change, tight), shown)
-        return BoundsInTime(self, steps, [swept[b] for b in self.lengths], change, outputs)
+        every = np.empty((2, steps + self.latency + self.N, 2 * nu + len(self.names)))
+        box, change, outputs = every[:, :, :nu], every[:, :, self._changes], every[:, :, 2 * nu :]
+        limits.write_rows("u", box, 0)
+        limits.write_rows("du", change, 0)
+        limits.write_rows("x", outputs[:, :, :nx], 0)
+        if len(self.names) > nx:
+            limits.write_rows("y", outputs[:, :, nx:], 0)
+        if len(self.fixed) and np.isfinite(every[:, :, self.fixed]).any():
+            groups = Interval(*box), Interval(*change), Interval(*outputs)
+            require_movable(self.shape.track.movable, groups, self.shape.inputs, self.names, nx)
+        table = np.empty((*every.shape[:2], self.width))
+        table[:, :, : self.free] = every[:, :, self.read_columns]
+        table[:, :, self.free] = [[-HUGE], [HUGE]]
+        for end, known in zip(table, self.shape.end_box, strict=True):
+            end[:, self.free + 1 : self.blocked] = known
+        for i, (b, used) in enumerate(self.used.items()):
+            swept = Interval(*box) if b == 1 else sweep_rows(_hold_last(box, b - 1), b)
+            if b > 1:
+                first = self.blocked + (i - 1) * nu
+                table[:, :, first : first + nu] = swept
+            self._require_inputs(swept, used, f" within a block of {b} held steps" if b > 1 else "")
+        refuse_crossed_rows(*change, "rate", self.shape.inputs)
+        why, kept = " once tightened by the margin" if self.most.any() else "", outputs[:, :, self.kept]
+        tight = Interval(kept[0] + self.most, kept[1] - self.most)
+        refuse_crossed_rows(*tight, "state and output", self.shown, why=why)
+        if self.shape.end is not None:
+            self._require_end(self.shape.end, limits, (Interval(*box), Interval(*change), tight), self.shown)
+        return BoundsInTime(self, steps, every, table)
 
     def _require_inputs(self, box: Interval, used: Bool[np.ndarray, " nu"], why: str) -> None:
         """Raise where limits of inputs cross, or an input on levels has none between them, of the inputs in use."""
         limits, inputs = self.shape.track.limits, self.shape.inputs
         levels = None if limits.levels is None else limits.base.input_levels(len(inputs))
-        low, high = np.where(used, box.low, -np.inf), np.where(used, box.high, np.inf)
+        low, high = box if used.all() else (np.where(used, box.low, -np.inf), np.where(used, box.high, np.inf))
         if levels is not None:
             levels.refuse_missing(Interval(low, high), inputs, why)
         refuse_crossed_rows(low, high, "input", inputs, why=why)
@@ -296,28 +321,21 @@ class BoundsInTime:
     """Limits that move: each step takes them from a table of checked rows; see `PlanBounds` and `BoundRows`."""
 
     def __init__(
-        self, rows: BoundRows, steps: int, boxes: Sequence[Interval], change: Interval, outputs: Interval
+        self, rows: BoundRows, steps: int, every: Float[np.ndarray, "2 count n"], table: Float[np.ndarray, "2 count W"]
     ) -> None:
-        self._rows, self._last, self._box = rows, steps - 1, boxes[0]
-        shape, count = rows.shape, len(change.low)
-        self._rates = change if rows.rated else None
-        targets = shape.targets
-        self._targets = Interval(*(np.hstack([a, b]) - targets.values for a, b in zip(boxes[0], outputs, strict=True)))
-        tables: list[np.ndarray] = []
-        for i, free in enumerate((-HUGE, HUGE)):
-            parts = [box[i] for box in boxes] + ([change[i]] if rows.rated else []) + [outputs[i]]
-            ends = np.broadcast_to(shape.end_box[i], (count, len(shape.end_box[i])))
-            tables.append(np.clip(np.hstack([*parts, np.full((count, 1), free), ends]), -HUGE, HUGE))
-        self._low, self._high, self._width = tables[0].ravel(), tables[1].ravel(), tables[0].shape[1]
+        self._rows, self._last, self._every, self._width = rows, steps - 1, every, rows.width
+        np.maximum(table, -HUGE, out=table)
+        np.minimum(table, HUGE, out=table)
+        self._low, self._high = table.reshape(2, -1)
         self._reaches: list[float] | None = None
+        shape, self._targets = rows.shape, every[:, :, rows.targeted] - rows.shape.targets.values
         if shape.aims_inside or len(rows.checked):
-            first = slice(rows.latency, rows.latency + steps)
-            limited = Interval(*(end[:, rows.limited] for end in self._targets))
-            swept = sweep_rows(limited, rows.N + 1)
-            self._tight = Interval(swept.low[first] - rows.rounding, swept.high[first] + rows.rounding)
+            first = slice(rows.latency, rows.latency + steps + rows.N)
+            swept = sweep_rows(self._targets[:, first, rows.limited], rows.N + 1)
+            self._tight = Interval(swept.low - rows.rounding, swept.high + rows.rounding)
             if shape.aims_inside:
                 tight = (end - rows.shift for end in self._tight)
-                self._reaches = find_reach(rows.K, *tight).tolist()
+                self._reaches = find_reach(rows.size, *tight).tolist()
 
     def place(self, k: int) -> int:
         """Return the row of the table that step k begins with."""
@@ -339,9 +357,9 @@ class BoundsInTime:
 
     def first(self, k: int) -> tuple[Interval, Interval | None]:
         """Return the box of the input that acts first in step k, and that of its change."""
-        row, rates = self.place(k), self._rates
-        change = None if rates is None else Interval(rates.low[row], rates.high[row])
-        return Interval(self._box.low[row], self._box.high[row]), change
+        (low, high), nu = self._every[:, self.place(k)], self._rows.nu
+        change = Interval(low[nu : 2 * nu], high[nu : 2 * nu]) if self._rows.rated else None
+        return Interval(low[:nu], high[:nu]), change
 
     def hard_rates(self, k: int) -> Interval | None:
         """Return the hard limits of the first change in step k, ±inf in place of the others; None without any."""
@@ -357,8 +375,7 @@ class BoundsInTime:
 
     def targets(self, k: int) -> Interval:
         """Return the (N+1, nl) limits of the targets of the preview of step k."""
-        ahead = slice(self.place(k), self.place(k) + self._rows.N + 1)
-        return Interval(self._targets.low[ahead], self._targets.high[ahead])
+        return Interval(*self._targets[:, self.place(k) : self.place(k) + self._rows.N + 1])
 
     def open_rates(self, k: int, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval, float]:
         """Return the limits of a plan after u_prev, and by how much rates ahead are wider than theirs.
@@ -426,26 +443,33 @@ def has_fields_of(limits: object, own: Limits) -> bool:
         return False
     mine = vars(own)
     return all(
-        not isinstance(value, Mapping) if name in BOUNDS else value is mine[name]
+        value is mine[name] if name not in _ENDS else value is None or isinstance(value, np.ndarray)
         for name, value in vars(limits).items()
     )
 
 
 def find_reach(
-    K: Float[np.ndarray, "nl nr"], low: Float[np.ndarray, "T nl"], high: Float[np.ndarray, "T nl"]
+    size: Float[np.ndarray, " nl"], low: Float[np.ndarray, "T nl"], high: Float[np.ndarray, "T nl"]
 ) -> Float[np.ndarray, " T"]:
-    """Return the largest a for which low ≤ K r ≤ high wherever no |r_i| is above a; below 0 where there is none."""
-    room, size = np.minimum(high, -low), np.abs(K).sum(axis=1)
-    moved = size > 0
+    """Return the largest a for which low ≤ K r ≤ high wherever no |r_i| is above a; below 0 where there is none.
+
+    `size` has the sum of |K| over the entries of r.
+    """
+    room, moved = np.minimum(high, -low), size > 0
     reach = np.where(moved, room / np.where(moved, size, 1.0), np.where(room >= 0, HUGE, -1.0))
     return np.minimum(reach.min(axis=-1, initial=HUGE), HUGE)
 
 
-def sweep_rows(rows: Interval, steps: int) -> Interval:
-    """Return the tightest limits over so many steps from each one on; the last row is held."""
-    if steps == 1:
-        return rows
-    low, high = (np.vstack([end, np.broadcast_to(end[-1], (steps - 1, end.shape[1]))]) for end in rows)
-    return Interval(
-        sliding_window_view(low, steps, axis=0).max(axis=-1), sliding_window_view(high, steps, axis=0).min(axis=-1)
-    )
+def sweep_rows(rows: Float[np.ndarray, "2 T n"], steps: int) -> Interval:
+    """Return the tightest limits over so many rows from each one on, as far as there are so many."""
+    (low, high), length = rows, 1
+    while length < steps:  # over twice as many rows each time
+        by = min(length, steps - length)
+        low, high = np.maximum(low[:-by], low[by:]), np.minimum(high[:-by], high[by:])
+        length += by
+    return Interval(low, high)
+
+
+def _hold_last(rows: Float[np.ndarray, "2 T n"], count: int) -> Float[np.ndarray, "2 T_count n"]:
+    """Return rows with the last one repeated so many times."""
+    return np.concatenate([rows, np.repeat(rows[:, -1:], count, axis=1)], axis=1)

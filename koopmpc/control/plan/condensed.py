@@ -179,9 +179,10 @@ def _assemble(
     if driven:
         from_drive = maps.from_drive
     if aimed:
-        shift, K = targets.rows[limited] @ targets.offset, targets.rows[limited] @ targets.from_reference
+        shift = targets.rows[limited] @ targets.offset
+        size = np.abs(targets.rows[limited] @ targets.from_reference).sum(axis=1)
         room = (np.clip(side, -HUGE, HUGE) - shift for side in (target_low, target_high))
-        unpushed = -1.0 if driven else float(find_reach(K, *(side[None] for side in room))[0])
+        unpushed = -1.0 if driven else float(find_reach(size, *(side[None] for side in room))[0])
     if aimed and driven:
         checked, free = limited, np.full(len(target_low), np.inf)
         from_disturbance = targets.from_disturbance @ disturbance

@@ -5,6 +5,7 @@ from jaxtyping import Float
 
 from koopmpc.control.plan.bounds import StepBounds
 from koopmpc.control.plan.condensed_program import CondensedPlan
+from koopmpc.control.step.deviation import is_inside
 from koopmpc.control.step.share import ReferenceShare
 
 
@@ -46,7 +47,11 @@ class FirstInput:
     def __init__(self, plan: CondensedPlan, nu: int) -> None:
         self._plan, self._nu = plan, nu
         count, nr = plan.from_held.shape
-        self._sizes = np.abs(plan.from_reference).reshape(count, -1, nr).sum(axis=1)
+        sizes = np.abs(plan.from_reference).reshape(count, -1, nr).sum(axis=1)
+        # column by column, for a product with few columns takes half the time then; halves, for sums of two extremes
+        self._M, self._half_held, self._half_sizes = (
+            np.asfortranarray(part) for part in (plan.M, plan.from_held / 2, sizes / 2)
+        )
         self._first = np.ascontiguousarray(plan.from_reference[:nu])
 
     def find(
@@ -60,15 +65,16 @@ class FirstInput:
         rows, plan, nu = aim.rows, self._plan, self._nu
         if len(rows) == 1 or not 0 <= aim.peak <= limits.reach:
             return None
-        high, low = rows.max(axis=0), rows.min(axis=0)
+        signals = rows.T.copy()  # the extremes of rows of a few numbers take three times as long
+        high, low = signals.max(axis=1), signals.min(axis=1)
         known = known.copy()
-        middle = plan.M.dot(known)
+        middle = self._M.dot(known)
         middle += plan.offset
         if given is not None:
             middle += given
         u = middle[:nu] + self._first.dot(rows.reshape(-1))
-        middle += plan.from_held.dot((high + low) / 2)
-        apart = self._sizes.dot((high - low) / 2)
-        if not ((middle - apart >= limits.low).all() and (middle + apart <= limits.high).all()):  # NaN is not
+        middle += self._half_held.dot(high + low)
+        apart = self._half_sizes.dot(high - low)
+        if not is_inside(middle, limits.low + apart, limits.high - apart):
             return None
         return u, FirstInputPlan(plan, known, rows, given, u)
