@@ -256,8 +256,8 @@ class Limits(Value):
 
     def count_rows(self) -> dict[str, int]:
         """Return the number of rows of each bound that has some."""
-        bound = ((end, getattr(self, end)) for end in BOUNDS)
-        return {end: len(value) for end, value in bound if isinstance(value, np.ndarray) and value.ndim == 2}
+        given: list[tuple[str, Any]] = [(end, getattr(self, end)) for end in BOUNDS]
+        return {end: len(value) for end, value in given if type(value) is np.ndarray and value.ndim == 2}
 
     def input_rows(self, nu: int, first: int, count: int) -> Interval:
         """Return the boxes (count, nu) of the inputs u_first …, from level to level where they have some."""

@@ -93,7 +93,7 @@ def write_rows(to: Float[np.ndarray, "count n"], bound: ArrayLike | None, end: s
     if bound is None:
         to[:] = omitted
         return
-    value = bound if isinstance(bound, np.ndarray) else checks.array(bound, end, infinite=True)
+    value: np.ndarray = cast("Any", bound) if isinstance(bound, np.ndarray) else checks.array(bound, end, infinite=True)
     if value.ndim < 2:
         to[:] = value if value.shape in ((), (n,)) else checks.vector(value, end, n, infinite=True)
         return

@@ -284,7 +284,7 @@ class BoundRows:
                 first = self.blocked + (i - 1) * nu
                 table[:, :, first : first + nu] = swept
             self._require_inputs(swept, used, f" within a block of {b} held steps" if b > 1 else "")
-        refuse_crossed_rows(*change, "rate", self.shape.inputs)
+        refuse_crossed_rows(*Interval(*change), "rate", self.shape.inputs)
         why, kept = " once tightened by the margin" if self.most.any() else "", outputs[:, :, self.kept]
         tight = Interval(kept[0] + self.most, kept[1] - self.most)
         refuse_crossed_rows(*tight, "state and output", self.shown, why=why)

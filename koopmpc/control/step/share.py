@@ -52,11 +52,11 @@ class ReferenceShare:
             return False
         self._key = None  # one that is refused leaves no rows of the last one
         if given.shape == (self._nr,):
-            self.rows = given.reshape(1, -1).copy()
+            self.rows = np.frombuffer(key).reshape(1, -1)
         elif self._latency or given.shape != (self._N + 1, self._nr):
             self.rows = checks.reference_rows(given, self._N, self._nr, self._latency)
         else:
-            self.rows = given.copy()
+            self.rows = np.frombuffer(key).reshape(given.shape)
         flat = self.rows.reshape(-1)
         peak = abs(flat.item(idamax(flat)))  # idamax passes over NaN, which gives a plan of NaN: it meets no limit
         self.peak = peak if peak < HUGE else -np.inf
