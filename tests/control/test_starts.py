@@ -29,7 +29,7 @@ def made(cost=CIRCLE, limits=None, model=None, **options):
 def start(mpc, x, u_prev, deadline=np.inf):
     """Return where a plan starts from a state, with the targets of the last step."""
     mpc._initial.take(x, np.asarray(u_prev), None, None)
-    mpc._given = np.asarray(u_prev)
+    mpc._memory.given = np.asarray(u_prev)
     if mpc._initial.u_prev.size:
         mpc._initial.u_prev[:] = u_prev
     begin = mpc._begin(np.array([0.2, 0.0] if mpc._aim.targets.equilibria.of_state else [0.0, 1.0, 0.0]), 0.0)

@@ -183,7 +183,7 @@ def _drive(rng, outcome, controllers, plant, limits, switches, broken, missed):
     x, goal, preview = rng.normal(size=nx), 0.3 * rng.normal(size=nx), rng.random() < 0.5
     W = np.cumsum(0.3 * rng.normal(size=(STEPS + acting.horizon, nw)), axis=0)
     wave, U = 0.05 * rng.normal(size=nx), []
-    late = mpc.horizon - sum(mpc._blocks)  # an input acts so many steps later, and keeps the limits of that step
+    late = mpc.latency  # an input acts so many steps later, and keeps the limits of that step
     sent = [np.zeros(nu)] * late
     for k in range(STEPS):
         mpc.solver_fails = k in broken
