@@ -126,7 +126,7 @@ class Walk:
     @staticmethod
     def _is_guarded() -> bool:
         handler = signal.getsignal(signal.SIGINT)
-        return isinstance(handler, functools.partial) and handler.func.__qualname__.startswith("raise_swallowed")
+        return getattr(handler, "__qualname__", "").startswith("raise_swallowed")
 
     @staticmethod
     def _places(frame) -> list[str]:
