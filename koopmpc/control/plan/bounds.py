@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -29,6 +29,7 @@ class StepBounds(NamedTuple):
     reach: float
 
 
+@runtime_checkable
 class PlanBounds(Protocol):
     """The limits of a plan in step after step."""
 

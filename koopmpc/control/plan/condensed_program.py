@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -75,6 +75,7 @@ class CondensedPlan(Value):
         return self.disturbance.shape[1] > 0
 
 
+@runtime_checkable
 class PlanProvider(Protocol):
     """The plan of each step."""
 

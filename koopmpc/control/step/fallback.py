@@ -1,7 +1,7 @@
 """What answers a step that has no plan: the last plan, moved on; the input without limits, clipped; the last input."""
 
 from time import perf_counter
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,6 +14,7 @@ from koopmpc.control.move import Fallback, Move, Status
 from koopmpc.control.stepped.levels import HeldLevels
 
 
+@runtime_checkable
 class LatePlan(Protocol):
     """A plan of which a step has computed the first input alone."""
 
