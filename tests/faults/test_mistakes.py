@@ -172,9 +172,9 @@ SPECTRA = {
     "reconstruct": lambda bad: spectrum.reconstruct(bad, [0.0, 0.0], [0.0]),
     "evolution_error": lambda bad: spectrum.evolution_error(bad, EPISODES),
     "forecast": lambda bad: km.validate.forecast(LIFTED, bad),
-    "runs": lambda bad: km.figures.runs(bad),
-    "runs of a title": lambda bad: km.figures.runs({"a": bad}),
-    "run of a name": lambda bad: km.figures.runs({"a": {"b": bad}}),
+    "runs": lambda bad: km.plot.runs(bad),
+    "runs of a title": lambda bad: km.plot.runs({"a": bad}),
+    "run of a name": lambda bad: km.plot.runs({"a": {"b": bad}}),
 }
 
 
