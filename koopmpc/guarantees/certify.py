@@ -132,8 +132,8 @@ def certify(
     (0.0, True)
     """
     refuse_moved(moved, CertifyOptions, "km.guarantees.CertifyOptions")
-    asked = _check_options(CertifyOptions() if options is None else options, model.nx)
     deviation = deviate(model, x, u)
+    asked = _check_options(CertifyOptions() if options is None else options, model.nx)
     if asked.estimated:
         deviation = deviate(model, x, _estimate_input(deviation))
     whole, few = _Search(deviation, data, limits, asked), None
