@@ -114,7 +114,7 @@ def plan_sequences(
     factor: Float[np.ndarray, "moves leveled"],
     levels: InputLevels,
     blocks: Sequence[int],
-) -> tuple[LevelsProgram, Float[np.ndarray, "n n"]] | None:
+) -> tuple[LevelsProgram, Float[np.ndarray, "n free"]] | None:
     """Return the search as data, and s → v; None where the moves on levels do not determine a plan.
 
     Parameters
