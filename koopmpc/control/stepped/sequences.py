@@ -178,7 +178,7 @@ class Sequences:
         The levels of now.
     """
 
-    def __init__(self, program: LevelsProgram, from_s: Float[np.ndarray, "n n"], held: HeldLevels) -> None:
+    def __init__(self, program: LevelsProgram, from_s: Float[np.ndarray, "n free"], held: HeldLevels) -> None:
         self.program, self._from_s, self._held = program, from_s, held
         n, leveled = len(program.free), len(program.levels.which)
         self._shape, self._input = (len(program.group) // leveled, leveled), program.free % leveled
