@@ -38,7 +38,6 @@ from koopmpc.base.lazy import find_public
 
 Array = NDArray[Any]
 Arrays = dict[str, Array]
-LINE = 8  # floats in a line of the cache
 
 
 class Interval(NamedTuple):
