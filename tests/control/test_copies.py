@@ -47,6 +47,24 @@ def test_a_copy_in_mid_run_goes_on(name: str) -> None:
         assert found == expected or not isinstance(original, km.KoopmanMPC)
 
 
+@pytest.mark.parametrize("kind", [km.KoopmanMPC, km.BilinearMPC, km.NonlinearMPC])
+def test_a_copy_with_an_estimator_of_a_local_class_goes_on_and_shares_no_disturbance(kind: type) -> None:
+    class Own:
+        def start(self, model: object, horizon: int) -> object:
+            return km.LiftedDisturbance(0.5).start(model, horizon)
+
+    original = kind(MODEL, km.Cost(Q=1.0, R=0.1), km.Limits(u_min=-5, u_max=5), 8, estimator=Own())
+    _, x = moves(original, np.array([2.0, 0.0]), 4)
+    copies = [copy.copy(original), copy.deepcopy(original)]
+    known = original.observer.d.copy()
+    assert known.any()
+    expected, _ = moves(original, x, 6)
+    assert (original.observer.d != known).any()
+    for other in copies:
+        np.testing.assert_array_equal(other.observer.d, known)
+        assert np.allclose(moves(other, x, 6)[0], expected, atol=1e-6)
+
+
 def test_a_new_model_after_a_hand_over_is_controlled_as_by_a_new_controller() -> None:
     make = MAKERS["koopman, handed over"]
     mpc, fresh = make(), make()

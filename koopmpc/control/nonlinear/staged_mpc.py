@@ -1,6 +1,9 @@
 """What BilinearMPC and NonlinearMPC share: a step from the measurement, over the targets of its stages, to a Move."""
 
+import copy
+import io
 import pickle
+from collections.abc import Sequence
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -33,6 +36,30 @@ from koopmpc.estimate.observer import Estimator, start_observer
 from koopmpc.plants.step_map import StepMap
 
 NO_DIGITS = 1e15  # at so many sizes no digit of a state is left: rounding is a fifth of a size
+
+
+class _PartsApartPickler(pickle.Pickler):
+    """Pickles an object without some parts of it."""
+
+    def __init__(self, stream: io.BytesIO, parts: Sequence[object]) -> None:
+        super().__init__(stream)
+        self._parts = parts
+
+    def persistent_id(self, obj: object) -> int | None:
+        """Return the place of a part that stays out; None for anything else."""
+        return next((place for place, part in enumerate(self._parts) if part is obj), None)
+
+
+class _PartsApartUnpickler(pickle.Unpickler):
+    """Restores an object with other parts in the places of those that stayed out."""
+
+    def __init__(self, stream: io.BytesIO, parts: Sequence[object]) -> None:
+        super().__init__(stream)
+        self._parts = parts
+
+    def persistent_load(self, pid: int) -> object:
+        """Return the part of this place."""
+        return self._parts[pid]
 
 
 class StagedMPC(MPCBase):
@@ -101,8 +128,16 @@ class StagedMPC(MPCBase):
         )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "StagedMPC":
-        """Return a copy with solvers of its own: CasADi's copies share one, and two threads in one end the process."""
-        return pickle.loads(pickle.dumps(self))
+        """Return a copy with solvers of its own: CasADi's copies share one, and two threads in one end the process.
+
+        An estimator of the user's own, and its observer, are copied by deepcopy: their classes may be local.
+        """
+        candidates = (part for part in (self._estimator, self.observer) if part is not None)
+        parts = [part for part in candidates if not type(part).__module__.startswith("koopmpc.")]
+        stream = io.BytesIO()
+        _PartsApartPickler(stream, parts).dump(self)
+        stream.seek(0)
+        return _PartsApartUnpickler(stream, copy.deepcopy(parts, memo)).load()
 
     @property
     def model(self) -> ModelOrMap:
