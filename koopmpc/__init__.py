@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc import data as data
     from koopmpc import estimate as estimate
     from koopmpc import guarantees as guarantees
+    from koopmpc import lifting as lifting
     from koopmpc import loop as loop
     from koopmpc import plants as plants
     from koopmpc import synthesis as synthesis
@@ -50,10 +51,7 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.data.delay import Delay as Delay
     from koopmpc.data.episodes import Episode as Episode
     from koopmpc.data.episodes import Episodes as Episodes
-    from koopmpc.data.excitation import PRBS as PRBS
-    from koopmpc.data.excitation import Chirp as Chirp
     from koopmpc.data.excitation import Feedback as Feedback
-    from koopmpc.data.excitation import Multisine as Multisine
     from koopmpc.data.excitation import Noise as Noise
     from koopmpc.data.files.load import load_episodes as load_episodes
     from koopmpc.estimate.disturbance import LiftedDisturbance as LiftedDisturbance
@@ -61,10 +59,8 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.estimate.kalman import LiftedKalman as LiftedKalman
     from koopmpc.guarantees.certify import certify as certify
     from koopmpc.lifting.base import Lifting as Lifting
-    from koopmpc.lifting.composed import Standardized as Standardized
     from koopmpc.lifting.fourier import Fourier as Fourier
     from koopmpc.lifting.fourier import RandomFourier as RandomFourier
-    from koopmpc.lifting.network import ONNX as ONNX
     from koopmpc.lifting.radial import Gaussian as Gaussian
     from koopmpc.lifting.radial import ThinPlate as ThinPlate
     from koopmpc.lifting.state import Constant as Constant
@@ -86,13 +82,8 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.models.predictors import BilinearPredictor as BilinearPredictor
     from koopmpc.models.predictors import LinearPredictor as LinearPredictor
     from koopmpc.models.predictors import load_model as load_model
-    from koopmpc.plants.dynamics import CVODES as CVODES
     from koopmpc.plants.dynamics import RK4 as RK4
-    from koopmpc.plants.dynamics import Collocation as Collocation
     from koopmpc.plants.dynamics import Dynamics as Dynamics
-    from koopmpc.plants.dynamics import Euler as Euler
-    from koopmpc.plants.dynamics import ImplicitMidpoint as ImplicitMidpoint
-    from koopmpc.plants.plant import Plant as Plant
     from koopmpc.plants.plant import black_box as black_box
     from koopmpc.plants.step_map import StepMap as StepMap
     from koopmpc.plants.step_map import discretize as discretize
@@ -181,12 +172,22 @@ else:
         },
         moved={
             "Adaptive": "supervise",
+            "CVODES": "plants",
+            "Chirp": "data",
+            "Collocation": "plants",
+            "Euler": "plants",
             "Files": "data",
-            "GymPlant": "plants",
             "Guarded": "supervise",
+            "GymPlant": "plants",
+            "ImplicitMidpoint": "plants",
             "KoopmanRegressor": "identify",
             "Monitor": "supervise",
+            "Multisine": "data",
+            "ONNX": "lifting",
+            "PRBS": "data",
+            "Plant": "plants",
             "Prior": "identify",
+            "Standardized": "lifting",
             "Stream": "data",
             "constrained_edmd": "identify",
             "eigenfunctions": "identify",

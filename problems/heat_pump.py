@@ -63,7 +63,7 @@ problem = km.Problem(
         excitation=km.Noise(0.0, 4.0, hold=6),
         episodes=40,
         steps=96,
-        measured=km.Multisine(12.0, period=48.0, harmonics=4, offset=3.0),
+        measured=km.data.Multisine(12.0, period=48.0, harmonics=4, offset=3.0),
     ),
     lifting=km.State() + km.Monomials(2) + km.Constant(),
     cost=km.Cost(Q=1.0, R=0.02, of=km.State("room"), u_target="zero"),

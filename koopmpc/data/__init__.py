@@ -6,6 +6,9 @@ from koopmpc.base.lazy import attach
 
 if TYPE_CHECKING:
     from koopmpc.data.episodes import Snapshots as Snapshots
+    from koopmpc.data.excitation import PRBS as PRBS
+    from koopmpc.data.excitation import Chirp as Chirp
+    from koopmpc.data.excitation import Multisine as Multisine
     from koopmpc.data.files.folder import Files as Files
     from koopmpc.data.partial import PartialEpisodes as PartialEpisodes
     from koopmpc.data.smoother import Mender as Mender

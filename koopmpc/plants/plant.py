@@ -179,7 +179,7 @@ def black_box(
 
     The function is called once a sample and may hold anything: another simulator, a table, compiled code. It gets
     copies of x (nx,) and u (nu,), and must depend on nothing else. For a plant that keeps its own state, such as
-    hardware, pass an object with the members of `km.Plant` instead.
+    hardware, pass an object with the members of `km.plants.Plant` instead.
 
     Parameters
     ----------

@@ -323,7 +323,7 @@ def test_a_reference_row_that_was_not_exported_is_found_at_run_time(name, swung,
 
 def test_an_implicit_integrator_is_refused_with_what_would_do(tmp_path):
     problem = km.load_problem("pendulum")
-    plant = km.discretize(problem.dynamics, 0.05, km.Collocation(2))
+    plant = km.discretize(problem.dynamics, 0.05, km.plants.Collocation(2))
     controller = km.BilinearMPC(plant, COST, km.Limits(**BOX), 5)
     with pytest.raises(km.errors.DataError, match=r"implicit integrator .* discretize with RK4"):
         km.compiled(controller)

@@ -142,7 +142,7 @@ def test_what_a_reference_says_of_states_without_weight_does_not_move_its_equili
     """A reactor has several equilibria, and from a wall at 0 K, which is far off the data, the wrong one is found."""
     task = TASKS["stiff"]
     data = task.data(0)
-    lifting = km.State() + km.Constant() + km.Standardized.of(data, km.Monomials(2))
+    lifting = km.State() + km.Constant() + km.lifting.Standardized.of(data, km.Monomials(2))
     model = km.bilinear_edmd(data, lifting, ridge=1e-8, difference=True)
     cost = km.Cost(Q=task.Q, R=task.R)
     tracking = state_tracking(model.states, model.inputs, cost, task.limits)

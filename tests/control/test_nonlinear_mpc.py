@@ -128,7 +128,9 @@ class Escape(km.Dynamics):
         return ca.vertcat(x[0] ** 2 + u[0])
 
 
-@pytest.mark.parametrize("integrator", [km.RK4(), km.ImplicitMidpoint(), km.Collocation(), km.CVODES()])
+@pytest.mark.parametrize(
+    "integrator", [km.RK4(), km.plants.ImplicitMidpoint(), km.plants.Collocation(), km.plants.CVODES()]
+)
 def test_a_plant_that_escapes_within_the_horizon_fails_a_step_and_raises_nothing(integrator):
     mpc = km.NonlinearMPC(km.discretize(Escape(), 0.2, integrator), km.Cost(1, 0.1), km.Limits(-1, 1), 10)
     good = mpc([0.2], [0.0])
@@ -142,7 +144,7 @@ def test_a_plant_that_escapes_within_the_horizon_fails_a_step_and_raises_nothing
 
 
 def test_an_estimate_from_which_no_next_state_is_found_ends_no_loop():
-    plant, estimator = km.discretize(Escape(), 0.2, km.Collocation()), km.LiftedDisturbance()
+    plant, estimator = km.discretize(Escape(), 0.2, km.plants.Collocation()), km.LiftedDisturbance()
     mpc = km.NonlinearMPC(plant, km.Cost(1, 0.1), km.Limits(-1, 1), 5, estimator=estimator)
     for x in (0.1, 0.1, 50.0, 0.1, np.nan, 0.2):
         move = mpc([x], [0.0])
@@ -284,7 +286,7 @@ class Tank(km.Dynamics):
 
 @pytest.mark.parametrize("kind", [km.BilinearMPC, km.NonlinearMPC])
 def test_a_forecast_that_turns_nan_is_no_plan(kind):
-    plant = km.discretize(Tank(), 0.2, km.Euler())
+    plant = km.discretize(Tank(), 0.2, km.plants.Euler())
     mpc = kind(plant, km.Cost(Q=[10.0], R=0.01, u_target=[0.0]), km.Limits(u_min=0, u_max=1), 10)
     for x in (1.0, 0.05, 0.01, 1e-4, 1e-9, 0.5):
         move = mpc([x], [0.0])

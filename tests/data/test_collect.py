@@ -55,9 +55,9 @@ PENDULUM = km.discretize(Pendulum(), 0.05)
 BOX = km.Uniform([-3, -4], [3, 4])
 EXCITATIONS = {
     "noise": km.Noise(-8, 8, 3),
-    "prbs": km.PRBS(-8, 8),
-    "multisine": km.Multisine(8, 0.5, 4),
-    "chirp": km.Chirp(8, 0.1, 5, 1),
+    "prbs": km.data.PRBS(-8, 8),
+    "multisine": km.data.Multisine(8, 0.5, 4),
+    "chirp": km.data.Chirp(8, 0.1, 5, 1),
     "feedback": km.Feedback([[5, 1]], km.Noise(-2, 2), u_min=-6, u_max=6),
     "function": lambda k, y, rng: -y[1] + k * rng.normal(),
 }

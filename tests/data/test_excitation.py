@@ -35,7 +35,7 @@ def test_noise_fills_its_box_evenly() -> None:
 
 @pytest.mark.parametrize("order", range(3, 14))
 def test_registers_are_of_maximal_length(order: int) -> None:
-    bits = km.PRBS(0, 1, 1, order).sequence(2**order - 1, 0.1, generator(0)).ravel()
+    bits = km.data.PRBS(0, 1, 1, order).sequence(2**order - 1, 0.1, generator(0)).ravel()
     words = {tuple(np.roll(bits, -k)[:order].tolist()) for k in range(len(bits))}
     assert len(bits) == len(words) == 2**order - 1  # every state of the register but zero, once
     assert bits.sum() == 2 ** (order - 1)
@@ -44,7 +44,7 @@ def test_registers_are_of_maximal_length(order: int) -> None:
 @given(SEEDS, st.integers(1, 5), st.integers(4, 9))
 def test_prbs_has_two_levels_and_a_flat_spectrum(seed: int, hold: int, order: int) -> None:
     period = 2**order - 1
-    u = km.PRBS(-1, 1, hold, order).sequence(2 * period * hold, 0.1, generator(seed)).ravel()
+    u = km.data.PRBS(-1, 1, hold, order).sequence(2 * period * hold, 0.1, generator(seed)).ravel()
     assert set(u.tolist()) == {-1.0, 1.0}
     assert (u[: period * hold] == u[period * hold :]).all()
     bits = u[: period * hold : hold]
@@ -54,13 +54,13 @@ def test_prbs_has_two_levels_and_a_flat_spectrum(seed: int, hold: int, order: in
 
 
 def test_the_inputs_of_a_prbs_are_hardly_correlated() -> None:
-    U = km.PRBS([-1, -1, -1], [1, 1, 1], order=8).sequence(255, 0.1, generator(0))
+    U = km.data.PRBS([-1, -1, -1], [1, 1, 1], order=8).sequence(255, 0.1, generator(0))
     np.testing.assert_allclose(U.T @ U, 256 * np.eye(3) - 1, atol=1e-9)
 
 
 @given(SEEDS, st.sampled_from([3, [1, 4, 9], [7]]))
 def test_multisine_holds_only_its_harmonics_and_reaches_its_peak(seed: int, harmonics: int | list[int]) -> None:
-    U = km.Multisine([2, 0.5], 2.0, harmonics, offset=[1, 0]).sequence(120, 0.05, generator(seed))
+    U = km.data.Multisine([2, 0.5], 2.0, harmonics, offset=[1, 0]).sequence(120, 0.05, generator(seed))
     np.testing.assert_allclose(U[:40], U[40:80], rtol=0, atol=0)
     one = U[:40] - [1, 0]
     np.testing.assert_allclose(np.abs(one).max(axis=0), [2, 0.5], rtol=1e-12)
@@ -82,7 +82,7 @@ def local_frequency(u: np.ndarray, dt: float) -> float:
 @pytest.mark.parametrize(("f0", "f1"), [(0.5, 4.0), (4.0, 0.5)])
 def test_a_chirp_runs_from_f0_to_f1(f0: float, f1: float) -> None:
     dt, duration = 0.01, 200.0
-    u = km.Chirp(3.0, f0, f1, duration, offset=-1.0).sequence(40_000, dt, generator(0)).ravel() + 1
+    u = km.data.Chirp(3.0, f0, f1, duration, offset=-1.0).sequence(40_000, dt, generator(0)).ravel() + 1
     assert np.abs(u).max() == pytest.approx(3, rel=1e-3)
     assert (u[:20_000] == u[20_000:]).all()
     assert local_frequency(u[:400], dt) == pytest.approx(f0, rel=0.1)
@@ -106,7 +106,7 @@ def test_feedback_is_its_formula(seed: int) -> None:
 
 @pytest.mark.parametrize(
     "excitation",
-    [km.Noise(-1, 1, 2), km.PRBS([0, 0], [1, 2]), km.Multisine(1, 1.0, 3), km.Chirp(1, 1, 2, 5), km.Feedback([[1, 2]], km.Noise(-1, 1))],
+    [km.Noise(-1, 1, 2), km.data.PRBS([0, 0], [1, 2]), km.data.Multisine(1, 1.0, 3), km.data.Chirp(1, 1, 2, 5), km.Feedback([[1, 2]], km.Noise(-1, 1))],
     ids=lambda value: type(value).__name__,
 )  # fmt: skip
 def test_excitations_are_values_and_follow_the_seed(excitation: Any) -> None:
@@ -118,4 +118,4 @@ def test_excitations_are_values_and_follow_the_seed(excitation: Any) -> None:
     assert np.array_equal(U, [again(k, y) for k in range(30)])
     other = excitation.start(30, 0.05, generator(4))
     same = np.array_equal(U, [other(k, y) for k in range(30)])
-    assert same == isinstance(excitation, km.Chirp)  # the one with nothing random in it
+    assert same == isinstance(excitation, km.data.Chirp)  # the one with nothing random in it

@@ -112,22 +112,22 @@ MISTAKES = [
     (SHAPE, r"low has shape \(1, 1\), expected \(any,\)", lambda: km.Noise([[1]], 2)),
     (DATA, "low holds 1 NaN or inf", lambda: km.Noise(np.nan, 2)),
     (DATA, "hold is 0; it must be at least 1", lambda: km.Noise(-1, 1, hold=0)),
-    (DATA, "order is 2; choose 3 … 16", lambda: km.PRBS(-1, 1, order=2)),
-    (DATA, "period is 0 s; it must be above zero", lambda: km.Multisine(1, 0.0, 3)),
+    (DATA, "order is 2; choose 3 … 16", lambda: km.data.PRBS(-1, 1, order=2)),
+    (DATA, "period is 0 s; it must be above zero", lambda: km.data.Multisine(1, 0.0, 3)),
     (
         DATA,
         "period is 0.12 s, no multiple of dt 0.05 s; choose 0.1",
-        lambda: km.Multisine(1, 0.12, 1).sequence(9, 0.05, generator(0)),
+        lambda: km.data.Multisine(1, 0.12, 1).sequence(9, 0.05, generator(0)),
     ),
     (
         DATA,
         "harmonic 5 of 10 samples a period is not below the Nyquist frequency; lengthen the period or drop it",
-        lambda: km.Multisine(1, 0.5, 5).sequence(9, 0.05, generator(0)),
+        lambda: km.data.Multisine(1, 0.5, 5).sequence(9, 0.05, generator(0)),
     ),
     (
         DATA,
         "a chirp up to 10 Hz needs dt below 0.05 s, dt is 0.05 s; lower the frequency",
-        lambda: km.Chirp(1, 1, 10, 5).sequence(9, 0.05, generator(0)),
+        lambda: km.data.Chirp(1, 1, 10, 5).sequence(9, 0.05, generator(0)),
     ),
     (SHAPE, r"K has shape \(2,\), expected \(any, any\)", lambda: km.Feedback([1, 2])),
     (

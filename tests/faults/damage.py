@@ -241,7 +241,7 @@ FORMATS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     # What others write has no checksums: values may be others in silence.
     "columns.dat": (lambda path: column_file(path, " "), columns_of),
     "columns.txt": (lambda path: column_file(path, "\t"), columns_of),
-    "net.onnx": (network, lambda path: km.ONNX(path).bind(["a", "b"])([0.1, 0.2]).tolist()),
+    "net.onnx": (network, lambda path: km.lifting.ONNX(path).bind(["a", "b"])([0.1, 0.2]).tolist()),
     "problem.py": (lambda path: path.write_bytes(TEMPLATE.read_bytes()), lambda path: repr(km.load_problem(path).cost)),
     "pendulum2.fmu": (unit, unit_of),
     "pendulum3.fmu": (unit, unit_of),

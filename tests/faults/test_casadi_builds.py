@@ -67,8 +67,8 @@ def hold_energy():
 
 BUILDS = {
     "discretize": lambda _: plant(),
-    "CVODES": lambda _: km.discretize(Pendulum(), 0.05, km.CVODES())([0.1, 0.0], [0.0]),
-    "Collocation": lambda _: km.discretize(Pendulum(), 0.05, km.Collocation(2)).linearize(*STEADY),
+    "CVODES": lambda _: km.discretize(Pendulum(), 0.05, km.plants.CVODES())([0.1, 0.0], [0.0]),
+    "Collocation": lambda _: km.discretize(Pendulum(), 0.05, km.plants.Collocation(2)).linearize(*STEADY),
     "linearize": lambda _: plant().linearize(*STEADY),
     "rollouts": lambda _: plant().rollouts(np.zeros((100, 2)), np.zeros((100, 250, 1))),
     "collect": lambda _: data(),

@@ -51,7 +51,7 @@ def _bilinear():
 
 
 def _cvodes():
-    plant = km.discretize(PENDULUM.dynamics, 0.05, km.CVODES())
+    plant = km.discretize(PENDULUM.dynamics, 0.05, km.plants.CVODES())
     return lambda: plant.rollout([0.1, 0.0], np.zeros((200, 1)))
 
 

@@ -34,7 +34,7 @@ def product(first: Recipe, second: Recipe) -> km.Lifting:
 
 
 def standardized(inner: Recipe, mean: np.ndarray, scale: np.ndarray) -> km.Lifting:
-    return km.Standardized(inner[0](*inner[1]), mean, scale)
+    return km.lifting.Standardized(inner[0](*inner[1]), mean, scale)
 
 
 def family(nx: int) -> st.SearchStrategy[Recipe]:

@@ -1,4 +1,4 @@
-"""Networks of .onnx files as liftings: km.ONNX."""
+"""Networks of .onnx files as liftings: km.lifting.ONNX."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def perceptron(path, layer="Tanh", nx=2, nz=3, rows="batch", matmul=False):
 @pytest.mark.parametrize("layer", LAYERS)
 def test_a_network_computes_what_it_says_for_arrays_symbols_and_onnxruntime(layer, tmp_path):
     path, forward = perceptron(tmp_path / "net.onnx", layer, matmul=layer == "Tanh")
-    lifting = km.ONNX(path).bind(STATES[:2])
+    lifting = km.lifting.ONNX(path).bind(STATES[:2])
     X = np.random.default_rng(0).normal(size=(50, 2))
     assert lifting.names == ("net0", "net1", "net2")
     assert lifting(X) == pytest.approx(forward(X), abs=1e-12)
@@ -94,7 +94,7 @@ def test_layers_that_casadi_lacks_are_written_in_others(layer, tmp_path):
     X = np.random.default_rng(1).normal(size=(20, 2))
     wide = {name: array.astype(np.float64) for name, array in w.items()}
     exact = np.tanh(formula(X @ wide["W1"] + wide["b1"])) @ wide["W2"] + wide["b2"]
-    found = km.ONNX(path).bind(STATES[:2])(X)
+    found = km.lifting.ONNX(path).bind(STATES[:2])(X)
     assert found == pytest.approx(exact, abs=3e-6)  # of parameters in single precision
     runtime = pytest.importorskip("onnxruntime", reason="the extra peers is not installed")
     session = runtime.InferenceSession(str(path))
@@ -104,7 +104,7 @@ def test_layers_that_casadi_lacks_are_written_in_others(layer, tmp_path):
 
 def test_states_and_names_are_chosen_and_the_file_is_needed_no_more(tmp_path):
     path, forward = perceptron(tmp_path / "net.onnx", rows=1)
-    lifting = km.State() + km.ONNX(path, states=["current", "theta"], names=["a", "b", "c"])
+    lifting = km.State() + km.lifting.ONNX(path, states=["current", "theta"], names=["a", "b", "c"])
     path.unlink()
     bound = lifting.bind(STATES)
     assert bound.names == (*STATES, "a", "b", "c")
@@ -116,7 +116,7 @@ def test_a_model_on_a_network_is_saved_controlled_and_written_to_c(tmp_path):
     path, _ = perceptron(tmp_path / "net.onnx")
     plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
     data = km.collect(plant, km.Uniform([-1, -2], [1, 2]), km.Noise(-5, 5), episodes=30, steps=20)
-    model = km.edmd(data, km.State() + km.ONNX(path), ridge=1e-8)
+    model = km.edmd(data, km.State() + km.lifting.ONNX(path), ridge=1e-8)
     model.save(tmp_path / "model.npz")
     path.unlink()
     again = km.load_model(tmp_path / "model.npz")
@@ -136,22 +136,22 @@ def test_what_cannot_be_read_is_named(tmp_path):
     with pytest.raises(
         km.KoopmpcError, match=r"norm.onnx cannot be read as a network: .*InstanceNormalization.*for inference"
     ):
-        km.ONNX(path)
+        km.lifting.ONNX(path)
     path = write(tmp_path / "foreign.onnx", [node("Foreign", ["x"], ["z"], domain="elsewhere")], nz=2)
     with pytest.raises(km.KoopmpcError, match="Foreign"):
-        km.ONNX(path)
+        km.lifting.ONNX(path)
     two = [node("Tanh", ["x"], ["z"]), node("Relu", ["x"], ["y"])]
     with pytest.raises(km.KoopmpcError, match="has 1 inputs and 2 outputs"):
-        km.ONNX(write(tmp_path / "two.onnx", two, nz=2, outputs=("z", "y")))
+        km.lifting.ONNX(write(tmp_path / "two.onnx", two, nz=2, outputs=("z", "y")))
     with pytest.raises(km.KoopmpcError, match="there is no file"):
-        km.ONNX(tmp_path / "none.onnx")
+        km.lifting.ONNX(tmp_path / "none.onnx")
     path, _ = perceptron(tmp_path / "net.onnx")
     with pytest.raises(km.KoopmpcError, match=r"names has 1 names, net.onnx has 3 outputs"):
-        km.ONNX(path, names=["a"])
+        km.lifting.ONNX(path, names=["a"])
     with pytest.raises(km.KoopmpcError, match="takes 2 inputs and is given 3 states: theta"):
-        km.ONNX(path).bind(STATES)
+        km.lifting.ONNX(path).bind(STATES)
     with pytest.raises(km.KoopmpcError, match="does not know its states yet"):
-        km.ONNX(path).as_saved()
+        km.lifting.ONNX(path).as_saved()
 
 
 @pytest.mark.parametrize("layer", ["Tanh", "LayerNormalization"])
@@ -173,7 +173,7 @@ def test_damaged_files_are_read_right_or_refused(layer, tmp_path):
             damaged[place:place] = rng.bytes(8)
         path.write_bytes(damaged)
         try:
-            assert km.ONNX(path).bind(STATES[:2])([0.1, 0.2]).shape == (3,)
+            assert km.lifting.ONNX(path).bind(STATES[:2])([0.1, 0.2]).shape == (3,)
         except km.KoopmpcError:
             refused += 1
     assert refused > 100

@@ -123,16 +123,20 @@ MISTAKES = [
     (
         DATA,
         r"a stream is read once, by the fit; take Standardized\.of from",
-        lambda: km.Standardized.of(
+        lambda: km.lifting.Standardized.of(
             km.data.Stream(iter([km.Episodes([km.Episode(X=np.zeros((4, 3)))], 0.1)])), km.State()
         ),
     ),
-    (DATA, "scale holds 0; it must be above zero for every state", lambda: km.Standardized(km.State(), [0, 0], [1, 0])),
-    (SHAPE, r"scale has shape \(1,\), expected \(2,\)", lambda: km.Standardized(km.State(), [0, 0], [1])),
+    (
+        DATA,
+        "scale holds 0; it must be above zero for every state",
+        lambda: km.lifting.Standardized(km.State(), [0, 0], [1, 0]),
+    ),
+    (SHAPE, r"scale has shape \(1,\), expected \(2,\)", lambda: km.lifting.Standardized(km.State(), [0, 0], [1])),
     (
         SHAPE,
         "mean and scale have 2 entries and there are 3 states",
-        lambda: km.Standardized(km.State(), [0, 0], [1, 1]).bind(NAMES),
+        lambda: km.lifting.Standardized(km.State(), [0, 0], [1, 1]).bind(NAMES),
     ),
     (DATA, "count is 0; it must be at least 1", lambda: km.RandomFourier(0, 1.0)),
     (DATA, "width is 0; it must be above zero", lambda: km.RandomFourier(3, 0.0)),

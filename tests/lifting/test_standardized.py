@@ -26,7 +26,7 @@ def _data(scale: np.ndarray | float = 1.0, offset: np.ndarray | float = 0.0) -> 
 
 def test_it_is_the_inner_lifting_of_standardized_states() -> None:
     data = _data(3.0, 5.0)
-    lifting = km.Standardized.of(data, km.Gaussian(CENTERS, 0.7)).bind(NAMES[:2])
+    lifting = km.lifting.Standardized.of(data, km.Gaussian(CENTERS, 0.7)).bind(NAMES[:2])
     X = np.concatenate([episode.X[:-1] for episode in data])
     assert lifting.mean == pytest.approx(X.mean(0), rel=1e-13)
     assert lifting.scale == pytest.approx(X.std(0), rel=1e-13)
@@ -41,7 +41,7 @@ def test_scaling_states_changes_no_prediction(family, powers: tuple[int, int], o
     scale = 10.0 ** np.array(powers)
     plain, scaled = _data(), _data(scale, offset * scale)
     first, second = (
-        km.edmd(data, km.State() + km.Constant() + km.Standardized.of(data, family)) for data in (plain, scaled)
+        km.edmd(data, km.State() + km.Constant() + km.lifting.Standardized.of(data, family)) for data in (plain, scaled)
     )
     episode, other = plain[0], scaled[0]
     a = first.rollout(episode.X[0], episode.U)
@@ -51,17 +51,17 @@ def test_scaling_states_changes_no_prediction(family, powers: tuple[int, int], o
 
 def test_other_numbers_are_other_observables_and_one_stays_one() -> None:
     a, b = (
-        km.Standardized(km.Fourier(1, "theta"), [0, 0], [1, 2]),
-        km.Standardized(km.Fourier(1, "theta"), [0, 0], [1, 3]),
+        km.lifting.Standardized(km.Fourier(1, "theta"), [0, 0], [1, 2]),
+        km.lifting.Standardized(km.Fourier(1, "theta"), [0, 0], [1, 3]),
     )
     assert (a + b + a).bind(NAMES[:2]).nz == 4
     assert a.bind(NAMES[:2]).names[0].startswith("sin(theta)~")
-    assert (km.State() + km.Standardized(km.State(), [0, 0], [1, 2])).bind(NAMES[:2]).nz == 4
-    assert km.Standardized(km.Constant(), [0.0], [1.0]).bind(["x"]).names == ("1",)
+    assert (km.State() + km.lifting.Standardized(km.State(), [0, 0], [1, 2])).bind(NAMES[:2]).nz == 4
+    assert km.lifting.Standardized(km.Constant(), [0.0], [1.0]).bind(["x"]).names == ("1",)
 
 
 def test_saved_bound_or_not() -> None:
-    lifting = km.Standardized(km.RandomFourier(3, 1.0, 2) + km.State(), [1 / 3, -1], [0.1, 7])
+    lifting = km.lifting.Standardized(km.RandomFourier(3, 1.0, 2) + km.State(), [1 / 3, -1], [0.1, 7])
     assert returned(lifting) == lifting
     bound = lifting.bind(NAMES[:2])
     assert returned(bound) == bound
@@ -69,13 +69,18 @@ def test_saved_bound_or_not() -> None:
 
 def test_a_state_that_stands_still_keeps_its_unit() -> None:
     X = np.column_stack([np.arange(6.0), np.full(6, 7.0)])
-    assert km.Standardized.of(km.Episodes([km.Episode(X=X)], 0.1), km.State()).scale == pytest.approx([np.sqrt(2), 1])
+    assert km.lifting.Standardized.of(km.Episodes([km.Episode(X=X)], 0.1), km.State()).scale == pytest.approx(
+        [np.sqrt(2), 1]
+    )
 
 
 def test_files_are_read_part_by_part(tmp_path) -> None:
     data = _data(2.0, -3.0)
     for i, episode in enumerate(data):
         km.Episodes([episode], data.dt, data.states).save(tmp_path / f"{i:02d}.npz")
-    read, whole = km.Standardized.of(km.data.Files(tmp_path), km.State()), km.Standardized.of(data, km.State())
+    read, whole = (
+        km.lifting.Standardized.of(km.data.Files(tmp_path), km.State()),
+        km.lifting.Standardized.of(data, km.State()),
+    )
     assert read.mean == pytest.approx(whole.mean, rel=1e-13)
     assert read.scale == pytest.approx(whole.scale, rel=1e-13)

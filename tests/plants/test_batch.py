@@ -20,7 +20,7 @@ from tests.compiler import avoid_compiling, needs_compiler
 from tests.example_plants import CartPole, Pendulum
 
 MAPS = {
-    "euler": km.discretize(CartPole(), 0.02, km.Euler()),
+    "euler": km.discretize(CartPole(), 0.02, km.plants.Euler()),
     "rk4": km.discretize(CartPole(), 0.02),
     "substeps": km.discretize(Pendulum(damping=0.1), 0.05, km.RK4(3)),
 }
@@ -82,7 +82,9 @@ def test_columns_beyond_one_chunk():
 
 
 @pytest.mark.parametrize(
-    "integrator", [km.Euler(), km.RK4(2), km.ImplicitMidpoint(), km.Collocation(2), km.CVODES()], ids=repr
+    "integrator",
+    [km.plants.Euler(), km.RK4(2), km.plants.ImplicitMidpoint(), km.plants.Collocation(2), km.plants.CVODES()],
+    ids=repr,
 )
 @pytest.mark.parametrize("episodes", [1, 70])
 def test_rollouts_are_rollouts(integrator, episodes):
@@ -312,7 +314,7 @@ def test_machine_code_is_the_interpreter_to_the_bit(monkeypatch: pytest.MonkeyPa
 
 
 def test_what_cannot_be_compiled_is_interpreted() -> None:
-    plant = km.discretize(CartPole(), 0.02, km.CVODES())
+    plant = km.discretize(CartPole(), 0.02, km.plants.CVODES())
     x, u, x_next = np.array([0.1, 0, 0.2, 0]), np.array([1.0]), np.zeros(4)
     routine = Routine(plant.F, [x, u], [x_next])
     routine.call()

@@ -13,7 +13,7 @@ NAMES = {"states": MAP.states, "inputs": MAP.inputs}
 
 def test_a_function_is_a_plant_whose_data_and_runs_are_those_of_the_step_map_in_it():
     box = km.black_box(lambda x, u: MAP(x, u), dt=0.05, **NAMES)
-    assert isinstance(box, km.Plant)
+    assert isinstance(box, km.plants.Plant)
     asked = {"episodes": 3, "steps": 12, "rng": 4}
     pushes, begin = km.Noise(-5, 5), km.Uniform([-1] * 4, [1] * 4)
     assert km.collect(box, begin, pushes, **asked) == km.collect(km.plants.SimulatedPlant(MAP), begin, pushes, **asked)

@@ -10,7 +10,7 @@ from tests.example_plants import CartPole, Pendulum, Spring
 
 def rate(dynamics, x, u, dt=0.5):
     """ẋ = f(x, u), read off a step of Euler's method."""
-    return (km.discretize(dynamics, dt, km.Euler())(x, u) - x) / dt
+    return (km.discretize(dynamics, dt, km.plants.Euler())(x, u) - x) / dt
 
 
 def test_a_step_map_holds_the_model_with_its_parameters():

@@ -82,7 +82,9 @@ def test_model_exchange_is_the_step_map_of_the_same_equations(name, request):
     assert np.array([e.X for e in data]) == pytest.approx(np.array([e.X for e in expected]), abs=1e-12)
 
 
-@pytest.mark.parametrize("integrator", [km.Euler(), km.ImplicitMidpoint(), km.Collocation(2), km.CVODES()])
+@pytest.mark.parametrize(
+    "integrator", [km.plants.Euler(), km.plants.ImplicitMidpoint(), km.plants.Collocation(2), km.plants.CVODES()]
+)
 def test_every_integrator_takes_the_equations_of_a_unit(integrator, pendulum3):
     unit, own = km.plants.fmu(pendulum3, dt=0.05, integrator=integrator), km.discretize(Pendulum(), 0.05, integrator)
     assert unit([0.4, 1.0], [0.7]) == pytest.approx(own([0.4, 1.0], [0.7]), abs=1e-8)
@@ -104,14 +106,14 @@ def test_start_values_limits_names_and_units_come_from_the_description(pendulum)
     assert moon([0.4, 0.0], [0.0]) == pytest.approx(km.discretize(own, 0.05)([0.4, 0.0], [0.0]), abs=1e-12)
     moon = km.plants.fmu(pendulum, interface="co-simulation", start_values={"g": 1.62}, outputs=ROD)
     moon.reset([0.4, 0.0])
-    exact = km.discretize(own, 0.05, km.CVODES())([0.4, 0.0], [0.0])
+    exact = km.discretize(own, 0.05, km.plants.CVODES())([0.4, 0.0], [0.0])
     assert moon.step([0.0]) == pytest.approx(exact, abs=1e-4)
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_co_simulation_steps_resets_and_is_measured_as_the_unit_says(fmi, tanks):
     tank = km.plants.fmu(tanks[fmi], dt=0.5, start_values={"drain": 0.3})
-    assert isinstance(tank, km.Plant)
+    assert isinstance(tank, km.plants.Plant)
     assert (tank.states, tank.inputs, tank.outputs) == (("level",), ("inflow",), ("level",))
     assert tank.state is None
     rng = np.random.default_rng(1)

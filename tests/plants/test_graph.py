@@ -100,7 +100,7 @@ def test_operations_outside_the_list_are_refused_by_name():
     ):
         Graph.trace(ca.Function("radial", [v], [ca.erfinv(v)]))
     with pytest.raises(km.errors.DataError, match="cannot be written as"):
-        Graph.trace(km.discretize(CartPole(), 0.05, km.ImplicitMidpoint()).F)
+        Graph.trace(km.discretize(CartPole(), 0.05, km.plants.ImplicitMidpoint()).F)
 
 
 def test_shapes_are_named():

@@ -26,7 +26,7 @@ def test_the_pendulum_moves_as_its_documentation_says_with_an_angle_that_never_j
     rng = np.random.default_rng(0)
     x = np.array([1.0, 6.0])
     assert pendulum.reset(x) == pytest.approx(x, abs=1e-6)
-    assert isinstance(pendulum, km.Plant)
+    assert isinstance(pendulum, km.plants.Plant)
     assert pendulum.dt == 0.05
     for _ in range(100):
         u = rng.uniform(-2, 2, 1)

@@ -29,13 +29,13 @@ def exact():
 @pytest.mark.parametrize(
     ("integrator", "order", "steps"),
     [
-        (km.Euler(), 1, (400, 800, 1600, 3200)),
+        (km.plants.Euler(), 1, (400, 800, 1600, 3200)),
         (km.RK4(), 4, (20, 40, 80, 160)),
         (km.RK4(substeps=3), 4, (10, 20, 40, 80)),
-        (km.ImplicitMidpoint(), 2, (50, 100, 200, 400)),
-        (km.Collocation(1), 2, (50, 100, 200, 400)),
-        (km.Collocation(2), 4, (10, 20, 40, 80)),
-        (km.Collocation(3), 6, (6, 9, 12, 18)),
+        (km.plants.ImplicitMidpoint(), 2, (50, 100, 200, 400)),
+        (km.plants.Collocation(1), 2, (50, 100, 200, 400)),
+        (km.plants.Collocation(2), 4, (10, 20, 40, 80)),
+        (km.plants.Collocation(3), 6, (6, 9, 12, 18)),
     ],
     ids=repr,
 )
@@ -51,7 +51,7 @@ def test_order_by_regression(integrator, order, steps):
 
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-8, 1e-10])
 def test_cvodes_keeps_its_tolerance(tolerance):
-    plant = km.discretize(Pendulum(damping=0.3), END, km.CVODES(rtol=tolerance, atol=tolerance))
+    plant = km.discretize(Pendulum(damping=0.3), END, km.plants.CVODES(rtol=tolerance, atol=tolerance))
     assert np.abs(plant(X0, [TORQUE]) - exact()).max() < 100 * tolerance
 
 
@@ -63,7 +63,7 @@ def test_substeps_are_steps():
 
 
 def test_implicit_midpoint_has_its_own_equation():
-    dt, plant = 0.1, km.discretize(CartPole(), 0.1, km.ImplicitMidpoint())
+    dt, plant = 0.1, km.discretize(CartPole(), 0.1, km.plants.ImplicitMidpoint())
     x, u = np.array([0.1, 0.5, -0.3, 2.0]), np.array([4.0])
     x_next = plant(x, u)
     slope = np.asarray(right_side(CartPole())((x + x_next) / 2, u)).ravel()
@@ -76,13 +76,14 @@ def test_collocation_integrates_polynomials_below_twice_its_stages_exactly(stage
     most = 2 * stages
     s, u = ca.SX.sym("s", most + 2), ca.SX.sym("u", 0)
     f = ca.Function("f", [s, u], [ca.vertcat(1, *((k + 1) * s[0] ** k for k in range(most + 1)))])
-    x_next = km.StepMap(km.Collocation(stages).step(f, 1.0), 1.0)(np.zeros(most + 2), [])
+    x_next = km.StepMap(km.plants.Collocation(stages).step(f, 1.0), 1.0)(np.zeros(most + 2), [])
     assert x_next[: most + 1] == pytest.approx(np.ones(most + 1), rel=1e-11)
     assert abs(x_next[-1] - 1) > 1e-12
 
 
 @pytest.mark.parametrize(
-    ("integrator", "stages"), [(km.ImplicitMidpoint(), 1), (km.Collocation(2), 2), (km.Collocation(4), 4)]
+    ("integrator", "stages"),
+    [(km.plants.ImplicitMidpoint(), 1), (km.plants.Collocation(2), 2), (km.plants.Collocation(4), 4)],
 )
 def test_gauss_methods_turn_a_linear_oscillator_by_its_pade_approximant(integrator, stages):
     A = km.discretize(Spring(), 0.5, integrator).linearize([0.0, 0.0], []).A
@@ -97,7 +98,7 @@ def test_gauss_methods_turn_a_linear_oscillator_by_its_pade_approximant(integrat
 def test_implicit_methods_take_stiff_plants_at_large_steps():
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
     f = ca.Function("f", [x, u], [ca.vertcat(-1e6 * (x[0] - x[1]), u - x[1])])
-    plant = km.StepMap(km.Collocation(2).step(f, 0.1), 0.1)
+    plant = km.StepMap(km.plants.Collocation(2).step(f, 0.1), 0.1)
     X = plant.rollout([1e4, 1e4], np.zeros((100, 1)))
     assert X[-1, 1] == pytest.approx(1e4 * np.exp(-10), rel=1e-4)
     assert np.isfinite(X).all()
@@ -111,7 +112,7 @@ PERIOD = 2.1393  # [s] about, at 1 rad
 )
 @pytest.mark.parametrize("periods", [2_000, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_implicit_midpoint_keeps_the_energy_for_thousands_of_periods(periods):
-    plant = km.discretize(Pendulum(), PERIOD / 20, km.ImplicitMidpoint())
+    plant = km.discretize(Pendulum(), PERIOD / 20, km.plants.ImplicitMidpoint())
     E = energy(plant.rollout([1.0, 0.0], np.zeros((20 * periods, 1)))).reshape(-1)
     swing = np.ptp(E[:2000])
     assert np.ptp(E) < 1.01 * swing  # as far off in the last hundred periods as in the first
@@ -132,7 +133,7 @@ def test_the_energy_drift_of_rk4_falls_with_its_order():
 def test_a_step_without_an_answer_is_nan_and_says_so():
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
     blow_up = ca.Function("f", [x, u], [x**2 + u])  # x(t) = 1/(1 − t)
-    for integrator in (km.CVODES(), km.ImplicitMidpoint()):
+    for integrator in (km.plants.CVODES(), km.plants.ImplicitMidpoint()):
         plant = km.StepMap(integrator.step(blow_up, 2.0), 2.0)
         with pytest.warns(RuntimeWarning, match=r"found no x⁺ from x=\[1\.\].*x⁺ is NaN, try a smaller dt"):
             assert np.isnan(plant(1.0, 0.0)).all()
@@ -146,9 +147,9 @@ def test_a_step_without_an_answer_is_nan_and_says_so():
     ("build", "message"),
     [
         (lambda: km.RK4(0), "substeps is 0; it must be at least 1"),
-        (lambda: km.Collocation(0), "degree is 0; it must be at least 1"),
-        (lambda: km.CVODES(rtol=0.0), "rtol is 0; it must be above zero"),
-        (lambda: km.CVODES(atol=-1.0), "atol is -1; it must be above zero"),
+        (lambda: km.plants.Collocation(0), "degree is 0; it must be at least 1"),
+        (lambda: km.plants.CVODES(rtol=0.0), "rtol is 0; it must be above zero"),
+        (lambda: km.plants.CVODES(atol=-1.0), "atol is -1; it must be above zero"),
     ],
 )
 def test_settings_are_checked(build, message):

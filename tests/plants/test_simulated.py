@@ -9,7 +9,7 @@ MAP = km.discretize(CartPole(), 0.05)
 
 def test_a_simulated_plant_is_a_plant_with_the_maps_names():
     plant = km.plants.SimulatedPlant(MAP)
-    assert isinstance(plant, km.Plant)
+    assert isinstance(plant, km.plants.Plant)
     assert (plant.dt, plant.states, plant.inputs, plant.outputs) == (
         0.05,
         MAP.states,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import koopmpc as km
 from tests.example_plants import CartPole, Pendulum, Spring
 
-ALL = [km.Euler(), km.RK4(), km.ImplicitMidpoint(), km.Collocation(2), km.CVODES()]
+ALL = [km.plants.Euler(), km.RK4(), km.plants.ImplicitMidpoint(), km.plants.Collocation(2), km.plants.CVODES()]
 PLANTS = {repr(integrator): km.discretize(CartPole(), 0.05, integrator) for integrator in ALL}
 number = st.floats(-2, 2)
 

@@ -238,8 +238,8 @@ def test_where_the_data_have_their_zero_changes_no_choice():
     data = noisy(episodes_of(quadratic), 0.02)
     far = km.Episodes([km.Episode(X=e.X + 40.0, U=e.U - 7.0) for e in data], data.dt)
     scaled = (
-        km.Standardized(km.Monomials(2), np.zeros(2), np.ones(2)),
-        km.Standardized(km.Monomials(2), np.full(2, 40.0), np.ones(2)),
+        km.lifting.Standardized(km.Monomials(2), np.zeros(2), np.ones(2)),
+        km.lifting.Standardized(km.Monomials(2), np.full(2, 40.0), np.ones(2)),
     )
     base = km.State() + km.Constant()
     here, there = (

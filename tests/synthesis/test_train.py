@@ -54,7 +54,8 @@ LIFTINGS = {
     "Gaussians, each with its width": km.State() + km.Constant() + km.Gaussian(CENTERS, np.linspace(0.4, 1.2, 6)),
     "thin plates": km.State() + km.ThinPlate(CENTERS),
     "cosines without the states": km.Constant() + km.RandomFourier(8, 1.0),
-    "a product in other units": km.State() * km.Standardized(km.Gaussian(CENTERS[:2], 0.8), [0.1, 0.2], [2.0, 0.5]),
+    "a product in other units": km.State()
+    * km.lifting.Standardized(km.Gaussian(CENTERS[:2], 0.8), [0.1, 0.2], [2.0, 0.5]),
     "a family of the user's": km.State() + km.Gaussian(CENTERS[:1], 0.5) * Bumps(),
 }
 

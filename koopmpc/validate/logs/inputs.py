@@ -17,7 +17,7 @@ def find_constant_inputs(log: Log) -> Iterator[LogFault]:
         yield LogFault(
             "constant input",
             f"{name} is {log.U[0, j]:.4g} throughout: its effect cannot be learned",
-            f"excite {name}, with km.Noise or km.PRBS, or leave it out",
+            f"excite {name}, with km.Noise or km.data.PRBS, or leave it out",
             (log.data.inputs[j],),
             repair=Repair.COLUMN,
         )
@@ -38,6 +38,6 @@ def find_low_excitation(log: Log) -> Iterator[LogFault]:
             yield LogFault(
                 "little excitation",
                 f"{name} excites to order {good} only, and {log.data.nx} states ask for {order}: a sine, or rare steps",
-                f"excite {name} with km.Noise, km.PRBS or km.Multisine",
+                f"excite {name} with km.Noise, km.data.PRBS or km.data.Multisine",
                 (log.data.inputs[j],),
             )
