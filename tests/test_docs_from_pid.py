@@ -55,7 +55,7 @@ def test_one_sensor_is_enough_for_a_better_loop_that_the_stand_ins_do_not_call_l
     assert np.isfinite(design.expected.fresh.cost).all()
     known = design.evidence
     before = replace(known.neighbours, local=3, ridge=1e-4)  # what a slope was of, whatever the log
-    pool = LoopPool(known.asked, known.surrogates, before, known.low, known.high)
+    pool = LoopPool(known.task, known.surrogates, before, known.low, known.high)
     fresh = run_fresh_loops(pool, km.compiled(design.controller), 600, np.random.default_rng(0))
     assert np.isinf(fresh.cost).mean() > 0.15
     wanted, rng = names["steps"][:, 0], np.random.default_rng(0)

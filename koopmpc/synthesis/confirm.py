@@ -112,7 +112,7 @@ def _confirm_best(judged: JudgedRows, options: DesignOptions) -> ChosenControlle
         linear=linear,
         best_linear=best_linear,
         standby=_fit_standby(judged, options),
-        pool=LoopPool(test.asked, test.surrogates, neighbours, test.low, test.high),
+        pool=LoopPool(test.task, test.surrogates, neighbours, test.low, test.high),
         notes=tuple(notes),
     )
 
@@ -131,7 +131,7 @@ def fit_row(judged: JudgedRows, options: DesignOptions, place: int) -> FittedRow
     for smoothed, measured in sets[: 1 + any(len(one) < judged.plan.shortest for one in data.held)]:
         learned = measured if hidden else smoothed
         model = data.mark(recipe.fit(learned, near, workers=options.workers, scheduler=options.scheduler))
-        controller = recipe.controller(model, test.asked.cost, test.limits(outcome.band), test.asked.horizon)
+        controller = recipe.controller(model, test.task.cost, test.limits(outcome.band), test.task.horizon)
         if is_confirmed(test, controller, outcome):
             if smoothed is not data.source:
                 notes.append(
@@ -170,7 +170,7 @@ def _fit_standby(judged: JudgedRows, options: DesignOptions) -> Any:
     recipe = replace(rows[plain[0]].recipe, estimator=None)
     model = data.mark(recipe.fit(data.source, workers=options.workers, scheduler=options.scheduler))
     limits = test.limits(judged.outcomes[plain[0]].band)
-    return recipe.controller(model, test.asked.cost, limits, test.asked.horizon)
+    return recipe.controller(model, test.task.cost, limits, test.task.horizon)
 
 
 def _compare_finalists(chosen: ChosenController, options: DesignOptions, rng: np.random.Generator) -> ChosenController:
@@ -198,7 +198,7 @@ def _leave_room_to_stop(chosen: ChosenController, rng: np.random.Generator) -> C
     limits, why = find_room_to_stop(chosen.pool, recipe, controller, chosen.judged.test.episodes, rng)
     if not why:
         return chosen
-    task, model = chosen.judged.test.asked, get_model(controller)
+    task, model = chosen.judged.test.task, get_model(controller)
     stopping = recipe.controller(model, task.cost, limits, task.horizon)
     return replace(
         chosen,
@@ -211,7 +211,7 @@ def _leave_room_to_stop(chosen: ChosenController, rng: np.random.Generator) -> C
 def _keep_promise(chosen: ChosenController, share: float, loops: int, rng: np.random.Generator) -> ChosenController:
     """Return the controller with the least margin with which this share of loops keeps the limits, and the promise."""
     judged, controller = chosen.judged, chosen.controller
-    recipe, band, task = judged.rows[chosen.best].recipe, judged.outcomes[chosen.best].band, judged.test.asked
+    recipe, band, task = judged.rows[chosen.best].recipe, judged.outcomes[chosen.best].band, judged.test.task
     promise, limits = keep_limits(judged.test, chosen.pool, recipe, controller, band, share, loops, rng)
     if limits.margin is not None:
         model = get_model(controller)

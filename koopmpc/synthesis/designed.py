@@ -3,14 +3,14 @@
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
 from rich.console import RenderableType
 
 from koopmpc.base import checks
-from koopmpc.base.errors import DataError, KoopmpcError, LogError
+from koopmpc.base.errors import DataError, Hint, KoopmpcError, LogError
 from koopmpc.base.terminal import build_leaderboard, render_text
 from koopmpc.base.text import format_duration, to_percent
 from koopmpc.base.values import Value
@@ -39,7 +39,7 @@ class Evidence(Value):
 
     Attributes
     ----------
-    asked
+    task
         Cost, limits, reference and starts.
     surrogates
         Learned stand-ins of the plant.
@@ -55,10 +55,13 @@ class Evidence(Value):
         Some of the data, not smoothed, with which new logs are compared; their inputs stand where the model has them.
         None in files of earlier designs.
     promise
-        The promised share of loops that keep their limits; None if no `coverage` was asked for.
+        The promised share of loops that keep their limits; None if the margin is no share of loops.
     """
 
-    asked: DesignTask
+    _FORMER: ClassVar = {"asked": "task"}
+    asked = Hint("write evidence.task")
+
+    task: DesignTask
     surrogates: tuple[Surrogate, ...]
     low: Float[np.ndarray, " nx"]
     high: Float[np.ndarray, " nx"]
@@ -157,7 +160,7 @@ class Design:
         """
         if self.evidence.neighbours is None:
             raise DataError("the design keeps no rows of its data; make it again with this version")
-        return choose_starts_to_record(self.evidence.asked, self.evidence.neighbours, checks.count(count, "count"))
+        return choose_starts_to_record(self.evidence.task, self.evidence.neighbours, checks.count(count, "count"))
 
     @property
     def best(self) -> DesignRow:
@@ -171,7 +174,7 @@ class Design:
 
     @property
     def promise(self) -> CoveragePromise | None:
-        """The promised share of loops that keep their limits; None if no `coverage` was asked for."""
+        """The promised share of loops that keep their limits; None if the margin is no share of loops."""
         return self.evidence.promise
 
     def save(self, path: str | Path, *, logs: LogSummary | None = None) -> None:

@@ -19,22 +19,22 @@ FAR = 1.0  # an episode is left out if it leaves the box of the others by more t
 MOST = 0.9  # share of the episodes inside this box
 
 
-def limit_margins(asked: DesignTask, data: Episodes) -> Float[np.ndarray, " nx"]:
+def limit_margins(task: DesignTask, data: Episodes) -> Float[np.ndarray, " nx"]:
     """Return the largest margin of each state (nx,): half of the way from the reference to the nearest limit.
 
     Without this bound, errors of a poor model could lead to margins that exclude the reference itself. A reference on
     or beyond a limit, or without a weight, bounds no margin.
     """
-    low, high = asked.limits.states(data.nx)
+    low, high = task.limits.states(data.nx)
     room = np.full(data.nx, np.inf)
-    for i, aims in _weighted_references(asked, data).items():
+    for i, aims in _weighted_references(task, data).items():
         way = min(aims.min() - low[i], high[i] - aims.max())
         if way > 0:
             room[i] = way / 2
     return room
 
 
-def find_stray_episodes(data: Episodes, asked: DesignTask) -> dict[int, str]:
+def find_stray_episodes(data: Episodes, task: DesignTask) -> dict[int, str]:
     """Return the episodes that went far away with ordinary inputs, each with a sentence that says how far.
 
     A sensor may have jumped, or the plant fallen over; the squares of such an episode outweigh all others in fits and
@@ -42,10 +42,10 @@ def find_stray_episodes(data: Episodes, asked: DesignTask) -> dict[int, str]:
     starts, the reference and the limits. Its inputs are ordinary if they stay within half a width of those of the
     others. Episodes with stronger inputs are kept, because they are valuable experiments.
     """
-    low, high = asked.limits.states(data.nx)
+    low, high = task.limits.states(data.nx)
     low, high = np.where(np.isfinite(low), low, np.inf), np.where(np.isfinite(high), high, -np.inf)
-    low, high = np.minimum(low, asked.starts.min(axis=0)), np.maximum(high, asked.starts.max(axis=0))
-    for i, aims in _weighted_references(asked, data).items():
+    low, high = np.minimum(low, task.starts.min(axis=0)), np.maximum(high, task.starts.max(axis=0))
+    for i, aims in _weighted_references(task, data).items():
         low[i], high[i] = min(low[i], aims.min()), max(high[i], aims.max())
     X, U = [episode.X for episode in data], [episode.U for episode in data]
     x_far, x_low, x_high = _measure_departures(X, low, high)
@@ -76,14 +76,14 @@ def _measure_departures(
     return np.maximum(low - least, most - high) / width, low, high
 
 
-def find_outside_data(asked: DesignTask, data: Episodes, tracked: Sequence[int], free: Sequence[int]) -> list[str]:
+def find_outside_data(task: DesignTask, data: Episodes, tracked: Sequence[int], free: Sequence[int]) -> list[str]:
     """Return a sentence for each state whose start or reference lies outside the data, where no model was fitted."""
     said: list[str] = []
-    room = 0.01 * (asked.high - asked.low)
-    targets = {i: asked.reference[:, column] for column, i in enumerate(tracked)}
+    room = 0.01 * (task.high - task.low)
+    targets = {i: task.reference[:, column] for column, i in enumerate(tracked)}
     for i, name in enumerate(data.states):
-        low, high = asked.low[i], asked.high[i]
-        for what, values in (("a start", asked.starts[:, i]), ("the reference", targets.get(i, np.zeros(0)))):
+        low, high = task.low[i], task.high[i]
+        for what, values in (("a start", task.starts[:, i]), ("the reference", targets.get(i, np.zeros(0)))):
             far = values[(values < low - room[i]) | (values > high + room[i])]
             if far.size and i not in free:
                 said.append(
@@ -94,16 +94,16 @@ def find_outside_data(asked: DesignTask, data: Episodes, tracked: Sequence[int],
     return said
 
 
-def find_outside_limits(asked: DesignTask, data: Episodes) -> list[str]:
+def find_outside_limits(task: DesignTask, data: Episodes) -> list[str]:
     """Return a sentence for each limit that a start or a moving reference lies beyond.
 
     A constant reference is not checked here; `explain_unreachable` says what can be held instead.
     """
-    limits, states = asked.limits, data.states
+    limits, states = task.limits, data.states
     names = states if limits.of is None else (*states, *limits.of.bind(states).names)
-    starts, box = stack_limited(limits, asked.starts, states)
-    tracked = asked.cost.of.bind(states).names
-    targets = dict(zip(tracked, asked.reference.T, strict=True)) if asked.moves else {}
+    starts, box = stack_limited(limits, task.starts, states)
+    tracked = task.cost.of.bind(states).names
+    targets = dict(zip(tracked, task.reference.T, strict=True)) if task.moves else {}
     said: list[str] = []
     for name, start, low, high in zip(names, starts.T, *box, strict=True):
         for what, values, meaning in (
@@ -118,7 +118,7 @@ def find_outside_limits(asked: DesignTask, data: Episodes) -> list[str]:
     return said
 
 
-def find_poor_logs(asked: DesignTask, data: Episodes, tracked: Sequence[int]) -> list[str]:
+def find_poor_logs(task: DesignTask, data: Episodes, tracked: Sequence[int]) -> list[str]:
     """Return sentences where logs cannot serve: outside of all limits, from a single start, slower than the reference.
 
     A reference is too fast if half of the rows that move it move it by more than the logs move that state in any step.
@@ -126,7 +126,7 @@ def find_poor_logs(asked: DesignTask, data: Episodes, tracked: Sequence[int]) ->
     X, said = [episode.X for episode in data], list[str]()
     least, most = (np.array([ends(one, axis=0) for one in X]) for ends in (np.min, np.max))
     for name, low, high, under, over in zip(
-        data.states, least.min(axis=0), most.max(axis=0), *asked.limits.states(data.nx), strict=True
+        data.states, least.min(axis=0), most.max(axis=0), *task.limits.states(data.nx), strict=True
     ):
         if low > over or high < under:
             said.append(
@@ -134,7 +134,7 @@ def find_poor_logs(asked: DesignTask, data: Episodes, tracked: Sequence[int]) ->
                 f"{high:.4g}: no log was inside these limits; record some there, or widen the limits"
             )
     first = np.array([one[0] for one in X])
-    if len(X) > 1 and (first == first[0]).all() and (asked.starts == first[0]).all():
+    if len(X) > 1 and (first == first[0]).all() and (task.starts == first[0]).all():
         shown = ", ".join(with_unit(name, f"= {value:.4g}") for name, value in zip(data.states, first[0], strict=True))
         said.append(
             f"all {len(X)} episodes start at {shown}: how the loop goes from elsewhere was tried on no such start; "
@@ -142,9 +142,9 @@ def find_poor_logs(asked: DesignTask, data: Episodes, tracked: Sequence[int]) ->
         )
     steps = np.max([np.abs(np.diff(one, axis=0)).max(axis=0) for one in X], axis=0)
     for column, i in enumerate(tracked):
-        moved = np.abs(np.diff(asked.reference[:, column]))
+        moved = np.abs(np.diff(task.reference[:, column]))
         usual = float(np.median(moved[moved > 0])) if (moved > 0).sum() > _FEW else 0.0
-        if usual > steps[i] and i in _weighted_references(asked, data):
+        if usual > steps[i] and i in _weighted_references(task, data):
             said.append(
                 f"no input can follow the reference: it moves {strip_unit(data.states[i])} by {usual:.4g} in a step, "
                 f"and no log moves it by more than {steps[i]:.4g}; ask for a slower one"
@@ -152,13 +152,13 @@ def find_poor_logs(asked: DesignTask, data: Episodes, tracked: Sequence[int]) ->
     return said
 
 
-def find_unweighted_limits(asked: DesignTask, data: Episodes) -> list[str]:
+def find_unweighted_limits(task: DesignTask, data: Episodes) -> list[str]:
     """Return a sentence for each limited state that the cost does not weigh."""
-    of = asked.cost.of.bind(data.states)
+    of = task.cost.of.bind(data.states)
     if not isinstance(of, State):
         return []
-    weighed = _weighted_references(asked, data)
-    box = asked.limits.states(data.nx)
+    weighed = _weighted_references(task, data)
+    box = task.limits.states(data.nx)
     idle = [i for i in range(data.nx) if i not in weighed and (np.isfinite(box.low[i]) or np.isfinite(box.high[i]))]
     if not idle:
         return []
@@ -169,31 +169,31 @@ def find_unweighted_limits(asked: DesignTask, data: Episodes) -> list[str]:
     ]
 
 
-def _weighted_references(asked: DesignTask, data: Episodes) -> dict[int, Float[np.ndarray, " T1"]]:
+def _weighted_references(task: DesignTask, data: Episodes) -> dict[int, Float[np.ndarray, " T1"]]:
     """Return the reference rows of each state that the cost weighs; none for a cost on other observables."""
-    of = asked.cost.of.bind(data.states)
+    of = task.cost.of.bind(data.states)
     if not isinstance(of, State):
         return {}
-    Q, _ = asked.cost.matrices(of.nz, data.nu)
-    return {int(i): asked.reference[:, column] for column, i in enumerate(of.state_indices) if Q[column, column] > 0}
+    Q, _ = task.cost.matrices(of.nz, data.nu)
+    return {int(i): task.reference[:, column] for column, i in enumerate(of.state_indices) if Q[column, column] > 0}
 
 
 UNHELD = 0.02  # an equilibrium may miss the reference by this share of the data's range
 HEADROOM = 0.1  # an input rests near a limit if less than this share of its range is left
 
 
-def explain_unreachable(one: Surrogate, asked: DesignTask) -> list[str]:
+def explain_unreachable(one: Surrogate, task: DesignTask) -> list[str]:
     """Return a sentence if no input holds a constant reference; it names the limit and the nearest equilibrium.
 
     Outputs without a weight in the cost are ignored, and so are deviations up to 2 % of the data's range, which may be
     errors of the surrogate.
     """
-    if asked.moves:
+    if task.moves:
         return []
-    model, row, cost = one.model, asked.reference[0], asked.cost
+    model, row, cost = one.model, task.reference[0], task.cost
     of, nx = cost.of.bind(model.states), model.nx
     Q, _ = cost.matrices(of.nz, model.nu)
-    ends = of(np.array([asked.low, asked.high]))
+    ends = of(np.array([task.low, task.high]))
     tolerance = np.where(np.diag(Q) > 0, np.maximum(UNHELD * np.abs(ends[1] - ends[0]), 1e-9), np.inf)
 
     def values(at: Equilibrium) -> Float[np.ndarray, " nr"]:
@@ -207,13 +207,13 @@ def explain_unreachable(one: Surrogate, asked: DesignTask) -> list[str]:
         shown = np.where(np.abs(numbers) > 1e-3 * tolerance, numbers, 0.0)
         return ", ".join(with_unit(of.names[i], f"= {shown[i]:.4g}") for i in np.flatnonzero(weighed))
 
-    room = UNHELD * (asked.high - asked.low)  # of the states
+    room = UNHELD * (task.high - task.low)  # of the states
 
     def list_broken(at: Equilibrium) -> list[str]:
         ways: list[str] = []
         for names, values, box, off in (
-            (model.inputs, at.u, asked.limits.inputs(model.nu), 1e-6 * np.abs(at.u)),
-            (model.states, at.x[:nx], asked.limits.states(nx), room),
+            (model.inputs, at.u, task.limits.inputs(model.nu), 1e-6 * np.abs(at.u)),
+            (model.states, at.x[:nx], task.limits.states(nx), room),
         ):
             for i, (name, value, low, high) in enumerate(zip(names, values, *box, strict=True)):
                 if not low - off[i] <= value <= high + off[i]:
@@ -221,7 +221,7 @@ def explain_unreachable(one: Surrogate, asked: DesignTask) -> list[str]:
                     ways.append(f"{shown}, and its limit is {low if value < low else high:.4g}")
         return ways
 
-    inside = one.holding(cost, asked.limits)(row)
+    inside = one.holding(cost, task.limits)(row)
     rests = not list_broken(inside)  # where no equilibrium is inside all limits, the search keeps those of inputs alone
     if rests and not is_missed(inside):
         return []
@@ -235,18 +235,18 @@ def explain_unreachable(one: Surrogate, asked: DesignTask) -> list[str]:
             f"{nearest}"
         ]
     ways = list_broken(free) or list_broken(inside)
-    if not ways and asked.limits.of is None:
+    if not ways and task.limits.of is None:
         return []
     needs = "; ".join(ways) if ways else "what the limits of its observables forbid"
     return [f"no input inside the limits holds {format_outputs(row)}: it needs {needs}; {nearest}"]
 
 
-def describe_rest(surrogates: Sequence[Surrogate], asked: DesignTask) -> str:
+def describe_rest(surrogates: Sequence[Surrogate], task: DesignTask) -> str:
     """Return at which inputs a constant reference rests, in the median of surrogates, and which are near a limit."""
-    row, names = asked.reference[0], surrogates[0].inputs
-    rest = np.median([one.holding(asked.cost, asked.limits)(row).u for one in surrogates], axis=0)
+    row, names = task.reference[0], surrogates[0].inputs
+    rest = np.median([one.holding(task.cost, task.limits)(row).u for one in surrogates], axis=0)
     values, near = list[str](), list[str]()
-    for name, value, low, high in zip(names, rest, *asked.limits.inputs(len(names)), strict=True):
+    for name, value, low, high in zip(names, rest, *task.limits.inputs(len(names)), strict=True):
         size = high - low
         if not np.isfinite(size):
             values.append(with_unit(name, f"= {value:.3g}"))

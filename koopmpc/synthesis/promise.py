@@ -38,8 +38,8 @@ def expect_loops(chosen: ChosenController, options: DesignOptions, few: int, rng
     assert near is not None, "a design has nearest rows"
     notes, fresh = list(posed.notes), None
     held = next(one.u_reference for one in test.conditions if one.gain == 1.0)
-    wide = find_blind_range(test.episodes, test.asked, near) if few else []
-    blind = find_blind_reference(test.episodes, test.asked, near, held)
+    wide = find_blind_range(test.episodes, test.task, near) if few else []
+    blind = find_blind_reference(test.episodes, test.task, near, held)
     if few:
         fast = speed_up(controller)
         count = MANY if options.loops is None and isinstance(fast, Compiled) else few
@@ -47,9 +47,9 @@ def expect_loops(chosen: ChosenController, options: DesignOptions, few: int, rng
             why = explain_python(controller)
             notes.append(f"{few} fresh loops ran in place of {MANY}, for {why}; loops={MANY} takes longer")
         fresh = run_fresh_loops(chosen.pool, fast, count, rng)
-        if test.asked.along:
+        if test.task.along:
             notes.append(ALONG.format(count=len(posed.data.held)))
-        blind = [*describe_outside(test.episodes, test.asked, fresh), *blind, *wide]
+        blind = [*describe_outside(test.episodes, test.task, fresh), *blind, *wide]
         blind += compare_longer_horizon(chosen.pool, rows[best].recipe, controller, fast, rng)
     controller.reset()
     remembered: list[str] = []
@@ -69,7 +69,7 @@ def expect_loops(chosen: ChosenController, options: DesignOptions, few: int, rng
         chosen=best,
         chosen_linear=place,
         evidence=Evidence(
-            test.asked,
+            test.task,
             test.surrogates,
             test.low,
             test.high,
@@ -104,7 +104,7 @@ def _summarise_expected(test: LoopTest, outcome: Outcome) -> ExpectedLoop:
         broken=float(known.mean()) if known.size else 1.0,
         starts=np.array([one.x0 for one in near]),
         surrogate=tuple(one.surrogate for one in near),
-        steps=test.asked.steps,
+        steps=test.task.steps,
     )
 
 

@@ -97,7 +97,7 @@ def judge_rounds(
     with the best estimator, and the best bilinear one with weights.
     """
     run, every = partial(judge_job, test), range(len(test.conditions))
-    unstable = is_unstable(test.surrogates, test.asked)
+    unstable = is_unstable(test.surrogates, test.task)
     screened = [replace(one, feedthrough=bool(options.feedthrough)) for one in _list_first_round(results, floor)]
     told = report_stage(options.progress, "closed loops")
     first = pool.map(run, [Job(one, test.nominal) for one in screened], told, size=Job.size)
@@ -143,9 +143,9 @@ class _Ways:
     def of(cls, test: LoopTest, options: DesignOptions) -> "_Ways":
         """Return those of a task; with feedthrough each recipe has a filter, and no other estimator."""
         estimators = (None, *(LiftedDisturbance(gain=gain) for gain in _GAINS))
-        horizon, moves = test.asked.horizon, test.asked.moves
+        horizon, moves = test.task.horizon, test.task.moves
         ends: list[dict[str, Any]] = [{}, {"tail": 0}, {"tail": horizon}]
-        if moves and test.asked.cost.moves_on:
+        if moves and test.task.cost.moves_on:
             ends.append({"rests": True})
         return cls((None,) if options.feedthrough else estimators, ends, horizon, moves)
 

@@ -287,9 +287,9 @@ def choose_horizon(data: Episodes, cost: Cost, limits: Limits | None, reference:
     )
 
 
-def goal_box(asked: DesignTask) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
+def goal_box(task: DesignTask) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
     """Return the range of the goal: what both the limits and the range of the data allow."""
-    low, high = asked.limits.states(len(asked.low))
-    low, high = np.maximum(low, asked.low), np.minimum(high, asked.high)
+    low, high = task.limits.states(len(task.low))
+    low, high = np.maximum(low, task.low), np.minimum(high, task.high)
     empty = low > high
-    return np.where(empty, asked.low, low), np.where(empty, asked.high, high)
+    return np.where(empty, task.low, low), np.where(empty, task.high, high)

@@ -104,9 +104,9 @@ def _describe_lengths(task: DesignTask, held: Episodes, forecast: int) -> list[s
     return said
 
 
-def _tracks_states(asked: DesignTask) -> bool:
+def _tracks_states(task: DesignTask) -> bool:
     """Return whether cost and limits are of states alone, which models with a hidden state have as outputs."""
-    return all(of is None or isinstance(of, State) for of in (asked.cost.of, asked.limits.of))
+    return all(of is None or isinstance(of, State) for of in (task.cost.of, task.limits.of))
 
 
 def _fit_forecast(episodes: Episodes, ahead: int, past: int) -> int:
@@ -124,12 +124,12 @@ def _has_folds(episodes: Episodes, ahead: int, past: int) -> bool:
 
 
 def _list_models(
-    held: Episodes, asked: DesignTask, options: DesignOptions, past: Sequence[int], draw: np.random.Generator
+    held: Episodes, task: DesignTask, options: DesignOptions, past: Sequence[int], draw: np.random.Generator
 ) -> list[Candidate]:
     """Return the models to try; each lifting includes the observables of cost and limits."""
     given, both = options.candidates, bool(options.bilinear)
     models = propose_candidates(held, past, both, draw) if given is None else expand_candidates(given, held, past, both)
-    asking = [of for of in (asked.cost.of, asked.limits.of) if of is not None and not isinstance(of, State)]
+    asking = [of for of in (task.cost.of, task.limits.of) if of is not None and not isinstance(of, State)]
     needed = [of.bind(held.states) for of in asking]
     if not needed:
         return models

@@ -272,7 +272,7 @@ def test_the_page_shows_what_to_expect_and_the_goal(made):
 )
 def test_a_design_says_at_which_inputs_its_reference_rests_and_how_far_from_their_limits(made, low, high, said):
     evidence = made.design.evidence
-    asked = replace(evidence.asked, limits=replace(evidence.asked.limits, u_min=low, u_max=high))
+    asked = replace(evidence.task, limits=replace(evidence.task.limits, u_min=low, u_max=high))
     rest = describe_rest(evidence.surrogates[:1], asked)
     assert rest.startswith(f"the reference rests at {said}")
     assert rest.endswith(said) or low == -np.inf
@@ -326,8 +326,8 @@ def test_a_controller_that_misses_its_goal_fails_the_check_with_the_reason(tmp_p
 def test_a_reference_that_no_input_holds_is_not_kept_where_every_run_ends_far_from_it(made, tmp_path, monkeypatch):
     monkeypatch.setattr("koopmpc.apps.fitting.check.kinds", lambda *_, **__: [RunKind("as in the data")])
     saved = load_value(made.controller, SavedDesign)
-    asked = replace(saved.evidence.asked, reference=saved.evidence.asked.reference * [1, 0] + [0, 0.7])  # x and speed
-    evidence = replace(saved.evidence, asked=asked, goal_can_be_held=False)
+    asked = replace(saved.evidence.task, reference=saved.evidence.task.reference * [1, 0] + [0, 0.7])  # x and speed
+    evidence = replace(saved.evidence, task=asked, goal_can_be_held=False)
     save_value(replace(saved, evidence=evidence), tmp_path / "design.npz")
     done = check_controller(tmp_path / "design.npz", tmp_path, runs=2, rate=0.5)
     assert done.verdict == "not kept"
@@ -513,12 +513,12 @@ def test_a_check_judges_by_the_cost_of_the_design_with_its_target_inputs_and_inp
     saved = load_value(made.controller, SavedDesign)
 
     def checked_cost(**weights):
-        asked = replace(saved.evidence.asked, cost=km.Cost(Q=[0, 0], R=1.0, **weights))
-        save_value(replace(saved, evidence=replace(saved.evidence, asked=asked)), tmp_path / "design.npz")
+        asked = replace(saved.evidence.task, cost=km.Cost(Q=[0, 0], R=1.0, **weights))
+        save_value(replace(saved, evidence=replace(saved.evidence, task=asked)), tmp_path / "design.npz")
         return check_controller(tmp_path / "design.npz", tmp_path, runs=1, rate=0.5).figures[0].cost
 
     zero, one, two = (checked_cost(u_target=[c]) for c in (0.0, 1.0, 2.0))
-    assert two - 2 * one + zero == pytest.approx(2 * saved.evidence.asked.steps)
+    assert two - 2 * one + zero == pytest.approx(2 * saved.evidence.task.steps)
     changes = checked_cost(u_target=[0.0], R_delta=1.0) - zero
     assert changes > 0
     assert checked_cost(u_target=[0.0], R_delta=3.0) - zero == pytest.approx(3 * changes)

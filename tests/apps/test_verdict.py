@@ -65,8 +65,8 @@ def test_the_bound_of_a_verdict_is_the_exact_binomial_one_and_its_number_of_loop
 def test_loops_that_break_a_narrower_limit_are_counted(made):
     """The controller keeps the limit of its goal; judged by one half as wide it cannot."""
     saved, controller = load(made)
-    asked = saved.evidence.asked
-    narrow = replace(saved.evidence, asked=replace(asked, limits=km.Limits(u_min=-2, u_max=2, x_max=[np.inf, 0.1])))
+    asked = saved.evidence.task
+    narrow = replace(saved.evidence, task=replace(asked, limits=km.Limits(u_min=-2, u_max=2, x_max=[np.inf, 0.1])))
     loops = [judge_rate(one, controller, 0.2, np.random.default_rng(0)) for one in (saved.evidence, narrow)]
     assert loops[0].failures < loops[1].failures
     assert loops[0].failure_bound < loops[1].failure_bound

@@ -59,13 +59,13 @@ def draw_states(task: Task, evidence: Any, rng: np.random.Generator) -> np.ndarr
     """Return first states of runs on the plant: what is measured by the design's distribution, the rest as logged."""
     x0, states = task.training.x0, list(task.plant.states)
     starts = rng.uniform(x0.low, x0.high, (STARTS, len(states)))
-    starts[:, [states.index(name) for name in evidence.surrogates[0].states]] = draw_starts(evidence.asked, STARTS, rng)
+    starts[:, [states.index(name) for name in evidence.surrogates[0].states]] = draw_starts(evidence.task, STARTS, rng)
     return starts
 
 
 def measure_design(task: Task, seed: int, controller: Any, evidence: Any) -> dict[str, Any]:
     """Return what a design promises, and cost and violation of each run on the plant; null where it was lost."""
-    asked, rng = evidence.asked, np.random.default_rng(1000 + seed)
+    asked, rng = evidence.task, np.random.default_rng(1000 + seed)
     fast = speed_up(controller)
     pool = LoopPool(asked, evidence.surrogates, evidence.neighbours, evidence.low, evidence.high)
     none = np.zeros(0)

@@ -61,7 +61,7 @@ def test_loops_of_a_few_records_start_all_along_them_with_their_past(delays):
     starts = np.array([one.x0 for one in loops])
     low, high = goal_box(task)
     assert (np.ptp(starts, axis=0) > 0.7 * (high - low)).all()
-    short = replace(pool, asked=replace(task, steps=3))
+    short = replace(pool, task=replace(task, steps=3))
     results = short.run(recipe.controller(recipe.fit(data), cost, LIMITS, 8), loops[:8])
     kept = [i for i, one in enumerate(results) if one.run is not None]
     assert len(kept) >= 4
@@ -70,7 +70,7 @@ def test_loops_of_a_few_records_start_all_along_them_with_their_past(delays):
         inputs = [u for e in data for u in e.U[:, 0]]
         assert np.isclose(inputs, one.past[2], rtol=0, atol=1e-12).any()  # u_{k-1} of a row, and no mean
     assert not check_task(data, cost, LIMITS, 8, rest, [0.1, 0.0], ()).along
-    assert not make()[0].asked.along
+    assert not make()[0].task.along
 
 
 CASES = [
@@ -156,10 +156,10 @@ def test_a_late_input_and_a_gain_change_a_loop_and_its_seed_repeats_it():
 def test_a_stretch_of_a_reference_ends_with_the_rows_behind_it_in_view():
     """A loop of 20 steps is the first part of one of 30: no controller sees the reference rest where it goes on."""
     pool, controller = make(moves=True)
-    assert pool.asked.steps == 120  # and not three horizons of 8 steps
+    assert pool.task.steps == 120  # and not three horizons of 8 steps
     loop = DrawnLoop(np.array([0.2, 0.1]), 0, 1.0, 5, 7)
     short, long = (
-        replace(pool, asked=replace(pool.asked, steps=steps)).run(controller, [loop])[0].run for steps in (20, 30)
+        replace(pool, task=replace(pool.task, steps=steps)).run(controller, [loop])[0].run for steps in (20, 30)
     )
     assert (short.steps, long.steps) == (20, 30)
     np.testing.assert_array_equal(short.U, long.U[:20])
@@ -168,7 +168,7 @@ def test_a_stretch_of_a_reference_ends_with_the_rows_behind_it_in_view():
 def test_the_verdict_starts_where_no_choice_did_and_corners_stand_apart():
     pool, controller = make()
     fresh = run_fresh_loops(pool, controller, 12, np.random.default_rng(0))
-    chosen = np.concatenate([pool.asked.starts, pool.asked.first_states])
+    chosen = np.concatenate([pool.task.starts, pool.task.first_states])
     first, second = (np.array([one.x0 for one in pool.draw(12, np.random.default_rng(seed))]) for seed in (0, 1))
     for starts in (chosen, second):
         assert np.abs(first[:, None] - starts[None]).max(axis=2).min() > 1e-6

@@ -444,7 +444,7 @@ def test_a_model_that_is_not_that_of_the_folds_is_not_confirmed():
     conditions = [test[-1].conditions[place] for place in last.conditions]
     usual = [one.gain == 1.0 and np.isfinite(cost) for one, cost in zip(conditions, outcome.cost, strict=True)]
     assert 0 < sum(usual) < len(usual)  # weights of fits are around states of runs with inputs as in the data
-    assert len(outcome.visited) == sum(usual) * (test[-1].asked.steps + 1)
+    assert len(outcome.visited) == sum(usual) * (test[-1].task.steps + 1)
     assert confirm.is_confirmed(test[-1], found.controller, outcome)
     model = found.controller.predictor
     wrong = km.KoopmanMPC(replace(model, B=-model.B), COST, LIMITS, 8)

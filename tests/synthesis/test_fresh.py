@@ -177,7 +177,7 @@ def narrow():
 
 def test_starts_to_record_lie_outside_the_data_far_from_each_other_and_make_the_range_known():
     design = narrow()
-    asked, rows = design.evidence.asked, design.evidence.neighbours
+    asked, rows = design.evidence.task, design.evidence.neighbours
     X = design.starts_to_record(12)
     low, high = goal_box(asked)
     assert X.shape == (12, 2)
@@ -212,7 +212,7 @@ def test_the_picture_of_blindness_shows_data_and_range_and_where_to_record(tmp_p
     drawn = {line.get_label(): len(line.get_xdata()) for line in panel.get_lines()}
     assert drawn["record from here"] == 6
     assert drawn["range without data"] == round(
-        256 * find_share_outside(narrow().evidence.neighbours, narrow().evidence.asked)
+        256 * find_share_outside(narrow().evidence.neighbours, narrow().evidence.task)
     )
     again = tmp_path / "controller.npz"
     narrow().save(again)
@@ -223,9 +223,9 @@ def test_the_picture_of_blindness_shows_data_and_range_and_where_to_record(tmp_p
 
 
 def test_the_picture_of_blindness_says_where_the_reference_is_outside():
-    asked, drawn = narrow().evidence.asked, []
+    asked, drawn = narrow().evidence.task, []
     for row in ([0.1, 0.1], [0.8, -0.8], [9.0, 9.0]):
-        evidence = replace(narrow().evidence, asked=replace(asked, reference=np.array([row])))
+        evidence = replace(narrow().evidence, task=replace(asked, reference=np.array([row])))
         panel = km.plot.blindness(replace(narrow(), evidence=evidence)).axes[0]
         shown = {line.get_label(): len(line.get_xdata()) for line in panel.get_lines()}
         drawn.append((shown["reference outside the data"], "the reference lies outside" in panel.get_title()))
@@ -240,7 +240,7 @@ def test_a_design_without_rows_of_its_data_has_no_picture():
 
 
 def test_fresh_starts_stay_in_the_range_of_the_goal_or_of_the_starts():
-    asked = fresh().evidence.asked
+    asked = fresh().evidence.task
     low, high = goal_box(asked)
     pool = np.concatenate([asked.starts, asked.first_states])
     X = draw_starts(asked, 200, np.random.default_rng(0))

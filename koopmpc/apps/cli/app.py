@@ -223,7 +223,7 @@ def run_export(
         saved = read_controller(controller)
         loaded = rebuild_controller(saved, controller)
         if isinstance(saved, SavedDesign):  # the model itself, from a start of the design to its reference
-            asked = saved.evidence.asked
+            asked = saved.evidence.task
             example = {"x0": asked.starts[0], "reference": asked.reference if asked.moves else asked.reference[:1]}
         if problem is not None:
             given = load_problem(problem)

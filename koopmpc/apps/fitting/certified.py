@@ -25,8 +25,8 @@ def describe_certificate(
     if why or unseen is None or not len(unseen):
         why = why or "no log is left that the model was not fitted to; record more episodes"
         return f"No certificate: {why}."
-    rest = evidence.surrogates[0].holding(evidence.asked.cost, evidence.asked.limits)(evidence.asked.reference[0])
-    limits = evidence.asked.limits
+    rest = evidence.surrogates[0].holding(evidence.task.cost, evidence.task.limits)(evidence.task.reference[0])
+    limits = evidence.task.limits
     try:
         certificate = certify(
             model,
@@ -49,7 +49,7 @@ def describe_certificate(
 
 def _explain_unfit(design: Design, reference: Float[np.ndarray, "..."]) -> str:
     """Return why a certificate cannot be sought at all; empty if it can."""
-    asked, model = design.evidence.asked, get_model(design.controller)
+    asked, model = design.evidence.task, get_model(design.controller)
     of = asked.cost.of.bind(model.states)
     if design.best.recipe.feedthrough:
         return "the inputs act on outputs at once, and a certificate is of a state that a controller reads"

@@ -115,7 +115,7 @@ def check_controller(
         )
     evidence = saved.evidence
     controller = rebuild_controller(saved, path)
-    asked = evidence.asked
+    asked = evidence.task
     controller.reset(asked.starts[0])
     start = perf_counter()
     controller(asked.starts[0], asked.reference[: controller.horizon + 1])
@@ -197,7 +197,7 @@ class _TestBench:
 
     def __init__(self, evidence: Evidence, controller: AnyMPC) -> None:
         self._evidence, self._controller, self.times = evidence, controller, list[float]()
-        asked = evidence.asked
+        asked = evidence.task
         self._steps = asked.steps
         self._reference = read_reference(asked, 0, asked.steps + 1 + controller.horizon)
         if not asked.moves:
@@ -207,7 +207,7 @@ class _TestBench:
 
     def run(self, kind: RunKind, first: Float[np.ndarray, " n"], seed: int) -> _Outcome:
         """Run the controller from a state, and return what `metrics` says of the run."""
-        evidence, asked, place = self._evidence, self._evidence.asked, seed % len(self._evidence.surrogates)
+        evidence, asked, place = self._evidence, self._evidence.task, seed % len(self._evidence.surrogates)
         surrogate, key = evidence.surrogates[place], (place, kind.gain)
         if key not in self._plants:
             inputs = surrogate.find_reference_inputs(
@@ -249,7 +249,7 @@ class _TestBench:
         neighbours, evidence = self._evidence.neighbours, self._evidence
         if neighbours is None:
             return [], []
-        asked, u_reference = evidence.asked, self._plants[0, 1.0][1] if (0, 1.0) in self._plants else None
+        asked, u_reference = evidence.task, self._plants[0, 1.0][1] if (0, 1.0) in self._plants else None
         if u_reference is None:
             u_reference = evidence.surrogates[0].find_reference_inputs(
                 asked.cost, asked.limits, self._reference[: self._steps]
@@ -338,14 +338,14 @@ def _reasons(
 def _explain_arrival(evidence: Evidence, one: Figures) -> list[str]:
     """Return why a constant reference is not reached; one that no input holds must be missed by every run."""
     off = one.error if evidence.goal_can_be_held else one.closest
-    if evidence.asked.moves or one.lost == one.runs or off <= ARRIVED:
+    if evidence.task.moves or one.lost == one.runs or off <= ARRIVED:
         return []
     if evidence.goal_can_be_held:
         return [f"{_say_off(one)}, {to_percent(ARRIVED)} are allowed"]
     return [
         f"{one.kind.name}: every run ends {to_percent(off)} of the data's range or more off its reference, "
         f"{to_percent(ARRIVED)} are allowed",
-        *explain_unreachable(evidence.surrogates[0], evidence.asked),
+        *explain_unreachable(evidence.surrogates[0], evidence.task),
     ]
 
 

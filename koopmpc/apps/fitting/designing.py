@@ -127,7 +127,7 @@ def design_data(
     tell(str(designed))
     evidence = designed.evidence
     if evidence.goal_can_be_held:
-        tell(describe_rest(evidence.surrogates, evidence.asked))
+        tell(describe_rest(evidence.surrogates, evidence.task))
     certified = ""
     if asked.certify:
         unseen = split.held_out if split.learned is None else None

@@ -68,7 +68,7 @@ def write_design_report(
         The file cannot be written.
     """
     evidence, logs = saved.evidence, saved.logs
-    of = evidence.asked.cost.of.bind(controller_states(evidence))
+    of = evidence.task.cost.of.bind(controller_states(evidence))
     page = HtmlPage(f"Controller report: {', '.join(strip_unit(name) for name in of.names)}")
     if verdict is None:
         page.verdict("good" if not evidence.expected.lost else "doubt", *_list_promise(evidence)[:2])
@@ -125,7 +125,7 @@ def _format_range(low: float, high: float, unit: str = "") -> str:
 
 
 def _add_goal(page: HtmlPage, evidence: Evidence, controller: AnyMPC) -> None:
-    asked, states, inputs = evidence.asked, controller_states(evidence), evidence.surrogates[0].model.inputs
+    asked, states, inputs = evidence.task, controller_states(evidence), evidence.surrogates[0].model.inputs
     of = asked.cost.of.bind(states)
     Q, R = asked.cost.matrices(of.nz, len(inputs))
     changes = asked.cost.rate(len(inputs))
@@ -262,7 +262,7 @@ def run_shown_loops(evidence: Evidence, controller: AnyMPC) -> dict[str, list[Ru
     controller
         Is reset before each loop and at the end.
     """
-    asked, starts = evidence.asked, evidence.expected.starts
+    asked, starts = evidence.task, evidence.expected.starts
     starts = starts if len(starts) else asked.starts
     rows = read_reference(asked, 0, asked.steps + 1 + controller.horizon)
     inputs = np.zeros((asked.steps, controller.nu))  # only the cost needs them, and no loop here is judged by it
@@ -300,9 +300,9 @@ def _add_loops(page: HtmlPage, evidence: Evidence, controller: AnyMPC, loops: di
     every = [run for runs in loops.values() for run in runs]
     ended = [run for run in every if run is not None]
     lost = len(every) - len(ended)
-    worst = max((float(violation_shares(run, evidence.asked.limit_sizes).max()) for run in ended), default=0.0)
+    worst = max((float(violation_shares(run, evidence.task.limit_sizes).max()) for run in ended), default=0.0)
     page.text(
-        f"{len(every)} loops of {evidence.asked.steps} steps from starts of the logs: {lost} of them "
+        f"{len(every)} loops of {evidence.task.steps} steps from starts of the logs: {lost} of them "
         f"{'is' if lost == 1 else 'are'} lost, and {_say_violated(worst)}. "
         "Stand-ins are models that the controller's own model does not know, the same with inputs that act 20 % more "
         "or less, and the nearest rows of the logs themselves."
@@ -310,7 +310,7 @@ def _add_loops(page: HtmlPage, evidence: Evidence, controller: AnyMPC, loops: di
     if not ended:
         return
     states, inputs = controller_states(evidence), ended[0].inputs
-    asked, tracked = evidence.asked, evidence.asked.cost.of.bind(states).names
+    asked, tracked = evidence.task, evidence.task.cost.of.bind(states).names
     boxes: tuple[Interval, Interval] = asked.limits.states(len(states)), asked.limits.inputs(len(inputs))
     groups = {name: [run for run in runs if run is not None] for name, runs in loops.items()}
     groups = {name: runs for name, runs in groups.items() if runs}
@@ -352,7 +352,7 @@ def _add_blind(page: HtmlPage, evidence: Evidence, loops: dict[str, list[Run | N
         page.text("The design kept no rows of its data, so nobody can say where they end.")
         return
     states = near.states
-    _, away = probe_range(evidence.asked, near)
+    _, away = probe_range(evidence.task, near)
     page.text(
         f"{to_percent(float(away.mean()))} of the goal's range, which is what limits and ranges of the signals allow, "
         "has no data around it. There the controller guesses, and its moves say known = False."
@@ -362,7 +362,7 @@ def _add_blind(page: HtmlPage, evidence: Evidence, loops: dict[str, list[Run | N
         more = f" The map shows two of {len(states)} signals." if len(states) > 2 else ""
         caption = f"Rows of the logs, points of the goal's range that have none around them, and loops.{more}"
         page.pictures(_draw([(caption, partial(draw_blindness, evidence, loops=ended))]))
-    advised = choose_starts_to_record(evidence.asked, near, _ADVISED)
+    advised = choose_starts_to_record(evidence.task, near, _ADVISED)
     if len(advised):
         page.text("Episodes that start in these states make the range known:")
         page.table(states, [[f"{value:.4g}" for value in row] for row in advised])
@@ -398,7 +398,7 @@ def _say_violated(share: float) -> str:
 
 
 def _add_usage(page: HtmlPage, file: str, controller: AnyMPC, evidence: Evidence) -> None:
-    row: Float[np.ndarray, " nr"] = evidence.asked.reference[0]
+    row: Float[np.ndarray, " nr"] = evidence.task.reference[0]
     reference = ", ".join(f"{value:.6g}" for value in row)
     states = ", ".join(controller_states(evidence))
     page.text("Test it on the stand-ins, write it as C, or run it in Python:")

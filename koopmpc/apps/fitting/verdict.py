@@ -43,7 +43,7 @@ def judge_rate(
     The number is fixed before the loops: a number that grows until the bound is met loses the confidence.
     """
     count = count_runs_needed(rate)
-    pool = LoopPool(evidence.asked, evidence.surrogates, evidence.neighbours, evidence.low, evidence.high)
+    pool = LoopPool(evidence.task, evidence.surrogates, evidence.neighbours, evidence.low, evidence.high)
     drawn, fast = pool.draw(count, rng), speed_up(controller)
     results: list[LoopResult] = []
     for first in range(0, count, ROUND):
@@ -66,7 +66,7 @@ def judge_plant_runs(evidence: Evidence, controller: Any, logs: Episodes) -> Loo
     DataError
         The logs have other states or inputs, or less than nine tenths of their inputs are this controller's.
     """
-    asked, nx, nu = evidence.asked, len(evidence.asked.low), controller.nu
+    asked, nx, nu = evidence.task, len(evidence.task.low), controller.nu
     if logs.nx != nx or logs.nu != nu:
         raise DataError(f"the logs have {logs.nx} states and {logs.nu} inputs, the design {nx} and {nu}")
     direct = evidence.surrogates[0].feedthrough

@@ -110,7 +110,7 @@ class Crowd:
 
 
 def run_abreast(
-    asked: DesignTask,
+    task: DesignTask,
     controller: Compiled,
     crowd: Crowd,
     step: CrowdStep,
@@ -160,14 +160,14 @@ def run_abreast(
             solve_time=nothing,
             iterations=nothing.astype(np.int64),
             slack=nothing,
-            cost=asked.cost,
-            limits=asked.limits,
+            cost=task.cost,
+            limits=task.limits,
             u_reference=u_reference[e],
             dt=controller.dt,
             states=stand_in.states,
             inputs=stand_in.inputs,
             outputs=stand_in.states,
-            angles=asked.angles,
+            angles=task.angles,
         )
         if alive[e]
         else None

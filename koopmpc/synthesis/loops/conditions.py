@@ -70,7 +70,7 @@ class LoopTest:
     the goal `holds` if the reference is constant and an input inside the limits holds it.
     """
 
-    asked: DesignTask
+    task: DesignTask
     episodes: Episodes
     fold: tuple[int, ...]
     surrogates: tuple[Surrogate, ...]
@@ -88,9 +88,9 @@ class LoopTest:
     def limits(self, band: Float[np.ndarray, "h nx"]) -> Limits:
         """Return the limits of a controller whose model has these errors."""
         if self.room is None:
-            return self.asked.limits
-        width = np.where(np.isfinite(band), band, self.asked.high - self.asked.low)
-        limits = self.asked.limits.tightened(np.minimum(width, self.room), states=self.episodes.states)
+            return self.task.limits
+        width = np.where(np.isfinite(band), band, self.task.high - self.task.low)
+        limits = self.task.limits.tightened(np.minimum(width, self.room), states=self.episodes.states)
         said = tuple(
             f"{strip_unit(self.episodes.states[i])}: the margin is {self.room[i]:.4g}, half way from the reference to "
             f"the limit, though the errors ask for up to {width[:, i].max():.4g}"
@@ -128,7 +128,7 @@ TURNS = 0.9 * 2 * np.pi  # [rad] an angle whose range in the data is larger make
 
 def prepare_test(
     folds: Folds,
-    asked: DesignTask,
+    task: DesignTask,
     pair: Sequence[Recipe],
     tighten: bool,
     noise: Float[np.ndarray, " nx"],
@@ -147,8 +147,8 @@ def prepare_test(
         for k in range(FOLDS):
             for family in families:
                 number, j = 2 * ((k + 1 + family) % FOLDS) + family, len(wanted)
-                row = asked.late * (j % STRETCHES) // (STRETCHES - 1)
-                start = asked.starts[j % len(asked.starts)]
+                row = task.late * (j % STRETCHES) // (STRETCHES - 1)
+                start = task.starts[j % len(task.starts)]
                 wanted.append(Condition(k, number, gain, start, row, np.zeros((0, data.nu))))
     mine = [[j for j, one in enumerate(wanted) if one.surrogate == number] for number in range(FOLDS * len(pair))]
     tasks = [
@@ -158,23 +158,23 @@ def prepare_test(
     ]
     surrogates: list[Surrogate] = []
     conditions = list(wanted)
-    for places, (one, inputs) in zip(mine, pool.map(partial(_fit_task, folds, asked, noise), tasks), strict=True):
+    for places, (one, inputs) in zip(mine, pool.map(partial(_fit_task, folds, task, noise), tasks), strict=True):
         surrogates.append(one)
         for j, rows in zip(places, inputs, strict=True):
             conditions[j] = replace(wanted[j], u_reference=rows)
     X = np.concatenate([episode.X for episode in data])
-    turning = [i for i in find_angles(data.states, X) if asked.high[i] - asked.low[i] > TURNS]
+    turning = [i for i in find_angles(data.states, X) if task.high[i] - task.low[i] > TURNS]
     ignored = find_ignored_states(surrogates[0], X)
-    turning = sorted({*asked.angles, *turning} - {*ignored})
+    turning = sorted({*task.angles, *turning} - {*ignored})
     free = sorted({*turning, *ignored})
-    of = asked.cost.of.bind(data.states)
+    of = task.cost.of.bind(data.states)
     tracked = [int(i) for i in of.state_indices] if isinstance(of, State) else []
-    low, high = asked.hull(free, tracked)
-    room = limit_margins(asked, data) if tighten else None
-    unreachable = explain_unreachable(surrogates[0], asked)
-    doubts = [*unreachable, *find_outside_limits(asked, data), *find_outside_data(asked, data, tracked, free)]
+    low, high = task.hull(free, tracked)
+    room = limit_margins(task, data) if tighten else None
+    unreachable = explain_unreachable(surrogates[0], task)
+    doubts = [*unreachable, *find_outside_limits(task, data), *find_outside_data(task, data, tracked, free)]
     return LoopTest(
-        asked=asked,
+        task=task,
         episodes=data,
         fold=folds.fold,
         surrogates=tuple(surrogates),
@@ -186,8 +186,8 @@ def prepare_test(
         ignored=tuple(ignored),
         turning=tuple(turning),
         raw=raw,
-        doubts=(*doubts, *find_poor_logs(asked, data, tracked)),
-        holds=not asked.moves and not unreachable,
+        doubts=(*doubts, *find_poor_logs(task, data, tracked)),
+        holds=not task.moves and not unreachable,
     )
 
 
@@ -200,12 +200,12 @@ class _SurrogateTask(NamedTuple):
 
 
 def _fit_task(
-    folds: Folds, asked: DesignTask, noise: Float[np.ndarray, " nx"], task: _SurrogateTask
+    folds: Folds, task: DesignTask, noise: Float[np.ndarray, " nx"], job: _SurrogateTask
 ) -> tuple[Surrogate, list[Float[np.ndarray, "T nu"]]]:
     """Return the surrogate and the `Condition.u_reference` of each run on it."""
     data, fold = folds.episodes, folds.fold
-    one = fit_surrogate(task.recipe, drop_fold(data, fold, task.out), select_fold(data, fold, task.out), noise)
-    cost, limits = asked.cost, asked.limits
-    rows = [(gain, asked.reference[first : first + asked.steps]) for gain, first in task.runs]
+    one = fit_surrogate(job.recipe, drop_fold(data, fold, job.out), select_fold(data, fold, job.out), noise)
+    cost, limits = task.cost, task.limits
+    rows = [(gain, task.reference[first : first + task.steps]) for gain, first in job.runs]
     inputs = [one.find_reference_inputs(cost, limits, part, gain) for gain, part in rows]
     return one, inputs

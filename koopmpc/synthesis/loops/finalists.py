@@ -56,7 +56,7 @@ def find_room_to_stop(
     still keep them, see `find_stopping_set`. That stays if the same loops prefer it, see `is_preferable`.
     """
     limits, near = controller.limits, pool.neighbours
-    low, high = limits.states(len(pool.asked.low))
+    low, high = limits.states(len(pool.task.low))
     if limits.terminal is not None or near is None or data.nw or not np.isfinite(np.stack([low, high])).any():
         return limits, ""
     fast = speed_up(controller)
@@ -67,12 +67,12 @@ def find_room_to_stop(
         return limits, ""
     with hide_fit_warnings():
         model = edmd(data, State() + Constant())
-    ends = find_stopping_set(model, pool.asked.limits, near.middle, X[:: -(-len(X) // DRAWN)])
+    ends = find_stopping_set(model, pool.task.limits, near.middle, X[:: -(-len(X) // DRAWN)])
     if ends is None:
         return limits, ""
     kept = replace(limits, terminal=ends)
     try:
-        other = recipe.controller(get_model(controller), pool.asked.cost, kept, controller.horizon)
+        other = recipe.controller(get_model(controller), pool.task.cost, kept, controller.horizon)
     except KoopmpcError:  # the model's states are others
         return limits, ""
     stopped = pool.run(speed_up(other), drawn)
@@ -144,7 +144,7 @@ def compare_longer_horizon(
     controller as `speed_up` returns it. Where twice as long is better, four times is tried, and told if better still.
     """
     N, drawn = controller.horizon, pool.draw(COMPARED if isinstance(fast, Compiled) else FEW, rng)
-    drawn += _draw_corners(pool.asked, rng)
+    drawn += _draw_corners(pool.task, rng)
 
     def run(horizon: int) -> list[LoopResult]:
         one = recipe.controller(get_model(controller), controller.cost, controller.limits, horizon)

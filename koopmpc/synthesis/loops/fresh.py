@@ -24,12 +24,12 @@ BLIND = 0.05  # share of steps outside the data above which a design says where 
 
 def run_fresh_loops(pool: LoopPool, controller: Any, loops: int, rng: np.random.Generator) -> FreshLoops:
     """Return fresh loops, and loops from the corners of the goal's range, which are on nearest neighbours."""
-    asked, near = pool.asked, pool.neighbours
+    task, near = pool.task, pool.neighbours
     assert near is not None, "a design has nearest rows"
     drawn = pool.draw(loops, rng)
-    corners = _draw_corners(asked, rng)
+    corners = _draw_corners(task, rng)
     results = pool.run(controller, [*drawn, *corners])
-    share, away = np.zeros(len(results)), [np.zeros((0, len(asked.low)))]
+    share, away = np.zeros(len(results)), [np.zeros((0, len(task.low)))]
     begun = 0
     for i, (result, loop) in enumerate(zip(results, [*drawn, *corners], strict=True)):
         if result.run is None:
@@ -53,16 +53,16 @@ def run_fresh_loops(pool: LoopPool, controller: Any, loops: int, rng: np.random.
     )
 
 
-def find_blind_range(data: Episodes, asked: DesignTask, neighbours: NeighbourMap) -> list[str]:
+def find_blind_range(data: Episodes, task: DesignTask, neighbours: NeighbourMap) -> list[str]:
     """Return a sentence if much of the goal's range has no data around it: each signal is inside, but not together."""
     kept = [i for i in range(data.nx) if i not in neighbours.ignored]
     if neighbours.embedding is not None or len(kept) < 2:
         return []
-    X, away = probe_range(asked, neighbours)
+    X, away = probe_range(task, neighbours)
     share = float(away.mean())
     if share <= BLIND_RANGE:
         return []
-    low, high = goal_box(asked)
+    low, high = goal_box(task)
     size = np.where(high > low, high - low, 1.0)
     distance, _ = neighbours.tree.query(neighbours.scale_states(X))
     place = int(np.argmax(np.where(away, distance, 0.0)))
@@ -78,9 +78,9 @@ def find_blind_range(data: Episodes, asked: DesignTask, neighbours: NeighbourMap
     ]
 
 
-def _draw_corners(asked: DesignTask, rng: np.random.Generator) -> list[DrawnLoop]:
+def _draw_corners(task: DesignTask, rng: np.random.Generator) -> list[DrawnLoop]:
     """Return loops from corners of the goal's range, some of them where there are many."""
-    low, high = goal_box(asked)
+    low, high = goal_box(task)
     if len(low) <= 3:
         corners = np.array([np.where(way, high, low) for way in product((False, True), repeat=len(low))])
     else:
@@ -88,12 +88,12 @@ def _draw_corners(asked: DesignTask, rng: np.random.Generator) -> list[DrawnLoop
     return [DrawnLoop(x0, -1, 1.0, 0, int(rng.integers(2**31))) for x0 in corners]
 
 
-def describe_outside(data: Episodes, asked: DesignTask, fresh: FreshLoops) -> list[str]:
+def describe_outside(data: Episodes, task: DesignTask, fresh: FreshLoops) -> list[str]:
     """Return one sentence that says where many steps of the loops are outside the data, and what to record."""
     share, X = float(fresh.outside.mean()) if len(fresh.outside) else 0.0, fresh.outside_states
     if share <= BLIND or not len(X):
         return []
-    size = np.where(asked.high > asked.low, asked.high - asked.low, 1.0)
+    size = np.where(task.high > task.low, task.high - task.low, 1.0)
     center, spread = np.median(X, axis=0), np.ptp(X, axis=0) / size
     named = np.argsort(spread, kind="stable")[: min(2, data.nx)]
     places = ", ".join(f"{strip_unit(data.states[i])} near {center[i]:.3g}" for i in sorted(map(int, named)))
@@ -105,19 +105,19 @@ def describe_outside(data: Episodes, asked: DesignTask, fresh: FreshLoops) -> li
 
 
 def find_blind_reference(
-    data: Episodes, asked: DesignTask, neighbours: NeighbourMap, u_held: Float[np.ndarray, "T nu"]
+    data: Episodes, task: DesignTask, neighbours: NeighbourMap, u_held: Float[np.ndarray, "T nu"]
 ) -> list[str]:
     """Return a sentence if a reference of the whole state lies outside the data though each of its values is inside."""
-    of = asked.cost.of.bind(data.states)
+    of = task.cost.of.bind(data.states)
     whole = isinstance(of, State) and sorted(of.state_indices) == list(range(data.nx))
-    Q = np.diag(asked.cost.matrices(of.nz, data.nu)[0])
-    if asked.moves or not whole or not isinstance(of, State) or (Q <= 0).any() or neighbours.embedding is not None:
+    Q = np.diag(task.cost.matrices(of.nz, data.nu)[0])
+    if task.moves or not whole or not isinstance(of, State) or (Q <= 0).any() or neighbours.embedding is not None:
         return []
     if find_angles(data.states, np.concatenate([e.X for e in data])):
         return []
     row = np.zeros(data.nx)
-    row[list(of.state_indices)] = asked.reference[0]
-    inside = ((row >= asked.low) & (row <= asked.high)).all()
+    row[list(of.state_indices)] = task.reference[0]
+    inside = ((row >= task.low) & (row <= task.high)).all()
     if not inside or not neighbours.find_outside(row[None], u_held[:1])[0]:
         return []
     return [

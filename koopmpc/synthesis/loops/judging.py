@@ -171,7 +171,7 @@ def _join_outcomes(first: Outcome, rest: Outcome) -> Outcome:
 
 def _judge_models(test: LoopTest, recipe: Recipe, models: _Models, conditions: Sequence[int]) -> Outcome:
     """Return the result of controllers of these models; all have the limits that the final controller gets."""
-    n, asked, limits = len(conditions), test.asked, test.limits(models.band)
+    n, task, limits = len(conditions), test.task, test.limits(models.band)
     cost, violation, broken = np.full(n, np.inf), np.full(n, np.inf), np.ones(n)
     visited: dict[int, Float[np.ndarray, "T1 nx"]] = {}
     controller: Designed | None = None
@@ -182,13 +182,13 @@ def _judge_models(test: LoopTest, recipe: Recipe, models: _Models, conditions: S
         if isinstance(controller, BilinearMPC) and not recipe.candidate.has_hidden_state:
             controller.update(model)  # its functions are those of the lifting, whatever the model
         else:
-            controller = recipe.controller(model, asked.cost, limits, asked.horizon, brief=True)
+            controller = recipe.controller(model, task.cost, limits, task.horizon, brief=True)
         for j in mine:
             one = test.conditions[conditions[j]]
             run, cost[j] = _run_condition(test, one, controller, conditions[j])
             if run is None:
                 continue
-            over = violation_shares(run, asked.limit_sizes)[1:]
+            over = violation_shares(run, task.limit_sizes)[1:]
             violation[j], broken[j] = over.max(), np.mean(over > BROKEN)
             if one.gain == 1.0:
                 visited[j] = run.X
@@ -221,15 +221,15 @@ def is_confirmed(test: LoopTest, controller: Designed, outcome: Outcome) -> bool
 
 def _run_condition(test: LoopTest, one: Condition, controller: Designed, seed: int) -> tuple[Run | None, float]:
     """Return the closed loop of a condition and its cost; None and inf if it is lost."""
-    asked = test.asked
+    task = test.task
     run = run_on_surrogate(
-        asked,
+        task,
         test.surrogates[one.surrogate],
         test.plant(one),
         controller,
         one.x0,
         box=(test.low, test.high),
-        reference=read_reference(asked, one.first, asked.steps + 1 + controller.horizon),
+        reference=read_reference(task, one.first, task.steps + 1 + controller.horizon),
         u_reference=one.u_reference,
         rng=seed,
     )
@@ -237,13 +237,13 @@ def _run_condition(test: LoopTest, one: Condition, controller: Designed, seed: i
     return (run, cost) if np.isfinite(cost) else (None, np.inf)
 
 
-def read_reference(asked: DesignTask, first: int, count: int) -> Float[np.ndarray, "count nr"]:
+def read_reference(task: DesignTask, first: int, count: int) -> Float[np.ndarray, "count nr"]:
     """Return so many rows of the reference from row `first` on, the last one repeated behind its end."""
-    return asked.reference[np.minimum(first + np.arange(count), len(asked.reference) - 1)]
+    return task.reference[np.minimum(first + np.arange(count), len(task.reference) - 1)]
 
 
 def run_on_surrogate(
-    asked: DesignTask,
+    task: DesignTask,
     surrogate: Surrogate | NeighbourMap,
     plant: Transition,
     controller: Controller,
@@ -274,11 +274,11 @@ def run_on_surrogate(
             steps=len(u_reference),
             options=LoopOptions(noise=noise * surrogate.noise, faults=faults, rng=rng),
             measured=surrogate.w if len(surrogate.w) else None,
-            limits=asked.limits,
+            limits=task.limits,
             observers=observers,
         )
     except LostError:
         return None
     return replace(
-        run, X=run.X[:, : len(states)], states=states, cost=asked.cost, angles=asked.angles, u_reference=u_reference
+        run, X=run.X[:, : len(states)], states=states, cost=task.cost, angles=task.angles, u_reference=u_reference
     )

@@ -56,17 +56,17 @@ def keep_limits(
     The tube is that of the model's one-step errors, the first row of `band`, around the reference; for a model of past
     rows, and where no feedback holds the model, it is the band itself.
     """
-    asked, model = test.asked, get_model(controller)
-    width = np.where(np.isfinite(band), band, asked.high - asked.low)
-    rest = test.surrogates[0].holding(asked.cost, asked.limits)(asked.reference[0])
-    nx = len(asked.low)
-    tube = find_tube(model, asked, width[0], np.asarray(rest.x)[:nx], np.asarray(rest.u))
+    task, model = test.task, get_model(controller)
+    width = np.where(np.isfinite(band), band, task.high - task.low)
+    rest = test.surrogates[0].holding(task.cost, task.limits)(task.reference[0])
+    nx = len(task.low)
+    tube = find_tube(model, task, width[0], np.asarray(rest.x)[:nx], np.asarray(rest.u))
     ends = controller.limits.terminal
     promise, limits = promise_coverage(
         pool,
-        lambda limits: recipe.controller(model, asked.cost, replace(limits, terminal=ends), asked.horizon),
+        lambda limits: recipe.controller(model, task.cost, replace(limits, terminal=ends), task.horizon),
         width if tube is None else tube,
-        limit_margins(asked, test.episodes),
+        limit_margins(task, test.episodes),
         coverage,
         loops,
         rng,
@@ -106,7 +106,7 @@ def promise_coverage(
         Draws the loops.
     """
     first, second, allowed = pool.draw(loops, rng), pool.draw(loops, rng), most_failures(loops, coverage)
-    limits = replace(pool.asked.limits, margin=None, capped=())
+    limits = replace(pool.task.limits, margin=None, capped=())
     low, high = limits.states(tube.shape[1])
     limited = np.isfinite(low) | np.isfinite(high)
     rigid = tube.max(axis=0, keepdims=True)
@@ -154,7 +154,7 @@ def promise_coverage(
         verified_on=loops,
         failures=_count_failures(fresh),
         found=found,
-        steps=pool.asked.steps,
+        steps=pool.task.steps,
     )
     return promise, chosen.limits
 
@@ -240,7 +240,7 @@ def propagate_errors(
 
 def find_tube(
     model: AnyPredictor,
-    asked: DesignTask,
+    task: DesignTask,
     error: Float[np.ndarray, " nx"],
     x: Float[np.ndarray, " nx"],
     u: Float[np.ndarray, " nu"],
@@ -256,9 +256,9 @@ def find_tube(
     try:
         at = model.step_map().linearize(x, u)
         A, B = at.A, at.B
-        n, size = len(A), np.maximum(asked.high - asked.low, 1e-12)
-        R = asked.cost.matrices(asked.reference.shape[1], B.shape[1])[1]
-        tracked = asked.weigh_states(x, model.states, B.shape[1])
+        n, size = len(A), np.maximum(task.high - task.low, 1e-12)
+        R = task.cost.matrices(task.reference.shape[1], B.shape[1])[1]
+        tracked = task.weigh_states(x, model.states, B.shape[1])
         weight = tracked + _SLACK * float(np.trace(tracked @ np.diag(size**2))) / n * np.diag(1 / size**2)
         stage = one_step(A, B, weight, R + 1e-9 * np.eye(len(R)) * max(float(np.trace(R)), 1e-9), None)
         K, _ = find_gain(stage, stationary(stage, _ITERATIONS).P)

@@ -326,19 +326,19 @@ class NeighbourPlant:
 
 
 def probe_range(
-    asked: DesignTask, neighbours: NeighbourMap
+    task: DesignTask, neighbours: NeighbourMap
 ) -> tuple[Float[np.ndarray, "probes nx"], Bool[np.ndarray, " probes"]]:
     """Return evenly spread points of the goal's range, and which of them have no data around them."""
     from scipy.stats.qmc import Halton  # slow to import
 
-    low, high = goal_box(asked)
+    low, high = goal_box(task)
     X = low + (high - low) * Halton(len(low), scramble=False).random(PROBES)
     return X, neighbours.find_outside_states(X)
 
 
-def choose_starts_to_record(asked: DesignTask, neighbours: NeighbourMap, count: int) -> Float[np.ndarray, "n nx"]:
+def choose_starts_to_record(task: DesignTask, neighbours: NeighbourMap, count: int) -> Float[np.ndarray, "n nx"]:
     """Return at most `count` points outside the data, each the farthest from the data and from those before it."""
-    X, away = probe_range(asked, neighbours)
+    X, away = probe_range(task, neighbours)
     X = X[away]
     V = neighbours.scale_states(X)
     distance = np.asarray(neighbours.tree.query(V)[0]) if len(X) else np.zeros(0)

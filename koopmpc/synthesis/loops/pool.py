@@ -54,14 +54,14 @@ class LoopResult(NamedTuple):
         return self.violation <= KEPT
 
 
-def draw_starts(asked: DesignTask, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n nx"]:
+def draw_starts(task: DesignTask, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n nx"]:
     """Return starts of the task, drawn at random, each moved a little inside the data's range and the limits."""
-    pool = np.unique(np.concatenate([asked.starts, asked.first_states]), axis=0)
-    if not any((asked.starts[0] == first).all() for first in asked.first_states):
-        pool = asked.starts  # the user has named them
+    pool = np.unique(np.concatenate([task.starts, task.first_states]), axis=0)
+    if not any((task.starts[0] == first).all() for first in task.first_states):
+        pool = task.starts  # the user has named them
     picked = pool[rng.integers(len(pool), size=count)]
-    low, high = goal_box(asked)
-    moved = picked + SHIFT * (asked.high - asked.low) * rng.uniform(-1, 1, picked.shape)
+    low, high = goal_box(task)
+    moved = picked + SHIFT * (task.high - task.low) * rng.uniform(-1, 1, picked.shape)
     return np.clip(moved, np.minimum(low, picked), np.maximum(high, picked))
 
 
@@ -74,7 +74,7 @@ class LoopPool:
     less, and up to a tenth of a step late. A loop is lost if it leaves the box from `low` to `high`.
     """
 
-    asked: DesignTask
+    task: DesignTask
     surrogates: tuple[Surrogate, ...]
     neighbours: NeighbourMap | None
     low: Float[np.ndarray, " nx"]
@@ -84,12 +84,12 @@ class LoopPool:
 
     def draw(self, count: int, rng: np.random.Generator) -> list[DrawnLoop]:
         """Return independent loops."""
-        starts, many = draw_starts(self.asked, count, rng), len(self.surrogates)
+        starts, many = draw_starts(self.task, count, rng), len(self.surrogates)
         places = rng.integers(many, size=count)
         if self.neighbours is not None:
             places = np.where(rng.uniform(size=count) < NEIGHBOURS, -1, places)
         gains = 1 + GAIN * rng.uniform(-1, 1, count)
-        firsts = self.asked.late * rng.integers(_PLACES, size=count) // (_PLACES - 1)
+        firsts = self.task.late * rng.integers(_PLACES, size=count) // (_PLACES - 1)
         seeds = rng.integers(2**31, size=count)
         late = LATE * rng.uniform(size=count)
         loops = [
@@ -97,9 +97,9 @@ class LoopPool:
             for i in range(count)
         ]
         near = self.neighbours
-        if near is None or near.embedding is None or not self.asked.along:
+        if near is None or near.embedding is None or not self.task.along:
             return loops
-        nx, size = starts.shape[1], np.maximum(self.asked.high - self.asked.low, 1e-300)
+        nx, size = starts.shape[1], np.maximum(self.task.high - self.task.low, 1e-300)
         some = rng.integers(len(near.pasts), size=(count, NEARBY))
         apart = ((near.pasts[some, :nx] - starts[:, None]) / size) ** 2
         pasts = near.pasts[some[np.arange(count), apart.sum(axis=2).argmin(axis=1)]]
@@ -119,12 +119,12 @@ class LoopPool:
     def _judge(self, run: Run | None) -> LoopResult:
         if run is None:
             return LoopResult(np.inf, np.inf)
-        cost, over = total_cost(run), float(violation_shares(run, self.asked.limit_sizes)[1:].max(initial=0.0))
+        cost, over = total_cost(run), float(violation_shares(run, self.task.limit_sizes)[1:].max(initial=0.0))
         return LoopResult(cost, over, run) if np.isfinite(cost) else LoopResult(np.inf, np.inf)
 
     def _run_place(self, controller: Any, loops: Sequence[DrawnLoop]) -> list[Run | None]:
         """Return the runs of loops that have one stand-in in common."""
-        asked, place, box = self.asked, loops[0].place, (self.low, self.high)
+        task, place, box = self.task, loops[0].place, (self.low, self.high)
         near = self.neighbours if place < 0 else None
         stand_in: Surrogate | NeighbourMap = self.surrogates[max(place, 0)] if near is None else near
         starts = [self._find_start(loop, stand_in) for loop in loops]
@@ -135,10 +135,10 @@ class LoopPool:
             step = self._step_model(place)
             if near is not None:
                 step = near.draw_many([np.random.default_rng(seed) for seed in crowd.seeds]).step
-            return run_abreast(asked, controller, crowd, step, np.array(rows), np.array(held), box)
+            return run_abreast(task, controller, crowd, step, np.array(rows), np.array(held), box)
         return [
             run_on_surrogate(
-                asked,
+                task,
                 stand_in,
                 self._find_model(place) if near is None else near.draw(np.random.default_rng(loop.seed)),
                 controller,
@@ -161,14 +161,14 @@ class LoopPool:
 
     def _find_rows(self, loop: DrawnLoop, ahead: int) -> tuple[Float[np.ndarray, "rows nr"], Float[np.ndarray, "T nu"]]:
         """Return the reference of a loop, with so many rows that are only seen ahead, and the inputs without cost."""
-        asked, place = self.asked, max(loop.place, 0)
-        given = not isinstance(asked.cost.u_target, str)  # by numbers, which count from the start of a loop
+        task, place = self.task, max(loop.place, 0)
+        given = not isinstance(task.cost.u_target, str)  # by numbers, which count from the start of a loop
         if place not in self._inputs:
-            every = asked.reference[:-1] if asked.moves or given else asked.reference[:1]
-            self._inputs[place] = self.surrogates[place].find_reference_inputs(asked.cost, asked.limits, every)
-        at = np.minimum(loop.first + np.arange(asked.steps), len(asked.reference) - 1)
+            every = task.reference[:-1] if task.moves or given else task.reference[:1]
+            self._inputs[place] = self.surrogates[place].find_reference_inputs(task.cost, task.limits, every)
+        at = np.minimum(loop.first + np.arange(task.steps), len(task.reference) - 1)
         held = self._inputs[place]
-        rows = read_reference(asked, loop.first, asked.steps + 1 + ahead)
+        rows = read_reference(task, loop.first, task.steps + 1 + ahead)
         return rows, held[np.minimum(at - given * loop.first, len(held) - 1)]
 
     def _find_model(self, place: int, *, reads: bool = True) -> StepMap:

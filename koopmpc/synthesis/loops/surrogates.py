@@ -215,20 +215,20 @@ def find_ignored_states(one: Surrogate, X: Float[np.ndarray, "M nx"]) -> list[in
     return found
 
 
-def is_unstable(surrogates: Sequence[Surrogate], asked: DesignTask) -> bool:
+def is_unstable(surrogates: Sequence[Surrogate], task: DesignTask) -> bool:
     """Return whether deviations from the equilibrium at the reference grow within a horizon, on half of the surrogates.
 
     Of a moving reference this is asked at its first, middle and last row. A pair of integrators does not count.
     """
-    places = (0, len(asked.reference) // 2, -1) if asked.moves else (0,)
+    places = (0, len(task.reference) // 2, -1) if task.moves else (0,)
     found: list[bool] = []
     for one in surrogates:
-        plant, find = one.plant(reads=False), one.holding(asked.cost, asked.limits)
+        plant, find = one.plant(reads=False), one.holding(task.cost, task.limits)
         for place in places:
-            at = find(asked.reference[place])
+            at = find(task.reference[place])
             A = plant.linearize(at.x, at.u).A
             modulus = np.abs(np.linalg.eigvals(A)).max() if np.isfinite(A).all() else np.inf
-            found.append(bool(asked.horizon * np.log(max(modulus, 1e-300)) > np.log(GROWN)))
+            found.append(bool(task.horizon * np.log(max(modulus, 1e-300)) > np.log(GROWN)))
     return bool(2 * sum(found) > len(found))
 
 

@@ -57,7 +57,7 @@ def draw_blindness(
     neighbours = evidence.neighbours
     if neighbours is None:
         raise DataError("the design keeps no rows of its data; make it again with this version")
-    names, asked = neighbours.states, evidence.asked
+    names, asked = neighbours.states, evidence.task
     if len(names) < 2:
         raise DataError(
             "a plane needs two states, and this design has one alone; design.advice says in words where data lack"

@@ -88,7 +88,7 @@ def judge(task: CoverageTask) -> Row:
                 candidates=CANDIDATES, delays=task.delays, loops=LOOPS, margin=COVERAGE, workers=1
             ),
         )
-    asked, recipe = design.evidence.asked, design.leaderboard[design.chosen].recipe
+    asked, recipe = design.evidence.task, design.leaderboard[design.chosen].recipe
     plain = recipe.controller(get_model(design.controller), asked.cost, task.limits, asked.horizon)
     rng = np.random.default_rng(0)
     low, high = task.limits.states(len(task.plant.outputs))
