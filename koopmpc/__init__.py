@@ -35,10 +35,10 @@ if TYPE_CHECKING:  # the one table: type checkers and editors see it as it is, a
     from koopmpc.base.errors import KoopmpcError as KoopmpcError
     from koopmpc.codegen.compiled import compiled as compiled
     from koopmpc.codegen.export import export as export
-    from koopmpc.control.cost import Cost as Cost
+    from koopmpc.control.ask.cost import Cost as Cost
+    from koopmpc.control.ask.limits import Limits as Limits
     from koopmpc.control.kinds.koopman_mpc import KoopmanMPC as KoopmanMPC
     from koopmpc.control.kinds.koopman_mpc import LinearMPC as LinearMPC
-    from koopmpc.control.limits import Limits as Limits
     from koopmpc.control.lqr import LQR as LQR
     from koopmpc.control.lqr import dlqr as dlqr
     from koopmpc.control.lqr import lqr as lqr

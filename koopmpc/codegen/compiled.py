@@ -18,13 +18,12 @@ from koopmpc.codegen.programs import make_tables, read_program
 from koopmpc.codegen.runs import FALLBACKS, STATUSES, CompiledLoops, TargetTable
 from koopmpc.codegen.sources import write_one_source
 from koopmpc.codegen.tables import Precision
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.levels import HeldLevels
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status, alone, busy
 from koopmpc.control.nonlinear.staged_program import StagedProgram
-from koopmpc.control.plan.condensed import planned_states
-from koopmpc.control.plan.condensed_program import CondensedProgram
+from koopmpc.control.plan.condensed_program import CondensedProgram, planned_states
 from koopmpc.control.program import StepProgram
-from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.models.predictors import LinearPredictor
 from koopmpc.plants.routines import find_compiler, find_private_cache, load_library
 from koopmpc.plants.step_map import StepMap

@@ -11,6 +11,7 @@ from koopmpc.base import checks
 from koopmpc.base.errors import DataError
 from koopmpc.codegen import tolerances
 from koopmpc.codegen.tables import CFunction, Tables, write_fields
+from koopmpc.control.ask.levels import FREE
 from koopmpc.control.lqr import FeedbackProgram
 from koopmpc.control.nonlinear import motion
 from koopmpc.control.nonlinear.iteration import MOST
@@ -19,8 +20,7 @@ from koopmpc.control.nonlinear.stagewise import list_hard_outputs
 from koopmpc.control.plan.condensed_program import BoundsProgram, CondensedProgram
 from koopmpc.control.program import Published, StepProgram, no_export
 from koopmpc.control.solvers.daqp import FEW, MOVED
-from koopmpc.control.stepped.levels import FREE
-from koopmpc.control.stepped.search import NODES
+from koopmpc.control.solvers.levels import NODES
 from koopmpc.estimate.disturbance import EXACT, DisturbanceProgram
 from koopmpc.estimate.filter import FilterProgram
 from koopmpc.estimate.gate import BEYOND, BRIDGED

@@ -12,13 +12,12 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
 from koopmpc.base.values import Interval, Value
-from koopmpc.control.cost import Tracking
-from koopmpc.control.move import Fallback, Move, Status, Token
+from koopmpc.control.ask.cost import Tracking
+from koopmpc.control.ask.levels import HeldLevels
+from koopmpc.control.move import Fallback, Move, PlanMemory, Status, Token
+from koopmpc.control.plan.task import MoveBlocks, Moves, find_move_blocks
 from koopmpc.control.program import Published, SavedController
-from koopmpc.control.step.fallback import PlanMemory
 from koopmpc.control.step.observe import InitialCondition
-from koopmpc.control.stepped.blocks import MoveBlocks, Moves, find_move_blocks
-from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.control.watching import StepMonitor, StepWatch
 from koopmpc.estimate.observer import Estimator, StateModel, StateObserver
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor

@@ -21,10 +21,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from koopmpc.control.cost import LiftedTracking
+from koopmpc.control.ask.cost import LiftedTracking
+from koopmpc.control.ask.terminal import EndRows
 from koopmpc.control.riccati import Law, Stage
 from koopmpc.control.target import Targets, Units
-from koopmpc.control.terminal.sets import EndRows
 from koopmpc.models.predictors import LinearPredictor
 
 Coordinates = Literal["auto", "riccati", "plain"]

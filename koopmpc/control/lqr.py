@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError, ShapeError
-from koopmpc.control.cost import Cost, check_cost_and_limits, lifted_tracking
+from koopmpc.control.ask.cost import Cost, check_cost_and_limits, lifted_tracking
+from koopmpc.control.ask.limits import Interval, Limits, clip_input, refuse_levels
+from koopmpc.control.ask.preview import InputRows
 from koopmpc.control.horizon import horizon_of
-from koopmpc.control.in_time.preview import InputRows
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
-from koopmpc.control.limits import Interval, Limits, clip_input, refuse_levels
 from koopmpc.control.move import Fallback, Move, Status, Token, alone
 from koopmpc.control.program import (
     LinearProgram,

@@ -15,8 +15,8 @@ from koopmpc.base import checks
 from koopmpc.base.errors import DataError, Hint
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Value
-from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Interval, Limits
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Interval, Limits
 from koopmpc.control.solvers.daqp import DAQPSetup
 from koopmpc.control.target import Targets
 from koopmpc.control.watching import StepMonitor

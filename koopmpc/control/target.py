@@ -8,8 +8,8 @@ from jaxtyping import Float
 from scipy.linalg import block_diag, null_space, solve_triangular
 
 from koopmpc.base import checks
-from koopmpc.control.cost import Cost, LiftedTracking, Sizes
-from koopmpc.control.limits import Interval, magnitude
+from koopmpc.control.ask.cost import Cost, LiftedTracking, Sizes
+from koopmpc.control.ask.limits import Interval, magnitude
 from koopmpc.control.move import Status
 from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.base import QP

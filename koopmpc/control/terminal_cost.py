@@ -12,7 +12,7 @@ from jaxtyping import Float
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import ShapeError
-from koopmpc.control.cost import Cost
+from koopmpc.control.ask.cost import Cost
 from koopmpc.control.horizon import Horizon, Terminal, input_target
 from koopmpc.control.riccati import (
     LARGEST,

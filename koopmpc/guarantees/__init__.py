@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 from koopmpc.base.lazy import attach
 
 if TYPE_CHECKING:
-    from koopmpc.control.terminal.sets import TerminalFeedback as TerminalFeedback
-    from koopmpc.control.terminal.sets import TerminalSet as TerminalSet
+    from koopmpc.control.ask.terminal import TerminalFeedback as TerminalFeedback
+    from koopmpc.control.ask.terminal import TerminalSet as TerminalSet
     from koopmpc.guarantees.certificate import Certificate as Certificate
     from koopmpc.guarantees.certificate import CertifiedFeedback as CertifiedFeedback
     from koopmpc.guarantees.certificate import load_certificate as load_certificate

@@ -13,13 +13,13 @@ from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import CertificateError, DataError
 from koopmpc.base.text import format_markdown_table
 from koopmpc.base.values import Value
-from koopmpc.control.cost import Cost
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Interval, Limits, refuse_levels
+from koopmpc.control.ask.terminal import TerminalFeedback, TerminalSet
 from koopmpc.control.kinds import ControllerKind, register_controller
-from koopmpc.control.limits import Interval, Limits, refuse_levels
 from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import Program, SavedController, no_export
-from koopmpc.control.terminal.sets import TerminalFeedback, TerminalSet
 from koopmpc.guarantees.deviation import DeviationModel
 from koopmpc.guarantees.error_bounds import ErrorBound
 from koopmpc.lifting.base import find_observables

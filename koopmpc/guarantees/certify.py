@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.errors import CertificateError, DataError, refuse_moved
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.guarantees.certificate import Certificate
 from koopmpc.guarantees.deviation import DeviationModel, deviate, is_stabilisable, reduce_to_states

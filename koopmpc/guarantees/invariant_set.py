@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import CertificateError, DataError
 from koopmpc.base.values import Value
-from koopmpc.control.terminal.inclusion import find_support
-from koopmpc.control.terminal.sets import TerminalSet
+from koopmpc.control.ask.terminal import TerminalSet, find_support
 
 _TOLERANCE = 1e-9  # a row is redundant if it exceeds its bound by at most this share of it
 

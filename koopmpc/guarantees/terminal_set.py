@@ -9,11 +9,11 @@ from scipy.linalg import block_diag
 
 from koopmpc.base import checks
 from koopmpc.base.errors import CertificateError, DataError
-from koopmpc.control.cost import Cost, LiftedTracking, lifted_tracking
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.cost import Cost, LiftedTracking, lifted_tracking
+from koopmpc.control.ask.limits import Limits
+from koopmpc.control.ask.terminal import TerminalFeedback, TerminalSet
 from koopmpc.control.riccati import Stage, find_gain, one_step, stationary
 from koopmpc.control.target import targets_of
-from koopmpc.control.terminal.sets import TerminalFeedback, TerminalSet
 from koopmpc.guarantees.invariant_set import find_invariant_set
 from koopmpc.models.predictors import LinearPredictor
 

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE, numbers
 from koopmpc.base.errors import DataError, KoopmpcError
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
-from koopmpc.control.limits import Limits
 from koopmpc.control.move import Move, Plan
 from koopmpc.control.program import Program, Published, SavedController, no_export
 from koopmpc.data.episodes import Episode, Episodes

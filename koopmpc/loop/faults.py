@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.limits import Interval
 
 __all__ = [
     "ActuatorDelay",

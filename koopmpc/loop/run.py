@@ -11,8 +11,8 @@ from koopmpc.base import checks
 from koopmpc.base.errors import Hint
 from koopmpc.base.scene import Scene
 from koopmpc.base.values import Value
-from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Interval, Limits
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Interval, Limits
 from koopmpc.control.move import Status
 from koopmpc.data.files.frames import build_frame
 from koopmpc.lifting.base import Lifting

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.errors import ShapeError
-from koopmpc.control.cost import Cost
+from koopmpc.control.ask.cost import Cost
 from koopmpc.loop.run import bind_outputs
 from koopmpc.plants.plant import Plant
 from koopmpc.plants.step_map import StepMap

@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, ShapeError, refuse_moved
-from koopmpc.control.cost import Cost
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Limits
+from koopmpc.control.ask.preview import require_preview
 from koopmpc.control.function import as_controller
-from koopmpc.control.in_time.preview import require_preview
-from koopmpc.control.limits import Limits
 from koopmpc.control.move import Controller, Fallible, Move, Plan
 from koopmpc.data.excitation import Excitation
 from koopmpc.loop.controllers import checked_input, count_disturbances, predictor_of, require_match, start_for

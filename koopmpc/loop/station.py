@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE, numbers
 from koopmpc.base.errors import DataError
+from koopmpc.control.ask.levels import HeldLevels
+from koopmpc.control.ask.limits import Interval, Limits, clip_input
+from koopmpc.control.ask.preview import InputRows
 from koopmpc.control.function import as_controller
-from koopmpc.control.in_time.preview import InputRows
 from koopmpc.control.kinds import ControllerKind, register_controller
-from koopmpc.control.limits import Interval, Limits, clip_input
 from koopmpc.control.move import Controller, Fallback, Move, Plan, Status
 from koopmpc.control.program import SavedController
-from koopmpc.control.stepped.levels import HeldLevels
 from koopmpc.loop.controllers import count_disturbances
 from koopmpc.loop.parts import ControllerPair, plan_of, rows_of
 

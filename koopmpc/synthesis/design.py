@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import FitWarning
 from koopmpc.base.parallel import Workers
-from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source
 from koopmpc.synthesis.confirm import choose_controller

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base.text import with_unit
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.nonlinear.equilibrium import Equilibrium
 from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.base import strip_unit

@@ -6,8 +6,8 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
-from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.estimate.kalman import NOT_TOGETHER

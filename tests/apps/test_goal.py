@@ -21,7 +21,7 @@ from koopmpc.apps.fitting.goal import format_template, load_reading, read_goal, 
 from koopmpc.apps.fitting.logs import read_logs, round_step
 from koopmpc.apps.fitting.options import FitOptions
 from koopmpc.base.text import format_duration
-from koopmpc.control.step.fallback import PlanMemory
+from koopmpc.control.move import PlanMemory
 from koopmpc.models.base import load_value, save_value
 from koopmpc.synthesis.designed import SavedDesign, read_controller
 from koopmpc.synthesis.doubts import describe_rest

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
 import koopmpc as km
-from koopmpc.control.cost import state_tracking
+from koopmpc.control.ask.cost import state_tracking
 from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria
 from koopmpc.control.nonlinear.learned_map import learned_map
 from koopmpc.control.plan.row_targets import RowTarget, RowTargets
 from koopmpc.control.riccati import one_step, stationary
-from koopmpc.control.step.rest import MovingEnd
+from koopmpc.control.step.aim import MovingEnd
 from tests.closed_loop.tasks import TASKS
 from tests.control.test_bilinear_mpc import UPRIGHT, pendulum
 from tests.control.test_nonlinear_mpc import pendulum as hinge

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-import koopmpc.control.stepped.search
-import koopmpc.control.stepped.sequences
+import koopmpc.control.solvers.levels
+import koopmpc.control.solvers.sequences
 
 OFF = 1e-9  # an input is on its level to this
 
@@ -251,8 +251,8 @@ def test_the_gap_of_a_search_that_is_cut_off_bounds_what_its_plan_misses(monkeyp
         best, cut = (km.KoopmanMPC(model, cost, limits, 9) for _ in range(2))
         x, r, costs = 2 * rng.standard_normal(3), np.zeros(3), []
         for mpc in (free, best, cut):
-            monkeypatch.setattr(koopmpc.control.stepped.search, "NODES", 36 if mpc is cut else 200_000)
-            monkeypatch.setattr(koopmpc.control.stepped.sequences, "WIDTH", 2 if mpc is cut else 128)
+            monkeypatch.setattr(koopmpc.control.solvers.levels, "NODES", 36 if mpc is cut else 200_000)
+            monkeypatch.setattr(koopmpc.control.solvers.sequences, "WIDTH", 2 if mpc is cut else 128)
             mpc.reset(u_prev=[-1.0])
             move = mpc(x, r)
             if move.fallback is km.control.Fallback.NONE:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.terminal.inclusion import measure_reach
+from koopmpc.control.ask.terminal import measure_reach
 from tests.guarantees.test_terminal_set import draw_model, make_cart
 
 ROWS = 30

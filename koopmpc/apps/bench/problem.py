@@ -12,8 +12,8 @@ from koopmpc.base import checks
 from koopmpc.base.checks import nearest
 from koopmpc.base.errors import DataError, KoopmpcError, ProblemError, ShapeError
 from koopmpc.base.scene import Scene
-from koopmpc.control.cost import Cost, check_cost_and_limits
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.cost import Cost, check_cost_and_limits
+from koopmpc.control.ask.limits import Limits
 from koopmpc.data.collect import InputFunction, Uniform
 from koopmpc.data.excitation import Excitation, OpenLoop
 from koopmpc.lifting.base import Lifting

@@ -25,7 +25,7 @@ from koopmpc.base import checks, disk
 from koopmpc.base.errors import DataError, ProblemError, WorkerError, refuse_moved
 from koopmpc.base.parallel import map_tasks
 from koopmpc.base.values import fingerprint, to_data
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.limits import Limits
 from koopmpc.loop.run import Run
 from koopmpc.views.recording.viewer import find_viewer, why_none
 

@@ -30,7 +30,7 @@ from koopmpc.base.errors import LogError
 from koopmpc.base.page import HtmlPage
 from koopmpc.base.parallel import StageProgress
 from koopmpc.base.text import format_duration, to_percent
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.limits import Interval
 from koopmpc.data.episodes import Episodes
 from koopmpc.loop.metrics import total_cost, tracking_error, violation_shares
 from koopmpc.loop.rows import Step

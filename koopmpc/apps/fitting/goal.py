@@ -17,8 +17,8 @@ from koopmpc.apps.fitting.logs import IN_MEMORY, Data, read_logs
 from koopmpc.apps.fitting.options import FitOptions
 from koopmpc.base import checks, disk
 from koopmpc.base.errors import DataError, LogError
-from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.files.load import load_episodes
 from koopmpc.lifting.state import State

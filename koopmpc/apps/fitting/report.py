@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from koopmpc.base.page import HtmlPage
 from koopmpc.base.text import shorten_observable, to_percent, with_unit
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.limits import Interval
 from koopmpc.lifting.base import strip_unit
 from koopmpc.loop.metrics import violation_shares
 from koopmpc.loop.run import Run

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, LogError
 from koopmpc.base.lazy import load_joint
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.move import Controller
 from koopmpc.control.program import Published, SavedController
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor

@@ -9,20 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Limits
+from koopmpc.control.ask.preview import check_bounds_alone
 from koopmpc.control.base import PredictiveController
-from koopmpc.control.cost import Cost
-from koopmpc.control.in_time.preview import check_bounds_alone
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
-from koopmpc.control.limits import Limits
 from koopmpc.control.move import Move, Plan, alone
-from koopmpc.control.plan.bounds import BoundRows, CallBounds
-from koopmpc.control.plan.condensed import find_shape, plan_condensed, planned_states
-from koopmpc.control.plan.condensed_program import CondensedProgram
-from koopmpc.control.plan.for_c import publish_condensed
-from koopmpc.control.plan.task import read_task
+from koopmpc.control.plan.bounds import BoundRows, CallBounds, find_shape
+from koopmpc.control.plan.condensed import plan_condensed, publish_condensed
+from koopmpc.control.plan.condensed_program import CondensedProgram, planned_states
+from koopmpc.control.plan.task import Moves, read_task
 from koopmpc.control.step.condensed import CondensedStep
 from koopmpc.control.step.observe import InitialCondition
-from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.disturbance import LiftedDisturbance

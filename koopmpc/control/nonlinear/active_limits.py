@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.limits import Interval
 
 RANK = 1e-12  # singular values below this share of the largest are rounding; ipopt meets all others too
 BENT = 0.25  # a step is shorter where the cost bends by more than this share beyond its Gauss–Newton part

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
-from koopmpc.control.cost import Cost
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
-from koopmpc.control.limits import Limits
 from koopmpc.control.nonlinear.iteration import RealTimeIteration
 from koopmpc.control.nonlinear.learned_map import ModelOrMap
 from koopmpc.control.nonlinear.motion import BEYOND
@@ -21,9 +21,9 @@ from koopmpc.control.nonlinear.rows import describe_stage_bounds
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC
 from koopmpc.control.nonlinear.staged_program import StagedProgram, find_targets, first_gain, trace_functions
 from koopmpc.control.nonlinear.stagewise import list_sides, weights
+from koopmpc.control.plan.task import Moves
 from koopmpc.control.program import no_export, publish_estimator, reference_table, trace_lifting
 from koopmpc.control.solvers.daqp import daqp_settings
-from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.disturbance import LiftedDisturbance

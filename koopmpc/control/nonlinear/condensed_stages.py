@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from koopmpc.base.errors import DefinitenessError
-from koopmpc.control.limits import Interval, Softness
+from koopmpc.control.ask.limits import Interval, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.riccati import Stage, step
 from koopmpc.control.solvers import FINISHER

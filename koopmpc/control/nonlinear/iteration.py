@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base.checks import HUGE
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.condensed_stages import Deviation, SearchesLevels, Stages, StageStep, least_deviation
 from koopmpc.control.nonlinear.convex_stage import ConvexStage

@@ -14,9 +14,9 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.levels import HeldLevels, LevelBox
+from koopmpc.control.ask.limits import Interval
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
-from koopmpc.control.stepped.levels import HeldLevels, LevelBox
 
 MOST = 5000  # beginnings of the same length, at most; beyond them nonlinear programs are searched
 _EQUAL = 1e-9  # a sequence is worse than the best one unless it is better by more than this share

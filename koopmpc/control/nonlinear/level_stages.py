@@ -3,14 +3,14 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.control.limits import Interval, Softness
+from koopmpc.control.ask.limits import Interval, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.condensed_stages import Deviation, Stages, condense_stages
 from koopmpc.control.nonlinear.iteration import RealTimeIteration
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.base import SolverTurn, StepQP
-from koopmpc.control.stepped.search import LevelSearch, LevelSolver
+from koopmpc.control.solvers.levels import LevelSearch, LevelSolver
 
 PASSES = 4  # linearisations of one step, at most: the levels of a plan move the point of the next one
 FOLLOWED = 1e-6  # a plan on levels follows the model if it misses each state by less than this share of its size

@@ -8,15 +8,15 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
-from koopmpc.control.cost import Cost
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
-from koopmpc.control.limits import Limits
 from koopmpc.control.nonlinear.learned_map import ModelOrMap
 from koopmpc.control.nonlinear.shooting import OPTIONS, NLPSolver
 from koopmpc.control.nonlinear.shooting_solver import ShootingSolver
 from koopmpc.control.nonlinear.staged_mpc import StagedMPC
+from koopmpc.control.plan.task import Moves
 from koopmpc.control.program import Program, no_export
-from koopmpc.control.stepped.blocks import Moves
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.observer import Estimator

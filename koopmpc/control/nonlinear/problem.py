@@ -9,12 +9,12 @@ from scipy.linalg import block_diag
 
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
-from koopmpc.control.bounds.stage_cost import trace_stage
-from koopmpc.control.cost import Cost, StateTracking
-from koopmpc.control.limits import SOFTENED, Interval, Softness, preview_margin
+from koopmpc.control.ask.cost import Cost, StateTracking
+from koopmpc.control.ask.limits import SOFTENED, Interval, Softness, preview_margin
+from koopmpc.control.ask.stage_cost import trace_stage
+from koopmpc.control.ask.terminal import HasTerminalSet, TerminalSet, read_terminal_set, terminal_function
 from koopmpc.control.nonlinear.learned_map import LearnedMap, point_sizes
-from koopmpc.control.stepped.blocks import MoveBlocks
-from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set, terminal_function
+from koopmpc.control.plan.task import MoveBlocks
 
 
 class StagedProblem(NamedTuple):

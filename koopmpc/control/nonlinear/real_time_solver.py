@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base.checks import HUGE
-from koopmpc.control.limits import SOFTENED, Interval
+from koopmpc.control.ask.limits import SOFTENED, Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.iteration import NEAR, RealTimeIteration
 from koopmpc.control.nonlinear.learned_map import LearnedMap
 from koopmpc.control.nonlinear.level_stages import StageLevels
 from koopmpc.control.nonlinear.plan_solver import GOOD, PlanSolver, PlanStart, StagePlan
-from koopmpc.control.stepped.search import LevelSearch
+from koopmpc.control.solvers.levels import LevelSearch
 from koopmpc.plants.step_map import StepMap
 
 SETTLED = 1e-6  # a plan is a solution when no input and no state moves by more than this share of its size

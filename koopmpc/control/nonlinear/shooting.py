@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
-from koopmpc.control.limits import SOFTENED, Interval
+from koopmpc.control.ask.limits import SOFTENED, Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.ranges import find_undefined_operation

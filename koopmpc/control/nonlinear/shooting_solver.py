@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base.checks import HUGE
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.levels import LevelBox
+from koopmpc.control.ask.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.nonlinear.learned_map import LearnedMap
 from koopmpc.control.nonlinear.level_rollouts import LevelRollouts, StageData
@@ -16,8 +17,7 @@ from koopmpc.control.nonlinear.plan_solver import PlanSolver, PlanStart, StagePl
 from koopmpc.control.nonlinear.problem import StagedProblem
 from koopmpc.control.nonlinear.shooting import NLPSolution, NLPSolver, Shooting
 from koopmpc.control.nonlinear.shooting import Start as Begin
-from koopmpc.control.stepped.levels import LevelBox
-from koopmpc.control.stepped.search import LevelSearch, Relaxed
+from koopmpc.control.solvers.levels import LevelSearch, Relaxed
 
 Guess = tuple[Float[np.ndarray, "N1 nx"], Float[np.ndarray, "N nu"]]  # states and inputs
 _HOLD = 5  # steps for which a random guess holds an input

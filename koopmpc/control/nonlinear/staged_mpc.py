@@ -14,21 +14,21 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
+from koopmpc.control.ask.cost import Cost, data_ranges, state_tracking
+from koopmpc.control.ask.limits import Interval, Limits, clip_input, measure_violation
+from koopmpc.control.ask.terminal import HasTerminalSet, TerminalSet, read_terminal_set
 from koopmpc.control.base import MPCBase
-from koopmpc.control.cost import Cost, data_ranges, state_tracking
-from koopmpc.control.limits import Interval, Limits, clip_input, measure_violation
 from koopmpc.control.move import Fallback, Move, Plan, Status, alone
+from koopmpc.control.nonlinear.kept_plan import JudgedPlan, PlanKeeper, choose_plan
 from koopmpc.control.nonlinear.learned_map import ModelOrMap, learned_map
 from koopmpc.control.nonlinear.plan_solver import GOOD, PlanSolver, PlanStart, StagePlan
 from koopmpc.control.nonlinear.problem import staged_problem
 from koopmpc.control.nonlinear.rows import MovingLimits, StageLimits
 from koopmpc.control.plan.row_targets import RowTargets
+from koopmpc.control.plan.task import Moves, find_move_blocks
+from koopmpc.control.solvers.levels import LevelSearch
+from koopmpc.control.solvers.priorities import weigh_priorities
 from koopmpc.control.step.aim import StageAim
-from koopmpc.control.stepped.blocks import Moves, find_move_blocks
-from koopmpc.control.stepped.priorities import weigh_priorities
-from koopmpc.control.stepped.search import LevelSearch
-from koopmpc.control.terminal.kept_plan import JudgedPlan, PlanKeeper, choose_plan
-from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set
 from koopmpc.control.watching import StepMonitor, find_monitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.disturbance import DisturbanceObserver

@@ -10,8 +10,8 @@ from scipy.linalg import solve
 
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
-from koopmpc.control.cost import StateTracking
-from koopmpc.control.limits import Interval, Softness
+from koopmpc.control.ask.cost import StateTracking
+from koopmpc.control.ask.limits import Interval, Softness
 from koopmpc.control.nonlinear.equilibrium import RestProgram
 from koopmpc.control.nonlinear.learned_map import LearnedMap, ModelOrMap
 from koopmpc.control.nonlinear.problem import StagedProblem

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.control.limits import SOFTENED, Interval, Softness, half_width
+from koopmpc.control.ask.limits import SOFTENED, Interval, Softness, half_width
 from koopmpc.control.nonlinear.problem import StagedProblem
 
 _SHORT = 0.995  # share of the way to the nearest bound

@@ -2,140 +2,23 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from koopmpc.base.checks import HUGE
 from koopmpc.base.values import Interval, Value
-from koopmpc.control.cost import LiftedTracking
-from koopmpc.control.in_time.bounds import refuse_crossed_rows
-from koopmpc.control.in_time.preview import check_bounds_alone, require_movable, require_preview
-from koopmpc.control.limits import BOUNDS, Limits, preview_margin
+from koopmpc.control.ask.bounds import refuse_crossed_rows
+from koopmpc.control.ask.cost import LiftedTracking
+from koopmpc.control.ask.limits import BOUNDS, Limits, preview_margin
+from koopmpc.control.ask.preview import check_bounds_alone, require_movable, require_preview
+from koopmpc.control.ask.terminal import EndReach, EndRows, measure_reach, read_end, require_inside
+from koopmpc.control.plan.condensed_program import BoundsProgram, CondensedPlan, StepBounds, find_reach
+from koopmpc.control.plan.task import ControlTask
 from koopmpc.control.target import ROUNDING, Targets
-from koopmpc.control.terminal.inclusion import EndReach, measure_reach, require_inside
-from koopmpc.control.terminal.sets import EndRows
 
 _ENDS = frozenset(BOUNDS)
 _SHARE = 1e-5  # a rate that gives way by more than this share of its allowance is reported
-
-
-class StepBounds(NamedTuple):
-    """low ≤ t ≤ high in one step, and the largest |r| of a preview for which no limit moves a target."""
-
-    low: Float[np.ndarray, " nt"]
-    high: Float[np.ndarray, " nt"]
-    reach: float
-
-
-@runtime_checkable
-class PlanBounds(Protocol):
-    """The limits of a plan in step after step."""
-
-    def at(self, k: int) -> StepBounds:
-        """Return the limits of step k."""
-        ...
-
-    def place(self, k: int) -> int:
-        """Return the row that step k reads: steps with the same one have the same limits."""
-        ...
-
-    def first(self, k: int) -> tuple[Interval, Interval | None]:
-        """Return the box of the input that acts first in step k, and that of its change."""
-        ...
-
-    def hard_rates(self, k: int) -> Interval | None:
-        """Return the hard limits of the first change in step k, ±inf in place of the others; None without any."""
-        ...
-
-    def moves(self, k: int) -> Interval:
-        """Return the limits of all moves of step k, one after the other."""
-        ...
-
-    def targets(self, k: int) -> Interval | None:
-        """Return the limits (N+1, nl) of the targets of the preview of step k; None for those of `Targets`."""
-        ...
-
-    def open_rates(self, k: int, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval | None, float]:
-        """Return the limits of a plan after u_prev, None where they do not move, and how far rates had to give way."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class ConstantBounds(Value):
-    """Limits that hold: each step has the same; see `PlanBounds`."""
-
-    step: StepBounds
-    inputs: Interval
-    rates: Interval | None
-    hard: Interval | None
-    all_moves: Interval
-
-    def at(self, k: int) -> StepBounds:
-        """Return the limits of any step."""
-        return self.step
-
-    def place(self, k: int) -> int:
-        """Return 0, the only row."""
-        return 0
-
-    def first(self, k: int) -> tuple[Interval, Interval | None]:
-        """Return the box of the first input, and that of its change."""
-        return self.inputs, self.rates
-
-    def hard_rates(self, k: int) -> Interval | None:
-        """Return the hard limits of the first change."""
-        return self.hard
-
-    def moves(self, k: int) -> Interval:
-        """Return the limits of all moves."""
-        return self.all_moves
-
-    def targets(self, k: int) -> Interval | None:
-        """Return None: targets have limits of their own."""
-        return None
-
-    def open_rates(self, k: int, u_prev: Float[np.ndarray, " nu"]) -> tuple[Interval | None, float]:
-        """Return None, for limits do not move."""
-        return None, 0.0
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class BoundsProgram(Value):
-    """How rows of limits in time become the limits of a plan.
-
-    Attributes
-    ----------
-    first, count
-        (moves, nu) the first step of what holds the value of a move, and for how many steps it does.
-    start
-        (moves,) the first step of each move.
-    held, tied
-        Which moves keep the value of the one before; which of them have no limits of their own, one after the other.
-    margin
-        (N, outputs) by how much each stage moves the limits of outputs inwards.
-    values
-        What the limits of targets count from.
-    checked
-        The limits of targets that a plan is tested by.
-    hard, allowance
-        Which rates are hard, and by how much one may give way before that is reported.
-    outputs
-        Which of the states and observables have a limit, or may get one.
-    """
-
-    first: Int[np.ndarray, "moves nu"]
-    count: Int[np.ndarray, "moves nu"]
-    start: Int[np.ndarray, " moves"]
-    held: Bool[np.ndarray, "moves nu"]
-    tied: Bool[np.ndarray, " all_moves"]
-    margin: Float[np.ndarray, "N outputs"]
-    values: Float[np.ndarray, " nl"]
-    checked: Int[np.ndarray, " nc"]
-    hard: Bool[np.ndarray, " nu"]
-    allowance: Float[np.ndarray, " nu"]
-    outputs: Bool[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +70,27 @@ def describe_bounds(shape: PlanShape) -> BoundsProgram:
         hard=np.isinf(track.rate_softness.linear),
         allowance=track.rate_softness.allowance,
         outputs=track.movable.outputs,
+    )
+
+
+def find_shape(task: ControlTask, targets: Targets, plan: CondensedPlan) -> PlanShape:
+    """Return what the limits of a plan depend on."""
+    track, held, planned = task.track, task.moves.held, len(plan.offset)
+    wanted = track.limits.terminal
+    end = None if wanted is None else read_end(wanted, task.predictor)
+    last = slice(planned - (0 if end is None else len(end.F)), planned)
+    return PlanShape(
+        track=track,
+        targets=targets,
+        blocks=task.moves.lengths,
+        held=held,
+        tied=held.ravel() & ~np.isin(np.arange(held.size), plan.qp.source),
+        end=end,
+        end_box=Interval(plan.low[last], plan.high[last]),
+        aims_inside=plan.aimed and not plan.is_driven,
+        checked=plan.checked,
+        states=task.predictor.states,
+        inputs=task.predictor.inputs,
     )
 
 
@@ -447,18 +351,6 @@ def has_fields_of(limits: object, own: Limits) -> bool:
         value is mine[name] if name not in _ENDS else value is None or isinstance(value, np.ndarray)
         for name, value in vars(limits).items()
     )
-
-
-def find_reach(
-    size: Float[np.ndarray, " nl"], low: Float[np.ndarray, "T nl"], high: Float[np.ndarray, "T nl"]
-) -> Float[np.ndarray, " T"]:
-    """Return the largest a for which low ≤ K r ≤ high wherever no |r_i| is above a; below 0 where there is none.
-
-    `size` has the sum of |K| over the entries of r.
-    """
-    room, moved = np.minimum(high, -low), size > 0
-    reach = np.where(moved, room / np.where(moved, size, 1.0), np.where(room >= 0, HUGE, -1.0))
-    return np.minimum(reach.min(axis=-1, initial=HUGE), HUGE)
 
 
 def sweep_rows(rows: Float[np.ndarray, "2 T n"], steps: int) -> Interval:

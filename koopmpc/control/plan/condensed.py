@@ -2,33 +2,188 @@
 
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+from scipy.linalg import null_space
 
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError
-from koopmpc.control.cost import add_held
+from koopmpc.control.ask.cost import LiftedTracking, add_held
+from koopmpc.control.ask.limits import Interval, Softness, preview_margin
+from koopmpc.control.ask.terminal import EndRows, read_end
 from koopmpc.control.horizon import Condensed, Horizon, Terminal, WeightRows, build_stages, condense, horizon_of
-from koopmpc.control.limits import Interval
-from koopmpc.control.plan.blocking import tie_moves
-from koopmpc.control.plan.bounds import BoundRows, ConstantBounds, PlanShape, StepBounds, describe_bounds, find_reach
-from koopmpc.control.plan.condensed_program import CondensedPlan, CondensedProgram
-from koopmpc.control.plan.rows import PlanLimits, build_qp, limit_plan, measure_rows
+from koopmpc.control.plan.bounds import BoundRows, describe_bounds, find_shape
+from koopmpc.control.plan.condensed_program import (
+    CondensedPlan,
+    CondensedProgram,
+    ConstantBounds,
+    StepBounds,
+    find_reach,
+)
 from koopmpc.control.plan.task import ControlTask
 from koopmpc.control.plan.weights import PlansInTime
+from koopmpc.control.program import no_export, reference_table, refuse_time_limit
 from koopmpc.control.riccati import Law, Stage, recursion
 from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.ball import make_ball
 from koopmpc.control.solvers.base import StepQP
 from koopmpc.control.solvers.daqp import daqp_settings
+from koopmpc.control.solvers.priorities import spread_priorities
 from koopmpc.control.solvers.stages import QPStages
-from koopmpc.control.stepped.priorities import spread_priorities
 from koopmpc.control.target import ROUNDING, Targets, Units, targets_of
-from koopmpc.control.terminal.sets import EndRows, read_end
 from koopmpc.control.terminal_cost import terminal_of
-from koopmpc.models.predictors import LinearPredictor
+
+
+class PlanLimits(NamedTuple):
+    """The limits of every entry of a plan [moves; their changes, where they have limits; outputs], stage by stage.
+
+    `size` is the norm of the entry's row of D, root mean square of all stages. `next` is the entry that takes the place
+    of this one when the plan moves on by one step: the same output one step later, or the move that holds then. Where
+    the plan has ended by then, it is the number of entries. `kept` are those that have a limit, or may get one in time.
+    """
+
+    low: Float[np.ndarray, " nv"]
+    high: Float[np.ndarray, " nv"]
+    softness: Softness
+    size: Float[np.ndarray, " nv"]
+    next: Int[np.ndarray, " nv"]
+    kept: Bool[np.ndarray, " nv"]
+
+
+def measure_rows(rows: Float[np.ndarray, "m nw"], stages: int) -> Float[np.ndarray, " n"]:
+    """Return the norm of the rows of a stage, root mean square of all stages; 1 for rows that nothing moves."""
+    squares = (rows**2).sum(axis=1).reshape(stages, -1).mean(axis=0)
+    return np.sqrt(np.where(squares > 0, squares, 1.0))
+
+
+def limit_plan(
+    track: LiftedTracking,
+    horizon: Horizon,
+    D: Float[np.ndarray, "nv nw"],
+    end: EndRows | None,
+    held: Bool[np.ndarray, "moves nu"],
+) -> PlanLimits:
+    """Return the limits of a plan whose entries move by D w; moves that are `held` need none of their own."""
+    moves, N, nu = len(horizon.blocks), horizon.N, horizon.B.shape[1]
+    starts = np.cumsum([0, *horizon.blocks[:-1]])
+    following = np.append(np.repeat(np.arange(moves), horizon.blocks), moves)[starts + 1]
+    none, can_move = np.zeros(nu), track.movable
+    groups = [(track.inputs, Softness(np.full(nu, np.inf), none, none), following, can_move.inputs)]
+    if track.rates is not None:
+        groups.append((track.rates, track.rate_softness, following, can_move.rates))
+    every = np.ones(len(track.outputs.low), np.bool_)
+    groups.append((track.outputs, track.softness, np.arange(1, N + 1), every))
+    ends = 0 if end is None else len(end.F)
+    if end is not None:  # the set stays where it is from step to step; cuts take the place of a ball's limits
+        high = np.full(ends, np.inf if end.ball else 1.0)
+        softness = track.limits.end_softness(ends, track.sizes.scale)
+        groups.append((Interval(np.full(ends, -np.inf), high), softness, np.zeros(1, dtype=np.intp), np.isfinite(high)))
+    parts: list[list[np.ndarray]] = []
+    first = 0
+    for bounds, softness, after, kept in groups:
+        stages, width = len(after), len(bounds.low)
+        size = measure_rows(D[first : first + stages * width], stages)
+        place = first + width * after[:, None] + np.arange(width)
+        place[after >= stages] = len(D)
+        parts.append([*(np.tile(each, stages) for each in (*bounds, *softness, size, kept)), place.ravel()])
+        first += stages * width
+    low, high, linear, quadratic, allowance, size, kept, place = (
+        np.concatenate(part) for part in zip(*parts, strict=True)
+    )
+    if track.margin.any():
+        margin = preview_margin(track.margin, N).ravel()
+        last = len(low) - ends
+        low[last - len(margin) : last] += margin
+        high[last - len(margin) : last] -= margin
+    free = _list_held(held, track)
+    low[free], high[free], kept[free] = -np.inf, np.inf, False
+    return PlanLimits(low, high, Softness(linear, quadratic, allowance), size, place, kept)
+
+
+def _list_held(held: Bool[np.ndarray, "moves nu"], track: LiftedTracking) -> Int[np.ndarray, " n"]:
+    """Return the entries of inputs that keep their value, except those that a search over levels needs, and rates."""
+    searched = np.zeros(held.shape[1], dtype=np.bool_)
+    levels = track.limits.base.input_levels(held.shape[1]) if held.any() else None
+    if levels is not None:
+        searched[levels.which] = True
+    rows = np.flatnonzero((held & ~searched).ravel())
+    return rows if track.rates is None else np.append(rows, held.size + np.flatnonzero(held.ravel()))
+
+
+def build_qp(maps: Condensed, limits: PlanLimits, changes: int, stages: QPStages | None) -> StepQP:
+    """Return the QP of a condensed horizon under these limits, so many of each move's changes having some.
+
+    Every row is measured by the norm of its row of D, so that the price of its violation is, too.
+    """
+    D, unit, n = maps.deviation, maps.unit, len(maps.hessian)
+    source = np.flatnonzero(limits.kept)
+    size, (linear, quadratic, allowance) = limits.size[source], limits.softness
+    row = np.full(len(D) + 1, len(source))
+    row[source] = np.arange(len(source))
+    first = np.arange(n, n + changes)
+    hard = first[limits.kept[first] & np.isinf(linear[first])]
+    return StepQP(
+        P=maps.hessian,
+        q=np.zeros(n),
+        A=D[source] * (1 / size)[:, None],
+        low=limits.low[source] * (1 / size),
+        high=limits.high[source] * (1 / size),
+        softness=Softness(
+            linear[source] * size / (2 * unit), quadratic[source] * size**2 / (2 * unit), allowance[source]
+        ),
+        source=source,
+        scale=1 / size,
+        shift_primal=np.minimum(limits.next[:n], n),
+        shift_dual=row[limits.next[source]],
+        rate_rows=row[hard],
+        rate_inputs=hard - n,
+        stages=stages,
+    )
+
+
+def tie_moves(maps: Condensed, held: Bool[np.ndarray, "moves nu"]) -> Condensed:
+    """Return the maps of a plan whose inputs keep their value from the move before where they are `held`.
+
+    In Riccati coordinates a plan costs unit · ‖w‖² above the one without ties, v + D w. The ties are T (v + D w) = 0,
+    so the cheapest plan that keeps them has w = −(T D)⁺ T v, and every other one adds a w of the null space of T D.
+    The null space is turned so that its first column moves the first free input and all later ones, and so on; the
+    entries of w that are left over move nothing.
+    """
+    moves, nu = held.shape
+    n, none = moves * nu, np.zeros(maps.deviation.shape)
+    tied, free = np.flatnonzero(held.ravel()), np.flatnonzero(~held.ravel())
+    D = maps.deviation
+    T = np.zeros((len(tied), n))
+    T[np.arange(len(tied)), tied], T[np.arange(len(tied)), tied - nu] = 1.0, -1.0
+    TD = T @ D[:n]
+    back = -D @ np.linalg.pinv(TD)
+    basis = null_space(TD)
+    basis = basis @ np.linalg.qr((D[free] @ basis).T)[0]
+    none[:, free] = D @ basis
+
+    def tie(rows: Float[np.ndarray, "nv m"]) -> Float[np.ndarray, "nv m"]:
+        return rows + back @ (T @ rows[:n])
+
+    def exact(rows: Float[np.ndarray, "nv m"]) -> Float[np.ndarray, "nv m"]:
+        """Return rows in which a tied input is that of the move before, to the bit."""
+        for i in tied:
+            rows[i] = rows[i - nu]
+        return rows
+
+    return replace(
+        maps,
+        from_state=exact(tie(maps.from_state)),
+        from_reference=exact(tie(maps.from_reference)),
+        from_target=exact(tie(maps.from_target)),
+        from_given=exact(tie(maps.from_given)),
+        from_drive=exact(tie(maps.from_drive)),
+        offset=exact(tie(maps.offset[:, None]))[:, 0],
+        deviation=exact(none),
+    )
 
 
 def plan_condensed(task: ControlTask) -> CondensedProgram:
@@ -50,7 +205,7 @@ def plan_condensed(task: ControlTask) -> CondensedProgram:
             raise DataError(f"the limits have {what} and a terminal ellipsoid; pass a polytope, or no terminal set")
     first = len(plan.deviation) * (1 if track.rates is None else 2)
     solved = limits.priority is not None and levels is None and not task.by_weights
-    layout, shape = (first, task.N, len(plan.offset)), find_shape(task, targets, plan)
+    layout, unpushed = (first, task.N, len(plan.offset)), plan.unpushed if plan.aimed and not plan.is_driven else HUGE
     program = CondensedProgram(
         **vars(plan),
         controller="KoopmanMPC",
@@ -67,16 +222,16 @@ def plan_condensed(task: ControlTask) -> CondensedProgram:
         with_rates=track.with_rates,
         hard_rates=track.hard_rates,
         plans=None,
-        step_bounds=BoundRows(shape, task.latency).read(limits, at_call=False)
+        step_bounds=BoundRows(find_shape(task, targets, plan), task.latency).read(limits, at_call=False)
         if limits.in_time
         else ConstantBounds(
-            StepBounds(plan.low, plan.high, plan.unpushed if shape.aims_inside else HUGE),
+            StepBounds(plan.low, plan.high, unpushed),
             track.inputs,
             track.rates,
             track.hard_rates,
             Interval(*(np.tile(side, len(blocks)) for side in track.inputs)),
         ),
-        bounds=describe_bounds(shape) if limits.in_time or limits.rows else None,
+        bounds=describe_bounds(find_shape(task, targets, plan)) if limits.in_time or limits.rows else None,
         input_levels=levels,
         priority=spread_priorities(limits, model.states, layout) if solved else None,
         rule=task.estimator,
@@ -96,27 +251,6 @@ def plan_condensed(task: ControlTask) -> CondensedProgram:
 def plan_weights(task: ControlTask, targets: Targets, terminal: Terminal, rows: WeightRows) -> CondensedPlan:
     """Return the plan of weights in time; targets and the end of the horizon are those of Q and R."""
     return plan_matrices(task, targets, terminal, rows)[0]
-
-
-def find_shape(task: ControlTask, targets: Targets, plan: CondensedPlan) -> PlanShape:
-    """Return what the limits of a plan depend on."""
-    track, held, planned = task.track, task.moves.held, len(plan.offset)
-    wanted = track.limits.terminal
-    end = None if wanted is None else read_end(wanted, task.predictor)
-    last = slice(planned - (0 if end is None else len(end.F)), planned)
-    return PlanShape(
-        track=track,
-        targets=targets,
-        blocks=task.moves.lengths,
-        held=held,
-        tied=held.ravel() & ~np.isin(np.arange(held.size), plan.qp.source),
-        end=end,
-        end_box=Interval(plan.low[last], plan.high[last]),
-        aims_inside=plan.aimed and not plan.is_driven,
-        checked=plan.checked,
-        states=task.predictor.states,
-        inputs=task.predictor.inputs,
-    )
 
 
 @checks.explain_overflow()
@@ -267,33 +401,46 @@ def _scale_deviation(maps: Condensed, inputs: Interval, stages: int) -> Condense
     return replace(maps, deviation=D * columns, hessian=hessian, unit=maps.unit * share)
 
 
-def planned_states(
-    predictor: LinearPredictor,
-    move_of: Int[np.ndarray, " N"],
-    *,
-    with_rates: bool,
-    disturbed: bool,
-    periodic: bool = False,
-) -> Float[np.ndarray, "N1nx nvk"]:
-    """Return the matrix that takes [moves; z; u_{−1}; w_0 … w_{N−1}; d; 1] to C z_0 … C z_N, one below the other.
+_OTHER_SOLVER = (
+    "The controller solves with OSQP; this C solves with DAQP, to rounding: inputs differ by OSQP's tolerance."
+)
+_BY_WEIGHTS = (
+    "The controller solves a QP for each priority of its limits; this C solves one, in which a limit weighs 1,000 "
+    "times as much as one of the priority below."
+)
 
-    z_{k+1} = A z_k + B u_k + E w_k + d; u_{−1} is there `with_rates`, d where it is estimated. Move move_of[k] is u_k.
+
+def publish_condensed(
+    controller: object, task: ControlTask, program: CondensedProgram, reference: ArrayLike | None
+) -> CondensedProgram:
+    """Return the program from which C code is generated; DataError where there is no code for a part of it.
+
+    C has one plan, solved by the finisher, in Riccati coordinates; weights stand for priorities.
     """
-    A, B, E, C, N = predictor.A, predictor.B, predictor.E, predictor.C, len(move_of)
-    if periodic:  # [w_k; p_k] in place of w_k
-        E = np.hstack([E, np.eye(len(A))])
-    nx, nz, nu, nw = len(C), len(A), B.shape[1], E.shape[1]
-    from_z = np.empty((N + 1, nx, nz))  # C Aᵏ
-    from_z[0] = C
-    for k in range(N):
-        from_z[k + 1] = from_z[k] @ A
-    from_u, from_w = np.zeros((N + 1, nx, int(move_of[-1]) + 1, nu)), np.zeros((N + 1, nx, N, nw))
-    through_B, through_E = from_z @ B, from_z @ E
-    for j in range(N):  # what acts at step j moves all states after it
-        from_u[j + 1 :, :, move_of[j]] += through_B[: N - j]
-        from_w[j + 1 :, :, j] = through_E[: N - j]
-    parts = [from_u, from_z, np.zeros((N + 1, nx, nu * with_rates)), from_w]
-    if disturbed:
-        parts.append(np.concatenate([np.zeros((1, nx, nz)), np.cumsum(from_z[:-1], axis=0)]))
-    parts.append(np.zeros((N + 1, nx, 1)))
-    return np.concatenate([part.reshape((N + 1) * nx, -1) for part in parts], axis=1)
+    if program.input_levels is not None and program.levels is None:
+        raise no_export(
+            controller,
+            "only some of its inputs or steps are on levels, and this search has no C code",
+            "one whose inputs are all on levels in all steps",
+        )
+    if program.plans is not None:
+        raise no_export(
+            controller, "its weights move in time, and its C holds one plan", "one without Cost(Q_rows=…, R_rows=…)"
+        )
+    if program.ball is not None:
+        raise no_export(
+            controller,
+            "Clarabel solves its QP with a terminal ellipsoid",
+            "one with a polytope, or without a terminal set",
+        )
+    rows, notes = reference_table(reference, program.nr), ()
+    refuse_time_limit(task.time_limit, 'solver="daqp", settings={"iter_limit": 100}')
+    if program.priority is not None:
+        notes = (_BY_WEIGHTS,)
+    elif task.solver == "osqp":
+        notes = (_OTHER_SOLVER,)
+    if notes or task.solver != FINISHER.name:
+        program = plan_condensed(task.for_c(FINISHER.name))
+    program = replace(program, controller=type(controller).__name__, reference=rows, notes=notes)
+    _ = program.estimator, program.lifting  # these may be code that cannot be written in C
+    return program

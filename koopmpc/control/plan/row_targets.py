@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import ShapeError
 from koopmpc.base.values import Value
-from koopmpc.control.cost import Cost, StateTracking
+from koopmpc.control.ask.cost import Cost, StateTracking
 from koopmpc.control.nonlinear.equilibrium import MISSED, Equilibria, Equilibrium
 from koopmpc.control.nonlinear.learned_map import LearnedMap
 from koopmpc.control.riccati import one_step, stationary

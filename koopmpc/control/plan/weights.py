@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base.errors import DefinitenessError
-from koopmpc.control.cost import LiftedTracking
+from koopmpc.control.ask.cost import LiftedTracking
 from koopmpc.control.horizon import WeightRows
 from koopmpc.control.plan.condensed_program import CondensedPlan
 

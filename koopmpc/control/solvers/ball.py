@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
-from koopmpc.control.limits import SOFTENED, Interval, Softness
+from koopmpc.control.ask.limits import SOFTENED, Interval, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolution, SolverTurn, StepQP, StepSolver, move_limits
 

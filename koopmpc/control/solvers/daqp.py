@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
 from koopmpc.base.values import Value
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver, StepQP
 

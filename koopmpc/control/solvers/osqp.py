@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import call_uninterrupted
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QP, QPSolution, QPSolver
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import call_uninterrupted
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver, StepQP
 

@@ -3,10 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from koopmpc.control.plan.bounds import StepBounds
-from koopmpc.control.plan.condensed_program import CondensedPlan
-from koopmpc.control.step.deviation import is_inside
-from koopmpc.control.step.share import ReferenceShare
+from koopmpc.control.plan.condensed_program import CondensedPlan, StepBounds, is_inside
+from koopmpc.control.step.observe import ReferenceShare
 
 
 class FirstInputPlan:

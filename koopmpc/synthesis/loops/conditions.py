@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base.parallel import Workers
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.limits import Limits
 from koopmpc.data.angles import find_angles
 from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.base import strip_unit

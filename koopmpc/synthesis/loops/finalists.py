@@ -11,8 +11,8 @@ from scipy.special import bdtr
 from koopmpc.base.errors import DataError, KoopmpcError, hide_fit_warnings
 from koopmpc.base.text import to_percent
 from koopmpc.codegen.compiled import Compiled
-from koopmpc.control.limits import Limits
-from koopmpc.control.terminal.sets import TerminalSet
+from koopmpc.control.ask.limits import Limits
+from koopmpc.control.ask.terminal import TerminalSet
 from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.state import Constant, State
 from koopmpc.models.fits.edmd import edmd

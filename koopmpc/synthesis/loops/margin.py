@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base.errors import DataError, KoopmpcError
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.riccati import find_gain, one_step, stationary
 from koopmpc.synthesis.doubts import limit_margins
 from koopmpc.synthesis.loops.abreast import speed_up

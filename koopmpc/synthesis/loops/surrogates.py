@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Value
-from koopmpc.control.cost import Cost, state_tracking
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.cost import Cost, state_tracking
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.nonlinear.equilibrium import Equilibria, Equilibrium
 from koopmpc.control.nonlinear.learned_map import LearnedMap, learned_map
 from koopmpc.data.episodes import Episodes

@@ -9,10 +9,10 @@ from scipy.spatial import KDTree
 
 from koopmpc.base.errors import hide_fit_warnings
 from koopmpc.base.values import Value
-from koopmpc.control.cost import Cost
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import kind_for
 from koopmpc.control.kinds.koopman_mpc import KoopmanMPC
-from koopmpc.control.limits import Limits
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Source

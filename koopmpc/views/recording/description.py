@@ -16,8 +16,8 @@ from koopmpc.base import checks
 from koopmpc.base.errors import LogError
 from koopmpc.base.text import format_markdown_table
 from koopmpc.base.values import checksum, from_data, to_data
-from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.move import Fallback, Status
 from koopmpc.lifting.base import Lifting
 from koopmpc.loop.metrics import Metrics

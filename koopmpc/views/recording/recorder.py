@@ -15,8 +15,8 @@ from koopmpc.base import checks
 from koopmpc.base.disk import path_of
 from koopmpc.base.errors import DataError, refuse_moved
 from koopmpc.base.scene import Scene
-from koopmpc.control.cost import Cost
-from koopmpc.control.limits import Limits
+from koopmpc.control.ask.cost import Cost
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.move import Plan
 from koopmpc.loop.rows import Step, StepRows
 from koopmpc.loop.run import About, Run

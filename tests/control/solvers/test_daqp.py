@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.limits import Softness
+from koopmpc.control.ask.limits import Softness
 from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.daqp import _ACCURACY, DAQP
 from tests.bare import shown
@@ -178,7 +178,7 @@ def test_settings_that_daqp_would_swallow():
     (line,) = shown(
         """
 from koopmpc.control.solvers.base import QP
-from koopmpc.control.limits import Softness
+from koopmpc.control.ask.limits import Softness
 from koopmpc.control.solvers.daqp import _ACCURACY, DAQP
 one = np.ones(1)
 show(lambda: DAQP(QP(np.eye(1), one, np.eye(1), -one, one), {"iter_limit": 2.5}))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.limits import Interval, Softness
+from koopmpc.control.ask.limits import Interval, Softness
 from koopmpc.control.solvers.base import QPSolution, SolverTurn, StepQP, StepSolver
 
 OPTIMAL, FAILED, MOST = km.Status.OPTIMAL, km.Status.FAILED, km.Status.MAX_ITERATIONS

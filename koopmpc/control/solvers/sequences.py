@@ -17,10 +17,10 @@ from jaxtyping import Float, Int
 from scipy.linalg import solve_triangular
 
 from koopmpc.base.values import Value
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.levels import HeldLevels, InputLevels, LevelBox
+from koopmpc.control.ask.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import StepQP
-from koopmpc.control.stepped.levels import HeldLevels, InputLevels, LevelBox
 
 WIDTH = 128  # beginnings that go on at once
 EQUAL = 1e-9  # a plan is worse than the best one unless it costs less by more than this share

@@ -8,8 +8,8 @@ import numpy as np
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.values import same
-from koopmpc.control.in_time.bounds import refuse_crossed_rows
-from koopmpc.control.limits import BOUNDS, Interval, Limits, Movable
+from koopmpc.control.ask.bounds import refuse_crossed_rows
+from koopmpc.control.ask.limits import BOUNDS, Interval, Limits, Movable
 
 _FIXED = tuple(f.name for f in fields(Limits) if f.name not in (*BOUNDS, "rows", "capped"))  # stay as they were made
 _GROUPS = ("u", "du", "x")

@@ -12,23 +12,22 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.values import Value
-from koopmpc.control.bounds.boxes import SOFTENED as SOFTENED
-from koopmpc.control.bounds.boxes import Bound as Bound
-from koopmpc.control.bounds.boxes import Interval as Interval
-from koopmpc.control.bounds.boxes import LimitRows as LimitRows
-from koopmpc.control.bounds.boxes import Movable as Movable
-from koopmpc.control.bounds.boxes import SizedLimits as SizedLimits
-from koopmpc.control.bounds.boxes import Slack as Slack
-from koopmpc.control.bounds.boxes import Softness as Softness
-from koopmpc.control.bounds.boxes import check_prices, is_finite
-from koopmpc.control.bounds.boxes import clip_input as clip_input
-from koopmpc.control.bounds.boxes import half_width as half_width
-from koopmpc.control.bounds.boxes import magnitude as magnitude
-from koopmpc.control.bounds.boxes import measure_violation as measure_violation
-from koopmpc.control.bounds.boxes import preview_margin as preview_margin
-from koopmpc.control.in_time import bounds
-from koopmpc.control.in_time.bounds import write_rows
-from koopmpc.control.stepped.levels import (
+from koopmpc.control.ask import bounds
+from koopmpc.control.ask.bounds import SOFTENED as SOFTENED
+from koopmpc.control.ask.bounds import Bound as Bound
+from koopmpc.control.ask.bounds import Interval as Interval
+from koopmpc.control.ask.bounds import LimitRows as LimitRows
+from koopmpc.control.ask.bounds import Movable as Movable
+from koopmpc.control.ask.bounds import SizedLimits as SizedLimits
+from koopmpc.control.ask.bounds import Slack as Slack
+from koopmpc.control.ask.bounds import Softness as Softness
+from koopmpc.control.ask.bounds import check_prices, is_finite, write_rows
+from koopmpc.control.ask.bounds import clip_input as clip_input
+from koopmpc.control.ask.bounds import half_width as half_width
+from koopmpc.control.ask.bounds import magnitude as magnitude
+from koopmpc.control.ask.bounds import measure_violation as measure_violation
+from koopmpc.control.ask.bounds import preview_margin as preview_margin
+from koopmpc.control.ask.levels import (
     DwellByInput,
     InputLevels,
     LevelsByInput,
@@ -36,7 +35,7 @@ from koopmpc.control.stepped.levels import (
     check_dwell,
     check_levels,
 )
-from koopmpc.control.terminal.sets import HasTerminalSet, TerminalSet, read_terminal_set
+from koopmpc.control.ask.terminal import HasTerminalSet, TerminalSet, read_terminal_set
 from koopmpc.lifting.base import Lifting, strip_unit
 
 LINEAR = 1e4  # default linear weight of a slack as a share of its limit's size, times the scale of the cost

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, ShapeError
-from koopmpc.control.limits import Interval, Limits, Softness
+from koopmpc.control.ask.limits import Interval, Limits, Softness
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolution, QPSolver, SolverTurn, StepQP, StepSolver
 

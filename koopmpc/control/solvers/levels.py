@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.levels import NEAR, HeldLevels, LevelBox, leveled_moves
+from koopmpc.control.ask.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import QPSolution, SolverTurn, StepQP, StepSolver
-from koopmpc.control.stepped.levels import NEAR, HeldLevels, LevelBox, leveled_moves
-from koopmpc.control.stepped.sequences import (
+from koopmpc.control.solvers.sequences import (
     EQUAL,
     Grow,
     Grown,

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.values import Value
-from koopmpc.control.bounds.boxes import Interval
+from koopmpc.control.ask.bounds import Interval
 
 LevelsByInput = Mapping[str, ArrayLike] | Sequence[ArrayLike | None]
 DwellByInput = Mapping[str, Any] | Sequence[Any]

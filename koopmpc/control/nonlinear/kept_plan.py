@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base.checks import HUGE
-from koopmpc.control.limits import Interval
+from koopmpc.control.ask.limits import Interval
+from koopmpc.control.ask.terminal import TerminalSet, terminal_feedback
 from koopmpc.control.nonlinear.learned_map import LearnedMap
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.nonlinear.stagewise import plan_cost
-from koopmpc.control.terminal.sets import TerminalSet, terminal_feedback
 
 _BROKEN = 1.0  # a plan is accepted that breaks no hard limit by more than this many allowances
 _MOVED = 1.01  # a kept plan may break one by this many: the model rounds otherwise from the measured state

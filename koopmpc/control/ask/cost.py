@@ -13,10 +13,10 @@ from koopmpc.base import checks
 from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Value
-from koopmpc.control.bounds.boxes import Bound
-from koopmpc.control.bounds.stage_cost import StageCost, trace_stage
-from koopmpc.control.in_time import bounds
-from koopmpc.control.limits import Interval, Limits, Movable, Softness, half_width, magnitude
+from koopmpc.control.ask import bounds
+from koopmpc.control.ask.bounds import Bound
+from koopmpc.control.ask.limits import Interval, Limits, Movable, Softness, half_width, magnitude
+from koopmpc.control.ask.stage_cost import StageCost, trace_stage
 from koopmpc.lifting.base import Lifting, find_observables
 from koopmpc.lifting.state import State
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
