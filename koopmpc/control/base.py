@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
 from koopmpc.base.values import Interval, Value
-from koopmpc.control.ask.cost import Tracking
 from koopmpc.control.ask.levels import HeldLevels
 from koopmpc.control.move import Fallback, Move, PlanMemory, Status, Token
 from koopmpc.control.plan.task import MoveBlocks, Moves, find_move_blocks
+from koopmpc.control.plan.tracking import Tracking
 from koopmpc.control.program import Published, SavedController
 from koopmpc.control.step.observe import InitialCondition
 from koopmpc.control.watching import StepMonitor, StepWatch

@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError, ShapeError
-from koopmpc.control.ask.cost import Cost, check_cost_and_limits, lifted_tracking
+from koopmpc.control.ask.cost import Cost, check_cost_and_limits
 from koopmpc.control.ask.limits import Interval, Limits, clip_input, refuse_levels
 from koopmpc.control.ask.preview import InputRows
 from koopmpc.control.horizon import horizon_of
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.move import Fallback, Move, Status, Token, alone
+from koopmpc.control.plan.tracking import lifted_tracking
 from koopmpc.control.program import (
     LinearProgram,
     Published,

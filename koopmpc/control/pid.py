@@ -15,11 +15,12 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError, ShapeError
-from koopmpc.control.ask.cost import Cost, check_cost_and_limits, lifted_tracking
+from koopmpc.control.ask.cost import Cost, check_cost_and_limits
 from koopmpc.control.ask.limits import Limits, refuse_levels
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
+from koopmpc.control.plan.tracking import lifted_tracking
 from koopmpc.control.program import SavedController
 from koopmpc.models.predictors import LinearPredictor
 

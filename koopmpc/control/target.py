@@ -8,9 +8,10 @@ from jaxtyping import Float
 from scipy.linalg import block_diag, null_space, solve_triangular
 
 from koopmpc.base import checks
-from koopmpc.control.ask.cost import Cost, LiftedTracking, Sizes
+from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Interval, magnitude
 from koopmpc.control.move import Status
+from koopmpc.control.plan.tracking import LiftedTracking, Sizes
 from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.base import QP
 from koopmpc.control.solvers.daqp import DAQP

@@ -90,7 +90,7 @@ def _limit_observables(model: DeviationModel, limits: Limits, names: Sequence[st
     if limits.of is None:
         return np.empty((0, len(model.kept)))
     wanted = limits.of.bind(tuple(names))
-    y_low, y_high = limits.outputs(wanted.nz)
+    y_low, y_high = (end[len(names) :] for end in limits.ends(len(names), wanted.nz))
     y = wanted(model.x)
     half = np.minimum(y - y_low, y_high - y)
     if (half <= 0).any():

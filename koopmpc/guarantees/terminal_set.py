@@ -9,9 +9,10 @@ from scipy.linalg import block_diag
 
 from koopmpc.base import checks
 from koopmpc.base.errors import CertificateError, DataError
-from koopmpc.control.ask.cost import Cost, LiftedTracking, lifted_tracking
+from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.ask.terminal import TerminalFeedback, TerminalSet
+from koopmpc.control.plan.tracking import LiftedTracking, lifted_tracking
 from koopmpc.control.riccati import Stage, find_gain, one_step, stationary
 from koopmpc.control.target import targets_of
 from koopmpc.guarantees.invariant_set import find_invariant_set

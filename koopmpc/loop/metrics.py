@@ -11,10 +11,10 @@ from koopmpc.base import checks
 from koopmpc.base.errors import ShapeError
 from koopmpc.base.text import format_duration
 from koopmpc.base.values import Value
-from koopmpc.control.ask.cost import Cost, Sizes
+from koopmpc.control.ask.cost import Cost, evaluate_stage
 from koopmpc.control.ask.levels import NEAR
 from koopmpc.control.ask.limits import SOFTENED, Interval, Limits
-from koopmpc.control.ask.stage_cost import evaluate_stage
+from koopmpc.control.plan.tracking import Sizes
 from koopmpc.loop.run import SECONDS, Run, bind_outputs
 
 SETTLED = 0.02  # the band of the settling time, as a share of the first error

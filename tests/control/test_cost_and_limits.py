@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.ask.cost import data_ranges, state_tracking
+from koopmpc.control.plan.tracking import data_ranges, state_tracking
 from tests.bare import shown
 
 

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
 import koopmpc as km
-from koopmpc.control.ask.cost import state_tracking
 from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibria
 from koopmpc.control.nonlinear.learned_map import learned_map
 from koopmpc.control.plan.row_targets import RowTarget, RowTargets
+from koopmpc.control.plan.tracking import state_tracking
 from koopmpc.control.riccati import one_step, stationary
 from koopmpc.control.step.aim import MovingEnd
 from tests.closed_loop.tasks import TASKS

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.ask.cost import state_tracking
 from koopmpc.control.ask.limits import SOFTENED
 from koopmpc.control.nonlinear.learned_map import learned_map
 from koopmpc.control.nonlinear.problem import StagedProblem, staged_problem
@@ -23,6 +22,7 @@ from koopmpc.control.nonlinear.stagewise import (
     weights,
 )
 from koopmpc.control.plan.task import find_move_blocks
+from koopmpc.control.plan.tracking import state_tracking
 
 OF = km.Fourier(1, "a") + km.State("b")
 Q, R, R_DELTA = [[3, 1, 0], [1, 2, 0.5], [0, 0.5, 1]], [[0.4, 0.1], [0.1, 0.3]], [[0.7, 0.2], [0.2, 0.5]]

@@ -18,13 +18,13 @@ from koopmpc.apps.bench.problem import Problem
 from koopmpc.base import disk
 from koopmpc.base.checks import nearest
 from koopmpc.base.errors import DataError, ProblemError, hide_fit_warnings
-from koopmpc.control.ask.cost import state_tracking
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.function import as_controller
 from koopmpc.control.kinds import BenchEntry, list_bench
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.equilibrium import Equilibria
 from koopmpc.control.nonlinear.learned_map import learned_map
+from koopmpc.control.plan.tracking import state_tracking
 from koopmpc.data.collect import Uniform, collect
 from koopmpc.data.episodes import Episodes
 from koopmpc.loop.monitor import Monitor

@@ -14,6 +14,11 @@ from koopmpc.base.values import Interval as Interval
 BoundByName = Mapping[str, ArrayLike]  # of each signal a number, or one a step
 
 
+def open_end(end: str) -> float:
+    """Return the value of a bound of this name that does not limit."""
+    return np.inf if end.endswith("max") else -np.inf
+
+
 def is_rows(bound: Any) -> bool:
     """Return whether a checked bound, or one of a bound by name, is a row a step."""
     if isinstance(bound, Mapping):
@@ -266,3 +271,22 @@ def check_prices(slack: Slack, name: str) -> Slack:
     if (linear < 0).any() or (quadratic < 0).any() or not (linear.any() or quadratic.any()):
         raise DataError(f"{name} is {slack}; pass weights (linear, quadratic) ≥ 0, one above zero, or None")
     return (linear if linear.ndim else float(linear)), (quadratic if quadratic.ndim else float(quadratic))
+
+
+def spread_prices(
+    slack: Slack | None, name: str, n: int, what: str
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the linear and quadratic price of n rows."""
+    if slack is None:
+        return np.full(n, np.inf), np.zeros(n)
+    parts = [checks.array(weight, name, infinite=True) for weight in slack]
+    for part in parts:
+        if part.ndim and part.shape != (n,):
+            raise ShapeError(f"{name} has a weight of shape {part.shape}, expected ({n},), {what}, or a scalar")
+    linear, quadratic = (np.broadcast_to(part, (n,)).copy() for part in parts)
+    free = np.flatnonzero(linear + quadratic == 0)
+    if free.size:
+        raise DataError(
+            f"{name} has both weights zero at index {int(free[0])}; give one above zero, or remove the limit"
+        )
+    return linear, quadratic

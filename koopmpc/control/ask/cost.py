@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeAlias, TypeVar, cast, runtime_checkable
+from typing import Any, Literal, Protocol, TypeAlias, cast, runtime_checkable
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
@@ -15,15 +15,15 @@ from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Value
 from koopmpc.control.ask import bounds
 from koopmpc.control.ask.bounds import Bound
-from koopmpc.control.ask.limits import Interval, Limits, Movable, Softness, half_width, magnitude
-from koopmpc.control.ask.stage_cost import StageCost, trace_stage
-from koopmpc.lifting.base import Lifting, find_observables
+from koopmpc.control.ask.checks import COST_CHECKS, refuse_contradictions
+from koopmpc.control.ask.limits import Limits
+from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.state import State
-from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.graph import Graph
 
-_CONSTANT = 1e-12  # share of the mean square below which a variance is rounding
-Read = TypeVar("Read", np.ndarray, ca.Function)
+StageCost: TypeAlias = Callable[[ca.SX, ca.SX], Any] | Graph
+_OF_OUTPUTS = ("Q", "Q_rows", "output_price")
+_BY_NAME = (*_OF_OUTPUTS, "R", "R_rows", "R_delta", "price")
 
 
 @runtime_checkable
@@ -129,80 +129,16 @@ class Cost(Value):
     def __post_init__(self) -> None:
         if isinstance(self.Q_N, WeighsEnd):
             object.__setattr__(self, "Q_N", self.Q_N.weigh_end(replace(self, Q_N=None)))
-        checks.kind(self.of, "of", Lifting, 'for example km.State("theta"), or km.Fourier(1, states="theta")')
-        for name in ("Q", "R", "Q_N", "R_delta"):
+        for name, check in COST_CHECKS.items():
             value = getattr(self, name)
-            if value is None and name in ("Q", "R"):
-                raise DataError(f"{name} must be a weight, got None; pass 0 to leave it out")
-            if isinstance(value, Mapping):
-                if name == "Q_N":
-                    raise DataError("Q_N is a table of names; pass a matrix (nx, nx) or (nz, nz)")
-                stored = checks.check_named(value, name)
-                for key, weight in stored.items():
-                    checks.weight(np.array(weight), f"{name}[{key!r}]")
-                object.__setattr__(self, name, stored)
-            elif value is not None:
-                stored = checks.array(value, name)
-                checks.weight(stored, name)
-                object.__setattr__(self, name, stored)
-        if isinstance(self.u_target, str):
-            if self.u_target not in ("equilibrium", "zero"):
-                known = '"equilibrium", "zero", an input or rows of inputs'
-                raise DataError(f"u_target is {self.u_target!r}; pass {known}")
-        else:
-            rows = np.atleast_1d(checks.array(self.u_target, "u_target"))
-            if rows.ndim > 2 or not rows.size:
-                raise ShapeError(f"u_target has shape {rows.shape}, expected (nu,) or rows (k, nu), one a step")
-            object.__setattr__(self, "u_target", rows)
-        if self.price is not None:
-            for value in self.price.values() if isinstance(self.price, Mapping) else [self.price]:
-                checks.array(value, "price")  # finite, and named by its row where it is not
-            object.__setattr__(self, "price", bounds.check_bound(self.price, "price"))
-        if self.output_price is not None:
-            if isinstance(self.output_price, Mapping):
-                stored = checks.check_named(self.output_price, "output_price")
-            else:
-                stored = np.atleast_1d(checks.array(self.output_price, "output_price"))
-                if stored.ndim > 1:
-                    raise ShapeError(f"output_price has shape {stored.shape}; pass a number for each tracked output")
-            object.__setattr__(self, "output_price", stored)
-        for name in ("Q_rows", "R_rows"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, self._check_rows(name))
-        if not (callable(cast("object", self.stage)) or isinstance(self.stage, Graph | None)):
-            raise DataError(f"stage is {self.stage!r}; pass a function of x and u, such as lambda x, u: x[0] * u[0]")
-        if self.beyond not in ("rest", "motion", None):
-            raise DataError(f'beyond is {self.beyond!r}; pass "rest" or "motion"')
-        if self.beyond == "motion" and not (self.Q_N is None and self.tail is None):
-            raise DataError('beyond="motion" moves the end that the default costs; leave Q_N and tail out')
-        if self.tail is not None:
-            object.__setattr__(self, "tail", int(checks.count(self.tail, "tail", 0)))
-            if self.Q_N is not None:
-                raise DataError(f"Q_N and tail = {self.tail} are given; Q_N takes the tail's place: pass one of them")
+            if value is not None:
+                object.__setattr__(self, name, check(value, name))
+        refuse_contradictions(self)
 
     @property
     def moves_on(self) -> bool:
         """Whether the end of a plan follows a reference that goes on as it moved."""
         return self.beyond != "rest" and self.Q_N is None and self.tail is None
-
-    def _check_rows(self, name: str) -> Any:
-        """Return rows of weights, checked."""
-        given: Any = getattr(self, name)
-        for value in bounds.list_bound(given):
-            if (checks.array(value, name) < 0).any():
-                raise DataError(f"{name} holds a number below 0; pass weights of 0 or above")
-        rows: Any = bounds.check_bound(given, name)
-        if not bounds.is_rows(rows):
-            raise ShapeError(f"{name} is {rows!r}; pass rows (steps, n), or by name a value a step")
-        if self.price is not None and name == "R_rows":
-            raise DataError("a price is paid back by R, which R_rows moves in time; pass one of the two")
-        if self.output_price is not None and name == "Q_rows":
-            raise DataError("an output_price is paid back by Q, which Q_rows moves in time; pass one of the two")
-        for weight in ("Q", "R"):  # the steps have diagonals of both
-            base = getattr(self, weight)
-            if not isinstance(base, Mapping) and np.ndim(base) == 2 and (base != np.diag(np.diagonal(base))).any():
-                raise DataError(f"{name} are diagonals, and {weight} is a full matrix; pass a diagonal one")
-        return rows
 
     def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Cost":
         """Return the cost with arrays in place of weights by name, and a graph in place of the function `stage`.
@@ -212,33 +148,17 @@ class Cost(Value):
         DataError
             A name is unknown or fits two, or R does not name every input; `stage` cannot be written as a graph.
         """
-        fields: dict[str, Any] = {
-            name: value for name in ("Q", "R", "R_delta") if isinstance(value := getattr(self, name), Mapping)
-        }
-        priced: dict[str, Any] = {}
-        if isinstance(self.price, Mapping):
-            priced["price"] = bounds.order_bound(self.price, "price", inputs, 0.0)
-        if isinstance(self.output_price, Mapping):
-            names = self.of.bind(tuple(states)).names
-            priced["output_price"] = checks.order_by_name(self.output_price, "output_price", names, 0.0)
-        if isinstance(self.R_rows, Mapping):
-            priced["R_rows"] = bounds.order_bound(self.R_rows, "R_rows", inputs, 0.0)
-        if isinstance(self.Q_rows, Mapping):
-            priced["Q_rows"] = bounds.order_bound(self.Q_rows, "Q_rows", self.of.bind(tuple(states)).names, 0.0)
+        named = [name for name in _BY_NAME if isinstance(getattr(self, name), Mapping)]
+        outputs = self.of.bind(tuple(states)).names if any(name in _OF_OUTPUTS for name in named) else ()
+        ordered: dict[str, Any] = {}
+        for name in named:
+            names, order = outputs if name in _OF_OUTPUTS else inputs, bounds.order_bound
+            if name in ("Q", "R", "R_delta", "output_price"):
+                order = checks.order_by_name
+            ordered[name] = order(getattr(self, name), name, names, None if name == "R" else 0.0)
         if callable(self.stage):
-            priced["stage"] = trace_stage(self.stage, len(states), len(inputs))
-        if not fields:
-            return replace(self, **priced) if priced else self
-        known = {"Q": self.of.bind(tuple(states)).names if "Q" in fields else ()}
-        omitted = {"Q": 0.0, "R": None, "R_delta": 0.0}
-        return replace(
-            self,
-            **{
-                name: checks.order_by_name(value, name, known.get(name, inputs), omitted[name])
-                for name, value in fields.items()
-            },
-            **priced,
-        )
+            ordered["stage"] = trace_stage(self.stage, len(states), len(inputs))
+        return replace(self, **ordered) if ordered else self
 
     def matrices(self, nr: int, nu: int) -> tuple[Float[np.ndarray, "nr nr"], Float[np.ndarray, "nu nu"]]:
         """Return Q (nr, nr) and R (nu, nu) for `nr` tracked outputs and `nu` inputs."""
@@ -335,180 +255,46 @@ class Cost(Value):
         return R_delta if R_delta.any() else None
 
 
-class Sizes(NamedTuple):
-    """The sizes of states, inputs and limited rows [x; of(x)], and the scale of the cost, by which units mean nothing.
-
-    The size of a row is the first of these that is known: half the width between two finite limits; half the range of
-    the model's data; the value whose cost by Q is the mean cost of the tracked rows of known size; |limit|; 1. States
-    without a limit have a size by the same rule. That of an input is half the width of its limits, or else the value
-    whose cost by R is the scale of the cost. This scale is the largest cost in a step of a tracked output or an input
-    at its known size.
-    """
-
-    states: Float[np.ndarray, " nx"]
-    inputs: Float[np.ndarray, " nu"]
-    rows: Float[np.ndarray, " n"]
-    scale: float
-
-    @staticmethod
-    def of(
-        tracked: Lifting,
-        Q: Float[np.ndarray, "nr nr"],
-        R: Float[np.ndarray, "nu nu"],
-        limits: Limits,
-        states: Sequence[str],
-        ranges: Mapping[str, float] | None,
-    ) -> "Sizes":
-        """Return the sizes under the weights of a cost and limits; `ranges` are half of those of the data, by name."""
-        nu, known = len(R), dict(ranges or {})
-        names = [*states, *(() if limits.of is None else limits.of.bind(states).names)]
-        ends, inputs = limits.ends(len(states), len(names) - len(states)), limits.inputs(nu)
-        known |= {name: float(half) for name, half in zip(names, half_width(ends), strict=True) if half > 0}
-        weights = dict(zip(tracked.names, Q.diagonal(), strict=True))
-        widths = half_width(inputs)
-        prices = [weights[name] * known[name] ** 2 for name in tracked.names if known.get(name, 0.0) > 0]
-        priced = [price for price in (*prices, *(R.diagonal() * widths**2)) if price > 0]
-        far = {name: float(end) for name, end in zip(names, magnitude(ends), strict=True) if end > 0}
-        if not priced:
-            priced = [weights[name] * end**2 for name, end in far.items() if weights.get(name, 0.0) > 0]
-        scale = max(priced or [*weights.values(), *R.diagonal()]) or 1.0
-        mean = float(np.mean([price for price in prices if price > 0] or [scale]))
-        alike = {name: np.sqrt(mean / weight) for name, weight in weights.items() if weight > 0}
-        found = {**far, **alike, **known}
-        rows = np.array([found.get(name, 1.0) for name in names])
-        by_cost = np.sqrt(scale / np.where(R.diagonal() > 0, R.diagonal(), scale))
-        return Sizes(rows[: len(states)], np.where(widths > 0, widths, by_cost), rows, float(scale))
-
-
-def data_ranges(model: LinearPredictor | BilinearPredictor) -> dict[str, float]:
-    """Return half the range of the data behind a model by the names of states and observables, if they are known.
-
-    It is √3 standard deviations, those of uniform data, from the triangular factor of the lifted data. What is constant
-    in the data has none.
-    """
-    if model.scale is None:
-        return {}
-    rows = np.vstack([np.eye(model.nz), model.C])
-    seen, constant = model.scale @ rows.T, model.lifting.constant_index
-    squares = np.einsum("ij,ij->j", seen, seen)
-    mean = np.zeros(len(rows)) if constant is None else model.scale[:, constant] @ seen
-    spread = squares - mean**2
-    known = spread > _CONSTANT * squares
-    half = np.sqrt(3 * np.where(known, spread, 0.0))
-    names = [*model.lifting.names, *model.states]
-    return {name: float(value) for name, value in zip(names, half, strict=True) if value > 0}
-
-
-@dataclass(frozen=True)
-class Tracking(Generic[Read]):
-    """The weights and limits of a cost and its limits, on what `tracked` and `limited` read from the model's state.
-
-    Both are matrices (nr, nz) and (ng, nz) on a lifted state, or functions of x. Rows without a limit are left out.
-    `softness` says what it costs to leave `outputs`, row by row; a linear weight of inf makes a row hard. `margin`
-    moves `outputs` inwards, see `Limits`. R_delta is None without a weight of input changes, `rates` without a limit;
-    `with_rates` says whether there is either. `hard_rates` are those of `SizedLimits`. `given` are the rows of a
-    u_target that is given as numbers, None for one by name. `Q_root` and `R_root` are S with SᵀS = Q and R. `sizes` are
-    those of states, inputs, limits and cost. Where limits have rows, all these are of their widest values, and
-    `movable` says which inputs, rates and outputs [x; of(x)] have a limit, or may get one. `shift` is what a price adds
-    to u_r, `pull` what an output price adds to the reference; `weighed` says that weights move in time.
-    """
-
-    cost: Cost
-    limits: Limits
-    tracked: Read
-    limited: Read
-    Q: Float[np.ndarray, "nr nr"]
-    R: Float[np.ndarray, "nu nu"]
-    R_delta: Float[np.ndarray, "nu nu"] | None
-    inputs: Interval
-    rates: Interval | None
-    hard_rates: Interval | None
-    rate_softness: Softness
-    outputs: Interval
-    softness: Softness
-    margin: Float[np.ndarray, "K ng"]
-    with_rates: bool
-    given: Float[np.ndarray, "T nu"] | None
-    Q_root: Float[np.ndarray, "nr nr"]
-    R_root: Float[np.ndarray, "nu nu"]
-    sizes: Sizes
-    movable: Movable
-    shift: Float[np.ndarray, "prices nu"] | None
-    pull: Float[np.ndarray, " nr"] | None
-    weighed: bool
-
-
-LiftedTracking: TypeAlias = Tracking[np.ndarray]
-StateTracking: TypeAlias = Tracking[ca.Function]
-
-
-def lifted_tracking(
-    predictor: LinearPredictor, cost: Cost, limits: Limits | None, *, in_time: bool = False
-) -> LiftedTracking:
-    """Return what `cost` tracks and `limits` bound, as matrices on the lifted coordinates of `predictor`.
-
-    `in_time` says that who asks knows limits and weights with rows, and prices of inputs.
+@raise_swallowed()
+def trace_stage(stage: StageCost, nx: int, nu: int) -> Graph:
+    """Return the graph of ℓ(x, u), a number, of nx states and nu inputs.
 
     Raises
     ------
     DataError
-        Limits or weights have rows in time, or the cost has a price, and who asks does not know them; or
-        ``cost.beyond`` is "motion".
-    ObservableError
-        The cost or a limit is on an observable that the lifting lacks.
+        The function raises, or holds an operation that a graph cannot hold.
     ShapeError
-        A weight or a limit has another size than what it weighs or limits.
+        It is of other sizes, or returns no single number.
     """
-    cost, limits = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
-    if not in_time:
-        refuse_steps(cost, limits)
-    who = "a controller on a linear model" if in_time else "a law with one gain for all steps"
-    refuse_stage(cost, who, in_time=in_time)
-    if cost.beyond == "motion":
+    if isinstance(stage, Graph):
+        if (stage.n, stage.m) != (nx + nu, 1):
+            raise ShapeError(
+                f"stage is of {stage.n} states and inputs together, and the plant has {nx} and {nu}; pass the function"
+                " of this plant"
+            )
+        return stage
+    x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
+    try:
+        value = ca.SX(stage(x, u))
+    except (RuntimeError, TypeError, ValueError, IndexError, NotImplementedError, AttributeError) as error:
         raise DataError(
-            'beyond="motion" needs a BilinearMPC or a NonlinearMPC; leave it out, or pass more reference rows'
-        )
-    C, G = select_rows(predictor, cost.of), predictor.C
-    if limits.of is not None:
-        G = np.vstack([G, select_rows(predictor, limits.of)])
-    states, nu, ranges = predictor.states, predictor.nu, data_ranges(predictor)
-    return _tracking(C, lambda kept: np.ascontiguousarray(G[kept]), cost, limits, len(C), states, nu, ranges)
+            f"stage(x, u) raised {type(error).__name__}: {error}; write it with CasADi's functions of x ({nx} states)"
+            f" and u ({nu} inputs), for example lambda x, u: x[0] ** 2 + 0.3 * u[0]"
+        ) from error
+    if value.shape != (1, 1):
+        raise ShapeError(f"stage(x, u) has shape {value.shape}, expected one number")
+    own = ca.vertcat(x, u)
+    free = [str(symbol) for symbol in ca.symvar(value) if not ca.depends_on(symbol, own)]
+    if free:
+        raise DataError(f"stage(x, u) holds the symbol {free[0]}, which is neither of its arguments; pass a number")
+    return Graph.trace(ca.Function("stage", [own], [ca.densify(value)]))
 
 
-@raise_swallowed()
-def state_tracking(
-    states: tuple[str, ...],
-    inputs: tuple[str, ...],
-    cost: Cost,
-    limits: Limits | None,
-    size: int | None = None,
-    ranges: Mapping[str, float] | None = None,
-    *,
-    in_time: bool = False,
-) -> StateTracking:
-    """Return what `cost` tracks and `limits` bound, as functions of these states.
-
-    The functions take `size` values, the states first; by default the states alone. `ranges` as for `Sizes`,
-    `in_time` as for `lifted_tracking`.
-    """
-    cost, limits = check_cost_and_limits(cost, limits, states, inputs)
-    if not in_time:
-        refuse_steps(cost, limits)
-    nx, nu = len(states), len(inputs)
-    point = ca.SX.sym("x", nx if size is None else size)
-    x, of = point[:nx], cost.of.bind(states)
-    bound = None if limits.of is None else limits.of.bind(states)
-    values = x if bound is None else ca.vertcat(x, bound.symbolic(x))
-    return _tracking(
-        ca.Function("tracked", [point], [ca.densify(of.symbolic(x))]),
-        lambda kept: ca.Function("limited", [point], [ca.densify(values[np.flatnonzero(kept).tolist(), 0])]),
-        cost,
-        limits,
-        of.nz,
-        states,
-        nu,
-        ranges,
-    )
+def evaluate_stage(
+    stage: StageCost, X: Float[np.ndarray, "T nx"], U: Float[np.ndarray, "T nu"]
+) -> Float[np.ndarray, " T"]:
+    """Return ℓ(x_k, u_k) row by row."""
+    return trace_stage(stage, X.shape[1], U.shape[1]).evaluate(np.hstack([X, U]))[:, 0]
 
 
 def add_held(
@@ -560,79 +346,6 @@ def refuse_stage(cost: Cost, who: str, *, in_time: bool = False) -> None:
             f"the cost has a stage of its own, which {who} does not know; take a BilinearMPC or a NonlinearMPC, or "
             "leave stage out"
         )
-
-
-def _tracking(
-    tracked: Read,
-    limited: Callable[[Bool[np.ndarray, " n"]], Read],
-    cost: Cost,
-    limits: Limits,
-    nr: int,
-    states: Sequence[str],
-    nu: int,
-    ranges: Mapping[str, float] | None,
-) -> Tracking[Read]:
-    """Return the weights and limits of nr tracked outputs of a model with these states and so many inputs.
-
-    `limited` makes the map of those outputs that have a limit.
-
-    Raises
-    ------
-    DataError
-        A row of u_target is outside the limits of the inputs.
-    """
-    if nu == 0:
-        raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")
-    nx = len(states)
-    if cost.weighs_in_time:
-        cost.weight_rows(nr, nu, 0, 1)  # checks their sizes
-    (Q, R), R_delta, rows = cost.matrices(nr, nu), cost.rate(nu), cost.given_inputs(nu)
-    base = limits.base
-    sizes = Sizes.of(cost.of.bind(states), Q, R, base, states, ranges)
-    sized = base.find_sizes(nx, len(sizes.rows) - nx, nu, sizes.rows, sizes.scale)
-    low, high = sized.inputs
-    if rows is not None:
-        reach = 1e-9 * np.maximum(np.abs(rows), np.abs(rows).max(axis=0))
-        outside = np.argwhere((rows < low - reach) | (rows > high + reach))
-        if len(outside):
-            k, i = outside[0]
-            raise DataError(
-                f"u_target is {rows[k, i]:g} for input {i} in row {k}, outside its limits {low[i]:g} … {high[i]:g};"
-                " pass inputs that the limits allow"
-            )
-    return Tracking(
-        cost=cost,
-        limits=limits,
-        tracked=tracked,
-        limited=limited(sized.rows.kept),
-        Q=Q,
-        R=R,
-        R_delta=R_delta,
-        inputs=sized.inputs,
-        rates=sized.rates,
-        hard_rates=sized.hard_rates,
-        rate_softness=sized.rate_softness,
-        outputs=sized.rows.box,
-        softness=sized.rows.softness,
-        margin=sized.rows.margin,
-        with_rates=R_delta is not None or sized.rates is not None,
-        given=rows,
-        Q_root=checks.root(Q),
-        R_root=checks.root(R),
-        sizes=sizes,
-        movable=base.movable(nx, len(sizes.rows) - nx, nu),
-        shift=cost.find_shift(nu),
-        pull=cost.find_pull(nr),
-        weighed=cost.weighs_in_time,
-    )
-
-
-def select_rows(predictor: LinearPredictor, of: Lifting) -> Float[np.ndarray, "nr nz"]:
-    """Return the matrix that reads the observables `of` from z: the predictor's own C for states."""
-    wanted = of.bind(predictor.states)
-    if isinstance(wanted, State):
-        return predictor.C[wanted.state_indices]
-    return np.eye(predictor.nz)[find_observables(predictor.lifting, wanted)]
 
 
 def check_cost_and_limits(

@@ -21,38 +21,22 @@ from koopmpc.control.ask.bounds import Movable as Movable
 from koopmpc.control.ask.bounds import SizedLimits as SizedLimits
 from koopmpc.control.ask.bounds import Slack as Slack
 from koopmpc.control.ask.bounds import Softness as Softness
-from koopmpc.control.ask.bounds import check_prices, is_finite, write_rows
 from koopmpc.control.ask.bounds import clip_input as clip_input
 from koopmpc.control.ask.bounds import half_width as half_width
+from koopmpc.control.ask.bounds import is_finite, spread_prices, write_rows
 from koopmpc.control.ask.bounds import magnitude as magnitude
 from koopmpc.control.ask.bounds import measure_violation as measure_violation
 from koopmpc.control.ask.bounds import preview_margin as preview_margin
-from koopmpc.control.ask.levels import (
-    DwellByInput,
-    InputLevels,
-    LevelsByInput,
-    build_levels,
-    check_dwell,
-    check_levels,
-)
-from koopmpc.control.ask.terminal import HasTerminalSet, TerminalSet, read_terminal_set
+from koopmpc.control.ask.checks import BOUNDS as BOUNDS
+from koopmpc.control.ask.checks import ENDS, LIMIT_CHECKS, refuse_crossed, refuse_margin
+from koopmpc.control.ask.levels import DwellByInput, InputLevels, LevelsByInput, build_levels
+from koopmpc.control.ask.terminal import HasTerminalSet, TerminalSet
 from koopmpc.lifting.base import Lifting, strip_unit
 
 LINEAR = 1e4  # default linear weight of a slack as a share of its limit's size, times the scale of the cost
 QUADRATIC = 1e2  # the quadratic weight, in the same unit
 TIGHTEST = 0.2  # share of the range by which a limit is tightened at most
 _AHEAD = 5  # steps of an error band that tighten limits
-
-_ENDS = (
-    ("u_min", "u_max", "input"),
-    ("du_min", "du_max", "rate"),
-    ("x_min", "x_max", "state"),
-    ("y_min", "y_max", "output"),
-)  # fields of the lower and the upper limit, and what they limit
-
-
-BOUNDS = tuple(end for pair in _ENDS for end in pair[:2])
-"""Names of the bounds of `Limits`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,52 +128,14 @@ class Limits(Value):
     priority: "Mapping[str, int] | ArrayLike | None" = None
 
     def __post_init__(self) -> None:
-        if self.terminal is not None:
-            object.__setattr__(self, "terminal", read_terminal_set(self.terminal))
-        self._check_ends(BOUNDS)
-        if not all(checks.among(name, BOUNDS) for name in checks.texts(self.rows, "rows")):
-            raise DataError(f"rows is {self.rows!r}; pass a tuple of {', '.join(BOUNDS)}")
-        object.__setattr__(self, "rows", tuple(self.rows))
-        if self.of is not None:
-            checks.kind(self.of, "of", Lifting, 'for example km.Fourier(1, states="theta")')
-        for name in ("slack", "du_slack", "terminal_slack"):
+        for name, check in LIMIT_CHECKS.items():
             value = getattr(self, name)
-            if value is not None and not (name != "du_slack" and isinstance(value, str) and value == "auto"):
-                object.__setattr__(self, name, check_prices(cast("Slack", value), name))
-        if self.margin is not None:
-            object.__setattr__(self, "margin", self._margin(checks.array(self.margin, "margin", (None, None))))
-        if self.priority is not None and not isinstance(self.priority, Mapping):
-            object.__setattr__(self, "priority", checks.array(self.priority, "priority", (None,)))
-        self._check_levels()
-
-    def _check_ends(self, ends: Sequence[str]) -> None:
-        """Check these bounds, each against the other end of its pair."""
-        for end in ends:
-            value = getattr(self, end)
             if value is not None:
-                object.__setattr__(self, end, bounds.check_limit(value, end))
-        for low, high, name in _ENDS:
-            pair = getattr(self, low), getattr(self, high)
-            if (low in ends or high in ends) and not any(isinstance(value, Mapping) for value in pair):
-                bounds.require_room(*pair, low, high, name)
-        if (self.y_min is not None or self.y_max is not None) and self.of is None:
-            raise DataError("y_min and y_max limit observables; say which with of=, for example of=km.Fourier(1)")
-        for end, sign in (("du_min", 1.0), ("du_max", -1.0)):
-            value = getattr(self, end) if end in ends else None
-            if value is not None and any((sign * np.asarray(v) > 0).any() for v in bounds.list_bound(value)):
-                raise DataError(f"{end} is {value}; an input must be free to stay, so keep 0 inside its rates")
-
-    def _check_levels(self) -> None:
-        """Check the levels, their dwell times, and the steps in which they count."""
-        if self.levels is None:
-            if self.dwell is not None or self.level_steps is not None:
-                raise DataError("dwell and level_steps are of inputs on levels; pass levels, or leave them out")
-            return
-        object.__setattr__(self, "levels", check_levels(self.levels))
-        if self.dwell is not None:
-            object.__setattr__(self, "dwell", check_dwell(self.dwell))
-        if self.level_steps is not None:
-            object.__setattr__(self, "level_steps", checks.count(self.level_steps, "level_steps"))
+                object.__setattr__(self, name, check(value, name))
+        refuse_crossed(self, BOUNDS)
+        refuse_margin(self)
+        if self.levels is None and (self.dwell is not None or self.level_steps is not None):
+            raise DataError("dwell and level_steps are of inputs on levels; pass levels, or leave them out")
 
     def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Limits":
         """Return the limits with arrays in place of limits by name; an omitted name has no limit.
@@ -199,7 +145,7 @@ class Limits(Value):
         DataError
             A name is unknown or fits two, or limits cross.
         """
-        named = [end for pair in _ENDS for end in pair[:2] if isinstance(getattr(self, end), Mapping)]
+        named = [end for pair in ENDS for end in pair[:2] if isinstance(getattr(self, end), Mapping)]
         entries = {
             field: tuple(checks.order_entries(getattr(self, field), field, inputs))
             for field in ("levels", "dwell")
@@ -209,8 +155,10 @@ class Limits(Value):
             return self
         outputs = () if self.of is None else self.of.bind(tuple(states)).names
         known = {"u": inputs, "d": inputs, "x": states, "y": outputs}
-        ordered = {end: bounds.order_bound(getattr(self, end), end, known[end[0]], _free(end)) for end in named}
-        for low, high, name in _ENDS:
+        ordered = {
+            end: bounds.order_bound(getattr(self, end), end, known[end[0]], bounds.open_end(end)) for end in named
+        }
+        for low, high, name in ENDS:
             if low in ordered or high in ordered:
                 lower, upper = (ordered.get(end, getattr(self, end)) for end in (low, high))
                 bounds.require_room(lower, upper, low, high, name, known[low[0]])
@@ -225,7 +173,9 @@ class Limits(Value):
     def base(self) -> "Limits":
         """The same limits without rows: of each bound its widest finite value, by which sizes and slacks count."""
         ends = {end: getattr(self, end) for end in BOUNDS}
-        rows = {end: bounds.find_widest(value, _free(end)) for end, value in ends.items() if np.ndim(value) == 2}
+        rows = {
+            end: bounds.find_widest(value, bounds.open_end(end)) for end, value in ends.items() if np.ndim(value) == 2
+        }
         return replace(self, **rows) if rows else self
 
     def with_bounds(self, **ends: Bound) -> "Limits":
@@ -241,10 +191,10 @@ class Limits(Value):
             raise DataError(f"Limits has no bound {unknown[0]}; it has {', '.join(BOUNDS)}")
         other = copy(self)
         for end, value in ends.items():
-            object.__setattr__(other, end, value)
-        other._check_ends(tuple(ends))
-        if self.margin is not None and ("x_min" in ends or "x_max" in ends):
-            other._margin(cast("Float[np.ndarray, 'K nx']", self.margin))
+            object.__setattr__(other, end, None if value is None else bounds.check_limit(value, end))
+        refuse_crossed(other, tuple(ends))
+        if "x_min" in ends or "x_max" in ends:
+            refuse_margin(other)
         return other
 
     def at(self, step: int) -> "Limits":
@@ -260,23 +210,15 @@ class Limits(Value):
 
     def input_rows(self, nu: int, first: int, count: int) -> Interval:
         """Return the boxes (count, nu) of the inputs u_first …, from level to level where they have some."""
-        box = np.empty((2, count, nu))
-        self.write_rows("u", box, first)
-        return Interval(*box)
+        return _write_box(self, {"u": nu}, first, count)
 
     def rate_rows(self, nu: int, first: int, count: int) -> Interval:
         """Return the boxes (count, nu) of u_k − u_{k−1} from k = first on; the last row is held."""
-        box = np.empty((2, count, nu))
-        self.write_rows("du", box, first)
-        return Interval(*box)
+        return _write_box(self, {"du": nu}, first, count)
 
     def output_rows(self, nx: int, ny: int, first: int, count: int) -> Interval:
         """Return the boxes (count, nx + ny) of [x_k; of(x_k)] from k = first on; ny is 0 without `of`."""
-        box = np.empty((2, count, nx + ny))
-        self.write_rows("x", box[:, :, :nx], first)
-        if ny:
-            self.write_rows("y", box[:, :, nx:], first)
-        return Interval(*box)
+        return _write_box(self, {"x": nx, "y": ny}, first, count)
 
     def write_rows(self, what: Literal["u", "du", "x", "y"], to: Float[np.ndarray, "2 count n"], first: int) -> None:
         """Write the lower and the upper limits of u, Δu, x or y from step `first` on; the last row is held."""
@@ -290,28 +232,11 @@ class Limits(Value):
             for end, index in zip(to, inside, strict=True):
                 end[:, levels.which] = np.where(inside.low <= inside.high, levels.values(index), end[:, levels.which])
 
-    def _declares(self, what: str) -> bool:
-        return f"{what}_min" in self.rows or f"{what}_max" in self.rows
-
     def movable(self, nx: int, ny: int, nu: int) -> "Movable":
         """Return which inputs, rates and outputs [x; of(x)] have a row: those with a finite or a declared bound."""
         base = self.base
-        inputs = is_finite(base.inputs(nu)) | self._declares("u")
-        return Movable(inputs, is_finite(base._rates(nu)) | self._declares("du"), base.find_rows(nx, ny).kept)
-
-    def _margin(self, margin: Float[np.ndarray, "K nx"]) -> Float[np.ndarray, "K nx"]:
-        if (margin < 0).any() or not len(margin):
-            raise DataError(f"margin is {margin.tolist()}; pass rows of numbers of 0 or above, one a step")
-        low, high = self.base.states(margin.shape[1])
-        most = margin.max(axis=0)
-        crossed = np.flatnonzero(low + most > high - most)
-        if crossed.size:
-            i = crossed[0]
-            raise DataError(
-                f"the limits of state {i} cross once tightened: {low[i]:g} … {high[i]:g} with a margin of {most[i]:g}; "
-                "pass a smaller margin, or a wider range"
-            )
-        return margin
+        inputs = is_finite(base.inputs(nu)) | _declares(self, "u")
+        return Movable(inputs, is_finite(_change_box(base, nu)) | _declares(self, "du"), base.find_rows(nx, ny).kept)
 
     def tightened(self, band: ArrayLike, most: float = TIGHTEST, *, states: Sequence[str] = ()) -> "Limits":
         """Return the limits with margins: at step k of the horizon by the error band of min(k, 5) steps.
@@ -360,16 +285,6 @@ class Limits(Value):
             raise DataError("band is infinite for a state with one limit alone; pass a finite band")
         return replace(self, margin=rows, capped=tuple(said))
 
-    def end_softness(self, count: int, scale: float = 1.0) -> Softness:
-        """Return how soft the `count` rows of the terminal set are, of which 1 is the size of the set."""
-        if isinstance(self.terminal_slack, str):
-            linear, quadratic = np.full(count, LINEAR * scale), np.full(count, QUADRATIC * scale)
-        else:
-            linear, quadratic = _spread_prices(
-                self.terminal_slack, "terminal_slack", count, "one a row of the terminal set"
-            )
-        return Softness(linear, quadratic, np.full(count, SOFTENED))
-
     def inputs(self, nu: int) -> Interval:
         """Return the box of the inputs; that of an input on levels is from its lowest to its highest one."""
         box = _box(self.u_min, self.u_max, "u_min", "u_max", nu)
@@ -390,49 +305,25 @@ class Limits(Value):
         if self.levels is None or isinstance(self.levels, Mapping):
             return None
         dwell = None if self.dwell is None or isinstance(self.dwell, Mapping) else self.dwell
-        hard = self._rates(nu) if self.du_slack is None else None
+        hard = _change_box(self, nu) if self.du_slack is None else None
         box = _box(self.u_min, self.u_max, "u_min", "u_max", nu)
         return build_levels(self.levels, dwell, self.level_steps, *box, hard)
 
     def rates(self, nu: int) -> Interval | None:
         """Return the box of u_k − u_{k−1}; None where nothing limits it."""
-        box = self._rates(nu)
-        return box if self._declares("du") or is_finite(box).any() else None
-
-    def _rates(self, nu: int) -> Interval:
-        low = (
-            -checks.array(cast("ArrayLike", self.du_max), "du_max", infinite=True)
-            if self.du_min is None and self.du_max is not None
-            else self.du_min
-        )
-        return _box(low, self.du_max, "du_min", "du_max", nu)
+        box = _change_box(self, nu)
+        return box if _declares(self, "du") or is_finite(box).any() else None
 
     def rate_softness(self, nu: int) -> Softness:
         """Return how soft the rate limits of each input are."""
-        linear, quadratic = _spread_prices(self.du_slack, "du_slack", nu, "one an input")
-        box = self._rates(nu)
+        linear, quadratic = spread_prices(self.du_slack, "du_slack", nu, "one an input")
+        box = _change_box(self, nu)
         size = np.where(np.isnan(half_width(box)), magnitude(box), half_width(box))
         return Softness(linear, quadratic, SOFTENED * np.where(size > 0, size, 1.0))
-
-    def find_sizes(self, nx: int, ny: int, nu: int, sizes: Float[np.ndarray, " n"], scale: float) -> SizedLimits:
-        """Return all limits of a model with `nx` states, `ny` observables `of` (0 without one) and `nu` inputs.
-
-        `sizes` are those of [x; of(x)], `scale` that of the cost, see `Sizes`.
-        """
-        rows, rates, rate_softness = self.find_rows(nx, ny, sizes, scale), self.rates(nu), self.rate_softness(nu)
-        hard = np.isinf(rate_softness.linear)
-        hard_rates = None
-        if rates is not None and hard.any():
-            hard_rates = Interval(np.where(hard, rates.low, -np.inf), np.where(hard, rates.high, np.inf))
-        return SizedLimits(self.inputs(nu), rates, hard_rates, rate_softness, rows)
 
     def states(self, nx: int) -> Interval:
         """Return the box of the states."""
         return _box(self.x_min, self.x_max, "x_min", "x_max", nx)
-
-    def outputs(self, ny: int) -> Interval:
-        """Return the box of the observables `of`."""
-        return _box(self.y_min, self.y_max, "y_min", "y_max", ny)
 
     def find_rows(
         self, nx: int, ny: int, sizes: Float[np.ndarray, " n"] | None = None, scale: float = 1.0
@@ -444,11 +335,14 @@ class Limits(Value):
         if isinstance(self.slack, str):
             linear, quadratic = LINEAR * scale / size, QUADRATIC * scale / size**2
         else:
-            x, y = self._declares("x"), self._declares("y")
-            mine = np.repeat([x or _is_set(self.x_min, self.x_max), y or _is_set(self.y_min, self.y_max)], [nx, ny])
-            given = _spread_prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
+            asked = [
+                _declares(self, what) or any(getattr(self, f"{what}_{end}") is not None for end in ("min", "max"))
+                for what in "xy"
+            ]
+            mine = np.repeat(asked, [nx, ny])
+            given = spread_prices(self.slack, "slack", int(mine.sum()), "one a state, then one an output")
             linear[mine], quadratic[mine] = given
-        kept = is_finite(Interval(low, high)) | np.repeat([self._declares("x"), self._declares("y")], [nx, ny])
+        kept = is_finite(Interval(low, high)) | np.repeat([_declares(self, "x"), _declares(self, "y")], [nx, ny])
         softness = Softness(linear[kept], quadratic[kept], SOFTENED * size[kept])
         margin = np.zeros((1, nx + ny))
         if self.margin is not None:
@@ -458,7 +352,7 @@ class Limits(Value):
 
     def ends(self, nx: int, ny: int) -> Interval:
         """Return the box of [x; of(x)]; ny is 0 without `of`."""
-        outputs = self.outputs(ny) if ny else Interval(np.zeros(0), np.zeros(0))
+        outputs = _box(self.y_min, self.y_max, "y_min", "y_max", ny) if ny else Interval(np.zeros(0), np.zeros(0))
         return Interval(*(np.concatenate(each) for each in zip(self.states(nx), outputs, strict=True)))
 
 
@@ -492,32 +386,26 @@ def refuse_levels(limits: Limits | None, who: str) -> None:
         )
 
 
-def _free(end: str) -> float:
-    """Return the value of a bound that does not limit."""
-    return np.inf if end.endswith("max") else -np.inf
+def _declares(limits: Limits, what: str) -> bool:
+    """Return whether a bound of u, du, x or y may come with a step."""
+    return f"{what}_min" in limits.rows or f"{what}_max" in limits.rows
 
 
-def _is_set(low: Bound, high: Bound) -> bool:
-    return low is not None or high is not None
+def _write_box(limits: Limits, widths: Mapping[Any, int], first: int, count: int) -> Interval:
+    """Return the boxes of so many u, du, x or y, one beside the other, from step `first` on."""
+    box, at = np.empty((2, count, sum(widths.values()))), 0
+    for what, n in widths.items():
+        if n:
+            limits.write_rows(what, box[:, :, at : at + n], first)
+        at += n
+    return Interval(*box)
 
 
-def _spread_prices(
-    slack: Slack | None, name: str, n: int, what: str
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return the linear and quadratic price of n rows."""
-    if slack is None:
-        return np.full(n, np.inf), np.zeros(n)
-    parts = [checks.array(weight, name, infinite=True) for weight in slack]
-    for part in parts:
-        if part.ndim and part.shape != (n,):
-            raise ShapeError(f"{name} has a weight of shape {part.shape}, expected ({n},), {what}, or a scalar")
-    linear, quadratic = (np.broadcast_to(part, (n,)).copy() for part in parts)
-    free = np.flatnonzero(linear + quadratic == 0)
-    if free.size:
-        raise DataError(
-            f"{name} has both weights zero at index {int(free[0])}; give one above zero, or remove the limit"
-        )
-    return linear, quadratic
+def _change_box(limits: Limits, nu: int) -> Interval:
+    low = limits.du_min
+    if low is None and limits.du_max is not None:
+        low = -checks.array(cast("ArrayLike", limits.du_max), "du_max", infinite=True)
+    return _box(low, limits.du_max, "du_min", "du_max", nu)
 
 
 def _box(low: Bound, high: Bound, low_name: str, high_name: str, n: int) -> Interval:

@@ -12,8 +12,7 @@ from scipy.linalg import block_diag
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, ShapeError
-from koopmpc.base.values import Value
-from koopmpc.control.ask.limits import Interval
+from koopmpc.base.values import Interval, Value
 from koopmpc.lifting.base import Lifting, find_observables
 from koopmpc.lifting.state import State
 from koopmpc.models.predictors import LinearPredictor

@@ -13,10 +13,11 @@ from jaxtyping import Float, Int
 
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Value
-from koopmpc.control.ask.cost import Cost, StateTracking
+from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import SOFTENED, Interval
 from koopmpc.control.nonlinear.active_limits import RANK, GaussNewtonStep, exchange_limits, find_length, invert
 from koopmpc.control.nonlinear.learned_map import LearnedMap, point_sizes
+from koopmpc.control.plan.tracking import StateTracking
 from koopmpc.lifting.state import State
 from koopmpc.plants.routines import Buffered
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
-from koopmpc.control.ask.cost import StateTracking
+from koopmpc.control.plan.tracking import StateTracking
 from koopmpc.data.delay import Delay
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.routines import Buffered

@@ -9,12 +9,12 @@ from scipy.linalg import block_diag
 
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
-from koopmpc.control.ask.cost import Cost, StateTracking
+from koopmpc.control.ask.cost import Cost, trace_stage
 from koopmpc.control.ask.limits import SOFTENED, Interval, Softness, preview_margin
-from koopmpc.control.ask.stage_cost import trace_stage
 from koopmpc.control.ask.terminal import HasTerminalSet, TerminalSet, read_terminal_set, terminal_function
 from koopmpc.control.nonlinear.learned_map import LearnedMap, point_sizes
 from koopmpc.control.plan.task import MoveBlocks
+from koopmpc.control.plan.tracking import StateTracking, soften_end
 
 
 class StagedProblem(NamedTuple):
@@ -261,7 +261,7 @@ def _add_end(
     u = s[nx : nx + nu] if problem.with_rates else ca.SX(nu, 1)
     end = terminal_function(wanted, tuple(model.model.states), nu)(s[:ny], u)
     count = int(end.size1())
-    box, soft = problem.box, o.limits.end_softness(count, problem.scale)
+    box, soft = problem.box, soften_end(o.limits, count, problem.scale)
     return problem._replace(
         limited=ca.Function("limited", [s], [ca.vertcat(problem.limited(s), end)]),
         box=Interval(np.append(box.low, np.full(count, -np.inf)), np.append(box.high, np.ones(count))),

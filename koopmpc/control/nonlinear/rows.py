@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float
 from koopmpc.base.errors import DataError
 from koopmpc.base.values import Value
 from koopmpc.control.ask.bounds import refuse_crossed_rows
-from koopmpc.control.ask.cost import StateTracking
 from koopmpc.control.ask.limits import Interval, Limits
 from koopmpc.control.ask.preview import check_bounds_alone, require_preview
 from koopmpc.control.nonlinear.problem import StagedProblem
+from koopmpc.control.plan.tracking import StateTracking
 
 _FAR = 1e3  # a row without a limit is this many sizes beyond the widest one, where it limits nothing
 

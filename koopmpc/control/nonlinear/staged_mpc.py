@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
-from koopmpc.control.ask.cost import Cost, data_ranges, state_tracking
+from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Interval, Limits, clip_input, measure_violation
 from koopmpc.control.ask.terminal import HasTerminalSet, TerminalSet, read_terminal_set
 from koopmpc.control.base import MPCBase
@@ -26,6 +26,7 @@ from koopmpc.control.nonlinear.problem import staged_problem
 from koopmpc.control.nonlinear.rows import MovingLimits, StageLimits
 from koopmpc.control.plan.row_targets import RowTargets
 from koopmpc.control.plan.task import Moves, find_move_blocks
+from koopmpc.control.plan.tracking import data_ranges, state_tracking
 from koopmpc.control.solvers.levels import LevelSearch
 from koopmpc.control.solvers.priorities import weigh_priorities
 from koopmpc.control.step.aim import StageAim

@@ -9,12 +9,12 @@ from jaxtyping import Bool, Float, Int
 from koopmpc.base.checks import HUGE
 from koopmpc.base.values import Interval, Value
 from koopmpc.control.ask.bounds import refuse_crossed_rows
-from koopmpc.control.ask.cost import LiftedTracking
 from koopmpc.control.ask.limits import BOUNDS, Limits, preview_margin
 from koopmpc.control.ask.preview import check_bounds_alone, require_movable, require_preview
 from koopmpc.control.ask.terminal import EndReach, EndRows, measure_reach, read_end, require_inside
 from koopmpc.control.plan.condensed_program import BoundsProgram, CondensedPlan, StepBounds, find_reach
 from koopmpc.control.plan.task import ControlTask
+from koopmpc.control.plan.tracking import LiftedTracking
 from koopmpc.control.target import ROUNDING, Targets
 
 _ENDS = frozenset(BOUNDS)

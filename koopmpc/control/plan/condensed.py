@@ -12,7 +12,7 @@ from scipy.linalg import null_space
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError
-from koopmpc.control.ask.cost import LiftedTracking, add_held
+from koopmpc.control.ask.cost import add_held
 from koopmpc.control.ask.limits import Interval, Softness, preview_margin
 from koopmpc.control.ask.terminal import EndRows, read_end
 from koopmpc.control.horizon import Condensed, Horizon, Terminal, WeightRows, build_stages, condense, horizon_of
@@ -25,6 +25,7 @@ from koopmpc.control.plan.condensed_program import (
     find_reach,
 )
 from koopmpc.control.plan.task import ControlTask
+from koopmpc.control.plan.tracking import LiftedTracking, soften_end
 from koopmpc.control.plan.weights import PlansInTime
 from koopmpc.control.program import no_export, reference_table, refuse_time_limit
 from koopmpc.control.riccati import Law, Stage, recursion
@@ -80,7 +81,7 @@ def limit_plan(
     ends = 0 if end is None else len(end.F)
     if end is not None:  # the set stays where it is from step to step; cuts take the place of a ball's limits
         high = np.full(ends, np.inf if end.ball else 1.0)
-        softness = track.limits.end_softness(ends, track.sizes.scale)
+        softness = soften_end(track.limits, ends, track.sizes.scale)
         groups.append((Interval(np.full(ends, -np.inf), high), softness, np.zeros(1, dtype=np.intp), np.isfinite(high)))
     parts: list[list[np.ndarray]] = []
     first = 0
@@ -299,7 +300,7 @@ def _assemble(
     """Return the plan of condensed maps: its matrix, its limits, and those of its targets."""
     track, low, high, ball = task.track, limits.low.copy(), limits.high.copy(), None
     if end is not None and end.ball:
-        softness = track.limits.end_softness(len(end.F), track.sizes.scale)
+        softness = soften_end(track.limits, len(end.F), track.sizes.scale)
         ball = make_ball(softness, maps.deviation, maps.unit, len(low) - len(end.F))
         low[ball.rows], high[ball.rows] = -ball.inner, ball.inner
     last = horizon.rest_disturbance()

@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import ShapeError
 from koopmpc.base.values import Value
-from koopmpc.control.ask.cost import Cost, StateTracking
+from koopmpc.control.ask.cost import Cost
 from koopmpc.control.nonlinear.equilibrium import MISSED, Equilibria, Equilibrium
 from koopmpc.control.nonlinear.learned_map import LearnedMap
+from koopmpc.control.plan.tracking import StateTracking
 from koopmpc.control.riccati import one_step, stationary
 from koopmpc.control.terminal_cost import tail_of, tail_stage
 

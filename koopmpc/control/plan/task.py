@@ -9,9 +9,10 @@ from jaxtyping import Bool, Int
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
-from koopmpc.control.ask.cost import Cost, LiftedTracking, lifted_tracking
+from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.horizon import Coordinates
+from koopmpc.control.plan.tracking import LiftedTracking, lifted_tracking
 from koopmpc.control.solvers import order
 from koopmpc.control.solvers.priorities import weigh_priorities
 from koopmpc.estimate.observer import Estimator

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base.errors import DefinitenessError
-from koopmpc.control.ask.cost import LiftedTracking
 from koopmpc.control.horizon import WeightRows
 from koopmpc.control.plan.condensed_program import CondensedPlan
+from koopmpc.control.plan.tracking import LiftedTracking
 
 _KEPT = 64  # plans that are kept; with weights of a day in hours all are found again after the first day
 

@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from koopmpc.base import checks
-from koopmpc.control.ask.cost import StateTracking
 from koopmpc.control.nonlinear.equilibrium import CLOSE, Equilibrium, Response
 from koopmpc.control.nonlinear.motion import BEYOND, Course, can_drift, extend_rows, shift_end
 from koopmpc.control.nonlinear.problem import StagedProblem, StageTargets
 from koopmpc.control.plan.row_targets import RowTarget, RowTargets, TerminalCost
+from koopmpc.control.plan.tracking import StateTracking
 
 AWAY = 2.0  # an equilibrium at limits may be so many sizes of a state from that of its row
 

@@ -9,10 +9,11 @@ from jaxtyping import Float
 
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Value
-from koopmpc.control.ask.cost import Cost, state_tracking
+from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Limits
 from koopmpc.control.nonlinear.equilibrium import Equilibria, Equilibrium
 from koopmpc.control.nonlinear.learned_map import LearnedMap, learned_map
+from koopmpc.control.plan.tracking import state_tracking
 from koopmpc.data.episodes import Episodes
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.search.cross_validation import HALF, Tried
