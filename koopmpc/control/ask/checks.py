@@ -169,7 +169,7 @@ LIMIT_CHECKS: dict[str, Callable[[Any, str], Any]] = {
 
 def refuse_crossed(limits: Any, ends: Sequence[str]) -> None:
     """Raise where one of these bounds crosses the other end of its pair, or is of the wrong sign."""
-    for low, high, name in _ENDS:
+    for low, high, name in ENDS:
         pair = getattr(limits, low), getattr(limits, high)
         if (low in ends or high in ends) and not any(isinstance(value, Mapping) for value in pair):
             bounds.require_room(*pair, low, high, name)

@@ -172,9 +172,9 @@ class QPSolver(ABC):
         self._now, self._spare = self._spare, self._now
         self.low, self.high = self._now
 
-    @abstractmethod
     def update(self, qp: QP) -> None:
         """Go on with another QP of the same size."""
+        self.__init__(qp, self._settings)
 
     def reset(self) -> None:
         """Have the next solve forget what earlier ones left behind."""

@@ -27,11 +27,11 @@ from koopmpc.base.values import Value
 from koopmpc.control.ask.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver, StepQP
+from koopmpc.control.solvers.scaled_qp import ACCURACY, ScaledQP
 
 # eta_prox: DAQP's own 1e-6 is all that remains of its accuracy where P is singular.
 DEFAULTS: Mapping[str, Any] = {"primal_tol": 1e-8, "eta_prox": 1e-9}
 _WIDER = 1e-8  # relative widening of the limits before a problem is believed to have no solution
-_ACCURACY = 1e-6  # of the scaled KKT conditions where P is not diagonal and definite, relative
 
 _STEEP = 1e-8  # smallest over largest eigenvalue of AᵀA of the hard rows below which rounding makes them look dependent
 _DAMPING = 1e7  # weight of a change of the hard rows in the first proximal step, by the size of P
@@ -40,7 +40,6 @@ _MOST_DAMPING = 1e9  # give up above this weight
 _PASSES = 20  # proximal steps, at most
 _LEAST = np.full(1, 1e-300)
 _SLOW = 0.1  # share of what the step before missed above which the weight is eased
-_CURVED = 1e-8  # least curvature of a price by its slope, per unit of a row: DAQP divides by it, and with 1e-10 it errs
 
 FEW = 20  # active rows up to which the next solve goes on from them
 MOVED = 6  # of more rows too, if a shift by one step changes at most so many
@@ -53,11 +52,13 @@ _OPTIMAL = 1
 _INFEASIBLE = -1
 _ITERATIONS = -4
 _TIME_LIMIT = -7
+_UNMET = -100  # our own: the answer does not meet its conditions
 # DAQP's senses of rows; _SOFT is added to another
 _UPPER = 1  # active at the upper end
 _LOWER = 3  # active at the lower end
 _SOFT = 8
 _STATUS = {
+    _OPTIMAL: Status.OPTIMAL,
     _INFEASIBLE: Status.INFEASIBLE,
     _ITERATIONS: Status.MAX_ITERATIONS,
     _TIME_LIMIT: Status.TIME_LIMIT,
@@ -139,21 +140,23 @@ class DAQP(QPSolver):
         self._most = self._few = known["iter_limit"]
         self._last_most: int | None = None
         self._pace = 1e-9  # how long an iteration takes [s], once it is known
-        self._scale()
+        self._scaled = ScaledQP(self._qp)
+        self._sense = np.where(self._scaled.is_soft, _SOFT, 0).astype(np.intc)
+        self._soft = bool(self._sense.any())
         free = np.full(len(self.low), INFINITY)
-        flag, _ = self._model.setup(self._H, self._f, self._M, free, -free, self._sense)
+        flag, _ = self._model.setup(self._scaled.H, self._scaled.f, self._scaled.M, free, -free, self._sense)
         if flag < 0:
             raise DataError(f"DAQP refuses the problem, exit flag {flag}; pass a convex QP, P ⪰ 0")
         self._mixed, self._unmet = self._soft and not self._sense.all(), False
         self._hard: DAQP | None = None  # the hard rows alone, set up when they are asked for
         self._is_steep: bool | None = None  # found out when it is asked
-        self.resumes, self._none = False, np.zeros(len(self._f))
+        self.resumes, self._none = False, np.zeros(len(self._qp.q))
         self._lighter: dict[float, DAQP] = {}  # the solvers of `_approach`, by their weight
-        self._far = (
-            False  # whether a solution of many active rows had to be approached last, so that the next one is at once
-        )
+        self._far = False  # whether the last solve had to approach a solution of many active rows: the next one does
         if self._soft:
-            linear, rho = (np.where(self._sense == _SOFT, part, 0.0) for part in (self._linear, 1 / self._curved))
+            linear, rho = (
+                np.where(self._sense == _SOFT, part, 0.0) for part in (self._scaled.linear, 1 / self._scaled.curvature)
+            )
             self._model.soft_weights(rho_l=rho, rho_u=rho, w_l=linear, w_u=linear)
 
     def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], tuple[Interval, bool]]:
@@ -172,21 +175,18 @@ class DAQP(QPSolver):
     @property
     def setup(self) -> DAQPSetup:
         """The scaled problem and the settings."""
+        scaled = self._scaled
         return DAQPSetup(
-            self._H,
-            self._M,
-            self._columns,
-            self._rows,
+            scaled.H,
+            scaled.M,
+            scaled.columns,
+            scaled.rows,
             self._sense != 0,
-            self._linear,
-            self._curved,
-            self._metric() if len(self._rows) and self._steep() else None,
+            scaled.linear,
+            scaled.curvature,
+            self._metric() if len(scaled.rows) and self._steep() else None,
             {**self._model.settings, _COLD: self._cold},
         )
-
-    def update(self, qp: QP) -> None:
-        """Go on with another QP of the same size: DAQP's setup is one factorisation."""
-        self.__init__(qp, self._settings)
 
     def _forget(self) -> None:
         """Forget how hard the last solve was: a solve starts from its y alone."""
@@ -222,38 +222,59 @@ class DAQP(QPSolver):
         again from the hard rows alone, and needs one or two hundred.
         """
         limit = self._time_limit if time_limit is None else time_limit
-        start = perf_counter() if limit else 0.0
+        end = perf_counter() + limit if limit else 0.0
         self._send(None if y is None else self._active(y))
         crowded = y is not None and self._soft and np.count_nonzero(y) > len(v)
         x, multipliers, flag, iterations = self._run(limit, len(v) if crowded else None)
         if y is not None and crowded and flag == _ITERATIONS:
             self._send(self._active(np.where(self._sense == _SOFT, 0.0, y)))
-            x, multipliers, flag, more = self._run(max(limit - (perf_counter() - start), 1e-6) if limit else limit)
+            x, multipliers, flag, more = self._run(max(end - perf_counter(), 1e-6) if limit else limit)
             iterations += more
-        good = (flag == _OPTIMAL and self._exact) or (flag > 0 and self._accurate(x, multipliers))
+        good = flag == _OPTIMAL and self._scaled.is_exact
+        good = good or (flag > 0 and self._scaled.is_met(x, multipliers, self._low, self._high))
         self.resumes = good and not self._cold and self._lasts(multipliers)
-        if not good and flag != _TIME_LIMIT:
-            steep = self._steep()
-            if flag == _INFEASIBLE and self._mixed and not steep and self._contradictory(time_limit):
-                self._unmet = True
-            elif flag != _INFEASIBLE or not steep:
-                left = limit - (perf_counter() - start) if limit else 0.0
-                if left < 0:
-                    flag = _TIME_LIMIT
-                else:
-                    self._send(self._sense, _WIDER)
-                    x, multipliers, flag, more = self._run(left)
-                    iterations += more
-                    good = flag > 0 and self._accurate(x, multipliers)
-            if not good and flag != _TIME_LIMIT and steep:
-                rows = np.zeros_like(self.low) if y is None else y
-                found = self._approach(v, rows, limit - (perf_counter() - start) if limit else 0.0)
-                found.iterations += iterations
-                return found
-        status = Status.OPTIMAL if good else _STATUS.get(flag, Status.FAILED)
-        if self._scaled:
-            x, multipliers = self._columns * x, self._multipliers * multipliers
-        return QPSolution(x, multipliers, status, iterations, self.name)
+        if good or flag == _TIME_LIMIT:
+            return self._unscale(x, multipliers, _OPTIMAL if good else flag, iterations)
+        return self._solve_again(v, y, (x, multipliers, flag, iterations), end)
+
+    def _solve_again(
+        self,
+        v: Float[np.ndarray, " n"],
+        y: Float[np.ndarray, " m"] | None,
+        ended: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], int, int],
+        end: float,
+    ) -> QPSolution:
+        """Solve what DAQP could not: cold, with limits a tolerance wider; then by proximal points, if rows are steep.
+
+        `ended` is what `_run` returned, `end` the time by `perf_counter` at which this has to be over, 0 for none.
+        """
+        (x, multipliers, flag, iterations), steep = ended, self._steep()
+        if flag == _INFEASIBLE and self._mixed and not steep and self._contradictory(_find_left(end)):
+            self._unmet = True
+        elif flag != _INFEASIBLE or not steep:
+            left = _find_left(end)
+            if left is not None and left < 0:
+                flag = _TIME_LIMIT
+            else:
+                self._send(self._sense, _WIDER)
+                x, multipliers, flag, more = self._run(left or 0.0)
+                iterations += more
+                if flag > 0:
+                    met = self._scaled.is_met(x, multipliers, self._low, self._high)
+                    flag = _OPTIMAL if met else _UNMET
+        if steep and flag not in (_OPTIMAL, _TIME_LIMIT):
+            found = self._approach(v, np.zeros_like(self.low) if y is None else y, _find_left(end) or 0.0)
+            found.iterations += iterations
+            return found
+        return self._unscale(x, multipliers, flag, iterations)
+
+    def _unscale(
+        self, x: Float[np.ndarray, " n"], multipliers: Float[np.ndarray, " m"], flag: int, iterations: int
+    ) -> QPSolution:
+        """Return the solution in the units of the QP."""
+        if not self._scaled.is_plain:
+            x, multipliers = self._scaled.columns * x, self._scaled.multipliers * multipliers
+        return QPSolution(x, multipliers, _STATUS.get(flag, Status.FAILED), iterations, self.name)
 
     def _lasts(self, multipliers: Float[np.ndarray, " m"]) -> bool:
         """Return whether few rows are active, or few change where a step moves them on."""
@@ -306,7 +327,9 @@ class DAQP(QPSolver):
         found, last = QPSolution(v.copy(), y.copy(), Status.INFEASIBLE, 0, self.name), None
         for _ in range(_PASSES):
             solver = self._weigh_changes(weight, metric)
-            solver.pull(qp.q - weight * metric @ center)
+            scaled = solver._scaled
+            scaled.f = (qp.q - weight * metric @ center) * scaled.columns / scaled.unit
+            solver._model.update(f=scaled.f)
             left = limit - (perf_counter() - start) if limit else None
             again = solver is last and found.status is Status.MAX_ITERATIONS  # the step before led here
             found, last = solver.resume(left) if again else solver.solve(center, rows, left), solver
@@ -314,7 +337,7 @@ class DAQP(QPSolver):
             if found.status is Status.OPTIMAL:
                 before, missed = missed, weight * float(np.abs(metric @ (found.v - center)).max())
                 missed /= max(float(np.abs(part).max()) for part in (qp.P @ found.v, found.y @ qp.A, _LEAST))
-                if missed <= _ACCURACY:
+                if missed <= ACCURACY:
                     break
                 center, rows, found.status = found.v, found.y, Status.MAX_ITERATIONS
                 if missed > _SLOW * before:
@@ -338,50 +361,20 @@ class DAQP(QPSolver):
         solver._mixed = solver._unmet = solver._is_steep = False
         return solver
 
-    def pull(self, q: Float[np.ndarray, " n"]) -> None:
-        """Go on with another linear cost."""
-        self._f = q * self._columns / self._unit
-        self._model.update(f=self._f)
-
     def _active(self, y: Float[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
         """Return the rows with the ends that y pushes to as DAQP's senses."""
         return self._sense + (y > 0) * np.intc(_UPPER) + (y < 0) * np.intc(_LOWER)
 
-    def _scale(self) -> None:
-        """Set DAQP's problem H, f, M with v = D x: unit diagonal of H, unit rows of M, a cost of the size of v."""
-        P, q, A = self._qp.P, self._qp.q, self._qp.A
-        diagonal = np.diag(P)
-        curved = diagonal > 0
-        unit = float(np.exp(np.log(diagonal[curved]).mean())) if curved.any() else 1.0
-        columns = np.sqrt(unit / np.where(curved, diagonal, unit))
-        norms = np.linalg.norm(A * columns, axis=1)
-        rows = 1.0 / np.where(norms > 0, norms, 1.0)
-        self._exact = bool(curved.all()) and not np.count_nonzero(P - np.diag(diagonal))
-        sizes = np.concatenate([[unit], columns, np.sqrt(rows)])
-        self._scaled = bool(sizes.min() < 0.01 or sizes.max() > 100)
-        if not self._scaled:
-            unit, columns, rows = 1.0, np.ones_like(columns), np.ones_like(rows)
-        self._H, self._f = P * np.outer(columns, columns) / unit, q * columns / unit
-        self._M = A * columns * rows[:, None]
-        self._columns, self._rows, self._multipliers, self._unit = columns, rows, rows * unit, unit
-        softness = self._qp.softness
-        none = np.full(len(rows), np.inf)
-        linear, quadratic = (none, none) if softness is None else softness[:2]
-        self._linear = linear / self._multipliers
-        self._curved = np.maximum(2 * quadratic / (self._multipliers * rows), _CURVED * self._linear)
-        self._sense = np.where(np.isfinite(linear), _SOFT, 0).astype(np.intc)
-        self._soft = bool(self._sense.any())
-
     def _send(self, sense: Int[np.ndarray, " m"] | None, wider: float = 0.0) -> None:
         """Give DAQP the limits, relaxed by the share `wider` of 1 + their size, and the rows to start from."""
-        self._low, self._high = self.low, self.high
-        if self._scaled:
-            self._low, self._high = self._rows * self._low, self._rows * self._high
+        self._low, self._high, rows = self.low, self.high, self._scaled.rows
+        if not self._scaled.is_plain:
+            self._low, self._high = rows * self._low, rows * self._high
         if wider:
             self._low = self._low - wider * (1 + np.abs(self._low))
             self._high = self._high + wider * (1 + np.abs(self._high))
         self._refused = 0  # DAQP fails to update no rows
-        if len(self._rows):
+        if len(rows):
             self._refused = self._model.update(bupper=self._high, blower=self._low, sense=sense)
 
     def _run(
@@ -389,7 +382,7 @@ class DAQP(QPSolver):
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], int, int]:
         """Return what DAQP says of the limits that it has: x, multipliers, exit flag, iterations (at most `most`)."""
         if self._refused < 0:
-            return np.zeros_like(self._f), np.zeros_like(self._rows), self._refused, 0
+            return np.zeros_like(self._scaled.f), np.zeros_like(self._scaled.rows), self._refused, 0
         if limit != self._allowed or most != self._last_most:
             few = self._most if not limit else min(self._most, 1 + int(limit / self._pace))
             few = few if most is None else min(few, most)
@@ -403,32 +396,10 @@ class DAQP(QPSolver):
             flag = _TIME_LIMIT
         return x, info["lam"], flag, iterations
 
-    def _accurate(self, x: Float[np.ndarray, " n"], multipliers: Float[np.ndarray, " m"]) -> bool:
-        """Tell whether H x + f + Mᵀλ = 0 holds, low ≤ M x ≤ high, and |λ| is the price of what a soft row gives way.
 
-        Where soft rows are, λ must push to an end that M x is at, or beyond.
-        """
-        Hx, Mx, Ml = self._H @ x, self._M @ x, multipliers @ self._M
-        size = max(float(np.abs(part).max(initial=1.0)) for part in (Hx, self._f, Ml))
-        near = _ACCURACY * float(np.abs(Mx).max(initial=1.0))
-        over, under = Mx - self._high, self._low - Mx
-        outside = np.maximum(over, under)
-        if float(np.abs(Hx + self._f + Ml).max()) > _ACCURACY * size:
-            return False
-        if not self._soft:
-            return float(outside.max(initial=0.0)) <= near
-        soft, push = self._sense == _SOFT, np.abs(multipliers)
-        slack = np.maximum(outside, 0.0)[soft]
-        price = self._linear[soft] + self._curved[soft] * slack
-        little = _ACCURACY * (size + self._linear[soft])
-        short = np.where(slack > near, price - push[soft], 0.0) - self._curved[soft] * near
-        inside = -np.where(multipliers > 0, over, under)[push > _ACCURACY * size]
-        return bool(
-            outside[~soft].max(initial=0.0) <= near
-            and (push[soft] - price <= little + self._curved[soft] * near).all()
-            and (short <= little).all()
-            and inside.max(initial=0.0) <= near
-        )
+def _find_left(end: float) -> float | None:
+    """Return the seconds until `end` by `perf_counter`; None where that is 0, for no end."""
+    return end - perf_counter() if end else None
 
 
 def _model(settings: Mapping[str, Any]) -> Any:

@@ -3,8 +3,9 @@
 
 OSQP 1.1 accepts short, strided and NaN vectors and crossed limits, and returns finite nonsense for an infeasible
 problem. If a solve runs out of iterations after one that succeeded, and no limit moved in between, OSQP still says
-"solved". This file checks for all of these. Updates and solves go to the extension object of OSQP: its Python wrapper
-would spend 15 µs on copies of the problem.
+"solved". This file checks for all of these. Some of its certificates of infeasibility are rounding: a step asks DAQP
+before it believes one. Updates and solves go to the extension object of OSQP: its Python wrapper would spend 15 µs on
+copies of the problem.
 
 Stellato et al., "OSQP: an operator splitting solver for quadratic programs", Math. Prog. Comp. 12, 2020.
 """
@@ -12,7 +13,6 @@ Stellato et al., "OSQP: an operator splitting solver for quadratic programs", Ma
 import signal
 from collections.abc import Callable, Mapping
 from functools import cache
-from time import perf_counter
 from typing import Any, ClassVar
 
 import numpy as np
@@ -39,11 +39,6 @@ DEFAULTS: Mapping[str, Any] = {
     "eps_dual_inf": 1e-6,
 }
 
-_STRICT = 1e-12  # eps_prim_inf where a first certificate was rounding
-# Measured: 29 false certificates exceeded their residual 23 times at most, 1489 true ones 6600 times at least.
-_CERTAIN = 1000.0  # believe a certificate that exceeds its own residual by this factor
-_ROUNDING = 1e-9  # believe it only if it exceeds this share of its terms, too
-_SHORTEST = 1e-6  # seconds that a solve gets at least
 _NO_LIMIT = 1e9  # seconds; OSQP's own default is above it
 
 
@@ -61,22 +56,6 @@ def _statuses() -> dict[int, Status]:
         int(codes.OSQP_PRIMAL_INFEASIBLE): Status.INFEASIBLE,
         int(codes.OSQP_PRIMAL_INFEASIBLE_INACCURATE): Status.INFEASIBLE,
     }
-
-
-class Pattern:
-    """Where a matrix in compressed columns has entries."""
-
-    def __init__(self, matrix: scipy.sparse.csc_matrix) -> None:
-        self._shape = matrix.shape
-        columns = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
-        self._places = matrix.indices.astype(np.intp) * matrix.shape[1] + columns
-
-    def entries(self, matrix: Float[np.ndarray, "m n"]) -> Float[np.ndarray, " k"] | None:
-        """Return the entries of another matrix in the same order; None where its zeros stand elsewhere."""
-        if matrix.shape != self._shape:
-            return None
-        found = matrix.ravel()[self._places]
-        return found if found.all() and np.count_nonzero(matrix) == len(found) else None
 
 
 class OSQP(QPSolver):
@@ -113,7 +92,6 @@ class OSQP(QPSolver):
 
         qp = self._qp
         P, A = scipy.sparse.csc_matrix(np.triu(qp.P)), scipy.sparse.csc_matrix(qp.A)
-        self._patterns = Pattern(P), Pattern(A)
         self._problem, self._status = osqp.OSQP(), _statuses()
         options = {"verbose": False, **DEFAULTS, **self._settings}
         try:
@@ -124,7 +102,6 @@ class OSQP(QPSolver):
         self._rho = self._solver.get_settings().rho
         self._time_limit = self._solver.get_settings().time_limit
         self._most = self._solver.get_settings().max_iter
-        self._prim_inf = self._solver.get_settings().eps_prim_inf
         self._first = True
 
     def __reduce__(self) -> tuple[type["OSQP"], tuple[QP, dict[str, Any]], tuple[Interval, float]]:
@@ -138,65 +115,14 @@ class OSQP(QPSolver):
         self.set_bounds(*limits)
         self._solver.update_rho(rho)
 
-    def update(self, qp: QP) -> None:
-        """Go on with another QP of the same size; if its zeros are in other places, the solver is set up again.
-
-        Raises
-        ------
-        DataError
-            OSQP refuses the problem.
-        """
-        P, A = (pattern.entries(matrix) for pattern, matrix in zip(self._patterns, (np.triu(qp.P), qp.A), strict=True))
-        if P is None or A is None:
-            self.__init__(qp, self._settings)
-            return
-        self._hold(qp)
-        self._solver.update_data_vec(q=qp.q, l=self.low, u=self.high)
-        if self._solver.update_data_mat(P_x=P, P_i=None, A_x=A, A_i=None):
-            raise DataError("OSQP refuses the new matrices; pass a convex QP, P ⪰ 0")
-
     def _forget(self) -> None:
         """Forget the step size ρ that earlier solves adapted: the same problem then has the same iterates."""
         self._solver.update_rho(self._rho)
 
     def _solve(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], time_limit: float | None) -> QPSolution:
-        """Solve; where OSQP says INFEASIBLE without a proof it solves again, and asks for one without rounding."""
-        start = perf_counter()
-        limit = self._time_limit if time_limit is None else time_limit
-        found = self._run(v, y, limit)
-        if found.status is not Status.INFEASIBLE or self._proven():
-            return found
-        self._believe(_STRICT)
-        again = self._run(v, y, max(limit - (perf_counter() - start), _SHORTEST))
-        self._believe(self._prim_inf)
-        again.iterations += found.iterations
-        if again.status is Status.INFEASIBLE and not self._proven():
-            again.status = Status.MAX_ITERATIONS
-        return again
-
-    def _proven(self) -> bool:
-        """Return whether the certificate of infeasibility shows more than its own rounding.
-
-        It is a y of low and high ends with Aᵀy = r ≈ 0, so that rᵀv ≤ s = highᵀy₊ − lowᵀy₋ < 0 for every feasible v.
-        With r = 0 this excludes all v. As a share of the terms that cancel, r has to be much less than s.
-        """
-        y = np.array(self._solver.solution.prim_inf_cert)
-        ends, A = np.where(y > 0, self.high, self.low), self._qp.A
-        s, whole = float(ends @ y), float(np.abs(ends) @ np.abs(y))
-        terms = float((np.abs(y) @ np.abs(A)).max(initial=0.0))
-        r = float(np.abs(y @ A).max(initial=0.0)) / max(terms, 1e-300)
-        return s < -max(_CERTAIN * r, _ROUNDING) * whole
-
-    def _believe(self, prim_inf: float) -> None:
-        """Set how small Aᵀy must be for OSQP to take y for a certificate of infeasibility."""
-        options = self._solver.get_settings()
-        options.eps_prim_inf = prim_inf
-        self._solver.update_settings(options)
-
-    def _run(self, v: Float[np.ndarray, " n"], y: Float[np.ndarray, " m"], limit: float) -> QPSolution:
         """Return what OSQP says from this start; new data also make it forget its last status."""
         self._solver.update_data_vec(q=None, l=self.low, u=self.high)
-        self._allow(limit)
+        self._allow(self._time_limit if time_limit is None else time_limit)
         self._solver.warm_start(np.ascontiguousarray(v), np.ascontiguousarray(y))
         _solve_uninterrupted(self._solver.solve)
         info, solution = self._solver.info, self._solver.solution

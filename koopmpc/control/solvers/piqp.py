@@ -111,10 +111,6 @@ class PIQP(QPSolver):
         """Take over the limits that the original had."""
         self.set_bounds(*limits)
 
-    def update(self, qp: QP) -> None:
-        """Go on with another QP of the same size."""
-        self.__init__(qp, self._settings)
-
     def _forget(self) -> None:
         """Do nothing: a solve starts from nothing."""
 

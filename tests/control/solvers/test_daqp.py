@@ -1,5 +1,3 @@
-from typing import ClassVar
-
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -7,7 +5,7 @@ import pytest
 import koopmpc as km
 from koopmpc.control.ask.limits import Softness
 from koopmpc.control.solvers.base import QP
-from koopmpc.control.solvers.daqp import _ACCURACY, DAQP
+from koopmpc.control.solvers.daqp import DAQP
 from tests.bare import shown
 from tests.control.solvers.random_qps import exactness, random_qp
 
@@ -179,104 +177,9 @@ def test_settings_that_daqp_would_swallow():
         """
 from koopmpc.control.solvers.base import QP
 from koopmpc.control.ask.limits import Softness
-from koopmpc.control.solvers.daqp import _ACCURACY, DAQP
+from koopmpc.control.solvers.daqp import DAQP
 one = np.ones(1)
 show(lambda: DAQP(QP(np.eye(1), one, np.eye(1), -one, one), {"iter_limit": 2.5}))
 """
     )
     assert line == "DataError DAQP's iter_limit is 2.5; pass a whole number"
-
-
-def test_a_row_that_pushes_must_be_at_its_end():
-    """v = 3 − λ with |v| ≤ 1 and the price 10 of giving way: λ = 2 at v = 1 alone; elsewhere H v + q + λ = 0 is not enough."""
-    prices = Softness(10 * ONE, np.zeros(2), np.zeros(2))
-    solver = DAQP(QP(EYE, -3 * ONE, EYE, -ONE, ONE, prices))
-    solver._send(None)
-    assert solver._accurate(ONE, 2 * ONE)
-    for v in (0.0, 0.9, 1.1, 2.0):
-        assert not solver._accurate(np.array([v, 1.0]), np.array([3 - v, 2.0]))
-    assert not solver._accurate(ONE, np.array([2.0, 2.1]))  # no minimum of the cost
-
-
-def test_no_more_iterations_are_taken_than_are_asked_for():
-    qp = random_qp(np.random.default_rng(0), "hard", 60)
-    solver = DAQP(qp)
-    for limit in (0.0, 60.0):
-        for most in (5, 3, 8):
-            solver.reset()
-            solver._send(None)
-            assert solver._run(limit, most)[3] == most
-
-
-def test_the_metric_of_hard_rows_is_as_large_as_the_cost():
-    """AᵀA of the hard rows alone, of all rows where none is hard, with the trace of P."""
-    A, P, none = np.array([[1.0, 2.0], [0.0, 3.0], [5.0, 1.0]]), np.diag([4.0, 6.0]), np.zeros(3)
-    for linear, rows in (([np.inf, np.inf, 9.0], A[:2]), ([9.0, 9.0, 9.0], A)):
-        solver = DAQP(QP(P, ONE, A, none - 1, none + 1, Softness(np.array(linear), none + 1, none)))
-        gram = rows.T @ rows
-        np.testing.assert_allclose(solver._metric(), gram * 10.0 / np.trace(gram), rtol=1e-12)
-
-
-@pytest.mark.parametrize("size", [1.0, 1e4])
-def test_an_answer_is_accurate_to_a_share_of_the_size_of_its_terms(size):
-    """½‖v − 3 s‖² with v₀ ≤ s hard and v₁ ≤ s for 1 s ε + ½ ε²: v = (1, 1.5) s, λ = (2, 1.5) s; v₂ has no limit near."""
-    prices = Softness(np.array([np.inf, size, size]), np.array([0, 0.5, 0.5]), np.zeros(3))
-    far = np.full(3, -100 * size)
-    solver = DAQP(QP(np.eye(3), np.full(3, -3 * size), np.eye(3), far, np.array([size, size, 100 * size]), prices))
-    found = solved(solver, 3, 3)
-    v, y = size * np.array([1, 1.5, 3]), size * np.array([2, 1.5, 0])
-    np.testing.assert_allclose(found.v, v, rtol=1e-9)
-    np.testing.assert_allclose(found.y, y, rtol=1e-9, atol=1e-12)
-    solver._send(None)
-    little, much = 0.2 * _ACCURACY * size, 12 * _ACCURACY * size
-    assert solver._accurate(v, y)
-    for i, row in enumerate(np.eye(3)):
-        for sign in (1, -1):
-            assert solver._accurate(v + sign * little * row, y)  # H v + f + Mᵀλ is nearly 0
-            assert not solver._accurate(v + sign * much * row, y)
-            assert solver._accurate(v + sign * little * row, y - sign * little * row)
-            if i < 2:  # at the end that it pushes to, and for its price
-                assert not solver._accurate(v + sign * much * row, y - sign * much * row)
-    beyond = 30 * size
-    assert not solver._accurate(v + beyond * np.eye(3)[2] * 4, y - beyond * np.eye(3)[2] * 4)
-
-
-def test_hard_rows_alone_are_accurate_where_they_are_met():
-    for size in (1.0, 1e4):
-        solver = DAQP(QP(np.eye(2), np.full(2, -3 * size), np.ones((2, 2)) + EYE, -size * ONE, size * ONE))
-        found = solved(solver)
-        solver._send(None)
-        multipliers = found.y / solver._multipliers
-        x = found.v / solver._columns
-        assert solver._accurate(x, multipliers)
-        assert not solver._accurate(x + 1e-3 * size, multipliers)
-        across = np.linalg.solve((np.ones((2, 2)) + EYE).T * solver._rows, np.full(2, -1e-3 * size))
-        assert not solver._accurate(x + 1e-3 * size, multipliers + across)  # stationary, but beyond its limits
-
-
-def test_a_solve_gets_as_many_iterations_as_its_time_is_enough_for_at_the_pace_of_the_last_ones():
-    """The pace moves half of the way to what the last solve took; a short solve says nothing of it."""
-
-    class Timed:
-        settings: ClassVar[dict] = {}
-        told = (0, 0.0)
-
-        def solve(self):
-            iterations, seconds = self.told
-            return ONE, None, 1, {"iterations": iterations, "solve_time": seconds, "lam": ONE}
-
-    solver, timed = box(), Timed()
-    solver._model, solver._refused, pace = timed, 0, solver._pace
-    assert pace == 1e-9
-    for limit, iterations, seconds in ((0.01, 100, 1e-3), (0.002, 200, 1e-4), (0.01, 16, 9.0), (0.003, 17, 1e-3)):
-        timed.told = iterations, seconds
-        wanted = min(solver._most, 1 + int(limit / pace))
-        solver._run(limit)
-        assert timed.settings == {"time_limit": limit, "iter_limit": wanted}
-        if iterations > 16:
-            pace = (pace + seconds / iterations) / 2
-        assert solver._pace == pytest.approx(pace)
-    timed.told = 500, 1.0
-    solver._run(0.0)  # without a limit nothing is learned
-    assert solver._pace == pytest.approx(pace)
-    assert timed.settings == {"time_limit": 0.0, "iter_limit": solver._most}
