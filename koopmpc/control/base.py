@@ -1,7 +1,6 @@
 """What predictive controllers share beside their step: names, files, copies; the base of those that plan in stages."""
 
 import copy
-from collections.abc import Sequence
 from time import perf_counter
 from typing import Any, TypeVar
 
@@ -14,7 +13,7 @@ from koopmpc.base.errors import DataError
 from koopmpc.base.values import Interval, Value
 from koopmpc.control.ask.levels import HeldLevels
 from koopmpc.control.move import Fallback, Move, PlanMemory, Status, Token
-from koopmpc.control.plan.task import MoveBlocks, Moves, find_move_blocks
+from koopmpc.control.plan.task import MoveBlocks
 from koopmpc.control.plan.tracking import Tracking
 from koopmpc.control.program import Published, SavedController
 from koopmpc.control.step.observe import InitialCondition
@@ -160,11 +159,9 @@ class MPCBase(PredictiveController):
         The model of the plan.
     tracking
         The tracked and limited outputs, with their weights and limits.
-    moves, horizon
-        N steps, and which of them hold their inputs, see `find_blocks`; a plan has an input for each step, with a
-        change of 0 in held ones.
-    inputs
-        Names of the inputs.
+    moves
+        N steps, and which of them hold their inputs; a plan has an input for each step, with a change of 0 in held
+        ones.
     observer, estimator
         The observer of this controller, and the rule that started it, None where y is the state.
     latency
@@ -182,9 +179,7 @@ class MPCBase(PredictiveController):
         dt: float,
         model: StateModel,
         tracking: Tracking[Any],
-        moves: Moves,
-        horizon: int,
-        inputs: Sequence[str],
+        moves: MoveBlocks,
         observer: StateObserver,
         estimator: Estimator | None,
         latency: int,
@@ -192,12 +187,11 @@ class MPCBase(PredictiveController):
         *,
         monitor: StepMonitor | None = None,
     ) -> None:
-        blocks = find_move_blocks(moves, horizon, inputs)
         watch = None if monitor is None else monitor.watch(model, checks.count(latency, "latency", 0))
-        super().__init__(dt, tracking, blocks, latency, estimator, time_limit, watch)
+        super().__init__(dt, tracking, moves, latency, estimator, time_limit, watch)
         self._inputs, self._rates, self._hard_rates = tracking.inputs, tracking.rates, tracking.hard_rates
-        self._blocks, self._N = blocks.lengths, sum(blocks.lengths)
-        self._with_rates = tracking.with_rates or len(self._blocks) < self._N or blocks.own
+        self._blocks, self._N = moves.lengths, sum(moves.lengths)
+        self._with_rates = tracking.with_rates or len(self._blocks) < self._N or moves.own
         self._allowed = np.inf if self._time_limit is None else self._time_limit
         self._initial = InitialCondition(
             model, observer, self._N, self._latency, with_rates=self._with_rates, estimated=estimator is not None

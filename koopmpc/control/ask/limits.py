@@ -128,14 +128,14 @@ class Limits(Value):
     priority: "Mapping[str, int] | ArrayLike | None" = None
 
     def __post_init__(self) -> None:
+        if self.levels is None and (self.dwell is not None or self.level_steps is not None):
+            raise DataError("dwell and level_steps are of inputs on levels; pass levels, or leave them out")
         for name, check in LIMIT_CHECKS.items():
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, check(value, name))
         refuse_crossed(self, BOUNDS)
         refuse_margin(self)
-        if self.levels is None and (self.dwell is not None or self.level_steps is not None):
-            raise DataError("dwell and level_steps are of inputs on levels; pass levels, or leave them out")
 
     def resolve(self, states: Sequence[str], inputs: Sequence[str]) -> "Limits":
         """Return the limits with arrays in place of limits by name; an omitted name has no limit.

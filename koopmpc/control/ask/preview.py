@@ -65,7 +65,8 @@ def check_bounds_alone(limits: object, own: Limits, states: Sequence[str], input
     if not isinstance(limits, Limits):
         raise DataError(f"limits is {checks.article(limits)}; pass controller.limits.with_bounds(u_max=…)")
     known = limits.resolve(states, inputs)
-    other = [name for name in _FIXED if not same(getattr(known, name), getattr(own, name))]
+    theirs, mine = vars(known), vars(own)  # those that `with_bounds` made hold the same objects
+    other = [name for name in _FIXED if theirs[name] is not mine[name] and not same(theirs[name], mine[name])]
     if other:
         raise DataError(
             f"limits at a call move bounds alone, and these have another {other[0]} than the controller's; pass "

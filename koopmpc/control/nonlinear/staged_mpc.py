@@ -91,16 +91,15 @@ class StagedMPC(MPCBase):
         if o.limits.priority is not None:
             o = replace(o, softness=weigh_priorities(o.softness, o.limits, model.states, checks.article(self)))
         self._outputs, self._steps = o, 0  # since reset: the row of limits and of weights in time
-        self._problem = staged_problem(given, o, find_move_blocks(moves, horizon, model.inputs))
+        blocks = find_move_blocks(moves, horizon, model.inputs)
+        self._problem = staged_problem(given, o, blocks)
         self._moving_limits = MovingLimits(o, self._problem, model.states, model.inputs, latency)
         self._limits_now = self._moving_limits.at(0, None)
         super().__init__(
             model.dt,
             given,
             o,
-            moves,
-            horizon,
-            model.inputs,
+            blocks,
             start_observer(estimator, given, checks.count(horizon, "horizon")),
             estimator,
             latency,

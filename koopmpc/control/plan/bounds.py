@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from koopmpc.base.checks import HUGE
 from koopmpc.base.values import Interval, Value
 from koopmpc.control.ask.bounds import refuse_crossed_rows
-from koopmpc.control.ask.limits import BOUNDS, Limits, preview_margin
+from koopmpc.control.ask.limits import Limits, preview_margin
 from koopmpc.control.ask.preview import check_bounds_alone, require_movable, require_preview
 from koopmpc.control.ask.terminal import EndReach, EndRows, measure_reach, read_end, require_inside
 from koopmpc.control.plan.condensed_program import BoundsProgram, CondensedPlan, StepBounds, find_reach
@@ -17,7 +17,6 @@ from koopmpc.control.plan.task import ControlTask
 from koopmpc.control.plan.tracking import LiftedTracking
 from koopmpc.control.target import ROUNDING, Targets
 
-_ENDS = frozenset(BOUNDS)
 _SHARE = 1e-5  # a rate that gives way by more than this share of its allowance is reported
 
 
@@ -335,22 +334,10 @@ class CallBounds:
             A bound has too few rows for the plan.
         """
         if self._last is None or self._last[0] is not limits:
-            shape, known = self._rows.shape, limits
-            if not has_fields_of(limits, self._limits):
-                known = check_bounds_alone(limits, self._limits, shape.states, shape.inputs)
+            shape = self._rows.shape
+            known = check_bounds_alone(limits, self._limits, shape.states, shape.inputs)
             self._last = limits, self._rows.read(known, at_call=True)
         return self._last[1]
-
-
-def has_fields_of(limits: object, own: Limits) -> bool:
-    """Return whether limits were made by `with_bounds` of these, or of others like them: all but bounds is the same."""
-    if not isinstance(limits, Limits):
-        return False
-    mine = vars(own)
-    return all(
-        value is mine[name] if name not in _ENDS else value is None or isinstance(value, np.ndarray)
-        for name, value in vars(limits).items()
-    )
 
 
 def sweep_rows(rows: Float[np.ndarray, "2 T n"], steps: int) -> Interval:

@@ -244,7 +244,7 @@ class CondensedStep:
     def _turn_to(self, plan: CondensedPlan) -> None:
         """Go on with another plan."""
         rows, self._plan = self.program.given, plan
-        self._given = None if rows is None else GivenInputs(plan.from_given, rows, tabled=self.program.plans is None)
+        self._given = None if rows is None else GivenInputs(plan.from_given, rows)
 
     def reset(self, x0: ArrayLike | None, u_prev: ArrayLike | None) -> None:
         """Forget all earlier steps, so that a run repeats to the bit."""

@@ -5,7 +5,6 @@ from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 from scipy.linalg.blas import idamax
 
@@ -116,45 +115,53 @@ class InitialCondition:
         w
             (nw,), or rows w_k … w_{k+L+N−1}, the last repeated; zero by default.
         """
-        measured, observer = numbers(y, "y"), self.observer
-        got = None if applied is None else numbers(applied, "applied")
+        measured, got = numbers(y, "y"), None if applied is None else numbers(applied, "applied")
         if got is not None and got.shape != last.shape:
             raise ShapeError(f"applied has shape {got.shape}, expected {last.shape}")
-        plain = self._measured
-        if plain is not None and w is None and measured.shape == self._shape:
-            lift = plain.lift
-            if lift is None:
-                self.known[:] = measured
-            else:
-                lift.arguments[0][:] = measured
-                lift.evaluate()
-                self.known[:] = lift.results[0]
-            plain.z = self.known
-            return
         if measured.shape != self._shape:
             what = "measurement of the estimator" if self._estimated else "state"
             raise ShapeError(f"y has shape {measured.shape}, expected {self._shape}, one value a {what}")
-        if got is not None and not (np.abs(got) < HUGE).all():
-            got = None
-        if self._first > self._nz:  # what acts before the plan's first input
-            self.u_prev[:] = last if got is None or self._latency else got
+        if self._measured is not None and w is None:
+            self._lift(self._measured, measured)
+            return
+        acted = self._find_acting(last, got if got is not None and (np.abs(got) < HUGE).all() else None)
         if self._nw or w is not None:
             self._preview(w)
-        acted = last
-        if self._latency:
-            self._sent.append(last.copy())
-            acted = self._sent[0]
-        if got is not None:
-            acted = got
-        good = observer.observe(measured, acted, self._w)
-        self.refused = getattr(observer, "refused", False)
+        good = self.observer.observe(measured, acted, self._w)
+        self.refused = getattr(self.observer, "refused", False)
         if self._nw:  # a disturbance that is not finite keeps its last value
             self._w = np.where(np.abs(self._ahead[0]) < HUGE, self._ahead[0], self._w)
-            stand_in = getattr(observer, "stand_in_w", None)
+            stand_in = getattr(self.observer, "stand_in_w", None)
             if stand_in is not None:
                 self._hold(stand_in, w is None or np.ndim(w) == 1 or len(np.asarray(w)) == 1)
+        self._predict(good)
+
+    def _lift(self, plain: Measured, y: Float[np.ndarray, " ny"]) -> None:
+        """Store z of y, where nothing else counts."""
+        lift = plain.lift
+        if lift is None:
+            self.known[:] = y
+        else:
+            lift.arguments[0][:] = y
+            lift.evaluate()
+            self.known[:] = lift.results[0]
+        plain.z = self.known
+
+    def _find_acting(
+        self, last: Float[np.ndarray, " nu"], got: Float[np.ndarray, " nu"] | None
+    ) -> Float[np.ndarray, " nu"]:
+        """Return the input that acted since the last call; store the one that acts before the plan's first."""
+        if self._first > self._nz:
+            self.u_prev[:] = last if got is None or self._latency else got
+        if not self._latency:
+            return last if got is None else got
+        self._sent.append(last.copy())
+        return self._sent[0] if got is None else got
+
+    def _predict(self, good: bool) -> None:
+        """Store z at the plan's start, and d; z is NaN where the observer has no good one."""
+        observer, p = self.observer, np.zeros((self._latency, 1))
         z, d = observer.z if good else np.full_like(observer.z, np.nan), observer.d
-        p = np.zeros((self._latency, 1))
         if self._np:
             forecast: np.ndarray = cast("Any", observer).forecast(self._latency + self._N)
             p, self.periodic[:] = forecast[: self._latency], forecast[self._latency :]
@@ -187,9 +194,6 @@ class InitialCondition:
         rows = np.where(np.abs(rows) < HUGE, rows, np.nan)  # products with inf, or of what is larger, would warn
         self._ahead[:] = rows if rows.ndim == 1 else rows[: self._latency + 1]
         self.W[:] = rows if rows.ndim == 1 else rows[self._latency :]
-
-
-_TABLE = 2**20  # entries of a table of GivenInputs: 8 MB
 
 
 class ReferenceShare:
@@ -276,31 +280,13 @@ class ReferenceShare:
 
 
 class GivenInputs:
-    """What the rows of a given u_target add to a plan, F (u_k, …, u_{k+N}), in step after step.
+    """What the rows of a given u_target, the last one held, add to a plan, F (u_k, …, u_{k+N}), in step after step."""
 
-    Parameters
-    ----------
-    from_given
-        F.
-    rows
-        The rows of u_target; the last one is held.
-    tabled
-        Whether steps to come will read the same F.
-    """
-
-    def __init__(
-        self, from_given: Float[np.ndarray, "nv Nnu"], rows: Float[np.ndarray, "T nu"], *, tabled: bool = True
-    ) -> None:
+    def __init__(self, from_given: Float[np.ndarray, "nv Nnu"], rows: Float[np.ndarray, "T nu"]) -> None:
         self._N, self._last, self._from_given = from_given.shape[1] // rows.shape[1], len(rows) - 1, from_given
         self._rows = np.vstack([rows, np.tile(rows[-1], (self._N - 1, 1))])
-        self._table: Float[np.ndarray, "T nv"] | None = None
-        if tabled and len(rows) * len(from_given) <= _TABLE:
-            windows = sliding_window_view(self._rows, self._N, axis=0).transpose(0, 2, 1)
-            self._table = windows.reshape(len(rows), -1) @ from_given.T
 
     def at(self, k: int) -> Float[np.ndarray, " nv"]:
         """Return the share of the preview that begins with row k."""
         k = min(k, self._last)
-        if self._table is not None:
-            return self._table[k]
         return self._from_given @ self._rows[k : k + self._N].reshape(-1)
