@@ -257,12 +257,6 @@ def test_a_name_that_a_plain_table_would_not_keep_is_refused(tmp_path: Path, nam
         assert km.load_episodes(tmp_path / "own.parquet") == data
 
 
-def test_a_table_with_a_checksum_of_an_earlier_edition_is_refused(tmp_path: Path) -> None:
-    file = text(tmp_path / "own.csv", "# koopmpc.episodes rows=2 crc32=00000000 {}\nepisode,step,x\n0,0,1\n0,1,2\n")
-    with pytest.raises(km.errors.LogError, match=r"it is of an edition before 0\.1\.0, with a checksum"):
-        km.load_episodes(file)
-
-
 def table(tmp_path: Path, cells: list[str], header: str = "t,x,v,u") -> Path:
     rows = [f"{0.1 * k},{cell},{k * k},{k % 3}" for k, cell in enumerate(cells)]
     return text(tmp_path / "log.csv", "\n".join([header, *rows, ""]))

@@ -11,8 +11,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import koopmpc as km
-from koopmpc.data.files.parquet import split_groups
-from koopmpc.data.source import Changed, Part, Subset, source_of
 from tests.bare import shown
 from tests.example_plants import brute_force, random_episodes
 
@@ -79,24 +77,6 @@ def test_a_stream_reads_one_set_ahead_and_no_more(monkeypatch: pytest.MonkeyPatc
     assert str(next(parts)) == "set 0 of the stream"
     assert taken == [0, 1]
     assert str(next(parts)) == "set 1 of the stream"
-
-
-def test_episodes_are_a_source_of_one_part() -> None:
-    data = sets()[0]
-    assert [part.load() for part in source_of(data).parts()] == [data]
-
-
-def last_state_only(episodes: km.Episodes) -> km.Episodes:
-    return km.Episodes([km.Episode(X=e.X[:, 1:], U=e.U) for e in episodes], episodes.dt, episodes.states[1:])
-
-
-@pytest.mark.parametrize("kind", ["files", "stream"])
-def test_a_change_is_made_to_each_part_as_it_is_loaded(kind: str, tmp_path: Path) -> None:
-    given = sets()
-    source = km.data.Files(folder_of(tmp_path, given)) if kind == "files" else km.data.Stream(iter(given))
-    changed = Changed(source, last_state_only, ("x1",), source.inputs)
-    assert (changed.nx, changed.nu, changed.nw) == (1, 1, 0)
-    assert read(changed) == [episode for one in given for episode in last_state_only(one)]
 
 
 def test_measured_disturbances_come_behind_the_inputs() -> None:
@@ -225,11 +205,11 @@ def test_row_groups_hold_each_pair_once_in_order(
         patch.setattr("koopmpc.data.files.parquet._GROUP", 8 * rows * (5 + disturbed))
         data.save(tmp_path / "a.parquet")
         patch.setattr("koopmpc.data.files.parquet._LARGE", 0)
-        parts = split_groups(tmp_path / "a.parquet", history, None, {})
-    assert parts is not None
+        parts = km.data.Files(tmp_path / "a.parquet").parts(history)
+    read: list[km.Episode] = []
     for part in parts:
-        assert sum(map(len, part.load())) <= rows + history + 1
-    read = [episode for part in parts for episode in part.load()]
+        read += part.load()
+        assert len(parts) == 1 or sum(map(len, part.load())) <= rows + history + 1
     assert np.array_equal(pairs(read, history), pairs(list(data), history))
 
 
@@ -273,7 +253,6 @@ def test_files_that_cannot_be_cut_are_read_whole_and_damage_is_named(
     data.save(a)
     monkeypatch.setattr("koopmpc.data.files.parquet._LARGE", 0)
     pq.write_table(pa.table({"time": [0.0, 0.1, 0.2], "x": [1.0, 2.0, 3.0], "u": [0.0, 1.0, 0.0]}), b)
-    assert split_groups(b, 0, None, {}) is None
     assert [len(one) for part in km.data.Files(b).parts() for one in part.load()] == [2]
     c.write_bytes(b"no table")
     with pytest.raises(km.errors.LogError, match=r"c\.parquet"):
@@ -290,19 +269,6 @@ def test_files_that_cannot_be_cut_are_read_whole_and_damage_is_named(
         parts[0].load()
 
 
-def test_a_subset_of_a_source_holds_its_parts_in_the_order_of_the_source() -> None:
-    data = random_episodes(0, [3] * 4, 2, 1)
-
-    class Four(km.data.source.Source):
-        def parts(self, history: int = 0) -> list[Part]:
-            return [Part(f"part {i}, {history} rows earlier", partial(data.with_episodes, [data[i]])) for i in range(4)]
-
-    some = Subset(Four(data.dt, data.states, data.inputs, ()), [3, 1])
-    assert [part.place for part in some.parts(2)] == ["part 1, 2 rows earlier", "part 3, 2 rows earlier"]
-    assert read(some) == [data[1], data[3]]
-    assert (some.dt, some.states, some.inputs, some.replayable) == (data.dt, data.states, data.inputs, True)
-
-
 @pytest.mark.parametrize("share", [0.9e-6, -0.9e-6, 1.1e-6, -1.1e-6])
 def test_sample_times_agree_to_a_millionth(share: float) -> None:
     one = random_episodes(0, [5], 2, 1)
@@ -314,30 +280,19 @@ def test_sample_times_agree_to_a_millionth(share: float) -> None:
             read(km.data.Stream([one, other]))
 
 
-def test_a_row_group_that_was_changed_is_told_wherever_the_change_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each block of rows has its own checksum, and the last one may hold fewer rows."""
+def test_a_number_that_was_changed_is_told_wherever_it_is(tmp_path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    monkeypatch.setattr("koopmpc.data.files.parquet._GROUP", 8 * 5 * 16)  # sixteen rows of five columns
-    monkeypatch.setattr("koopmpc.data.files.parquet._LARGE", 0)
-    data = random_episodes(0, [20, 7, 12, 10], 2, 1)  # 53 rows: three blocks and five rows
+    data = random_episodes(0, [20, 7, 12, 10], 2, 1)
     data.save(tmp_path / "whole.parquet")
     table = pq.read_table(tmp_path / "whole.parquet")
     assert km.load_episodes(tmp_path / "whole.parquet") == data
-    for row in (0, 15, 16, 47, 48, 52):
-        for name in (data.states[0], data.states[1], data.inputs[0]):
-            column = table[name].to_numpy().copy()
-            if np.isnan(column[row]):
-                continue  # the input of the last row of an episode
-            column[row] += 1e-9
-            place = table.column_names.index(name)
-            changed = table.set_column(place, table.schema.field(name), pa.array(column, mask=np.isnan(column)))
-            pq.write_table(changed, tmp_path / "changed.parquet", row_group_size=16)
-            with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
-                km.load_episodes(tmp_path / "changed.parquet")
-            parts = split_groups(tmp_path / "changed.parquet", 0, None, {})
-            with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
-                parts[row // 16].load()
+    for row, name in ((0, "x0"), (16, "x1"), (47, "u0"), (52, "x1")):
+        column = table[name].to_numpy().copy()
+        column[row] += 1e-9
+        place = table.column_names.index(name)
+        changed = table.set_column(place, table.schema.field(name), pa.array(column, mask=np.isnan(column)))
+        pq.write_table(changed, tmp_path / "changed.parquet")
+        with pytest.raises(km.errors.LogError, match="its numbers are not those that were written"):
+            km.load_episodes(tmp_path / "changed.parquet")

@@ -106,15 +106,6 @@ def test_foreign_contents_are_refused(tmp_path: Path) -> None:
         km.load_episodes(tmp_path / "other.npz")
 
 
-def test_a_parquet_file_of_an_edition_without_checksums_is_refused(tmp_path: Path) -> None:
-    random_episodes([3], 1, 1, 0).save(tmp_path / "old.parquet")
-    table = pq.read_table(tmp_path / "old.parquet")
-    named = {key: value for key, value in table.schema.metadata.items() if key == b"koopmpc.episodes"}
-    pq.write_table(table.replace_schema_metadata(named), tmp_path / "old.parquet")
-    with pytest.raises(km.errors.LogError, match=r"it is of an edition before 0\.1\.0, without checksums"):
-        km.load_episodes(tmp_path / "old.parquet")
-
-
 def test_no_pickle_is_opened(tmp_path: Path) -> None:
     pickled = np.array([{"a": 1}], dtype=object)
     np.savez(tmp_path / "evil.npz", X=pickled, U=pickled, steps=pickled, about=pickled)

@@ -4,12 +4,10 @@ import gc
 import io
 import random
 import signal
-import struct
 import subprocess
 import sys
 import warnings
 import zipfile
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,6 @@ import pytest
 
 import koopmpc as km
 from koopmpc.base import disk
-from koopmpc.data.files.foreign.hdf5 import _require_sound_heaps
 from tests.faults.damage import FORMATS, PLAIN, READERS, WRITERS, damaged, episodes, model, recorded, room_for, store
 from tests.tiers import few
 from tests.views.runs import make_run
@@ -288,31 +285,3 @@ def test_nested_text_in_a_model_is_refused(tmp_path: Path, depth: int, kind: str
     rezipped(path, tree=member.getvalue())
     with pytest.raises(km.errors.LogError, match=r"model\.npz"):
         km.load_model(path)
-
-
-def test_a_table_from_before_there_were_checksums_is_refused_by_its_edition(tmp_path: Path) -> None:
-    import pyarrow.parquet as pq
-
-    path = tmp_path / "data.parquet"
-    episodes().save(path)
-    table = pq.read_table(path)
-    kept = {key: value for key, value in table.schema.metadata.items() if key != b"koopmpc.check"}
-    assert len(kept) == len(table.schema.metadata) - 1
-    pq.write_table(table.replace_schema_metadata(kept), path)
-    with pytest.raises(
-        km.errors.LogError, match=r"of an edition before 0\.1\.0, without checksums; save it by that edition"
-    ):
-        km.load_episodes(path)
-
-
-@pytest.mark.parametrize("before", [0, 1, 3])
-def test_free_space_of_no_length_at_the_very_end_of_a_heap_of_texts_is_refused(tmp_path: Path, before: int) -> None:
-    def make_heap(last: int) -> bytes:
-        words = b"".join(struct.pack("<HHIQ", 7, 1, 0, 5) + b"words\0\0\0" for _ in range(before))
-        content = words + struct.pack("<HHIQ", 0, 0, 0, last)
-        return b"GCOL\1\0\0\0" + struct.pack("<Q", 16 + len(content)) + content
-
-    for last in (0, 16):
-        (tmp_path / "heap.h5").write_bytes(b"\x89HDF" + make_heap(last) + bytes(40))
-        with nullcontext() if last else pytest.raises(km.errors.LogError, match="a heap of texts is damaged"):
-            _require_sound_heaps(tmp_path / "heap.h5")

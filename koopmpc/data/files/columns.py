@@ -172,7 +172,50 @@ def find_roles(
     DataError
         A given column is missing or stands twice, or no column is left for a state.
     """
+    _require_columns(names, numeric, told, where)
+    single = [name for name in dict.fromkeys(names) if names.count(name) == 1 and name not in told.named]
+    time, episode, step = (next(filter(is_it, single), None) for is_it in (is_clock, is_episode, "step".__eq__))
+    time = clock if time is None and clock in single else time
+    free = [name for name in single if name not in (time, episode, step) and name in numeric]
+    guessed = driving is None and None in (told.states, told.inputs)
+    targets = tuple(filter(is_target, free)) if guessed else ()
+    free = [name for name in free if name not in targets]
+    states, inputs, disturbances = _fill_roles(free, told, driving)
+    if not states:
+        raise DataError(
+            f"{where} has no column that could be a state: its columns are {', '.join(names)}; pass states="
+        )
+    return ColumnRoles(
+        states,
+        inputs,
+        disturbances,
+        time,
+        1.0 if time is None else _find_scale(time, where),
+        episode,
+        step,
+        targets if told.states is None else (),
+        guessed=guessed,
+    )
+
+
+def _fill_roles(
+    free: Sequence[str], told: TableSettings, driving: Sequence[str] | None
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Return states, inputs and disturbances: as the caller gives them, else those of these columns by their names."""
+    may_drive = free if driving is None else [name for name in free if name in driving]
+    pushes = list(filter(is_disturbance, may_drive))
     states, inputs, disturbances = told.states, told.inputs, told.disturbances
+    if inputs is None:
+        inputs = _pick_inputs(free) if driving is None else [name for name in may_drive if name not in pushes]
+    if disturbances is None:
+        disturbances = [name for name in pushes if name not in inputs and states is None]
+    if states is None:
+        states = [name for name in free if name not in (*inputs, *disturbances)]
+    return tuple(states), tuple(inputs), tuple(disturbances)
+
+
+def _require_columns(names: Sequence[str], numeric: Sequence[str], told: TableSettings, where: str) -> None:
+    """Raise where a column that the caller names, or that a guess needs, is missing or stands twice."""
     for what, given in told.roles.items():
         if isinstance(given, str):
             raise DataError(f"{what} is {given!r}; pass a tuple of names")
@@ -180,45 +223,18 @@ def find_roles(
             if names.count(name) != 1:
                 has = "has two columns" if name in names else "has no column"
                 raise DataError(f"{where} {has} {name!r}; its columns are {', '.join(names)}")
-    sought = told.named
-    rest = [name for name in dict.fromkeys(names) if names.count(name) == 1 and name not in sought]
-    time = next((name for name in rest if is_clock(name)), clock if clock in rest else None)
-    episode = next((name for name in rest if _EPISODE.fullmatch(drop_unit(name))), None)
-    step = next((name for name in rest if name == "step"), None)
-    free = [name for name in rest if name not in (time, episode, step) and name in numeric]
-    if any(names.count(name) > 1 for name in numeric) and (states is None or inputs is None):
-        twice = next(name for name in numeric if names.count(name) > 1)
+    twice = next((name for name in numeric if names.count(name) > 1), None)
+    if twice is not None and None in (told.states, told.inputs):
         raise DataError(f"{where} has two columns {twice!r}; rename one")
-    guessed = (states is None or inputs is None) and driving is None
-    targets = [n for n in free if is_target(n)] if guessed else []
-    free = [name for name in free if name not in targets]
-    if inputs is None and driving is not None:
-        found_inputs = [n for n in free if n in driving and not _DISTURBANCE.fullmatch(drop_unit(n))]
-    else:
-        found_inputs = _pick_inputs(free) if inputs is None else list(inputs)
-    free_pushes = free if driving is None else [n for n in free if n in driving]
-    pushes = [n for n in free_pushes if _DISTURBANCE.fullmatch(drop_unit(n)) and n not in found_inputs]
-    found_pushes = (pushes if states is None else []) if disturbances is None else list(disturbances)
-    taken = {*found_inputs, *found_pushes}
-    found_states = [name for name in free if name not in taken] if states is None else list(states)
-    if not found_states:
-        raise DataError(
-            f"{where} has no column that could be a state: its columns are {', '.join(names)}; pass states="
-        )
-    unit = "s" if time is None else _find_unit(time)
+
+
+def _find_scale(time: str, where: str) -> float:
+    """Return the unit of a column of time in seconds."""
+    found = re.search(r"[\[(]([^\])]*)[\])]", time)
+    unit = found.group(1).strip() if found else "s"
     if unit not in _PER_SECOND:
         raise DataError(f"{where}: the unit of {time!r} is not one of {', '.join(_PER_SECOND)}; rename it, or pass dt=")
-    return ColumnRoles(
-        tuple(found_states),
-        tuple(found_inputs),
-        tuple(found_pushes),
-        time,
-        _PER_SECOND[unit],
-        episode,
-        step,
-        tuple(targets) if states is None else (),
-        guessed=guessed,
-    )
+    return _PER_SECOND[unit]
 
 
 def is_input(name: str) -> bool:
@@ -261,19 +277,19 @@ def is_clock(name: str) -> bool:
     return bool(words & _CLOCKS) and words <= _CLOCKS | _OF_CLOCKS and not re.search(r"\d", drop_unit(name))
 
 
-def is_label(name: str) -> bool:
-    """Return True for the name of a time or episode column, which need not hold numbers."""
-    return is_clock(name) or _EPISODE.fullmatch(drop_unit(name)) is not None
+def is_episode(name: str) -> bool:
+    """Return whether a column's name says that it tells episodes apart."""
+    return _EPISODE.fullmatch(drop_unit(name)) is not None
+
+
+def is_disturbance(name: str) -> bool:
+    """Return whether a column's name says that it is a measured disturbance."""
+    return _DISTURBANCE.fullmatch(drop_unit(name)) is not None
 
 
 def drop_unit(name: str) -> str:
     """Return the name without its unit, in lower case."""
     return re.split(r"\s*[\[(]", name)[0].strip().lower()
-
-
-def _find_unit(name: str) -> str:
-    found = re.search(r"[\[(]([^\])]*)[\])]", name)
-    return found.group(1).strip() if found else "s"
 
 
 def _list_words(name: str) -> set[str]:

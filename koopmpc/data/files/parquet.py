@@ -7,7 +7,6 @@ A group of rows of a .parquet file is read without the rest of the file, so that
 import json
 from collections.abc import Mapping
 from functools import partial
-from os import SEEK_END
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,7 +21,7 @@ from koopmpc.data.files.npz import describe_episodes, split_rows, stack_episodes
 from koopmpc.data.source import Part
 
 _KEY = b"koopmpc.episodes"  # metadata of the file: sample time and names
-_CHECK = b"koopmpc.check"  # metadata of the file: checksums of its groups of rows
+_CHECK = b"koopmpc.check"  # metadata of the file: checksum of its names and numbers, for pages alone have others
 _PLACES = ("episode", "step")  # columns that say where a row stands
 _GROUP = 8_000_000  # bytes of a group of rows, about
 _LARGE = 32_000_000  # bytes from which a file is read in groups of rows
@@ -55,37 +54,15 @@ def write_parquet(stream: BinaryIO, episodes: Episodes) -> None:
     columns += [pa.array(column, mask=last) for column in full.T]
     table = pa.table(columns, names=[*_PLACES, *names])
     rows = max(_GROUP // (8 * len(columns)), 1)
-    check = json.dumps({"rows": rows, "crc32": _checksums(about, rows, 0, np.column_stack([episode, step]), X, full)})
+    check = json.dumps({"crc32": [_checksum(about, episode, step, X, full)]})
     table = table.replace_schema_metadata({_KEY: about.encode(), _CHECK: check.encode()})
     pq.write_table(table, stream, row_group_size=rows, write_page_checksum=True)
 
 
-def _checksums(about: str, size: int, first: int, *columns: np.ndarray) -> list[int]:
-    """Return a checksum of each whole block of `size` rows and of the metadata; `first` is the number of the first row.
-
-    Pages have checksums of their own, but names, sizes and the places of pages have none.
-    """
-    seed, blocks = checksum(about.encode()), range(-first % size, len(columns[0]), size)
-    whole = [np.ascontiguousarray(some) for some in columns]
-    return [checksum(*(some[at : at + size].data for some in whole), start=seed) for at in blocks]
-
-
-def _verify(table: Any, named: dict[str, Any], first: int = 0, rows: int | None = None) -> None:
-    """Raise where rows of a file, the first of them number `first` of `rows`, are not those that were written."""
-    metadata = table.schema.metadata
-    if _CHECK not in metadata:
-        raise ValueError("it is of an edition before 0.1.0, without checksums; save it by that edition as .npz")
-    check = json.loads(metadata[_CHECK])
-    size, rows = int(check["rows"]), len(table) if rows is None else rows
-    places = np.stack([table[name].to_numpy() for name in ("episode", "step")], axis=1)
-    U = _stack(table, _driving(named))
-    found = _checksums(metadata[_KEY].decode(), size, first, places, _stack(table, named["states"]), np.nan_to_num(U))
-    if (first + len(table)) % size and first + len(table) < rows:  # the last block is not whole
-        found.pop()
-    begin = -(-first // size)
-    written = check["crc32"][begin : begin + len(found)] if first + len(table) < rows else check["crc32"][begin:]
-    if found != written:
-        raise ValueError("its numbers are not those that were written; take another copy")
+def _checksum(about: str, episode: np.ndarray, step: np.ndarray, X: np.ndarray, U: np.ndarray) -> int:
+    """Return the checksum of a whole file's metadata and numbers; inputs that are null count as 0."""
+    columns = np.column_stack([episode, step]), X, np.nan_to_num(U)
+    return checksum(*(np.ascontiguousarray(some).data for some in columns), start=checksum(about.encode()))
 
 
 def read_parquet(file: Path) -> Episodes | LogTable:
@@ -96,39 +73,25 @@ def read_parquet(file: Path) -> Episodes | LogTable:
     LogError
         The file is damaged, or its rows were changed.
     """
-    if not _is_ours(file):
-        names = _schema(file).names
-        table = _table(file, [name for name in names if names.count(name) == 1])
-        return LogTable(tuple(names), {name: table[name].to_numpy() for name in table.column_names})
+    schema = _schema(file)
+    if not {_KEY, _CHECK} & (schema.metadata or {}).keys():
+        table = _table(file, [name for name in schema.names if schema.names.count(name) == 1])
+        return LogTable(tuple(schema.names), {name: table[name].to_numpy() for name in table.column_names})
     table = _table(file)
     try:
         about = table.schema.metadata[_KEY].decode()
         named = json.loads(about)
-        X, U, steps = _unpack(table, named)
-        _verify(table, named)
-        return split_rows(X, U, steps, about)
+        episode, step = (np.asarray(table[name], dtype=np.intp) for name in _PLACES)
+        steps = np.bincount(episode) - 1
+        if not np.array_equal((episode, step), _positions(steps)):
+            raise ValueError("rows are missing or out of order")
+        X, U = _stack(table, named["states"]), _stack(table, named["inputs"] + named["disturbances"])
+        check = json.loads(table.schema.metadata.get(_CHECK, b"{}"))
+        if check.get("crc32") != [_checksum(about, episode, step, X, U)]:
+            raise ValueError("its numbers are not those that were written; take another copy")
+        return split_rows(X, U[step != steps[episode]], steps, about)
     except (KeyError, TypeError, ValueError) as error:
-        raise LogError(f"{file} holds no episodes that can be read: {error}; {ADVICE}") from error
-
-
-def _is_ours(file: Path) -> bool:
-    """Return True where `write_parquet` wrote the table, so that it holds its own metadata.
-
-    Raises
-    ------
-    LogError
-        It is no .parquet file, or one of ours whose metadata are damaged.
-    """
-    if any(key in (_schema(file).metadata or {}) for key in (_KEY, _CHECK)):
-        return True
-    with file.open("rb") as stream:  # the footer, whose length stands in the eight bytes at the end
-        stream.seek(-8, SEEK_END)
-        length = int.from_bytes(stream.read(4), "little")
-        stream.seek(-8 - length, SEEK_END)
-        footer = stream.read(length)
-    if _KEY in footer or _CHECK in footer:
-        raise LogError(f"{file} holds no episodes that can be read: its metadata are damaged; take another copy")
-    return False
+        raise LogError(f"{file} {_DAMAGED}: {error}; {ADVICE}") from error
 
 
 def _read_rows(file: Path, stretches: list[tuple[int, int]], plant: PlantSignature | None, place: str) -> Episodes:
@@ -165,7 +128,6 @@ def _read_rows(file: Path, stretches: list[tuple[int, int]], plant: PlantSignatu
             if np.ptp(episode[a : b + 1]) or (np.diff(step[a : b + 1]) != 1).any():
                 raise ValueError("rows are missing or out of order")
             found.append(Episode(X=X[a : b + 1], U=U[a:b], W=W[a:b]))
-        _verify(table, named, before, int(ends[-1]))
         episodes = Episodes(found, named["dt"], named["states"], named["inputs"], disturbances)
     except (KeyError, IndexError, TypeError, ValueError, OSError, pa.ArrowException) as error:
         raise LogError(f"{place} holds no episodes that can be read: {error}") from error
@@ -216,22 +178,6 @@ def split_groups(
     return parts
 
 
-def _unpack(columns: Any, named: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return X, U and the steps of each episode, of a table of all rows; ValueError where some are out of order."""
-    episode, step = (np.asarray(columns[name], dtype=np.intp) for name in ("episode", "step"))
-    steps = np.bincount(episode) - 1
-    expected = _positions(steps)
-    if not (np.array_equal(episode, expected[0]) and np.array_equal(step, expected[1])):
-        raise ValueError("rows are missing or out of order")
-    last = step == steps[episode]
-    return _stack(columns, named["states"]), _stack(columns, _driving(named))[~last], steps
-
-
-def _driving(named: dict[str, Any]) -> list[str]:
-    """Return the names of the columns of U: the inputs, and behind them the measured disturbances."""
-    return named["inputs"] + named["disturbances"]
-
-
 def _stack(columns: Any, names: list[str]) -> np.ndarray:
     """Return the columns of these names side by side, (rows, columns), as numbers; null is NaN."""
     found = [np.asarray(columns[name], dtype=np.float64) for name in names]
@@ -252,9 +198,7 @@ def _schema(path: Path) -> Any:
     try:
         return pq.read_schema(path)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise LogError(
-            f"{path} holds no episodes that can be read: it is no .parquet file, or was cut; {_TABLE_ADVICE}"
-        ) from error
+        raise LogError(f"{path} {_DAMAGED}: it is no .parquet file, or was cut; {_TABLE_ADVICE}") from error
 
 
 def _table(path: Path, wanted: list[str] | None = None) -> Any:
@@ -267,7 +211,7 @@ def _table(path: Path, wanted: list[str] | None = None) -> Any:
             affordable(8 * size, f"{size} cells")
             return held.read(columns=wanted)
     except ValueError as error:
-        raise LogError(f"{path} holds no episodes that can be read: {error}; {ADVICE}") from error
+        raise LogError(f"{path} {_DAMAGED}: {error}; {ADVICE}") from error
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise LogError(f"{path} {_DAMAGED}: its columns are damaged; {_TABLE_ADVICE}") from error
 

@@ -1,6 +1,7 @@
 # pyright: basic
 """Tables as text (.csv, .dat, .txt): a line of names, then a row a time step."""
 
+import re
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
@@ -13,9 +14,6 @@ from koopmpc.data.files.columns import TableSettings, find_roles
 from koopmpc.data.files.formats import LogFormat, LogTable, register_format
 from koopmpc.data.files.tables import SAVED, is_a_number, pick_driving
 
-_UTF8 = "utf-8-sig"
-_LATIN = "latin-1"
-_WITH_CHECKSUM = b"# koopmpc.episodes "  # began the .csv files of editions before 0.1.0
 _MISSING = ["", "nan", "NaN", "NAN", "null", "NULL", "NA", "N/A", "#N/A"]
 
 
@@ -44,20 +42,19 @@ def write_plain(stream: BinaryIO, episodes: Episodes) -> None:
 def _check_names(episodes: Episodes, head: str) -> None:
     """Raise DataError unless the table reads back with the names and roles of these episodes."""
     names = (*episodes.states, *episodes.inputs, *episodes.disturbances)
-    numbers = ["0.0"] * (3 + episodes.nx)
+    numbers = ["0.0"] * (len(SAVED) + episodes.nx)
     rows = [",".join(numbers + [cell] * (episodes.nu + episodes.nw)) for cell in ("0.0", "")]
-    wrong = ""
     try:
         table = _parse("\n".join([head, *rows, ""]).encode(), Path("table.csv"))
-        every = list(table.names)
-        roles = find_roles(every, every, TableSettings(), "table.csv", pick_driving(every, table.columns))
-        states, inputs, disturbances = map(set, (episodes.states, episodes.inputs, episodes.disturbances))
-        pairs = ((states, roles.states), (inputs, roles.inputs), (disturbances, roles.disturbances))
-        changed = [name for given, read in pairs for name in given ^ set(read)]
-        wrong = next((name for name in names if name in changed), "")
+        roles = find_roles(
+            table.names, table.names, TableSettings(), "table.csv", pick_driving(table.names, table.columns)
+        )
+        pairs = [(getattr(episodes, role), getattr(roles, role)) for role in ("states", "inputs", "disturbances")]
+        changed = {name for given, read in pairs for name in {*given} ^ {*read}}
     except KoopmpcError:
-        wrong = next((n for n in names if n in SAVED or n != n.strip() or is_a_number(n)), names[0])
-    if wrong:
+        changed = {n for n in names if n in SAVED or n != n.strip() or is_a_number(n)} or {names[0]}
+    wrong = next(filter(changed.__contains__, names), None)
+    if wrong is not None:
         raise DataError(
             f"a .csv file would not keep the name {wrong!r} in its role; rename it (disturbances as w, w0 or "
             "disturbance), or save as .npz or .parquet"
@@ -77,48 +74,35 @@ def read_plain(file: Path) -> LogTable:
     Raises
     ------
     LogError
-        The file is empty, a row has another number of cells, or a name is a number; koopmpc wrote it with a checksum.
+        The file is empty, a row has another number of cells, or a name is a number.
     """
-    raw = file.read_bytes()
-    if raw.startswith(_WITH_CHECKSUM):
-        raise LogError(
-            f"{file} holds no episodes that can be read: it is of an edition before 0.1.0, with a checksum in its "
-            "first line; remove this line and pass dt=, states= and inputs=, or save the episodes again"
-        )
-    return _parse(raw, file)
+    return _parse(file.read_bytes(), file)
 
 
 def _parse(raw: bytes, file: Path) -> LogTable:
     import pyarrow as pa
     from pyarrow import csv
 
-    try:
-        raw.decode(_UTF8)
-        encoding = "utf8"
-    except UnicodeDecodeError:
-        encoding = _LATIN
-    raw = raw.removeprefix(b"\xef\xbb\xbf")
-    while raw.startswith((b"#", b"%")):
-        raw = raw.partition(b"\n")[2]
+    encoding = "utf8" if _is_utf8(raw) else "latin-1"
+    raw = re.sub(rb"\A(?:[#%][^\n]*\n?)+", b"", raw.removeprefix(b"\xef\xbb\xbf"))
     head, _, rest = raw.partition(b"\n")
     if not head.strip():
         raise LogError(
             f"{file} holds no episodes that can be read: it is no {file.suffix} file, or was cut; pass a file that "
             "Episodes.save wrote, or a table: a line of names, then a row a time step"
         )
-    if not any(mark in head for mark in (b",", b";")) and _has_spaces(head, rest.partition(b"\n")[0]):
+    if _has_spaces(head, rest.partition(b"\n")[0]):
         raw = b"\n".join(b"\t".join(line.split()) for line in raw.splitlines() if line.strip())
         head, _, rest = raw.partition(b"\n")
     separator = max((b",", b";", b"\t"), key=head.count)
     comma = separator == b";" and b"," in rest.partition(b"\n")[0]
-    cells = head.split(separator)
-    named = not _are_numbers([cell.replace(b",", b".") for cell in cells] if comma else cells)
+    cells = (head.replace(b",", b".") if comma else head).split(separator)
+    named = not _are_numbers(cells)
+    numbered = [f"column {i + 1}" for i in range(len(cells))]
     try:
         table = csv.read_csv(
             BytesIO(raw),
-            read_options=csv.ReadOptions(
-                encoding=encoding, column_names=None if named else [f"column {i + 1}" for i in range(len(cells))]
-            ),
+            read_options=csv.ReadOptions(encoding=encoding, column_names=None if named else numbered),
             parse_options=csv.ParseOptions(delimiter=separator.decode()),
             convert_options=csv.ConvertOptions(
                 decimal_point="," if comma else ".", null_values=_MISSING, strings_can_be_null=True
@@ -132,17 +116,25 @@ def _parse(raw: bytes, file: Path) -> LogTable:
     return LogTable(names, {name: _convert(table.column(i)) for i, name in enumerate(names)}, named=named)
 
 
+def _is_utf8(raw: bytes) -> bool:
+    try:
+        raw.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
 def _has_spaces(first: bytes, second: bytes) -> bool:
     """Return whether spaces separate the cells of the first two lines of a file, or spaces and tabs."""
-    if b"\t" in first and not _are_numbers(first.split()):
+    if b"," in first or b";" in first or (b"\t" in first and not _are_numbers(first.split())):
         return False
     return len(first.split()) == len(second.split()) > 1
 
 
 def _are_numbers(cells: list[bytes]) -> bool:
     """Return whether these cells are numbers or empty, as in a file without a line of names."""
-    texts = [cell.decode(_LATIN).strip() for cell in cells]
-    return any(texts) and all(map(is_a_number, filter(None, texts)))
+    texts = [text for cell in cells if (text := cell.decode("latin-1").strip())]
+    return bool(texts) and all(map(is_a_number, texts))
 
 
 def _convert(column) -> np.ndarray:

@@ -3,7 +3,7 @@
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from numbers import Real
 from pathlib import Path
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from koopmpc.base import checks, disk
 from koopmpc.base.errors import ColumnWarning, DataError, FitWarning, KoopmpcError, LogError, NoInputWarning
 from koopmpc.data.episodes import Episodes
-from koopmpc.data.files.columns import ColumnRoles, TableSettings, drop_unit, find_roles, is_label
+from koopmpc.data.files.columns import ColumnRoles, TableSettings, drop_unit, find_roles, is_clock, is_episode
 from koopmpc.data.files.formats import LogTable
 from koopmpc.data.files.sampling import Signals, episodes_from, read_clock, resample, restarts, sample_time
 
@@ -52,6 +52,16 @@ def _is_missing(column: np.ndarray) -> np.ndarray:
     return np.array([cell is None or cell != cell for cell in column])
 
 
+@dataclass(frozen=True, eq=False)
+class _Assigned:
+    """The columns of a table by their roles: `values` holds states, inputs and disturbances as numbers."""
+
+    roles: ColumnRoles
+    columns: Mapping[str, np.ndarray]
+    values: Mapping[str, Float[np.ndarray, " M"]]
+    time: Float[np.ndarray, " M"] | None  # [s]
+
+
 def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
     """Return the episodes of a plain table; `load_episodes` says what its columns mean.
 
@@ -72,89 +82,114 @@ def read_table(file: Path, table: LogTable, told: TableSettings) -> Episodes:
     """
     where = str(file)
     table = _rename_columns(table.with_units(), told, where)
-    names, columns = list(table.names), table.columns
-    told = told.match_names(names)
-    rows = len(next(iter(columns.values()))) if columns else 0
-    if rows == 0:
-        raise DataError(f"{where} has columns and no row in them; leave the file out")
-    sought = told.named
-    every = told.states is None or told.inputs is None
-    columns = {
-        name: _numbers(column, name, where) if name in sought or (every and not is_label(name)) else column
-        for name, column in columns.items()
-    }
-    numeric = [name for name in names if name in columns and columns[name].dtype.kind in "fiub"]
-    clock = None if table.named else _find_clock(names, columns, told, where)
-    found = find_roles(list(names), numeric, told, where, pick_driving(names, columns), clock)
-    if found.targets:
-        warnings.warn(
-            f"{where}: {_say_set_points(found.targets)}",
-            FitWarning,
-            stacklevel=2,
-        )
-    values = {name: checks.array(columns[name], f"{where}: {name}", (None,), finite=False) for name in found.values}
-    for name, column in values.items():
-        _plausible(column, name, where)
-    if told.states is None and found.guessed:
-        found = _without_counters(found, values, where)
-    text = [name for name, column in columns.items() if every and column.dtype.kind == "O" and not is_label(name)]
-    if text:
-        warnings.warn(
-            f"{where}: {', '.join(map(repr, text))} hold{'s' * (len(text) == 1)} text, and no part of it is a state or "
-            "an input; write numbers, or pass states= and inputs=",
-            FitWarning,
-            stacklevel=2,
-        )
-    time = None
-    if found.time is not None and not (found.time == clock and told.dt is not None):
-        time = read_clock(checks.array(columns[found.time], found.time, (None,), finite=False), found, where)
-    if time is None and told.resample is not None:
-        raise DataError(f"{where} has no column of time to resample by; its columns are {', '.join(names)}")
-    episode = np.zeros(rows, dtype=np.intp)
-    if found.episode is not None:
-        episode = _number_episodes(columns[found.episode], file)
-    step = None
-    if found.step is not None and time is None:
-        step = checks.array(columns[found.step], f"{where}: step", (None,))
-    X, U, W = (_stack([values[n] for n in some], rows) for some in (found.states, found.inputs, found.disturbances))
-    parts: list[Signals] = []
-    for e in range(int(episode.max(initial=-1)) + 1):
-        here = np.flatnonzero(episode == e)
-        if step is not None:
-            here = here[np.argsort(step[here], kind="stable")]
-            if (np.diff(step[here]) != 1).any():
-                raise DataError(f"{where}, episode {e}: steps are missing or come twice; split it there")
-        of = None if time is None else time[here]
-        parts += restarts(Signals(of, X[here], U[here], W[here], here + 1, found.states), where)
-    dt = told.resample if told.resample is not None else told.dt
-    if dt is None and time is None:
-        dt = table.dt
-    if dt is None and time is not None and names[: len(SAVED)] == list(SAVED):
-        dt = _find_exact_step(columns[SAVED[1]], time)
-    usual = None if time is None else sample_time([part.time for part in parts if part.time is not None], where)
-    if dt is None:
-        if usual is None:
-            clock = next(
-                (f"; {name!r} looks like it: rename it by columns=" for name in found.states if _even(values[name])), ""
-            )
-            raise DataError(
-                f"{where} does not say its sample time: pass dt=, or add a column 'time [s]'{clock}; its columns are "
-                f"{', '.join(names)}"
-            )
-        dt = usual
-    dt = checks.positive(dt, "dt", "s")
+    told = told.match_names(table.names)
+    found = _assign_columns(table, told, where)
+    roles = found.roles
+    if found.time is None and told.resample is not None:
+        raise DataError(f"{where} has no column of time to resample by; its columns are {', '.join(table.names)}")
+    parts = _split_rows(found, where)
+    dt = _choose_step(table, told, found, parts, where)
     if told.resample is not None:
-        _affordable(parts, dt, len(found.values), where)
+        _affordable(parts, dt, len(roles.values), where)
         parts = resample(parts, dt, where)
-    if found.guessed:
-        _doubt(found, values, where, alone=told.inputs is None and not found.inputs)
+    if roles.guessed:
+        _doubt(roles, found.values, where, alone=told.inputs is None and not roles.inputs)
     try:
-        episodes = episodes_from(parts, dt, where)
-        return Episodes(episodes, dt, found.states, found.inputs, found.disturbances)
+        return Episodes(episodes_from(parts, dt, where), dt, roles.states, roles.inputs, roles.disturbances)
     except KoopmpcError as error:
         if str(error).startswith(where):
             raise
         raise DataError(f"{where}: {error}") from error
+
+
+def _assign_columns(table: LogTable, told: TableSettings, where: str) -> _Assigned:
+    """Return the columns by their roles, and time in seconds; warn of columns that have none."""
+    names, columns = table.names, _convert_columns(table, told, where)
+    numeric = [name for name in names if name in columns and columns[name].dtype.kind in "fiub"]
+    clock = None if table.named else _find_clock(names, columns, told, where)
+    roles = find_roles(names, numeric, told, where, pick_driving(names, columns), clock)
+    if roles.targets:
+        warnings.warn(f"{where}: {_say_set_points(roles.targets)}", FitWarning, stacklevel=3)
+    values = {name: checks.array(columns[name], f"{where}: {name}", (None,), finite=False) for name in roles.values}
+    for name, column in values.items():
+        _plausible(column, name, where)
+    if told.states is None and roles.guessed:
+        roles = _without_counters(roles, values, where)
+    _warn_of_text(columns, told, where)
+    time = None
+    if roles.time is not None and not (roles.time == clock and told.dt is not None):
+        time = read_clock(checks.array(columns[roles.time], roles.time, (None,), finite=False), roles, where)
+    return _Assigned(roles, columns, values, time)
+
+
+def _is_value(name: str, told: TableSettings) -> bool:
+    """Return whether a column must hold numbers: the caller names it, or a role is guessed and it labels no rows."""
+    return name in told.named or (None in (told.states, told.inputs) and not is_clock(name) and not is_episode(name))
+
+
+def _convert_columns(table: LogTable, told: TableSettings, where: str) -> dict[str, np.ndarray]:
+    if not any(map(len, table.columns.values())):
+        raise DataError(f"{where} has columns and no row in them; leave the file out")
+    return {
+        name: _numbers(column, name, where) if _is_value(name, told) else column
+        for name, column in table.columns.items()
+    }
+
+
+def _warn_of_text(columns: Mapping[str, np.ndarray], told: TableSettings, where: str) -> None:
+    text = [name for name, column in columns.items() if column.dtype.kind == "O" and _is_value(name, told)]
+    if text and None in (told.states, told.inputs):
+        warnings.warn(
+            f"{where}: {', '.join(map(repr, text))} hold{'s' * (len(text) == 1)} text, and no part of it is a state or "
+            "an input; write numbers, or pass states= and inputs=",
+            FitWarning,
+            stacklevel=4,
+        )
+
+
+def _split_rows(found: _Assigned, where: str) -> list[Signals]:
+    """Return the rows of each episode, in the order of their steps, and cut where a recorder was restarted."""
+    roles, values = found.roles, found.values
+    rows = len(next(iter(values.values())))
+    number, step = np.zeros(rows, dtype=np.intp), None
+    if roles.episode is not None:
+        number = _number_episodes(found.columns[roles.episode], where)
+    if roles.step is not None and found.time is None:
+        step = checks.array(found.columns[roles.step], f"{where}: step", (None,))
+    X, U, W = (
+        np.array([values[name] for name in some]).reshape(len(some), rows).T.copy()
+        for some in (roles.states, roles.inputs, roles.disturbances)
+    )
+    parts: list[Signals] = []
+    for e in range(int(number.max(initial=-1)) + 1):
+        here = np.flatnonzero(number == e)
+        if step is not None:
+            here = here[np.argsort(step[here], kind="stable")]
+            if (np.diff(step[here]) != 1).any():
+                raise DataError(f"{where}, episode {e}: steps are missing or come twice; split it there")
+        time = None if found.time is None else found.time[here]
+        parts += restarts(Signals(time, X[here], U[here], W[here], here + 1, roles.states), where)
+    return parts
+
+
+def _choose_step(table: LogTable, told: TableSettings, found: _Assigned, parts: list[Signals], where: str) -> float:
+    """Return the sample time [s]: as given, as the file states it, or as its clock shows it."""
+    dt = told.resample if told.resample is not None else told.dt
+    if found.time is not None:
+        usual = sample_time([part.time for part in parts if part.time is not None], where)
+        if dt is None and table.names[: len(SAVED)] == SAVED:
+            dt = _find_exact_step(found.columns[SAVED[1]], found.time)
+        dt = usual if dt is None else dt
+    elif dt is None:
+        dt = table.dt
+    if dt is None:
+        even = next((name for name in found.roles.states if _even(found.values[name])), None)
+        clock = "" if even is None else f"; {even!r} looks like it: rename it by columns="
+        raise DataError(
+            f"{where} does not say its sample time: pass dt=, or add a column 'time [s]'{clock}; its columns are "
+            f"{', '.join(table.names)}"
+        )
+    return checks.positive(dt, "dt", "s")
 
 
 def _say_set_points(names: Sequence[str]) -> str:
@@ -186,7 +221,7 @@ def _rename_columns(table: LogTable, told: TableSettings, where: str) -> LogTabl
     return table.renamed(told.rename(table.names, where))
 
 
-def _find_clock(names: list[str], columns: Mapping[str, np.ndarray], told: TableSettings, where: str) -> str | None:
+def _find_clock(names: Sequence[str], columns: Mapping[str, np.ndarray], told: TableSettings, where: str) -> str | None:
     """Return the first column of a table without names where it grows by the same in each row, as time does."""
     first = names[0]
     if first in told.named or columns[first].dtype.kind not in "fiu" or not _even(columns[first]):
@@ -240,24 +275,15 @@ def _like_a_number(cell: object) -> bool:
     return True
 
 
-_USUAL = 0.99  # quantile of |cells| that counts as usual in a column
-_ABSURD = 1e6  # a cell this many times larger than the usual one is an error
-_MANY = 100  # a column with fewer cells is not checked
-
-
-def _plausible(column: Float[np.ndarray, " M"], name: str, where: str) -> None:
-    """Raise where one cell is a million times larger than 99 % of the column, or no model could compute with it.
-
-    Raises
-    ------
-    DataError
-        The message names the row.
-    """
+def _plausible(
+    column: Float[np.ndarray, " M"], name: str, where: str, *, many: int = 100, absurd: float = 1e6, most: float = 1e30
+) -> None:
+    """Raise where a cell of `many` or more is `absurd` times larger than 99 % of them, or above what models compute."""
     size = np.abs(column[np.isfinite(column)])
-    if not len(size):
+    if len(size) < many:
         return
-    usual, largest = float(np.quantile(size, _USUAL, method="lower")), float(size.max())
-    if len(size) >= _MANY and (largest > 1e30 or (usual > 0 and largest > _ABSURD * usual)):
+    usual, largest = float(np.quantile(size, 0.99, method="lower")), float(size.max())
+    if largest > most or (usual > 0 and largest > absurd * usual):
         row = int(np.nanargmax(np.where(np.isfinite(column), np.abs(column), np.nan)))
         raise DataError(
             f"{where}: {name!r} is {column[row]:g} in row {row + 1}, where 99 % of its cells are within {usual:.3g}; "
@@ -345,15 +371,9 @@ def _is_stepped(column: Float[np.ndarray, " M"]) -> bool:
     return 0 < int(np.count_nonzero(changes)) < len(changes) / 2
 
 
-def _number_episodes(labels: np.ndarray, file: Path) -> np.ndarray:
+def _number_episodes(labels: np.ndarray, where: str) -> np.ndarray:
     """Return 0, 1, … for the labels in the order in which they first come."""
-    if any(label is None or label != label for label in labels):
-        raise DataError(f"{file} has rows whose episode is null; give each row the name of its episode")
-    _, first, number = np.unique(labels, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), dtype=np.intp)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[number]
-
-
-def _stack(columns: list[np.ndarray], rows: int) -> Float[np.ndarray, "rows n"]:
-    return np.stack(columns, axis=1) if columns else np.empty((rows, 0))
+    if _is_missing(labels).any():
+        raise DataError(f"{where} has rows whose episode is null; give each row the name of its episode")
+    known: dict[object, int] = {}
+    return np.array([known.setdefault(label, len(known)) for label in labels.tolist()], dtype=np.intp)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from koopmpc.base.errors import DataError, LogError
-from koopmpc.data.files.foreign.arrays import tabulate_arrays
-from koopmpc.data.files.foreign.hdf5 import EXTRA, load_datasets
+from koopmpc.data.files.foreign.hdf5 import EXTRA, load_datasets, tabulate_arrays
 from koopmpc.data.files.formats import LogFormat, LogTable, register_format
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"  # begins an HDF5 file; MATLAB 7.3 writes it after 512 bytes of its own
@@ -35,9 +34,7 @@ def read_matlab(file: Path) -> LogTable:
         return tabulate_arrays(file, arrays, units)
     try:
         content = loadmat(file, struct_as_record=False, squeeze_me=True)
-    except (
-        Exception
-    ) as error:  # loadmat raises what it stumbles over: ValueError, TypeError, zlib.error, MemoryError, …
+    except Exception as error:  # loadmat raises what it stumbles over: ValueError, zlib.error, MemoryError, …
         raise LogError(f"{file} cannot be read as a .mat file: {error}; take another copy") from error
     arrays = dict[str, np.ndarray]()
     for name, value in content.items():
