@@ -15,9 +15,9 @@ from koopmpc.control.ask.preview import check_bounds_alone
 from koopmpc.control.base import PredictiveController
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller
 from koopmpc.control.move import Move, Plan, alone
-from koopmpc.control.plan.bounds import BoundRows, CallBounds, find_shape
 from koopmpc.control.plan.condensed import plan_condensed, publish_condensed
 from koopmpc.control.plan.condensed_program import CondensedProgram, planned_states
+from koopmpc.control.plan.in_time import BoundRows, CallBounds
 from koopmpc.control.plan.task import Moves, read_task
 from koopmpc.control.step.condensed import CondensedStep
 from koopmpc.control.step.observe import InitialCondition
@@ -247,8 +247,7 @@ class KoopmanMPC(PredictiveController):
     def _read_calls(self) -> CallBounds:
         """Return what reads the limits of calls."""
         if self._calls is None:
-            shape = find_shape(self._task, self.program.targets, self.program)
-            self._calls = CallBounds(BoundRows(shape, self._latency))
+            self._calls = CallBounds(BoundRows(self._task, self.program.targets, self.program))
         return self._calls
 
     def read_limits(self, limits: Limits) -> Limits:

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
-from scipy.linalg import null_space
 
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
@@ -16,17 +15,17 @@ from koopmpc.control.ask.cost import add_held
 from koopmpc.control.ask.limits import Interval, Softness, preview_margin
 from koopmpc.control.ask.terminal import EndRows, read_end
 from koopmpc.control.horizon import Condensed, Horizon, Terminal, WeightRows, build_stages, condense, horizon_of
-from koopmpc.control.plan.bounds import BoundRows, describe_bounds, find_shape
 from koopmpc.control.plan.condensed_program import (
     CondensedPlan,
     CondensedProgram,
     ConstantBounds,
+    PlanBounds,
     StepBounds,
     find_reach,
 )
-from koopmpc.control.plan.task import ControlTask
+from koopmpc.control.plan.in_time import BoundRows, PlansInTime, describe_bounds
+from koopmpc.control.plan.task import ControlTask, tie_moves
 from koopmpc.control.plan.tracking import LiftedTracking, soften_end
-from koopmpc.control.plan.weights import PlansInTime
 from koopmpc.control.program import no_export, reference_table, refuse_time_limit
 from koopmpc.control.riccati import Law, Stage, recursion
 from koopmpc.control.solvers import FINISHER
@@ -100,19 +99,13 @@ def limit_plan(
         last = len(low) - ends
         low[last - len(margin) : last] += margin
         high[last - len(margin) : last] -= margin
-    free = _list_held(held, track)
-    low[free], high[free], kept[free] = -np.inf, np.inf, False
-    return PlanLimits(low, high, Softness(linear, quadratic, allowance), size, place, kept)
-
-
-def _list_held(held: Bool[np.ndarray, "moves nu"], track: LiftedTracking) -> Int[np.ndarray, " n"]:
-    """Return the entries of inputs that keep their value, except those that a search over levels needs, and rates."""
-    searched = np.zeros(held.shape[1], dtype=np.bool_)
-    levels = track.limits.base.input_levels(held.shape[1]) if held.any() else None
+    searched = np.zeros(nu, dtype=np.bool_)  # a search over levels needs limits of held inputs, too
+    levels = track.limits.base.input_levels(nu) if held.any() else None
     if levels is not None:
         searched[levels.which] = True
-    rows = np.flatnonzero((held & ~searched).ravel())
-    return rows if track.rates is None else np.append(rows, held.size + np.flatnonzero(held.ravel()))
+    free = np.flatnonzero(np.concatenate([(held & ~searched).ravel(), held.ravel()][: 1 + (track.rates is not None)]))
+    low[free], high[free], kept[free] = -np.inf, np.inf, False
+    return PlanLimits(low, high, Softness(linear, quadratic, allowance), size, place, kept)
 
 
 def build_qp(maps: Condensed, limits: PlanLimits, changes: int, stages: QPStages | None) -> StepQP:
@@ -146,47 +139,6 @@ def build_qp(maps: Condensed, limits: PlanLimits, changes: int, stages: QPStages
     )
 
 
-def tie_moves(maps: Condensed, held: Bool[np.ndarray, "moves nu"]) -> Condensed:
-    """Return the maps of a plan whose inputs keep their value from the move before where they are `held`.
-
-    In Riccati coordinates a plan costs unit · ‖w‖² above the one without ties, v + D w. The ties are T (v + D w) = 0,
-    so the cheapest plan that keeps them has w = −(T D)⁺ T v, and every other one adds a w of the null space of T D.
-    The null space is turned so that its first column moves the first free input and all later ones, and so on; the
-    entries of w that are left over move nothing.
-    """
-    moves, nu = held.shape
-    n, none = moves * nu, np.zeros(maps.deviation.shape)
-    tied, free = np.flatnonzero(held.ravel()), np.flatnonzero(~held.ravel())
-    D = maps.deviation
-    T = np.zeros((len(tied), n))
-    T[np.arange(len(tied)), tied], T[np.arange(len(tied)), tied - nu] = 1.0, -1.0
-    TD = T @ D[:n]
-    back = -D @ np.linalg.pinv(TD)
-    basis = null_space(TD)
-    basis = basis @ np.linalg.qr((D[free] @ basis).T)[0]
-    none[:, free] = D @ basis
-
-    def tie(rows: Float[np.ndarray, "nv m"]) -> Float[np.ndarray, "nv m"]:
-        return rows + back @ (T @ rows[:n])
-
-    def exact(rows: Float[np.ndarray, "nv m"]) -> Float[np.ndarray, "nv m"]:
-        """Return rows in which a tied input is that of the move before, to the bit."""
-        for i in tied:
-            rows[i] = rows[i - nu]
-        return rows
-
-    return replace(
-        maps,
-        from_state=exact(tie(maps.from_state)),
-        from_reference=exact(tie(maps.from_reference)),
-        from_target=exact(tie(maps.from_target)),
-        from_given=exact(tie(maps.from_given)),
-        from_drive=exact(tie(maps.from_drive)),
-        offset=exact(tie(maps.offset[:, None]))[:, 0],
-        deviation=exact(none),
-    )
-
-
 def plan_condensed(task: ControlTask) -> CondensedProgram:
     """Return the program of a task.
 
@@ -206,7 +158,6 @@ def plan_condensed(task: ControlTask) -> CondensedProgram:
             raise DataError(f"the limits have {what} and a terminal ellipsoid; pass a polytope, or no terminal set")
     first = len(plan.deviation) * (1 if track.rates is None else 2)
     solved = limits.priority is not None and levels is None and not task.by_weights
-    layout, unpushed = (first, task.N, len(plan.offset)), plan.unpushed if plan.aimed and not plan.is_driven else HUGE
     program = CondensedProgram(
         **vars(plan),
         controller="KoopmanMPC",
@@ -223,18 +174,10 @@ def plan_condensed(task: ControlTask) -> CondensedProgram:
         with_rates=track.with_rates,
         hard_rates=track.hard_rates,
         plans=None,
-        step_bounds=BoundRows(find_shape(task, targets, plan), task.latency).read(limits, at_call=False)
-        if limits.in_time
-        else ConstantBounds(
-            StepBounds(plan.low, plan.high, unpushed),
-            track.inputs,
-            track.rates,
-            track.hard_rates,
-            Interval(*(np.tile(side, len(blocks)) for side in track.inputs)),
-        ),
-        bounds=describe_bounds(find_shape(task, targets, plan)) if limits.in_time or limits.rows else None,
+        step_bounds=_bound_steps(task, targets, plan),
+        bounds=describe_bounds(task, targets, plan) if limits.in_time or limits.rows else None,
         input_levels=levels,
-        priority=spread_priorities(limits, model.states, layout) if solved else None,
+        priority=spread_priorities(limits, model.states, (first, task.N, len(plan.offset))) if solved else None,
         rule=task.estimator,
         time_limit=task.time_limit,
         solver_name="auto" if task.auto else task.solver,
@@ -244,14 +187,19 @@ def plan_condensed(task: ControlTask) -> CondensedProgram:
     if not track.weighed:
         return program
     alike = replace(task, coordinates="plain" if plan.coordinates == "plain" else "riccati")
-    plans = PlansInTime(track, task.N, task.latency, program, partial(plan_weights, alike, targets, terminal))
+    plans = PlansInTime(track, task.N, task.latency, program, partial(plan_matrices, alike, targets, terminal))
     plans.check_free_inputs()
     return replace(program, plans=plans)
 
 
-def plan_weights(task: ControlTask, targets: Targets, terminal: Terminal, rows: WeightRows) -> CondensedPlan:
-    """Return the plan of weights in time; targets and the end of the horizon are those of Q and R."""
-    return plan_matrices(task, targets, terminal, rows)[0]
+def _bound_steps(task: ControlTask, targets: Targets, plan: CondensedPlan) -> PlanBounds:
+    """Return the limits of each step."""
+    track = task.track
+    if track.limits.in_time:
+        return BoundRows(task, targets, plan).read(track.limits, at_call=False)
+    step = StepBounds(plan.low, plan.high, plan.unpushed if plan.aimed and not plan.is_driven else HUGE)
+    moves = Interval(*(np.tile(side, len(task.moves.lengths)) for side in track.inputs))
+    return ConstantBounds(step, track.inputs, track.rates, track.hard_rates, moves)
 
 
 @checks.explain_overflow()
@@ -418,22 +366,25 @@ def publish_condensed(
 
     C has one plan, solved by the finisher, in Riccati coordinates; weights stand for priorities.
     """
-    if program.input_levels is not None and program.levels is None:
-        raise no_export(
-            controller,
+    for refused, why, instead in (
+        (
+            program.input_levels is not None and program.levels is None,
             "only some of its inputs or steps are on levels, and this search has no C code",
             "one whose inputs are all on levels in all steps",
-        )
-    if program.plans is not None:
-        raise no_export(
-            controller, "its weights move in time, and its C holds one plan", "one without Cost(Q_rows=…, R_rows=…)"
-        )
-    if program.ball is not None:
-        raise no_export(
-            controller,
+        ),
+        (
+            program.plans is not None,
+            "its weights move in time, and its C holds one plan",
+            "one without Cost(Q_rows=…, R_rows=…)",
+        ),
+        (
+            program.ball is not None,
             "Clarabel solves its QP with a terminal ellipsoid",
             "one with a polytope, or without a terminal set",
-        )
+        ),
+    ):
+        if refused:
+            raise no_export(controller, why, instead)
     rows, notes = reference_table(reference, program.nr), ()
     refuse_time_limit(task.time_limit, 'solver="daqp", settings={"iter_limit": 100}')
     if program.priority is not None:

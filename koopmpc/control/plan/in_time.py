@@ -1,17 +1,18 @@
-"""Limits of a plan, step by step: those that hold, and those that rows in time, or a call, bring."""
+"""What moves in time: the limits of each step from a table of rows, and a plan for each preview of weights."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from koopmpc.base.checks import HUGE
-from koopmpc.base.values import Interval, Value
+from koopmpc.base.errors import DefinitenessError
+from koopmpc.base.values import Interval
 from koopmpc.control.ask.bounds import refuse_crossed_rows
 from koopmpc.control.ask.limits import Limits, preview_margin
 from koopmpc.control.ask.preview import check_bounds_alone, require_movable, require_preview
 from koopmpc.control.ask.terminal import EndReach, EndRows, measure_reach, read_end, require_inside
+from koopmpc.control.horizon import WeightRows
 from koopmpc.control.plan.condensed_program import BoundsProgram, CondensedPlan, StepBounds, find_reach
 from koopmpc.control.plan.task import ControlTask
 from koopmpc.control.plan.tracking import LiftedTracking
@@ -20,76 +21,23 @@ from koopmpc.control.target import ROUNDING, Targets
 _SHARE = 1e-5  # a rate that gives way by more than this share of its allowance is reported
 
 
-@dataclass(frozen=True, eq=False)
-class PlanShape(Value):
-    """What of a plan its limits depend on.
-
-    Attributes
-    ----------
-    track, targets
-        What is tracked and limited, and the equilibria.
-    blocks, held, tied
-        Lengths of the blocks of held inputs; moves that keep the value of the one before, and those without limits.
-    end, end_box
-        The rows of a terminal set, and their limits, which do not move.
-    aims_inside, checked
-        Whether limits move the targets of a plan; the limits of targets that a plan is tested by.
-    states, inputs
-        Names of the model.
-    """
-
-    track: LiftedTracking
-    targets: Targets
-    blocks: tuple[int, ...]
-    held: Bool[np.ndarray, "moves nu"]
-    tied: Bool[np.ndarray, " all_moves"]
-    end: EndRows | None
-    end_box: Interval
-    aims_inside: bool
-    checked: Bool[np.ndarray, " nl"]
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-
-
-def describe_bounds(shape: PlanShape) -> BoundsProgram:
+def describe_bounds(task: ControlTask, targets: Targets, plan: CondensedPlan) -> BoundsProgram:
     """Return how rows of limits become the limits of a plan."""
-    track, held, blocks = shape.track, shape.held, np.array(shape.blocks)
-    start = np.cumsum([0, *blocks[:-1]])
-    origin = np.maximum.accumulate(np.where(held, 0, np.arange(len(blocks))[:, None]), axis=0)
-    count = np.array([np.bincount(own, blocks, len(blocks))[own] for own in origin.T], dtype=np.intp).T
+    track, held, lengths = task.track, task.moves.held, np.array(task.moves.lengths)
+    start, origin = np.cumsum([0, *lengths[:-1]]), task.moves.origins()
+    count = np.array([np.bincount(own, lengths, len(lengths))[own] for own in origin.T], dtype=np.intp).T
     return BoundsProgram(
         first=start[origin],
         count=count,
         start=start,
         held=held,
-        tied=shape.tied,
-        margin=preview_margin(track.margin, sum(shape.blocks)),
-        values=shape.targets.values,
-        checked=np.flatnonzero(shape.checked),
+        tied=held.ravel() & ~np.isin(np.arange(held.size), plan.qp.source),
+        margin=preview_margin(track.margin, task.N),
+        values=targets.values,
+        checked=np.flatnonzero(plan.checked),
         hard=np.isinf(track.rate_softness.linear),
         allowance=track.rate_softness.allowance,
         outputs=track.movable.outputs,
-    )
-
-
-def find_shape(task: ControlTask, targets: Targets, plan: CondensedPlan) -> PlanShape:
-    """Return what the limits of a plan depend on."""
-    track, held, planned = task.track, task.moves.held, len(plan.offset)
-    wanted = track.limits.terminal
-    end = None if wanted is None else read_end(wanted, task.predictor)
-    last = slice(planned - (0 if end is None else len(end.F)), planned)
-    return PlanShape(
-        track=track,
-        targets=targets,
-        blocks=task.moves.lengths,
-        held=held,
-        tied=held.ravel() & ~np.isin(np.arange(held.size), plan.qp.source),
-        end=end,
-        end_box=Interval(plan.low[last], plan.high[last]),
-        aims_inside=plan.aimed and not plan.is_driven,
-        checked=plan.checked,
-        states=task.predictor.states,
-        inputs=task.predictor.inputs,
     )
 
 
@@ -98,42 +46,38 @@ class BoundRows:
 
     The table has a row for each step: inputs, their changes, outputs, a column without limits, the terminal set, and
     inputs over each length of a block.
-
-    Parameters
-    ----------
-    shape
-        What of a plan its limits depend on.
-    latency
-        Steps until the first input of a plan acts.
     """
 
-    def __init__(self, shape: PlanShape, latency: int) -> None:
-        self.shape, self.latency, self.N = shape, latency, sum(shape.blocks)
-        track, targets = shape.track, shape.targets
-        self.program = rows = describe_bounds(shape)
+    def __init__(self, task: ControlTask, targets: Targets, plan: CondensedPlan) -> None:
+        self.track, self.targets, self.latency, self.N = task.track, targets, task.latency, task.N
+        self.states, self.inputs = task.predictor.states, task.predictor.inputs
+        self.aims_inside = plan.aimed and not plan.is_driven
+        self.program = rows = describe_bounds(task, targets, plan)
+        track, wanted = self.track, self.track.limits.terminal
+        self.end = None if wanted is None else read_end(wanted, task.predictor)
         self.nu, self.rated, outs = len(track.inputs.low), track.rates is not None, len(track.outputs.low)
-        self.names = [*shape.states, *(() if track.limits.of is None else track.limits.of.bind(shape.states).names)]
+        nu, ends, planned = self.nu, 0 if self.end is None else len(self.end.F), len(plan.offset)
+        self.end_box = Interval(plan.low[planned - ends : planned], plan.high[planned - ends : planned])
+        self.names = [*self.states, *(() if track.limits.of is None else track.limits.of.bind(self.states).names)]
         movable = track.movable
-        read = np.concatenate([np.ones(self.nu, np.bool_), np.full(self.nu, self.rated), movable.outputs])
+        read = np.concatenate([np.ones(nu, np.bool_), np.full(nu, self.rated), movable.outputs])
         self.read_columns, self.targeted = np.flatnonzero(read), np.flatnonzero(np.delete(read, self._changes))
-        self.targeted[self.nu :] += self.nu
+        self.targeted[nu:] += nu
         self.fixed = np.flatnonzero(~np.concatenate(movable))
         self.kept = np.flatnonzero(movable.outputs)
         self.shown = [self.names[i] for i in self.kept]
         lengths = sorted({1, *rows.count.ravel().tolist()})
         self.used = {b: (rows.count == b).any(axis=0) | (b == 1) for b in lengths}  # the first one is 1
-        nu, ends = self.nu, len(shape.end_box.low)
-        change, output = nu, nu * (1 + self.rated)
+        output = nu * (1 + self.rated)
         self.free = output + outs
         end, self.blocked = self.free + 1, self.free + 1 + ends
         self.width = W = self.blocked + nu * (len(lengths) - 1)
         column = dict(zip(lengths, (0, *range(self.blocked, W, nu)), strict=True))
         moves = rows.first * W + np.vectorize(column.__getitem__, otypes=[np.intp])(rows.count) + np.arange(nu)
-        places: list[np.ndarray] = [np.where(shape.tied, self.free, moves.ravel())]
+        places: list[np.ndarray] = [np.where(rows.tied, self.free, moves.ravel())]
         if self.rated:
-            changes: Int[np.ndarray, "moves nu"] = rows.start[:, None] * W + change + np.arange(nu)
-            changes[shape.held] = self.free
-            places.append(changes.ravel())
+            changes: Int[np.ndarray, "moves nu"] = rows.start[:, None] * W + nu + np.arange(nu)
+            places.append(np.where(rows.held, self.free, changes).ravel())
         places.append((np.arange(1, self.N + 1)[:, None] * W + output + np.arange(outs)).ravel())
         places.append(end + np.arange(ends))
         self.places, self.moves = np.concatenate(places).astype(np.intp), moves.ravel()
@@ -145,7 +89,7 @@ class BoundRows:
         self.rounding = ROUNDING * targets.size[self.limited]
         self.size = np.abs(targets.rows[self.limited] @ targets.from_reference).sum(axis=1)
         self.shift = targets.rows[self.limited] @ targets.offset
-        self.checked = np.flatnonzero(shape.checked[self.limited])
+        self.checked = np.flatnonzero(plan.checked[self.limited])
         self.reach: EndReach | None = None  # the extremes on the terminal set, once they are asked for
 
     @property
@@ -163,7 +107,7 @@ class BoundRows:
         ShapeError
             A bound has too few rows for the plan, or as many signals as it should not.
         """
-        nu, nx = self.nu, len(self.shape.states)
+        nu, nx = self.nu, len(self.states)
         if at_call:
             require_preview(limits, self.N + self.latency)
         steps = 1 if at_call else max(limits.count_rows().values(), default=1)
@@ -176,11 +120,11 @@ class BoundRows:
             limits.write_rows("y", outputs[:, :, nx:], 0)
         if len(self.fixed) and np.isfinite(every[:, :, self.fixed]).any():
             groups = Interval(*box), Interval(*change), Interval(*outputs)
-            require_movable(self.shape.track.movable, groups, self.shape.inputs, self.names, nx)
+            require_movable(self.track.movable, groups, self.inputs, self.names, nx)
         table = np.empty((*every.shape[:2], self.width))
         table[:, :, : self.free] = every[:, :, self.read_columns]
         table[:, :, self.free] = [[-HUGE], [HUGE]]
-        for end, known in zip(table, self.shape.end_box, strict=True):
+        for end, known in zip(table, self.end_box, strict=True):
             end[:, self.free + 1 : self.blocked] = known
         for i, (b, used) in enumerate(self.used.items()):
             swept = Interval(*box) if b == 1 else sweep_rows(_hold_last(box, b - 1), b)
@@ -188,17 +132,17 @@ class BoundRows:
                 first = self.blocked + (i - 1) * nu
                 table[:, :, first : first + nu] = swept
             self._require_inputs(swept, used, f" within a block of {b} held steps" if b > 1 else "")
-        refuse_crossed_rows(*Interval(*change), "rate", self.shape.inputs)
+        refuse_crossed_rows(*Interval(*change), "rate", self.inputs)
         why, kept = " once tightened by the margin" if self.most.any() else "", outputs[:, :, self.kept]
         tight = Interval(kept[0] + self.most, kept[1] - self.most)
         refuse_crossed_rows(*tight, "state and output", self.shown, why=why)
-        if self.shape.end is not None:
-            self._require_end(self.shape.end, limits, (Interval(*box), Interval(*change), tight), self.shown)
+        if self.end is not None:
+            self._require_end(self.end, limits, (Interval(*box), Interval(*change), tight), self.shown)
         return BoundsInTime(self, steps, every, table)
 
     def _require_inputs(self, box: Interval, used: Bool[np.ndarray, " nu"], why: str) -> None:
         """Raise where limits of inputs cross, or an input on levels has none between them, of the inputs in use."""
-        limits, inputs = self.shape.track.limits, self.shape.inputs
+        limits, inputs = self.track.limits, self.inputs
         levels = None if limits.levels is None else limits.base.input_levels(len(inputs))
         low, high = box if used.all() else (np.where(used, box.low, -np.inf), np.where(used, box.high, np.inf))
         if levels is not None:
@@ -209,9 +153,9 @@ class BoundRows:
         self, end: EndRows, limits: Limits, rows: tuple[Interval, Interval, Interval], shown: Sequence[str]
     ) -> None:
         """Raise where the terminal set leaves limits of the inputs, their changes or the outputs after a plan's end."""
-        (box, change, outputs), inputs, first = rows, self.shape.inputs, self.N + self.latency
+        (box, change, outputs), inputs, first = rows, self.inputs, self.N + self.latency
         if self.reach is None:
-            self.reach = measure_reach(end.of, end.places, self.shape.track.limited, end.constant)
+            self.reach = measure_reach(end.of, end.places, self.track.limited, end.constant)
         require_inside("state and output", self.reach.outputs, outputs, first + 1, shown, moved=True)
         for what, reach, field, bounds in (
             ("input", self.reach.inputs, "u_", box),
@@ -232,12 +176,12 @@ class BoundsInTime:
         np.minimum(table, HUGE, out=table)
         self._low, self._high = table.reshape(2, -1)
         self._reaches: list[float] | None = None
-        shape, self._targets = rows.shape, every[:, :, rows.targeted] - rows.shape.targets.values
-        if shape.aims_inside or len(rows.checked):
+        self._targets = every[:, :, rows.targeted] - rows.targets.values
+        if rows.aims_inside or len(rows.checked):
             first = slice(rows.latency, rows.latency + steps + rows.N)
             swept = sweep_rows(self._targets[:, first, rows.limited], rows.N + 1)
             self._tight = Interval(swept.low - rows.rounding, swept.high + rows.rounding)
-            if shape.aims_inside:
+            if rows.aims_inside:
                 tight = (end - rows.shift for end in self._tight)
                 self._reaches = find_reach(rows.size, *tight).tolist()
 
@@ -311,16 +255,10 @@ class BoundsInTime:
 
 
 class CallBounds:
-    """Reads the limits of calls: those that `with_bounds` of the controller's own made by their numbers alone.
-
-    Parameters
-    ----------
-    rows
-        Reads rows of limits for the controller.
-    """
+    """Reads the limits of calls, which differ from the controller's own in bounds alone, by the rows of its plans."""
 
     def __init__(self, rows: BoundRows) -> None:
-        self._rows, self._limits = rows, rows.shape.track.limits
+        self._rows = rows
         self._last: tuple[Limits, BoundsInTime] | None = None
 
     def read(self, limits: Limits) -> BoundsInTime:
@@ -334,9 +272,9 @@ class CallBounds:
             A bound has too few rows for the plan.
         """
         if self._last is None or self._last[0] is not limits:
-            shape = self._rows.shape
-            known = check_bounds_alone(limits, self._limits, shape.states, shape.inputs)
-            self._last = limits, self._rows.read(known, at_call=True)
+            rows = self._rows
+            known = check_bounds_alone(limits, rows.track.limits, rows.states, rows.inputs)
+            self._last = limits, rows.read(known, at_call=True)
         return self._last[1]
 
 
@@ -353,3 +291,82 @@ def sweep_rows(rows: Float[np.ndarray, "2 T n"], steps: int) -> Interval:
 def _hold_last(rows: Float[np.ndarray, "2 T n"], count: int) -> Float[np.ndarray, "2 T_count n"]:
     """Return rows with the last one repeated so many times."""
     return np.concatenate([rows, np.repeat(rows[:, -1:], count, axis=1)], axis=1)
+
+
+_KEPT = 64  # plans that are kept; with weights of a day in hours all are found again after the first day
+
+
+class PlansInTime:
+    """Finds the plan of each step: made when its weights are met first, kept for steps with the same ones.
+
+    A plan depends on the weights of all of its steps, through the Riccati recursion. What the set points and the end
+    of the horizon are does not: these follow Q and R.
+
+    Parameters
+    ----------
+    track, N, latency
+        The cost with weights in time; steps of a plan; steps until its first input acts.
+    base
+        The plan of Q and R, for previews that hold nothing else.
+    make
+        Makes the plan of other weights, and something else.
+    """
+
+    def __init__(
+        self,
+        track: LiftedTracking,
+        N: int,
+        latency: int,
+        base: CondensedPlan,
+        make: Callable[[WeightRows], tuple[CondensedPlan, object]],
+    ) -> None:
+        self._track, self._N, self._latency, self._make = track, N, latency, make
+        Q, R = (np.tile(weight.diagonal(), (N, 1)) for weight in (track.Q, track.R))
+        self._base = self._key(Q, R)
+        self._plans = {self._base: base}
+
+    @staticmethod
+    def _key(Q: Float[np.ndarray, "N nr"], R: Float[np.ndarray, "N nu"]) -> bytes:
+        return Q[1:].tobytes() + R.tobytes()  # the weight of the present state changes no plan
+
+    def check_free_inputs(self) -> None:
+        """Raise where a plan of some later step cannot be made: only rows of R that hold a zero may do that.
+
+        Raises
+        ------
+        DefinitenessError
+            In the plan of a step some change of the inputs costs nothing.
+        """
+        cost = self._track.cost
+        steps = max(len(np.asarray(rows)) for rows in (cost.Q_rows, cost.R_rows) if rows is not None)
+        Q, R = cost.weight_rows(len(self._track.Q), len(self._track.R), 0, steps + self._N)
+        tried = set[bytes]()
+        for k in range(steps):
+            ahead = slice(k, k + self._N)
+            key = self._key(Q[ahead], R[ahead])
+            if R[ahead].min() <= 0 and key not in tried:
+                tried.add(key)
+                try:
+                    self._find(k)
+                except DefinitenessError as error:
+                    raise DefinitenessError(
+                        f"in the plan that begins at row {k} of Q_rows and R_rows {error}"
+                    ) from None
+
+    def at(self, k: int) -> CondensedPlan:
+        """Return the plan of step k."""
+        return self._find(k + self._latency)
+
+    def _find(self, row: int) -> CondensedPlan:
+        """Return the plan whose first input acts at this row of the weights."""
+        track = self._track
+        Q, R = track.cost.weight_rows(len(track.Q), len(track.R), row, self._N)
+        key = self._key(Q, R)
+        plan = self._plans.pop(key, None)
+        if plan is None:
+            plan, _ = self._make(WeightRows(Q, R))
+            while len(self._plans) >= _KEPT:
+                oldest = next(key for key in self._plans if key != self._base)
+                del self._plans[oldest]
+        self._plans[key] = plan
+        return plan
