@@ -29,7 +29,7 @@ from koopmpc.control.lqr import FeedbackProgram
 from koopmpc.control.nonlinear.staged_program import StagedProgram
 from koopmpc.control.nonlinear.stagewise import Sides
 from koopmpc.control.program import LinearProgram, StepProgram
-from koopmpc.control.solvers.daqp import DAQPSetup
+from koopmpc.control.solvers.scaled_qp import DAQPSetup
 from koopmpc.estimate.filter import FilterProgram
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.plants.graph import Graph

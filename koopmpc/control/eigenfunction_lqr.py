@@ -12,8 +12,9 @@ from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.interrupts import raise_swallowed
+from koopmpc.control.ask.checks import refuse_levels
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits, refuse_stage, refuse_steps
-from koopmpc.control.ask.limits import Limits, refuse_levels
+from koopmpc.control.ask.limits import Limits
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone

@@ -392,13 +392,9 @@ def _coordinates(
     if wanted != "riccati":
         back = np.linalg.inv(deviation[:n])  # w of the Riccati coordinates from u less its optimum
         H = back.T @ back
-        if wanted == "plain" or _condition(H) <= limit:
+        least, most = np.linalg.eigvalsh(H)[[0, -1]]
+        if wanted == "plain" or 0 < most <= limit * least:
             plain = deviation @ back
             plain[:n] = np.eye(n)
             return "plain", plain, H
     return "riccati", np.ascontiguousarray(deviation), np.eye(n)
-
-
-def _condition(H: Float[np.ndarray, "n n"]) -> float:
-    least, most = np.linalg.eigvalsh(H)[[0, -1]]
-    return float(most / least) if least > 0 else np.inf

@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError, ShapeError
+from koopmpc.control.ask.checks import refuse_levels
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits
-from koopmpc.control.ask.limits import Interval, Limits, clip_input, refuse_levels
+from koopmpc.control.ask.limits import Interval, Limits, clip_input
 from koopmpc.control.ask.preview import InputRows
 from koopmpc.control.horizon import horizon_of
 from koopmpc.control.kinds import BenchEntry, ControllerKind, register_controller

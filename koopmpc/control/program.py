@@ -17,7 +17,7 @@ from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Value
 from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Interval, Limits
-from koopmpc.control.solvers.daqp import DAQPSetup
+from koopmpc.control.solvers.scaled_qp import DAQPSetup
 from koopmpc.control.target import Targets
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.delay import Delay

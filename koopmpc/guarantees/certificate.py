@@ -13,8 +13,9 @@ from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import CertificateError, DataError
 from koopmpc.base.text import format_markdown_table
 from koopmpc.base.values import Value
+from koopmpc.control.ask.checks import refuse_levels
 from koopmpc.control.ask.cost import Cost
-from koopmpc.control.ask.limits import Interval, Limits, refuse_levels
+from koopmpc.control.ask.limits import Interval, Limits
 from koopmpc.control.ask.terminal import TerminalFeedback, TerminalSet
 from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.lqr import FeedbackLaw

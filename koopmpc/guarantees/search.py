@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
-from koopmpc.control.ask.limits import Limits, refuse_levels
+from koopmpc.control.ask.checks import refuse_levels
+from koopmpc.control.ask.limits import Limits
 from koopmpc.guarantees.deviation import DeviationModel
 from koopmpc.guarantees.error_bounds import ErrorBound, ErrorPairs
 from koopmpc.guarantees.semidefinite import FeedbackProof, FeedbackTask, solve_feedback

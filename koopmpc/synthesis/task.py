@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.values import Value
+from koopmpc.control.ask.checks import refuse_levels, refuse_priority
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits, refuse_stage
-from koopmpc.control.ask.limits import Limits, refuse_levels, refuse_priority
+from koopmpc.control.ask.limits import Limits
 from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.composed import evaluate_jacobians
 from koopmpc.lifting.state import State

@@ -197,3 +197,33 @@ def refuse_margin(limits: Any) -> None:
             f"the limits of state {i} cross once tightened: {low[i]:g} … {high[i]:g} with a margin of {most[i]:g}; "
             "pass a smaller margin, or a wider range"
         )
+
+
+def refuse_priority(limits: Any, who: str) -> None:
+    """Raise where soft limits have priorities, for a choice that compares controllers by weights alone.
+
+    Raises
+    ------
+    DataError
+        The limits have priorities.
+    """
+    if limits is not None and limits.priority is not None:
+        raise DataError(
+            f"the limits have a priority, which {who} does not know; weigh the limits with slack=, and make the"
+            " controller anew with the priority"
+        )
+
+
+def refuse_levels(limits: Any, who: str) -> None:
+    """Raise where inputs are on levels, for a law that does not search over them.
+
+    Raises
+    ------
+    DataError
+        The limits have levels.
+    """
+    if limits is not None and limits.levels is not None:
+        raise DataError(
+            f"the limits have levels={limits.levels}, which {who} does not keep;"
+            " take a KoopmanMPC, a LinearMPC, a BilinearMPC or a NonlinearMPC, or pass limits without levels"
+        )

@@ -265,36 +265,39 @@ def build_levels(
         No level is between the limits of its input; two levels are farther apart than du_max; a dwell time without
         levels, or one time for "on" of an input with more than two.
     """
-    nu = len(low)
-    if len(levels) != nu or (dwell is not None and len(dwell) != nu):
-        came = len(levels) if len(levels) != nu else len(dwell or ())
+    nu, times = len(low), [None] * len(low) if dwell is None else list(dwell)
+    if len(levels) != nu or len(times) != nu:
+        came = len(levels) if len(levels) != nu else len(times)
         raise ShapeError(f"levels and dwell have {came} entries, the plant {nu} inputs; pass one for each, or None")
-    which = [i for i, row in enumerate(levels) if row is not None]
-    parts: list[tuple[float, float, int, tuple[int, int]]] = []
-    times = [None] * nu if dwell is None else list(dwell)
-    for i in range(nu):
-        if levels[i] is None:
-            if times[i] is not None:
-                raise DataError(f"input {i} has a dwell time and no levels; give it levels, for example [0, 1]")
-            continue
-        row = np.asarray(levels[i], dtype=np.float64)
-        spacing, reach = float(row[1] - row[0]), _EVEN * float(row[1] - row[0])
-        allowed = row[(row >= low[i] - reach) & (row <= high[i] + reach)]
-        if not len(allowed):
-            raise DataError(
-                f"no level of input {i}, {row.tolist()}, is between its limits {low[i]:g} … {high[i]:g};"
-                " pass wider limits, or other levels"
-            )
-        if rates is not None and len(allowed) > 1 and spacing > min(rates[1][i], -rates[0][i]) + reach:
-            raise DataError(
-                f"a level of input {i} is {spacing:g} from the next one, and it may change by"
-                f" {min(rates[1][i], -rates[0][i]):g} in a step; pass a du_max of the spacing or more"
-            )
-        on, off = times[i] or (1, 1)
-        if on != off and len(row) > 2:
-            raise DataError(f"input {i} has {len(row)} levels and dwell times for on and off; pass one time for all")
-        parts.append((float(allowed[0]), spacing, len(allowed), (off if allowed[0] == row[0] else on, on)))
+    reach = np.full(nu, np.inf) if rates is None else np.minimum(rates[1], -rates[0])
+    which = [i for i in range(nu) if levels[i] is not None]
+    bare = next((i for i in range(nu) if levels[i] is None and times[i] is not None), None)
+    if bare is not None:
+        raise DataError(f"input {bare} has a dwell time and no levels; give it levels, for example [0, 1]")
+    parts = [_allow_levels(i, np.asarray(levels[i]), times[i] or (1, 1), (low[i], high[i]), reach[i]) for i in which]
     if not parts:
         return None
     first, gaps, count, pairs = zip(*parts, strict=True)
     return InputLevels(np.array(which), np.array(first), np.array(gaps), np.array(count), np.array(pairs), steps)
+
+
+def _allow_levels(
+    i: int, row: Float[np.ndarray, " count"], dwell: tuple[int, int], ends: tuple[float, float], change: float
+) -> tuple[float, float, int, tuple[int, int]]:
+    """Return the lowest level of input i inside its limits, their spacing and number, and least steps (off, on)."""
+    (low, high), (on, off), spacing = ends, dwell, float(row[1] - row[0])
+    near = _EVEN * spacing
+    allowed = row[(row >= low - near) & (row <= high + near)]
+    if not len(allowed):
+        raise DataError(
+            f"no level of input {i}, {row.tolist()}, is between its limits {low:g} … {high:g};"
+            " pass wider limits, or other levels"
+        )
+    if len(allowed) > 1 and spacing > change + near:
+        raise DataError(
+            f"a level of input {i} is {spacing:g} from the next one, and it may change by"
+            f" {change:g} in a step; pass a du_max of the spacing or more"
+        )
+    if on != off and len(row) > 2:
+        raise DataError(f"input {i} has {len(row)} levels and dwell times for on and off; pass one time for all")
+    return float(allowed[0]), spacing, len(allowed), (off if allowed[0] == row[0] else on, on)

@@ -356,36 +356,6 @@ class Limits(Value):
         return Interval(*(np.concatenate(each) for each in zip(self.states(nx), outputs, strict=True)))
 
 
-def refuse_priority(limits: Limits | None, who: str) -> None:
-    """Raise where soft limits have priorities, for a choice that compares controllers by weights alone.
-
-    Raises
-    ------
-    DataError
-        The limits have priorities.
-    """
-    if limits is not None and limits.priority is not None:
-        raise DataError(
-            f"the limits have a priority, which {who} does not know; weigh the limits with slack=, and make the"
-            " controller anew with the priority"
-        )
-
-
-def refuse_levels(limits: Limits | None, who: str) -> None:
-    """Raise where inputs are on levels, for a law that does not search over them.
-
-    Raises
-    ------
-    DataError
-        The limits have levels.
-    """
-    if limits is not None and limits.levels is not None:
-        raise DataError(
-            f"the limits have levels={limits.levels}, which {who} does not keep;"
-            " take a KoopmanMPC, a LinearMPC, a BilinearMPC or a NonlinearMPC, or pass limits without levels"
-        )
-
-
 def _declares(limits: Limits, what: str) -> bool:
     """Return whether a bound of u, du, x or y may come with a step."""
     return f"{what}_min" in limits.rows or f"{what}_max" in limits.rows

@@ -16,8 +16,8 @@ from koopmpc.control.program import LinearProgram
 from koopmpc.control.solvers import FINISHER
 from koopmpc.control.solvers.ball import Ball
 from koopmpc.control.solvers.base import SolverTurn, StepQP
-from koopmpc.control.solvers.daqp import DAQPSetup
 from koopmpc.control.solvers.levels import LevelSearch, LevelSolver
+from koopmpc.control.solvers.scaled_qp import DAQPSetup
 from koopmpc.control.solvers.sequences import LevelsProgram
 from koopmpc.estimate.observer import Estimator, EstimatorProgram, estimator_program, start_observer
 from koopmpc.models.predictors import LinearPredictor

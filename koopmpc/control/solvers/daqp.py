@@ -14,20 +14,18 @@ updates", IEEE Trans. Automatic Control 67(8), 2022.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
-from koopmpc.base.values import Value
 from koopmpc.control.ask.limits import Interval
 from koopmpc.control.move import Status
 from koopmpc.control.solvers.base import INFINITY, QP, QPSolution, QPSolver, StepQP
-from koopmpc.control.solvers.scaled_qp import ACCURACY, ScaledQP
+from koopmpc.control.solvers.scaled_qp import ACCURACY, DAQPSetup, ScaledQP
 
 # eta_prox: DAQP's own 1e-6 is all that remains of its accuracy where P is singular.
 DEFAULTS: Mapping[str, Any] = {"primal_tol": 1e-8, "eta_prox": 1e-9}
@@ -63,37 +61,6 @@ _STATUS = {
     _ITERATIONS: Status.MAX_ITERATIONS,
     _TIME_LIMIT: Status.TIME_LIMIT,
 }
-
-
-@dataclass(frozen=True, eq=False)
-class DAQPSetup(Value):
-    """½ xᵀH x → min, low ≤ M x ≤ high, v = D x: a QP with q = 0 as DAQP solves it.
-
-    Attributes
-    ----------
-    H, M
-        (n, n), (m, n).
-    columns, rows
-        (n,) the diagonal D, (m,) the factor of each row and of its limits.
-    soft
-        (m,) whether a row may be broken by ε ≥ 0 at the price linear ε + ½ curvature ε².
-    linear, curvature
-        (m,) these prices, by the scaled row.
-    metric
-        (n, n) AᵀA of the hard rows where these are so close to dependent that proximal points solve the QP; else None.
-    settings
-        All settings of DAQP.
-    """
-
-    H: Float[np.ndarray, "n n"]
-    M: Float[np.ndarray, "m n"]
-    columns: Float[np.ndarray, " n"]
-    rows: Float[np.ndarray, " m"]
-    soft: Bool[np.ndarray, " m"]
-    linear: Float[np.ndarray, " m"]
-    curvature: Float[np.ndarray, " m"]
-    metric: Float[np.ndarray, "n n"] | None
-    settings: Mapping[str, Any]
 
 
 def daqp_settings(settings: Mapping[str, Any] | None = None) -> dict[str, Any]:

@@ -1,8 +1,13 @@
 """ScaledQP: a QP in units of its own, in which DAQP's absolute tolerances are relative ones."""
 
-import numpy as np
-from jaxtyping import Float
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+from jaxtyping import Bool, Float
+
+from koopmpc.base.values import Value
 from koopmpc.control.solvers.base import QP
 
 ACCURACY = 1e-6  # of the scaled KKT conditions where P is not diagonal and definite, relative
@@ -78,3 +83,34 @@ class ScaledQP:
             and (short <= little).all()
             and inside.max(initial=0.0) <= near
         )
+
+
+@dataclass(frozen=True, eq=False)
+class DAQPSetup(Value):
+    """½ xᵀH x → min, low ≤ M x ≤ high, v = D x: a QP with q = 0 as DAQP solves it.
+
+    Attributes
+    ----------
+    H, M
+        (n, n), (m, n).
+    columns, rows
+        (n,) the diagonal D, (m,) the factor of each row and of its limits.
+    soft
+        (m,) whether a row may be broken by ε ≥ 0 at the price linear ε + ½ curvature ε².
+    linear, curvature
+        (m,) these prices, by the scaled row.
+    metric
+        (n, n) AᵀA of the hard rows where these are so close to dependent that proximal points solve the QP; else None.
+    settings
+        All settings of DAQP.
+    """
+
+    H: Float[np.ndarray, "n n"]
+    M: Float[np.ndarray, "m n"]
+    columns: Float[np.ndarray, " n"]
+    rows: Float[np.ndarray, " m"]
+    soft: Bool[np.ndarray, " m"]
+    linear: Float[np.ndarray, " m"]
+    curvature: Float[np.ndarray, " m"]
+    metric: Float[np.ndarray, "n n"] | None
+    settings: Mapping[str, Any]
