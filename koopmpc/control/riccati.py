@@ -78,13 +78,6 @@ def recursion(stages: Sequence[Stage], P_N: Float[np.ndarray, "nx nx"], p_N: Flo
     A step loses eps ‖A‖² of the digits of P, in balanced units. If this is more than 1e-9, as with models whose
     observables are almost dependent, or if P has lost its definiteness, the same recursion goes backwards on a root F
     of P = FᵀF (`step_root`): it loses eps ‖A‖ and takes ten times as long.
-
-    Raises
-    ------
-    DefinitenessError
-        R + BᵀPB is not positive definite at some stage, in exact arithmetic.
-    DataError
-        The model's forecast overflows within the horizon.
     """
     if np.finfo(float).eps * max(map(_growth, {id(stage.A): stage.A for stage in stages}.values())) ** 2 < DIGITS:
         try:
@@ -145,13 +138,6 @@ def step_root(
 
     With a root [W_u W_x] of the stage cost, the triangular factor of [W_u W_x; F B  F A] is [Lᵀ LᵀK; 0 F] of the stage
     before. It is the same to rounding whatever the units of x and u are.
-
-    Raises
-    ------
-    DefinitenessError
-        R + BᵀPB is not positive definite.
-    OverflowError
-        The model's forecast overflows.
 
     References
     ----------

@@ -56,11 +56,6 @@ def terminal_of(
 
     The default tail of a model with a fit report or a scale is no longer than the model is accurate, see
     `learned_steps`; that of a given model goes on until it rests.
-
-    Raises
-    ------
-    ShapeError
-        Q_N has another size than z or the state, or weighs a state of which there is no reference.
     """
     if cost.Q_N is not None:
         return _weigh_end(predictor, cost, horizon, targets)
@@ -149,11 +144,6 @@ def tail_of(stage: Stage, steps: int | None) -> Tail:
     """Return the tail of this many steps, all of them `stage`; its last state is weighed like the others.
 
     With None it goes on until it rests. K and v are those of its first step, without steps those of a step before it.
-
-    Raises
-    ------
-    DefinitenessError
-        R + BᵀPB is not positive definite at some step.
     """
     A, B, _, _, _, e, q, r = stage
     if e is None or q is None or r is None:

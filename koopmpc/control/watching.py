@@ -62,12 +62,6 @@ def register_monitor(make: MonitorMaker) -> None:
 
 
 def find_monitor(given: StepMonitor | Episodes, model: object) -> StepMonitor:
-    """Return the monitor of a controller, made of the data where these were given.
-
-    Raises
-    ------
-    DataError
-        The controller's model was not fitted to data, or the monitor is of another lifting.
-    """
+    """Return the monitor of a controller, made of the data where these were given."""
     load_joint("monitor")
     return _MAKERS[0](given, model)

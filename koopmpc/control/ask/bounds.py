@@ -32,15 +32,7 @@ def list_bound(bound: Any) -> list[Any]:
 
 
 def check_bound(bound: Any, end: str) -> Any:
-    """Return a bound as a float64 array of at most two dimensions, or as numbers and columns by name.
-
-    Raises
-    ------
-    ShapeError
-        It has more than two dimensions, no row, or columns of unequal lengths.
-    DataError
-        It holds NaN or no numbers.
-    """
+    """Return a bound as a float64 array of at most two dimensions, or as numbers and columns by name."""
     if not isinstance(bound, Mapping):
         value = checks.array(bound, end, infinite=True)
         if value.ndim > 2 or (value.ndim == 2 and not value.size):
@@ -81,13 +73,7 @@ def order_bound(bound: BoundByName, end: str, names: Sequence[str], omitted: flo
 def hold_rows(
     bound: ArrayLike | None, end: str, n: int, first: int, count: int, omitted: float
 ) -> Float[np.ndarray, "count n"]:
-    """Return rows first … first + count − 1 of a bound of n signals; a vector is held, as the last row is.
-
-    Raises
-    ------
-    ShapeError
-        Its rows have another number of signals.
-    """
+    """Return rows first … first + count − 1 of a bound of n signals; a vector is held, as the last row is."""
     rows = np.empty((count, n))
     write_rows(rows, bound, end, first, omitted)
     return rows
@@ -123,15 +109,7 @@ def find_widest(bound: Float[np.ndarray, "T n"], omitted: float) -> Float[np.nda
 
 
 def require_room(low: Any, high: Any, low_name: str, high_name: str, name: str, signals: Sequence[str] = ()) -> None:
-    """Raise where no number is between the limits, in any row; `signals` name them, where names are known.
-
-    Raises
-    ------
-    ShapeError
-        The two have other numbers of signals, or of rows.
-    DataError
-        They cross; a lower limit is +inf, or an upper one −inf.
-    """
+    """Raise where no number is between the limits, in any row; `signals` name them, where names are known."""
     lower = np.atleast_1d(-np.inf if low is None else low)
     upper = np.atleast_1d(np.inf if high is None else high)
     steps = max([len(end) for end in (lower, upper) if end.ndim == 2], default=0)

@@ -200,13 +200,7 @@ def refuse_margin(limits: Any) -> None:
 
 
 def refuse_priority(limits: Any, who: str) -> None:
-    """Raise where soft limits have priorities, for a choice that compares controllers by weights alone.
-
-    Raises
-    ------
-    DataError
-        The limits have priorities.
-    """
+    """Raise where soft limits have priorities, for a choice that compares controllers by weights alone."""
     if limits is not None and limits.priority is not None:
         raise DataError(
             f"the limits have a priority, which {who} does not know; weigh the limits with slack=, and make the"
@@ -215,13 +209,7 @@ def refuse_priority(limits: Any, who: str) -> None:
 
 
 def refuse_levels(limits: Any, who: str) -> None:
-    """Raise where inputs are on levels, for a law that does not search over them.
-
-    Raises
-    ------
-    DataError
-        The limits have levels.
-    """
+    """Raise where inputs are on levels, for a law that does not search over them."""
     if limits is not None and limits.levels is not None:
         raise DataError(
             f"the limits have levels={limits.levels}, which {who} does not keep;"

@@ -257,15 +257,7 @@ class Cost(Value):
 
 @raise_swallowed()
 def trace_stage(stage: StageCost, nx: int, nu: int) -> Graph:
-    """Return the graph of ℓ(x, u), a number, of nx states and nu inputs.
-
-    Raises
-    ------
-    DataError
-        The function raises, or holds an operation that a graph cannot hold.
-    ShapeError
-        It is of other sizes, or returns no single number.
-    """
+    """Return the graph of ℓ(x, u), a number, of nx states and nu inputs."""
     if isinstance(stage, Graph):
         if (stage.n, stage.m) != (nx + nu, 1):
             raise ShapeError(
@@ -308,13 +300,7 @@ def add_held(
 
 
 def refuse_steps(cost: Cost, limits: Limits) -> None:
-    """Raise where limits have rows in time or inputs a price, for a law or a search that knows neither.
-
-    Raises
-    ------
-    DataError
-        There is one of the two.
-    """
+    """Raise where limits have rows in time or inputs a price, for a law or a search that knows neither."""
     if limits.in_time:
         end = next(iter(limits.count_rows()))
         raise DataError(
@@ -329,13 +315,7 @@ def refuse_steps(cost: Cost, limits: Limits) -> None:
 
 
 def refuse_stage(cost: Cost, who: str, *, in_time: bool = False) -> None:
-    """Raise where the cost has a stage of its own, or weights in time that who asks does not know.
-
-    Raises
-    ------
-    DataError
-        It has one of the two.
-    """
+    """Raise where the cost has a stage of its own, or weights in time that who asks does not know."""
     if cost.weighs_in_time and not in_time:
         raise DataError(
             f"the cost has rows of weights in time, which {who} does not know; take a KoopmanMPC, a LinearMPC, a "
@@ -351,13 +331,7 @@ def refuse_stage(cost: Cost, who: str, *, in_time: bool = False) -> None:
 def check_cost_and_limits(
     cost: object, limits: object, states: Sequence[str], inputs: Sequence[str]
 ) -> tuple[Cost, Limits]:
-    """Return the cost and the limits of a plant with these names, no limits for None.
-
-    Raises
-    ------
-    DataError
-        One is something else, perhaps the other; or names a signal that the plant does not have.
-    """
+    """Return the cost and the limits of a plant with these names, no limits for None."""
     if not isinstance(cost, Cost):
         raise DataError(f"cost is {checks.article(cost)}; pass a Cost, and the Limits after it")
     if limits is None:
@@ -370,13 +344,7 @@ def check_cost_and_limits(
 
 
 def _drop_constant_rows(cost: Cost, states: Sequence[str], inputs: Sequence[str]) -> Cost:
-    """Return the cost without rows that are all the diagonal of their weight, so that plans are alike to the bit.
-
-    Raises
-    ------
-    ShapeError
-        Such rows are not as long as what is tracked, or the inputs.
-    """
+    """Return the cost without rows that are all the diagonal of their weight, so that plans are alike to the bit."""
     dropped: dict[str, None] = {}
     for name, given in (("Q_rows", cost.Q), ("R_rows", cost.R)):
         rows, weight = getattr(cost, name), np.asarray(given, dtype=np.float64)

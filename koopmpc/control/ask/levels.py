@@ -68,13 +68,7 @@ class InputLevels(Value):
         return LevelBox(np.maximum(least, 0).astype(np.intp), np.minimum(most, self.count - 1).astype(np.intp))
 
     def refuse_missing(self, box: Interval, inputs: Sequence[str], why: str = "") -> None:
-        """Raise where no level of an input is between its limits (steps, nu), and name the input and the step.
-
-        Raises
-        ------
-        DataError
-            There is none.
-        """
+        """Raise where no level of an input is between its limits (steps, nu), and name the input and the step."""
         inside = self.inside(box)
         none = np.argwhere(inside.low > inside.high)
         if len(none):
@@ -184,13 +178,7 @@ def leveled_moves(levels: InputLevels, blocks: Sequence[int]) -> int:
 
 
 def check_levels(levels: Any) -> Any:
-    """Return levels with an array for each input, None where one has none.
-
-    Raises
-    ------
-    DataError
-        They are not two, or not evenly spaced and in order.
-    """
+    """Return levels with an array for each input, None where one has none."""
     if isinstance(levels, Mapping):
         named = cast("Mapping[str, Any]", levels)
         if not named:
@@ -219,13 +207,7 @@ def _check_values(values: Any, name: str) -> Float[np.ndarray, " count"]:
 
 
 def check_dwell(dwell: Any) -> Any:
-    """Return dwell times as (least steps at the lowest level, least steps at another) of each input.
-
-    Raises
-    ------
-    DataError
-        A dwell time is no whole number above zero.
-    """
+    """Return dwell times as (least steps at the lowest level, least steps at another) of each input."""
     if isinstance(dwell, Mapping):
         named = cast("Mapping[str, Any]", dwell)
         return {str(name): _check_pair(pair, str(name)) for name, pair in named.items()}
@@ -255,16 +237,7 @@ def build_levels(
     high: Float[np.ndarray, " nu"],
     rates: tuple[Float[np.ndarray, " nu"], Float[np.ndarray, " nu"]] | None,
 ) -> InputLevels | None:
-    """Return the levels of nu inputs that are inside their limits; None where no input has any.
-
-    Raises
-    ------
-    ShapeError
-        There is not one entry for each input.
-    DataError
-        No level is between the limits of its input; two levels are farther apart than du_max; a dwell time without
-        levels, or one time for "on" of an input with more than two.
-    """
+    """Return the levels of nu inputs that are inside their limits; None where no input has any."""
     nu, times = len(low), [None] * len(low) if dwell is None else list(dwell)
     if len(levels) != nu or len(times) != nu:
         came = len(levels) if len(levels) != nu else len(times)

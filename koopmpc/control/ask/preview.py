@@ -38,13 +38,7 @@ class InputRows:
 
 
 def require_preview(limits: Limits, steps: int, who: str = "the plan") -> None:
-    """Raise where a bound has fewer rows than a plan or a run reads, u_0 … u_{steps−1} and x_0 … x_steps.
-
-    Raises
-    ------
-    ShapeError
-        A bound has too few rows.
-    """
+    """Raise where a bound has fewer rows than a plan or a run reads, u_0 … u_{steps−1} and x_0 … x_steps."""
     for end, count in limits.count_rows().items():
         needed = steps + (end[0] in "xy")
         if count < needed:
@@ -55,13 +49,7 @@ def require_preview(limits: Limits, steps: int, who: str = "the plan") -> None:
 
 
 def check_bounds_alone(limits: object, own: Limits, states: Sequence[str], inputs: Sequence[str]) -> Limits:
-    """Return the limits of a call with arrays in place of names.
-
-    Raises
-    ------
-    DataError
-        They are no Limits, or differ from the controller's own in more than bounds.
-    """
+    """Return the limits of a call with arrays in place of names."""
     if not isinstance(limits, Limits):
         raise DataError(f"limits is {checks.article(limits)}; pass controller.limits.with_bounds(u_max=…)")
     known = limits.resolve(states, inputs)
@@ -88,11 +76,6 @@ def require_movable(
         The limits of these in time, (steps, n) each.
     inputs, outputs
         Their names; the first `nx` outputs are states.
-
-    Raises
-    ------
-    DataError
-        A limit has no row.
     """
     for group, can_move, box in zip(_GROUPS, movable, boxes, strict=True):
         low, high = (np.isfinite(end) & ~can_move for end in box)

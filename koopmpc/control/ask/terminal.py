@@ -163,13 +163,7 @@ class EndRows(NamedTuple):
 
 
 def read_terminal_set(given: object) -> TerminalSet:
-    """Return the terminal set that a user passes.
-
-    Raises
-    ------
-    DataError
-        It is neither a set nor has one.
-    """
+    """Return the terminal set that a user passes."""
     found = given.terminal_set() if isinstance(given, HasTerminalSet) else given
     checks.kind(found, "terminal", TerminalSet, _ADVICE)
     assert isinstance(found, TerminalSet)
@@ -177,15 +171,7 @@ def read_terminal_set(given: object) -> TerminalSet:
 
 
 def read_end(given: TerminalSet | HasTerminalSet, predictor: LinearPredictor) -> EndRows:
-    """Return the rows of a terminal set on the lifted state of a predictor.
-
-    Raises
-    ------
-    ObservableError
-        The lifting lacks an observable of the set.
-    ShapeError
-        The set has another number of coordinates.
-    """
+    """Return the rows of a terminal set on the lifted state of a predictor."""
     wanted, names, nz, nu = read_terminal_set(given), predictor.states, predictor.nz, predictor.nu
     if wanted.of is None:
         E = np.eye(nz)
@@ -205,26 +191,14 @@ def read_end(given: TerminalSet | HasTerminalSet, predictor: LinearPredictor) ->
 
 
 def terminal_function(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> ca.Function:
-    """Return (x, u_{N−1}) → values that are at most 1 where x lies in the set: F (ξ − c), or (ξ − c)ᵀW(ξ − c).
-
-    Raises
-    ------
-    ShapeError
-        The set has another number of coordinates.
-    """
+    """Return (x, u_{N−1}) → values that are at most 1 where x lies in the set: F (ξ − c), or (ξ − c)ᵀW(ξ − c)."""
     x, u, away = _trace_deviation(wanted, states, nu)
     value = ca.mtimes(ca.DM(wanted.rows), away)
     return ca.Function("terminal", [x, u], [ca.densify(ca.sumsqr(value) if wanted.is_ellipsoid else value)])
 
 
 def terminal_feedback(wanted: TerminalSet, states: tuple[str, ...], nu: int) -> ca.Function:
-    """Return (x, u_{k−1}) → u of the feedback of a terminal set.
-
-    Raises
-    ------
-    ShapeError
-        The set has another number of coordinates, or its feedback of inputs.
-    """
+    """Return (x, u_{k−1}) → u of the feedback of a terminal set."""
     law = wanted.feedback
     assert law is not None, "only asked where the set has a feedback"
     x, u, away = _trace_deviation(wanted, states, nu)
@@ -331,11 +305,6 @@ def require_inside(
     """Raise where a terminal set leaves its limits in a row, from `first` on; the last row is held.
 
     Where the reach is not known, the limits may not move.
-
-    Raises
-    ------
-    DataError
-        The set leaves them, or they move and its reach is not known.
     """
     if reach is None:
         if moved:

@@ -90,15 +90,7 @@ def list_bench() -> dict[str, BenchEntry]:
 
 
 def build_controller(saved: SavedController) -> Any:
-    """Return the controller that is made of these data.
-
-    Raises
-    ------
-    LogError
-        No kind of this name is registered.
-    KoopmpcError
-        The parts do not go together.
-    """
+    """Return the controller that is made of these data."""
     kinds = list_kinds()
     if saved.name not in kinds:
         raise LogError(f"there is no controller {saved.name!r}; there are {', '.join(kinds)}; register it first")

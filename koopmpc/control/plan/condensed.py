@@ -140,15 +140,7 @@ def build_qp(maps: Condensed, limits: PlanLimits, changes: int, stages: QPStages
 
 
 def plan_condensed(task: ControlTask) -> CondensedProgram:
-    """Return the program of a task.
-
-    Raises
-    ------
-    DefinitenessError
-        A weight, or R + BᵀPB, is not positive definite.
-    DataError, ShapeError
-        Limits in time cross, or have too few rows; levels or a priority together with a terminal ellipsoid.
-    """
+    """Return the program of a task."""
     track, model, limits = task.track, task.predictor, task.track.limits
     targets = targets_of(model, track)
     plan, terminal = plan_matrices(task, targets)

@@ -98,15 +98,7 @@ class BoundRows:
         return slice(self.nu, 2 * self.nu)
 
     def read(self, limits: Limits, *, at_call: bool) -> "BoundsInTime":
-        """Return the limits of each step; `at_call` says that row 0 is that of the present step, and the only one.
-
-        Raises
-        ------
-        DataError
-            A limit has no row in the plan; limits cross in some step; the terminal set leaves limits of later rows.
-        ShapeError
-            A bound has too few rows for the plan, or as many signals as it should not.
-        """
+        """Return the limits of each step; `at_call` says that row 0 is that of the present step, and the only one."""
         nu, nx = self.nu, len(self.states)
         if at_call:
             require_preview(limits, self.N + self.latency)
@@ -262,15 +254,7 @@ class CallBounds:
         self._last: tuple[Limits, BoundsInTime] | None = None
 
     def read(self, limits: Limits) -> BoundsInTime:
-        """Return the limits of a call.
-
-        Raises
-        ------
-        DataError
-            They differ from the controller's own in more than bounds, cross, or have no row in the plan.
-        ShapeError
-            A bound has too few rows for the plan.
-        """
+        """Return the limits of a call."""
         if self._last is None or self._last[0] is not limits:
             rows = self._rows
             known = check_bounds_alone(limits, rows.track.limits, rows.states, rows.inputs)
@@ -330,13 +314,7 @@ class PlansInTime:
         return Q[1:].tobytes() + R.tobytes()  # the weight of the present state changes no plan
 
     def check_free_inputs(self) -> None:
-        """Raise where a plan of some later step cannot be made: only rows of R that hold a zero may do that.
-
-        Raises
-        ------
-        DefinitenessError
-            In the plan of a step some change of the inputs costs nothing.
-        """
+        """Raise where a plan of some later step cannot be made: only rows of R that hold a zero may do that."""
         cost = self._track.cost
         steps = max(len(np.asarray(rows)) for rows in (cost.Q_rows, cost.R_rows) if rows is not None)
         Q, R = cost.weight_rows(len(self._track.Q), len(self._track.R), 0, steps + self._N)

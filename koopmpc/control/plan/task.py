@@ -55,11 +55,6 @@ def find_blocks(moves: Blocking | None, horizon: int) -> tuple[int, ...]:
     """Return the lengths of the blocks of steps in which a plan of N steps holds its inputs: move blocking.
 
     They are N ones, or M moves of which the last is held, or `moves` itself.
-
-    Raises
-    ------
-    DataError
-        The horizon is no whole number above zero; there are more moves than steps; the lengths do not sum to N.
     """
     N = checks.count(horizon, "horizon")
     if moves is None:
@@ -81,13 +76,7 @@ def find_blocks(moves: Blocking | None, horizon: int) -> tuple[int, ...]:
 
 
 def find_move_blocks(moves: Moves, horizon: int, inputs: Sequence[str]) -> MoveBlocks:
-    """Return the blocks of a plan whose inputs have these names; an input that is left out may change at every step.
-
-    Raises
-    ------
-    DataError
-        As `find_blocks`; or a name is unknown, or fits two inputs.
-    """
+    """Return the blocks of a plan whose inputs have these names; an input that is left out may change at every step."""
     if not isinstance(moves, Mapping):
         lengths = find_blocks(moves, horizon)
         return MoveBlocks(lengths, np.zeros((len(lengths), len(inputs)), dtype=np.bool_), lengths)
@@ -191,13 +180,7 @@ class ControlTask:
         return self.solver == order.SPARSE or self.N >= order.LONG
 
     def with_predictor(self, predictor: LinearPredictor) -> "ControlTask":
-        """Return the task on another predictor of the same lifting.
-
-        Raises
-        ------
-        DataError
-            The predictor has another lifting, dt, other states, inputs or disturbances than the last one.
-        """
+        """Return the task on another predictor of the same lifting."""
         checks.kind(predictor, "predictor", LinearPredictor, "it replaces another LinearPredictor")
         for name in _LIKE:
             if getattr(predictor, name) != getattr(self.predictor, name):
@@ -225,15 +208,7 @@ def read_task(
     solver: str,
     settings: Mapping[str, Any],
 ) -> ControlTask:
-    """Return the task of a controller without an estimator.
-
-    Raises
-    ------
-    ObservableError
-        The cost or a limit is on an observable that the lifting lacks.
-    DataError, ShapeError
-        There is no such solver; a horizon below 1, crossed limits, sizes that do not fit.
-    """
+    """Return the task of a controller without an estimator."""
     first = order.order_solvers(solver, settings)[0].solver
     return ControlTask(
         predictor=predictor,

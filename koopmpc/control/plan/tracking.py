@@ -135,16 +135,6 @@ def lifted_tracking(
     """Return what `cost` tracks and `limits` bound, as matrices on the lifted coordinates of `predictor`.
 
     `in_time` says that who asks knows limits and weights with rows, and prices of inputs.
-
-    Raises
-    ------
-    DataError
-        Limits or weights have rows in time, or the cost has a price, and who asks does not know them; or
-        ``cost.beyond`` is "motion".
-    ObservableError
-        The cost or a limit is on an observable that the lifting lacks.
-    ShapeError
-        A weight or a limit has another size than what it weighs or limits.
     """
     cost, limits = check_cost_and_limits(cost, limits, predictor.states, predictor.inputs)
     if not in_time:
@@ -232,11 +222,6 @@ def _tracking(
     """Return the weights and limits of nr tracked outputs of a model with these states and so many inputs.
 
     `limited` makes the map of those outputs that have a limit.
-
-    Raises
-    ------
-    DataError
-        A row of u_target is outside the limits of the inputs.
     """
     if nu == 0:
         raise DataError("the model has no inputs, so there is nothing to control; fit it on episodes with U")

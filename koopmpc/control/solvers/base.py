@@ -107,15 +107,7 @@ class QPSolver(ABC):
         """Set up the QP that is held in the solver, with the limits `low` and `high`."""
 
     def _hold(self, qp: QP) -> None:
-        """Make this the problem, its limits in arrays of their own, cut to ±INFINITY.
-
-        Raises
-        ------
-        ShapeError
-            The parts of the QP do not fit together.
-        DataError
-            It holds NaN, or its limits cross.
-        """
+        """Make this the problem, its limits in arrays of their own, cut to ±INFINITY."""
         for name in ("P", "q", "A"):
             checks.array(getattr(qp, name), f"the QP's {name}")
         for name in ("low", "high"):
@@ -135,15 +127,7 @@ class QPSolver(ABC):
         self._in_order_array = np.frombuffer(self._in_order, bool)
 
     def shift(self, by: Float[np.ndarray, " m"]) -> None:
-        """Set the limits to those of the QP less `by`, as `move_limits` does; the old ones stay where that is refused.
-
-        Raises
-        ------
-        ShapeError
-            `by` has the wrong length.
-        DataError
-            It holds NaN.
-        """
+        """Set the limits to those of the QP less `by`, see `move_limits`; the old ones stay where that is refused."""
         if by.shape != self.low.shape:
             raise ShapeError(f"the limits move by shape {by.shape}, the QP has {len(self.low)} rows")
         if by.dot(by) < _BELOW_ROUNDING:
@@ -152,15 +136,7 @@ class QPSolver(ABC):
             self.set_bounds(*move_limits(Interval(self._qp.low, self._qp.high), by))
 
     def set_bounds(self, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> None:
-        """Set new limits, ±inf where there is none; the old ones stay where they are refused.
-
-        Raises
-        ------
-        ShapeError
-            They have the wrong length.
-        DataError
-            They hold NaN or cross.
-        """
+        """Set new limits, ±inf where there is none; the old ones stay where they are refused."""
         if low.shape != self.low.shape or high.shape != self.low.shape:
             raise ShapeError(f"the limits have shapes {low.shape} and {high.shape}, the QP has {len(self.low)} rows")
         new_low, new_high = self._spare

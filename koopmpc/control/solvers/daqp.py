@@ -64,13 +64,7 @@ _STATUS = {
 
 
 def daqp_settings(settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return all settings of DAQP: ours, and those that are given.
-
-    Raises
-    ------
-    DataError
-        DAQP has no such setting, or the value is out of range.
-    """
+    """Return all settings of DAQP: ours, and those that are given."""
     known = settings or {}
     return {**_model(known).settings, _COLD: bool(known.get(_COLD, False))}
 

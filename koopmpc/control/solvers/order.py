@@ -38,11 +38,6 @@ def order_solvers(solver: str, settings: Mapping[str, Any]) -> list[SolverTurn]:
 
     That is DAQP, of which a second one would find no more where the first has no settings of its own. Settings that
     the solver of the rule does not have name the solver that has them all.
-
-    Raises
-    ------
-    DataError
-        There is no such solver.
     """
     first = solver
     if checks.among(solver, ("auto",)):
@@ -66,13 +61,7 @@ def add_sparse(turns: list[SolverTurn], qp: StepQP) -> list[SolverTurn]:
 
 
 def exact_turn(turns: list[SolverTurn]) -> SolverTurn:
-    """Return the turn of the exact solver, which the search over levels and the order of priorities need.
-
-    Raises
-    ------
-    DataError
-        A solver was chosen that is not exact.
-    """
+    """Return the turn of the exact solver, which the search over levels and the order of priorities need."""
     if not turns[0].solver.exact:
         raise DataError(
             f'solver is {turns[0].solver.name!r}; inputs on levels and priorities of limits need "daqp", or "auto"'

@@ -28,14 +28,6 @@ def find_priorities(
     ----------
     linear
         Price of each limit, inf where it is hard, and 0 where there is none.
-
-    Raises
-    ------
-    DataError
-        A name is unknown, given twice, or is that of a state and of an observable; what has a priority has no limit, or
-        a hard one.
-    ShapeError
-        There is not one number for each state and observable.
     """
     names = [*states, *outputs]
     if isinstance(given, Mapping):
@@ -64,13 +56,7 @@ def find_priorities(
 
 
 def find_row_priorities(limits: Limits, states: Sequence[str]) -> Int[np.ndarray, " n"]:
-    """Return the priority of each row of [x; of(x)] that has a limit, or may get one.
-
-    Raises
-    ------
-    DataError, ShapeError
-        As `find_priorities`.
-    """
+    """Return the priority of each row of [x; of(x)] that has a limit, or may get one."""
     outputs = () if limits.of is None else limits.of.bind(tuple(states)).names
     rows = limits.base.find_rows(len(states), len(outputs))
     linear = np.zeros(len(states) + len(outputs))
@@ -79,13 +65,7 @@ def find_row_priorities(limits: Limits, states: Sequence[str]) -> Int[np.ndarray
 
 
 def spread_priorities(limits: Limits, states: Sequence[str], layout: tuple[int, int, int]) -> Int[np.ndarray, " nv"]:
-    """Return the priority of each entry of a plan; `layout` is its first output, its steps and its length.
-
-    Raises
-    ------
-    DataError, ShapeError
-        As `find_priorities`.
-    """
+    """Return the priority of each entry of a plan; `layout` is its first output, its steps and its length."""
     first, steps, length = layout
     priority = np.zeros(length, dtype=np.intp)
     own = find_row_priorities(limits, states)
@@ -94,15 +74,7 @@ def spread_priorities(limits: Limits, states: Sequence[str], layout: tuple[int, 
 
 
 def weigh_priorities(softness: Softness, limits: Limits, states: Sequence[str], who: str) -> Softness:
-    """Return what soft limits cost where weights stand for their priorities: `WEIGHT` times as much each.
-
-    Raises
-    ------
-    DataError
-        There are more priorities than weights can tell apart.
-    DataError, ShapeError
-        As `find_priorities`.
-    """
+    """Return what soft limits cost where weights stand for their priorities: `WEIGHT` times as much each."""
     own = find_row_priorities(limits, states)
     soft = np.isfinite(softness.linear)
     known = np.unique(own[soft])
