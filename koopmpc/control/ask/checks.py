@@ -1,6 +1,7 @@
 """What each field of `Cost` and `Limits` may be: a table of fields and checks, and what contradicts what."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -87,13 +88,13 @@ def _check_beyond(value: Any, name: str) -> Any:
     return value
 
 
-def _check_of(value: Any, name: str) -> Any:
-    checks.kind(value, name, Lifting, 'for example km.State("theta"), or km.Fourier(1, states="theta")')
+def _check_of(value: Any, name: str, advice: str = 'for example km.Fourier(1, states="theta")') -> Any:
+    checks.kind(value, name, Lifting, advice)
     return value
 
 
 COST_CHECKS: dict[str, Callable[[Any, str], Any]] = {
-    "of": _check_of,
+    "of": partial(_check_of, advice='for example km.State("theta"), or km.Fourier(1, states="theta")'),
     **dict.fromkeys(("Q", "R", "Q_N", "R_delta"), _check_weight),
     "u_target": _check_target,
     "price": _check_price,
