@@ -21,7 +21,6 @@ from koopmpc.control.solvers.scaled_qp import DAQPSetup
 from koopmpc.control.target import Targets
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.delay import Delay
-from koopmpc.estimate.observer import Estimator, EstimatorProgram, StateObserver, estimator_program
 from koopmpc.lifting.base import strip_unit
 from koopmpc.models.base import save_value
 from koopmpc.models.hidden_state import HiddenState
@@ -182,10 +181,10 @@ def describe_controller(controller: Any) -> str:
         ahead = "" if steps is None else f", horizon {steps} = {steps * known['dt']:.4g} s"
         parts.append(f"dt {known['dt']:.4g} s{ahead}")
     names = getattr(model, "states", ()), getattr(model, "inputs", ())
-    parts += [text for text in (_describe_limits(known.get("limits"), *names),) if text]
+    parts.append(_describe_limits(known.get("limits"), *names))
     solver = getattr(controller, "solver", None)
     parts += [f"solver {solver}"] if isinstance(solver, str) else []
-    return f"{type(controller).__name__}({'; '.join(parts)})"
+    return f"{type(controller).__name__}({'; '.join(filter(None, parts))})"
 
 
 def _describe_model(model: Any) -> str:
@@ -199,19 +198,14 @@ def _describe_limits(limits: Any, states: Sequence[str], inputs: Sequence[str]) 
     if limits is None:
         return ""
     widest, parts = limits.base, list[str]()
-    for low, high, names in (("u_min", "u_max", inputs), ("x_min", "x_max", states)):
-        ends = [getattr(widest, end) for end in (low, high)]
-        if all(end is None for end in ends):
-            continue
-        count = len(names) or max(np.size(end) for end in ends if end is not None)
-        lows, highs = (
-            np.broadcast_to(default if end is None else end, count)
-            for end, default in zip(ends, (-np.inf, np.inf), strict=True)
-        )
-        for i in range(count):
-            if np.isfinite(lows[i]) or np.isfinite(highs[i]):
-                name = strip_unit(names[i]) if names else f"{low[0]}{i}"
-                parts.append(f"{lows[i]:.4g} ≤ {name} ≤ {highs[i]:.4g}")
+    for letter, names in (("u", inputs), ("x", states)):
+        ends = [getattr(widest, f"{letter}_{end}") for end in ("min", "max")]
+        count = len(names) or max(np.size(end) for end in ends)
+        free = zip(ends, (-np.inf, np.inf), strict=True)
+        low, high = (np.broadcast_to(default if end is None else end, count) for end, default in free)
+        for i in np.flatnonzero(np.isfinite(low) | np.isfinite(high)):
+            name = strip_unit(names[i]) if names else f"{letter}{i}"
+            parts.append(f"{low[i]:.4g} ≤ {name} ≤ {high[i]:.4g}")
     more = {
         "limited rates": limits.du_max is not None or limits.du_min is not None,
         "limited outputs": limits.of is not None,
@@ -314,27 +308,6 @@ def refuse_time_limit(time_limit: float | None, bound: str) -> None:
             "the controller has a time_limit, and C has no clock; make it without one and bound the iterations: "
             + bound
         )
-
-
-def publish_estimator(
-    observer: StateObserver, estimator: Estimator | None, time_limit: float | None, bound: str
-) -> EstimatorProgram:
-    """Return how the observer of a predictive controller finds z and d.
-
-    Parameters
-    ----------
-    observer, estimator, time_limit
-        Those of the controller. Its monitor is left out: the C does not say whether a step is known.
-    bound
-        The arguments that bound the iterations of a step of this controller.
-
-    Raises
-    ------
-    DataError
-        The controller has a time_limit, or an estimator for which no C code can be generated.
-    """
-    refuse_time_limit(time_limit, bound)
-    return estimator_program(observer, estimator)
 
 
 def reference_table(reference: ArrayLike | None, nr: int) -> Float[np.ndarray, "rows nr"]:

@@ -22,12 +22,12 @@ from koopmpc.control.nonlinear.staged_mpc import StagedMPC
 from koopmpc.control.nonlinear.staged_program import StagedProgram, find_targets, first_gain, trace_functions
 from koopmpc.control.nonlinear.stagewise import list_sides, weights
 from koopmpc.control.plan.task import Moves
-from koopmpc.control.program import no_export, publish_estimator, reference_table, trace_lifting
+from koopmpc.control.program import no_export, reference_table, refuse_time_limit, trace_lifting
 from koopmpc.control.solvers.daqp import daqp_settings
 from koopmpc.control.watching import StepMonitor
 from koopmpc.data.episodes import Episodes
 from koopmpc.estimate.disturbance import LiftedDisturbance
-from koopmpc.estimate.observer import Estimator
+from koopmpc.estimate.observer import Estimator, estimator_program
 from koopmpc.models.predictors import BilinearPredictor
 
 
@@ -171,7 +171,8 @@ class BilinearMPC(StagedMPC):
         """Return the data of a step."""
         problem, outputs, model = self._problem, self._outputs, self._map
         self._refuse_export()
-        estimator = publish_estimator(self._initial.observer, self._estimator, self._time_limit, "sqp_iterations=1")
+        refuse_time_limit(self._time_limit, "sqp_iterations=1")
+        estimator = estimator_program(self._initial.observer, self._estimator)
         rows, terminal, cost = reference_table(reference, len(outputs.Q)), self._aim.targets, self.cost
         R, held = weights(problem), int((~problem.free).argmax()) * (not problem.free.all())
         return StagedProgram(
