@@ -3,6 +3,7 @@
 The tail is the same tracking problem going on without limits, its signals held.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -35,14 +36,45 @@ ITERATIONS = 10_000  # end an infinite tail after this many steps, settled or no
 EXACT = 1e-14  # the feedforward rests when it moves by less, relative to its size
 GROWS = 1 + 1e-5  # modulus beyond which a mode grows: two integrators in a row come out as 1 ± 1e-8, three as 1 ± 1e-5
 APART = 1e6  # entries of the eigenvectors' transform up to which modes can be told apart
-AXES = 8  # trial loops start along this many principal axes of the states
-FARTHEST = 20.0  # states of trial loops stay within this many standard deviations
-ALIKE = 0.01  # share of a law, over the data, by which others may differ and need no trial
-LATE = 0.5  # in trial loops an input acts this many steps late
-WORTH = 0.005  # accept a shorter tail if its trial loop costs at most this share more
-LITTLE = 1e-3  # a trial loop rests if a step costs at most this share of WORTH
-AHEAD = 10  # a trial loop lasts this many horizons, and a gain must rest within them
-SHORT = 20  # a horizon counts there as at least this many steps
+
+
+@dataclass(frozen=True)
+class TrialLoops:
+    """How long a tail has to be is tried in loops on the model; tuned by the table of docs/closed_loop.md.
+
+    Attributes
+    ----------
+    axes
+        Loops start along this many principal axes of the states.
+    farthest
+        States stay within this many standard deviations.
+    alike
+        Share of a law, over the data, by which others may differ and need no trial.
+    late
+        An input acts this many steps late.
+    worth
+        A shorter tail is taken if its loop costs at most this share more.
+    little
+        A loop rests if a step costs at most this share of `worth`.
+    ahead, short
+        A loop lasts this many horizons, of at least so many steps; a gain must rest within them.
+    """
+
+    axes: int = 8
+    farthest: float = 20.0
+    alike: float = 0.01
+    late: float = 0.5
+    worth: float = 0.005
+    little: float = 1e-3
+    ahead: int = 10
+    short: int = 20
+
+    def count_steps(self, N: int) -> int:
+        """Return T, the steps of a loop."""
+        return self.ahead * max(N, self.short)
+
+
+TRIALS = TrialLoops()
 
 
 def terminal_of(
@@ -163,15 +195,12 @@ def learned_steps(
 ) -> int:
     """Return the steps of the default tail of a learned model: until the gain rests as far as the model is accurate.
 
-    Every further step of the tail changes the gain K. Once the change is a smaller share of K than what the model
-    misses in one step is of its states, further steps only make the tail follow the model's errors: modes that the
-    plant does not have grow in it until they rule the plan. Both shares are root mean squares over the data, about
-    their mean: that of the change is ‖Lᵀ(K⁺ − K)(z − z̄)‖ over ‖LᵀK⁺(z − z̄)‖, S = L Lᵀ, so that inputs count by what
-    they cost. The gain rests when the change is so small for as many steps in a row as ψ has arguments, for a weight
-    may take that long to reach an input; it is waited for T = 10 N steps, 200 at least. The tail is shortened where the
-    loop on the re-lifted model does not gain by its length, see `believed_steps`. Models of delays and of fewer
-    coordinates than their lifting has are not tried so; where their gain does not rest, and where a model does not know
-    its errors, the tail has N steps. `inverse` takes z into the coordinates of the stage, where these are others.
+    Once a further step changes the gain K by a smaller share than the model misses of its states in one step, the tail
+    only follows the model's errors: modes that the plant does not have grow in it until they rule the plan. Both are
+    root mean squares over the data about their mean; inputs count by S = L Lᵀ, what they cost. The gain rests when the
+    change is so small for as many steps in a row as ψ has arguments; it is waited for T = 10 N steps, 200 at least.
+    Then `believed_steps` shortens the tail, but for models of delays and reduced ones. Where the gain does not rest, or
+    a model does not know its errors, it has N steps. `inverse` takes z into other coordinates of the stage.
     """
     scale = predictor.scale
     if predictor.report is None or scale is None:
@@ -181,7 +210,7 @@ def learned_steps(
     rested = _rested_steps(gains, stage, predictor, N, back)
     if predictor.embedding is not None or predictor.lifting.nz != len(scale):
         return rested or N
-    return believed_steps(gains, stage, predictor, N, rested or _ahead(N), back)
+    return believed_steps(gains, stage, predictor, N, rested or TRIALS.count_steps(N), back)
 
 
 def believed_steps(
@@ -195,15 +224,12 @@ def believed_steps(
     """Return the shortest tail of none, N, `most`, a half, a quarter … of these steps, down to N/4, that is as good.
 
     Without limits, N planned steps and a tail are a law u = −K z. Each law steers the re-lifted model
-    x⁺ = C (A ψ(x) + B u) for T steps. Modes of A that the lifted states do not have grow in a
-    long tail until they rule the law; in these trials such a law costs what it would on the plant, for states that are
-    lifted afresh do not have the mode. States, z and u are deviations from the mean of the data, which is taken to be
-    at rest. The trials start a standard deviation from it, along the first eight principal axes of the states in units
-    of their standard deviations. The inputs act half a step late, u = (−K z_k − K z_{k−1})/2: a law that leans on fast
-    modes, those of the model's errors above all, pays for that, a good one hardly. What little a longer tail gains on
-    the model need not be gained on the plant: a trial is as good as the best one up to 0.5 % above it. Both, the
-    lateness and this share, go to zero with (T m)² where the share m that the model misses of its states in a step is
-    small: a model without errors is believed. The tail has `most` steps where all laws are alike.
+    x⁺ = C (A ψ(x) + B u) for T steps from a standard deviation along each principal axis of the states, all counted
+    from the mean of the data, which is taken to be at rest. A law that leans on modes of A that lifted states do not
+    have costs there what it would on the plant. Inputs act half a step late, which a law pays for that leans on fast
+    modes, those of the model's errors above all. What little a longer tail gains on the model need not be gained on the
+    plant: see `TrialLoops`. Lateness and that share go to zero with (T m)² where the share m that the model misses of
+    its states in a step is small. The tail has `most` steps where all laws are alike.
     """
     scale, lifting = predictor.scale, predictor.lifting
     if scale is None:
@@ -211,9 +237,10 @@ def believed_steps(
     C, nz, constant = predictor.C, len(scale), lifting.constant_index
     halves = max(2, (4 * most // N).bit_length() - 1)
     lengths = sorted({0, min(N, most), *(most >> i for i in range(halves + 1))})
-    laws = _laws(gains, stage, [n + N for n in lengths])
+    found = [gains.find_step(n + N) for n in lengths]
+    laws = np.array([np.full(stage.B.shape, np.nan) if each is None else each.K.T for each in found])
     seen = scale @ inverse.T
-    if max(np.linalg.norm(seen @ (law - laws[-1])[:nz]) for law in laws) <= ALIKE * np.linalg.norm(
+    if max(np.linalg.norm(seen @ (law - laws[-1])[:nz]) for law in laws) <= TRIALS.alike * np.linalg.norm(
         seen @ laws[-1][:nz]
     ):
         return most
@@ -222,16 +249,16 @@ def believed_steps(
     spread = apart.T @ apart
     sizes = np.sqrt(np.where(spread.diagonal() > 0, spread.diagonal(), 1.0))
     values, axes = np.linalg.eigh(spread / np.outer(sizes, sizes))
-    ways = (sizes[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))[:, ::-1][:, :AXES].T
+    ways = (sizes[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))[:, ::-1][:, : TRIALS.axes].T
     X = np.tile(center + np.vstack([ways, -ways]), (len(laws), 1, 1))
     V, cost = np.zeros((*X.shape[:2], stage.B.shape[1])), np.zeros(len(laws))
     CA, CB = C @ predictor.A, np.linalg.solve(inverse.T, C.T).T @ stage.B[:nz]
-    rest, steps = lifting(center[None]), _ahead(N)
+    rest, steps = lifting(center[None]), TRIALS.count_steps(N)
     if len(stage.A) > nz:  # the last input is beside z
         inverse = scipy.linalg.block_diag(inverse, np.eye(len(stage.A) - nz))
     laws, crossed = inverse.T @ laws, None if stage.M is None else inverse.T @ stage.M
     weight = _root_of_few(inverse.T @ stage.Q @ inverse)
-    unsure = min(1.0, (steps * _measure_residual(predictor, scale)) ** 2 / WORTH)
+    unsure = min(1.0, (steps * _measure_residual(predictor, scale)) ** 2 / TRIALS.worth)
     with np.errstate(all="ignore"):
         for _ in range(steps):
             moved = lifting(X.reshape(-1, len(center))).reshape(*X.shape[:2], nz) - rest
@@ -241,13 +268,15 @@ def believed_steps(
             if crossed is not None:
                 spent += 2 * ((xi @ crossed) * V).sum(axis=(1, 2))
             cost += spent
-            if not (spent > LITTLE * WORTH * unsure * cost).any():  # all loops are at rest, or beyond all numbers
+            if not (
+                spent > TRIALS.little * TRIALS.worth * unsure * cost
+            ).any():  # all loops are at rest, or beyond all numbers
                 break
-            acts = V + LATE * unsure * (V_before - V)
-            ahead = np.nan_to_num((moved @ CA.T + acts @ CB.T) / sizes, nan=FARTHEST)
-            X = center + sizes * np.clip(ahead, -FARTHEST, FARTHEST)
+            acts = V + TRIALS.late * unsure * (V_before - V)
+            ahead = np.nan_to_num((moved @ CA.T + acts @ CB.T) / sizes, nan=TRIALS.farthest)
+            X = center + sizes * np.clip(ahead, -TRIALS.farthest, TRIALS.farthest)
     cost = np.where(np.isfinite(cost), cost, np.inf)
-    return next(n for n, each in zip(lengths, cost, strict=True) if each <= (1 + WORTH * unsure) * cost.min())
+    return next(n for n, each in zip(lengths, cost, strict=True) if each <= (1 + TRIALS.worth * unsure) * cost.min())
 
 
 def _root_of_few(Q: Float[np.ndarray, "nx nx"]) -> Float[np.ndarray, "nx n"]:
@@ -255,12 +284,6 @@ def _root_of_few(Q: Float[np.ndarray, "nx nx"]) -> Float[np.ndarray, "nx n"]:
     F = checks.root(Q)
     sizes = np.linalg.norm(F, axis=1)
     return F[sizes > np.finfo(float).eps * len(F) * sizes.max(initial=0.0)].T
-
-
-def _laws(gains: Recursion, stage: Stage, steps: list[int]) -> Float[np.ndarray, "laws nx nu"]:
-    """Return Kᵀ after so many steps of the recursion each; NaN where P has lost its digits."""
-    found = [gains.find_step(n) for n in steps]
-    return np.array([np.full(stage.B.shape, np.nan) if each is None else each.K.T for each in found])
 
 
 def _rested_steps(
@@ -273,7 +296,7 @@ def _rested_steps(
     enough, spread = max(_measure_residual(predictor, scale), SETTLED), _spread(predictor, scale) @ inverse.T
     nz, needed, rested = len(scale), len(predictor.lifting.bound or ()), 0
     K = np.zeros(stage.B.T.shape)
-    for n in range(1, _ahead(N) + 1):
+    for n in range(1, TRIALS.count_steps(N) + 1):
         found = gains.find_step(n)
         if found is None or not found.largest < HUGE:
             break
@@ -282,11 +305,6 @@ def _rested_steps(
         if rested >= needed:
             return n
     return 0
-
-
-def _ahead(N: int) -> int:
-    """Return T, the steps of a trial loop, within which the gain is to rest."""
-    return AHEAD * max(N, SHORT)
 
 
 def _spread(predictor: LinearPredictor, scale: Float[np.ndarray, "nz nz"]) -> Float[np.ndarray, "nz nz"]:

@@ -45,21 +45,30 @@ _MANY = 16  # iterations of a solve that tell how long one takes
 
 _COLD = "cold_start"  # our own setting
 
-# DAQP's exit flags
-_OPTIMAL = 1
-_INFEASIBLE = -1
-_ITERATIONS = -4
-_TIME_LIMIT = -7
-_UNMET = -100  # our own: the answer does not meet its conditions
-# DAQP's senses of rows; _SOFT is added to another
-_UPPER = 1  # active at the upper end
-_LOWER = 3  # active at the lower end
-_SOFT = 8
+
+class _Flag:
+    """DAQP's exit flags."""
+
+    OPTIMAL = 1
+    INFEASIBLE = -1
+    ITERATIONS = -4
+    TIME_LIMIT = -7
+    UNMET = -100  # our own: the answer does not meet its conditions
+
+
+class _Sense:
+    """DAQP's senses of rows; SOFT is added to another."""
+
+    UPPER = 1  # active at the upper end
+    LOWER = 3  # active at the lower end
+    SOFT = 8
+
+
 _STATUS = {
-    _OPTIMAL: Status.OPTIMAL,
-    _INFEASIBLE: Status.INFEASIBLE,
-    _ITERATIONS: Status.MAX_ITERATIONS,
-    _TIME_LIMIT: Status.TIME_LIMIT,
+    _Flag.OPTIMAL: Status.OPTIMAL,
+    _Flag.INFEASIBLE: Status.INFEASIBLE,
+    _Flag.ITERATIONS: Status.MAX_ITERATIONS,
+    _Flag.TIME_LIMIT: Status.TIME_LIMIT,
 }
 
 
@@ -102,7 +111,7 @@ class DAQP(QPSolver):
         self._last_most: int | None = None
         self._pace = 1e-9  # how long an iteration takes [s], once it is known
         self._scaled = ScaledQP(self._qp)
-        self._sense = np.where(self._scaled.is_soft, _SOFT, 0).astype(np.intc)
+        self._sense = np.where(self._scaled.is_soft, _Sense.SOFT, 0).astype(np.intc)
         self._soft = bool(self._sense.any())
         free = np.full(len(self.low), INFINITY)
         flag, _ = self._model.setup(self._scaled.H, self._scaled.f, self._scaled.M, free, -free, self._sense)
@@ -115,9 +124,8 @@ class DAQP(QPSolver):
         self._lighter: dict[float, DAQP] = {}  # the solvers of `_approach`, by their weight
         self._far = False  # whether the last solve had to approach a solution of many active rows: the next one does
         if self._soft:
-            linear, rho = (
-                np.where(self._sense == _SOFT, part, 0.0) for part in (self._scaled.linear, 1 / self._scaled.curvature)
-            )
+            prices = self._scaled.linear, 1 / self._scaled.curvature
+            linear, rho = (np.where(self._sense == _Sense.SOFT, part, 0.0) for part in prices)
             self._model.soft_weights(rho_l=rho, rho_u=rho, w_l=linear, w_u=linear)
 
     def __reduce__(self) -> tuple[type["DAQP"], tuple[QP, dict[str, Any]], tuple[Interval, bool]]:
@@ -187,15 +195,15 @@ class DAQP(QPSolver):
         self._send(None if y is None else self._active(y))
         crowded = y is not None and self._soft and np.count_nonzero(y) > len(v)
         x, multipliers, flag, iterations = self._run(limit, len(v) if crowded else None)
-        if y is not None and crowded and flag == _ITERATIONS:
-            self._send(self._active(np.where(self._sense == _SOFT, 0.0, y)))
+        if y is not None and crowded and flag == _Flag.ITERATIONS:
+            self._send(self._active(np.where(self._sense == _Sense.SOFT, 0.0, y)))
             x, multipliers, flag, more = self._run(max(end - perf_counter(), 1e-6) if limit else limit)
             iterations += more
-        good = flag == _OPTIMAL and self._scaled.is_exact
+        good = flag == _Flag.OPTIMAL and self._scaled.is_exact
         good = good or (flag > 0 and self._scaled.is_met(x, multipliers, self._low, self._high))
         self.resumes = good and not self._cold and self._lasts(multipliers)
-        if good or flag == _TIME_LIMIT:
-            return self._unscale(x, multipliers, _OPTIMAL if good else flag, iterations)
+        if good or flag == _Flag.TIME_LIMIT:
+            return self._unscale(x, multipliers, _Flag.OPTIMAL if good else flag, iterations)
         return self._solve_again(v, y, (x, multipliers, flag, iterations), end)
 
     def _solve_again(
@@ -210,20 +218,20 @@ class DAQP(QPSolver):
         `ended` is what `_run` returned, `end` the time by `perf_counter` at which this has to be over, 0 for none.
         """
         (x, multipliers, flag, iterations), steep = ended, self._steep()
-        if flag == _INFEASIBLE and self._mixed and not steep and self._contradictory(_find_left(end)):
+        if flag == _Flag.INFEASIBLE and self._mixed and not steep and self._contradictory(_find_left(end)):
             self._unmet = True
-        elif flag != _INFEASIBLE or not steep:
+        elif flag != _Flag.INFEASIBLE or not steep:
             left = _find_left(end)
             if left is not None and left < 0:
-                flag = _TIME_LIMIT
+                flag = _Flag.TIME_LIMIT
             else:
                 self._send(self._sense, _WIDER)
                 x, multipliers, flag, more = self._run(left or 0.0)
                 iterations += more
                 if flag > 0:
                     met = self._scaled.is_met(x, multipliers, self._low, self._high)
-                    flag = _OPTIMAL if met else _UNMET
-        if steep and flag not in (_OPTIMAL, _TIME_LIMIT):
+                    flag = _Flag.OPTIMAL if met else _Flag.UNMET
+        if steep and flag not in (_Flag.OPTIMAL, _Flag.TIME_LIMIT):
             found = self._approach(v, np.zeros_like(self.low) if y is None else y, _find_left(end) or 0.0)
             found.iterations += iterations
             return found
@@ -251,7 +259,7 @@ class DAQP(QPSolver):
         Where soft rows are far outside, DAQP moves through all of these before it finds that out; it is asked at once
         where it was so in the last solve.
         """
-        rows, qp = self._sense != _SOFT, self._qp
+        rows, qp = self._sense != _Sense.SOFT, self._qp
         if self._hard is None:
             self._hard = DAQP(QP(qp.P, qp.q, qp.A[rows], qp.low[rows], qp.high[rows]), self._settings)
         own = self._hard
@@ -262,7 +270,7 @@ class DAQP(QPSolver):
 
     def _metric(self) -> Float[np.ndarray, "n n"]:
         """Return AᵀA of the hard rows, of all rows where none is hard, with the mean diagonal of P."""
-        hard = self._qp.A[self._sense != _SOFT]
+        hard = self._qp.A[self._sense != _Sense.SOFT]
         rows = hard if len(hard) else self._qp.A
         gram = rows.T @ rows
         return gram * float(np.trace(self._qp.P) / max(np.trace(gram), 1e-300))
@@ -324,7 +332,7 @@ class DAQP(QPSolver):
 
     def _active(self, y: Float[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
         """Return the rows with the ends that y pushes to as DAQP's senses."""
-        return self._sense + (y > 0) * np.intc(_UPPER) + (y < 0) * np.intc(_LOWER)
+        return self._sense + (y > 0) * np.intc(_Sense.UPPER) + (y < 0) * np.intc(_Sense.LOWER)
 
     def _send(self, sense: Int[np.ndarray, " m"] | None, wider: float = 0.0) -> None:
         """Give DAQP the limits, relaxed by the share `wider` of 1 + their size, and the rows to start from."""
@@ -353,8 +361,8 @@ class DAQP(QPSolver):
         iterations = info["iterations"]
         if limit and iterations > _MANY:
             self._pace += 0.5 * (info["solve_time"] / iterations - self._pace)
-        if flag == _ITERATIONS and limit and self._few < (most or self._most):
-            flag = _TIME_LIMIT
+        if flag == _Flag.ITERATIONS and limit and self._few < (most or self._most):
+            flag = _Flag.TIME_LIMIT
         return x, info["lam"], flag, iterations
 
 
