@@ -81,14 +81,7 @@ class _Node:
 
 
 def list_ways(problem: ParametricQP, most: int, rng: np.random.Generator) -> list[Way]:
-    """Return all ways of the box.
-
-    Raises
-    ------
-    CertificateError
-        There are more than `most`; rows are so near to dependent that rounding decides; or a soft row is broken by more
-        than its linear price where it is added, so that iterates are not affine.
-    """
+    """Return all ways of the box."""
     p1 = problem.low.shape[1]
     points = np.ones((_SAMPLES, p1))
     points[:, :-1] = rng.uniform(-1, 1, (_SAMPLES, p1 - 1))

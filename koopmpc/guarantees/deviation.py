@@ -62,13 +62,7 @@ class DeviationModel(Value):
 
 
 def deviate(model: LinearPredictor | BilinearPredictor, x: ArrayLike, u: ArrayLike) -> DeviationModel:
-    """Return the model around the set point (x, u).
-
-    Raises
-    ------
-    DataError
-        The model has no inputs, an embedding, measured disturbances, or a lifting without the states.
-    """
+    """Return the model around the set point (x, u)."""
     advice = "fit one with bilinear_edmd or edmd"
     checks.kind(model, "model", (LinearPredictor, BilinearPredictor), advice)
     if model.nu == 0:

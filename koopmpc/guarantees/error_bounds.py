@@ -187,11 +187,6 @@ def bound_by_lipschitz(
 
     Norms are of D⁻¹r, x/d_x and u/d, where d_x are the entries of D of the states. The constant is the user's: pairs
     can refute it, and cannot prove it.
-
-    Raises
-    ------
-    DataError
-        Pairs refute the constant.
     """
     shape = np.diag(phi_size**2)
     bound = ErrorBound("lipschitz", constant, constant, 0.0, shape, phi_size, v_size, lipschitz=constant)
@@ -223,11 +218,6 @@ def bound_by_covering(
     this is at most the value in its middle, plus L times the reach of the cell. The least c_x, c_u and c_0 above it on
     all cells are those of a linear program; ‖D⁻¹φ‖ is at least ‖(x − x_s)/d_x‖, for the lifting holds the states. So
     the bound is proved where L is.
-
-    Raises
-    ------
-    DataError
-        Two pairs refute L, or a grid of so many states and inputs has too many cells.
     """
     from scipy.optimize import linprog  # slow to import
     from scipy.spatial import cKDTree

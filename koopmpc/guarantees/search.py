@@ -107,13 +107,7 @@ def _stay_inside(
     sampled: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
     names: Sequence[str],
 ) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]]:
-    """Return the part of a region that was sampled; a bound that is made of samples says nothing of the rest.
-
-    Raises
-    ------
-    DataError
-        More of it than rounding was not sampled.
-    """
+    """Return the part of a region that was sampled; a bound that is made of samples says nothing of the rest."""
     (low, high), (first, last) = region, sampled
     beyond = np.maximum(first - low, high - last) / np.maximum(last - first, 1e-300)
     i = int(np.argmax(beyond))
@@ -203,15 +197,7 @@ def prove(
     noise: float = 0.0,
     linear: bool = False,
 ) -> Found | None:
-    """Return the best proof for one bound and one room, None where there is none.
-
-    Parameters
-    ----------
-    decay
-        ρ; by default 1 − 10⁻⁴, and searched where c_0 or noise adds a constant.
-    noise
-        Largest ‖D⁻¹(ψ(x + n) − ψ(x))‖ of the measurement.
-    """
+    """Return the best proof for one bound and one room, None where there is none."""
     constant = bound.c_0 > 0 or noise > 0
     decays = [decay] if decay is not None else [1 - step for step in _FASTER] if constant else [DECAY]
     best: Found | None = None

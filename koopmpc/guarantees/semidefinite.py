@@ -33,39 +33,21 @@ _SOLVED = ("optimal", "optimal_inaccurate")  # the solver's word is checked afte
 
 @dataclass(frozen=True)
 class FeedbackTask:
-    """What the program is about, in coordinates in which entries of φ and v are about one.
+    """What the program is about, in coordinates in which entries of φ and v are about one."""
 
-    Attributes
-    ----------
-    A, B, N
-        (n, n), (n, m) and (n, m n); N is None for a linear model.
-    S
-        (n, n) shape of the error, ⪰ 0.
-    c_x, c_u
-        Its bound.
-    E
-        (n, n) the ellipsoid in which products v ⊗ φ are bounded.
-    inputs
-        (m,) largest |v_i|, inf where there is no limit.
-    rows
-        (p, n) rows h of limits |h φ| ≤ 1.
-    volume
-        (k, n) coordinates whose ellipsoid is made large.
-    decay
-        ρ.
-    """
-
+    # A, B, N: (n, n), (n, m) and (n, m n); N is None for a linear model
     A: Float[np.ndarray, "n n"]
     B: Float[np.ndarray, "n m"]
     N: Float[np.ndarray, "n mn"] | None
-    S: Float[np.ndarray, "n n"]
+    S: Float[np.ndarray, "n n"]  # (n, n) shape of the error, ⪰ 0
+    # c_x, c_u: its bound
     c_x: float
     c_u: float
-    E: Float[np.ndarray, "n n"]
-    inputs: Float[np.ndarray, " m"]
-    rows: Float[np.ndarray, "p n"]
-    volume: Float[np.ndarray, "k n"]
-    decay: float
+    E: Float[np.ndarray, "n n"]  # (n, n) the ellipsoid in which products v ⊗ φ are bounded
+    inputs: Float[np.ndarray, " m"]  # (m,) largest |v_i|, inf where there is no limit
+    rows: Float[np.ndarray, "p n"]  # (p, n) rows h of limits |h φ| ≤ 1
+    volume: Float[np.ndarray, "k n"]  # (k, n) coordinates whose ellipsoid is made large
+    decay: float  # ρ
 
 
 @dataclass(frozen=True)
@@ -88,15 +70,7 @@ class FeedbackProof:
 
 
 def solve_feedback(task: FeedbackTask, *, linear: bool = False) -> FeedbackProof | None:
-    """Return the feedback with the largest ellipsoid that the program finds, and that the checks confirm, or None.
-
-    Parameters
-    ----------
-    task
-        The model, its error and the limits.
-    linear
-        Keep K_w = 0, so that v = K φ.
-    """
+    """Return the feedback with the largest ellipsoid that the program finds, and that the checks confirm, or None."""
     program = _Program(task, linear)
     return check_feedback(task, *program.solution()) if program.solve() else None
 

@@ -131,29 +131,17 @@ def _list_limits(c: Certificate) -> list[str]:
 
 @dataclass(frozen=True)
 class Refused:
-    """A search without a certificate.
+    """A search without a certificate."""
 
-    Attributes
-    ----------
-    model, room
-        Those of the search.
-    bounds
-        The bound of the error on each share of the box that has one.
-    decay, noise
-        As `prove` takes them.
-    pairs
-        Those that made the bounds; None where the user gave constants.
-    few
-        Whether some smaller share of the box holds too few pairs for a bound.
-    """
-
+    # model, room: those of the search
     model: DeviationModel
     room: Room
-    bounds: dict[float, ErrorBound]
+    bounds: dict[float, ErrorBound]  # the bound of the error on each share of the box that has one
+    # decay, noise: as `prove` takes them
     decay: float | None
     noise: float
-    pairs: ErrorPairs | None
-    few: bool
+    pairs: ErrorPairs | None  # those that made the bounds; None where the user gave constants
+    few: bool  # whether some smaller share of the box holds too few pairs for a bound
 
     def is_provable(
         self,

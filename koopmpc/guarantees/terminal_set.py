@@ -135,13 +135,7 @@ def find_terminal_set(
 
 
 def build_tail_loop(predictor: LinearPredictor, cost: Cost, limits: Limits, reference: ArrayLike) -> TailLoop:
-    """Return the loop of the stationary feedback around a reference, and all limits on it.
-
-    Raises
-    ------
-    DataError
-        The limits exclude the set point, or the feedback does not stabilise the model.
-    """
+    """Return the loop of the stationary feedback around a reference, and all limits on it."""
     track = lifted_tracking(predictor, cost, limits)
     targets = targets_of(predictor, track)
     row = checks.vector(reference, "reference", len(track.tracked))[None]

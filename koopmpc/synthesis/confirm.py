@@ -22,38 +22,20 @@ from koopmpc.synthesis.search.recipe import Designed, Nearness, get_model
 
 @dataclass(frozen=True, eq=False)
 class ChosenController:
-    """The controller of a design, and what it was chosen from.
+    """The controller of a design, and what it was chosen from."""
 
-    Attributes
-    ----------
-    judged
-        The leaderboard, with the task and its data.
-    controller, best
-        The controller that is fitted to all data, and the place of its row.
-    linear, best_linear
-        The best linear one, and the place of its row; None where none was confirmed.
-    standby
-        A plain linear controller of the states alone; None where no such model was tried.
-    pool
-        The distribution of fresh loops.
-    compared
-        Number of loops in which finalists were compared.
-    promise
-        What the margin promises; None where no share of loops was asked for.
-    notes
-        How the choice came about, in sentences.
-    """
-
-    judged: JudgedRows
+    judged: JudgedRows  # the leaderboard, with the task and its data
+    # controller, best: the controller that is fitted to all data, and the place of its row
     controller: Designed
     best: int
+    # linear, best_linear: the best linear one, and the place of its row; None where none was confirmed
     linear: Designed | None
     best_linear: int | None
-    standby: Any
-    pool: LoopPool
-    compared: int = 0
-    promise: CoveragePromise | None = None
-    notes: tuple[str, ...] = ()
+    standby: Any  # A plain linear controller of the states alone; None where no such model was tried
+    pool: LoopPool  # the distribution of fresh loops
+    compared: int = 0  # number of loops in which finalists were compared
+    promise: CoveragePromise | None = None  # what the margin promises; None where no share of loops was asked for
+    notes: tuple[str, ...] = ()  # how the choice came about, in sentences
 
 
 class FittedRow(NamedTuple):
@@ -66,13 +48,7 @@ class FittedRow(NamedTuple):
 def choose_controller(
     judged: JudgedRows, options: DesignOptions, few: int, rng: np.random.Generator
 ) -> ChosenController:
-    """Return the best confirmed controller; `few` is the number of loops in Python, 0 for no finalists.
-
-    Raises
-    ------
-    DataError
-        No controller that was fitted to all data is confirmed.
-    """
+    """Return the best confirmed controller; `few` is the number of loops in Python, 0 for no finalists."""
     chosen = _confirm_best(judged, options)
     if few:
         chosen = _compare_finalists(chosen, options, rng)

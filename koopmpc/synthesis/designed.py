@@ -283,13 +283,7 @@ def read_controller(path: str | Path) -> SavedController | SavedDesign:
 
 
 def rebuild_controller(saved: SavedController | SavedDesign, path: str | Path) -> Any:
-    """Return the controller that was saved.
-
-    Raises
-    ------
-    LogError
-        Its parts do not go together.
-    """
+    """Return the controller that was saved."""
     try:
         return build_controller(saved.controller if isinstance(saved, SavedDesign) else saved)
     except LogError:

@@ -35,37 +35,17 @@ class ControlGoal:
 
 @dataclass(frozen=True, eq=False)
 class PosedTask:
-    """A task on data that are ready for trials.
+    """A task on data that are ready for trials."""
 
-    Attributes
-    ----------
-    task
-        Cost, limits, horizon, reference and starts, checked.
-    data
-        The prepared data, without stray episodes.
-    notes
-        What was done to the data, and where the horizon comes from.
-    doubts
-        Episodes that were left out.
-    advice
-        Limits that the cost does not weigh.
-    """
-
-    task: DesignTask
-    data: PreparedData
-    notes: tuple[str, ...]
-    doubts: tuple[str, ...]
-    advice: tuple[str, ...]
+    task: DesignTask  # cost, limits, horizon, reference and starts, checked
+    data: PreparedData  # the prepared data, without stray episodes
+    notes: tuple[str, ...]  # what was done to the data, and where the horizon comes from
+    doubts: tuple[str, ...]  # episodes that were left out
+    advice: tuple[str, ...]  # limits that the cost does not weigh
 
 
 def pose_task(data: Episodes | Source, goal: ControlGoal, options: DesignOptions) -> PosedTask:
-    """Return the task on these data.
-
-    Raises
-    ------
-    DataError, ShapeError
-        No inputs; feedthrough with measured disturbances; a size does not fit.
-    """
+    """Return the task on these data."""
     ahead = 1 if goal.horizon is None else checks.count(goal.horizon, "horizon")
     if source_of(data).nu == 0:
         raise DataError("the data have no inputs, so there is nothing to control; give each Episode its U")

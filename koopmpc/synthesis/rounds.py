@@ -49,25 +49,14 @@ def _list_first_round(results: Sequence[Tried], floor: float) -> list[Recipe]:
 
 @dataclass(frozen=True, eq=False)
 class JudgedRows:
-    """The leaderboard of a design with the outcome of each row, and the loops that judged them.
+    """The leaderboard of a design with the outcome of each row, and the loops that judged them."""
 
-    Attributes
-    ----------
-    plan
-        The task, its data and the folds.
-    test
-        The surrogates and conditions.
-    rows, outcomes
-        The recipes of the final rounds, the best first, then the others.
-    unstable
-        Whether the plant is unstable where it is used.
-    """
-
-    plan: PlannedTrials
-    test: LoopTest
+    plan: PlannedTrials  # the task, its data and the folds
+    test: LoopTest  # the surrogates and conditions
+    # rows, outcomes: the recipes of the final rounds, the best first, then the others
     rows: tuple[DesignRow, ...]
     outcomes: Sequence[Outcome]
-    unstable: bool
+    unstable: bool  # whether the plant is unstable where it is used
 
 
 def build_test(

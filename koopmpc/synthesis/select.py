@@ -156,35 +156,19 @@ def select(
 
 @dataclass(frozen=True, eq=False)
 class SearchPlan:
-    """What a search tries, and on which folds.
+    """What a search tries, and on which folds."""
 
-    Attributes
-    ----------
-    data
-        The prepared data.
-    candidates
-        Bound candidates.
-    folds, rough
-        Episodes in folds, and the same episodes as they were measured.
-    first
-        Past steps of the longest embedding: forecasts start there.
-    horizon, near
-        Steps ahead that models are judged by, and those of the short forecasts of free runs.
-    hidden
-        The data show a hidden state.
-    notes
-        What was done to the data, in sentences.
-    """
-
-    data: PreparedData
-    candidates: Sequence[Candidate]
+    data: PreparedData  # the prepared data
+    candidates: Sequence[Candidate]  # bound candidates
+    # folds, rough: episodes in folds, and the same episodes as they were measured
     folds: Folds
     rough: Episodes
-    first: int
+    first: int  # past steps of the longest embedding: forecasts start there
+    # horizon, near: steps ahead that models are judged by, and those of the short forecasts of free runs
     horizon: int
     near: int
-    hidden: bool
-    notes: tuple[str, ...]
+    hidden: bool  # the data show a hidden state
+    notes: tuple[str, ...]  # what was done to the data, in sentences
 
 
 def _list_doubts(held: Episodes) -> list[str]:

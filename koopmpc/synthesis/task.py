@@ -112,13 +112,7 @@ def check_task(
     starts: ArrayLike | None,
     angles: Sequence[int],
 ) -> DesignTask:
-    """Return the task, checked.
-
-    Raises
-    ------
-    DataError, ShapeError
-        A size does not fit, NaN, an angle that is no state.
-    """
+    """Return the task, checked."""
     cost, limits = check_cost_and_limits(cost, limits, data.states, data.inputs)
     if limits.in_time:
         raise DataError(

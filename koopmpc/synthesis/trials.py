@@ -25,31 +25,16 @@ from koopmpc.validate.memory import Memory
 
 @dataclass(frozen=True, eq=False)
 class PlannedTrials:
-    """Models to try, and the folds that they are judged on.
+    """Models to try, and the folds that they are judged on."""
 
-    Attributes
-    ----------
-    posed
-        The task and its data.
-    folds, raw
-        Episodes in three folds, and the same episodes as they were measured.
-    trials
-        One for each candidate.
-    shortest
-        Steps that an episode needs to be in a fold.
-    memory
-        What shows a hidden state; None where nothing does.
-    notes
-        Sentences on short episodes.
-    """
-
-    posed: PosedTask
+    posed: PosedTask  # the task and its data
+    # folds, raw: episodes in three folds, and the same episodes as they were measured
     folds: Folds
     raw: Episodes
-    trials: Sequence[Trial]
-    shortest: int
-    memory: Memory | None
-    notes: tuple[str, ...]
+    trials: Sequence[Trial]  # one for each candidate
+    shortest: int  # steps that an episode needs to be in a fold
+    memory: Memory | None  # what shows a hidden state; None where nothing does
+    notes: tuple[str, ...]  # sentences on short episodes
 
     def run(self, pool: Workers, options: DesignOptions) -> tuple[list[Tried], float]:
         """Return the result of each trial, and the least ridge of models with delays."""
@@ -59,13 +44,7 @@ class PlannedTrials:
 
 
 def plan_trials(posed: PosedTask, options: DesignOptions, draw: np.random.Generator) -> PlannedTrials:
-    """Return the trials of all candidates on three folds.
-
-    Raises
-    ------
-    DataError
-        There are too few long episodes for three folds.
-    """
+    """Return the trials of all candidates on three folds."""
     task, held, measured = posed.task, posed.data.held, posed.data.measured
     past, memory = list_delays(posed.data, options.delays)
     models = _list_models(held, task, options, past, draw)

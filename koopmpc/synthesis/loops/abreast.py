@@ -24,16 +24,10 @@ class Acting:
     """v_k = u_0 + gain ((1 − late) u_k + late u_{k−1} − u_0), with a gain and a delay for each of E loops.
 
     An input that comes a share `late` of a step late has this mean over the step, with that of the step before.
-
-    Attributes
-    ----------
-    middle
-        (nu,) u_0, the mean of the data's inputs.
-    gain, late
-        (E,) factors on the inputs, and delays as shares of a step.
     """
 
-    middle: Float[np.ndarray, " nu"]
+    middle: Float[np.ndarray, " nu"]  # (nu,) u_0, the mean of the data's inputs
+    # gain, late: (E,) factors on the inputs, and delays as shares of a step
     gain: Float[np.ndarray, " E"]
     late: Float[np.ndarray, " E"]
 
@@ -82,24 +76,12 @@ def explain_python(controller: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Crowd:
-    """Loops that have one stand-in in common.
+    """Loops that have one stand-in in common."""
 
-    Attributes
-    ----------
-    stand_in
-        What stands in for the plant.
-    acting
-        How the inputs of each loop act.
-    starts
-        (E, nx) first states, or (E, n) with their past.
-    seeds
-        The seed of each loop's measurement noise, as `simulate` draws it.
-    """
-
-    stand_in: Surrogate | NeighbourMap
-    acting: Acting
-    starts: Float[np.ndarray, "E n"]
-    seeds: Sequence[int]
+    stand_in: Surrogate | NeighbourMap  # what stands in for the plant
+    acting: Acting  # how the inputs of each loop act
+    starts: Float[np.ndarray, "E n"]  # (E, nx) first states, or (E, n) with their past
+    seeds: Sequence[int]  # the seed of each loop's measurement noise, as `simulate` draws it
 
     def draw_noise(self, steps: int) -> Float[np.ndarray, "E T1 nx"]:
         """Return the measurement noise of each loop."""

@@ -32,30 +32,15 @@ LESS = 0.5  # weight of a run with inputs 20 % off; other runs have weight 1
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """One run of a controller whose model was fitted without a fold.
+    """One run of a controller whose model was fitted without a fold."""
 
-    Attributes
-    ----------
-    fold
-        The fold that the model does not know.
-    surrogate
-        Number of the surrogate that is controlled; it knows that fold.
-    gain
-        Factor on the effect of the inputs; 1 is as in the data.
-    x0
-        (nx,) start.
-    first
-        Row of the reference at which the run begins.
-    u_reference
-        (T, nu) inputs without cost: those of the cost if it names them, else those that hold the reference on this
-        surrogate.
-    """
-
-    fold: int
-    surrogate: int
-    gain: float
-    x0: Float[np.ndarray, " nx"]
-    first: int
+    fold: int  # the fold that the model does not know
+    surrogate: int  # number of the surrogate that is controlled; it knows that fold
+    gain: float  # factor on the effect of the inputs; 1 is as in the data
+    x0: Float[np.ndarray, " nx"]  # (nx,) start
+    first: int  # row of the reference at which the run begins
+    # (T, nu) inputs without cost: those of the cost if it names them, else those that hold the reference on this
+    # surrogate
     u_reference: Float[np.ndarray, "T nu"]
 
 

@@ -94,17 +94,6 @@ def find_stopping_set(
     For each limit c x ≤ b of a state and each k ≤ 40 the set has a row c x_k ≤ b under those inputs that make c x_k
     least. So it leaves out only what no input can keep inside, if the plant is the `model`. Inputs are trusted with
     nine tenths of their way from `middle` to their limits.
-
-    Parameters
-    ----------
-    model
-        z⁺ = A z + B u of observables that are affine in the state.
-    limits
-        Of states and inputs; those of the inputs bound how fast a motion can be stopped.
-    middle
-        (nu,) usual inputs.
-    points
-        (n, nx) states in whose box the set is wanted. The one that is deepest inside is its center.
     """
     nx = model.nx
     bounds = np.stack([-limits.states(nx).low, limits.states(nx).high])

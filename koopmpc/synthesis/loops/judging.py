@@ -37,34 +37,18 @@ BROKEN = 1e-3  # a step violates a limit if it exceeds the limit by more than th
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The result of a job.
+    """The result of a job."""
 
-    Attributes
-    ----------
-    cost
-        Cost of each run; infinite where it was lost.
-    violation
-        Largest violation of a limit in each run, as a share of its range.
-    broken
-        Share of each run's steps that violate a limit by more than 0.1 % of its range.
-    visited
-        (n, nx) states of the runs in which the inputs act as in the data.
-    band
-        (h, nx) half-width of the band that holds 90 % of the errors 1 … h steps ahead, on folds that the models do not
-        know.
-    models
-        For each fold, the model that does not know it.
-    failure
-        Why there is no controller; empty where there is one.
-    """
-
-    cost: Float[np.ndarray, " runs"]
-    violation: Float[np.ndarray, " runs"]
+    cost: Float[np.ndarray, " runs"]  # cost of each run; infinite where it was lost
+    violation: Float[np.ndarray, " runs"]  # largest violation of a limit in each run, as a share of its range
+    # share of each run's steps that violate a limit by more than 0.1 % of its range
     broken: Float[np.ndarray, " runs"]
-    visited: Float[np.ndarray, "n nx"]
+    visited: Float[np.ndarray, "n nx"]  # (n, nx) states of the runs in which the inputs act as in the data
+    # (h, nx) half-width of the band that holds 90 % of the errors 1 … h steps ahead, on folds that the models do not
+    # know
     band: Float[np.ndarray, "h nx"]
-    models: tuple[AnyPredictor, ...] = ()
-    failure: str = ""
+    models: tuple[AnyPredictor, ...] = ()  # for each fold, the model that does not know it
+    failure: str = ""  # why there is no controller; empty where there is one
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,23 +87,6 @@ def promise_coverage(
 
     The least factor on the tube is taken with which few enough of the first loops fail; of a growing and a rigid margin
     the one whose loops cost less. Then it is fixed, and as many further loops are run.
-
-    Parameters
-    ----------
-    pool
-        The distribution of loops.
-    build
-        Limits → a controller.
-    tube
-        (h, nx) half-widths of each state along a plan.
-    room
-        (nx,) the largest margin of each state.
-    coverage
-        Wished share of loops that keep their limits.
-    loops
-        Number of loops of the choice, and of the verification.
-    rng
-        Draws the loops.
     """
     first, second, allowed = pool.draw(loops, rng), pool.draw(loops, rng), most_failures(loops, coverage)
     limits = replace(pool.task.limits, margin=None, capped=())

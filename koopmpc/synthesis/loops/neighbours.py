@@ -41,54 +41,29 @@ class NeighbourMap(Value):
     weights (Cleveland & Devlin, "Locally weighted regression", J. Am. Stat. Assoc. 83, 1988). How local it is, and its
     ridge, are chosen by forecasts of unseen episodes: in logs that hold noise, or were made in closed loop, a few rows
     tell no slope. Where no rows are near, the slope of the nearest ones goes on.
-
-    Attributes
-    ----------
-    rows
-        (M, n) v of each row.
-    steps
-        (M, nzeta) ζ⁺ − ζ.
-    points
-        (M, nx) state of each row, without its past.
-    episode
-        (M,) number of the episode of each row, which a bootstrap draws as a whole.
-    scale
-        (n,) spread of v.
-    ignored, turning
-        Places in ζ of the states that nothing depends on, and of angles that make whole turns.
-    middle, w
-        (nu,) and (nw,) means of the inputs and of the measured disturbances.
-    noise
-        (nx,) standard deviation of the measurements.
-    embedding
-        The delays of ζ, None where ζ is the state.
-    states, inputs
-        Names of the state without its past, and of the inputs.
-    dt
-        Sampling time [s].
-    local, ridge
-        Neighbours for each coefficient of the local slope, and its ridge.
-    feedthrough
-        As of a `Surrogate`.
     """
 
-    rows: Float[np.ndarray, "M n"]
-    steps: Float[np.ndarray, "M nzeta"]
-    points: Float[np.ndarray, "M nx"]
-    episode: Int[np.ndarray, " M"]
-    scale: Float[np.ndarray, " n"]
+    rows: Float[np.ndarray, "M n"]  # (M, n) v of each row
+    steps: Float[np.ndarray, "M nzeta"]  # (M, nzeta) ζ⁺ − ζ
+    points: Float[np.ndarray, "M nx"]  # (M, nx) state of each row, without its past
+    episode: Int[np.ndarray, " M"]  # (M,) number of the episode of each row, which a bootstrap draws as a whole
+    scale: Float[np.ndarray, " n"]  # (n,) spread of v
+    # ignored, turning: places in ζ of the states that nothing depends on, and of angles that make whole turns
     ignored: tuple[int, ...]
     turning: tuple[int, ...]
+    # middle, w: (nu,) and (nw,) means of the inputs and of the measured disturbances
     middle: Float[np.ndarray, " nu"]
     w: Float[np.ndarray, " nw"]
-    noise: Float[np.ndarray, " nx"]
-    embedding: Delay | None
+    noise: Float[np.ndarray, " nx"]  # (nx,) standard deviation of the measurements
+    embedding: Delay | None  # the delays of ζ, None where ζ is the state
+    # states, inputs: names of the state without its past, and of the inputs
     states: tuple[str, ...]
     inputs: tuple[str, ...]
-    dt: float
+    dt: float  # sampling time [s]
+    # local, ridge: neighbours for each coefficient of the local slope, and its ridge
     local: int = SLOPES[0][0]
     ridge: float = SLOPES[0][1]
-    feedthrough: bool = False
+    feedthrough: bool = False  # as of a `Surrogate`
 
     @classmethod
     def of(

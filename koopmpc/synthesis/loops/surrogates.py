@@ -123,15 +123,7 @@ class Surrogate(Value):
 
 
 class Holding:
-    """Reference row → the equilibrium of a surrogate that comes nearest to it inside the limits, kept for next time.
-
-    Parameters
-    ----------
-    equilibria
-        The equilibria of the surrogate's map.
-    push
-        (nx,) what its measured disturbances do to the state.
-    """
+    """Reference row → the equilibrium of a surrogate that comes nearest to it inside the limits, kept for next time."""
 
     def __init__(self, equilibria: Equilibria, push: Float[np.ndarray, " nx"]) -> None:
         self._equilibria, self._push = equilibria, push

@@ -132,13 +132,7 @@ def relift_model(model: LinearPredictor) -> BilinearPredictor:
 
 
 def check_delays(delays: Sequence[int]) -> list[int]:
-    """Return the numbers of past steps to try, each once, the least first.
-
-    Raises
-    ------
-    DataError
-        There is none, or one is no whole number of 0 or above.
-    """
+    """Return the numbers of past steps to try, each once, the least first."""
     checks.kind(delays, "delays", (Sequence, np.ndarray), "pass the numbers of past steps in a list")
     past = sorted({checks.count(d, "delays", 0) for d in delays})
     if not past:

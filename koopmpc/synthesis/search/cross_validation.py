@@ -40,34 +40,19 @@ _DIVERGED = 100.0  # forecasts diverge if their error exceeds this many spreads 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One task: a bound candidate, the episodes with their folds, the horizon and the ridges.
+    """One task: a bound candidate, the episodes with their folds, the horizon and the ridges."""
 
-    Attributes
-    ----------
-    candidate
-        Bound to the episodes' names.
-    episodes, fold
-        Episodes, and the fold of each episode.
-    horizon
-        Steps ahead.
-    first
-        The earliest step of an episode at which forecasts start: the length of the longest embedding of all
-        candidates, so that all are judged on the same forecasts.
-    ridges
-        Weights to try, the least first.
-    relift
-        Lift the forecasts of bilinear models at every step, as BilinearMPC does.
-    raw
-        The same episodes as they were measured, from which hidden states learn; by default the episodes themselves.
-    """
-
-    candidate: Candidate
+    candidate: Candidate  # bound to the episodes' names
+    # episodes, fold: episodes, and the fold of each episode
     episodes: Episodes
     fold: tuple[int, ...]
-    horizon: int
+    horizon: int  # steps ahead
+    # the earliest step of an episode at which forecasts start: the length of the longest embedding of all candidates,
+    # so that all are judged on the same forecasts
     first: int
-    ridges: tuple[float, ...]
-    relift: bool = False
+    ridges: tuple[float, ...]  # weights to try, the least first
+    relift: bool = False  # lift the forecasts of bilinear models at every step, as BilinearMPC does
+    # the same episodes as they were measured, from which hidden states learn; by default the episodes themselves
     raw: Episodes | None = None
 
     @property
@@ -81,34 +66,17 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Tried(Value):
-    """The result of a trial, for each ridge.
+    """The result of a trial, for each ridge."""
 
-    Attributes
-    ----------
-    candidate
-        The candidate that was tried.
-    ridges
-        Tikhonov weights as in `edmd`.
-    errors
-        (ridges, folds, horizon) root-mean-square error over the states h steps ahead, each relative to the state's
-        spread; infinite from the step on at which the forecasts of a fold diverge.
-    inputs
-        Number of columns of B and E.
-    A
-        (ridges, nz, nz) matrices A, fitted to all folds.
-    misfit
-        Mean over the states of (one-step residual / spread)², of all folds with the least ridge.
-    seconds
-        Time that the trial took.
-    """
-
-    candidate: Candidate
-    ridges: tuple[float, ...]
+    candidate: Candidate  # the candidate that was tried
+    ridges: tuple[float, ...]  # tikhonov weights as in `edmd`
+    # (ridges, folds, horizon) root-mean-square error over the states h steps ahead, each relative to the state's
+    # spread; infinite from the step on at which the forecasts of a fold diverge
     errors: Float[np.ndarray, "ridges folds horizon"]
-    inputs: int
-    A: Float[np.ndarray, "ridges nz nz"]
-    misfit: float
-    seconds: float
+    inputs: int  # number of columns of B and E
+    A: Float[np.ndarray, "ridges nz nz"]  # (ridges, nz, nz) matrices A, fitted to all folds
+    misfit: float  # mean over the states of (one-step residual / spread)², of all folds with the least ridge
+    seconds: float  # time that the trial took
 
     @property
     def scores(self) -> Float[np.ndarray, "ridges folds"]:
@@ -296,13 +264,7 @@ def _errors(
 
 
 def check_ridges(ridges: object) -> tuple[float, ...]:
-    """Return the ridges in ascending order; those below 1e-9 are raised to it.
-
-    Raises
-    ------
-    DataError
-        There is no ridge, or one is negative.
-    """
+    """Return the ridges in ascending order; those below 1e-9 are raised to it."""
     given = checks.array(ridges, "ridges", (None,))  # pyright: ignore[reportArgumentType]  # checks.array accepts any object
     if not given.size or (given < 0).any():
         raise DataError(f"ridges is {given.tolist()}; pass weights of 0 or above, at least one")

@@ -20,13 +20,7 @@ _TOLD = 3  # a note names at most this many glitches
 
 
 def take_sample(source: Source, pairs: int) -> tuple[Episodes, tuple[str, ...]]:
-    """Return episodes of about `pairs` snapshot pairs at most, spread over the source, and a sentence if not all.
-
-    Raises
-    ------
-    DataError
-        The source can be read once only.
-    """
+    """Return episodes of about `pairs` snapshot pairs at most, spread over the source, and a sentence if not all."""
     if not source.replayable:
         raise DataError(
             "a stream is read once, and a selection reads its data several times; pass Episodes, "

@@ -49,22 +49,6 @@ def project_on_instruments(
     episodes. A share lags / M of the noise variance remains, and feedback no longer carries it from y to u. Models of
     any kind can be fitted to the result; if the loop is linear and settles within the lags, they are consistent.
 
-    Parameters
-    ----------
-    episodes
-        Logs of closed loops.
-    instruments
-        For each episode (T, nr) or (T + 1, nr) rows of its set point or test signal.
-    lags
-        Rows of it; the first lags − 1 rows of each episode are dropped.
-
-    Raises
-    ------
-    DataError
-        No episode is longer than the lags.
-    ShapeError
-        There is not one array an episode, of one row a step.
-
     References
     ----------
     Van den Hof & Schrama, "An indirect method for transfer function estimation from closed loop data", Automatica 29,
@@ -109,17 +93,6 @@ def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None)
     the data must have an error in forecasts of unseen, measured rows that is 2 % below that of least squares, and
     a model with thin plates must not lose: else what looks like noise is a curvature of the plant.
 
-    Parameters
-    ----------
-    episodes
-        Logs of closed loops, as measured.
-    instruments
-        As for `project_on_instruments`, or None.
-
-    Raises
-    ------
-    ShapeError
-        The instruments do not fit the episodes.
     """
     signals = None if instruments is None else _check(episodes, instruments)
     kept = FeedbackData(episodes, np.zeros(episodes.nx), "")
@@ -230,13 +203,7 @@ def require_episodes(data: object) -> Episodes:
 
 
 def _compare_unseen(episodes: Episodes, pieces: _Pieces, way: _Way) -> float:
-    """Return the error of forecasts by a linear model of the changed rows over that of least squares, on unseen rows.
-
-    Raises
-    ------
-    DataError
-        The logs are too short, or a model with thin plates loses by the change.
-    """
+    """Return the error of forecasts by a linear model of the changed rows over that of least squares, on unseen rows."""
     block = max(min(len(e) for e in episodes) // _FOLDS, way.settles + _AHEAD)
     parts = [
         (e.cut(k, min(k + block, len(e))), None if r is None else r[k : min(k + block, len(e)) + 1])

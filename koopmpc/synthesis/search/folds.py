@@ -50,21 +50,6 @@ def make_folds(episodes: Episodes, needed: int, folds: int, rng: np.random.Gener
     Episodes are dealt out at random. Neighbouring blocks are alike, so blocks keep their order and a fold is one
     stretch of time.
 
-    Parameters
-    ----------
-    episodes
-        Of any length.
-    needed
-        Steps that an episode must have to be scored.
-    folds
-        Number of folds; fewer if there are fewer episodes.
-    rng
-        Deals out the episodes.
-
-    Raises
-    ------
-    DataError
-        Less than two episodes, or blocks, are long enough.
     """
     notes: list[str] = []
     long = [episode for episode in episodes if len(episode) >= needed]

@@ -32,17 +32,11 @@ _LONGEST = 4000  # rows of a free run that judges finalists, at most; the search
 
 @dataclass(frozen=True, eq=False)
 class FreeRun(Value):
-    """How a model does on stretches of records that its fit did not see, in free run and in short forecasts.
+    """How a model does on stretches of records that its fit did not see, in free run and in short forecasts."""
 
-    Attributes
-    ----------
-    errors
-        (blocks,) geometric means of both errors, relative to the spread of each state.
-    calm
-        The model that is fitted to all rows stays within three times the range of the data, over each record twice.
-    """
-
+    # (blocks,) geometric means of both errors, relative to the spread of each state
     errors: Float[np.ndarray, " blocks"]
+    # the model that is fitted to all rows stays within three times the range of the data, over each record twice
     calm: bool
 
     @property
@@ -65,28 +59,10 @@ def judge_free_run(
 ) -> FreeRun:
     """Return how a fit does on each quarter of the records when it learns from the others.
 
-    Where it errs by a tenth more than a `rival` on each of the first two quarters, it is not fitted to the others, and
-    has lost there. One quarter does not decide: without it the data may lack what only that quarter holds.
-
-    Parameters
-    ----------
-    fit
-        Returns the model of some episodes.
-    learned, measured
-        The same records, as they are fitted, smoothed for example, and as they were measured.
-    first
-        Row of a record at which its free run begins; the model's past lies before it.
-    horizon
-        Steps of the short forecasts.
-    relift
-        Lift the forecasts at every step.
-    rival
-        How another model did on the same stretches.
-    beaten
-        How a model did that this one must beat by a tenth to be taken. Where it would have to halve those errors on the
-        quarters that are left, it is not fitted to them; nor to all rows where it did not.
-    calm
-        Whether it is calm, where that is known; else it is fitted to all rows to see.
+    It learns from `learned` rows, smoothed for example, and is judged on `measured` ones: in free run from row `first`
+    on, and in forecasts of `horizon` steps. Where it errs by a tenth more than a `rival` on each of the first two
+    quarters, it is not fitted to the others: one quarter may hold what the others lack. Nor is it where it would have
+    to halve the errors of `beaten` there, a model that it must beat by a tenth. Whether it is `calm` may be known.
     """
     seen, truth = cut_pieces(learned), cut_pieces(measured)
     scale = np.concatenate([episode.X for episode in truth]).std(axis=0)
@@ -229,20 +205,7 @@ def judge_finalists(
     The best row of each kind runs, with delays and without, sparse or not. Linear models with other observables than
     the states run lifted once and lifted at each step; where that is better, the row becomes one of a bilinear model
     with N = 0, for those are used so. Where smoothed rows are learned from, measured ones are tried too, and taken
-    unless the smoothed ones gain.
-
-    Parameters
-    ----------
-    rows
-        The leaderboard.
-    learned, measured, first, horizon
-        As in `judge_free_run`.
-    sparse
-        How the sparse polynomial of each kind ran.
-    progress
-        Called after each model.
-    ran
-        Further rows, of models that ran freely already.
+    unless the smoothed ones gain. The `sparse` polynomial of each kind has run already, and so have the rows `ran`.
     """
     groups: dict[tuple[str, bool, bool], list[int]] = {}
     for i, row in enumerate(rows):
@@ -252,43 +215,44 @@ def judge_finalists(
     for done, place in enumerate(places):
         if progress is not None:
             progress(done, len(places))
-        row = rows[place]
-        if isinstance(row.structure, Structure):
-            runs[place] = sparse[row.kind]
-            continue
-        fit = partial(_fit_quietly, row.candidate, row.ridge)
-        run = judge_free_run(fit, learned, measured, first, horizon, relift=row.bilinear)
-        if learned is not measured:
-            raw = judge_free_run(fit, measured, measured, first, horizon, relift=row.bilinear)
-            if (raw.calm, -raw.error) >= (run.calm, -run.error):  # the smoother gains nothing
-                row, run = replace(row, rough=True), raw
-                every[place] = row
-        lifted = row.nz > len(row.lifting.bound_states) + 1
-        if row.kind == "linear" and lifted:
-            seen = measured if row.rough else learned
-            again = judge_free_run(fit, seen, measured, first, horizon, relift=True)
-            if again.calm >= run.calm and is_worse(run.errors, again.errors):
-                every[place], run = replace(row, bilinear=True, relifted=True), again
-        runs[place] = run
-    for row, run in ran:
-        runs[len(every)] = run
-        places.append(len(every))
-        every.append(row)
+        known = sparse[rows[place].kind] if isinstance(rows[place].structure, Structure) else None
+        every[place], runs[place] = (
+            (rows[place], known) if known else _run_row(rows[place], learned, measured, first, horizon)
+        )
+    runs |= {len(every) + i: run for i, (_, run) in enumerate(ran)}
+    every += [row for row, _ in ran]
     some = any(run.calm for run in runs.values())
     for place, run in runs.items():
         every[place] = replace(every[place], free=run.error if run.calm or not some else np.inf)
-    found = tuple(every)
+    kinds = {every[i].kind for i in runs}
+    return tuple(every), _choose_run(every, runs), {kind: _choose_run(every, runs, kind) for kind in kinds}
 
-    def choose(kind: str | None) -> int:
-        asked = [i for i in places if kind is None or found[i].kind == kind]
-        plain = [i for i in asked if not isinstance(found[i].structure, HiddenStructure)]
-        calm = [found[i].free for i in plain]
-        those = [i for i in asked if i in plain or found[i].free < _PAYS * min(calm, default=np.inf)]
-        sizes = [found[i].size if i in plain else np.inf for i in those]  # of models alike one without a hidden state
-        return those[choose_by_free_run([runs[i] for i in those], sizes)]
 
-    kinds = {found[i].kind for i in places}
-    return found, choose(None), {kind: choose(kind) for kind in kinds}
+def _run_row(
+    row: LeaderboardRow, learned: Episodes, measured: Episodes, first: int, horizon: int
+) -> tuple[LeaderboardRow, FreeRun]:
+    """Return how a row's model runs, and the row: of measured rows, or lifted at each step, where that is better."""
+    fit = partial(_fit_quietly, row.candidate, row.ridge)
+    run = judge_free_run(fit, learned, measured, first, horizon, relift=row.bilinear)
+    if learned is not measured:
+        raw = judge_free_run(fit, measured, measured, first, horizon, relift=row.bilinear)
+        if (raw.calm, -raw.error) >= (run.calm, -run.error):  # the smoother gains nothing
+            row, run, learned = replace(row, rough=True), raw, measured
+    if row.kind == "linear" and row.nz > len(row.lifting.bound_states) + 1:
+        again = judge_free_run(fit, learned, measured, first, horizon, relift=True)
+        if again.calm >= run.calm and is_worse(run.errors, again.errors):
+            return replace(row, bilinear=True, relifted=True), again
+    return row, run
+
+
+def _choose_run(rows: Sequence[LeaderboardRow], runs: Mapping[int, FreeRun], kind: str | None = None) -> int:
+    """Return the place of the best row; one with a hidden state has to pay."""
+    same = [i for i in runs if kind in (None, rows[i].kind)]
+    plain = [i for i in same if not isinstance(rows[i].structure, HiddenStructure)]
+    least = min((rows[i].free for i in plain), default=np.inf)
+    those = [i for i in same if i in plain or rows[i].free < _PAYS * least]
+    sizes = [rows[i].size if i in plain else np.inf for i in those]  # of models alike one without a hidden state
+    return those[choose_by_free_run([runs[i] for i in those], sizes)]
 
 
 def _fit_quietly(candidate: Candidate, ridge: float, data: Episodes) -> AnyPredictor:

@@ -1,8 +1,9 @@
 """Models of records with a hidden state: linear and polynomial ones, with rails and without, and neurons."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -52,23 +53,8 @@ def judge_hidden_states(
     are judged, if they are calm and err by a tenth less than all others; else of those that err by less than half more.
     Where records are too short for a kind, it is left out; so is a model that on the first stretches errs by
     a tenth more than the best calm one so far, and one that does not err a tenth less than the calm one of its kind.
-
-    Parameters
-    ----------
-    measured
-        The records, their inputs in time.
-    first, horizon
-        As in `judge_free_run`.
-    rival
-        Least error of other models on unseen rows; what errs by far more is not judged.
-    bilinear
-        Try polynomial ones, which are bilinear predictors.
-    ran
-        How the best other model of each kind ran over the same stretches.
-    short
-        Steps of the short forecasts that judge; `horizon` by default, whose errors the leaderboard shows.
-    progress
-        Called with what is done and how many there are.
+    `rival` is the least error of other models on unseen rows, and `ran` how the best of each kind ran. Forecasts of
+    `short` steps judge, and the leaderboard shows the errors of `horizon` steps.
     """
     begun = perf_counter()
     found = search_hidden_states(measured, bilinear, rival, progress, near=NEAR)
@@ -95,51 +81,55 @@ def search_hidden_states(
 
     If no model with neurons errs by a tenth less, those count that err by less than `near` times the best of all.
     """
-    found: list[HiddenStructure] = []
-    neural: list[HiddenStructure] = []
-    try:
-        (order,), (delays,), errors = choose_sizes(measured)
-        found.append(HiddenStructure(order, 1, delays, 0, None, errors, True, order * (order + 1 + measured.nu)))
-    except KoopmpcError:
-        pass
     rails = find_rails(measured)
 
     def ask(_: str, done: int, total: int) -> None:
         if progress is not None:
             progress(done, total)
 
-    orders, kinds = _ORDERS, dict[bool, list[HiddenStructure]]()
-    for limits in (None,) if rails is None else (None, rails):
+    def search(how: Any, *args: Any, **more: Any) -> list[HiddenStructure]:
         try:
-            tried = search_hidden(measured, orders, rails=limits, ask=ask)
-        except KoopmpcError:
-            continue
-        ranked = dict.fromkeys(one.order for one in sorted(tried, key=lambda one: one.error))
-        orders = tuple(ranked)[:_RAILED]  # with rails only those that did best without
-        for kind in (False, True) if bilinear else (False,):
-            same = [one for one in tried if one.is_nonlinear is kind]
-            if same and (kind or limits is None):
-                kinds.setdefault(kind, []).extend(same)
-    found += map(choose_hidden, kinds.values())
+            return how(measured, *args, ask=ask, **more)
+        except KoopmpcError:  # the records are too short for this kind
+            return []
+
+    found = search(_find_subspace)
+    plain = search(search_hidden, _ORDERS, rails=None)
+    railed = list[HiddenStructure]()
+    if rails is not None:  # only orders that did best without
+        ranked = dict.fromkeys(one.order for one in sorted(plain, key=lambda one: one.error))
+        railed = search(search_hidden, tuple(ranked)[:_RAILED] or _ORDERS, rails=rails)
+    linear = [one for one in plain if not one.is_nonlinear]
+    bent = [one for one in (*plain, *railed) if one.is_nonlinear] if bilinear else []
+    found += [choose_hidden(same) for same in (linear, bent) if same]
+    neural = list[HiddenStructure]()
     if bilinear and measured.nx <= _SENSORS:
-        try:
-            saturates = bool(found) and min(found, key=lambda one: one.error).rails is not None
-            tried = search_neural(
-                measured, _NEURAL_ORDERS, degrees=(1,), rails=rails if saturates else None, quick=True, ask=ask
-            )
-        except KoopmpcError:
-            tried = []
-        best = min([rival, *(one.error for one in found if one.calm)])
-        calm = [one for one in tried if one.calm and one.error < PAYS * best]
-        if not calm:  # one quarter hardly tells models apart: the others may
-            calm = [one for one in tried if one.calm and one.error < near * best]
-        orders = sorted({one.order for one in calm})
-        each = [choose_hidden([one for one in calm if one.order == order]) for order in orders]
-        each.sort(key=lambda one: one.parameters)
-        best_one = min(each, key=lambda one: one.error, default=None)
-        neural = [one for one in each if one is each[0] or one is best_one]  # the best one races against the smallest
+        saturates = bool(found) and min(found, key=lambda one: one.error).rails is not None
+        limits = rails if saturates else None
+        tried = search(search_neural, _NEURAL_ORDERS, degrees=(1,), rails=limits, quick=True)
+        neural = _choose_neural(tried, min([rival, *(one.error for one in found if one.calm)]), near)
     least = min([rival, *(one.error for one in (*found, *neural))])
     return [*(one for one in found if one.error < FAR * least), *neural]
+
+
+def _find_subspace(measured: Episodes, *, ask: object) -> list[HiddenStructure]:
+    del ask  # it takes no time
+    (order,), (delays,), errors = choose_sizes(measured)
+    return [HiddenStructure(order, 1, delays, 0, None, errors, True, order * (order + 1 + measured.nu))]
+
+
+def _choose_neural(tried: Sequence[HiddenStructure], best: float, near: float) -> list[HiddenStructure]:
+    """Return the smallest order and the best one of those with neurons; where no model gains, of those nearly as good.
+
+    One quarter hardly tells models apart: the others may.
+    """
+    calm = [[one for one in tried if one.calm and one.error < share * best] for share in (PAYS, near)]
+    same = calm[0] or calm[1]
+    orders = sorted({one.order for one in same})
+    each = [choose_hidden([one for one in same if one.order == order]) for order in orders]
+    each.sort(key=lambda one: one.parameters)
+    best_one = min(each, key=lambda one: one.error, default=None)
+    return [one for one in each if one is each[0] or one is best_one]  # the best one races against the smallest
 
 
 def propose_hidden_states(episodes: Episodes, bilinear: bool, progress: Progress | None = None) -> list[Candidate]:
@@ -158,7 +148,6 @@ def propose_hidden_states(episodes: Episodes, bilinear: bool, progress: Progress
 
 
 def _name_structure(structure: HiddenStructure) -> str:
-    """Return the name of a candidate."""
     rails = "" if structure.rails is None else ", saturating sensor"
     how = "simulation error" if structure.horizon else "subspace"
     name = f"hidden state of order {structure.order}"

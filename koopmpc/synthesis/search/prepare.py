@@ -36,37 +36,21 @@ LATE_COLUMN = (
 
 @dataclass(frozen=True, eq=False)
 class PreparedData:
-    """The data of a search, and what was done to them.
+    """The data of a search, and what was done to them."""
 
-    Attributes
-    ----------
-    source, held
-        What the chosen model is fitted to, and the episodes that the choice uses; smoothed where noise was found.
-    measured_source, measured
-        The same before they were smoothed.
-    noise
-        (nx,) standard deviation of the noise that was taken out.
-    noisy
-        Noise is still to be looked for.
-    record
-        The data are a few long records and no candidates were given.
-    lead
-        Rows by which the inputs were moved up.
-    moved
-        Sentence on these, for the report of a model.
-    sampled, notes
-        The sentence on the sample, and all sentences on what was done.
-    """
-
+    # source, held: what the chosen model is fitted to, and the episodes that the choice uses; smoothed where noise
+    # was found
     source: Source
     held: Episodes
+    # measured_source, measured: the same before they were smoothed
     measured_source: Source
     measured: Episodes
-    noise: Float[np.ndarray, " nx"]
-    noisy: bool
-    record: bool
-    lead: int
-    moved: str
+    noise: Float[np.ndarray, " nx"]  # (nx,) standard deviation of the noise that was taken out
+    noisy: bool  # noise is still to be looked for
+    record: bool  # the data are a few long records and no candidates were given
+    lead: int  # rows by which the inputs were moved up
+    moved: str  # sentence on these, for the report of a model
+    # sampled, notes: the sentence on the sample, and all sentences on what was done
     sampled: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -79,22 +63,7 @@ class PreparedData:
 
 
 def prepare_data(data: Episodes | Source, options: SearchOptions, *, feedback: bool, feedthrough: str) -> PreparedData:
-    """Return a sample of the data without glitches, with inputs in time, and without noise that feedback carries.
-
-    Parameters
-    ----------
-    data, options
-        As for `select`.
-    feedback
-        Look for feedback in episodes in memory, where noise is to be taken out.
-    feedthrough
-        What a model is told about inputs that act at once.
-
-    Raises
-    ------
-    DataError
-        Feedthrough of data without inputs; a stream that can be read only once; instruments without episodes.
-    """
+    """Return a sample of the data without glitches, with inputs in time, and without noise that feedback carries."""
     used, noise, smooth = "", None, bool(options.smooth)
     if options.instruments is not None or (smooth and feedback and isinstance(data, Episodes)):
         loop = remove_feedback(require_episodes(data), options.instruments)

@@ -33,21 +33,11 @@ Designed = KoopmanMPC | BilinearMPC
 
 @dataclass(frozen=True, eq=False)
 class Nearness(Value):
-    """Weight 1e-3 + exp(−d²/2h²) of each step of an episode, d the distance to the nearest visited state.
+    """Weight 1e-3 + exp(−d²/2h²) of each step of an episode, d the distance to the nearest visited state."""
 
-    Attributes
-    ----------
-    visited
-        (n, nx) visited states, divided by `scale`.
-    scale
-        (nx,) standard deviation of each state in the data.
-    width
-        h, in units of `scale`.
-    """
-
-    visited: Float[np.ndarray, "n nx"]
-    scale: Float[np.ndarray, " nx"]
-    width: float
+    visited: Float[np.ndarray, "n nx"]  # (n, nx) visited states, divided by `scale`
+    scale: Float[np.ndarray, " nx"]  # (nx,) standard deviation of each state in the data
+    width: float  # h, in units of `scale`
 
     @staticmethod
     def of(X: Float[np.ndarray, "m nx"], data: Episodes) -> "Nearness":
@@ -152,11 +142,6 @@ class Recipe(Value):
         """Return the controller of a model; one that is used briefly (`brief`) compiles no machine code of the model.
 
         With `monitor`, its moves say whether they are `known` to these data.
-
-        Raises
-        ------
-        KoopmpcError
-            The model and the cost do not go together.
         """
         if self.tail is not None and cost.Q_N is None and cost.tail is None:
             cost = replace(cost, tail=self.tail)

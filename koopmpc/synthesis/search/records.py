@@ -150,15 +150,7 @@ def _segments(data: Episodes, horizon: int) -> list[int]:
 
 
 def fit_again(selection: Selection, episodes: Episodes) -> AnyPredictor:
-    """Return the chosen model of a selection fitted to other rows: the same observables, ridge and refinement.
-
-    Parameters
-    ----------
-    selection
-        The choice.
-    episodes
-        Logs like those of the choice; their inputs are moved as the chosen model's were.
-    """
+    """Return the chosen model of a selection fitted to other rows: the same observables, ridge and refinement."""
     row, data = selection.best, selection.predictor.align(episodes)
     if row.structure is None and not row.rough:
         data = smooth_data(Held(data), data)[1]
