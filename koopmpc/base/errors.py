@@ -110,11 +110,17 @@ class SourcesOnlyWarning(UserWarning):
     """A Functional Mock-up Unit that was written holds no machine code, for want of a C compiler."""
 
 
-def refuse_moved(keywords: Mapping[str, object], options: Any, name: str) -> None:
-    """Raise a TypeError where there is a keyword, which says that it is a field of the dataclass `options` now."""
+def refuse_moved(
+    keywords: Mapping[str, object], options: Any, name: str, others: Mapping[str, str] | None = None
+) -> None:
+    """Raise a TypeError where there is a keyword, which says that it is a field of the dataclass `options` now.
+
+    `others` are keywords that became another field: the old name, and what to pass.
+    """
+    places = {field.name: f"{field.name}=…" for field in fields(options)} | dict(others or {})
     for word in keywords:
-        if word in {field.name for field in fields(options)}:
-            raise TypeError(f"{word}= is a field of the options now: pass options={name}({word}=…)")
+        if word in places:
+            raise TypeError(f"{word}= is a field of the options now: pass options={name}({places[word]})")
         raise TypeError(f"there is no argument {word}=")
 
 

@@ -5,11 +5,12 @@ choice and its confirmation (confirm), fresh loops (promise).
 """
 
 import warnings
+from typing import Any
 
 from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
-from koopmpc.base.errors import FitWarning
+from koopmpc.base.errors import FitWarning, refuse_moved
 from koopmpc.base.parallel import Workers
 from koopmpc.control.ask.cost import Cost
 from koopmpc.control.ask.limits import Limits
@@ -18,14 +19,13 @@ from koopmpc.data.source import Source
 from koopmpc.synthesis.confirm import choose_controller
 from koopmpc.synthesis.designed import Design
 from koopmpc.synthesis.loops.margin import check_share
-from koopmpc.synthesis.options import DesignOptions, check_options, explain_moved
+from koopmpc.synthesis.options import DesignOptions, check_options
 from koopmpc.synthesis.pose import ControlGoal, pose_task
 from koopmpc.synthesis.promise import FEW, expect_loops
 from koopmpc.synthesis.rounds import build_test, judge_rounds
 from koopmpc.synthesis.trials import plan_trials
 
 
-@explain_moved(DesignOptions, {"tighten": "margin=None", "coverage": "margin=0.95"})
 def design(
     data: Episodes | Source,
     cost: Cost,
@@ -35,6 +35,7 @@ def design(
     horizon: int | None = None,
     starts: ArrayLike | None = None,
     options: DesignOptions | None = None,
+    **moved: Any,
 ) -> Design:
     """Choose model and controller by closed loop on learned surrogates of the plant, and fit them to all data.
 
@@ -104,6 +105,7 @@ def design(
         No input inside the limits holds the reference; the reference or a start lies outside the data; an episode is
         left out.
     """
+    refuse_moved(moved, DesignOptions, "km.DesignOptions", {"tighten": "margin=None", "coverage": "margin=0.95"})
     asked = check_options(options, DesignOptions)
     draw, few = checks.generator(asked.rng), FEW if asked.loops is None else asked.loops
     if asked.promised is not None:

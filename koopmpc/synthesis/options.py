@@ -1,9 +1,8 @@
-"""Options of `select` and `design`, field by field, and the sentence for a keyword that has moved into them."""
+"""Options of `select` and `design`, field by field."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from functools import wraps
-from typing import Literal, ParamSpec, TypeVar
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,8 +14,6 @@ from koopmpc.lifting.base import Lifting
 from koopmpc.synthesis.search.candidates import Candidate
 
 Options = TypeVar("Options")
-P = ParamSpec("P")
-R = TypeVar("R")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,23 +120,3 @@ def check_options(options: Options | None, kind: type[Options]) -> Options:
         return kind()
     checks.kind(options, "options", kind, f"pass km.{kind.__name__}(…)")
     return options
-
-
-def explain_moved(kind: type, others: Mapping[str, str]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Return a decorator: keywords that are fields of `kind`, or in `others`, raise a sentence with the new place."""
-    advice = {field.name: f"{field.name}=…" for field in fields(kind)} | dict(others)
-
-    def decorate(call: Callable[P, R]) -> Callable[P, R]:
-        @wraps(call)
-        def checked(*args: P.args, **keywords: P.kwargs) -> R:
-            for name in keywords:
-                if name in advice:
-                    raise DataError(
-                        f"{call.__name__} has no argument {name} any more; pass "
-                        f"options=km.{kind.__name__}({advice[name]})"
-                    )
-            return call(*args, **keywords)
-
-        return checked
-
-    return decorate

@@ -6,12 +6,13 @@ Of long records the best of each kind also run freely over stretches that no fit
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
-from koopmpc.base.errors import FitWarning
+from koopmpc.base.errors import FitWarning, refuse_moved
 from koopmpc.base.parallel import map_tasks
 from koopmpc.data.angles import count_wraps
 from koopmpc.data.episodes import Episodes
@@ -19,7 +20,7 @@ from koopmpc.data.source import Source
 from koopmpc.models.moments.read import ReadOptions
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.models.records.structure import Structure, find_forecast_horizon
-from koopmpc.synthesis.options import SearchOptions, check_options, explain_moved
+from koopmpc.synthesis.options import SearchOptions, check_options
 from koopmpc.synthesis.search.candidates import (
     Candidate,
     check_delays,
@@ -46,7 +47,6 @@ FEEDTHROUGH = (
 )
 
 
-@explain_moved(SearchOptions, {"episodes": "…): the data are the first argument, select(data"})
 def select(
     data: Episodes | Source,
     *,
@@ -55,6 +55,7 @@ def select(
     ridges: ArrayLike | None = None,
     relift: bool = True,
     options: SearchOptions | None = None,
+    **moved: Any,
 ) -> Selection:
     """Choose the model with min over models of max over folds of the mean log error, h = 1 … horizon steps ahead.
 
@@ -123,6 +124,7 @@ def select(
     ----------
     Breiman, Friedman, Olshen & Stone, "Classification and Regression Trees", 1984, section 3.4.3.
     """
+    refuse_moved(moved, SearchOptions, "km.SearchOptions")
     asked = check_options(options, SearchOptions)
     draw = checks.generator(asked.rng)
     weights, folds = RIDGES if ridges is None else check_ridges(ridges), checks.count(folds, "folds", 2)

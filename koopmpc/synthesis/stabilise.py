@@ -1,7 +1,8 @@
 """stabilise: from short episodes near an equilibrium to a feedback that holds an unstable plant, and to data."""
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -20,9 +21,8 @@ FIRST = 0.05  # share of `reach` from which the first episodes start
 WIDEST = 0.5  # share of `reach` from which the last ones may start
 LOUD = (1.0, 0.5, 0.25, 0.1)  # shares of the input range that the noise of the first episodes has, tried in turn
 GROWTH = 2.0  # from round to round, of starts and of lengths, while nothing is lost
-_RIDGE = 1e-9
-_HELD = 20  # runs without noise that the feedback is judged by, from nearer where too few of them stay
-_ENOUGH = 0.95  # share of them that must stay
+HELD = 20  # runs without noise that the feedback is judged by, from nearer where too few of them stay
+ENOUGH = 0.95  # share of them that must stay
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Stabilised(Value):
         """Return what was reached, in a sentence."""
         steps = sum(map(len, self.data))
         return (
-            f"held in {self.held:.0%} of {_HELD} runs from within {self.start:.0%} of the reach, after "
+            f"held in {self.held:.0%} of {HELD} runs from within {self.start:.0%} of the reach, after "
             f"{len(self.data)} episodes of {steps} steps in all, {self.lost} of which were lost"
         )
 
@@ -117,75 +117,37 @@ def stabilise(
         plant = SimulatedPlant(plant)
     require_plant(plant)
     draw = checks.generator(rng)
-    nu = len(plant.inputs)
-    checks.kind(equilibrium, "equilibrium", (tuple, list), "pass (x, u) of the resting plant")
-    if len(equilibrium) != 2:
-        raise ShapeError(f"equilibrium has {len(equilibrium)} parts; pass (x, u) of the resting plant")
-    x_ref = np.atleast_1d(checks.array(equilibrium[0], "the equilibrium's state"))
-    nx = len(x_ref)
-    if len(plant.outputs) != nx:
-        raise DataError(
-            f"the equilibrium has {nx} states and the plant measures {len(plant.outputs)}: pass all that is measured; "
-            "a feedback of states needs every one of them"
-        )
-    u_ref = checks.vector(equilibrium[1], "the equilibrium's input", nu)
-    size = checks.vector(reach, "reach", nx)
-    low, high = checks.vector(u_min, "u_min", nu), checks.vector(u_max, "u_max", nu)
-    checks.refuse_crossed(low, high, "input")
-    if (size <= 0).any():
-        raise DataError(f"reach is {size}; pass a distance above zero for each state, beyond which an episode ends")
-    if ((u_ref < low) | (u_ref > high)).any() or (low == high).any():
-        raise DataError(f"the equilibrium's input is {u_ref}; it must lie inside u_min {low} and u_max {high}")
+    near = _check_surroundings(plant, equilibrium, reach, u_min, u_max)
     episodes, steps, rounds = (
         checks.count(value, name) for value, name in ((episodes, "episodes"), (steps, "steps"), (rounds, "rounds"))
     )
-    test = _Trials(plant, x_ref, size, draw)
-    room = np.minimum(u_ref - low, high - u_ref)
-    room = np.where(room > 0, room, (high - low) / 2)
-    start, lost = FIRST, 0
-    made: list[Episode] = []
-    for i in range(episodes):
-        loud = LOUD[i % len(LOUD)] * room
-        policy = Noise(np.maximum(u_ref - loud, low), np.minimum(u_ref + loud, high), hold=2)
-        episode, whole = test.run(policy, start, max(steps // 4, 5))
-        made.append(episode)
-        lost += not whole
-    share, feedback = 0.5, None
-    length = max(steps // 2, 5)
+    trials = _Trials(plant, near, draw)
+    room = np.minimum(near.u - near.low, near.high - near.u)
+    room = np.where(room > 0, room, (near.high - near.low) / 2)
+    loud = [LOUD[i % len(LOUD)] * room for i in range(episodes)]
+    shaken = [Noise(np.maximum(near.u - one, near.low), np.minimum(near.u + one, near.high), hold=2) for one in loud]
+    trials.record(shaken, FIRST, max(steps // 4, 5))
+    start, share, length, feedback = FIRST, 0.5, max(steps // 2, 5), None
     for _ in range(rounds):
-        found = _feedback(made, x_ref, u_ref, size, low, high)
-        if found is None:
+        again = _find_feedback(trials.made, near, share * room)
+        if again is None:
             continue
-        gain, held_by = found
-        loud = share * room
-        feedback = Feedback(gain, Noise(-loud, loud, hold=2), x_ref, held_by, low, high)
-        fallen = 0
-        for _ in range(episodes):
-            episode, whole = test.run(feedback, start, length)
-            made.append(episode)
-            fallen += not whole
-        lost += fallen
-        if fallen:
+        feedback = again
+        if trials.record([feedback] * episodes, start, length):
             share, start = share / 2, max(start / GROWTH, FIRST)
+        elif length == steps and start == WIDEST:
+            break
         else:
-            done = length == steps and start == WIDEST
             length, start = min(int(GROWTH * length), steps), min(GROWTH * start, WIDEST)
-            if done:
-                break
     if feedback is None:
         raise KoopmpcError(
-            f"{len(made)} episodes near the equilibrium gave no model with a stabilising gain; pass wider input bounds "
-            "or a larger reach, or more episodes"
+            f"{len(trials.made)} episodes near the equilibrium gave no model with a stabilising gain; pass wider input "
+            "bounds or a larger reach, or more episodes"
         )
-    still = Feedback(feedback.K, None, x_ref, feedback.u_ref, low, high)
-    start *= GROWTH
-    held = 0.0
-    while held < _ENOUGH and start > FIRST:
-        start = max(start / GROWTH, FIRST)
-        held = float(np.mean([test.run(still, start, steps)[1] for _ in range(_HELD)]))
-    kept = Episodes([e for e in made if len(e)], plant.dt, plant.states, plant.inputs)
-    result = Stabilised(feedback, kept, held, start, lost)
-    if held < _ENOUGH:
+    held, start = trials.measure_hold(replace(feedback, noise=None), start, steps)
+    kept = Episodes([e for e in trials.made if len(e)], plant.dt, plant.states, plant.inputs)
+    result = Stabilised(feedback, kept, held, start, trials.lost)
+    if held < ENOUGH:
         warnings.warn(
             f"{result}: give the inputs a wider range, sample faster, or measure what is not measured; a smaller reach "
             "keeps the plant where it is nearly linear",
@@ -195,59 +157,102 @@ def stabilise(
     return result
 
 
-class _Trials:
-    """Runs of a plant near x_ref, which end where it leaves the box of half-widths `size`."""
+@dataclass(frozen=True, eq=False)
+class _Surroundings:
+    """An equilibrium (x, u), how far each state may go from it, and the bounds of the inputs."""
 
-    def __init__(
-        self, plant: Plant, x_ref: Float[np.ndarray, " nx"], size: Float[np.ndarray, " nx"], draw: np.random.Generator
-    ) -> None:
-        self._plant, self._x_ref, self._size, self._draw = plant, x_ref, size, draw
+    x: Float[np.ndarray, " nx"]
+    u: Float[np.ndarray, " nu"]
+    size: Float[np.ndarray, " nx"]
+    low: Float[np.ndarray, " nu"]
+    high: Float[np.ndarray, " nu"]
+
+    def hold(self, y: Float[np.ndarray, " nx"]) -> bool:
+        """Return whether a reading is within the reach."""
+        return bool((np.abs(y - self.x) <= self.size).all())
+
+
+def _check_surroundings(
+    plant: Plant, equilibrium: tuple[ArrayLike, ArrayLike], reach: ArrayLike, u_min: ArrayLike, u_max: ArrayLike
+) -> _Surroundings:
+    nu = len(plant.inputs)
+    checks.kind(equilibrium, "equilibrium", (tuple, list), "pass (x, u) of the resting plant")
+    if len(equilibrium) != 2:
+        raise ShapeError(f"equilibrium has {len(equilibrium)} parts; pass (x, u) of the resting plant")
+    x = np.atleast_1d(checks.array(equilibrium[0], "the equilibrium's state"))
+    if len(plant.outputs) != len(x):
+        raise DataError(
+            f"the equilibrium has {len(x)} states and the plant measures {len(plant.outputs)}: pass all that is "
+            "measured; a feedback of states needs every one of them"
+        )
+    u, size = checks.vector(equilibrium[1], "the equilibrium's input", nu), checks.vector(reach, "reach", len(x))
+    low, high = checks.vector(u_min, "u_min", nu), checks.vector(u_max, "u_max", nu)
+    checks.refuse_crossed(low, high, "input")
+    if (size <= 0).any():
+        raise DataError(f"reach is {size}; pass a distance above zero for each state, beyond which an episode ends")
+    if ((u < low) | (u > high)).any() or (low == high).any():
+        raise DataError(f"the equilibrium's input is {u}; it must lie inside u_min {low} and u_max {high}")
+    return _Surroundings(x, u, size, low, high)
+
+
+class _Trials:
+    """Runs of a plant near an equilibrium, which end where it leaves the reach."""
+
+    def __init__(self, plant: Plant, near: _Surroundings, draw: np.random.Generator) -> None:
+        self._plant, self._near, self._draw = plant, near, draw
+        self.made, self.lost = list[Episode](), 0
+
+    def record(self, policies: Sequence[Excitation], start: float, steps: int) -> int:
+        """Keep an episode of each policy, and return how many did not stay."""
+        ran = [self.run(policy, start, steps) for policy in policies]
+        self.made += [episode for episode, _ in ran]
+        fallen = sum(not whole for _, whole in ran)
+        self.lost += fallen
+        return fallen
+
+    def measure_hold(self, feedback: Feedback, start: float, steps: int) -> tuple[float, float]:
+        """Return the share of runs that stay, and from where: nearer until enough of them do."""
+        held, start = 0.0, GROWTH * start
+        while held < ENOUGH and start > FIRST:
+            start = max(start / GROWTH, FIRST)
+            held = float(np.mean([self.run(feedback, start, steps)[1] for _ in range(HELD)]))
+        return held, start
 
     def run(self, excitation: Excitation, start: float, steps: int) -> tuple[Episode, bool]:
-        """Return an episode from within `start` of the box, and whether it stayed for all steps."""
-        policy = excitation.start(steps, self._plant.dt, self._draw)
-        x0 = self._x_ref + start * self._size * self._draw.uniform(-1, 1, len(self._size))
-        y = np.asarray(self._plant.reset(x0, self._draw), dtype=np.float64)
-        X, U, inside = [y], list[Float[np.ndarray, " nu"]](), self._inside(y)
-        while len(U) < steps and inside and not getattr(self._plant, "ended", ""):
+        """Return an episode from within `start` of the reach, and whether it stayed for all steps."""
+        plant, near = self._plant, self._near
+        policy = excitation.start(steps, plant.dt, self._draw)
+        x0 = near.x + start * near.size * self._draw.uniform(-1, 1, len(near.size))
+        y = np.asarray(plant.reset(x0, self._draw), dtype=np.float64)
+        X, U, inside = [y], list[Float[np.ndarray, " nu"]](), near.hold(y)
+        while len(U) < steps and inside and not getattr(plant, "ended", ""):
             u = np.asarray(policy(len(U), y), dtype=np.float64)
-            y = np.asarray(self._plant.step(u.copy()), dtype=np.float64)
-            inside = self._inside(y)
+            y = np.asarray(plant.step(u.copy()), dtype=np.float64)
+            inside = near.hold(y)
             if not np.isfinite(y).all():
                 break
             X.append(y)
             U.append(u)
-        episode = Episode(X=np.array(X), U=np.array(U).reshape(len(U), len(self._plant.inputs)))
+        episode = Episode(X=np.array(X), U=np.array(U).reshape(len(U), len(plant.inputs)))
         return episode, inside and len(U) == steps
 
-    def _inside(self, y: Float[np.ndarray, " nx"]) -> bool:
-        return bool((np.abs(y - self._x_ref) <= self._size).all())
 
-
-def _feedback(
-    made: list[Episode],
-    x_ref: Float[np.ndarray, " nx"],
-    u_ref: Float[np.ndarray, " nu"],
-    size: Float[np.ndarray, " nx"],
-    low: Float[np.ndarray, " nu"],
-    high: Float[np.ndarray, " nu"],
-) -> tuple[Float[np.ndarray, "nu nx"], Float[np.ndarray, " nu"]] | None:
-    """Return the LQR gain of the affine model of all steps, and the input that holds x_ref; None where there is none.
+def _find_feedback(made: Sequence[Episode], near: _Surroundings, loud: Float[np.ndarray, " nu"]) -> Feedback | None:
+    """Return the LQR of the affine model of all steps around the input that holds x, with noise; None without one.
 
     A step weighs exp(−d²), d its distance to the equilibrium in units of the reach, so that the model tells how the
     plant leaves the equilibrium.
     """
-    room = (high - low) / 2
-    X = np.concatenate([episode.X[:-1] for episode in made])
-    X_next = np.concatenate([episode.X[1:] for episode in made])
+    room = (near.high - near.low) / 2
+    X, X_next = (np.concatenate([episode.X[rows] for episode in made]) for rows in (slice(-1), slice(1, None)))
     U = np.concatenate([episode.U for episode in made])
-    Z, V, Z_next = (X - x_ref) / size, (U - u_ref) / room, (X_next - x_ref) / size
+    Z, V, Z_next = (X - near.x) / near.size, (U - near.u) / room, (X_next - near.x) / near.size
     nx, nu = Z.shape[1], V.shape[1]
     P = np.hstack([Z, V, np.ones((len(Z), 1))])
     if len(P) < 2 * P.shape[1]:
         return None
     weight = np.exp(-(Z**2).sum(axis=1) / 2)[:, None]  # its square is the weight
-    ridge = np.sqrt(_RIDGE * len(P)) * np.eye(P.shape[1])
+    ridge = np.sqrt(1e-9 * len(P)) * np.eye(P.shape[1])
     theta = np.linalg.lstsq(
         np.vstack([P * weight, ridge]), np.vstack([(Z_next - Z) * weight, np.zeros((len(ridge), nx))]), rcond=None
     )[0]
@@ -256,5 +261,5 @@ def _feedback(
         K = dlqr(A, B, np.eye(nx), np.eye(nu)).K
     except KoopmpcError:
         return None
-    hold = u_ref - room * (np.linalg.pinv(B, rcond=1e-6) @ c)
-    return room[:, None] * K / size, np.clip(hold, low, high)
+    hold = np.clip(near.u - room * (np.linalg.pinv(B, rcond=1e-6) @ c), near.low, near.high)
+    return Feedback(room[:, None] * K / near.size, Noise(-loud, loud, hold=2), near.x, hold, near.low, near.high)

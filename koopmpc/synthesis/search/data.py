@@ -130,8 +130,4 @@ def is_record(episodes: Episodes) -> bool:
 
 def advance_inputs(source: Source, held: Episodes) -> tuple[Source, Episodes]:
     """Return the source and the episodes `held` of it with the inputs one row up."""
-    moved = held.with_inputs_advanced(1)
-    if isinstance(source, Held) and source.episodes is held:
-        return Held(moved), moved
-    change = methodcaller("with_inputs_advanced", 1)
-    return Changed(source, change, held.states, held.inputs, held.disturbances), moved
+    return _apply_change(source, held, methodcaller("with_inputs_advanced", 1))

@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float
 
+from koopmpc.base import checks
 from koopmpc.base.errors import DataError, hide_fit_warnings
 from koopmpc.base.parallel import Progress, StageProgress
 from koopmpc.data.delay import Delay
@@ -18,7 +20,7 @@ from koopmpc.models.fits.edmd import edmd
 from koopmpc.synthesis.options import SearchOptions
 from koopmpc.synthesis.search.candidates import check_delays
 from koopmpc.synthesis.search.data import advance_inputs, is_record, replace_glitches, smooth_data, take_sample
-from koopmpc.synthesis.search.feedback import remove_feedback, require_episodes
+from koopmpc.synthesis.search.feedback import remove_feedback
 from koopmpc.synthesis.search.folds import cut_blocks
 from koopmpc.synthesis.search.records import is_late
 from koopmpc.validate.memory import Memory, find_hidden_state
@@ -66,7 +68,8 @@ def prepare_data(data: Episodes | Source, options: SearchOptions, *, feedback: b
     """Return a sample of the data without glitches, with inputs in time, and without noise that feedback carries."""
     used, noise, smooth = "", None, bool(options.smooth)
     if options.instruments is not None or (smooth and feedback and isinstance(data, Episodes)):
-        loop = remove_feedback(require_episodes(data), options.instruments)
+        checks.kind(data, "the data", Episodes, "instruments go with episodes; load the source, or leave them out")
+        loop = remove_feedback(cast("Episodes", data), options.instruments)
         data, noise, used = loop.episodes, loop.noise, loop.sentence
         smooth = smooth and not noise.any()
     source = source_of(data)
