@@ -34,10 +34,11 @@ from koopmpc.control.ask.limits import Interval
 from koopmpc.data.episodes import Episodes
 from koopmpc.loop.metrics import total_cost, tracking_error, violation_shares
 from koopmpc.loop.rows import Step
+from koopmpc.loop.simulate import LoopOptions
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign, read_controller, rebuild_controller
 from koopmpc.synthesis.doubts import explain_unreachable
-from koopmpc.synthesis.loops.judging import read_reference, run_on_surrogate
+from koopmpc.synthesis.loops.judging import Fenced, read_reference, run_on_surrogate
 from koopmpc.synthesis.search.recipe import get_model
 from koopmpc.synthesis.task import goal_box
 
@@ -219,15 +220,12 @@ class _TestBench:
         run = run_on_surrogate(
             asked,
             surrogate,
-            plant,
+            Fenced(plant, evidence.low, evidence.high),
             self._controller,
             first,
-            box=(evidence.low, evidence.high),
             reference=self._reference,
             u_reference=inputs,
-            rng=seed,
-            noise=kind.noise,
-            faults=kind.faults,
+            options=LoopOptions(noise=kind.noise * surrogate.noise, faults=kind.faults, rng=seed),
             observers=[watch],
         )
         if run is None:
@@ -261,13 +259,12 @@ class _TestBench:
             run = run_on_surrogate(
                 asked,
                 neighbours,
-                neighbours.draw(rng),
+                Fenced(neighbours.draw(rng), evidence.low, evidence.high),
                 self._controller,
                 x0,
-                box=(evidence.low, evidence.high),
                 reference=self._reference,
                 u_reference=u_reference,
-                rng=j,
+                options=LoopOptions(noise=neighbours.noise, rng=j),
             )
             known = not neighbours.find_outside(neighbours.start(x0)[None], neighbours.middle[None])[0]
             bad = run is None or bool(violation_shares(run, asked.limit_sizes)[len(run.X) // 2 :].max() > ALLOWED_OFF)

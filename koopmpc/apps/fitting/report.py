@@ -15,9 +15,10 @@ from koopmpc.control.ask.limits import Interval
 from koopmpc.lifting.base import strip_unit
 from koopmpc.loop.metrics import violation_shares
 from koopmpc.loop.run import Run
+from koopmpc.loop.simulate import LoopOptions
 from koopmpc.synthesis.designed import AnyMPC, Evidence, SavedDesign
 from koopmpc.synthesis.doubts import describe_rest
-from koopmpc.synthesis.loops.judging import read_reference, run_on_surrogate
+from koopmpc.synthesis.loops.judging import Fenced, read_reference, run_on_surrogate
 from koopmpc.synthesis.loops.neighbours import choose_starts_to_record, probe_range
 from koopmpc.validate.logs.summary import LogExcerpt, LogSummary
 from koopmpc.views.figures.blind_regions import draw_blindness
@@ -273,13 +274,12 @@ def run_shown_loops(evidence: Evidence, controller: AnyMPC) -> dict[str, list[Ru
         return run_on_surrogate(
             asked,
             stand_in,
-            plant,
+            Fenced(plant, evidence.low, evidence.high),
             controller,
             starts[k % len(starts)],
-            box=(evidence.low, evidence.high),
             reference=rows,
             u_reference=inputs,
-            rng=k,
+            options=LoopOptions(noise=stand_in.noise, rng=k),
         )
 
     made: dict[str, list[Run | None]] = {"learned models": [], "inputs 20 % off": []}

@@ -12,7 +12,6 @@ from koopmpc.base.errors import KoopmpcError
 from koopmpc.control.move import Controller
 from koopmpc.control.nonlinear.bilinear_mpc import BilinearMPC
 from koopmpc.data.episodes import Episodes
-from koopmpc.loop.faults import Fault
 from koopmpc.loop.metrics import total_cost, violation_shares
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import LoopOptions, StepObserver, simulate
@@ -209,13 +208,12 @@ def _run_condition(test: LoopTest, one: Condition, controller: Designed, seed: i
     run = run_on_surrogate(
         task,
         test.surrogates[one.surrogate],
-        test.plant(one),
+        Fenced(test.plant(one), test.low, test.high),
         controller,
         one.x0,
-        box=(test.low, test.high),
         reference=read_reference(task, one.first, task.steps + 1 + controller.horizon),
         u_reference=one.u_reference,
-        rng=seed,
+        options=LoopOptions(noise=test.surrogates[one.surrogate].noise, rng=seed),
     )
     cost = np.inf if run is None else total_cost(run)
     return (run, cost) if np.isfinite(cost) else (None, np.inf)
@@ -229,34 +227,29 @@ def read_reference(task: DesignTask, first: int, count: int) -> Float[np.ndarray
 def run_on_surrogate(
     task: DesignTask,
     surrogate: Surrogate | NeighbourMap,
-    plant: Transition,
+    plant: Fenced,
     controller: Controller,
     x0: Float[np.ndarray, " n"],
     *,
-    box: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
     reference: Float[np.ndarray, "rows nr"],
     u_reference: Float[np.ndarray, "T nu"],
-    rng: int,
-    noise: float = 1.0,
-    faults: Sequence[Fault] = (),
+    options: LoopOptions,
     observers: Sequence[StepObserver] = (),
-    acting: Acting | None = None,
 ) -> Run | None:
     """Return a closed loop on the plant of a surrogate, with the states without their past; None if it is lost.
 
-    The run is lost if a state leaves the box. It is judged by the cost and the limits of the task. `reference` is as
-    `simulate` takes it, `noise` a factor on the noise of the surrogate, and `acting` says how the inputs act. With
-    feedthrough its state k + 1 is h(x_k, u_k), the row k of a log.
+    It is judged by the cost and the limits of the task. With feedthrough its state k + 1 is h(x_k, u_k), the row k of a
+    log.
     """
     states, start = surrogate.states, surrogate.start(x0)
     try:
         run = simulate(
-            Fenced(plant, *box, acting),
+            plant,
             controller,
             x0=np.concatenate([start, surrogate.middle]) if surrogate.feedthrough else start,
             reference=reference,
             steps=len(u_reference),
-            options=LoopOptions(noise=noise * surrogate.noise, faults=faults, rng=rng),
+            options=options,
             measured=surrogate.w if len(surrogate.w) else None,
             limits=task.limits,
             observers=observers,

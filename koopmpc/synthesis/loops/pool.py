@@ -10,9 +10,10 @@ from jaxtyping import Float
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.loop.metrics import total_cost, violation_shares
 from koopmpc.loop.run import Run
+from koopmpc.loop.simulate import LoopOptions
 from koopmpc.plants.step_map import StepMap
 from koopmpc.synthesis.loops.abreast import Acting, Crowd, CrowdStep, run_abreast
-from koopmpc.synthesis.loops.judging import read_reference, run_on_surrogate
+from koopmpc.synthesis.loops.judging import Fenced, read_reference, run_on_surrogate
 from koopmpc.synthesis.loops.neighbours import NeighbourMap
 from koopmpc.synthesis.loops.surrogates import Surrogate
 from koopmpc.synthesis.rates import KEPT, SHIFT
@@ -140,14 +141,16 @@ class LoopPool:
             run_on_surrogate(
                 task,
                 stand_in,
-                self._find_model(place) if near is None else near.draw(np.random.default_rng(loop.seed)),
+                Fenced(
+                    self._find_model(place) if near is None else near.draw(np.random.default_rng(loop.seed)),
+                    *box,
+                    acting.take(i),
+                ),
                 controller,
                 starts[i],
-                box=box,
                 reference=rows[i],
                 u_reference=held[i],
-                rng=loop.seed,
-                acting=acting.take(i),
+                options=LoopOptions(noise=stand_in.noise, rng=loop.seed),
             )
             for i, loop in enumerate(loops)
         ]
