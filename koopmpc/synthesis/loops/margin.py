@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -85,58 +86,49 @@ def promise_coverage(
 ) -> tuple[CoveragePromise, Limits]:
     """Return the promise, and the limits with the margin that it rests on.
 
-    The least factor on the tube is taken with which few enough of the first loops fail; of a growing and a rigid margin
-    the one whose loops cost less. Then it is fixed, and as many further loops are run.
+    The least factor on the tube, at most `room`, is taken with which few enough of the first loops fail; of a growing
+    and a rigid margin the one whose loops cost less. Then it is fixed, and as many further loops are run. `build` makes
+    a controller of limits.
     """
-    first, second, allowed = pool.draw(loops, rng), pool.draw(loops, rng), most_failures(loops, coverage)
+    first, second = pool.draw(loops, rng), pool.draw(loops, rng)
     limits = replace(pool.task.limits, margin=None, capped=())
     low, high = limits.states(tube.shape[1])
     limited = np.isfinite(low) | np.isfinite(high)
     rigid = tube.max(axis=0, keepdims=True)
+    allowed = most_failures(loops, coverage)
 
-    def widen(rows: Float[np.ndarray, "h nx"], scale: float) -> Float[np.ndarray, "h nx"]:
-        return np.minimum(scale * np.where(limited, rows, 0.0), room)
-
-    def attempt(rows: Float[np.ndarray, "h nx"], scale: float) -> _Attempt | None:
-        margin = widen(rows, scale)
+    def attempt(shape: str, rows: Float[np.ndarray, "h nx"], scale: float) -> _Attempt | None:
+        margin = np.minimum(scale * np.where(limited, rows, 0.0), room)
         try:
             inside = replace(limits, margin=margin) if margin.any() else limits
             controller = build(inside)
         except KoopmpcError:  # limits that cross
             return None
         results = _run_until(pool, controller, first, allowed)
-        return _Attempt(scale, margin, inside, controller, results)
+        return _Attempt(shape, scale, margin, inside, controller, results, _count_failures(results) <= allowed)
 
-    plain = attempt(rigid, 0.0)
-    assert plain is not None, "limits without a margin do not cross"
-    chosen, shape, found = plain, "none", plain.failures <= allowed
-    if not found and limited.any():
-        options: list[tuple[float, str, _Attempt]] = []
-        widest: list[tuple[str, _Attempt]] = []
-        for name, rows in (("growing", tube), ("rigid", rigid)):
-            best, last = _find_least(lambda scale, rows=rows: attempt(rows, scale), allowed)
-            options += [] if best is None else [(best.cost, name, best)]
-            widest += [] if last is None else [(name, last)]
-        if options:
-            _, shape, chosen = min(options, key=lambda option: option[:2])
-            found = True
+    chosen = attempt("none", rigid, 0.0)
+    assert chosen is not None, "limits without a margin do not cross"
+    if not chosen.holds and limited.any():
+        tried = [_find_least(partial(attempt, shape, rows)) for shape, rows in (("growing", tube), ("rigid", rigid))]
+        found = [one for one in tried if one is not None and one.holds]
+        if found:
+            chosen = min(found, key=lambda one: (one.cost, one.shape))
         else:  # none holds: the one with the fewest failures of all loops
-            every = [("none", plain), *widest]
-            counts = [_count_failures(pool.run(speed_up(one.controller), first)) for _, one in every]
-            shape, chosen = every[int(np.argmin(counts))]
+            widest = [chosen, *(one for one in tried if one is not None)]
+            chosen = min(widest, key=lambda one: _count_failures(pool.run(speed_up(one.controller), first)))
     fast = speed_up(chosen.controller)
     whole = pool.run(fast, first) if len(chosen.results) < loops else chosen.results
-    fresh = pool.run(fast, second)
     promise = CoveragePromise(
         coverage=coverage,
-        shape=shape,
+        shape=chosen.shape,
         scale=chosen.scale,
         margin=chosen.margin,
         chosen_from=loops,
         chosen_failures=_count_failures(whole),
         verified_on=loops,
-        failures=_count_failures(fresh),
-        found=found,
+        failures=_count_failures(pool.run(fast, second)),
+        found=chosen.holds,
         steps=pool.task.steps,
     )
     return promise, chosen.limits
@@ -144,17 +136,15 @@ def promise_coverage(
 
 @dataclass(frozen=True, eq=False)
 class _Attempt:
-    """A margin, its controller, and the loops that were run before too many of them failed."""
+    """A margin, its controller, the loops that were run before too many of them failed, and whether few enough did."""
 
+    shape: str
     scale: float
     margin: Float[np.ndarray, "h nx"]
     limits: Limits
     controller: Any
     results: Sequence[LoopResult]
-
-    @property
-    def failures(self) -> int:
-        return _count_failures(self.results)
+    holds: bool
 
     @property
     def cost(self) -> float:
@@ -170,34 +160,31 @@ def _count_failures(results: Sequence[LoopResult]) -> int:
 def _run_until(pool: LoopPool, controller: Any, loops: Sequence[DrawnLoop], allowed: int) -> list[LoopResult]:
     """Return the results of loops, up to the round with one failure too many."""
     results: list[LoopResult] = []
-    failures = 0
-    while len(results) < len(loops) and failures <= allowed:
-        some = pool.run(controller, loops[len(results) : len(results) + ROUND])
-        results += some
-        failures += _count_failures(some)
+    while len(results) < len(loops) and _count_failures(results) <= allowed:
+        results += pool.run(controller, loops[len(results) : len(results) + ROUND])
     return results
 
 
-def _find_least(attempt: Callable[[float], _Attempt | None], allowed: int) -> tuple[_Attempt | None, _Attempt | None]:
-    """Return the attempt with the least scale that holds, None where none does, and the last one that was tried."""
-    below, best, last = 0.0, None, None
+def _find_least(attempt: Callable[[float], _Attempt | None]) -> _Attempt | None:
+    """Return the attempt with the least scale that holds; where none does the widest one, None if there is none."""
+    below, last = 0.0, None
     for scale in SCALES:
         tried = attempt(scale)
         if tried is None or (last is not None and np.array_equal(tried.margin, last.margin)):
-            break  # the limits cross, or the room is used up
+            return last  # the limits cross, or the room is used up
         last = tried
-        if tried.failures <= allowed:
-            best = tried
+        if tried.holds:
             break
         below = scale
-    for _ in range(FINER if best is not None else 0):
-        assert best is not None
-        tried = attempt((below + best.scale) / 2)
-        if tried is not None and tried.failures <= allowed:
-            best = tried
+    for _ in range(FINER if last is not None and last.holds else 0):
+        assert last is not None
+        middle = (below + last.scale) / 2
+        tried = attempt(middle)
+        if tried is not None and tried.holds:
+            last = tried
         else:
-            below = (below + best.scale) / 2
-    return best, last
+            below = middle
+    return last
 
 
 _ITERATIONS = 10_000  # of the Riccati equation
