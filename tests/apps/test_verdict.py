@@ -20,6 +20,7 @@ from koopmpc.synthesis.designed import SavedDesign, rebuild_controller
 from koopmpc.synthesis.search.recipe import get_model
 from tests.apps.mass import GOAL, NAMES, A, B, logs
 from tests.small_designs import small_designs, undrawn_pages
+from tests.synthesis import test_design_feedthrough as direct
 
 
 @pytest.fixture(scope="module")
@@ -190,3 +191,25 @@ def test_a_design_without_neighbours_is_judged_on_its_models(made, tmp_path):
 def test_a_certificate_is_not_sought_around_a_reference_that_moves(made):
     assert _explain_unfit(made.design, np.zeros(2)) == ""
     assert _explain_unfit(made.design, np.zeros((5, 2))).startswith("the reference moves")
+
+
+def test_runs_on_the_plant_are_judged_by_what_the_controller_read_and_others_are_told_so():
+    found = direct.usual()
+    A, B, C, D = direct.A, direct.B, direct.C, direct.D
+    x, u, readings, inputs = np.zeros(2), np.zeros(1), [], []
+    found.controller.reset()
+    for _ in range(12):
+        readings.append(C @ x + D @ u)
+        u = found.controller(readings[-1], [direct.GOAL]).u
+        inputs.append(u)
+        x = A @ x + B @ u
+    for rows, own in (
+        (np.array(readings), True),
+        (direct.steer(found.controller, np.zeros(2), 0.0, 12)[1][:, None], False),
+    ):
+        runs = km.Episodes([km.Episode(X=rows, U=np.array(inputs)[:-1])], 0.1, ["y"], ["u"])
+        if own:
+            assert judge_plant_runs(found.evidence, found.controller, runs).own == 1
+        else:
+            with pytest.raises(km.errors.DataError, match="of the input before, which the controller had"):
+                judge_plant_runs(found.evidence, found.controller, runs)

@@ -14,7 +14,7 @@ import koopmpc as km
 from koopmpc.codegen import tolerances
 from koopmpc.codegen.programs import make_tables, read_program
 from tests.compiler import find_compiler, needs_compiler
-from tests.synthesis.test_abreast import make
+from tests.synthesis.test_loops import make
 from tests.tiers import few
 
 COST = km.Cost(Q=[10.0, 1.0], R=0.1)

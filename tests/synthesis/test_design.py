@@ -3,7 +3,6 @@
 import importlib
 import re
 import warnings
-from dataclasses import replace
 from functools import cache
 
 import casadi as ca
@@ -13,24 +12,20 @@ from scipy.optimize import lsq_linear
 from scipy.signal import dlsim
 
 import koopmpc as km
-from koopmpc.models.records.hidden_fit import fit_hidden
-from koopmpc.models.records.hidden_structure import HiddenStructure
-from koopmpc.models.records.structure import Structure
-from koopmpc.synthesis.choice import LOST, average_ratios, choose_row, rate_runs
-from koopmpc.synthesis.loops.abreast import explain_python
-from koopmpc.synthesis.loops.judging import Outcome
-from koopmpc.synthesis.loops.surrogates import choose_surrogates
-from koopmpc.synthesis.search.candidates import Candidate
-from koopmpc.synthesis.search.cross_validation import Tried
-from koopmpc.synthesis.search.recipe import Recipe
 from tests.searches import design
 from tests.small_designs import short_loops
 from tests.synthesis.test_select import PLAIN, SQUARES, episodes_of, noisy
 from tests.tiers import slow
 
 A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.005], [0.1]])  # a mass with friction; its position is free
-confirm, rounds = (importlib.import_module(f"koopmpc.synthesis.{file}") for file in ("confirm", "rounds"))
+
+
+confirm = importlib.import_module("koopmpc.synthesis.confirm")
+
+
 COST = km.Cost(Q=[1.0, 0.1], R=0.1)
+
+
 LIMITS = km.Limits(u_min=-1, u_max=1, x_min=[-np.inf, -0.5], x_max=[np.inf, 0.5])
 
 
@@ -121,64 +116,10 @@ def test_the_same_data_and_seed_give_the_same_design_whoever_works(workers):
     assert one.expected == usual().expected
 
 
-def test_a_recipe_that_is_lost_on_every_surrogate_is_never_chosen():
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        n = int(rng.integers(2, 6))
-        costs = rng.uniform(1, 3, (n, 12))
-        costs[rng.uniform(size=costs.shape) < 0.5] = np.inf
-        lost = int(rng.integers(n))
-        costs[lost] = np.inf
-        costs[(lost + 1) % n, 0] = 1.0
-        outcomes = [
-            Outcome(c, np.where(np.isfinite(c), 0.0, np.inf), np.zeros(12), *[np.zeros((0, 2))] * 2) for c in costs
-        ]
-        each = rate_runs(outcomes)
-        assert (each[lost] == LOST).all()
-        rows = [
-            replace(usual().best, score=float(score), off=True)
-            for score in average_ratios(each, np.array([1.0] * 6 + [0.5] * 6))
-        ]
-        assert choose_row(rows) != lost
-
-
-def test_of_equal_rows_the_smallest_model_is_taken_and_of_one_model_the_controller_with_an_estimator():
-    best = usual().best
-    data = km.Episodes([km.Episode(X=np.zeros((3, 2)), U=np.zeros((2, 1)))], 0.1)
-    liftings = [km.State() + km.Constant() + km.Monomials(degree) for degree in (4, 3)]
-    models = [Candidate(f"{i}", each, bilinear=i > 0).bind(data.states, data.inputs) for i, each in enumerate(liftings)]
-    assert models[0].lifting.nz < 2 * models[1].lifting.nz
-    recipes = [Recipe(models[1], 1e-6), *(Recipe(models[0], 1e-6, one) for one in (None, km.LiftedDisturbance()))]
-
-    def chosen(*scores):
-        rows = [
-            replace(best, recipe=recipe, score=score, off=True) for recipe, score in zip(recipes, scores, strict=True)
-        ]
-        return choose_row(rows)
-
-    assert chosen(1.0, 1.001, 1.004) == 2
-    assert chosen(1.0, 1.001, 1.02) == 2
-    assert chosen(1.0, 1.001, 1.022) == 1  # the estimator costs more than two percent
-    assert chosen(1.0, 1.006, 1.006) == 0
-
-
-def test_a_run_with_inputs_off_counts_half():
-    one, two = average_ratios(np.array([[1.0, 4.0], [4.0, 1.0]]), np.array([1.0, 0.5]))
-    np.testing.assert_allclose([one, two], [4 ** (1 / 3), 4 ** (2 / 3)])
-
-
 def test_by_default_each_loop_of_a_design_has_a_start_of_its_own():
     of_many, of_few = designed(data(count=24)).expected.starts, usual().expected.starts
     assert len(np.unique(of_many, axis=0)) == len(of_many) == 6
     assert len(np.unique(of_few, axis=0)) == 4  # the half of eight episodes that begin inside the limits
-
-
-def test_violations_count_beyond_half_a_percent_and_beyond_what_nobody_avoids():
-    ones, none = np.ones(2), np.zeros((0, 2))
-    kept, broken = np.array([0.0, 0.3]), np.array([0.105, 0.4])
-    each = rate_runs([Outcome(ones, kept, ones, none, none), Outcome(ones, broken, ones, none, none)])
-    np.testing.assert_allclose(each[0], 1.0)
-    np.testing.assert_allclose(each[1], 1 + 0.99**-1 * 0.99 * np.array([1.0, 0.95]) / 1.01, rtol=1e-9)
 
 
 def test_a_position_that_nothing_depends_on_may_leave_the_data():
@@ -427,30 +368,6 @@ def test_a_controller_that_turns_when_it_is_fitted_to_all_data_is_passed_over(mo
     assert found.best == found.leaderboard[found.chosen]
 
 
-def test_a_model_that_is_not_that_of_the_folds_is_not_confirmed():
-    test, jobs = [], []
-    judged = rounds.judge_job
-
-    def kept(one, job):
-        test.append(one)
-        jobs.append(job)
-        return judged(one, job)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rounds, "judge_job", kept)
-        found = designed(data())
-    last = next(job for job in jobs if job.recipe == found.best.recipe and len(job.conditions) == 12)
-    outcome = judged(test[-1], last)
-    conditions = [test[-1].conditions[place] for place in last.conditions]
-    usual = [one.gain == 1.0 and np.isfinite(cost) for one, cost in zip(conditions, outcome.cost, strict=True)]
-    assert 0 < sum(usual) < len(usual)  # weights of fits are around states of runs with inputs as in the data
-    assert len(outcome.visited) == sum(usual) * (test[-1].task.steps + 1)
-    assert confirm.is_confirmed(test[-1], found.controller, outcome)
-    model = found.controller.predictor
-    wrong = km.KoopmanMPC(replace(model, B=-model.B), COST, LIMITS, 8)
-    assert not confirm.is_confirmed(test[-1], wrong, outcome)
-
-
 def test_a_single_wrong_measurement_is_replaced_and_its_episode_kept():
     last = data(12)[11]
     X = np.array(last.X)
@@ -475,37 +392,6 @@ def test_one_record_of_a_sensor_tries_as_much_of_the_past_as_many_episodes():
     assert {row.recipe.candidate.delays for row in found.leaderboard} == {0, 1, 2}
 
 
-@pytest.mark.slow
-def test_a_hidden_state_with_a_past_that_leaves_too_few_folds_is_left_out(monkeypatch):
-    asked = list[km.Episodes]()
-
-    def propose(episodes, bilinear, progress):
-        del bilinear, progress
-        asked.append(episodes)
-        found = [Candidate(f"past {i}", km.State() + km.Constant(), km.Delay(i), False) for i in (4, 100)]
-        return [one.bind(episodes.states, episodes.inputs) for one in found]
-
-    monkeypatch.setattr("koopmpc.synthesis.trials.propose_hidden_states", propose)
-    cost, limits = HELD_LEVEL
-    found = designed(hidden_record(), cost, limits, horizon=15, delays=None, candidates=None, reference=[1.2])
-    assert len(asked) == 1
-    assert "past 100" not in {row.recipe.candidate.name for row in found.leaderboard}
-
-
-def test_no_model_with_a_hidden_state_stands_in_for_the_plant_where_there_is_another():
-    sizes = {"errors": np.ones(8), "calm": True}
-    hidden = HiddenStructure(order=2, degree=1, delays=4, horizon=0, rails=None, parameters=8, **sizes)
-    sparse = Structure(4, 1, (np.zeros((0, 1), int),), np.zeros(2), np.ones(2), **sizes)
-
-    def tried(name, structure, error):
-        one = Candidate(name, PLAIN, km.Delay(4), False, structure)
-        return Tried(one, (0.0,), np.full((1, 3, 5), error), 1, np.eye(1)[None], np.inf, 0.0)
-
-    known = [tried("hidden", hidden, 0.1), tried("sparse", sparse, 0.2), tried("plain", None, 0.3)]
-    assert [one.candidate.name for one in choose_surrogates(known, 0.0, hidden=True)] == ["sparse", "plain"]
-    assert [one.candidate.name for one in choose_surrogates(known[:1], 0.0, hidden=True)] == ["hidden", "hidden"]
-
-
 def hidden_record(rows=600, seed=0):
     """Return one record of a tank's level; the valve that feeds it lags, and its position is hidden."""
     rng = np.random.default_rng(seed)
@@ -526,16 +412,8 @@ HELD_LEVEL = (km.Cost(Q=10.0, R=0.01, u_target="equilibrium"), km.Limits(u_min=0
 
 
 @pytest.mark.slow
-def test_models_with_a_hidden_state_are_judged_in_the_loops_of_one_record(monkeypatch):
+def test_models_with_a_hidden_state_are_judged_in_the_loops_of_one_record():
     cost, limits = HELD_LEVEL
-    learned = list[float]()
-
-    def watch(structure, episodes, *, quick=False):
-        learned.extend(np.concatenate([e.X[:, 0] for e in episodes]).tolist())
-        return fit_hidden(structure, episodes, quick=quick)
-
-    for module in ("candidates", "cross_validation"):
-        monkeypatch.setattr(f"koopmpc.synthesis.search.{module}.fit_hidden", watch)
     found = designed(
         hidden_record(), cost, limits, horizon=15, delays=None, candidates=None, bilinear=True, reference=[1.2]
     )
@@ -543,8 +421,6 @@ def test_models_with_a_hidden_state_are_judged_in_the_loops_of_one_record(monkey
     assert hidden
     assert min(row.score for row in hidden) < 1.1  # beside the best of all
     assert any("smoothed" in note for note in found.notes)
-    assert learned
-    assert {*learned} <= {*hidden_record()[0].X[:, 0].tolist()}  # rows as they were measured
     valve, level = 0.2, 0.1
     for _ in range(80):
         valve, level = lagged(valve, level, float(found.controller([level], [1.2]).u[0]))
@@ -579,10 +455,3 @@ def test_without_a_compiler_a_design_says_that_fewer_loops_ran(monkeypatch):
     assert any(
         "no C compiler was found" in note and "60 fresh loops ran in place of 600" in note for note in found.notes
     )
-
-
-def test_loops_in_python_are_explained_by_the_controller_before_the_compiler(monkeypatch):
-    monkeypatch.setattr("koopmpc.plants.routines.shutil.which", lambda _: None)
-    assert "no C compiler was found" in explain_python(usual().controller)
-    nonlinear = km.NonlinearMPC(km.edmd(data(), PLAIN), COST, LIMITS, 3)
-    assert "has no C code" in explain_python(nonlinear)

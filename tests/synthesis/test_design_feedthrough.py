@@ -8,8 +8,6 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import koopmpc as km
-from koopmpc.apps.fitting.verdict import judge_plant_runs
-from koopmpc.base.errors import DataError
 from tests.bare import shown
 from tests.estimate.test_feedthrough import PLAIN, A, B, C, D, log_of
 from tests.searches import design
@@ -96,24 +94,6 @@ def test_a_stand_in_shows_a_controller_its_next_output_under_the_input_of_the_st
     assert other.measure(np.concatenate([point, rows.U[7]])) == pytest.approx(rows.X[8], abs=1e-3)
 
 
-def test_runs_on_the_plant_are_judged_by_what_the_controller_read_and_others_are_told_so():
-    found = usual()
-    x, u, readings, inputs = np.zeros(2), np.zeros(1), [], []
-    found.controller.reset()
-    for _ in range(12):
-        readings.append(C @ x + D @ u)
-        u = found.controller(readings[-1], [GOAL]).u
-        inputs.append(u)
-        x = A @ x + B @ u
-    for rows, own in ((np.array(readings), True), (steer(found.controller, np.zeros(2), 0.0, 12)[1][:, None], False)):
-        runs = km.Episodes([km.Episode(X=rows, U=np.array(inputs)[:-1])], 0.1, ["y"], ["u"])
-        if own:
-            assert judge_plant_runs(found.evidence, found.controller, runs).own == 1
-        else:
-            with pytest.raises(DataError, match="of the input before, which the controller had"):
-                judge_plant_runs(found.evidence, found.controller, runs)
-
-
 @pytest.mark.slow
 def test_the_inputs_of_a_late_log_are_moved_without_a_flag():
     """x⁺ = 0.8 x + 0.5 u, and row k of the log holds u_{k−1}: its controller is that of the log in time."""
@@ -136,10 +116,10 @@ def test_the_inputs_of_a_late_log_are_moved_without_a_flag():
 
 def test_data_that_feedthrough_does_not_go_with_are_refused_in_a_sentence():
     data = records(1)
-    with pytest.raises(DataError, match="there is nothing to control"):
+    with pytest.raises(km.errors.DataError, match="there is nothing to control"):
         designed(km.Episodes([km.Episode(X=e.X) for e in data], 0.1))
     watched = km.Episodes([km.Episode(X=e.X, U=e.U, W=e.U[::-1]) for e in data], 0.1, ["y"], ["u"], ["w"])
-    with pytest.raises(DataError, match="fit the model without W"):
+    with pytest.raises(km.errors.DataError, match="fit the model without W"):
         designed(watched)
     (said,) = shown("""
 data = km.Episodes([km.Episode(X=np.zeros((9, 1)), U=np.ones((8, 1)))], 0.1)

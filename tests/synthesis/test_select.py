@@ -7,13 +7,6 @@ import pytest
 from scipy.linalg import expm
 
 import koopmpc as km
-from koopmpc.data.angles import find_angles
-from koopmpc.synthesis.search.candidates import propose_candidates
-from koopmpc.synthesis.search.cross_validation import Trial, cross_validate
-from koopmpc.synthesis.search.data import take_sample
-from koopmpc.synthesis.search.folds import make_folds, usual_horizon
-from koopmpc.synthesis.search.leaderboard import choose_model
-from koopmpc.synthesis.search.prepare import extend_past
 from tests.roundtrip import returned
 from tests.searches import select
 
@@ -124,27 +117,6 @@ def test_what_is_not_measured_is_found_in_the_past():
     assert isinstance(found.predictor.embedding, km.Delay)
 
 
-def test_a_score_is_the_relative_error_of_fits_that_never_saw_the_fold():
-    """Beside a loop that fits to all folds but one and rolls out from every start of that one."""
-    data = noisy(episodes_of(quadratic, count=6, steps=14), 0.02)
-    fold, horizon, ridge = (0, 1, 2, 0, 1, 2), 5, 1e-3
-    lifting = SQUARES.bind(data.states)
-    result = cross_validate(Trial(km.synthesis.Candidate("", lifting), data, fold, horizon, 2, (ridge,)))
-    spread = np.concatenate([e.X for e in data]).std(axis=0)
-    for f in range(3):
-        train = km.Episodes([e for e, g in zip(data, fold, strict=True) if g != f], data.dt)
-        model = km.edmd(train, lifting, ridge=ridge, towards="affine")
-        gaps = [
-            (e.X[k + 1 : k + horizon + 1] - model.rollout(e.X[k], e.U[k : k + horizon])[1:]) / spread
-            for e, g in zip(data, fold, strict=True)
-            if g == f
-            for k in range(2, len(e) - horizon + 1)
-        ]
-        expected = np.sqrt(np.mean(np.square(gaps), axis=(0, 2)))
-        assert result.errors[0, f] == pytest.approx(expected, rel=1e-8)
-    assert result.scores == pytest.approx(np.exp(np.mean(np.log(result.errors), axis=2)))
-
-
 def test_neither_units_nor_offsets_change_the_choice_or_the_errors():
     data = noisy(episodes_of(quadratic), 0.01)
     scale, offset = np.array([1e3, 1e-3]), np.array([2e3, 2e-3])
@@ -214,18 +186,6 @@ def test_on_an_unstable_plant_the_next_step_is_not_given_up_for_the_last_one():
     assert chosen < 1.1 * plain < 1.0
 
 
-@pytest.mark.parametrize(("seen", "more"), [(2, False), (1, True)])
-def test_one_long_log_shows_a_hidden_state_as_eight_short_ones_do(seen, more):
-    rng, X = np.random.default_rng(0), [np.zeros(2)]
-    U = rng.uniform(-1, 1, (400, 1))
-    for u in U:
-        X.append(np.array([[0.9, 0.1], [-0.1, 0.95]]) @ X[-1] + [0.1, 0.3] * u)
-    whole = km.Episode(X=np.array(X)[:, :seen] + 0.01 * rng.standard_normal((401, seen)), U=U)
-    one = km.Episodes([whole], dt=0.1)
-    eight = one.with_episodes([whole.cut(50 * i, 50 * i + 50) for i in range(8)])
-    assert [len(extend_past([1, 2], logs, logs)) > 2 for logs in (one, eight)] == [more, more]
-
-
 def test_delays_are_taken_only_where_they_halve_the_error():
     """All of the state is measured, with noise: the past tells a little more, and a controller needs none of it."""
     data = noisy(episodes_of(quadratic), 0.02)
@@ -249,32 +209,6 @@ def test_where_the_data_have_their_zero_changes_no_choice():
     assert [row.title for row in here.leaderboard] == [row.title for row in there.leaderboard]
     assert [row.ridge for row in here.leaderboard] == [row.ridge for row in there.leaderboard]
     assert np.allclose([row.worst for row in here.leaderboard], [row.worst for row in there.leaderboard], rtol=1e-6)
-
-
-def test_a_linear_model_that_grows_for_nothing_is_not_chosen():
-    found = km.select(
-        episodes_of(linear), horizon=8, options=km.SearchOptions(candidates=[PLAIN, SQUARES], bilinear=False)
-    )
-    plain, wild = (
-        replace(found.leaderboard[0], worst=1.0, deviation=0.0, last=1.0, growth=2.0, size=2),
-        replace(found.leaderboard[0], worst=0.1, deviation=0.0, last=0.9, growth=7.0, size=50),
-    )
-    assert choose_model((wild, plain)) == 1
-    assert choose_model((replace(wild, growth=5.0), plain)) == 0  # less than three times
-    assert choose_model((replace(wild, last=0.4), plain)) == 0  # the data bear it out
-    assert choose_model((replace(wild, bilinear=True), plain)) == 0  # lifted anew at each step
-
-
-def test_the_smallest_model_within_one_standard_error_is_chosen():
-    found = km.select(
-        episodes_of(linear), horizon=8, options=km.SearchOptions(candidates=[PLAIN, SQUARES], bilinear=False)
-    )
-    rows = [
-        replace(found.leaderboard[0], worst=w, deviation=d, size=s)
-        for w, d, s in [(1.0, 0.2, 50), (1.1, 0.0, 20), (1.19, 0.0, 30), (1.3, 0.0, 2)]
-    ]
-    assert choose_model(tuple(rows)) == 1
-    assert choose_model((replace(rows[0], worst=np.inf, deviation=0.0), replace(rows[3], worst=np.inf))) == 1
 
 
 def test_workers_change_nothing_and_a_lifting_of_ones_own_reaches_them():
@@ -325,48 +259,15 @@ def test_one_long_episode_is_cut_into_blocks_and_the_choice_says_so():
     assert "1 episode is too few for 5 folds: cut into" in str(found)
 
 
-def test_blocks_share_no_pair_and_a_fold_of_them_is_one_stretch():
-    (whole,) = data = episodes_of(linear, count=1, steps=203)
-    found = make_folds(data, 6, 5, np.random.default_rng(0))
-    assert sum(len(e) for e in found.episodes) == 203
-    assert np.array_equal(np.concatenate([e.X[:-1] for e in found.episodes]), whole.X[:-1])
-    assert list(found.fold) == sorted(found.fold)
-    assert set(found.fold) == set(range(5))
-
-
-def test_whole_episodes_are_dealt_out_evenly_and_short_ones_are_counted():
-    rng = np.random.default_rng(0)
-    data = km.Episodes(
-        [km.Episode(X=rng.standard_normal((n + 1, 1)), U=np.zeros((n, 0))) for n in [40] * 12 + [3] * 2], 0.1
-    )
-    found = make_folds(data, 10, 4, rng)
-    assert "2 of 14 episodes are shorter than the 10 steps" in found.notes[0]
-    assert np.bincount(found.fold).tolist() == [3, 3, 3, 3]
-    with pytest.raises(km.errors.DataError, match="pass a shorter horizon, or longer episodes"):
-        make_folds(data[12:], 10, 4, rng)
-
-
-def test_a_sample_is_whole_episodes_or_the_beginning_of_one():
-    data = episodes_of(linear, count=50, steps=20)
-    held, notes = take_sample(km.data.Stream([data]), 200)
-    assert sum(map(len, held)) == 200
-    assert all(any(np.array_equal(one.X, e.X) for e in data) for one in held)
-    assert notes
-    held, _ = take_sample(km.data.Stream([episodes_of(linear, count=1, steps=500)]), 100)
-    assert [len(e) for e in held] == [100]
-
-
 @pytest.mark.parametrize(
-    ("lengths", "expected"),
-    [([40] * 20, 20), ([3] * 20 + [40] * 10, 20), ([15] * 20, 13), ([15] * 20 + [400], 20), ([60], 13), ([500], 20)],
+    ("lengths", "expected"), [([3] * 20 + [40] * 10, 20), ([15] * 20, 13), ([15] * 20 + [400], 20)]
 )
 def test_the_usual_horizon_is_twenty_steps_or_what_most_data_allow_and_then_a_note_says_so(lengths, expected):
-    X = np.random.default_rng(0).standard_normal((501, 1))
+    X = np.random.default_rng(0).standard_normal((401, 1))
     data = km.Episodes([km.Episode(X=X[: n + 1], U=np.zeros((n, 0))) for n in lengths], 0.1)
-    ahead, notes = usual_horizon(data, 2)
-    assert ahead == expected
-    assert [f"judged {expected} steps ahead, not 20" in note for note in notes] == [True] * (expected < 20)
-    assert make_folds(data, ahead + 2, 5, np.random.default_rng(0)).number > 1
+    found = select(data, candidates=[km.State()], delays=[2], ridges=[1e-6])
+    assert found.horizon == expected
+    assert any(f"judged {expected} steps ahead, not 20" in note for note in found.notes) == (expected < 20)
 
 
 def test_a_few_short_episodes_do_not_shorten_the_horizon():
@@ -413,14 +314,6 @@ def test_what_is_constant_in_the_data_is_named():
     assert "x2 is constant in these data, so what it does cannot be learned; excite it, or leave it out" in said
     assert any(text.startswith("u1 is constant") for text in said)
     assert found.linear.rollout([0.1, 0.2, 3.0], np.ones((5, 2)))[-1, 2] == pytest.approx(3.0, rel=1e-6)
-
-
-def test_angles_are_told_by_unit_then_by_name():
-    names = ["theta [rad]", "omega [rad/s]", "roll [deg]", "phi", "dtheta", "x", "pole_angle", "theta2"]
-    X = np.random.default_rng(0).uniform(-2, 2, (50, 8))
-    assert find_angles(names, X) == [0, 3, 6, 7]
-    X[:, 3] *= 0.01
-    assert find_angles(names, X) == [0, 6, 7]
 
 
 def test_a_wrapped_angle_is_named():
@@ -515,29 +408,30 @@ def test_a_bilinear_model_with_a_hundredth_of_the_error_is_worth_its_step():
     assert hidden.best.kind == "linear"
 
 
-def level(offset, rng, names=("y",)):
-    """Return a record of a plant whose output stays about an offset, read in steps of 1e-4 spreads at least."""
+def level(offset, rng):
+    """Return logs of a plant whose output stays about an offset."""
     y, u = np.zeros(301), rng.uniform(-1, 1, 300)
     for k in range(300):
         y[k + 1] = 0.9 * y[k] + 0.5 * u[k]
-    return km.Episodes([km.Episode(X=(offset + y)[:, None], U=u[:, None])], 0.1, list(names), ["u"])
+    whole = km.Episode(X=(offset + y)[:, None], U=u[:, None])
+    return km.Episodes([whole.cut(25 * i, 25 * i + 25) for i in range(12)], 0.1, ["y"], ["u"])
 
 
 @pytest.mark.parametrize(("offset", "turns"), [(0.0, True), (95.0, False)])
 def test_a_number_without_a_unit_is_an_angle_only_if_it_comes_near_zero(offset, turns):
-    rng = np.random.default_rng(0)
-    names = [one.name for one in propose_candidates(level(offset, rng), (0,), False, rng)]
-    assert any("fourier 1" in name for name in names) is turns
+    found = select(level(offset, np.random.default_rng(0)), delays=[0], bilinear=False, ridges=[1e-6], horizon=4)
+    assert any("fourier 1" in row.name for row in found.leaderboard) is turns
 
 
 def test_of_centres_at_one_place_one_is_kept():
     rng = np.random.default_rng(0)
     data = level(0.0, rng)
-    steps = np.round(data[0].X, 0)  # a coarse sensor, whose readings jitter by a millionth
-    jitter = 1e-6 * rng.standard_normal(steps.shape)
-    coarse = data.with_episodes([km.Episode(X=steps + jitter, U=data[0].U)])
-    tried = [one for one in propose_candidates(coarse, (0,), False, rng) if "gaussian" in one.name]
-    assert {one.name for one in tried} == {f"gaussian {len(np.unique(steps))}"}
+    steps = [np.round(e.X, 0) for e in data]  # a coarse sensor, whose readings jitter by a millionth
+    jitter = [1e-6 * rng.standard_normal(x.shape) for x in steps]
+    coarse = data.with_episodes([km.Episode(X=x + d, U=e.U) for x, d, e in zip(steps, jitter, data, strict=True)])
+    found = select(coarse, delays=[0], bilinear=False, ridges=[1e-6], horizon=4, smooth=False)
+    names = {row.name for row in found.leaderboard if "gaussian" in row.name}
+    assert names == {f"gaussian {len(np.unique(np.concatenate(steps)))}"}
 
 
 def test_more_of_the_past_is_tried_where_two_rows_of_it_forecast_better_than_one():
