@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.control.ask.terminal import measure_reach
 from tests.guarantees.test_terminal_set import draw_model, make_cart
 
 ROWS = 30
@@ -74,25 +73,6 @@ def test_hundreds_of_loops_stay_feasible_under_moving_rows():
         feasible, lost, left = np.sum([run_loops(seed, kind, seed % 2 > 0, 10) for seed in range(100, 140)], axis=0)
         assert feasible >= 200
         assert (lost, left) == (0, 0)
-
-
-@pytest.mark.parametrize("kind", ["polytope", "ellipsoid"])
-def test_the_reach_of_a_set_is_that_of_its_points(kind):
-    model, rng = make_cart(), np.random.default_rng(0)
-    cost, limits = km.Cost(Q=1, R=0.1), km.Limits(u_min=-1, u_max=1, x_max=[2, 0.5], x_min=-3, du_max=0.8)
-    end = km.guarantees.find_terminal_set(model, cost, limits, [0.3, 0.0], kind=kind)
-    G = rng.normal(size=(3, 2))
-    reach = measure_reach(end, np.eye(2), G, None)
-    spread = np.linalg.norm(np.linalg.pinv(end.rows), axis=0).sum()
-    ways = rng.normal(size=(40_000, 3)) * spread
-    points = end.center + ways / np.maximum(end.measure(end.center + ways), 1e-9)[:, None]  # on the edge
-    values = points[:, :2] @ G.T
-    inputs = end.feedback.u + (points - end.center) @ end.feedback.K.T
-    for seen, bound in ((values, reach.outputs), (inputs, reach.inputs), (inputs - points[:, 2:], reach.rates)):
-        width = bound.high - bound.low
-        assert (seen <= bound.high + 1e-9).all()
-        assert (seen >= bound.low - 1e-9).all()
-        assert (seen.max(axis=0) >= bound.high - 0.05 * width).all()
 
 
 def test_a_set_that_leaves_a_later_row_is_refused_and_earlier_rows_do_not_count(tmp_path):
