@@ -3,6 +3,7 @@
 import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
 
@@ -29,11 +30,9 @@ def short_loops() -> Iterator[None]:
     """Let designs run fewer and shorter loops, and choose the slope of nearest rows by fewer forecasts."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PROMISE, "MANY", 100)
-        patch.setattr(FINALISTS, "COMPARED", 20)
-        patch.setattr(FINALISTS, "FURTHER", 40)
-        patch.setattr(TASK, "LONGEST", 60)
-        patch.setattr(TASK, "MOVING", 60)
-        patch.setattr(NEIGHBOURS, "BEGUN", 80)
+        patch.setattr(FINALISTS, "COMPARISON", replace(FINALISTS.COMPARISON, loops=20, further=40))
+        patch.setattr(TASK, "LENGTHS", replace(TASK.LENGTHS, longest=60, moving=60))
+        patch.setattr(NEIGHBOURS, "SETTINGS", replace(NEIGHBOURS.SETTINGS, begun=80))
         yield
 
 
@@ -50,5 +49,5 @@ def small_designs() -> Iterator[None]:
     """Let designs try two models, from few starts and in short loops."""
     with short_loops(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(TRIALS, "propose_candidates", propose_two)
-        patch.setattr(TASK, "STARTS", 6)
+        patch.setattr(TASK, "LENGTHS", replace(TASK.LENGTHS, starts=6))
         yield

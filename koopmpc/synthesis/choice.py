@@ -10,9 +10,24 @@ from koopmpc.base.values import Value
 from koopmpc.synthesis.loops.judging import LITTLE, Outcome
 from koopmpc.synthesis.search.recipe import Recipe
 
-BREAKS = 0.01  # a larger violation, as a share of the range, is less safe
-WORTH = 0.02  # a controller with an estimator may cost this share more
-WORTH_UNSTABLE = 0.05  # on an unstable plant one without an estimator may cost this share more
+
+@dataclass(frozen=True)
+class ChoiceSettings:
+    """What a violation or a lost run costs, and which rows of a leaderboard are alike."""
+
+    breaks: float = 0.01  # a larger violation, as a share of the range, is less safe
+    worth: float = 0.02  # a controller with an estimator may cost this share more
+    worth_unstable: float = 0.05  # on an unstable plant one without an estimator may cost this share more
+    lost: float = 20.0  # ratio to the best of a lost run, and the largest ratio of any run
+    free: float = 0.005  # a violation up to this share of the limits' range costs nothing
+    price: float = 10.0  # each further 1 % of violation adds this many percent to the cost
+    alike: float = 0.005  # scores that differ by this share are alike
+    unsure: float = (
+        0.03  # the largest standard error by which two scores are alike, and share by which two worst runs are
+    )
+
+
+CHOICE = ChoiceSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +86,11 @@ def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: 
         return None
     best = min((rows[i] for i in places), key=lambda row: (row.score, row.worst))
     near = [i for i in places if is_alike(rows[i].score, best.score, rows[i].error)]
-    near = [i for i in near if rows[i].worst <= best.worst * (1 + UNSURE)]
+    near = [i for i in near if rows[i].worst <= best.worst * (1 + CHOICE.unsure)]
 
     def rank(i: int) -> tuple[object, ...]:
         row, one = rows[i], rows[i].recipe
-        safe = row.lost, row.violation > BREAKS
+        safe = row.lost, row.violation > CHOICE.breaks
         return *safe, one.weighted, one.candidate.size, one.candidate.delays, one.estimator is None, row.score, i
 
     def without_estimator(i: int) -> Recipe:
@@ -85,18 +100,20 @@ def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: 
     same = [i for i in places if without_estimator(i) == without_estimator(place)]
     if unstable:
         plain = [i for i in same if rows[i].recipe.estimator is None and rows[i].lost <= rows[place].lost]
-        return next((i for i in plain if rows[i].score <= (1 + WORTH_UNSTABLE) * rows[place].score), place)
+        return next((i for i in plain if rows[i].score <= (1 + CHOICE.worth_unstable) * rows[place].score), place)
     if rows[place].recipe.estimator is None:
         estimating = [
-            i for i in same if rows[i].recipe.estimator is not None and rows[i].score <= (1 + WORTH) * rows[place].score
+            i
+            for i in same
+            if rows[i].recipe.estimator is not None and rows[i].score <= (1 + CHOICE.worth) * rows[place].score
         ]
         place = min(estimating, key=lambda i: (rows[i].score, i), default=place)
     estimator, row = rows[place].recipe.estimator, rows[place]
     if estimator is None or estimator.gain is None:
         return place
     own = [i for i in same if rows[i].recipe.estimator == replace(estimator, gain=None) and rows[i].lost <= row.lost]
-    own = [i for i in own if rows[i].worst <= (1 + UNSURE) * row.worst]
-    return next((i for i in own if rows[i].score <= (1 + WORTH) * row.score), place)
+    own = [i for i in own if rows[i].worst <= (1 + CHOICE.unsure) * row.worst]
+    return next((i for i in own if rows[i].score <= (1 + CHOICE.worth) * row.score), place)
 
 
 def choose_estimator(scores: Sequence[float], *, unstable: bool) -> int:
@@ -105,14 +122,7 @@ def choose_estimator(scores: Sequence[float], *, unstable: bool) -> int:
     One that costs at most 2 % more than none is taken, for it leaves no offset; none of those on an unstable plant.
     """
     place, some = int(np.argmin(scores)), 1 + int(np.argmin(scores[1:]))
-    return some if not unstable and scores[some] <= (1 + WORTH) * scores[place] else place
-
-
-LOST = 20.0  # ratio to the best of a lost run, and the largest ratio of any run
-FREE = 0.005  # a violation up to this share of the limits' range costs nothing
-PRICE = 10.0  # each further 1 % of violation adds this many percent to the cost
-ALIKE = 0.005  # scores that differ by this share are alike
-UNSURE = 0.03  # the largest standard error by which two scores are alike, and share by which two worst runs are
+    return some if not unstable and scores[some] <= (1 + CHOICE.worth) * scores[place] else place
 
 
 def rate_runs(outcomes: Sequence[Outcome]) -> Float[np.ndarray, "jobs runs"]:
@@ -124,13 +134,13 @@ def rate_runs(outcomes: Sequence[Outcome]) -> Float[np.ndarray, "jobs runs"]:
     cost, violation = (np.array([getattr(each, name) for each in outcomes]) for name in ("cost", "violation"))
     least = np.where(np.isfinite(violation), violation, np.inf).min(axis=0)
     with np.errstate(invalid="ignore"):
-        priced = cost * (1 + PRICE * np.maximum(violation - least - FREE, 0.0))
+        priced = cost * (1 + CHOICE.price * np.maximum(violation - least - CHOICE.free, 0.0))
         priced = np.where(np.isfinite(priced), priced, np.inf)
         best = priced.min(axis=0)
         known = best[np.isfinite(best)]
         little = LITTLE * float(np.median(known)) if known.size else 0.0
         ratio = (priced + little) / np.maximum(best + little, 1e-300)
-    return np.where(np.isfinite(ratio), np.minimum(ratio, LOST), LOST)
+    return np.where(np.isfinite(ratio), np.minimum(ratio, CHOICE.lost), CHOICE.lost)
 
 
 def average_ratios(
@@ -159,4 +169,4 @@ def measure_errors(
 
 def is_alike(score: float, best: float, error: float) -> bool:
     """Return whether a score is as good as the best one, by the standard error of their difference."""
-    return bool(score <= best * (1 + max(ALIKE, min(error, UNSURE))))
+    return bool(score <= best * (1 + max(CHOICE.alike, min(error, CHOICE.unsure))))

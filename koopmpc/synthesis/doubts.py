@@ -13,7 +13,7 @@ from koopmpc.lifting.base import strip_unit
 from koopmpc.lifting.state import State
 from koopmpc.loop.metrics import stack_limited
 from koopmpc.synthesis.loops.surrogates import Surrogate
-from koopmpc.synthesis.task import _FEW, ROOM, DesignTask
+from koopmpc.synthesis.task import LENGTHS, DesignTask
 
 FAR = 1.0  # an episode is left out if it leaves the box of the others by more than this many widths
 MOST = 0.9  # share of the episodes inside this box
@@ -51,7 +51,7 @@ def find_stray_episodes(data: Episodes, task: DesignTask) -> dict[int, str]:
     x_far, x_low, x_high = _measure_departures(X, low, high)
     u_far, _, _ = _measure_departures(U, np.full(data.nu, np.inf), np.full(data.nu, -np.inf))
     found: dict[int, str] = {}
-    for k in np.flatnonzero((x_far.max(axis=1) > FAR) & (u_far.max(axis=1) <= ROOM)).tolist():
+    for k in np.flatnonzero((x_far.max(axis=1) > FAR) & (u_far.max(axis=1) <= LENGTHS.room)).tolist():
         i = int(x_far[k].argmax())
         furthest = X[k][np.abs(X[k][:, i] - (x_low[i] + x_high[i]) / 2).argmax(), i]
         found[k] = (
@@ -143,7 +143,7 @@ def find_poor_logs(task: DesignTask, data: Episodes, tracked: Sequence[int]) -> 
     steps = np.max([np.abs(np.diff(one, axis=0)).max(axis=0) for one in X], axis=0)
     for column, i in enumerate(tracked):
         moved = np.abs(np.diff(task.reference[:, column]))
-        usual = float(np.median(moved[moved > 0])) if (moved > 0).sum() > _FEW else 0.0
+        usual = float(np.median(moved[moved > 0])) if (moved > 0).sum() > LENGTHS.few else 0.0
         if usual > steps[i] and i in _weighted_references(task, data):
             said.append(
                 f"no input can follow the reference: it moves {strip_unit(data.states[i])} by {usual:.4g} in a step, "

@@ -19,15 +19,26 @@ from koopmpc.lifting.composed import evaluate_jacobians
 from koopmpc.lifting.state import State
 from koopmpc.loop.metrics import stack_limited
 
-RUN = 3  # length of a run in horizons
-MOVING = 120  # steps of a run with a moving reference, at least: three short horizons show the way there, no tracking
-LONGEST = 120  # steps of a run that is as long as a loop takes to settle, at most
-STARTS = 12  # default number of starts: one for each condition of a design
-_FEW = 4  # if at least this many first states are inside the limits, only those are used
-_ROWS = 400  # rows along a few records from which random starts are drawn, at most
-ROOM = 0.5  # a run may leave the data by this share of their range
-SETTLED = 0.1  # a loop has settled where its error is below this share of its first error
-TRIED = 400  # steps of the trial loop
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """How long loops and plans are, and from where loops begin."""
+
+    run: int = 3  # length of a run in horizons
+    moving: int = 120  # steps of a run with a moving reference, at least: three short horizons show no tracking
+    longest: int = 120  # steps of a run that is as long as a loop takes to settle, at most
+    starts: int = 12  # default number of starts: one for each condition of a design
+    few: int = 4  # if at least this many first states are inside the limits, only those are used
+    rows: int = 400  # rows along a few records from which random starts are drawn, at most
+    room: float = 0.5  # a run may leave the data by this share of their range
+    settled: float = 0.1  # a loop has settled where its error is below this share of its first error
+    tried: int = 400  # steps of the trial loop
+    least_plan: int = 8  # steps
+    most_plan: int = 40  # steps
+    plan_share: float = 0.5  # of the settling time; the tail of the cost stands for the rest
+
+
+LENGTHS = TaskSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +108,7 @@ class DesignTask(Value):
         for column, i in enumerate(tracked):
             low[i] = min(low[i], self.reference[:, column].min())
             high[i] = max(high[i], self.reference[:, column].max())
-        room = ROOM * (self.high - self.low)
+        room = LENGTHS.room * (self.high - self.low)
         low, high = low - room, high + room
         low[list(free)], high[list(free)] = -np.inf, np.inf
         return low, high
@@ -142,7 +153,7 @@ def check_task(
         raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
     X = np.concatenate([episode.X for episode in data])
     low, high = X.min(axis=0), X.max(axis=0)
-    firsts, along = _first_states(data, limits), starts is None and len(data) < _FEW
+    firsts, along = _first_states(data, limits), starts is None and len(data) < LENGTHS.few
     if starts is None:
         points = _choose_spread(firsts)
     else:
@@ -152,11 +163,11 @@ def check_task(
         )
         if not len(points):
             raise DataError("starts is empty; pass states (n, nx), or None for first states of the data's episodes")
-    steps = max(RUN * horizon, min(measure_settling(data, cost, limits, rows, points), LONGEST))
+    steps = max(LENGTHS.run * horizon, min(measure_settling(data, cost, limits, rows, points), LENGTHS.longest))
     if len(rows) == 1:
         rows = np.repeat(rows, steps + 1, axis=0)
     if (rows != rows[0]).any():
-        steps = max(steps, MOVING)
+        steps = max(steps, LENGTHS.moving)
     values, box = stack_limited(limits, X, states)
     sizes = box.high - box.low
     sizes = np.where(np.isfinite(sizes) & (sizes > 0), sizes, np.maximum(np.ptp(values, axis=0), 1e-300))
@@ -219,18 +230,18 @@ def _count_steps(
     try:
         P: Float[np.ndarray, "nx nx"] = np.asarray(scipy.linalg.solve_discrete_are(A, B, Q, R))
     except (np.linalg.LinAlgError, ValueError):
-        return TRIED
+        return LENGTHS.tried
     K: Float[np.ndarray, "nu nx"] = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     low, high = limits.inputs(data.nu)
     U = np.concatenate([e.U for e in data])
     half = np.where(np.isfinite(high - low), high - low, np.ptp(U, axis=0)) / 2 / u_size
     E, first, last = starts.T, np.sqrt(np.einsum("in,ij,jn->n", starts.T, Q, starts.T)), 1
     with np.errstate(all="ignore"):
-        for k in range(1, TRIED + 1):
+        for k in range(1, LENGTHS.tried + 1):
             E = A @ E + B @ np.clip(-K @ E, -half[:, None], half[:, None])
-            if not (np.sqrt(np.einsum("in,ij,jn->n", E, Q, E)) <= SETTLED * first).all():
+            if not (np.sqrt(np.einsum("in,ij,jn->n", E, Q, E)) <= LENGTHS.settled * first).all():
                 last = k + 1
-    return min(last, TRIED)
+    return min(last, LENGTHS.tried)
 
 
 def _first_states(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
@@ -238,7 +249,7 @@ def _first_states(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
     points = np.unique(np.array([episode.X[0] for episode in data]), axis=0)
     low, high = limits.states(data.nx)
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
-    return inside if len(inside) >= _FEW else points
+    return inside if len(inside) >= LENGTHS.few else points
 
 
 def _rows_along(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
@@ -246,24 +257,19 @@ def _rows_along(data: Episodes, limits: Limits) -> Float[np.ndarray, "n nx"]:
     rows = np.concatenate([episode.X for episode in data])
     low, high = limits.states(data.nx)
     inside = rows[((rows >= low) & (rows <= high)).all(axis=1)]
-    return inside[:: -(-len(inside) // _ROWS) or 1]
+    return inside[:: -(-len(inside) // LENGTHS.rows) or 1]
 
 
 def _choose_spread(points: Float[np.ndarray, "n nx"]) -> Float[np.ndarray, "m nx"]:
     """Return a few of the points: of the half nearest to their median, far from each other."""
     size = np.ptp(points, axis=0)
     Z = (points - np.median(points, axis=0)) / np.where(size > 0, size, 1.0)
-    central = np.argsort((Z**2).sum(axis=1), kind="stable")[: max(-(-len(Z) // 2), min(_FEW, len(Z)))]
+    central = np.argsort((Z**2).sum(axis=1), kind="stable")[: max(-(-len(Z) // 2), min(LENGTHS.few, len(Z)))]
     picked = [int(central[-1])]
-    while len(picked) < min(STARTS, len(central)):
+    while len(picked) < min(LENGTHS.starts, len(central)):
         apart = np.min([((Z[central] - Z[i]) ** 2).sum(axis=1) for i in picked], axis=0)
         picked.append(int(central[apart.argmax()]))
     return points[picked]
-
-
-_LEAST_PLAN = 8  # steps
-_MOST_PLAN = 40  # steps
-_SHARE = 0.5  # of the settling time; the tail of the cost stands for the rest
 
 
 def choose_horizon(data: Episodes, cost: Cost, limits: Limits | None, reference: ArrayLike) -> tuple[int, str]:
@@ -274,8 +280,8 @@ def choose_horizon(data: Episodes, cost: Cost, limits: Limits | None, reference:
     """
     cost, limits = check_cost_and_limits(cost, limits, data.states, data.inputs)
     settled = measure_settling(data, cost, limits, reference, np.array([e.X[0] for e in data]))
-    most = max(min(_MOST_PLAN, int(np.median([len(e) for e in data])) // 2), 1)
-    N = int(min(max(np.ceil(_SHARE * settled), min(_LEAST_PLAN, most)), most))
+    most = max(min(LENGTHS.most_plan, int(np.median([len(e) for e in data])) // 2), 1)
+    N = int(min(max(np.ceil(LENGTHS.plan_share * settled), min(LENGTHS.least_plan, most)), most))
     return N, (
         f"the horizon is {N} steps of {data.dt:g} s: half of the {settled} steps in which a linear loop with limited "
         "inputs settles, within 8 to 40 steps and half of the episodes"

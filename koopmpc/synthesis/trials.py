@@ -19,7 +19,7 @@ from koopmpc.synthesis.search.cross_validation import LEAST, RIDGES, Trial, Trie
 from koopmpc.synthesis.search.folds import Folds, make_folds
 from koopmpc.synthesis.search.hidden_states import propose_hidden_states
 from koopmpc.synthesis.search.prepare import list_delays, report_stage
-from koopmpc.synthesis.task import RUN, DesignTask
+from koopmpc.synthesis.task import LENGTHS, DesignTask
 from koopmpc.validate.memory import Memory
 
 
@@ -72,7 +72,7 @@ def plan_trials(posed: PosedTask, options: DesignOptions, draw: np.random.Genera
 def _describe_lengths(task: DesignTask, held: Episodes, forecast: int) -> list[str]:
     """Return sentences where loops are longer than episodes, or forecasts shorter than plans."""
     said, longest = list[str](), max(len(one) for one in held)
-    if task.steps > max(longest, RUN * task.horizon):
+    if task.steps > max(longest, LENGTHS.run * task.horizon):
         why = "since the reference moves" if task.moves else "until a linear loop on the data settles, at most 120"
         said.append(
             f"loops take {task.steps} steps, {why}; no episode is longer than {longest}, so what comes later rests on "

@@ -11,7 +11,7 @@ import koopmpc as km
 from koopmpc.codegen.compiled import Compiled
 from koopmpc.models.records.hidden_structure import HiddenStructure
 from koopmpc.models.records.structure import Structure
-from koopmpc.synthesis.choice import LOST, average_ratios, choose_estimator, choose_row, measure_errors, rate_runs
+from koopmpc.synthesis.choice import CHOICE, average_ratios, choose_estimator, choose_row, measure_errors, rate_runs
 from koopmpc.synthesis.doubts import find_poor_logs
 from koopmpc.synthesis.loops.abreast import speed_up
 from koopmpc.synthesis.loops.finalists import choose_finalist, find_stopping_set, is_preferable, list_finalists
@@ -410,7 +410,7 @@ def test_a_recipe_that_is_lost_on_every_surrogate_is_never_chosen():
             Outcome(c, np.where(np.isfinite(c), 0.0, np.inf), np.zeros(12), *[np.zeros((0, 2))] * 2) for c in costs
         ]
         each = rate_runs(outcomes)
-        assert (each[lost] == LOST).all()
+        assert (each[lost] == CHOICE.lost).all()
         rows = [
             replace(usual().best, score=float(score), off=True)
             for score in average_ratios(each, np.array([1.0] * 6 + [0.5] * 6))

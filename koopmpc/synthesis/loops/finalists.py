@@ -1,7 +1,7 @@
 """Controllers compared on the same fresh loops: finalists, ends of plans, longer horizons."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.state import Constant, State
 from koopmpc.models.fits.edmd import edmd
 from koopmpc.models.predictors import LinearPredictor
-from koopmpc.synthesis.choice import UNSURE, DesignRow
+from koopmpc.synthesis.choice import CHOICE, DesignRow
 from koopmpc.synthesis.loops.abreast import speed_up
 from koopmpc.synthesis.loops.fresh import DRAWN, _draw_corners
 from koopmpc.synthesis.loops.judging import LITTLE
@@ -26,16 +26,24 @@ from koopmpc.synthesis.rates import KEPT
 from koopmpc.synthesis.search.recipe import Designed, Recipe, get_model
 from koopmpc.validate.scoring import AnyPredictor
 
-COMPARED = 60  # fresh loops in which horizons, or finalists, are compared in machine code
-FEW = 12  # and in Python
-FINALISTS = 3  # rows beside the chosen one whose controllers run many fresh loops
-FURTHER = 240  # further loops of the last two finalists
-DIFFERENT = 0.05  # share of the loops by which one of two controllers must keep more
-CHANCE = 0.05  # and probability that this is chance
-CHEAPER = 0.98  # a finalist that costs this share of the chosen one takes its place
-MUCH = 0.9  # a horizon that costs this share of the given one is much better
-AHEAD = 40  # steps after the end of a plan in which limits are to be kept
-ACTING = 0.9  # share of an input's way to its limit that is trusted to stop a motion
+
+@dataclass(frozen=True)
+class Comparison:
+    """How many loops compare controllers, and by what one of them is better."""
+
+    loops: int = 60  # fresh loops in which horizons, or finalists, are compared in machine code
+    loops_in_python: int = 12  # and in Python
+    finalists: int = 3  # rows beside the chosen one whose controllers run many fresh loops
+    further: int = 240  # further loops of the last two finalists
+    different: float = 0.05  # share of the loops by which one of two controllers must keep more
+    chance: float = 0.05  # and probability that this is chance
+    cheaper: float = 0.98  # a finalist that costs this share of the chosen one takes its place
+    much: float = 0.9  # a horizon that costs this share of the given one is much better
+    ahead: int = 40  # steps after the end of a plan in which limits are to be kept
+    acting: float = 0.9  # share of an input's way to its limit that is trusted to stop a motion
+
+
+COMPARISON = Comparison()
 
 
 def watch_data(recipe: Recipe, model: AnyPredictor, controller: Designed, data: Episodes) -> Designed:
@@ -60,10 +68,10 @@ def find_room_to_stop(
     if limits.terminal is not None or near is None or data.nw or not np.isfinite(np.stack([low, high])).any():
         return limits, ""
     fast = speed_up(controller)
-    drawn = pool.draw(COMPARED if isinstance(fast, Compiled) else FEW, rng)
+    drawn = pool.draw(COMPARISON.loops if isinstance(fast, Compiled) else COMPARISON.loops_in_python, rng)
     given = pool.run(fast, drawn)
     X = near.points[((near.points >= low) & (near.points <= high)).all(axis=1)]
-    if _count_broken(given) < DIFFERENT * len(given) or not len(X):
+    if _count_broken(given) < COMPARISON.different * len(given) or not len(X):
         return limits, ""
     with hide_fit_warnings():
         model = edmd(data, State() + Constant())
@@ -76,7 +84,7 @@ def find_room_to_stop(
     except KoopmpcError:  # the model's states are others
         return limits, ""
     stopped = pool.run(speed_up(other), drawn)
-    if not is_preferable(stopped, given, MUCH):
+    if not is_preferable(stopped, given, COMPARISON.much):
         return limits, ""
     broken = [_count_broken(one) for one in (given, stopped)]
     return kept, (
@@ -97,13 +105,13 @@ def find_stopping_set(
     """
     nx = model.nx
     bounds = np.stack([-limits.states(nx).low, limits.states(nx).high])
-    u_low, u_high = (middle + ACTING * (each - middle) for each in limits.inputs(model.nu))
+    u_low, u_high = (middle + COMPARISON.acting * (each - middle) for each in limits.inputs(model.nu))
     zero, *ones = model.lifting(np.vstack([np.zeros(nx), np.eye(nx)]))
     S = np.column_stack([one - zero for one in ones])
     H, h = list[Float[np.ndarray, " nx"]](), list[float]()
     for way, i in np.argwhere(np.isfinite(bounds)).tolist():
         row, least = (-1.0, 1.0)[way] * model.C[i], 0.0
-        for _ in range(AHEAD):
+        for _ in range(COMPARISON.ahead):
             effect = row @ model.B
             reach = np.where(effect > 0, u_low, u_high)[effect != 0]
             row, least = row @ model.A, least + float(effect[effect != 0] @ reach)
@@ -132,7 +140,10 @@ def compare_longer_horizon(
     All horizons run the same loops, from fresh starts and from the corners of the goal's range; `fast` is the
     controller as `speed_up` returns it. Where twice as long is better, four times is tried, and told if better still.
     """
-    N, drawn = controller.horizon, pool.draw(COMPARED if isinstance(fast, Compiled) else FEW, rng)
+    N, drawn = (
+        controller.horizon,
+        pool.draw(COMPARISON.loops if isinstance(fast, Compiled) else COMPARISON.loops_in_python, rng),
+    )
     drawn += _draw_corners(pool.task, rng)
 
     def run(horizon: int) -> list[LoopResult]:
@@ -140,7 +151,7 @@ def compare_longer_horizon(
         return pool.run(fast if horizon == N else speed_up(one), drawn)
 
     given, twice = run(N), run(2 * N)
-    if not is_preferable(twice, given, MUCH):
+    if not is_preferable(twice, given, COMPARISON.much):
         return []
     lost, broken = ([count_loops(one) for one in (given, twice)] for count_loops in (_count_lost, _count_broken))
     said = (
@@ -148,7 +159,7 @@ def compare_longer_horizon(
         f"{len(given)} loops {broken[1]} violate limits by more than {to_percent(KEPT)} of their range in place of "
         f"{broken[0]}, and {lost[1]} are lost in place of {lost[0]}: take it if a step has the time"
     )
-    if is_preferable(longer := run(4 * N), twice, MUCH):
+    if is_preferable(longer := run(4 * N), twice, COMPARISON.much):
         said += (
             f"; {4 * N} steps cost {_compare_costs(longer, given)[0]:.3g} times as much, {_count_broken(longer)} "
             f"violate, and {_count_lost(longer)} are lost"
@@ -166,10 +177,10 @@ def list_finalists(rows: Sequence[DesignRow], best: int) -> list[int]:
     for i, row in enumerate(rows):
         one = row.recipe
         other = row.off and one.candidate not in known and one.estimator == chosen.recipe.estimator
-        if other and row.score <= (1 + UNSURE) * least and row.lost <= chosen.lost:
+        if other and row.score <= (1 + CHOICE.unsure) * least and row.lost <= chosen.lost:
             known.append(one.candidate)
             found.append(i)
-    return found[:FINALISTS]
+    return found[: COMPARISON.finalists]
 
 
 def choose_finalist(pool: LoopPool, finalists: Sequence[Designed], rng: np.random.Generator) -> tuple[int, int, str]:
@@ -182,16 +193,16 @@ def choose_finalist(pool: LoopPool, finalists: Sequence[Designed], rng: np.rando
     places = [i for i, one in enumerate(fast) if isinstance(one, Compiled)]
     if len(places) < 2 or places[0] != 0:
         return 0, 0, ""
-    drawn = pool.draw(COMPARED, rng)
+    drawn = pool.draw(COMPARISON.loops, rng)
     results = {i: pool.run(fast[i], drawn) for i in places}
 
     def rank(i: int) -> tuple[float, ...]:
         return _count_lost(results[i]), _count_broken(results[i]), _compare_costs(results[i], results[0])[0]
 
     other = min(places[1:], key=rank)
-    more, loops = pool.draw(FURTHER, rng), len(places) * COMPARED + 2 * FURTHER
+    more, loops = pool.draw(COMPARISON.further, rng), len(places) * COMPARISON.loops + 2 * COMPARISON.further
     first, second = (results[i] + pool.run(fast[i], more) for i in (0, other))
-    if not is_preferable(second, first, CHEAPER):
+    if not is_preferable(second, first, COMPARISON.cheaper):
         return 0, loops, ""
     lost, broken = ([count_loops(one) for one in (first, second)] for count_loops in (_count_lost, _count_broken))
     return (
@@ -213,7 +224,7 @@ def is_preferable(one: Sequence[LoopResult], other: Sequence[LoopResult], cheape
         mine, others = (np.array([fails(result) for result in each]) for each in (one, other))
         worse, better = int(np.sum(mine & ~others)), int(np.sum(others & ~mine))
         few, many = sorted((worse, better))
-        if many - few >= DIFFERENT * len(mine) and bdtr(few, few + many, 0.5) <= CHANCE:
+        if many - few >= COMPARISON.different * len(mine) and bdtr(few, few + many, 0.5) <= COMPARISON.chance:
             return better > worse
     change, error = _compare_costs(one, other)
     return change < cheaper and bool(np.log(change) < -3 * error)

@@ -20,9 +20,29 @@ from koopmpc.synthesis.search.recipe import Designed, Recipe, get_model
 from koopmpc.synthesis.task import DesignTask
 from koopmpc.validate.scoring import AnyPredictor
 
-SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)  # times the tube that are tried as a margin, the least one first
-ROUND = 20  # loops that are run before their failures are counted
-FINER = 2  # halvings between the last scale that fails and the first that holds
+
+@dataclass(frozen=True)
+class MarginSettings:
+    """Which margins are tried, and how long their tube is."""
+
+    scales: tuple[float, ...] = (
+        0.25,
+        0.5,
+        1.0,
+        2.0,
+        4.0,
+    )  # times the tube that are tried as a margin, the least one first
+    round: int = 20  # loops that are run before their failures are counted
+    finer: int = 2  # halvings between the last scale that fails and the first that holds
+    iterations: int = 10_000  # of the Riccati equation
+    slack: float = (
+        1e-6  # weight of the states in the feedback of the tube, as a share of 1 / range², beside those of the cost
+    )
+    rested: float = 1e-4  # the tube ends once a step widens it by less than this share
+    longest: int = 400  # steps of a tube, at most
+
+
+SETTINGS = MarginSettings()
 
 
 def most_failures(loops: int, coverage: float) -> int:
@@ -161,14 +181,14 @@ def _run_until(pool: LoopPool, controller: Any, loops: Sequence[DrawnLoop], allo
     """Return the results of loops, up to the round with one failure too many."""
     results: list[LoopResult] = []
     while len(results) < len(loops) and _count_failures(results) <= allowed:
-        results += pool.run(controller, loops[len(results) : len(results) + ROUND])
+        results += pool.run(controller, loops[len(results) : len(results) + SETTINGS.round])
     return results
 
 
 def _find_least(attempt: Callable[[float], _Attempt | None]) -> _Attempt | None:
     """Return the attempt with the least scale that holds; where none does the widest one, None if there is none."""
     below, last = 0.0, None
-    for scale in SCALES:
+    for scale in SETTINGS.scales:
         tried = attempt(scale)
         if tried is None or (last is not None and np.array_equal(tried.margin, last.margin)):
             return last  # the limits cross, or the room is used up
@@ -176,7 +196,7 @@ def _find_least(attempt: Callable[[float], _Attempt | None]) -> _Attempt | None:
         if tried.holds:
             break
         below = scale
-    for _ in range(FINER if last is not None and last.holds else 0):
+    for _ in range(SETTINGS.finer if last is not None and last.holds else 0):
         assert last is not None
         middle = (below + last.scale) / 2
         tried = attempt(middle)
@@ -185,12 +205,6 @@ def _find_least(attempt: Callable[[float], _Attempt | None]) -> _Attempt | None:
         else:
             below = middle
     return last
-
-
-_ITERATIONS = 10_000  # of the Riccati equation
-_SLACK = 1e-6  # weight of the states in the feedback of the tube, as a share of 1 / range², beside those of the cost
-_RESTED = 1e-4  # the tube ends once a step widens it by less than this share
-_LONGEST = 400  # steps of a tube, at most
 
 
 def propagate_errors(
@@ -229,14 +243,14 @@ def find_tube(
         n, size = len(A), np.maximum(task.high - task.low, 1e-12)
         R = task.cost.matrices(task.reference.shape[1], B.shape[1])[1]
         tracked = task.weigh_states(x, model.states, B.shape[1])
-        weight = tracked + _SLACK * float(np.trace(tracked @ np.diag(size**2))) / n * np.diag(1 / size**2)
+        weight = tracked + SETTINGS.slack * float(np.trace(tracked @ np.diag(size**2))) / n * np.diag(1 / size**2)
         stage = one_step(A, B, weight, R + 1e-9 * np.eye(len(R)) * max(float(np.trace(R)), 1e-9), None)
-        K, _ = find_gain(stage, stationary(stage, _ITERATIONS).P)
+        K, _ = find_gain(stage, stationary(stage, SETTINGS.iterations).P)
     except (KoopmpcError, np.linalg.LinAlgError):
         return None
     loop = A - B @ K
     if not np.isfinite(loop).all() or np.abs(np.linalg.eigvals(loop)).max() >= 1:
         return None
-    widths = propagate_errors(loop, error, _LONGEST)
-    still = np.flatnonzero((np.diff(widths, axis=0) <= _RESTED * widths[:-1] + 1e-300).all(axis=1))
+    widths = propagate_errors(loop, error, SETTINGS.longest)
+    still = np.flatnonzero((np.diff(widths, axis=0) <= SETTINGS.rested * widths[:-1] + 1e-300).all(axis=1))
     return widths[: int(still[0]) + 2] if still.size else widths

@@ -17,19 +17,27 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.synthesis.search.folds import usual_horizon
 from koopmpc.synthesis.task import DesignTask, goal_box
 
-MOST = 6000  # rows that are kept
-NEAR = 3  # neighbours for each coefficient say whether a row is inside the data
-LEAST = 12  # neighbours at least
-# neighbours for each coefficient of the local slope, and its ridge, as a share of its largest squared direction
-SLOPES = tuple((near, ridge) for near in (NEAR, 20) for ridge in (1e-4, 1e-2, 1.0))
-AHEAD = 10  # steps of the forecasts that choose among them
-BEGUN = 400  # of these forecasts, at most
-GROUPS = 8  # of episodes; each is forecast by the rows of the others
-ALIKE = 1.05  # the first of them is taken whose error is at most this many times the least one
-KNOWN = 0.99  # share of the data's own rows that is inside the data
-ROOM = 1.5  # a row is outside if its neighbours are this many times as far as those of KNOWN
-PROBES = 256  # points of the goal's range that are looked up in the data
-GRID = 1e-9  # spread below which a column counts as constant
+
+@dataclass(frozen=True)
+class NeighbourSettings:
+    """How near rows are neighbours, and how the slope of a stand-in by rows is chosen."""
+
+    most_rows: int = 6000  # rows that are kept
+    near: int = 3  # neighbours for each coefficient say whether a row is inside the data
+    least: int = 12  # neighbours at least
+    # neighbours for each coefficient of the local slope, and its ridge, as a share of its largest squared direction
+    slopes: tuple[tuple[int, float], ...] = ((3, 1e-4), (3, 1e-2), (3, 1.0), (20, 1e-4), (20, 1e-2), (20, 1.0))
+    ahead: int = 10  # steps of the forecasts that choose among them
+    begun: int = 400  # of these forecasts, at most
+    groups: int = 8  # of episodes; each is forecast by the rows of the others
+    alike: float = 1.05  # the first of them is taken whose error is at most this many times the least one
+    known: float = 0.99  # share of the data's own rows that is inside the data
+    room: float = 1.5  # a row is outside if its neighbours are this many times as far as those of `known`
+    probes: int = 256  # points of the goal's range that are looked up in the data
+    constant: float = 1e-9  # spread below which a column counts as constant
+
+
+SETTINGS = NeighbourSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +69,8 @@ class NeighbourMap(Value):
     inputs: tuple[str, ...]
     dt: float  # sampling time [s]
     # local, ridge: neighbours for each coefficient of the local slope, and its ridge
-    local: int = SLOPES[0][0]
-    ridge: float = SLOPES[0][1]
+    local: int = SETTINGS.slopes[0][0]
+    ridge: float = SETTINGS.slopes[0][1]
     feedthrough: bool = False  # as of a `Surrogate`
 
     @classmethod
@@ -84,8 +92,8 @@ class NeighbourMap(Value):
         steps = np.concatenate([np.diff(e.X, axis=0) for e in points])
         number = np.repeat(np.arange(len(points)), [len(e) for e in points])
         spread = V.std(axis=0)
-        scale = np.where(spread > GRID * (np.abs(V).max(axis=0) + 1e-300), spread, 1.0)
-        apart = -(-len(V) // MOST)
+        scale = np.where(spread > SETTINGS.constant * (np.abs(V).max(axis=0) + 1e-300), spread, 1.0)
+        apart = -(-len(V) // SETTINGS.most_rows)
         mean = np.concatenate([np.hstack([e.U, e.W]) for e in points]).mean(axis=0)
         found = cls(
             rows=np.ascontiguousarray((V / scale)[::apart]),
@@ -115,14 +123,14 @@ class NeighbourMap(Value):
     @property
     def near(self) -> int:
         """Number k of neighbours that say whether a row is inside the data."""
-        return min(max(NEAR * (self.rows.shape[1] + 1), LEAST), len(self.rows))
+        return min(max(SETTINGS.near * (self.rows.shape[1] + 1), SETTINGS.least), len(self.rows))
 
     @cached_property
     def reach(self) -> float:
         """Distance to the k-th neighbour beyond which a row is outside the data."""
         apart = -(-len(self.rows) // 1000)
         distance, _ = self.tree.query(self.rows[::apart], self.near)
-        return ROOM * float(np.quantile(np.reshape(distance, (-1, self.near))[:, -1], KNOWN))
+        return SETTINGS.room * float(np.quantile(np.reshape(distance, (-1, self.near))[:, -1], SETTINGS.known))
 
     def start(self, x0: Float[np.ndarray, " n"]) -> Float[np.ndarray, " nzeta"]:
         """Return ζ after a rest at x0; x0 itself if it is a ζ."""
@@ -186,14 +194,14 @@ class NeighbourMap(Value):
 def _choose_slope(map_: NeighbourMap, episodes: Episodes) -> tuple[int, float]:
     """Return the neighbours for each coefficient and the ridge of the local slope that forecast best."""
     number = len(map_.triangles)  # a last episode may have no row that is kept
-    group = np.arange(number) % GROUPS
-    counts = np.array([group != out for out in range(min(GROUPS, number))], dtype=np.float64)
-    ahead = min(AHEAD, usual_horizon(episodes)[0])
-    apart = -(-sum(len(e) for e in episodes) // BEGUN)
+    group = np.arange(number) % SETTINGS.groups
+    counts = np.array([group != out for out in range(min(SETTINGS.groups, number))], dtype=np.float64)
+    ahead = min(SETTINGS.ahead, usual_horizon(episodes)[0])
+    apart = -(-sum(len(e) for e in episodes) // SETTINGS.begun)
     at = [(i, k) for i, e in enumerate(list(episodes)[:number]) for k in range(0, len(e) - ahead + 1, apart)]
-    at = at[:: max(-(-len(at) // BEGUN), 1)]
+    at = at[:: max(-(-len(at) // SETTINGS.begun), 1)]
     if number < 2 or (counts @ np.bincount(map_.episode, minlength=number)).min() < map_.near:
-        return SLOPES[0]
+        return SETTINGS.slopes[0]
     which = np.array([group[i] for i, _ in at])
     begun: Float[np.ndarray, "n nzeta"] = np.array([episodes[i].X[k] for i, k in at])
     U = np.array([episodes[i].U[k : k + ahead] for i, k in at])
@@ -202,14 +210,16 @@ def _choose_slope(map_: NeighbourMap, episodes: Episodes) -> tuple[int, float]:
     spread = np.maximum(np.concatenate([e.X for e in episodes]).std(axis=0), 1e-300)
     errors: list[float] = []
     plants = NeighbourPlants(map_, counts)
-    for slope in SLOPES:
+    for slope in SETTINGS.slopes:
         plants.slope, Z = slope, begun
         for k in range(ahead):
             Z = plants.step(Z, U[:, k], which, W[:, k])
         missed: Float[np.ndarray, "n nzeta"] = (Z - after) / spread
         error = float(np.sqrt(np.mean(missed**2)))
         errors.append(error if np.isfinite(error) else np.inf)
-    return next(slope for slope, error in zip(SLOPES, errors, strict=True) if error <= ALIKE * min(errors))
+    return next(
+        slope for slope, error in zip(SETTINGS.slopes, errors, strict=True) if error <= SETTINGS.alike * min(errors)
+    )
 
 
 def _regress(
@@ -252,7 +262,9 @@ class NeighbourPlants:
         Z, U, which = Z[good], U[good], which[good]
         V = one.scale_rows(Z, U, None if W is None else W[good])
         local, ridge = self.slope
-        found = one.tree.query(V, min(2 * max(local * (V.shape[1] + 1), LEAST), len(one.rows)))  # a bootstrap has fewer
+        found = one.tree.query(
+            V, min(2 * max(local * (V.shape[1] + 1), SETTINGS.least), len(one.rows))
+        )  # a bootstrap has fewer
         distance, places = (np.reshape(part, (len(V), -1)) for part in found)
         affine, near = self._affine[which], one.rows[places]
         width = 1.0001 * np.maximum(distance[:, -1:], 1e-12)
@@ -307,7 +319,7 @@ def probe_range(
     from scipy.stats.qmc import Halton  # slow to import
 
     low, high = goal_box(task)
-    X = low + (high - low) * Halton(len(low), scramble=False).random(PROBES)
+    X = low + (high - low) * Halton(len(low), scramble=False).random(SETTINGS.probes)
     return X, neighbours.find_outside_states(X)
 
 
