@@ -93,27 +93,30 @@ def choose_row(rows: Sequence[DesignRow], kind: str | None = None, *, unstable: 
         safe = row.lost, row.violation > CHOICE.breaks
         return *safe, one.weighted, one.candidate.size, one.candidate.delays, one.estimator is None, row.score, i
 
-    def without_estimator(i: int) -> Recipe:
-        return replace(rows[i].recipe, estimator=None)
-
     place = min(near, key=rank)
-    same = [i for i in places if without_estimator(i) == without_estimator(place)]
+    plain = replace(rows[place].recipe, estimator=None)
+    same = [i for i in places if replace(rows[i].recipe, estimator=None) == plain]
+    return _choose_among_estimators(rows, same, place, unstable)
+
+
+def _choose_among_estimators(rows: Sequence[DesignRow], same: Sequence[int], place: int, unstable: bool) -> int:
+    """Return the row whose estimator is worth its cost, of the rows of one recipe but for it; see `choose_row`."""
+
+    def admit(i: int, worth: float) -> bool:
+        return rows[i].score <= (1 + worth) * rows[place].score
+
     if unstable:
         plain = [i for i in same if rows[i].recipe.estimator is None and rows[i].lost <= rows[place].lost]
-        return next((i for i in plain if rows[i].score <= (1 + CHOICE.worth_unstable) * rows[place].score), place)
+        return next((i for i in plain if admit(i, CHOICE.worth_unstable)), place)
     if rows[place].recipe.estimator is None:
-        estimating = [
-            i
-            for i in same
-            if rows[i].recipe.estimator is not None and rows[i].score <= (1 + CHOICE.worth) * rows[place].score
-        ]
-        place = min(estimating, key=lambda i: (rows[i].score, i), default=place)
+        some = [i for i in same if rows[i].recipe.estimator is not None and admit(i, CHOICE.worth)]
+        place = min(some, key=lambda i: (rows[i].score, i), default=place)
     estimator, row = rows[place].recipe.estimator, rows[place]
     if estimator is None or estimator.gain is None:
         return place
     own = [i for i in same if rows[i].recipe.estimator == replace(estimator, gain=None) and rows[i].lost <= row.lost]
     own = [i for i in own if rows[i].worst <= (1 + CHOICE.unsure) * row.worst]
-    return next((i for i in own if rows[i].score <= (1 + CHOICE.worth) * row.score), place)
+    return next((i for i in own if admit(i, CHOICE.worth)), place)
 
 
 def choose_estimator(scores: Sequence[float], *, unstable: bool) -> int:

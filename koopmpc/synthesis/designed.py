@@ -26,6 +26,7 @@ from koopmpc.synthesis.choice import DesignRow
 from koopmpc.synthesis.loops.neighbours import NeighbourMap, choose_starts_to_record
 from koopmpc.synthesis.loops.surrogates import Surrogate
 from koopmpc.synthesis.rates import CoveragePromise, ExpectedLoop
+from koopmpc.synthesis.search.leaderboard import group_twins
 from koopmpc.synthesis.search.recipe import Designed
 from koopmpc.synthesis.task import DesignTask
 from koopmpc.validate.logs.summary import LogSummary
@@ -194,24 +195,6 @@ class Design:
         """
         save_value(SavedDesign(self.controller.as_data(), self.evidence, logs), path)
 
-    def _find_twins(self) -> tuple[list[int], list[int]]:
-        """Return the rows to print, and for each row its place among them.
-
-        Rows with the same figures that differ only in the ridge or in the end of the horizon are printed as one.
-        """
-        kept: list[int] = []
-        leads: list[int] = []
-        known: dict[tuple[str, ...], int] = {}
-        for i, row in enumerate(self.leaderboard):
-            key = (str(replace(row.recipe, tail=None)), *_list_figures(row))
-            if key not in known:
-                known[key] = len(kept)
-                kept.append(i)
-            elif i == self.chosen:
-                kept[known[key]] = i
-            leads.append(known[key])
-        return kept, leads
-
     def __str__(self) -> str:
         """Return the choice, what to expect of it, advice, and the first rows of the leaderboard."""
         parts: list[RenderableType] = [f"chosen: {self.best.title}"]
@@ -230,15 +213,17 @@ class Design:
         ]
         rows: list[list[str]] = []
         titles = Counter(row.title for row in self.leaderboard)
-        kept, leads = self._find_twins()
+        # rows with the same figures that differ only in the ridge or in the end of the horizon are printed as one
+        keys = [(str(replace(row.recipe, tail=None)), *_list_figures(row)) for row in self.leaderboard]
+        kept, leads = group_twins(keys, self.chosen)
         for i in kept:
-            row, twins = self.leaderboard[i], [k for k, lead in enumerate(leads) if lead == len(rows) and k != i]
+            row, twins = self.leaderboard[i], leads.count(len(rows)) - 1
             title = (
                 row.title
                 if titles[row.title] == 1
                 else f"{row.title} (ridge {row.recipe.ridge:.0e})".replace("0e+00", "0")
             )
-            rows.append([title + f"; {len(twins)} more alike" * bool(twins), *_list_figures(row)])
+            rows.append([title + f"; {twins} more alike" * bool(twins), *_list_figures(row)])
         headings = ["controller", "score", "worst\nrun", "viol-\nation", "lost\nruns"]
         parts.append(build_leaderboard(headings, rows, leads[self.chosen], None if place is None else leads[place])[0])
         parts += [

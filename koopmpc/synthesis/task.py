@@ -15,6 +15,7 @@ from koopmpc.control.ask.checks import refuse_levels, refuse_priority
 from koopmpc.control.ask.cost import Cost, check_cost_and_limits, refuse_stage
 from koopmpc.control.ask.limits import Limits
 from koopmpc.data.episodes import Episodes
+from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import evaluate_jacobians
 from koopmpc.lifting.state import State
 from koopmpc.loop.metrics import stack_limited
@@ -139,30 +140,13 @@ def check_task(
     ny = 0 if limits.of is None else limits.of.bind(states).nz
     limits.inputs(data.nu)
     limits.find_rows(nx, ny)
-    rows = checks.array(reference, "reference")
-    given = (rows.shape or (1,))[-1]
-    if rows.ndim > 2 or given != of.nz or not rows.size:
-        fewer = "; to track fewer pass Cost(of=km.State(…), …)" if 0 < given < of.nz else ""
-        raise ShapeError(
-            f"reference has shape {rows.shape}, expected ({of.nz},) or rows (T+1, {of.nz}), one column for each "
-            f"output that the cost tracks: {', '.join(of.names)}{fewer}"
-        )
-    rows = rows.reshape(-1, of.nz)
+    rows = _check_reference(reference, of)
     outside = [i for i in angles if not 0 <= i < nx]
     if outside:
         raise DataError(f"angles holds {outside[0]}; pass indices of states, 0 to {nx - 1}")
     X = np.concatenate([episode.X for episode in data])
-    low, high = X.min(axis=0), X.max(axis=0)
     firsts, along = _first_states(data, limits), starts is None and len(data) < LENGTHS.few
-    if starts is None:
-        points = _choose_spread(firsts)
-    else:
-        points = checks.array(starts, "starts")
-        points = checks.array(
-            points.reshape(-1, nx) if points.ndim < 2 and points.size == nx else points, "starts", (None, nx)
-        )
-        if not len(points):
-            raise DataError("starts is empty; pass states (n, nx), or None for first states of the data's episodes")
+    points = _choose_spread(firsts) if starts is None else _check_starts(starts, nx)
     steps = max(LENGTHS.run * horizon, min(measure_settling(data, cost, limits, rows, points), LENGTHS.longest))
     if len(rows) == 1:
         rows = np.repeat(rows, steps + 1, axis=0)
@@ -180,11 +164,32 @@ def check_task(
         first_states=np.vstack([firsts, _rows_along(data, limits)]) if along else firsts,
         steps=min(steps, max(len(rows) - 1, 1)),
         angles=tuple(angles),
-        low=low,
-        high=high,
+        low=X.min(axis=0),
+        high=X.max(axis=0),
         limit_sizes=sizes,
         along=along,
     )
+
+
+def _check_reference(reference: ArrayLike, of: Lifting) -> Float[np.ndarray, "T1 nr"]:
+    rows = checks.array(reference, "reference")
+    given = (rows.shape or (1,))[-1]
+    if rows.ndim > 2 or given != of.nz or not rows.size:
+        fewer = "; to track fewer pass Cost(of=km.State(…), …)" if 0 < given < of.nz else ""
+        raise ShapeError(
+            f"reference has shape {rows.shape}, expected ({of.nz},) or rows (T+1, {of.nz}), one column for each "
+            f"output that the cost tracks: {', '.join(of.names)}{fewer}"
+        )
+    return rows.reshape(-1, of.nz)
+
+
+def _check_starts(starts: ArrayLike, nx: int) -> Float[np.ndarray, "n nx"]:
+    points = checks.array(starts, "starts")
+    single = points.ndim < 2 and points.size == nx
+    points = checks.array(points.reshape(-1, nx) if single else points, "starts", (None, nx))
+    if not len(points):
+        raise DataError("starts is empty; pass states (n, nx), or None for first states of the data's episodes")
+    return points
 
 
 def measure_settling(

@@ -126,15 +126,7 @@ def prepare_test(
     fold k is tested on two surrogates, which do not know fold k + 1 and fold k + 2. Hidden states learn from the `raw`
     episodes.
     """
-    data = folds.episodes
-    wanted: list[Condition] = []
-    for gain, families in ((1.0, (0, 1)), (1.0 + OFF, (1,)), (1.0 - OFF, (0,))):
-        for k in range(FOLDS):
-            for family in families:
-                number, j = 2 * ((k + 1 + family) % FOLDS) + family, len(wanted)
-                row = task.late * (j % STRETCHES) // (STRETCHES - 1)
-                start = task.starts[j % len(task.starts)]
-                wanted.append(Condition(k, number, gain, start, row, np.zeros((0, data.nu))))
+    data, wanted = folds.episodes, _list_conditions(task, folds.episodes.nu)
     mine = [[j for j, one in enumerate(wanted) if one.surrogate == number] for number in range(FOLDS * len(pair))]
     tasks = [
         _SurrogateTask(recipe, i, tuple((wanted[j].gain, wanted[j].first) for j in mine[i * len(pair) + family]))
@@ -174,6 +166,19 @@ def prepare_test(
         doubts=(*doubts, *find_poor_logs(task, data, tracked)),
         holds=not task.moves and not unreachable,
     )
+
+
+def _list_conditions(task: DesignTask, nu: int) -> list[Condition]:
+    """Return the conditions of all runs, without the inputs that cost nothing."""
+    wanted: list[Condition] = []
+    for gain, families in ((1.0, (0, 1)), (1.0 + OFF, (1,)), (1.0 - OFF, (0,))):
+        for k in range(FOLDS):
+            for family in families:
+                number, j = 2 * ((k + 1 + family) % FOLDS) + family, len(wanted)
+                row = task.late * (j % STRETCHES) // (STRETCHES - 1)
+                start = task.starts[j % len(task.starts)]
+                wanted.append(Condition(k, number, gain, start, row, np.zeros((0, nu))))
+    return wanted
 
 
 class _SurrogateTask(NamedTuple):

@@ -203,10 +203,9 @@ def _choose_slope(map_: NeighbourMap, episodes: Episodes) -> tuple[int, float]:
     if number < 2 or (counts @ np.bincount(map_.episode, minlength=number)).min() < map_.near:
         return SETTINGS.slopes[0]
     which = np.array([group[i] for i, _ in at])
-    begun: Float[np.ndarray, "n nzeta"] = np.array([episodes[i].X[k] for i, k in at])
-    U = np.array([episodes[i].U[k : k + ahead] for i, k in at])
-    W = np.array([episodes[i].W[k : k + ahead] for i, k in at])
-    after: Float[np.ndarray, "n nzeta"] = np.array([episodes[i].X[k + ahead] for i, k in at])
+    parts = [episodes[i].cut(k, k + ahead) for i, k in at]
+    X, U, W = (np.array([getattr(part, name) for part in parts]) for name in "XUW")
+    begun, after = X[:, 0], X[:, -1]
     spread = np.maximum(np.concatenate([e.X for e in episodes]).std(axis=0), 1e-300)
     errors: list[float] = []
     plants = NeighbourPlants(map_, counts)

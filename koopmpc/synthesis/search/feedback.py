@@ -202,15 +202,7 @@ def _compare_unseen(episodes: Episodes, signals: Sequence[Signal], way: _Way) ->
 
     A DataError says that the logs are too short, or that a model with thin plates loses by the change.
     """
-    block = max(min(len(e) for e in episodes) // SETTINGS.parts, way.settles + SETTINGS.ahead)
-    cuts = [
-        (e, r, k, min(k + block, len(e)))
-        for e, r in zip(episodes, signals, strict=True)
-        for k in range(0, len(e), block)
-    ]
-    parts = [
-        (e.cut(k, end), None if r is None else r[k : end + 1]) for e, r, k, end in cuts if end - k > way.settles + 1
-    ]
+    parts = _cut_parts(episodes, signals, way.settles)
     logs: list[list[float]] = []
     for fold in range(min(SETTINGS.judged, len(parts))):
         seen = [one for i, one in enumerate(parts) if i % SETTINGS.parts != fold]
@@ -231,6 +223,17 @@ def _compare_unseen(episodes: Episodes, signals: Sequence[Signal], way: _Way) ->
     if not np.isfinite(mean).all() or mean[1] > 1:
         raise DataError("with the set points a nonlinear model forecasts unseen rows worse")
     return float(mean[0])
+
+
+def _cut_parts(episodes: Episodes, signals: Sequence[Signal], settles: int) -> list[tuple[Episode, Signal]]:
+    """Return the logs in parts in which a way settles and forecasts follow."""
+    block = max(min(len(e) for e in episodes) // SETTINGS.parts, settles + SETTINGS.ahead)
+    cuts = [
+        (e, r, k, min(k + block, len(e)))
+        for e, r in zip(episodes, signals, strict=True)
+        for k in range(0, len(e), block)
+    ]
+    return [(e.cut(k, end), None if r is None else r[k : end + 1]) for e, r, k, end in cuts if end - k > settles + 1]
 
 
 def _bend(episodes: Episodes) -> Lifting:

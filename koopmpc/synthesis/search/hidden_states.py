@@ -99,15 +99,15 @@ def search_hidden_states(
     if rails is not None:  # only orders that did best without
         ranked = dict.fromkeys(one.order for one in sorted(plain, key=lambda one: one.error))
         railed = search(search_hidden, tuple(ranked)[:_RAILED] or _ORDERS, rails=rails)
-    linear = [one for one in plain if not one.is_nonlinear]
-    bent = [one for one in (*plain, *railed) if one.is_nonlinear] if bilinear else []
-    found += [choose_hidden(same) for same in (linear, bent) if same]
+    for kind, tried in ((False, plain), (True, [*plain, *railed]))[: 1 + bilinear]:
+        same = [one for one in tried if one.is_nonlinear is kind]
+        found += [choose_hidden(same)] if same else []
     neural = list[HiddenStructure]()
     if bilinear and measured.nx <= _SENSORS:
         saturates = bool(found) and min(found, key=lambda one: one.error).rails is not None
         limits = rails if saturates else None
-        tried = search(search_neural, _NEURAL_ORDERS, degrees=(1,), rails=limits, quick=True)
-        neural = _choose_neural(tried, min([rival, *(one.error for one in found if one.calm)]), near)
+        with_neurons = search(search_neural, _NEURAL_ORDERS, degrees=(1,), rails=limits, quick=True)
+        neural = _choose_neural(with_neurons, min([rival, *(one.error for one in found if one.calm)]), near)
     least = min([rival, *(one.error for one in (*found, *neural))])
     return [*(one for one in found if one.error < FAR * least), *neural]
 

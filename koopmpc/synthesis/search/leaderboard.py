@@ -150,22 +150,6 @@ class Selection(Value):
         """The row of `linear`."""
         return self.leaderboard[self.chosen_linear]
 
-    def _find_twins(self) -> tuple[list[int], list[int]]:
-        """Return the rows to print, and for each row its place among them.
-
-        Rows of one lifting with the same figures, of another name or ridge, are printed as one.
-        """
-        kept: list[int] = []
-        leads: list[int] = []
-        for i, row in enumerate(self.leaderboard):
-            twin = next((place for place, k in enumerate(kept) if _is_twin(row, self.leaderboard[k])), len(kept))
-            if twin == len(kept):
-                kept.append(i)
-            elif i == self.chosen or (i == self.chosen_linear and kept[twin] != self.chosen):
-                kept[twin] = i
-            leads.append(twin)
-        return kept, leads
-
     def __str__(self) -> str:
         """Return the choice, and the first rows of the leaderboard with those chosen and the plain linear model."""
         horizon, best, linear = self.horizon, self.best, self.best_linear
@@ -176,7 +160,9 @@ class Selection(Value):
         steps = [f"{n} step{'s' * (n > 1)}" for n in (1, max(horizon // 2, 1), horizon)]
         headings = ["model", "observ-\nables", *(f"error\n{n}" for n in steps), "worst\nfold"]
         headings += [*["free\nrun"] * bool(ran), "spectral\nradius", "ridge", "time\n[s]"]
-        kept, leads = self._find_twins()
+        # rows of one lifting with the same figures, of another name or ridge, are printed as one
+        keys = [(row.nz, _list_figures(row), replace(row.candidate, name="")) for row in self.leaderboard]
+        kept, leads = group_twins(keys, self.chosen, self.chosen_linear)
         rows: list[list[str]] = []
         extra: list[int] = []
         for place, i in enumerate(kept):
@@ -212,11 +198,18 @@ def _list_figures(row: LeaderboardRow) -> list[str]:
     return [*errors, "" if np.isnan(row.free) else f"{row.free:.2g}", f"{row.radius:.4g}"]
 
 
-def _is_twin(one: LeaderboardRow, other: LeaderboardRow) -> bool:
-    """Return whether both are the same model in print, apart from its name and ridge."""
-    if (one.nz, _list_figures(one)) != (other.nz, _list_figures(other)):
-        return False
-    return replace(one.candidate, name="") == replace(other.candidate, name="")
+def group_twins(keys: Sequence[object], chosen: int, second: int | None = None) -> tuple[list[int], list[int]]:
+    """Return a row for each key, `chosen` and `second` before others, and for each row the place of its key."""
+    kept: list[int] = []
+    leads: list[int] = []
+    for i, key in enumerate(keys):
+        twin = next((place for place, k in enumerate(kept) if keys[k] == key), len(kept))
+        if twin == len(kept):
+            kept.append(i)
+        elif i == chosen or (i == second and kept[twin] != chosen):
+            kept[twin] = i
+        leads.append(twin)
+    return kept, leads
 
 
 def _sentence(role: str, row: LeaderboardRow) -> str:
@@ -273,12 +266,13 @@ def choose_model(
     `among` holds the places to choose from; by default all. Where the data show a hidden state, `hidden`, models with
     delays need not halve the error.
     """
-    asked = [i for i in (range(len(rows)) if among is None else among) if kind is None or rows[i].kind == kind]
-    places = [i for i in asked if not _runaway(rows[i], rows)] or asked
-    present = [i for i in places if not rows[i].delays]
-    if present and not hidden and not min(rows[i].worst for i in places) < HALF * min(rows[i].worst for i in present):
-        places = present
+    same = [i for i in (range(len(rows)) if among is None else among) if kind in (None, rows[i].kind)]
+    places = [i for i in same if not _runaway(rows[i], rows)] or same
     best = min((rows[i] for i in places), key=lambda row: row.worst)
+    present = [i for i in places if not rows[i].delays]
+    if present and not hidden and not best.worst < HALF * min(rows[i].worst for i in present):
+        places = present
+        best = min((rows[i] for i in places), key=lambda row: row.worst)
     near = [i for i in places if rows[i].worst <= max(best.worst + best.deviation, alike)]
     chosen = min(near, key=lambda i: (rows[i].size, rows[i].worst))
     exact = [
