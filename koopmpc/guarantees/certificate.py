@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import CertificateError, DataError
-from koopmpc.base.text import format_markdown_table
+from koopmpc.base.text import format_markdown_table, to_percent
 from koopmpc.base.values import Value
 from koopmpc.control.ask.checks import refuse_levels
 from koopmpc.control.ask.cost import Cost
@@ -21,9 +21,8 @@ from koopmpc.control.kinds import ControllerKind, register_controller
 from koopmpc.control.lqr import FeedbackLaw
 from koopmpc.control.move import Move, alone
 from koopmpc.control.program import Program, SavedController, no_export
-from koopmpc.guarantees.deviation import DeviationModel
+from koopmpc.guarantees.deviation import DeviationModel, measure_spending
 from koopmpc.guarantees.error_bounds import ErrorBound
-from koopmpc.lifting.base import find_observables
 from koopmpc.models.base import load_value, save_value
 from koopmpc.plants.step_map import StepMap
 
@@ -164,7 +163,19 @@ class Certificate(Value):
         DataError
             The cost weighs changes of the inputs, which V does not know.
         """
-        return weigh_decrease(self, cost)
+        if self.ball > 0:
+            raise CertificateError(
+                "Q_N is a certificate with a ball: inside it V does not fall, so it cannot pay for the stage cost; pass"
+                " a certificate of an equilibrium with exact measurements"
+            )
+        deviation, nz = self.deviation, self.deviation.lifting.nz
+        worst = measure_spending(deviation, self.P, self.K, self.K_w, cost.resolve(self.states, self.inputs))
+        weight = worst / (1 - self.decay) * np.linalg.inv(self.P)
+        if len(weight) == nz:
+            return (weight + weight.T) / 2
+        whole = np.zeros((nz, nz))
+        whole[np.ix_(deviation.kept, deviation.kept)] = (weight + weight.T) / 2
+        return whole
 
     def controller(self, limits: Limits | None = None) -> "CertifiedFeedback":
         """Return the feedback as a controller; `limits` in place of those of the certificate."""
@@ -182,9 +193,7 @@ class Certificate(Value):
 
     def page(self) -> str:
         """Return the theorem, each assumption, what was checked, and what is not claimed, as Markdown."""
-        from koopmpc.guarantees.statement import state_theorem
-
-        return state_theorem(self)
+        return _state_theorem(self)
 
     def __str__(self) -> str:
         """Return the certificate in a sentence."""
@@ -207,44 +216,123 @@ def load_certificate(path: str | Path) -> Certificate:
     return load_value(path, Certificate)
 
 
-def weigh_decrease(certificate: Certificate, cost: Cost) -> Float[np.ndarray, "n n"]:
-    """Return the weight of `Certificate.weigh_end`."""
-    c, deviation = certificate, certificate.deviation
-    if c.ball > 0:
-        raise CertificateError(
-            "Q_N is a certificate with a ball: inside it V does not fall, so it cannot pay for the stage cost; pass a"
-            " certificate of an equilibrium with exact measurements"
+_METHODS = {
+    "given": "You gave the constants. The proof rests on them.",
+    "covering": "They are a proof, given L: the errors of the pairs, and L times the distance to them, bound the error"
+    " on every cell of a grid over the box and the inputs. The data did not refute L; they cannot prove it.",
+    "lipschitz": "They are a proof, given L: c_x = c_u = L, because the error is 0 at the set point and has"
+    " the Lipschitz constant L that you gave. The data did not refute L; they cannot prove it.",
+}
+
+
+def _state_theorem(certificate: Certificate) -> str:
+    """Return the page of a certificate as Markdown."""
+    c, error = certificate, certificate.error
+    goal = (
+        "and x tends to the set point"
+        if c.ball == 0
+        else f"until V ≤ {c.ball:.3g}, and then V stays there: an ultimate bound, not stability"
+    )
+    parts = [
+        "# Certificate",
+        "## Theorem",
+        f"Let x be a state with V(x) = φᵀP⁻¹φ ≤ 1, φ = ψ(x) − ψ(x_s), and let the assumptions below hold. Then under"
+        f" u = κ(x) every later state has V ≤ 1, every state and input keeps the limits, and V falls by the factor"
+        f" {c.decay:.6g} or more in each step of {c.dt:g} s, {goal}.",
+        "## Assumptions",
+        format_markdown_table(("assumption", "why it is believed"), _list_assumptions(c)),
+        "## The bound of the error",
+        f"‖S^−½ r‖ ≤ c_x ‖D⁻¹φ‖ + c_u ‖v/d‖ + c_0 with c_x = {error.c_x:.4g}, c_u = {error.c_u:.4g},"
+        f" c_0 = {error.c_0:.4g}, where r is what the model misses of φ in one step. {_describe_bound(c)}",
+        "The box, and the limits of the inputs around u_s:",
+        format_markdown_table(
+            ("signal", "from", "to"),
+            [
+                *((n, f"{a:.5g}", f"{b:.5g}") for n, a, b in zip(c.states, c.low, c.high, strict=True)),
+                *(
+                    (n, f"{s - v:.5g}", f"{s + v:.5g}")
+                    for n, s, v in zip(c.inputs, c.deviation.u, c.v_max, strict=True)
+                ),
+            ],
+        ),
+        "## What was checked",
+        "\n".join(f"- {line}" for line in _list_checks(c)),
+        "## What is not claimed",
+        "\n".join(f"- {line}" for line in _list_limits(c)),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _list_assumptions(c: Certificate) -> list[tuple[str, str]]:
+    error = c.error
+    measured = "measured on the data, which include it"
+    equilibrium = (
+        ("the error is at most c_0 at the set point", "see below" if error.method == "covering" else measured)
+        if c.estimated
+        else ("(x_s, u_s) is an equilibrium of the plant", "you gave it")
+    )
+    steep = f"you gave L = {error.lipschitz:.4g}"
+    slope = [("the error has the Lipschitz constant L in the box", steep)] if error.lipschitz else []
+    noise = (
+        ("the whole state is measured exactly", "you said so: noise was not given")
+        if not c.noise.any()
+        else (f"each measured state errs by {c.noise.tolist()} at most", "you gave it; its effect on ψ was sampled")
+    )
+    return [
+        equilibrium,
+        ("the error keeps its bound everywhere in the box", "see below"),
+        *slope,
+        noise,
+        ("the plant is a map x⁺ = f(x, u) that does not change, without disturbances", "not checked"),
+        ("the input acts at once and as computed", "not checked"),
+    ]
+
+
+def _describe_bound(c: Certificate) -> str:
+    error = c.error
+    if error.method in _METHODS:
+        return _METHODS[error.method]
+    exact = " They are at the level of rounding: the data are exact." if error.c_x <= 1e-8 >= error.c_u else ""
+    return (
+        f"These are the least constants that hold on {error.pairs} pairs of {error.episodes} episodes.{exact} A"
+        f" scenario argument says of them: they hold on all pairs of at least {to_percent(1 - error.share)} of episodes"
+        f" that are drawn like these, with the confidence {to_percent(error.confidence)}. That does not prove it for"
+        " the rest. The model must not have been fitted to these episodes, and they must be independent."
+        " The box, the sizes, the shape of the error and the least values of the constants come from other episodes, a"
+        " half of all."
+    )
+
+
+def _list_checks(c: Certificate) -> list[str]:
+    error = c.error
+    lines = [
+        f"The inequality behind the theorem was evaluated after the solver, in plain arithmetic: its least eigenvalue"
+        f" is {c.margin:.3g}, above zero.",
+        "The region lies inside the box and inside the limits, by the same arithmetic.",
+    ]
+    if error.held_out:
+        lines.append(
+            f"Of {error.held_out} pairs that did not make the bound, {error.broken} broke it"
+            + (f" ({to_percent(error.broken / error.held_out)})." if error.broken else ".")
         )
-    cost = cost.resolve(c.states, c.inputs)
-    of = cost.of.bind(c.states)
-    (Q, R), n, nu = cost.matrices(of.nz, len(c.inputs)), len(c.P), len(c.inputs)
-    if cost.rate(nu) is not None:
-        raise DataError("Q_N is a certificate, and the cost has R_delta, which V does not know; leave R_delta out")
-    place = {int(kept): i for i, kept in enumerate(deviation.kept)}
-    S = np.zeros((of.nz, n))
-    for row, index in enumerate(find_observables(deviation.lifting, of)):
-        if int(index) in place:
-            S[row, place[int(index)]] = 1.0
-    root = np.linalg.cholesky(c.P)
-    if np.abs(c.K_w).max(initial=0.0) > 0:
-        # G = Σ_k (K_w)_k φ_k in the region: ‖G‖² ≤ Σ over the entries in the coordinates P^½
-        parts = c.K_w.reshape(nu, nu, n) @ root
-        gamma = float(np.linalg.norm(parts.reshape(nu * nu, n), 2)) if nu == 1 else float(np.linalg.norm(parts))
-        if gamma >= 1:
-            raise CertificateError(
-                "the feedback of the certificate is a quotient whose input cannot be bounded in its region; certify a"
-                " smaller region, or leave Q_N out"
-            )
-        spent = c.K.T @ c.K * float(np.linalg.norm(R, 2)) / (1 - gamma) ** 2
-    else:
-        spent = c.K.T @ R @ c.K
-    worst = float(np.linalg.eigvalsh(root.T @ (S.T @ Q @ S + spent) @ root)[-1])
-    weight = worst / (1 - c.decay) * np.linalg.inv(c.P)
-    if n == deviation.lifting.nz:
-        return (weight + weight.T) / 2
-    whole = np.zeros((deviation.lifting.nz, deviation.lifting.nz))
-    whole[np.ix_(deviation.kept, deviation.kept)] = (weight + weight.T) / 2
-    return whole
+    return lines
+
+
+def _list_limits(c: Certificate) -> list[str]:
+    low, high = c.sampled
+    lines = ["Nothing outside {V ≤ 1}.", "That the region is the largest one: it is the largest that was found."]
+    if (c.low < low - 1e-12).any() or (c.high > high + 1e-12).any():
+        lines.append(
+            "That the data support it: part of the box was never sampled, and there the bound is your word alone."
+        )
+    if not c.is_proof:
+        lines.append("A proof for the plant: the bound of the error holds with a probability, see above.")
+    if c.ball > 0:
+        lines.append("That the set point is reached.")
+    if not np.all(np.isfinite(c.v_max)):
+        lines.append("Anything about limits of inputs that were not given.")
+    lines.append("Performance: the feedback was chosen for a large region, and not for a small cost.")
+    return lines
 
 
 class CertifiedFeedback(FeedbackLaw):

@@ -23,8 +23,8 @@ from koopmpc.guarantees.error_bounds import (
     sizes_of,
     split_pairs,
 )
+from koopmpc.guarantees.refusal import Refused, explain_refusal
 from koopmpc.guarantees.search import DECAY, Corners, Found, find_room, prove
-from koopmpc.guarantees.statement import Refused, explain_refusal
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 
 _SCALES = (1.0, 0.7, 0.5, 0.35, 0.25, 0.12, 0.06)  # shares of the box that are tried

@@ -8,10 +8,11 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
-from koopmpc.base.errors import DataError
+from koopmpc.base.errors import CertificateError, DataError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Value
-from koopmpc.lifting.base import Lifting
+from koopmpc.control.cost import Cost
+from koopmpc.lifting.base import Lifting, find_observables
 from koopmpc.lifting.state import State
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 
@@ -128,6 +129,39 @@ def reduce_to_states(deviation: DeviationModel) -> DeviationModel:
         np.eye(nx),
         C @ deviation.defect,
     )
+
+
+def measure_spending(
+    deviation: DeviationModel,
+    P: Float[np.ndarray, "n n"],
+    K: Float[np.ndarray, "nu n"],
+    K_w: Float[np.ndarray, "nu nun"],
+    cost: Cost,
+) -> float:
+    """Return the least λ for which the stage cost is at most λ V in {V ≤ 1}, see `Certificate.weigh_end`."""
+    of = cost.of.bind(deviation.lifting.bound_states)
+    n, nu = len(P), len(K)
+    Q, R = cost.matrices(of.nz, nu)
+    if cost.rate(nu) is not None:
+        raise DataError("Q_N is a certificate, and the cost has R_delta, which V does not know; leave R_delta out")
+    place = {int(kept): i for i, kept in enumerate(deviation.kept)}
+    S = np.zeros((of.nz, n))
+    for row, index in enumerate(find_observables(deviation.lifting, of)):
+        if int(index) in place:
+            S[row, place[int(index)]] = 1.0
+    root = np.linalg.cholesky(P)
+    spent = K.T @ R @ K
+    if np.abs(K_w).max(initial=0.0) > 0:
+        # G = Σ_k (K_w)_k φ_k in the region: ‖G‖² ≤ Σ over the entries in the coordinates P^½
+        parts = K_w.reshape(nu, nu, n) @ root
+        gamma = float(np.linalg.norm(parts.reshape(nu * nu, n), 2)) if nu == 1 else float(np.linalg.norm(parts))
+        if gamma >= 1:
+            raise CertificateError(
+                "the feedback of the certificate is a quotient whose input cannot be bounded in its region; certify a"
+                " smaller region, or leave Q_N out"
+            )
+        spent = K.T @ K * float(np.linalg.norm(R, 2)) / (1 - gamma) ** 2
+    return float(np.linalg.eigvalsh(root.T @ (S.T @ Q @ S + spent) @ root)[-1])
 
 
 def is_stabilisable(model: DeviationModel, decay: float) -> bool:

@@ -18,7 +18,7 @@ Source of the method: Strässer, Schaller, Worthmann, Berberich, Allgöwer, arXi
 """
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
@@ -65,14 +65,14 @@ class FeedbackProof:
     Lambda: Float[np.ndarray, "m m"]
     tau_x: float
     tau_u: float
-    margin: float
-    size: float
+    margin: float = np.nan
+    size: float = np.nan
 
 
 def solve_feedback(task: FeedbackTask, *, linear: bool = False) -> FeedbackProof | None:
     """Return the feedback with the largest ellipsoid that the program finds, and that the checks confirm, or None."""
     program = _Program(task, linear)
-    return check_feedback(task, *program.solution()) if program.solve() else None
+    return check_feedback(task, program.solution()) if program.solve() else None
 
 
 class _Program:
@@ -157,8 +157,8 @@ class _Program:
         values = [self.P.value] if self.lam is None else [self.P.value, self.lam.value]
         return all(np.linalg.eigvalsh(_symmetric(value))[0] > 0 for value in values)
 
-    def solution(self) -> tuple[Any, Any, Any, Any, float, float]:
-        """Return P, K, K_w, Λ, τ_x and τ_u in the coordinates of the task."""
+    def solution(self) -> FeedbackProof:
+        """Return what the solver claims in the coordinates of the task, before it is checked."""
         g, T, back, (n, m) = self.g, self.T, self.back, self.task.B.shape
         P = _symmetric(self.P.value)
         Lambda = np.eye(m) if self.lam is None else _symmetric(self.lam.value)
@@ -168,51 +168,35 @@ class _Program:
             products = np.kron(np.linalg.inv(Lambda), np.eye(n))
             K_w = g[:, None] * (self.L_w.value @ products) @ np.kron(np.diag(1 / g), back)
         taus = (0.0, 0.0) if self.exact else (self.c * float(self.tau_x.value), self.c * float(self.tau_u.value))
-        return _symmetric(T @ P @ T.T), K, K_w, g[:, None] * Lambda * g, *taus
+        return FeedbackProof(_symmetric(T @ P @ T.T), K, K_w, g[:, None] * Lambda * g, *taus)
 
 
-def check_feedback(
-    task: FeedbackTask,
-    P: Float[np.ndarray, "n n"],
-    K: Float[np.ndarray, "m n"],
-    K_w: Float[np.ndarray, "m mn"],
-    Lambda: Float[np.ndarray, "m m"],
-    tau_x: float,
-    tau_u: float,
-) -> FeedbackProof | None:
+def check_feedback(task: FeedbackTask, claimed: FeedbackProof) -> FeedbackProof | None:
     """Return the solution shrunk until it keeps every limit, with its margin, or None where that is not above zero.
 
     The check does not use the program: it evaluates the condition on V itself, and the limits, in plain arithmetic.
     """
+    P = claimed.P
     over = [float(row @ P @ row) for row in task.rows]
     if task.N is not None:
         over.append(float(np.linalg.eigvalsh(np.linalg.solve(_root(task.E), np.linalg.solve(_root(task.E), P).T))[-1]))
     level = 1 / max([1.0, *over])  # {V ≤ level} of a valid V is valid, too
-    n = len(P)
-    rest = 1e-12 * n
-    margin = _decay_margin(task, P, K, K_w, Lambda, tau_x, tau_u)
-    if margin <= rest:
+    margin = _decay_margin(task, claimed)
+    if margin <= 1e-12 * len(P):
         return None
     for i in np.flatnonzero(np.isfinite(task.inputs)):
-        level = min(level, _input_level(task, P, K, K_w, Lambda, int(i)))
+        level = min(level, _input_level(task, claimed, int(i)))
     if level < 0.5:  # the solver's answer is far from what it claims
         return None
     shrunk = P * level * (1 - 1e-9)
     # {V ≤ level} in the old P is {V' ≤ 1} in the new one; V' is a multiple of V, so the decrease carries over.
     C = task.volume
-    return FeedbackProof(shrunk, K, K_w, Lambda, tau_x, tau_u, margin, float(np.linalg.slogdet(C @ shrunk @ C.T)[1]))
+    return replace(claimed, P=shrunk, margin=margin, size=float(np.linalg.slogdet(C @ shrunk @ C.T)[1]))
 
 
-def _decay_margin(
-    task: FeedbackTask,
-    P: Float[np.ndarray, "n n"],
-    K: Float[np.ndarray, "m n"],
-    K_w: Float[np.ndarray, "m mn"],
-    Lambda: Float[np.ndarray, "m m"],
-    tau_x: float,
-    tau_u: float,
-) -> float:
+def _decay_margin(task: FeedbackTask, proof: FeedbackProof) -> float:
     """Return the least eigenvalue of the decrease of V in the coordinates P^½, (Λ⊗E)^½ and τ^½ of φ, w and q."""
+    P, K, K_w, Lambda, tau_x, tau_u = proof.P, proof.K, proof.K_w, proof.Lambda, proof.tau_x, proof.tau_u
     n, exact = len(P), task.c_x == 0 and task.c_u == 0
     if not exact and min(tau_x, tau_u) <= 0:
         return -np.inf
@@ -239,16 +223,9 @@ def _decay_margin(
     return float(np.linalg.eigvalsh(np.diag(ones) - G.T @ G)[0])
 
 
-def _input_level(
-    task: FeedbackTask,
-    P: Float[np.ndarray, "n n"],
-    K: Float[np.ndarray, "m n"],
-    K_w: Float[np.ndarray, "m mn"],
-    Lambda: Float[np.ndarray, "m m"],
-    i: int,
-) -> float:
+def _input_level(task: FeedbackTask, proof: FeedbackProof, i: int) -> float:
     """Return the largest level of V at which |v_i| is proved to keep its limit, 1 at most."""
-    F = _root(P)
+    F, K, K_w, Lambda = _root(proof.P), proof.K, proof.K_w, proof.Lambda
     if task.N is None:
         return min(1.0, float(task.inputs[i] ** 2 / max(((K[i] @ F) ** 2).sum(), 1e-300)))
     W = np.kron(_root(Lambda), _root(task.E))
