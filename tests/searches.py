@@ -1,4 +1,4 @@
-"""`km.select` and `km.design` with all their settings as keywords, for tests that vary them in tables."""
+"""`km.select`, `km.design` and `km.certify` with all their settings as keywords, for tests that vary them in tables."""
 
 from dataclasses import fields
 from typing import Any
@@ -21,3 +21,8 @@ def select(data: Any, **asked: Any) -> Any:
 def design(data: Any, cost: km.Cost, limits: km.Limits | None = None, **asked: Any) -> Any:
     """Return `km.design` for the data, cost and limits."""
     return km.design(data, cost, limits, **_split(asked, km.DesignOptions))
+
+
+def certify(*given: Any, **asked: Any) -> km.guarantees.Certificate:
+    """Return `km.certify` of the model and the data."""
+    return km.certify(*given, **_split(asked, km.guarantees.CertifyOptions))

@@ -25,6 +25,7 @@ from tests.closed_loop.controllers import Parts
 from tests.closed_loop.more_tasks import ALL
 from tests.closed_loop.optimum import held
 from tests.closed_loop.tasks import Task
+from tests.searches import design
 
 STORED = Path(__file__).parent / "calibration.json"
 STARTS = 12  # runs on the plant for each design
@@ -40,17 +41,18 @@ def read_or_design(task: str, seed: int, folder: Path | None) -> tuple[Any, Any]
         parts = Parts(ALL[task], seed)
         rows = parts.task.rows
         reference = rows if (rows != rows[0]).any() else rows[0]
-        design = km.design(
+        made = design(
             parts.data,
             parts.cost(),
             parts.task.limits,
             horizon=parts.task.horizon,
             reference=reference,
-            options=km.DesignOptions(loops=0, workers=1),
+            loops=0,
+            workers=1,
         )
         if path is None:
-            return design.controller, design.evidence
-        design.save(path)
+            return made.controller, made.evidence
+        made.save(path)
     saved = read_controller(path)
     return rebuild_controller(saved, path), saved.evidence
 

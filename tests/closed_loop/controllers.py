@@ -91,50 +91,6 @@ def _dmdc(p: Parts) -> Any:
     return p.plain(km.edmd(p.data, km.State(), embedding=km.Delay(2)))
 
 
-def _lqr(p: Parts) -> Any:
-    model = km.LinearPredictor.local(p.equations, *p.task.around)
-    return km.LQR(model, p.cost(), p.task.limits)
-
-
-def _linear_mpc(p: Parts) -> Any:
-    x, u, *w = p.task.around
-    return km.LinearMPC(p.equations, x, u, p.cost(), p.task.limits, p.task.horizon, w=w[0] if w else None)
-
-
-def _nonlinear_mpc(p: Parts) -> Any:
-    return km.NonlinearMPC(p.equations, p.cost(), p.task.limits, p.task.horizon)
-
-
-def _bilinear_exact(p: Parts) -> Any:
-    return km.BilinearMPC(p.equations, p.cost(), p.task.limits, p.task.horizon)
-
-
-def _koopman_mpc(p: Parts) -> Any:
-    return km.KoopmanMPC(p.linear, p.cost(), p.task.limits, p.task.horizon)
-
-
-def _koopman_offset(p: Parts) -> Any:
-    return km.KoopmanMPC(p.linear, p.cost(), p.task.limits, p.task.horizon, estimator=km.LiftedDisturbance())
-
-
-def _bilinear_mpc(p: Parts) -> Any:
-    return km.BilinearMPC(p.bilinear, p.cost(), p.task.limits, p.task.horizon)
-
-
-def _bilinear_offset(p: Parts) -> Any:
-    return km.BilinearMPC(p.bilinear, p.cost(), p.task.limits, p.task.horizon, estimator=km.LiftedDisturbance())
-
-
-def _designed(p: Parts) -> Any:
-    """km.design with no other option, one design for all starts of a task."""
-    return p.design.controller
-
-
-def _guarded(p: Parts) -> Any:
-    """The same design, with the plain linear controller outside the data."""
-    return p.design.guarded()
-
-
 def _designed_linear(p: Parts) -> Any:
     """The best KoopmanMPC of the same design."""
     if p.design.linear is None:
@@ -142,23 +98,34 @@ def _designed_linear(p: Parts) -> Any:
     return p.design.linear
 
 
+def _plan(kind: Any, model: str, **more: Any) -> Callable[[Parts], Any]:
+    """Return how a predictive controller with the library's settings is made of the model of that name."""
+    return lambda p: kind(getattr(p, model), p.cost(), p.task.limits, p.task.horizon, **more)
+
+
+def _linear_mpc(p: Parts) -> Any:
+    x, u, *w = p.task.around
+    return km.LinearMPC(p.equations, x, u, p.cost(), p.task.limits, p.task.horizon, w=w[0] if w else None)
+
+
+OFFSET_FREE = {"estimator": km.LiftedDisturbance()}
 CONTROLLERS: dict[str, Callable[[Parts], Any]] = {
     "edmd": _edmd,
     "dmdc": _dmdc,
-    "lqr": _lqr,
+    "lqr": lambda p: km.LQR(km.LinearPredictor.local(p.equations, *p.task.around), p.cost(), p.task.limits),
     "linear-mpc": _linear_mpc,
-    "nonlinear-mpc": _nonlinear_mpc,
-    "bilinear-exact": _bilinear_exact,
-    "koopman-mpc": _koopman_mpc,
-    "koopman-offset": _koopman_offset,
-    "bilinear-mpc": _bilinear_mpc,
-    "bilinear-offset": _bilinear_offset,
+    "nonlinear-mpc": _plan(km.NonlinearMPC, "equations"),
+    "bilinear-exact": _plan(km.BilinearMPC, "equations"),
+    "koopman-mpc": _plan(km.KoopmanMPC, "linear"),
+    "koopman-offset": _plan(km.KoopmanMPC, "linear", **OFFSET_FREE),
+    "bilinear-mpc": _plan(km.BilinearMPC, "bilinear"),
+    "bilinear-offset": _plan(km.BilinearMPC, "bilinear", **OFFSET_FREE),
 }
 # a design takes up to a minute of one core, so these are measured where they are named, and are not in the stored table
 DESIGNED: dict[str, Callable[[Parts], Any]] = {
-    "designed": _designed,
+    "designed": lambda p: p.design.controller,  # km.design with no other option, one design for all starts of a task
     "designed-linear": _designed_linear,
-    "guarded": _guarded,
+    "guarded": lambda p: p.design.guarded(),  # the same design, with the plain linear controller outside the data
 }
 YARDSTICKS = ("edmd", "dmdc")
 GIVEN = ("lqr", "linear-mpc", "nonlinear-mpc", "bilinear-exact")  # on equations: one seed is as good as three

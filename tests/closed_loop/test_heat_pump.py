@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.searches import select
 
 pytestmark = pytest.mark.slow
 
@@ -70,7 +71,7 @@ def test_learned_with_the_weather_it_costs_what_the_equations_cost(plant, logs, 
 def test_what_select_takes_from_logs_with_the_weather_beats_all_without(plant, logs, blind, record_property):
     costs = []
     for data in (logs, blind):
-        found = km.select(data, horizon=HORIZON, options=km.SearchOptions(workers=1))
+        found = select(data, horizon=HORIZON, workers=1)
         mpc = km.BilinearMPC(found.bilinear, COST, LIMITS, HORIZON)
         costs.append(sum(spend(plant, mpc, seed) for seed in (11, 12)))
     best = sum(spend(plant, km.BilinearMPC(plant, COST, LIMITS, HORIZON), seed) for seed in (11, 12))

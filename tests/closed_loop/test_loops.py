@@ -7,10 +7,10 @@ import pytest
 
 import koopmpc as km
 from tests.closed_loop.controllers import CONTROLLERS, GIVEN, YARDSTICKS
-from tests.closed_loop.judge import LOST, Row, measure, worst
+from tests.closed_loop.judge import LOST, Row, measure
 from tests.closed_loop.more_tasks import TABLE
 from tests.closed_loop.optimum import boxes, held, optimum
-from tests.closed_loop.table import losses, saved, stored, text
+from tests.closed_loop.table import losses, stored, text
 from tests.closed_loop.tasks import TASKS, TEN
 
 NONE = km.control.move.Fallback.NONE
@@ -106,13 +106,6 @@ def test_nothing_that_keeps_the_limits_beats_the_optimum(name):
 
 
 @pytest.mark.loops
-def test_a_table_is_read_as_it_was_written(tmp_path):
-    table = {"one": {"edmd": Row(1.25, 0.01, 0.002, {"OPTIMAL": 3}, "", 0.001, 0.002), "lqr": Row(None)}}
-    saved(table, tmp_path / "table.json")
-    assert stored(tmp_path / "table.json") == table
-
-
-@pytest.mark.loops
 def test_losses_are_named_and_yardsticks_are_free_to_lose():
     old = {"t": {"koopman-mpc": Row(1.0), "bilinear-mpc": Row(1.0), "edmd": Row(1.0), "lqr": Row(LOST)}}
     new = {"t": {"koopman-mpc": Row(1.06), "bilinear-mpc": Row(1.04), "edmd": Row(9.0), "lqr": Row(LOST)}}
@@ -121,12 +114,6 @@ def test_losses_are_named_and_yardsticks_are_free_to_lose():
     assert "failed" in losses(broken, old)[0]
     pushed = {"t": {"bilinear-mpc": replace(old["t"]["bilinear-mpc"], violation=0.02)}}
     assert "violates" in losses(pushed, old)[0]
-
-
-@pytest.mark.loops
-def test_the_worst_row_has_the_worst_of_each_figure_and_all_statuses():
-    row = worst([Row(1.0, 0.2, statuses={"OPTIMAL": 1}), Row(2.0, 0.1, statuses={"OPTIMAL": 2, "FAILED": 1})])
-    assert (row.ratio, row.violation, row.statuses) == (2.0, 0.2, {"OPTIMAL": 3, "FAILED": 1})
 
 
 @pytest.mark.loops

@@ -9,6 +9,7 @@ from scipy.stats import kstest
 import koopmpc as km
 from koopmpc.guarantees.semidefinite import FeedbackTask, check_feedback, solve_feedback
 from tests.guarantees.plants import INVARIANT, SINE, Invariant, Upright, library_task, published_data
+from tests.searches import certify
 
 
 def make_task(seed, bilinear=True):
@@ -74,7 +75,7 @@ def region_area(value, reach):
 def test_the_invariant_example_is_certified_beyond_its_published_starts():
     plant, data = published_data(Invariant(), -1, 1, 100, 0.0)
     model = km.bilinear_edmd(data, INVARIANT)
-    certificate = km.certify(model, data, options=km.guarantees.CertifyOptions(error=(5e-3, 5e-3), region=(-120, 120)))
+    certificate = certify(model, data, error=(0.005, 0.005), region=(-120, 120))
     starts = [(10, 18), (-10, 18), (8, 0), (-8, 0), (5, -12), (-5, -12), (5, 5), (5, -5), (-5, 5), (-5, -5)]
     assert certificate.contains(starts).all()
     # the program of the paper gives {ψᵀP⁻¹ψ ≤ 1} with an area of 624 on these data; an oracle of its own was written for it
@@ -89,7 +90,7 @@ def test_the_invariant_example_is_certified_beyond_its_published_starts():
 def test_the_published_pendulum_is_stabilised_from_all_starts_and_lqr_on_edmdc_from_none():
     plant, data = published_data(Upright(), -2, 10, 6000, 1e-2)
     model = km.bilinear_edmd(data, SINE)
-    certificate = km.certify(model, data, options=km.guarantees.CertifyOptions(error=(3e-4, 3e-4), region=(-12, 12)))
+    certificate = certify(model, data, error=(0.0003, 0.0003), region=(-12, 12))
     assert region_area(certificate.value, 12) > 12  # the program of the paper: 11.9 on these data
     linear = km.edmd(data, SINE)
     feedback = km.LQR(linear, km.Cost(Q=1, R=1, of=linear.lifting, u_target="zero"))
@@ -206,7 +207,7 @@ def test_the_episodes_that_set_box_and_sizes_are_not_those_of_the_bound(tanks):
     _, model, data, limits, x, u, certificate = tanks
     error = certificate.error
     assert error.pairs + error.held_out <= sum(len(episode.U) for episode in data.episodes) / 2 + 1
-    other = km.certify(model, data, limits, x=x, u=u, options=km.guarantees.CertifyOptions(rng=1))  # another half
+    other = certify(model, data, limits, x=x, u=u, rng=1)  # another half
     assert (other.low != certificate.low).any()
     assert (other.error.phi_size != error.phi_size).all()
 
@@ -215,7 +216,7 @@ def test_the_episodes_that_set_box_and_sizes_are_not_those_of_the_bound(tanks):
 def test_a_set_point_that_is_no_equilibrium_gives_a_ball_that_loops_reach(tanks):
     plant, model, data, limits, x, u, _ = tanks
     off = x + np.array([0.05, -0.05])
-    certificate = km.certify(model, data, limits, x=off, u=u, options=km.guarantees.CertifyOptions(estimated=True))
+    certificate = certify(model, data, limits, x=off, u=u, estimated=True)
     assert 0 < certificate.ball < 1
     assert certificate.error.c_0 > 0
     assert certificate.check(plant, 2000) == 0
@@ -227,7 +228,7 @@ def test_a_set_point_that_is_no_equilibrium_gives_a_ball_that_loops_reach(tanks)
 @pytest.mark.slow
 def test_noise_gives_a_ball_and_loops_with_noise_stay_in_it(tanks):
     plant, model, data, limits, x, u, _ = tanks
-    certificate = km.certify(model, data, limits, x=x, u=u, options=km.guarantees.CertifyOptions(noise=0.01))
+    certificate = certify(model, data, limits, x=x, u=u, noise=0.01)
     assert 0 < certificate.ball < 1
     run = km.simulate(
         plant,
@@ -294,7 +295,7 @@ def test_states_are_drawn_evenly_from_the_region():
     pairs = [(x, rng.uniform(-1, 1, 1)) for x in rng.uniform(-1, 1, (300, 2))]
     data = km.Episodes([km.Episode(X=[x, A @ x + B @ u], U=[u]) for x, u in pairs], 1.0)
     model = km.LinearPredictor(A, B, np.eye(2), km.State(), 1.0, data.states, data.inputs)
-    found = km.certify(model, data, options=km.guarantees.CertifyOptions(error=(0.01, 0.01)))
+    found = certify(model, data, error=(0.01, 0.01))
     X = found.sample(2000)
     V, turned = found.value(X), np.linalg.solve(np.linalg.cholesky(found.P), (X - found.deviation.x).T)
     assert kstest(V, "uniform").pvalue > 0.01
@@ -307,12 +308,7 @@ def test_the_region_keeps_limits_that_are_nearer_on_one_side_than_the_data():
     data = km.Episodes([km.Episode(X=[[x], [1.2 * x + 0.5 * u]], U=[[u]]) for x, u in zip(X, U, strict=True)], 1.0)
     model = km.LinearPredictor([[1.2]], [[0.5]], [[1.0]], km.State(), 1.0, data.states, data.inputs)
     for low, high in ((-0.1, 0.7), (-0.7, 0.1)):
-        found = km.certify(
-            model,
-            data,
-            km.Limits(-1, 1, x_min=low, x_max=high),
-            options=km.guarantees.CertifyOptions(error=(0.01, 0.01)),
-        )
+        found = certify(model, data, km.Limits(-1, 1, x_min=low, x_max=high), error=(0.01, 0.01))
         seen = found.sample(500)
         assert low - 1e-9 <= seen.min() < seen.max() <= high + 1e-9
         assert seen.max() - seen.min() > 0.15
@@ -321,15 +317,9 @@ def test_the_region_keeps_limits_that_are_nearer_on_one_side_than_the_data():
 def test_given_constants_are_a_proof_and_a_lipschitz_constant_may_be_refuted(tanks):
     _, model, data, limits, x, u, _ = tanks
     with pytest.raises(km.errors.DataError, match=r"lipschitz=0.0001 is refuted by \d+ of \d+ pairs"):
-        km.certify(model, data, limits, x=x, u=u, options=km.guarantees.CertifyOptions(lipschitz=1e-4))
+        certify(model, data, limits, x=x, u=u, lipschitz=0.0001)
     _, data = published_data(Invariant(), -1, 1, 100, 0.0)
-    certificate = km.certify(
-        km.bilinear_edmd(data, INVARIANT),
-        data,
-        u=0.5,
-        x=[0, -0.5],
-        options=km.guarantees.CertifyOptions(lipschitz=0.004),
-    )
+    certificate = certify(km.bilinear_edmd(data, INVARIANT), data, u=0.5, x=[0, -0.5], lipschitz=0.004)
     assert certificate.is_proof
     assert certificate.error.c_x == certificate.error.c_u == 0.004
     assert "cannot prove it" in certificate.page()
@@ -341,27 +331,25 @@ def test_a_refusal_names_the_error_or_the_model():
     with pytest.raises(
         km.errors.CertificateError, match=r"too large. It is bounded by c_x = 0.9, .* exists for 0\.\d+ of"
     ):
-        km.certify(free, data, options=km.guarantees.CertifyOptions(error=(0.9, 0.9), region=(-5, 5)))
+        certify(free, data, error=(0.9, 0.9), region=(-5, 5))
     small = km.Limits(u_min=-0.01, u_max=0.01)
-    assert (
-        km.certify(free, data, small, options=km.guarantees.CertifyOptions(error=(0, 0), region=(-5, 5))).margin > 0
-    )  # the region shrinks with the limits
+    assert certify(free, data, small, error=(0, 0), region=(-5, 5)).margin > 0  # the region shrinks with the limits
     blind = km.BilinearPredictor(free.A, 0 * free.B, free.N * 0, free.C, INVARIANT, 0.01, plant.states, plant.inputs)
     with pytest.raises(km.errors.CertificateError, match="nearer to 1"):  # x1 falls to 0.96 of its square by itself
-        km.certify(free, data, options=km.guarantees.CertifyOptions(error=(0, 0), region=(-5, 5), decay=0.5))
+        certify(free, data, error=(0, 0), region=(-5, 5), decay=0.5)
     with pytest.raises(km.errors.CertificateError, match="an unstable mode that no input moves"):
-        km.certify(blind, data, options=km.guarantees.CertifyOptions(error=(0, 0)))
+        certify(blind, data, error=(0, 0))
 
 
 def test_bad_input_is_an_error_that_says_what_to_do(tanks):
     _, model, data, limits, x, u, _ = tanks
     for decay in (1.0, 2.0):  # of which every region were a certificate
         with pytest.raises(km.errors.DataError, match=f"decay is {decay:g}, and V has to fall; pass a number below 1"):
-            km.certify(model, data, limits, x=x, u=u, options=km.guarantees.CertifyOptions(decay=decay))
+            certify(model, data, limits, x=x, u=u, decay=decay)
     with pytest.raises(km.errors.DataError, match="decay is 0; it must be above zero"):
-        km.certify(model, data, limits, x=x, u=u, options=km.guarantees.CertifyOptions(decay=0))
+        certify(model, data, limits, x=x, u=u, decay=0)
     with pytest.raises(km.errors.DataError, match=r"noise is -0\.1; an error of measurement is 0 or above"):
-        km.certify(model, data, limits, x=x, u=u, options=km.guarantees.CertifyOptions(noise=-0.1))
+        certify(model, data, limits, x=x, u=u, noise=-0.1)
     with pytest.raises(km.errors.DataError, match="not inside the sampled box"):
         km.certify(model, data, limits, x=[100, 100], u=u)
     with pytest.raises(km.errors.DataError, match="not inside the limits"):
@@ -371,7 +359,7 @@ def test_bad_input_is_an_error_that_says_what_to_do(tanks):
     with pytest.raises(km.errors.DataError, match="limits of changes"):
         km.certify(model, data, km.Limits(du_max=1), x=x, u=u)
     with pytest.raises(km.errors.DataError, match="error and lipschitz are both given"):
-        km.certify(model, data, options=km.guarantees.CertifyOptions(error=(0, 0), lipschitz=1))
+        certify(model, data, error=(0, 0), lipschitz=1)
     still = km.Episodes([km.Episode(X=[[1.0], [2.0]], U=np.zeros((1, 0)))], dt=1.0)
     growing = km.LinearPredictor([[1.2]], np.zeros((1, 0)), [[1.0]], km.State(), 1.0, ["x"], [])
     with pytest.raises(km.errors.DataError, match=r"no inputs, so there is no feedback .* radius is 1.2"):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.searches import certify
 from tests.tiers import few
 
 A, B = np.array([[1.1, 0.2], [0.0, 0.8]]), np.array([[0.0], [0.5]])
@@ -28,7 +29,7 @@ def draw_pairs(count, size, offset):
 @pytest.mark.parametrize("offset", few([0.0, 0.01], 0.01))
 def test_the_true_error_never_exceeds_a_covering_bound(offset):
     data, L = draw_pairs(500, 0.02, offset)
-    certificate = km.certify(MODEL, data, options=km.guarantees.CertifyOptions(lipschitz=L, estimated=True))
+    certificate = certify(MODEL, data, lipschitz=L, estimated=True)
     error, rng = certificate.error, np.random.default_rng(1)
     X = rng.uniform(certificate.low, certificate.high, (10_000, 2))
     U = certificate.deviation.u + certificate.v_max * rng.uniform(-1, 1, (10_000, 1))
@@ -47,10 +48,7 @@ def test_the_true_error_never_exceeds_a_covering_bound(offset):
 
 def test_denser_pairs_prove_a_smaller_ball():
     few, many = (draw_pairs(count, 0.02, 0.0) for count in (300, 3000))
-    wide, small = (
-        km.certify(MODEL, data, options=km.guarantees.CertifyOptions(lipschitz=L, estimated=True))
-        for data, L in (few, many)
-    )
+    wide, small = (certify(MODEL, data, lipschitz=L, estimated=True) for data, L in (few, many))
     assert small.ball < 0.7 * wide.ball
     assert small.error.c_0 < wide.error.c_0
 
@@ -58,11 +56,11 @@ def test_denser_pairs_prove_a_smaller_ball():
 def test_pairs_refute_a_constant_and_bad_input_is_said():
     data, L = draw_pairs(500, 0.02, 0.0)
     with pytest.raises(km.errors.DataError, match="is refuted by two pairs; the data need"):
-        km.certify(MODEL, data, options=km.guarantees.CertifyOptions(lipschitz=0.3 * L, estimated=True))
+        certify(MODEL, data, lipschitz=0.3 * L, estimated=True)
     with pytest.raises(km.errors.DataError, match="leave error out, or pass lipschitz"):
-        km.certify(MODEL, data, options=km.guarantees.CertifyOptions(error=(0.1, 0.1), estimated=True))
+        certify(MODEL, data, error=(0.1, 0.1), estimated=True)
     with pytest.raises(km.errors.DataError, match="a covering needs exact pairs"):
-        km.certify(MODEL, data, options=km.guarantees.CertifyOptions(lipschitz=L, estimated=True, noise=0.01))
+        certify(MODEL, data, lipschitz=L, estimated=True, noise=0.01)
     steep, L = draw_pairs(500, 0.05, 0.01)
     with pytest.raises(km.errors.CertificateError, match=r"c_0 .* or a wider box, and denser data for the covering"):
-        km.certify(MODEL, steep, options=km.guarantees.CertifyOptions(lipschitz=2 * L, estimated=True))
+        certify(MODEL, steep, lipschitz=2 * L, estimated=True)

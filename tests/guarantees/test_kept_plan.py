@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.searches import certify
 
 
 def draw_task(seed):
@@ -22,9 +23,7 @@ def draw_task(seed):
     pairs = [km.Episode(X=np.stack([x, step(model, x, u)]), U=u[None]) for x, u in zip(X, U, strict=True)]
     data = km.Episodes(pairs, dt=0.1, states=model.states, inputs=model.inputs)
     box = {"u_min": -1.0, "u_max": rng.uniform(0.7, 1.3, nu), "x_max": rng.uniform(0.8, 2.5, n)}
-    end = km.certify(
-        model, data, km.Limits(**box), options=km.guarantees.CertifyOptions(error=(0, 0), region=(-3, 3), decay=0.9)
-    )
+    end = certify(model, data, km.Limits(**box), error=(0, 0), region=(-3, 3), decay=0.9)
     return model, box, end, rng
 
 

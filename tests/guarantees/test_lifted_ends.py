@@ -5,6 +5,7 @@ import pytest
 
 import koopmpc as km
 from tests.guarantees.plants import library_task
+from tests.searches import certify
 
 
 @pytest.fixture(scope="module")
@@ -14,7 +15,7 @@ def manifold():
     return (
         model,
         limits,
-        km.certify(model, data, limits, x=x, u=u, options=km.guarantees.CertifyOptions(decay=0.995)),
+        certify(model, data, limits, x=x, u=u, decay=0.995),
         x,
     )
 

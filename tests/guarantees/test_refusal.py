@@ -5,6 +5,7 @@ import pytest
 
 import koopmpc as km
 from tests.gathered import of_certificate
+from tests.searches import certify
 
 
 def draw_pairs(error=None, reach=1.0, u_reach=1.0):
@@ -117,24 +118,17 @@ def test_observables_that_are_nearly_one_another_are_named():
     lifting = km.State() + km.Expressions(lambda x: [x[0] + 1e-6 * x[0] ** 2], ["e"])
     data = draw_pairs(lambda X, U: 0.3 * X * U)
     with pytest.raises(km.errors.CertificateError, match="nearly functions of one another; leave some of them out"):
-        km.certify(km.bilinear_edmd(data, lifting), data, options=km.guarantees.CertifyOptions(error=(0, 0)))
-    assert (
-        km.certify(km.bilinear_edmd(data, km.State()), data, options=km.guarantees.CertifyOptions(error=(0, 0))).margin
-        > 0
-    )
+        certify(km.bilinear_edmd(data, lifting), data, error=(0, 0))
+    assert certify(km.bilinear_edmd(data, km.State()), data, error=(0, 0)).margin > 0
 
 
 def test_a_region_outside_the_data_is_refused_unless_the_bound_is_given():
     data = draw_pairs()
     with pytest.raises(km.errors.DataError, match=r"the region has x = -2 … 2, and the data have -0.99"):
-        km.certify(MODEL, data, options=km.guarantees.CertifyOptions(region=(-2, 2)))
-    inside = km.certify(
-        MODEL, data, options=km.guarantees.CertifyOptions(region=(-1, 1))
-    )  # ends of random data are a little inside
+        certify(MODEL, data, region=(-2, 2))
+    inside = certify(MODEL, data, region=(-1, 1))  # ends of random data are a little inside
     assert -1 < inside.low[0] < inside.high[0] < 1
-    assert (
-        km.certify(MODEL, data, options=km.guarantees.CertifyOptions(region=(-2, 2), error=(0.01, 0.01))).high[0] == 2
-    )
+    assert certify(MODEL, data, region=(-2, 2), error=(0.01, 0.01)).high[0] == 2
 
 
 def test_a_model_with_measured_disturbances_is_refused():

@@ -8,6 +8,7 @@ import scipy.linalg
 import scipy.signal
 
 import koopmpc as km
+from tests.searches import certify
 
 
 def draw_model(rng, n=None, nu=None):
@@ -353,7 +354,7 @@ def mixed():
     X_next = X @ np.transpose(A) + U @ np.transpose(B) + U * (X @ np.transpose(N[0]))
     pairs = [km.Episode(X=np.stack(pair), U=u[None]) for *pair, u in zip(X, X_next, U, strict=True)]
     data = km.Episodes(pairs, dt=0.1, states=model.states, inputs=model.inputs)
-    return model, limits, km.certify(model, data, limits, options=km.guarantees.CertifyOptions(decay=0.9))
+    return model, limits, certify(model, data, limits, decay=0.9)
 
 
 def test_a_certificate_as_terminal_cost_falls_by_the_stage_cost(mixed):

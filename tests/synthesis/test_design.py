@@ -217,7 +217,18 @@ def test_what_is_printed_names_the_choice_and_says_that_figures_are_estimates():
 def test_a_goal_that_no_input_holds_is_told_with_the_limit_in_the_way_and_the_nearest_that_can_be_held():
     spring = episodes_of(lambda x, u: np.array([x[0] + 0.1 * x[1], 0.8 * x[1] - 0.1 * x[0] + 0.1 * u[0]]), count=9)
     with pytest.warns(km.FitWarning, match="no input inside the limits holds") as caught:
-        found = km.design(spring, km.Cost(Q=[1.0, 0.1], R=0.1), km.Limits(u_min=-0.3, u_max=0.3), horizon=8, reference=[0.5, 0.0], options=km.DesignOptions(candidates=[PLAIN], delays=[0], bilinear=False, loops=0, smooth=False))  # fmt: skip
+        found = design(
+            spring,
+            km.Cost(Q=[1.0, 0.1], R=0.1),
+            km.Limits(u_min=-0.3, u_max=0.3),
+            horizon=8,
+            reference=[0.5, 0.0],
+            candidates=[PLAIN],
+            delays=[0],
+            bilinear=False,
+            loops=0,
+            smooth=False,
+        )
     said = str(caught[0].message)
     assert "u0 = 0.5, and its limit is 0.3" in said
     assert "the nearest that can be held is x0 = 0.3" in said

@@ -256,13 +256,16 @@ def test_a_design_says_what_its_logs_cannot_serve():
     one_start = np.tile([0.5, 0.0], (9, 1))
     same = km.collect(spring(), one_start, km.Noise(-3.0, 3.0), episodes=9, steps=40, rng=0)
     with pytest.warns(km.FitWarning, match="all 9 episodes start at p = 0.5"):
-        found = km.design(
+        found = design(
             same,
             km.Cost(Q=[1.0, 0.1], R=0.1),
             km.Limits(u_min=-3, u_max=3),
             horizon=8,
             reference=[0.0, 0.0],
-            options=km.DesignOptions(candidates=[km.State() + km.Constant()], delays=[0], bilinear=False, loops=0),
+            candidates=[km.State() + km.Constant()],
+            delays=[0],
+            bilinear=False,
+            loops=0,
         )
     assert sum("all 9 episodes start at p = 0.5" in sentence for sentence in found.advice) == 1
 

@@ -8,7 +8,7 @@ import pytest
 import koopmpc as km
 from tests.models.test_hidden_state import friction_record, saturating_record
 from tests.models.test_instruments import TRUTH, run_loop
-from tests.searches import design
+from tests.searches import design, select
 
 
 def oscillator(rows=420, noise=0.01, late=False, gain=None, seed=0):
@@ -31,12 +31,8 @@ def selection(late):
     with pytest.MonkeyPatch.context() as patch:
         if late:  # without hidden states and neurons, which take most of the time; others look at them
             patch.setattr("koopmpc.synthesis.select.judge_hidden_states", lambda *_, **__: [])
-        return km.select(
-            oscillator(rows=240 if late else 420, late=late),
-            ridges=[1e-6],
-            horizon=10,
-            folds=2,
-            options=km.SearchOptions(delays=[0, 2]),
+        return select(
+            oscillator(rows=240 if late else 420, late=late), ridges=[1e-06], horizon=10, folds=2, delays=[0, 2]
         )
 
 
@@ -90,7 +86,7 @@ def test_a_hidden_state_is_taken_where_it_pays_on_unseen_rows():
     """Two tanks of which the second one's sensor saturates; polynomials of past rows cannot hold that."""
     data = saturating_record(np.random.default_rng(0), noise=0.005)
     found, fresh = (
-        km.select(data, horizon=10, folds=2, options=km.SearchOptions(delays=[0, 2, 4])),
+        select(data, horizon=10, folds=2, delays=[0, 2, 4]),
         saturating_record(np.random.default_rng(1)),
     )
     hidden = [row for row in found.leaderboard if "hidden state" in row.title]
@@ -129,9 +125,7 @@ def test_of_models_alike_one_without_a_hidden_state_is_taken():
 
 def test_select_says_whether_it_removed_noise_that_feedback_carries():
     data, _ = run_loop(np.random.default_rng(1), 1200, sensor=0.2)
-    chosen = km.select(
-        data, options=km.SearchOptions(candidates=[km.State() + km.Constant()], delays=(0,), bilinear=False)
-    )
+    chosen = select(data, candidates=[km.State() + km.Constant()], delays=(0,), bilinear=False)
     assert any("as a filter sees them" in note for note in chosen.notes)
     assert np.linalg.norm(chosen.predictor.A[:2, :2] - TRUTH[:, :2]) < 0.05
 

@@ -47,18 +47,14 @@ def noisy(data, size, seed=1):
 
 
 def test_a_linear_plant_gets_the_linear_model_though_larger_ones_hold_it():
-    found = km.select(
-        noisy(episodes_of(linear), 0.01), horizon=8, folds=2, ridges=[0.0, 1e-6], options=km.SearchOptions(delays=[0])
-    )
+    found = select(noisy(episodes_of(linear), 0.01), horizon=8, folds=2, ridges=[0.0, 1e-06], delays=[0])
     assert (found.best.name, found.best.kind, found.chosen) == ("x, 1", "linear", found.chosen_linear)
     assert found.predictor is found.linear
     assert len(found.leaderboard) > 20
 
 
 def test_a_closed_quadratic_dictionary_wins_and_is_exact_over_the_horizon():
-    found = km.select(
-        episodes_of(quadratic), horizon=10, options=km.SearchOptions(candidates=[PLAIN, SQUARES], delays=[0])
-    )
+    found = select(episodes_of(quadratic), horizon=10, candidates=[PLAIN, SQUARES], delays=[0])
     assert found.best.nz == 6
     assert found.best.median < 1e-6  # the ridge is as large as that allows
     plain = next(row for row in found.leaderboard if row.kind == "linear" and row.nz == 3)
@@ -67,13 +63,13 @@ def test_a_closed_quadratic_dictionary_wins_and_is_exact_over_the_horizon():
 
 def test_inputs_that_multiply_the_state_get_a_bilinear_model_and_the_best_linear_one_beside_it():
     data = episodes_of(bilinear)
-    found = km.select(data, horizon=8, options=km.SearchOptions(candidates=[PLAIN], delays=[0]))
+    found = select(data, horizon=8, candidates=[PLAIN], delays=[0])
     assert (found.best.kind, found.best_linear.kind) == ("bilinear", "linear")
     assert found.best.worst < 1e-6 < 0.05 < found.best_linear.worst
     row = found.best
     assert found.predictor == km.bilinear_edmd(data, row.lifting, ridge=row.ridge, difference=True)
     assert found.linear == km.edmd(data, found.best_linear.lifting, ridge=found.best_linear.ridge, towards="affine")
-    only = km.select(data, horizon=8, options=km.SearchOptions(candidates=[PLAIN], delays=[0], bilinear=False))
+    only = select(data, horizon=8, candidates=[PLAIN], delays=[0], bilinear=False)
     assert {row.kind for row in only.leaderboard} == {"linear"}
 
 
@@ -84,7 +80,7 @@ def test_a_bilinear_model_is_judged_by_forecasts_that_lift_afresh_as_its_control
         return np.array([0.9 * x[0] + 0.1 * x[1], 0.9 * x[1] - 0.2 * x[0] ** 3 + 0.4 * u[0] * x[0]])
 
     data = episodes_of(cubic)
-    found = km.select(data, horizon=15, options=km.SearchOptions(candidates=[PLAIN + km.Monomials(3)], delays=[0]))
+    found = select(data, horizon=15, candidates=[PLAIN + km.Monomials(3)], delays=[0])
     assert found.best.bilinear
     assert found.best.worst < 1e-6
     assert km.score(found.predictor, data, 15, relift=True).total < 1e-6
@@ -100,8 +96,7 @@ def test_errors_below_a_hundredth_are_alike_for_a_controller_and_not_for_a_forec
     # with so much noise no bilinear model reaches a hundredth of the linear one's error, which would be worth its step
     data, candidates = noisy(episodes_of(nearly), 1e-4), [PLAIN, PLAIN + km.Monomials(3)]
     control, forecast = (
-        km.select(data, horizon=10, relift=relift, options=km.SearchOptions(candidates=candidates, delays=[0]))
-        for relift in (True, False)
+        select(data, horizon=10, relift=relift, candidates=candidates, delays=[0]) for relift in (True, False)
     )
     assert (control.best.name[0], control.best.bilinear) == ("0", False)
     assert 1e-6 < control.best.worst < 1e-2
@@ -111,7 +106,7 @@ def test_errors_below_a_hundredth_are_alike_for_a_controller_and_not_for_a_forec
 
 def test_what_is_not_measured_is_found_in_the_past():
     """Of two linear states one is measured: one delay closes the model."""
-    found = km.select(episodes_of(linear, keep=1), horizon=8, options=km.SearchOptions(candidates=[km.State()]))
+    found = select(episodes_of(linear, keep=1), horizon=8, candidates=[km.State()])
     assert found.best.delays == 1
     assert found.best.worst < 1e-6
     assert isinstance(found.predictor.embedding, km.Delay)
@@ -138,12 +133,7 @@ def test_what_runs_away_counts_as_infinite_and_the_smallest_of_such_is_taken():
     ]
     data = km.Episodes(made, 0.1)
     with pytest.warns(km.FitWarning) as told:
-        found = km.select(
-            data,
-            horizon=20,
-            ridges=[0.0],
-            options=km.SearchOptions(candidates=[km.State() + km.Monomials(5)], delays=[0]),
-        )
+        found = select(data, horizon=20, ridges=[0.0], candidates=[km.State() + km.Monomials(5)], delays=[0])
     assert any("the forecasts of all 1 candidates run away within 20" in str(one.message) for one in told)
     assert np.isinf(found.best.worst)
     assert "inf" in str(found)
@@ -167,7 +157,7 @@ def test_on_an_unstable_plant_the_next_step_is_not_given_up_for_the_last_one():
             X.append(levitated(X[-1], U[-1]))
         made.append(km.Episode(X=np.array(X), U=np.array(U)))
     data = km.Episodes(made, 0.005)
-    model = km.select(data, horizon=20, options=km.SearchOptions(candidates=[PLAIN, SQUARES], bilinear=False)).linear
+    model = select(data, horizon=20, candidates=[PLAIN, SQUARES], bilinear=False).linear
     limits, x0, goal = km.Limits(u_min=0.3, u_max=1.8), np.array([1.1, 0.0]), np.array([0.9, 0.0])
     assert model is not None
 
@@ -189,7 +179,7 @@ def test_on_an_unstable_plant_the_next_step_is_not_given_up_for_the_last_one():
 def test_delays_are_taken_only_where_they_halve_the_error():
     """All of the state is measured, with noise: the past tells a little more, and a controller needs none of it."""
     data = noisy(episodes_of(quadratic), 0.02)
-    found = km.select(data, horizon=8, options=km.SearchOptions(candidates=[SQUARES], delays=[0, 1, 2], bilinear=False))
+    found = select(data, horizon=8, candidates=[SQUARES], delays=[0, 1, 2], bilinear=False)
     assert found.best.delays == 0
     assert min(row.worst for row in found.leaderboard if row.delays) > 0.5 * found.best.worst
 
@@ -203,8 +193,7 @@ def test_where_the_data_have_their_zero_changes_no_choice():
     )
     base = km.State() + km.Constant()
     here, there = (
-        km.select(one, horizon=8, options=km.SearchOptions(candidates=[base, base + more]))
-        for one, more in zip((data, far), scaled, strict=True)
+        select(one, horizon=8, candidates=[base, base + more]) for one, more in zip((data, far), scaled, strict=True)
     )
     assert [row.title for row in here.leaderboard] == [row.title for row in there.leaderboard]
     assert [row.ridge for row in here.leaderboard] == [row.ridge for row in there.leaderboard]
@@ -218,12 +207,13 @@ def test_workers_change_nothing_and_a_lifting_of_ones_own_reaches_them():
     data = episodes_of(quadratic, count=8)
     told = []
     found = [
-        km.select(
+        select(
             data,
             horizon=5,
-            options=km.SearchOptions(
-                candidates=[SQUARES, own], delays=[0], workers=workers, progress=lambda *args: told.append(args)
-            ),
+            candidates=[SQUARES, own],
+            delays=[0],
+            workers=workers,
+            progress=lambda *args: told.append(args),
         )
         for workers in (None, 2)
     ]
@@ -236,25 +226,18 @@ def test_workers_change_nothing_and_a_lifting_of_ones_own_reaches_them():
 
 def test_a_source_is_chosen_on_a_sample_and_fitted_to_all():
     sets = [episodes_of(quadratic, count=4, steps=20, seed=s) for s in range(12)]
-    found = km.select(
-        km.data.Stream(sets),
-        horizon=5,
-        ridges=[1e-6],
-        options=km.SearchOptions(candidates=[SQUARES], delays=[0], sample=300, bilinear=False),
+    found = select(
+        km.data.Stream(sets), horizon=5, ridges=[1e-06], candidates=[SQUARES], delays=[0], sample=300, bilinear=False
     )
     assert found.predictor.report.samples == 12 * 4 * 20
     assert "chosen on" in found.notes[0]
     assert "fitted to all" in found.notes[0]
     with pytest.raises(km.errors.DataError, match="a selection reads its data several times"):
-        km.select(km.data.Stream(iter(sets)), options=km.SearchOptions(candidates=[SQUARES]))
+        select(km.data.Stream(iter(sets)), candidates=[SQUARES])
 
 
 def test_one_long_episode_is_cut_into_blocks_and_the_choice_says_so():
-    found = km.select(
-        episodes_of(quadratic, count=1, steps=400),
-        horizon=5,
-        options=km.SearchOptions(candidates=[SQUARES], delays=[0]),
-    )
+    found = select(episodes_of(quadratic, count=1, steps=400), horizon=5, candidates=[SQUARES], delays=[0])
     assert found.folds == 5
     assert "1 episode is too few for 5 folds: cut into" in str(found)
 
@@ -273,7 +256,7 @@ def test_the_usual_horizon_is_twenty_steps_or_what_most_data_allow_and_then_a_no
 def test_a_few_short_episodes_do_not_shorten_the_horizon():
     data = episodes_of(quadratic, count=20, steps=40)
     short = [km.Episode(X=e.X[:5], U=e.U[:4]) for e in data]
-    found = km.select(km.Episodes([*data, *short], data.dt), options=km.SearchOptions(candidates=[SQUARES], delays=[0]))
+    found = select(km.Episodes([*data, *short], data.dt), candidates=[SQUARES], delays=[0])
     assert found.horizon == 20
     assert any("20 of 40 episodes are shorter than the 20 steps" in note for note in found.notes)
 
@@ -285,9 +268,7 @@ def test_the_only_model_whose_forecasts_last_is_taken_however_small_the_error_of
         km.Episode(X=rng.standard_normal((25, 2)) * 10.0 ** rng.integers(-3, 4), U=np.zeros((24, 0))) for _ in range(10)
     ]
     wild = km.State() + km.Monomials(5)
-    found = km.select(
-        km.Episodes(made, 0.1), horizon=20, ridges=[0.0], options=km.SearchOptions(candidates=[wild, PLAIN], delays=[0])
-    )
+    found = select(km.Episodes(made, 0.1), horizon=20, ridges=[0.0], candidates=[wild, PLAIN], delays=[0])
     assert found.best.name.startswith("1")
     assert np.isfinite(found.best.worst)
 
@@ -295,9 +276,7 @@ def test_the_only_model_whose_forecasts_last_is_taken_however_small_the_error_of
 def test_a_ridge_is_never_below_its_floor_nor_below_what_the_misfit_of_a_step_supports():
     """Noise of a share s of the state's size, where it is not smoothed away, is worth a ridge of s²."""
     clean = episodes_of(quadratic)
-    given = km.select(
-        clean, horizon=6, ridges=[0.0], options=km.SearchOptions(candidates=[SQUARES], delays=[0], bilinear=False)
-    )
+    given = select(clean, horizon=6, ridges=[0.0], candidates=[SQUARES], delays=[0], bilinear=False)
     assert {row.ridge for row in given.leaderboard} == {1e-9}
     size = 0.03 * np.sqrt(np.mean(np.concatenate([e.X for e in clean]) ** 2))
     rough, options = noisy(clean, size), {"horizon": 6, "delays": [0, 1], "bilinear": False}
@@ -309,7 +288,7 @@ def test_what_is_constant_in_the_data_is_named():
     data = episodes_of(linear)
     held = km.Episodes([km.Episode(X=np.c_[e.X, 3 + 0 * e.X[:, 0]], U=np.c_[e.U, 0 * e.U]) for e in data], data.dt)
     with pytest.warns(km.FitWarning) as told:
-        found = km.select(held, horizon=6, options=km.SearchOptions(candidates=[PLAIN], delays=[0]))
+        found = select(held, horizon=6, candidates=[PLAIN], delays=[0])
     said = [str(one.message) for one in told]
     assert "x2 is constant in these data, so what it does cannot be learned; excite it, or leave it out" in said
     assert any(text.startswith("u1 is constant") for text in said)
@@ -321,16 +300,12 @@ def test_a_wrapped_angle_is_named():
     turning = [np.cumsum(np.full((40, 1), 0.3), axis=0) + rng.uniform(-3, 3) for _ in range(6)]
     wrapped = [km.Episode(X=(t + np.pi) % (2 * np.pi) - np.pi, U=np.zeros((39, 0))) for t in turning]
     with pytest.warns(km.FitWarning, match=r"theta jumps by 2π \d+ times: it was wrapped"):
-        km.select(
-            km.Episodes(wrapped, 0.1, ["theta"]), horizon=4, options=km.SearchOptions(candidates=[PLAIN], delays=[0])
-        )
+        select(km.Episodes(wrapped, 0.1, ["theta"]), horizon=4, candidates=[PLAIN], delays=[0])
 
 
 def test_a_lifting_made_for_the_states_is_tried_without_delays_only():
     bells = km.State() + km.Gaussian(np.zeros((1, 2)), 1.0)
-    found = km.select(
-        episodes_of(linear), horizon=5, options=km.SearchOptions(candidates=[bells, PLAIN], bilinear=False)
-    )
+    found = select(episodes_of(linear), horizon=5, candidates=[bells, PLAIN], bilinear=False)
     assert {row.delays for row in found.leaderboard if row.name.startswith("0")} == {0}
     assert {row.delays for row in found.leaderboard if row.name.startswith("1")} == {0, 1, 2}
 
@@ -343,7 +318,7 @@ def test_measured_disturbances_are_in_the_fit_and_in_the_forecast():
         for k in range(len(e)):
             X[k + 1] = A @ X[k] + B @ e.U[k] + [0.2, 0.0] * W[k]
         made.append(km.Episode(X=X, U=e.U, W=W))
-    found = km.select(km.Episodes(made, 0.1), horizon=6, options=km.SearchOptions(candidates=[PLAIN]))
+    found = select(km.Episodes(made, 0.1), horizon=6, candidates=[PLAIN])
     assert found.best.kind == "linear"
     assert found.best.worst < 1e-6
     assert found.predictor.disturbances == ("w0",)
@@ -366,16 +341,12 @@ def test_a_mistake_is_told(change, words):
 
 
 def test_a_selection_is_data():
-    found = km.select(episodes_of(linear, count=6), horizon=5, folds=2, options=km.SearchOptions(candidates=[PLAIN]))
+    found = select(episodes_of(linear, count=6), horizon=5, folds=2, candidates=[PLAIN])
     assert returned(found) == found
 
 
 def test_the_table_shows_the_choice_the_plain_model_and_fits_a_terminal():
-    lines = str(
-        km.select(
-            episodes_of(bilinear, count=8), horizon=5, folds=2, ridges=[0.0], options=km.SearchOptions(delays=[0])
-        )
-    ).splitlines()
+    lines = str(select(episodes_of(bilinear, count=8), horizon=5, folds=2, ridges=[0.0], delays=[0])).splitlines()
     assert lines[0].startswith("chosen: bilinear: ")
     assert any(line.startswith("→ ") for line in lines)
     assert any("linear: x, 1 " in line for line in lines)
@@ -383,12 +354,7 @@ def test_the_table_shows_the_choice_the_plain_model_and_fits_a_terminal():
 
 
 def test_the_table_shows_a_model_that_was_tried_twice_once():
-    found = km.select(
-        episodes_of(bilinear, count=8),
-        horizon=5,
-        folds=2,
-        options=km.SearchOptions(candidates=[PLAIN, PLAIN, SQUARES], delays=[0]),
-    )
+    found = select(episodes_of(bilinear, count=8), horizon=5, folds=2, candidates=[PLAIN, PLAIN, SQUARES], delays=[0])
     shown = [line for line in str(found).splitlines()[4:] if "linear: " in line]
     assert len(found.leaderboard) == 6
     assert len(shown) == 4
@@ -401,10 +367,10 @@ def test_a_bilinear_model_with_a_hundredth_of_the_error_is_worth_its_step():
     def product(x, u):
         return [0.9 * x[0] + 0.1 * x[1], 0.8 * x[1] + u[0] + 0.002 * u[0] * x[0]]
 
-    exact = km.select(episodes_of(product), horizon=8, options=km.SearchOptions(candidates=[PLAIN]))
+    exact = select(episodes_of(product), horizon=8, candidates=[PLAIN])
     assert min(row.worst for row in exact.leaderboard if row.kind == "linear") < 0.01
     assert exact.best.kind == "bilinear"
-    hidden = km.select(noisy(episodes_of(product), 0.02), horizon=8, options=km.SearchOptions(candidates=[PLAIN]))
+    hidden = select(noisy(episodes_of(product), 0.02), horizon=8, candidates=[PLAIN])
     assert hidden.best.kind == "linear"
 
 
@@ -451,8 +417,6 @@ def test_more_of_the_past_is_tried_where_two_rows_of_it_forecast_better_than_one
                 X.append(AB[:n, :n] @ X[-1] + AB[:n, n:] @ u)
             logs.append(km.Episode(X=np.array(X)[:, :1] + 1e-3 * rng.standard_normal((41, 1)), U=U))
         data = km.Episodes(logs, dt=0.3)
-        chosen = km.select(
-            data, horizon=10, options=km.SearchOptions(candidates=[km.State() + km.Constant()], bilinear=False)
-        )
+        chosen = select(data, horizon=10, candidates=[km.State() + km.Constant()], bilinear=False)
         found.append(max(row.delays for row in chosen.leaderboard))
     assert found == [2, 4]

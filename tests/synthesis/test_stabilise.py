@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import koopmpc as km
+from tests.searches import design
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,19 @@ def test_its_data_are_enough_for_a_design_that_holds_the_plant():
     cost, limits = km.Cost(Q=[10, 1], R=0.1), km.Limits(u_min=low, u_max=high)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", km.FitWarning)
-        design = km.design(found(pendulum).data, cost, limits, horizon=15, reference=[0, 0], options=km.DesignOptions(candidates=[km.State() + km.Constant()], delays=[0], bilinear=False, loops=0, smooth=False))  # fmt: skip
-    run = km.simulate(plant, design.controller, x0=[0.3, 0.0], reference=[0, 0], steps=100)
+        made = design(
+            found(pendulum).data,
+            cost,
+            limits,
+            horizon=15,
+            reference=[0, 0],
+            candidates=[km.State() + km.Constant()],
+            delays=[0],
+            bilinear=False,
+            loops=0,
+            smooth=False,
+        )
+    run = km.simulate(plant, made.controller, x0=[0.3, 0.0], reference=[0, 0], steps=100)
     assert np.abs(run.X[-1]).max() < 0.02
 
 
