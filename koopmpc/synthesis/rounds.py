@@ -13,7 +13,7 @@ from koopmpc.estimate.disturbance import LiftedDisturbance
 from koopmpc.synthesis.choice import DesignRow, average_ratios, choose_estimator, is_alike, measure_errors, rate_runs
 from koopmpc.synthesis.loops.conditions import LoopTest, prepare_test
 from koopmpc.synthesis.loops.judging import Job, Outcome, judge_job
-from koopmpc.synthesis.loops.surrogates import choose_surrogates, is_unstable
+from koopmpc.synthesis.loops.surrogates import choose_surrogates, is_unstable, rank_results
 from koopmpc.synthesis.options import DesignOptions
 from koopmpc.synthesis.search.cross_validation import Tried
 from koopmpc.synthesis.search.prepare import report_stage
@@ -33,17 +33,14 @@ def _list_first_round(results: Sequence[Tried], floor: float) -> list[Recipe]:
     Models with a hidden state are few, and all of them are judged. Plain linear models are also tried with the smallest
     ridge, as in a textbook fit.
     """
-    places = [tried.best(floor) for tried in results]
-    worst = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
-    ranked = sorted(range(len(results)), key=lambda i: (worst[i], i))
+    ranked = [recipe for _, recipe in rank_results(results, floor)]
     found: list[Recipe] = []
     for bilinear in (False, True):
-        same = [i for i in ranked if results[i].candidate.bilinear == bilinear]
-        best = same[:_FIRST_ROUND] + [i for i in same[_FIRST_ROUND:] if results[i].candidate.has_hidden_state]
-        found += [Recipe(results[i].candidate, results[i].ridges[places[i]]) for i in best]
-    for one, place in zip(results, places, strict=True):
+        same = [one for one in ranked if one.candidate.bilinear == bilinear]
+        found += same[:_FIRST_ROUND] + [one for one in same[_FIRST_ROUND:] if one.candidate.has_hidden_state]
+    for one in results:
         if one.candidate.name == "x, 1" and not one.candidate.bilinear:
-            found += [Recipe(one.candidate, one.ridges[i], tail=0) for i in sorted({0, place})]
+            found += [Recipe(one.candidate, one.ridges[i], tail=0) for i in sorted({0, one.best(floor)})]
     return found
 
 

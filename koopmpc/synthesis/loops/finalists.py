@@ -19,7 +19,7 @@ from koopmpc.models.fits.edmd import edmd
 from koopmpc.models.predictors import LinearPredictor
 from koopmpc.synthesis.choice import CHOICE, DesignRow
 from koopmpc.synthesis.loops.abreast import speed_up
-from koopmpc.synthesis.loops.fresh import DRAWN, _draw_corners
+from koopmpc.synthesis.loops.fresh import DRAWN, draw_corners
 from koopmpc.synthesis.loops.judging import LITTLE
 from koopmpc.synthesis.loops.pool import LoopPool, LoopResult
 from koopmpc.synthesis.rates import KEPT
@@ -144,7 +144,7 @@ def compare_longer_horizon(
         controller.horizon,
         pool.draw(COMPARISON.loops if isinstance(fast, Compiled) else COMPARISON.loops_in_python, rng),
     )
-    drawn += _draw_corners(pool.task, rng)
+    drawn += draw_corners(pool.task, rng)
 
     def run(horizon: int) -> list[LoopResult]:
         one = recipe.controller(get_model(controller), controller.cost, controller.limits, horizon)

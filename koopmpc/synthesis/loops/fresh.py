@@ -27,7 +27,7 @@ def run_fresh_loops(pool: LoopPool, controller: Any, loops: int, rng: np.random.
     task, near = pool.task, pool.neighbours
     assert near is not None, "a design has nearest rows"
     drawn = pool.draw(loops, rng)
-    corners = _draw_corners(task, rng)
+    corners = draw_corners(task, rng)
     results = pool.run(controller, [*drawn, *corners])
     share, away = np.zeros(len(results)), [np.zeros((0, len(task.low)))]
     begun = 0
@@ -78,7 +78,7 @@ def find_blind_range(data: Episodes, task: DesignTask, neighbours: NeighbourMap)
     ]
 
 
-def _draw_corners(task: DesignTask, rng: np.random.Generator) -> list[DrawnLoop]:
+def draw_corners(task: DesignTask, rng: np.random.Generator) -> list[DrawnLoop]:
     """Return loops from corners of the goal's range, some of them where there are many."""
     low, high = goal_box(task)
     if len(low) <= 3:

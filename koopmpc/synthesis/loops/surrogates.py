@@ -1,6 +1,6 @@
 """Surrogates: learned maps that replace the plant when controllers are judged."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -26,6 +26,9 @@ INVARIANT = 0.25  # the plant ignores a state that changes increments by less th
 GROWN = 2.0  # a plant is unstable if a deviation grows by this factor within a horizon
 _SAMPLE = 500  # number of states on which ignored states are searched
 _FAMILIES = ("monomials", "fourier", "gaussian", "thin plate", "random fourier")
+
+
+Holding = Callable[[Float[np.ndarray, " nr"]], Equilibrium]  # reference row → equilibrium, kept for next time
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +97,21 @@ class Surrogate(Value):
         return x0 if same or embedding is None else embedding.repeat(x0, self.middle)
 
     def holding(self, cost: Cost, limits: Limits, gain: float = 1.0) -> "Holding":
-        """Return the search for equilibria of this plant."""
+        """Return the search for the equilibrium of this plant nearest to a row inside the limits, from the last one."""
         given = self._map(gain)
-        outputs = state_tracking(self.model.states, self.model.inputs, cost, limits, given.nx)
-        return Holding(Equilibria(given, cost, outputs), given.E @ self.w)
+        equilibria = Equilibria(
+            given, cost, state_tracking(self.model.states, self.model.inputs, cost, limits, given.nx)
+        )
+        push, known, last = given.E @ self.w, dict[bytes, Equilibrium](), list[Equilibrium]()
+
+        def find(row: Float[np.ndarray, " nr"]) -> Equilibrium:
+            key, before = row.tobytes(), last[-1] if last else None
+            if key not in known:
+                known[key] = equilibria.find(row, push, before) or before or equilibria.guess(row)
+                last[:] = [known[key]]
+            return known[key]
+
+        return find
 
     def find_reference_inputs(
         self, cost: Cost, limits: Limits, rows: Float[np.ndarray, "T nr"], gain: float = 1.0
@@ -122,21 +136,11 @@ class Surrogate(Value):
         return replace(given, F=ca.Function("F", [x, u, theta], [given.F(x, origin + gain * (u - origin), theta)]))
 
 
-class Holding:
-    """Reference row → the equilibrium of a surrogate that comes nearest to it inside the limits, kept for next time."""
-
-    def __init__(self, equilibria: Equilibria, push: Float[np.ndarray, " nx"]) -> None:
-        self._equilibria, self._push = equilibria, push
-        self._known: dict[bytes, Equilibrium] = {}
-        self._last: Equilibrium | None = None
-
-    def __call__(self, row: Float[np.ndarray, " nr"]) -> Equilibrium:
-        """Return the equilibrium of a row; that of the row before it is where the search begins."""
-        key = row.tobytes()
-        if key not in self._known:
-            found = self._equilibria.find(row, self._push, self._last) or self._last
-            self._known[key] = self._last = self._equilibria.guess(row) if found is None else found
-        return self._known[key]
+def rank_results(results: Sequence[Tried], floor: float) -> list[tuple[float, Recipe]]:
+    """Return the error in the worst fold of each model with its best ridge, and the recipe of that, the best first."""
+    places = [(tried, tried.best(floor)) for tried in results]
+    ranked = [(float(one.scores[k].max()), Recipe(one.candidate, one.ridges[k])) for one, k in places]
+    return sorted(ranked, key=lambda each: each[0])
 
 
 def choose_surrogates(results: Sequence[Tried], floor: float, hidden: bool = False) -> list[Recipe]:
@@ -150,19 +154,16 @@ def choose_surrogates(results: Sequence[Tried], floor: float, hidden: bool = Fal
     knows their state.
     """
     results = [one for one in results if not one.candidate.has_hidden_state] or results
-    places = [tried.best(floor) for tried in results]
-    error = [float(tried.scores[place].max()) for tried, place in zip(results, places, strict=True)]
-    ranked = sorted(range(len(results)), key=lambda i: (error[i], i))
-    bilinear = [i for i in ranked if results[i].candidate.bilinear] or ranked
-    pool = [i for i in bilinear if not results[i].candidate.delays] or bilinear
-    late = [i for i in bilinear if results[i].candidate.delays]
-    if late and error[late[0]] < (1.0 if hidden else HALF) * error[pool[0]]:
+    ranked = rank_results(results, floor)
+    bilinear = [one for one in ranked if one[1].candidate.bilinear] or ranked
+    pool = [one for one in bilinear if not one[1].candidate.delays] or bilinear
+    late = [one for one in bilinear if one[1].candidate.delays]
+    if late and late[0][0] < (1.0 if hidden else HALF) * pool[0][0]:
         pool = late
-    first = pool[0]
-    rest = [i for i in pool[1:] if error[i] <= SECOND * error[first]]
-    other = [i for i in rest if _find_family(results[i]) != _find_family(results[first])]
-    second = [*other, *rest, first][0]
-    return [Recipe(results[i].candidate, results[i].ridges[places[i]]) for i in (first, second)]
+    least, first = pool[0]
+    rest = [recipe for error, recipe in pool[1:] if error <= SECOND * least]
+    other = [recipe for recipe in rest if _find_family(recipe) != _find_family(first)]
+    return [first, [*other, *rest, first][0]]
 
 
 def fit_surrogate(
@@ -225,6 +226,6 @@ def is_unstable(surrogates: Sequence[Surrogate], task: DesignTask) -> bool:
     return bool(2 * sum(found) > len(found))
 
 
-def _find_family(tried: Tried) -> str:
-    name = tried.candidate.name
+def _find_family(recipe: Recipe) -> str:
+    name = recipe.candidate.name
     return next((family for family in reversed(_FAMILIES) if name.startswith(family)), name)
