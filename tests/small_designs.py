@@ -11,7 +11,9 @@ import koopmpc as km
 from koopmpc.data.episodes import Episodes
 from koopmpc.synthesis.search.candidates import Candidate
 
-PROMISE, TASK, TRIALS = (importlib.import_module(f"koopmpc.synthesis.{file}") for file in ("promise", "task", "trials"))
+PROMISE, TASK, CANDIDATES = (
+    importlib.import_module(f"koopmpc.synthesis.{file}") for file in ("promise", "task", "search.candidates")
+)
 FINALISTS = importlib.import_module("koopmpc.synthesis.loops.finalists")
 NEIGHBOURS = importlib.import_module("koopmpc.synthesis.loops.neighbours")
 
@@ -48,6 +50,6 @@ def undrawn_pages() -> Iterator[None]:
 def small_designs() -> Iterator[None]:
     """Let designs try two models, from few starts and in short loops."""
     with short_loops(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TRIALS, "propose_candidates", propose_two)
+        patch.setattr(CANDIDATES, "propose_candidates", propose_two)
         patch.setattr(TASK, "LENGTHS", replace(TASK.LENGTHS, starts=6))
         yield

@@ -24,10 +24,9 @@ from koopmpc.synthesis.options import SearchOptions, check_options
 from koopmpc.synthesis.search.candidates import (
     Candidate,
     check_delays,
-    expand_candidates,
     find_constant_states,
     fit_candidate,
-    propose_candidates,
+    list_candidates,
 )
 from koopmpc.synthesis.search.cross_validation import EXACT, LEAST, RIDGES, Trial, Tried, check_ridges, cross_validate
 from koopmpc.synthesis.search.data import is_record
@@ -194,11 +193,7 @@ def _plan_search(
     past, memory = check_delays((0, 1, 2) if delays is None else delays), None
     if not data.record:
         past, memory = list_delays(data, delays)
-    both = bool(options.bilinear) and held.nu > 0
-    if options.candidates is None:
-        candidates = propose_candidates(held, past, both, draw)
-    else:
-        candidates = expand_candidates(options.candidates, held, past, both)
+    candidates = list_candidates(options.candidates, held, past, options.bilinear, draw)
     if data.record:
         told = report_stage(options.progress, "sparse polynomials")
         candidates += propose_structures(measured, None if delays is None else past, options.bilinear, told)

@@ -14,7 +14,7 @@ from koopmpc.lifting.state import State
 from koopmpc.synthesis.loops.conditions import FOLDS
 from koopmpc.synthesis.options import DesignOptions
 from koopmpc.synthesis.pose import PosedTask
-from koopmpc.synthesis.search.candidates import Candidate, expand_candidates, propose_candidates
+from koopmpc.synthesis.search.candidates import Candidate, list_candidates
 from koopmpc.synthesis.search.cross_validation import LEAST, RIDGES, Trial, Tried, cross_validate
 from koopmpc.synthesis.search.folds import Folds, make_folds
 from koopmpc.synthesis.search.hidden_states import propose_hidden_states
@@ -106,8 +106,7 @@ def _list_models(
     held: Episodes, task: DesignTask, options: DesignOptions, past: Sequence[int], draw: np.random.Generator
 ) -> list[Candidate]:
     """Return the models to try; each lifting includes the observables of cost and limits."""
-    given, both = options.candidates, bool(options.bilinear)
-    models = propose_candidates(held, past, both, draw) if given is None else expand_candidates(given, held, past, both)
+    models = list_candidates(options.candidates, held, past, options.bilinear, draw)
     asking = [of for of in (task.cost.of, task.limits.of) if of is not None and not isinstance(of, State)]
     needed = [of.bind(held.states) for of in asking]
     if not needed:

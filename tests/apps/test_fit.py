@@ -65,7 +65,7 @@ def few(monkeypatch):
         tried += [km.synthesis.Candidate("squares", tried[1].lifting, bilinear=True)] * bilinear
         return [one.bind(episodes.states, episodes.inputs) for one in tried]
 
-    monkeypatch.setattr("koopmpc.synthesis.select.propose_candidates", usual)
+    monkeypatch.setattr("koopmpc.synthesis.search.candidates.propose_candidates", usual)
     monkeypatch.setattr("koopmpc.synthesis.search.records.DELAYS", (0, 1))
     monkeypatch.setattr("koopmpc.synthesis.search.prepare.is_late", lambda _: False)
     monkeypatch.setattr("koopmpc.synthesis.select.judge_hidden_states", lambda *_, **__: [])

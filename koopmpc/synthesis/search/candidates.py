@@ -170,6 +170,20 @@ def expand_candidates(
     return found
 
 
+def list_candidates(
+    given: Sequence[Candidate | Lifting] | None,
+    episodes: Episodes,
+    delays: Sequence[int],
+    bilinear: bool,
+    rng: np.random.Generator,
+) -> list[Candidate]:
+    """Return the given candidates, or those for an unknown plant; bilinear ones only where there are inputs."""
+    both = bool(bilinear) and episodes.nu > 0
+    if given is None:
+        return propose_candidates(episodes, delays, both, rng)
+    return expand_candidates(given, episodes, delays, both)
+
+
 def propose_candidates(
     episodes: Episodes, delays: Sequence[int], bilinear: bool, rng: np.random.Generator
 ) -> list[Candidate]:
