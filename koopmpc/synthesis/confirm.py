@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -36,13 +36,6 @@ class ChosenController:
     compared: int = 0  # number of loops in which finalists were compared
     promise: CoveragePromise | None = None  # what the margin promises; None where no share of loops was asked for
     notes: tuple[str, ...] = ()  # how the choice came about, in sentences
-
-
-class FittedRow(NamedTuple):
-    """The controller of a row that was fitted to all data, None where it is not confirmed; and notes."""
-
-    controller: Designed | None
-    notes: list[str]
 
 
 def choose_controller(
@@ -93,10 +86,10 @@ def _confirm_best(judged: JudgedRows, options: DesignOptions) -> ChosenControlle
     )
 
 
-def fit_row(judged: JudgedRows, options: DesignOptions, place: int) -> FittedRow:
-    """Return the controller of a row fitted to all data, if it is confirmed; else fitted to the episodes of the choice.
+def fit_row(judged: JudgedRows, options: DesignOptions, place: int) -> tuple[Designed | None, list[str]]:
+    """Return the controller of a row fitted to all data, if it is confirmed, and notes; None where it is not.
 
-    Some episodes may be too short to take part in the choice.
+    Else it is fitted to the episodes of the choice, in which those that were too short took no part.
     """
     recipe, outcome, test, data = judged.rows[place].recipe, judged.outcomes[place], judged.test, judged.plan.posed.data
     title, near, notes = judged.rows[place].title, None, list[str]()
@@ -115,9 +108,8 @@ def fit_row(judged: JudgedRows, options: DesignOptions, place: int) -> FittedRow
                     "on the surrogates"
                 )
             # begins without what it saw of the surrogates
-            return FittedRow(watch_data(recipe, model, controller, data.measured), notes)
-    said = f"passed over: {title}, for fitted to all data it does worse than fitted to two folds"
-    return FittedRow(None, [*notes, said])
+            return watch_data(recipe, model, controller, data.measured), notes
+    return None, [*notes, f"passed over: {title}, for fitted to all data it does worse than fitted to two folds"]
 
 
 def _confirm_first(
@@ -155,8 +147,8 @@ def _compare_finalists(chosen: ChosenController, options: DesignOptions, rng: np
     others = list_finalists(rows, chosen.best)
     if not others:
         return chosen
-    fits = [(i, fit_row(chosen.judged, options, i)) for i in others]
-    tried = [(i, one.controller, one.notes) for i, one in fits if one.controller is not None]
+    fits = [(i, *fit_row(chosen.judged, options, i)) for i in others]
+    tried = [(i, controller, notes) for i, controller, notes in fits if controller is not None]
     place, compared, why = choose_finalist(chosen.pool, [chosen.controller, *(one for _, one, _ in tried)], rng)
     if not place:
         return replace(chosen, compared=compared)

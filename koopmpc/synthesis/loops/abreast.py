@@ -62,28 +62,14 @@ def speed_up(controller: Any) -> Any:
         return controller
 
 
-@dataclass(frozen=True, eq=False)
-class Crowd:
-    """Loops that have one stand-in in common."""
-
-    stand_in: Surrogate | NeighbourMap  # what stands in for the plant
-    acting: Acting  # how the inputs of each loop act
-    starts: Float[np.ndarray, "E n"]  # (E, nx) first states, or (E, n) with their past
-    seeds: Sequence[int]  # the seed of each loop's measurement noise, as `simulate` draws it
-
-    def draw_noise(self, steps: int) -> Float[np.ndarray, "E T1 nx"]:
-        """Return the measurement noise of each loop."""
-        shape = steps + 1, len(self.stand_in.noise)
-        return (
-            np.array([np.random.default_rng(seed).standard_normal(shape) for seed in self.seeds]) * self.stand_in.noise
-        )
-
-
 def run_abreast(
     task: DesignTask,
     controller: Compiled,
-    crowd: Crowd,
+    stand_in: Surrogate | NeighbourMap,
     step: CrowdStep,
+    acting: Acting,
+    starts: Sequence[Float[np.ndarray, " n"]],
+    seeds: Sequence[int],
     reference: Float[np.ndarray, "E rows nr"],
     u_reference: Float[np.ndarray, "E T nu"],
     box: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nx"]],
@@ -92,10 +78,11 @@ def run_abreast(
 
     Of the T + 1 + N rows of each reference the last N are only seen ahead.
     """
-    stand_in, N, nx = crowd.stand_in, controller.horizon, len(crowd.stand_in.states)
+    N, nx = controller.horizon, len(stand_in.states)
     E, T1 = len(reference), u_reference.shape[1] + 1
-    Z = np.array([stand_in.start(x0) for x0 in crowd.starts])
-    noise, V = crowd.draw_noise(T1 - 1), np.tile(stand_in.middle, (E, 1))
+    Z = np.array([stand_in.start(x0) for x0 in starts])
+    draws = [np.random.default_rng(seed).standard_normal((T1, nx)) for seed in seeds]  # as `simulate` draws them
+    noise, V = np.array(draws) * stand_in.noise, np.tile(stand_in.middle, (E, 1))
     W = np.tile(stand_in.w, (N + 1, 1)) if len(stand_in.w) else None
     known = Z.shape[1] == nx and not stand_in.feedthrough
     fleet = controller.start_abreast(reference, Z if known else None, W)
@@ -111,7 +98,7 @@ def run_abreast(
         Y[which, k] = read[:, :nx] + noise[which, k]
         U[which, k] = fleet.step(k, Y[:, k], which)[which]
         reports[which, k] = fleet.reports[which]
-        V[which] = crowd.acting.change(U[which, k], U[which, max(k - 1, 0)], which)
+        V[which] = acting.change(U[which, k], U[which, max(k - 1, 0)], which)
         Z[which] = step(Z[which], V[which], which)
         X[which, k + 1] = Z[which, :nx]
         alive[which] = ((X[which, k + 1] >= box[0]) & (X[which, k + 1] <= box[1])).all(axis=1)

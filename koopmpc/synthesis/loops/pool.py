@@ -12,7 +12,7 @@ from koopmpc.loop.metrics import total_cost, violation_shares
 from koopmpc.loop.run import Run
 from koopmpc.loop.simulate import LoopOptions
 from koopmpc.plants.step_map import StepMap
-from koopmpc.synthesis.loops.abreast import Acting, Crowd, CrowdStep, run_abreast
+from koopmpc.synthesis.loops.abreast import Acting, CrowdStep, run_abreast
 from koopmpc.synthesis.loops.judging import Fenced, read_reference, run_on_surrogate
 from koopmpc.synthesis.loops.neighbours import NeighbourMap
 from koopmpc.synthesis.loops.surrogates import Surrogate
@@ -132,11 +132,12 @@ class LoopPool:
         rows, held = zip(*(self._find_rows(loop, controller.horizon) for loop in loops), strict=True)
         acting = Acting(stand_in.middle, np.array([one.gain for one in loops]), np.array([one.late for one in loops]))
         if isinstance(controller, Compiled):
-            crowd = Crowd(stand_in, acting, np.array(starts), [loop.seed for loop in loops])
-            step = self._step_model(place)
-            if near is not None:
-                step = near.draw_many([np.random.default_rng(seed) for seed in crowd.seeds]).step
-            return run_abreast(task, controller, crowd, step, np.array(rows), np.array(held), box)
+            seeds = [loop.seed for loop in loops]
+            draws = [np.random.default_rng(seed) for seed in seeds]
+            step = self._step_model(place) if near is None else near.draw_many(draws).step
+            return run_abreast(
+                task, controller, stand_in, step, acting, starts, seeds, np.array(rows), np.array(held), box
+            )
         return [
             run_on_surrogate(
                 task,
