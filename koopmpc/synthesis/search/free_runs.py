@@ -1,6 +1,6 @@
 """FreeRun: models of long records, judged by free runs over stretches that no fit saw."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -65,14 +65,9 @@ def judge_free_run(
     to halve the errors of `beaten` there, a model that it must beat by a tenth. Whether it is `calm` may be known.
     """
     seen, truth = cut_pieces(learned), cut_pieces(measured)
-    scale = np.concatenate([episode.X for episode in truth]).std(axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
     errors: list[float] = []
-    for fold in range(FOLDS):
-        spans = [(len(e) * fold // FOLDS, len(e) * (fold + 1) // FOLDS) for e in truth]
-        kept = [e.cut(a, b) for e, (low, high) in zip(seen, spans, strict=True) for a, b in ((0, low), (high, len(e)))]
-        model = fit(truth.with_episodes([e for e in kept if len(e) > first]))
-        errors += _stretch_errors(model, truth, spans, scale, first, horizon, relift=relift)
+    for spans, rest in leave_quarters(seen, truth, first):
+        errors += measure_stretches(fit(rest), truth, spans, first, horizon, relift=relift)
         if len(errors) <= _HALVES:
             continue
         behind = rival is not None and _is_behind(errors, rival.errors[: len(errors)])
@@ -80,6 +75,20 @@ def judge_free_run(
             left = _HALVES * FOLDS - len(errors) if rival is None else len(rival.errors) - len(errors)
             return FreeRun(np.array(errors + [_LOST] * left), False)
     return FreeRun(np.array(errors), _is_calm(fit(seen), truth, first, relift) if calm is None else calm)
+
+
+def leave_quarters(learned: Episodes, truth: Episodes, first: int) -> Iterator[tuple[list[tuple[int, int]], Episodes]]:
+    """Yield the rows of each quarter of the records, and what is left of them without it, in parts that have a past."""
+    for fold in range(FOLDS):
+        spans = [(len(e) * fold // FOLDS, len(e) * (fold + 1) // FOLDS) for e in truth]
+        sides = [(e, ends) for e, (a, b) in zip(learned, spans, strict=True) for ends in ((0, a), (b, len(e)))]
+        yield spans, truth.with_episodes([e.cut(a, b) for e, (a, b) in sides if b - a > first])
+
+
+def measure_spread(episodes: Episodes) -> Float[np.ndarray, " nx"]:
+    """Return the standard deviation of each state, 1 where it is constant."""
+    spread = np.concatenate([episode.X for episode in episodes]).std(axis=0)
+    return np.where(spread > 0, spread, 1.0)
 
 
 def _is_behind(errors: Sequence[float], than: Float[np.ndarray, " blocks"]) -> bool:
@@ -108,19 +117,17 @@ def _mean(errors: ArrayLike) -> float:
     return float(np.exp(np.log(np.maximum(errors, EXACT)).mean()))
 
 
-def _stretch_errors(
+def measure_stretches(
     model: AnyPredictor,
     truth: Episodes,
     spans: Sequence[tuple[int, int]],
-    scale: Float[np.ndarray, " nx"],
     first: int,
     horizon: int,
     *,
     relift: bool,
 ) -> list[float]:
     """Return the errors on both halves of these spans: of free runs from row `first` and of short forecasts."""
-    free: list[np.ndarray] = []
-    short: list[np.ndarray] = []
+    scale, free, short = measure_spread(truth), list[np.ndarray](), list[np.ndarray]()
     for e, (start, high) in zip(truth, spans, strict=True):
         low = max(start, first)
         if high - low < 2:

@@ -19,7 +19,7 @@ from koopmpc.models.records.narx import FOLDS
 from koopmpc.models.records.state_space import search_hidden, search_neural
 from koopmpc.models.records.subspace import choose_sizes
 from koopmpc.synthesis.search.candidates import Candidate
-from koopmpc.synthesis.search.free_runs import FreeRun, cut_pieces, forecast_rows, judge_free_run
+from koopmpc.synthesis.search.free_runs import FreeRun, cut_pieces, forecast_rows, judge_free_run, measure_spread
 from koopmpc.synthesis.search.leaderboard import LeaderboardRow
 from koopmpc.validate.scoring import AnyPredictor
 
@@ -217,8 +217,7 @@ def _errors_ahead(
 ) -> Float[np.ndarray, " horizon"]:
     """Return the error of each step ahead, in spreads, each model on the quarter that it did not learn from."""
     pieces = cut_pieces(data)
-    scale = np.concatenate([e.X for e in pieces]).std(axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
+    scale = measure_spread(pieces)
     squares, count = np.zeros(horizon), 0
     for fold, model in enumerate(models[:FOLDS]):
         for e in pieces:

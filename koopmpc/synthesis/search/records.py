@@ -7,14 +7,14 @@ import numpy as np
 
 from koopmpc.base.errors import KoopmpcError
 from koopmpc.base.parallel import Progress
-from koopmpc.data.episodes import Episode, Episodes
+from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Held
 from koopmpc.models.base import replace_report
 from koopmpc.models.fits.refinement import refine
 from koopmpc.models.predictors import BilinearPredictor
 from koopmpc.models.records.free_run import PIECE
 from koopmpc.models.records.hidden_structure import find_rails
-from koopmpc.models.records.narx import DELAYS, FOLDS, choose_structure, search_structures
+from koopmpc.models.records.narx import DELAYS, choose_structure, search_structures
 from koopmpc.models.records.structure import Structure, find_forecast_horizon, fit_structure
 from koopmpc.synthesis.search.candidates import Candidate
 from koopmpc.synthesis.search.data import smooth_data
@@ -22,9 +22,10 @@ from koopmpc.synthesis.search.free_runs import (
     _PAYS,
     _fit_quietly,
     _is_calm,
-    _stretch_errors,
     cut_pieces,
     is_surely_better,
+    leave_quarters,
+    measure_stretches,
     run_structure,
 )
 from koopmpc.synthesis.search.leaderboard import Selection
@@ -110,22 +111,16 @@ def refine_structure(
     these eight blocks a refinement must err by more than one standard error less, and on most of them. The model of all
     rows is then refined in the same way.
     """
-    truth = cut_pieces(data)
-    scale = np.concatenate([episode.X for episode in truth]).std(axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    relift = isinstance(model, BilinearPredictor)
-    before, after = list[float](), dict[int, list[float]]()
+    truth, relift = cut_pieces(data), isinstance(model, BilinearPredictor)
+    room = min(map(len, truth)) - max(DELAYS)  # of segments, which have a past
+    before, after = list[float](), {h: list[float]() for h in (5 * horizon // 2, 10 * horizon) if h <= room}
     try:
-        for fold in range(FOLDS):
-            spans = [(len(e) * fold // FOLDS, len(e) * (fold + 1) // FOLDS) for e in truth]
-            kept = [e.cut(*part) for e, span in zip(truth, spans, strict=True) for part in _sides(e, span)]
-            learned = truth.with_episodes([e for e in kept if len(e) > first])
+        for spans, learned in leave_quarters(truth, truth, first):
             start = fit_structure(structure, learned)
-            before += _stretch_errors(start, truth, spans, scale, first, horizon, relift=relift)
-            for h in _segments(truth, horizon) if not fold else tuple(after):
-                long = learned.with_episodes([e for e in learned if len(e) >= h + max(DELAYS)])
-                one = refine(start, long, horizon=h, held_out=long)
-                after.setdefault(h, []).extend(_stretch_errors(one, truth, spans, scale, first, horizon, relift=relift))
+            before += measure_stretches(start, truth, spans, first, horizon, relift=relift)
+            for h, errors in after.items():
+                one = _refine_long(start, learned, h)
+                errors += measure_stretches(one, truth, spans, first, horizon, relift=relift)
         if not after:
             return model, 0
         best = min(after, key=lambda h: float(np.prod(after[h])))
@@ -138,15 +133,10 @@ def refine_structure(
     return (refined, best) if calm else (model, 0)
 
 
-def _sides(episode: Episode, span: tuple[int, int]) -> list[tuple[int, int]]:
-    """Return the rows before and behind a span."""
-    return [(a, b) for a, b in ((0, span[0]), (span[1], len(episode))) if b > a]
-
-
-def _segments(data: Episodes, horizon: int) -> list[int]:
-    """Return the lengths of segments that fit into every record, and its past."""
-    room = min(map(len, data)) - max(DELAYS)
-    return [h for h in (5 * horizon // 2, 10 * horizon) if h <= room]
+def _refine_long(model: AnyPredictor, data: Episodes, horizon: int) -> AnyPredictor:
+    """Return the model refined on the episodes that hold a segment of this length and its past."""
+    long = data.with_episodes([e for e in data if len(e) >= horizon + max(DELAYS)])
+    return refine(model, long, horizon=horizon, held_out=long)
 
 
 def fit_again(selection: Selection, episodes: Episodes) -> AnyPredictor:
@@ -157,10 +147,8 @@ def fit_again(selection: Selection, episodes: Episodes) -> AnyPredictor:
     model = _fit_quietly(row.candidate, row.ridge, data)
     if selection.refined:
         pieces = cut_pieces(data)
-        room = selection.refined + max(DELAYS)
-        long = pieces.with_episodes([e for e in pieces if len(e) >= room])
-        if len(long):
-            model = refine(model, long, horizon=selection.refined, held_out=long)
+        if max(map(len, pieces)) >= selection.refined + max(DELAYS):
+            model = _refine_long(model, pieces, selection.refined)
     report = model.report
     if selection.predictor.input_lead and report is not None:
         model = replace_report(model, replace(report, input_lead=selection.predictor.input_lead))
