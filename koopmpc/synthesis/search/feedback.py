@@ -166,9 +166,7 @@ def _project_biased(logs: Episodes, signals: Sequence[Signal], *, lags: int) -> 
     return project_on_instruments(logs, known, lags)
 
 
-def project_on_instruments(
-    episodes: Episodes, signals: Sequence[Float[np.ndarray, "rows nr"]], lags: int
-) -> tuple[Episodes, Noise]:
+def project_on_instruments(episodes: Episodes, signals: Sequence[ArrayLike], lags: int) -> tuple[Episodes, Noise]:
     """Return the episodes with states and inputs as the set points explain them, and the (nx,) size of the rest.
 
     The first stage of the two-stage method: x_k and u_k are regressed on r_k … r_{k−lags+1} and a constant over all
@@ -181,7 +179,8 @@ def project_on_instruments(
     Van den Hof & Schrama, "An indirect method for transfer function estimation from closed loop data", Automatica 29,
     1993.
     """
-    kept = [(e, r) for e, r in zip(episodes, signals, strict=True) if len(e) > lags]
+    rows = check_instruments(episodes, signals)
+    kept = [(e, r) for e, r in zip(episodes, rows, strict=True) if len(e) > lags]
     if not kept:
         raise DataError(f"no episode is longer than the {lags} rows of the set point that a projection sees")
     Q: list[np.ndarray] = []
