@@ -106,17 +106,17 @@ def design(
         left out.
     """
     refuse_moved(moved, DesignOptions, "km.DesignOptions", {"tighten": "margin=None", "coverage": "margin=0.95"})
-    asked = check_options(options, DesignOptions)
-    draw, few = checks.generator(asked.rng), FEW if asked.loops is None else asked.loops
-    if asked.promised is not None:
-        check_share(asked.promised, few)
-    posed = pose_task(data, ControlGoal(cost, limits, reference, horizon, starts), asked)
-    plan = plan_trials(posed, asked, draw)
-    with Workers(asked.workers, asked.scheduler) as pool:
-        results, floor = plan.run(pool, asked)
-        test = build_test(plan, results, floor, asked, pool)
+    options = check_options(options, DesignOptions)
+    draw, few = checks.generator(options.rng), FEW if options.loops is None else options.loops
+    if options.promised is not None:
+        check_share(options.promised, few)
+    posed = pose_task(data, ControlGoal(cost, limits, reference, horizon, starts), options)
+    plan = plan_trials(posed, options, draw)
+    with Workers(options.workers, options.scheduler) as pool:
+        results, floor = plan.run(pool, options)
+        test = build_test(plan, results, floor, options, pool)
         for sentence in test.doubts:
             warnings.warn(sentence, FitWarning, stacklevel=3)
-        judged = judge_rounds(plan, results, floor, test, asked, pool)
-    chosen = choose_controller(judged, asked, few, draw)
-    return expect_loops(chosen, asked, few, draw)
+        judged = judge_rounds(plan, results, floor, test, options, pool)
+    chosen = choose_controller(judged, options, few, draw)
+    return expect_loops(chosen, options, few, draw)

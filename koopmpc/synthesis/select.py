@@ -124,22 +124,24 @@ def select(
     Breiman, Friedman, Olshen & Stone, "Classification and Regression Trees", 1984, section 3.4.3.
     """
     refuse_moved(moved, SearchOptions, "km.SearchOptions")
-    asked = check_options(options, SearchOptions)
-    draw = checks.generator(asked.rng)
+    options = check_options(options, SearchOptions)
+    draw = checks.generator(options.rng)
     weights, folds = RIDGES if ridges is None else check_ridges(ridges), checks.count(folds, "folds", 2)
     ahead = None if horizon is None else checks.count(horizon, "horizon")
-    feedback = isinstance(data, Episodes) and not (asked.candidates is None and is_record(data))
-    prepared = prepare_data(data, asked, feedback=feedback, feedthrough=FEEDTHROUGH)
+    feedback = isinstance(data, Episodes) and not (options.candidates is None and is_record(data))
+    prepared = prepare_data(data, options, feedback=feedback, feedthrough=FEEDTHROUGH)
     for sentence in _list_doubts(prepared.held):
         warnings.warn(sentence, FitWarning, stacklevel=3)
     prepared = take_out_noise(prepared)
-    plan = _plan_search(prepared, asked, (ahead, folds), draw)
+    plan = _plan_search(prepared, options, (ahead, folds), draw)
     trials = _list_trials(plan, weights, relift)
-    told = report_stage(asked.progress, "candidates")
-    results = list(map_tasks(cross_validate, trials, workers=asked.workers, scheduler=asked.scheduler, progress=told))
+    told = report_stage(options.progress, "candidates")
+    results = list(
+        map_tasks(cross_validate, trials, workers=options.workers, scheduler=options.scheduler, progress=told)
+    )
     # on a grid of decades the one nearest to ε² is the first
     floor = LEAST if ridges is not None else min(result.misfit for result in results) / np.sqrt(10)
-    ranked = _choose_row(plan, asked, results, floor, ENOUGH if relift else EXACT)
+    ranked = _choose_row(plan, options, results, floor, ENOUGH if relift else EXACT)
     for place, which in (
         (ranked.chosen, f"all {len(ranked.rows)} candidates"),
         (ranked.linear, "all linear candidates"),
@@ -152,7 +154,7 @@ def select(
                 stacklevel=3,
             )
             break
-    return _fit_chosen(plan, asked, ranked)
+    return _fit_chosen(plan, options, ranked)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +191,7 @@ def _plan_search(
     data: PreparedData, options: SearchOptions, sizes: tuple[int | None, int], draw: np.random.Generator
 ) -> SearchPlan:
     """Return the candidates and the folds; `sizes` are the horizon that was asked for, and the number of folds."""
-    (asked, folds), held, measured, delays = sizes, data.held, data.measured, options.delays
+    (horizon, folds), held, measured, delays = sizes, data.held, data.measured, options.delays
     past, memory = check_delays((0, 1, 2) if delays is None else delays), None
     if not data.record:
         past, memory = list_delays(data, delays)
@@ -198,8 +200,8 @@ def _plan_search(
         told = report_stage(options.progress, "sparse polynomials")
         candidates += propose_structures(measured, None if delays is None else past, options.bilinear, told)
     first = max(one.delays for one in candidates)
-    ahead, short = usual_horizon(held, first) if asked is None else (asked, ())
-    near = max(ahead, find_forecast_horizon(measured)) if data.record and asked is None else ahead
+    ahead, short = usual_horizon(held, first) if horizon is None else (horizon, ())
+    near = max(ahead, find_forecast_horizon(measured)) if data.record and horizon is None else ahead
     dealt = make_folds(held, ahead + first, folds, draw)
     rough = make_folds(measured, ahead + first, folds, draw).episodes if data.record else dealt.episodes
     seen = () if memory is None else (f"{memory}; models with delays are tried, and need not halve the error",)
