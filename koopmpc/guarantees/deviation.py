@@ -11,7 +11,7 @@ from koopmpc.base import checks
 from koopmpc.base.errors import CertificateError, DataError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import Value
-from koopmpc.control.cost import Cost
+from koopmpc.control.ask.cost import Cost
 from koopmpc.lifting.base import Lifting, find_observables
 from koopmpc.lifting.state import State
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
