@@ -49,8 +49,8 @@ class FeedbackSettings:
 SETTINGS = FeedbackSettings()
 _UNUSED = "the set points are not used, and models are fitted by plain least squares"
 _PLAIN = State() + Constant()
-Signal = Float[np.ndarray, "rows nr"] | None
-Noise = Float[np.ndarray, " nx"]
+_Rows = Float[np.ndarray, "rows nr"] | None
+_Size = Float[np.ndarray, " nx"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class FeedbackData:
     """The data that models are to be fitted to, the (nx,) noise that was taken out of them, and a sentence."""
 
     episodes: Episodes
-    noise: Noise
+    noise: _Size
     sentence: str
 
 
@@ -68,7 +68,7 @@ class _Way:
 
     settles: int
     says: str
-    apply: Callable[[Episodes, Sequence[Signal]], tuple[Episodes, Noise]]
+    apply: Callable[[Episodes, Sequence[_Rows]], tuple[Episodes, _Size]]
 
 
 def remove_feedback(episodes: Episodes, instruments: Sequence[ArrayLike] | None) -> FeedbackData:
@@ -122,7 +122,7 @@ def _measure_share(episodes: Episodes, instruments: bool) -> float:
     return float(feedback_share(episodes, _PLAIN)[: episodes.nu].max())
 
 
-def _list_ways(episodes: Episodes, signals: Sequence[Signal]) -> list[_Way]:
+def _list_ways(episodes: Episodes, signals: Sequence[_Rows]) -> list[_Way]:
     total, ways = sum(map(len, episodes)), list[_Way]()
     if total * episodes.nx**2 <= SETTINGS.work:
         said = "models are of the states as a filter sees them that was fitted together with a linear model"
@@ -145,7 +145,7 @@ def _mend(episodes: Episodes) -> tuple[Episodes, str]:
     return (mender(episodes), f"; {count} wild readings were replaced") if count else (episodes, "")
 
 
-def _filter_logs(logs: Episodes, _: Sequence[Signal]) -> tuple[Episodes, Noise]:
+def _filter_logs(logs: Episodes, _: Sequence[_Rows]) -> tuple[Episodes, _Size]:
     """Return the states as the filter sees them, and the spread of what it takes out."""
     start = edmd(logs, _PLAIN)
     model, gain = fit_with_gain(start, logs, SETTINGS.iterations)
@@ -156,7 +156,7 @@ def _filter_logs(logs: Episodes, _: Sequence[Signal]) -> tuple[Episodes, Noise]:
     return filtered, np.asarray(rest.std(axis=0), dtype=np.float64)
 
 
-def _project_biased(logs: Episodes, signals: Sequence[Signal], *, lags: int) -> tuple[Episodes, Noise]:
+def _project_biased(logs: Episodes, signals: Sequence[_Rows], *, lags: int) -> tuple[Episodes, _Size]:
     """Return what `project_on_instruments` does, where a test finds least squares biased."""
     known = [r for r in signals if r is not None]
     tested = instrumental_edmd(logs, _PLAIN, known, lags=min(12, lags), level=0.01)
@@ -166,7 +166,7 @@ def _project_biased(logs: Episodes, signals: Sequence[Signal], *, lags: int) -> 
     return project_on_instruments(logs, known, lags)
 
 
-def project_on_instruments(episodes: Episodes, signals: Sequence[ArrayLike], lags: int) -> tuple[Episodes, Noise]:
+def project_on_instruments(episodes: Episodes, signals: Sequence[ArrayLike], lags: int) -> tuple[Episodes, _Size]:
     """Return the episodes with states and inputs as the set points explain them, and the (nx,) size of the rest.
 
     The first stage of the two-stage method: x_k and u_k are regressed on r_k … r_{k−lags+1} and a constant over all
@@ -196,7 +196,7 @@ def project_on_instruments(episodes: Episodes, signals: Sequence[ArrayLike], lag
     return episodes.with_episodes(made), np.asarray(rest.std(axis=0), dtype=np.float64)
 
 
-def _compare_unseen(episodes: Episodes, signals: Sequence[Signal], way: _Way) -> float:
+def _compare_unseen(episodes: Episodes, signals: Sequence[_Rows], way: _Way) -> float:
     """Return the error of forecasts by a linear model of the changed rows over that of least squares, on unseen rows.
 
     A DataError says that the logs are too short, or that a model with thin plates loses by the change.
@@ -224,7 +224,7 @@ def _compare_unseen(episodes: Episodes, signals: Sequence[Signal], way: _Way) ->
     return float(mean[0])
 
 
-def _cut_parts(episodes: Episodes, signals: Sequence[Signal], settles: int) -> list[tuple[Episode, Signal]]:
+def _cut_parts(episodes: Episodes, signals: Sequence[_Rows], settles: int) -> list[tuple[Episode, _Rows]]:
     """Return the logs in parts in which a way settles and forecasts follow."""
     block = max(min(len(e) for e in episodes) // SETTINGS.parts, settles + SETTINGS.ahead)
     cuts = [
