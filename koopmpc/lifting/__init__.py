@@ -11,14 +11,13 @@ from koopmpc.lifting import composed as composed
 from koopmpc.lifting import fourier as fourier
 from koopmpc.lifting import neurons as neurons
 from koopmpc.lifting import radial as radial
-from koopmpc.lifting import saturated as saturated
 from koopmpc.lifting import state as state
 
 if TYPE_CHECKING:
     from koopmpc.lifting.composed import Projected as Projected
+    from koopmpc.lifting.composed import Saturated as Saturated
     from koopmpc.lifting.composed import Standardized as Standardized
     from koopmpc.lifting.network import ONNX as ONNX
     from koopmpc.lifting.neurons import Neurons as Neurons
-    from koopmpc.lifting.saturated import Saturated as Saturated
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

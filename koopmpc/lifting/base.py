@@ -1,4 +1,4 @@
-"""The base class of liftings z = ψ(x), and the traced form in which a file holds a user's lifting.
+"""The base class of liftings z = ψ(x), their sums and products, and the traced form in which a file holds a user's.
 
 A lifting is a frozen rule ("all monomials up to degree 3"). `bind` gives it the names of the states and so
 its size; from then on it evaluates arrays (`lifting(X)`) and CasADi symbols (`lifting.symbolic(x)`), the
@@ -8,10 +8,11 @@ same function twice.
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import accumulate
 from operator import index
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import casadi as ca
 import numpy as np
@@ -66,9 +67,22 @@ class Lifting(Value, ABC):
         ShapeError
             The lifting is made for another number of states.
         """
-        bound = replace(self, bound=tuple(states))
+        inner = {
+            name: tuple(part.bind(states) for part in value) if isinstance(value, tuple) else value.bind(states)
+            for name, value in self.inner_liftings().items()
+        }
+        bound = replace(self, **inner, bound=tuple(states))
         _ = bound.names
         return bound
+
+    def inner_liftings(self) -> "dict[str, Lifting | tuple[Lifting, ...]]":
+        """Return the fields that hold a lifting or a tuple of liftings, by name."""
+        values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {
+            name: value
+            for name, value in values.items()
+            if isinstance(value, Lifting) or (isinstance(value, tuple) and value and isinstance(value[0], Lifting))
+        }
 
     @property
     def bound_states(self) -> tuple[str, ...]:
@@ -137,8 +151,6 @@ class Lifting(Value, ABC):
 
     def __add__(self, other: "Lifting") -> "Lifting":
         """Return the observables of both liftings, one under the other; a name that both have occurs once."""
-        from koopmpc.lifting.composed import Sum  # here, because that file imports this one
-
         other = check_lifting(other)
         parts = [part for side in (self, other) for part in (side.parts if isinstance(side, Sum) else (side,))]
         total, bound = Sum(tuple(parts)), self._common(other)
@@ -146,8 +158,6 @@ class Lifting(Value, ABC):
 
     def __mul__(self, other: "Lifting") -> "Lifting":
         """Return all products of this lifting's observables with the other's."""
-        from koopmpc.lifting.composed import Product  # here, because that file imports this one
-
         product = Product(self, check_lifting(other))
         bound = self._common(other)
         return product if bound is None else product.bind(bound)
@@ -192,6 +202,94 @@ class Lifting(Value, ABC):
     def _misfit(self, got: object) -> str:
         what = f"has {got} states" if isinstance(got, int) else f"has shape {got}"
         return f"x {what}, the lifting was bound to {len(self.bound_states)} ({', '.join(self.bound_states)})"
+
+
+@dataclass(frozen=True, eq=False)
+class Sum(Lifting):
+    """ψ(x) = [ψ₁(x); ψ₂(x); …], written ``a + b``; an observable whose name an earlier part has is left out."""
+
+    parts: tuple[Lifting, ...]
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names of all parts, each once."""
+        return tuple(dict.fromkeys(name for part in self.parts for name in part.names))
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the new observables of each part, one under the other."""
+        columns = [part.formula(x) for part in self.parts]
+        return ca.vertcat(*(z[int(i)] for z, new in zip(columns, self._new, strict=True) for i in new))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        ends = accumulate(len(new) for new in self._new)
+        for part, new, end in zip(self.parts, self._new, ends, strict=True):
+            columns = Z[:, end - len(new) : end]
+            if len(new) == part.nz:
+                part._fill(x, columns)
+            elif len(new):
+                whole = np.empty((len(Z), part.nz))
+                part._fill(x, whole)
+                columns[:] = whole[:, new]
+
+    @cached_property
+    def _new(self) -> tuple[Indices, ...]:
+        """For each part the indices of the observables that no earlier part names."""
+        earlier: set[str] = set()
+        new: list[Indices] = []
+        for part in self.parts:
+            new.append(np.array([i for i, name in enumerate(part.names) if name not in earlier], dtype=np.intp))
+            earlier.update(part.names)
+        return tuple(new)
+
+
+@dataclass(frozen=True, eq=False)
+class Product(Lifting):
+    """ψ(x) = aᵢ(x) bⱼ(x) for every i and j; written ``a * b``.
+
+    Equal products, such as x₁ x₂ and x₂ x₁, occur once. A name lists its factors in one order, states first and
+    without units, so ``State() * State()`` has the names of ``Monomials(2)``.
+    """
+
+    first: Lifting
+    second: Lifting
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return names such as ``"omega*sin(theta)"`` and ``"theta^2"``."""
+        return tuple(self._pairs)
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the products; the index of the second lifting runs fastest."""
+        a, b = self.first.formula(x), self.second.formula(x)
+        return ca.vertcat(*(a[int(i)] * b[int(j)] for i, j in self._pairs.values()))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        a, b = np.empty((len(Z), self.first.nz)), np.empty((len(Z), self.second.nz))
+        self.first._fill(x, a)
+        self.second._fill(x, b)
+        left, right = np.array(list(self._pairs.values()), dtype=np.intp).T
+        np.multiply(a[:, left], b[:, right], out=Z)
+
+    @cached_property
+    def _pairs(self) -> dict[str, tuple[int, int]]:
+        """Indices of the two factors by the name of their product; of equal names the first pair counts."""
+        plain = [strip_unit(state) for state in self.bound_states]
+        names = plain if len(set(plain)) == len(plain) else list(self.bound_states)
+        order = {state: (i, name) for i, (state, name) in enumerate(zip(self.bound_states, names, strict=True))}
+        pairs: dict[str, tuple[int, int]] = {}
+        for i, left in enumerate(self.first.names):
+            for j, right in enumerate(self.second.names):
+                pairs.setdefault(_name_product(left, right, order), (i, j))
+        return pairs
+
+
+def _name_product(left: str, right: str, states: dict[str, tuple[int, str]]) -> str:
+    """Return the name of the product; `states` holds the position and the name without unit of each state."""
+    if CONSTANT in (left, right):
+        return right if left == CONSTANT else left
+    pair = sorted((left, right), key=lambda name: (name not in states, states.get(name, (0, ""))[0], name))
+    a, b = (states[name][1] if name in states else name for name in pair)
+    if left == right:
+        return f"({a})^2" if "*" in a or "^" in a else f"{a}^2"
+    return f"{a}*{b}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,7 @@
-"""Liftings made of other liftings: sums, products, projections, selections, scaled states and eigenfunctions."""
+"""Liftings made of another lifting: projections, selections, scaled or bounded states, and eigenfunctions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import accumulate
 
 import casadi as ca
 import numpy as np
@@ -16,106 +14,8 @@ from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.base.values import checksum, freeze
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.lifting.base import CONSTANT, Indices, Lifting, check_lifting, strip_unit
+from koopmpc.lifting.base import CONSTANT, Lifting, check_lifting, strip_unit
 from koopmpc.plants.graph import Graph
-
-
-@dataclass(frozen=True, eq=False)
-class Sum(Lifting):
-    """ψ(x) = [ψ₁(x); ψ₂(x); …], written ``a + b``; an observable whose name an earlier part has is left out."""
-
-    parts: tuple[Lifting, ...]
-
-    def bind(self, states: Sequence[str]) -> "Sum":
-        """Return the sum of the bound parts."""
-        return Sum(tuple(part.bind(states) for part in self.parts), bound=tuple(states))
-
-    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the names of all parts, each once."""
-        return tuple(dict.fromkeys(name for part in self.parts for name in part.names))
-
-    def formula(self, x: ca.SX) -> ca.SX:
-        """Return the new observables of each part, one under the other."""
-        columns = [part.formula(x) for part in self.parts]
-        return ca.vertcat(*(z[int(i)] for z, new in zip(columns, self._new, strict=True) for i in new))
-
-    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
-        ends = accumulate(len(new) for new in self._new)
-        for part, new, end in zip(self.parts, self._new, ends, strict=True):
-            columns = Z[:, end - len(new) : end]
-            if len(new) == part.nz:
-                part._fill(x, columns)
-            elif len(new):
-                whole = np.empty((len(Z), part.nz))
-                part._fill(x, whole)
-                columns[:] = whole[:, new]
-
-    @cached_property
-    def _new(self) -> tuple[Indices, ...]:
-        """For each part the indices of the observables that no earlier part names."""
-        earlier: set[str] = set()
-        new: list[Indices] = []
-        for part in self.parts:
-            new.append(np.array([i for i, name in enumerate(part.names) if name not in earlier], dtype=np.intp))
-            earlier.update(part.names)
-        return tuple(new)
-
-
-@dataclass(frozen=True, eq=False)
-class Product(Lifting):
-    """ψ(x) = aᵢ(x) bⱼ(x) for every i and j; written ``a * b``.
-
-    Equal products, such as x₁ x₂ and x₂ x₁, occur once. A name lists its factors in one order, states first and
-    without units, so ``State() * State()`` has the names of ``Monomials(2)``.
-    """
-
-    first: Lifting
-    second: Lifting
-
-    def bind(self, states: Sequence[str]) -> "Product":
-        """Return the product of the bound liftings."""
-        bound = Product(self.first.bind(states), self.second.bind(states), bound=tuple(states))
-        _ = bound.names
-        return bound
-
-    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return names such as ``"omega*sin(theta)"`` and ``"theta^2"``."""
-        return tuple(self._pairs)
-
-    def formula(self, x: ca.SX) -> ca.SX:
-        """Return the products; the index of the second lifting runs fastest."""
-        a, b = self.first.formula(x), self.second.formula(x)
-        return ca.vertcat(*(a[int(i)] * b[int(j)] for i, j in self._pairs.values()))
-
-    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
-        a, b = np.empty((len(Z), self.first.nz)), np.empty((len(Z), self.second.nz))
-        self.first._fill(x, a)
-        self.second._fill(x, b)
-        left, right = np.array(list(self._pairs.values()), dtype=np.intp).T
-        np.multiply(a[:, left], b[:, right], out=Z)
-
-    @cached_property
-    def _pairs(self) -> dict[str, tuple[int, int]]:
-        """Indices of the two factors by the name of their product; of equal names the first pair counts."""
-        plain = [strip_unit(state) for state in self.bound_states]
-        names = plain if len(set(plain)) == len(plain) else list(self.bound_states)
-        order = {state: (i, name) for i, (state, name) in enumerate(zip(self.bound_states, names, strict=True))}
-        pairs: dict[str, tuple[int, int]] = {}
-        for i, left in enumerate(self.first.names):
-            for j, right in enumerate(self.second.names):
-                pairs.setdefault(_name_product(left, right, order), (i, j))
-        return pairs
-
-
-def _name_product(left: str, right: str, states: dict[str, tuple[int, str]]) -> str:
-    """Return the name of the product; `states` holds the position and the name without unit of each state."""
-    if CONSTANT in (left, right):
-        return right if left == CONSTANT else left
-    pair = sorted((left, right), key=lambda name: (name not in states, states.get(name, (0, ""))[0], name))
-    a, b = (states[name][1] if name in states else name for name in pair)
-    if left == right:
-        return f"({a})^2" if "*" in a or "^" in a else f"{a}^2"
-    return f"{a}*{b}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,18 +41,13 @@ class Projected(Lifting):
     def __post_init__(self) -> None:
         freeze(self, basis=checks.array(self.basis, "basis", (None, None)))
 
-    def bind(self, states: Sequence[str]) -> "Projected":
-        """Return the copy on the bound lifting."""
-        bound = replace(self, lifting=self.lifting.bind(states), bound=tuple(states))
-        if bound.lifting.nz != len(self.basis):
-            raise ShapeError(
-                f"basis has {len(self.basis)} rows, the lifting returns {bound.lifting.nz} observables; "
-                "pass the lifting that the basis was made for"
-            )
-        return bound
-
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return ``"z0", "z1", …``."""
+        if self.lifting.nz != len(self.basis):
+            raise ShapeError(
+                f"basis has {len(self.basis)} rows, the lifting returns {self.lifting.nz} observables; "
+                "pass the lifting that the basis was made for"
+            )
         return tuple(f"z{j}" for j in range(self.basis.shape[1]))
 
     def formula(self, x: ca.SX) -> ca.SX:
@@ -188,16 +83,11 @@ class Picked(Lifting):
     def __post_init__(self) -> None:
         freeze(self, which=tuple(int(i) for i in self.which))
 
-    def bind(self, states: Sequence[str]) -> "Picked":
-        """Return the copy on the bound lifting."""
-        bound = replace(self, lifting=self.lifting.bind(states), bound=tuple(states))
-        bad = [i for i in self.which if not 0 <= i < bound.lifting.nz]
-        if bad:
-            raise DataError(f"which holds {bad[0]}; the lifting has observables 0 … {bound.lifting.nz - 1}")
-        return bound
-
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names of the chosen observables."""
+        bad = [i for i in self.which if not 0 <= i < self.lifting.nz]
+        if bad:
+            raise DataError(f"which holds {bad[0]}; the lifting has observables 0 … {self.lifting.nz - 1}")
         return tuple(self.lifting.names[i] for i in self.which)
 
     def formula(self, x: ca.SX) -> ca.SX:
@@ -222,6 +112,10 @@ class Present(Lifting):
     """
 
     lifting: Lifting
+
+    def bind(self, states: Sequence[str]) -> "Present":
+        """Return the copy on these names of ζ; its lifting stays bound to those of x."""
+        return replace(self, bound=tuple(states))
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names of the lifting's own observables."""
@@ -300,21 +194,9 @@ class Standardized(Lifting):
         still = scale <= 1e-12 * np.abs(mean)
         return cls(lifting, mean, np.where(still, 1.0, scale))
 
-    def bind(self, states: Sequence[str]) -> "Standardized":
-        """Return the copy on the bound inner lifting."""
-        if len(states) != len(self.mean):
-            raise ShapeError(
-                f"mean and scale have {len(self.mean)} entries and there are {len(states)} states "
-                f"({', '.join(states)}); standardize by data of these states"
-            )
-        bound = Standardized(self.lifting.bind(states), self.mean, self.scale, bound=tuple(states))
-        _ = bound.names
-        return bound
-
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return the inner names, each with ``~`` and a checksum of mean and scale: a name fixes the function."""
-        tag = f"~{checksum(self.mean.tobytes(), self.scale.tobytes()):08x}"
-        return tuple(name if name == CONSTANT else name + tag for name in self.lifting.bind(states).names)
+        return _tag_names(self.lifting, states, "~", ("mean", self.mean), ("scale", self.scale))
 
     def formula(self, x: ca.SX) -> ca.SX:
         """Return the inner formula of the standardized states."""
@@ -322,6 +204,78 @@ class Standardized(Lifting):
 
     def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
         self.lifting._fill((x - self.mean[:, None]) / self.scale[:, None], Z)
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Saturated(Lifting):
+    """ψ(x) = inner(min(max(x, low), high)): a polynomial that does not grow where no data were.
+
+    Parameters
+    ----------
+    lifting
+        The inner lifting.
+    low, high
+        (nx,) in the states' units, ±inf where a state has no bound.
+
+    Raises
+    ------
+    ShapeError
+        The bounds have more or fewer entries than there are states.
+    DataError
+        A low bound is not below the high one.
+
+    Examples
+    --------
+    >>> import koopmpc as km
+    >>> from koopmpc.lifting import Saturated
+    >>> square = Saturated(km.Monomials(2), low=[-1.0], high=[1.0])
+    >>> square.bind(["x"])([[0.5], [1.0], [7.0]]).ravel().tolist()
+    [0.25, 1.0, 1.0]
+    """
+
+    lifting: Lifting
+    low: Float[np.ndarray, " nx"]
+    high: Float[np.ndarray, " nx"]
+
+    def __init__(
+        self, lifting: Lifting, low: ArrayLike, high: ArrayLike, *, bound: tuple[str, ...] | None = None
+    ) -> None:
+        least = checks.array(low, "low", (None,), infinite=True)
+        most = checks.array(high, "high", least.shape, infinite=True)
+        if not (least < most).all():
+            raise DataError("low must be below high for every state")
+        freeze(self, lifting=check_lifting(lifting), low=least, high=most, bound=bound)
+
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the inner names, each with ``|`` and a checksum of the bounds: a name fixes the function."""
+        return _tag_names(self.lifting, states, "|", ("low", self.low), ("high", self.high))
+
+    def formula(self, x: ca.SX) -> ca.SX:
+        """Return the inner formula of the bounded states."""
+        inside = [_bound(x[i], low, high) for i, (low, high) in enumerate(zip(self.low, self.high, strict=True))]
+        return self.lifting.formula(ca.vertcat(*inside))
+
+    def _fill(self, x: Float[np.ndarray, "nx M"], Z: Float[np.ndarray, "M nz"]) -> None:
+        self.lifting._fill(np.clip(x, self.low[:, None], self.high[:, None]), Z)
+
+
+def _bound(x: ca.SX, low: float, high: float) -> ca.SX:
+    x = ca.fmin(x, high) if np.isfinite(high) else x
+    return ca.fmax(x, low) if np.isfinite(low) else x
+
+
+def _tag_names(
+    lifting: Lifting, states: tuple[str, ...], sign: str, *values: tuple[str, Float[np.ndarray, " nx"]]
+) -> tuple[str, ...]:
+    """Return the names of a lifting, each with a sign and a checksum of these values, one number for each state."""
+    what, parts = " and ".join(name for name, _ in values), [value for _, value in values]
+    if len(states) != len(parts[0]):
+        raise ShapeError(
+            f"{what} have {len(parts[0])} entries and there are {len(states)} states ({', '.join(states)}); "
+            "pass one for each, or standardize by data of these states"
+        )
+    tag = f"{sign}{checksum(*(value.tobytes() for value in parts)):08x}"
+    return tuple(name if name == CONSTANT else name + tag for name in lifting.names)
 
 
 @dataclass(frozen=True, eq=False)

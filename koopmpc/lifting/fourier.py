@@ -1,7 +1,7 @@
 """Sines and cosines: harmonics of angles, and random features of the Gaussian kernel."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -145,11 +145,9 @@ class RandomFourier(Lifting):
         frequencies, phases = self.frequencies, self.phases
         if frequencies is None or frequencies.shape[1] != len(states):
             frequencies, phases = self._draw_features(len(states))
-        bound = RandomFourier(
-            self.count, self.width, self.rng, frequencies=frequencies, phases=phases, bound=tuple(states)
-        )
-        _ = bound.names
-        return bound
+        drawn = replace(self, frequencies=frequencies, phases=phases, bound=tuple(states))
+        _ = drawn.names
+        return drawn
 
     def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
         """Return names such as ``"randomfourier(3 of 100; 0.5; seed 0)"``; tuned numbers add a checksum to the name."""

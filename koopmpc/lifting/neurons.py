@@ -1,6 +1,6 @@
 """Neurons: tanh(w·x + b) as observables, for dry friction, diodes, valves and sensors at their limits."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -51,21 +51,14 @@ class Neurons(Lifting):
     ) -> None:
         freeze(self, weights=checks.array(weights, "weights", (None, None)), states=freeze_choice(states), bound=bound)
 
-    def bind(self, states: Sequence[str]) -> "Neurons":
-        """Return the copy that knows its states."""
+    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
+        """Return names such as ``"tanh 1|89ab12cd"``, with a checksum of the weights: a name fixes the function."""
         columns = find_states(self.states, states, "Neurons")
         if len(columns) + 1 != self.weights.shape[1]:
             raise ShapeError(
                 f"a row of weights has {self.weights.shape[1]} entries for {len(columns)} states "
                 f"({', '.join(states[i] for i in columns)}); pass one for each state and an offset"
             )
-        bound = Neurons(self.weights, self.states, bound=tuple(states))
-        _ = bound.names
-        return bound
-
-    def observables(self, states: tuple[str, ...]) -> tuple[str, ...]:
-        """Return names such as ``"tanh 1|89ab12cd"``, with a checksum of the weights: a name fixes the function."""
-        columns = find_states(self.states, states, "Neurons")
         return tuple(f"tanh {i}|{checksum(row.tobytes(), bytes(columns)):08x}" for i, row in enumerate(self.weights, 1))
 
     def formula(self, x: ca.SX) -> ca.SX:

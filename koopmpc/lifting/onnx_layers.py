@@ -11,22 +11,26 @@ from math import prod
 
 Field = tuple[int, int, bytes | int]  # number, wire type, content
 
-# Numbers of fields in onnx.proto.
-_GRAPH = 7  # of a model
-_NODE = 1  # of a graph
-_INITIALIZER = 5  # of a graph
-_DIMS = 1  # of a tensor
-_TENSOR_NAME = 8
-_INPUT = 1  # of a node
-_OUTPUT = 2
-_OPERATION = 4
-_ATTRIBUTE = 5
-_ATTRIBUTE_NAME = 1  # of an attribute
-_FLOAT = 2
-_INTEGER = 3
-_TYPE = 20
+
+class _Number:
+    """Numbers of fields in onnx.proto: of a model, a graph, a tensor, a node and an attribute."""
+
+    GRAPH = 7  # of a model
+    NODE = 1  # of a graph
+    INITIALIZER = 5
+    DIMS = 1  # of a tensor
+    TENSOR_NAME = 8
+    INPUT = 1  # of a node
+    OUTPUT = 2
+    OPERATION = 4
+    ATTRIBUTE = 5
+    NAME = 1  # of an attribute
+    FLOAT = 2
+    INTEGER = 3
+    TYPE = 20
+
+
 _SIZES = {1: 8, 5: 4}  # bytes of a wire type of fixed size
-_EPSILON = 1e-5  # of both normalisations, if they do not tell another
 
 
 @dataclass
@@ -40,16 +44,16 @@ class Node:
 
     def encode(self) -> bytes:
         """Return the node as bytes; attributes are single floats."""
-        parts: list[Field] = [(_INPUT, 2, name.encode()) for name in self.inputs]
-        parts += [(_OUTPUT, 2, name.encode()) for name in self.outputs]
-        parts.append((_OPERATION, 2, self.operation.encode()))
+        parts: list[Field] = [(_Number.INPUT, 2, name.encode()) for name in self.inputs]
+        parts += [(_Number.OUTPUT, 2, name.encode()) for name in self.outputs]
+        parts.append((_Number.OPERATION, 2, self.operation.encode()))
         for name, value in self.attributes.items():
             said: list[Field] = [
-                (_ATTRIBUTE_NAME, 2, name.encode()),
-                (_FLOAT, 5, struct.pack("<f", value)),
-                (_TYPE, 0, 1),
+                (_Number.NAME, 2, name.encode()),
+                (_Number.FLOAT, 5, struct.pack("<f", value)),
+                (_Number.TYPE, 0, 1),
             ]
-            parts.append((_ATTRIBUTE, 2, join_fields(said)))
+            parts.append((_Number.ATTRIBUTE, 2, join_fields(said)))
         return join_fields(parts)
 
 
@@ -57,7 +61,10 @@ def replace_layers(model: bytes) -> bytes:
     """Return an ONNX model in which known layers stand for those that CasADi lacks; what is damaged stays as it is."""
     try:
         return join_fields(
-            [(k, w, _replace(v) if k == _GRAPH and isinstance(v, bytes) else v) for k, w, v in split_fields(model)]
+            [
+                (k, w, _replace(v) if k == _Number.GRAPH and isinstance(v, bytes) else v)
+                for k, w, v in split_fields(model)
+            ]
         )
     except (ValueError, IndexError, struct.error):  # CasADi says what is wrong with it
         return model
@@ -65,11 +72,11 @@ def replace_layers(model: bytes) -> bytes:
 
 def _replace(graph: bytes) -> bytes:
     parts = list(split_fields(graph))
-    sizes = dict(_read_size(v) for k, _, v in parts if k == _INITIALIZER and isinstance(v, bytes))
+    sizes = dict(_read_size(v) for k, _, v in parts if k == _Number.INITIALIZER and isinstance(v, bytes))
     result: list[Field] = []
     for number, wire, content in parts:
-        others = _rewrite(_read_node(content), sizes) if number == _NODE and isinstance(content, bytes) else None
-        result += [(number, wire, content)] if others is None else [(_NODE, 2, each.encode()) for each in others]
+        others = _rewrite(_read_node(content), sizes) if number == _Number.NODE and isinstance(content, bytes) else None
+        result += [(number, wire, content)] if others is None else [(_Number.NODE, 2, each.encode()) for each in others]
     return join_fields(result)
 
 
@@ -93,7 +100,7 @@ def _rewrite(node: Node, sizes: dict[str, int]) -> list[Node] | None:
         powers = add("Exp", add("Sub", x, add("ReduceMax", x)))  # of no axes: of all, and there is one row
         add("Div", powers, add("ReduceSum", powers))
     else:
-        epsilon = add("Constant", value_float=told.get("epsilon", _EPSILON))
+        epsilon = add("Constant", value_float=told.get("epsilon", 1e-5))
         scale, *rest = node.inputs[1:]
         if operation == "BatchNormalization":
             if told.get("training_mode", 0):
@@ -118,16 +125,16 @@ def _read_node(content: bytes) -> Node:
     for number, _, value in split_fields(content):
         if not isinstance(value, bytes):
             continue
-        if number == _ATTRIBUTE:
+        if number == _Number.ATTRIBUTE:
             said = {k: v for k, _, v in split_fields(value)}
-            name, real, whole = said.get(_ATTRIBUTE_NAME), said.get(_FLOAT), said.get(_INTEGER)
+            name, real, whole = said.get(_Number.NAME), said.get(_Number.FLOAT), said.get(_Number.INTEGER)
             if isinstance(name, bytes) and isinstance(real, bytes):
                 node.attributes[name.decode()] = float(struct.unpack("<f", real)[0])
             elif isinstance(name, bytes) and isinstance(whole, int):
                 node.attributes[name.decode()] = whole - (1 << 64) * (whole >> 63)
-        elif number in (_INPUT, _OUTPUT):
-            (node.inputs if number == _INPUT else node.outputs).append(value.decode())
-        elif number == _OPERATION:
+        elif number in (_Number.INPUT, _Number.OUTPUT):
+            (node.inputs if number == _Number.INPUT else node.outputs).append(value.decode())
+        elif number == _Number.OPERATION:
             node.operation = value.decode()
     return node
 
@@ -136,9 +143,9 @@ def _read_size(tensor: bytes) -> tuple[str, int]:
     """Return the name of a tensor, and how many numbers it holds."""
     name, sizes = "", list[int]()
     for number, _, value in split_fields(tensor):
-        if number == _TENSOR_NAME and isinstance(value, bytes):
+        if number == _Number.TENSOR_NAME and isinstance(value, bytes):
             name = value.decode()
-        elif number == _DIMS:
+        elif number == _Number.DIMS:
             sizes += [value] if isinstance(value, int) else list(_read_packed(value))
     return name, prod(sizes)
 

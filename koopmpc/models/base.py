@@ -287,10 +287,12 @@ class Predictor(Value):
 P = TypeVar("P", bound=Predictor)
 
 
-def replace_report(model: P, report: FitReport) -> P:
-    """Return the same model with another report."""
-    other = copy(model)
-    freeze(other, report=report)
+def change_model(model: P, **fields: object) -> P:
+    """Return the same model with other matrices or another report; what was computed from the old ones goes."""
+    other, kind = copy(model), type(model)
+    for name in [name for name in vars(other) if isinstance(getattr(kind, name, None), cached_property)]:
+        del vars(other)[name]
+    freeze(other, **fields)
     return other
 
 

@@ -22,7 +22,7 @@ from koopmpc.models.moments.solve import (
     solve,
 )
 from koopmpc.models.predictors import LinearPredictor
-from koopmpc.models.shared.regression import build_predictor, build_regression, build_result
+from koopmpc.models.shared.regression import build_predictor, build_regression
 
 WEAK = 10.0  # warn below this F of the first stage: the estimate leans towards least squares (Staiger & Stock 1997)
 CHANCE = 2.0  # refuse below this F: instruments that have no effect on the plant reach about 1
@@ -111,14 +111,13 @@ def instrumental_edmd(
         chance = _compare(regression.rows, explained, K - plain_fit, plain_fit)
         if chance > checks.positive(level, "level"):
             rule = f"least squares, not found biased by the instruments (chance {chance:.2g})"
-            return build_predictor(regression, build_result(regression, plain_fit, rule=rule))
-    result = build_result(
+            return build_predictor(regression, plain_fit, rule=rule)
+    return build_predictor(
         regression,
         K,
         rule=f"two-stage least squares, {lags} lags of the instruments, F = {strength:.3g}",
         doubts=(weak,) if strength < WEAK else (),
     )
-    return build_predictor(regression, result)
 
 
 def check_instruments(episodes: Episodes, instruments: Sequence[ArrayLike]) -> list[Float[np.ndarray, "rows nr"]]:

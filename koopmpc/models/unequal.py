@@ -1,5 +1,6 @@
 """unequal_rates: a model of runs in which sensors measured at rates of their own, fitted to measured cells."""
 
+import warnings
 from dataclasses import replace
 from typing import Literal, NamedTuple, overload
 
@@ -7,16 +8,16 @@ import numpy as np
 from jaxtyping import Float
 
 from koopmpc.base import checks
-from koopmpc.base.errors import DataError
+from koopmpc.base.errors import DataError, FitWarning
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.partial import PartialEpisodes
 from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.state import State
+from koopmpc.models.base import change_model
 from koopmpc.models.fits.bilinear import bilinear_edmd
 from koopmpc.models.fits.edmd import edmd
-from koopmpc.models.measured_cells import Cells, MeasuredError, ModelColumns, cut_cells
-from koopmpc.models.moments.solve import column_norms
+from koopmpc.models.fits.refinement import rows_of_states, with_coefficients
+from koopmpc.models.measured_cells import Cells, MeasuredError, cut_cells
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 
 _GAPS = 4  # a segment has this many measurements of the slowest sensor for each of its unknown rows
@@ -125,8 +126,19 @@ def unequal_rates(
     checks.kind(data, "data", PartialEpisodes, "pass km.data.PartialEpisodes(X=[…], U=[…], dt=…)")
     checks.kind(lifting, "lifting", Lifting, "for example km.State()")
     iterations = checks.count(iterations, "iterations")
-    columns = _find_columns(data, lifting, embedding, bilinear=bilinear, crossed=scheduled_inputs)
-    longest, past = max(map(len, data.U)), columns.past
+    if scheduled_inputs and not (bilinear and data.disturbances):
+        raise DataError("scheduled_inputs multiply inputs by measured disturbances; pass W, and bilinear=True")
+    if embedding is not None:
+        checks.kind(embedding, "embedding", Delay, "pass km.Delay(steps)")
+        if embedding.rails is not None:
+            raise DataError("the embedding has rails, which this fit does not know; pass km.Delay without them")
+
+    def fit(rows: Episodes) -> LinearPredictor | BilinearPredictor:
+        if bilinear:
+            return bilinear_edmd(rows, lifting, embedding=embedding, scheduled_inputs=scheduled_inputs)
+        return edmd(rows, lifting, embedding=embedding)
+
+    longest, past = max(map(len, data.U)), 0 if embedding is None else embedding.steps
     wanted = (
         max(_GAPS * data.find_gap() * (past + 1), _SHORT) + past
         if horizon is None
@@ -142,11 +154,14 @@ def unequal_rates(
             f"a segment has {wanted} steps, and the embedding keeps {past}; pass longer runs or a longer horizon"
         )
     size = np.nanstd(np.concatenate(data.X), axis=0)
-    error = MeasuredError(columns, np.where(size > 0, size, 1.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FitWarning)  # rows with bridged gaps are a start alone
+        model = fit(_bridge(data, "line"))
+    places, error = rows_of_states(model), MeasuredError(model, np.where(size > 0, size, 1.0), crossed=scheduled_inputs)
     lengths = sorted({max(wanted // 2, past + 1), wanted})
     best: _Found | None = None
     for kind in ("line", "held", "mean"):
-        found = _fit_from(data, error, _bridge(data, kind), lengths, iterations)
+        found = _fit_from(data, error, model, _bridge(data, kind), lengths, iterations)
         best = found if best is None or found.value < best.value else best
         if best.value < _EXACT:
             break
@@ -156,69 +171,23 @@ def unequal_rates(
         f"fitted to {measured} measured cells of {sum(x.size for x in data.X)} by simulation over {wanted} steps, "
         f"{best.steps} iterations; their error is {np.sqrt(best.value):.3g} spreads"
     )
-    return _build_model(columns, best, lifting, measured, sentence)
-
-
-def _find_columns(
-    data: PartialEpisodes, lifting: Lifting, embedding: Delay | None, *, bilinear: bool, crossed: bool
-) -> ModelColumns:
-    """Return what the model is linear in."""
-    nu, nw = len(data.inputs), len(data.disturbances)
-    if bilinear and not nu:
-        raise DataError("the runs have no inputs, so nothing multiplies the state; leave bilinear out")
-    if crossed and not (bilinear and nw):
-        raise DataError("scheduled_inputs multiply inputs by measured disturbances; pass W, and bilinear=True")
-    if embedding is not None:
-        checks.kind(embedding, "embedding", Delay, "pass km.Delay(steps)")
-        if embedding.rails is not None:
-            raise DataError("the embedding has rails, which this fit does not know; pass km.Delay without them")
-        embedding = embedding.bind(data.states, data.inputs)
-    bound = lifting.bind(data.states if embedding is None else embedding.names)
-    if not set(State().bind(data.states).names) <= set(bound.names):
-        raise DataError(f"the lifting lacks a state; pass km.State() + … of {', '.join(data.states)}")
-    return ModelColumns(bound, len(data.states), nu, nw, embedding, bilinear, crossed)
-
-
-def _build_model(
-    columns: ModelColumns, found: _Found, lifting: Lifting, measured: int, sentence: str
-) -> LinearPredictor | BilinearPredictor:
-    """Return the model whose rows of the states are Θ, and the others those of EDMD on what it simulates."""
-    delays = None if columns.embedding is None else Delay(columns.past, columns.embedding.inputs)
-    simulated = found.simulated
-    if columns.bilinear:
-        model = bilinear_edmd(simulated, lifting, embedding=delays, scheduled_inputs=columns.crossed)
-    else:
-        model = edmd(simulated, lifting, embedding=delays)
-    places = np.argmax(model.C, axis=1)
-    K = np.zeros((found.theta.shape[1], model.nz))
-    K[:, places] = found.theta.T
-    parts = columns.parts.split(K, columns.factors)
-    A, B, E = model.A.copy(), model.B.copy(), model.E.copy()
-    A[places], B[places], E[places] = parts.A[places], parts.B[places], parts.E[places]
-    report = model.report
-    if report is not None:
-        report = replace(report, method="unequal_rates", samples=measured, changes=(*report.changes, sentence))
-    about = (model.C, model.lifting, model.dt, model.states, model.inputs, report)
-    if isinstance(model, LinearPredictor):
-        return LinearPredictor(
-            A, B, *about, embedding=model.embedding, scale=model.scale, E=E, disturbances=model.disturbances
-        )
-    N, S, M = model.N.copy(), model.S.copy(), model.M.copy()
-    N[:, places], S[:, places], M[:, places] = parts.N[:, places], parts.S[:, places], parts.M[:, places]
-    return BilinearPredictor(
-        A, B, N, *about, embedding=model.embedding, scale=model.scale, E=E, S=S, M=M, disturbances=model.disturbances
-    )
+    refitted = with_coefficients(fit(best.simulated), places, best.theta, sentence)
+    assert refitted.report is not None, "it was fitted"
+    return change_model(refitted, report=replace(refitted.report, method="unequal_rates", samples=measured))
 
 
 def _fit_from(
-    data: PartialEpisodes, error: MeasuredError, bridged: Episodes, lengths: list[int], iterations: int
+    data: PartialEpisodes,
+    error: MeasuredError,
+    model: LinearPredictor | BilinearPredictor,
+    bridged: Episodes,
+    lengths: list[int],
+    iterations: int,
 ) -> _Found:
     """Return where the minimisation ends that starts at one-step least squares on the bridged rows."""
-    columns = error.columns
-    phi, norms, after = _pairs(columns, bridged)
-    theta, steps = (np.asarray(np.linalg.lstsq(phi, after, rcond=None)[0]) / norms[:, None]).T, 0
-    cells, starts = cut_cells(data, bridged, lengths[-1], columns.past)
-    unknowns = theta.size + starts.size
+    theta, steps = error.regress(model.embed(bridged), model.nx), 0
+    cells, starts = cut_cells(data, bridged, lengths[-1], error.past)
+    unknowns = model.nx * int(error.columns.sum()) + starts.size
     if cells.measured.sum() < unknowns:
         raise DataError(
             f"{int(cells.measured.sum())} cells were measured, and the fit has {unknowns} unknowns; measure longer,"
@@ -226,34 +195,16 @@ def _fit_from(
         )
     value = np.inf
     for length in lengths:
-        cells, starts = cut_cells(data, bridged, length, columns.past)
+        cells, starts = cut_cells(data, bridged, length, error.past)
         theta, starts, value, taken = _minimise(error, theta, starts, cells, iterations)
         steps += taken
     X = error.simulate(theta, starts, cells)
-    episodes = [Episode(X=X[:, i], U=cells.U[:, i], W=cells.W[:, i]) for i in range(X.shape[1])]
+    episodes = [Episode(X=X[:, i], U=cells.V[:, i, : model.nu], W=cells.V[:, i, model.nu :]) for i in range(X.shape[1])]
     simulated = Episodes(episodes, data.dt, data.states, data.inputs, data.disturbances)
-    least = _least_norm(columns, simulated)
-    if error.evaluate(least, starts, cells) <= max(value, _EXACT):
+    least = error.regress(model.embed(simulated), model.nx, _RANK)  # no unstable modes that nothing excited
+    if error.evaluate_from(least, starts, cells) <= max(value, _EXACT):
         theta = least
     return _Found(value, steps, theta, simulated)
-
-
-def _pairs(
-    columns: ModelColumns, rows: Episodes
-) -> tuple[Float[np.ndarray, "m nphi"], Float[np.ndarray, " nphi"], Float[np.ndarray, "m nx"]]:
-    """Return the columns of φ by their norms, these norms, and the states that follow."""
-    points = rows if columns.embedding is None else columns.embedding(rows)
-    Z, U = np.concatenate([e.X[:-1] for e in points]), np.concatenate([e.U for e in points])
-    phi = columns.evaluate(Z, U, np.concatenate([e.W for e in points]))
-    norms = column_norms(phi)
-    norms[norms == 0] = 1.0
-    return phi / norms, norms, np.concatenate([e.X[1:, : columns.nx] for e in points])
-
-
-def _least_norm(columns: ModelColumns, simulated: Episodes) -> Float[np.ndarray, "nx nphi"]:
-    """Return the smallest Θ that makes the simulated rows: it has no unstable modes that nothing excited."""
-    phi, norms, after = _pairs(columns, simulated)
-    return (np.asarray(np.linalg.lstsq(phi, after, rcond=_RANK)[0]) / norms[:, None]).T
 
 
 def _minimise(
@@ -264,15 +215,17 @@ def _minimise(
     iterations: int,
 ) -> tuple[Float[np.ndarray, "nx nphi"], Float[np.ndarray, "m ns"], float, int]:
     """Return Θ, the first states, the error there, and the iterations."""
-    value, damping, steps = error.evaluate(theta, starts, cells), _DAMPING, 0
+    value, damping, steps = error.evaluate_from(theta, starts, cells), _DAMPING, 0
     for _ in range(iterations):
         if not np.isfinite(value) or value < _LEAST:
             break
-        slopes, lower = error.derivatives(theta, starts, cells), np.inf
+        slopes, lower = error.slopes_from(theta, starts, cells), np.inf
         for _trial in range(_TRIALS):
             move, moved = slopes.solve(damping)
-            trial = theta + move.reshape(theta.shape), starts + moved * error.start_size
-            lower = error.evaluate(*trial, cells)
+            step = np.zeros(theta.size)
+            step[np.flatnonzero(np.tile(error.columns, len(theta)))] = move
+            trial = theta + step.reshape(theta.shape), starts + moved * error.start_size
+            lower = error.evaluate_from(*trial, cells)
             if lower < value:
                 (theta, starts), damping = trial, max(damping / 10, 1e-15)
                 break

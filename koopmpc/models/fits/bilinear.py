@@ -26,7 +26,7 @@ from koopmpc.models.moments.solve import (
     solve,
 )
 from koopmpc.models.predictors import BilinearPredictor
-from koopmpc.models.shared.regression import FitResult, build_regression, build_report, compute_scale_factor
+from koopmpc.models.shared.regression import build_bilinear, build_regression
 
 
 def bilinear_edmd(
@@ -128,7 +128,7 @@ def bilinear_edmd(
     P, C, basis, state_residual, words = rows.P, regression.C, np.eye(nz), regression.state_residual, ""
     if rank is not None:
         basis, words = leading_directions(rows, nz, rank, sentences)
-        P, C, bound = _project_rows(P, basis, nu, which), C @ basis, Projected(bound, basis)
+        P, C, bound = _project_rows(P, basis, nu, which), C @ basis, Projected(bound, basis).bind(bound.bound_states)
         state_residual = np.hypot(state_residual, truncation_loss(rows.P[:, :nz], basis, regression.C, rows.samples))
         which = np.arange(len(basis.T))
     r = len(basis.T)
@@ -139,38 +139,24 @@ def bilinear_edmd(
     shifted, back = columns.centre(change, which)
     solution = solve(shifted, ridge=ridge)
     K = (back @ solution.K + start) @ basis
-    parts = columns.split(K, which)
-    regression = replace(regression, rows=replace(rows, P=P, constant=constant))
-    solved = describe_solve(regression.rows, ridge, solution.ridge)
-    result = FitResult(
-        A=parts.A,
-        B=parts.B,
-        C=C,
+    regression = replace(
+        regression,
+        rows=replace(rows, P=P, constant=constant),
         lifting=bound,
-        residual=regression.rows.residual(regression.x_next, K @ C.T),
+        C=C,
+        inputs=(*source.inputs, *source.disturbances),
         state_residual=state_residual,
+    )
+    solved = describe_solve(regression.rows, ridge, solution.ridge)
+    return build_bilinear(
+        regression,
+        K,
+        columns.split(K, which),
+        rule=f"{words}, {solved}" if words else solved,
         rank=solution.rank,
         condition=condition,
-        rule=f"{words}, {solved}" if words else solved,
         ridge=solution.ridge,
         doubts=sentences,
-    )
-    return BilinearPredictor(
-        result.A,
-        result.B,
-        parts.N,
-        C,
-        bound,
-        regression.dt,
-        regression.states,
-        source.inputs,
-        build_report(regression, result),
-        embedding=regression.embedding,
-        scale=compute_scale_factor(P[:, :r], rows.samples),
-        E=parts.E,
-        S=parts.S,
-        M=parts.M,
-        disturbances=source.disturbances,
     )
 
 

@@ -20,7 +20,7 @@ from koopmpc.models.moments.doubts import find_doubts
 from koopmpc.models.moments.read import ReadOptions
 from koopmpc.models.moments.solve import RegressionRows, Ridge, check_ridge, column_norms, describe_solve, solve
 from koopmpc.models.predictors import LinearPredictor
-from koopmpc.models.shared.regression import build_predictor, build_result, describe_misfit, read_regression
+from koopmpc.models.shared.regression import build_predictor, describe_misfit, read_regression
 
 _AT_BOUND = 1e-8  # an entry is at its bound within this distance, the solver's accuracy on columns of unit norm
 _MET = 1e-10  # the plain fit meets the prior if it violates it by at most this, in units of the data
@@ -91,9 +91,7 @@ def constrained_edmd(
     changes += [sentence for sentence, field in _COUPLINGS.items() if getattr(prior, field)]
     changes.append(describe_misfit(rows, K, plain.K))
     rule = f"{'Clarabel' if statuses else 'linear algebra'} under priors, {describe_solve(rows, ridge, plain.ridge)}"
-    return build_predictor(
-        regression, build_result(regression, K, rule=rule, ridge=plain.ridge, doubts=sentences, changes=changes)
-    )
+    return build_predictor(regression, K, rule=rule, ridge=plain.ridge, doubts=sentences, changes=changes)
 
 
 _COUPLINGS = {
@@ -219,7 +217,7 @@ def largest_violation(
         worst = float(np.abs(A - A.T).max()) / max(float(np.abs(A).max()), 1e-300)
     for combination in prior.combinations:
         pairs = ((combination.A, A), (combination.B, B))
-        value = sum(float(np.sum(weights * matrix)) for weights, matrix in pairs if weights is not None)
+        value = sum(float(np.sum(np.asarray(weights) * matrix)) for weights, matrix in pairs if weights is not None)
         worst = max(worst, combination.low - value, value - combination.high)
     if prior.dissipation is not None:
         M = _dissipation_matrix(prior.dissipation, A, B, size[:nz], size[nz:], np.block)
@@ -251,7 +249,7 @@ def _build_limits(cp: Any, combination: Combination, A: Any, B: Any) -> list[Any
     """Return the constraints low ≤ Σ Fᵢⱼ Aᵢⱼ + Σ Gᵢⱼ Bᵢⱼ ≤ high."""
     total: Any = 0
     for weights, matrix in ((combination.A, A), (combination.B, B)):
-        if weights is not None and weights.size:
+        if weights is not None and np.size(weights):
             total = total + cp.sum(cp.multiply(weights, matrix))
     if combination.low == combination.high:
         return [total == combination.low]
@@ -275,17 +273,18 @@ def _dissipation_matrix(
 
     z and u are scaled by their sizes, and V by the largest diagonal entry of the scaled P.
     """
-    values, vectors = np.linalg.eigh(dissipation.P)
+    stored = np.asarray(dissipation.P, dtype=np.float64)
+    values, vectors = np.linalg.eigh(stored)
     positive = values > 1e-12 * values[-1]
     L = np.sqrt(values[positive])[:, None] * vectors[:, positive].T
-    unit = max(float((dissipation.P.diagonal() * size**2).max()), 1e-300) ** -0.5
+    unit = max(float((stored.diagonal() * size**2).max()), 1e-300) ** -0.5
     z, u = np.diag(size * unit), np.diag(force * unit)
-    P = dissipation.decay**2 * z @ dissipation.P @ z
+    P = dissipation.decay**2 * z @ stored @ z
     LA = (L @ A) @ z
     if dissipation.C is None:
         return block([[P, LA.T], [LA, np.eye(len(L))]])
-    D = np.zeros((len(force), len(force))) if dissipation.D is None else dissipation.D
-    C, LB = u @ dissipation.C @ z, (L @ B) @ u
+    D = np.zeros((len(force), len(force))) if dissipation.D is None else np.asarray(dissipation.D)
+    C, LB = u @ np.asarray(dissipation.C) @ z, (L @ B) @ u
     return block([[P, C.T, LA.T], [C, u @ (D + D.T) @ u, LB.T], [LA, LB, np.eye(len(L))]])
 
 

@@ -17,7 +17,7 @@ from koopmpc.models.moments.read import ReadOptions, second_moments
 from koopmpc.models.moments.rows import concatenate_parts
 from koopmpc.models.moments.solve import RegressionRows
 from koopmpc.models.predictors import LinearPredictor
-from koopmpc.models.shared.regression import Regression, build_predictor
+from koopmpc.models.shared.regression import Regression
 
 
 def dmd(
@@ -72,7 +72,7 @@ def dmd(
     regression = _regression(
         source_of(episodes), "dmd", inputs=(), noisy=not checks.among(method, ("ls",)), options=options
     )
-    return build_predictor(regression, fit_regression(regression, rank=rank, method=method))
+    return fit_regression(regression, rank=rank, method=method)
 
 
 def dmdc(
@@ -121,7 +121,7 @@ def dmdc(
     regression = _regression(
         source, "dmdc", inputs=source.inputs, B=known, noisy=not checks.among(method, ("ls",)), options=options
     )
-    return build_predictor(regression, fit_regression(regression, rank=rank, method=method))
+    return fit_regression(regression, rank=rank, method=method)
 
 
 def _regression(

@@ -28,7 +28,7 @@ from koopmpc.models.moments.solve import (
     solve,
 )
 from koopmpc.models.predictors import LinearPredictor
-from koopmpc.models.shared.regression import FitResult, Regression, build_predictor, read_regression
+from koopmpc.models.shared.regression import Regression, build_predictor, read_regression
 
 Method = Literal["ls", "tls", "fb"]
 Towards = Literal["zero", "affine"]
@@ -39,8 +39,8 @@ _WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward,
 
 def fit_regression(
     regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls", towards: Towards = "zero"
-) -> FitResult:
-    """Solve min Σ ‖ψ(x⁺) − A ψ(x) − B u‖².
+) -> LinearPredictor:
+    """Return the model of min Σ ‖ψ(x⁺) − A ψ(x) − B u‖².
 
     Parameters
     ----------
@@ -75,9 +75,8 @@ def fit_regression(
     free = regression.inputs if regression.B is None else ()
     sentences, condition = find_doubts(rows, regression.lifting.names, free, regular=ridge != 0 or rank is not None)
     if rank is not None:
-        result = _fit_reduced(regression, rows, ridge, rank, method, condition, sentences)
-        return result._replace(rule=_WORDS[method] + result.rule, doubts=sentences)
-    fit_rows, C = rows.keep_targets(nz), regression.C
+        return _fit_reduced(regression, rows, ridge, rank, method, condition, sentences)
+    fit_rows = rows.keep_targets(nz)
     light = [i for i in regression.affine_columns if i < rows.P.shape[1]] if towards == "affine" else []
     if method == "tls":
         fit_rows = _remove_noise(regression, fit_rows, nz)
@@ -87,16 +86,12 @@ def fit_regression(
     else:
         solution = solve(fit_rows, ridge=ridge, scaled=scaled, light=light)
     K = solution.K if regression.B is None else np.vstack([solution.K, regression.B.T])
-    return FitResult(
-        A=K[:nz].T,
-        B=K[nz:].T,
-        C=np.eye(nz) if C is None else C,
-        lifting=regression.lifting,
-        residual=regression.rows.residual(regression.x_next, K if C is None else K @ C.T),
-        state_residual=regression.state_residual,
+    return build_predictor(
+        regression,
+        K,
+        rule=_WORDS[method] + describe_solve(rows, ridge, solution.ridge, scaled=scaled, light=light),
         rank=solution.rank,
         condition=condition,
-        rule=_WORDS[method] + describe_solve(rows, ridge, solution.ridge, scaled=scaled, light=light),
         ridge=solution.ridge,
         doubts=sentences,
     )
@@ -110,7 +105,7 @@ def _fit_reduced(
     method: Method,
     condition: float,
     sentences: list[str],
-) -> FitResult:
+) -> LinearPredictor:
     """Return the fit on [U_rᵀψ(x) u]. Without inputs that is Ã = U_rᵀ X′ V_r Σ_r⁻¹ (Tu et al. 2014)."""
     nz = regression.lifting.nz
     basis, words = leading_directions(rows, nz, rank, sentences)
@@ -131,18 +126,24 @@ def _fit_reduced(
     C = basis if regression.C is None else regression.C @ basis
     Z = rows.P[:, :nz]
     seen = RegressionRows(np.hstack([Z @ basis, regression.rows.P[:, nz:]]), regression.rows.T, rows.rest, rows.samples)
-    return FitResult(
-        A=A,
-        B=B,
+    reduced = replace(
+        regression,
+        rows=seen,
+        lifting=Projected(regression.lifting, basis).bind(regression.lifting.bound_states),
         C=C,
-        lifting=Projected(regression.lifting, basis),
-        residual=seen.residual(regression.x_next, np.vstack([A.T, B.T]) @ C.T),
+        B=None,
         state_residual=np.hypot(regression.state_residual, truncation_loss(Z, basis, regression.C, rows.samples)),
+    )
+    return build_predictor(
+        reduced,
+        np.vstack([A.T, B.T]),
+        modes=forward @ sorted_eigen(A)[1],
+        rule=_WORDS[method] + (words if ridge == 0 else f"{words}, {describe_solve(seen, ridge, solution.ridge)}"),
         rank=r,
         condition=condition,
-        rule=words if ridge == 0 else f"{words}, {describe_solve(seen, ridge, solution.ridge)}",
+        columns=regression.columns,
         ridge=solution.ridge,
-        modes=forward @ sorted_eigen(A)[1],
+        doubts=sentences,
     )
 
 
@@ -327,6 +328,4 @@ def edmd(
     regression = read_regression(
         episodes, lifting, embedding, "edmd", noisy=not checks.among(method, ("ls",)), **options
     )
-    return build_predictor(
-        regression, fit_regression(regression, ridge=ridge, rank=rank, method=method, towards=towards)
-    )
+    return fit_regression(regression, ridge=ridge, rank=rank, method=method, towards=towards)

@@ -16,7 +16,7 @@ from koopmpc.models.moments.moments import Moments
 from koopmpc.models.moments.rows import ForgettingMemory, WindowMemory, row_columns
 from koopmpc.models.moments.solve import Ridge, check_ridge, describe_solve, solve
 from koopmpc.models.predictors import LinearPredictor
-from koopmpc.models.shared.regression import build_predictor, build_regression, build_result
+from koopmpc.models.shared.regression import build_predictor, build_regression
 
 _BLOCK = 32  # rows that the factor absorbs at once
 
@@ -246,8 +246,7 @@ class OnlineEDMD:
         if self.outliers:
             rule += f"{self.outliers} pairs were outliers and were not learned, "
         rule += describe_solve(rows, self._ridge, solution.ridge)
-        result = build_result(regression, solution.K, rule=rule, ridge=solution.ridge, doubts=sentences)
-        return build_predictor(regression, result, warn=False)
+        return build_predictor(regression, solution.K, rule=rule, ridge=solution.ridge, doubts=sentences, silent=True)
 
     def _lift_pair(self, now: Float[np.ndarray, " nx"], after: Float[np.ndarray, " nx"]) -> Float[np.ndarray, "2 nf"]:
         """Return ψ of both states, in memory that the next call overwrites; NaN for a state beyond 1e30."""

@@ -1,11 +1,10 @@
 """Prior knowledge of A and B: known entries and rows, zeros, bounds, weighted sums, symmetry and dissipation."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TypeVar, cast
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from koopmpc.base import checks
@@ -13,10 +12,8 @@ from koopmpc.base.errors import DataError, ShapeError
 from koopmpc.base.values import Value, freeze
 from koopmpc.lifting.base import strip_unit
 
-MaybeArray = TypeVar("MaybeArray", bound="np.ndarray | None")
 
-
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False)
 class Combination(Value):
     """low ≤ Σ Fᵢⱼ Aᵢⱼ + Σ Gᵢⱼ Bᵢⱼ ≤ high, an equation if low = high.
 
@@ -35,24 +32,19 @@ class Combination(Value):
 
     low: float
     high: float
-    A: Float[np.ndarray, "nz nz"] | None
-    B: Float[np.ndarray, "nz nu"] | None
+    A: ArrayLike | None = field(default=None, kw_only=True)
+    B: ArrayLike | None = field(default=None, kw_only=True)
 
-    def __init__(self, low: float, high: float, *, A: ArrayLike | None = None, B: ArrayLike | None = None) -> None:
-        if A is None and B is None:
+    def __post_init__(self) -> None:
+        if self.A is None and self.B is None:
             raise DataError("a Combination has no weights; pass A, B or both")
-        ends = checks.array([low, high], "low, high", (2,), infinite=True)
+        ends = checks.array([self.low, self.high], "low, high", (2,), infinite=True)
         checks.refuse_crossed(ends[:1], ends[1:], "Combination")
-        freeze(
-            self,
-            low=float(ends[0]),
-            high=float(ends[1]),
-            A=None if A is None else checks.array(A, "Combination.A", (None, None)),
-            B=None if B is None else checks.array(B, "Combination.B", (None, None)),
-        )
+        freeze(self, low=float(ends[0]), high=float(ends[1]))
+        _check_matrices(self, "Combination.A", "Combination.B")
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False)
 class Dissipation(Value):
     """Dissipation with V(z) = ½ zᵀP z: V(A z + B u) ≤ decay² V(z) + uᵀ(C z + D u) for every z and u.
 
@@ -83,26 +75,29 @@ class Dissipation(Value):
     systems", IEEE Trans. Automat. Contr. 39, 1994.
     """
 
-    P: Float[np.ndarray, "nz nz"]
-    decay: float
-    C: Float[np.ndarray, "nu nz"] | None
-    D: Float[np.ndarray, "nu nu"] | None
+    P: ArrayLike
+    decay: float = field(default=1.0, kw_only=True)
+    C: ArrayLike | None = field(default=None, kw_only=True)
+    D: ArrayLike | None = field(default=None, kw_only=True)
 
-    def __init__(
-        self, P: ArrayLike, *, decay: float = 1.0, C: ArrayLike | None = None, D: ArrayLike | None = None
-    ) -> None:
-        if C is None and D is not None:
+    def __post_init__(self) -> None:
+        if self.C is None and self.D is not None:
             raise DataError("Dissipation has D but no C; pass the output C that D belongs to")
-        freeze(
-            self,
-            P=checks.weight(P, "Dissipation.P"),
-            decay=checks.positive(decay, "decay"),
-            C=None if C is None else checks.array(C, "Dissipation.C", (None, None)),
-            D=None if D is None else checks.array(D, "Dissipation.D", (None, None)),
-        )
+        stored = checks.array(self.P, "Dissipation.P")
+        freeze(self, P=checks.weight(stored, "Dissipation.P"), decay=checks.positive(self.decay, "decay"))
+        _check_matrices(self, "Dissipation.C", "Dissipation.D")
 
 
-@dataclass(frozen=True, eq=False, init=False)
+def _check_matrices(part: object, *names: str, **options: bool) -> None:
+    """Store the fields of these names as matrices, if they are given."""
+    for name in names:
+        field_name = name.rpartition(".")[2]
+        value = getattr(part, field_name)
+        if value is not None:
+            freeze(part, **{field_name: checks.array(value, name, (None, None), **options)})
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Prior(Value):
     """Prior knowledge of A and B in z⁺ = A z + B u; `constrained_edmd` fits the free entries.
 
@@ -131,72 +126,43 @@ class Prior(Value):
         The arguments are not such arrays, or contradict each other.
     """
 
-    A: Float[np.ndarray, "nz nz"] | None
-    B: Float[np.ndarray, "nz nu"] | None
-    rows: dict[str, dict[str, float]]
-    mask_A: Bool[np.ndarray, "nz nz"] | None
-    mask_B: Bool[np.ndarray, "nz nu"] | None
-    lower_A: Float[np.ndarray, "..."]
-    upper_A: Float[np.ndarray, "..."]
-    lower_B: Float[np.ndarray, "..."]
-    upper_B: Float[np.ndarray, "..."]
-    symmetric: bool
-    combinations: tuple[Combination, ...]
-    dissipation: Dissipation | None
+    A: ArrayLike | None = None
+    B: ArrayLike | None = None
+    rows: Mapping[str, Mapping[str, float]] = field(default_factory=dict[str, Mapping[str, float]])
+    mask_A: ArrayLike | None = None
+    mask_B: ArrayLike | None = None
+    lower_A: ArrayLike = -np.inf
+    upper_A: ArrayLike = np.inf
+    lower_B: ArrayLike = -np.inf
+    upper_B: ArrayLike = np.inf
+    symmetric: bool = False
+    combinations: Sequence[Combination] = ()
+    dissipation: Dissipation | None = None
 
-    def __init__(
-        self,
-        *,
-        A: ArrayLike | None = None,
-        B: ArrayLike | None = None,
-        rows: Mapping[str, Mapping[str, float]] | None = None,
-        mask_A: ArrayLike | None = None,
-        mask_B: ArrayLike | None = None,
-        lower_A: ArrayLike = -np.inf,
-        upper_A: ArrayLike = np.inf,
-        lower_B: ArrayLike = -np.inf,
-        upper_B: ArrayLike = np.inf,
-        symmetric: bool = False,
-        combinations: Sequence[Combination] = (),
-        dissipation: Dissipation | None = None,
-    ) -> None:
-        if rows is not None:
-            checks.kind(rows, "rows", Mapping, 'pass {"x [m]": {"v [m/s]": 0.1}}')
-            for name, row in rows.items():
-                checks.kind(row, f"rows[{name!r}]", Mapping, 'pass {"v [m/s]": 0.1}')
-        checks.kind(symmetric, "symmetric", (bool, np.bool_), "pass True or False")
+    def __post_init__(self) -> None:
+        checks.kind(self.rows, "rows", Mapping, 'pass {"x [m]": {"v [m/s]": 0.1}}')
+        for name, row in self.rows.items():
+            checks.kind(row, f"rows[{name!r}]", Mapping, 'pass {"v [m/s]": 0.1}')
+        checks.kind(self.symmetric, "symmetric", (bool, np.bool_), "pass True or False")
+        checks.kind(self.combinations, "combinations", (tuple, list), "pass a list of Combination")
+        for each in self.combinations:
+            checks.kind(each, "an entry of combinations", Combination, "pass a list of Combination")
         known = {
             name: {other: float(checks.array(v, f"rows[{name!r}]", ())) for other, v in row.items()}
-            for name, row in (rows or {}).items()
+            for name, row in self.rows.items()
         }
-        freeze(
-            self,
-            A=None if A is None else checks.array(A, "Prior.A", (None, None), finite=False),
-            B=None if B is None else checks.array(B, "Prior.B", (None, None), finite=False),
-            rows=known,
-            mask_A=None if mask_A is None else checks.array(mask_A, "mask_A", (None, None)) != 0,
-            mask_B=None if mask_B is None else checks.array(mask_B, "mask_B", (None, None)) != 0,
-            lower_A=checks.array(lower_A, "lower_A", infinite=True),
-            upper_A=checks.array(upper_A, "upper_A", infinite=True),
-            lower_B=checks.array(lower_B, "lower_B", infinite=True),
-            upper_B=checks.array(upper_B, "upper_B", infinite=True),
-            symmetric=bool(symmetric),
-            combinations=_check_combinations(combinations),
-            dissipation=dissipation,
-        )
+        _check_matrices(self, "Prior.A", "Prior.B", finite=False)
+        _check_matrices(self, "mask_A", "mask_B")
+        bounds = {
+            name: checks.array(getattr(self, name), name, infinite=True)
+            for name in ("lower_A", "upper_A", "lower_B", "upper_B")
+        }
+        freeze(self, rows=known, symmetric=bool(self.symmetric), combinations=tuple(self.combinations), **bounds)
 
     @property
     def couples_rows(self) -> bool:
         """True if the prior couples rows of [A B] by symmetry, combinations or dissipation."""
         return self.symmetric or bool(self.combinations) or self.dissipation is not None
-
-
-def _check_combinations(given: object) -> tuple[Combination, ...]:
-    checks.kind(given, "combinations", (tuple, list), "pass a list of Combination")
-    found = tuple(cast("Sequence[Combination]", given))
-    for each in found:
-        checks.kind(each, "an entry of combinations", Combination, "pass a list of Combination")
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,18 +187,16 @@ def build_entries(prior: Prior, observables: Sequence[str], inputs: Sequence[str
     nz, nu = len(observables), len(inputs)
     known = np.full((nz, nz + nu), np.nan)
     low, high = np.full_like(known, -np.inf), np.full_like(known, np.inf)
-    parts = (
-        ("A", slice(0, nz), prior.A, prior.mask_A, prior.lower_A, prior.upper_A),
-        ("B", slice(nz, nz + nu), prior.B, prior.mask_B, prior.lower_B, prior.upper_B),
-    )
-    for name, columns, values, mask, lower, upper in parts:
+    for name, columns in (("A", slice(0, nz)), ("B", slice(nz, nz + nu))):
         shape = known[:, columns].shape
-        for bound, into, what in ((lower, low, f"lower_{name}"), (upper, high, f"upper_{name}")):
-            into[:, columns] = bound if bound.ndim == 0 else _check_shape(bound, shape, what)
+        for end, into in (("lower", low), ("upper", high)):
+            into[:, columns] = _check_shape(getattr(prior, f"{end}_{name}"), shape, f"{end}_{name}", scalar=True)
+        mask = _check_shape(getattr(prior, f"mask_{name}"), shape, f"mask_{name}")
         if mask is not None:
-            known[:, columns][~_check_shape(mask, shape, f"mask_{name}")] = 0.0
+            known[:, columns][mask == 0] = 0.0
+        values = _check_shape(getattr(prior, name), shape, f"Prior.{name}")
         if values is not None:
-            _write_known(known[:, columns], _check_shape(values, shape, f"Prior.{name}"), f"Prior.{name}")
+            _write_known(known[:, columns], values, f"Prior.{name}")
     names = [*observables, *inputs]
     for name, row in prior.rows.items():
         values = np.zeros((1, nz + nu))
@@ -257,11 +221,14 @@ def build_entries(prior: Prior, observables: Sequence[str], inputs: Sequence[str
     return Entries(known, low, high)
 
 
-def _check_shape(value: MaybeArray, shape: tuple[int, ...], name: str) -> MaybeArray:
+def _check_shape(
+    value: ArrayLike | None, shape: tuple[int, ...], name: str, *, scalar: bool = False
+) -> np.ndarray | None:
     """Return the array, or None for an absent one; raise if it has another shape."""
-    if value is not None and value.shape != shape:
-        raise ShapeError(f"{name} has shape {value.shape}, expected {shape}: observables by observables or inputs")
-    return value
+    found = None if value is None else np.asarray(value)
+    if found is not None and found.shape != shape and not (scalar and found.ndim == 0):
+        raise ShapeError(f"{name} has shape {found.shape}, expected {shape}: observables by observables or inputs")
+    return found
 
 
 def _write_known(into: Float[np.ndarray, "r n"], values: Float[np.ndarray, "r n"], name: str) -> None:

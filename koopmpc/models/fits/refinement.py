@@ -12,7 +12,7 @@ from koopmpc.base import checks
 from koopmpc.base.errors import DataError
 from koopmpc.base.interrupts import raise_swallowed
 from koopmpc.data.episodes import Episode, Episodes, episodes_of
-from koopmpc.models.base import FitReport
+from koopmpc.models.base import FitReport, change_model
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.models.records.conversion import SignalUnits, cut_segments, from_standard, is_hidden, to_standard
 from koopmpc.models.records.free_starts import shoot
@@ -303,28 +303,14 @@ def with_coefficients(
     report: FitReport | None = model.report
     if report is not None:
         report = replace(report, changes=(*report.changes, sentence))
-    about = (model.C, model.lifting, model.dt, model.states, model.inputs, report)
     if isinstance(model, LinearPredictor):
-        return LinearPredictor(
-            A, B, *about, embedding=model.embedding, scale=model.scale, E=E, disturbances=model.disturbances
-        )
+        return change_model(model, A=A, B=B, E=E, report=report)
     N, S, M = model.N.copy(), model.S.copy(), model.M.copy()
     N[:, rows] = of_N.reshape(len(rows), nu, nz).transpose(1, 0, 2)
     if model.is_scheduled:
         S[:, rows] = of_S.reshape(len(rows), nw, nz).transpose(1, 0, 2)
         M[:, rows] = of_M.reshape(len(rows), nw, nu).transpose(1, 0, 2)
-    return BilinearPredictor(
-        A,
-        B,
-        N,
-        *about,
-        embedding=model.embedding,
-        scale=model.scale,
-        E=E,
-        S=S,
-        M=M,
-        disturbances=model.disturbances,
-    )
+    return change_model(model, A=A, B=B, E=E, N=N, S=S, M=M, report=report)
 
 
 def split_ends(episodes: Episodes) -> tuple[list[Episode], list[Episode]]:

@@ -19,7 +19,7 @@ from koopmpc.models.moments.doubts import find_doubts
 from koopmpc.models.moments.read import ReadOptions
 from koopmpc.models.moments.solve import RegressionRows, column_norms, project_onto, solve
 from koopmpc.models.predictors import LinearPredictor
-from koopmpc.models.shared.regression import build_predictor, build_result, describe_misfit, read_regression
+from koopmpc.models.shared.regression import build_predictor, describe_misfit, read_regression
 
 _STEPS = 20_000  # largest number of steps of the proximal gradient method
 
@@ -175,7 +175,7 @@ def sparse_edmd(
     where = np.array([picked.names.index(state) for state in regression.states])
     part = replace(regression, rows=few, lifting=picked, C=regression.C[:, stay], x_next=where)
     rule = f"{'LASSO' if over == 'entries' else 'group LASSO'} with penalty {penalty:g}, then least squares"
-    return build_predictor(part, build_result(part, K, rule=rule, doubts=sentences, changes=changes))
+    return build_predictor(part, K, rule=rule, doubts=sentences, changes=changes)
 
 
 def _grow_support(

@@ -29,7 +29,6 @@ from koopmpc.models.predictors import LinearPredictor
 from koopmpc.models.shared.regression import (
     Regression,
     build_predictor,
-    build_result,
     describe_misfit,
     read_regression,
     relative_misfit,
@@ -138,9 +137,7 @@ def stable_edmd(
         changes += _compare_residuals(regression, K, stable)
         sentences += _doubt_misfit(relative_misfit(rows, K), relative_misfit(rows, stable))
         K = stable
-    return build_predictor(
-        regression, build_result(regression, K, rule=rule, ridge=weight, doubts=sentences, changes=changes)
-    )
+    return build_predictor(regression, K, rule=rule, ridge=weight, doubts=sentences, changes=changes)
 
 
 def _doubt_misfit(before: float, after: float) -> list[str]:

@@ -9,10 +9,9 @@ from jaxtyping import Float
 from koopmpc.base.errors import DataError
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
-from koopmpc.lifting.base import Lifting
-from koopmpc.lifting.composed import Projected, Sum
+from koopmpc.lifting.base import Lifting, Sum
+from koopmpc.lifting.composed import Projected, Saturated
 from koopmpc.lifting.neurons import Neurons
-from koopmpc.lifting.saturated import Saturated
 from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.models.base import FitReport
 from koopmpc.models.hidden_state import HiddenState, hidden_names

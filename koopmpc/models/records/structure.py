@@ -21,17 +21,10 @@ from koopmpc.lifting.composed import Picked, Standardized
 from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.models.moments.moments import Moments
 from koopmpc.models.moments.read import ReadOptions, Weights, second_moments
-from koopmpc.models.moments.solve import column_norms, scaled_rank, solve
+from koopmpc.models.moments.solve import BilinearParts, column_norms, scaled_rank, solve
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.models.records.forward import Terms, list_terms
-from koopmpc.models.shared.regression import (
-    FitResult,
-    Regression,
-    build_predictor,
-    build_regression,
-    build_report,
-    compute_scale,
-)
+from koopmpc.models.shared.regression import FitNotes, Regression, build_bilinear, build_predictor, build_regression
 
 HORIZON = 20  # steps of the short forecasts, at least, which count as much as the free run
 LONGEST = 200  # steps of these, at most
@@ -288,37 +281,21 @@ def _build_model(
 ) -> LinearPredictor | BilinearPredictor:
     """Return the predictor with [A B N]ᵀ = K, and its report."""
     nz, nu = regression.lifting.nz, len(regression.inputs)
-    assert regression.C is not None, "ψ holds the states"
-    result = FitResult(
-        A=K[:nz].T,
-        B=K[nz : nz + nu].T,
-        C=regression.C,
-        lifting=regression.lifting,
-        residual=regression.rows.residual(regression.x_next, K @ regression.C.T),
-        state_residual=regression.state_residual,
+    notes = FitNotes(
+        rule="least squares on the terms that forward regression took",
         rank=numbers[0],
         condition=numbers[1],
-        rule="least squares on the terms that forward regression took",
         changes=(structure.describe(),),
     )
     if not structure.is_nonlinear:
-        return build_predictor(regression, result)
+        return build_predictor(regression, K, **notes)
     N = np.zeros((nu, nz, nz))
     if len(K) > nz + nu:
         N[:, :, products] = K[nz + nu :].reshape(nu, -1, nz).transpose(0, 2, 1)
-    return BilinearPredictor(
-        result.A,
-        result.B,
-        N,
-        result.C,
-        regression.lifting,
-        regression.dt,
-        regression.states,
-        regression.inputs,
-        build_report(regression, result),
-        embedding=regression.embedding,
-        scale=compute_scale(regression, regression.lifting),
+    parts = BilinearParts(
+        K[:nz].T, K[nz : nz + nu].T, N, np.zeros((nz, 0)), np.zeros((0, nz, nz)), np.zeros((0, nz, nu))
     )
+    return build_bilinear(regression, K, parts, **notes)
 
 
 def check_rails(rails: ArrayLike, ny: int) -> Float[np.ndarray, "2 ny"]:

@@ -1,6 +1,7 @@
 """subspace: a linear model with a hidden state of least order, which is a linear function of the past rows."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple, Unpack
 
 import numpy as np
@@ -12,15 +13,14 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.lifting.composed import Projected
 from koopmpc.lifting.state import Constant, State
-from koopmpc.models.base import FitReport
 from koopmpc.models.moments.moments import Moments
 from koopmpc.models.moments.read import ReadOptions, second_moments
-from koopmpc.models.moments.solve import column_norms, solve
+from koopmpc.models.moments.solve import RegressionRows, column_norms, solve
 from koopmpc.models.predictors import LinearPredictor
 from koopmpc.models.records.narx import check_list, is_worse, source_episodes
 from koopmpc.models.records.structure import EXACT, find_forecast_horizon
 from koopmpc.models.records.unseen import cut_quarter, measure_forecasts
-from koopmpc.models.shared.regression import Regression, build_regression, compute_scale_factor
+from koopmpc.models.shared.regression import Regression, build_predictor, build_regression
 
 DELAYS = (4, 8, 12)  # numbers of past rows that are tried
 ORDERS = (1, 2, 3, 4, 5, 6, 8)  # orders of the hidden state that are tried
@@ -209,35 +209,23 @@ def _build_model(regression: Regression, found: Realisation) -> LinearPredictor:
     Z = np.hstack([rows.P[:, :n] @ T.T, ones[:, None]])
     driven = np.vstack([B, np.zeros((1, nu))])
 
-    forecast = Z @ transition.T @ output.T + rows.P[:, n + 1 :] @ driven.T @ output.T
-    miss = rows.T[:, regression.x_next] - forecast
-    residual = np.sqrt((np.sum(miss**2, axis=0) + rows.rest[regression.x_next]) / rows.samples)
     gap = rows.P[:, : len(C)] - Z @ output.T
     norms = column_norms(Z)
-    condition = float(np.linalg.cond(Z / np.where(norms > 0, norms, 1.0)))
     assert regression.embedding is not None
-    report = FitReport(
-        method="subspace",
-        route=f"{regression.route}, a state of order {m} from {regression.embedding.steps} past rows",
-        samples=rows.samples,
-        condition=condition,
-        rank=m + 1 + nu,
-        columns=m + 1 + nu,
-        ridge=0.0,
-        residual=residual,
+    lifting = (Projected(State(), np.ascontiguousarray(T.T)) + Constant()).bind(regression.embedding.names)
+    realised = replace(
+        regression,
+        rows=RegressionRows(np.hstack([Z, rows.P[:, n + 1 :]]), rows.T, rows.rest, rows.samples),
+        lifting=lifting,
+        C=output,
         state_residual=np.sqrt(np.sum(gap**2, axis=0) / rows.samples),
     )
-    return LinearPredictor(
-        transition,
-        driven,
-        output,
-        Projected(State(), np.ascontiguousarray(T.T)) + Constant(),
-        regression.dt,
-        regression.states,
-        regression.inputs,
-        report,
-        embedding=regression.embedding,
-        scale=compute_scale_factor(Z, rows.samples),
+    return build_predictor(
+        realised,
+        np.vstack([transition.T, driven.T]),
+        rule=f"a state of order {m} from {regression.embedding.steps} past rows",
+        rank=m + 1 + nu,
+        condition=float(np.linalg.cond(Z / np.where(norms > 0, norms, 1.0))),
     )
 
 

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from inspect import currentframe
-from typing import NamedTuple, Unpack
+from typing import Required, TypedDict, Unpack
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -16,12 +16,11 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.lifting.base import CONSTANT, Lifting
-from koopmpc.lifting.composed import Projected
 from koopmpc.models.base import FitReport
 from koopmpc.models.moments.moments import Moments
 from koopmpc.models.moments.read import ReadOptions, second_moments
-from koopmpc.models.moments.solve import RegressionRows, column_norms, scaled_rank
-from koopmpc.models.predictors import LinearPredictor
+from koopmpc.models.moments.solve import BilinearParts, RegressionRows, column_norms, scaled_rank
+from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 
 _HALF = float(
     np.sqrt(np.finfo(float).eps)
@@ -134,82 +133,55 @@ def build_regression(
     )
 
 
-class FitResult(NamedTuple):
-    """The result of a fit: z⁺ = A z + B u, where B has the columns of w too, and the entries of its report.
+class FitNotes(TypedDict, total=False):
+    """What a fit tells its report.
 
     Attributes
     ----------
     rule
         How the regression was solved, in words.
+    rank, condition
+        Those of the regressors; computed if they are left out.
+    columns
+        Number of regressors, if it is not that of the rows.
+    ridge
+        The Tikhonov weight.
     doubts, changes
         Sentences of the report: its warnings, and the changes by a prior, a limit or a penalty.
+    silent
+        Raise no warning.
     """
 
-    A: Float[np.ndarray, "nz nz"]
-    B: Float[np.ndarray, "nz nu"]
-    C: Float[np.ndarray, "nx nz"]
-    lifting: Lifting
-    residual: Float[np.ndarray, " nx"]
-    state_residual: Float[np.ndarray, " nx"]
+    rule: Required[str]
     rank: int
     condition: float
-    rule: str
-    ridge: float = 0.0
-    doubts: Sequence[str] = ()
-    changes: Sequence[str] = ()
-    modes: Complex[np.ndarray, "nl nz"] | None = None
+    columns: int
+    ridge: float
+    doubts: Sequence[str]
+    changes: Sequence[str]
+    silent: bool
 
 
-def build_result(
-    regression: Regression,
-    K: Float[np.ndarray, "n nz"],
-    *,
-    rule: str,
-    rank: int | None = None,
-    condition: float = np.inf,
-    ridge: float = 0.0,
-    doubts: Sequence[str] = (),
-    changes: Sequence[str] = (),
-) -> FitResult:
-    """Return the result for K = [A B E]ᵀ, in the lifting of the regression.
-
-    Rank and condition number are those of the regressors; this computes them if no rank is passed.
-    """
-    nz = regression.lifting.nz
-    if rank is None:
-        rank, condition = scaled_rank(regression.rows, regression.rows.P)
-    return FitResult(
-        A=K[:nz].T,
-        B=K[nz:].T,
-        C=np.eye(nz) if regression.C is None else regression.C,
-        lifting=regression.lifting,
-        residual=regression.rows.residual(regression.x_next, regression.decode(K)),
-        state_residual=regression.state_residual,
-        rank=rank,
-        condition=condition,
-        rule=rule,
-        ridge=ridge,
-        doubts=doubts,
-        changes=changes,
-    )
-
-
-def build_report(regression: Regression, result: FitResult, *, warn: bool = True) -> FitReport:
-    """Return the report. Each doubt in it also becomes a FitWarning at the user's line that called the fit."""
-    for sentence in result.doubts if warn else ():
+def build_report(regression: Regression, K: Float[np.ndarray, "n nz"], notes: FitNotes) -> FitReport:
+    """Return the report of the fit K. Each doubt also becomes a FitWarning at the user's line that called the fit."""
+    rows, doubts = regression.rows, tuple(notes.get("doubts", ()))
+    for sentence in () if notes.get("silent") else doubts:
         warnings.warn(sentence, FitWarning, stacklevel=_level_outside())
+    rank, condition = notes.get("rank"), notes.get("condition", np.inf)
+    if rank is None:
+        rank, condition = scaled_rank(rows, rows.P)
     return FitReport(
         method=regression.method,
-        route=f"{regression.route}, {result.rule}",
-        samples=regression.rows.samples,
-        condition=result.condition,
-        rank=result.rank,
-        columns=regression.columns,
-        ridge=result.ridge,
-        residual=result.residual,
-        state_residual=result.state_residual,
-        warnings=tuple(result.doubts),
-        changes=tuple(result.changes),
+        route=f"{regression.route}, {notes['rule']}",
+        samples=rows.samples,
+        condition=condition,
+        rank=rank,
+        columns=notes.get("columns", regression.columns),
+        ridge=notes.get("ridge", 0.0),
+        residual=rows.residual(regression.x_next, regression.decode(K)),
+        state_residual=regression.state_residual,
+        warnings=doubts,
+        changes=tuple(notes.get("changes", ())),
     )
 
 
@@ -221,32 +193,55 @@ def _level_outside() -> int:
     return level
 
 
-def build_predictor(regression: Regression, result: FitResult, *, warn: bool = True) -> LinearPredictor:
-    """Return z⁺ = A z + B u + E w with its report; `warn` makes each doubt in it a FitWarning."""
-    nu = len(regression.inputs) - len(regression.disturbances)
+def build_predictor(
+    regression: Regression,
+    K: Float[np.ndarray, "n nz"],
+    *,
+    modes: Complex[np.ndarray, "nl nz"] | None = None,
+    **notes: Unpack[FitNotes],
+) -> LinearPredictor:
+    """Return z⁺ = A z + B u + E w with [A B E]ᵀ = K, and its report."""
+    nz, nu = regression.lifting.nz, len(regression.inputs) - len(regression.disturbances)
     return LinearPredictor(
-        result.A,
-        result.B[:, :nu],
-        result.C,
-        result.lifting,
+        K[:nz].T,
+        K[nz : nz + nu].T,
+        np.eye(nz) if regression.C is None else regression.C,
+        regression.lifting,
         regression.dt,
         regression.states,
         regression.inputs[:nu],
-        build_report(regression, result, warn=warn),
-        exact_modes=result.modes,
-        E=result.B[:, nu:],
+        build_report(regression, K, notes),
+        exact_modes=modes,
+        E=K[nz + nu :].T,
         disturbances=regression.disturbances,
         embedding=regression.embedding,
-        scale=compute_scale(regression, result.lifting),
+        scale=compute_scale_factor(regression.rows.P[:, :nz], regression.rows.samples),
     )
 
 
-def compute_scale(regression: Regression, lifting: Lifting) -> Float[np.ndarray, "nz nz"]:
-    """Return the upper triangular R with RᵀR = Σ w z zᵀ / Σ w, where z is the lifted data of the regression."""
-    Z = regression.rows.P[:, : regression.lifting.nz]
-    if lifting is not regression.lifting and isinstance(lifting, Projected):
-        Z = Z @ lifting.basis
-    return compute_scale_factor(Z, regression.rows.samples)
+def build_bilinear(
+    regression: Regression, K: Float[np.ndarray, "n nz"], parts: BilinearParts, **notes: Unpack[FitNotes]
+) -> BilinearPredictor:
+    """Return the bilinear model with the matrices `parts` of K, and its report."""
+    nz, nu = regression.lifting.nz, len(regression.inputs) - len(regression.disturbances)
+    assert regression.C is not None, "an extended regression has its C"
+    return BilinearPredictor(
+        parts.A,
+        parts.B,
+        parts.N,
+        regression.C,
+        regression.lifting,
+        regression.dt,
+        regression.states,
+        regression.inputs[:nu],
+        build_report(regression, K, notes),
+        E=parts.E,
+        S=parts.S,
+        M=parts.M,
+        disturbances=regression.disturbances,
+        embedding=regression.embedding,
+        scale=compute_scale_factor(regression.rows.P[:, :nz], regression.rows.samples),
+    )
 
 
 def compute_scale_factor(P: Float[np.ndarray, "m n"], samples: int) -> Float[np.ndarray, "n n"]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from copy import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, cast
 
 import casadi as ca
@@ -112,16 +112,6 @@ def _inputs(*arguments: np.ndarray) -> Any:
     return [row if argument.ndim == 2 else float(row) for argument in arguments for row in argument]
 
 
-def _inside(lifting: Lifting) -> Iterator[tuple[str, Lifting | tuple[Lifting, ...]]]:
-    """Yield name and value of the fields that hold a lifting or a tuple of liftings."""
-    for field in fields(lifting):
-        value: Any = getattr(lifting, field.name)
-        if isinstance(value, Lifting):
-            yield field.name, value
-        elif isinstance(value, tuple) and all(isinstance(part, Lifting) for part in cast("tuple[Any, ...]", value)):
-            yield field.name, cast("tuple[Lifting, ...]", value)
-
-
 def _tunable(lifting: Lifting) -> Iterator[_Field]:
     """Yield the tunable fields of the lifting, then those of the liftings in it."""
     values = {name: np.asarray(getattr(lifting, name), dtype=float) for name in lifting.tunable}
@@ -130,7 +120,7 @@ def _tunable(lifting: Lifting) -> Iterator[_Field]:
     for name, value in values.items():
         spread = float(np.std(value - np.mean(value, axis=0))) if value.ndim else 0.0
         yield _Field(value, widths[0] if widths else spread or 1.0, name in positive)
-    for _, inner in _inside(lifting):
+    for inner in lifting.inner_liftings().values():
         for part in inner if isinstance(inner, tuple) else (inner,):
             yield from _tunable(part)
 
@@ -138,7 +128,7 @@ def _tunable(lifting: Lifting) -> Iterator[_Field]:
 def _copy_with(lifting: Lifting, values: Iterator[Any], *, symbols: bool) -> Lifting:
     """Return the lifting with the next of `values` in each tunable field, in the order of `_tunable`."""
     changes: dict[str, Any] = {name: next(values) for name in lifting.tunable}
-    for name, value in _inside(lifting):
+    for name, value in lifting.inner_liftings().items():
         if isinstance(value, tuple):
             changes[name] = tuple(_copy_with(part, values, symbols=symbols) for part in value)
         else:

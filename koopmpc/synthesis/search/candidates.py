@@ -15,8 +15,8 @@ from koopmpc.data.angles import find_angles
 from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
-from koopmpc.lifting.base import Lifting, check_lifting, strip_unit
-from koopmpc.lifting.composed import Standardized, Sum
+from koopmpc.lifting.base import Lifting, Sum, check_lifting, strip_unit
+from koopmpc.lifting.composed import Standardized
 from koopmpc.lifting.fourier import Fourier, RandomFourier
 from koopmpc.lifting.radial import Gaussian, ThinPlate
 from koopmpc.lifting.state import Constant, Monomials, State

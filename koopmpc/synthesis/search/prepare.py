@@ -15,7 +15,7 @@ from koopmpc.data.delay import Delay
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Source, source_of
 from koopmpc.lifting.state import Constant, State
-from koopmpc.models.base import replace_report
+from koopmpc.models.base import change_model
 from koopmpc.models.fits.edmd import edmd
 from koopmpc.synthesis.options import SearchOptions
 from koopmpc.synthesis.search.candidates import check_delays
@@ -61,7 +61,7 @@ class PreparedData:
         report = model.report
         if not self.lead or report is None:
             return model
-        return replace_report(model, replace(report, input_lead=self.lead, changes=(*report.changes, self.moved)))
+        return change_model(model, report=replace(report, input_lead=self.lead, changes=(*report.changes, self.moved)))
 
 
 def prepare_data(data: Episodes | Source, options: SearchOptions, *, feedback: bool, feedthrough: str) -> PreparedData:

@@ -9,7 +9,7 @@ from koopmpc.base.errors import KoopmpcError
 from koopmpc.base.parallel import Progress
 from koopmpc.data.episodes import Episodes
 from koopmpc.data.source import Held
-from koopmpc.models.base import replace_report
+from koopmpc.models.base import change_model
 from koopmpc.models.fits.refinement import refine
 from koopmpc.models.predictors import BilinearPredictor
 from koopmpc.models.records.free_run import PIECE
@@ -151,5 +151,5 @@ def fit_again(selection: Selection, episodes: Episodes) -> AnyPredictor:
             model = _refine_long(model, pieces, selection.refined)
     report = model.report
     if selection.predictor.input_lead and report is not None:
-        model = replace_report(model, replace(report, input_lead=selection.predictor.input_lead))
+        model = change_model(model, report=replace(report, input_lead=selection.predictor.input_lead))
     return model
