@@ -271,17 +271,8 @@ class KalmanFilter(Gated, Viewing):
             v = self._inputs.popleft()
             self._s[:] = self._predict_delayed(y, v, len(w)) if self._delay and len(w) else self._next(self._s, v)
         came = np.abs(y) < HUGE  # False for NaN
-        first = len(self._inputs) < self._delay  # y is older than the start
-        if not first and (self._delay or not self._started):
-            self._gate.judge(y, self._clip(system.M @ self._s + system.h))
-        if self._gate.lost:
-            if system.shows and came.all():
-                self._rest_at(y, u)
-            else:
-                self._s[: len(self._start)] = self._start
-        useful = came & ~self._is_silent(y, system.M @ self._s + system.h)
-        if not first and useful.any() and not self._gate.refused:
-            self._s += self._gain(useful) @ (y[useful] - system.M[useful] @ self._s - system.h[useful])
+        if len(self._inputs) >= self._delay:  # else y is older than the start
+            self._use(y, u, came)
         self._missed = 0 if came.any() else self._missed + 1
         self._started = True
         s = self._s
@@ -290,6 +281,20 @@ class KalmanFilter(Gated, Viewing):
         np.add(system.to_z @ s, system.one, out=self.z)
         np.dot(system.to_d, s, out=self.d)
         return self._missed <= self._patience and bool(np.abs(s).max() < HUGE)
+
+    def _use(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], came: Bool[np.ndarray, " ny"]) -> None:
+        """Correct the state with the entries of y that have come and tell something, unless y is refused."""
+        system = self._system
+        if self._delay or not self._started:
+            self._gate.judge(y, self._clip(system.M @ self._s + system.h))
+        if self._gate.lost:
+            if system.shows and came.all():
+                self._rest_at(y, u)
+            else:
+                self._s[: len(self._start)] = self._start
+        useful = came & ~self._is_silent(y, system.M @ self._s + system.h)
+        if useful.any() and not self._gate.refused:
+            self._s += self._gain(useful) @ (y[useful] - system.M[useful] @ self._s - system.h[useful])
 
     def _is_silent(self, y: Float[np.ndarray, " ny"], expected: Float[np.ndarray, " ny"]) -> Bool[np.ndarray, " ny"]:
         """Return which readings are at a rail of their sensor with a prediction at it or beyond."""

@@ -216,7 +216,8 @@ class Measured(Gated):
         self._gate = ReadingGate(model.ny, leaps=True) if self._remembers or model.embedding is not None else None
         self._nothing, self._known_z = np.full(model.ny, np.nan), False
         self._nothing_z = np.full(model.nz, np.nan)
-        self._foreseen, self._acted = self._nothing_z, np.zeros(model.nu)
+        self._foreseen = self._expected = self._nothing_z  # the z of the last prediction, of a w and that was used
+        self._acted = np.zeros(model.nu)
         self._from, self._bridged = np.zeros(model.nz), 0  # what the next prediction starts from; missed readings since
         self.z: Float[np.ndarray, " nz"] = np.zeros(model.nz)
         self.d: Float[np.ndarray, " nz"] = np.zeros(model.nz)
@@ -242,23 +243,26 @@ class Measured(Gated):
         self._model = state_model(model)
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
-        """Take y as it is; where it is lifted, a bad entry makes all of z NaN, which shows in every plan."""
+        """Take y, or what was expected of it; where it is lifted, a bad entry makes all of z NaN."""
         expected = self._nothing_z
-        if self._history is not None and self._gate is not None:
+        if self._gate is not None:
             if self._known_z:
+                self._acted = u
                 if len(w):
-                    self._acted = u
                     self._gate.choose(y, w, self._predict)
-                    expected = self._foreseen
                 else:
-                    expected = self._model.advance(self._from, u, w, self.d)
-            y = self._history.take(self._check_reading(self._gate, y, expected), u)
+                    self._predict(w)
+                expected = self._foreseen
+            y = self._check_reading(self._gate, y, expected)
+        if self._history is not None:
+            y = self._history.take(y, u)
         if self.lift is None:
             self.z = y
         else:
             self.lift.arguments[0][:] = y
             self.lift.evaluate()
             self.z = self.lift.results[0]
+        self._expected = expected
         if self._gate is not None:
             self._follow(expected)
         return True

@@ -11,7 +11,6 @@ from koopmpc.base import checks
 from koopmpc.base.checks import HUGE
 from koopmpc.base.errors import DataError
 from koopmpc.data.episodes import Episodes, episodes_of
-from koopmpc.estimate.gate import BRIDGED
 from koopmpc.estimate.observer import EstimatorProgram, Measured, StateModel
 from koopmpc.models.predictors import LinearPredictor
 
@@ -70,7 +69,7 @@ class PeriodicObserver(Measured):
                 unknown[constant] = 0.0
         else:
             unknown[self.ny :] = 0.0
-        self._unknown, self._none = unknown, np.zeros(self._model.nz)
+        self._unknown = unknown
         self._forget = float(np.exp(-1 / max(PERIODS * 2 * np.pi / turns[0], SHORTEST)))
         self.reset()
 
@@ -80,8 +79,6 @@ class PeriodicObserver(Measured):
         n = 1 + 2 * len(self._turns)
         self._theta: Float[np.ndarray, "n nz"] = np.zeros((n, self._model.nz))
         self._P: Float[np.ndarray, "n n"] = np.eye(n)
-        self._last: Float[np.ndarray, " nz"] = self._nothing_z
-        self._ahead: Float[np.ndarray, " nz"] = self._none
         self._k: int = 0
         self._stood_in = False
 
@@ -102,51 +99,25 @@ class PeriodicObserver(Measured):
 
     def observe(self, y: Float[np.ndarray, " ny"], u: Float[np.ndarray, " nu"], w: Float[np.ndarray, " nw"]) -> bool:
         """Take y, and learn from the misfit of the step that led here."""
-        gate, predicted = self._gate, self._nothing_z
+        phi, known = make_regressor(self._turns, self._k - 1), self._known_z
+        self.d[:] = phi @ self._theta
+        super().observe(y, u, w)
+        gate = self._gate
         assert gate is not None, "it remembers readings"
-        phi = make_regressor(self._turns, self._k - 1)
-        expected = self._nothing
-        if np.isfinite(self._last).all():
-            self._acted, self._ahead = u, phi @ self._theta
-            expected = gate.choose(y, w, self._predict) if len(w) else self._predict(w)
-            predicted = self._foreseen
-        stands_in = gate.judge(y, expected)
         if gate.lost:
-            self._theta[:], self._P, predicted = 0.0, np.eye(len(self._P)), self._nothing_z
-            if self._history is not None:
-                self._history.reset()
-        if stands_in:
-            y = expected
-        point = y if self._history is None else self._history.take(y, u)
-        if self.lift is None:
-            z = point.copy()
-        else:
-            self.lift.arguments[0][:] = point
-            self.lift.evaluate()
-            z = self.lift.results[0].copy()
-        e = self._unknown * (z - predicted)
-        if not (stands_in or self._stood_in or gate.opened) and e.dot(e) < HUGE**2:  # False for NaN
-            self._learn(phi, e)
-        self._stood_in = stands_in
-        self._last, self.z = z, z
-        if np.isfinite(z).all():
-            self._bridged = 0
-        elif self._bridged < BRIDGED:  # the next reading is judged all the same
-            self._last, self._stood_in = predicted + phi @ self._theta, True
-            self._bridged += 1
+            self._theta[:], self._P, known = 0.0, np.eye(len(self._P)), False
+        gap = self._unknown * (self.z - self._expected)
+        if known and not (gate.refused or self._stood_in or gate.opened) and gap.dot(gap) < HUGE**2:  # False for NaN
+            self._learn(phi, gap)
+        self._stood_in = gate.refused or self._bridged > 0  # the next reading is judged all the same
         self._k += 1
         self.d[:] = self._theta[0]
         return True
 
-    def _predict(self, w: Float[np.ndarray, " nw"]) -> Float[np.ndarray, " ny"]:
-        """Store the z that the last input and w predict without d, and return what it shows with d."""
-        self._foreseen = self._model.advance(self._last, self._acted, w, self._none)
-        return self._show(self._foreseen + self._ahead)
-
-    def _learn(self, phi: Float[np.ndarray, " n"], e: Float[np.ndarray, " nz"]) -> None:
+    def _learn(self, phi: Float[np.ndarray, " n"], gap: Float[np.ndarray, " nz"]) -> None:
         Pphi = self._P @ phi
         gain = Pphi / (self._forget + phi @ Pphi)
-        self._theta += np.outer(gain, e - phi @ self._theta)
+        self._theta += np.outer(gain, gap)
         P = (self._P - np.outer(gain, Pphi)) / self._forget
         self._P = 0.5 * (P + P.T)
 

@@ -10,13 +10,9 @@ from koopmpc.data.episodes import Episode
 from koopmpc.models.hidden_state import HiddenState
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
 from koopmpc.models.records.conversion import is_hidden
+from koopmpc.models.shared.levenberg_marquardt import find_starts
 
-_ITERATIONS = 20  # Gauss-Newton steps, at most
-_HALVINGS = 8  # of one step, until it lowers the sum of squares
-_CONVERGED = 1e-12  # stop where a step lowers the sum of squares by less than this share
 _ENCODED = 0.1  # spread of an entry of a hidden state that past rows give
-_EXACT = 1e-6  # share of an output's size that its noise is at least
-_KNOWN = 0.01  # share of an output's size that is its noise where the model has no report
 _PUSH = 0.1  # spread of an unknown past input, at least, as a share of one that moves an output by its size
 _FAR = 1e6  # a forecast of so many sizes has left the model
 
@@ -81,34 +77,17 @@ def estimate_start(
     whole = np.flatnonzero(np.isfinite(rows).all(axis=1))
     if not len(whole):
         raise DataError("no row of X is whole, so nothing tells where the record begins; pass one that is")
-    first, before = rows[whole[0]], moves[0] if len(moves) else np.zeros(model.nu)
-    size = np.ones(model.nx) if model.scale is None else np.linalg.norm(model.scale @ model.C.T, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    noise = _KNOWN * size if model.report is None else np.maximum(model.report.residual, _EXACT * size)
-    usual, spread, reach = first, size, size
-    if model.embedding is not None:
-        past = model.embedding.steps
-        usual = model.embedding.repeat(first, before)
-        pushes = np.maximum(np.abs(moves).max(axis=0, initial=0.0), _PUSH * _size_inputs(model, usual, before, size))
-        spread = reach = np.abs(model.embedding.spread(size, pushes))
-        if past < len(rows) and np.isfinite(rows[: past + 1]).all():
-            usual = model.start(rows[past], Episode(X=rows[: past + 1], U=moves[:past]))
-            spread = model.embedding.spread(noise, np.zeros(model.nu))
-            if isinstance(model.embedding, HiddenState):
-                spread[model.nx :] = _ENCODED
-            rows, moves = rows[past:], moves[past:]
+    usual, spread, reach, noise, rows, moves = _describe_start(model, rows, moves, rows[whole[0]])
     course: _LinearCourse | _PointCourse
     if isinstance(model, LinearPredictor) and is_hidden(model):
         course = _LinearCourse(model, usual, spread, reach)
     else:
         course = _PointCourse(model, usual, spread, reach)
 
-    def explain(
-        w: Float[np.ndarray, " n"],
-    ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r n"], Float[np.ndarray, " n"]]:
+    def explain(w: Float[np.ndarray, "1 n"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the residuals of the start v̄ + L w, their derivative, and the state behind the rows."""
-        v, D = course.mean + course.factor @ w, course.factor
-        gaps, slopes = [w], [np.eye(len(w))]
+        v, D = course.mean + course.factor @ w[0], course.factor
+        gaps, slopes = [w[0]], [np.eye(len(w[0]))]
         for k, row in enumerate(rows):
             shown, told = course.C @ v + course.c, np.isfinite(row)
             if model.embedding is not None:
@@ -118,27 +97,45 @@ def estimate_start(
             if k < len(moves):
                 v, D = course.advance(v, moves[k]), course.slope(v, moves[k]) @ D
                 if not (np.abs(v) < _FAR * course.reach).all():
-                    return np.full(1, np.inf), np.zeros((1, len(w))), v
+                    return np.full(1, np.inf), np.zeros((1, len(w[0]))), v
         return np.concatenate(gaps), np.vstack(slopes), v
 
-    w = np.zeros(course.factor.shape[1])
-    gap, slope, last = explain(w)
-    if not np.isfinite(gap).all():
+    def evaluate(w: Float[np.ndarray, "1 n"]) -> Float[np.ndarray, "1"]:
+        return np.array([np.sum(explain(w)[0] ** 2)])
+
+    def differentiate(w: Float[np.ndarray, "1 n"]) -> tuple[np.ndarray, np.ndarray]:
+        gap, slope, _ = explain(w)
+        return (slope.T @ gap)[None], (slope.T @ slope)[None]
+
+    start = np.zeros((1, course.factor.shape[1]))
+    if not np.isfinite(evaluate(start)).all():
         raise DataError(f"the model's forecast of these {len(rows)} rows overflows; pass fewer first rows")
-    for _ in range(_ITERATIONS):
-        value, move = gap @ gap, np.linalg.lstsq(slope, -gap, rcond=None)[0]
-        found = gap, slope, last
-        for halving in range(_HALVINGS):
-            found = explain(w + move / 2**halving)
-            if found[0] @ found[0] < value:
-                w = w + move / 2**halving
-                break
-        if not found[0] @ found[0] < value:
-            break
-        gap, slope, last = found
-        if gap @ gap > (1 - _CONVERGED) * value:
-            break
-    return course.point(last, rows, moves)
+    return course.point(explain(find_starts(evaluate, differentiate, start))[2], rows, moves)
+
+
+def _describe_start(
+    model: LinearPredictor | BilinearPredictor,
+    rows: Float[np.ndarray, "k1 nx"],
+    moves: Float[np.ndarray, "k nu"],
+    first: Float[np.ndarray, " nx"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return p̄, s, the sizes of p's entries, σ, and the rows and inputs behind the past, of which p̄ is made."""
+    before = moves[0] if len(moves) else np.zeros(model.nu)
+    size = np.ones(model.nx) if model.scale is None else np.linalg.norm(model.scale @ model.C.T, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    noise = 0.01 * size if model.report is None else np.maximum(model.report.residual, 1e-6 * size)
+    if model.embedding is None:
+        return first, size, size, noise, rows, moves
+    past, usual = model.embedding.steps, model.embedding.repeat(first, before)
+    pushes = np.maximum(np.abs(moves).max(axis=0, initial=0.0), _PUSH * _size_inputs(model, usual, before, size))
+    spread = reach = np.abs(model.embedding.spread(size, pushes))
+    if past < len(rows) and np.isfinite(rows[: past + 1]).all():
+        usual = model.start(rows[past], Episode(X=rows[: past + 1], U=moves[:past]))
+        spread = model.embedding.spread(noise, np.zeros(model.nu))
+        if isinstance(model.embedding, HiddenState):
+            spread[model.nx :] = _ENCODED
+        rows, moves = rows[past:], moves[past:]
+    return usual, spread, reach, noise, rows, moves
 
 
 def _size_inputs(

@@ -51,22 +51,11 @@ def read_state_space(
     A, B, C, D = (checks.array(getattr(system, name), name, (None, None)) for name in _MATRICES)
     if D.any():
         raise DataError("D is not zero: the input acts on the output of its own step, and a predictor has none of that")
-    own = getattr(system, "dt", None)
-    if own is None or own == 0:
-        if own is None and not hasattr(system, "to_discrete"):
-            raise DataError("the system does not say whether it is continuous; give it dt=0, or its sample time")
-        if dt is None:
-            raise DataError("the system is continuous; pass dt=, the sample time in seconds")
-        step = checks.positive(dt, "dt", "s")
+    step, continuous = _find_step(system, dt)
+    if continuous:
         from scipy.signal import cont2discrete  # slow to import
 
         A, B, *_ = cont2discrete((A, B, C, D), step)
-    elif own is True:
-        step = checks.positive(1.0 if dt is None else dt, "dt", "s")
-    else:
-        step = float(own)
-        if dt is not None and not np.isclose(dt, step):
-            raise DataError(f"the system has dt = {step:g} s, but dt= is {dt:g} s; leave dt out")
     state_names = getattr(system, "state_labels", None) if states is None else states
     input_names = getattr(system, "input_labels", None) if inputs is None else inputs
     return SystemMatrices(
@@ -77,6 +66,22 @@ def read_state_space(
         checks.names(state_names, "states", "x", len(A)),
         checks.names(input_names, "inputs", "u", B.shape[1]),
     )
+
+
+def _find_step(system: Any, dt: float | None) -> tuple[float, bool]:
+    """Return the sample time [s], and whether the system is continuous."""
+    own = getattr(system, "dt", None)
+    if own is None and not hasattr(system, "to_discrete"):
+        raise DataError("the system does not say whether it is continuous; give it dt=0, or its sample time")
+    if own is None or own == 0:
+        if dt is None:
+            raise DataError("the system is continuous; pass dt=, the sample time in seconds")
+        return checks.positive(dt, "dt", "s"), True
+    if own is True:
+        return checks.positive(1.0 if dt is None else dt, "dt", "s"), False
+    if dt is not None and not np.isclose(dt, float(own)):
+        raise DataError(f"the system has dt = {float(own):g} s, but dt= is {dt:g} s; leave dt out")
+    return float(own), False
 
 
 def build_system(

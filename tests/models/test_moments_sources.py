@@ -103,11 +103,11 @@ def test_a_stream_that_is_read_once_is_summed_in_qr_unless_told(sets: list[km.Ep
         km.moments.second_moments(spent, LIFTING)
 
 
-def test_a_folder_that_turns_out_worse_than_its_pilot_is_read_again_in_qr(
+def test_a_folder_that_turns_out_worse_than_its_first_file_is_read_again_in_qr(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("koopmpc.data.files.folder._PART", 10)
-    for i in range(8):  # the pilot reads 0, 2, 5 and 7
+    for i in range(8):
         data = random_episodes(i, [200], 2, 0)
         X = np.array(data[0].X)
         X[50] = [1e9, 1e9] if i == 3 else X[50]
@@ -131,15 +131,17 @@ class Counting:
             yield random_episodes(i, [50], 2, 1)
 
 
-def test_a_replayable_stream_of_unknown_length_has_a_pilot_at_its_start(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(("flat", "route", "most"), [(0, "gram", 1 + 20), (1, "qr", 1 + 3 + 20)])
+def test_a_replayable_stream_is_judged_by_its_first_sets(
+    flat: int, route: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("koopmpc.data.source._PART", 10)
     sets = Counting(20)
-    total = km.moments.second_moments(km.data.Stream(sets), LIFTING)
+    parallel = km.Expressions(lambda x: [x[0] + 1e-9 * x[1]], ["again"])
+    total = km.moments.second_moments(km.data.Stream(sets), LIFTING + parallel if flat else LIFTING)
     assert total.samples == 1000
-    assert total.route == "gram"
-    assert sets.given <= 1 + 5 + 20  # the first set for the names, the pilot and one ahead, the whole
+    assert total.route == route
+    assert sets.given <= most
 
 
 def test_every_fit_takes_a_source(folder: Path, sets: list[km.Episodes]) -> None:

@@ -1,9 +1,7 @@
-"""The moments of a whole source: its parts are read by workers, and a pilot chooses between sums and a factor."""
+"""The moments of a whole source: its parts are read by workers, and the condition chooses sums or a factor."""
 
 from collections.abc import Callable, Iterable, Sequence, Sized
 from dataclasses import dataclass, replace
-from functools import reduce
-from itertools import islice
 from typing import Any, Literal, NamedTuple, TypedDict, cast
 
 import numpy as np
@@ -19,14 +17,14 @@ from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.data.source import Changed, Held, Part, Source, source_of
 from koopmpc.lifting.base import Lifting, bind_lifting
 from koopmpc.models.moments.moments import Moments
-from koopmpc.models.moments.rows import ROWS, GramSums, TriangularFactor, lift_chunks, row_columns, split_chunks
+from koopmpc.models.moments.rows import GramSums, TriangularFactor, lift_chunks, row_columns
 
 Route = Literal["gram", "qr"]
 Weights = Callable[[Episode], ArrayLike] | Sequence[ArrayLike] | Float[np.ndarray, "..."]
 Steps = list[Float[np.ndarray, " T"]]  # the weights of each episode, one for each step
 
 _WELL_CONDITIONED = 1e6  # up to this scaled cond(Z) Gram sums lose no accuracy
-_PILOT = 4  # the pilot reads at most so many parts, and at least so many chunks
+_ENOUGH = 4  # pairs for each regressor from which the condition of the first parts tells that of all
 
 
 class ReadOptions(TypedDict, total=False):
@@ -65,10 +63,9 @@ def second_moments(
     embedding
         ψ acts on ζ, the state and its past, as `Delay` makes it.
     route
-        "gram" sums products, "qr" updates a triangular factor. By default a pilot chooses: it sums chunks sampled from
-        up to 4 parts. If their scaled condition number is at most 1e6, the other chunks are added to these Gram sums.
-        If it is larger, or if that of all data is, everything is read by "qr". So is a stream that can be read only
-        once.
+        "gram" sums products, "qr" updates a triangular factor. By default products are summed. If their scaled
+        condition number is above 1e6, for the first parts or for all data, everything is read again by "qr". A stream
+        that can be read only once is read by "qr".
     bilinear
         Put u⊗ψ(x) into the rows, for z⁺ = A z + B u + Σ uᵢ Nᵢ z.
     weights
@@ -100,33 +97,30 @@ def second_moments(
     reading = _ReadTask(None, bound, source.inputs, bilinear, _align_weights(weights, source))
     zero = Moments(bound, source.inputs, source.dt, 0, 0.0, "", np.empty((0, 0)), bilinear, embedding)
 
-    def read(route: Route, done: dict[int, tuple[int, ...]]) -> Iterable[Moments]:
-        """Yield the moments of the parts in order, without the chunks in `done`."""
-        parts = source.parts()
-        lazy = (replace(reading, part=p, route=route, done=done.get(i, ())) for i, p in enumerate(parts))
+    def add_up(route: Route, *, judged: bool) -> Moments | None:
+        """Return the moments of all parts, added in order; None where `judged` Gram sums turn out ill-conditioned."""
+        parts, total = source.parts(), replace(zero, route=route)
+        lazy = (replace(reading, part=part, route=route) for part in parts)
         tasks = list(lazy) if isinstance(parts, Sized) else lazy
+        waits = judged and not (isinstance(parts, Sized) and len(parts) == 1)
         for sums in map_tasks(read_part, tasks, workers=workers, scheduler=scheduler, progress=progress):
-            yield replace(zero, route=route, **sums._asdict())
+            each = replace(zero, route=route, **sums._asdict())
+            total = total + each if total.samples else each
+            if waits and total.samples >= _ENOUGH * total.columns.regressors.size:
+                if total.condition > _WELL_CONDITIONED:
+                    return None
+                waits = False
+        if not total.samples:
+            raise DataError("all weights are 0; give some pair a weight above 0")
+        return None if judged and total.condition > _WELL_CONDITIONED else total
 
-    if route is None and not source.replayable:
-        route = "qr"
-    if route is None:
-        pilot, done, complete = _run_pilot(source, reading)
-        total = replace(zero, route="gram", **pilot._asdict())
-        if not total.samples or total.condition <= _WELL_CONDITIONED:
-            if not complete:
-                total = reduce(Moments.__add__, read("gram", done), total)
-            if not total.samples:
-                raise DataError(_NO_WEIGHT)
-            if complete or total.condition <= _WELL_CONDITIONED:
-                return total
-    total = reduce(Moments.__add__, read(route or "qr", {}))
-    if not total.samples:
-        raise DataError(_NO_WEIGHT)
+    if route is None and source.replayable:
+        total = add_up("gram", judged=True)
+        if total is not None:
+            return total
+    total = add_up(route or "qr", judged=False)
+    assert total is not None, "it was not judged"
     return total
-
-
-_NO_WEIGHT = "all weights are 0; give some pair a weight above 0"
 
 
 class _Sums(NamedTuple):
@@ -151,8 +145,6 @@ class _ReadTask:
         Weights of the steps; None weighs all by 1.
     route
         "gram" for Σ w dᵀd, "qr" for its triangular factor.
-    done
-        Numbers of the chunks that the pilot has summed.
     """
 
     part: Part | None
@@ -161,14 +153,13 @@ class _ReadTask:
     bilinear: bool
     weights: Weights | None
     route: Route = "gram"
-    done: tuple[int, ...] = ()
 
     def __str__(self) -> str:
         return str(self.part)
 
     def __reduce__(self) -> tuple[Any, ...]:
         arrays: Arrays = {}
-        rest = (self.inputs, self.bilinear, self.weights, self.route, self.done)
+        rest = (self.inputs, self.bilinear, self.weights, self.route)
         return _unpack, (self.part, to_data(self.lifting, arrays), arrays, *rest)
 
 
@@ -180,17 +171,10 @@ def read_part(reading: _ReadTask) -> _Sums:
     """Return the sums of one part: chunks of fixed size, lifted, added in order and forgotten."""
     assert reading.part is not None, "a task has a part"
     episodes = reading.part.load()
-    done = set(reading.done)
-    which = [i for i in range(len(split_chunks(episodes))) if i not in done] if done else None
-    return _sum_chunks(reading, episodes, which)
-
-
-def _sum_chunks(reading: _ReadTask, episodes: Episodes, which: Sequence[int] | None) -> _Sums:
-    """Return the sums of these chunks of the episodes, by default of all."""
     weights = None if reading.weights is None else _check_weights(reading.weights, episodes)
     columns = row_columns(reading.lifting, reading.inputs, reading.bilinear)
     names, total, samples, weight = columns.names, None, 0, 0.0
-    for chunk in lift_chunks(episodes, columns, which, weights):
+    for chunk in lift_chunks(episodes, columns, weights):
         if total is None:
             total = (GramSums if reading.route == "gram" else TriangularFactor)(chunk.P.shape[1], chunk.nz)
         count = len(chunk.P) - len(chunk.last)
@@ -206,28 +190,6 @@ def _sum_chunks(reading: _ReadTask, episodes: Episodes, which: Sequence[int] | N
             )
     sums = np.zeros((len(names), len(names))) if total is None else total.sums
     return _Sums(sums, samples, weight)
-
-
-def _run_pilot(source: Source, reading: _ReadTask) -> tuple[_Sums, dict[int, tuple[int, ...]], bool]:
-    """Return Gram sums of chunks sampled from a few parts, their numbers by part, and whether these are all chunks."""
-    parts = source.parts()
-    if isinstance(parts, list):
-        complete = len(parts) <= _PILOT
-        chosen = {i: parts[i] for i in (range(len(parts)) if complete else space_evenly(len(parts), _PILOT))}
-    else:
-        chosen, complete = dict(enumerate(islice(parts, _PILOT))), False
-    width = reading.lifting.nz + len(reading.inputs) * (1 + reading.lifting.nz * reading.bilinear)
-    limit = -(-max(_PILOT, -(-4 * width // ROWS)) // len(chosen))
-    done: dict[int, tuple[int, ...]] = {}
-    pilots: list[_Sums] = []
-    for i, part in chosen.items():
-        episodes = part.load()
-        count = -(-sum(len(e.U) for e in episodes.episodes) // ROWS)
-        done[i] = tuple(range(count) if count <= limit else space_evenly(count, limit))
-        complete = complete and len(done[i]) == count
-        pilots.append(_sum_chunks(replace(reading, part=part), episodes, done[i]))
-    sums = reduce(np.add, (pilot.sums for pilot in pilots))
-    return _Sums(sums, sum(p.samples for p in pilots), sum(p.weight for p in pilots)), done, complete
 
 
 def space_evenly(total: int, wanted: int) -> list[int]:

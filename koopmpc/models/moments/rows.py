@@ -122,10 +122,9 @@ class LiftedChunk(NamedTuple):
 def lift_chunks(
     episodes: Episodes,
     columns: RowColumns,
-    which: Sequence[int] | None = None,
     weights: list[Float[np.ndarray, " _"]] | None = None,
 ) -> Iterator[LiftedChunk]:
-    """Yield the lifted chunks with these numbers, by default all; each overwrites the memory of the one before.
+    """Yield the lifted chunks; each overwrites the memory of the one before.
 
     Parameters
     ----------
@@ -133,17 +132,14 @@ def lift_chunks(
         They have as many inputs as the columns name.
     columns
         The columns of the rows.
-    which
-        Numbers of chunks, in the order of `split_chunks`.
     weights
         Weight of each step, episode by episode; None weighs all by 1.
     """
     of, lifting, products = episodes.episodes, columns.full, columns.products
     nz, nu = lifting.nz, len(episodes.inputs)
     n = len(columns.names) - nz
-    pieces = split_chunks(episodes)
     space = np.empty((2 * ROWS, n))  # fresh memory costs as much as the rows
-    for chunk in pieces if which is None else [pieces[i] for i in which]:
+    for chunk in split_chunks(episodes):
         last = np.cumsum([end - first + 1 for _, first, end in chunk]) - 1
         first = np.concatenate([[0], last[:-1] + 1])
         P = space[: int(last[-1]) + 1]

@@ -12,12 +12,10 @@ from koopmpc.models.records.hidden import (
     list_states,
     start_states,
 )
-from koopmpc.models.shared.levenberg_marquardt import minimise
+from koopmpc.models.shared.levenberg_marquardt import find_starts, invert_softly, minimise
 
 _STEPS = 12  # Gauss-Newton steps for the states of the segments, at most
-_SHARES = (1.0, 0.3, 0.1, 0.03, 0.01)  # of a step, until it lowers a segment's error
 _SOFT = 1e-9  # weight of the states' own size in such a step, as a share of the mean of its diagonal
-_CONVERGED = 1e-14  # stop where a step lowers the squared errors by less than this share
 _FAR = 1e3  # a state beyond this many spreads has left the model
 _LEAST = 1e-6  # ridge of the encoder that is fitted to the states found, as a share of its regressors
 
@@ -36,23 +34,15 @@ class FreeStartsError(SimulationError):
 
     def begin(self, model: HiddenModel, data: RecordSegments) -> Float[np.ndarray, "m n"]:
         """Return the z_0 of each segment that explains its outputs best."""
-        z = start_states(model, data.points)
-        errors = _errors_of(model, z, data)
-        for _ in range(_STEPS):
-            slope, square = self._by_starts(model, z, data)
-            n, before = model.order, errors.sum()
-            move = -np.matmul(_invert(square), slope.reshape(-1, n, 1)).reshape(-1, n)
-            waits = np.ones(len(z), dtype=np.bool_)
-            for share in _SHARES:
-                trial = np.where(waits[:, None], z + share * move, z)
-                now = _errors_of(model, trial, data)
-                better = waits & (now < errors)
-                z, errors, waits = np.where(better[:, None], trial, z), np.where(better, now, errors), waits & ~better
-                if not waits.any():
-                    break
-            if not before - errors.sum() > _CONVERGED * before:
-                break
-        return z
+        return find_starts(
+            lambda z: _errors_of(model, z, data),
+            lambda z: self._by_starts(model, z, data),
+            start_states(model, data.points),
+            steps=_STEPS,
+            soft=_SOFT,
+            shares=(1.0, 0.3, 0.1, 0.03, 0.01),
+            converged=1e-14,
+        )
 
     def _by_starts(
         self, model: HiddenModel, z: Float[np.ndarray, "m n"], data: RecordSegments
@@ -83,19 +73,11 @@ class FreeStartsError(SimulationError):
         (slope, both), (early, cross, square) = by_others, by_starts
         n = square.shape[1]
         joined = np.concatenate([early.reshape(-1, n, 1), cross], axis=2)
-        follows = np.matmul(_invert(square), joined)
+        follows = np.matmul(invert_softly(square, _SOFT), joined)
         gradient, matrix = np.zeros(size), np.zeros((size, size))
         gradient[others] = slope - np.einsum("snw,sn->w", cross, follows[..., 0])
         matrix[np.ix_(others, others)] = both - np.tensordot(cross, follows[..., 1:], axes=([0, 1], [0, 1]))
         return gradient, matrix
-
-
-def _invert(square: Float[np.ndarray, "m n n"]) -> Float[np.ndarray, "m n n"]:
-    """Return the inverse of each matrix, with a little weight on its diagonal."""
-    n = square.shape[1]
-    weighed = square.copy()
-    weighed[:, np.arange(n), np.arange(n)] += _SOFT * np.trace(square, axis1=1, axis2=2)[:, None] / n + 1e-300
-    return np.linalg.inv(weighed)
 
 
 def shoot(model: HiddenModel, fitted: Sets, judged: Sets, iterations: int) -> tuple[HiddenModel, int]:

@@ -1,6 +1,6 @@
-"""Levenberg-Marquardt descent that stops on rows which it does not fit."""
+"""Levenberg-Marquardt descent that stops on rows which it does not fit; Gauss-Newton for the first states of runs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -113,3 +113,58 @@ def minimise(
 
 def _keep(theta: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return theta
+
+
+def find_starts(
+    evaluate: Callable[[Float[np.ndarray, "m n"]], Float[np.ndarray, " m"]],
+    differentiate: Callable[[Float[np.ndarray, "m n"]], tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n n"]]],
+    starts: Float[np.ndarray, "m n"],
+    *,
+    steps: int = 20,
+    soft: float = 0.0,
+    shares: Sequence[float] = tuple(0.5**i for i in range(8)),
+    converged: float = 1e-12,
+) -> Float[np.ndarray, "m n"]:
+    """Return the first state of each of m runs that explains its rows best, by Gauss-Newton on all runs at once.
+
+    Parameters
+    ----------
+    evaluate
+        Squared error of each run; inf where it leaves the model.
+    differentiate
+        Half its gradient by the first state, and the Gauss-Newton matrix.
+    starts
+        Where the search begins.
+    steps
+        Steps, at most.
+    soft
+        Weight of a state's own size in a step, as a share of the mean of the matrix's diagonal.
+    shares
+        Of a step, tried until it lowers the error of a run.
+    converged
+        Stop where a step lowers the sum of all errors by less than this share.
+    """
+    errors = evaluate(starts)
+    for _ in range(steps):
+        (slope, square), before = differentiate(starts), errors.sum()
+        move = -np.matmul(invert_softly(square, soft), slope[..., None])[..., 0]
+        waits = np.ones(len(starts), dtype=np.bool_)
+        for share in shares:
+            trial = np.where(waits[:, None], starts + share * move, starts)
+            lower = evaluate(trial)
+            better = waits & (lower < errors)
+            starts, errors = np.where(better[:, None], trial, starts), np.where(better, lower, errors)
+            waits &= ~better
+            if not waits.any():
+                break
+        if not before - errors.sum() > converged * before:
+            break
+    return starts
+
+
+def invert_softly(square: Float[np.ndarray, "m n n"], soft: float) -> Float[np.ndarray, "m n n"]:
+    """Return the inverse of each matrix, with a little weight on its diagonal."""
+    n = square.shape[1]
+    weighed = square.copy()
+    weighed[:, np.arange(n), np.arange(n)] += soft * np.trace(square, axis1=1, axis2=2)[:, None] / n + 1e-300
+    return np.linalg.inv(weighed)
