@@ -2,7 +2,7 @@
 
 import warnings
 from dataclasses import replace
-from typing import Literal, NamedTuple, overload
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -39,28 +39,6 @@ class _Found(NamedTuple):
     simulated: Episodes
 
 
-@overload
-def unequal_rates(
-    data: PartialEpisodes,
-    lifting: Lifting,
-    *,
-    embedding: Delay | None = None,
-    bilinear: Literal[False] = False,
-    scheduled_inputs: bool = False,
-    horizon: int | None = None,
-    iterations: int = 100,
-) -> LinearPredictor: ...
-@overload
-def unequal_rates(
-    data: PartialEpisodes,
-    lifting: Lifting,
-    *,
-    embedding: Delay | None = None,
-    bilinear: Literal[True],
-    scheduled_inputs: bool = False,
-    horizon: int | None = None,
-    iterations: int = 100,
-) -> BilinearPredictor: ...
 def unequal_rates(
     data: PartialEpisodes,
     lifting: Lifting,
@@ -138,21 +116,8 @@ def unequal_rates(
             return bilinear_edmd(rows, lifting, embedding=embedding, scheduled_inputs=scheduled_inputs)
         return edmd(rows, lifting, embedding=embedding)
 
-    longest, past = max(map(len, data.U)), 0 if embedding is None else embedding.steps
-    wanted = (
-        max(_GAPS * data.find_gap() * (past + 1), _SHORT) + past
-        if horizon is None
-        else checks.count(horizon, "horizon")
-    )
-    if horizon is not None and horizon > longest:
-        raise DataError(
-            f"no run has the {horizon} steps of a segment; the longest has {longest}, pass a shorter horizon"
-        )
-    wanted = min(wanted, longest)
-    if wanted <= past:
-        raise DataError(
-            f"a segment has {wanted} steps, and the embedding keeps {past}; pass longer runs or a longer horizon"
-        )
+    past = 0 if embedding is None else embedding.steps
+    wanted = _choose_horizon(data, horizon, past)
     size = np.nanstd(np.concatenate(data.X), axis=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)  # rows with bridged gaps are a start alone
@@ -174,6 +139,24 @@ def unequal_rates(
     refitted = with_coefficients(fit(best.simulated), places, best.theta, sentence)
     assert refitted.report is not None, "it was fitted"
     return change_model(refitted, report=replace(refitted.report, method="unequal_rates", samples=measured))
+
+
+def _choose_horizon(data: PartialEpisodes, horizon: int | None, past: int) -> int:
+    """Return the steps of a segment."""
+    longest = max(map(len, data.U))
+    if horizon is None:
+        wanted = min(max(_GAPS * data.find_gap() * (past + 1), _SHORT) + past, longest)
+    else:
+        wanted = checks.count(horizon, "horizon")
+        if wanted > longest:
+            raise DataError(
+                f"no run has the {wanted} steps of a segment; the longest has {longest}, pass a shorter horizon"
+            )
+    if wanted <= past:
+        raise DataError(
+            f"a segment has {wanted} steps, and the embedding keeps {past}; pass longer runs or a longer horizon"
+        )
+    return wanted
 
 
 def _fit_from(

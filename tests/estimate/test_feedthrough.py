@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.base.errors import DataError
 from tests.bare import shown
 from tests.compiler import needs_compiler
 
@@ -97,7 +96,7 @@ def test_a_model_that_select_takes_with_feedthrough_drives_the_plant_as_its_opti
 
 def test_feedthrough_without_inputs_is_refused_in_a_sentence():
     data = log_of(1, np.random.default_rng(0))
-    with pytest.raises(DataError, match="feedthrough says how inputs act, and the data have none"):
+    with pytest.raises(km.errors.DataError, match="feedthrough says how inputs act, and the data have none"):
         km.select(km.Episodes([km.Episode(X=data[0].X)], 0.1), options=km.SearchOptions(feedthrough=True))
     (said,) = shown("""
 data = km.Episodes([km.Episode(X=np.zeros((9, 1)), U=np.ones((8, 1)))], 0.1)
@@ -220,13 +219,13 @@ def test_machine_code_reads_as_python_does(start):
 
 def test_what_feedthrough_does_not_go_with_is_refused_in_a_sentence():
     model = learn(1)
-    with pytest.raises(DataError, match=r"feedthrough and a period"):
+    with pytest.raises(km.errors.DataError, match=r"feedthrough and a period"):
         km.LiftedKalman(model.C, feedthrough=True, period=1.0)
     plant = km.discretize(km.load_problem("pendulum").dynamics, dt=0.05)
-    with pytest.raises(DataError, match="give the StepMap an output"):
+    with pytest.raises(km.errors.DataError, match="give the StepMap an output"):
         km.NonlinearMPC(plant, km.Cost(Q=[1, 1], R=1), None, 5, estimator=km.ExtendedKalman(feedthrough=True))
     data = log_of(1, np.random.default_rng(0))
     watched = km.Episodes([km.Episode(X=e.X, U=e.U, W=0.1 * e.U[::-1]) for e in data], 0.1, ["y"], ["u"], ["w"])
     seen = km.edmd(watched, PLAIN, embedding=km.Delay(1))
-    with pytest.raises(DataError, match="fit the model without W"):
+    with pytest.raises(km.errors.DataError, match="fit the model without W"):
         km.KoopmanMPC(seen, COST, None, N, estimator=km.LiftedKalman(seen.C, feedthrough=True))

@@ -5,7 +5,6 @@ import pytest
 import scipy.special
 
 import koopmpc as km
-from koopmpc.lifting.onnx_layers import join_fields, split_fields
 from tests.compiler import find_compiler
 from tests.docs.page import alike, run
 
@@ -177,21 +176,6 @@ def test_damaged_files_are_read_right_or_refused(layer, tmp_path):
         except km.KoopmpcError:
             refused += 1
     assert refused > 100
-
-
-def test_a_message_that_ends_inside_a_field_is_none():
-    rng = np.random.default_rng(0)
-    for _ in range(30):
-        kinds = [(0, int(rng.integers(2**40))), (1, rng.bytes(8)), (5, rng.bytes(4)), (2, rng.bytes(rng.integers(9)))]
-        fields = [(int(rng.integers(1, 40)), *kinds[i]) for i in rng.integers(4, size=3)]
-        parts = [join_fields([field]) for field in fields]
-        whole, ends = b"".join(parts), np.cumsum([0, *map(len, parts)]).tolist()
-        for end in range(len(whole) + 1):
-            if end in ends:
-                assert list(split_fields(whole[:end])) == fields[: ends.index(end)]
-            else:
-                with pytest.raises((ValueError, IndexError)):
-                    list(split_fields(whole[:end]))
 
 
 def test_the_page_how_onnx_md_runs_with_a_network(tmp_path):

@@ -32,15 +32,6 @@ def test_coefficients_are_those_of_lstsq(lengths: list[int], nu: int, seed: int)
     assert not model.report.warnings
 
 
-@given(st.permutations(range(6)), st.integers(0, 99))
-def test_the_order_of_episodes_changes_nothing(order: list[int], seed: int) -> None:
-    data = random_episodes(seed, [30] * 6, 2, 1)
-    mixed = km.Episodes([data[i] for i in order], data.dt)
-    a, b = km.edmd(data, LIFTING), km.edmd(mixed, LIFTING)
-    assert np.allclose(a.A, b.A, rtol=0, atol=1e-11)
-    assert np.allclose(a.B, b.B, rtol=0, atol=1e-11)
-
-
 def test_episodes_of_two_regimes_are_not_paired() -> None:
     # within each regime x⁺ = x/2; a pair across the seam would be −100 → +100
     halves = 0.5 ** np.arange(6)[:, None]

@@ -57,13 +57,6 @@ def test_permuting_splitting_and_merging_change_nothing_but_rounding(
         assert np.allclose(coefficients(other, LIFTING, route), K, rtol=0, atol=1e-9)
 
 
-@ROUTES
-@given(st.integers(0, 999))
-def test_coefficients_are_those_of_lstsq_on_well_conditioned_data(route: str, seed: int) -> None:
-    data = random_episodes(seed, [40, 9], 2, 1)
-    assert np.allclose(coefficients(data, LIFTING, route), least_squares(data, LIFTING), rtol=0, atol=1e-10)
-
-
 @given(
     st.integers(0, 99),
     st.lists(st.integers(-4, 4), min_size=2, max_size=2),

@@ -60,14 +60,7 @@ def fit_regression(
         The model that a large ridge leads to, as in `edmd`.
     """
     ridge = check_ridge(ridge)
-    if not checks.among(towards, ("zero", "affine")):
-        raise DataError(f'towards is {towards!r}; pass "zero" or "affine"')
-    if towards == "affine" and rank is not None:
-        raise DataError('towards="affine" treats columns differently, and rank mixes them; pass one of the two')
-    if not checks.among(method, _WORDS):
-        raise DataError(f"method is {method!r}; pass one of {', '.join(map(repr, _WORDS))}")
-    if method != "ls" and ridge != 0:
-        raise DataError(f'a ridge shrinks A, and method="{method}" undoes what noise shrank; pass one of the two')
+    _check_method(ridge, rank, method, towards)
     rows, nz = regression.rows, regression.lifting.nz
     if regression.B is not None:  # B is known: subtract B u from the targets, and fit A alone
         known = rows.P[:, nz:] @ regression.B.T
@@ -95,6 +88,18 @@ def fit_regression(
         ridge=solution.ridge,
         doubts=sentences,
     )
+
+
+def _check_method(ridge: Ridge, rank: Rank, method: Method, towards: Towards) -> None:
+    """Raise DataError where two options do not go together, or one has no such value."""
+    if not checks.among(towards, ("zero", "affine")):
+        raise DataError(f'towards is {towards!r}; pass "zero" or "affine"')
+    if towards == "affine" and rank is not None:
+        raise DataError('towards="affine" treats columns differently, and rank mixes them; pass one of the two')
+    if not checks.among(method, _WORDS):
+        raise DataError(f"method is {method!r}; pass one of {', '.join(map(repr, _WORDS))}")
+    if method != "ls" and ridge != 0:
+        raise DataError(f'a ridge shrinks A, and method="{method}" undoes what noise shrank; pass one of the two')
 
 
 def _fit_reduced(

@@ -106,8 +106,8 @@ class OnlineEDMD:
         elif factor < 1:
             raise DataError(f"window is {window} and forgetting {factor:g}; choose one of them")
         else:
-            self._memory = WindowMemory(width, checks.count(window, "window"), max(_BLOCK, width))
-        self._rows = np.empty((_BLOCK if window is None else max(_BLOCK, width), width))
+            self._memory = WindowMemory(width, checks.count(window, "window"))
+        self._rows = np.empty((_BLOCK, width))
         self._waiting: int = 0
         long = factor < 1 and 1 / (1 - factor) >= 4 * self._n  # forecasts from a short memory cannot reveal outliers
         self._gate = OutlierGate(width, self._n, nz) if long else None
@@ -187,33 +187,33 @@ class OnlineEDMD:
         after = checks.array(x_next, "x_next", (*lead, nx))
         if w is None and nw:
             raise DataError(f"the model has {nw} measured disturbances; pass w")
-        pushed = checks.array(np.zeros((*lead, 0)) if w is None else w, "w", (*lead, nw)) if nw else None
-        count = 1 if single else len(now)
-        Z = self._lift_pair(now, after) if single else None
-        if Z is None or not np.isfinite(Z).all():  # many rows, or one row that the fast path could not lift
-            with np.errstate(all="ignore"):  # the check below names an observable that is not finite
-                Z = self._full(np.concatenate([now.reshape(count, nx), after.reshape(count, nx)]))
-            if not np.isfinite(Z).all():
-                bad = self._full.names[int(np.argwhere(~np.isfinite(Z))[0, 1])]
-                raise DataError(f"the observable {bad!r} is not finite on these data; leave the sample out")
-        done, before = 0, self.outliers
-        while done < count:
-            take = min(count - done, len(self._rows) - self._waiting)
-            self._write(Z, forced.reshape(count, nu), pushed, done, take)
+        pushed = checks.array(np.zeros((*lead, 0)) if w is None else w, "w", (*lead, nw))
+        count, nz = 1 if single else len(now), self._lifting.nz
+        Z = self._lift(np.concatenate([now.reshape(count, nx), after.reshape(count, nx)]))
+        parts = [Z[:count, :nz], forced.reshape(count, nu), pushed.reshape(count, nw), Z[:count, nz:], Z[count:]]
+        before = self.outliers
+        self._take(np.hstack(parts))
+        self.pairs += count - (self.outliers - before)
+
+    def _take(self, table: Float[np.ndarray, "M width"]) -> None:
+        """Learn from rows [ψ(x) u w, states that ψ lacks, ψ(x⁺) …], a block at a time."""
+        done, rows, gate = 0, self._rows, self._gate
+        while done < len(table):
+            take = min(len(table) - done, len(rows) - self._waiting)
+            part = rows[self._waiting : self._waiting + take]
+            part[:] = table[done : done + take]
             done += take
-            if self._gate is not None:
-                learned = self._gate.keep(self._rows[self._waiting - take : self._waiting])
-                self._waiting -= take - learned
-                self.outliers += take - learned
-            if self._waiting == len(self._rows) and self._gate is not None and not self._gate.begun:
-                self._waiting = self._gate.first(self._rows)
-                self.outliers += len(self._rows) - self._waiting
-            if self._waiting == len(self._rows):
-                self._memory.push(self._rows)
+            learned = take if gate is None else gate.keep(part)
+            self._waiting += learned
+            self.outliers += take - learned
+            if self._waiting == len(rows) and gate is not None and not gate.begun:
+                self._waiting = gate.first(rows)
+                self.outliers += len(rows) - self._waiting
+            if self._waiting == len(rows):
+                self._memory.push(rows)
                 self._waiting = 0
-                if self._gate is not None:
-                    self._judge(self._gate)
-        self.pairs = self.pairs + count - (self.outliers - before)
+                if gate is not None:
+                    self._judge(gate)
 
     def _judge(self, gate: "OutlierGate") -> None:
         """Start a shadow model when signals have fallen; let it take over if it is better; update the forecasts."""
@@ -248,35 +248,21 @@ class OnlineEDMD:
         rule += describe_solve(rows, self._ridge, solution.ridge)
         return build_predictor(regression, solution.K, rule=rule, ridge=solution.ridge, doubts=sentences, silent=True)
 
-    def _lift_pair(self, now: Float[np.ndarray, " nx"], after: Float[np.ndarray, " nx"]) -> Float[np.ndarray, "2 nf"]:
-        """Return ψ of both states, in memory that the next call overwrites; NaN for a state beyond 1e30."""
-        memory = self._psi
-        for z, point in zip(self._pair, (now, after), strict=True):
-            memory.arguments[0][:] = point
-            memory.evaluate()
-            z[:] = memory.results[0]
-        return self._pair
-
-    def _write(
-        self,
-        Z: Float[np.ndarray, "M2 nf"],
-        forced: Float[np.ndarray, "M nu"],
-        pushed: Float[np.ndarray, "..."] | None,
-        first: int,
-        take: int,
-    ) -> None:
-        """Write rows [ψ(x) u w, states that ψ lacks, ψ(x⁺) …] into the buffer."""
-        count, nz, full, nu = len(forced), self._lifting.nz, self._full.nz, forced.shape[1]
-        taken = slice(first, first + take)
-        rows = self._rows[self._waiting : self._waiting + take]
-        rows[:, :nz] = Z[taken, :nz]
-        rows[:, nz : nz + nu] = forced[taken]
-        if pushed is not None:
-            rows[:, nz + nu : self._n] = pushed.reshape(count, -1)[taken]
-        last = rows.shape[1] - full
-        rows[:, self._n : last] = Z[taken, nz:]
-        rows[:, last:] = Z[count + first : count + first + take]
-        self._waiting += take
+    def _lift(self, points: Float[np.ndarray, "M2 nx"]) -> Float[np.ndarray, "M2 nf"]:
+        """Return ψ of rows of states; of two in memory that the next call overwrites."""
+        if len(points) == 2:
+            for z, point in zip(self._pair, points, strict=True):
+                self._psi.arguments[0][:] = point
+                self._psi.evaluate()
+                z[:] = self._psi.results[0]
+            if np.isfinite(self._pair).all():  # NaN for a state beyond 1e30
+                return self._pair
+        with np.errstate(all="ignore"):  # the check below names an observable that is not finite
+            Z = self._full(points)
+        if not np.isfinite(Z).all():
+            bad = self._full.names[int(np.argwhere(~np.isfinite(Z))[0, 1])]
+            raise DataError(f"the observable {bad!r} is not finite on these data; leave the sample out")
+        return Z
 
     def _moments(self, R: Float[np.ndarray, "nd nd"], weight: float) -> Moments:
         """Return the factor as Moments, whose rows hold the states that ψ lacks before u."""

@@ -97,30 +97,42 @@ def second_moments(
     reading = _ReadTask(None, bound, source.inputs, bilinear, _align_weights(weights, source))
     zero = Moments(bound, source.inputs, source.dt, 0, 0.0, "", np.empty((0, 0)), bilinear, embedding)
 
-    def add_up(route: Route, *, judged: bool) -> Moments | None:
-        """Return the moments of all parts, added in order; None where `judged` Gram sums turn out ill-conditioned."""
-        parts, total = source.parts(), replace(zero, route=route)
-        lazy = (replace(reading, part=part, route=route) for part in parts)
-        tasks = list(lazy) if isinstance(parts, Sized) else lazy
-        waits = judged and not (isinstance(parts, Sized) and len(parts) == 1)
-        for sums in map_tasks(read_part, tasks, workers=workers, scheduler=scheduler, progress=progress):
-            each = replace(zero, route=route, **sums._asdict())
-            total = total + each if total.samples else each
-            if waits and total.samples >= _ENOUGH * total.columns.regressors.size:
-                if total.condition > _WELL_CONDITIONED:
-                    return None
-                waits = False
-        if not total.samples:
-            raise DataError("all weights are 0; give some pair a weight above 0")
-        return None if judged and total.condition > _WELL_CONDITIONED else total
-
+    parallel = _Parallel(workers, scheduler, progress)
     if route is None and source.replayable:
-        total = add_up("gram", judged=True)
+        total = _add_up(source, reading, replace(zero, route="gram"), parallel, judged=True)
         if total is not None:
             return total
-    total = add_up(route or "qr", judged=False)
+    total = _add_up(source, reading, replace(zero, route=route or "qr"), parallel, judged=False)
     assert total is not None, "it was not judged"
     return total
+
+
+class _Parallel(NamedTuple):
+    """Who reads the parts, see `map_tasks`."""
+
+    workers: int | None
+    scheduler: str | None
+    progress: Progress | None
+
+
+def _add_up(
+    source: Source, reading: "_ReadTask", zero: Moments, parallel: _Parallel, *, judged: bool
+) -> Moments | None:
+    """Return the moments of all parts, added in order; None where `judged` Gram sums turn out ill-conditioned."""
+    parts, total = source.parts(), zero
+    lazy = (replace(reading, part=part, route=cast("Route", zero.route)) for part in parts)
+    tasks = list(lazy) if isinstance(parts, Sized) else lazy
+    waits = judged and not (isinstance(parts, Sized) and len(parts) == 1)
+    for sums in map_tasks(read_part, tasks, **parallel._asdict()):
+        each = replace(zero, **sums._asdict())
+        total = total + each if total.samples else each
+        if waits and total.samples >= _ENOUGH * total.columns.regressors.size:
+            if total.condition > _WELL_CONDITIONED:
+                return None
+            waits = False
+    if not total.samples:
+        raise DataError("all weights are 0; give some pair a weight above 0")
+    return None if judged and total.condition > _WELL_CONDITIONED else total
 
 
 class _Sums(NamedTuple):

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from koopmpc.base.errors import DataError
 from koopmpc.data.delay import Delay
-from koopmpc.data.episodes import Episodes
+from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.lifting.base import Lifting, Sum
 from koopmpc.lifting.composed import Projected, Saturated
 from koopmpc.lifting.neurons import Neurons
@@ -16,8 +16,8 @@ from koopmpc.lifting.state import Constant, Monomials, State
 from koopmpc.models.base import FitReport
 from koopmpc.models.hidden_state import HiddenState, hidden_names
 from koopmpc.models.predictors import BilinearPredictor, LinearPredictor
-from koopmpc.models.records.forward import list_terms
-from koopmpc.models.records.free_run import embed_rows
+from koopmpc.models.records.forward import Terms, list_terms
+from koopmpc.models.records.free_run import embed_rows, find_units
 from koopmpc.models.records.hidden import HiddenModel, RecordSegments, join_segments, read_features, start_states
 from koopmpc.models.shared.regression import compute_scale_factor
 
@@ -43,12 +43,14 @@ class SignalUnits:
     @classmethod
     def of(cls, episodes: Episodes, rails: Float[np.ndarray, "2 ny"] | None) -> "SignalUnits":
         """Return the units of these records."""
-        X, U = np.concatenate([e.X for e in episodes]), np.concatenate([e.U for e in episodes])
-        mean = np.concatenate([X.mean(axis=0), U.mean(axis=0)])
-        scale = np.concatenate([X.std(axis=0), U.std(axis=0)])
-        scale = np.where(scale > 1e-12 * np.abs(mean), scale, 1.0)
-        ny = X.shape[1]
+        mean, scale = find_units(episodes)
+        ny = episodes.nx
         return cls(mean, scale, None if rails is None else (rails - mean[:ny]) / scale[:ny], ny)
+
+    def apply(self, e: Episode) -> tuple[Float[np.ndarray, "rows1 ny"], Float[np.ndarray, "rows nu"]]:
+        """Return outputs and inputs in these units."""
+        ny = self.ny
+        return (e.X - self.mean[:ny]) / self.scale[:ny], (e.U - self.mean[ny:]) / self.scale[ny:]
 
     def zeta(self, delays: int) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Return mean and scale of ζ."""
@@ -98,14 +100,15 @@ def to_standard(model: LinearPredictor | BilinearPredictor, units: SignalUnits) 
     A[:, n] += B @ mean_u
     V = _weights_of(psi)
     q = 0 if V is None else len(V)
-    last = psi.nz - q
-    degree = 1 if last == n + 1 else max(map(_degree_of, psi.names[n + 1 : last]))
-    E = np.hstack([A[:, n : n + 1], A[:, :n], A[:, n + 1 : last]])
-    blocks = [np.hstack([(B[:, i : i + 1] + N[i][:, n : n + 1]), N[i][:, :n], N[i][:, n + 1 : last]]) * s
-              for i, s in enumerate(scale_u)]  # fmt: skip
-    terms = list_terms(n, nu, degree)
-    width = (len(terms) - (E.shape[1] - 1)) // max(nu, 1)  # products of an input: those of lower degree
-    E = np.hstack([E, *(block[:, :width] for block in blocks), A[:, last:]])
+    degree = max([1, *map(_degree_of, psi.names[n + 1 : psi.nz - q])])
+    terms, places, width = _order_columns(n, nu, degree)
+    count = len(places)
+    E = np.zeros((n, 1 + len(terms) + q))
+    E[:, :count], E[:, 1 + len(terms) :] = A[:, places], A[:, count:]
+    for i, size in enumerate(scale_u):
+        first = count + i * width
+        E[:, first : first + width] = size * N[i][:, places[:width]]
+        E[:, first] += size * B[:, i]
     mean, scale = units.zeta(embedding.steps)
     encoder = np.hstack([T[:, :-1] * scale, (T[:, -1] + T[:, :-1] @ mean)[:, None]])
     H = C / units.scale[:ny, None]
@@ -127,87 +130,113 @@ def _degree_of(name: str) -> int:
     return sum(int(factor.partition("^")[2] or 1) for factor in name.partition("|")[0].split("*"))
 
 
+def _order_columns(n: int, nu: int, degree: int) -> tuple[Terms, Int[np.ndarray, " count"], int]:
+    """Return the terms of φ, the place in ψ = [z, 1, monomials] of its first columns, and how many each input has.
+
+    φ begins with [1, z, monomials]; then each input multiplies the first ones of these.
+    """
+    terms, count = list_terms(n, nu, degree), 1 + len(list_terms(n, 0, degree))
+    places = np.concatenate([[n], np.arange(n), np.arange(n + 1, count)]).astype(np.intp)
+    return terms, places, (1 + len(terms) - count) // max(nu, 1)
+
+
 def from_standard(
     found: HiddenModel, units: SignalUnits, episodes: Episodes, delays: int, report: FitReport | None
 ) -> LinearPredictor | BilinearPredictor:
     """Return the predictor: a linear one on [T ζ, 1], a nonlinear one with a `HiddenState`."""
-    n, ny, nu = found.order, units.ny, episodes.nu
+    n, ny, nu, degree, q = found.order, units.ny, episodes.nu, found.terms.shape[1], len(found.neurons)
     mean_u, scale_u = units.mean[ny:], units.scale[ny:]
     mean, scale = units.zeta(delays)
     T = found.T[:, :-1] / scale
-    t = found.T[:, -1] - T @ mean
-    C = np.hstack([found.H[:, :-1], found.H[:, -1:]]) * units.scale[:ny, None]
+    encoder = np.hstack([T, (found.T[:, -1] - T @ mean)[:, None]])
+    C = found.H * units.scale[:ny, None]
     C[:, -1] += units.mean[:ny]
-    rails = None if units.rails is None else units.rails * units.scale[:ny] + units.mean[:ny]
-    degree = found.terms.shape[1]
-    lifting: Lifting = State() + Constant()
-    if degree > 1:
-        monomials: Lifting = Monomials(degree, states=hidden_names(n))
-        if np.isfinite(found.bound).all():
-            high = np.concatenate([np.full(ny, np.inf), found.bound])
-            monomials = Saturated(monomials, -high, high)
-        lifting = State(hidden_names(n)) + Constant() + monomials
-    elif found.V is not None:
-        lifting = State(hidden_names(n)) + Constant()
-    if found.V is not None:
-        lifting = lifting + Neurons(found.V, states=hidden_names(n))
-    nz, q = 1 + len(list_terms(n, 0, degree)), len(found.neurons)
-    last = found.E.shape[1] - q
-    A = np.hstack([found.E[:, 1 : 1 + n], found.E[:, :1], found.E[:, 1 + n : nz], found.E[:, last:]])
-    N, B = np.zeros((nu, n, nz + q)), np.zeros((n, nu))
-    width = (last - nz) // max(nu, 1)
+    terms, places, width = _order_columns(n, nu, degree)
+    count = len(places)
+    A, N, B = np.zeros((n, count + q)), np.zeros((nu, n, count + q)), np.zeros((n, nu))
+    A[:, places], A[:, count:] = found.E[:, :count], found.E[:, 1 + len(terms) :]
     for i in range(nu):
-        block = found.E[:, nz + i * width : nz + (i + 1) * width] / scale_u[i]
-        B[:, i] = block[:, 0]
-        N[i][:, :n] = block[:, 1 : 1 + n] if degree > 1 else 0.0
-        N[i][:, n + 1 : width] = block[:, 1 + n :] if degree > 1 else 0.0
+        first = count + i * width
+        N[i][:, places[:width]] = found.E[:, first : first + width] / scale_u[i]
+        B[:, i], N[i][:, n] = N[i][:, n], 0.0
     A = A - np.einsum("i,inz->nz", mean_u, N)
     A[:, n] -= B @ mean_u
-    about = episodes.dt, episodes.states, episodes.inputs
+    rails = None if units.rails is None else units.rails * units.scale[:ny] + units.mean[:ny]
     if degree == 1 and not q:
-        # z = T ζ without an offset: z − t takes the place of z
-        A[:, n] += A[:, :n] @ t - t
-        C[:, -1] += C[:, :-1] @ t
-        transition = np.vstack([A, np.eye(1, n + 1, n)])
-        delay = Delay(delays, rails=rails).bind(episodes.states, episodes.inputs)
-        psi = (Projected(State(), np.ascontiguousarray(T.T)) + Constant()).bind(delay.names)
-        Z = np.concatenate([psi(e.X[:-1]) for e in delay(episodes)])
-        factor = compute_scale_factor(Z, len(Z))
-        return LinearPredictor(
-            transition, np.vstack([B, np.zeros((1, nu))]), C, psi, *about, report, embedding=delay, scale=factor
-        )
-    nz += q
-    whole = np.zeros((nz, nz))
-    whole[:n], whole[n, n] = A, 1.0
-    driven, products = np.vstack([B, np.zeros((nz - n, nu))]), np.zeros((nu, nz, nz))
-    products[:, :n] = N
-    names = (*episodes.states, *hidden_names(n))
+        return _build_linear((A, B, C, encoder), Delay(delays, rails=rails), episodes, report)
+    gain = _fit_gain(found, units, episodes, delays) / units.scale[:ny]
     embedding = HiddenState(
         delays,
         rails=rails,
         bound=(episodes.states, episodes.inputs),
-        lifting=lifting.bind(names),
+        lifting=_build_lifting(found, ny).bind((*episodes.states, *hidden_names(n))),
         A=A,
         B=B,
         N=N,
         C=C[:, :-1],
         c=C[:, -1],
-        encoder=np.hstack([T, t[:, None]]),
+        encoder=encoder,
         reach=found.bound,
-        gain=_fit_gain(found, units, episodes, delays) / units.scale[:ny],
+        gain=gain,
     )
+    nz = count + q
+    whole, output = np.zeros((nz, nz)), np.zeros((ny, nz))
+    whole[:n], whole[n, n], output[:, : n + 1] = A, 1.0, C
+    products = np.zeros((nu, nz, nz))
+    products[:, :n] = N
     Z = np.concatenate([embedding.lifting(e.X[:-1]) for e in embedding(episodes)])
-    output = np.zeros((ny, nz))
-    output[:, : n + 1] = C
     return BilinearPredictor(
         whole,
-        driven,
+        np.vstack([B, np.zeros((nz - n, nu))]),
         products,
         output,
-        lifting,
-        *about,
+        embedding.lifting,
+        episodes.dt,
+        episodes.states,
+        episodes.inputs,
         report,
         embedding=embedding,
+        scale=compute_scale_factor(Z, len(Z)),
+    )
+
+
+def _build_lifting(found: HiddenModel, ny: int) -> Lifting:
+    """Return ψ(p) = [z, 1, monomials, neurons] of a point p = [y; z]."""
+    names, degree = hidden_names(found.order), found.terms.shape[1]
+    lifting: Lifting = State(names) + Constant()
+    if degree > 1:
+        monomials: Lifting = Monomials(degree, states=names)
+        if np.isfinite(found.bound).all():
+            high = np.concatenate([np.full(ny, np.inf), found.bound])
+            monomials = Saturated(monomials, -high, high)
+        lifting = lifting + monomials
+    return lifting if found.V is None else lifting + Neurons(found.V, states=names)
+
+
+def _build_linear(
+    matrices: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    delay: Delay,
+    episodes: Episodes,
+    report: FitReport | None,
+) -> LinearPredictor:
+    """Return the model on z = T ζ without an offset: z less the offset of the encoder takes the place of z."""
+    (A, B, C, encoder), n = matrices, len(matrices[0])
+    T, offset = encoder[:, :-1], encoder[:, -1]
+    A[:, n] += A[:, :n] @ offset - offset
+    C[:, -1] += C[:, :-1] @ offset
+    bound = delay.bind(episodes.states, episodes.inputs)
+    psi = (Projected(State(), np.ascontiguousarray(T.T)) + Constant()).bind(bound.names)
+    Z = np.concatenate([psi(e.X[:-1]) for e in bound(episodes)])
+    return LinearPredictor(
+        np.vstack([A, np.eye(1, n + 1, n)]),
+        np.vstack([B, np.zeros((1, B.shape[1]))]),
+        C,
+        psi,
+        episodes.dt,
+        episodes.states,
+        episodes.inputs,
+        report,
+        embedding=bound,
         scale=compute_scale_factor(Z, len(Z)),
     )
 
@@ -253,30 +282,6 @@ def _steady_gain(A: Float[np.ndarray, "n n"], C: Float[np.ndarray, "ny n"], rati
     return gain
 
 
-def _standard_rows(
-    episodes: Episodes, units: SignalUnits, delays: int, *, last: bool = False
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return of each long record the points ζ, the inputs and the outputs that follow, in standard units.
-
-    With `last` the points are those that follow, ζ_{k+1}.
-    """
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    ny = units.ny
-    for e in episodes:
-        if len(e) <= delays:
-            continue
-        Y, U = (e.X - units.mean[:ny]) / units.scale[:ny], (e.U - units.mean[ny:]) / units.scale[ny:]
-        V, ahead = embed_rows(Y, U, delays)
-        n = ny + delays * len(units.mean)
-        zeta = V[:, 1 : 1 + n]
-        if last:
-            begun = embed_rows(np.vstack([Y, Y[-1:]]), np.vstack([U, U[-1:]]), delays)[0][1:, 1 : 1 + n]
-            found.append((begun, U[delays:], ahead))
-        else:
-            found.append((zeta, U[delays:], ahead))
-    return found
-
-
 def cut_segments(
     episodes: Episodes,
     units: SignalUnits,
@@ -287,12 +292,15 @@ def cut_segments(
 ) -> list[RecordSegments]:
     """Return segments of `horizon` steps that begin every `apart` rows, inside of the spans of rows."""
     found: list[RecordSegments] = []
+    ny, nu = units.ny, episodes.nu
     spans = [(0, len(e)) for e in episodes] if spans is None else spans
     for e, (a, b) in zip(episodes, spans, strict=True):
         first = max(a - delays, 0)
         if b - max(a, delays) < max(horizon, 1):
             continue
-        ((zeta, U, Y),) = _standard_rows(episodes.with_episodes([e.cut(first, b)]), units, delays)
+        part = e.cut(first, b)
+        V, Y = embed_rows(*units.apply(part), delays)
+        zeta, U = V[:, 1 : 1 + ny + delays * len(units.mean)], V[:, -nu:] if nu else V[:, :0]
         starts = np.arange(0, len(zeta) - horizon + 1, apart)
         rows = np.arange(horizon)[:, None] + starts
         outputs = Y[rows]

@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from koopmpc.data.episodes import Episodes
+from koopmpc.data.episodes import Episode, Episodes
 from koopmpc.models.records.forward import Terms, evaluate_terms
 
 PIECE = 1500  # rows of a free run, at most: a longer record is cut, and each piece starts at measured rows
@@ -51,21 +50,29 @@ class Pieces:
     @classmethod
     def of(cls, episodes: Episodes) -> "Pieces":
         """Return the episodes in pieces of up to 1500 rows; of very long data evenly spread ones."""
-        X = np.concatenate([episode.X for episode in episodes])
-        V = np.concatenate([episode.U for episode in episodes])
-        mean = np.concatenate([X.mean(axis=0), V.mean(axis=0)])
-        scale = np.concatenate([X.std(axis=0), V.std(axis=0)])
-        scale = np.where(scale > 1e-12 * np.abs(mean), scale, 1.0)
-        nx = X.shape[1]
-        Y: list[np.ndarray] = []
-        U: list[np.ndarray] = []
-        for episode in episodes:
-            at = np.linspace(0, len(episode), -(-len(episode) // PIECE) + 1).astype(int)
-            for a, b in pairwise(at.tolist()):
-                Y.append((episode.X[a : b + 1] - mean[:nx]) / scale[:nx])
-                U.append((episode.U[a:b] - mean[nx:]) / scale[nx:])
-        apart = -(-sum(map(len, U)) // ROWS)
-        return cls(tuple(Y[::apart]), tuple(U[::apart]), mean, scale)
+        mean, scale = find_units(episodes)
+        nx, pieces = episodes.nx, spread_pieces(episodes, ROWS, PIECE)
+        Y = tuple((e.X - mean[:nx]) / scale[:nx] for e in pieces)
+        return cls(Y, tuple((e.U - mean[nx:]) / scale[nx:] for e in pieces), mean, scale)
+
+
+def find_units(episodes: Episodes) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " nv"]]:
+    """Return mean and standard deviation of [x u]; 1 for a signal that does not move."""
+    both = [np.concatenate([e.X for e in episodes]), np.concatenate([e.U for e in episodes])]
+    mean = np.concatenate([rows.mean(axis=0) for rows in both])
+    scale = np.concatenate([rows.std(axis=0) for rows in both])
+    return mean, np.where(scale > 1e-12 * np.abs(mean), scale, 1.0)
+
+
+def spread_pieces(episodes: Episodes, most: int, piece: int) -> list[Episode]:
+    """Return pieces of up to `piece` rows, evenly spread so that they have `most` rows together, about."""
+    pieces = [
+        e.cut(len(e) * i // count, len(e) * (i + 1) // count)
+        for e in episodes
+        for count in [-(-len(e) // piece)]
+        for i in range(count)
+    ]
+    return pieces[:: max(-(-sum(map(len, pieces)) // most), 1)]
 
 
 def embed_rows(

@@ -115,7 +115,7 @@ def fit_hidden(
         chain = list(fit_chain(data, s, quick=quick))[-1:]
     elif not quick and sum(map(len, data)) <= _SHORT:
         starts = [replace(s, start=s.start + i) for i in range(_STARTS)]
-        chains = [list(fit_chain(data, start, counts, plain=True, close=True)) for start in starts]
+        chains = [list(fit_chain(data, start, counts, plain=True, effort=_CLOSE)) for start in starts]
         chain = min(chains, key=lambda models: _rank(*models[-1], data, s.delays))
     else:
         chain = list(fit_chain(data, s, counts, quick=True, plain=True, last=not quick))
@@ -144,7 +144,7 @@ def fit_chain(
     *,
     quick: bool = False,
     plain: bool = False,
-    close: bool = False,
+    effort: tuple[int, int, float] | None = None,
     last: bool = False,
 ) -> Chain:
     """Yield models of more and more terms that learn from the first three quarters of each record.
@@ -162,8 +162,8 @@ def fit_chain(
         Learn from the segments of a search.
     plain
         Yield the model without neurons first.
-    close
-        Take more and smaller steps.
+    effort
+        Of each stage with neurons, in place of the settings'.
     last
         Have the last number of neurons learn from all segments behind the others.
     """
@@ -181,7 +181,6 @@ def fit_chain(
 
     sets = cut(settings.quick_steps if quick else settings.steps)
     model, noise = _start(learned, units, s, basis, sets[0], settings)
-    effort = _CLOSE if close else settings.effort
     if neurons:
         if s.degree > 1:
             model = _fit(model.raise_degree(s.degree), noise, sets[0], settings)

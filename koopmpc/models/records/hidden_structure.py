@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -11,15 +10,15 @@ from koopmpc.base.values import Value
 from koopmpc.data.episodes import Episodes
 from koopmpc.models.base import FitReport
 from koopmpc.models.records.conversion import SignalUnits, cut_segments
-from koopmpc.models.records.free_run import HELD
+from koopmpc.models.records.free_run import HELD, spread_pieces
 from koopmpc.models.records.hidden import (
     HiddenModel,
     join_segments,
     simulate_hidden,
     start_states,
 )
-from koopmpc.models.records.narx import is_worse
-from koopmpc.models.records.structure import EXACT, HORIZON
+from koopmpc.models.records.narx import choose_simplest
+from koopmpc.models.records.structure import HORIZON, average_errors
 from koopmpc.models.records.unseen import UNSEEN, average_gaps
 
 RESTS = 10  # rows at the least or the largest reading, at least, that make it a rail
@@ -63,10 +62,10 @@ class HiddenStructure(Value):
     neurons: int = 0
     start: int = 0
 
-    @cached_property
+    @property
     def error(self) -> float:
         """Geometric mean of the errors of the blocks."""
-        return float(np.exp(np.log(np.maximum(self.errors, EXACT)).mean()))
+        return average_errors(self.errors)
 
     @property
     def is_nonlinear(self) -> bool:
@@ -86,11 +85,7 @@ class HiddenStructure(Value):
 
 def choose_hidden(found: Sequence[HiddenStructure]) -> HiddenStructure:
     """Return the structure of the fewest coefficients within one standard error of the best; a calm one if any is."""
-    calm = [one for one in found if one.calm] or list(found)
-    best = min(calm, key=lambda one: one.error)
-    return min(
-        (one for one in calm if not is_worse(one.errors, best.errors)), key=lambda one: (one.parameters, one.error)
-    )
+    return choose_simplest([s for s in found if s.calm] or found, lambda s: (s.parameters, s.error))
 
 
 def find_rails(episodes: Episodes) -> Float[np.ndarray, "2 ny"] | None:
@@ -110,14 +105,8 @@ def find_rails(episodes: Episodes) -> Float[np.ndarray, "2 ny"] | None:
 
 def thin_records(episodes: Episodes, most: int, piece: int) -> Episodes:
     """Return the records; of more than `most` rows, evenly spread pieces of `piece` rows."""
-    pieces = [
-        e.cut(len(e) * i // count, len(e) * (i + 1) // count)
-        for e in episodes
-        for count in [-(-len(e) // piece)]
-        for i in range(count)
-    ]
-    total = sum(map(len, pieces))
-    return episodes if total <= most else episodes.with_episodes(pieces[:: -(-total // most)])
+    short = sum(map(len, episodes)) <= most
+    return episodes if short else episodes.with_episodes(spread_pieces(episodes, most, piece))
 
 
 def is_calm_hidden(
@@ -141,7 +130,7 @@ def is_calm_hidden(
         if len(e) <= delays + _STARTS:
             continue
         points = join_segments(cut_segments(data.with_episodes([e]), units, delays, 1, (len(e) - delays) // _STARTS))
-        inputs = (e.U - units.mean[units.ny :]) / units.scale[units.ny :]
+        inputs = units.apply(e)[1]
         out = simulate_hidden(model, points.points, np.repeat(inputs[:, None], len(points.points), axis=1))
         if not ((out > low - FAR * (high - low)) & (out < high + FAR * (high - low))).all():
             return False

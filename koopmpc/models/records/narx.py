@@ -1,7 +1,9 @@
 """narx: a polynomial of few terms in the past of outputs and inputs, as a predictor lifted afresh at each step."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Unpack
+from contextlib import suppress
+from itertools import product
+from typing import Protocol, TypeVar, Unpack
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -25,6 +27,7 @@ from koopmpc.models.records.free_run import Models, Pieces, embed_rows, is_calm,
 from koopmpc.models.records.structure import (
     EXACT,
     Structure,
+    average_errors,
     check_rails,
     find_forecast_horizon,
     find_told_rows,
@@ -44,6 +47,15 @@ RAILED = 2  # pairs of delays and degree that are tried with the rails of the se
 _NEAR = np.array([[1e-9], [-1e-9]])  # spreads from a rail that rounding makes
 _MEDIAN = 0.1  # log of the ratio by which the errors of half of the blocks may be larger
 
+
+class _Judged(Protocol):
+    """What has errors on blocks of unseen rows."""
+
+    @property
+    def errors(self) -> Float[np.ndarray, " blocks"]: ...
+
+
+Judged = TypeVar("Judged", bound=_Judged)
 Ask = Callable[[str, int, int], object]  # name of a structure, done, of how many
 
 
@@ -138,11 +150,13 @@ def check_list(values: Sequence[int] | int, least: int) -> list[int]:
 
 def choose_structure(found: Sequence[Structure]) -> Structure:
     """Return the structure of the fewest terms whose error is within one standard error of the least one."""
-    best = min(found, key=lambda one: one.error)
-    return min(
-        (one for one in found if not is_worse(one.errors, best.errors)),
-        key=lambda one: (one.size, one.delays, one.error),
-    )
+    return choose_simplest(found, lambda structure: (structure.size, structure.delays, structure.error))
+
+
+def choose_simplest(found: Sequence[Judged], size: Callable[[Judged], tuple[float, ...]]) -> Judged:
+    """Return the one of least size whose error is within one standard error of the least one."""
+    least = min(found, key=lambda judged: average_errors(judged.errors)).errors
+    return min((judged for judged in found if not is_worse(judged.errors, least)), key=size)
 
 
 def is_worse(errors: Float[np.ndarray, " blocks"], than: Float[np.ndarray, " blocks"]) -> bool:
@@ -180,23 +194,10 @@ def search_structures(
     """
     if episodes.nw:
         raise DataError("the records hold measured disturbances, which narx does not know; pass them as inputs")
-    pieces, horizon = Pieces.of(episodes), find_forecast_horizon(episodes) if horizon is None else horizon
-    nx, nu = pieces.nx, pieces.nu
-    longest = max(map(len, pieces.U))
-    room = [d for d in delays if 4 * FOLDS * (d + 1) <= longest]
-    if not room:
-        raise DataError(
-            f"the longest record has {longest} steps, and {min(delays)} delays need {4 * FOLDS * (min(delays) + 1)}; "
-            "pass fewer delays, or a longer record"
-        )
-    first = max(room)
+    pieces, horizon = Pieces.of(episodes), horizon or find_forecast_horizon(episodes)
+    plans, first = _find_plans(pieces, delays, degrees)
     usable = [i for i, u in enumerate(pieces.U) if len(u) > first + FOLDS]
     pieces = Pieces(tuple(pieces.Y[i] for i in usable), tuple(pieces.U[i] for i in usable), pieces.mean, pieces.scale)
-    plans = [(d, g) for d in room for g in degrees if nx * count_terms(nx + d * (nx + nu), nu, g) <= MOST]
-    if not plans:
-        raise DataError(
-            f"every structure has more than {MOST} terms of all states together; pass fewer delays, or a lower degree"
-        )
     found: list[Structure] = []
     for i, (d, g) in enumerate(plans):
         if ask is not None:
@@ -204,14 +205,28 @@ def search_structures(
         found += list(_try_plan(pieces, d, g, first, terms, horizon))
     if rails is not None:
         ranked = dict.fromkeys((one.delays, one.degree) for one in sorted(found, key=lambda one: one.error))
-        for d, g in [(d, g) for d, g in ranked if d][:RAILED]:
-            for masked in (False, True):
-                try:
-                    found += list(_try_plan(pieces, d, g, first, terms, horizon, rails, masked))
-                except DataError:  # a stretch has no row without a rail
-                    continue
+        for (d, g), masked in product([pair for pair in ranked if pair[0]][:RAILED], (False, True)):
+            with suppress(DataError):  # a stretch has no row without a rail
+                found += list(_try_plan(pieces, d, g, first, terms, horizon, rails, masked))
     driven = [structure for structure in found if structure.is_driven] or found  # a controller needs the input
     return [structure for structure in driven if structure.calm] or driven
+
+
+def _find_plans(pieces: Pieces, delays: Sequence[int], degrees: Sequence[int]) -> tuple[list[tuple[int, int]], int]:
+    """Return the pairs of delays and degree that the pieces have room for, and the most delays."""
+    nx, nu, longest = pieces.nx, pieces.nu, max(map(len, pieces.U))
+    room = [d for d in delays if 4 * FOLDS * (d + 1) <= longest]
+    if not room:
+        raise DataError(
+            f"the longest record has {longest} steps, and {min(delays)} delays need {4 * FOLDS * (min(delays) + 1)}; "
+            "pass fewer delays, or a longer record"
+        )
+    plans = [(d, g) for d in room for g in degrees if nx * count_terms(nx + d * (nx + nu), nu, g) <= MOST]
+    if not plans:
+        raise DataError(
+            f"every structure has more than {MOST} terms of all states together; pass fewer delays, or a lower degree"
+        )
+    return plans, max(room)
 
 
 def _try_plan(

@@ -164,7 +164,12 @@ class Structure(Value):
     @property
     def error(self) -> float:
         """Geometric mean of the errors of the blocks."""
-        return float(np.exp(np.log(np.maximum(self.errors, EXACT)).mean()))
+        return average_errors(self.errors)
+
+
+def average_errors(errors: Float[np.ndarray, " blocks"]) -> float:
+    """Return the geometric mean of the errors of some blocks, in spreads."""
+    return float(np.exp(np.log(np.maximum(errors, EXACT)).mean()))
 
 
 def fit_structure(
