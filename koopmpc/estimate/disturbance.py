@@ -146,15 +146,6 @@ class DisturbanceObserver(Viewing, Measured):
 
     The Constant and the past of a state have no disturbances. A step is one product,
     A z + B u + E w, and one call of the CasADi function `_rule`: an observer has half of the time of a step.
-
-    Parameters
-    ----------
-    model
-        The predictor, or a model whose z is the state.
-    gain
-        Weight of the newest misfit, in (0, 1].
-    reach
-        Steps over which a misfit must hardly change to be taken as it is; 0: a mean is always taken.
     """
 
     _remembers = True

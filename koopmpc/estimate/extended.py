@@ -106,17 +106,7 @@ class ExtendedKalman(Value):
 
 
 class ExtendedObserver(Gated):
-    """The observer of an `ExtendedKalman`.
-
-    Parameters
-    ----------
-    rule
-        Its settings.
-    model
-        The model of the controller.
-    gain
-        Share of an innovation that d takes over in a step, about.
-    """
+    """The observer of an `ExtendedKalman`."""
 
     _gate: ReadingGate
 

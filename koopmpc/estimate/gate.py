@@ -115,13 +115,6 @@ class ReadingGate(Viewing):
         Whether the last prediction was absurd, so that the observer starts again from the reading.
     w
         The measured disturbance of the last prediction that was chosen; empty before.
-
-    Parameters
-    ----------
-    ny
-        Number of entries of a reading.
-    leaps
-        Whether all states are measured, so that a leap of the first readings shows in them, see `gate_function`.
     """
 
     _VIEWS = ("_y", "_predicted", "_after", "_evaluate", "_buffer")
@@ -156,12 +149,8 @@ class ReadingGate(Viewing):
 
         w is wild if its prediction, as a reading, would be refused beside that of the last one, and y would not. A step
         of w that the reading shows is used at once: no w is doubted while all |yᵢ − ŷᵢ| ≤ 8 σᵢ, see `gate_function`.
-        After five wild ones in sequence w is used whatever it predicts.
-
-        Parameters
-        ----------
-        predict
-            w → the predicted reading. The last call is that of the prediction that is returned.
+        After five wild ones in sequence w is used whatever it predicts. The last call of `predict` is that of the
+        prediction that is returned.
         """
         predicted, last = predict(w), self.w if self.w.size else np.zeros(len(w))
         if not self._agrees(y, predicted) and self._doubted < BRIDGED and (w != last).any():

@@ -340,13 +340,7 @@ def _stationary(
 
 
 def _places(lifting: Lifting, names: tuple[str, ...]) -> list[int]:
-    """Return the indices of observables by name, with or without the unit.
-
-    Raises
-    ------
-    ObservableError
-        The lifting lacks one of them.
-    """
+    """Return the indices of observables by name, with or without the unit."""
     place = {strip_unit(name): i for i, name in enumerate(lifting.names)}
     place |= {name: i for i, name in enumerate(lifting.names)}
     for name in names:

@@ -167,11 +167,6 @@ class History:
 
     The first measurement also fills the past before it. A missed measurement makes x_k NaN in its own ζ_k; in later ζ
     the last measured state takes its place.
-
-    Parameters
-    ----------
-    embedding
-        The `Delay`, bound to the plant's names.
     """
 
     def __init__(self, embedding: Delay) -> None:
@@ -199,11 +194,6 @@ class Measured(Gated):
 
     ζ is y, or under an embedding y with its past. Then a reading far from its prediction does not enter the past: the
     prediction stands in, see `ReadingGate`.
-
-    Parameters
-    ----------
-    model
-        The predictor, or a model whose z is the state.
     """
 
     _remembers = False  # whether a reading acts on later estimates though the model has no delays
@@ -298,13 +288,7 @@ class Measured(Gated):
 
 
 def start_observer(estimator: Estimator | None, model: LinearPredictor | StateModel, horizon: int) -> StateObserver:
-    """Return the observer of one controller with plans of this many steps; without an estimator y is the state.
-
-    Raises
-    ------
-    DataError
-        The estimator is something else, perhaps a class.
-    """
+    """Return the observer of one controller with plans of this many steps; without an estimator y is the state."""
     if estimator is None:
         return Measured(model)
     can_start = isinstance(cast(object, estimator), Estimator) and callable(estimator.start)  # a range has a start, too
@@ -314,13 +298,7 @@ def start_observer(estimator: Estimator | None, model: LinearPredictor | StateMo
 
 
 def estimator_program(observer: StateObserver, estimator: Estimator | None) -> EstimatorProgram:
-    """Return the data of an observer.
-
-    Raises
-    ------
-    DataError
-        Its class publishes none; a class that inherits from one that does may find z in another way.
-    """
+    """Return the data of an observer."""
     if "program" not in vars(type(observer)):
         raise DataError(
             f"the estimator {type(estimator).__name__} cannot be written in C; use LiftedDisturbance or LiftedKalman"

@@ -22,13 +22,7 @@ _CHANCE = 1e-4  # a period is believed if noise shows as strong a line less ofte
 
 
 def find_harmonics(period: float, dt: float, harmonics: int) -> Float[np.ndarray, " h"]:
-    """Return the angles by which the harmonics of a period turn in a step [rad]: those below half a turn.
-
-    Raises
-    ------
-    DataError
-        The period is shorter than two samples.
-    """
+    """Return the angles by which the harmonics of a period turn in a step [rad]: those below half a turn."""
     if period < 2 * dt * (1 - 1e-12):
         raise DataError(
             f"period is {period:g} s, less than two samples of {dt:g} s; pass a longer period, or sample faster"
@@ -48,13 +42,6 @@ class PeriodicObserver(Measured):
     Recursive least squares of the misfits e = z − A z₋ − B u − E w with forgetting finds Θ. It starts as if one row of
     zeros had been seen, so that the first rows are not believed too much. The Constant and the past of a state have no
     disturbances.
-
-    Parameters
-    ----------
-    model
-        The predictor, or a model whose z is the state.
-    turns
-        Angles by which the harmonics turn in a step [rad].
     """
 
     _remembers = True
@@ -83,13 +70,7 @@ class PeriodicObserver(Measured):
         self._stood_in = False
 
     def program(self) -> EstimatorProgram:
-        """Raise the DataError that says why no C code can be generated.
-
-        Raises
-        ------
-        DataError
-            Always.
-        """
+        """Raise the DataError that says why no C code can be generated."""
         raise DataError(NO_CODE)
 
     def forecast(self, steps: int) -> Float[np.ndarray, "steps nz"]:

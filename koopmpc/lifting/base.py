@@ -319,13 +319,7 @@ def bind_lifting(value: object, states: Sequence[str]) -> Lifting:
 
 
 def check_lifting(value: object) -> Lifting:
-    """Return `value` if it is a Lifting.
-
-    Raises
-    ------
-    DataError
-        `value` is something else, or a class instead of an instance.
-    """
+    """Return `value` if it is a Lifting."""
     if isinstance(value, Lifting):
         return value
     if isinstance(value, type) and issubclass(value, Lifting):
@@ -343,13 +337,7 @@ def buffer_lifting(lifting: Lifting) -> Buffered:
 
 
 def find_observables(lifting: Lifting, wanted: Lifting) -> Indices:
-    """Return the indices in the bound `lifting` of the observables of the bound `wanted`, found by name.
-
-    Raises
-    ------
-    ObservableError
-        The lifting lacks one of them.
-    """
+    """Return the indices in the bound `lifting` of the observables of the bound `wanted`, found by name."""
     place = {name: i for i, name in enumerate(lifting.names)}
     for name in wanted.names:
         if name not in place:
@@ -363,13 +351,7 @@ StateChoice = int | str | Sequence[int | str]
 
 
 def find_state(state: int | str, states: Sequence[str], who: str) -> int:
-    """Return the index of a state given by its index, or by its name with or without the unit.
-
-    Raises
-    ------
-    DataError
-        There is no such state; the message names `who` asked for it.
-    """
+    """Return the index of a state given by its index, or by its name with or without the unit."""
     if isinstance(state, str):
         matches = [i for i, name in enumerate(states) if state in (name, strip_unit(name))]
         if len(matches) == 1:

@@ -158,13 +158,7 @@ def _read_packed(content: bytes) -> Iterator[int]:
 
 
 def split_fields(message: bytes) -> Iterator[Field]:
-    """Yield the fields of a message in their order.
-
-    Raises
-    ------
-    ValueError, IndexError
-        It is no message.
-    """
+    """Yield the fields of a message in their order."""
     place = 0
     while place < len(message):
         key, place = _read_varint(message, place)

@@ -23,13 +23,7 @@ _FORMAT = "koopmpc-1"
 
 
 def save_value(value: Value, path: str | Path) -> None:
-    """Write `value` as .npz: float arrays as they are, everything else as JSON; nothing is pickled.
-
-    Raises
-    ------
-    LogError
-        The path cannot be written.
-    """
+    """Write `value` as .npz: float arrays as they are, everything else as JSON; nothing is pickled."""
     arrays: Arrays = {}
     tree = {"format": _FORMAT, "value": to_data(value, arrays)}
     text = np.frombuffer(json.dumps(tree).encode(), dtype=np.uint8)
@@ -38,13 +32,7 @@ def save_value(value: Value, path: str | Path) -> None:
 
 
 def load_value(path: str | Path, *kinds: type[V]) -> V:
-    """Read a Value of one of these kinds that `save_value` wrote.
-
-    Raises
-    ------
-    LogError
-        The file is missing, a folder, damaged, or holds something else.
-    """
+    """Read a Value of one of these kinds that `save_value` wrote."""
     wanted = " or ".join(kind.__name__.removeprefix("Saved") for kind in kinds)
     advice = f"pass the .npz of a saved {wanted}"
     source = disk.existing(path, advice)

@@ -121,13 +121,7 @@ def instrumental_edmd(
 
 
 def check_instruments(episodes: Episodes, instruments: Sequence[ArrayLike]) -> list[Float[np.ndarray, "rows nr"]]:
-    """Return the signals with T + 1 rows each, the last one repeated where it is missing.
-
-    Raises
-    ------
-    ShapeError
-        There is not one array an episode, of one row a step.
-    """
+    """Return the signals with T + 1 rows each, the last one repeated where it is missing."""
     checks.members(instruments, "instruments", ("__len__", "__iter__"), "pass one array an episode")
     if len(instruments) != len(episodes):
         raise ShapeError(f"instruments has {len(instruments)} arrays for {len(episodes)} episodes; pass one an episode")

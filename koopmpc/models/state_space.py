@@ -37,12 +37,6 @@ def read_state_space(
     """Return the matrices of a system of scipy.signal (``StateSpace``, ``dlti``) or python-control (``ss``).
 
     A continuous system is discretised by a zero-order hold of `dt` seconds.
-
-    Raises
-    ------
-    DataError
-        It is no state-space system; it has feedthrough (D is not zero); it is continuous and dt is missing; it is
-        discrete and dt is another, or its own is not stated.
     """
     if not is_state_space(system) and hasattr(system, "to_ss"):
         system = system.to_ss()

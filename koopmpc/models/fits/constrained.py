@@ -160,11 +160,6 @@ def solve_convex_program(
 
     Columns of P and targets have unit norm in the program, so the units of the data do not matter. `prior` adds the
     constraints that couple rows of [A B]; the targets must then be all observables.
-
-    Raises
-    ------
-    DataError
-        No A and B meet the priors, or the solver gives up.
     """
     cp: Any = import_module("cvxpy")  # without types, and slow to import
     n, nz = rows.P.shape[1], len(which)

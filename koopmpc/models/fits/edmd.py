@@ -40,25 +40,7 @@ _WORDS = {"ls": "", "tls": "total least squares, ", "fb": "forward and backward,
 def fit_regression(
     regression: Regression, *, ridge: Ridge = 0.0, rank: Rank = None, method: Method = "ls", towards: Towards = "zero"
 ) -> LinearPredictor:
-    """Return the model of min Σ ‖ψ(x⁺) − A ψ(x) − B u‖².
-
-    Parameters
-    ----------
-    regression
-        The regression.
-    ridge
-        Weight of ‖[A B] S‖². S holds the column norms of the regressors on its diagonal; it is the identity without a
-        rank where the regression is not `scaled`. 0: the minimum-norm solution. "gcv": chosen by generalised
-        cross-validation.
-    rank
-        Number of left singular vectors U_r of the unscaled snapshots ψ(x) to keep; then z = U_rᵀ ψ(x). Or a share, or
-        "hard-threshold", as in `edmd`.
-    method
-        "ls"; for noisy snapshots "tls" or "fb". These two need a regression that was read with ``noisy=True``, so
-        that the rows hold all of T.
-    towards
-        The model that a large ridge leads to, as in `edmd`.
-    """
+    """Return the model of min Σ ‖ψ(x⁺) − A ψ(x) − B u‖²."""
     ridge = check_ridge(ridge)
     _check_method(ridge, rank, method, towards)
     rows, nz = regression.rows, regression.lifting.nz
@@ -160,15 +142,6 @@ def _remove_noise(regression: Regression, rows: RegressionRows, directions: int)
     L_r, the rows are multiplied by [E, L_r]ᵀ. All other columns are assumed to hold white noise of one size: relative
     to each observable's size if the regression is `scaled`, else in the units of the data.
 
-    Parameters
-    ----------
-    regression
-        The regression of these rows.
-    rows
-        P = [ψ(x) u]; T = ψ(x⁺), all of it inside the rows (`rest` is 0).
-    directions
-        Number of directions that the signal spans, the Constant included.
-
     References
     ----------
     Hemati, Rowley, Deem & Cattafesta, "De-biasing the dynamic mode decomposition for applied Koopman spectral
@@ -201,18 +174,6 @@ def _fit_forward_backward(rows: RegressionRows, nz: int) -> Solution:
     A_f is the fit of z⁺ by [z u], A_b that of z by [z⁺ u]. Without noise they are A and A⁻¹. Noise shrinks both, and in
     A_f A_b⁻¹ ≈ A² the shrinking cancels to first order. A is the square root of it that is nearest to A_f. B is the
     least squares fit of z⁺ − A z by u.
-
-    Parameters
-    ----------
-    rows
-        P = [z u]; T = z⁺, all of it inside the rows (`rest` is 0).
-    nz
-        Number of columns of z.
-
-    Raises
-    ------
-    DataError
-        A_b is singular, or the square root is not real: the motion in these data cannot be reversed.
 
     References
     ----------

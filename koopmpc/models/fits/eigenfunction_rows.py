@@ -12,12 +12,20 @@ from koopmpc.data.episodes import Episodes
 from koopmpc.lifting.base import Lifting
 from koopmpc.lifting.composed import Eigenfunction, evaluate_jacobians
 
-FLAT = 1e-9  # a combination of observables is constant if its gradient is below this share of the largest gradient
-EXACT = 1e-6  # add no more observables once the relative residual is below this
-REAL = 1e-6  # an imaginary part below this share of |λ|, or of the rate of the states, is a rounding error
-ZERO = 1e-7  # a function vanishes on the data if it is below this share of its gradient
-GAP = 10.0  # singular values up to so many times the smallest belong to the same null space
-ALIKE = 0.99  # two gradient fields are those of one function if their cosine on the data is at least this
+
+@dataclass(frozen=True)
+class _Tolerances:
+    """What counts as zero, as exact and as alike."""
+
+    flat: float = 1e-9  # a combination of observables is constant below this share of the largest gradient
+    exact: float = 1e-6  # add no more observables once the relative residual is below this
+    real: float = 1e-6  # an imaginary part below this share of |λ|, or of the rate of the states, is a rounding error
+    zero: float = 1e-7  # a function vanishes on the data if it is below this share of its gradient
+    gap: float = 10.0  # singular values up to so many times the smallest belong to the same null space
+    alike: float = 0.99  # two gradient fields are those of one function if their cosine on the data is at least this
+
+
+_AT = _Tolerances()
 ROWS = 4096  # number of rows that are reduced at once
 
 Eigenpair = tuple[complex, Inexact[np.ndarray, " nz"]]  # λ and ξ
@@ -91,7 +99,7 @@ class EigenfunctionRows:
         """Return the sparsest vectors of the null space for λ, with residuals near the smallest or near rounding."""
         support = np.arange(self.lifting.nz)
         least = self._solve_effect(value, self._null(value, support, 0.0, 1)[:, 0]).residual
-        null = self._null(value, support, max(GAP * least, EXACT * self.speed), count)
+        null = self._null(value, support, max(_AT.gap * least, _AT.exact * self.speed), count)
         size: Float[np.ndarray, " nz"] = np.linalg.norm(self.G, axis=0)
         if value:  # the size of a Constant is its value: x − 3 may be an eigenfunction although x is not
             null = null[:, [not self._vanishes(c) for c in null.T]]
@@ -111,10 +119,10 @@ class EigenfunctionRows:
         for j, mu in enumerate(values):
             xi: Inexact[np.ndarray, " nz"] = vectors[:, j]
             steepness = float(np.linalg.norm(self.G @ xi))
-            if abs(mu) < 1e-8 or steepness < FLAT * float(np.linalg.norm(sizes * np.abs(xi))):
+            if abs(mu) < 1e-8 or steepness < _AT.flat * float(np.linalg.norm(sizes * np.abs(xi))):
                 continue
             rate = complex(np.log(mu) / self.dt if self.by == "steps" else mu)
-            if abs(rate.imag) < REAL * max(abs(rate), self.speed):
+            if abs(rate.imag) < _AT.real * max(abs(rate), self.speed):
                 rate, xi = complex(rate.real), np.real(_rotate_to_real(xi))
             if rate.imag >= 0 and not self._vanishes(xi):
                 M, F = self.parts(rate)
@@ -125,7 +133,7 @@ class EigenfunctionRows:
 
     def _vanishes(self, c: Inexact[np.ndarray, " nz"]) -> bool:
         """Return True if φ is zero on all data, as H − H₀ is on one trajectory; then any λ fits."""
-        return bool(np.linalg.norm(self._now @ c) <= ZERO * np.linalg.norm(self.G @ c))
+        return bool(np.linalg.norm(self._now @ c) <= _AT.zero * np.linalg.norm(self.G @ c))
 
     def sparse(
         self, value: complex, xi: Inexact[np.ndarray, " nz"], growth: float, *, free: bool
@@ -139,12 +147,12 @@ class EigenfunctionRows:
         order = order[weight[order] > 0]
         xi = xi / np.linalg.norm(self.G @ xi)
         rate, solved = value, self._solve_effect(value, xi)
-        allowed = growth * max(solved.residual, EXACT * self.speed)
+        allowed = growth * max(solved.residual, _AT.exact * self.speed)
         for n in range(1, len(order) + 1) if growth > 1 else ():
             support = np.sort(order[:n])
             if np.linalg.norm(self.G[:, support]) > 0:
                 rate_n, candidate = self._refine(value, support, xi, allowed, free)
-                if candidate.residual <= allowed and abs(np.vdot(self.G @ xi, self.G @ candidate.c)) >= ALIKE:
+                if candidate.residual <= allowed and abs(np.vdot(self.G @ xi, self.G @ candidate.c)) >= _AT.alike:
                     rate, solved = rate_n, candidate
                     break
         if (rate or free) and self._vanishes(solved.c):
@@ -188,7 +196,7 @@ class EigenfunctionRows:
         size = np.where(size > 0, size, 1.0)
         _, s, Vt = np.linalg.svd(G / size)
         s = np.pad(s, (0, len(Vt) - len(s)))
-        steep = s > FLAT * s[0]
+        steep = s > _AT.flat * s[0]
         W, flat = Vt[steep].T / s[steep] / size[:, None], Vt[~steep].T / size[:, None]
         others = np.hstack([M @ flat, F])  # constants and β are free: their part of the residual is projected out
         norms = np.linalg.norm(others, axis=0)

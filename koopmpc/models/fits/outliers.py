@@ -1,5 +1,7 @@
 """Outliers among rows that are learned one after the other, and a rival model that learns from all of them."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_triangular
@@ -7,12 +9,21 @@ from scipy.linalg import solve_triangular
 from koopmpc.models.moments.rows import ForgettingMemory, Table, Triangle
 
 # The gate of outliers:
-BEYOND = 30.0  # a row is an outlier if an innovation is above so many times the spread of its column
-LEAST = 0.01  # the spread of a column counts as at least this share of the column's size
-MEMORY = 0.01  # weight of a new row in the running spread and size
-FEW = 20  # the gate judges innovations after so many of them, and sizes after so many rows
-FAR = 1000.0  # without a forecast, a row is an outlier if a value is above so many times its column's size
-FALLEN = 0.01  # signals have fallen if a column stays below this share of its size for FEW rows
+
+
+@dataclass(frozen=True)
+class _Gate:
+    """The gate of outliers."""
+
+    beyond: float = 30.0  # a row is an outlier if an innovation is above so many times the spread of its column
+    least: float = 0.01  # the spread of a column counts as at least this share of the column's size
+    memory: float = 0.01  # weight of a new row in the running spread and size
+    few: int = 20  # the gate judges innovations after so many of them, and sizes after so many rows
+    far: float = 1000.0  # without a forecast, a row is an outlier if a value is above so many times its column's size
+    fallen: float = 0.01  # signals have fallen if a column stays below this share of its size for FEW rows
+
+
+_GATE = _Gate()
 
 
 class OutlierGate:
@@ -26,11 +37,6 @@ class OutlierGate:
     over about 100 rows. Among the very first rows, a value is compared with all others of its column. Inputs never make
     an outlier. `fell` becomes True when some column has stayed below 1 % of its size for 20 rows: either the plant came
     to rest, or the rows before were bad readings.
-
-    Parameters
-    ----------
-    nd, n, nz
-        Columns of a row; how many of them are regressors r, the others are t; how many of r are observables.
     """
 
     def __init__(self, nd: int, n: int, nz: int) -> None:
@@ -38,7 +44,7 @@ class OutlierGate:
         self.begun, self._measured = False, (np.arange(nd) < nz) | (np.arange(nd) >= n)
         self._K: Float[np.ndarray, "n nt"] | None = None
         self._spread, self._size = np.zeros(nd - n), np.zeros(nd)  # mean squares
-        self.fell, self._low = False, np.zeros(nd)  # _low counts rows in sequence below FALLEN
+        self.fell, self._low = False, np.zeros(nd)  # _low counts rows in sequence below _GATE.fallen
 
     def learn(self, R: Triangle) -> None:
         """Take the forecast from the regression R K = T of all rows so far."""
@@ -56,7 +62,7 @@ class OutlierGate:
 
     def first(self, rows: Table) -> int:
         """Judge the first rows together: move the rows without outliers to the front, and return their number."""
-        most = FAR * np.sort(np.abs(rows), axis=0)[-2]  # the largest value itself may be an outlier
+        most = _GATE.far * np.sort(np.abs(rows), axis=0)[-2]  # the largest value itself may be an outlier
         kept = rows[((np.abs(rows) <= most) | (most == 0) | ~self._measured).all(axis=1)]
         rows[: len(kept)] = kept
         self._rows, self._size, self.begun = len(kept), np.mean(kept**2, axis=0), True
@@ -70,21 +76,21 @@ class OutlierGate:
             square, good = row**2, True
             if self._K is not None:
                 e = np.abs(row[n:] - row[:n] @ self._K)
-                gate = BEYOND * np.maximum(np.sqrt(self._spread), LEAST * np.sqrt(self._size[n:]))
+                gate = _GATE.beyond * np.maximum(np.sqrt(self._spread), _GATE.least * np.sqrt(self._size[n:]))
                 self._seen += 1
-                if self._seen > FEW:
+                if self._seen > _GATE.few:
                     good = bool((e <= gate).all())
                     e = np.minimum(e, gate)
-                self._spread += max(MEMORY, 1.0 / self._seen) * (e**2 - self._spread)
-            if self._seen <= FEW < self._rows:
-                far = np.where(self._measured & (self._size > 0), FAR**2 * self._size, np.inf)
+                self._spread += max(_GATE.memory, 1.0 / self._seen) * (e**2 - self._spread)
+            if self._seen <= _GATE.few < self._rows:
+                far = np.where(self._measured & (self._size > 0), _GATE.far**2 * self._size, np.inf)
                 good = bool((square <= far).all())
                 square = np.minimum(square, far)
-            if good or self._seen <= FEW:
-                self._size += max(MEMORY, 1.0 / (self._rows + 1)) * (square - self._size)
+            if good or self._seen <= _GATE.few:
+                self._size += max(_GATE.memory, 1.0 / (self._rows + 1)) * (square - self._size)
             if good:
-                self._low = np.where(self._measured & (row**2 < FALLEN**2 * self._size), self._low + 1, 0)
-                self.fell |= bool((self._low == FEW).any())
+                self._low = np.where(self._measured & (row**2 < _GATE.fallen**2 * self._size), self._low + 1, 0)
+                self.fell |= bool((self._low == _GATE.few).any())
                 rows[kept] = row
                 kept += 1
                 self._rows += 1
@@ -99,15 +105,6 @@ class ShadowModel:
     period of ten memories. The shadow is better if the error of the first exceeds 0.1 % of some column's size and twice
     the error of the shadow. A plant that came to rest keeps its model, because the first factor has then adapted to the
     small signals.
-
-    Parameters
-    ----------
-    memory
-        A factor of no rows yet.
-    n
-        Regressors.
-    memory_rows
-        Length of its memory in rows, 1 / (1 − λ).
     """
 
     def __init__(self, memory: ForgettingMemory, n: int, memory_rows: float) -> None:

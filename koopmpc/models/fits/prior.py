@@ -175,15 +175,7 @@ class Entries:
 
 
 def build_entries(prior: Prior, observables: Sequence[str], inputs: Sequence[str]) -> Entries:
-    """Return the known value and the bounds of each entry of [A B], for these observables and inputs.
-
-    Raises
-    ------
-    ShapeError
-        A part is made for another number of observables or inputs.
-    DataError
-        Two parts contradict each other, or a name is unknown.
-    """
+    """Return the known value and the bounds of each entry of [A B], for these observables and inputs."""
     nz, nu = len(observables), len(inputs)
     known = np.full((nz, nz + nu), np.nan)
     low, high = np.full_like(known, -np.inf), np.full_like(known, np.inf)

@@ -22,17 +22,7 @@ def leading_directions(
 ) -> tuple[Float[np.ndarray, "nz r"], str]:
     """Return U_r, the leading left singular vectors of the unscaled snapshots ψ(x), and the rule in words.
 
-    Parameters
-    ----------
-    rows
-        P begins with ψ(x).
-    nz
-        Number of observables.
-    rank
-        A whole number; the least number of directions that hold this share of Σσ², between 0 and 1; or
-        "hard-threshold", all σ above ω(β) times their median.
-    sentences
-        List of doubts. If the snapshots have a lower rank, that one is used and a sentence is appended here.
+    If the snapshots have a lower rank, that one is used and a doubt is appended to `sentences`.
     """
     Z = rows.P[:, :nz]
     if len(Z) < nz:  # LAPACK is faster on the tall side

@@ -42,19 +42,6 @@ def lasso(
 ) -> LassoSolution:
     """Return argmin ½ tr KᵀGK − tr KᵀH + the penalty of K, by accelerated proximal gradient with restarts.
 
-    Parameters
-    ----------
-    G
-        PᵀP ⪰ 0.
-    H
-        PᵀT.
-    weights
-        Penalties ≥ 0 of the entries; with `grouped` the first column holds the penalty of each row.
-    grouped
-        Penalise each row of K by its Euclidean norm, so that whole rows become zero.
-    tolerance
-        Largest violation of the optimality conditions, relative to the largest entry of H.
-
     References
     ----------
     Beck & Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging Sci. 2, 2009; restart:

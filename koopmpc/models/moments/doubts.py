@@ -17,15 +17,6 @@ def find_doubts(
     """Return a sentence for each reason to doubt the regression on P = [ψ(x) u], and its condition number.
 
     The condition number is that of columns scaled to unit norm; inf if they are dependent.
-
-    Parameters
-    ----------
-    rows
-        The rows; their P holds the observables, then the inputs.
-    observables, inputs
-        Names of the columns of P.
-    regular
-        The user passed a ridge or a rank; dependent or ill-conditioned observables then cause no doubt.
     """
     nz, nu = len(observables), len(inputs)
     names = [*observables, *inputs]

@@ -212,15 +212,7 @@ def space_evenly(total: int, wanted: int) -> list[int]:
 
 
 def _check_weights(weights: Weights, episodes: Episodes) -> Steps:
-    """Return the weight of each step of each episode.
-
-    Raises
-    ------
-    ShapeError
-        There are more or fewer items than episodes, or an item is neither a number nor an array of one a step.
-    DataError
-        A weight is below zero or not finite.
-    """
+    """Return the weight of each step of each episode."""
     if callable(weights):
         given = [weights(episode) for episode in episodes]
     else:
@@ -244,13 +236,7 @@ def _check_weights(weights: Weights, episodes: Episodes) -> Steps:
 
 
 def _align_weights(weights: Weights | None, source: Source) -> Weights | None:
-    """Return the weights of the steps that `source` keeps: an embedding drops the first steps of each episode.
-
-    Raises
-    ------
-    DataError
-        They are a list, and the source is not made from Episodes: another source has no known order.
-    """
+    """Return the weights of the steps that `source` keeps: an embedding drops the first steps of each episode."""
     if weights is None or callable(weights):
         return weights
     dropped, inner = 0, source

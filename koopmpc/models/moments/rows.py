@@ -123,17 +123,7 @@ def lift_chunks(
     columns: RowColumns,
     weights: list[Float[np.ndarray, " _"]] | None = None,
 ) -> Iterator[LiftedChunk]:
-    """Yield the lifted chunks; each overwrites the memory of the one before.
-
-    Parameters
-    ----------
-    episodes
-        They have as many inputs as the columns name.
-    columns
-        The columns of the rows.
-    weights
-        Weight of each step, episode by episode; None weighs all by 1.
-    """
+    """Yield the lifted chunks; each overwrites the memory of the one before."""
     of, lifting, products = episodes.episodes, columns.full, columns.products
     nz, nu = lifting.nz, len(episodes.inputs)
     n = len(columns.names) - nz
@@ -183,13 +173,6 @@ class GramSums:
 
     In a piece of consecutive states, Σ ψψᵀ and Σ ψ⁺ψ⁺ᵀ share all states except the first and the last. So the products
     of the shared rows are computed once, and those of the end rows are added; no subtraction loses digits.
-
-    Parameters
-    ----------
-    n
-        Columns of p = [ψ(x) u u⊗ψ(x)].
-    nz
-        Columns of ψ.
     """
 
     def __init__(self, n: int, nz: int) -> None:
@@ -234,13 +217,7 @@ class GramSums:
 
 
 class TriangularFactor:
-    """The triangular factor R of the rows of chunks, RᵀR = Σ w dᵀd; it has twice the digits of the sums.
-
-    Parameters
-    ----------
-    n, nz
-        As for `GramSums`.
-    """
+    """The triangular factor R of the rows of chunks, RᵀR = Σ w dᵀd; it has twice the digits of the sums."""
 
     def __init__(self, n: int, nz: int) -> None:
         self._R = empty_factor(n + nz)
@@ -265,15 +242,6 @@ class ForgettingMemory:
     rows along a direction its equation would fade until noise alone decides it (wind-up). So forgetting stops at a
     floor: an equation whose information r_jj² falls below `keep` times its maximum so far is scaled back to that floor.
     Both sides are scaled, so K does not change.
-
-    Parameters
-    ----------
-    nd, n
-        Columns of a row, and how many of them are regressors.
-    forgetting
-        λ in (0, 1].
-    keep
-        The floor, as a share of information.
     """
 
     def __init__(self, nd: int, n: int, forgetting: float, keep: float) -> None:

@@ -191,19 +191,6 @@ def choose_ridge(
     error, the data have no noise and λ is 0. The errors are those of one step; `select` chooses a ridge by errors over
     a horizon on held-out folds.
 
-    Parameters
-    ----------
-    s
-        Singular values of P on unit-norm columns.
-    shares
-        Uᵀ T.
-    outside
-        Energy of each target outside the span of P.
-    samples
-        The number M of snapshot pairs.
-    cut
-        Singular values below cut · σ₁ are rounding errors.
-
     References
     ----------
     Golub, Heath & Wahba, "Generalized cross-validation as a method for choosing a good ridge parameter",

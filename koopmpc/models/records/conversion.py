@@ -21,14 +21,22 @@ from koopmpc.models.records.free_run import embed_rows, find_units
 from koopmpc.models.records.hidden import HiddenModel, RecordSegments, join_segments, read_features, start_states
 from koopmpc.models.shared.regression import compute_scale_factor
 
-_OBSERVED = 0.999  # an observer's spectral radius is below this
+
+@dataclass(frozen=True)
+class _GainSearch:
+    """The search for the gain that corrects a hidden state."""
+
+    observed: float = 0.999  # an observer's spectral radius is below this
+    followed: int = 40  # steps in which readings correct the state
+    forecast: int = 20  # steps of the forecasts behind them, which judge
+    segments: int = 200  # of the records that judge, about
+    alike: float = 1.05  # squared errors within this factor are alike
+    far: float = 1e3  # a state stays within this many spreads
+    passes: int = 300  # steps of the Riccati equation
+
+
+_SEARCH = _GainSearch()
 _RATIOS = tuple(10.0**power for power in range(-6, 5))  # variances of process noise beside that of the sensors
-_FOLLOWED = 40  # steps in which readings correct the state
-_FORECAST = 20  # steps of the forecasts behind them, which judge
-_SEGMENTS = 200  # of the records that judge, about
-_ALIKE = 1.05  # squared errors within this factor are alike
-_FAR = 1e3  # a state stays within this many spreads
-_PASSES = 300  # steps of the Riccati equation
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,18 +257,18 @@ def _fit_gain(found: HiddenModel, units: SignalUnits, episodes: Episodes, delays
     """
     n, ny, A, C = found.order, units.ny, found.E[:, 1 : 1 + found.order], found.H[:, :-1]
     gains = [_steady_gain(A, C, ratio) for ratio in _RATIOS]
-    gains = [one for one in gains if np.abs(np.linalg.eigvals(A - one @ C @ A)).max() < _OBSERVED]
+    gains = [one for one in gains if np.abs(np.linalg.eigvals(A - one @ C @ A)).max() < _SEARCH.observed]
     if not gains:
         return np.zeros((n, ny))
-    steps = max(min(_FOLLOWED + _FORECAST, max(map(len, episodes)) - delays), 1)
-    apart = max(steps // 2, sum(map(len, episodes)) // _SEGMENTS, 1)
+    steps = max(min(_SEARCH.followed + _SEARCH.forecast, max(map(len, episodes)) - delays), 1)
+    apart = max(steps // 2, sum(map(len, episodes)) // _SEARCH.segments, 1)
     part = join_segments(cut_segments(episodes, units, delays, steps, apart))
-    followed = steps - min(_FORECAST, -(-steps // 3))
+    followed = steps - min(_SEARCH.forecast, -(-steps // 3))
     errors: list[float] = []
     for gain in gains:
         z, total = start_states(found, part.points), 0.0
         for k, (u, y) in enumerate(zip(part.inputs, part.outputs, strict=True)):
-            z = np.clip(read_features(found, z, u) @ found.E.T, -_FAR, _FAR)
+            z = np.clip(read_features(found, z, u) @ found.E.T, -_SEARCH.far, _SEARCH.far)
             shown = z @ C.T + found.H[:, -1]
             if units.rails is not None:
                 shown = np.clip(shown, *units.rails)
@@ -269,14 +277,14 @@ def _fit_gain(found: HiddenModel, units: SignalUnits, episodes: Episodes, delays
             else:
                 total += float(np.sum((y - shown) ** 2))
         errors.append(total)
-    return gains[max(i for i, error in enumerate(errors) if error <= _ALIKE * min(errors))]
+    return gains[max(i for i, error in enumerate(errors) if error <= _SEARCH.alike * min(errors))]
 
 
 def _steady_gain(A: Float[np.ndarray, "n n"], C: Float[np.ndarray, "ny n"], ratio: float) -> Float[np.ndarray, "n ny"]:
     """Return the steady Kalman gain for process noise of this variance and sensors with noise of variance one."""
     n, ny = len(A), len(C)
     P, gain = ratio * np.eye(n), np.zeros((n, ny))
-    for _ in range(_PASSES):
+    for _ in range(_SEARCH.passes):
         gain = np.linalg.solve(C @ P @ C.T + np.eye(ny), C @ P).T
         P = A @ (P - gain @ C @ P) @ A.T + ratio * np.eye(n)
     return gain

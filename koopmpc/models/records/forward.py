@@ -53,19 +53,6 @@ def select_forward(
     less its projection on the columns taken before. Columns and target are deviations from their means, so a constant
     is always among the regressors. All of this follows from their products, by a Cholesky factorisation that pivots.
 
-    Parameters
-    ----------
-    products
-        PᵀP.
-    cross
-        Pᵀy.
-    energy
-        ‖y‖².
-    floor
-        ‖p_j‖² up to which a column is constant.
-    most
-        Number of columns to take; fewer where the rest explains nothing.
-
     References
     ----------
     Chen, Billings & Luo, "Orthogonal least squares methods and their application to non-linear system

@@ -102,13 +102,6 @@ class SimulationError:
 
     With D_k = ∂z_k/∂θ and J = ∂(E φ)/∂z the derivative follows D_{k+1} = D_k Jᵀ + I ⊗ φ. Where a reading is at a rail
     and ŷ lies beyond it, the error is zero.
-
-    Parameters
-    ----------
-    model
-        Its terms and sizes; E, H and T come with each call.
-    noise
-        Standard deviation of noise in ζ, against which T is made robust: noise² ‖T‖² / steps is added, without offsets.
     """
 
     def __init__(self, model: HiddenModel, noise: float = 0.0) -> None:
@@ -301,13 +294,7 @@ def read_features(
 
 
 class FeatureTable:
-    """φ of many states and inputs, a row for each feature. Each product is a shorter one times one more factor.
-
-    Parameters
-    ----------
-    model
-        Its terms, bounds and neurons; E, H and T play no part.
-    """
+    """φ of many states and inputs, a row for each feature. Each product is a shorter one times one more factor."""
 
     def __init__(self, model: HiddenModel) -> None:
         self._model, self._limited = model, bool(np.isfinite(model.bound).any())

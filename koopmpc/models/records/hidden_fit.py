@@ -100,11 +100,6 @@ def fit_hidden(
     few rows leave minima apart. Others with neurons learn from a third of the segments, and without `quick` the last
     number of neurons goes on with all of them. Where the free run of the polished model is not calm, the last model
     before it that is takes its place: before the polish, with fewer neurons, or without any.
-
-    Raises
-    ------
-    DataError
-        The free runs of all models with neurons leave the data, without `quick`.
     """
     s, settings = structure, find_settings(structure)
     if not s.horizon:
@@ -150,22 +145,8 @@ def fit_chain(
     """Yield models of more and more terms that learn from the first three quarters of each record.
 
     Without `neurons` these are the linear model and those of degrees 2 up to that of the plan. With neurons each has
-    the next number of them, beside products of the plan's degree.
-
-    Parameters
-    ----------
-    data, plan
-        The records, and orders, degree, delays, horizon and rails.
-    neurons
-        Numbers of neurons, in ascending order.
-    quick
-        Learn from the segments of a search.
-    plain
-        Yield the model without neurons first.
-    effort
-        Of each stage with neurons, in place of the settings'.
-    last
-        Have the last number of neurons learn from all segments behind the others.
+    the next number of them, beside products of the plan's degree; `plain` yields the model without them first. `quick`
+    learns from the segments of a search; `last` has the last number of neurons go on with all segments.
     """
     settings, s = NEURAL if neurons else POLYNOMIAL, plan
     units = SignalUnits.of(data, s.rails)

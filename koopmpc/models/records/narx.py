@@ -177,21 +177,7 @@ def search_structures(
     ask: Ask | None = None,
     rails: Float[np.ndarray, "2 nx"] | None = None,
 ) -> list[Structure]:
-    """Return structures of all delays, degrees and sizes with their errors in free run; the calm ones if there are any.
-
-    Parameters
-    ----------
-    episodes
-        The records.
-    delays, degrees, terms
-        As in `narx`.
-    horizon
-        Steps of the short forecasts; `find_forecast_horizon` says what it is by default.
-    ask
-        Called before each pair of delays and degree.
-    rails
-        As in `narx`.
-    """
+    """Return structures of all delays, degrees and sizes with their errors; the calm ones if there are any."""
     if episodes.nw:
         raise DataError("the records hold measured disturbances, which narx does not know; pass them as inputs")
     pieces, horizon = Pieces.of(episodes), horizon or find_forecast_horizon(episodes)

@@ -97,11 +97,6 @@ class ContainedError:
     Neurons are bounded, so far from the data z⁺ is A z and a bounded rest. With |λᵢ| ≤ 1 no free run grows
     exponentially, whatever bounded inputs act. Its derivative is d|λ| = Re(λ̄ / |λ| wᴴ dA v), v and w the right and
     left eigenvectors with wᴴ v = 1.
-
-    Parameters
-    ----------
-    error
-        What is minimised beside it.
     """
 
     def __init__(self, error: SimulationError) -> None:

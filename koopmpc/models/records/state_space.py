@@ -251,13 +251,7 @@ def search_hidden(
     rails: Float[np.ndarray, "2 ny"] | None = None,
     ask: Ask | None = None,
 ) -> list[HiddenStructure]:
-    """Return all polynomial structures with their errors on the last quarter of each record.
-
-    Raises
-    ------
-    DataError
-        The records are too short for all of them.
-    """
+    """Return all polynomial structures with their errors on the last quarter of each record."""
     count = len(orders) * len(delays) + _FINALISTS * (len(horizons) - 1)
     name = "hidden states with polynomials"
     search = _Search(episodes, POLYNOMIAL, lambda done: ask and ask(name, done, count))
@@ -294,11 +288,6 @@ def search_neural(
 
     Degrees above the first, and other starts for the neurons, are tried with the best order; with `quick` no other
     starts.
-
-    Raises
-    ------
-    DataError
-        The records are too short for all of them.
     """
     count, name = len(orders) + len(degrees) + _STARTS - 2, "hidden states with neurons"
     search = _Search(episodes, NEURAL, lambda done: ask and ask(name, done, count))

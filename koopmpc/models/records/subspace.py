@@ -232,13 +232,7 @@ def _build_model(regression: Regression, found: Realisation) -> LinearPredictor:
 def choose_sizes(
     episodes: Episodes, orders: Sequence[int] = ORDERS, pasts: Sequence[int] = DELAYS
 ) -> tuple[list[int], list[int], Float[np.ndarray, " blocks"]]:
-    """Return the smallest order, and its past rows, whose error on the last quarter is like the least one; its errors.
-
-    Raises
-    ------
-    DataError
-        The records are too short.
-    """
+    """Return the smallest order, and its past rows, whose error on the last quarter is like the least; its errors."""
     (learned, spans), horizon = cut_quarter(episodes), find_forecast_horizon(episodes)
     tried: list[tuple[int, int, Float[np.ndarray, " blocks"]]] = []
     for delays in pasts:

@@ -1,16 +1,25 @@
 """Levenberg-Marquardt descent that stops on rows which it does not fit; Gauss-Newton for the first states of runs."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
 
-DAMPING = 1e-3  # first weight of the diagonal in a Levenberg-Marquardt step
-GROWTH = 4.0  # factor on the damping after a step that does not lower the error
-DECAY = 0.2  # factor on the damping after a step that does
-LEAST_DAMPING = 1e-14  # damping does not fall below this
-TRIALS = 10  # dampings tried for one step
+
+@dataclass(frozen=True)
+class _Steps:
+    """How the damping of a step is chosen."""
+
+    damping: float = 1e-3  # first weight of the diagonal in a Levenberg-Marquardt step
+    growth: float = 4.0  # factor on the damping after a step that does not lower the error
+    decay: float = 0.2  # factor on the damping after a step that does
+    least_damping: float = 1e-14  # damping does not fall below this
+    trials: int = 10  # dampings tried for one step
+
+
+_STEPS = _Steps()
 CONVERGED = 1e-12  # stop where a step lowers the squared error by less than this share
 _ROUNDING = float(np.finfo(float).eps)  # smaller eigenvalues than this share of the largest are rounding error
 PATIENCE = 3  # stop after this many steps in a row that do not lower the error on the held-out rows
@@ -47,29 +56,14 @@ def minimise(
 ) -> tuple[Float[np.ndarray, "..."], int]:
     """Return the Θ on the way down the error of `fitted` that has the least error on `judged`, and its iteration.
 
-    Parameters
-    ----------
-    error
-        What is minimised.
-    start
-        Θ to start from.
-    fitted, judged
-        Data that are fitted, and data that decide when to stop.
-    iterations
-        Steps, at most.
-    free
-        Places of the entries of Θ that may change; all by default.
-    patience
-        Stop after this many steps in a row that do not lower the error of `judged`.
-    converged
-        Stop where a step lowers the error of `fitted` by less than this share.
-    project
-        Returns the Θ that may be taken in place of that of a step, tried where no step itself lowers the error.
+    Only the entries at the places `free` change. `patience` counts steps in a row that do not gain on `judged`,
+    `converged` is the share of the error of `fitted` that a step has to gain, and `project` returns the Θ that may be
+    taken in place of that of a step, where no step itself lowers the error.
     """
     theta = best = start
     places = np.arange(theta.size) if free is None else free
     value, least = error.evaluate(theta, fitted), error.evaluate(theta, judged)
-    damping, at, waited = DAMPING, 0, 0
+    damping, at, waited = _STEPS.damping, 0, 0
     for step in range(1, iterations + 1):
         if not np.isfinite(value):
             break  # the start overflows: there is no derivative to follow
@@ -81,7 +75,7 @@ def minimise(
         begun = damping
         for turn in (_keep,) if project is None else (_keep, project):
             damping = begun
-            for _ in range(TRIALS):
+            for _ in range(_STEPS.trials):
                 move = np.zeros(theta.size)
                 damped = sizes + damping
                 steep = damped > _ROUNDING * len(sizes) * damped[-1]  # directions that are more than rounding error
@@ -93,9 +87,9 @@ def minimise(
                 lower = error.evaluate(trial, fitted)
                 if lower < value:
                     theta = trial
-                    damping = max(DECAY * damping, LEAST_DAMPING)
+                    damping = max(_STEPS.decay * damping, _STEPS.least_damping)
                     break
-                damping *= GROWTH
+                damping *= _STEPS.growth
             if lower < value:
                 break
         if not lower < value:
@@ -127,22 +121,9 @@ def find_starts(
 ) -> Float[np.ndarray, "m n"]:
     """Return the first state of each of m runs that explains its rows best, by Gauss-Newton on all runs at once.
 
-    Parameters
-    ----------
-    evaluate
-        Squared error of each run; inf where it leaves the model.
-    differentiate
-        Half its gradient by the first state, and the Gauss-Newton matrix.
-    starts
-        Where the search begins.
-    steps
-        Steps, at most.
-    soft
-        Weight of a state's own size in a step, as a share of the mean of the matrix's diagonal.
-    shares
-        Of a step, tried until it lowers the error of a run.
-    converged
-        Stop where a step lowers the sum of all errors by less than this share.
+    `evaluate` returns the squared error of each run, inf where it leaves the model, `differentiate` half its gradient
+    and the Gauss-Newton matrix. `soft` is the weight of a state's own size in a step, `shares` are those of a step that
+    are tried, and `converged` is the share of all errors that a step has to gain.
     """
     errors = evaluate(starts)
     for _ in range(steps):

@@ -36,11 +36,6 @@ class TunableLifting:
     A field that must stay above zero is its value times exp(p). Any other is its value plus p times a unit: the width
     of the family if it has one, else the spread of the field's rows. So p does not depend on the units of the states.
 
-    Parameters
-    ----------
-    lifting
-        Bound to its states.
-
     Raises
     ------
     DataError
@@ -189,17 +184,7 @@ class _LeastSquares:
 
 
 class VariableProjection:
-    """J(p) = log of the relative forecast error over the horizon, with A, B and C by least squares for each p.
-
-    Parameters
-    ----------
-    tuning
-        ψ(x; p).
-    windows
-        The data.
-    ridge
-        Ridge of the least squares, as in `edmd`.
-    """
+    """J(p) = log of the relative forecast error over the horizon, with A, B and C by least squares for each p."""
 
     def __init__(self, tuning: TunableLifting, windows: Windows, ridge: float) -> None:
         self.tuning, self.windows, self.ridge = tuning, windows, ridge
