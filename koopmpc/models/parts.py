@@ -18,7 +18,7 @@ from koopmpc.models.base import FitReport, Predictor
 from koopmpc.plants.step_map import StepMap
 
 
-class BilinearFields(TypedDict, total=False):
+class _Fields(TypedDict, total=False):
     """Further fields of a predictor, which most models leave out.
 
     Attributes
@@ -29,25 +29,24 @@ class BilinearFields(TypedDict, total=False):
         (nz, nz) upper triangular factor of the lifted data's covariance.
     E, disturbances
         (nz, nw) effects of measured disturbances w, and their names.
-    S, M
-        (nw, nz, nz) and (nw, nz, nu), how w changes A and B; of bilinear predictors.
     """
 
     embedding: Delay | None
     scale: ArrayLike | None
     E: ArrayLike | None
     disturbances: Sequence[str] | None
+
+
+class BilinearFields(_Fields, total=False):
+    """Those of bilinear predictors too: S, (nw, nz, nz), and M, (nw, nz, nu), how w changes A and B."""
+
     S: ArrayLike | None
     M: ArrayLike | None
 
 
-class LinearFields(TypedDict, total=False):
-    """Further fields of a linear predictor: those of `BilinearFields` without S and M, and `exact_modes`."""
+class LinearFields(_Fields, total=False):
+    """Those of linear predictors too."""
 
-    embedding: Delay | None
-    scale: ArrayLike | None
-    E: ArrayLike | None
-    disturbances: Sequence[str] | None
     exact_modes: Complex[np.ndarray, "nl nz"] | None
 
 

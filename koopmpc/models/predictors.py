@@ -178,9 +178,8 @@ class LinearPredictor(Predictor):
         >>> model.A.tolist()
         [[1.0, 0.1], [0.0, 1.0]]
         """
-        found = read_state_space(system, dt, states, inputs)
-        nx = len(found.A)
-        return cls(found.A, found.B, np.eye(nx), State(), found.dt, found.states, found.inputs)
+        A, B, *about = read_state_space(system, dt, states, inputs)
+        return cls(A, B, np.eye(len(A)), State(), *about)
 
     def to_state_space(self) -> Any:
         """Return z⁺ = A z + B u, x = C z as a scipy.signal.dlti; ``control.ss(system)`` takes its matrices."""

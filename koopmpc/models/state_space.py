@@ -1,7 +1,7 @@
 """State-space systems of scipy.signal and python-control as predictors, and back."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,17 +10,6 @@ from koopmpc.base import checks
 from koopmpc.base.errors import DataError
 
 _MATRICES = ("A", "B", "C", "D")
-
-
-class SystemMatrices(NamedTuple):
-    """The matrices of x⁺ = A x + B u, y = C x, the sample time and the names of a system."""
-
-    A: Float[np.ndarray, "nx nx"]
-    B: Float[np.ndarray, "nx nu"]
-    C: Float[np.ndarray, "ny nx"]
-    dt: float
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
 
 
 def is_state_space(given: object) -> bool:
@@ -33,8 +22,8 @@ def read_state_space(
     dt: float | None = None,
     states: Sequence[str] | None = None,
     inputs: Sequence[str] | None = None,
-) -> SystemMatrices:
-    """Return the matrices of a system of scipy.signal (``StateSpace``, ``dlti``) or python-control (``ss``).
+) -> tuple[np.ndarray, np.ndarray, float, tuple[str, ...], tuple[str, ...]]:
+    """Return A, B, the sample time and the names of a system of scipy.signal or python-control (``ss``).
 
     A continuous system is discretised by a zero-order hold of `dt` seconds.
     """
@@ -52,10 +41,9 @@ def read_state_space(
         A, B, *_ = cont2discrete((A, B, C, D), step)
     state_names = getattr(system, "state_labels", None) if states is None else states
     input_names = getattr(system, "input_labels", None) if inputs is None else inputs
-    return SystemMatrices(
+    return (
         np.asarray(A, dtype=np.float64),
         np.asarray(B, dtype=np.float64),
-        C,
         step,
         checks.names(state_names, "states", "x", len(A)),
         checks.names(input_names, "inputs", "u", B.shape[1]),

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 import koopmpc as km
 from tests.models.plants import one_step_pairs, random_episodes
-from tests.models.test_exact_cases import data_of, slow_manifold
 
 SQUARE = km.State() + km.Expressions(lambda x: [x[0] ** 2], ["x0^2"])
 
@@ -41,14 +40,6 @@ def test_proctor_2018_inputs_that_enter_linearly_have_no_products() -> None:
     assert np.allclose(model.N, 0, rtol=0, atol=1e-12)
     assert np.allclose(model.eigenvalues, [lam, lam**2, mu], rtol=0, atol=1e-12)
     assert np.abs(model.report.residual).max() < 1e-7  # as far as the Gram route resolves it
-
-
-def test_a_bilinear_fit_is_exact_on_the_linear_system_of_safedmd() -> None:
-    data = data_of(*slow_manifold(-2.0, 1.0, 0.01))
-    model = km.bilinear_edmd(data, km.State() + km.Expressions(lambda x: [x[1] - 0.2 * x[0] ** 2], ["x1 - 0.2 x0^2"]))
-    assert model.eigenvalues.real == pytest.approx([1.010050, 0.980199, 0.960789], abs=5e-7)
-    assert model.B[:, 0] == pytest.approx([0, 0.01005017, 0.01005017], abs=5e-9)
-    assert np.allclose(model.N, 0, rtol=0, atol=1e-12)
 
 
 def test_an_input_on_the_squared_state_needs_the_products() -> None:

@@ -103,13 +103,3 @@ def test_edmd_is_exact_on_the_system_of_safedmd() -> None:
     s = data.snapshots()
     Z, Z_next = model.lift(s.X), model.lift(s.X_next)
     assert np.abs(Z_next - Z @ model.A.T - s.U @ model.B.T).max() < 1e-13
-
-
-@pytest.mark.parametrize(("lam", "mu", "delta"), [(0.9, 0.5, 1.0), (0.7, 1.1, 0.3)])
-def test_edmd_is_exact_on_the_example_of_proctor(lam: float, mu: float, delta: float) -> None:
-    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return np.array([lam * x[0], mu * x[1] + (lam**2 - mu) * x[0] ** 2 + delta * u[0]])
-
-    model = km.edmd(one_step_pairs(step, 2, 1, 200), SQUARE)
-    assert np.allclose(model.A, [[lam, 0, 0], [0, mu, lam**2 - mu], [0, 0, lam**2]], rtol=0, atol=1e-12)
-    assert np.allclose(model.B, [[0], [delta], [0]], rtol=0, atol=1e-12)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import koopmpc as km
-from koopmpc.models.records import hidden_fit
 from koopmpc.models.records.conversion import SignalUnits, cut_segments, from_standard, to_standard
 from koopmpc.models.records.forward import list_terms
 from koopmpc.models.records.free_starts import FreeStartsError
@@ -17,7 +16,6 @@ from koopmpc.models.records.hidden import (
     SimulationError,
     simulate_hidden,
 )
-from koopmpc.models.records.hidden_structure import HiddenStructure
 from tests.models.test_subspace import linear_plant, markov, model_markov, record_of
 
 
@@ -386,24 +384,6 @@ def test_an_output_that_never_moves_is_refused_in_a_sentence():
     data = km.Episodes([km.Episode(X=np.ones((201, 1)), U=np.random.default_rng(0).uniform(-1, 1, (200, 1)))], 0.1)
     with pytest.raises(km.errors.DataError, match="no output moves"):
         km.identify.neural_state_space(data, order=2, neurons=1)
-
-
-def test_a_short_record_is_fitted_from_several_sets_of_neurons(monkeypatch):
-    u, y = np.random.default_rng(0).uniform(-1, 1, 150), np.zeros(151)
-    for k in range(150):
-        y[k + 1] = 0.9 * y[k] + u[k] - 0.3 * np.tanh(10 * y[k])
-    data = km.Episodes([km.Episode(X=y[:, None], U=u[:, None])], 0.1, ["y"], ["u"])
-    chain = hidden_fit.fit_chain
-
-    def fit_chain(data, structure, neurons, **options):
-        found = chain(data, replace(structure, start=0), neurons, **options)
-        return found if structure.start else [next(found)]  # no neurons in the first set
-
-    monkeypatch.setattr(hidden_fit, "fit_chain", fit_chain)
-    plan = HiddenStructure(1, 1, 8, 50, None, np.ones(1), True, 4, neurons=1)
-    model = hidden_fit.fit_hidden(plan, data)
-    start = model.embed(data)[0].X[0]
-    assert abs(model.step_map().rollout(start, u[8:, None])[:, 0] - y[8:]).max() < 0.02 * y.std()
 
 
 @pytest.mark.parametrize("degree", [1, 2])

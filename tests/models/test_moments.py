@@ -1,9 +1,7 @@
 """Moments are sums: order, grouping and chunks change nothing, and no pair spans two episodes."""
 
 from dataclasses import replace
-from functools import reduce
 from itertools import pairwise
-from operator import add
 
 import numpy as np
 import pytest
@@ -43,20 +41,6 @@ def test_each_chunk_is_lifted_once_where_gram_sums_serve(monkeypatch: pytest.Mon
     monkeypatch.setattr(km.State, "lift_into", lambda self, X, Z: (lifted.append(len(X)), count(self, X, Z))[1])
     km.edmd(data, km.State())
     assert sum(lifted) <= 12_000 * (1 + 2 / 1023) + 4
-
-
-@given(LENGTHS, st.integers(0, 999), st.sampled_from(["gram", "qr"]), st.randoms(use_true_random=False))
-def test_moments_add_in_any_order_and_grouping(lengths: list[int], seed: int, route: str, random) -> None:
-    data = random_episodes(seed, lengths, 2, 1)
-    whole = km.moments.second_moments(data, LIFTING, route=route)
-    parts = [km.moments.second_moments(data[i : i + 1], LIFTING, route=route) for i in range(len(data))]
-    random.shuffle(parts)
-    left = reduce(add, parts)
-    right = reduce(lambda a, b: b + a, reversed(parts))
-    for total in (left, right):
-        assert total.samples == whole.samples
-        assert total.route == route
-        assert close(gram(total), gram(whole))
 
 
 def test_a_long_episode_in_many_chunks_equals_its_parts() -> None:

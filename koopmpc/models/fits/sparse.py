@@ -1,6 +1,6 @@
 """EDMD that keeps few observables, or few entries of A and B."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, Unpack
 
 import numpy as np
@@ -24,14 +24,6 @@ from koopmpc.models.shared.regression import build_predictor, describe_misfit, r
 _STEPS = 20_000  # largest number of steps of the proximal gradient method
 
 
-@dataclass(frozen=True, eq=False)
-class LassoSolution:
-    """A minimiser K, (n, nt), and the largest violation `missed` of its optimality conditions."""
-
-    K: Float[np.ndarray, "n nt"]
-    missed: float
-
-
 def lasso(
     G: Float[np.ndarray, "n n"],
     H: Float[np.ndarray, "n nt"],
@@ -39,7 +31,7 @@ def lasso(
     *,
     grouped: bool,
     tolerance: float = 1e-10,
-) -> LassoSolution:
+) -> tuple[Float[np.ndarray, "n nt"], float]:
     """Return argmin ½ tr KᵀGK − tr KᵀH + the penalty of K, by accelerated proximal gradient with restarts.
 
     References
@@ -55,13 +47,13 @@ def lasso(
         new = _shrink(ahead - step * (G @ ahead - H), step * weights, grouped)
         missed = float(np.abs(new - ahead).max()) / step
         if missed <= enough:
-            return LassoSolution(new, missed)
+            return new, missed
         if np.sum((ahead - new) * (new - K)) > 0:
             momentum = 1.0
         later = 0.5 * (1 + np.sqrt(1 + 4 * momentum**2))
         ahead = new + (momentum - 1) / later * (new - K)
         K, momentum = new, later
-    return LassoSolution(K, missed)
+    return K, missed
 
 
 def _shrink(K: Float[np.ndarray, "n nt"], by: Float[np.ndarray, "n nt"], grouped: bool) -> Float[np.ndarray, "n nt"]:
@@ -190,11 +182,11 @@ def _grow_support(
             plain = np.sqrt(np.sum(plain**2, axis=1, keepdims=True)) * np.ones_like(plain)
         weights = penalty / np.maximum(plain, 1e-12) if adaptive else np.full_like(plain, penalty)
         residual = P[:, penalized] - project_onto(P[:, ~penalized], P[:, penalized])
-        solution = lasso(residual.T @ residual, residual.T @ T[:, targets], weights, grouped=not entries)
-        worst = max(worst, solution.missed)
+        K, missed = lasso(residual.T @ residual, residual.T @ T[:, targets], weights, grouped=not entries)
+        worst = max(worst, missed)
         used = np.zeros((P.shape[1], nz), dtype=bool)
         used[np.ix_(~penalized, kept)] = True
-        used[np.ix_(penalized, kept)] = solution.K != 0
+        used[np.ix_(penalized, kept)] = K != 0
         joining = used[:nz].any(axis=1) & ~kept
         if not joining.any():
             return used, worst

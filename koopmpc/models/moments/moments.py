@@ -3,7 +3,6 @@
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -170,26 +169,11 @@ class Moments(Value):
         return self.sums if self.route == "gram" else self.sums.T @ self.sums
 
 
-class BothSides(NamedTuple):
-    """Rows with the PᵀP, PᵀT and TᵀT of the M snapshots, where p = [ψ(x) u] and t = ψ(x⁺).
+def both_sides(total: Moments) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m nz"], float]:
+    """Return rows P, T with the PᵀP, PᵀT and TᵀT of the M snapshots, p = [ψ(x) u …] and t = ψ(x⁺), and a cut.
 
-    Attributes
-    ----------
-    P
-        (m, n) the observables, the inputs, and for a bilinear model their products.
-    T
-        (m, nz) the observables one step later.
-    cut
-        On columns of unit norm, singular values below this share of the largest are rounding errors.
+    On columns of unit norm, singular values below the cut are rounding errors; rows of Gram sums have half the digits.
     """
-
-    P: Float[np.ndarray, "m n"]
-    T: Float[np.ndarray, "m nz"]
-    cut: float
-
-
-def both_sides(total: Moments) -> BothSides:
-    """Return these rows and the cut of their singular values; rows from Gram sums have half the digits."""
     rows = total.complete_rows(total.columns.regressors, total.columns.targets[: total.nz])
     rounding = float(np.finfo(float).eps * max(total.samples, len(total.columns.regressors) + total.nz))
-    return BothSides(rows.P, rows.T, rounding if total.route == "qr" else float(np.sqrt(rounding)))
+    return rows.P, rows.T, rounding if total.route == "qr" else float(np.sqrt(rounding))

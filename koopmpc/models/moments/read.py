@@ -1,7 +1,8 @@
 """The moments of a whole source: its parts are read by workers, and the condition chooses sums or a factor."""
 
-from collections.abc import Callable, Iterable, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, NamedTuple, TypedDict, cast
 
 import numpy as np
@@ -97,33 +98,25 @@ def second_moments(
     reading = _ReadTask(None, bound, source.inputs, bilinear, _align_weights(weights, source))
     zero = Moments(bound, source.inputs, source.dt, 0, 0.0, "", np.empty((0, 0)), bilinear, embedding)
 
-    parallel = _Parallel(workers, scheduler, progress)
+    run = partial(map_tasks, read_part, workers=workers, scheduler=scheduler, progress=progress)
     if route is None and source.replayable:
-        total = _add_up(source, reading, replace(zero, route="gram"), parallel, judged=True)
+        total = _add_up(source, reading, replace(zero, route="gram"), run, judged=True)
         if total is not None:
             return total
-    total = _add_up(source, reading, replace(zero, route=route or "qr"), parallel, judged=False)
+    total = _add_up(source, reading, replace(zero, route=route or "qr"), run, judged=False)
     assert total is not None, "it was not judged"
     return total
 
 
-class _Parallel(NamedTuple):
-    """Who reads the parts, see `map_tasks`."""
-
-    workers: int | None
-    scheduler: str | None
-    progress: Progress | None
-
-
 def _add_up(
-    source: Source, reading: "_ReadTask", zero: Moments, parallel: _Parallel, *, judged: bool
+    source: Source, reading: "_ReadTask", zero: Moments, run: Callable[..., Iterator["_Sums"]], *, judged: bool
 ) -> Moments | None:
     """Return the moments of all parts, added in order; None where `judged` Gram sums turn out ill-conditioned."""
     parts, total = source.parts(), zero
     lazy = (replace(reading, part=part, route=cast("Route", zero.route)) for part in parts)
     tasks = list(lazy) if isinstance(parts, Sized) else lazy
     waits = judged and not (isinstance(parts, Sized) and len(parts) == 1)
-    for sums in map_tasks(read_part, tasks, **parallel._asdict()):
+    for sums in run(tasks):
         each = replace(zero, **sums._asdict())
         total = total + each if total.samples else each
         if waits and total.samples >= _ENOUGH * total.columns.regressors.size:
