@@ -2,15 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import factorial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from koopmpc.models.records.forward import Terms, evaluate_terms, list_terms
 
-_FULL = 8  # of more past rows only the smooth part tells where the state begins
-_SMOOTH = 3  # degree in time of that part
 _ROWS = 2000  # so many rows, and eight steps at least, are multiplied at once
 _FAR = 1e3  # a state beyond this many spreads has left the model
 
@@ -358,50 +355,3 @@ def find_gap(y: Float[np.ndarray, "steps m ny"], data: RecordSegments) -> Float[
     """Return ŷ − y; zero where a reading says nothing."""
     gap = y - data.outputs
     return gap if data.low is None else np.where(_is_silent(y, data), 0.0, gap)
-
-
-def start_with_differences(ny: int, nu: int, order: int, delays: int) -> HiddenModel:
-    """Return z = the outputs and their derivatives in time, one per row, which go on as polynomials in time do.
-
-    The past rows give them by least squares. It is what every plant looks like where samples are fast.
-    """
-    owner = [i % ny for i in range(order)]
-    rank = [i // ny for i in range(order)]
-    E, H, T = np.zeros((order, 1 + order + nu)), np.zeros((ny, order + 1)), np.zeros((order, _size(ny, nu, delays) + 1))
-    lags = -np.arange(delays + 1.0)[:, None]
-    for i in range(order):
-        own = [j for j in range(order) if owner[j] == owner[i]]
-        powers = np.arange(len(own))
-        derivatives = np.linalg.pinv(lags**powers / [factorial(int(p)) for p in powers])
-        T[i, _rows_of(owner[i], ny, nu, delays)] = derivatives[rank[i]]
-        for j in own:
-            if rank[j] >= rank[i]:
-                E[i, 1 + j] = 1 / factorial(rank[j] - rank[i])
-        if rank[i] == 0:
-            H[owner[i], i] = 1.0
-    return HiddenModel(list_terms(order, nu, 1), E, H, T, np.full(order, np.inf))
-
-
-def _size(ny: int, nu: int, delays: int) -> int:
-    return ny + delays * (ny + nu)
-
-
-def _rows_of(signal: int, ny: int, nu: int, delays: int) -> Int[np.ndarray, " rows"]:
-    """Return the places in ζ of an output, newest first, or of an input, signals ny and more."""
-    past = ny + np.arange(delays) * (ny + nu)
-    return np.append(signal, past + nu + signal) if signal < ny else past + signal - ny
-
-
-def smooth_basis(ny: int, nu: int, delays: int) -> Float[np.ndarray, "k nzeta"]:
-    """Return orthonormal rows, of many past rows Legendre polynomials in time of each signal; of few all of ζ."""
-    n = _size(ny, nu, delays)
-    if delays <= _FULL:
-        return np.eye(n)
-    rows: list[np.ndarray] = []
-    for signal in range(ny + nu):
-        places = _rows_of(signal, ny, nu, delays)
-        time = np.linspace(-1, 1, len(places))
-        part = np.zeros((_SMOOTH + 1, n))
-        part[:, places] = np.linalg.qr(np.polynomial.legendre.legvander(time, _SMOOTH))[0].T
-        rows.append(part)
-    return np.vstack(rows)

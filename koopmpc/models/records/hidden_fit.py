@@ -18,9 +18,7 @@ from koopmpc.models.records.hidden import (
     SimulationError,
     bound_states,
     join_segments,
-    smooth_basis,
     start_states,
-    start_with_differences,
 )
 from koopmpc.models.records.hidden_structure import (
     HiddenStructure,
@@ -29,7 +27,14 @@ from koopmpc.models.records.hidden_structure import (
     report_fit,
     thin_records,
 )
-from koopmpc.models.records.neurons import ContainedError, contain, draw_neurons, take_neurons
+from koopmpc.models.records.neurons import (
+    ContainedError,
+    contain,
+    draw_neurons,
+    smooth_basis,
+    start_with_differences,
+    take_neurons,
+)
 from koopmpc.models.records.structure import HORIZON, find_forecast_horizon
 from koopmpc.models.records.subspace import build_realisation, compute_block_moments
 from koopmpc.models.records.unseen import cut_quarter

@@ -1,11 +1,13 @@
-"""Neurons of a hidden state: their candidates, the choice among them, and an error whose linear part cannot grow."""
+"""Where fits with neurons begin, the candidates for neurons and the choice among them, and an error without growth."""
 
 from dataclasses import replace
+from math import factorial
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from koopmpc.base.errors import DataError
+from koopmpc.models.records.forward import list_terms
 from koopmpc.models.records.hidden import (
     HiddenModel,
     RecordSegments,
@@ -15,6 +17,8 @@ from koopmpc.models.records.hidden import (
     start_states,
 )
 
+_FULL = 8  # of more past rows only the smooth part tells where the state begins
+_SMOOTH = 3  # degree in time of that part
 _DRAWN = 40  # candidates for neurons, of random directions
 _SHARP = (1.0, 4.0, 16.0)  # slopes of candidates along the output and its differences, for each spread
 _PLACES = (0.1, 0.5, 0.9)  # quantiles at which their bends lie
@@ -153,3 +157,50 @@ def contain(model: HiddenModel) -> HiddenModel:
     E = model.E.copy()
     E[:, 1 : 1 + n] /= radius * (1 + _INSIDE)
     return replace(model, E=E)
+
+
+def start_with_differences(ny: int, nu: int, order: int, delays: int) -> HiddenModel:
+    """Return z = the outputs and their derivatives in time, one per row, which go on as polynomials in time do.
+
+    The past rows give them by least squares. It is what every plant looks like where samples are fast.
+    """
+    owner = [i % ny for i in range(order)]
+    rank = [i // ny for i in range(order)]
+    E, H, T = np.zeros((order, 1 + order + nu)), np.zeros((ny, order + 1)), np.zeros((order, _size(ny, nu, delays) + 1))
+    lags = -np.arange(delays + 1.0)[:, None]
+    for i in range(order):
+        own = [j for j in range(order) if owner[j] == owner[i]]
+        powers = np.arange(len(own))
+        derivatives = np.linalg.pinv(lags**powers / [factorial(int(p)) for p in powers])
+        T[i, _rows_of(owner[i], ny, nu, delays)] = derivatives[rank[i]]
+        for j in own:
+            if rank[j] >= rank[i]:
+                E[i, 1 + j] = 1 / factorial(rank[j] - rank[i])
+        if rank[i] == 0:
+            H[owner[i], i] = 1.0
+    return HiddenModel(list_terms(order, nu, 1), E, H, T, np.full(order, np.inf))
+
+
+def _size(ny: int, nu: int, delays: int) -> int:
+    return ny + delays * (ny + nu)
+
+
+def _rows_of(signal: int, ny: int, nu: int, delays: int) -> Int[np.ndarray, " rows"]:
+    """Return the places in ζ of an output, newest first, or of an input, signals ny and more."""
+    past = ny + np.arange(delays) * (ny + nu)
+    return np.append(signal, past + nu + signal) if signal < ny else past + signal - ny
+
+
+def smooth_basis(ny: int, nu: int, delays: int) -> Float[np.ndarray, "k nzeta"]:
+    """Return orthonormal rows, of many past rows Legendre polynomials in time of each signal; of few all of ζ."""
+    n = _size(ny, nu, delays)
+    if delays <= _FULL:
+        return np.eye(n)
+    rows: list[np.ndarray] = []
+    for signal in range(ny + nu):
+        places = _rows_of(signal, ny, nu, delays)
+        time = np.linspace(-1, 1, len(places))
+        part = np.zeros((_SMOOTH + 1, n))
+        part[:, places] = np.linalg.qr(np.polynomial.legendre.legvander(time, _SMOOTH))[0].T
+        rows.append(part)
+    return np.vstack(rows)
