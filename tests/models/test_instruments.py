@@ -1,4 +1,4 @@
-"""Instrumental regression: exact where least squares is, unbiased under feedback with noisy sensors, refused without."""
+"""Instruments and the direct method: unbiased under feedback with noisy sensors, least squares where they are exact."""
 
 import numpy as np
 import pytest
@@ -35,34 +35,41 @@ def fit_plain(data):
     return np.hstack([model.A, model.B])
 
 
+def fit_directly(data, r=None):
+    model = km.identify.prediction_error(km.edmd(data, km.State()), data)
+    return np.hstack([model.A, model.B])
+
+
 def test_a_loop_without_noise_gives_the_plant_exactly():
     data, r = run_loop(np.random.default_rng(0), 400)
     np.testing.assert_allclose(fit(data, r), TRUTH, atol=1e-9)
 
 
-def test_units_of_the_states_and_of_the_set_point_change_nothing_else():
-    data, r = run_loop(np.random.default_rng(1), 400, sensor=0.05)
+@pytest.mark.parametrize(("way", "noise", "rtol"), [(fit, 0.05, 1e-6), (fit_directly, 0.1, 1e-4)])
+def test_units_of_the_states_and_of_the_set_point_change_nothing_else(way, noise, rtol):
+    data, r = run_loop(np.random.default_rng(1), 400, sensor=noise)
     T = np.diag([1e3, 1e-2])
-    moved = km.Episodes([km.Episode(X=data[0].X @ T, U=data[0].U)], dt=0.1)
-    K = fit(moved, [1e4 * r[0]])
-    np.testing.assert_allclose(np.linalg.solve(T, K[:, :2] @ T), fit(data, r)[:, :2], rtol=1e-6, atol=1e-8)
+    K = way(km.Episodes([km.Episode(X=data[0].X @ T, U=data[0].U)], dt=0.1), [1e4 * r[0]])
+    np.testing.assert_allclose(np.linalg.solve(T, K[:, :2] @ T), way(data, r)[:, :2], rtol=rtol, atol=1e-2 * rtol)
 
 
-def test_noisy_sensors_bias_least_squares_and_not_the_instruments():
+@pytest.mark.parametrize(("way", "noise", "count", "steps"), [(fit, 0.2, 30, 800), (fit_directly, 0.1, 4, 600)])
+def test_noisy_sensors_bias_least_squares_and_neither_instruments_nor_the_direct_method(way, noise, count, steps):
     rng = np.random.default_rng(2)
-    records = [run_loop(rng, 800, sensor=0.2) for _ in range(30)]
+    records = [run_loop(rng, steps, sensor=noise) for _ in range(count)]
     plain = np.linalg.norm(np.mean([fit_plain(d) for d, _ in records], axis=0) - TRUTH)
-    ours = np.linalg.norm(np.mean([fit(d, r) for d, r in records], axis=0) - TRUTH)
+    ours = np.linalg.norm(np.mean([way(d, r) for d, r in records], axis=0) - TRUTH)
     assert ours <= plain / 5
 
 
 @pytest.mark.slow
-def test_the_bias_over_100_records_stays_within_three_standard_errors_which_fall_with_the_length():
+@pytest.mark.parametrize(("way", "process"), [(fit, 0.0), (fit_directly, 0.03)])
+def test_the_bias_over_100_records_stays_within_three_standard_errors_which_fall_with_the_length(way, process):
     rng, bound = np.random.default_rng(3), {}
     for steps in (500, 2000, 8000):
-        records = [run_loop(rng, steps, sensor=0.1) for _ in range(100)]
+        records = [run_loop(rng, steps, sensor=0.1, process=process) for _ in range(100)]
         plain = np.linalg.norm(np.mean([fit_plain(d) for d, _ in records], axis=0) - TRUTH)
-        ours = np.array([fit(d, r) for d, r in records])
+        ours = np.array([way(d, r) for d, r in records])
         bias = np.linalg.norm(ours.mean(axis=0) - TRUTH)
         bound[steps] = 3 * np.linalg.norm(ours.std(axis=0)) / np.sqrt(len(ours))
         assert bias <= plain / 5
@@ -114,3 +121,38 @@ def test_least_squares_stays_with_process_noise_alone_and_goes_with_noisy_sensor
     assert variance[1] <= 1.1 * variance[0]
     bias, _ = compare_fits(records, sensor=0.1)
     assert bias[1] <= bias[0] / 5
+
+
+@pytest.mark.slow
+def test_with_process_noise_alone_the_variance_is_that_of_least_squares():
+    rng = np.random.default_rng(0)
+    records = [run_loop(rng, 800, process=0.05)[0] for _ in range(100)]
+    plain, ours = (np.array([way(d) for d in records]).var(axis=0).sum() for way in (fit_plain, fit_directly))
+    assert ours <= 1.1 * plain
+
+
+def test_exact_readings_keep_the_model():
+    data, _ = run_loop(np.random.default_rng(0), 400)
+    model = km.edmd(data, km.State())
+    assert km.identify.prediction_error(model, data) is model
+
+
+def test_logs_that_identify_nothing_are_refused():
+    resting, _ = run_loop(np.random.default_rng(4), 400, sensor=0.1, moves=False)
+    with pytest.raises(km.errors.DataError, match="not identifiable from these logs: u0"):
+        fit_directly(resting)
+
+
+def test_too_few_rows_do_not_make_an_input_follow_from_the_readings():
+    rng = np.random.default_rng(0)
+    data = km.Episodes([km.Episode(X=rng.standard_normal((81, 4)), U=rng.standard_normal((80, 20)))], dt=0.1)
+    km.identify.prediction_error(km.edmd(data, km.State()), data, iterations=2)
+
+
+def test_models_that_it_does_not_know_are_refused():
+    data, _ = run_loop(np.random.default_rng(6), 200, sensor=0.1)
+    with pytest.raises(km.errors.DataError, match="has past rows"):
+        km.identify.prediction_error(km.edmd(data, km.State(), embedding=km.Delay(1)), data)
+    other = km.Episodes([km.Episode(X=data[0].X[:, :1], U=data[0].U)], dt=0.1)
+    with pytest.raises(km.errors.ShapeError):
+        km.identify.prediction_error(km.edmd(data, km.State()), other)
