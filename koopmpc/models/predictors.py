@@ -178,8 +178,8 @@ class LinearPredictor(Predictor):
         >>> model.A.tolist()
         [[1.0, 0.1], [0.0, 1.0]]
         """
-        A, B, *about = read_state_space(system, dt, states, inputs)
-        return cls(A, B, np.eye(len(A)), State(), *about)
+        A, B, step, names, pushes = read_state_space(system, dt, states, inputs)
+        return cls(A, B, np.eye(len(A)), State(), step, names, pushes)
 
     def to_state_space(self) -> Any:
         """Return z⁺ = A z + B u, x = C z as a scipy.signal.dlti; ``control.ss(system)`` takes its matrices."""

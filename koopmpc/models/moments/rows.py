@@ -61,12 +61,8 @@ def row_columns(lifting: Lifting, inputs: tuple[str, ...], bilinear: bool) -> Ro
     )
 
 
-class Piece(NamedTuple):
-    """The pairs x_k → x_{k+1}, first ≤ k < last, of one episode."""
-
-    episode: int
-    first: int
-    last: int
+Piece = tuple[int, int, int]
+"""The pairs x_k → x_{k+1}, first ≤ k < last, of one episode: its number, first and last."""
 
 
 def split_chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
@@ -80,7 +76,7 @@ def split_chunks(episodes: Episodes, rows: int = ROWS) -> list[list[Piece]]:
                 result.append([])
                 room = rows
             last = min(first + room, length)
-            result[-1].append(Piece(i, first, last))
+            result[-1].append((i, first, last))
             room -= last - first
             first = last
     return result

@@ -333,13 +333,13 @@ def project_onto(basis: Float[np.ndarray, "m k"], columns: Float[np.ndarray, "m 
 
 
 def describe_solve(
-    rows: RegressionRows, asked: Ridge, ridge: float, *, scaled: bool = True, light: Sequence[int] = ()
+    rows: RegressionRows, choice: Ridge, ridge: float, *, scaled: bool = True, light: Sequence[int] = ()
 ) -> str:
     """Return in words the ridge, or the cut of singular values, of a solve without a rank."""
     columns = "unit-norm" if scaled else "unscaled"
     columns += " columns" if rows.constant is None or ridge == 0 else " deviations"
     spared = ", a millionth of it on states, Constant and inputs" if light else ""
-    how = ", chosen by generalised cross-validation" if asked == "gcv" else ""
+    how = ", chosen by generalised cross-validation" if choice == "gcv" else ""
     if ridge > 0:
         return f"ridge {ridge:.6g} on {columns}{spared}{how}"
     zero = f", ridge 0{how}" if how else ""

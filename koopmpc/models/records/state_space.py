@@ -234,10 +234,10 @@ class _Search:
                 return
             least = best
 
-    def finish(self, asked: str) -> list[HiddenStructure]:
+    def finish(self, advice: str) -> list[HiddenStructure]:
         """Return the structures that were tried."""
         if not self.tried:
-            raise self.reason or DataError(f"no structure was asked for; pass {asked}")
+            raise self.reason or DataError(f"there is no structure to try; pass {advice}")
         return self.tried
 
 
