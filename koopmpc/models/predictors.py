@@ -32,7 +32,7 @@ from koopmpc.models.parts import (
     refuse_unknown,
     store_fields,
 )
-from koopmpc.models.state_space import build_system, read_state_space
+from koopmpc.models.state_space import read_state_space
 from koopmpc.plants.step_map import StepMap
 
 
@@ -183,7 +183,10 @@ class LinearPredictor(Predictor):
 
     def to_state_space(self) -> Any:
         """Return z⁺ = A z + B u, x = C z as a scipy.signal.dlti; ``control.ss(system)`` takes its matrices."""
-        return build_system(self.A, self.B, self.C, self.dt)
+        from scipy.signal import dlti  # slow to import
+
+        make: Any = dlti  # its stubs call it abstract
+        return make(self.A, self.B, self.C, np.zeros((self.nx, self.nu)), dt=self.dt)
 
     @classmethod
     def local(cls, step_map: StepMap, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None) -> "LinearPredictor":

@@ -1,10 +1,9 @@
-"""State-space systems of scipy.signal and python-control as predictors, and back."""
+"""State-space systems of scipy.signal and python-control as predictors."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from koopmpc.base import checks
 from koopmpc.base.errors import DataError
@@ -64,13 +63,3 @@ def _find_step(system: Any, dt: float | None) -> tuple[float, bool]:
     if dt is not None and not np.isclose(dt, float(own)):
         raise DataError(f"the system has dt = {float(own):g} s, but dt= is {dt:g} s; leave dt out")
     return float(own), False
-
-
-def build_system(
-    A: Float[np.ndarray, "nz nz"], B: Float[np.ndarray, "nz nu"], C: Float[np.ndarray, "nx nz"], dt: float
-) -> Any:
-    """Return z⁺ = A z + B u, x = C z as a scipy.signal.dlti in state-space form."""
-    from scipy.signal import dlti  # slow to import
-
-    make: Any = dlti  # its stubs call it abstract
-    return make(A, B, C, np.zeros((len(C), B.shape[1])), dt=dt)

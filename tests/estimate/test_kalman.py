@@ -222,42 +222,21 @@ def test_infinities_are_missed_samples():
 INTEGRATOR = linear(np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]]), [0.0, 0.0])
 
 
+DATA, SHAPE = km.errors.DataError, km.errors.ShapeError
+TWO_INPUTS, UNSTABLE = linear(np.diag([0.5, 0.6]), np.eye(2)), linear(np.diag([0.5, 1.2]), np.ones((2, 1)))
+
+
 @pytest.mark.parametrize(
     ("rule", "model", "error", "words"),
     [
-        (
-            km.LiftedKalman("x0", "output"),
-            INTEGRATOR,
-            km.errors.DataError,
-            "with λ = 1, 'x0 \\[m\\]', an offset of output 'x0'",
-        ),
-        (
-            km.LiftedKalman("x1"),
-            INTEGRATOR,
-            km.errors.DataError,
-            "'x0 \\[m\\]' can move without a trace in y; measure one",
-        ),
-        (km.LiftedKalman(("x0", "x0")), INTEGRATOR, km.errors.DataError, "depend on each other"),
-        (km.LiftedKalman("1"), INTEGRATOR, km.errors.DataError, "or on the Constant"),
+        (km.LiftedKalman("x0", "output"), INTEGRATOR, DATA, "with λ = 1, 'x0 \\[m\\]', an offset of output"),
+        (km.LiftedKalman("x1"), INTEGRATOR, DATA, "'x0 \\[m\\]' can move without a trace"),
+        (km.LiftedKalman(("x0", "x0")), INTEGRATOR, DATA, "depend on each other"),
+        (km.LiftedKalman("1"), INTEGRATOR, DATA, "or on the Constant"),
         (km.LiftedKalman("theta"), INTEGRATOR, km.errors.ObservableError, "lacks 'theta'; add it"),
-        (
-            km.LiftedKalman(np.eye(2)),
-            INTEGRATOR,
-            km.errors.ShapeError,
-            r"outputs has shape \(2, 2\), expected \(ny, 3\)",
-        ),
-        (
-            km.LiftedKalman("x0"),
-            linear(np.diag([0.5, 0.6]), np.eye(2)),
-            km.errors.DataError,
-            "1 outputs cannot tell the disturbances of 2 inputs apart; measure at least 2",
-        ),
-        (
-            km.LiftedKalman("x0", "output"),
-            linear(np.diag([0.5, 1.2]), np.ones((2, 1))),
-            km.errors.DataError,
-            "λ = 1.2, 'x1 \\[m\\]' can move",
-        ),
+        (km.LiftedKalman(np.eye(2)), INTEGRATOR, SHAPE, r"outputs has shape \(2, 2\)"),
+        (km.LiftedKalman("x0"), TWO_INPUTS, DATA, "1 outputs cannot tell"),
+        (km.LiftedKalman("x0", "output"), UNSTABLE, DATA, "λ = 1.2, 'x1 \\[m\\]' can move"),
     ],
 )
 def test_what_cannot_be_estimated_is_refused_in_words(rule, model, error, words):
